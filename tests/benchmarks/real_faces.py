@@ -21,10 +21,10 @@ from torchface.io.video import open_video
 from torchface.landmarks import (
     Agreement,
     FaceBoxes,
+    FaceReading,
     HaarDetector,
     LandmarkTracker,
     NoFaceError,
-    TrackedFace,
     agreement,
     find_blinks,
     find_landmarks,
@@ -157,7 +157,7 @@ def follow(finder: LandmarkFinder, clip: Clip) -> Follow:
     return Follow(clip, torch.stack(found), 1000 * (time.perf_counter() - begin) / len(found))
 
 
-def see(finder: LandmarkFinder, picture: Picture, seed: int = 0) -> TrackedFace:
+def see(finder: LandmarkFinder, picture: Picture, seed: int = 0) -> FaceReading:
     """The landmarks of a picture from its face's box, moved and sized as a detector's is."""
     tilt = float(tilt_around(picture.landmarks)) if picture.told is None else picture.told
     box = box_around(picture.landmarks, tilt)
@@ -169,7 +169,7 @@ def see(finder: LandmarkFinder, picture: Picture, seed: int = 0) -> TrackedFace:
     try:
         return find_landmarks(picture.image, finder, detector=lambda _: given)
     except NoFaceError:  # the finder says so
-        return replace(TrackedFace.lost(), presence=0.0)
+        return FaceReading.lost()
 
 
 def errors(finder: LandmarkFinder, pictures: list[Picture], seeds: int = 3) -> Tensor:
@@ -186,7 +186,7 @@ def errors(finder: LandmarkFinder, pictures: list[Picture], seeds: int = 3) -> T
     return offsets
 
 
-def verdict(picture: Picture, found: TrackedFace) -> str:
+def verdict(picture: Picture, found: FaceReading) -> str:
     """``right``, ``said so`` or ``wrong``: of a face whose landmarks, or those that it vouches for, are off."""
     off = (found.landmarks - picture.landmarks)[INNER].norm(dim=1) / picture.width
     if found.presence < 0.5:

@@ -16,7 +16,7 @@ from torchface.rendering.point_light import PointLight
 from torchface.synthetic.head.performer import performer
 from torchface.synthetic.stages.weight_curves import perform
 from torchface.workflows.evaluate.compare_with_truth import EvaluationSettings, evaluate
-from torchface.workflows.track.track_settings import TrackSettings
+from torchface.workflows.track.track_inputs import TrackSettings
 from torchface.workflows.track.track_video import track_video
 
 FRAMES, FPS = 150, 60.0

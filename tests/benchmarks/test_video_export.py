@@ -15,8 +15,8 @@ from torch import Tensor
 from torchface.capture.own_rig import VideoSettings
 from torchface.cli import main
 from torchface.io.camera_files import save_calibration
+from torchface.workflows.track.track_inputs import TrackSettings
 from torchface.workflows.track.track_result import Tracked
-from torchface.workflows.track.track_settings import TrackSettings
 from torchface.workflows.track.track_video import track_video
 
 pytestmark = pytest.mark.real

@@ -33,12 +33,10 @@ from torchface.capture.own_rig.landmark_smoothing import LandmarkFilter
 from torchface.files.content_keys import content_key
 from torchface.files.whole_files import write_file
 from torchface.geometry.cameras.calibration import assumed_calibration
-from torchface.landmarks.images.face_reading import FaceReading
-from torchface.landmarks.images.ibug_68 import box_around
-from torchface.landmarks.images.landmark_finder import confidence_of, trust_of
+from torchface.landmarks.images.face_reading import READ_BY_NETWORKS, FaceReading
 from torchface.onnx.graph_values import OPSET, ValueGraph
 from torchface.onnx.webcam.face_reader import STATE, ReaderSettings, read_face
-from torchface.onnx.webcam.webcam_solver_graph import READING, webcam_solver_model
+from torchface.onnx.webcam.webcam_solver_graph import webcam_solver_model
 from torchface.shape_names import ARKIT, mapping
 from torchface.synthetic import performer
 from torchface.workflows.track.track_inputs import solver_for
@@ -82,7 +80,7 @@ def read_faces(frames: Tensor, fps: float, kept: Path) -> list[FaceReading]:
             rows.append(row)
         tables = {
             name: torch.from_numpy(np.stack(column))
-            for name, column in zip(READING, zip(*rows, strict=True), strict=True)
+            for name, column in zip(READ_BY_NETWORKS, zip(*rows, strict=True), strict=True)
         }
         write_file(path, save(tables))
     stored = load_file(path)
@@ -95,7 +93,7 @@ def _reader() -> ModelProto:
     graph = ValueGraph()
     image, interval, state = (graph.value(name) for name in ("image", "interval", "state"))
     read = read_face(graph, image, interval, state, webcam_networks(), ReaderSettings())
-    for name in (*READING, "state"):
+    for name in (*READ_BY_NETWORKS, "state"):
         graph.build.op("Identity", getattr(read, name).name, output=f"read_{name}")
     shapes = {
         "landmarks": (68, 2), "deviation": (68,), "visibility": (68,), "presence": (1,), "iris": (2, 2),
@@ -112,13 +110,6 @@ def _one_thread() -> onnxruntime.SessionOptions:
     return options
 
 
-def _trust(reading: FaceReading) -> Tensor:
-    """How far each landmark is to be trusted, (68,), as ``trust_of`` says it of trackers' landmarks."""
-    share = reading.deviation / box_around(reading.landmarks)[2]
-    sure = trust_of(confidence_of(share), reading.visibility)
-    return torch.where(torch.isfinite(reading.landmarks).all(1), sure, 0.0).nan_to_num(0.0)
-
-
 def video_solver(readings: list[FaceReading], fps: float, size: tuple[int, int]) -> Solved:
     """``VideoSolver`` on the embedded performer's mean head, as ``torchface track --live`` runs it."""
     rig = performer(texture=False)
@@ -128,8 +119,8 @@ def video_solver(readings: list[FaceReading], fps: float, size: tuple[int, int])
 
     def step(reading: FaceReading) -> Tensor:
         nonlocal state
-        sure = _trust(reading)
-        landmarks = smoother.step(torch.where(sure[:, None] > 0, reading.landmarks, torch.nan))
+        sure = reading.trust.nan_to_num(0.0)
+        landmarks = smoother.step(reading.trusted_landmarks)
         if state is None and int((torch.isfinite(landmarks).all(1) & (sure > 0)).sum()) < _LEAST:
             return torch.zeros(len(rig.names))
         state = solver.step(state or solver.start(), landmarks, confidence=sure, interval=1 / fps)
@@ -149,7 +140,7 @@ def webcam_solver(readings: list[FaceReading], fps: float, size: tuple[int, int]
     weights, gazes = [], []
     started = time.process_time()
     for reading in readings:  # a frame's state is the next one's
-        given = {name: getattr(reading, name).numpy() for name in READING}
+        given = {name: getattr(reading, name).numpy() for name in READ_BY_NETWORKS}
         solved, gaze, state = session.run(["weights", "gaze", "next_state"], given | fixed | {"state": state})
         weights.append(torch.from_numpy(solved))
         gazes.append(torch.from_numpy(gaze))

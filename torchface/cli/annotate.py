@@ -48,7 +48,8 @@ def annotate(
     from torchface.files.job_lock import job_lock
     from torchface.workflows.annotate_video import prepare_annotation, write_proposals
     from torchface.workflows.named_finders import load_finder
-    from torchface.workflows.track.given_frames import given_frames, is_table
+    from torchface.workflows.track.frame_readings import given_reading
+    from torchface.workflows.track.track_models import is_table
 
     if browser:
         from torchface.viz.browser.browser_page import HOST, import_viser
@@ -64,7 +65,7 @@ def annotate(
                 from torchface.landmarks.images.tracking.video_landmarks import track_landmarks
 
                 if finder is None:
-                    given = given_frames(Path(landmarks), video)
+                    given = given_reading(Path(landmarks), video)
                     return given.landmarks, given.confidence
                 found = track_landmarks(video, LandmarkTracker(finder.finder, face=face), progress)
                 return found.values, found.confidence

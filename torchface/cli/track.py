@@ -88,7 +88,7 @@ def track(
     from torchface.errors import ValueRangeError
     from torchface.workflows.batch.batch_items import find_items, is_batch
     from torchface.workflows.batch.run_batch import BatchOptions, run_batch
-    from torchface.workflows.track.track_settings import TrackSettings
+    from torchface.workflows.track.track_inputs import TrackSettings
     from torchface.workflows.track.video_job import VIDEOS, VideoJob
 
     given = landmarks.lower().endswith(".csv")
@@ -127,15 +127,15 @@ def track(
 
 def _file(video: Path | None, rig: Path, out: Path, settings: object, quiet: bool) -> None:
     from torchface.files.job_lock import job_lock
+    from torchface.workflows.track.track_inputs import TrackSettings
     from torchface.workflows.track.track_page import write_track_page
-    from torchface.workflows.track.track_settings import TrackSettings
     from torchface.workflows.track.track_video import track_video
 
     assert isinstance(settings, TrackSettings)
     with job_lock(out), progress_bars(quiet) as progress:
         tracked = track_video(video, rig, out, settings, progress)
         progress("writing the report")
-        page = write_track_page(tracked, out, settings.texture)
+        page = write_track_page(tracked, out)
     for line in tracked.lines():
         console.print(line, highlight=False, soft_wrap=True)
     for path in (*tracked.products.values(), page):
@@ -148,7 +148,7 @@ def _live(
     from torchface.files.job_lock import job_lock
     from torchface.workflows.live.live_track import track_live
     from torchface.workflows.track.track_files import WEIGHTS
-    from torchface.workflows.track.track_settings import TrackSettings
+    from torchface.workflows.track.track_inputs import TrackSettings
 
     assert isinstance(settings, TrackSettings)
     with nullcontext() if out is None else job_lock(out), progress_bars(quiet) as progress:

@@ -12,7 +12,8 @@ from torchface.landmarks.images.boxes.face_box import (
     find_faces,
 )
 from torchface.landmarks.images.boxes.network_detector import NetworkDetector
-from torchface.landmarks.images.landmark_finder import FoundLandmarks, LandmarkFinder
+from torchface.landmarks.images.face_reading import FaceReading
+from torchface.landmarks.images.landmark_finder import LandmarkFinder
 from torchface.landmarks.images.landmark_measures import (
     Agreement,
     agreement,
@@ -26,7 +27,6 @@ from torchface.landmarks.images.networks.landmark_network import LandmarkNetwork
 from torchface.landmarks.images.networks.landmark_training import NetworkSettings
 from torchface.landmarks.images.photograph_landmarks import find_landmarks
 from torchface.landmarks.images.tracking.landmark_tracker import LandmarkTracker
-from torchface.landmarks.images.tracking.tracked_face import TrackedFace
 from torchface.landmarks.images.tracking.video_landmarks import track_landmarks
 from torchface.landmarks.images.trees.landmark_trees import LandmarkTrees
 from torchface.landmarks.images.trees.tree_finder import TreeFinder
@@ -59,7 +59,7 @@ __all__ = [
     "EyeNetwork",
     "FaceBoxes",
     "FaceFrame",
-    "FoundLandmarks",
+    "FaceReading",
     "HaarDetector",
     "LabelledPicture",
     "LandmarkFinder",
@@ -75,7 +75,6 @@ __all__ = [
     "ScanAnnotation",
     "ScanLandmarks",
     "TraceSettings",
-    "TrackedFace",
     "TreeFinder",
     "TreeSettings",
     "UVLandmarkDetector",

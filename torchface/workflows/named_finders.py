@@ -11,9 +11,8 @@ from torchface.errors import NameMismatchError, ValueRangeError
 from torchface.landmarks import LandmarkNetwork, LandmarkTrees
 from torchface.landmarks.images.landmark_finder import LandmarkFinder
 from torchface.landmarks.images.networks.crop_finder import BothSides
-from torchface.landmarks.images.networks.eye_finder import EyeFinder, graph_eye_finder
+from torchface.landmarks.images.networks.eye_finder import EyedFinder, EyeFinder, graph_eye_finder
 from torchface.landmarks.images.networks.eye_network import EyeNetwork
-from torchface.landmarks.images.networks.eyed_finder import EyedFinder
 from torchface.landmarks.images.networks.mediapipe_finder import MediaPipeFinder
 from torchface.landmarks.images.networks.onnx_finder import graph_finder, onnx_finder
 from torchface.landmarks.images.trees.landmark_consensus import ConsensusSettings

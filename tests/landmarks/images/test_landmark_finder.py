@@ -12,14 +12,14 @@ from torch import Tensor
 from torchface.errors import ShapeError, ValueRangeError
 from torchface.landmarks import (
     FaceBoxes,
-    FoundLandmarks,
+    FaceReading,
     LandmarkTracker,
     NoFaceError,
     find_landmarks,
     track_landmarks,
 )
+from torchface.landmarks.images.face_reading import trust_of
 from torchface.landmarks.images.ibug_68 import box_around, tilt_around
-from torchface.landmarks.images.landmark_finder import confidence_of, trust_of
 from torchface.synthetic import performer
 
 
@@ -57,10 +57,10 @@ class Knowing:
     def __init__(self, landmarks: Tensor) -> None:
         self.landmarks = landmarks
 
-    def __call__(self, image: Tensor, box: Tensor, tilt: float = 0.0) -> FoundLandmarks:
+    def __call__(self, image: Tensor, box: Tensor, tilt: float = 0.0) -> FaceReading:
         at = self.landmarks
         away = (at.mean(0) - box[:2] - box[2:] / 2).norm() / box[2]
-        return FoundLandmarks(at, confidence_of(torch.full((68,), 0.01)), torch.ones(68), float(away < 0.5))
+        return FaceReading(at, 0.01 * box[2] * torch.ones(68), torch.ones(68), (away < 0.5).float())
 
 
 def test_a_finder_of_ones_own_is_followed(face: Tensor) -> None:
@@ -100,11 +100,11 @@ class Stage:
                 shown.append(place)
         return shown
 
-    def find(self, image: Tensor, box: Tensor, tilt: float = 0.0) -> FoundLandmarks:
+    def find(self, image: Tensor, box: Tensor, tilt: float = 0.0) -> FaceReading:
         middle = box[:2] + box[2:] / 2
         near = min(self.seen(), key=lambda place: float((place - middle).norm()))
-        there = float((near - middle).norm() < 0.5 * box[2])
-        return FoundLandmarks(self.face + near, confidence_of(torch.full((68,), 0.01)), torch.ones(68), there)
+        there = ((near - middle).norm() < 0.5 * box[2]).float()
+        return FaceReading(self.face + near, 0.01 * box[2] * torch.ones(68), torch.ones(68), there)
 
     def detect(self, image: Tensor) -> FaceBoxes:
         boxes = torch.stack([box_around(self.face + place) for place in self.seen()])
@@ -139,7 +139,7 @@ def test_a_face_that_was_hidden_or_went_is_noticed_and_found_again(face: Tensor)
 def test_a_resumed_tracker_does_as_one_that_went_on(face: Tensor) -> None:
     stage = Stage(face, [(200, 120, 90)])
 
-    def high(image: Tensor, box: Tensor, tilt: float = 0.0) -> FoundLandmarks:
+    def high(image: Tensor, box: Tensor, tilt: float = 0.0) -> FaceReading:
         found = stage.find(image, box, tilt)  # five hundredths of the box's side above where the box says the face is
         middle = (box[:2] + box[2:] / 2) * torch.tensor([0.1, 0.1]) + 0.9 * found.landmarks.mean(0)
         return replace(found, landmarks=face + middle - torch.tensor([0.0, 0.05]) * box[2])
@@ -154,7 +154,7 @@ def test_a_resumed_tracker_does_as_one_that_went_on(face: Tensor) -> None:
             memory = other.memory
             assert last is not None
             other = LandmarkTracker(high, detector=stage.detect)
-            other.resume(last.landmarks, last.confidence, memory)
+            other.resume(memory)
         last = other.step(frame)
         assert torch.equal(kept.landmarks, last.landmarks)
 
@@ -166,16 +166,16 @@ def test_a_finder_that_breaks_the_protocol_is_named(face: Tensor) -> None:
         (replace(good, landmarks=face[:5]), ShapeError, r"frame 0: .*function: .*\(5, 2\).*expected \(68,2\)"),
         (replace(good, landmarks=face * torch.nan), ValueRangeError, "68 landmarks that are not finite"),
         (
-            replace(good, confidence=torch.full((68,), 1.5)),
+            replace(good, deviation=torch.full((68,), -1.0)),
             ValueRangeError,
-            "confidence from 1.5 to 1.5, expected 0 to",
+            "deviation from -1 to -1, expected 0 pixels or more",
         ),
         (replace(good, visibility=torch.full((68,), torch.nan)), ValueRangeError, "visibility from nan"),
-        (replace(good, presence=2.0), ValueRangeError, "presence 2, expected 0 to 1"),
+        (replace(good, presence=torch.tensor(2.0)), ValueRangeError, "presence from 2 to 2, expected 0 to 1"),
     ]
     for found, kind, message in cases:
 
-        def finder(image: Tensor, box: Tensor, tilt: float = 0.0, found: FoundLandmarks = found) -> FoundLandmarks:
+        def finder(image: Tensor, box: Tensor, tilt: float = 0.0, found: FaceReading = found) -> FaceReading:
             return found
 
         tracker = LandmarkTracker(finder, detector=lambda _: FaceBoxes(box_around(face + 100)[None], torch.ones(1)))
@@ -194,9 +194,9 @@ def test_a_mouth_behind_a_hand_counts_nothing() -> None:
 
 
 def test_a_box_that_shows_no_face_is_told() -> None:
-    def doubting(image: torch.Tensor, box: torch.Tensor, tilt: float = 0.0) -> FoundLandmarks:
+    def doubting(image: torch.Tensor, box: torch.Tensor, tilt: float = 0.0) -> FaceReading:
         marks = box[:2] + box[2:] * torch.rand(68, 2, generator=torch.Generator().manual_seed(1))
-        return FoundLandmarks(marks, torch.ones(68), torch.ones(68), 0.02)
+        return FaceReading(marks, torch.ones(68), torch.ones(68), torch.tensor(0.02))
 
     def one_box(image: torch.Tensor) -> FaceBoxes:
         return FaceBoxes(torch.tensor([[10.0, 10.0, 40.0, 40.0]]), torch.ones(1))

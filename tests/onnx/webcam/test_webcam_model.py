@@ -13,12 +13,12 @@ from torch import Tensor
 
 from torchface import zoo
 from torchface.capture.anybody.webcam_state import CONTROLS
-from torchface.landmarks import LandmarkTracker
+from torchface.landmarks import FaceReading, LandmarkTracker
 from torchface.landmarks.images.boxes.network_detector import shipped_detector
 from torchface.landmarks.images.face_crop import crop_transform, cut_crop, from_crop
 from torchface.landmarks.images.ibug_68 import turned_box
 from torchface.landmarks.images.networks.crop_finder import CropFinder
-from torchface.landmarks.images.networks.eye_finder import EyeFinder, face_without_eyes
+from torchface.landmarks.images.networks.eye_finder import EyeFinder
 from torchface.onnx.graph_values import OPSET, Value, ValueGraph
 from torchface.onnx.webcam import face_place, picture_pieces
 from torchface.onnx.webcam.eye_reader import read_eyes
@@ -78,7 +78,7 @@ def test_eyes_are_read_as_the_library_reads_them(portrait: tuple[Tensor, Tensor]
     finder = EyeFinder(networks.eyes, networks.eyes.width, networks.eyes.height)
     sure = torch.ones(68)
     for size in (1.0, 0.05):
-        face = finder(picture, face_without_eyes(size * marks, deviation, sure, sure[0]))
+        face = finder(picture, FaceReading(size * marks, deviation, sure, sure[0]))
         read = (face.landmarks, face.deviation, face.iris, face.openness, face.closed, face.eye_visibility)
         expected = torch.cat([one.flatten() for one in read])
 

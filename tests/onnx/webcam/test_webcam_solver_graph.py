@@ -12,7 +12,8 @@ import torch
 from torchface import zoo
 from torchface.capture.anybody import WebcamSettings, WebcamSolver
 from torchface.capture.anybody.webcam_state import CONTROLS
-from torchface.onnx.webcam.webcam_solver_graph import INPUTS, OUTPUTS, READING, empty_reading, webcam_solver_model
+from torchface.landmarks.images.face_reading import READ_BY_NETWORKS
+from torchface.onnx.webcam.webcam_solver_graph import INPUTS, OUTPUTS, empty_reading, webcam_solver_model
 from torchface.shape_names import ARKIT
 from torchface.synthetic import performer
 
@@ -34,7 +35,7 @@ def parity(settings: WebcamSettings, frames: int) -> float:
     controls[1:3] = torch.tensor([1.0, 0.5])
     for frame in range(frames):
         empty = empty_reading()
-        given = {name: getattr(empty, name) for name in READING}
+        given = {name: getattr(empty, name) for name in READ_BY_NETWORKS}
         if frame != 3:
             noise = torch.randn(68, 3, generator=generator)
             face = (rest + noise) * torch.tensor([1.0, -1.0, -1.0]) + torch.tensor([3.0 * frame, 0.0, 600.0])

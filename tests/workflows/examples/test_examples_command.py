@@ -15,7 +15,7 @@ from torchface.errors import NameMismatchError
 from torchface.io import save_rig
 from torchface.io.images.image_files import save_image
 from torchface.io.video.video_writing import write_video
-from torchface.landmarks import NoFaceError, TrackedFace
+from torchface.landmarks import FaceReading, NoFaceError
 from torchface.synthetic import performer
 from torchface.workflows.examples import guided_session, picture_examples
 from torchface.workflows.examples.guided_session import calmest, guided_examples
@@ -38,23 +38,23 @@ def shapes() -> Tensor:
 def finder(monkeypatch: pytest.MonkeyPatch, shapes: Tensor) -> None:
     """A finder that sees in a picture's level of grey which expression it is; half a level off the face jitters."""
 
-    def seen(image: Tensor) -> TrackedFace:
+    def seen(image: Tensor) -> FaceReading:
         level = float(image.float().mean()) / STEP - 1
         if round(level) < 0:
-            return TrackedFace.lost()
+            return FaceReading.lost()
         number = min(round(level), 15)
         shake = 4 * abs(level - number) * torch.tensor([1.0, -1.0])[int(image.float().mean()) % 2]
         landmarks = shapes[number] + shake
-        return TrackedFace(landmarks, torch.zeros(4), torch.ones(68))
+        return FaceReading(landmarks, torch.zeros(68), torch.ones(68), torch.ones(()))
 
     class Tracker:
         def __init__(self, finder: object) -> None:
             pass
 
-        def step(self, frame: Tensor) -> TrackedFace:
+        def step(self, frame: Tensor) -> FaceReading:
             return seen(frame)
 
-    def found(image: Tensor, finder: object) -> TrackedFace:
+    def found(image: Tensor, finder: object) -> FaceReading:
         face = seen(image)
         if not face.found:
             raise NoFaceError("image: found nothing, expected a face")

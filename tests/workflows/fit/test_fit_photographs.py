@@ -26,7 +26,7 @@ from torchface.io import load_identity_modes
 from torchface.io.camera_files import load_calibration
 from torchface.io.images.image_files import load_image, save_image
 from torchface.io.landmarks.landmark_points import load_landmark_points
-from torchface.landmarks import NoFaceError, TrackedFace, find_faces
+from torchface.landmarks import FaceReading, NoFaceError, find_faces
 from torchface.modeling import FitSettings, HeadModel, ImageFit, MorphableModel, fit_images
 from torchface.rendering.clay_shading import render
 from torchface.rig import BlendshapeRig
@@ -148,13 +148,14 @@ def test_unsure_landmarks_are_left_out(studio: Path) -> None:
     points[3] = torch.tensor([-4.0, 20.0])
     confidence = torch.full((68,), 0.8)
     confidence[60:] = 0.05
-    face = TrackedFace(points, torch.tensor([10.0, 10, 60, 60]), confidence)
+    box, sure = torch.tensor([10.0, 10, 60, 60]), torch.ones(68)
+    face = FaceReading.of_confidence(points, confidence, sure, sure[0], box)
     boxes = torch.tensor([[200.0, 5, 80, 80], [10, 10, 60, 60]])
     found = PhotographLandmarks(Path("a.png"), "face_landmarks", face, 1, boxes, (300, 100))
     assert found.confident.isnan().any(1).nonzero()[:, 0].tolist() == [3, *range(60, 68)]
     assert "lowest at the mouth with 0.50; 9 left out" in found.lines()[0]
     assert found.lines()[1] == "  number 1 of 2 faces; others with --face 0: at (200, 5)"
-    unsure = TrackedFace(points, face.box, torch.full((68,), 0.1))
+    unsure = FaceReading.of_confidence(points, torch.full((68,), 0.1), sure, sure[0], box)
     kept = PhotographLandmarks(Path("a.png"), "face_landmarks", unsure, 0, boxes[:1], (300, 100)).confident
     assert kept.isnan().any(1).nonzero()[:, 0].tolist() == [3]
 

@@ -19,29 +19,28 @@ from torchface import BlendshapeRig, load_rig, load_take, save_rig, zoo
 from torchface.capture.priors import ShapePrior
 from torchface.cli import main
 from torchface.errors import FileFormatError, NameMismatchError, ValueRangeError
-from torchface.geometry.cameras.calibration import CameraCalibration
+from torchface.geometry.cameras.calibration import CameraCalibration, assumed_calibration
 from torchface.geometry.rotations import rotation_matrix
 from torchface.io.camera_files import save_calibration
 from torchface.io.gltf.animation_reading import read_gltf_weights
-from torchface.io.video import open_video, write_video
+from torchface.io.video import VideoFile, open_video, write_video
 from torchface.io.weights.live_link_stream import decode_frame
+from torchface.landmarks import FaceReading
 from torchface.landmarks.images.tracking.landmark_tracker import LandmarkTracker
-from torchface.landmarks.images.tracking.tracked_face import TrackedFace
 from torchface.rendering.point_light import PointLight
 from torchface.shape_names import ARKIT, mapping
 from torchface.synthetic.head.performer import performer
 from torchface.workflows.live.live_track import track_live
 from torchface.workflows.named_finders import load_finder
-from torchface.workflows.track import frame_landmarks
+from torchface.workflows.track import frame_readings
+from torchface.workflows.track.face_overlay import mesh_drawer, paint_drawer, undistorted
 from torchface.workflows.track.head_rotations import head_angles
-from torchface.workflows.track.side_by_side import head_window
-from torchface.workflows.track.track_inputs import check_length
+from torchface.workflows.track.overlay_video import head_window
+from torchface.workflows.track.track_inputs import TrackInputs, TrackSettings
 from torchface.workflows.track.track_models import TrackModels, load_track_models
-from torchface.workflows.track.track_overlay import mesh_drawer, paint_drawer, undistorted
 from torchface.workflows.track.track_page import write_track_page
 from torchface.workflows.track.track_result import Tracked
-from torchface.workflows.track.track_settings import TrackSettings
-from torchface.workflows.track.track_state import FOLDER, TrackedFrames, TrackState
+from torchface.workflows.track.track_state import FOLDER, TrackState
 from torchface.workflows.track.track_video import track_video
 
 pytestmark = pytest.mark.usefixtures("coarse_figures")
@@ -114,13 +113,13 @@ def done(filmed: Filmed, tmp_path_factory: pytest.TempPathFactory) -> Done:
     steps = 0
     step = LandmarkTracker.step
 
-    def counted(self: LandmarkTracker, frame: torch.Tensor) -> TrackedFace:
+    def counted(self: LandmarkTracker, frame: torch.Tensor) -> FaceReading:
         nonlocal steps
         steps += 1
         return step(self, frame)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(frame_landmarks, "PIECE", PIECE)
+        patch.setattr(frame_readings, "PIECE", PIECE)
         with pytest.raises(KeyboardInterrupt):
             track_video(filmed.video, filmed.rig, out, settings, killed)
         left = tuple(path.name for path in out.iterdir())
@@ -132,7 +131,7 @@ def done(filmed: Filmed, tmp_path_factory: pytest.TempPathFactory) -> Done:
 def test_a_filmed_performer_comes_back(done: Done, filmed: Filmed) -> None:
     tracked = done.tracked
     assert tracked.seen.all()
-    off = (tracked.frames.landmarks - filmed.landmarks).norm(dim=2)[:, 17:]
+    off = (tracked.reading.landmarks - filmed.landmarks).norm(dim=2)[:, 17:]
     assert float(off.mean()) < 0.05 * float((filmed.landmarks[0, 36] - filmed.landmarks[0, 45]).norm())
     turned = tracked.solution.rotation.double() @ filmed.rotation.transpose(1, 2)
     angle = torch.rad2deg((((turned.diagonal(dim1=1, dim2=2).sum(1)) - 1) / 2).clamp(-1, 1).acos())
@@ -164,7 +163,7 @@ def test_every_file_tells_the_same(done: Done) -> None:
         torch.testing.assert_close(unreal.extras["columns"][name], angles[:, i], atol=1e-6, rtol=0)
     marks = load_take(out / "landmarks.csv")
     assert marks.landmarks is not None
-    torch.testing.assert_close(marks.landmarks.values, tracked.frames.landmarks)
+    torch.testing.assert_close(marks.landmarks.values, tracked.reading.landmarks)
     depth = marks.extras["columns"]["pose_Tz"]
     torch.testing.assert_close(depth, tracked.solution.translation[:, 2].double(), atol=1e-3, rtol=0)
     drawn = open_video(out / "overlay.mp4")
@@ -195,7 +194,7 @@ def test_a_killed_run_goes_on_where_it_was_and_gives_the_same(done: Done, filmed
     tracker = LandmarkTracker(load_finder().finder)
     whole: list[torch.Tensor] = []
     whole.extend(tracker.step(frame).landmarks for frame in open_video(filmed.video).color_frames())
-    assert torch.equal(done.tracked.frames.landmarks, torch.stack(whole))
+    assert torch.equal(done.tracked.reading.landmarks, torch.stack(whole))
 
 
 def test_what_is_up_to_date_is_kept(done: Done, filmed: Filmed, tmp_path: Path) -> None:
@@ -204,19 +203,19 @@ def test_what_is_up_to_date_is_kept(done: Done, filmed: Filmed, tmp_path: Path) 
     made = {path: path.stat().st_mtime_ns for path in (out / "overlay.mp4", out / FOLDER / "solution.safetensors")}
     again = track_video(filmed.video, filmed.rig, out, TrackSettings(camera=filmed.camera))
     assert {path: path.stat().st_mtime_ns for path in made} == made
-    assert set(again.seconds) == {"steadying"}
+    assert set(again.seconds) == {"smoothing"}
     torch.testing.assert_close(again.solution.weights, done.tracked.solution.weights)
     smooth = track_video(
         filmed.video, filmed.rig, out, TrackSettings(camera=filmed.camera, overlay="none", whole_take=True)
     )
-    assert set(smooth.seconds) == {"steadying", "weights"}  # landmarks stay
+    assert set(smooth.seconds) == {"smoothing", "weights"}  # landmarks stay
     assert not torch.equal(smooth.solution.weights, again.solution.weights)
 
 
 def test_damaged_files_are_told_and_made_anew(
     done: Done, filmed: Filmed, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(frame_landmarks, "PIECE", PIECE)
+    monkeypatch.setattr(frame_readings, "PIECE", PIECE)
     out = tmp_path / "out"
     shutil.copytree(done.out, out)
     names = {path.relative_to(done.out) for path in done.out.rglob("*") if path.is_file()}
@@ -232,7 +231,7 @@ def test_damaged_files_are_told_and_made_anew(
     with pytest.warns(UserWarning, match="overlay.mp4: found other content than was written"):
         again = track_video(filmed.video, filmed.rig, out, settings)
     assert again.reused == FRAMES
-    assert set(again.seconds) == {"steadying", "overlay"}
+    assert set(again.seconds) == {"smoothing", "overlay"}
     assert {path.relative_to(out) for path in out.rglob("*") if path.is_file()} == names
     for name in names - {Path("summary.json"), Path(FOLDER) / "track.json"}:  # these hold times and hashes of files
         if name.suffix == ".safetensors":  # whose header names things in any order
@@ -251,10 +250,10 @@ def test_another_run_into_the_folder_is_refused(done: Done, filmed: Filmed, tmp_
 
 
 def test_pieces_of_other_runs_and_damaged_ones_are_thrown_away(tmp_path: Path) -> None:
-    piece = TrackedFrames(torch.rand(4, 68, 2), torch.rand(4, 68), torch.rand(4, 4))
+    piece = FaceReading(torch.rand(4, 68, 2), torch.rand(4, 68), torch.ones(4, 68), torch.ones(4))
     state = TrackState(tmp_path, "a")
     for _ in range(3):
-        state.append(piece)
+        state.append(piece, torch.zeros(3))
     assert TrackState(tmp_path, "a").done == 12
     files = sorted((tmp_path / FOLDER).glob("*.safetensors"))
     files[1].write_bytes(files[1].read_bytes()[:-1000] + bytes(1000))
@@ -286,7 +285,7 @@ def test_paint_stays_on_the_skin_and_landmarks_are_drawn_where_they_are(
     light = PointLight(torch.full((3,), 0.5), torch.full((3,), 0.5), torch.tensor([-500.0, -700.0, 100.0]))
     painted = paint_drawer(Tracked(**{**vars(tracked), "light": light}), tmp_path / "blue.png")(0, frame)
     changed = (painted != frame).any(0)
-    x, y = tracked.frames.landmarks[0, [30, 8]].round().long().T.tolist()
+    x, y = tracked.reading.landmarks[0, [30, 8]].round().long().T.tolist()
     assert changed[y[0], x[0]]
     assert painted[2, y[0], x[0]] > painted[0, y[0], x[0]] + 60
     assert not changed[:, :20].any()
@@ -361,10 +360,12 @@ def test_a_take_shorter_than_the_window_is_told() -> None:
     class Short:
         window, fps = 8, 60.0
 
+    take = VideoFile(Path("take.mp4"), 60.0, 160, 120, 9)
     models = TrackModels(None, dynamics=Short())  # type: ignore[arg-type]
-    check_length(9, models, Path("take.mp4"))
+    inputs = TrackInputs(QUICK, take, performer(texture=False), assumed_calibration(160, 120), models)
+    inputs.check_length(9)
     with pytest.raises(ValueRangeError, match=r"take.mp4: found 8 frames, expected more than the 8"):
-        check_length(8, models, Path("take.mp4"))
+        inputs.check_length(8)
 
 
 def test_of_several_faces_the_one_asked_for_is_followed(filmed: Filmed, tmp_path: Path) -> None:
@@ -375,7 +376,7 @@ def test_of_several_faces_the_one_asked_for_is_followed(filmed: Filmed, tmp_path
     wide[..., 15:105, 170:290] = small
     write_video([wide.round().to(torch.uint8)], tmp_path / "two.avi", 30.0)
     tracked = track_video(tmp_path / "two.avi", filmed.rig, tmp_path / "out", TrackSettings(face=1, overlay="none"))
-    assert float(tracked.frames.landmarks[..., 0].min()) > 170
+    assert float(tracked.reading.landmarks[..., 0].min()) > 170
     assert tracked.faces == 2
     told = " ".join(tracked.lines())
     assert "2 faces in the first frame" in told

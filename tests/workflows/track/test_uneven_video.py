@@ -21,7 +21,7 @@ from torchface.io.landmarks.openface_csv import save_landmarks_csv
 from torchface.io.video import open_video
 from torchface.synthetic.head.performer import performer
 from torchface.take import Take, Track
-from torchface.workflows.track.track_settings import TrackSettings
+from torchface.workflows.track.track_inputs import TrackSettings
 from torchface.workflows.track.track_video import track_video
 
 pytestmark = pytest.mark.usefixtures("coarse_figures")

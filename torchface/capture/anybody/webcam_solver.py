@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
@@ -42,8 +42,7 @@ from torchface.capture.priors.student_groups import StudentGroups
 from torchface.errors import NameMismatchError, ShapeError
 from torchface.geometry.cameras.affine_pose import affine_pose, orthonormal
 from torchface.geometry.cameras.calibration import ASSUMED_FIELD_OF_VIEW
-from torchface.landmarks.images.face_reading import FaceReading
-from torchface.landmarks.images.landmark_finder import trust_of
+from torchface.landmarks.images.face_reading import READ_BY_NETWORKS, FaceReading, trust_of
 from torchface.optim.exported_operators import split_box_program_quickly, symmetric_inverse
 from torchface.rig import BlendshapeRig
 from torchface.shape_names import ARKIT, mapping
@@ -253,7 +252,7 @@ class WebcamSolver(nn.Module):
             controls: what the user asks for.
             size: width and height of the picture, pixels; the camera is assumed from it.
         """
-        tensors = [getattr(reading, one.name).detach().float() for one in fields(FaceReading)]
+        tensors = [getattr(reading, name).detach().float() for name in READ_BY_NETWORKS]
         pixels = torch.tensor([float(n) for n in size])
         with torch.inference_mode():
             given = (

@@ -1,40 +1,148 @@
-"""What networks read of one face in one picture."""
+"""What was read of a face, in one picture or in those of a take."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
 
+import torch
 from torch import Tensor
 
-__all__ = ["FaceReading"]
+from torchface.landmarks.images.ibug_68 import COUNT, box_around
+
+READ_BY_NETWORKS = (
+    "landmarks", "deviation", "visibility", "presence", "iris", "openness", "closed", "eye_visibility"
+)  # fmt: skip
+"""The parts of a reading that networks give, in the order in which a webcam's solver takes them."""
+
+HALF_CONFIDENCE = 0.02
+"""The deviation, in sides of the face's box, of a confidence of one half."""
+
+_HIDDEN, _VISIBLE = 0.7, 0.95
+_LIPS, _CHIN, _CONTOUR = slice(48, 68), slice(4, 13), 17
+_GROUPS = (slice(17, 22), slice(22, 27), slice(27, 36), slice(36, 42), slice(42, 48), _LIPS)
+"""Brows, nose, eyes, lips."""
 
 
 @dataclass(frozen=True, eq=False)
 class FaceReading:
-    """One face in one picture; the person's right eye (iBUG's 36 to 41) comes before the left (42 to 47).
+    """One face in one picture, or in the T pictures of a take: then every part has T rows.
+
+    The person's right eye (iBUG's 36 to 41) comes before the left (42 to 47).
 
     Args:
-        landmarks: iBUG's 68, (68,2) pixels of the whole picture, centres at integers; NaN where there is no face.
-        deviation: what each landmark is expected to be off by, standard deviation of a coordinate, (68,) pixels.
-        visibility: (68,) in [0,1]: how likely nothing stands before the landmark.
-        presence: () in [0,1]: how likely there is a face; 0 where none was found.
-        iris: centres of the irises, (2,2) pixels; NaN where there is no face.
-        openness: distance of the lids over that of the eye's corners, (2,).
-        closed: (2,) in [0,1]: how likely the eye is shut.
-        eye_visibility: (2,) in [0,1]: how likely nothing hides the eye.
+        landmarks: iBUG's 68, (...,68,2) pixels of the whole picture, centres at integers; NaN where there is no face.
+        deviation: what each landmark is expected to be off by, standard deviation of a coordinate, (...,68) pixels;
+            infinite where nothing is known.
+        visibility: (...,68) in [0,1]: how likely nothing stands before the landmark.
+        presence: (...) in [0,1]: how likely there is a face; 0 where none was found.
+        iris: centres of the irises, (...,2,2) pixels; NaN, if absent too, where nobody looked at the eyes.
+        openness: distance of the lids over that of the eye's corners, (...,2); likewise.
+        closed: (...,2) in [0,1]: how likely the eye is shut; likewise.
+        eye_visibility: (...,2) in [0,1]: how likely nothing hides the eye; 0 where nobody looked.
+        search_box: x, y, width, height of the box that the face was looked for in, (...,4) pixels; the box round the
+            landmarks if absent.
 
     Example:
-        >>> sure, eyes = torch.ones(68), torch.ones(2)
-        >>> face = FaceReading(torch.zeros(68, 2), sure, sure, eyes[0], torch.zeros(2, 2), 0.3 * eyes, 0 * eyes, eyes)
-        >>> face.closed.tolist()  # both eyes are open
-        [0.0, 0.0]
+        >>> sure = torch.ones(68)
+        >>> face = FaceReading(torch.rand(68, 2) * 60, sure, sure, sure[0], search_box=torch.tensor([0.0, 0, 50, 50]))
+        >>> face.confidence[0].item()  # a pixel is a fiftieth of the box
+        0.5
+        >>> bool(FaceReading.lost().found)
+        False
     """
 
     landmarks: Tensor
     deviation: Tensor
     visibility: Tensor
     presence: Tensor
-    iris: Tensor
-    openness: Tensor
-    closed: Tensor
-    eye_visibility: Tensor
+    iris: Tensor = None  # type: ignore[assignment]
+    openness: Tensor = None  # type: ignore[assignment]
+    closed: Tensor = None  # type: ignore[assignment]
+    eye_visibility: Tensor = None  # type: ignore[assignment]
+    search_box: Tensor = None  # type: ignore[assignment]
+
+    def __post_init__(self) -> None:
+        lead = self.landmarks.shape[:-2]
+        unread = {"iris": (2, 2), "openness": (2,), "closed": (2,), "eye_visibility": (2,)}
+        for name, shape in unread.items():
+            if getattr(self, name) is None:
+                value = 0.0 if name == "eye_visibility" else torch.nan
+                object.__setattr__(self, name, self.landmarks.new_full((*lead, *shape), value))
+        if self.search_box is None and self.landmarks.shape[-2:] == (COUNT, 2):
+            object.__setattr__(self, "search_box", box_around(self.landmarks))
+
+    @classmethod
+    def of_confidence(
+        cls, landmarks: Tensor, confidence: Tensor, visibility: Tensor, presence: Tensor, search_box: Tensor
+    ) -> FaceReading:
+        """A reading by what gives confidences (...,68) in [0,1] rather than deviations."""
+        deviation = box_side(search_box)[..., None] * HALF_CONFIDENCE * (1 / confidence - 1).clamp(min=0).sqrt()
+        return cls(landmarks, deviation, visibility, presence, search_box=search_box)
+
+    @classmethod
+    def lost(cls) -> FaceReading:
+        """No face."""
+        nothing = torch.zeros(COUNT)
+        return cls(torch.full((COUNT, 2), torch.nan), nothing + torch.inf, nothing, torch.zeros(()))
+
+    @classmethod
+    def stacked(cls, readings: Sequence[FaceReading]) -> FaceReading:
+        """A take's reading (T,...) of its frames', one at least."""
+        return cls(*(torch.stack([getattr(one, part.name) for one in readings]) for part in fields(cls)))
+
+    @property
+    def found(self) -> Tensor:
+        """Whether there is a face, (...) bool: any landmark of it."""
+        return torch.isfinite(self.landmarks).all(-1).any(-1)
+
+    @property
+    def box(self) -> Tensor:
+        """x, y, width, height round the face as a detector draws it, (...,4) pixels; NaN where there is none."""
+        return box_around(self.landmarks)
+
+    @property
+    def confidence(self) -> Tensor:
+        r""":math:`1 / (1 + (s/0.02)^2)` of deviations s in sides of the search box, (...,68) in [0,1]: one half where a
+        landmark may be off by 0.02 of the side, 0 where there is no face."""
+        return confidence_of(self.deviation / box_side(self.search_box)[..., None]).nan_to_num(0.0)
+
+    @property
+    def trust(self) -> Tensor:
+        """See :func:`trust_of`, (...,68) in [0,1]."""
+        return trust_of(self.confidence, self.visibility)
+
+    @property
+    def trusted_landmarks(self) -> Tensor:
+        """The landmarks, NaN where they are not trusted at all: what is hidden is a guess, that a filter would carry on
+        into the frames after."""
+        return torch.where(self.trust[..., None] > 0, self.landmarks, torch.nan)
+
+
+def box_side(box: Tensor) -> Tensor:
+    """The side (...) of the square of a box's area, of boxes (...,4)."""
+    return (box[..., 2] * box[..., 3]).clamp(min=0).sqrt()
+
+
+def confidence_of(deviation: Tensor) -> Tensor:
+    r""":math:`1 / (1 + (s/0.02)^2)` of deviations s in sides of the face's box: one half at 0.02."""
+    return 1 / (1 + (deviation / HALF_CONFIDENCE).square())
+
+
+def trust_of(confidence: Tensor, visibility: Tensor) -> Tensor:
+    """How much each landmark counts, (...,68) in [0,1]: its confidence, if it is visible and so is what it belongs to.
+
+    A landmark behind a hand is a guess, however sure: below a visibility of 0.7 it does not count at all, above 0.95
+    fully. Brows, nose, eyes and lips are each hidden as a whole where they are hidden in the mean: from a few points
+    beside a hand a mouth would be invented.
+
+    Args:
+        confidence, visibility: of landmarks, (...,68) in [0,1].
+    """
+    parts = [visibility[..., group] for group in _GROUPS]
+    whole = [part.minimum(part.mean(-1, keepdim=True)) for part in parts]
+    # Who hides the mouth hides the chin: what is found of it would open the jaw.
+    contour, lips = visibility[..., :_CONTOUR], parts[-1].mean(-1, keepdim=True)
+    jaw = contour[..., : _CHIN.start], contour[..., _CHIN].minimum(lips), contour[..., _CHIN.stop :]
+    visible = torch.cat([*jaw, *whole], dim=-1)
+    return confidence * ((visible - _HIDDEN) / (_VISIBLE - _HIDDEN)).clamp(0, 1)

@@ -1,4 +1,4 @@
-"""iBUG's 68 landmarks: which are mirror images of each other, and the face box that goes with them."""
+"""iBUG's 68 landmarks: which are mirror images of each other, and the face boxes and tilts that go with them."""
 
 from __future__ import annotations
 
@@ -8,6 +8,9 @@ import torch
 from torch import Tensor
 
 from torchface.errors import ShapeError
+
+COUNT = 68
+"""How many."""
 
 _RUNS = ((0, 16), (17, 26), (27, 27), (28, 28), (29, 29), (30, 30), (31, 35))
 _PAIRS = ((36, 45), (37, 44), (38, 43), (39, 42), (40, 47), (41, 46))
@@ -23,7 +26,7 @@ MIDDLE_ABOVE = 0.037
 def _mirror() -> tuple[int, ...]:
     twins = {row: first + last - row for first, last in _RUNS + _LIPS for row in range(first, last + 1)}
     twins |= dict(_PAIRS) | {right: left for left, right in _PAIRS}
-    return tuple(twins[row] for row in range(68))
+    return tuple(twins[row] for row in range(COUNT))
 
 
 MIRROR_68 = _mirror()

@@ -1,51 +1,16 @@
-"""What finds the landmarks of a face in a box: one protocol, whoever finds them."""
+"""The protocol of what finds the landmarks of a face in a box, and the check of what it gives."""
 
 from __future__ import annotations
 
-import math
-from dataclasses import dataclass
+from dataclasses import replace
 from typing import Protocol
 
 import torch
 from torch import Tensor
 
 from torchface.errors import ShapeError, ValueRangeError
-
-COUNT = 68
-"""iBUG's landmarks, that every finder gives."""
-
-HALF_CONFIDENCE = 0.02
-"""The deviation, in sides of the face's box, of a confidence of one half."""
-
-_HIDDEN, _SEEN = 0.7, 0.95
-_LIPS, _CHIN, _CONTOUR = slice(48, 68), slice(4, 13), 17
-_GROUPS = (slice(17, 22), slice(22, 27), slice(27, 36), slice(36, 42), slice(42, 48), _LIPS)
-"""Brows, nose, eyes, lips."""
-
-
-@dataclass(frozen=True, eq=False)
-class FoundLandmarks:
-    """Landmarks of one face in one image.
-
-    Args:
-        landmarks: iBUG's 68, (68,2) float32 pixels of the whole image.
-        confidence: (68,) in [0,1]; see :func:`confidence_of`.
-        visibility: (68,) in [0,1]: how likely nothing stands before the landmark.
-        presence: in [0,1]: how likely the box shows a face at all.
-
-    Example:
-        >>> from torchface import zoo
-        >>> from torchface.landmarks import TreeFinder
-        >>> blank = torch.full((80, 80), 128, dtype=torch.uint8)
-        >>> found = TreeFinder(zoo.get_model("face_landmarks"))(blank, torch.tensor([10.0, 10.0, 60.0, 60.0]))
-        >>> len(found.landmarks), found.confidence.max().item()  # sees nothing, and says so
-        (68, 0.0)
-    """
-
-    landmarks: Tensor
-    confidence: Tensor
-    visibility: Tensor
-    presence: float
+from torchface.landmarks.images.face_reading import FaceReading
+from torchface.landmarks.images.ibug_68 import COUNT
 
 
 class LandmarkFinder(Protocol):
@@ -59,42 +24,14 @@ class LandmarkFinder(Protocol):
         >>> class Middle:
         ...     name = "middle"
         ...     def __call__(self, image, box, tilt=0.0):
-        ...         return FoundLandmarks((box[:2] + box[2:] / 2).expand(68, 2), torch.ones(68), torch.ones(68), 1.0)
+        ...         sure = torch.ones(68)
+        ...         return FaceReading((box[:2] + box[2:] / 2).expand(68, 2), sure, sure, sure[0])
         >>> finder: LandmarkFinder = Middle()
         >>> finder(torch.zeros(80, 80, dtype=torch.uint8), torch.tensor([10.0, 10, 60, 60])).landmarks[0].tolist()
         [40.0, 40.0]
     """
 
-    def __call__(self, image: Tensor, box: Tensor, tilt: float = 0.0) -> FoundLandmarks: ...
-
-
-def confidence_of(deviation: Tensor) -> Tensor:
-    r""":math:`1 / (1 + (s/0.02)^2)` of deviations s in sides of the face's box: one half at 0.02."""
-    return 1 / (1 + (deviation / HALF_CONFIDENCE).square())
-
-
-def deviation_of(confidence: Tensor) -> Tensor:
-    """Deviations in sides of the face's box of confidences in [0,1]: the inverse of :func:`confidence_of`."""
-    return HALF_CONFIDENCE * (1 / confidence.clamp(min=1e-6) - 1).clamp(min=0).sqrt()
-
-
-def trust_of(confidence: Tensor, visibility: Tensor) -> Tensor:
-    """How much each landmark counts, (...,68) in [0,1]: its confidence, if it is seen and so is what it belongs to.
-
-    A landmark behind a hand is a guess, however sure: below a visibility of 0.7 it does not count at all, above 0.95
-    fully. Brows, nose, eyes and lips are each hidden as a whole where they are hidden in the mean: from a few points
-    beside a hand a mouth would be invented.
-
-    Args:
-        confidence, visibility: of landmarks, (...,68) in [0,1].
-    """
-    parts = [visibility[..., group] for group in _GROUPS]
-    whole = [part.minimum(part.mean(-1, keepdim=True)) for part in parts]
-    # Who hides the mouth hides the chin: what is found of it would open the jaw.
-    contour, lips = visibility[..., :_CONTOUR], parts[-1].mean(-1, keepdim=True)
-    jaw = contour[..., : _CHIN.start], contour[..., _CHIN].minimum(lips), contour[..., _CHIN.stop :]
-    seen = torch.cat([*jaw, *whole], dim=-1)
-    return confidence * ((seen - _HIDDEN) / (_SEEN - _HIDDEN)).clamp(0, 1)
+    def __call__(self, image: Tensor, box: Tensor, tilt: float = 0.0) -> FaceReading: ...
 
 
 def finder_name(finder: LandmarkFinder) -> str:
@@ -102,30 +39,28 @@ def finder_name(finder: LandmarkFinder) -> str:
     return str(getattr(finder, "name", type(finder).__name__))
 
 
-def find_in_box(finder: LandmarkFinder, image: Tensor, box: Tensor, tilt: float = 0.0) -> FoundLandmarks:
-    """What a finder finds, checked: it may be anybody's.
+def find_in_box(finder: LandmarkFinder, image: Tensor, box: Tensor, tilt: float = 0.0) -> FaceReading:
+    """What a finder reads in a box, checked: it may be anybody's.
 
     Raises:
         ShapeError: it gave another count of landmarks, or other shapes; the message names the finder.
-        ValueRangeError: it gave landmarks that are not finite, or likelihoods outside of [0,1].
+        ValueRangeError: it gave landmarks that are not finite, negative deviations, or likelihoods outside of [0,1].
     """
-    found = finder(image, box, tilt)
-    shapes = tuple(tuple(one.shape) for one in (found.landmarks, found.confidence, found.visibility))
+    reading, name = finder(image, box, tilt), finder_name(finder)
+    shapes = tuple(tuple(one.shape) for one in (reading.landmarks, reading.deviation, reading.visibility))
     if shapes != ((COUNT, 2), (COUNT,), (COUNT,)):
         raise ShapeError(
-            f"{finder_name(finder)}: found landmarks, confidence and visibility of {shapes[0]}, {shapes[1]} and "
-            f"{shapes[2]}, expected ({COUNT},2), ({COUNT},) and ({COUNT},)"
+            f"{name}: found landmarks, deviation and visibility of {shapes[0]}, {shapes[1]} and {shapes[2]}, expected "
+            f"({COUNT},2), ({COUNT},) and ({COUNT},)"
         )
-    if not bool(torch.isfinite(found.landmarks).all()):
-        lost = int((~torch.isfinite(found.landmarks)).any(1).sum())
-        raise ValueRangeError(f"{finder_name(finder)}: found {lost} landmarks that are not finite, expected none")
-    for name in ("confidence", "visibility"):
-        values = getattr(found, name)
-        if not bool(((values >= 0) & (values <= 1)).all()):
+    if not bool(torch.isfinite(reading.landmarks).all()):
+        lost = int((~torch.isfinite(reading.landmarks)).any(1).sum())
+        raise ValueRangeError(f"{name}: found {lost} landmarks that are not finite, expected none")
+    for part, most in (("deviation", torch.inf), ("visibility", 1.0), ("presence", 1.0)):
+        values = getattr(reading, part)
+        if not bool(((values >= 0) & (values <= most)).all()):
             raise ValueRangeError(
-                f"{finder_name(finder)}: found {name} from {float(values.min()):g} to {float(values.max()):g}, "
-                "expected 0 to 1"
+                f"{name}: found {part} from {float(values.min()):g} to {float(values.max()):g}, expected "
+                + ("0 to 1" if most == 1 else "0 pixels or more")
             )
-    if not (math.isfinite(found.presence) and 0 <= found.presence <= 1):
-        raise ValueRangeError(f"{finder_name(finder)}: found presence {found.presence:g}, expected 0 to 1")
-    return found
+    return replace(reading, search_box=box)

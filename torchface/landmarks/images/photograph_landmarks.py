@@ -7,8 +7,9 @@ from torch import Tensor
 from torchface.landmarks.images.appearance.appearance_model import AppearanceModel
 from torchface.landmarks.images.boxes.face_box import FaceDetector, NoFaceError, find_some_faces
 from torchface.landmarks.images.boxes.turned_search import find_faces_of_any_turn
+from torchface.landmarks.images.face_reading import FaceReading
 from torchface.landmarks.images.landmark_finder import LandmarkFinder
-from torchface.landmarks.images.tracking.tracked_face import TrackedFace, refined_face, settled_face
+from torchface.landmarks.images.tracking.settled_face import refined_face, settled_face
 from torchface.landmarks.images.trees.landmark_trees import LandmarkTrees
 from torchface.landmarks.images.trees.tree_finder import PHOTOGRAPH, TreeFinder
 
@@ -22,7 +23,7 @@ def find_landmarks(
     face: int = 0,
     detector: FaceDetector | None = None,
     appearance: AppearanceModel | None = None,
-) -> TrackedFace:
+) -> FaceReading:
     """Landmarks of one face in a photograph.
 
     Args:
@@ -47,11 +48,12 @@ def find_landmarks(
     """
     finder = TreeFinder(finder, PHOTOGRAPH) if isinstance(finder, LandmarkTrees) else finder
     faces = find_some_faces(image, face, detector or find_faces_of_any_turn)
-    seen = settled_face(finder, image, faces.boxes[face], float(faces.tilts[face]))
-    if seen.found.presence < _PHOTOGRAPHED:
-        x, y, wide = (round(float(value)) for value in seen.box[:3])
+    reading = settled_face(finder, image, faces.boxes[face], float(faces.tilts[face]))
+    presence = float(reading.presence)
+    if presence < _PHOTOGRAPHED:
+        x, y, wide = (round(float(value)) for value in reading.search_box[:3])
         raise NoFaceError(
             f"image of {image.shape[-1]} x {image.shape[-2]}: found something at ({x}, {y}), {wide} pixels wide, that "
-            f"is a face with a probability of {seen.found.presence:.2f}, expected a face"
+            f"is a face with a probability of {presence:.2f}, expected a face"
         )
-    return refined_face(seen.found, image, appearance)
+    return refined_face(reading, image, appearance)

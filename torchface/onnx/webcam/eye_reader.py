@@ -7,8 +7,7 @@ from dataclasses import dataclass
 import torch
 
 from torchface.landmarks.images.networks.eye_crop import DOWN, EYE_LANDMARKS, NOSE_BASE, SHARE
-from torchface.landmarks.images.networks.eye_finder import LEAST
-from torchface.landmarks.images.networks.eye_merge import HIDDEN, PLACES, SEEN
+from torchface.landmarks.images.networks.eye_finder import HIDDEN, LEAST, PLACES, SEEN
 from torchface.landmarks.images.networks.eye_network import EyeFindings, EyeNetwork
 from torchface.onnx.eye_network_graph import eye_nodes
 from torchface.onnx.graph_values import Value

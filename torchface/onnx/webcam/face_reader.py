@@ -7,9 +7,10 @@ from dataclasses import dataclass, field
 import torch
 
 from torchface.landmarks.images.boxes.box_network import BoxNetwork
-from torchface.landmarks.images.landmark_finder import HALF_CONFIDENCE
+from torchface.landmarks.images.face_reading import HALF_CONFIDENCE
+from torchface.landmarks.images.ibug_68 import COUNT
 from torchface.landmarks.images.networks.eye_network import EyeNetwork
-from torchface.landmarks.images.networks.landmark_network import COUNT, LandmarkNetwork
+from torchface.landmarks.images.networks.landmark_network import LandmarkNetwork
 from torchface.onnx.graph_values import Value, ValueGraph
 from torchface.onnx.landmark_network_graph import landmark_network_nodes
 from torchface.onnx.webcam.eye_reader import read_eyes
@@ -197,6 +198,6 @@ def _look(graph: ValueGraph, image: Value, place: Value, network: LandmarkNetwor
 
 
 def _confidence(deviation: Value, place: Value) -> Value:
-    """The mean (1,) of :func:`~torchface.landmarks.images.landmark_finder.confidence_of` deviations (68,) in pixels."""
+    """The mean (1,) of :func:`~torchface.landmarks.images.face_reading.confidence_of` deviations (68,) in pixels."""
     share = deviation / (side(place).most(1.0) * HALF_CONFIDENCE)
     return (1.0 / (share * share + 1.0)).reduced("ReduceMean", 0, keep=True)

@@ -12,11 +12,11 @@ from torchface import __version__
 from torchface.capture.anybody import WebcamControls
 from torchface.capture.anybody.webcam_state import CONTROLS, POSES
 from torchface.errors import ShapeError
-from torchface.landmarks.images.networks.landmark_network import COUNT
+from torchface.landmarks.images.face_reading import READ_BY_NETWORKS
+from torchface.landmarks.images.ibug_68 import COUNT
 from torchface.onnx.graph_values import OPSET, Value, ValueGraph
 from torchface.onnx.webcam.face_reader import STATE, ReaderSettings, WebcamNetworks, read_face
 from torchface.onnx.webcam.picture_pieces import picture_size
-from torchface.onnx.webcam.webcam_solver_graph import READING
 from torchface.shape_names import ARKIT
 
 SOLVED = ("weights", "rotation", "translation", "gaze", "calibrated")
@@ -42,10 +42,10 @@ def webcam_model(
 
     Args:
         networks: what read faces.
-        solver: the graph that solves weights. Its inputs are ``READING``'s names with their shapes, ``presence`` (),
-            ``size`` (2,), width and height of the picture, ``interval`` () and ``controls`` (5,), finite and in their
-            ranges, and ``state`` (S,), zeros to start; inputs that it has no use for may be missing. Its outputs are
-            ``SOLVED``'s names and ``next_state`` (S,).
+        solver: the graph that solves weights. Its inputs are ``READ_BY_NETWORKS``'s names with their shapes,
+            ``presence`` (), ``size`` (2,), width and height of the picture, ``interval`` () and ``controls`` (5,),
+            finite and in their ranges, and ``state`` (S,), zeros to start; inputs that it has no use for may be
+            missing. Its outputs are ``SOLVED``'s names and ``next_state`` (S,).
         settings: when a face counts as found and as lost.
         facts: further metadata, such as licence.
 
@@ -64,7 +64,7 @@ def webcam_model(
     state = graph.where(broken, 0.0, state)
     reader_state = graph.where(forget, 0.0, state.rows(0, own))
     read = read_face(graph, image, interval, reader_state, networks, settings or ReaderSettings())
-    given = {name: getattr(read, name) for name in READING}
+    given = {name: getattr(read, name) for name in READ_BY_NETWORKS}
     given |= {
         "presence": read.presence.shaped(),
         "size": picture_size(image),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import fields
+from dataclasses import replace
 from typing import NamedTuple
 
 import onnx
@@ -12,13 +12,12 @@ from torch import Tensor, nn
 from torchface import __version__
 from torchface.capture.anybody import WebcamSolver
 from torchface.capture.anybody.webcam_state import CONTROLS, POSES
-from torchface.landmarks.images.face_reading import FaceReading
+from torchface.landmarks.images.face_reading import READ_BY_NETWORKS, FaceReading
 from torchface.onnx.exported_model import exported_model
 from torchface.onnx.unrolled_operators import TRANSLATIONS
 from torchface.shape_names import ARKIT
 
-READING = tuple(one.name for one in fields(FaceReading))
-INPUTS = (*READING, "size", "interval", "controls", "state")
+INPUTS = (*READ_BY_NETWORKS, "size", "interval", "controls", "state")
 """A ``FaceReading``'s tensors, the picture's width and height (2,), seconds since the frame before (), ``CONTROLS``
 (5,) and the state (S,), zeros to start; all float32."""
 OUTPUTS = ("weights", "rotation", "translation", "gaze", "tracked", "calibrated", "error", "next_state")
@@ -58,17 +57,7 @@ class WebcamSolverGraph(nn.Module):
 
 def empty_reading() -> FaceReading:
     """What networks read of a picture without a face."""
-    nan = float("nan")
-    return FaceReading(
-        landmarks=torch.full((68, 2), nan),
-        deviation=torch.zeros(68),
-        visibility=torch.zeros(68),
-        presence=torch.zeros(()),
-        iris=torch.full((2, 2), nan),
-        openness=torch.full((2,), nan),
-        closed=torch.full((2,), nan),
-        eye_visibility=torch.zeros(2),
-    )
+    return replace(FaceReading.lost(), deviation=torch.zeros(68))
 
 
 def webcam_solver_model(solver: WebcamSolver) -> onnx.ModelProto:
@@ -77,7 +66,7 @@ def webcam_solver_model(solver: WebcamSolver) -> onnx.ModelProto:
     The metadata holds ``names`` (JSON list, of the weights), ``state`` (S), ``controls``, ``poses`` and ``version``.
     """
     reading = empty_reading()
-    examples = [getattr(reading, name) for name in READING]
+    examples = [getattr(reading, name) for name in READ_BY_NETWORKS]
     examples += [torch.tensor([640.0, 480.0]), torch.tensor(1 / 30), torch.zeros(len(CONTROLS))]
     examples.append(torch.zeros(solver.layout.length))
     return exported_model(

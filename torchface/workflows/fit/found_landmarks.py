@@ -9,7 +9,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from torchface.landmarks import NoFaceError, TrackedFace, find_landmarks
+from torchface.landmarks import FaceReading, NoFaceError, find_landmarks
 from torchface.landmarks.images.boxes.turned_search import find_faces_of_any_turn
 from torchface.workflows.named_finders import DEFAULT_LANDMARKS, load_finder
 
@@ -37,7 +37,7 @@ class PhotographLandmarks:
 
     photograph: Path
     model: str
-    face: TrackedFace
+    face: FaceReading
     number: int
     boxes: Tensor
     size: tuple[int, int]

@@ -18,7 +18,7 @@ from torchface.io.landmarks.landmark_points import load_landmark_points
 from torchface.io.landmarks.landmark_tables import load_landmark_table
 from torchface.landmarks import find_faces
 from torchface.landmarks.images.face_mesh_478 import landmarks_of_mesh
-from torchface.landmarks.images.landmark_finder import COUNT
+from torchface.landmarks.images.ibug_68 import COUNT
 from torchface.modeling.photographs.landmark_view import LANDMARKS
 
 

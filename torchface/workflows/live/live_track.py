@@ -18,11 +18,9 @@ from torchface.workflows.live.live_figures import LiveFigures, LiveReport
 from torchface.workflows.live.live_frames import open_source
 from torchface.workflows.live.solved_frames import solved_frames
 from torchface.workflows.live.weight_streams import WeightStreams
-from torchface.workflows.track.take_offsets import offsets_of
-from torchface.workflows.track.track_files import OFFSETS, save_curves
-from torchface.workflows.track.track_inputs import camera_of, load_actor
-from torchface.workflows.track.track_models import load_track_models
-from torchface.workflows.track.track_settings import TrackSettings
+from torchface.workflows.track.take_solution import OFFSETS, offsets_of
+from torchface.workflows.track.track_files import save_curves
+from torchface.workflows.track.track_inputs import TrackSettings, inputs_of, load_actor
 
 _DEFAULT = TrackSettings()
 
@@ -59,13 +57,10 @@ def track_live(
     actor = load_actor(rig, settings.part)
     figures = LiveFigures()
     with closing(open_source(camera, notes.append)) as source:
-        models = load_track_models(
-            actor, settings.landmarks, settings.appearance, settings.prior, settings.dynamics, source.video.fps
-        )
-        calibration = camera_of(source.video, settings.camera)
+        inputs = inputs_of(source.video, actor, settings)
         known = settings.offsets or (None if out is None or not (out / OFFSETS).is_file() else out / OFFSETS)
-        offsets = None if known is None else offsets_of(known, actor, models)
-        solver = ActorSolver(actor, models, calibration, settings.face, offsets)
+        offsets = None if known is None else offsets_of(known, inputs)
+        solver = ActorSolver(inputs, offsets)
         log = None if out is None else FrameLog(make_folder(out), actor.names)
         with (
             log or nullcontext(),

@@ -1,79 +1,25 @@
-"""What tracking a video leaves on disk: curves, animation, and what a later run may take up."""
+"""Files of a tracked video: curves of weights, landmarks and head pose, offsets, animation, summary."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
-from safetensors import SafetensorError
-from safetensors.torch import load, save
-
-from torchface.capture.own_rig import VideoSolution
-from torchface.errors import FileFormatError, TorchfaceError
-from torchface.files.whole_files import delete_file, make_folder, read_file, write_file
+from torchface.files.whole_files import delete_file
 from torchface.io import save_animation
 from torchface.io.landmarks.openface_csv import save_landmarks_csv
 from torchface.io.weights.live_link_csv import save_live_link
 from torchface.io.weights.weight_csv import save_weights_csv
 from torchface.landmarks.images.tracking.video_landmarks import LANDMARK_NAMES
-from torchface.rendering.point_light import PointLight
 from torchface.shape_names import ARKIT, mapping
 from torchface.take import Take, Track
 from torchface.workflows.track.head_rotations import rotation_columns
+from torchface.workflows.track.take_solution import OFFSETS
 from torchface.workflows.track.track_result import Tracked
-from torchface.workflows.track.track_state import TrackState
 
-SOLUTION, LIGHT, WEIGHTS, LIVE_LINK = "solution.safetensors", "light.safetensors", "weights.csv", "live_link.csv"
-CONFIDENCE, OFFSETS = "confidence.csv", "landmark_offsets.json"
-LANDMARKS, ANIMATION, OVERLAY, SUMMARY = "landmarks.csv", "animation.glb", "overlay.mp4", "summary.json"
+WEIGHTS, CONFIDENCE, LIVE_LINK, LANDMARKS = "weights.csv", "confidence.csv", "live_link.csv", "landmarks.csv"
+ANIMATION, OVERLAY, SUMMARY = "animation.glb", "overlay.mp4", "summary.json"
 
 _FORMAT = "torchface.track-summary/1"
-_MAX_SOLUTION = 2**31
-
-
-def keep_solution(state: TrackState, key: str, solution: VideoSolution) -> None:
-    """Keeps a solution for a later run."""
-    tensors = {
-        name: getattr(solution, name).detach().float().contiguous()
-        for name in ("weights", "rotation", "translation", "errors", "confidence")
-    }
-    path = make_folder(state.folder) / SOLUTION
-    write_file(path, save({**tensors, "solved": solution.solved.contiguous()}))
-    state.made(path, key)
-
-
-def kept_solution(state: TrackState, key: str, frames: int, shapes: int) -> VideoSolution | None:
-    """The solution of an earlier run, if it is whole and of these frames and shapes."""
-    path = state.folder / SOLUTION
-    if not state.is_current(path, key):
-        return None
-    try:
-        found = load(read_file(path, _MAX_SOLUTION))
-        if found["weights"].shape != (frames, shapes) or found["rotation"].shape != (frames, 3, 3):
-            return None
-        return VideoSolution(**found)
-    except (SafetensorError, FileFormatError, KeyError, TypeError, ValueError):
-        return None  # made anew
-
-
-def keep_light(state: TrackState, key: str, light: PointLight) -> None:
-    """Keeps a video's light for a later run."""
-    path = state.folder / LIGHT
-    tensors = {
-        name: getattr(light, name).detach().float().contiguous() for name in ("ambient", "intensity", "position")
-    }
-    write_file(path, save(tensors))
-    state.made(path, key)
-
-
-def kept_light(state: TrackState, key: str) -> PointLight | None:
-    """The light of an earlier run, if it is whole and of this video's solution."""
-    path = state.folder / LIGHT
-    if not state.is_current(path, key):
-        return None
-    try:
-        return PointLight(**load(read_file(path, _MAX_SOLUTION)))
-    except (SafetensorError, TorchfaceError, KeyError, TypeError, ValueError):
-        return None  # found anew
 
 
 def save_curves(take: Take, out: Path) -> dict[str, Path]:
@@ -86,7 +32,7 @@ def save_curves(take: Take, out: Path) -> dict[str, Path]:
         products["live link"] = out / LIVE_LINK
         save_live_link(take, out / LIVE_LINK)
     else:
-        delete_file(out / LIVE_LINK)  # one of an earlier run would tell of another rig
+        delete_file(out / LIVE_LINK)  # one of an earlier run is of another rig
     return products
 
 
@@ -113,11 +59,12 @@ def write_curves(tracked: Tracked, out: Path) -> dict[str, Path]:
     moved = tracked.solution.translation.detach().double()
     columns = {f"pose_T{axis}": moved[:, i] for i, axis in enumerate("xyz")}
     columns |= {f"pose_{name.removeprefix('Head').lower()}": angles[name] for name in list(angles)[:3]}
+    reading = tracked.reading
     for kind in ("confidence", "visibility"):
-        each = getattr(tracked.frames, kind)
+        each = getattr(reading, kind)
         columns |= {f"{kind}_{name}": each[:, i] for i, name in enumerate(LANDMARK_NAMES)}
-    columns["presence"] = tracked.frames.presence
-    track = Track(LANDMARK_NAMES, tracked.frames.landmarks, tracked.frames.confidence)
+    columns["presence"] = reading.presence
+    track = Track(LANDMARK_NAMES, reading.landmarks, reading.confidence)
     save_landmarks_csv(Take(fps, landmarks=track, extras={"columns": columns} | when), products["landmarks"])
     save_animation(tracked.rig, take, products["animation"])
     return products
@@ -129,7 +76,7 @@ def summary(tracked: Tracked) -> dict[str, object]:
     return {
         "format": _FORMAT,
         "video": tracked.video.path.name,
-        "frames": len(tracked.frames),
+        "frames": len(tracked),
         "fps": tracked.video.fps,
         "found": int(tracked.seen.sum()),
         "landmarks_found_by": tracked.finder,

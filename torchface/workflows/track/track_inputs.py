@@ -1,23 +1,159 @@
-"""What tracking starts from, checked: the actor, the clip, its camera, and the solver of these."""
+"""Inputs of tracking, read and checked: settings, the video, the actor's rig, the camera, the models."""
 
 from __future__ import annotations
 
-from dataclasses import replace
+import warnings
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Literal
+
+from torch import Tensor
 
 from torchface.capture.own_rig import VideoSettings, VideoSolver
 from torchface.errors import ValueRangeError
+from torchface.files.content_keys import content_key
 from torchface.geometry.cameras.calibration import CameraCalibration, assumed_calibration
 from torchface.io import load_rig
 from torchface.io.camera_files import load_calibration
 from torchface.io.images.transparent_images import load_paint
+from torchface.io.landmarks.landmark_tables import load_landmark_table
 from torchface.io.video import VideoFile, open_video
+from torchface.io.video.blank_video import BlankVideo
+from torchface.number_checks import check_rate
 from torchface.rig import BlendshapeRig
-from torchface.workflows.track.given_frames import blank_clip, is_table
 from torchface.workflows.track.track_models import (
+    DEFAULT_LANDMARKS,
+    DEFAULT_PRIOR,
     TrackModels,
+    is_table,
+    load_track_models,
 )
-from torchface.workflows.track.track_settings import TrackSettings
+
+METHOD = "track/5"
+"""Of the keys; another number where the same inputs, or pieces of another length, come to give other results."""
+
+Overlay = Literal["side", "over", "none"]
+"""The opaque rig beside the picture, the mesh half through over it, or no video."""
+
+_SIDES = (1, 2**16)
+_AT_ITS_TIMES = "solved at the frames' own times; the overlay and live_link.csv's timecodes run at the mean rate"
+
+
+@dataclass(frozen=True)
+class TrackSettings:
+    """How a video is tracked.
+
+    Args:
+        landmarks: what finds them, see :func:`~torchface.workflows.named_finders.load_finder`; or a table that gives
+            them, see :func:`~torchface.io.landmarks.landmark_tables.load_landmark_table`.
+        appearance, prior, dynamics: models by name or folder; ``prior`` may be "none".
+        camera: a calibration; a focal length is assumed without.
+        face: which of several, from 0, the largest first.
+        whole_take: landmarks smoothed by all frames, those after each too; weights as well where there is a dynamics
+            prior.
+        part: keep this region of the rig only.
+        texture: an image to put on the face in the overlay, in the rig's texture coordinates.
+        overlay: the rig in a video "side" by side with the picture, "over" it half through, or "none"; a texture
+            goes over the face.
+        fps: frames a second of a table of landmarks without a video; by its times if absent.
+        size: width and height of the pictures that such landmarks were found in; the camera's if absent.
+        offsets: a file of fixed offsets between this rig's landmarks and this finder's; those in the folder of results,
+            or estimated with the take, if absent.
+    """
+
+    landmarks: str | Path = DEFAULT_LANDMARKS
+    appearance: str | Path | None = None
+    prior: str | Path | None = DEFAULT_PRIOR
+    dynamics: str | Path | None = None
+    camera: Path | None = None
+    face: int = 0
+    whole_take: bool = False
+    part: str | None = None
+    texture: Path | None = None
+    overlay: Overlay = "side"
+    fps: float | None = None
+    size: tuple[int, int] | None = None
+    offsets: Path | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class TrackInputs:
+    """What tracking starts from.
+
+    Args:
+        settings: as the user gave them.
+        clip: the video; or what stands for it, where a table gives the landmarks and there is none.
+        actor: the rig, with 68 landmarks.
+        calibration: of the camera, at the video's resolution.
+        models: what tracks and solves.
+        times: when each frame is shown, (T,) seconds, where the frame rate varies.
+        rate_varies: how, in words.
+    """
+
+    settings: TrackSettings
+    clip: VideoFile
+    actor: BlendshapeRig
+    calibration: CameraCalibration
+    models: TrackModels
+    times: Tensor | None = None
+    rate_varies: str = ""
+
+    @property
+    def reading_key(self) -> str:
+        """Changes when what is read of the frames does."""
+        return content_key(METHOD, video=self.clip.path, models=self.models.seeing, face=self.settings.face)
+
+    def solver(self, fps: float | None = None) -> VideoSolver:
+        """The solver of the rig, for landmarks that the models find, at a frame rate."""
+        return solver_for(self.actor, self.models, self.calibration, fps)
+
+    def check_length(self, frames: int) -> None:
+        """Raises a ``ValueRangeError`` where a take is too short for the dynamics prior's window."""
+        dynamics = self.models.dynamics
+        if dynamics is not None and frames <= dynamics.window:
+            raise ValueRangeError(
+                f"{self.clip.path}: found {frames} frames, expected more than the {dynamics.window} that the dynamics "
+                "prior looks back"
+            )
+
+
+def load_inputs(video: Path | None, rig: Path, settings: TrackSettings) -> TrackInputs:
+    """Reads and checks everything; warns of a video of variable frame rate.
+
+    Raises:
+        FileFormatError: the video or another file cannot be read.
+        ValueRangeError: neither video nor table; the rig has no 68 landmarks; the calibration is of another aspect; or
+            the take is too short for the dynamics prior.
+        NameMismatchError: a model is missing, or a prior has learned other shapes than the rig has.
+    """
+    clip = _clip(video, settings)
+    clip.check()
+    times, rate_varies = clip.uneven_seconds()
+    if times is not None:
+        clip = replace(clip, fps=check_rate(float((len(times) - 1) / times[-1]), str(clip.path)))
+        warnings.warn(f"{clip.path}: found a variable frame rate: {rate_varies}; {_AT_ITS_TIMES}", stacklevel=4)
+    inputs = inputs_of(clip, load_actor(rig, settings.part), settings)
+    inputs.check_length(clip.count)
+    if settings.texture is not None:
+        load_paint(settings.texture)
+        if inputs.actor.neutral.uvs is None:
+            raise ValueRangeError(
+                f"{settings.texture}: found a rig without texture coordinates, expected some to put it on"
+            )
+    return replace(inputs, times=times, rate_varies=rate_varies)
+
+
+def inputs_of(clip: VideoFile, actor: BlendshapeRig, settings: TrackSettings) -> TrackInputs:
+    """The inputs of a video or a camera that is open: its calibration, and models for its frame rate.
+
+    Raises:
+        See :func:`load_inputs`.
+    """
+    calibration = _calibration(clip, settings.camera)
+    models = load_track_models(
+        actor, settings.landmarks, settings.appearance, settings.prior, settings.dynamics, clip.fps
+    )
+    return TrackInputs(settings, clip, actor, calibration, models)
 
 
 def load_actor(rig: Path, part: str | None) -> BlendshapeRig:
@@ -29,59 +165,13 @@ def load_actor(rig: Path, part: str | None) -> BlendshapeRig:
     """
     actor = load_rig(rig, part=part)
     notes = actor.neutral.annotations
-    found = 0 if notes is None or notes.landmarks is None else len(notes.landmarks)
-    if found != 68:
-        what = "no landmark vertices" if found == 0 else f"{found} landmark vertices"
+    count = 0 if notes is None or notes.landmarks is None else len(notes.landmarks)
+    if count != 68:
+        what = "no landmark vertices" if count == 0 else f"{count} landmark vertices"
         raise ValueRangeError(
             f"{rig}: found {what}, expected the 68 of iBUG (torchface pick annotates them on the rig)"
         )
     return actor
-
-
-def video_clip(video: Path | None, settings: TrackSettings) -> VideoFile:
-    """The video; or what stands for it, where a table gives the landmarks and there is none."""
-    if video is not None:
-        if settings.fps is not None or settings.size is not None:
-            raise ValueRangeError(f"{video}: found --fps or --size beside a video, expected them without one alone")
-        return replace(open_video(video), even=False)
-    if not is_table(settings.landmarks):
-        raise ValueRangeError("track: found neither a video nor a table of landmarks, expected one at least")
-    if settings.texture is not None:
-        raise ValueRangeError(f"{settings.texture}: found no video, expected one whose light falls on the texture")
-    calibration = None if settings.camera is None else load_calibration(settings.camera)
-    size = settings.size or (None if calibration is None else (calibration.width, calibration.height))
-    return blank_clip(Path(settings.landmarks), settings.fps, size)
-
-
-def camera_of(clip: VideoFile, camera: Path | None) -> CameraCalibration:
-    """The video's camera: as calibrated, brought to its resolution, or assumed.
-
-    Raises:
-        FileFormatError: the calibration is broken.
-        ValueRangeError: it was made for another aspect.
-    """
-    if camera is None:
-        return assumed_calibration(clip.width, clip.height)
-    try:
-        return load_calibration(camera).resized(clip.width, clip.height)
-    except ValueRangeError as error:
-        raise ValueRangeError(f"{camera}: {error}") from error
-
-
-def check_length(frames: int, models: TrackModels, path: Path) -> None:
-    """Raises a ``ValueRangeError`` where a take is too short for the dynamics prior's window."""
-    if models.dynamics is not None and frames <= models.dynamics.window:
-        raise ValueRangeError(
-            f"{path}: found {frames} frames, expected more than the {models.dynamics.window} that the dynamics prior "
-            "looks back"
-        )
-
-
-def check_texture(rig: BlendshapeRig, texture: Path) -> None:
-    """Raises where the rig cannot wear a texture, or the image cannot be read."""
-    load_paint(texture)
-    if rig.neutral.uvs is None:
-        raise ValueRangeError(f"{texture}: found a rig without texture coordinates, expected some to put it on")
 
 
 def solver_for(
@@ -90,3 +180,42 @@ def solver_for(
     """The solver of a rig, for landmarks that the models find, at a frame rate."""
     settings = VideoSettings.of_found_landmarks(models.dynamics is not None, models.appearance is not None, fps)
     return VideoSolver(rig, None, calibration.intrinsics, models.prior, models.dynamics, settings)
+
+
+def _clip(video: Path | None, settings: TrackSettings) -> VideoFile:
+    """The video, or a blank one for a table of landmarks."""
+    if video is not None:
+        if settings.fps is not None or settings.size is not None:
+            raise ValueRangeError(f"{video}: found --fps or --size beside a video, expected them without one alone")
+        return replace(open_video(video), even=False)
+    if not is_table(settings.landmarks):
+        raise ValueRangeError("track: found neither a video nor a table of landmarks, expected one at least")
+    if settings.texture is not None:
+        raise ValueRangeError(f"{settings.texture}: found no video, expected one whose light falls on the texture")
+    path = Path(settings.landmarks)
+    table = load_landmark_table(path)
+    rate = settings.fps or table.fps
+    if rate is None:
+        raise ValueRangeError(f"{path}: found no times, expected --fps RATE, the frames a second")
+    if not 1 <= rate <= 1000:
+        raise ValueRangeError(f"{path}: found {rate:g} frames a second, expected 1 to 1000")
+    camera = None if settings.camera is None else load_calibration(settings.camera)
+    size = settings.size or (None if camera is None else (camera.width, camera.height))
+    if size is None:
+        raise ValueRangeError(
+            f"{path}: found no video, expected --size WIDTHxHEIGHT of the pictures that the landmarks were found in, "
+            "or the --camera that took them"
+        )
+    if not all(_SIDES[0] <= side <= _SIDES[1] for side in size):
+        raise ValueRangeError(f"--size: found {size[0]}x{size[1]}, expected {_SIDES[0]} to {_SIDES[1]} pixels a side")
+    return BlankVideo(path, rate, *size, len(table.points))
+
+
+def _calibration(clip: VideoFile, camera: Path | None) -> CameraCalibration:
+    """The video's camera: as calibrated, brought to its resolution, or assumed."""
+    if camera is None:
+        return assumed_calibration(clip.width, clip.height)
+    try:
+        return load_calibration(camera).resized(clip.width, clip.height)
+    except ValueRangeError as error:
+        raise ValueRangeError(f"{camera}: {error}") from error

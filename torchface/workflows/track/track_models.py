@@ -19,7 +19,6 @@ from torchface.landmarks import AppearanceModel
 from torchface.landmarks.images.landmark_finder import LandmarkFinder
 from torchface.rig import BlendshapeRig
 from torchface.workflows.named_finders import DEFAULT_LANDMARKS, load_finder
-from torchface.workflows.track.given_frames import is_table
 
 DEFAULT_PRIOR = "shape_prior"
 """Of the zoo; what weights faces have, where no other prior is named."""
@@ -57,6 +56,11 @@ class TrackModels:
     unlearned: tuple[str, ...] = ()
     seeing: str = ""
     solving: str = ""
+
+
+def is_table(landmarks: str | Path | None) -> bool:
+    """Whether what a user names is a table of landmarks rather than what finds them."""
+    return landmarks is not None and Path(landmarks).suffix.lower() == ".csv"
 
 
 def load_track_models(

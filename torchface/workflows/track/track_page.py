@@ -1,4 +1,4 @@
-"""The report of a tracked video: what was found, frames with the solved face over them, curves, figures."""
+"""Report of a tracked video: figures, frames with the solved face beside and over them, curves."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from torchface.shown_text import as_markup
 from torchface.viz.figures.curves import error_curve, weight_curves
 from torchface.viz.figures.helmet_motion import motion_curves
 from torchface.viz.reports.report_page import Section, Table, write_page
+from torchface.workflows.track.face_overlay import camera_at, mesh_drawer, paint_drawer
 from torchface.workflows.track.head_rotations import head_angles
-from torchface.workflows.track.side_by_side import side_by_side_drawer
-from torchface.workflows.track.track_overlay import camera_at, mesh_drawer, paint_drawer
+from torchface.workflows.track.overlay_video import side_by_side_drawer
 from torchface.workflows.track.track_result import MIN_STABLE, Tracked
 
 SHOWN = 12
@@ -25,27 +25,18 @@ _CURVES_A_PICTURE = 13
 _MARGIN = 0.6
 
 
-def write_track_page(tracked: Tracked, out: Path, texture: Path | None = None) -> Path:
-    """Writes the report's page and figures into a folder.
-
-    Args:
-        tracked: what came of the video.
-        out: the folder.
-        texture: what was put on the face, where something was.
-
-    Returns:
-        The page's path.
-    """
-    fps, solution = tracked.video.fps, tracked.solution
+def write_track_page(tracked: Tracked, out: Path) -> Path:
+    """Writes the report's page and figures into a folder, and returns the page's path."""
+    fps, solution, texture = tracked.video.fps, tracked.solution, tracked.inputs.settings.texture
     files = ", ".join(f"{name}: {path.name}" for name, path in tracked.products.items())
     sections = [
         Section("What was done", "; ".join(tracked.lines()) + f". Files: {files}."),
         Section("Figures", tables=[Table(("figure", "value"), figures(tracked))]),
         Section(
             "Frames",
-            "The picture and, beside it, the solved rig in the same pose; landmarks are green, doubtful ones and what "
-            "of the rig lies there orange.",
-            [_doubtful(tracked)],
+            "The picture and, beside it, the solved rig in the same pose; landmarks are green, those of low confidence "
+            "and what of the rig lies there orange.",
+            [_suspect(tracked)],
             [("frames.png", frames_sheet(tracked, side_by_side_drawer(tracked), cut=False))],
             _player(tracked),
         ),
@@ -88,7 +79,7 @@ def write_track_page(tracked: Tracked, out: Path, texture: Path | None = None) -
 
 def figures(tracked: Tracked) -> list[tuple[str, str]]:
     """Names and numbers for a table."""
-    errors, count = tracked.solution.errors.detach(), len(tracked.frames)
+    errors, count = tracked.solution.errors.detach(), len(tracked)
     seen, camera = tracked.seen, tracked.calibration
     few = int((seen & (tracked.stable < MIN_STABLE)).sum())
     weights = tracked.solution.weights.detach()
@@ -115,7 +106,7 @@ def frames_sheet(
     tracked: Tracked, draw: Callable[[int, Tensor], Tensor], most: int = SHOWN, cut: bool = True
 ) -> Tensor:
     """Frames spread over the video as ``draw`` makes frame number t, (3,H,W), cut to the face unless they are."""
-    count = len(tracked.frames)
+    count = len(tracked)
     wanted = torch.linspace(0, count - 1, min(most, count)).round().long().unique().tolist()
     cells, at = [], 0
     box = _face_box(tracked, wanted) if cut else None
@@ -154,13 +145,13 @@ def _player(tracked: Tracked) -> str:
     return f'<video src="{as_markup(name)}" controls loop muted style="max-width: 100%"></video>\n' if name else ""
 
 
-def _doubtful(tracked: Tracked) -> Table:
-    spans = tracked.doubtful_spans()
+def _suspect(tracked: Tracked) -> Table:
+    spans = tracked.suspect_spans()
     rows = [
         (f"{first} to {last}", f"{tracked.seconds_at(first):.2f} to {tracked.seconds_at(last):.2f} s", what)
         for first, last, what in spans
     ]
-    return Table(("frames", "time", "what is doubtful"), rows or [("none", "", "")])
+    return Table(("frames", "time", "what is suspect"), rows or [("none", "", "")])
 
 
 def _bounds(tracked: Tracked) -> Table:

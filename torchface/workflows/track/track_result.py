@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import torch
@@ -14,15 +14,16 @@ from torchface.capture.own_rig.landmark_offsets import LandmarkOffsets
 from torchface.capture.own_rig.weight_walk import HIDDEN
 from torchface.geometry.cameras.calibration import CameraCalibration
 from torchface.io.video import VideoFile
+from torchface.landmarks.images.face_reading import FaceReading
 from torchface.landmarks.images.landmark_measures import landmark_jitter
 from torchface.rendering.point_light import PointLight
 from torchface.rig import BlendshapeRig
-from torchface.workflows.track.track_state import TrackedFrames
+from torchface.workflows.track.track_inputs import TrackInputs
 
 MIN_STABLE = 6
 """Stable landmarks that a pose needs."""
 _POOR = 0.04  # of the distance of the eyes' outer corners; landmarks of a rig's own face are off by 2 to 3 %
-_DOUBTFUL = 0.5
+_SURE = 0.5
 _AT_BOUND, _OFTEN, _MAX_NAMED = 1e-3, 0.2, 5
 _LEAST_MOTION = 1e-2  # mm²
 
@@ -32,40 +33,53 @@ class Tracked:
     """What came of a video.
 
     Args:
-        video: the file.
-        rig: the actor's.
-        frames: what the tracker saw.
-        pinhole: its landmarks as a camera without distortion has them, filtered along time, (T,68,2), pixels.
+        inputs: what it was tracked from.
+        reading: the face in all frames, (T,...).
+        landmarks: the reading's as a camera without distortion has them, filtered along time, (T,68,2), pixels.
         solution: weights and refined poses.
-        calibration: of the camera.
+        times: when each frame is shown, (T,) seconds, where the frame rate varies; even at the video's if absent.
+        offsets: between the rig's landmarks and those found; None where the take is too short to tell.
         faces: how many there are in the first frame.
-        reused: frames whose landmarks were known from an earlier run.
+        reused: frames whose readings were known from an earlier run.
         seconds: what each step took, by its name.
         products: the files, by what they are.
-        unlearned: shapes that a prior says nothing of.
         light: of the video, where a texture was put on the face.
-        offsets: between the rig's landmarks and those found; None where the take is too short to tell.
-        finder: what found the landmarks, by its name.
-        times: when each frame is shown, (T,) seconds, where the frame rate varies; even at the video's if absent.
-        rate_varies: how, in words.
     """
 
-    video: VideoFile
-    rig: BlendshapeRig
-    frames: TrackedFrames
-    pinhole: Tensor
+    inputs: TrackInputs
+    reading: FaceReading
+    landmarks: Tensor
     solution: VideoSolution
-    calibration: CameraCalibration
-    faces: int
-    reused: int
-    seconds: dict[str, float]
-    products: dict[str, Path]
-    unlearned: tuple[str, ...] = ()
-    light: PointLight | None = None
-    offsets: LandmarkOffsets | None = None
-    finder: str = ""
     times: Tensor | None = None
-    rate_varies: str = ""
+    offsets: LandmarkOffsets | None = None
+    faces: int = 0
+    reused: int = 0
+    seconds: dict[str, float] = field(default_factory=dict)
+    products: dict[str, Path] = field(default_factory=dict)
+    light: PointLight | None = None
+
+    def __len__(self) -> int:
+        return len(self.landmarks)
+
+    @property
+    def video(self) -> VideoFile:
+        """The video, or what stands for it."""
+        return self.inputs.clip
+
+    @property
+    def rig(self) -> BlendshapeRig:
+        """The actor's."""
+        return self.inputs.actor
+
+    @property
+    def calibration(self) -> CameraCalibration:
+        """Of the camera."""
+        return self.inputs.calibration
+
+    @property
+    def finder(self) -> str:
+        """What found the landmarks, by its name."""
+        return Path(self.inputs.settings.landmarks).name
 
     def seconds_at(self, frame: int) -> float:
         """When a frame is shown."""
@@ -74,23 +88,23 @@ class Tracked:
     @property
     def seen(self) -> Tensor:
         """Frames in which the face was found, (T,) bool."""
-        return torch.isfinite(self.frames.landmarks).all(2).any(1)
+        return self.reading.found
 
     @property
     def stable(self) -> Tensor:
         """How many stable landmarks each frame shows, (T,)."""
-        return torch.isfinite(self.frames.landmarks[:, list(STABLE_LANDMARKS)]).all(2).sum(1)
+        return torch.isfinite(self.reading.landmarks[:, list(STABLE_LANDMARKS)]).all(2).sum(1)
 
     @property
     def jitter(self) -> float:
         """How much the landmarks tremble, pixels."""
-        return float(landmark_jitter(self.frames.landmarks))
+        return float(landmark_jitter(self.reading.landmarks))
 
-    def doubtful_spans(self) -> list[tuple[int, int, str]]:
-        """First and last frame of each span without a face, or with landmarks that are doubtful in the mean."""
-        frames = self.frames
-        sure = (frames.confidence * frames.visibility).nan_to_num().mean(1) * frames.presence.nan_to_num()
-        kind = torch.where(self.seen, (sure < _DOUBTFUL).long(), 2)
+    def suspect_spans(self) -> list[tuple[int, int, str]]:
+        """First and last frame of each span without a face, or with landmarks of low confidence in the mean."""
+        reading = self.reading
+        sure = (reading.confidence * reading.visibility).nan_to_num().mean(1) * reading.presence.nan_to_num()
+        kind = torch.where(self.seen, (sure < _SURE).long(), 2)
         runs, counts = kind.unique_consecutive(return_counts=True)
         ends = counts.cumsum(0)
         return [
@@ -116,7 +130,7 @@ class Tracked:
 
     def lines(self) -> list[str]:
         """For people to read."""
-        count, seen = len(self.frames), int(self.seen.sum())
+        count, seen = len(self), int(self.seen.sum())
         errors = torch.where(self.seen, self.solution.errors, torch.nan)
         lines = [
             f"{count} frames at {self.video.fps:g} a second, the face found in {seen} ({100 * seen / count:.1f} %)",
@@ -125,8 +139,8 @@ class Tracked:
         ]
         if self.times is not None:
             lines.append(
-                f"variable frame rate: {self.rate_varies}; weights.csv and animation.glb have the frames' own times, "
-                f"the overlay and the timecodes run at {self.video.fps:.2f} frames a second"
+                f"variable frame rate: {self.inputs.rate_varies}; weights.csv and animation.glb have the frames' own "
+                f"times, the overlay and the timecodes run at {self.video.fps:.2f} frames a second"
             )
         if self.calibration.assumed:
             lines.append(
@@ -164,14 +178,16 @@ class Tracked:
         if often:
             named = ", ".join(f"{self.rig.names[i]} {100 * float(bounds[i]):.0f} %" for i in often[:_MAX_NAMED])
             lines.append(f"often at their bound of 1: {named}")
-        span = (self.pinhole[:, 36] - self.pinhole[:, 45]).norm(dim=1).nanmedian()
+        span = (self.landmarks[:, 36] - self.landmarks[:, 45]).norm(dim=1).nanmedian()
         if float(errors.nanmedian()) > _POOR * float(span):
             lines.append(
                 f"the rig fits the landmarks poorly ({100 * float(errors.nanmedian() / span):.0f} % of the distance of "
                 "the eyes): is it this person's own?"
             )
-        if self.unlearned:
-            lines.append(f"the priors have not learned {', '.join(self.unlearned)}: they hold these near rest")
+        if self.inputs.models.unlearned:
+            lines.append(
+                f"the priors have not learned {', '.join(self.inputs.models.unlearned)}: they hold these near rest"
+            )
         if self.reused:
             lines.append(f"landmarks of {self.reused} frames were known from an earlier run")
         lines.extend(

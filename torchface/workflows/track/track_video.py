@@ -3,59 +3,37 @@
 from __future__ import annotations
 
 import time
-import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
-import torch
-from torch import Tensor
-
-from torchface.capture.own_rig.landmark_smoothing import filter_landmarks, smooth_landmarks
-from torchface.capture.own_rig.take_solve import solve_take
-from torchface.capture.own_rig.weight_walk import frame_intervals
-from torchface.errors import ValueRangeError
+from torchface.files.checkpoints import read_checkpoint, write_checkpoint
 from torchface.files.content_keys import content_key
 from torchface.files.documents import write_json
 from torchface.files.job_lock import within_job
 from torchface.files.whole_files import all_or_none
-from torchface.geometry.cameras.distortion import undistort
-from torchface.landmarks.images.landmark_finder import trust_of
-from torchface.number_checks import check_rate
 from torchface.progress import Progress, silent
 from torchface.rendering.point_light import PointLight
-from torchface.workflows.track.frame_landmarks import track_frames
-from torchface.workflows.track.given_frames import given_frames
+from torchface.workflows.track.face_overlay import video_light
+from torchface.workflows.track.frame_readings import read_frames
 from torchface.workflows.track.overlay_video import write_overlay
-from torchface.workflows.track.take_offsets import rig_digest, take_offsets
-from torchface.workflows.track.track_files import (
-    OVERLAY,
-    SUMMARY,
-    keep_light,
+from torchface.workflows.track.take_solution import (
+    frame_times,
     keep_solution,
-    kept_light,
     kept_solution,
-    summary,
-    write_curves,
+    known_offsets,
+    new_offsets,
+    new_solution,
+    smoothed_landmarks,
+    solution_key,
 )
-from torchface.workflows.track.track_inputs import (
-    camera_of,
-    check_length,
-    check_texture,
-    load_actor,
-    solver_for,
-    video_clip,
-)
-from torchface.workflows.track.track_models import (
-    load_track_models,
-)
-from torchface.workflows.track.track_overlay import video_light
+from torchface.workflows.track.track_files import OVERLAY, SUMMARY, summary, write_curves
+from torchface.workflows.track.track_inputs import METHOD, TrackInputs, TrackSettings, load_inputs
 from torchface.workflows.track.track_result import Tracked
-from torchface.workflows.track.track_settings import TrackSettings
 from torchface.workflows.track.track_state import TrackState
 
-_AT_ITS_TIMES = "solved at the frames' own times; the overlay and live_link.csv's timecodes run at the mean rate"
-_METHOD = "track/4"
-"""Of the keys; another number where the same inputs, or another ``PIECE``, come to give other results."""
+_LIGHT = "light.safetensors"
 
 
 def track_video(
@@ -83,126 +61,71 @@ def track_video(
         NameMismatchError: a model is missing, or a prior has learned other shapes than the rig has.
     """
     with within_job(out):
-        return _track_video(video, rig, out, settings or TrackSettings(), progress or silent)
+        inputs = load_inputs(video, rig, settings or TrackSettings())
+        return _track(inputs, out, video is not None, progress or silent)
 
 
-def _track_video(video: Path | None, rig: Path, out: Path, settings: TrackSettings, progress: Progress) -> Tracked:
-    clip = video_clip(video, settings)
-    clip.check()
-    times, rate_varies = clip.uneven_seconds()
-    if times is not None:
-        clip = replace(clip, fps=check_rate(float((len(times) - 1) / times[-1]), str(clip.path)))
-        warnings.warn(f"{clip.path}: found a variable frame rate: {rate_varies}; {_AT_ITS_TIMES}", stacklevel=3)
-    actor = load_actor(rig, settings.part)
-    calibration = camera_of(clip, settings.camera)
-    models = load_track_models(
-        actor, settings.landmarks, settings.appearance, settings.prior, settings.dynamics, clip.fps
-    )
-    check_length(clip.count, models, clip.path)
-    if settings.texture is not None:
-        check_texture(actor, settings.texture)
-    see_key = content_key(_METHOD, video=clip.path, models=models.seeing, face=settings.face)
-    state = TrackState(out, see_key)
-    reused = state.done
+def _track(inputs: TrackInputs, out: Path, filmed: bool, progress: Progress) -> Tracked:
+    state = TrackState(out, inputs.reading_key)
     seconds: dict[str, float] = {}
-    begin, faces = time.perf_counter(), 0
-    if models.finder is None:
-        frames = given_frames(Path(settings.landmarks), clip)
-    else:
-        faces = track_frames(clip, models.finder, models.appearance, settings.face, state, progress)
-        frames = state.frames()
-    if state.done > reused:
-        seconds["landmarks"] = time.perf_counter() - begin
-    check_length(len(frames), models, clip.path)
-    if not torch.isfinite(frames.landmarks).any():
-        state.clear()
-        raise ValueRangeError(f"{clip.path}: found no face in any of its {len(frames)} frames, expected one")
-    begin = time.perf_counter()
-    times = None if times is None else _times_of(times, len(frames), clip.fps)
-    intervals = None
-    if times is not None:
-        intervals = [clip.fps * step for step in frame_intervals(times, len(frames), 1 / clip.fps)]
-    steadied = smooth_landmarks if settings.whole_take else filter_landmarks
-    trust = trust_of(frames.confidence, frames.visibility)
-    # What is hidden is a guess, that a filter would carry on into the frames after.
-    seen = torch.where(trust[..., None] > 0, frames.landmarks.double(), torch.nan)
-    pinhole = steadied(undistort(seen, calibration), intervals=intervals).float()
-    seconds["steadying"] = time.perf_counter() - begin
-    solver = solver_for(actor, models, calibration, clip.fps)
-    begin = time.perf_counter()
-    offsets, known = take_offsets(solver, actor, models, pinhole, trust, settings.offsets, out)
-    if not known:
-        seconds["offsets"] = time.perf_counter() - begin
-    if offsets is not None:
-        solver = solver.shifted(offsets)
-    solve_key = content_key(
-        _METHOD,
-        landmarks=see_key,
-        models=models.solving,
-        neutral=actor.neutral,
-        rig=rig_digest(actor),
-        calibration=calibration,
-        whole_take=settings.whole_take,
-        solver=solver.settings,
-        offsets=torch.zeros(0) if offsets is None else offsets.millimetres,
-        seconds=torch.zeros(0) if times is None else times,
-    )
-    solution = kept_solution(state, solve_key, len(frames), len(actor.names))
+    reused = state.done
+    with _timed(seconds, "landmarks"):
+        reading, faces = read_frames(inputs, state, progress)
+    if state.done == reused:
+        seconds.clear()
+    times = frame_times(inputs, len(reading.landmarks))
+    with _timed(seconds, "smoothing"):
+        landmarks = smoothed_landmarks(inputs, reading, times)
+    trust, solver = reading.trust, inputs.solver(inputs.clip.fps)
+    offsets = known_offsets(inputs, out)
+    if offsets is None:
+        with _timed(seconds, "offsets"):
+            offsets = new_offsets(inputs, solver, landmarks, trust)
+    solver = solver if offsets is None else solver.shifted(offsets)
+    key = solution_key(inputs, solver, offsets, times)
+    solution = kept_solution(state, key)
     if solution is None:
-        begin = time.perf_counter()
-        try:
-            solution = solve_take(solver, pinhole, trust, times, settings.whole_take, progress)
-        except ValueRangeError as error:
-            raise ValueRangeError(f"{clip.path}: {error}") from error
-        seconds["weights"] = time.perf_counter() - begin
-        keep_solution(state, solve_key, solution)
-    products: dict[str, Path] = {}
-    tracked = Tracked(
-        clip,
-        actor,
-        frames,
-        pinhole,
-        solution,
-        calibration,
-        faces,
-        reused,
-        seconds,
-        products,
-        models.unlearned,
-        offsets=offsets,
-        finder=Path(settings.landmarks).name,
-        times=times,
-        rate_varies=rate_varies,
-    )
+        with _timed(seconds, "weights"):
+            solution = new_solution(inputs, solver, landmarks, trust, times, progress)
+        keep_solution(state, key, solution)
+    tracked = Tracked(inputs, reading, landmarks, solution, times, offsets, faces, reused, seconds)
     with all_or_none():
-        products |= write_curves(tracked, out)
-    if settings.overlay != "none" and video is not None:
-        overlay_key = content_key(_METHOD, solution=solve_key, texture=settings.texture, kind=settings.overlay)
-        products["overlay"] = out / OVERLAY
-        if settings.texture is not None:
-            tracked = replace(tracked, light=_light(tracked, state, solve_key, progress))
-        if not state.is_current(out / OVERLAY, overlay_key):
-            begin = time.perf_counter()
-            write_overlay(tracked, out / OVERLAY, settings.texture, progress, settings.overlay)
-            seconds["overlay"] = time.perf_counter() - begin
-            state.made(out / OVERLAY, overlay_key)
+        tracked.products.update(write_curves(tracked, out))
+    if filmed and inputs.settings.overlay != "none":
+        tracked = _with_overlay(tracked, out, state, key, progress)
     write_json(out / SUMMARY, summary(tracked))
     return tracked
 
 
-def _times_of(times: Tensor, count: int, fps: float) -> Tensor:
-    """Times of as many frames as could be decoded: a file that was cut lacks some at its end."""
-    more = times[-1] + torch.arange(1, max(count - len(times), 0) + 1, dtype=times.dtype) / fps
-    return torch.cat([times, more])[:count]
+def _with_overlay(tracked: Tracked, out: Path, state: TrackState, key: str, progress: Progress) -> Tracked:
+    """What was tracked with its overlay, drawn unless that of an earlier run is up to date."""
+    settings, path = tracked.inputs.settings, out / OVERLAY
+    if settings.texture is not None:
+        tracked = replace(tracked, light=_light(tracked, state, key, progress))
+    tracked.products["overlay"] = path
+    key = content_key(METHOD, solution=key, texture=settings.texture, kind=settings.overlay)
+    if not state.is_current(path, key):
+        with _timed(tracked.seconds, "overlay"):
+            write_overlay(tracked, path, progress)
+        state.made(path, key)
+    return tracked
 
 
 def _light(tracked: Tracked, state: TrackState, key: str, progress: Progress) -> PointLight:
-    kept = kept_light(state, key)
+    """The video's light, of an earlier run or estimated and kept."""
+    kept = read_checkpoint(state.folder / _LIGHT, key)
     if kept is not None:
-        return kept
+        return PointLight(**kept)
     progress("estimating the light")
+    with _timed(tracked.seconds, "light"):
+        light = video_light(tracked)
+    write_checkpoint(state.folder / _LIGHT, {name: values.float() for name, values in vars(light).items()}, key)
+    return light
+
+
+@contextmanager
+def _timed(seconds: dict[str, float], step: str) -> Iterator[None]:
+    """Notes what a step took."""
     begin = time.perf_counter()
-    found = video_light(tracked)
-    tracked.seconds["light"] = time.perf_counter() - begin
-    keep_light(state, key, found)
-    return found
+    yield
+    seconds[step] = time.perf_counter() - begin

@@ -12,8 +12,8 @@ from torchface.workflows.batch.batch_items import VIDEO_ENDINGS, BatchItem, Item
 from torchface.workflows.batch.contact_sheet import face_picture
 from torchface.workflows.batch.model_contents import model_content
 from torchface.workflows.batch.outcomes import Made
+from torchface.workflows.track.track_inputs import TrackSettings
 from torchface.workflows.track.track_page import write_track_page
-from torchface.workflows.track.track_settings import TrackSettings
 from torchface.workflows.track.track_video import track_video
 
 VIDEOS = ItemKind("video", "tracked", VIDEO_ENDINGS)
@@ -46,12 +46,12 @@ class VideoJob:
         """
         own, folder = item.owned(self), out / item.name
         done = track_video(item.path, own.rig, folder, own.settings)
-        page = write_track_page(done, folder, own.settings.texture)
+        page = write_track_page(done, folder)
         errors = torch.where(done.seen, done.solution.errors, torch.nan)
         shown = done.solution.weights[done.solution.weights.norm(dim=1).argmax()].to(done.rig.deltas)
         with torch.no_grad():
             picture = face_picture(done.rig.neutral.with_vertices(done.rig(shown[None])[0]))
-        seen, frames = float(done.seen.float().mean()), len(done.frames)
+        seen, frames = float(done.seen.float().mean()), len(done)
         return Made(
             (*done.products.values(), page),
             {

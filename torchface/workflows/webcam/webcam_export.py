@@ -17,11 +17,10 @@ from torchface.errors import ValueRangeError
 from torchface.files.whole_files import check_writable, write_file
 from torchface.geometry.cameras.pinhole import look_at
 from torchface.landmarks.images.face_crop import crop_transform, cut_crop, from_crop
-from torchface.landmarks.images.face_reading import FaceReading
-from torchface.landmarks.images.networks.eye_finder import EyeFinder, face_without_eyes
+from torchface.landmarks.images.face_reading import READ_BY_NETWORKS, FaceReading
+from torchface.landmarks.images.networks.eye_finder import EyeFinder
 from torchface.onnx.webcam.face_reader import STATE
 from torchface.onnx.webcam.webcam_session import WebcamFrame, WebcamSession
-from torchface.onnx.webcam.webcam_solver_graph import READING
 from torchface.progress import Progress, silent
 from torchface.rendering.clay_shading import render
 from torchface.synthetic import performer
@@ -150,7 +149,7 @@ def _gap(
 ) -> tuple[float, float]:
     """Of one frame, from the graph's state before it."""
     read = _read(torch.from_numpy(frame).permute(2, 0, 1), before[:STATE].double(), networks)
-    given = [getattr(read, name).float() for name in READING]
+    given = [getattr(read, name).float() for name in READ_BY_NETWORKS]
     height, width = frame.shape[:2]
     extra = [torch.tensor([width, height]).float(), torch.tensor(1 / _FPS), WebcamControls().tensor(), before[STATE:]]
     with torch.inference_mode():
@@ -172,7 +171,7 @@ def _read(image: Tensor, state: Tensor, networks: WebcamNetworks) -> FaceReading
     crop = cut_crop(image, way, network.size)
     marks, deviation, visibility, presence = (one[0] for one in network(crop[None].float() / 255))
     scale = float(side) * network.margin / network.size
-    face = face_without_eyes(from_crop(marks, way), deviation * scale, visibility, presence)
+    face = FaceReading(from_crop(marks, way), deviation * scale, visibility, presence)
     return EyeFinder(networks.eyes, networks.eyes.width, networks.eyes.height)(image, face)
 
 

@@ -1,4 +1,4 @@
-"""The eye network learns what rendered eyes show, and a finder gives it back in the picture's pixels."""
+"""The eye network learns what rendered eyes show."""
 
 import pytest
 import torch
@@ -7,8 +7,7 @@ from torch.utils.data import TensorDataset
 from torchface.errors import ShapeError, ValueRangeError
 from torchface.landmarks.images.networks.eye_augmentation import EyeAugmentation, EyeLabels, augmented_eyes
 from torchface.landmarks.images.networks.eye_crop import EYE_LANDMARKS, eye_transforms, moved
-from torchface.landmarks.images.networks.eye_finder import EyeFinder, face_without_eyes
-from torchface.landmarks.images.networks.eye_network import EyeFindings, EyeNetwork
+from torchface.landmarks.images.networks.eye_network import EyeNetwork
 from torchface.landmarks.images.networks.eye_training import EyeSettings
 from train.rendered_people.eye_picture import EyePicture, draw_eye_pictures
 from train.rendered_people.head_kind import performer_kind
@@ -75,28 +74,6 @@ def test_training_finds_lids_and_irises(pictures: list[EyePicture], labels: EyeL
     # Nearer than the mean eye is, in crops that are dark, grey, blurred and compressed by chance.
     assert float(torch.cat(offsets).norm(dim=1).median()) < 0.75 * float(torch.cat(spread).norm(dim=1).median())
     assert float(torch.corrcoef(torch.cat(gaps, 1))[0, 1]) > 0.8
-
-
-def test_a_finder_gives_pixels_of_the_picture(labels: EyeLabels) -> None:
-    """A network that says where its crops' middles are puts both irises there, and a sure one draws the lids there."""
-    landmarks = 2 * labels.landmarks[0]
-
-    def network(crops: torch.Tensor) -> EyeFindings:
-        middle = torch.tensor([23.5, 15.5])
-        one = torch.ones(2)
-        return EyeFindings(middle.expand(2, 6, 2), middle.expand(2, 2), torch.full((2, 7), 1e-3), one, one, one)
-
-    image = torch.zeros(3, 200, 400, dtype=torch.uint8)
-    before = face_without_eyes(landmarks, torch.ones(68), torch.ones(68), torch.tensor(1.0))
-    face = EyeFinder(network, 48, 32)(image, before)
-    corners = landmarks[[36, 39, 42, 45]].view(2, 2, 2).mean(1)
-    torch.testing.assert_close(face.iris, corners, atol=1e-2, rtol=0)
-    torch.testing.assert_close(face.landmarks[36:48], corners.repeat_interleave(6, 0), atol=1e-2, rtol=0)
-    assert torch.equal(face.landmarks[:36], landmarks[:36])
-    nobody = face_without_eyes(torch.full((68, 2), torch.nan), torch.ones(68), torch.ones(68), torch.tensor(0.0))
-    assert bool(EyeFinder(network, 48, 32)(image, nobody).iris.isnan().all())
-    tiny = face_without_eyes(landmarks / 30, torch.ones(68), torch.ones(68), torch.tensor(1.0))
-    assert bool(EyeFinder(network, 48, 32)(image, tiny).iris.isnan().all())
 
 
 def test_what_cannot_be_is_refused() -> None:

@@ -196,17 +196,6 @@ def test_what_is_black_is_hidden(trees: LandmarkTrees, film: tuple[Tensor, Tenso
     assert not found.found or bool((found.confidence[hidden] < 0.3).all())
 
 
-def test_a_resumed_tracker_goes_on_near_where_it_was(trees: LandmarkTrees, film: tuple[Tensor, Tensor]) -> None:
-    frames, _ = film
-    video, _ = side_by_side(frames[:6], (0.9, 1.2))
-    tracker = LandmarkTracker(trees, face=1)
-    whole = track_landmarks(video, tracker)
-    other = LandmarkTracker(trees)  # the larger one but for what it goes on from
-    assert whole.confidence is not None
-    other.resume(whole.values[2], whole.confidence[2])
-    assert (track_landmarks(video[3:], other).values - whole.values[3:]).abs().mean() < 0.8
-
-
 def test_an_appearance_model_refines(trees: LandmarkTrees, film: tuple[Tensor, Tensor]) -> None:
     frames, truth = film
     learned, rest = [0, 3, 6, 9], [4, 5, 7]
@@ -288,7 +277,7 @@ def test_what_cannot_be_tracked_is_said(trees: LandmarkTrees, tmp_path: Path) ->
     with pytest.raises(ShapeError, match="expected uint8"):
         LandmarkTracker(trees).step(torch.zeros(3, 40, 40))
     with pytest.raises(ShapeError, match="resume"):
-        LandmarkTracker(trees).resume(torch.zeros(5, 2), torch.zeros(5))
+        LandmarkTracker(trees).resume(torch.zeros(5))
     with pytest.raises(ValueRangeError, match="consensus: found 3 starts"):
         ConsensusSettings(starts=3)
     with pytest.raises(ValueRangeError, match="box"):

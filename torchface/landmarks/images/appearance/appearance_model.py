@@ -16,10 +16,10 @@ from torchface.landmarks.images.appearance.appearance_level import AppearanceLev
 from torchface.landmarks.images.appearance.dense_features import CHANNELS, Features, dense_features
 from torchface.landmarks.images.appearance.face_warp import with_forehead
 from torchface.landmarks.images.appearance.shape_modes import PlanarPose, planar_pose
+from torchface.landmarks.images.ibug_68 import COUNT
 from torchface.optim.prepared_tensors import Prepared
 from torchface.progress import Progress, silent
 
-COUNT = 68
 _MARGIN = 0.15
 _MAX_SAMPLES = 8
 _ASTRAY = 4.0  # times the lowest energy: steps that have come to this lead nowhere

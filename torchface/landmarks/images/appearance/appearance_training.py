@@ -10,10 +10,10 @@ from torch import Tensor
 from torchface.color_space import grey_images
 from torchface.errors import ShapeError, ValueRangeError
 from torchface.landmarks.images.appearance.appearance_level import AppearanceLevel, sample_pixels
-from torchface.landmarks.images.appearance.appearance_model import COUNT, AppearanceModel, AppearanceSettings
+from torchface.landmarks.images.appearance.appearance_model import AppearanceModel, AppearanceSettings
 from torchface.landmarks.images.appearance.face_warp import FaceGrid, face_grid, face_triangles, with_forehead
 from torchface.landmarks.images.appearance.shape_modes import learn_shape_modes, similarity_modes
-from torchface.landmarks.images.ibug_68 import MIRROR_68
+from torchface.landmarks.images.ibug_68 import COUNT, MIRROR_68
 from torchface.progress import Progress
 
 _MIN_IMAGES = 3

@@ -10,8 +10,8 @@ from torch import Tensor
 
 from torchface.errors import ShapeError
 from torchface.landmarks.images.face_crop import CROP_MARGIN, crop_transform, cut_crop, from_crop
-from torchface.landmarks.images.ibug_68 import MIRROR_68
-from torchface.landmarks.images.landmark_finder import COUNT, FoundLandmarks, confidence_of
+from torchface.landmarks.images.face_reading import FaceReading, box_side
+from torchface.landmarks.images.ibug_68 import COUNT, MIRROR_68
 
 CropNetwork = Callable[[Tensor], tuple[Tensor, Tensor, Tensor, Tensor]]
 """Crops (B,3,S,S) float32 in [0,1], red first, to landmarks (B,68,2) and their deviations (B,68), pixels of the crop,
@@ -30,13 +30,13 @@ class BothSides:
 
     def __call__(self, crops: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         rows, last = list(MIRROR_68), crops.shape[-1] - 1
-        seen, mirrored = self.network(crops), self.network(crops.flip(-1).contiguous())
+        upright, mirrored = self.network(crops), self.network(crops.flip(-1).contiguous())
         across = mirrored[0][:, rows] * mirrored[0].new_tensor([-1.0, 1.0]) + mirrored[0].new_tensor([last, 0.0])
-        landmarks = (seen[0] + across) / 2
+        landmarks = (upright[0] + across) / 2
         # Where the two disagree the landmark is less sure than either says.
-        apart = (seen[0] - across).norm(dim=-1) / 2
-        deviation = ((seen[1] + mirrored[1][:, rows]) / 2).square().add(apart.square()).sqrt()
-        return landmarks, deviation, (seen[2] + mirrored[2][:, rows]) / 2, (seen[3] + mirrored[3]) / 2
+        apart = (upright[0] - across).norm(dim=-1) / 2
+        deviation = ((upright[1] + mirrored[1][:, rows]) / 2).square().add(apart.square()).sqrt()
+        return landmarks, deviation, (upright[2] + mirrored[2][:, rows]) / 2, (upright[3] + mirrored[3]) / 2
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,7 +56,7 @@ class CropFinder:
     name: str = "landmark network"
 
     @torch.no_grad()
-    def __call__(self, image: Tensor, box: Tensor, tilt: float = 0.0) -> FoundLandmarks:
+    def __call__(self, image: Tensor, box: Tensor, tilt: float = 0.0) -> FaceReading:
         """See :class:`~torchface.landmarks.images.landmark_finder.LandmarkFinder`."""
         transform = crop_transform(box, tilt, self.size, self.margin)
         crop = cut_crop(image, transform, self.size)
@@ -68,5 +68,7 @@ class CropFinder:
                 f"(1,{COUNT}) and presence (1,)"
             )
         landmarks, deviation, visibility, presence = (one[0].detach().float().cpu() for one in outputs)
-        confidence = confidence_of(deviation * (self.margin / self.size))
-        return FoundLandmarks(from_crop(landmarks, transform), confidence, visibility, float(presence))
+        scale = box_side(box) * (self.margin / self.size)  # pixels of the image a pixel of the crop
+        return FaceReading(
+            from_crop(landmarks, transform), scale * deviation, visibility, presence, search_box=box.to(landmarks)
+        )

@@ -11,13 +11,13 @@ from torch.utils.data import Dataset
 
 from torchface.errors import ShapeError, ValueRangeError
 from torchface.files.documents import Value
+from torchface.landmarks.images.ibug_68 import COUNT
 from torchface.landmarks.images.networks.heat_maps import ResidualBlock, convolution, doubled, read_heat
 from torchface.progress import Progress, ValueLog
 
 if TYPE_CHECKING:
     from torchface.landmarks.images.networks.landmark_training import NetworkSettings
 
-COUNT = 68
 STRIDE = 4
 """Pixels of the crop a side of a heat map's cell."""
 _MOST_CHANNELS, _MOST_BLOCKS, _MOST_SIZE = 512, 16, 512

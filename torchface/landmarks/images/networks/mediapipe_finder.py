@@ -21,7 +21,8 @@ from torch import Tensor
 from torchface.errors import MissingExtraError, TorchfaceError
 from torchface.landmarks.images.face_crop import crop_transform, cut_crop, from_crop
 from torchface.landmarks.images.face_mesh_478 import MESH_POINTS, landmarks_of_mesh
-from torchface.landmarks.images.landmark_finder import COUNT, FoundLandmarks, confidence_of
+from torchface.landmarks.images.face_reading import FaceReading, box_side
+from torchface.landmarks.images.ibug_68 import COUNT
 from torchface.landmarks.images.networks import mediapipe_process
 
 PYTHON = "TORCHFACE_MEDIAPIPE_PYTHON"
@@ -82,7 +83,7 @@ class MediaPipeFinder:
             self._end()
             raise MissingExtraError(f"{error}; {_how()}") from error
 
-    def __call__(self, image: Tensor, box: Tensor, tilt: float = 0.0) -> FoundLandmarks:
+    def __call__(self, image: Tensor, box: Tensor, tilt: float = 0.0) -> FaceReading:
         """See :class:`~torchface.landmarks.images.landmark_finder.LandmarkFinder`."""
         transform = crop_transform(box, tilt, _SIZE, _MARGIN)
         crop = np.ascontiguousarray(cut_crop(image, transform, _SIZE).permute(1, 2, 0).numpy())
@@ -94,10 +95,11 @@ class MediaPipeFinder:
         points = self._answer(_ANSWER_SECONDS)
         nothing = torch.zeros(COUNT)
         if not len(points):
-            middle = box[:2] + box[2:] / 2
-            return FoundLandmarks(middle.float().expand(COUNT, 2).clone(), nothing, nothing, 0.0)
+            middle = (box[:2] + box[2:] / 2).float().expand(COUNT, 2).clone()
+            return FaceReading(middle, nothing + torch.inf, nothing, torch.zeros(()), search_box=box)
         landmarks = from_crop(landmarks_of_mesh(points) * _SIZE - 0.5, transform)
-        return FoundLandmarks(landmarks, confidence_of(nothing + _DEVIATION), torch.ones(COUNT), 1.0)
+        deviation = nothing + _DEVIATION * box_side(box)
+        return FaceReading(landmarks, deviation, torch.ones(COUNT), torch.ones(()), search_box=box)
 
     def close(self) -> None:
         """Ends the process."""

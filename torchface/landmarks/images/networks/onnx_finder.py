@@ -13,7 +13,7 @@ from torch import Tensor
 from torchface.errors import FileFormatError
 from torchface.files.whole_files import read_file
 from torchface.landmarks.images.face_crop import CROP_MARGIN
-from torchface.landmarks.images.landmark_finder import COUNT
+from torchface.landmarks.images.ibug_68 import COUNT
 from torchface.landmarks.images.networks.crop_finder import CropFinder
 
 if TYPE_CHECKING:

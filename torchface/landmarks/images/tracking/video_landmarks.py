@@ -11,9 +11,9 @@ from torch import Tensor
 
 from torchface.errors import ShapeError, ValueRangeError
 from torchface.io.video import VideoFile, open_video
-from torchface.landmarks.images.landmark_finder import COUNT
+from torchface.landmarks.images.face_reading import FaceReading
+from torchface.landmarks.images.ibug_68 import COUNT
 from torchface.landmarks.images.tracking.landmark_tracker import LandmarkTracker
-from torchface.landmarks.images.tracking.tracked_face import TrackedFace
 from torchface.progress import Progress, silent
 from torchface.take import Track
 
@@ -61,13 +61,12 @@ def track_landmarks(
         video = open_video(video)
     frames = video.color_frames() if isinstance(video, VideoFile) else video
     total = video.count if isinstance(video, VideoFile) else len(video) if isinstance(video, Sized) else 0
-    found: list[TrackedFace] = []
+    readings: list[FaceReading] = []
     for frame in frames:  # a frame's box is the one before's
-        with naming_the_frame(len(found)):
-            found.append(tracker.step(frame))
-        progress("tracking landmarks", len(found), max(total, len(found)) if total else 0)
-    if not found:
+        with naming_the_frame(len(readings)):
+            readings.append(tracker.step(frame))
+        progress("tracking landmarks", len(readings), max(total, len(readings)) if total else 0)
+    if not readings:
         return Track(LANDMARK_NAMES, torch.zeros(0, COUNT, 2), torch.zeros(0, COUNT))
-    return Track(
-        LANDMARK_NAMES, torch.stack([one.landmarks for one in found]), torch.stack([one.confidence for one in found])
-    )
+    take = FaceReading.stacked(readings)
+    return Track(LANDMARK_NAMES, take.landmarks, take.confidence)

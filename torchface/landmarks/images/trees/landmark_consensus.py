@@ -12,8 +12,8 @@ import torch
 from torch import Tensor
 
 from torchface.errors import ShapeError, ValueRangeError
+from torchface.landmarks.images.face_reading import confidence_of
 from torchface.landmarks.images.ibug_68 import MIRROR_68
-from torchface.landmarks.images.landmark_finder import confidence_of
 from torchface.landmarks.images.trees.landmark_trees import LandmarkTrees, initial_shapes, similarity_to
 
 REACH = 1.1

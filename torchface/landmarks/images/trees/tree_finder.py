@@ -11,7 +11,8 @@ from torch import Tensor
 
 from torchface.errors import ValueRangeError
 from torchface.landmarks.images.boxes.face_box import grey_pixels
-from torchface.landmarks.images.landmark_finder import COUNT, FoundLandmarks
+from torchface.landmarks.images.face_reading import FaceReading
+from torchface.landmarks.images.ibug_68 import COUNT
 from torchface.landmarks.images.trees.landmark_consensus import REACH, Consensus, ConsensusSettings, consensus
 from torchface.landmarks.images.trees.landmark_trees import LandmarkTrees
 
@@ -43,8 +44,8 @@ class TreeFinder:
     Example:
         >>> from torchface import zoo
         >>> blank = torch.full((80, 80), 128, dtype=torch.uint8)
-        >>> found = TreeFinder(zoo.get_model("face_landmarks"))(blank, torch.tensor([10.0, 10.0, 60.0, 60.0]))
-        >>> found.confidence.max().item()  # there is no face, and it is sure of nothing
+        >>> face = TreeFinder(zoo.get_model("face_landmarks"))(blank, torch.tensor([10.0, 10.0, 60.0, 60.0]))
+        >>> face.confidence.max().item()  # there is no face, and it is sure of nothing
         0.0
     """
 
@@ -59,14 +60,17 @@ class TreeFinder:
             )
 
     @torch.no_grad()
-    def __call__(self, image: Tensor, box: Tensor, tilt: float = 0.0) -> FoundLandmarks:
+    def __call__(self, image: Tensor, box: Tensor, tilt: float = 0.0) -> FaceReading:
         """See :class:`~torchface.landmarks.images.landmark_finder.LandmarkFinder`."""
         corner, piece = _piece(image, box)
         grey = grey_pixels(piece)
         found = consensus(self.trees, torch.from_numpy(grey), box - corner, tilt, self.starts)
         visibility = _visibility(grey, found.landmarks, float((box[2] * box[3]).sqrt()))
         landmarks = found.landmarks.float() + corner[:2].to(found.landmarks).float()
-        return FoundLandmarks(landmarks, found.confidence.float() * visibility, visibility, presence_of(found))
+        confidence = found.confidence.float() * visibility
+        return FaceReading.of_confidence(
+            landmarks, confidence, visibility, torch.tensor(presence_of(found)), box.float()
+        )
 
 
 def presence_of(found: Consensus) -> float:

@@ -20,8 +20,8 @@ from torchface.io.video import write_video
 from torchface.synthetic.head.performer import performer
 from torchface.take import Take, Track
 from torchface.workflows.named_finders import load_finder
-from torchface.workflows.track.given_frames import given_frames
-from torchface.workflows.track.track_settings import TrackSettings
+from torchface.workflows.track.frame_readings import given_reading
+from torchface.workflows.track.track_inputs import TrackSettings
 from torchface.workflows.track.track_video import track_video
 
 pytestmark = pytest.mark.usefixtures("coarse_figures")
@@ -90,9 +90,9 @@ def test_tables_that_do_not_fit_are_told(tmp_path: Path, capsys: pytest.CaptureF
     wall = torch.full((3, HEIGHT, WIDTH), 99, dtype=torch.uint8)
     film = write_video([wall], tmp_path / "wall.avi", 25.0)
     with pytest.raises(ValueRangeError, match=rf"take.csv: found landmarks of {COUNT} frames, expected the 4 of wall"):
-        given_frames(table, replace(film, count=4))
+        given_reading(table, replace(film, count=4))
     with pytest.raises(ValueRangeError, match=r"in the 100 x 80 pixels of wall.avi: .* of another size"):
-        given_frames(table, replace(film, count=COUNT, width=100, height=80))
+        given_reading(table, replace(film, count=COUNT, width=100, height=80))
     with pytest.raises(NameMismatchError, match="a table of landmarks, expected what finds them"):
         load_finder(table)
     for words, message in (

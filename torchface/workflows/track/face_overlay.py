@@ -47,7 +47,7 @@ def mesh_drawer(tracked: Tracked) -> Callable[[int, Tensor], Tensor]:
         shaded = shade_over(straight, vertices, rig.neutral.faces, camera)
         here = weights[t : t + 1].double()
         rows = points.chosen(here, camera.rotation[None], camera.translation[None], camera.intrinsics)[0]
-        return with_dots(shaded, tracked.pinhole[t], camera.project(points.at(here)[0, rows]))
+        return with_dots(shaded, tracked.landmarks[t], camera.project(points.at(here)[0, rows]))
 
     return draw
 
@@ -58,7 +58,7 @@ def paint_drawer(tracked: Tracked, texture: Path) -> Callable[[int, Tensor], Ten
     Raises:
         FileFormatError: the texture cannot be read.
         TopologyError: the rig has no texture coordinates.
-        AlignmentError: the video shows too little of the face to tell the light.
+        AlignmentError: the video shows too little of the face for an estimate of the light.
     """
     rig = tracked.rig
     paint = FacePaint.of(rig.neutral, load_paint(texture))
@@ -83,8 +83,8 @@ def video_light(tracked: Tracked) -> PointLight:
     Raises:
         AlignmentError: the frames show too little of the face.
     """
-    rig, found = tracked.rig, tracked.seen.nonzero()[:, 0]
-    wanted = found[torch.linspace(0, len(found) - 1, min(_LIGHT_FRAMES, len(found))).round().long()].tolist()
+    rig, shown = tracked.rig, tracked.seen.nonzero()[:, 0]
+    wanted = shown[torch.linspace(0, len(shown) - 1, min(_LIGHT_FRAMES, len(shown))).round().long()].tolist()
     frames, at = [], 0
     for chunk in tracked.video.color_chunks(_CHUNK):
         frames += [chunk[t - at] for t in wanted if at <= t < at + len(chunk)]

@@ -1,4 +1,4 @@
-"""The rig beside the picture: where the camera sees it, tinted where landmarks are doubtful, absent without a face."""
+"""The rig beside the picture: where the camera sees it, tinted where landmarks are suspect, absent without a face."""
 
 from __future__ import annotations
 
@@ -10,14 +10,16 @@ import torch
 from torchface.capture.own_rig import VideoSolution
 from torchface.geometry.cameras.calibration import assumed_calibration
 from torchface.io.video import VideoFile
+from torchface.landmarks import FaceReading
 from torchface.synthetic import performer
-from torchface.workflows.track.side_by_side import head_window, side_by_side_drawer
-from torchface.workflows.track.track_overlay import camera_at
+from torchface.workflows.track.face_overlay import camera_at
+from torchface.workflows.track.overlay_video import head_window, side_by_side_drawer
+from torchface.workflows.track.track_inputs import TrackInputs, TrackSettings
+from torchface.workflows.track.track_models import TrackModels
 from torchface.workflows.track.track_result import Tracked
-from torchface.workflows.track.track_state import TrackedFrames
 
 
-def test_the_rig_stands_where_the_camera_sees_it_and_shows_what_is_doubtful() -> None:
+def test_the_rig_stands_where_the_camera_sees_it_and_shows_what_is_suspect() -> None:
     rig, calibration = performer(), assumed_calibration(320, 240)
     marks = rig.vertices[rig.neutral.landmarks].double()
     rotation = torch.diag(torch.tensor([1.0, -1.0, -1.0])).double()
@@ -32,19 +34,10 @@ def test_the_rig_stands_where_the_camera_sees_it_and_shows_what_is_doubtful() ->
     )
     rays = (marks @ rotation.T + move) @ calibration.intrinsics.double().T
     landmarks = (rays[:, :2] / rays[:, 2:]).float().repeat(2, 1, 1)
-    frames = TrackedFrames(landmarks, torch.ones(2, 68), torch.ones(2, 4))
-    tracked = Tracked(
-        video=VideoFile(Path("film.avi"), 30.0, 320, 240, 2),
-        rig=rig,
-        frames=frames,
-        pinhole=landmarks,
-        solution=solution,
-        calibration=calibration,
-        faces=1,
-        reused=0,
-        seconds={},
-        products={},
-    )
+    film = VideoFile(Path("film.avi"), 30.0, 320, 240, 2)
+    reading = FaceReading(landmarks, torch.zeros(2, 68), torch.ones(2, 68), torch.ones(2))
+    inputs = TrackInputs(TrackSettings(), film, rig, calibration, TrackModels(None))
+    tracked = Tracked(inputs, reading, landmarks, solution)
     picture = torch.full((3, 240, 320), 120, dtype=torch.uint8)
     window, at = head_window(tracked), camera_at(tracked, 0)
     seen = replace(window, rotation=at.rotation, translation=at.translation)
@@ -55,12 +48,12 @@ def test_the_rig_stands_where_the_camera_sees_it_and_shows_what_is_doubtful() ->
     assert clay.shape == (3, window.height, 2 * window.width)
     assert (clay[:, y, window.width + x] > 90).all()  # the tip of the nose, lit
     assert clay[1, y, x] - clay[0, y, x] > 60  # the landmark found there, green
-    doubted = replace(tracked, frames=replace(frames, confidence=torch.zeros(2, 68)))
+    doubted = replace(tracked, reading=replace(reading, deviation=torch.full((2, 68), 1e3)))
     tinted = side_by_side_drawer(doubted)(0, picture).int()[:, y, window.width + x]
     assert tinted[0] - tinted[2] > 60
-    assert doubted.doubtful_spans() == [(0, 1, "low confidence")]
+    assert doubted.suspect_spans() == [(0, 1, "low confidence")]
     gone = landmarks.clone()
     gone[0] = torch.nan
-    lost = replace(tracked, frames=replace(frames, landmarks=gone))
+    lost = replace(tracked, reading=replace(reading, landmarks=gone))
     assert (side_by_side_drawer(lost)(0, picture)[:, y, window.width + x] < 50).all()
-    assert lost.doubtful_spans() == [(0, 0, "no face")]
+    assert lost.suspect_spans() == [(0, 0, "no face")]

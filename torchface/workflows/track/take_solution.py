@@ -1,0 +1,145 @@
+"""From readings of all frames to weights: smoothed landmarks, fixed offsets of the rig's landmarks, the solve."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from torchface.capture.own_rig import VideoSolution, VideoSolver
+from torchface.capture.own_rig.landmark_offsets import LandmarkOffsets
+from torchface.capture.own_rig.landmark_smoothing import filter_landmarks, smooth_landmarks
+from torchface.capture.own_rig.offset_estimate import estimate_offsets
+from torchface.capture.own_rig.take_solve import solve_take
+from torchface.capture.own_rig.weight_walk import frame_intervals
+from torchface.errors import FileFormatError, ValueRangeError
+from torchface.files.checkpoints import read_checkpoint, write_checkpoint
+from torchface.files.content_keys import content_key
+from torchface.files.whole_files import make_folder
+from torchface.geometry.cameras.distortion import undistort
+from torchface.landmarks.images.face_reading import FaceReading
+from torchface.progress import Progress
+from torchface.rig import BlendshapeRig
+from torchface.workflows.track.track_inputs import METHOD, TrackInputs
+from torchface.workflows.track.track_state import TrackState
+
+OFFSETS = "landmark_offsets.json"
+_SOLUTION = "solution.safetensors"
+
+
+def frame_times(inputs: TrackInputs, count: int) -> Tensor | None:
+    """When each of the frames that could be decoded is shown, (T,) seconds; None where they are even.
+
+    A file that was cut lacks some times at its end.
+    """
+    times = inputs.times
+    if times is None:
+        return None
+    missing = torch.arange(1, max(count - len(times), 0) + 1, dtype=times.dtype)
+    return torch.cat([times, times[-1] + missing / inputs.clip.fps])[:count]
+
+
+def smoothed_landmarks(inputs: TrackInputs, reading: FaceReading, times: Tensor | None) -> Tensor:
+    """The landmarks (T,68,2) as a camera without distortion has them, filtered along time."""
+    fps, count = inputs.clip.fps, len(reading.landmarks)
+    intervals = None if times is None else [fps * step for step in frame_intervals(times, count, 1 / fps)]
+    smooth = smooth_landmarks if inputs.settings.whole_take else filter_landmarks
+    return smooth(undistort(reading.trusted_landmarks.double(), inputs.calibration), intervals=intervals).float()
+
+
+def known_offsets(inputs: TrackInputs, out: Path) -> LandmarkOffsets | None:
+    """The offsets that the user gives, or those of an earlier take in the folder of results; None where there are none.
+
+    Raises:
+        FileFormatError: what the user gives is no such file.
+        ValueRangeError: it is of another rig or finder.
+    """
+    if inputs.settings.offsets is not None:
+        return offsets_of(inputs.settings.offsets, inputs)
+    if not (out / OFFSETS).is_file():
+        return None
+    try:
+        return offsets_of(out / OFFSETS, inputs)
+    except (FileFormatError, ValueRangeError):
+        return None  # another rig's, or damaged: made anew
+
+
+def offsets_of(path: Path, inputs: TrackInputs) -> LandmarkOffsets:
+    """A file's offsets, which must be this rig's and this finder's.
+
+    Raises:
+        FileFormatError: it is no such file.
+        ValueRangeError: they are another rig's or finder's.
+    """
+    offsets = LandmarkOffsets.load(path)
+    offsets.require(_rig_digest(inputs.actor), _finder_digest(inputs), path)
+    return offsets
+
+
+def new_offsets(inputs: TrackInputs, solver: VideoSolver, landmarks: Tensor, trust: Tensor) -> LandmarkOffsets | None:
+    """The offsets of a take's smoothed landmarks (T,68,2), trusted (T,68); None where it is too short to tell."""
+    return estimate_offsets(solver, landmarks, trust, _rig_digest(inputs.actor), _finder_digest(inputs))
+
+
+def solution_key(
+    inputs: TrackInputs, solver: VideoSolver, offsets: LandmarkOffsets | None, times: Tensor | None
+) -> str:
+    """Changes when the solution does."""
+    return content_key(
+        METHOD,
+        landmarks=inputs.reading_key,
+        models=inputs.models.solving,
+        neutral=inputs.actor.neutral,
+        rig=_rig_digest(inputs.actor),
+        calibration=inputs.calibration,
+        whole_take=inputs.settings.whole_take,
+        solver=solver.settings,
+        offsets=torch.zeros(0) if offsets is None else offsets.millimetres,
+        seconds=torch.zeros(0) if times is None else times,
+    )
+
+
+def kept_solution(state: TrackState, key: str) -> VideoSolution | None:
+    """The solution of an earlier run of the same inputs, if it is whole."""
+    tensors = read_checkpoint(state.folder / _SOLUTION, key)
+    return None if tensors is None else VideoSolution(**tensors)
+
+
+def new_solution(
+    inputs: TrackInputs,
+    solver: VideoSolver,
+    landmarks: Tensor,
+    trust: Tensor,
+    times: Tensor | None,
+    progress: Progress,
+) -> VideoSolution:
+    """Weights and poses of smoothed landmarks (T,68,2), trusted (T,68).
+
+    Raises:
+        ValueRangeError: no frame shows enough of them; the message names the video or table.
+    """
+    try:
+        return solve_take(solver, landmarks, trust, times, inputs.settings.whole_take, progress)
+    except ValueRangeError as error:
+        raise ValueRangeError(f"{inputs.clip.path}: {error}") from error
+
+
+def keep_solution(state: TrackState, key: str, solution: VideoSolution) -> None:
+    """Keeps a solution for a later run."""
+    tensors = {
+        name: values if values.dtype == torch.bool else values.float() for name, values in vars(solution).items()
+    }
+    write_checkpoint(make_folder(state.folder) / _SOLUTION, tensors, key)
+
+
+def _rig_digest(rig: BlendshapeRig) -> str:
+    """Changes when a rig does."""
+    correctives = rig.correctives
+    more = {} if correctives is None else {"correctives": correctives.deltas, "definitions": correctives.definitions}
+    return content_key("rig", neutral=rig.neutral, deltas=rig.deltas, names=rig.names, **more)
+
+
+def _finder_digest(inputs: TrackInputs) -> str:
+    """Changes when what finds landmarks does; a table does not say what found it."""
+    return "" if inputs.models.finder is None else inputs.models.seeing
