@@ -55,13 +55,13 @@ def test_a_file_is_a_recipe_too(tmp_path: Path, capsys: pytest.CaptureFixture[st
 def test_the_recipe_of_the_documentation_learns(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     page = (Path(marker_solver.__file__).parents[1] / "docs" / "how_to" / "models.md").read_text()
     own = tmp_path / "steady.py"
-    own.write_text(page.partition("## A recipe of your own")[2].partition("```python\n")[2].partition("```")[0])
+    own.write_text(page.partition("## Your own recipe")[2].partition("```python\n")[2].partition("```")[0])
     for seed in range(2):
         save_take(perform(60, torch.Generator().manual_seed(seed), 60.0), tmp_path / f"{seed}.csv")
     words = ["--network.steps", "60", "--network.rate", "0.02", "--out", str(tmp_path / "steady")]
     main(["train", str(own), "--takes", str(tmp_path), *words])
-    told = dict(line.split() for line in capsys.readouterr().out.splitlines())
-    assert set(told) == {"noisy", "freed"}
+    printed = dict(line.split() for line in capsys.readouterr().out.splitlines())
+    assert set(printed) == {"noisy", "filtered"}
     assert {"steady.safetensors", "settings.toml", "log.csv"} <= {path.name for path in (tmp_path / "steady").iterdir()}
 
 
