@@ -22,7 +22,7 @@ class TorchfaceError(Exception):
         ...     load_mesh("head.dae")
         ... except TorchfaceError as error:
         ...     print(error)
-        head.dae: found the suffix '.dae', expected one of .obj, .ply, .stl, .off, .glb, ...
+        head.dae: found the ending '.dae', expected .obj, .ply, .stl, .off, .glb, ...
     """
 
 

@@ -15,6 +15,7 @@ from torch import Tensor
 from torchface.color_space import grey_images
 from torchface.errors import FileFormatError
 from torchface.io import load_image
+from torchface.io.images.image_files import IMAGE_ENDINGS
 from torchface.io.landmarks.dlib_xml import load_dlib_faces
 from torchface.io.landmarks.landmark_points import load_landmark_points
 from torchface.landmarks.images.ibug_68 import box_around
@@ -22,7 +23,6 @@ from torchface.progress import Progress, silent
 
 from .rendered_people.portraits import FaceImage, FaceImageSettings, face_images
 
-_ENDINGS = (".png", ".jpg", ".jpeg", ".bmp", ".webp", ".tif", ".tiff")
 _MAX_BOX = 240.0  # pixels a side; larger faces are made smaller, as pairs of pixels say no more than this anyway
 _PART = 60  # images that a process renders at once
 _AROUND = 0.8  # of the box that is kept on every side
@@ -75,7 +75,7 @@ def load_faces(path: Path, folders_are_people: bool = False) -> Faces:
                 found.append((_beside(path, face.image), face.points))
     elif path.is_dir():
         for file in sorted(path.rglob("*.pts")):
-            pictures = [file.with_suffix(ending) for ending in _ENDINGS if file.with_suffix(ending).is_file()]
+            pictures = [file.with_suffix(ending) for ending in IMAGE_ENDINGS if file.with_suffix(ending).is_file()]
             if not pictures:
                 raise FileFormatError(f"{file}: found no image of the same name, expected one beside it")
             found.append((pictures[0], load_landmark_points(file).ibug()))

@@ -10,7 +10,7 @@ import pytest
 import torch
 from built_files import check_built
 
-from torchface.io.images.transparent_images import load_paint
+from torchface.io.images.image_files import load_paint
 from torchface.io.video import open_video
 
 CASES = int(os.environ.get("TORCHFACE_FUZZ_CASES", "60"))

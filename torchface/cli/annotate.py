@@ -52,8 +52,7 @@ def annotate(
     from torchface.workflows.track.track_models import is_table
 
     if browser:
-        from torchface.viz.browser.browser_page import HOST, import_viser
-        from torchface.viz.browser.free_port import free_port
+        from torchface.viz.browser.browser_page import HOST, free_port, import_viser
 
         import_viser()
         free_port(HOST, port)

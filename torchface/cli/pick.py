@@ -49,8 +49,7 @@ def pick(
     from torchface.io.rigs.ict_facekit import region
     from torchface.mesh import Mesh, submesh
     from torchface.rig import BlendshapeRig
-    from torchface.viz.browser.browser_page import HOST, import_viser
-    from torchface.viz.browser.free_port import free_port
+    from torchface.viz.browser.browser_page import HOST, free_port, import_viser
     from torchface.viz.browser.landmark_sets import IBUG_68, THESIS_12, custom_set
     from torchface.viz.browser.picker import Picker
 

@@ -34,8 +34,7 @@ def view(
     from torchface.files.whole_files import check_ending, check_writable
     from torchface.io import load_detail_maps, load_rig, load_take
     from torchface.io.rig_files import SCENE_ENDINGS
-    from torchface.viz.browser.browser_page import HOST, import_viser
-    from torchface.viz.browser.free_port import free_port
+    from torchface.viz.browser.browser_page import HOST, free_port, import_viser
     from torchface.viz.browser.rig_viewer import RigViewer
 
     import_viser()  # what is missing should be said before a large rig is read

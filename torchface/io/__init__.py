@@ -1,11 +1,8 @@
 """Files in and out: meshes, rigs, takes; lengths become millimetres coming in and the file's unit going out."""
 
-from torchface.io.animation_files import load_animation, save_animation
 from torchface.io.camera_files import load_calibration, save_calibration
-from torchface.io.detail_files import load_detail_maps
 from torchface.io.gltf import load_region_maps
-from torchface.io.images.image_files import load_image, save_image, save_image16
-from torchface.io.images.normal_map_files import load_normal_map, save_normal_map
+from torchface.io.images.image_files import load_image, save_image, save_image16, save_normal_map
 from torchface.io.landmarks.landmark_points import load_landmark_points, save_pts
 from torchface.io.landmarks.picks import (
     Correspondences,
@@ -17,7 +14,7 @@ from torchface.io.landmarks.picks import (
 )
 from torchface.io.mesh_files import load_mesh, save_mesh
 from torchface.io.meshes.mesh_sequence import MeshSequence, MeshSequenceWriter
-from torchface.io.rig_files import load_rig, save_rig
+from torchface.io.rig_files import load_animation, load_detail_maps, load_rig, save_animation, save_rig
 from torchface.io.rigs.ict_facekit import IdentityModes, load_ict_facekit, load_identity_modes
 from torchface.io.rigs.rig_folder import load_obj_folder
 from torchface.io.scenes.weight_keys import ShapeMatch
@@ -43,7 +40,6 @@ __all__ = [
     "load_landmark_points",
     "load_landmarks",
     "load_mesh",
-    "load_normal_map",
     "load_obj_folder",
     "load_region_maps",
     "load_rig",

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from torchface.errors import FileFormatError
+from torchface.files.whole_files import check_ending
 from torchface.io.gltf import read_gltf_mesh, save_gltf_mesh
 from torchface.io.meshes.obj import read_obj, write_obj
 from torchface.io.meshes.off import read_off, write_off
@@ -48,15 +48,12 @@ def load_mesh(path: str | Path, unit: str | None = None) -> Mesh:
         >>> torch.allclose(load_mesh("head.obj", unit="cm").vertices, 10 * load_mesh("head.obj").vertices)
         True
     """
-    path = Path(path)
-    suffix = path.suffix.lower()
+    check_ending(path, *_READERS, *_GLTF, *USD_ENDINGS)
+    suffix = Path(path).suffix.lower()
     if suffix in _GLTF:
         return read_gltf_mesh(path, unit or "m")
     if suffix in USD_ENDINGS:
         return read_usd_mesh(path, unit)
-    if suffix not in _READERS:
-        known = ", ".join([*_READERS, *_GLTF, *USD_ENDINGS])
-        raise FileFormatError(f"{path}: found the suffix {suffix!r}, expected one of {known}")
     return _READERS[suffix](path, unit or "mm")
 
 
@@ -67,7 +64,7 @@ def save_mesh(mesh: Mesh, path: str | Path) -> None:
     annotations; PLY keeps polygons and colours, STL and OFF triangles. The file appears only when it is complete.
 
     Raises:
-        FileFormatError: another suffix, or the folder cannot be written to.
+        FileFormatError: another ending, or the folder cannot be written to.
 
     Example:
         >>> from torchface.synthetic import neutral_head
@@ -76,8 +73,5 @@ def save_mesh(mesh: Mesh, path: str | Path) -> None:
         >>> torch.equal(load_mesh("head.glb").landmarks, head.landmarks)
         True
     """
-    path = Path(path)
-    suffix = path.suffix.lower()
-    if suffix not in _WRITERS:
-        raise FileFormatError(f"{path}: found the suffix {suffix!r}, expected one of {', '.join(_WRITERS)}")
-    _WRITERS[suffix](mesh, path)
+    check_ending(path, *_WRITERS)
+    _WRITERS[Path(path).suffix.lower()](mesh, path)

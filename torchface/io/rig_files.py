@@ -1,4 +1,4 @@
-"""Rigs by path: glTF and USD files, a folder of OBJ files, ICT-FaceKit's folder."""
+"""Rigs, their animations and wrinkle maps by path: glTF, USD, a folder of OBJ files, ICT-FaceKit's folder."""
 
 from __future__ import annotations
 
@@ -6,19 +6,20 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from torchface.errors import FileFormatError
+from torchface.files.whole_files import check_ending
 from torchface.geometry.meshes.normal_maps import DetailMaps
 from torchface.geometry.meshes.region_maps import RegionMaps
-from torchface.io.gltf import read_gltf_rig, write_gltf_rig
+from torchface.io.gltf import read_gltf_detail, read_gltf_rig, read_gltf_weights, write_gltf_rig
 from torchface.io.rigs.ict_facekit import is_ict_folder, load_ict_facekit, region
 from torchface.io.rigs.rig_folder import load_obj_folder, save_obj_folder
-from torchface.io.scenes.weight_keys import WeightKeys
-from torchface.io.usd import USD_ENDINGS, read_usd_rig, require_usd, write_usd_rig
+from torchface.io.scenes.weight_keys import ShapeMatch, WeightKeys, weight_keys
+from torchface.io.usd import USD_ENDINGS, read_usd_detail, read_usd_rig, read_usd_weights, require_usd, write_usd_rig
 from torchface.rig import BlendshapeRig
+from torchface.take import Take
 
 GLTF_ENDINGS = (".glb", ".gltf")
 SCENE_ENDINGS = (*GLTF_ENDINGS, *USD_ENDINGS)
 """Files that may hold a rig, or a mesh without shapes."""
-_WRITTEN = ", ".join((".glb", *USD_ENDINGS))
 
 
 def load_rig(
@@ -111,17 +112,104 @@ def write_rig(
         save_obj_folder(rig, path, detail)
 
 
+def save_animation(
+    rig: BlendshapeRig, take: Take, path: str | Path, detail: DetailMaps | RegionMaps | None = None
+) -> ShapeMatch:
+    """Writes a rig with the take's weights as its animation, a key a frame at its time, linear between.
+
+    Correctives get the weights that the shapes' call for, so that the animation plays everywhere.
+
+    Args:
+        rig: the rig.
+        take: with ``weights``; names are matched by ``shape_names.mapping``.
+        path: a ``.glb``, or ``.usda``, ``.usdc``, ``.usd`` or ``.usdz``; it appears only when it is complete.
+        detail: wrinkle maps of the rig's shapes, or of its regions, for ``.glb`` alone.
+
+    Returns:
+        ``ShapeMatch(driven, missing, unused)``.
+
+    Raises:
+        NameMismatchError: no channel drives any shape, or a wrinkle map belongs to none.
+        ValueRangeError: the take has no weights or no frame, or a weight is NaN.
+        FileFormatError: another ending, or the folder cannot be written to.
+        MissingExtraError: USD, and usd-core is not installed.
+
+    Example:
+        >>> from torchface import BlendshapeRig, Take, Track
+        >>> rig = BlendshapeRig.from_tensors(torch.eye(3), torch.tensor([[0, 1, 2]]), torch.ones(1, 3, 3), ["jawOpen"])
+        >>> take = Take(30.0, weights=Track(("JawOpen", "tongueOut"), torch.rand(4, 2, 1)))
+        >>> save_animation(rig, take, "take.glb")
+        ShapeMatch(driven=('jawOpen',), missing=(), unused=('tongueOut',))
+    """
+    check_ending(path, ".glb", *USD_ENDINGS)
+    keys, match = weight_keys(rig, take)
+    write_rig(rig, path, detail, keys)
+    return match
+
+
+def load_animation(path: str | Path) -> Take | None:
+    """The weights that a file's animation gives its shapes, one frame a key; none where nothing moves shapes.
+
+    Args:
+        path: a ``.glb``, ``.gltf`` or USD file whose keys are a film's frames, as :func:`save_animation` writes them.
+
+    Returns:
+        weights (T,N,1), by the names of the shapes; correctives follow them and are left out. Frames that come unevenly
+        have their times in ``extras["seconds"]``, from 0.
+
+    Raises:
+        FileFormatError: another kind of file, broken, or keys that are no frames: out of order, or with gaps of ten
+            frames.
+        MissingExtraError: USD, and usd-core is not installed.
+
+    Example:
+        >>> from torchface import BlendshapeRig, Take, Track
+        >>> rig = BlendshapeRig.from_tensors(torch.eye(3), torch.tensor([[0, 1, 2]]), torch.ones(1, 3, 3), ["jawOpen"])
+        >>> take = Take(30.0, weights=Track(("jawOpen",), torch.linspace(0, 1, 5)[:, None, None]))
+        >>> _ = save_animation(rig, take, "take.glb")
+        >>> load_animation("take.glb").weights.values.flatten().tolist()
+        [0.0, 0.25, 0.5, 0.75, 1.0]
+    """
+    if Path(path).suffix.lower() in USD_ENDINGS:
+        return read_usd_weights(path)
+    return read_gltf_weights(path)
+
+
+def load_detail_maps(path: str | Path) -> DetailMaps | None:
+    """The wrinkle maps of a rig's file; none where it has neither such maps nor a normal texture.
+
+    Args:
+        path: a ``.glb``, ``.gltf`` or USD file.
+
+    Raises:
+        FileFormatError: another kind of file, a broken list, images of different sizes, or more of them than the file
+            can hold.
+        MissingExtraError: USD, and usd-core is not installed.
+
+    Example:
+        >>> from torchface.io import save_mesh
+        >>> from torchface.synthetic import neutral_head
+        >>> save_mesh(neutral_head(texture=False), "smooth.glb")
+        >>> load_detail_maps("smooth.glb") is None
+        True
+    """
+    if Path(path).suffix.lower() in USD_ENDINGS:
+        return read_usd_detail(path)
+    return read_gltf_detail(path)
+
+
 def check_rig_ending(path: str | Path) -> None:
     """Refuses what no rig can be written to.
 
     Raises:
-        FileFormatError: another ending.
+        FileFormatError: another ending than ``.glb``, USD's and none, which stands for a folder of OBJ files.
         MissingExtraError: USD, and usd-core is not installed.
     """
     suffix = Path(path).suffix.lower()
-    if suffix not in (".glb", "", *USD_ENDINGS):
+    if suffix not in ("", ".glb", *USD_ENDINGS):
+        known = ", ".join((".glb", *USD_ENDINGS))
         raise FileFormatError(
-            f"{path}: found the ending {suffix!r}, expected {_WRITTEN}, or none for a folder of OBJ files"
+            f"{path}: found the ending {suffix!r}, expected {known}, or none for a folder of OBJ files"
         )
     if suffix in USD_ENDINGS:
         require_usd()

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from torchface.errors import FileFormatError, ValueRangeError
+from torchface.files.whole_files import check_ending
 from torchface.io.landmarks.openface_csv import is_landmark_header, load_landmarks_csv, save_landmarks_csv
 from torchface.io.markers.c3d import load_c3d, save_c3d
 from torchface.io.markers.marker_csv import is_marker_header, load_markers_csv, save_markers_csv
@@ -15,7 +16,8 @@ from torchface.io.weights.live_link_csv import are_live_link_shapes, is_live_lin
 from torchface.io.weights.weight_csv import load_weights_csv, save_weights_csv
 from torchface.take import Take
 
-_SUFFIXES = "'.c3d', '.trc' or '.csv'"
+MARKER_ENDINGS = (".c3d", ".trc")
+TAKE_ENDINGS = (*MARKER_ENDINGS, ".csv")
 
 
 def load_take(path: str | Path, unit: str | None = None) -> Take:
@@ -47,14 +49,13 @@ def load_take(path: str | Path, unit: str | None = None) -> Take:
         >>> take.fps, take.weights.names, take.weights.values[1].flatten().tolist()
         (25.0, ('jawOpen', 'mouthPucker'), [0.5, 0.0])
     """
+    check_ending(path, *TAKE_ENDINGS)
     path = Path(path)
     suffix = path.suffix.lower()
     if suffix == ".c3d":
         return load_c3d(path, unit)
     if suffix == ".trc":
         return load_trc(path, unit)
-    if suffix != ".csv":
-        raise FileFormatError(f"{path}: found the suffix {path.suffix!r}, expected {_SUFFIXES}")
     header = TableReader(path).header
     if is_live_link(header):
         return load_live_link(path)
@@ -83,7 +84,7 @@ def save_take(take: Take, path: str | Path) -> None:
         path: the file; it appears only when it is complete.
 
     Raises:
-        FileFormatError: the suffix is none of ``.c3d``, ``.trc``, ``.csv``.
+        FileFormatError: the ending is none of ``.c3d``, ``.trc``, ``.csv``.
         ValueRangeError: the take holds nothing for this format, markers and landmarks for one ``.csv``, or infinite
             numbers.
         NameMismatchError: a name would not come back as it is.
@@ -95,14 +96,13 @@ def save_take(take: Take, path: str | Path) -> None:
         >>> load_take("take.trc").markers.names
         ('chin', 'nose')
     """
+    check_ending(path, *TAKE_ENDINGS)
     path = Path(path)
     suffix = path.suffix.lower()
     if suffix == ".c3d":
         return save_c3d(take, path)
     if suffix == ".trc":
         return save_trc(take, path)
-    if suffix != ".csv":
-        raise FileFormatError(f"{path}: found the suffix {path.suffix!r}, expected {_SUFFIXES}")
     if take.weights is not None:
         return save_live_link(take, path) if are_live_link_shapes(take.weights.names) else save_weights_csv(take, path)
     present = [name for name in ("markers", "landmarks") if getattr(take, name) is not None]

@@ -8,10 +8,11 @@ from pathlib import Path
 from torchface.errors import FileFormatError
 from torchface.files.whole_files import check_ending, check_writable, make_folder
 from torchface.geometry.meshes.normal_maps import DetailMaps
-from torchface.io import load_animation, load_detail_maps, load_mesh, load_rig, save_mesh
+from torchface.geometry.meshes.region_maps import RegionMaps
+from torchface.io import load_animation, load_detail_maps, load_mesh, load_region_maps, load_rig, save_mesh
 from torchface.io.blender import BLENDER_ENDINGS, blender_program, read_blender_file, write_blender_file
 from torchface.io.mesh_files import MESH_ENDINGS
-from torchface.io.rig_files import SCENE_ENDINGS, check_rig_ending, write_rig
+from torchface.io.rig_files import GLTF_ENDINGS, SCENE_ENDINGS, check_rig_ending, write_rig
 from torchface.io.rigs.ict_facekit import region
 from torchface.io.scenes.weight_keys import weight_keys
 from torchface.io.usd import USD_ENDINGS, require_usd
@@ -82,8 +83,16 @@ def convert_file(
         save_mesh(found.mesh, out)
         return found
     rig = renamed(found.rig, names)
-    detail = load_detail_maps(source) if source.suffix.lower() in SCENE_ENDINGS and part is None else None
-    notes = _write(rig, found.take, renamed_detail(detail, found.rig, names), out)
+    detail: DetailMaps | RegionMaps | None = None
+    notes: list[str] = []
+    if part is None and source.suffix.lower() in GLTF_ENDINGS and (by_region := load_region_maps(source)) is not None:
+        if out.suffix.lower() == ".glb":
+            detail = by_region
+        else:
+            notes.append(f"{out.name} has no place for wrinkle maps by region, which are left out; .glb has")
+    if part is None and source.suffix.lower() in SCENE_ENDINGS and detail is None:
+        detail = renamed_detail(load_detail_maps(source), found.rig, names)
+    notes += _write(rig, found.take, detail, out)
     return Converted(rig.neutral, rig, found.take, (*naming_lines(found.rig, names), *notes))
 
 
@@ -109,13 +118,13 @@ def _read(source: Path, unit: str | None, part: str | None) -> Converted:
     return Converted(mesh, rig, take, ())
 
 
-def _write(rig: BlendshapeRig, take: Take | None, detail: DetailMaps | None, out: Path) -> list[str]:
+def _write(rig: BlendshapeRig, take: Take | None, detail: DetailMaps | RegionMaps | None, out: Path) -> list[str]:
     """Writes the rig with what ``out`` has a place for; says what it has none for."""
     suffix, notes = out.suffix.lower(), []
     if take is not None and not suffix:
         notes.append("a folder of OBJ files has no place for the animation, which is left out")
         take = None
-    if detail is not None and suffix in BLENDER_ENDINGS:
+    if isinstance(detail, DetailMaps) and suffix in BLENDER_ENDINGS:
         notes.append(f"{suffix} has no place for the wrinkle maps of {len(detail.names)} shapes, which are left out")
         detail = None
     keys = None if take is None else weight_keys(rig, take)[0]

@@ -14,10 +14,11 @@ from torchface.capture.markers import MarkerSolver, observability
 from torchface.errors import FileFormatError
 from torchface.files.whole_files import read_file
 from torchface.io import load_animation, load_mesh, load_rig, load_take
-from torchface.io.images.image_files import load_image
+from torchface.io.images.image_files import IMAGE_ENDINGS, load_image
 from torchface.io.mesh_files import MESH_ENDINGS
 from torchface.io.rig_files import SCENE_ENDINGS
-from torchface.io.video import open_video
+from torchface.io.take_files import TAKE_ENDINGS
+from torchface.io.video import VIDEO_ENDINGS, open_video
 from torchface.mesh import Mesh
 from torchface.rig import BlendshapeRig
 from torchface.take import Take
@@ -27,8 +28,6 @@ Rows = list[tuple[str, str]]
 
 _MAX_LENGTH = 240
 _MAX_NAMED = 8
-_VIDEO_ENDINGS = (".mp4", ".mov", ".avi", ".mkv", ".webm", ".gif")
-_IMAGE_ENDINGS = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
 
 
 def describe(path: Path, attachment: Path | None = None, part: str | None = None) -> Rows:
@@ -63,7 +62,7 @@ def describe(path: Path, attachment: Path | None = None, part: str | None = None
         raise FileFormatError(f"{path}: found no rig, expected one to test the markers of {attachment} on")
     if suffix in MESH_ENDINGS:
         return _mesh_rows(load_mesh(path))
-    if suffix in {".c3d", ".trc", ".csv"}:
+    if suffix in TAKE_ENDINGS:
         return _take_rows(load_take(path))
     if suffix == ".json" and is_examples(path):
         return _example_rows(ExampleShapes.load(path))
@@ -71,28 +70,18 @@ def describe(path: Path, attachment: Path | None = None, part: str | None = None
         return _attachment_rows(Attachment.load(path))
     if suffix == ".onnx":
         return _graph_rows(path)
-    if suffix in _VIDEO_ENDINGS:
+    if suffix in VIDEO_ENDINGS:
         video = open_video(path)
         return [
             ("frames", f"{video.count} at {video.fps:g} a second, {video.count / video.fps:.1f} s"),
             ("pixels", f"{video.width} x {video.height}"),
         ]
-    if suffix in _IMAGE_ENDINGS:
+    if suffix in IMAGE_ENDINGS:
         _, height, width = load_image(path).shape
         return [("pixels", f"{width} x {height}")]
-    endings = (
-        *SCENE_ENDINGS,
-        *MESH_ENDINGS,
-        *_VIDEO_ENDINGS,
-        *_IMAGE_ENDINGS,
-        ".c3d",
-        ".trc",
-        ".csv",
-        ".json",
-        ".onnx",
-    )
+    endings = (*SCENE_ENDINGS, *MESH_ENDINGS, *VIDEO_ENDINGS, *IMAGE_ENDINGS, *TAKE_ENDINGS, ".json", ".onnx")
     raise FileFormatError(
-        f"{path}: found the ending {suffix!r}, expected a folder or one of {' '.join(sorted(set(endings)))}"
+        f"{path}: found the ending {suffix!r}, expected a folder or one of {' '.join(sorted(endings))}"
     )
 
 

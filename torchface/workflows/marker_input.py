@@ -19,8 +19,9 @@ from torchface.io import load_take
 from torchface.io.markers.label_maps import load_label_map
 from torchface.io.markers.marker_csv import is_marker_header
 from torchface.io.tables.csv_table import TableReader
+from torchface.io.take_files import MARKER_ENDINGS
 from torchface.take import Take, Track
-from torchface.workflows.batch.batch_items import MARKER_ENDINGS, ItemKind
+from torchface.workflows.batch.batch_items import ItemKind
 
 _SHOWN = 6
 _AXES = "xyz"

@@ -12,7 +12,7 @@ from rig_samples import sheet_rig
 
 from torchface.cli import main
 from torchface.errors import FileFormatError, MissingExtraError
-from torchface.io import load_rig, save_mesh, save_rig
+from torchface.io import save_rig
 from torchface.io.blender import read_blender_file, write_blender_file
 from torchface.io.blender.blender_files import PROGRAM, blender_command
 
@@ -68,19 +68,3 @@ def test_a_blender_that_fails_is_told(monkeypatch: pytest.MonkeyPatch, tmp_path:
     with pytest.raises(FileFormatError, match="Blender wrote nothing"):
         write_blender_file(sheet_rig(), tmp_path / "new.fbx")
     assert not (tmp_path / "new.fbx").exists()
-
-
-def test_files_are_converted_without_blender_where_it_is_not_needed(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    rig = sheet_rig()
-    save_rig(rig, tmp_path / "rig.glb")
-    main(["convert", str(tmp_path / "rig.glb"), str(tmp_path / "folder"), "--part", "lower"])
-    assert "3 shapes, 12 vertices" in capsys.readouterr().err
-    assert load_rig(tmp_path / "folder").names == rig.names
-    save_mesh(rig.neutral, tmp_path / "scan.obj")
-    main(["convert", str(tmp_path / "scan.obj"), str(tmp_path / "scan.ply")])
-    assert "0 shapes, 30 vertices" in capsys.readouterr().err
-    with pytest.raises(SystemExit):
-        main(["convert", str(tmp_path / "scan.obj"), str(tmp_path / "other")])
-    assert "found a mesh without shapes, expected a rig" in " ".join(capsys.readouterr().err.split())

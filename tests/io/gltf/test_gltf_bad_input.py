@@ -256,7 +256,7 @@ def test_a_missing_file_an_unknown_suffix_and_an_unknown_unit(tmp_path: Path) ->
     (tmp_path / "rig.fbx").write_bytes(b"x")
     with pytest.raises(FileFormatError, match=r"rig.fbx: found a file that is no .glb, .gltf, .usd"):
         load_rig(tmp_path / "rig.fbx")
-    with pytest.raises(FileFormatError, match=r"found the suffix '.fbx', expected one of .obj, .ply"):
+    with pytest.raises(FileFormatError, match=r"found the ending '.fbx', expected .obj, .ply"):
         load_mesh(tmp_path / "rig.fbx")
     path = square(["a", "b"]).save(tmp_path / "face.gltf")
     with pytest.raises(ValueRangeError, match="unit: found 'inch', expected one of 'mm', 'cm', 'm'"):

@@ -23,8 +23,7 @@ from image_bytes import (
 from PIL import Image
 from reader_budget import check_budget
 
-from torchface.io.images.image_files import load_image
-from torchface.io.images.transparent_images import load_paint
+from torchface.io.images.image_files import load_image, load_paint
 
 TINY = np.arange(27, dtype=np.uint8).reshape(3, 3, 3)
 

@@ -15,7 +15,7 @@ from PIL import Image, ImageOps
 
 from torchface.errors import FileFormatError
 from torchface.io import load_image
-from torchface.io.images.transparent_images import load_paint
+from torchface.io.images.image_files import load_paint
 from torchface.landmarks.images.appearance.annotated_frames import load_annotated_frames
 
 HEIGHT, WIDTH = 6, 9

@@ -12,8 +12,8 @@ from mutation import check_reader
 from rig_samples import quad_sheet, sheet_rig
 
 from torchface.errors import FileFormatError, NameMismatchError, TopologyError
-from torchface.geometry.meshes.normal_maps import DetailMaps
-from torchface.io import load_normal_map, load_rig, save_mesh, save_rig
+from torchface.geometry.meshes.normal_maps import DetailMaps, decode_normals
+from torchface.io import load_image, load_rig, save_mesh, save_rig
 from torchface.mesh import Mesh
 from torchface.rig import BlendshapeRig
 
@@ -126,7 +126,7 @@ def test_wrinkle_maps_lie_beside_their_shapes(tmp_path: Path) -> None:
     maps = torch.nn.functional.normalize(torch.rand(2, 3, 8, 8, generator=torch.Generator().manual_seed(0)), dim=1)
     save_rig(rig, tmp_path / "actor", DetailMaps(("jawOpen",), maps[:1], maps[1]))
     for name, normals in (("jawOpen", maps[0]), ("neutral", maps[1])):
-        assert (load_normal_map(tmp_path / "actor" / f"{name}_normals.png") - normals).abs().max() < 1e-3
+        assert (decode_normals(load_image(tmp_path / "actor" / f"{name}_normals.png")) - normals).abs().max() < 1e-3
     with pytest.raises(NameMismatchError, match="no shape 'frown'"):
         save_rig(rig, tmp_path / "other", DetailMaps(("frown",), maps[:1]))
     assert not (tmp_path / "other").exists()

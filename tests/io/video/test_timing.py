@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from torchface.errors import FileFormatError
-from torchface.io.video.timing import check_even_rate
+from torchface.io.video.even_rate import check_even_rate
 
 FILE = Path("clip.mov")
 

@@ -16,7 +16,7 @@ from video_samples import RATE
 
 from torchface.errors import FileFormatError
 from torchface.io.video import open_video, write_video
-from torchface.io.video.container import frames_beside
+from torchface.io.video.video_packets import frames_beside
 
 WIDTH, HEIGHT = 3840, 2160
 

@@ -17,7 +17,7 @@ from video_samples import RATE, encode, pattern
 
 from torchface.errors import FileFormatError
 from torchface.io.video import open_video, write_video
-from torchface.io.video.packets import read_packets
+from torchface.io.video.video_packets import read_packets
 
 FORMATS = [
     ("libx264", "mp4"), ("libx264", "mkv"), ("libx264", "avi"), ("libx265", "mp4"), ("libx265", "mkv"),

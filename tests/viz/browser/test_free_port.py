@@ -8,7 +8,7 @@ import socket
 import pytest
 
 from torchface.errors import ValueRangeError
-from torchface.viz.browser.free_port import LAST_PORT, free_port
+from torchface.viz.browser.browser_page import LAST_PORT, free_port
 
 HOST = "127.0.0.1"
 

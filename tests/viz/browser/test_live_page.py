@@ -16,7 +16,7 @@ from planted_faces import JAW, Endless, ShadeSolver
 from torchface.io import load_take, save_rig
 from torchface.rig import BlendshapeRig
 from torchface.viz.browser import live_page
-from torchface.viz.browser.camera_drawing import camera_drawing
+from torchface.viz.browser.live_page import camera_drawing
 from torchface.viz.browser.live_view import LiveView
 from torchface.workflows.live import live_webcam
 from torchface.workflows.live.live_webcam import LiveSettings, go_live

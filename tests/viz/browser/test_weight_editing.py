@@ -6,7 +6,7 @@ import torch
 from torchface.errors import NameMismatchError, ShapeError, ValueRangeError
 from torchface.shape_names import ARKIT
 from torchface.take import Take, Track
-from torchface.viz.browser.shape_groups import GROUPS, grouped
+from torchface.viz.browser.rig_viewer import GROUPS, grouped
 from torchface.viz.browser.weight_editor import WeightEditor
 
 NAMES = ("jawOpen", "mouthSmileLeft", "mouthSmileRight", "browInnerUp")

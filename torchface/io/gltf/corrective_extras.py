@@ -14,7 +14,7 @@ from torch import Tensor
 
 from torchface.correctives.definitions import Corrective, Correctives, definitions_from_records
 from torchface.errors import FileFormatError, NameMismatchError, ValueRangeError
-from torchface.io.gltf.container import Document
+from torchface.io.gltf.gltf_document import Document
 from torchface.mesh import Mesh
 from torchface.rig import BlendshapeRig
 

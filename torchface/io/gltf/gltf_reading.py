@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Sequence
+from dataclasses import replace
+from itertools import accumulate
 from pathlib import Path
 
 import numpy as np
@@ -12,11 +15,10 @@ from torch import Tensor
 
 from torchface.errors import FileFormatError
 from torchface.geometry.meshes.uv_seams import merge_equal_rows
-from torchface.io.gltf.container import Document, read_document
 from torchface.io.gltf.corrective_extras import rig_of_targets, scene_correctives
-from torchface.io.gltf.mesh_extras import read_annotations, read_order, read_polygons
-from torchface.io.gltf.part_joining import rejoined
-from torchface.io.gltf.primitive_reading import BYTES_A_CORNER, BYTES_A_VERTEX, Part, read_part
+from torchface.io.gltf.gltf_document import Document, read_document
+from torchface.io.gltf.mesh_extras import read_annotations, read_mesh_count, read_order, read_polygons
+from torchface.io.gltf.primitive_reading import BYTES_A_CORNER, BYTES_A_VERTEX, Part, filled, read_part
 from torchface.io.gltf.scene import Instance, instances
 from torchface.io.gltf.seam_welding import weld
 from torchface.io.images.image_files import decode_image
@@ -165,3 +167,40 @@ def read_texture(document: Document, index: int) -> Tensor | None:
     else:
         data, _ = document.view(image.get("bufferView"), f"{place}.bufferView")
     return decode_image(bytes(data), f"{document.path}: {place}")
+
+
+def rejoined(document: Document, found: Sequence[tuple[Instance, Part]]) -> tuple[Instance, Part] | None:
+    """The parts of a scene as one, in the scene's axes; none where they were not written as one.
+
+    Args:
+        document: the file.
+        found: the scene's meshes and where they stand.
+    """
+    first = found[0]
+    place = f"meshes[{first[0].mesh}].extras.torchface"
+    if read_mesh_count(document, first[1].extras.get("torchface"), place) != len(found) or len(found) == 1:
+        return None
+    parts = [part for _, part in found]
+    if any(part.vertex_ids is None or part.names != first[1].names for part in parts):
+        return None
+    count = [len(part.positions) for part in parts]
+    document.reserve(sum(part.deltas.nbytes + part.positions.nbytes for part in parts), "nodes")
+    positions, deltas = [], []
+    for instance, part in found:
+        linear, translation = instance.transform[:3, :3], instance.transform[:3, 3]
+        with np.errstate(over="ignore", invalid="ignore"):
+            positions.append((part.positions @ linear.T + translation).astype(np.float32))
+            deltas.append((part.deltas @ linear.T).astype(np.float32))
+    starts = [0, *accumulate(count[:-1])]
+    whole = Part(
+        np.concatenate(positions),
+        np.concatenate(deltas, axis=1),
+        first[1].names,
+        np.concatenate([part.triangles + start for part, start in zip(parts, starts, strict=True)]),
+        filled([part.uvs for part in parts], count, 0.0),
+        filled([part.colors for part in parts], count, 1.0),
+        np.concatenate([part.vertex_ids for part in parts if part.vertex_ids is not None]),
+        next((part.texture for part in parts if part.texture is not None), None),
+        first[1].extras,
+    )
+    return replace(first[0], transform=np.eye(4)), whole

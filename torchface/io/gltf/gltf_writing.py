@@ -17,13 +17,12 @@ from torchface.geometry.meshes.normal_maps import DetailMaps
 from torchface.geometry.meshes.region_maps import RegionMaps
 from torchface.geometry.meshes.uv_seams import split_at_seams
 from torchface.io.gltf.buffers import BufferWriter
-from torchface.io.gltf.container import glb_pieces
 from torchface.io.gltf.corrective_extras import all_targets, write_correctives
-from torchface.io.gltf.material_writing import MaterialWriter
+from torchface.io.gltf.gltf_document import glb_pieces
 from torchface.io.gltf.mesh_extras import write_extras, write_order
 from torchface.io.gltf.part_colors.eyes import eye_centre
 from torchface.io.gltf.part_colors.surfaces import surfaces
-from torchface.io.gltf.primitive_writing import PrimitiveWriter, metres
+from torchface.io.gltf.primitive_writing import MaterialWriter, PrimitiveWriter, metres
 from torchface.io.gltf.region_textures import write_region_maps
 from torchface.io.gltf.wrinkle_maps import corner_tangents, write_detail
 from torchface.io.length_units import millimetres_per

@@ -9,7 +9,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from torchface.io.gltf.container import Document, shown
+from torchface.io.gltf.gltf_document import Document, shown
 from torchface.io.meshes.polygons import corners_of_fans, corners_of_polygons, pad_polygons
 from torchface.mesh import Annotations, Mesh
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from torchface.color_space import to_srgb
 from torchface.io.gltf.accessors import read_floats, read_indices
-from torchface.io.gltf.container import Document, shown
+from torchface.io.gltf.gltf_document import Document, shown
 
 _TRIANGLES, _STRIP, _FAN = 4, 5, 6
 _MAX_EXACT_ID = 2**24

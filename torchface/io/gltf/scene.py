@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from torchface.io.gltf.container import Document
+from torchface.io.gltf.gltf_document import Document
 
 _MAX_INSTANCES = 4096
 

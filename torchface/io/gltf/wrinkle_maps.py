@@ -21,7 +21,7 @@ from torchface.geometry.meshes.normal_maps import DetailMaps, decode_normals, en
 from torchface.geometry.meshes.operators import vertex_normals
 from torchface.geometry.meshes.tangent_space import tangent_space
 from torchface.io.gltf.buffers import BufferWriter
-from torchface.io.gltf.container import Document, read_document
+from torchface.io.gltf.gltf_document import Document, read_document
 from torchface.io.gltf.gltf_reading import read_texture
 from torchface.io.images.image_files import encode_png
 from torchface.mesh import Mesh

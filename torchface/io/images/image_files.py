@@ -12,7 +12,11 @@ from torch import Tensor
 
 from torchface.errors import ShapeError
 from torchface.files.whole_files import read_file, write_file
+from torchface.geometry.meshes.normal_maps import encode_normals
 from torchface.io.images.image_samples import decode_samples
+
+IMAGE_ENDINGS = (".png", ".jpg", ".jpeg", ".bmp", ".webp", ".tif", ".tiff")
+"""What photographs are called; :func:`load_image` goes by their content."""
 
 
 def load_image(path: str | Path) -> Tensor:
@@ -92,3 +96,28 @@ def encode_png16(image: Tensor) -> bytes:
         raise ShapeError(f"image: found {tuple(image.shape)}, expected (3,H,W) with at least one pixel")
     steps = image.detach().cpu().clamp(0, 1).double().mul(65535).round().permute(1, 2, 0).numpy().astype(np.uint16)
     return cv2.imencode(".png", cv2.cvtColor(steps, cv2.COLOR_RGB2BGR))[1].tobytes()
+
+
+def save_normal_map(normals: Tensor, path: str | Path) -> None:
+    """Writes unit vectors in tangent space (3,H,W) as PNG of 16 bits a channel.
+
+    Raises:
+        FileFormatError: the folder cannot be written to.
+        ShapeError: not (3,H,W).
+
+    Example:
+        >>> tilted = torch.tensor([0.6, 0.0, 0.8])[:, None, None].repeat(1, 4, 4)
+        >>> save_normal_map(tilted, "normals.png")
+        >>> bool((decode_normals(load_image("normals.png")) - tilted).abs().max() < 1e-4)
+        True
+    """
+    save_image16(encode_normals(normals), path)
+
+
+def load_paint(path: str | Path) -> Tensor:
+    """An image file as red, green, blue and alpha, (4,H,W) float32 in [0,1]; one without transparency is opaque.
+
+    Raises:
+        FileFormatError: the file is missing, no image, or unpacks to far more pixels than its size lets expect.
+    """
+    return decode_samples(read_file(path), str(path), planes=4).paint()

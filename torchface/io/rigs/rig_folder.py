@@ -12,10 +12,10 @@ from torchface.errors import FileFormatError, NameMismatchError
 from torchface.files.documents import read_json, write_json
 from torchface.files.whole_files import all_or_none, check_writable, made_folder, read_file
 from torchface.geometry.meshes.normal_maps import DetailMaps
-from torchface.io.gltf.container import Document
 from torchface.io.gltf.corrective_extras import all_targets, read_correctives, rig_of_targets, write_correctives
+from torchface.io.gltf.gltf_document import Document
 from torchface.io.gltf.mesh_extras import read_annotations, write_extras
-from torchface.io.images.normal_map_files import save_normal_map
+from torchface.io.images.image_files import save_normal_map
 from torchface.io.meshes.obj import face_bytes, read_obj, read_obj_vertices, write_obj, write_obj_shapes
 from torchface.rig import BlendshapeRig
 

@@ -29,8 +29,8 @@ from torchface.color_space import to_srgb
 from torchface.correctives.definitions import Corrective
 from torchface.errors import FileFormatError
 from torchface.files.documents import parse_json
-from torchface.io.gltf.container import Document
 from torchface.io.gltf.corrective_extras import read_correctives, rig_of_targets
+from torchface.io.gltf.gltf_document import Document
 from torchface.io.gltf.mesh_extras import read_annotations
 from torchface.io.images.image_files import decode_image
 from torchface.io.length_units import millimetres_per

@@ -15,14 +15,25 @@ import torch
 from torch import Tensor
 
 from torchface.errors import FileFormatError, ValueRangeError
-from torchface.io.video.container import frames_beside, open_container, pyav, reason
-from torchface.io.video.packets import key_frame_sizes, packets_of, quarter_turns, read_packets
-from torchface.io.video.timing import check_even_rate, rate_changes
+from torchface.io.video.even_rate import check_even_rate, rate_changes
+from torchface.io.video.video_packets import (
+    frames_beside,
+    key_frame_sizes,
+    open_container,
+    packets_of,
+    pyav,
+    quarter_turns,
+    read_packets,
+    reason,
+)
 from torchface.number_checks import check_rate
 
 if TYPE_CHECKING:
     from av.container import InputContainer
     from av.video.stream import VideoStream
+
+VIDEO_ENDINGS = (".avi", ".mkv", ".webm", ".mp4", ".mov", ".gif")
+"""What films are called; :func:`open_video` goes by their content."""
 
 _MAX_FRAMES = 2**31 - 1
 _CHUNK_BYTES = 32 * 2**20

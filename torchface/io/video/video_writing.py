@@ -14,10 +14,9 @@ import torch
 from torch import Tensor
 
 from torchface.errors import FileFormatError, ShapeError, ValueRangeError
-from torchface.files.whole_files import replaced_file
-from torchface.io.video.container import pyav, reason
-from torchface.io.video.packets import read_packets
+from torchface.files.whole_files import check_ending, replaced_file
 from torchface.io.video.video_file import VideoFile, open_video
+from torchface.io.video.video_packets import pyav, read_packets, reason
 from torchface.number_checks import check_rate
 
 if TYPE_CHECKING:
@@ -51,8 +50,7 @@ def write_video(frames: Iterable[Tensor], path: str | Path, fps: float) -> Video
         True
     """
     path = Path(path)
-    if path.suffix.lower() not in _FORMATS:
-        raise FileFormatError(f"{path}: found the ending {path.suffix!r}, expected {', '.join(_FORMATS)}")
+    check_ending(path, *_FORMATS)
     check_rate(fps, "fps", ValueRangeError)
     single = _single(frames)
     first = next(single, None)

@@ -2,21 +2,24 @@
 
 from __future__ import annotations
 
+import errno
 import importlib
 import math
+import os
 import secrets
+import socket
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
 
-from torchface.errors import TorchfaceError
+from torchface.errors import TorchfaceError, ValueRangeError
 from torchface.files.extra_packages import import_extra
 from torchface.mesh import Mesh
-from torchface.viz.browser.free_port import free_port
+from torchface.number_checks import checked_count
 from torchface.viz.browser.origin_check import only_this_page
 from torchface.viz.browser.page_messages import MessageCheck
 
@@ -178,3 +181,76 @@ def _quiet() -> Iterator[None]:
         yield
     finally:
         console.quiet = before
+
+
+_SAME = 5e-4
+
+
+class SharedInput:
+    """A slider, dropdown or checkbox of the page, which tells changes by the user from those by the program.
+
+    Args:
+        handle: viser's.
+        lock: held while ``act`` runs.
+        act: called with the newest value after the user changed it.
+    """
+
+    def __init__(self, handle: Any, lock: AbstractContextManager, act: Callable[[Any], Any]) -> None:
+        self.handle = handle
+        self._lock = lock
+        self._act = act
+        self._value = handle.value
+        handle.on_update(self._changed)
+
+    def push(self, value: Any) -> None:
+        """Shows a value, unless the user has just set another that is still to be acted on."""
+        if self.handle.value != self._value:
+            return
+        if isinstance(value, float | int) and abs(value - self._value) < _SAME:
+            return
+        self._value = value
+        self.handle.value = value
+        self._value = self.handle.value
+
+    def _changed(self, event: Any) -> None:
+        if event.client is None:  # the program's own doing
+            return
+        with self._lock:
+            self._value = event.target.value
+            self._act(self._value)
+
+
+LAST_PORT = 65535
+_TRIES = 100
+
+
+def free_port(host: str, first: int) -> int:
+    """The first port from ``first`` that can be listened on; 0 stays, for any.
+
+    A server that looks for one by itself waits for ever where it runs out of them.
+
+    Args:
+        host: the address to listen on.
+        first: 0 to 65535.
+
+    Raises:
+        ValueRangeError: no such port, this user may not listen on it, or all of a hundred are in use.
+    """
+    checked_count("port", first, 0, LAST_PORT)
+    if first == 0:
+        return 0
+    last = min(first + _TRIES - 1, LAST_PORT)
+    for port in range(first, last + 1):
+        with socket.socket(socket.AF_INET, socket.SOCK_STREAM) as trial:
+            if os.name == "posix":  # elsewhere it would take ports that are in use
+                trial.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            try:
+                trial.bind((host, port))
+            except OSError as error:
+                if error.errno == errno.EACCES and port < 1024:
+                    raise ValueRangeError(
+                        f"port: found {port}, which this user may not listen on; expected one from 1024 to {LAST_PORT}"
+                    ) from None
+                continue
+            return port
+    raise ValueRangeError(f"port: found {first} to {last} in use, expected a free one among them; try another")

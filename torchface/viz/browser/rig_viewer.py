@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import re
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -17,13 +18,12 @@ from torchface.geometry.meshes.normal_maps import DetailMaps
 from torchface.io import save_take
 from torchface.mesh import Mesh
 from torchface.rig import BlendshapeRig
+from torchface.shape_names import mirror
 from torchface.take import Take
-from torchface.viz.browser.browser_page import BrowserPage, frame_camera, icon
+from torchface.viz.browser.browser_page import BrowserPage, SharedInput, frame_camera, icon
 from torchface.viz.browser.head_mesh import HeadOnPage
 from torchface.viz.browser.html_lists import caption, shape_list
 from torchface.viz.browser.playback import Playback
-from torchface.viz.browser.shape_groups import grouped, label_of
-from torchface.viz.browser.shared_input import SharedInput
 from torchface.viz.browser.weight_editor import WeightEditor
 
 _TICK = 1 / 120
@@ -243,3 +243,48 @@ class RigViewer(BrowserPage):
 def _time_line(frame: int, frames: int, take: Take) -> str:
     code = "" if take.timecode is None else f" · {take.timecode[frame]}"
     return caption(f"{frame} of {frames - 1} · {frame / take.fps:.2f} s{code}")
+
+
+GROUPS = ("brows", "eyes", "jaw", "mouth", "cheeks", "nose", "other")
+"""The field's groups, top of the panel first."""
+
+_PREFIXES = {"brow": "brows", "eye": "eyes", "jaw": "jaw", "mouth": "mouth", "cheek": "cheeks", "nose": "nose"}
+
+
+def group_of(name: str) -> str:
+    """The group of one shape.
+
+    Example:
+        >>> [group_of(name) for name in ("browInnerUp_L", "EyeBlinkLeft", "tongueOut")]
+        ['brows', 'eyes', 'other']
+    """
+    lowered = name.lower()
+    return next((group for prefix, group in _PREFIXES.items() if lowered.startswith(prefix)), "other")
+
+
+def grouped(names: Sequence[str]) -> dict[str, list[int]]:
+    """Rows of ``names`` by group, groups without a shape left out, mirror twins side by side.
+
+    Example:
+        >>> grouped(["mouthSmileLeft", "jawOpen", "mouthPucker", "mouthSmileRight"])
+        {'jaw': [1], 'mouth': [0, 3, 2]}
+    """
+    twins = mirror(names).tolist()
+    order: dict[int, None] = {}
+    for row, twin in enumerate(twins):
+        order.setdefault(row)
+        order.setdefault(twin)
+    members = {group: [row for row in order if group_of(names[row]) == group] for group in GROUPS}
+    return {group: rows for group, rows in members.items() if rows}
+
+
+def label_of(name: str) -> str:
+    """A shape's name as it fits beside its slider, inside its group: without the group, sides as one letter.
+
+    Example:
+        >>> [label_of(name) for name in ("mouthLowerDownRight", "browInnerUp_L", "jawLeft", "jawOpen", "tongueOut")]
+        ['LowerDown R', 'InnerUp L', 'Left', 'Open', 'tongueOut']
+    """
+    prefix = next((prefix for prefix in _PREFIXES if name.lower().startswith(prefix)), "")
+    rest = name[len(prefix) :].lstrip("_") or name
+    return re.sub(r"(?<=.)(?:_|(?<=[a-z])(?=[LR]))(L|R)(?:eft|ight)?$", r" \1", rest)

@@ -12,6 +12,8 @@ from typing import TYPE_CHECKING, Any, TypeVar, overload
 from torchface.errors import FileFormatError, ValueRangeError
 from torchface.io.mesh_files import MESH_ENDINGS
 from torchface.io.rig_files import SCENE_ENDINGS
+from torchface.io.take_files import MARKER_ENDINGS
+from torchface.io.video import VIDEO_ENDINGS
 
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
@@ -22,8 +24,6 @@ NAME = "{name}"
 """Stands in an option's path for the item's name."""
 
 SCAN_ENDINGS = (*MESH_ENDINGS, *SCENE_ENDINGS)
-MARKER_ENDINGS = (".c3d", ".trc")
-VIDEO_ENDINGS = (".avi", ".mkv", ".webm", ".mp4", ".mov", ".gif")
 SUMMARY, RECORDS = "summary.csv", "records"
 """Of a batch: its table, and the folder of its records."""
 _OWN = (SUMMARY, RECORDS)

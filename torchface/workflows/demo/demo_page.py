@@ -16,8 +16,7 @@ from torchface.rendering.compositing import caption, headed, sheet
 from torchface.shape_names import ARKIT, mapping
 from torchface.viz.figures.curves import compared_curves, error_curve, named_bars
 from torchface.viz.figures.face_views import FRONT, THREE_QUARTER, face_views, heat_map
-from torchface.viz.figures.marker_maps import marker_regions
-from torchface.viz.figures.marker_scatter import marker_views
+from torchface.viz.figures.marker_maps import marker_regions, marker_views
 from torchface.viz.reports.player import Markers, Panel, Played, Player, write_player
 from torchface.viz.reports.report_page import Section, Table, write_page
 from torchface.workflows.demo.run_demo import FLAWS, DemoResult, Solved

@@ -6,8 +6,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from torchface.files.content_keys import content_key
+from torchface.io.take_files import MARKER_ENDINGS
 from torchface.workflows.animated_meshes import is_animation
-from torchface.workflows.batch.batch_items import MARKER_ENDINGS, SCAN_ENDINGS, BatchItem, ItemKind
+from torchface.workflows.batch.batch_items import SCAN_ENDINGS, BatchItem, ItemKind
 from torchface.workflows.batch.contact_sheet import HEIGHT, WIDTH
 from torchface.workflows.batch.model_contents import model_content
 from torchface.workflows.batch.outcomes import Made

@@ -11,13 +11,12 @@ import torch
 from torchface.capture.anybody import ExampleShapes, paper_expressions, shown_examples
 from torchface.capture.anybody.examples.example_expressions import NEUTRAL
 from torchface.errors import FileFormatError, NameMismatchError
-from torchface.io.images.image_files import load_image
+from torchface.io.images.image_files import IMAGE_ENDINGS, load_image
 from torchface.landmarks import NoFaceError, find_landmarks
 from torchface.progress import Progress, silent
 from torchface.shape_names import ARKIT
 from torchface.workflows.named_finders import DEFAULT_LANDMARKS, load_finder
 
-_ENDINGS = {".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff"}
 _MOST = 256
 
 
@@ -60,9 +59,9 @@ def picture_examples(
 def _files(pictures: Sequence[Path]) -> list[Path]:
     if len(pictures) == 1 and pictures[0].is_dir():
         folder = pictures[0]
-        files = sorted((p for p in folder.iterdir() if p.suffix.lower() in _ENDINGS), key=_natural)
+        files = sorted((p for p in folder.iterdir() if p.suffix.lower() in IMAGE_ENDINGS), key=_natural)
         if not files:
-            raise FileFormatError(f"{folder}: found no picture, expected files ending in {', '.join(sorted(_ENDINGS))}")
+            raise FileFormatError(f"{folder}: found no picture, expected files ending in {', '.join(IMAGE_ENDINGS)}")
     else:
         files = list(pictures)
     if len(files) > _MOST:

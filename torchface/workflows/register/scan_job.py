@@ -26,7 +26,7 @@ from torchface.rendering.clay_shading import render
 from torchface.rendering.compositing import sheet
 from torchface.viz.figures.face_views import frame_face
 from torchface.viz.figures.heat_maps import error_colors
-from torchface.viz.figures.wireframe import lines_on_clay
+from torchface.viz.figures.registration_views import lines_on_clay
 from torchface.workflows.batch.batch_items import BatchItem
 from torchface.workflows.batch.contact_sheet import HEIGHT, WIDTH
 from torchface.workflows.batch.outcomes import Made

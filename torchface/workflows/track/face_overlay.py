@@ -16,7 +16,7 @@ from torchface.errors import ValueRangeError
 from torchface.geometry.cameras.calibration import CameraCalibration
 from torchface.geometry.cameras.pinhole import Camera
 from torchface.geometry.meshes.operators import vertex_normals
-from torchface.io.images.transparent_images import load_paint
+from torchface.io.images.image_files import load_paint
 from torchface.rendering.point_light import vertex_albedo
 from torchface.rendering.raycast import RayCaster
 from torchface.rendering.texture_overlay import FacePaint, overlay, skin_faces

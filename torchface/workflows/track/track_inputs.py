@@ -15,7 +15,7 @@ from torchface.files.content_keys import content_key
 from torchface.geometry.cameras.calibration import CameraCalibration, assumed_calibration
 from torchface.io import load_rig
 from torchface.io.camera_files import load_calibration
-from torchface.io.images.transparent_images import load_paint
+from torchface.io.images.image_files import load_paint
 from torchface.io.landmarks.landmark_tables import load_landmark_table
 from torchface.io.video import VideoFile, open_video
 from torchface.io.video.blank_video import BlankVideo

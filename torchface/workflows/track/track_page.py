@@ -11,8 +11,7 @@ from torch import Tensor
 from torchface.evaluation import weight_jitter
 from torchface.rendering.compositing import caption, sheet
 from torchface.shown_text import as_markup
-from torchface.viz.figures.curves import error_curve, weight_curves
-from torchface.viz.figures.helmet_motion import motion_curves
+from torchface.viz.figures.curves import error_curve, motion_curves, weight_curves
 from torchface.viz.reports.report_page import Section, Table, write_page
 from torchface.workflows.track.face_overlay import camera_at, mesh_drawer, paint_drawer
 from torchface.workflows.track.head_rotations import head_angles

@@ -8,7 +8,8 @@ from pathlib import Path
 import torch
 
 from torchface.files.content_keys import content_key
-from torchface.workflows.batch.batch_items import VIDEO_ENDINGS, BatchItem, ItemKind
+from torchface.io.video import VIDEO_ENDINGS
+from torchface.workflows.batch.batch_items import BatchItem, ItemKind
 from torchface.workflows.batch.contact_sheet import face_picture
 from torchface.workflows.batch.model_contents import model_content
 from torchface.workflows.batch.outcomes import Made

@@ -10,10 +10,8 @@ from torch import Tensor
 
 from torchface.errors import FileFormatError
 from torchface.files.whole_files import all_or_none, made_folder
-from torchface.io.images.image_files import load_image, save_image
+from torchface.io.images.image_files import IMAGE_ENDINGS, load_image, save_image
 from torchface.io.landmarks.landmark_points import load_landmark_points, save_pts
-
-_IMAGE_ENDINGS = (".png", ".jpg", ".jpeg", ".bmp", ".webp", ".tif", ".tiff")
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,7 +41,7 @@ def load_annotated_frames(folder: str | Path) -> list[AnnotatedFrame]:
         raise FileFormatError(f"{folder}: found no such folder, expected one with images and .pts files")
     frames = []
     for path in sorted(folder.glob("*.pts")):
-        image_path = next((found for end in _IMAGE_ENDINGS if (found := path.with_suffix(end)).is_file()), None)
+        image_path = next((found for end in IMAGE_ENDINGS if (found := path.with_suffix(end)).is_file()), None)
         if image_path is None:
             raise FileFormatError(f"{path}: found no image beside it, expected {path.stem}.png or another")
         points = load_landmark_points(path).ibug()

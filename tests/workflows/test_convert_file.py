@@ -1,0 +1,43 @@
+"""Rigs and meshes from one kind of file to another."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import torch
+from rig_samples import sheet_rig
+
+from torchface.cli import main
+from torchface.geometry.meshes.region_maps import RegionMaps
+from torchface.io import load_detail_maps, load_region_maps, load_rig, save_mesh, save_rig
+from torchface.workflows.convert_file import convert_file
+
+
+def test_files_are_converted_without_blender_where_it_is_not_needed(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    rig = sheet_rig()
+    save_rig(rig, tmp_path / "rig.glb")
+    main(["convert", str(tmp_path / "rig.glb"), str(tmp_path / "folder"), "--part", "lower"])
+    assert "3 shapes, 12 vertices" in capsys.readouterr().err
+    assert load_rig(tmp_path / "folder").names == rig.names
+    save_mesh(rig.neutral, tmp_path / "scan.obj")
+    main(["convert", str(tmp_path / "scan.obj"), str(tmp_path / "scan.ply")])
+    assert "0 shapes, 30 vertices" in capsys.readouterr().err
+    with pytest.raises(SystemExit):
+        main(["convert", str(tmp_path / "scan.obj"), str(tmp_path / "other")])
+    assert "found a mesh without shapes, expected a rig" in " ".join(capsys.readouterr().err.split())
+
+
+def test_wrinkle_maps_by_region_stay_in_a_glb_and_are_named_where_there_is_no_place_for_them(tmp_path: Path) -> None:
+    normals = torch.tensor([0.0, 0.6, 0.8])[:, None, None].repeat(2, 1, 8, 8)
+    maps = RegionMaps(("brow", "chin"), normals, torch.rand(2, 8, 8), torch.ones(2, 4, 4), normals[0])
+    save_rig(sheet_rig(), tmp_path / "rig.glb", maps)
+    assert convert_file(tmp_path / "rig.glb", tmp_path / "again.glb").notes == ()
+    again = load_region_maps(tmp_path / "again.glb")
+    assert again is not None
+    assert again.regions == maps.regions
+    notes = convert_file(tmp_path / "rig.glb", tmp_path / "folder").notes
+    assert notes == ("folder has no place for wrinkle maps by region, which are left out; .glb has",)
+    assert load_detail_maps(tmp_path / "again.glb") is not None
