@@ -125,7 +125,10 @@ def load_action_labels(path: str | Path) -> ActionLabels:
             helmet,
             (left, right),
             {name: _pixels(box, 4) for name, box in document["regions"].table().items()},
-            tuple(Performed(one["units"].texts(), one["first"].whole(), one["last"].whole()) for one in performed),
+            tuple(
+                Performed(stretch["units"].texts(), stretch["first"].whole(), stretch["last"].whole())
+                for stretch in performed
+            ),
         )
     except (ValueRangeError, NameMismatchError) as error:
         raise type(error)(f"{path}: {error}") from error

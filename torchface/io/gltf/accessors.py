@@ -49,31 +49,33 @@ def read_floats(
 
 
 def _read(
-    document: Document, accessor: dict[str, Any], place: str, types: tuple[str, ...], expected: int | None
+    document: Document, accessor: dict[str, Any], location: str, types: tuple[str, ...], expected: int | None
 ) -> NDArray[Any]:
     component, kind = accessor.get("componentType"), accessor.get("type")
     if not isinstance(component, int) or component not in _COMPONENTS:
-        raise document.error(f"{place}.componentType", shown(component), f"one of {', '.join(map(str, _COMPONENTS))}")
+        raise document.error(
+            f"{location}.componentType", shown(component), f"one of {', '.join(map(str, _COMPONENTS))}"
+        )
     if not isinstance(kind, str) or kind not in types:
-        raise document.error(f"{place}.type", shown(kind), " or ".join(types))
-    count = document.integer(accessor, "count", place)
+        raise document.error(f"{location}.type", shown(kind), " or ".join(types))
+    count = document.integer(accessor, "count", location)
     if expected is not None and count != expected:
-        raise document.error(f"{place}.count", count, f"{expected}, as the primitive's other attributes")
+        raise document.error(f"{location}.count", count, f"{expected}, as the primitive's other attributes")
     dtype, width = np.dtype(_COMPONENTS[component]), _WIDTHS[kind]
-    document.reserve(count * width * 4, f"{place}.count")
+    document.reserve(count * width * 4, f"{location}.count")
     if accessor.get("bufferView") is None:
         rows = np.zeros((count, width), dtype)
     else:
-        view, stride = document.view(accessor["bufferView"], f"{place}.bufferView")
-        offset = document.integer(accessor, "byteOffset", place, 0)
-        rows = _rows(document, place, view, offset, stride, count, width, dtype)
+        view, stride = document.view(accessor["bufferView"], f"{location}.bufferView")
+        offset = document.integer(accessor, "byteOffset", location, 0)
+        rows = _rows(document, location, view, offset, stride, count, width, dtype)
     sparse = accessor.get("sparse")
-    return rows if sparse is None else _replace(document, document.record(sparse, place), place, rows)
+    return rows if sparse is None else _replace(document, document.record(sparse, location), location, rows)
 
 
 def _rows(
     document: Document,
-    place: str,
+    location: str,
     view: memoryview,
     offset: int,
     stride: int | None,
@@ -84,33 +86,35 @@ def _rows(
     size = width * dtype.itemsize
     stride = size if stride is None else stride
     if stride < size:
-        raise document.error(f"{place}: byteStride", stride, f"at least the {size} bytes of an element")
+        raise document.error(f"{location}: byteStride", stride, f"at least the {size} bytes of an element")
     last = offset + (count - 1) * stride + size if count else offset
     if last > len(view):
-        raise document.error(place, f"{count} elements up to byte {last}", f"at most the {len(view)} bytes there are")
+        raise document.error(
+            location, f"{count} elements up to byte {last}", f"at most the {len(view)} bytes there are"
+        )
     if count == 0:
         return np.zeros((0, width), dtype)
     return np.ndarray((count, width), dtype, buffer=view, offset=offset, strides=(stride, dtype.itemsize))
 
 
-def _replace(document: Document, sparse: dict[str, Any], place: str, rows: NDArray[Any]) -> NDArray[Any]:
+def _replace(document: Document, sparse: dict[str, Any], location: str, rows: NDArray[Any]) -> NDArray[Any]:
     """The rows with those replaced that a sparse accessor names."""
-    place += ".sparse"
-    count = document.integer(sparse, "count", place)
+    location += ".sparse"
+    count = document.integer(sparse, "count", location)
     if count > len(rows):
-        raise document.error(f"{place}.count", count, f"at most {len(rows)}")
-    indices = document.record(sparse.get("indices"), f"{place}.indices")
-    values = document.record(sparse.get("values"), f"{place}.values")
+        raise document.error(f"{location}.count", count, f"at most {len(rows)}")
+    indices = document.record(sparse.get("indices"), f"{location}.indices")
+    values = document.record(sparse.get("values"), f"{location}.values")
     component = indices.get("componentType")
     if component not in _INDEX_COMPONENTS:
-        raise document.error(f"{place}.indices.componentType", shown(component), "5121, 5123 or 5125")
-    view, _ = document.view(indices.get("bufferView"), f"{place}.indices.bufferView")
-    offset = document.integer(indices, "byteOffset", f"{place}.indices", 0)
-    where = _rows(document, f"{place}.indices", view, offset, None, count, 1, np.dtype(_COMPONENTS[component]))[:, 0]
+        raise document.error(f"{location}.indices.componentType", shown(component), "5121, 5123 or 5125")
+    view, _ = document.view(indices.get("bufferView"), f"{location}.indices.bufferView")
+    offset = document.integer(indices, "byteOffset", f"{location}.indices", 0)
+    where = _rows(document, f"{location}.indices", view, offset, None, count, 1, np.dtype(_COMPONENTS[component]))[:, 0]
     if count and int(where.max()) >= len(rows):
-        raise document.error(f"{place}.indices", int(where.max()), f"less than {len(rows)}")
-    view, _ = document.view(values.get("bufferView"), f"{place}.values.bufferView")
-    offset = document.integer(values, "byteOffset", f"{place}.values", 0)
+        raise document.error(f"{location}.indices", int(where.max()), f"less than {len(rows)}")
+    view, _ = document.view(values.get("bufferView"), f"{location}.values.bufferView")
+    offset = document.integer(values, "byteOffset", f"{location}.values", 0)
     replaced = rows.copy()
-    replaced[where] = _rows(document, f"{place}.values", view, offset, None, count, rows.shape[1], rows.dtype)
+    replaced[where] = _rows(document, f"{location}.values", view, offset, None, count, rows.shape[1], rows.dtype)
     return replaced

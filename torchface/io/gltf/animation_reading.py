@@ -53,35 +53,35 @@ def read_gltf_weights(path: str | Path) -> Take | None:
     left_out: list[str] = []
     followers = {corrective.name for corrective in scene_correctives(document)}
     for which, animation in enumerate(document.objects("animations")):
-        own: set[int] = set()
-        for place, channel, mesh in _weight_channels(document, animation, which):
-            if mesh in own:
+        moved: set[int] = set()
+        for location, channel, mesh in _weight_channels(document, animation, which):
+            if mesh in moved:
                 continue  # another node shows it again, and the first's weights count
             if mesh in meshes:
                 left_out.append(_shown_name(animation, which))
                 continue
-            here, names, values = _channel(document, animation, channel, mesh, place)
+            here, names, values = _channel(document, animation, channel, mesh, location)
             if times is not None and (len(here) != len(times) or not np.allclose(here, times)):
                 if first == which:
-                    raise document.error(place, "keys at other times", "those of the first channel")
+                    raise document.error(location, "keys at other times", "those of the first channel")
                 left_out.append(_shown_name(animation, which))
                 continue
             times, first = here, which if first is None else first
-            own.add(mesh)
+            moved.add(mesh)
             for name, column in zip(names, values.T, strict=True):
                 if name not in followers:
                     weights.setdefault(name, column)
-        meshes |= own
+        meshes |= moved
     if left_out:
-        shown = ", ".join(dict.fromkeys(left_out[:5]))
+        listed = ", ".join(dict.fromkeys(left_out[:5]))
         warnings.warn(
-            f"{path}: left out: animations of other times or of the same mesh: {visible(shown)}", stacklevel=2
+            f"{path}: left out: animations of other times or of the same mesh: {visible(listed)}", stacklevel=2
         )
     if times is None or not weights:
         return None
     stacked = np.stack(list(weights.values()), axis=1)
-    place = f"animations[{first}]"
-    rate, seconds = rate_of_keys(times, lambda found, expected: document.error(place, found, expected))
+    location = f"animations[{first}]"
+    rate, seconds = rate_of_keys(times, lambda found, expected: document.error(location, found, expected))
     extras = {} if seconds is None else {"seconds": seconds}
     return Take(rate, weights=Track(tuple(weights), torch.from_numpy(stacked.copy())[..., None]), extras=extras)
 
@@ -91,12 +91,12 @@ def _weight_channels(
 ) -> Iterator[tuple[str, dict[str, Any], int]]:
     """The channels of an animation that move shapes: their places in words, themselves, and the meshes."""
     for number, row in enumerate(document.array(animation, "channels", f"animations[{which}]")):
-        place = f"animations[{which}].channels[{number}]"
-        channel = document.record(row, place)
-        target = document.record(channel.get("target"), f"{place}.target")
+        location = f"animations[{which}].channels[{number}]"
+        channel = document.record(row, location)
+        target = document.record(channel.get("target"), f"{location}.target")
         if target.get("path") == "weights":
-            node = document.item("nodes", target.get("node"), f"{place}.target.node")
-            yield place, channel, document.integer(node, "mesh", f"{place}.target.node")
+            node = document.item("nodes", target.get("node"), f"{location}.target.node")
+            yield location, channel, document.integer(node, "mesh", f"{location}.target.node")
 
 
 def _shown_name(animation: dict[str, Any], which: int) -> str:
@@ -105,22 +105,22 @@ def _shown_name(animation: dict[str, Any], which: int) -> str:
 
 
 def _channel(
-    document: Document, animation: dict[str, Any], channel: dict[str, Any], mesh: int, place: str
+    document: Document, animation: dict[str, Any], channel: dict[str, Any], mesh: int, location: str
 ) -> tuple[np.ndarray, tuple[str, ...], np.ndarray]:
     """Times (T,), names and values (T,N) of one channel."""
-    samplers = document.array(animation, "samplers", place)
-    index = document.integer(channel, "sampler", place)
+    samplers = document.array(animation, "samplers", location)
+    index = document.integer(channel, "sampler", location)
     if index >= len(samplers):
-        raise document.error(f"{place}.sampler", index, f"less than {len(samplers)}")
-    sampler = document.record(samplers[index], f"{place}.sampler")
+        raise document.error(f"{location}.sampler", index, f"less than {len(samplers)}")
+    sampler = document.record(samplers[index], f"{location}.sampler")
     names = read_target_names(document, mesh)
     if not names:
-        raise document.error(f"{place}.target.node", "a mesh without morph targets", "one with them")
-    times = read_floats(document, sampler.get("input"), f"{place}.input", ("SCALAR",))[:, 0]
+        raise document.error(f"{location}.target.node", "a mesh without morph targets", "one with them")
+    times = read_floats(document, sampler.get("input"), f"{location}.input", ("SCALAR",))[:, 0]
     each = 3 if sampler.get("interpolation") == _CUBIC else 1  # a cubic key is tangent, value, tangent
     count = len(times) * len(names) * each
-    values = read_floats(document, sampler.get("output"), f"{place}.output", ("SCALAR",), count)[:, 0]
+    values = read_floats(document, sampler.get("output"), f"{location}.output", ("SCALAR",), count)[:, 0]
     values = values.reshape(len(times), each, len(names))[:, each // 2]
     if len(times) == 0:
-        raise document.error(f"{place}.input", "no key", "at least one")
+        raise document.error(f"{location}.input", "no key", "at least one")
     return times, names, values

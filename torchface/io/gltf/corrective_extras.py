@@ -40,7 +40,7 @@ def scene_correctives(document: Document) -> tuple[Corrective, ...]:
     return ()
 
 
-def read_correctives(document: Document, extras: Mapping[str, Any], place: str) -> tuple[Corrective, ...]:
+def read_correctives(document: Document, extras: Mapping[str, Any], location: str) -> tuple[Corrective, ...]:
     """The definitions that a record of ours holds; none where it has no such field.
 
     Raises:
@@ -49,7 +49,7 @@ def read_correctives(document: Document, extras: Mapping[str, Any], place: str) 
     try:
         return definitions_from_records(extras.get(_FIELD, []))
     except (NameMismatchError, ValueRangeError) as error:
-        raise FileFormatError(f"{document.path}: {place}: {error}") from error
+        raise FileFormatError(f"{document.path}: {location}: {error}") from error
 
 
 def rig_of_targets(
@@ -63,13 +63,13 @@ def rig_of_targets(
     if not definitions:
         return BlendshapeRig(neutral, deltas, names)
     row = {name: i for i, name in enumerate(names)}
-    own = {definition.name for definition in definitions}
-    shapes = [name for name in names if name not in own]
+    followers = {definition.name for definition in definitions}
+    shapes = [name for name in names if name not in followers]
     for definition in definitions:
         missing = [name for name in (definition.name, *definition.drivers) if name not in row]
         if missing:
-            found = f"a corrective {definition.name[:60]!r} and no morph target {missing[0][:60]!r}"
-            raise document.error(_FIELD, found, "a target for it and for each driver")
+            target_less = f"a corrective {definition.name[:60]!r} and no morph target {missing[0][:60]!r}"
+            raise document.error(_FIELD, target_less, "a target for it and for each driver")
     correctives = Correctives(deltas[[row[definition.name] for definition in definitions]], tuple(definitions))
     return BlendshapeRig(neutral, deltas[[row[name] for name in shapes]], shapes, correctives)
 

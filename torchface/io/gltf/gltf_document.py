@@ -102,14 +102,14 @@ class Document:
     def view(self, index: object, where: str) -> tuple[memoryview, int | None]:
         """The bytes of a bufferView, and its stride."""
         view = self.item("bufferViews", index, where)
-        place = f"bufferViews[{index}]"
-        if "EXT_meshopt_compression" in self.record(view.get("extensions"), f"{place}.extensions"):
-            raise self.error(place, "meshopt compression", "plain data; decompress the file first")
-        start, length = self.integer(view, "byteOffset", place, 0), self.integer(view, "byteLength", place)
-        buffer = self._buffer(self.integer(view, "buffer", place))
+        location = f"bufferViews[{index}]"
+        if "EXT_meshopt_compression" in self.record(view.get("extensions"), f"{location}.extensions"):
+            raise self.error(location, "meshopt compression", "plain data; decompress the file first")
+        start, length = self.integer(view, "byteOffset", location, 0), self.integer(view, "byteLength", location)
+        buffer = self._buffer(self.integer(view, "buffer", location))
         if start + length > len(buffer):
-            raise self.error(place, f"bytes {start} to {start + length}", f"at most the buffer's {len(buffer)}")
-        stride = self.integer(view, "byteStride", place) if "byteStride" in view else None
+            raise self.error(location, f"bytes {start} to {start + length}", f"at most the buffer's {len(buffer)}")
+        stride = self.integer(view, "byteStride", location) if "byteStride" in view else None
         return buffer[start : start + length], stride
 
     def bytes_at(self, uri: object, where: str) -> memoryview:
@@ -153,16 +153,16 @@ class Document:
 
     def _buffer(self, index: int) -> memoryview:
         buffer = self.item("buffers", index, f"buffers[{index}]")
-        place = f"buffers[{index}]"
-        length = self.integer(buffer, "byteLength", place)
+        location = f"buffers[{index}]"
+        length = self.integer(buffer, "byteLength", location)
         if buffer.get("uri") is None:
             if index != 0 or self.binary is None:
-                raise self.error(place, "no uri", "one, or the binary chunk of a .glb")
+                raise self.error(location, "no uri", "one, or the binary chunk of a .glb")
             data = self.binary
         else:
-            data = self.bytes_at(buffer["uri"], f"{place}.uri")
+            data = self.bytes_at(buffer["uri"], f"{location}.uri")
         if len(data) < length:
-            raise self.error(place, f"{len(data)} bytes (truncated)", f"byteLength {length}")
+            raise self.error(location, f"{len(data)} bytes (truncated)", f"byteLength {length}")
         return data[:length]
 
 

@@ -78,7 +78,7 @@ _AT_ONCE = 2**20  # numbers
 
 def _read(document: Document, scale: float) -> tuple[Mesh, Tensor, tuple[str, ...]]:
     parts: dict[int, Part | None] = {}
-    found: list[tuple[Instance, Part]] = []
+    instanced: list[tuple[Instance, Part]] = []
     for instance in instances(document):
         if instance.mesh not in parts:
             parts[instance.mesh] = read_part(document, instance.mesh)
@@ -86,24 +86,24 @@ def _read(document: Document, scale: float) -> tuple[Mesh, Tensor, tuple[str, ..
         if part is not None and len(part.triangles):
             size = part.deltas.nbytes + BYTES_A_VERTEX * len(part.positions) + BYTES_A_CORNER * part.triangles.size
             document.reserve(size, f"nodes: {instance.name[:40]}")
-            found.append((instance, part))
-    if not found:
+            instanced.append((instance, part))
+    if not instanced:
         raise FileFormatError(f"{document.path}: found no triangle in its scene, expected a mesh")
-    whole = rejoined(document, found)
-    pieces = [_piece(document, instance, part, scale) for instance, part in ([whole] if whole else found)]
-    textures = list(dict.fromkeys(part.texture for _, part in found if part.texture is not None))
+    whole = rejoined(document, instanced)
+    pieces = [_piece(document, instance, part, scale) for instance, part in ([whole] if whole else instanced)]
+    textures = list(dict.fromkeys(part.texture for _, part in instanced if part.texture is not None))
     if len(textures) > 1:
         what = f"{len(textures)} textures, of which a mesh has one: the first is taken"
         warnings.warn(f"{document.path}: left out: {what}", stacklevel=3)
     texture = textures[0] if textures else None
-    del parts, found, part, whole  # their shapes fit the memory once, not twice
+    del parts, instanced, part, whole  # their shapes fit the memory once, not twice
     image = None if texture is None else read_texture(document, texture)
     document.reserve(joined_size(pieces), "the scene's morph targets")
     return join_meshes(pieces, image), join_deltas(pieces), all_names(pieces)
 
 
 def _piece(document: Document, instance: Instance, part: Part, scale: float) -> Piece:
-    place = f"meshes[{instance.mesh}].extras.torchface"
+    location = f"meshes[{instance.mesh}].extras.torchface"
     joined = weld(part)
     linear, translation = instance.transform[:3, :3] * scale, instance.transform[:3, 3] * scale
     vertices = _moved(part.positions[joined.row_of], linear, translation)
@@ -114,7 +114,7 @@ def _piece(document: Document, instance: Instance, part: Part, scale: float) -> 
     if not np.isfinite(vertices).all() or not np.isfinite(deltas).all():
         raise document.error(f"meshes[{instance.mesh}]", "positions that overflow", "finite millimetres")
     extras, triangles = part.extras.get("torchface"), part.triangles
-    rows = read_order(document, extras, place, len(triangles)) if joined.authored else None
+    rows = read_order(document, extras, location, len(triangles)) if joined.authored else None
     if rows is not None:
         triangles = np.empty_like(triangles)
         triangles[rows] = part.triangles
@@ -129,8 +129,8 @@ def _piece(document: Document, instance: Instance, part: Part, scale: float) -> 
         uvs,
         uv_faces,
         None if part.colors is None else torch.from_numpy(part.colors[joined.row_of]),
-        read_polygons(document, extras, place, faces),
-        read_annotations(document, extras, place, len(vertices)) if joined.authored else None,
+        read_polygons(document, extras, location, faces),
+        read_annotations(document, extras, location, len(vertices)) if joined.authored else None,
         torch.from_numpy(deltas),
         part.names,
     )
@@ -156,37 +156,37 @@ def _moved(
 
 def read_texture(document: Document, index: int) -> Tensor | None:
     """The image of a texture; none where only an extension has it."""
-    place = f"textures[{index}]"
-    texture = document.item("textures", index, place)
+    location = f"textures[{index}]"
+    texture = document.item("textures", index, location)
     if texture.get("source") is None:
         return None
-    image = document.item("images", texture["source"], f"{place}.source")
-    place = f"images[{texture['source']}]"
+    image = document.item("images", texture["source"], f"{location}.source")
+    location = f"images[{texture['source']}]"
     if image.get("uri") is not None:
-        data = document.bytes_at(image["uri"], f"{place}.uri")
+        data = document.bytes_at(image["uri"], f"{location}.uri")
     else:
-        data, _ = document.view(image.get("bufferView"), f"{place}.bufferView")
-    return decode_image(bytes(data), f"{document.path}: {place}")
+        data, _ = document.view(image.get("bufferView"), f"{location}.bufferView")
+    return decode_image(bytes(data), f"{document.path}: {location}")
 
 
-def rejoined(document: Document, found: Sequence[tuple[Instance, Part]]) -> tuple[Instance, Part] | None:
+def rejoined(document: Document, instanced: Sequence[tuple[Instance, Part]]) -> tuple[Instance, Part] | None:
     """The parts of a scene as one, in the scene's axes; none where they were not written as one.
 
     Args:
         document: the file.
         found: the scene's meshes and where they stand.
     """
-    first = found[0]
-    place = f"meshes[{first[0].mesh}].extras.torchface"
-    if read_mesh_count(document, first[1].extras.get("torchface"), place) != len(found) or len(found) == 1:
+    first = instanced[0]
+    location = f"meshes[{first[0].mesh}].extras.torchface"
+    if read_mesh_count(document, first[1].extras.get("torchface"), location) != len(instanced) or len(instanced) == 1:
         return None
-    parts = [part for _, part in found]
+    parts = [part for _, part in instanced]
     if any(part.vertex_ids is None or part.names != first[1].names for part in parts):
         return None
     count = [len(part.positions) for part in parts]
     document.reserve(sum(part.deltas.nbytes + part.positions.nbytes for part in parts), "nodes")
     positions, deltas = [], []
-    for instance, part in found:
+    for instance, part in instanced:
         linear, translation = instance.transform[:3, :3], instance.transform[:3, 3]
         with np.errstate(over="ignore", invalid="ignore"):
             positions.append((part.positions @ linear.T + translation).astype(np.float32))

@@ -18,17 +18,17 @@ _VERSION = 1
 
 def write_extras(mesh: Mesh) -> dict[str, Any]:
     """The JSON of a mesh's polygons and annotations; lists of runs stand for polygon sizes and region masks."""
-    found: dict[str, Any] = {"version": _VERSION, "vertices": len(mesh.vertices)}
+    extras: dict[str, Any] = {"version": _VERSION, "vertices": len(mesh.vertices)}
     if mesh.polygons is not None:
         sizes, _, _ = corners_of_polygons(mesh)
         start = np.flatnonzero(np.diff(sizes, prepend=-1))
-        found["polygons"] = np.stack([sizes[start], np.diff(start, append=len(sizes))], axis=1).tolist()
+        extras["polygons"] = np.stack([sizes[start], np.diff(start, append=len(sizes))], axis=1).tolist()
     annotations = mesh.annotations
     if annotations is not None:
         lists = {"landmarks": annotations.landmarks, "mirror": annotations.mirror, "contacts": annotations.contacts}
-        found.update({name: tensor.tolist() for name, tensor in lists.items() if tensor is not None})
-        found["regions"] = {name: _runs(mask.cpu().numpy()) for name, mask in annotations.regions.items()}
-    return found
+        extras.update({name: tensor.tolist() for name, tensor in lists.items() if tensor is not None})
+        extras["regions"] = {name: _runs(mask.cpu().numpy()) for name, mask in annotations.regions.items()}
+    return extras
 
 
 def write_order(rows: Tensor, meshes: int) -> dict[str, Any]:
@@ -40,27 +40,27 @@ def write_order(rows: Tensor, meshes: int) -> dict[str, Any]:
     """
     ids = rows.numpy()
     start = np.flatnonzero(np.diff(ids, prepend=-2) != 1)
-    found: dict[str, Any] = {} if meshes == 1 else {"meshes": meshes}
+    extras: dict[str, Any] = {} if meshes == 1 else {"meshes": meshes}
     if len(start) > 1:
-        found["triangles"] = np.stack([ids[start], np.diff(start, append=len(ids))], axis=1).tolist()
-    return found
+        extras["triangles"] = np.stack([ids[start], np.diff(start, append=len(ids))], axis=1).tolist()
+    return extras
 
 
-def read_mesh_count(document: Document, extras: object, place: str) -> int:
+def read_mesh_count(document: Document, extras: object, location: str) -> int:
     """How many meshes of the scene are one mesh's parts, this one the first; 1 where the file does not say."""
-    return document.integer(_record(document, extras, place), "meshes", place, 1)
+    return document.integer(_record(document, extras, location), "meshes", location, 1)
 
 
-def read_order(document: Document, extras: object, place: str, count: int) -> NDArray[np.int64] | None:
+def read_order(document: Document, extras: object, location: str, count: int) -> NDArray[np.int64] | None:
     """For each of ``count`` triangles its row in the mesh as authored; none where the file has them in that order.
 
     Raises:
         FileFormatError: the field is broken.
     """
-    record = _record(document, extras, place)
+    record = _record(document, extras, location)
     if "triangles" not in record:
         return None
-    runs = _integers(document, record, "triangles", place, (2,))
+    runs = _integers(document, record, "triangles", location, (2,))
     start, length = runs[:, 0], runs[:, 1]
     if len(runs) == 0 or length.min() < 1 or length.max() > count or int(length.sum()) != count:
         return None
@@ -69,16 +69,16 @@ def read_order(document: Document, extras: object, place: str, count: int) -> ND
     return rows if np.array_equal(np.sort(rows), np.arange(count)) else None
 
 
-def read_polygons(document: Document, extras: object, place: str, triangles: NDArray[np.int64]) -> Tensor | None:
+def read_polygons(document: Document, extras: object, location: str, triangles: NDArray[np.int64]) -> Tensor | None:
     """The polygons (P,K) whose fans the triangles (F,3) are; none where they are not, as after an edit elsewhere.
 
     Raises:
         FileFormatError: the field is broken, or its table of polygons would fill the memory.
     """
-    record = _record(document, extras, place)
+    record = _record(document, extras, location)
     if "polygons" not in record:
         return None
-    runs = _integers(document, record, "polygons", place, (2,))
+    runs = _integers(document, record, "polygons", location, (2,))
     sizes, counts = runs[:, 0], runs[:, 1]
     if len(runs) == 0 or sizes.min() < 3 or counts.min() < 1 or counts.max() > len(triangles):
         return None
@@ -93,32 +93,32 @@ def read_polygons(document: Document, extras: object, place: str, triangles: NDA
     return pad_polygons(str(document.path), sizes, corners_of_fans(sizes, triangles))
 
 
-def read_annotations(document: Document, extras: object, place: str, count: int) -> Annotations | None:
+def read_annotations(document: Document, extras: object, location: str, count: int) -> Annotations | None:
     """The annotations of a mesh of ``count`` vertices; none where the file has none, or for another vertex count.
 
     Raises:
         FileFormatError: a list is broken or names a vertex that is not there.
     """
-    record = _record(document, extras, place)
+    record = _record(document, extras, location)
     if record.get("vertices") != count:
         return None
     ids = {}
     for name, shape in (("landmarks", ()), ("mirror", ()), ("contacts", (2,))):
         if name in record:
-            ids[name] = torch.from_numpy(_vertex_ids(document, record, name, place, shape, count))
+            ids[name] = torch.from_numpy(_vertex_ids(document, record, name, location, shape, count))
     if "mirror" in ids and len(ids["mirror"]) != count:
-        raise document.error(f"{place}.mirror", f"{len(ids['mirror'])} entries", f"one for each of {count} vertices")
-    regions = document.record(record.get("regions"), f"{place}.regions")
-    document.reserve(len(regions) * count, f"{place}.regions")
-    masks = {name: _mask(document, regions, name, f"{place}.regions", count) for name in regions}
+        raise document.error(f"{location}.mirror", f"{len(ids['mirror'])} entries", f"one for each of {count} vertices")
+    regions = document.record(record.get("regions"), f"{location}.regions")
+    document.reserve(len(regions) * count, f"{location}.regions")
+    masks = {name: _mask(document, regions, name, f"{location}.regions", count) for name in regions}
     if not ids and not masks:
         return None
     return Annotations(regions=masks, **ids)
 
 
-def _record(document: Document, extras: object, place: str) -> dict[str, Any]:
+def _record(document: Document, extras: object, location: str) -> dict[str, Any]:
     """Another version's record is left alone."""
-    record = document.record(extras, place)
+    record = document.record(extras, location)
     return record if record.get("version") == _VERSION else {}
 
 
@@ -129,35 +129,35 @@ def _runs(mask: NDArray[np.bool_]) -> list[int]:
     return np.diff(edges, prepend=0, append=len(mask)).tolist()
 
 
-def _mask(document: Document, regions: dict[str, Any], name: str, place: str, count: int) -> Tensor:
-    runs = _integers(document, regions, name, place, ())
+def _mask(document: Document, regions: dict[str, Any], name: str, location: str, count: int) -> Tensor:
+    runs = _integers(document, regions, name, location, ())
     if len(runs) and (runs.min() < 0 or runs.max() > count or int(runs.sum()) != count):
-        raise document.error(f"{place}.{name[:40]}", f"runs of {int(runs.sum())} vertices", f"{count}")
+        raise document.error(f"{location}.{name[:40]}", f"runs of {int(runs.sum())} vertices", f"{count}")
     values = np.arange(len(runs)) % 2 == 1
     mask = np.repeat(values, runs)
     if len(mask) != count:
-        raise document.error(f"{place}.{name[:40]}", f"runs of {len(mask)} vertices", f"{count}")
+        raise document.error(f"{location}.{name[:40]}", f"runs of {len(mask)} vertices", f"{count}")
     return torch.from_numpy(mask)
 
 
 def _vertex_ids(
-    document: Document, record: dict[str, Any], name: str, place: str, shape: tuple[int, ...], count: int
+    document: Document, record: dict[str, Any], name: str, location: str, shape: tuple[int, ...], count: int
 ) -> NDArray[np.int64]:
-    ids = _integers(document, record, name, place, shape)
+    ids = _integers(document, record, name, location, shape)
     if ids.size and (ids.min() < 0 or ids.max() >= count):
-        raise document.error(f"{place}.{name}", f"vertices {ids.min()} to {ids.max()}", f"0 to {count - 1}")
+        raise document.error(f"{location}.{name}", f"vertices {ids.min()} to {ids.max()}", f"0 to {count - 1}")
     return ids
 
 
 def _integers(
-    document: Document, record: dict[str, Any], name: str, place: str, shape: tuple[int, ...]
+    document: Document, record: dict[str, Any], name: str, location: str, shape: tuple[int, ...]
 ) -> NDArray[np.int64]:
     """A list of integers, or of rows of them; each within 53 bits."""
-    rows = document.array(record, name, place)
+    rows = document.array(record, name, location)
     flat = [x for row in rows for x in row] if shape and all(isinstance(row, list) for row in rows) else rows
     whole = all(type(x) is int and abs(x) < 2**53 for x in flat)
     if not whole or (shape and not all(isinstance(row, list) and len(row) == shape[0] for row in rows)):
         raise document.error(
-            f"{place}.{name[:40]}", shown(rows), "a list of integers" if not shape else "pairs of integers"
+            f"{location}.{name[:40]}", shown(rows), "a list of integers" if not shape else "pairs of integers"
         )
     return np.array(flat, np.int64).reshape(-1, *shape)

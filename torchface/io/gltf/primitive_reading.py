@@ -55,41 +55,41 @@ def read_part(document: Document, index: int) -> Part | None:
     Raises:
         FileFormatError: broken accessors, primitives of different morph targets, or names that do not match them.
     """
-    place = f"meshes[{index}]"
-    mesh = document.item("meshes", index, place)
+    location = f"meshes[{index}]"
+    mesh = document.item("meshes", index, location)
     blocks: dict[str, _Block] = {}
     triangles, textures, first = [], [], 0
-    for i, row in enumerate(document.array(mesh, "primitives", place)):
-        primitive = document.record(row, f"{place}.primitives[{i}]")
+    for i, row in enumerate(document.array(mesh, "primitives", location)):
+        primitive = document.record(row, f"{location}.primitives[{i}]")
         if primitive.get("mode", _TRIANGLES) not in (_TRIANGLES, _STRIP, _FAN):
             continue
         # Exporters that split by material let all primitives share one set of vertices.
         key = json.dumps([primitive.get("attributes"), primitive.get("targets")], sort_keys=True)
         if key not in blocks:
-            blocks[key] = _read_block(document, primitive, f"{place}.primitives[{i}]", first)
+            blocks[key] = _read_block(document, primitive, f"{location}.primitives[{i}]", first)
             first += len(blocks[key].positions)
-        corners = _read_triangles(document, primitive, f"{place}.primitives[{i}]", len(blocks[key].positions))
+        corners = _read_triangles(document, primitive, f"{location}.primitives[{i}]", len(blocks[key].positions))
         triangles.append(corners + blocks[key].first)
         painted = _painted(primitive)  # that texture is not of the mesh
-        texture = None if painted else _texture(document, primitive, f"{place}.primitives[{i}]")[0]
+        texture = None if painted else _texture(document, primitive, f"{location}.primitives[{i}]")[0]
         textures.append((len(corners), texture))
     if not blocks:
         return None
     rows = list(blocks.values())
     if len({len(block.deltas) for block in rows}) > 1:
         counts = [len(block.deltas) for block in rows]
-        raise document.error(place, f"primitives of {counts} morph targets", "the same number in each")
+        raise document.error(location, f"primitives of {counts} morph targets", "the same number in each")
     has = [count for count, texture in textures if texture is not None]
     return Part(
         np.concatenate([block.positions for block in rows]),
         rows[0].deltas if len(rows) == 1 else np.concatenate([block.deltas for block in rows], axis=1),
-        _target_names(document, mesh, place, len(rows[0].deltas)),
+        _target_names(document, mesh, location, len(rows[0].deltas)),
         np.concatenate(triangles),
         filled([block.uvs for block in rows], [len(block.positions) for block in rows], 0.0),
         filled([block.colors for block in rows], [len(block.positions) for block in rows], 1.0),
         None if any(block.vertex_ids is None for block in rows) else np.concatenate([b.vertex_ids for b in rows]),
         next((texture for count, texture in textures if has and count == max(has) and texture is not None), None),
-        document.record(mesh.get("extras"), f"{place}.extras") if isinstance(mesh.get("extras"), dict) else {},
+        document.record(mesh.get("extras"), f"{location}.extras") if isinstance(mesh.get("extras"), dict) else {},
     )
 
 
@@ -105,53 +105,53 @@ class _Block:
     vertex_ids: NDArray[np.int64] | None
 
 
-def _read_block(document: Document, primitive: dict[str, Any], place: str, first: int) -> _Block:
-    if "KHR_draco_mesh_compression" in document.record(primitive.get("extensions"), f"{place}.extensions"):
-        raise document.error(place, "Draco compression", "plain data; decompress the file first")
-    attributes = document.record(primitive.get("attributes"), f"{place}.attributes")
+def _read_block(document: Document, primitive: dict[str, Any], location: str, first: int) -> _Block:
+    if "KHR_draco_mesh_compression" in document.record(primitive.get("extensions"), f"{location}.extensions"):
+        raise document.error(location, "Draco compression", "plain data; decompress the file first")
+    attributes = document.record(primitive.get("attributes"), f"{location}.attributes")
     if "POSITION" not in attributes:
-        raise document.error(f"{place}.attributes", "no POSITION", "one")
-    positions = read_floats(document, attributes["POSITION"], f"{place}.POSITION", ("VEC3",))
+        raise document.error(f"{location}.attributes", "no POSITION", "one")
+    positions = read_floats(document, attributes["POSITION"], f"{location}.POSITION", ("VEC3",))
     count = len(positions)
-    document.reserve(count * BYTES_A_VERTEX, f"{place}.POSITION")
-    targets = document.array(primitive, "targets", place)
-    document.reserve(len(targets) * count * 12, f"{place}.targets")
+    document.reserve(count * BYTES_A_VERTEX, f"{location}.POSITION")
+    targets = document.array(primitive, "targets", location)
+    document.reserve(len(targets) * count * 12, f"{location}.targets")
     deltas = np.zeros((len(targets), count, 3), np.float32)
     for i, row in enumerate(targets):  # each target has accessors of its own
-        target = document.record(row, f"{place}.targets[{i}]")
+        target = document.record(row, f"{location}.targets[{i}]")
         if "POSITION" in target:
-            deltas[i] = read_floats(document, target["POSITION"], f"{place}.targets[{i}].POSITION", ("VEC3",), count)
-    uv_name = f"TEXCOORD_{_texture(document, primitive, place)[1]}"
+            deltas[i] = read_floats(document, target["POSITION"], f"{location}.targets[{i}].POSITION", ("VEC3",), count)
+    uv_name = f"TEXCOORD_{_texture(document, primitive, location)[1]}"
     uvs = colors = ids = None
     if uv_name in attributes:
-        uvs = read_floats(document, attributes[uv_name], f"{place}.{uv_name}", ("VEC2",), count)
+        uvs = read_floats(document, attributes[uv_name], f"{location}.{uv_name}", ("VEC2",), count)
         uvs = np.stack([uvs[:, 0], 1 - uvs[:, 1]], axis=1)
     color_name = "_COLOR" if "_COLOR" in attributes or _painted(primitive) else "COLOR_0"
     if color_name in attributes:
-        colors = read_floats(document, attributes[color_name], f"{place}.{color_name}", ("VEC3", "VEC4"), count)
+        colors = read_floats(document, attributes[color_name], f"{location}.{color_name}", ("VEC3", "VEC4"), count)
         colors = to_srgb(torch.from_numpy(colors[:, :3].clip(0, 1))).numpy()
     if "_VERTEX_ID" in attributes:
-        numbers = read_floats(document, attributes["_VERTEX_ID"], f"{place}._VERTEX_ID", ("SCALAR",), count)[:, 0]
+        numbers = read_floats(document, attributes["_VERTEX_ID"], f"{location}._VERTEX_ID", ("SCALAR",), count)[:, 0]
         whole = numbers == np.floor(numbers)
         ids = numbers.astype(np.int64) if bool(np.all(whole & (numbers >= 0) & (numbers < _MAX_EXACT_ID))) else None
     return _Block(first, positions, deltas, uvs, colors, ids)
 
 
-def _read_triangles(document: Document, primitive: dict[str, Any], place: str, count: int) -> NDArray[np.int64]:
+def _read_triangles(document: Document, primitive: dict[str, Any], location: str, count: int) -> NDArray[np.int64]:
     if primitive.get("indices") is None:
         corners = np.arange(count)
     else:
-        corners = read_indices(document, primitive["indices"], f"{place}.indices")
-    document.reserve(len(corners) * BYTES_A_CORNER, f"{place}.indices")
+        corners = read_indices(document, primitive["indices"], f"{location}.indices")
+    document.reserve(len(corners) * BYTES_A_CORNER, f"{location}.indices")
     if len(corners) and int(corners.max()) >= count:
-        raise document.error(f"{place}.indices", int(corners.max()), f"less than the {count} vertices")
+        raise document.error(f"{location}.indices", int(corners.max()), f"less than the {count} vertices")
     mode = primitive.get("mode", _TRIANGLES)
     if mode == _TRIANGLES:
         if len(corners) % 3:
-            raise document.error(f"{place}.indices", f"{len(corners)} corners", "three a triangle")
+            raise document.error(f"{location}.indices", f"{len(corners)} corners", "three a triangle")
         return corners.reshape(-1, 3)
     if len(corners) < 3:
-        raise document.error(f"{place}.indices", f"{len(corners)} corners", "at least three")
+        raise document.error(f"{location}.indices", f"{len(corners)} corners", "at least three")
     if mode == _FAN:
         return np.stack([np.full(len(corners) - 2, corners[0]), corners[1:-1], corners[2:]], axis=1)
     odd = np.arange(len(corners) - 2) % 2  # every second triangle of a strip runs the other way
@@ -159,17 +159,17 @@ def _read_triangles(document: Document, primitive: dict[str, Any], place: str, c
     return np.stack([corners[steps], corners[steps + 1 + odd], corners[steps + 2 - odd]], axis=1)
 
 
-def _texture(document: Document, primitive: dict[str, Any], place: str) -> tuple[int | None, int]:
+def _texture(document: Document, primitive: dict[str, Any], location: str) -> tuple[int | None, int]:
     """The base colour's texture, and which set of texture coordinates it takes."""
     if primitive.get("material") is None:
         return None, 0
-    material = document.item("materials", primitive["material"], f"{place}.material")
-    surface = document.record(material.get("pbrMetallicRoughness"), f"{place}.material")
-    texture = document.record(surface.get("baseColorTexture"), f"{place}.material.baseColorTexture")
+    material = document.item("materials", primitive["material"], f"{location}.material")
+    surface = document.record(material.get("pbrMetallicRoughness"), f"{location}.material")
+    texture = document.record(surface.get("baseColorTexture"), f"{location}.material.baseColorTexture")
     if "index" not in texture:
         return None, 0
-    found = document.integer(texture, "index", f"{place}.material.baseColorTexture")
-    return found, document.integer(texture, "texCoord", f"{place}.material.baseColorTexture", 0)
+    index = document.integer(texture, "index", f"{location}.material.baseColorTexture")
+    return index, document.integer(texture, "texCoord", f"{location}.material.baseColorTexture", 0)
 
 
 def _painted(primitive: dict[str, Any]) -> bool:
@@ -181,26 +181,26 @@ def _painted(primitive: dict[str, Any]) -> bool:
 
 def read_target_names(document: Document, index: int) -> tuple[str, ...]:
     """The names of the morph targets of mesh ``index``."""
-    place = f"meshes[{index}]"
-    mesh = document.item("meshes", index, place)
-    rows = document.array(mesh, "primitives", place)
-    targets = [document.array(document.record(row, place), "targets", place) for row in rows[:1]]
-    return _target_names(document, mesh, place, len(targets[0]) if targets else 0)
+    location = f"meshes[{index}]"
+    mesh = document.item("meshes", index, location)
+    rows = document.array(mesh, "primitives", location)
+    targets = [document.array(document.record(row, location), "targets", location) for row in rows[:1]]
+    return _target_names(document, mesh, location, len(targets[0]) if targets else 0)
 
 
-def _target_names(document: Document, mesh: dict[str, Any], place: str, count: int) -> tuple[str, ...]:
+def _target_names(document: Document, mesh: dict[str, Any], location: str, count: int) -> tuple[str, ...]:
     """From the mesh, as Blender and three.js have it, or its first primitive; else ``target_0`` and so on."""
-    primitives = [row for row in document.array(mesh, "primitives", place) if isinstance(row, dict)]
+    primitives = [row for row in document.array(mesh, "primitives", location) if isinstance(row, dict)]
     for owner in (mesh, *primitives[:1]):
         extras = owner.get("extras")
         names = extras.get("targetNames") if isinstance(extras, dict) else None
         if names is None:
             continue
         if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
-            raise document.error(f"{place}.extras.targetNames", shown(names), "a list of names")
+            raise document.error(f"{location}.extras.targetNames", shown(names), "a list of names")
         if len(names) != count or len(set(names)) != count:
-            found = f"{len(names)} names, {len(set(names))} of them different"
-            raise document.error(f"{place}.extras.targetNames", found, f"one for each of {count} morph targets")
+            counted = f"{len(names)} names, {len(set(names))} of them different"
+            raise document.error(f"{location}.extras.targetNames", counted, f"one for each of {count} morph targets")
         return tuple(names)
     return tuple(f"target_{i}" for i in range(count))
 

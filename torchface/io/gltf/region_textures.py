@@ -39,14 +39,13 @@ def write_region_maps(maps: RegionMaps, root: dict[str, Any], buffers: BufferWri
     root["materials"][0]["normalTexture"] = {"index": neutral}
     low, high = float(maps.heights.min()), float(maps.heights.max())
     high = max(high, low + _LEAST_RANGE)
+    levels = (maps.heights - low) / (high - low)
     root["meshes"][0]["extras"]["torchface"][_KEY] = {
         "regions": list(maps.regions),
-        "normals": [texture(encode_normals(one), f"wrinkle_{i}_normals") for i, one in enumerate(maps.normals)],
-        "heights": [
-            texture(one, f"wrinkle_heights_{i}") for i, one in enumerate(_packed((maps.heights - low) / (high - low)))
-        ],
+        "normals": [texture(encode_normals(image), f"wrinkle_{i}_normals") for i, image in enumerate(maps.normals)],
+        "heights": [texture(image, f"wrinkle_heights_{i}") for i, image in enumerate(_packed(levels))],
         "heightRange": [low, high],
-        "masks": [texture(one, f"region_masks_{i}") for i, one in enumerate(_packed(maps.masks))],
+        "masks": [texture(image, f"region_masks_{i}") for i, image in enumerate(_packed(maps.masks))],
     }
 
 
@@ -64,30 +63,32 @@ def load_region_maps(path: str | Path) -> RegionMaps | None:
         True
     """
     document = read_document(path)
-    found = list_of_first_mesh(document, _KEY)
-    if found is None:
+    listed_mesh = list_of_first_mesh(document, _KEY)
+    if listed_mesh is None:
         return None
-    mesh, place = found
-    listed = document.record(mesh["extras"]["torchface"][_KEY], place)
-    regions = document.array(listed, "regions", place)
+    mesh, location = listed_mesh
+    listed = document.record(mesh["extras"]["torchface"][_KEY], location)
+    regions = document.array(listed, "regions", location)
     if not regions or not all(isinstance(name, str) and name for name in regions) or len(set(regions)) < len(regions):
-        raise document.error(f"{place}.regions", regions, "names, each once")
+        raise document.error(f"{location}.regions", regions, "names, each once")
     reader = TextureReader(document, path)
     neutral = normal_texture(document, mesh)
     if neutral is None:
-        raise document.error(place, "a material without a normal texture", "the normals of the face at rest in it")
-    normals = _stacked(document, reader, [neutral, *document.array(listed, "normals", place)], f"{place}.normals")
+        raise document.error(location, "a material without a normal texture", "the normals of the face at rest in it")
+    normals = _stacked(document, reader, [neutral, *document.array(listed, "normals", location)], f"{location}.normals")
     count = len(normals) - 1
     if count < 1:
-        raise document.error(f"{place}.normals", "no map", "one or more")
-    heights = _stacked(document, reader, _textures(document, listed, "heights", count, place), f"{place}.heights")
-    masks = _stacked(document, reader, _textures(document, listed, "masks", len(regions), place), f"{place}.masks")
+        raise document.error(f"{location}.normals", "no map", "one or more")
+    heights = _stacked(document, reader, _textures(document, listed, "heights", count, location), f"{location}.heights")
+    masks = _stacked(
+        document, reader, _textures(document, listed, "masks", len(regions), location), f"{location}.masks"
+    )
     if heights.shape[2:] != normals.shape[2:]:
         raise document.error(
-            place, f"maps of {tuple(normals.shape[2:])} and heights of {tuple(heights.shape[2:])}", "one size"
+            location, f"maps of {tuple(normals.shape[2:])} and heights of {tuple(heights.shape[2:])}", "one size"
         )
-    low, high = _range(document, listed, place)
-    decoded = torch.stack([decode_normals(one) for one in normals])
+    low, high = _range(document, listed, location)
+    decoded = torch.stack([decode_normals(image) for image in normals])
     return RegionMaps(
         tuple(regions),
         decoded[1:],
@@ -103,27 +104,27 @@ def _packed(channels: Tensor) -> list[Tensor]:
     return list(torch.cat([channels, channels.new_zeros(missing, *channels.shape[1:])]).unflatten(0, (-1, 3)))
 
 
-def _textures(document: Document, listed: dict[str, Any], key: str, channels: int, place: str) -> list[Any]:
+def _textures(document: Document, listed: dict[str, Any], key: str, channels: int, location: str) -> list[Any]:
     """As many textures as hold the channels."""
-    found = document.array(listed, key, place)
+    indices = document.array(listed, key, location)
     wanted = math.ceil(channels / 3)
-    if len(found) != wanted:
-        raise document.error(f"{place}.{key}", f"{len(found)} textures", f"{wanted}, three channels each")
-    return found
+    if len(indices) != wanted:
+        raise document.error(f"{location}.{key}", f"{len(indices)} textures", f"{wanted}, three channels each")
+    return indices
 
 
-def _stacked(document: Document, reader: TextureReader, indices: list[Any], place: str) -> Tensor:
+def _stacked(document: Document, reader: TextureReader, indices: list[Any], location: str) -> Tensor:
     images: list[Tensor] = []
     for index in indices:
-        image = reader.read(index, place)
+        image = reader.read(index, location)
         if images and image.shape != images[0].shape:
-            raise document.error(place, f"{tuple(images[0].shape[1:])} and {tuple(image.shape[1:])}", "one size")
+            raise document.error(location, f"{tuple(images[0].shape[1:])} and {tuple(image.shape[1:])}", "one size")
         images.append(image)
     return torch.stack(images)
 
 
-def _range(document: Document, listed: dict[str, Any], place: str) -> tuple[float, float]:
-    found = document.numbers(listed, "heightRange", place, 2)
-    if found is None or not found[0] < found[1]:
-        raise document.error(f"{place}.heightRange", found, "two numbers, the lower first, millimetres")
-    return float(found[0]), float(found[1])
+def _range(document: Document, listed: dict[str, Any], location: str) -> tuple[float, float]:
+    ends = document.numbers(listed, "heightRange", location, 2)
+    if ends is None or not ends[0] < ends[1]:
+        raise document.error(f"{location}.heightRange", ends, "two numbers, the lower first, millimetres")
+    return float(ends[0]), float(ends[1])

@@ -41,17 +41,17 @@ def instances(document: Document) -> list[Instance]:
     nodes = document.objects("nodes")
     if not nodes:
         return [Instance(i, _name(mesh, {}, i), np.eye(4)) for i, mesh in enumerate(meshes[:_MAX_INSTANCES])]
-    found = []
+    visible = []
     for index, transform in _walk(document, nodes):
-        node, place = nodes[index], f"nodes[{index}]"
+        node, location = nodes[index], f"nodes[{index}]"
         if node.get("mesh") is None:
             continue
-        mesh = document.item("meshes", node["mesh"], f"{place}.mesh")
+        mesh = document.item("meshes", node["mesh"], f"{location}.mesh")
         skinned = node.get("skin") is not None
-        found.append(Instance(node["mesh"], _name(node, mesh, node["mesh"]), np.eye(4) if skinned else transform))
-        if len(found) > _MAX_INSTANCES:
+        visible.append(Instance(node["mesh"], _name(node, mesh, node["mesh"]), np.eye(4) if skinned else transform))
+        if len(visible) > _MAX_INSTANCES:
             raise document.error("nodes", f"more than {_MAX_INSTANCES} meshes in the scene", "a rig")
-    return found
+    return visible
 
 
 def _name(first: dict[str, Any], second: dict[str, Any], index: int) -> str:
@@ -61,13 +61,13 @@ def _name(first: dict[str, Any], second: dict[str, Any], index: int) -> str:
 
 def _walk(document: Document, nodes: list[dict[str, Any]]) -> Iterator[tuple[int, NDArray[np.float64]]]:
     pending = [(root, np.eye(4)) for root in reversed(_roots(document, nodes))]
-    seen: set[int] = set()
+    visited: set[int] = set()
     while pending:
         index, parent = pending.pop()
         node = document.item("nodes", index, "nodes")
-        if index in seen:
+        if index in visited:
             raise document.error(f"nodes[{index}]", "a cycle or a second parent", "a tree of nodes")
-        seen.add(index)
+        visited.add(index)
         with np.errstate(over="ignore", invalid="ignore"):
             transform = parent @ _local(document, node, f"nodes[{index}]")
         if not np.isfinite(transform).all():
@@ -89,17 +89,17 @@ def _roots(document: Document, nodes: list[dict[str, Any]]) -> list[Any]:
     return roots
 
 
-def _local(document: Document, node: dict[str, Any], place: str) -> NDArray[np.float64]:
-    matrix = document.numbers(node, "matrix", place, 16)
+def _local(document: Document, node: dict[str, Any], location: str) -> NDArray[np.float64]:
+    matrix = document.numbers(node, "matrix", location, 16)
     if matrix is not None:
         transform = np.array(matrix).reshape(4, 4).T  # column by column in the file
         if not np.allclose(transform[3], (0, 0, 0, 1)):
-            raise document.error(f"{place}.matrix", transform[3].tolist(), "a last row of 0, 0, 0, 1")
+            raise document.error(f"{location}.matrix", transform[3].tolist(), "a last row of 0, 0, 0, 1")
         return transform
-    x, y, z, w = document.numbers(node, "rotation", place, 4) or (0.0, 0.0, 0.0, 1.0)
+    x, y, z, w = document.numbers(node, "rotation", location, 4) or (0.0, 0.0, 0.0, 1.0)
     length = np.sqrt(x * x + y * y + z * z + w * w)
     if not 0.5 < length < 2:
-        raise document.error(f"{place}.rotation", [x, y, z, w], "a unit quaternion")
+        raise document.error(f"{location}.rotation", [x, y, z, w], "a unit quaternion")
     x, y, z, w = x / length, y / length, z / length, w / length
     transform = np.eye(4)
     transform[:3, :3] = [
@@ -107,6 +107,6 @@ def _local(document: Document, node: dict[str, Any], place: str) -> NDArray[np.f
         [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
         [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
     ]
-    transform[:3, :3] *= document.numbers(node, "scale", place, 3) or (1.0, 1.0, 1.0)
-    transform[:3, 3] = document.numbers(node, "translation", place, 3) or (0.0, 0.0, 0.0)
+    transform[:3, :3] *= document.numbers(node, "scale", location, 3) or (1.0, 1.0, 1.0)
+    transform[:3, 3] = document.numbers(node, "translation", location, 3) or (0.0, 0.0, 0.0)
     return transform

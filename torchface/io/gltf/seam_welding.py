@@ -32,9 +32,9 @@ class Weld:
 def weld(part: Part) -> Weld:
     """By the vertex ids in the file where they are consistent, else by equal position and equal deltas."""
     if part.vertex_ids is not None:
-        found = _by_id(part, part.vertex_ids)
-        if found is not None:
-            return found
+        welded = _by_id(part, part.vertex_ids)
+        if welded is not None:
+            return welded
     return _by_position(part)
 
 

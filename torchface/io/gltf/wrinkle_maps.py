@@ -103,29 +103,31 @@ def read_gltf_detail(path: str | Path) -> DetailMaps | None:
     if len(set(names)) != len(names):
         raise document.error(f"extras.torchface.{_LIST}", names, "each shape once")
     reader = TextureReader(document, path)
-    found: list[Tensor] = []
+    images: list[Tensor] = []
     neutral = normal_texture(document, mesh)
     for index in ([] if neutral is None else [neutral]) + [entry.get("texture") for entry in listed]:
         image = reader.read(index, _LIST)
-        if found and image.shape != found[0].shape:
-            raise document.error(_LIST, f"maps of {tuple(image.shape[1:])} and {tuple(found[0].shape[1:])}", "one size")
-        found.append(decode_normals(image))
-    if not found:
+        if images and image.shape != images[0].shape:
+            raise document.error(
+                _LIST, f"maps of {tuple(image.shape[1:])} and {tuple(images[0].shape[1:])}", "one size"
+            )
+        images.append(decode_normals(image))
+    if not images:
         return None
-    shapes = found if neutral is None else found[1:]
-    maps = torch.stack(shapes) if shapes else found[0].new_zeros(0, *found[0].shape)
-    return DetailMaps(tuple(names), maps, None if neutral is None else found[0])
+    shapes = images if neutral is None else images[1:]
+    maps = torch.stack(shapes) if shapes else images[0].new_zeros(0, *images[0].shape)
+    return DetailMaps(tuple(names), maps, None if neutral is None else images[0])
 
 
 def _listed(document: Document) -> tuple[list[dict[str, Any]], dict[str, Any]]:
     """The list of the first mesh that has one, and that mesh; else the first mesh."""
-    found = list_of_first_mesh(document, _LIST)
-    if found is None:
+    listed_mesh = list_of_first_mesh(document, _LIST)
+    if listed_mesh is None:
         meshes = document.objects("meshes")
         return [], meshes[0] if meshes else {}
-    mesh, place = found
-    rows = document.array(mesh["extras"]["torchface"], _LIST, place.removesuffix(f".{_LIST}"))
-    return [document.record(row, f"{place}[{k}]") for k, row in enumerate(rows)], mesh
+    mesh, location = listed_mesh
+    rows = document.array(mesh["extras"]["torchface"], _LIST, location.removesuffix(f".{_LIST}"))
+    return [document.record(row, f"{location}[{k}]") for k, row in enumerate(rows)], mesh
 
 
 def list_of_first_mesh(document: Document, key: str) -> tuple[dict[str, Any], str] | None:
@@ -169,18 +171,20 @@ class TextureReader:
         self._document = document
         self._unpacked, self._allowed = 0, max(_UNPACKED_ALWAYS, _UNPACKED_PER_BYTE * Path(path).stat().st_size)
 
-    def read(self, index: object, place: str) -> Tensor:
+    def read(self, index: object, location: str) -> Tensor:
         """An image (3,H,W) in [0,1].
 
         Raises:
             FileFormatError: there is no such texture, or it is one too many.
         """
-        self._document.item("textures", index, f"{place}.texture")
+        self._document.item("textures", index, f"{location}.texture")
         assert isinstance(index, int)
         image = read_texture(self._document, index)
         if image is None:
             raise self._document.error(f"textures[{index}]", "no source", "a PNG or JPEG")
         self._unpacked += image.numel() * 4
         if self._unpacked > self._allowed:
-            raise self._document.error(place, f"maps that unpack to {self._unpacked} bytes", f"at most {self._allowed}")
+            raise self._document.error(
+                location, f"maps that unpack to {self._unpacked} bytes", f"at most {self._allowed}"
+            )
         return image

@@ -104,18 +104,18 @@ def _png(data: bytes, source: str) -> ImageHeader:
     width, height, bits, color = struct.unpack_from(">IIBB", data, 16)
     if data[12:16] != b"IHDR" or color not in _PNG_SAMPLES:
         raise FileFormatError(f"{source}: no readable image: found {data[12:16]!r} and colour type {color} in a PNG")
-    kept, exif, transparent = list[bytes | memoryview]([data[:8]]), b"", tuple[int, ...]()
+    chunks, exif, transparent = list[bytes | memoryview]([data[:8]]), b"", tuple[int, ...]()
     view, samples = memoryview(data), _PNG_SAMPLES[color]
     for kind, first, end in _png_chunks(data):
         if kind == b"tRNS" and color in (0, 2):  # which Pillow misses in grey of less than 8 bits, OpenCV in grey of 16
             highest = 2**bits - 1
             step = 255 // highest if bits in (1, 2, 4) else 1
             transparent = tuple(step * (c & highest) for c in struct.unpack_from(f">{samples}H", data, first + 8))
-        elif kind in _PNG_PIXELS and (kind != b"IHDR" or len(kept) == 1):  # the size that is checked, not a later one
-            kept.append(view[first:end])
+        elif kind in _PNG_PIXELS and (kind != b"IHDR" or len(chunks) == 1):  # the size that is checked, not a later one
+            chunks.append(view[first:end])
         elif kind == b"eXIf":
             exif = data[first + 8 : end - 4]
-    orientation, plain = exif_orientation(exif, source), b"".join(kept)
+    orientation, plain = exif_orientation(exif, source), b"".join(chunks)
     return ImageHeader("PNG", width, height, samples, bits, 1, orientation, plain, transparent=transparent)
 
 
@@ -130,7 +130,7 @@ def _png_chunks(data: bytes) -> Iterator[tuple[bytes, int, int]]:
 
 def _jpeg(data: bytes, source: str) -> ImageHeader:
     """Metadata is left out; each of thousands of scans of a few bytes would cost a pass over all pixels."""
-    kept, exif, size = list[bytes | memoryview]([data[:2]]), b"", b""
+    segments, exif, size = list[bytes | memoryview]([data[:2]]), b"", b""
     at, view = 2, memoryview(data)
     while True:  # segments have to be walked one after the other
         at = data.find(b"\xff", at)
@@ -152,15 +152,16 @@ def _jpeg(data: bytes, source: str) -> ImageHeader:
         if marker == 0xE1 and data[at + 4 : at + 10] == b"Exif\0\0":
             exif = exif or data[at + 4 : end]
         if marker in _JPEG_KEPT or not 0xE0 <= marker <= 0xFE:
-            kept.append(view[at:end])
+            segments.append(view[at:end])
         at = end
     bits, height, width, samples = struct.unpack_from(">BHHB", size)
     end, scans = at, 0
-    while found := _JPEG_MARKER.search(data, end):  # what follows the end is none of the image, such as a phone's video
-        end = found.end()
-        if found[0] == b"\xff\xd9":
+    # What follows the end is none of the image, such as a phone's video.
+    while match := _JPEG_MARKER.search(data, end):
+        end = match.end()
+        if match[0] == b"\xff\xd9":
             break
-        scans += found[0] == b"\xff\xda"
+        scans += match[0] == b"\xff\xda"
         end += int.from_bytes(data[end : end + 2], "big")
     else:
         end = len(data)
@@ -168,8 +169,8 @@ def _jpeg(data: bytes, source: str) -> ImageHeader:
         raise FileFormatError(f"{source}: found a JPEG of {scans} scans, expected at most {_MOST_SCANS}")
     if bits != 8:
         raise FileFormatError(f"{source}: found a JPEG of {bits} bits a sample, expected 8; save it as TIFF or PNG")
-    kept.append(view[at:end])
-    return ImageHeader("JPEG", width, height, samples, bits, 1, exif_orientation(exif, source), b"".join(kept))
+    segments.append(view[at:end])
+    return ImageHeader("JPEG", width, height, samples, bits, 1, exif_orientation(exif, source), b"".join(segments))
 
 
 def _webp(data: bytes, source: str) -> ImageHeader:

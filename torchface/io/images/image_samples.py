@@ -151,21 +151,21 @@ def _deep_samples(header: ImageHeader, source: str) -> np.ndarray:
     level = cv2.utils.logging.getLogLevel()
     cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)  # what matters comes as an error
     try:
-        found = cv2.imdecode(np.frombuffer(header.data, np.uint8), cv2.IMREAD_UNCHANGED)
+        decoded = cv2.imdecode(np.frombuffer(header.data, np.uint8), cv2.IMREAD_UNCHANGED)
     except cv2.error as error:
         raise FileFormatError(f"{source}: no readable image ({error.err})") from error
     finally:
         cv2.utils.logging.setLogLevel(level)
     expected = {16: np.uint16, 32: np.float32, 64: np.float64}[header.bits]
-    if found is None or found.dtype != expected or found.shape[:2] != (header.height, header.width):
+    if decoded is None or decoded.dtype != expected or decoded.shape[:2] != (header.height, header.width):
         raise FileFormatError(
             f"{source}: found a broken {header.kind} ({what}), or a layout that is not read; expected a whole one"
         )
     if header.number == 3:
-        found = _checked_range(found.astype(np.float32, copy=False), source)
-    if found.ndim == 3:
-        found = cv2.cvtColor(found, {3: cv2.COLOR_BGR2RGB, 4: cv2.COLOR_BGRA2RGBA}[found.shape[2]], dst=found)
-    array = found if found.ndim == 3 else found[..., None]
+        decoded = _checked_range(decoded.astype(np.float32, copy=False), source)
+    if decoded.ndim == 3:
+        decoded = cv2.cvtColor(decoded, {3: cv2.COLOR_BGR2RGB, 4: cv2.COLOR_BGRA2RGBA}[decoded.shape[2]], dst=decoded)
+    array = decoded if decoded.ndim == 3 else decoded[..., None]
     if header.inverted:
         np.subtract(_HIGHEST[array.dtype], array, out=array)
     return array

@@ -44,16 +44,16 @@ def first_directory(data: bytes, source: str) -> dict[int, tuple[int, ...]]:
     Raises:
         FileFormatError: it is cut off, or its tags claim more than there is.
     """
-    found: dict[int, tuple[int, ...]] = {}
+    values: dict[int, tuple[int, ...]] = {}
     try:
         order, entries = _entries(data, source)
         for entry in entries:
             if entry.tag in _WANTED and entry.kind in _LETTERS and 0 < entry.number <= _MOST_VALUES:
                 letters = f"{order}{entry.number}{_LETTERS[entry.kind]}"
-                found.setdefault(entry.tag, struct.unpack_from(letters, data, entry.place))
+                values.setdefault(entry.tag, struct.unpack_from(letters, data, entry.place))
     except (struct.error, OverflowError) as error:
         raise FileFormatError(f"{source}: found tags that are cut off ({error})") from error
-    return found
+    return values
 
 
 def without_metadata(data: bytes, source: str) -> bytes:
@@ -87,13 +87,13 @@ def _entries(data: bytes, source: str) -> tuple[str, list[_Entry]]:
     entries, claimed = list[_Entry](), 0
     for row in range(at, at + count * step, step):
         tag, kind, number = struct.unpack_from(head, data, row)
-        place, size = row + step - room, _SIZES.get(kind, 1) * number
+        value_at, size = row + step - room, _SIZES.get(kind, 1) * number
         if size > room:
-            (place,) = struct.unpack_from(offset, data, place)
+            (value_at,) = struct.unpack_from(offset, data, value_at)
             claimed += size
         if claimed > len(data):
             raise FileFormatError(f"{source}: found tags that claim more than the {len(data)} bytes that there are")
-        entries.append(_Entry(row, tag, kind, number, place))
+        entries.append(_Entry(row, tag, kind, number, value_at))
     return order, entries
 
 

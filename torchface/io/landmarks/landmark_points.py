@@ -64,7 +64,7 @@ class LandmarkPoints:
         return self.points[rows]
 
     def _ibug_rows(self) -> Tensor:
-        found, missing, chosen = ", ".join(self.groups), [], []
+        listed, missing, chosen = ", ".join(self.groups), [], []
         for label, former, count in _IBUG_GROUPS:
             name = label if label in self.groups else former
             rows = self.groups.get(name)
@@ -77,12 +77,12 @@ class LandmarkPoints:
         if missing:
             expected = ", ".join(label for label, _, _ in _IBUG_GROUPS)
             raise NameMismatchError(
-                f"{self.source}: found the groups {found}, expected {expected}, menpo's labels of iBUG's 68 "
+                f"{self.source}: found the groups {listed}, expected {expected}, menpo's labels of iBUG's 68 "
                 f"(none for {', '.join(missing)})"
             )
         order = torch.cat(chosen)
         if len(order.unique()) != len(order):
-            raise ShapeError(f"{self.source}: found points that belong to two of the groups {found}, expected one each")
+            raise ShapeError(f"{self.source}: found points in two of the groups {listed}, expected one each")
         return order
 
 
@@ -145,16 +145,16 @@ def _ljson(path: Path, document: Any) -> LandmarkPoints:
         raise FileFormatError(f'{path}: found no field "version" of 1, 2 or 3, expected LJSON landmarks')
     if document["version"] == 1:
         return _first_version(path, document)
-    found = document
+    entry = document
     if document["version"] == 3:
         sets = document.get("groups")
         if not isinstance(sets, dict) or len(sets) != 1:
             count = len(sets) if isinstance(sets, dict) else "no"
             raise FileFormatError(f'{path}: found {count} sets of landmarks under "groups", expected one')
-        found = next(iter(sets.values()))
-    landmarks = found.get("landmarks") if isinstance(found, dict) else None
+        entry = next(iter(sets.values()))
+    landmarks = entry.get("landmarks") if isinstance(entry, dict) else None
     points = _points(path, landmarks.get("points") if isinstance(landmarks, dict) else None)
-    labels = found.get("labels") or []
+    labels = entry.get("labels") or []
     if not isinstance(labels, list):
         raise FileFormatError(f'{path}: found no list under "labels", expected one')
     groups = {}

@@ -90,7 +90,7 @@ def load_landmark_table(path: str | Path) -> LandmarkTable:
     if _SUCCESS in table.names:
         unseen[rows] |= (table.column(_SUCCESS) == 0)[:, None]
     points[unseen] = np.nan
-    seen = points[~unseen]
+    known = points[~unseen]
     confidence = np.zeros((total, count), np.float32)
     level = next((name for name in _LEVELS if name in table.names), None)
     confidence[rows] = 1 if level is None else _shares(table, [level], path)
@@ -102,7 +102,7 @@ def load_landmark_table(path: str | Path) -> LandmarkTable:
     if _PRESENCE in table.names:
         presence[rows] = _shares(table, [_PRESENCE], path)[:, 0]
     confidence[unseen], visibility[unseen], presence[unseen.all(1)] = 0, 0, 0
-    shares = len(seen) > 0 and float(np.abs(seen).max()) < _SHARES
+    shares = len(known) > 0 and float(np.abs(known).max()) < _SHARES
     return LandmarkTable(
         torch.from_numpy(points),
         torch.from_numpy(confidence),
@@ -115,22 +115,24 @@ def load_landmark_table(path: str | Path) -> LandmarkTable:
 
 def _point_columns(reader: TableReader) -> list[str]:
     """The names of x and y of each point in turn."""
-    found: dict[tuple[str, int], str] = {}
+    columns: dict[tuple[str, int], str] = {}
     for name in reader.header:
         if match := _POINT.fullmatch(name):
-            place = (match[1], int(match[2]))
-            if place in found:
-                raise FileFormatError(f"{reader.path}: found the columns {quoted([found[place], name])}, expected one")
-            found[place] = name
-    count = len(found) // 2
+            coordinate = (match[1], int(match[2]))
+            if coordinate in columns:
+                raise FileFormatError(
+                    f"{reader.path}: found the columns {quoted([columns[coordinate], name])}, expected one"
+                )
+            columns[coordinate] = name
+    count = len(columns) // 2
     wanted = [(axis, i) for i in range(count) for axis in "xy"]
-    if count not in COUNTS or set(found) != set(wanted):
-        what = f"x and y of {count} points" if found else f"the columns {quoted(reader.header)}"
+    if count not in COUNTS or set(columns) != set(wanted):
+        what = f"x and y of {count} points" if columns else f"the columns {quoted(reader.header)}"
         raise FileFormatError(
             f"{reader.path}: found {what}, expected x_0, y_0, ... of {COUNTS[0]} landmarks, or of {COUNTS[1]} or "
             f"{COUNTS[2]} points of MediaPipe's mesh, each number once from 0"
         )
-    return [found[place] for place in wanted]
+    return [columns[coordinate] for coordinate in wanted]
 
 
 def _rows(table: Table, path: Path) -> np.ndarray:

@@ -74,8 +74,8 @@ def load_c3d(path: str | Path, unit: str | None = None) -> Take:
         )
     if points == 0:
         raise FileFormatError(f"{path}: found no points (POINT:USED is 0), expected at least one")
-    found = "".join(sections.texts("POINT:UNITS")[:1])
-    factor = millimetres(found, path, "POINT:UNITS", unit)
+    file_unit = "".join(sections.texts("POINT:UNITS")[:1])
+    factor = millimetres(file_unit, path, "POINT:UNITS", unit)
     fps = check_rate(_number(sections, "POINT:RATE", sections.header.rate), f"{path}: POINT:RATE")
     fps = simplest_rate(fps, lambda rate: np.float32(rate) == np.float32(fps))
     axes = _axes(sections, path)

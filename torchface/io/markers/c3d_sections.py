@@ -115,7 +115,7 @@ def read_sections(data: bytes, path: Path) -> Sections:
 
 def _read_parameters(section: bytes, order: str, path: Path) -> dict[str, Parameter]:
     groups: dict[int, str] = {}
-    found: list[tuple[int, str, Parameter]] = []
+    entries: list[tuple[int, str, Parameter]] = []
     at = taken = 0
     while at + 2 <= len(section):
         length, group = struct.unpack_from("bb", section, at)
@@ -129,8 +129,8 @@ def _read_parameters(section: bytes, order: str, path: Path) -> dict[str, Parame
         if group < 0:
             groups[-group] = name
         else:
-            found.append((group, name, _read_parameter(section, at + 2, name, path)))
-            taken += len(found[-1][2].data)
+            entries.append((group, name, _read_parameter(section, at + 2, name, path)))
+            taken += len(entries[-1][2].data)
             if taken > len(section):
                 raise FileFormatError(f"{path}: parameter {name[:40]!r}: found it to overlap others, expected it apart")
         if offset == 0:
@@ -140,7 +140,7 @@ def _read_parameters(section: bytes, order: str, path: Path) -> dict[str, Parame
                 f"{path}: parameter {name[:40]!r}: found the next {offset} bytes on, expected 2 or more"
             )
         at += offset
-    return {f"{groups.get(group, '')}:{name}": parameter for group, name, parameter in found}
+    return {f"{groups.get(group, '')}:{name}": parameter for group, name, parameter in entries}
 
 
 def _read_parameter(section: bytes, at: int, name: str, path: Path) -> Parameter:

@@ -24,7 +24,7 @@ _SPELLINGS = {
 }
 
 
-def millimetres(found: str, path: Path, field: str, unit: str | None) -> float:
+def millimetres(file_unit: str, path: Path, field: str, unit: str | None) -> float:
     """Millimetres in a file's unit, or in the ``unit`` that the caller says it is.
 
     Raises:
@@ -36,10 +36,12 @@ def millimetres(found: str, path: Path, field: str, unit: str | None) -> float:
         if unit not in UNITS:
             raise ValueRangeError(f"unit: found {unit!r}, expected one of {expected}")
         return UNITS[unit]
-    name = found.strip().lower()
+    name = file_unit.strip().lower()
     name = _SPELLINGS.get(name, name)
     if name not in UNITS:
-        raise FileFormatError(f"{path}: {field}: found {quoted([found])}, expected one of {expected}; or give unit=")
+        raise FileFormatError(
+            f"{path}: {field}: found {quoted([file_unit])}, expected one of {expected}; or give unit="
+        )
     return UNITS[name]
 
 
@@ -54,13 +56,13 @@ def unique_labels(labels: Sequence[str]) -> tuple[str, ...]:
         ('nose', 'unlabeled2', 'nose_3', 'nose_2', 'nose_4')
     """
     filled = [label or f"unlabeled{i + 1}" for i, label in enumerate(labels)]
-    taken, seen, following, unique = set(filled), set(), dict.fromkeys(filled, 2), []
+    taken, used, following, unique = set(filled), set(), dict.fromkeys(filled, 2), []
     for label in filled:
         name = label
-        while name in seen or (name != label and name in taken):
+        while name in used or (name != label and name in taken):
             name = f"{label}_{following[label]}"
             following[label] += 1
-        seen.add(name)
+        used.add(name)
         unique.append(name)
     return tuple(unique)
 

@@ -52,9 +52,9 @@ class MeshSequence:
         try:
             with safe_open(self.path, framework="pt") as file:
                 names = set(file.keys())
-                told = file.metadata() or {}
-                self.key: str = told.get("key", "")
-                self._content: str | None = told.get("content")
+                metadata = file.metadata() or {}
+                self.key: str = metadata.get("key", "")
+                self._content: str | None = metadata.get("content")
                 if not {"vertices", "faces"} <= names:
                     raise FileFormatError(f"{self.path}: found {sorted(names)[:5]}, expected vertices and faces")
                 vertices, faces = file.get_slice("vertices"), file.get_slice("faces")
@@ -246,13 +246,13 @@ class MeshSequenceWriter:
                 # Killed between the last write and the rename it holds the content's hash already.
                 if (begin[: self._content_at], begin[after:]) != (self._begin[: self._content_at], self._begin[after:]):
                     return 0
-                found = _hashed(file, self._offset(done) - len(self._begin))
-            if found.hexdigest() != note["sha256"].found:
+                content = _hashed(file, self._offset(done) - len(self._begin))
+            if content.hexdigest() != note["sha256"].found:
                 raise FileFormatError(f"{self._part}: found other meshes than were written")
         except (OSError, FileFormatError) as error:
             warnings.warn(f"{error}; the meshes of {self.path.name} are written anew", stacklevel=4)
             return 0
-        self._hash = found
+        self._hash = content
         return done
 
 

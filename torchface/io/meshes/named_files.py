@@ -24,7 +24,7 @@ _NAMES = {
 def named_files(mesh: str | Path) -> list[Path]:
     """The existing files, in the mesh's folder or below, that it and its material libraries name; none where it cannot
     be read."""
-    found: dict[Path, None] = {}
+    files: dict[Path, None] = {}
     waiting = [Path(mesh)]
     while waiting:
         file = waiting.pop()
@@ -32,26 +32,26 @@ def named_files(mesh: str | Path) -> list[Path]:
         if pattern is None:
             continue
         try:
-            names = dict.fromkeys(islice((one[1] for one in pattern.finditer(read_file(file))), _MAX_NAMES))
+            names = dict.fromkeys(islice((match[1] for match in pattern.finditer(read_file(file))), _MAX_NAMES))
         except FileFormatError:
             continue
         for name in names:
             for other in _beside(file, name.decode("utf-8", "replace").strip()):
-                if other not in found:
-                    found[other] = None
+                if other not in files:
+                    files[other] = None
                     waiting.append(other)
-    return list(found)
+    return list(files)
 
 
 def _beside(file: Path, name: str) -> list[Path]:
     """What a name may mean: as it stands, percent-decoded, or its last word after options."""
     folder = file.resolve().parent
-    found = []
+    files = []
     for text in dict.fromkeys((name, unquote(name), name.split()[-1] if name.split() else "")):
         try:
             path = (folder / text.replace("\\", "/")).resolve()
             if path.is_relative_to(folder) and path.is_file():
-                found.append(path)
+                files.append(path)
         except (OSError, ValueError):
             continue
-    return found
+    return files

@@ -33,12 +33,12 @@ def read_obj(path: str | Path, unit: str = "mm") -> Mesh:
         TopologyError: a face names a vertex that is not there.
     """
     path, scale = Path(path), millimetres_per(unit)
-    found = read_statements(path, read_file(path))
-    vertices = finite_vertices(path, found.vertices[:, :3] * scale)
-    polygons = pad_polygons(str(path), found.sizes, found.corners)
-    uvs, uv_polygons = _texture_coordinates(path, found)
-    rest = {"colors": _colors(path, found.vertices), "texture": _texture(path, found)}
-    del found  # a large mesh fits the memory once, not twice
+    statements = read_statements(path, read_file(path))
+    vertices = finite_vertices(path, statements.vertices[:, :3] * scale)
+    polygons = pad_polygons(str(path), statements.sizes, statements.corners)
+    uvs, uv_polygons = _texture_coordinates(path, statements)
+    rest = {"colors": _colors(path, statements.vertices), "texture": _texture(path, statements)}
+    del statements  # a large mesh fits the memory once, not twice
     if polygons.shape[1] == 3:
         return Mesh(vertices, polygons, uvs, uv_polygons, **rest)  # type: ignore[arg-type]
     return Mesh.from_polygons(vertices, polygons, uvs, uv_polygons, **rest)  # type: ignore[arg-type]
@@ -136,15 +136,15 @@ def _surface_lines(mesh: Mesh) -> bytes:
     return ("\n".join(text) + "\n").encode()
 
 
-def _texture_coordinates(path: Path, found: Statements) -> tuple[Tensor | None, Tensor | None]:
-    corners = found.uv_corners
+def _texture_coordinates(path: Path, statements: Statements) -> tuple[Tensor | None, Tensor | None]:
+    corners = statements.uv_corners
     if corners is None:
         return None, None
-    uvs = texture_coordinates(path, found.coordinates)
+    uvs = texture_coordinates(path, statements.coordinates)
     if (corners < 0).any():  # faces without coordinates beside faces with them share one row at the origin
         corners = np.where(corners < 0, len(uvs), corners)
         uvs = np.vstack([uvs, np.zeros((1, 2), np.float32)])
-    return torch.from_numpy(uvs), pad_polygons(str(path), found.sizes, corners)
+    return torch.from_numpy(uvs), pad_polygons(str(path), statements.sizes, corners)
 
 
 def _colors(path: Path, table: NDArray[np.float64]) -> Tensor | None:
@@ -157,17 +157,17 @@ def _colors(path: Path, table: NDArray[np.float64]) -> Tensor | None:
     return torch.from_numpy((colors / scale).clip(0, 1).astype(np.float32))
 
 
-def _texture(path: Path, found: Statements) -> Tensor | None:
+def _texture(path: Path, statements: Statements) -> Tensor | None:
     """The image of the first material in use that has one."""
     images: dict[str, str] = {}
-    seen: set[Path] = set()
+    opened: set[Path] = set()
     left = _MAX_MATERIALS
-    for library in found.libraries:
+    for library in statements.libraries:
         file = _beside(path, library)
-        if file is None or file in seen or not file.is_file():
+        if file is None or file in opened or not file.is_file():
             continue  # exporters name libraries that nobody passes on; the mesh is whole without
         text = read_file(file, left)
-        seen.add(file)
+        opened.add(file)
         left -= len(text)
         material = ""
         for line in text.decode("utf-8", "replace").splitlines():
@@ -176,7 +176,7 @@ def _texture(path: Path, found: Statements) -> Tensor | None:
                 material = " ".join(words[1:])
             elif len(words) >= 2 and words[0] == "map_Kd":
                 images.setdefault(material, words[-1])
-    used = [name.decode("utf-8", "replace").strip() for name in found.materials]
+    used = [name.decode("utf-8", "replace").strip() for name in statements.materials]
     for name in used or list(images):
         image = _beside(path, images[name].encode()) if name in images else None
         if image is not None and image.is_file():

@@ -168,9 +168,9 @@ def _absolute(path: Path, face: bytes, vertices: int, coordinates: int) -> bytes
     corners = []
     for corner in face.split():
         parts = corner.split(b"/")
-        for place, count in ((0, vertices), (1, coordinates)):
-            if len(parts) > place and parts[place].startswith(b"-"):
-                parts[place] = b"%d" % (count + 1 + _integers(path, [parts[place]])[0])
+        for index, count in ((0, vertices), (1, coordinates)):
+            if len(parts) > index and parts[index].startswith(b"-"):
+                parts[index] = b"%d" % (count + 1 + _integers(path, [parts[index]])[0])
         corners.append(b"/".join(parts))
     return b" ".join(corners)
 
@@ -186,8 +186,8 @@ def _joined(path: Path, tables: Sequence[NDArray[np.float64]]) -> NDArray[np.flo
 
 def _number_rows(path: Path, keyword: str, lines: Sequence[bytes], widths: Sequence[int]) -> NDArray[np.float64]:
     rows = [line.split() for line in lines]
-    found = set(map(len, rows))
-    if len(found) > 1 or not found <= set(widths):
+    widths_there = set(map(len, rows))
+    if len(widths_there) > 1 or not widths_there <= set(widths):
         odd = next(i for i, row in enumerate(rows) if len(row) not in widths or len(row) != len(rows[0]))
         raise FileFormatError(
             f"{path}: found {len(rows[odd])} numbers in '{keyword}' line {odd + 1}, "

@@ -117,8 +117,8 @@ def _columns(path: Path, element: Element, order: str, body: NDArray[Any], at: i
     spans = _spans(path, element, order, body, at, element.count)
     columns = {}
     for (name, kind, count), (starts, units) in zip(element.properties, spans.transpose(1, 2, 0), strict=True):
-        place = np.repeat(starts - (np.cumsum(units) - units), units) + np.arange(int(units.sum()))
-        values = _decode(body[place], order, kind)
+        units_of = np.repeat(starts - (np.cumsum(units) - units), units) + np.arange(int(units.sum()))
+        values = _decode(body[units_of], order, kind)
         columns[name] = values if count is None else Lists(units // _width(order, kind), values)
     return columns, int(spans[-1, -1].sum())
 
@@ -162,7 +162,7 @@ def _spans(path: Path, element: Element, order: str, body: NDArray[Any], at: int
         for _, kind, count in element.properties
     ]
     units = body.data  # quicker one by one
-    found = array("q")
+    spans = array("q")
     end = len(body)
     for _ in range(rows):  # where a row begins is known only after the one before
         for width, read_length, before in plan:
@@ -172,10 +172,10 @@ def _spans(path: Path, element: Element, order: str, body: NDArray[Any], at: int
                 at += before
             if not 0 <= length * width <= end - at:
                 raise _truncated(path, element, max(end - at, 0), f"a list of {length}")
-            found.append(at)
-            found.append(length * width)
+            spans.append(at)
+            spans.append(length * width)
             at += length * width
-    return np.frombuffer(found, np.int64).reshape(rows, -1, 2)
+    return np.frombuffer(spans, np.int64).reshape(rows, -1, 2)
 
 
 def _length_reader(order: str, kind: str) -> Callable[[Any, int], int]:
@@ -194,8 +194,8 @@ def _decode(units: NDArray[Any], order: str, kind: str) -> NDArray[Any]:
     return np.ascontiguousarray(units).view(order + kind) if order else units
 
 
-def _truncated(path: Path, element: Element, found: int, wanted: str) -> FileFormatError:
+def _truncated(path: Path, element: Element, left: int, wanted: str) -> FileFormatError:
     return FileFormatError(
-        f"{path}: found {found} bytes or words (truncated) for {element.count} rows of {element.name!r}, "
+        f"{path}: found {left} bytes or words (truncated) for {element.count} rows of {element.name!r}, "
         f"expected {wanted}"
     )

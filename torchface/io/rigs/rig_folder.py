@@ -106,8 +106,8 @@ def _write(rig: BlendshapeRig, folder: Path, detail: DetailMaps | None) -> None:
     notes = write_extras(mesh)
     notes.pop("polygons", None)  # the OBJ files have them
     correctives = () if rig.correctives is None else rig.correctives.definitions
-    found = {"shapes": list(names), "mesh": notes, **write_correctives(correctives)}
-    write_json(folder / NOTES, found, indent=None)
+    document = {"shapes": list(names), "mesh": notes, **write_correctives(correctives)}
+    write_json(folder / NOTES, document, indent=None)
     if detail is not None:
         maps: list[tuple[str, Any]] = list(zip(detail.names, detail.maps, strict=True))
         maps += [] if detail.neutral is None else [(NEUTRAL, detail.neutral)]

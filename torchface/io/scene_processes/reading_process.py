@@ -46,17 +46,17 @@ def run_process(command: Sequence[str], what: str, reader: str, seconds: float) 
     """
     environment = {name: value for name, value in os.environ.items() if name not in _FOREIGN}
     environment |= {"PXR_WORK_THREAD_LIMIT": "1", "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
-    with tempfile.TemporaryFile() as told:
+    with tempfile.TemporaryFile() as output:
         try:
             done = subprocess.run(
-                list(command), stdin=subprocess.DEVNULL, stdout=told, stderr=told, env=environment, timeout=seconds
+                list(command), stdin=subprocess.DEVNULL, stdout=output, stderr=output, env=environment, timeout=seconds
             )
         except subprocess.TimeoutExpired as late:
             raise FileFormatError(f"{what}: {reader} took more than {seconds:.0f} s, expected a rig of less") from late
         except OSError as error:
             raise FileFormatError(f"{what}: {reader} cannot be started ({error})") from error
-        told.seek(max(0, told.seek(0, os.SEEK_END) - 4096))
-        lines = told.read().decode("utf-8", "replace").strip().splitlines()
+        output.seek(max(0, output.seek(0, os.SEEK_END) - 4096))
+        lines = output.read().decode("utf-8", "replace").strip().splitlines()
     said = f" ({lines[-1].strip()[:200]})" if lines else ""
     if done.returncode == 0:
         return said

@@ -129,24 +129,24 @@ def _definitions(scene: Scene, names: Sequence[str]) -> tuple[list[Corrective], 
     nobody noted has its name in the file, or its shape's before it where that is taken.
     """
     noted = _noted_correctives(scene)
-    found = [one for one in noted if not one.is_in_between or one.name in names]
-    own = {name: None for name in names if _KEY not in name} | {one.name: None for one in noted}
+    definitions = [known for known in noted if not known.is_in_between or known.name in names]
+    taken = {name for name in names if _KEY not in name} | {known.name for known in noted}
     renamed: dict[str, str] = {}
-    between = [(shape["name"], one) for mesh in _named_meshes(scene) for shape in mesh for one in shape["between"]]
-    for driver, one in between:
-        key, peak = _key(driver, one["weight"]), one["weight"]
+    between = [(shape["name"], step) for mesh in _named_meshes(scene) for shape in mesh for step in shape["between"]]
+    for driver, step in between:
+        key, peak = _key(driver, step["weight"]), step["weight"]
         if key in renamed:
             continue
         same = [other for other in noted if other.drivers == (driver,) and abs((other.peak or 0.0) - peak) < _SAME_PEAK]
         if same:
             renamed[key] = same[0].name
-            found.append(same[0])
+            definitions.append(same[0])
             continue
-        free = next(name for name in _names_to_try(driver, one["name"]) if name not in own)
-        own[free] = None
+        free = next(name for name in _names_to_try(driver, step["name"]) if name not in taken)
+        taken.add(free)
         renamed[key] = free
-        found.append(Corrective(free, (driver,), peak))
-    return sorted(found, key=lambda one: noted.index(one) if one in noted else len(noted)), renamed
+        definitions.append(Corrective(free, (driver,), peak))
+    return sorted(definitions, key=lambda known: noted.index(known) if known in noted else len(noted)), renamed
 
 
 def _names_to_try(driver: str, name: str) -> Iterator[str]:
@@ -171,11 +171,11 @@ def _noted_correctives(scene: Scene) -> tuple[Corrective, ...]:
 
 def _named_meshes(scene: Scene) -> list[list[dict[str, Any]]]:
     """The shapes of each mesh, under the names that they have in the rig."""
-    found = []
+    named = []
     for mesh in scene.record["meshes"]:
         names = _names(mesh, [shape["name"] for shape in mesh["shapes"]])
-        found.append([shape | {"name": name} for shape, name in zip(mesh["shapes"], names, strict=True)])
-    return found
+        named.append([shape | {"name": name} for shape, name in zip(mesh["shapes"], names, strict=True)])
+    return named
 
 
 def scene_weights(scene: Scene) -> Take | None:
@@ -212,32 +212,32 @@ def scene_weights(scene: Scene) -> Take | None:
 def _piece(scene: Scene, number: int, unit: str | None) -> Piece:
     record = scene.record["meshes"][number]
     arrays = {name.partition("/")[2]: array for name, array in scene.arrays.items() if name.startswith(f"{number}/")}
-    points, place = arrays["points"], f"{scene.path}: {record['place']}"
+    points, location = arrays["points"], f"{scene.path}: {record['place']}"
     linear, translation = _transform(scene, record, unit)
     shapes, names = record["shapes"], list(_names(record, [shape["name"] for shape in record["shapes"]]))
     _reserve(scene, 12 * len(points) * sum(1 + len(shape["between"]) for shape in shapes))
-    vertices = _finite(points @ linear + translation, f"{place}: points")
+    vertices = _finite(points @ linear + translation, f"{location}: points")
     deltas = np.zeros((sum(1 + len(shape["between"]) for shape in shapes), len(points), 3), np.float32)
     for number, shape in enumerate(shapes):  # each has rows of its own
-        where = f"{place}: {shape['name'][:40]}"
+        where = f"{location}: {shape['name'][:40]}"
         rows = arrays.get(f"shape/{number}/rows")
         _place_offsets(arrays[f"shape/{number}/offsets"], rows, deltas[number], linear, where)
         for step, between in enumerate(shape["between"]):
             if not 0 < between["weight"] < 1:
-                found = f"an in-between at the weight {between['weight']:g}"
-                raise FileFormatError(f"{where}: found {found}, expected one between 0 and 1")
+                position = f"an in-between at the weight {between['weight']:g}"
+                raise FileFormatError(f"{where}: found {position}, expected one between 0 and 1")
             target = deltas[len(names)]
             _place_offsets(arrays[f"shape/{number}/between/{step}"], rows, target, linear, where)
             target -= np.float32(between["weight"]) * deltas[number]  # the rig moves as far without it
             names.append(_key(names[number], between["weight"]))
-    sizes, polygons = arrays["counts"], pad_polygons(place, arrays["counts"], arrays["corners"])
+    sizes, polygons = arrays["counts"], pad_polygons(location, arrays["counts"], arrays["corners"])
     faces, uvs, uv_faces = fan_triangulation(polygons), None, None
     if "uvs" in arrays:
-        uvs = torch.from_numpy(_finite(arrays["uvs"], f"{place}: texture coordinates"))
-        uv_faces = fan_triangulation(pad_polygons(place, sizes, arrays["uv_corners"]))
+        uvs = torch.from_numpy(_finite(arrays["uvs"], f"{location}: texture coordinates"))
+        uv_faces = fan_triangulation(pad_polygons(location, sizes, arrays["uv_corners"]))
     colors = None
     if "colors" in arrays:
-        light = _finite(arrays["colors"], f"{place}: colours").clip(0, 1)
+        light = _finite(arrays["colors"], f"{location}: colours").clip(0, 1)
         colors = to_srgb(torch.from_numpy(light))
     notes = _notes(record)
     document = Document(scene.path, {})
@@ -275,18 +275,18 @@ def _place_offsets(
     rows: NDArray[np.int64] | None,
     target: NDArray[np.float32],
     linear: NDArray[np.float64],
-    place: str,
+    location: str,
 ) -> None:
     """Writes a shape's offsets to their rows of ``target`` (V,3), millimetres."""
     if rows is None and len(offsets) not in (0, len(target)):
-        raise FileFormatError(f"{place}: found {len(offsets)} offsets, expected one for each of {len(target)} points")
+        raise FileFormatError(f"{location}: found {len(offsets)} offsets for {len(target)} points, expected one each")
     if rows is not None and len(rows) != len(offsets):
-        raise FileFormatError(f"{place}: found {len(offsets)} offsets for {len(rows)} points, expected one each")
+        raise FileFormatError(f"{location}: found {len(offsets)} offsets for {len(rows)} points, expected one each")
     if rows is not None and len(rows) and not 0 <= rows.min() <= rows.max() < len(target):
-        found = f"{rows.min()} to {rows.max()}"
-        raise FileFormatError(f"{place}: found offsets of the points {found}, expected 0 to {len(target) - 1}")
+        span = f"{rows.min()} to {rows.max()}"
+        raise FileFormatError(f"{location}: found offsets of the points {span}, expected 0 to {len(target) - 1}")
     if len(offsets):
-        target[slice(None) if rows is None else rows] = _finite(offsets @ linear, f"{place}: offsets")
+        target[slice(None) if rows is None else rows] = _finite(offsets @ linear, f"{location}: offsets")
 
 
 def _names(record: dict[str, Any], tokens: list[str]) -> tuple[str, ...]:
@@ -302,19 +302,21 @@ def _notes(record: dict[str, Any]) -> dict[str, Any]:
     if record["notes"] is None:
         return {}
     try:
-        found = parse_json(record["notes"].encode())
+        document = parse_json(record["notes"].encode())
     except (ValueError, RecursionError):
         return {}
-    return found if isinstance(found, dict) else {}
+    return document if isinstance(document, dict) else {}
 
 
-def _finite(values: NDArray[Any], place: str) -> NDArray[np.float32]:
+def _finite(values: NDArray[Any], location: str) -> NDArray[np.float32]:
     with np.errstate(over="ignore"):
-        found = values.astype(np.float32)
-    if not np.isfinite(found).all():
-        bad = int((~np.isfinite(found)).any(-1).sum())
-        raise FileFormatError(f"{place}: found NaN or infinity in {bad} of {len(found)} rows, expected finite numbers")
-    return found
+        rows = values.astype(np.float32)
+    if not np.isfinite(rows).all():
+        bad = int((~np.isfinite(rows)).any(-1).sum())
+        raise FileFormatError(
+            f"{location}: found NaN or infinity in {bad} of {len(rows)} rows, expected finite numbers"
+        )
+    return rows
 
 
 def _reserve(scene: Scene, size: int) -> None:

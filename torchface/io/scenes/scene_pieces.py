@@ -68,8 +68,10 @@ def join_deltas(pieces: Sequence[Piece]) -> Tensor:
 def join_meshes(pieces: Sequence[Piece], texture: Tensor | None) -> Mesh:
     """One mesh of all; of several, each piece becomes a region."""
     if len(pieces) == 1:
-        one = pieces[0]
-        return Mesh(one.vertices, one.faces, one.uvs, one.uv_faces, one.colors, texture, one.polygons, one.annotations)
+        only = pieces[0]
+        return Mesh(
+            only.vertices, only.faces, only.uvs, only.uv_faces, only.colors, texture, only.polygons, only.annotations
+        )
     counts = [len(piece.vertices) for piece in pieces]
     faces = torch.cat([piece.faces + first for piece, first in zip(pieces, _starts(counts), strict=True)])
     uvs = uv_faces = colors = None
@@ -93,10 +95,10 @@ def _join_polygons(pieces: Sequence[Piece], counts: list[int]) -> Tensor | None:
     """All polygons, (P,K), triangles of pieces without any among them; none where no piece has some."""
     if all(piece.polygons is None for piece in pieces):
         return None
-    own = [piece.faces if piece.polygons is None else piece.polygons for piece in pieces]
-    widest = max(rows.shape[1] for rows in own)
+    polygons = [piece.faces if piece.polygons is None else piece.polygons for piece in pieces]
+    widest = max(rows.shape[1] for rows in polygons)
     padded = []
-    for rows, first in zip(own, _starts(counts), strict=True):
+    for rows, first in zip(polygons, _starts(counts), strict=True):
         moved = torch.where(rows < 0, rows, rows + first)
         padded.append(torch.nn.functional.pad(moved, (0, widest - rows.shape[1]), value=-1))
     return torch.cat(padded)

@@ -57,8 +57,8 @@ def weight_keys(rig: BlendshapeRig, take: Take) -> tuple[WeightKeys, ShapeMatch]
     """
     track = take.weights
     if track is None or len(track) == 0 or track.values.shape[2] != 1:
-        found = "no weights" if track is None else f"weights {tuple(track.values.shape)}"
-        raise ValueRangeError(f"take: found {found}, expected weights (T,N,1) of at least one frame")
+        content = "no weights" if track is None else f"weights {tuple(track.values.shape)}"
+        raise ValueRangeError(f"take: found {content}, expected weights (T,N,1) of at least one frame")
     values = track.values[..., 0].detach().cpu().float()
     if not torch.isfinite(values).all():
         frames = (~torch.isfinite(values)).any(1).nonzero()[:, 0]

@@ -43,11 +43,11 @@ class Table:
     def columns(self, names: Sequence[str], dtype: type[np.floating] = np.float64) -> np.ndarray:
         """Some columns (T,C) in this order."""
         wanted = [self._index[name] for name in names]
-        found = np.empty((len(self.numbers), len(wanted)), dtype)
+        numbers = np.empty((len(self.numbers), len(wanted)), dtype)
         rows = 1 + _BLOCK // max(1, len(wanted))
-        for first in range(0, len(found), rows):  # so that no second copy of a long take is made
-            found[first : first + rows] = self.numbers[first : first + rows, wanted]
-        return found
+        for first in range(0, len(numbers), rows):  # so that no second copy of a long take is made
+            numbers[first : first + rows] = self.numbers[first : first + rows, wanted]
+        return numbers
 
 
 class TableReader:
@@ -102,10 +102,10 @@ class TableReader:
             FileFormatError: a row has too few or too many cells, or a number is none, or is infinite.
         """
         width = len(self.header)
-        kept: dict[str, list[str]] = {name: [] for name in texts}
+        text_cells: dict[str, list[str]] = {name: [] for name in texts}
         shared: dict[str, str] = {}
-        text_columns = [i for i, name in enumerate(self.header) if name in kept]
-        numeric = set(self.header if only is None else only) - set(kept)
+        text_columns = [i for i, name in enumerate(self.header) if name in text_cells]
+        numeric = set(self.header if only is None else only) - set(text_cells)
         number_columns = [i for i, name in enumerate(self.header) if name in numeric]
         names = tuple(self.header[i] for i in number_columns)
         numbers, rows = array("d"), 0
@@ -120,7 +120,7 @@ class TableReader:
                 )
             for i in text_columns:
                 text = cells[i].strip()
-                kept[self.header[i]].append(text if len(text) > _SHARED_TEXT else shared.setdefault(text, text))
+                text_cells[self.header[i]].append(text if len(text) > _SHARED_TEXT else shared.setdefault(text, text))
             wanted = [cells[i] for i in number_columns]
             numbers.extend(parse_numbers(wanted, names, f"{self.path}: row {self._rows.line_num}"))
             rows += 1
@@ -129,7 +129,7 @@ class TableReader:
         return Table(
             names,
             np.frombuffer(numbers, np.float64).reshape(rows, len(number_columns)),
-            {name: tuple(kept.pop(name)) for name in list(kept)},
+            {name: tuple(text_cells.pop(name)) for name in list(text_cells)},
         )
 
 
@@ -212,8 +212,8 @@ def parse_number(cell: str) -> float | None:
 
 def quoted(names: Sequence[str], limit: int = 5) -> str:
     """The first few, short enough for a message."""
-    shown = ", ".join(repr(name if len(name) <= 40 else name[:37] + "...") for name in names[:limit])
-    return shown + (f" and {len(names) - limit} more" if len(names) > limit else "")
+    listed = ", ".join(repr(name if len(name) <= 40 else name[:37] + "...") for name in names[:limit])
+    return listed + (f" and {len(names) - limit} more" if len(names) > limit else "")
 
 
 def write_table(path: str | Path, header: Sequence[str], rows: Iterable[Sequence[str]], line_end: str = "\n") -> None:

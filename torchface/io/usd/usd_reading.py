@@ -129,20 +129,20 @@ def read_usd_detail(path: str | Path) -> DetailMaps | None:
     """
     scene = read_stage(path, "--maps")
     allowed = max(_UNPACKED_ALWAYS, _UNPACKED_PER_BYTE * scene.record["bytes"])
-    found: dict[str, Tensor] = {}
+    images: dict[str, Tensor] = {}
     unpacked = 0
     for name, data in scene.arrays.items():
         image = decode_image(data.tobytes(), f"{path}: its wrinkle map {name}")
         unpacked += 4 * image.numel()
         if unpacked > allowed:
             raise FileFormatError(f"{path}: found maps that unpack to {unpacked} bytes, expected at most {allowed}")
-        found[name] = decode_normals(image[:3])
-    if not found:
+        images[name] = decode_normals(image[:3])
+    if not images:
         return None
-    neutral = found.get("neutral")
-    maps = [found[f"{row}"] for row in range(len(scene.record["shapes"]))]
-    if len({one.shape for one in found.values()}) > 1:
-        sizes = sorted({f"{one.shape[2]}x{one.shape[1]}" for one in found.values()})
+    neutral = images.get("neutral")
+    maps = [images[f"{row}"] for row in range(len(scene.record["shapes"]))]
+    if len({normals.shape for normals in images.values()}) > 1:
+        sizes = sorted({f"{normals.shape[2]}x{normals.shape[1]}" for normals in images.values()})
         raise FileFormatError(f"{path}: found wrinkle maps of {' and '.join(sizes[:3])} pixels, expected one size")
     stacked = torch.stack(maps) if neutral is None or maps else neutral.new_zeros(0, *neutral.shape)
     try:

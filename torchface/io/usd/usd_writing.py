@@ -217,12 +217,14 @@ def _targets(rig: BlendshapeRig) -> list[_Target]:
     between: dict[str, list[tuple[str, float, Tensor]]] = {}
     combinations = []
     if (correctives := rig.correctives) is not None:
-        for one, delta in zip(correctives.definitions, correctives.deltas.detach().cpu().double(), strict=True):
-            if one.peak is None:
-                combinations.append(_Target(one.name, delta))
+        for corrective, delta in zip(correctives.definitions, correctives.deltas.detach().cpu().double(), strict=True):
+            if corrective.peak is None:
+                combinations.append(_Target(corrective.name, delta))
             else:
-                driver = one.drivers[0]
-                between.setdefault(driver, []).append((one.name, one.peak, one.peak * deltas[driver] + delta))
+                driver = corrective.drivers[0]
+                between.setdefault(driver, []).append(
+                    (corrective.name, corrective.peak, corrective.peak * deltas[driver] + delta)
+                )
     shapes = [_Target(name, delta, tuple(between.get(name, ()))) for name, delta in deltas.items()]
     return [*shapes, *combinations]
 
@@ -231,7 +233,7 @@ def _with_combinations(rig: BlendshapeRig, keys: WeightKeys) -> WeightKeys:
     """Keys of all blend shapes: USD blends in-betweens itself, combinations get what the shapes' weights call for."""
     if rig.activation is None or rig.correctives is None:
         return keys
-    columns = [row for row, one in enumerate(rig.correctives.definitions) if not one.is_in_between]
+    columns = [row for row, corrective in enumerate(rig.correctives.definitions) if not corrective.is_in_between]
     followed = rig.activation(keys.weights.to(rig.vertices.device)).cpu()[:, columns]
     return replace(keys, weights=torch.cat([keys.weights, followed], 1))
 
@@ -258,7 +260,7 @@ def _shapes(usd: Any, stage: Any, mesh: Mesh, targets: Sequence[_Target], tokens
     used: set[str] = set()
     paths = []
     for token, target in zip(tokens, targets, strict=True):  # all normals at once would fill the memory
-        poses = [moves(target.delta), *(moves(place) for _, _, place in target.between)]
+        poses = [moves(target.delta), *(moves(reached) for _, _, reached in target.between)]
         rows = np.flatnonzero(np.any([(moved != 0) | (rotated != 0) for moved, rotated in poses], axis=(0, 2)))
         rows = rows if len(rows) else np.zeros(1, np.int64)  # Blender leaves a shape without any offset out
         shape = usd.UsdSkel.BlendShape.Define(stage, f"{_MESH}/{_free(usd.Tf.MakeValidIdentifier(token), used)}")

@@ -156,17 +156,17 @@ class VideoFile:
     def _decoded(self) -> Iterator[np.ndarray]:
         """Checked frames, red first, (H,W,3)."""
         self.check()
-        found, errors = 0, list[str]()
+        count, errors = 0, list[str]()
         with open_container(self.path) as (container, stream):
             for frame in _rgb_frames(container, stream, errors):
                 if frame.shape[:2] != (self.height, self.width):
-                    raise self._resized(found, frame.shape[1], frame.shape[0], self.width, self.height)
-                found += 1
+                    raise self._resized(count, frame.shape[1], frame.shape[0], self.width, self.height)
+                count += 1
                 yield frame
         # Recordings that were cut lose a frame or two at their ends.
-        if found == 0 or self.count - found > 1 + (0 if errors else 0.01 * self.count):
+        if count == 0 or self.count - count > 1 + (0 if errors else 0.01 * self.count):
             raise FileFormatError(
-                f"{self.path}: {found} frames could be decoded, expected {self.count}: the file is cut off or "
+                f"{self.path}: {count} frames could be decoded, expected {self.count}: the file is cut off or "
                 f"damaged{''.join(errors[:1])}"
             )
 
@@ -229,9 +229,9 @@ def _rgb_frames(container: InputContainer, stream: VideoStream, errors: list[str
             errors.append(f" ({reason(error)})")
 
 
-def _grey_into(frame: np.ndarray, place: np.ndarray) -> None:
-    cv2.cvtColor(frame, cv2.COLOR_RGB2GRAY, dst=place)
+def _grey_into(frame: np.ndarray, target: np.ndarray) -> None:
+    cv2.cvtColor(frame, cv2.COLOR_RGB2GRAY, dst=target)
 
 
-def _planes_into(frame: np.ndarray, place: np.ndarray) -> None:
-    cv2.split(frame, list(place))
+def _planes_into(frame: np.ndarray, target: np.ndarray) -> None:
+    cv2.split(frame, list(target))

@@ -89,14 +89,14 @@ def _check_written(expected: VideoFile, temporary: Path) -> None:
         FileFormatError: it does not hold what was written.
     """
     try:
-        found = open_video(temporary)
+        copy = open_video(temporary)
         frames = len(read_packets(temporary).seconds)
     except FileFormatError as error:
         message = str(error).replace(str(temporary), "read back")
         raise FileFormatError(f"{expected.path}: cannot be written ({message}); is the disk full?") from error
-    if (frames, found.width, found.height) != (expected.count, expected.width, expected.height):
+    if (frames, copy.width, copy.height) != (expected.count, expected.width, expected.height):
         raise FileFormatError(
-            f"{expected.path}: cannot be written: read back, found {frames} frames of {found.width} x {found.height} "
+            f"{expected.path}: cannot be written: read back, found {frames} frames of {copy.width} x {copy.height} "
             f"pixels, expected {expected.count} of {expected.width} x {expected.height}; is the disk full?"
         )
 

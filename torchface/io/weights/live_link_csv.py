@@ -42,7 +42,7 @@ def not_in_live_link(names: Sequence[str]) -> tuple[str, ...]:
         ('browInnerUp_L', 'cheekRaiser_L')
     """
     matrix = mapping(names, ARKIT)
-    return tuple(name for name, kept in zip(names, (matrix == 1).any(0).tolist(), strict=True) if not kept)
+    return tuple(name for name, comes_back in zip(names, (matrix == 1).any(0).tolist(), strict=True) if not comes_back)
 
 
 def load_live_link(path: str | Path) -> Take:

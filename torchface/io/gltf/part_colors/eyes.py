@@ -62,8 +62,8 @@ def painted_eye(mesh: Mesh, triangles: Tensor) -> list[tuple[Tensor, PartMateria
     clear = inside[mesh.faces[rows]].all(1)
     shell = painted(mesh, rows[~clear], points, lambda at: _outer_shell(at, iris))
     depth = float(points[inner.unique(), 2].max()) - _DEPTH
-    seen = painted(mesh, behind, points, lambda at: _inner_shell(at, iris, depth, iris_color))
-    return [(rows[~clear], SCLERA, shell), (behind, IRIS, seen), (rows[clear], CORNEA, None)]
+    inner_paint = painted(mesh, behind, points, lambda at: _inner_shell(at, iris, depth, iris_color))
+    return [(rows[~clear], SCLERA, shell), (behind, IRIS, inner_paint), (rows[clear], CORNEA, None)]
 
 
 def _shells(mesh: Mesh, triangles: Tensor) -> tuple[Tensor, Tensor]:
@@ -83,15 +83,15 @@ def _sphere(ids: Tensor, mesh: Mesh) -> tuple[Tensor, Tensor]:
     """Centre (3,) and radius of the sphere most of the vertices lie on; a cornea that bulges is an outlier."""
     points = mesh.vertices[ids].double()
     middle = points.mean(0)
-    kept = torch.ones(len(points), dtype=torch.bool)
+    inliers = torch.ones(len(points), dtype=torch.bool)
     centre, radius = middle, (points - middle).norm(dim=1).mean()
     for _ in range(_MAX_ITERATIONS):  # fit and outliers in turn
-        centred = points[kept] - middle
+        centred = points[inliers] - middle
         system = torch.cat([2 * centred, torch.ones(len(centred), 1, dtype=centred.dtype)], dim=1)
-        found = torch.linalg.lstsq(system, centred.square().sum(1, keepdim=True), driver="gelsd").solution[:, 0]
-        centre, radius = found[:3] + middle, (found[3] + found[:3].square().sum()).clamp(min=0).sqrt()
+        solution = torch.linalg.lstsq(system, centred.square().sum(1, keepdim=True), driver="gelsd").solution[:, 0]
+        centre, radius = solution[:3] + middle, (solution[3] + solution[:3].square().sum()).clamp(min=0).sqrt()
         residual = ((points - centre).norm(dim=1) - radius).abs()
-        kept = residual <= max(float(_OUTLIER * residual.median()), 1e-9)
+        inliers = residual <= max(float(_OUTLIER * residual.median()), 1e-9)
     return centre, radius
 
 
@@ -118,8 +118,8 @@ def _outer_shell(at: Tensor, iris: float) -> Tensor:
 
 
 def _inner_shell(at: Tensor, iris: float, depth: float, iris_color: Tensor | None) -> Tensor:
-    seen = torch.where(at[:, 2] > depth, _ramp(_axis_distance(at), _PUPIL - 0.1, _PUPIL + 0.1), 0.0)
-    color = _mix(torch.tensor(_DARK, dtype=at.dtype).expand(len(at), 3), (1.0, 1.0, 1.0), seen) * _iris(
+    outside_pupil = torch.where(at[:, 2] > depth, _ramp(_axis_distance(at), _PUPIL - 0.1, _PUPIL + 0.1), 0.0)
+    color = _mix(torch.tensor(_DARK, dtype=at.dtype).expand(len(at), 3), (1.0, 1.0, 1.0), outside_pupil) * _iris(
         at, iris, iris_color
     )
     return torch.cat([color, torch.ones(len(at), 1, dtype=at.dtype)], dim=1)

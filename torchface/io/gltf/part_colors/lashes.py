@@ -64,10 +64,10 @@ def _along(points: Tensor, card: Tensor) -> Tensor:
 def _opacity(at: Tensor) -> Tensor:
     """1 on a hair, 0 between, of values (N,3): root to tip, millimetres along the lid, card."""
     tip, along, card = at.unbind(1)
-    place = along / _SPACING + _LEAN * (tip * (0.7 + 0.3 * torch.sin(1.7 * along))) + 0.37 * card.round()
-    hair = place.floor()
+    position = along / _SPACING + _LEAN * (tip * (0.7 + 0.3 * torch.sin(1.7 * along))) + 0.37 * card.round()
+    hair = position.floor()
     random = torch.frac(torch.sin(hair * 12.9898 + card.round() * 78.233) * 43758.5453).abs()
     length = _MIN_LENGTH + (1 - _MIN_LENGTH) * random
     width = 0.5 * _ROOT * (1 - tip / length).clamp(0, 1).sqrt()
-    offset = (place - hair - 0.5 + 0.2 * (random - 0.5)).abs()
+    offset = (position - hair - 0.5 + 0.2 * (random - 0.5)).abs()
     return ((width - offset) / 0.06 + 0.5).clamp(0, 1) * (tip < length)

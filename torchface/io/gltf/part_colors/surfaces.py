@@ -55,24 +55,24 @@ def surfaces(mesh: Mesh, has_image: bool) -> list[Surface]:
         everything = torch.arange(len(mesh.faces))
         return [Surface(everything, SKIN, _color_source(mesh, mesh.texture is not None and mesh.uvs is not None))]
     textured = _with_own_texels(mesh, groups) if has_image else torch.zeros(len(mesh.faces), dtype=torch.bool)
-    found: list[Surface] = []
+    cut: list[Surface] = []
     for material, part, triangles in groups:
         if material is SKIN:
             pieces = [(triangles[textured[triangles]], True), (triangles[~textured[triangles]], False)]
-            found += [
+            cut += [
                 Surface(rows, SKIN, _color_source(mesh, owns and mesh.texture is not None))
                 for rows, owns in pieces
                 if len(rows)
             ]
         elif mesh.texture is not None and bool(textured[triangles].all()):
-            found.append(Surface(triangles, material, "texture", part))
+            cut.append(Surface(triangles, material, "texture", part))
         elif material is EYEBALL:
             layers = painted_eye(mesh, triangles)
-            found += [Surface(rows, made, "material", part, paint) for rows, made, paint in layers if len(rows)]
+            cut += [Surface(rows, made, "material", part, paint) for rows, made, paint in layers if len(rows)]
         else:
             paint = painted_lashes(mesh, triangles, material) if material is EYELASHES else None
-            found.append(Surface(triangles, material, "material", part, paint))
-    return found
+            cut.append(Surface(triangles, material, "material", part, paint))
+    return cut
 
 
 def parts_without_texels(mesh: Mesh) -> Tensor:
