@@ -299,10 +299,10 @@ def _part_of_annotations(whole: Annotations, ids: Tensor, new_id: Tensor) -> Ann
 
 
 def _check_shape(name: str, tensor: Tensor, expected: tuple[int | None, ...]) -> None:
-    found = tuple(tensor.shape)
-    if len(found) != len(expected) or any(e is not None and f != e for f, e in zip(found, expected, strict=True)):
+    sizes = tuple(tensor.shape)
+    if len(sizes) != len(expected) or any(e is not None and f != e for f, e in zip(sizes, expected, strict=True)):
         wanted = ",".join("*" if e is None else str(e) for e in expected)
-        raise ShapeError(f"{name}: found {found}, expected ({wanted})")
+        raise ShapeError(f"{name}: found {sizes}, expected ({wanted})")
 
 
 def _check_indices(name: str, indices: Tensor, count: int) -> None:

@@ -47,7 +47,7 @@ def spelled_as(name: str, names: Sequence[str]) -> str | None:
     return next((other for other in names if _canonical(other) == _canonical(name)), None)
 
 
-def near_names(unknown: Sequence[str], names: Sequence[str], shown: int = 8) -> str:
+def near_names(unknown: Sequence[str], names: Sequence[str], most: int = 8) -> str:
     """What to expect in place of unknown names: the near misses among names, else the first of them.
 
     Example:
@@ -55,7 +55,7 @@ def near_names(unknown: Sequence[str], names: Sequence[str], shown: int = 8) -> 
         'did you mean jawOpen?'
     """
     near = sorted({close for name in unknown for close in get_close_matches(name, names, 2)})
-    return f"did you mean {' or '.join(near)}?" if near else f"{', '.join(names[:shown])}, ..."
+    return f"did you mean {' or '.join(near)}?" if near else f"{', '.join(names[:most])}, ..."
 
 
 def mapping(from_names: Sequence[str], to_names: Sequence[str]) -> Tensor:

@@ -61,8 +61,8 @@ def pick(
                 return load_rig(mesh, unit, part)
             except FileFormatError:  # no morph targets: a mesh
                 pass
-        found = load_mesh(mesh, unit)
-        return found if part is None else submesh(found, region(found, part)).mesh
+        picked_on = load_mesh(mesh, unit)
+        return picked_on if part is None else submesh(picked_on, region(picked_on, part)).mesh
 
     import_viser()
     free_port(HOST, port)

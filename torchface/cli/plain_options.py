@@ -35,7 +35,7 @@ def _word(kind: Any) -> str | None:
     """What an option takes where it is given, if there is one word for it."""
     given = [kind]
     if get_origin(kind) in (Union, UnionType):
-        given = [one for one in get_args(kind) if one is not NoneType]
+        given = [option for option in get_args(kind) if option is not NoneType]
     if len(given) != 1:
         return None
     if get_origin(given[0]) is Literal:

@@ -14,8 +14,8 @@ from rich.progress import Progress as Bars
 from rich.text import Text
 from tyro.conf import arg
 
+from torchface.escaped_text import visible
 from torchface.progress import Progress, silent
-from torchface.shown_text import visible
 
 
 class PlainConsole(Console):

@@ -60,20 +60,20 @@ def recipes_package() -> ModuleType:
         raise FileFormatError(f"{_PACKAGE / '_train'}: found no recipes, expected those that come with torchface")
     if str(checkout) not in sys.path:
         sys.path.append(str(checkout))  # processes that recipes start are told of it
-    found = import_module(_IN_CHECKOUT)
-    if Path(found.__file__ or "").resolve().parent != folder:
-        raise FileFormatError(f"{found.__file__}: found another package 'train', expected {folder}")
-    return found
+    package = import_module(_IN_CHECKOUT)
+    if Path(package.__file__ or "").resolve().parent != folder:
+        raise FileFormatError(f"{package.__file__}: found another package 'train', expected {folder}")
+    return package
 
 
 def summaries(package: ModuleType) -> dict[str, str]:
     """What each recipe makes, by name, read off its file without running it."""
-    found = {}
+    first_lines = {}
     for path in sorted(Path(package.__file__ or "").parent.glob("*.py")):
-        told = (ast.get_docstring(ast.parse(path.read_bytes())) or "").partition("\n\n")[0]
-        if told.startswith(_MARK):
-            found[path.stem] = " ".join(told.partition("``: ")[2].split()).rstrip(".")
-    return found
+        docstring = (ast.get_docstring(ast.parse(path.read_bytes())) or "").partition("\n\n")[0]
+        if docstring.startswith(_MARK):
+            first_lines[path.stem] = " ".join(docstring.partition("``: ")[2].split()).rstrip(".")
+    return first_lines
 
 
 def _loaded(path: Path, package: ModuleType) -> ModuleType:

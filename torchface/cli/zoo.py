@@ -11,7 +11,7 @@ from rich.text import Text
 from tyro.conf import Positional, arg
 
 from torchface.cli.progress import PlainConsole
-from torchface.shown_text import visible
+from torchface.escaped_text import visible
 
 SOME_DAMAGED = 1
 """Exit status of ``torchface zoo verify`` where a model is damaged."""
@@ -36,13 +36,13 @@ def list_models() -> None:
         if name in faults:
             table.add_row(name, "damaged", "", "", "see below")
         else:
-            found = zoo.describe(name)
+            model = zoo.describe(name)
             table.add_row(
                 name,
-                found.kind,
-                _size(found.size),
-                found.licence,
-                Text(visible(found.summary), no_wrap=True, overflow="ellipsis"),
+                model.kind,
+                _size(model.size),
+                model.licence,
+                Text(visible(model.summary), no_wrap=True, overflow="ellipsis"),
             )
     page = PlainConsole(stderr=False)
     if not page.is_terminal:
@@ -63,24 +63,24 @@ def describe(name: Annotated[Positional[str], arg(metavar="NAME")]) -> None:
     """
     from torchface import zoo
 
-    found = zoo.describe(name)
+    model = zoo.describe(name)
     table = Table(box=None, show_header=False, padding=(0, 2, 0, 0))
     table.add_column(no_wrap=True)
     table.add_column(overflow="fold")
-    learned = zoo.KINDS.get(found.kind)
+    learned = zoo.KINDS.get(model.kind)
     rows = {
-        "name": found.name,
-        "what it is": found.summary,
-        "kind": f"{found.kind} ({learned.__name__})" if learned else f"{found.kind} (unknown to this torchface)",
-        "size": _size(found.size),
-        "licence": found.licence,
-        "data": found.data,
-        **{key: f"{value:.4g}" for key, value in found.metrics.items()},
-        "recipe": found.recipe,
-        "folder": str(found.folder),
-        "url": found.url,
-        "sha256": found.sha256,
-        "goes before": ", ".join(map(str, found.shadowed)),
+        "name": model.name,
+        "what it is": model.summary,
+        "kind": f"{model.kind} ({learned.__name__})" if learned else f"{model.kind} (unknown to this torchface)",
+        "size": _size(model.size),
+        "licence": model.licence,
+        "data": model.data,
+        **{key: f"{value:.4g}" for key, value in model.metrics.items()},
+        "recipe": model.recipe,
+        "folder": str(model.folder),
+        "url": model.url,
+        "sha256": model.sha256,
+        "goes before": ", ".join(map(str, model.shadowed)),
     }
     for key, value in rows.items():
         if value:
@@ -104,12 +104,12 @@ def verify(names: Annotated[Positional[tuple[str, ...]], arg(metavar="[NAME ...]
     page, damaged = PlainConsole(stderr=False), False
     for name in names or sorted(all_names()):
         try:
-            found = zoo.verify(name)
+            model = zoo.verify(name)
         except FileFormatError as error:
             page.print(f"{name}: damaged: {error}", style="bold yellow", highlight=False, soft_wrap=True)
             damaged = True
         else:
-            line = f"{name}: whole, {_size(found.size)}, sha256 {found.sha256}"
+            line = f"{name}: whole, {_size(model.size)}, sha256 {model.sha256}"
             page.print(line, highlight=False, soft_wrap=True)
     if damaged:
         raise SystemExit(SOME_DAMAGED)

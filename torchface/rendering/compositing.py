@@ -16,8 +16,8 @@ from matplotlib.text import Text
 from PIL import Image, ImageDraw, ImageFont
 from torch import Tensor
 
+from torchface.escaped_text import visible
 from torchface.files.whole_files import check_ending, make_folder, write_file
-from torchface.shown_text import visible
 
 __all__ = ["caption", "heat_colors", "save_rendered_image", "sheet"]
 

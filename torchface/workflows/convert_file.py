@@ -74,15 +74,15 @@ def convert_file(
     else:
         check_writable(folder=out)
     progress("reading")
-    found = _read(source, unit, part)
+    source_rig = _read(source, unit, part)
     progress("writing")
     make_folder(out.parent)
-    if found.rig is None:
+    if source_rig.rig is None:
         if out.suffix.lower() in BLENDER_ENDINGS or not out.suffix:
             raise FileFormatError(f"{source}: found a mesh without shapes, expected a rig to write {out.name} from")
-        save_mesh(found.mesh, out)
-        return found
-    rig = renamed(found.rig, names)
+        save_mesh(source_rig.mesh, out)
+        return source_rig
+    rig = renamed(source_rig.rig, names)
     detail: DetailMaps | RegionMaps | None = None
     notes: list[str] = []
     if part is None and source.suffix.lower() in GLTF_ENDINGS and (by_region := load_region_maps(source)) is not None:
@@ -91,9 +91,9 @@ def convert_file(
         else:
             notes.append(f"{out.name} has no place for wrinkle maps by region, which are left out; .glb has")
     if part is None and source.suffix.lower() in SCENE_ENDINGS and detail is None:
-        detail = renamed_detail(load_detail_maps(source), found.rig, names)
-    notes += _write(rig, found.take, detail, out)
-    return Converted(rig.neutral, rig, found.take, (*naming_lines(found.rig, names), *notes))
+        detail = renamed_detail(load_detail_maps(source), source_rig.rig, names)
+    notes += _write(rig, source_rig.take, detail, out)
+    return Converted(rig.neutral, rig, source_rig.take, (*naming_lines(source_rig.rig, names), *notes))
 
 
 def _read(source: Path, unit: str | None, part: str | None) -> Converted:

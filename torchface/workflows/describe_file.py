@@ -55,8 +55,8 @@ def describe(path: Path, attachment: Path | None = None, part: str | None = None
         if attachment is not None:
             where = Attachment.load(attachment)
             where.check(rig.neutral, attachment, path)
-            seen = observability(MarkerSolver(rig, where))
-            rows += [("what the markers see", str(seen))]
+            visible = observability(MarkerSolver(rig, where))
+            rows += [("what the markers see", str(visible))]
         return rows
     if attachment is not None:
         raise FileFormatError(f"{path}: found no rig, expected one to test the markers of {attachment} on")
@@ -147,10 +147,11 @@ def _take_rows(take: Take) -> Rows:
         track = getattr(take, kind)
         if track is None:
             continue
-        seen = torch.isfinite(track.values).all(-1).float()
+        visible = torch.isfinite(track.values).all(-1).float()
+        empty = int((visible.sum(1) == 0).sum())
         rows += [
             (kind, f"{len(track.names)}: {', '.join(track.names)}"),
-            (f"{kind} seen", f"{100 * float(seen.mean()):.2f} %, {int((seen.sum(1) == 0).sum())} frames without any"),
+            (f"{kind} seen", f"{100 * float(visible.mean()):.2f} %, {empty} frames without any"),
         ]
     if take.weights is not None:
         rows += [("warning", fault) for fault in weight_faults(take.weights)]

@@ -5,9 +5,9 @@ import torch
 
 from torchface.io import load_detail_maps, load_mesh
 from torchface.mesh import Annotations, Mesh
-from torchface.viz.browser.colored_pieces import split_parts, triangle_texture
 from torchface.viz.browser.head_mesh import TexturedHead
 from torchface.viz.browser.html_lists import pick_list, shape_list
+from torchface.viz.browser.single_color_parts import split_parts, triangle_texture
 
 trimesh = pytest.importorskip("trimesh")
 

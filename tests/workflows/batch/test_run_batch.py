@@ -143,8 +143,8 @@ def test_what_a_folder_holds_of_other_kinds_is_told(tmp_path: Path) -> None:
 
 def test_each_of_many_results_has_a_place_of_its_own() -> None:
     item = BatchItem("take1", Path("take1.c3d"))
-    assert item.own(Path("sites/{name}.json")) == Path("sites/take1.json")
-    assert item.own(None) is None
+    assert item.path_of(Path("sites/{name}.json")) == Path("sites/take1.json")
+    assert item.path_of(None) is None
     check_for_each("--report", Path("reports/{name}"))
     with pytest.raises(ValueRangeError, match=r"--animation: found out\.glb.*such as \{name\}\.glb"):
         check_for_each("--animation", Path("out.glb"))

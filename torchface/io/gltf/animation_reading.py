@@ -10,12 +10,12 @@ from typing import Any
 import numpy as np
 import torch
 
+from torchface.escaped_text import visible
 from torchface.io.gltf.accessors import read_floats
 from torchface.io.gltf.corrective_extras import scene_correctives
 from torchface.io.gltf.gltf_document import Document, read_document
 from torchface.io.gltf.primitive_reading import read_target_names
 from torchface.io.tables.frame_rates import rate_of_keys
-from torchface.shown_text import visible
 from torchface.take import Take, Track
 
 _CUBIC = "CUBICSPLINE"

@@ -28,6 +28,7 @@ from numpy.typing import NDArray
 from torchface.color_space import to_srgb
 from torchface.correctives.definitions import Corrective
 from torchface.errors import FileFormatError
+from torchface.escaped_text import visible
 from torchface.files.documents import parse_json
 from torchface.io.gltf.corrective_extras import read_correctives, rig_of_targets
 from torchface.io.gltf.gltf_document import Document
@@ -39,7 +40,6 @@ from torchface.io.scenes.scene_pieces import Piece, all_names, join_deltas, join
 from torchface.io.tables.frame_rates import rate_of_keys
 from torchface.mesh import Mesh, fan_triangulation
 from torchface.rig import BlendshapeRig
-from torchface.shown_text import visible
 from torchface.take import Take, Track
 
 _UNPACKED_ALWAYS, _UNPACKED_PER_BYTE = 2**28, 32

@@ -70,7 +70,7 @@ class AnnotationSession:
         self._grabbed = (row, self.landmarks.clone())
         self._history[self.number].append(self.landmarks.clone())
 
-    def drag(self, place: Tensor, reach: float = 0.0) -> None:
+    def drag(self, target: Tensor, reach: float = 0.0) -> None:
         r"""Moves the landmark that is grabbed; others follow with :math:`e^{-d^2 / 2r^2}` of its motion.
 
         Args:
@@ -83,15 +83,15 @@ class AnnotationSession:
         """
         if self._grabbed is None:
             raise ValueRangeError("drag: found no landmark grabbed, expected grab() first")
-        if not bool(torch.isfinite(place).all()):
-            raise ValueRangeError(f"drag: found the place {place.tolist()}, expected finite pixels")
+        if not bool(torch.isfinite(target).all()):
+            raise ValueRangeError(f"drag: found the place {target.tolist()}, expected finite pixels")
         row, before = self._grabbed
         height, width = self.frame.image.shape[-2:]
-        target = torch.minimum(place.double().clamp(min=0), torch.tensor([width - 1.0, height - 1.0]).double())
+        inside = torch.minimum(target.double().clamp(min=0), torch.tensor([width - 1.0, height - 1.0]).double())
         apart = (before - before[row]).square().sum(1)
         weight = torch.exp(-apart / (2 * reach**2)) if reach > 0 else torch.zeros(len(before), dtype=torch.float64)
         weight[row] = 1.0
-        self._history[self.number][-1] = before + weight[:, None] * (target - before[row])
+        self._history[self.number][-1] = before + weight[:, None] * (inside - before[row])
 
     def let_go(self) -> None:
         """Ends a drag."""

@@ -88,6 +88,7 @@ class BrowserPage:
     def __init__(self, label: str, port: int) -> None:
         self._lock = threading.RLock()
         self._stopped = threading.Event()
+        self._threads: list[threading.Thread] = []
         self._token = secrets.token_urlsafe(16)
         self.server = start_server(label, self._token, port)
 
@@ -99,12 +100,19 @@ class BrowserPage:
     def stop(self) -> None:
         """Closes the page."""
         self._stopped.set()
+        for thread in self._threads:
+            thread.join(timeout=5)
         with _quiet():
             self.server.stop()
 
     def wait(self) -> None:
         """Returns when the page is closed by :meth:`stop`, or at an interrupt."""
         self._stopped.wait()
+
+    def _start(self, run: Callable[[], None]) -> None:
+        """Starts a thread of the page, which :meth:`stop` ends: it returns once ``_stopped`` is set."""
+        self._threads.append(threading.Thread(target=run, name="torchface-page", daemon=True))
+        self._threads[-1].start()
 
     def _add_save_button(self, label: str, hint: str, save: Callable[[], str]) -> None:
         """A button that saves and notifies whoever clicked it of the files, or of what went wrong."""

@@ -25,7 +25,7 @@ from torchface.mesh import Mesh
 from torchface.rendering.clay_shading import CLAY
 from torchface.rendering.compositing import to_pillow
 from torchface.viz.browser.browser_page import SCALE
-from torchface.viz.browser.colored_pieces import split_parts
+from torchface.viz.browser.single_color_parts import split_parts
 
 if TYPE_CHECKING:
     import viser
@@ -66,7 +66,7 @@ class HeadOnPage:
         self._textured = TexturedHead(mesh) if has_colors or self._normal_map is not None else None
         self._texture_shown = False
         self._texture_enabled = True
-        place = SCALE * np.array(offset)
+        origin = SCALE * np.array(offset)
         self._nodes = [
             server.scene.add_mesh_simple(
                 f"/{name}/part{number}",
@@ -75,7 +75,7 @@ class HeadOnPage:
                 color=part.color,
                 scale=SCALE,
                 side="double",
-                position=place,
+                position=origin,
                 cast_shadow=False,
                 receive_shadow=False,
             )
@@ -84,7 +84,7 @@ class HeadOnPage:
         self._textured_node = None
         if self._textured is not None:
             centre = (self._vertices.amin(0) + self._vertices.amax(0)) / 2
-            position = place + SCALE * (1 - _TEXTURED_SCALE) * centre.double().numpy()
+            position = origin + SCALE * (1 - _TEXTURED_SCALE) * centre.double().numpy()
             self._textured_node = server.scene.add_glb(
                 f"/{name}/textured",
                 self._glb(self._textured),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from torchface.shown_text import as_markup
+from torchface.escaped_text import as_markup
 
 _MAX_SHAPES = 8
 

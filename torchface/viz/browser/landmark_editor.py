@@ -236,13 +236,13 @@ class LandmarkEditor(BrowserPage):
         origin = torch.tensor(event.ray_origin, dtype=torch.float64)
         direction = torch.tensor(event.ray_direction, dtype=torch.float64)
         with self._lock:
-            place = self.to_pixels(origin, direction)
-            near = (self.session.landmarks - place).norm(dim=1)
+            pixels = self.to_pixels(origin, direction)
+            near = (self.session.landmarks - pixels).norm(dim=1)
             if self.chosen is None or float(near.min()) * self._unit < _DOT:
                 return
             self.session.grab(self.chosen)
             try:
-                self.session.drag(place, self._reach.value * self.session.extent)
+                self.session.drag(pixels, self._reach.value * self.session.extent)
             except TorchfaceError:
                 self.session.undo()
             self.session.let_go()

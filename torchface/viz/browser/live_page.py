@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import threading
 import time
 from collections.abc import Callable
 from dataclasses import replace
@@ -66,19 +65,12 @@ class LivePage(BrowserPage):
         self._pivot = ((vertices.amin(0) + vertices.amax(0)) / 2).double().numpy()
         frame_camera(self.server, rig.neutral)
         self._add_panel()
-        self._thread = threading.Thread(target=self._run, name="torchface-live-page", daemon=True)
-        self._thread.start()
+        self._start(self._run)
 
     @property
     def rate(self) -> float:
         """How often the character is shown, times a second at most: heavy ones more rarely."""
         return max(_LEAST_RATE, min(_RATE, _RATE * _LIGHT / len(self._rig.neutral.vertices)))
-
-    def stop(self) -> None:
-        """Closes the page."""
-        self._stopped.set()
-        self._thread.join(timeout=5)
-        super().stop()
 
     def _add_panel(self) -> None:
         gui, desk = self.server.gui, self._desk
@@ -158,7 +150,7 @@ class LivePage(BrowserPage):
         label = "Start recording" if view.recording is None else "Stop recording"
         if self._record.label != label:
             self._record.label = label
-        active = sorted(zip(ARKIT, view.weights.tolist(), strict=True), key=lambda one: -one[1])
+        active = sorted(zip(ARKIT, view.weights.tolist(), strict=True), key=lambda shape: -shape[1])
         self._active.content = shape_list([(name, weight) for name, weight in active if weight >= 0.01])
         notes = (*self._messages, *view.notes[-_SHOWN_NOTES:])
         self._notes.content = "".join(caption(note) for note in notes)
@@ -189,8 +181,8 @@ def camera_drawing(view: LiveView, mirrored: bool) -> np.ndarray:
         drawn = np.ascontiguousarray(drawn[:, ::-1])
         view = replace(view, landmarks=_flipped(view.landmarks, width), iris=_flipped(view.iris, width))
     for points, radius, color in ((view.landmarks, 1.6, _POINT), (view.iris, 3.2, _IRIS)):
-        found = points[torch.isfinite(points).all(1)]
-        places = (((found.double() + 0.5) * scale - 0.5).clamp(-1e3, 1e4) * 2**_SHIFT).round().int().tolist()
+        visible = points[torch.isfinite(points).all(1)]
+        places = (((visible.double() + 0.5) * scale - 0.5).clamp(-1e3, 1e4) * 2**_SHIFT).round().int().tolist()
         for x, y in places:
             at = (x, y)
             cv2.circle(drawn, at, round((radius + 0.8) * 2**_SHIFT), _EDGE, -1, cv2.LINE_AA, _SHIFT)

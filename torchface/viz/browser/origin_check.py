@@ -45,7 +45,7 @@ def is_allowed(host: str | None, origin: str | None, port: int) -> bool:
         port: that it came to.
     """
     places = {f"{name}:{port}" for name in _HOSTS} | (set(_HOSTS) if port == 80 else set())
-    return host in places and (origin is None or origin in {f"http://{place}" for place in places})
+    return host in places and (origin is None or origin in {f"http://{name}" for name in places})
 
 
 def without_token(path: str, token: str) -> str | None:

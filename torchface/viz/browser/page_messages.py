@@ -86,16 +86,16 @@ class MessageCheck:
         if not isinstance(message, bytes):
             return False
         try:
-            found = msgpack.decode(message)
+            content = msgpack.decode(message)
         except (ValueError, RecursionError):  # no MessagePack; msgspec's errors are of the former
             return False
-        if type(found) is not dict or type(kind := found.pop("type", None)) is not str or kind not in _FIELDS:
+        if type(content) is not dict or type(kind := content.pop("type", None)) is not str or kind not in _FIELDS:
             return False
         # A later viser may say more than we read: of that, one plain value a field.
-        checks = {**dict.fromkeys(found, _plain), **_FIELDS[kind]}
-        if not all(name in found and check(found[name]) for name, check in checks.items()):
+        checks = {**dict.fromkeys(content, _plain), **_FIELDS[kind]}
+        if not all(name in content and check(content[name]) for name, check in checks.items()):
             return False
-        return kind != "GuiUpdateMessage" or self._fits(self._inputs.get(found["uuid"]), found["updates"]["value"])
+        return kind != "GuiUpdateMessage" or self._fits(self._inputs.get(content["uuid"]), content["updates"]["value"])
 
     @staticmethod
     def _fits(handle: Any, value: Any) -> bool:

@@ -166,8 +166,8 @@ class PickSession:
             image = torch.tensor(point.barycentric, dtype=torch.float64) @ self.mesh.vertices[corners].double()
         else:
             image = torch.tensor(point.position, dtype=torch.float64) * torch.tensor([-1.0, 1.0, 1.0])
-        found = self._index.nearest(image[None])
-        return _surface_point(self.mesh, int(found.triangle[0]), found.barycentric[0])
+        nearest = self._index.nearest(image[None])
+        return _surface_point(self.mesh, int(nearest.triangle[0]), nearest.barycentric[0])
 
     def landmarks(self) -> LandmarkVertices:
         """The landmarks picked so far.
@@ -247,6 +247,6 @@ def _surface_point(mesh: Mesh, triangle: int, barycentric: Tensor) -> SurfacePoi
     return SurfacePoint(triangle, (a, b, c), (x, y, z), int(mesh.faces[triangle, nearest]))
 
 
-def _need(found: object, what: str) -> None:
-    if not found:
+def _need(picked: object, what: str) -> None:
+    if not picked:
         raise ValueRangeError(f"{what}s: found none picked, expected at least one")

@@ -99,14 +99,14 @@ class Picker(BrowserPage):
 
     def _nearest(self, origin: Tensor, direction: Tensor) -> tuple[SurfacePoint | None, bool]:
         """The first surface in the ray's way, and whether it is the scan's."""
-        found = self.session.on_mesh(origin, direction)
+        on_head = self.session.on_mesh(origin, direction)
         beyond = self.session.on_scan(origin - self.scan_offset, direction)
-        if found is None or beyond is None:
-            return (beyond, True) if found is None else (found, False)
+        if on_head is None or beyond is None:
+            return (beyond, True) if on_head is None else (on_head, False)
         eye = origin.double()
-        near = (torch.tensor(found.position, dtype=torch.float64) - eye).norm()
+        near = (torch.tensor(on_head.position, dtype=torch.float64) - eye).norm()
         far = (torch.tensor(beyond.position, dtype=torch.float64) + self.scan_offset - eye).norm()
-        return (found, False) if near <= far else (beyond, True)
+        return (on_head, False) if near <= far else (beyond, True)
 
     def _pick(self, point: SurfacePoint, on_scan: bool) -> str:
         session, mode, mirrored = self.session, self._mode.value, self._mirrored.value

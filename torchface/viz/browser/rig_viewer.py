@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import threading
 import time
 from collections.abc import Callable, Sequence
 from functools import partial
@@ -79,14 +78,7 @@ class RigViewer(BrowserPage):
             self._active = self.server.gui.add_html("")
         self.sliders = self._add_sliders()
         self._refresh_panel()
-        self._thread = threading.Thread(target=self._run, name="torchface-viewer", daemon=True)
-        self._thread.start()
-
-    def stop(self) -> None:
-        """Closes the page."""
-        self._stopped.set()
-        self._thread.join(timeout=5)
-        super().stop()
+        self._start(self._run)
 
     def show_frame(self, frame: int) -> int:
         """Brings a frame into view; returns how many pieces of the head were sent."""
@@ -120,8 +112,8 @@ class RigViewer(BrowserPage):
             return None
         return self._detail.blend(self.rig.names, self.editor.pose)
 
-    def _show_wrinkles(self, shown: bool) -> None:
-        self._wrinkled = bool(shown)
+    def _show_wrinkles(self, enabled: bool) -> None:
+        self._wrinkled = bool(enabled)
         self.head.refresh_texture()
 
     def _show(self) -> int:

@@ -35,20 +35,20 @@ class WeightEditor:
     def __init__(
         self, names: Sequence[str], weights: Tensor | None = None, spread: int = 0, symmetric: bool = False
     ) -> None:
-        found = torch.zeros(1, len(names)) if weights is None else weights.detach().to("cpu", torch.float32)
-        if found.ndim != 2 or found.shape[1] != len(names) or len(found) == 0:
-            raise ShapeError(f"weights: found {tuple(found.shape)}, expected (T,{len(names)}) with at least one frame")
-        if not torch.isfinite(found).all():
+        start = torch.zeros(1, len(names)) if weights is None else weights.detach().to("cpu", torch.float32)
+        if start.ndim != 2 or start.shape[1] != len(names) or len(start) == 0:
+            raise ShapeError(f"weights: found {tuple(start.shape)}, expected (T,{len(names)}) with at least one frame")
+        if not torch.isfinite(start).all():
             raise ValueRangeError(
-                f"weights: {int((~torch.isfinite(found)).sum())} are NaN or infinite; expected numbers to show"
+                f"weights: {int((~torch.isfinite(start)).sum())} are NaN or infinite; expected numbers to show"
             )
         self.names = tuple(names)
-        self.weights = found.clone()
+        self.weights = start.clone()
         self.spread = spread
         self.symmetric = symmetric
-        self.low = found.amin(0).clamp(max=0.0)
-        self.high = found.amax(0).clamp(min=1.0)
-        self._loaded = found.clone()
+        self.low = start.amin(0).clamp(max=0.0)
+        self.high = start.amax(0).clamp(min=1.0)
+        self._loaded = start.clone()
         self._twins = mirror(names).tolist()
         self._frame = 0
 

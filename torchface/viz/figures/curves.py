@@ -49,10 +49,10 @@ def weight_curves(solved: Tensor, true: Tensor | None, names: Sequence[str], fps
     seconds = torch.arange(len(solved)) / fps
     curves = [("sum of weights", solved.sum(1), None if true is None else true.sum(1))]
     curves += [(names[i], solved[:, i], None if true is None else true[:, i]) for i in order]
-    for axes, (label, found, truth) in zip(rows, curves, strict=True):
+    for axes, (label, values, truth) in zip(rows, curves, strict=True):
         if truth is not None:
             axes.plot(seconds, truth, color=TRUE, linewidth=1.6, alpha=0.8, label="true")
-        axes.plot(seconds, found, color=SOLVED, linewidth=0.8, label="solved")
+        axes.plot(seconds, values, color=SOLVED, linewidth=0.8, label="solved")
         axes.set_ylabel(label, fontsize=8)
         axes.set_ylim(0, None if label == "sum of weights" else 1.02)
     rows[0].legend(loc="upper right", frameon=False, ncols=2, fontsize=8)
@@ -121,13 +121,13 @@ def motion_curves(
     figure = Figure(figsize=(10, 6), dpi=100, layout="constrained")
     rows = figure.subplots(3, 2, sharex=True)
     seconds = torch.arange(len(translation)) / fps
-    for column, (found, unit) in enumerate(((translation, "mm along"), (degrees, "° about"))):
-        reach = 1.1 * max(float(found.abs().max()), 0.5 if column else 1.0)
+    for column, (values, unit) in enumerate(((translation, "mm along"), (degrees, "° about"))):
+        reach = 1.1 * max(float(values.abs().max()), 0.5 if column else 1.0)
         for axis, name in enumerate("xyz"):
             axes = rows[axis][column]
             if true is not None:
                 axes.plot(seconds, true[column][:, axis], color=TRUE, linewidth=1.8, alpha=0.8, label="true")
-            axes.plot(seconds, found[:, axis], color=SOLVED, linewidth=0.8, label="solved")
+            axes.plot(seconds, values[:, axis], color=SOLVED, linewidth=0.8, label="solved")
             axes.set(ylabel=f"{unit} {name}", ylim=(-reach, reach), xlim=(0, float(seconds[-1])))
             axes.axhline(0, color="grey", linewidth=0.5)
     for axes in rows[-1]:

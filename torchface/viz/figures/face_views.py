@@ -72,8 +72,8 @@ def face_views(
         True
     """
     cameras = [frame_face(framed_by or mesh, yaw, width=width, height=height) for yaw in yaws]
-    seen = as_seen(mesh)
-    return sheet([render(seen, camera, colors, lighting, samples=samples) for camera in cameras], len(cameras))
+    drawn = as_seen(mesh)
+    return sheet([render(drawn, camera, colors, lighting, samples=samples) for camera in cameras], len(cameras))
 
 
 def heat_map(mesh: Mesh, values: Tensor, maximum: float, label: str, width: int = 400, height: int = 500) -> Tensor:

@@ -62,7 +62,7 @@ def error_views(mesh: Mesh, errors: Tensor, maximum: float, title: str, height: 
     return headed(sheet([row, _scale(maximum, row.shape[1])], 2), title)
 
 
-def compared_views(found: Mesh, true: Mesh, errors: Tensor, maximum: float, title: str, height: int = 290) -> Tensor:
+def compared_views(result: Mesh, true: Mesh, errors: Tensor, maximum: float, title: str, height: int = 290) -> Tensor:
     """One frame: what came back, what was, and the error between them, a row each, from three sides; (3,H,W).
 
     Args:
@@ -84,9 +84,9 @@ def compared_views(found: Mesh, true: Mesh, errors: Tensor, maximum: float, titl
     width = height * 4 // 5
     rows = [
         headed(face_views(true, colors=clay_colors(true), width=width, height=height, framed_by=true), "truth"),
-        headed(face_views(found, colors=clay_colors(found), width=width, height=height, framed_by=true), "result"),
+        headed(face_views(result, colors=clay_colors(result), width=width, height=height, framed_by=true), "result"),
         headed(
-            face_views(found, colors=error_colors(errors, maximum), width=width, height=height, framed_by=true),
+            face_views(result, colors=error_colors(errors, maximum), width=width, height=height, framed_by=true),
             "error",
         ),
     ]

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
+import torch
 from matplotlib import colormaps
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
@@ -44,8 +45,8 @@ def marker_map(
     colors = heat_colors(errors.nan_to_num(0.0), maximum).numpy()
     colors[errors.isnan().numpy()] = _NOT_KNOWN
     worst = set(errors.nan_to_num(-1.0).argsort(descending=True)[:named].tolist())
-    shown = ["" if i not in worst or errors.isnan()[i] else label for i, label in enumerate(labels)]
-    views = _views(mesh, points, colors, shown)
+    named_labels = ["" if i not in worst or errors.isnan()[i] else label for i, label in enumerate(labels)]
+    views = _views(mesh, points, colors, named_labels)
     scale = color_bar(maximum, "mm, root mean square", _HEIGHT, (0.12, 0.2, 0.2, 0.6), extend="max")
     return sheet([*views, scale], len(views) + 1)
 
@@ -78,11 +79,11 @@ def _view(mesh: Mesh, points: Tensor, colors: np.ndarray, labels: Sequence[str],
     figure = Figure(figsize=(_WIDTH / 100, _HEIGHT / 100), dpi=100)
     axes: Axes = figure.add_axes((0, 0, 1, 1))
     axes.imshow(image.permute(1, 2, 0).numpy())
-    shown = facing(mesh, points, yaw)
+    front = facing(mesh, points, yaw)
     at = camera.project(points.double())
-    x, y = at[shown].T
-    axes.scatter(x, y, s=34, c=colors[shown.numpy()], edgecolors="black", linewidths=0.6)
-    for i in shown.nonzero()[:, 0].tolist():
+    x, y = at[front].T
+    axes.scatter(x, y, s=34, c=colors[front.numpy()], edgecolors="black", linewidths=0.6)
+    for i in front.nonzero()[:, 0].tolist():
         if labels[i]:
             left = float(at[i, 0]) < _WIDTH / 2
             axes.annotate(
@@ -102,19 +103,17 @@ def _view(mesh: Mesh, points: Tensor, colors: np.ndarray, labels: Sequence[str],
 def marker_views(markers: Tensor, on_mesh: Tensor, title: str = "") -> Tensor:
     """One frame: seen markers (M,3), NaN where not seen, joined to their points on the mesh (M,3); (3,H,W)."""
     figure = Figure(figsize=(10, 5), dpi=100, layout="constrained")
-    seen = markers.isfinite().all(-1)
-    error = (markers - on_mesh)[seen].norm(dim=-1)
+    known = markers.isfinite().all(-1)
+    error = (markers - on_mesh)[known].norm(dim=-1)
     for axes, (name, across) in zip(figure.subplots(1, 2), (("front", 0), ("side", 2)), strict=True):
         columns = [across, 1]
-        pairs = [
-            [a.tolist(), b.tolist()] for a, b in zip(markers[seen][:, columns], on_mesh[seen][:, columns], strict=True)
-        ]
+        pairs = torch.stack([markers[known], on_mesh[known]], 1)[..., columns].tolist()
         axes.add_collection(LineCollection(pairs, colors="grey", linewidths=1))
         axes.scatter(*on_mesh[:, columns].T, marker="x", s=22, color="#1f5fa8", label="mesh", linewidths=1)
-        axes.scatter(*markers[seen][:, columns].T, marker="+", s=28, color="#c8321e", label="marker", linewidths=1)
+        axes.scatter(*markers[known][:, columns].T, marker="+", s=28, color="#c8321e", label="marker", linewidths=1)
         axes.set(title=name, xlabel="mm", aspect="equal")
         if name == "side":  # the face looks to the left, as in a profile from the viewer's right
             axes.invert_xaxis()
     figure.legend(*axes.get_legend_handles_labels(), loc="outside right center", frameon=False)
-    figure.suptitle(f"{title} mean distance {float(error.mean()):.2f} mm, {int((~seen).sum())} not seen".strip())
+    figure.suptitle(f"{title} mean distance {float(error.mean()):.2f} mm, {int((~known).sum())} not seen".strip())
     return from_figure(figure)

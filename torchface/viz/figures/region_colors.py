@@ -63,12 +63,12 @@ def as_seen(mesh: Mesh) -> Mesh:
 
 def drawn_triangles(mesh: Mesh) -> Tensor:
     """Which triangles are drawn, (F,) bool: all but those of clear shells over the eye and of lashes."""
-    shown = torch.ones(len(mesh.faces), dtype=torch.bool)
+    drawn = torch.ones(len(mesh.faces), dtype=torch.bool)
     for name, mask in _regions(mesh).items():
         material = part_material(name)
         if material is not None and material.alpha == "BLEND":
-            shown &= ~mask[mesh.faces].all(1).cpu()
-    return shown
+            drawn &= ~mask[mesh.faces].all(1).cpu()
+    return drawn
 
 
 def _regions(mesh: Mesh) -> dict[str, Tensor]:

@@ -78,16 +78,16 @@ def lines_on_clay(mesh: Mesh, camera: Camera) -> Tensor:
     origins, directions = camera.rays(_SAMPLES)
     height, width = directions.shape[:2]
     hits = RayCaster(vertices, faces).cast(origins.reshape(-1, 3), directions.reshape(-1, 3))
-    seen = hits.triangle >= 0
+    hit = hits.triangle >= 0
     a, b, c = corners(vertices, faces)
     lengths = torch.stack([(b - c).norm(dim=-1), (c - a).norm(dim=-1), (a - b).norm(dim=-1)], dim=-1)
     # A corner's barycentric coordinate times its height is the distance to the edge that lies opposite.
     heights = 2 * triangle_areas(vertices, faces)[:, None] / lengths.clamp(min=1e-9)
     heights = heights.masked_fill(~_drawn(mesh), torch.inf)
-    triangle = hits.triangle[seen]
-    gap = (hits.barycentric[seen].double().clamp(min=1e-12) * heights[triangle]).amin(-1)
-    dark = torch.zeros(len(seen), dtype=torch.float64)
-    dark[seen] = (gap < _WIDTH / 2 * float(lengths.median())).double()
+    triangle = hits.triangle[hit]
+    gap = (hits.barycentric[hit].double().clamp(min=1e-12) * heights[triangle]).amin(-1)
+    dark = torch.zeros(len(hit), dtype=torch.float64)
+    dark[hit] = (gap < _WIDTH / 2 * float(lengths.median())).double()
     coverage = dark.view(height // _SAMPLES, _SAMPLES, width // _SAMPLES, _SAMPLES).mean((1, 3)).float()
     return image * (1 - _DARK * coverage)
 

@@ -28,8 +28,8 @@ def site_views(mesh: Mesh, before: Tensor, after: Tensor, yaws: Sequence[float] 
     images = []
     for yaw in yaws:
         camera = frame_face(mesh, yaw, width=560, height=700)
-        shown = facing(mesh, after, yaw)
-        old, new = camera.project(before[shown].double()), camera.project(after[shown].double())
+        front = facing(mesh, after, yaw)
+        old, new = camera.project(before[front].double()), camera.project(after[front].double())
         image = render(mesh, camera, clay_colors(mesh), samples=2)
         figure = Figure(figsize=(image.shape[2] / 100, image.shape[1] / 100), dpi=100)
         axes = figure.add_axes((0, 0, 1, 1))

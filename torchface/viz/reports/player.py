@@ -119,11 +119,11 @@ def write_player(player: Player, folder: Path, name: str = "performance") -> str
     frames = len(first.weights)
     step = max(1, round(player.fps / _MAX_RATE), math.ceil(frames / _MAX_FRAMES))
     rigs = list({id(take.rig): take.rig for take in player.takes}.values())
-    kept = [take.weights[::step] for take in player.takes]
+    thinned = [take.weights[::step] for take in player.takes]
     data: dict[str, Any] = {
         "fps": player.fps / step,
         "step": step,
-        "frames": len(kept[0]),
+        "frames": len(thinned[0]),
         "start": player.start // step,
         "shapes": first.rig.names,
         "curves": [first.rig.names.index(shape) for shape in player.curves],
@@ -134,7 +134,7 @@ def write_player(player: Player, folder: Path, name: str = "performance") -> str
                 "rig": next(i for i, rig in enumerate(rigs) if rig is take.rig),
                 "weights": _packed((weights.clamp(0, 1) * 65535).round(), np.uint16),
             }
-            for take, weights in zip(player.takes, kept, strict=True)
+            for take, weights in zip(player.takes, thinned, strict=True)
         ],
         "panels": [vars(panel) for panel in player.panels],
         "choices": list(player.choices),

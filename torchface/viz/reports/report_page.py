@@ -8,9 +8,9 @@ from pathlib import Path
 
 from torch import Tensor
 
+from torchface.escaped_text import as_markup
 from torchface.files.whole_files import all_or_none, make_folder, write_file
 from torchface.rendering.compositing import save_rendered_image
-from torchface.shown_text import as_markup
 
 _STYLE = """
 body { font: 15px/1.5 system-ui, sans-serif; margin: 2rem auto; max-width: 1240px; padding: 0 1rem; color: #222 }

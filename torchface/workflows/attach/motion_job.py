@@ -31,7 +31,7 @@ class MotionJob:
 
     def key(self, item: BatchItem) -> str:
         """A key of all that the sites depend on."""
-        return content_key(_METHOD, take=item.path, settings=item.owned(self))
+        return content_key(_METHOD, take=item.path, settings=item.settings_of(self))
 
     def run(self, item: BatchItem, out: Path) -> Made:
         """Finds the sites of a take and writes ``NAME.json`` and a picture of them, ``NAME.png``.
@@ -39,7 +39,7 @@ class MotionJob:
         Raises:
             TorchfaceError: they cannot be found.
         """
-        own, sites, picture = item.owned(self), out / f"{item.name}.json", out / f"{item.name}.png"
+        own, sites, picture = item.settings_of(self), out / f"{item.name}.json", out / f"{item.name}.png"
         done = attach(own.rig, item.path, sites, own.settings, picture)
         last = done.fit.errors[-1]
         error = float(torch.as_tensor(last).mean())

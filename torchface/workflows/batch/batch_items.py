@@ -43,30 +43,30 @@ class BatchItem:
     path: Path
 
     @overload
-    def own(self, path: Path) -> Path: ...
+    def path_of(self, path: Path) -> Path: ...
 
     @overload
-    def own(self, path: None) -> None: ...
+    def path_of(self, path: None) -> None: ...
 
     @overload
-    def own(self, path: Path | None) -> Path | None: ...
+    def path_of(self, path: Path | None) -> Path | None: ...
 
-    def own(self, path: Path | None) -> Path | None:
+    def path_of(self, path: Path | None) -> Path | None:
         """A path of an option for this item: ``{name}`` in it is the item's name."""
         return None if path is None else Path(str(path).replace(NAME, self.name))
 
-    def owned(self, settings: S) -> S:
+    def settings_of(self, settings: S) -> S:
         """Settings for this item: ``{name}`` in each path and text of the dataclass is the item's name."""
-        own: dict[str, Any] = {}
+        changed: dict[str, Any] = {}
         for field in fields(settings):
             value = getattr(settings, field.name)
             if isinstance(value, Path):
-                own[field.name] = self.own(value)
+                changed[field.name] = self.path_of(value)
             elif isinstance(value, str):
-                own[field.name] = value.replace(NAME, self.name)
+                changed[field.name] = value.replace(NAME, self.name)
             elif is_dataclass(value) and not isinstance(value, type):
-                own[field.name] = self.owned(value)
-        return replace(settings, **own)
+                changed[field.name] = self.settings_of(value)
+        return replace(settings, **changed)
 
 
 @dataclass(frozen=True)
@@ -113,31 +113,31 @@ def is_batch(inputs: Sequence[Path], kind: ItemKind) -> bool:
 def find_items(inputs: Sequence[str | Path], kind: ItemKind) -> FoundItems:
     """Files as named, and for each folder the items in it, sorted by name; absolute, none twice.
 
-    Files of another kind in a folder are left out and told; what may belong to an item (images, landmarks, tables) is
+    Files of another kind in a folder are left out and named; what may belong to an item (images, landmarks, tables) is
     left alone.
 
     Raises:
         FileFormatError: nothing is named, or a folder holds none.
     """
-    found: dict[Path, None] = {}
+    files: dict[Path, None] = {}
     left_out = []
-    for one in map(Path, inputs):
-        if not one.is_dir() or kind.holds(one):
-            found[one.resolve()] = None
+    for given in map(Path, inputs):
+        if not given.is_dir() or kind.holds(given):
+            files[given.resolve()] = None
             continue
-        shown = [path for path in sorted(one.iterdir()) if path.name[0] != "." and path.name not in _OWN]
-        inside = [path for path in shown if kind.holds(path)]
-        others = _others([path for path in shown if path not in set(inside)], kind)
+        visible = [path for path in sorted(given.iterdir()) if path.name[0] != "." and path.name not in _OWN]
+        inside = [path for path in visible if kind.holds(path)]
+        others = _others([path for path in visible if path not in set(inside)], kind)
         expected = f"expected {kind.noun}s ({', '.join(kind.endings)})"
         if not inside:
             found_instead = f" but {others}" if others else ""
-            raise FileFormatError(f"{one}: found no {kind.noun} in the folder{found_instead}, {expected}")
+            raise FileFormatError(f"{given}: found no {kind.noun} in the folder{found_instead}, {expected}")
         if others:
-            left_out.append(f"{one}: left out {others}, {expected}")
-        found |= dict.fromkeys(path.resolve() for path in inside)
-    if not found:
+            left_out.append(f"{given}: left out {others}, {expected}")
+        files |= dict.fromkeys(path.resolve() for path in inside)
+    if not files:
         raise FileFormatError(f"{kind.noun}s: found none named, expected files or folders")
-    paths = list(found)
+    paths = list(files)
     return FoundItems(tuple(map(BatchItem, _names(paths), paths)), tuple(left_out))
 
 
@@ -185,7 +185,7 @@ def _names(files: Sequence[Path]) -> list[str]:
     )
     names = [ways[0](path) for path in files]
     for way in ways[1:]:
-        # File systems may not tell upper from lower case.
+        # Some file systems do not distinguish upper from lower case.
         count = Counter(name.lower() for name in names)
         names = [way(path) if count[name.lower()] > 1 else name for name, path in zip(names, files, strict=True)]
     return names

@@ -10,6 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Protocol
 
+from torchface import zoo
 from torchface.errors import MissingExtraError, TorchfaceError
 from torchface.rendering.compositing import save_rendered_image
 from torchface.workflows.batch.batch_items import BatchItem
@@ -36,8 +37,8 @@ def attempt(job: BatchJob, item: BatchItem, out: Path) -> Outcome:
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
             made = job.run(item, out)
-        told = tuple(dict.fromkeys(str(one.message) for one in caught if issubclass(one.category, UserWarning)))
-        outcome = Outcome(item, made.results, made.figures, made.headline, (*made.notes, *told))
+        warned = dict.fromkeys(str(row.message) for row in caught if issubclass(row.category, UserWarning))
+        outcome = Outcome(item, made.results, made.figures, made.headline, (*made.notes, *warned))
         if made.picture is not None:
             save_rendered_image(made.picture, picture_path(out, item))
     except TorchfaceError as error:
@@ -66,7 +67,17 @@ def picture_path(out: Path, item: BatchItem) -> Path:
 
 def _causes(error: BaseException) -> Iterator[BaseException]:
     """An error and what it came from."""
-    found: BaseException | None = error
-    while found is not None:
-        yield found
-        found = found.__cause__
+    cause: BaseException | None = error
+    while cause is not None:
+        yield cause
+        cause = cause.__cause__
+
+
+def model_content(name: str | Path | None) -> str | Path | None:
+    """The folder or file of a model, of which a key takes the content; the name itself where there is none."""
+    if name is None or Path(name).exists():
+        return None if name is None else Path(name)
+    try:
+        return zoo.find(name)
+    except TorchfaceError:  # not a model of the zoo, such as "mediapipe" or "none"
+        return name

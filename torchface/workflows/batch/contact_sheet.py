@@ -10,10 +10,10 @@ import torch
 from PIL import Image, ImageDraw, ImageFont
 from torch import Tensor
 
+from torchface.escaped_text import visible
 from torchface.mesh import Mesh
 from torchface.rendering.clay_shading import render
 from torchface.rendering.compositing import caption, from_pillow, sheet
-from torchface.shown_text import visible
 from torchface.viz.figures.face_views import frame_face
 from torchface.workflows.batch.batch_job import picture_path
 from torchface.workflows.batch.outcomes import Outcome
@@ -37,11 +37,11 @@ def contact_sheet(outcomes: Sequence[Outcome], out: Path) -> Tensor:
         outcomes: of all items; the first :data:`MOST_PICTURES` are shown.
         out: the folder of results.
     """
-    shown = outcomes[:MOST_PICTURES]
-    pictures = [_picture(outcome, out) for outcome in shown]
+    pictured = outcomes[:MOST_PICTURES]
+    pictures = [_picture(outcome, out) for outcome in pictured]
     size = next((picture.shape[1:] for picture in pictures if picture is not None), torch.Size((HEIGHT, WIDTH)))
     cells = []
-    for outcome, picture in zip(shown, pictures, strict=True):
+    for outcome, picture in zip(pictured, pictures, strict=True):
         name = outcome.name if len(outcome.name) <= 20 else f"{outcome.name[:9]}..{outcome.name[-9:]}"
         view = _blank(outcome, *size) if picture is None else picture
         cells.append(caption(caption(view, name, _TEXT), outcome.headline if outcome.done else "skipped", _TEXT))

@@ -140,7 +140,7 @@ def write_summary(outcomes: Sequence[Outcome], path: Path) -> None:
     rows = []
     for outcome in outcomes:
         cells = [_cell(outcome.figures.get(name, "")) for name in columns]
-        results = "; ".join(found.relative_to(path.parent).as_posix() for found in outcome.results)
+        results = "; ".join(file.relative_to(path.parent).as_posix() for file in outcome.results)
         remarks = outcome.error or "; ".join(outcome.notes)
         status = _DONE if outcome.done else _SKIPPED
         seconds = (f"{outcome.seconds:.2f}", f"{outcome.processor_seconds:.2f}")

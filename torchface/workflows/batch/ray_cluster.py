@@ -67,13 +67,13 @@ def _check_answers(address: str) -> None:
     """Raises where nobody takes a connection at ``HOST:PORT``."""
     host, _, port = address.removeprefix("ray://").rpartition(":")
     host, port = (host, port) if host else (port, str(_PORT))
-    found: list[Exception] = []
+    errors: list[Exception] = []
 
     def connect() -> None:
         try:
             socket.create_connection((host.strip("[]"), int(port)), _SECONDS_TO_ANSWER).close()
         except (OSError, ValueError, OverflowError) as error:
-            found.append(error)
+            errors.append(error)
 
     # Where name servers do not answer, looking a name up takes longer than any time limit of a connection.
     thread = threading.Thread(target=connect, daemon=True)
@@ -81,8 +81,8 @@ def _check_answers(address: str) -> None:
     thread.join(_SECONDS_TO_ANSWER + 1)
     if thread.is_alive():
         raise _none_there(address, f"nobody answered within {_SECONDS_TO_ANSWER:g} seconds")
-    if found:
-        raise _none_there(address, str(found[0])) from found[0]
+    if errors:
+        raise _none_there(address, str(errors[0])) from errors[0]
 
 
 def on_cluster(
@@ -106,8 +106,8 @@ def on_cluster(
         ValueRangeError: no cluster answers.
     """
     ray = _import_ray()
-    own = not ray.is_initialized()
-    if own:
+    started_here = not ray.is_initialized()
+    if started_here:
         try:
             ray.init(address=address, log_to_driver=False, logging_level=logging.ERROR)
         except (ConnectionError, RuntimeError, ValueError, OSError) as error:
@@ -137,7 +137,7 @@ def on_cluster(
                         first = str(error).strip().partition("\n")[0]
                         yield lost(item, f"was lost {_ATTEMPTS} times on the cluster: {first}")
     finally:
-        if own:
+        if started_here:
             ray.shutdown()
 
 

@@ -89,7 +89,7 @@ class BatchReport:
 def run_batch(
     job: BatchJob,
     kind: ItemKind,
-    found: FoundItems,
+    inputs: FoundItems,
     out: str | Path,
     options: BatchOptions = ONE_BY_ONE,
     progress: Progress | None = None,
@@ -106,7 +106,7 @@ def run_batch(
     Args:
         job: what is done with each.
         kind: of the items.
-        found: the items.
+        inputs: the items.
         out: the folder of results, made where it is missing; not one that holds items.
         options: where the items are worked on.
         progress: called with how many items are done, and of how many; those of an earlier run count at once.
@@ -120,14 +120,14 @@ def run_batch(
     """
     options.check()
     folder, progress = Path(out).resolve(), progress or silent
-    step, items = f"{kind.noun}s {kind.done}", found.items
-    _check_apart(folder, found.items, kind)
+    step, items = f"{kind.noun}s {kind.done}", inputs.items
+    _check_apart(folder, inputs.items, kind)
     with within_job(folder):
-        kept = [outcome for item in items if (outcome := _kept(job, item, folder)) is not None]
-        outcomes = {outcome.name: outcome for outcome in kept}
+        earlier = [outcome for item in items if (outcome := _kept(job, item, folder)) is not None]
+        outcomes = {outcome.name: outcome for outcome in earlier}
         progress(step, len(outcomes), len(items))
         todo = [item for item in items if item.name not in outcomes]
-        for outcome in chain(kept, _worked_on(job, todo, folder, options)):
+        for outcome in chain(earlier, _worked_on(job, todo, folder, options)):
             if outcome.fatal:
                 raise FileFormatError(
                     f"{outcome.item.path}: {outcome.error}; {len(outcomes)} of {len(items)} {kind.noun}s are finished "
@@ -138,7 +138,7 @@ def run_batch(
                 finished(outcome)
             if not outcome.reused:
                 progress(step, len(outcomes), len(items))
-        report = BatchReport(kind, tuple(outcomes[item.name] for item in items), folder, found.left_out)
+        report = BatchReport(kind, tuple(outcomes[item.name] for item in items), folder, inputs.left_out)
         write_summary(report.outcomes, report.summary)
         save_rendered_image(contact_sheet(report.outcomes, folder), report.contact_sheet)
     return report

@@ -9,8 +9,8 @@ from torchface.files.content_keys import content_key
 from torchface.io.take_files import MARKER_ENDINGS
 from torchface.workflows.animated_meshes import is_animation
 from torchface.workflows.batch.batch_items import SCAN_ENDINGS, BatchItem, ItemKind
+from torchface.workflows.batch.batch_job import model_content
 from torchface.workflows.batch.contact_sheet import HEIGHT, WIDTH
-from torchface.workflows.batch.model_contents import model_content
 from torchface.workflows.batch.outcomes import Made
 from torchface.workflows.enhance.coarse_input import is_markers, tracked_animation
 from torchface.workflows.enhance.enhance_animation import EnhanceSettings, enhance_animation, spread_frames
@@ -43,7 +43,7 @@ class AnimationJob:
 
     def key(self, item: BatchItem) -> str:
         """A key of all that an animation's results depend on."""
-        own = item.owned(self)
+        own = item.settings_of(self)
         return content_key(_METHOD, animation=item.path, own=own, model=model_content(own.model))
 
     def run(self, item: BatchItem, out: Path) -> Made:
@@ -52,7 +52,7 @@ class AnimationJob:
         Raises:
             TorchfaceError: it cannot be enhanced.
         """
-        own, folder = item.owned(self), out / item.name
+        own, folder = item.settings_of(self), out / item.name
         done = enhance_animation(item.path, own.model, folder, own.settings)
         page = write_enhance_page(done, folder, own.height)
         shown = shown_frame(done.animation, done.model, done.frames, spread_frames(done, 1)[0])

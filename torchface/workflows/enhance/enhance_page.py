@@ -8,8 +8,8 @@ import torch
 from matplotlib.figure import Figure
 from torch import Tensor
 
+from torchface.escaped_text import as_markup
 from torchface.rendering.compositing import from_figure
-from torchface.shown_text import as_markup
 from torchface.viz.reports.report_page import Section, Table, write_page
 from torchface.workflows.enhance.enhance_animation import Enhanced, spread_frames
 from torchface.workflows.enhance.enhance_views import added_views, compared_frames, curvature_views, shown_frame

@@ -41,7 +41,9 @@ class ResultJob:
             truth: Path | None = self._truth(item)
         except FileFormatError:
             truth = None
-        return content_key(_METHOD, result=item.path, truth=truth, own=item.owned(self.settings), height=self.height)
+        return content_key(
+            _METHOD, result=item.path, truth=truth, own=item.settings_of(self.settings), height=self.height
+        )
 
     def run(self, item: BatchItem, out: Path) -> Made:
         """Compares a result with its truth and writes the folder ``NAME``.
@@ -50,7 +52,7 @@ class ResultJob:
             TorchfaceError: they cannot be compared.
         """
         folder = out / item.name
-        found = evaluate(item.path, [self._truth(item)], folder, item.owned(self.settings))
+        found = evaluate(item.path, [self._truth(item)], folder, item.settings_of(self.settings))
         page = write_evaluation_page(found, folder, self.height)
         whole = found.regions[ALL]
         return Made(
@@ -67,7 +69,7 @@ class ResultJob:
         )
 
     def _truth(self, item: BatchItem) -> Path:
-        truth = item.own(self.truth)
+        truth = item.path_of(self.truth)
         if not truth.is_dir() or is_animation(truth) or self.settings.scans:
             return truth
         named = sorted(path for path in truth.iterdir() if path.stem == item.path.stem and is_animation(path))

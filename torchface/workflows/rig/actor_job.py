@@ -14,8 +14,8 @@ from torchface.registration.landmark_files import landmark_file
 from torchface.rendering.compositing import sheet
 from torchface.viz.figures.heat_maps import error_colors
 from torchface.workflows.batch.batch_items import SCAN_ENDINGS, BatchItem, ItemKind
+from torchface.workflows.batch.batch_job import model_content
 from torchface.workflows.batch.contact_sheet import face_picture
-from torchface.workflows.batch.model_contents import model_content
 from torchface.workflows.batch.outcomes import Made
 from torchface.workflows.rig.actor_rig import ActorReport, RigOptions, rig_actor
 
@@ -71,7 +71,7 @@ class ActorJob:
         )
 
     def _own(self, item: BatchItem) -> ActorJob:
-        own = item.owned(self)
+        own = item.settings_of(self)
         if own.landmarks is not None and own.landmarks.is_dir():
             return replace(own, landmarks=landmark_file(own.landmarks, item.path))
         return own

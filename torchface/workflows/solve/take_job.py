@@ -43,12 +43,12 @@ class TakeJob:
         return content_key(
             _METHOD,
             take=item.path,
-            rig=item.own(self.rig),
-            attachment=item.own(self.attachment),
+            rig=item.path_of(self.rig),
+            attachment=item.path_of(self.attachment),
             settings=self.settings,
             part=self.part,
-            camera=None if self.camera is None else item.owned(self.camera),
-            options=item.owned(self.options),
+            camera=None if self.camera is None else item.settings_of(self.camera),
+            options=item.settings_of(self.options),
             written=[str(path) for path in (self.animation, self.report, self.live_link)],
         )
 
@@ -58,12 +58,20 @@ class TakeJob:
         Raises:
             TorchfaceError: it cannot be solved.
         """
-        weights, animation, live_link = out / f"{item.name}.csv", item.own(self.animation), item.own(self.live_link)
-        camera = None if self.camera is None else item.owned(self.camera)
-        rig, attachment, options = item.own(self.rig), item.own(self.attachment), item.owned(self.options)
+        weights, animation, live_link = (
+            out / f"{item.name}.csv",
+            item.path_of(self.animation),
+            item.path_of(self.live_link),
+        )
+        camera = None if self.camera is None else item.settings_of(self.camera)
+        rig, attachment, options = (
+            item.path_of(self.rig),
+            item.path_of(self.attachment),
+            item.settings_of(self.options),
+        )
         done = solve_take(
             TakeInputs(rig, item.path, attachment, self.part, camera, options),
-            TakeOutputs(weights, animation, live_link, item.own(self.report)),
+            TakeOutputs(weights, animation, live_link, item.path_of(self.report)),
             self.settings,
         )
         assert done.rig is not None

@@ -8,9 +8,9 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+from torchface.escaped_text import as_markup
 from torchface.evaluation import weight_jitter
 from torchface.rendering.compositing import caption, sheet
-from torchface.shown_text import as_markup
 from torchface.viz.figures.curves import error_curve, motion_curves, weight_curves
 from torchface.viz.reports.report_page import Section, Table, write_page
 from torchface.workflows.track.face_overlay import camera_at, mesh_drawer, paint_drawer

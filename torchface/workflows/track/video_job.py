@@ -10,8 +10,8 @@ import torch
 from torchface.files.content_keys import content_key
 from torchface.io.video import VIDEO_ENDINGS
 from torchface.workflows.batch.batch_items import BatchItem, ItemKind
+from torchface.workflows.batch.batch_job import model_content
 from torchface.workflows.batch.contact_sheet import face_picture
-from torchface.workflows.batch.model_contents import model_content
 from torchface.workflows.batch.outcomes import Made
 from torchface.workflows.track.track_inputs import TrackSettings
 from torchface.workflows.track.track_page import write_track_page
@@ -34,7 +34,7 @@ class VideoJob:
 
     def key(self, item: BatchItem) -> str:
         """A key of all that a video's results depend on."""
-        own = item.owned(self)
+        own = item.settings_of(self)
         names = ("landmarks", "appearance", "prior", "dynamics")
         contents = {name: model_content(getattr(own.settings, name)) for name in names}
         return content_key(_METHOD, video=item.path, rig=own.rig, settings=own.settings, **contents)
@@ -45,7 +45,7 @@ class VideoJob:
         Raises:
             TorchfaceError: it cannot be tracked.
         """
-        own, folder = item.owned(self), out / item.name
+        own, folder = item.settings_of(self), out / item.name
         done = track_video(item.path, own.rig, folder, own.settings)
         page = write_track_page(done, folder)
         errors = torch.where(done.seen, done.solution.errors, torch.nan)

@@ -13,6 +13,7 @@ from torchface.geometry.meshes.operators import components
 from torchface.io.gltf.region_materials import part_material
 from torchface.mesh import Mesh
 from torchface.rendering.clay_shading import CLAY
+from torchface.viz.figures.region_colors import drawn_triangles
 
 _MAX_COMPONENTS = 16
 _MAX_COLORS = 6
@@ -46,13 +47,13 @@ def split_parts(mesh: Mesh, most_colors: int = _MAX_COLORS) -> list[Part]:
         most_colors: at most; more look smoother and make more pieces.
     """
     mesh = mesh.to("cpu")
-    colors, shown = _triangle_colors(mesh)
+    colors, drawn = _triangle_colors(mesh)
     component = _components(mesh)
     classes, palette = _color_classes(colors, most_colors)
-    piece = torch.where(shown, component * len(palette) + classes, -1)
+    piece = torch.where(drawn, component * len(palette) + classes, -1)
     # A few triangles of a stray colour do not deserve a part of their own: they take their component's main one.
     for number in component.unique().tolist():
-        members = (component == number) & shown
+        members = (component == number) & drawn
         if not members.any():
             continue
         counts = torch.bincount(classes[members], minlength=len(palette))
@@ -82,21 +83,17 @@ def triangle_texture(mesh: Mesh) -> Tensor:
 
 
 def _triangle_colors(mesh: Mesh) -> tuple[Tensor, Tensor]:
+    """Colours (F,3), and which triangles are drawn, (F,)."""
     count = len(mesh.faces)
-    shown = torch.ones(count, dtype=torch.bool)
     if mesh.texture is not None and mesh.uvs is not None:
-        return triangle_texture(mesh).float(), shown
+        return triangle_texture(mesh).float(), torch.ones(count, dtype=torch.bool)
     if mesh.colors is not None:
-        return mesh.colors[mesh.faces].mean(1).float(), shown
+        return mesh.colors[mesh.faces].mean(1).float(), torch.ones(count, dtype=torch.bool)
     colors = torch.tensor(CLAY).repeat(count, 1)
-    regions = {} if mesh.annotations is None else mesh.annotations.regions
-    for name, mask in regions.items():
-        material, inside = part_material(name), mask[mesh.faces].all(1)
-        if material is not None and material.alpha == "BLEND":
-            shown &= ~inside  # clear shells over the eye, and lashes that are cards for a texture
-        elif material is not None:
-            colors[inside] = torch.tensor(material.color)
-    return colors, shown
+    for name, mask in ({} if mesh.annotations is None else mesh.annotations.regions).items():
+        if (material := part_material(name)) is not None:
+            colors[mask[mesh.faces].all(1)] = torch.tensor(material.color)
+    return colors, drawn_triangles(mesh)
 
 
 def _components(mesh: Mesh) -> Tensor:

@@ -16,7 +16,7 @@ def visible(text: str) -> str:
         >>> visible("smile\x1b[2Jleft")
         'smile\\x1b[2Jleft'
     """
-    return _HARMFUL.sub(lambda found: found[0].encode("unicode_escape").decode("ascii"), text)
+    return _HARMFUL.sub(lambda match: match[0].encode("unicode_escape").decode("ascii"), text)
 
 
 def as_markup(text: str) -> str:
