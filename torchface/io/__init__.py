@@ -14,13 +14,13 @@ from torchface.io.landmarks.picks import (
 )
 from torchface.io.mesh_files import load_mesh, save_mesh
 from torchface.io.meshes.mesh_sequence import MeshSequence, MeshSequenceWriter
+from torchface.io.protocols.weight_sender import WeightSender, open_sender
 from torchface.io.rig_files import load_animation, load_detail_maps, load_rig, save_animation, save_rig
 from torchface.io.rigs.ict_facekit import IdentityModes, load_ict_facekit, load_identity_modes
 from torchface.io.rigs.rig_folder import load_obj_folder
 from torchface.io.scenes.weight_keys import ShapeMatch
 from torchface.io.take_files import load_take, save_take
 from torchface.io.weights.live_link_csv import save_live_link
-from torchface.io.weights.weight_senders import WeightSender, open_sender
 
 __all__ = [
     "Correspondences",

@@ -18,7 +18,8 @@ from torchface.io.images.image_files import IMAGE_ENDINGS, load_image
 from torchface.io.mesh_files import MESH_ENDINGS
 from torchface.io.rig_files import SCENE_ENDINGS
 from torchface.io.take_files import TAKE_ENDINGS
-from torchface.io.video import VIDEO_ENDINGS, open_video
+from torchface.io.video import open_video
+from torchface.io.video.video_file import VIDEO_ENDINGS
 from torchface.mesh import Mesh
 from torchface.rig import BlendshapeRig
 from torchface.take import Take

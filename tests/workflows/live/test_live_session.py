@@ -12,13 +12,13 @@ import numpy as np
 import pytest
 import torch
 from planted_faces import JAW, SMILE, Endless, ShadeSolver, film
+from received_frames import decode_frame
 
 from torchface import BlendshapeRig, load_rig, load_take, save_rig
 from torchface.capture.anybody import WebcamControls
 from torchface.cli import main
 from torchface.errors import FileFormatError, ValueRangeError
 from torchface.io.gltf.animation_reading import read_gltf_weights
-from torchface.io.weights.live_link_stream import decode_frame
 from torchface.shape_names import ARKIT
 from torchface.workflows.live import character as characters
 from torchface.workflows.live import live_webcam, person_solver

@@ -7,13 +7,13 @@ from pathlib import Path
 
 import pytest
 import torch
+from received_frames import decode_frame
 
 from torchface import BlendshapeRig, Take, Track, load_take, save_rig, save_take
 from torchface.capture import MarkerSolver
 from torchface.cli import main
 from torchface.errors import ValueRangeError
 from torchface.evaluation import weight_jitter
-from torchface.io.weights.live_link_stream import decode_frame
 from torchface.onnx.live_solver import LiveMarkerSolver
 from torchface.onnx.solver_graph_export import random_frames
 from torchface.shape_names import ARKIT

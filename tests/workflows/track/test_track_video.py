@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 import torch
 from forked_runs import held, killed
+from received_frames import decode_frame
 from safetensors.torch import load_file
 
 from planted.light_stage import LightStageSettings, render_lit_video
@@ -24,7 +25,6 @@ from torchface.geometry.rotations import rotation_matrix
 from torchface.io.camera_files import save_calibration
 from torchface.io.gltf.animation_reading import read_gltf_weights
 from torchface.io.video import VideoFile, open_video, write_video
-from torchface.io.weights.live_link_stream import decode_frame
 from torchface.landmarks import FaceReading
 from torchface.landmarks.images.tracking.landmark_tracker import LandmarkTracker
 from torchface.rendering.point_light import PointLight

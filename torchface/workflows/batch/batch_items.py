@@ -13,7 +13,7 @@ from torchface.errors import FileFormatError, ValueRangeError
 from torchface.io.mesh_files import MESH_ENDINGS
 from torchface.io.rig_files import SCENE_ENDINGS
 from torchface.io.take_files import MARKER_ENDINGS
-from torchface.io.video import VIDEO_ENDINGS
+from torchface.io.video.video_file import VIDEO_ENDINGS
 
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from torchface.errors import ValueRangeError
 from torchface.files.whole_files import all_or_none, make_folder
-from torchface.io.weights.udp_sending import find_receiver
+from torchface.io.protocols.weight_sender import find_receiver
 from torchface.number_checks import checked_number
 from torchface.progress import Progress, silent
 from torchface.workflows.live.actor_solver import ActorSolver
@@ -39,7 +39,7 @@ def track_live(
     Args:
         camera: a device's number, or a video file, which is played at its own rate.
         rig: the actor's.
-        addresses: see :func:`torchface.io.weights.weight_senders.open_sender`.
+        addresses: see :func:`torchface.io.open_sender`.
         out: a folder for the curves of what was sent; none are kept without.
         settings: models, calibration, face.
         seconds: after which it ends; until it is interrupted (Ctrl-C) or the video ends if absent.

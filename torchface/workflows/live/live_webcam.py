@@ -9,7 +9,7 @@ from pathlib import Path
 
 from torchface.errors import ValueRangeError
 from torchface.files.job_lock import job_lock
-from torchface.io.weights.udp_sending import find_receiver
+from torchface.io.protocols.weight_sender import find_receiver
 from torchface.landmarks.images.boxes.network_detector import shipped_detector
 from torchface.number_checks import checked_number
 from torchface.progress import Progress, silent
@@ -37,7 +37,7 @@ class LiveSettings:
             ``record`` names a folder.
         character: a rig by ARKit's names; the embedded performer if absent.
         mapping: a table for shapes of other names.
-        addresses: see :func:`torchface.io.weights.weight_senders.open_sender`.
+        addresses: see :func:`torchface.io.open_sender`.
         record: a folder to record into from the first frame on.
         calibrate: begin with the guided calibration.
         page: open the page in the browser.

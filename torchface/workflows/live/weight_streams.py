@@ -9,14 +9,14 @@ from types import TracebackType
 from torch import Tensor
 
 from torchface.errors import ValueRangeError
-from torchface.io.weights.weight_senders import WeightSender, open_sender
+from torchface.io.protocols.weight_sender import WeightSender, open_sender
 
 
 class WeightStreams:
     """Senders to several addresses.
 
     Args:
-        addresses: see :func:`torchface.io.weights.weight_senders.open_sender`.
+        addresses: see :func:`torchface.io.open_sender`.
         names: of the weights, (N,).
         fps: frames a second.
         say: told once a receiver that refuses packets, or that the network no longer reaches.

@@ -26,7 +26,7 @@ from torchface.evaluation import marker_rmse
 from torchface.files.whole_files import make_folder
 from torchface.geometry.similarity import Similarity
 from torchface.io import load_rig, save_animation
-from torchface.io.weights.udp_sending import find_receiver
+from torchface.io.protocols.weight_sender import find_receiver
 from torchface.onnx.live_solver import LiveMarkerSolver
 from torchface.progress import Progress, silent
 from torchface.rig import BlendshapeRig

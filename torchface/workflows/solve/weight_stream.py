@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from torchface.errors import ValueRangeError
-from torchface.io.weights.weight_senders import open_sender
+from torchface.io.protocols.weight_sender import open_sender
 from torchface.onnx.live_solver import LiveMarkerSolver
 from torchface.temporal import OneEuroFilter
 
@@ -77,7 +77,7 @@ def stream_weights(
         frames: (N,) each; each is asked for when it is due.
         names: of the weights.
         fps: frames a second; a frame that comes too early waits, one that comes too late goes at once.
-        address: where to and how; see :func:`torchface.io.weights.weight_senders.open_sender`.
+        address: where to and how; see :func:`torchface.io.open_sender`.
         clock, wait: what time it is, and to let it pass, in seconds.
 
     Raises:

@@ -8,7 +8,7 @@ from pathlib import Path
 import torch
 
 from torchface.files.content_keys import content_key
-from torchface.io.video import VIDEO_ENDINGS
+from torchface.io.video.video_file import VIDEO_ENDINGS
 from torchface.workflows.batch.batch_items import BatchItem, ItemKind
 from torchface.workflows.batch.batch_job import model_content
 from torchface.workflows.batch.contact_sheet import face_picture

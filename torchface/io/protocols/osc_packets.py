@@ -13,114 +13,86 @@ from pythonosc.osc_message_builder import OscMessageBuilder
 from torch import Tensor
 
 from torchface.errors import NameMismatchError, ShapeError
-from torchface.io.weights.arkit_weights import ArkitWeights
-from torchface.io.weights.udp_sending import UdpSocket, parse_address
+from torchface.io.protocols.live_link_packets import ArkitWeights, rotations_sent
 from torchface.io.weights.weight_csv import ROTATIONS
 from torchface.shape_names import ARKIT
 
-DEFAULT_PREFIX = "/torchface"
+_DEFAULT_PREFIX = "/torchface"
 
 _LARGEST_VMC = 1400  # bytes of a packet, which one Ethernet frame must hold
 _LARGEST = 60_000  # what UDP carries
 _NOT_IN_ADDRESSES = re.compile(r"[^!-~]|[#*,/?\[\]{}]")  # what OSC gives another meaning in an address
 
 
-class VmcSender:
-    """Sends weights by the VMC protocol: ``/VMC/Ext/Blend/Val`` a shape by ARKit's names, ``/VMC/Ext/Blend/Apply``,
-    the head's rotation as ``/VMC/Ext/Bone/Pos``, ``/VMC/Ext/OK`` and ``/VMC/Ext/T``.
+class VmcPackets:
+    """Packets of the VMC protocol: ``/VMC/Ext/Blend/Val`` a shape by ARKit's names, ``/VMC/Ext/Blend/Apply``, the
+    head's rotation as ``/VMC/Ext/Bone/Pos``, ``/VMC/Ext/OK`` and ``/VMC/Ext/T``.
 
     Args:
-        address: ``vmc://HOST:PORT``; programs listen on port 39539.
         names: of the weights that come, (N,); any rig's names that ARKit's can be had from.
         clock: what time it is, seconds.
 
     Raises:
-        ValueRangeError: the address is none, or its host is not known.
         NameMismatchError: not one name is one of ARKit's.
 
     Source: Virtual Motion Capture Protocol, marionette specification, protocol.vmc.info.
     """
 
-    def __init__(self, address: str, names: Sequence[str], clock: Callable[[], float] = time.perf_counter) -> None:
-        self._arkit, self._clock = ArkitWeights(names), clock
-        self._socket = UdpSocket(address)
-        self._began = clock()
+    def __init__(self, names: Sequence[str], clock: Callable[[], float] = time.perf_counter) -> None:
+        self._arkit, self._clock, self._began = ArkitWeights(names), clock, clock()
 
-    def send(self, weights: Tensor, rotations: Tensor | None = None) -> bool:
-        """Sends one frame: weights (N,), rotations (9,) in radians, of which the head's count; NaN is sent as 0.
-
-        Returns:
-            Whether nothing told that a frame before was refused.
+    def __call__(self, weights: Tensor, rotations: Tensor | None) -> list[bytes]:
+        """The packets of a frame: weights (N,), rotations (9,) in radians, of which the head's count.
 
         Raises:
-            ShapeError: another number of weights than names.
-            ValueRangeError: this machine cannot send there.
+            ShapeError: another number of weights than names, or of rotations than nine.
         """
-        turned = torch.zeros(len(ROTATIONS)) if rotations is None else rotations
         messages = [
             _message("/VMC/Ext/OK", 1),
             _message("/VMC/Ext/T", self._clock() - self._began),
             # The skeleton keeps its own places of bones: a receiver adds the rotation to the rest pose.
-            _message("/VMC/Ext/Bone/Pos", "Head", 0.0, 0.0, 0.0, *unity_quaternion(turned[:3])),
+            _message("/VMC/Ext/Bone/Pos", "Head", 0.0, 0.0, 0.0, *unity_quaternion(rotations_sent(rotations)[:3])),
         ]
         values = self._arkit(weights).tolist()
         messages += [_message("/VMC/Ext/Blend/Val", name, value) for name, value in zip(ARKIT, values, strict=True)]
         messages.append(_message("/VMC/Ext/Blend/Apply"))
-        welcome = [self._socket.send(packet) for packet in _bundles(messages, _LARGEST_VMC)]
-        return all(welcome)
-
-    def close(self) -> None:
-        """Gives the socket back."""
-        self._socket.close()
+        return _bundles(messages, _LARGEST_VMC)
 
 
-class OscSender:
-    """Sends weights as plain OSC, one bundle a frame: ``PREFIX/weights/NAME`` and, in radians,
+class OscPackets:
+    """Packets of plain OSC, one bundle a frame: ``PREFIX/weights/NAME`` and, in radians,
     ``PREFIX/rotations/HeadYaw`` and so on by Live Link Face's nine names, one float each.
 
     Args:
-        address: ``osc://HOST:PORT/PREFIX``; ``/torchface`` is the prefix if absent.
         names: of the weights that come, (N,).
+        prefix: of the addresses; ``/torchface`` if empty.
 
     Raises:
-        ValueRangeError: the address is none, or its host is not known.
         NameMismatchError: a name that no OSC address can hold.
     """
 
-    def __init__(self, address: str, names: Sequence[str]) -> None:
+    def __init__(self, names: Sequence[str], prefix: str = "") -> None:
         strange = [name for name in names if not name or _NOT_IN_ADDRESSES.search(name)]
         if strange:
             raise NameMismatchError(
                 f"stream: found the shape {strange[0]!r:.60}, expected names without blanks and without any of "
                 "# * , / ? [ ] { }, which OSC addresses cannot hold"
             )
-        prefix = parse_address(address).path or DEFAULT_PREFIX
-        self._weights = [f"{prefix}/weights/{name}" for name in names]
-        self._rotations = [f"{prefix}/rotations/{name}" for name in ROTATIONS]
-        self._socket = UdpSocket(address)
+        prefix = prefix or _DEFAULT_PREFIX
+        self._count = len(names)
+        self._addresses = [f"{prefix}/weights/{name}" for name in names]
+        self._addresses += [f"{prefix}/rotations/{name}" for name in ROTATIONS]
 
-    def send(self, weights: Tensor, rotations: Tensor | None = None) -> bool:
-        """Sends one frame: weights (N,), rotations (9,) in radians; NaN is sent as 0.
-
-        Returns:
-            Whether nothing told that a frame before was refused.
+    def __call__(self, weights: Tensor, rotations: Tensor | None) -> list[bytes]:
+        """The packets of a frame: weights (N,), rotations (9,) in radians; NaN is sent as 0.
 
         Raises:
-            ShapeError: another number of weights than names.
-            ValueRangeError: this machine cannot send there.
+            ShapeError: another number of weights than names, or of rotations than nine.
         """
-        if weights.shape != (len(self._weights),):
-            raise ShapeError(f"stream: found weights {tuple(weights.shape)}, expected ({len(self._weights)},)")
-        turned = torch.zeros(len(ROTATIONS)) if rotations is None else rotations
-        values = torch.cat([weights.detach().float().cpu(), turned.float()]).nan_to_num(0.0).tolist()
-        addresses = self._weights + self._rotations
-        messages = [_message(address, value) for address, value in zip(addresses, values, strict=True)]
-        welcome = [self._socket.send(packet) for packet in _bundles(messages)]
-        return all(welcome)
-
-    def close(self) -> None:
-        """Gives the socket back."""
-        self._socket.close()
+        if weights.shape != (self._count,):
+            raise ShapeError(f"stream: found weights {tuple(weights.shape)}, expected ({self._count},)")
+        values = torch.cat([weights.detach().float().cpu().nan_to_num(0.0), rotations_sent(rotations)]).tolist()
+        return _bundles([_message(address, value) for address, value in zip(self._addresses, values, strict=True)])
 
 
 def unity_quaternion(angles: Tensor) -> tuple[float, float, float, float]:

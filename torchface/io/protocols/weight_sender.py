@@ -1,16 +1,24 @@
-"""Packets to one place over UDP: addresses, the host looked up, and a receiver that is not there."""
+"""Senders of frames of weights over UDP, by the scheme of an address."""
 
 from __future__ import annotations
 
 import re
 import socket
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from torch import Tensor
+
 from torchface.errors import ValueRangeError
+from torchface.io.protocols.live_link_packets import LiveLinkPackets
+from torchface.io.protocols.osc_packets import OscPackets, VmcPackets
+
+Encode = Callable[[Tensor, Tensor | None], list[bytes]]
+"""Packets of a frame: weights (N,), and rotations (9,) in radians, none of which turn the head."""
 
 DEFAULT_PORTS = {"livelink": 11111, "vmc": 39539}
-"""Where receivers listen unless they are told otherwise; the other schemes' addresses name their port."""
+"""Where receivers listen unless they are set up otherwise; the other schemes' addresses name their port."""
 
 _SCHEMES = ("udp", "livelink", "vmc", "osc")
 _ADDRESS = re.compile(
@@ -68,35 +76,48 @@ def find_receiver(address: str) -> tuple[socket.AddressFamily, Any]:
     return family, target
 
 
-class UdpSocket:
-    """Sends packets to one address; that nobody listens there yet is counted and no error.
+class WeightSender:
+    """Sends one frame after another to one address; that nobody listens there yet is reported and no error.
 
     Args:
-        address: as :func:`parse_address` takes it. A broadcast address reaches a whole network.
+        address: see :func:`open_sender`. A broadcast address reaches a whole network.
+        encode: makes the packets of a frame.
 
     Raises:
         ValueRangeError: the address is none, its host is not known, or this machine's network does not reach it.
     """
 
-    def __init__(self, address: str) -> None:
+    def __init__(self, address: str, encode: Encode) -> None:
         family, target = find_receiver(address)
-        self.address = address
+        self.address, self._encode = address, encode
         self._socket = socket.socket(family, socket.SOCK_DGRAM)
         self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_BROADCAST, 1)
         try:
-            self._socket.connect(target)  # of one that is not connected the system tells no refusal
+            self._socket.connect(target)  # of one that is not connected the system reports no refusal
         except OSError as error:
             self._socket.close()
             raise self._unreachable(error) from error
 
-    def send(self, packet: bytes) -> bool:
-        """Sends a packet; whether nothing said that a packet before it was refused.
+    def send(self, weights: Tensor, rotations: Tensor | None = None) -> bool:
+        """Sends one frame: weights (N,), Live Link Face's rotations (9,) in radians; NaN is sent as 0.
+
+        Returns:
+            Whether no packet before was reported as refused.
 
         Raises:
+            ShapeError: another number of weights than names.
             ValueRangeError: this machine cannot send there.
         """
+        welcome = [self._send(packet) for packet in self._encode(weights, rotations)]
+        return all(welcome)
+
+    def close(self) -> None:
+        """Gives the socket back."""
+        self._socket.close()
+
+    def _send(self, packet: bytes) -> bool:
         welcome = True
-        for _ in range(2):  # the first call tells of the packet before and sends nothing
+        for _ in range(2):  # the first call reports the packet before and sends nothing
             try:
                 self._socket.send(packet)
                 return welcome
@@ -106,12 +127,34 @@ class UdpSocket:
                 raise self._unreachable(error) from error
         return welcome
 
-    def close(self) -> None:
-        """Gives the socket back."""
-        self._socket.close()
-
     def _unreachable(self, error: OSError) -> ValueRangeError:
         return ValueRangeError(
             f"stream: cannot send to {self.address} ({error.strerror or error}); expected an address that this "
             "machine's network reaches"
         )
+
+
+def open_sender(address: str, names: Sequence[str], fps: float) -> WeightSender:
+    """A sender to an address.
+
+    Args:
+        address: ``udp://HOST:PORT`` or ``livelink://HOST:PORT`` for Live Link Face's packets, ``vmc://HOST:PORT`` for
+            the VMC protocol, ``osc://HOST:PORT/PREFIX`` for plain OSC.
+        names: of the weights that come, (N,).
+        fps: frames a second.
+
+    Raises:
+        ValueRangeError: the address is none, or its host is not known or not reached; or ``fps`` is no camera's.
+        NameMismatchError: the protocol cannot carry weights by these names.
+
+    Example:
+        >>> sender = open_sender("vmc://127.0.0.1:39539", ["jawOpen", "browInnerUp"], fps=60.0)
+        >>> nobody_refused = sender.send(torch.tensor([0.5, 0.0]))
+        >>> sender.close()
+    """
+    parts = parse_address(address)
+    if parts.scheme == "vmc":
+        return WeightSender(address, VmcPackets(names))
+    if parts.scheme == "osc":
+        return WeightSender(address, OscPackets(names, parts.path))
+    return WeightSender(address, LiveLinkPackets(names, fps))
