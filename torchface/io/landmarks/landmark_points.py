@@ -82,7 +82,8 @@ class LandmarkPoints:
             )
         order = torch.cat(chosen)
         if len(order.unique()) != len(order):
-            raise ShapeError(f"{self.source}: found points in two of the groups {listed}, expected one each")
+            found = f"points that belong to two of the groups {listed}"
+            raise ShapeError(f"{self.source}: found {found}, expected one each")
         return order
 
 
