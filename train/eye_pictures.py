@@ -10,13 +10,13 @@ import torch
 from torch import Tensor
 from torch.utils.data import Dataset
 
-from torchface.files.shards import Shards
 from torchface.landmarks.images.networks.eye_augmentation import EyeLabels
 from torchface.progress import Progress
 
 from .face_pictures import head_kinds
 from .rendered_files import Rendering, rendered_files
 from .rendered_people.eye_picture import draw_eye_pictures
+from .tensor_shards import Shards
 
 PART = 200
 """Pictures in a file: what a killed run loses at most."""

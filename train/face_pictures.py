@@ -12,7 +12,6 @@ from torch import Tensor
 from torch.utils.data import Dataset
 
 from torchface.errors import FileFormatError
-from torchface.files.shards import Shards
 from torchface.io import load_ict_facekit, load_identity_modes
 from torchface.progress import Progress
 
@@ -20,6 +19,7 @@ from .rendered_files import Rendering, rendered_files
 from .rendered_people.face_picture import draw_pictures
 from .rendered_people.face_scenes import cut_out, upright_faces
 from .rendered_people.head_kind import HeadKind, people_kind, performer_kind
+from .tensor_shards import Shards
 
 PART = 240
 """Pictures in a file: what a killed run loses at most."""

@@ -12,8 +12,9 @@ import torch
 from torch import Tensor
 
 from torchface.files.checkpoints import read_checkpoint, write_checkpoint
-from torchface.files.shards import Shards
 from torchface.files.whole_files import make_folder
+
+from .tensor_shards import Shards
 
 
 @dataclass(frozen=True, eq=False)

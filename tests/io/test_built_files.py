@@ -23,8 +23,9 @@ from torchface.io import (
     load_take,
 )
 from torchface.io.action_labels import load_action_labels
-from torchface.io.gltf import read_gltf_detail, read_gltf_rig
 from torchface.io.gltf.animation_reading import read_gltf_weights
+from torchface.io.gltf.gltf_reading import read_gltf_rig
+from torchface.io.gltf.wrinkle_maps import read_gltf_detail
 from torchface.io.landmarks.dlib_xml import load_dlib_faces
 from torchface.landmarks.scans.scan_annotations import load_annotations
 

@@ -5,12 +5,14 @@ from __future__ import annotations
 from pathlib import Path
 
 from torchface.files.whole_files import check_ending
-from torchface.io.gltf import read_gltf_mesh, save_gltf_mesh
+from torchface.io.gltf.gltf_reading import read_gltf_mesh
+from torchface.io.gltf.gltf_writing import save_gltf_mesh
 from torchface.io.meshes.obj import read_obj, write_obj
 from torchface.io.meshes.off import read_off, write_off
 from torchface.io.meshes.ply import read_ply, write_ply
 from torchface.io.meshes.stl import read_stl, write_stl
-from torchface.io.usd import USD_ENDINGS, read_usd_mesh, write_usd_mesh
+from torchface.io.usd.usd_reading import read_usd_mesh
+from torchface.io.usd.usd_writing import USD_ENDINGS, write_usd_mesh
 from torchface.mesh import Mesh
 
 _READERS = {".obj": read_obj, ".ply": read_ply, ".stl": read_stl, ".off": read_off}

@@ -9,11 +9,16 @@ from torchface.errors import FileFormatError
 from torchface.files.whole_files import check_ending
 from torchface.geometry.meshes.normal_maps import DetailMaps
 from torchface.geometry.meshes.region_maps import RegionMaps
-from torchface.io.gltf import read_gltf_detail, read_gltf_rig, read_gltf_weights, write_gltf_rig
+from torchface.io.gltf.animation_reading import read_gltf_weights
+from torchface.io.gltf.gltf_reading import read_gltf_rig
+from torchface.io.gltf.gltf_writing import write_gltf_rig
+from torchface.io.gltf.wrinkle_maps import read_gltf_detail
 from torchface.io.rigs.ict_facekit import is_ict_folder, load_ict_facekit, region
 from torchface.io.rigs.rig_folder import load_obj_folder, save_obj_folder
 from torchface.io.scenes.weight_keys import ShapeMatch, WeightKeys, weight_keys
-from torchface.io.usd import USD_ENDINGS, read_usd_detail, read_usd_rig, read_usd_weights, require_usd, write_usd_rig
+from torchface.io.usd.usd_library import require_usd
+from torchface.io.usd.usd_reading import read_usd_detail, read_usd_rig, read_usd_weights
+from torchface.io.usd.usd_writing import USD_ENDINGS, write_usd_rig
 from torchface.rig import BlendshapeRig
 from torchface.take import Take
 
@@ -75,9 +80,9 @@ def save_rig(rig: BlendshapeRig, path: str | Path, detail: DetailMaps | RegionMa
 
     Args:
         rig: the rig.
-        path: a ``.glb``, see ``torchface.io.gltf``; a ``.usda``, ``.usdc``, ``.usd`` or ``.usdz``, see
-            ``torchface.io.usd``; or a name without an ending, for a folder of ``neutral.obj`` and an OBJ a shape, see
-            ``save_obj_folder``. It appears only when it is complete.
+        path: a ``.glb`` (metres; parts that regions name have materials of their own; shapes are sparse morph targets,
+            correctives among them); a ``.usda``, ``.usdc``, ``.usd`` or ``.usdz``; or a name without an ending, for a
+            folder of ``neutral.obj`` and an OBJ a shape. It appears only when it is complete.
         detail: wrinkle maps of its shapes, or of its regions, for ``.glb`` alone.
 
     Raises:

@@ -12,7 +12,7 @@ from torchface.io.landmarks.landmark_points import load_landmark_points
 from torchface.io.landmarks.picks import load_correspondences
 from torchface.io.length_units import millimetres_per
 from torchface.io.rig_files import GLTF_ENDINGS
-from torchface.io.usd import USD_ENDINGS
+from torchface.io.usd.usd_writing import USD_ENDINGS
 from torchface.mesh import Mesh
 from torchface.registration.scan_preparation import Landmarks
 

@@ -15,7 +15,8 @@ from torchface.io.mesh_files import MESH_ENDINGS
 from torchface.io.rig_files import GLTF_ENDINGS, SCENE_ENDINGS, check_rig_ending, write_rig
 from torchface.io.rigs.ict_facekit import region
 from torchface.io.scenes.weight_keys import weight_keys
-from torchface.io.usd import USD_ENDINGS, require_usd
+from torchface.io.usd.usd_library import require_usd
+from torchface.io.usd.usd_writing import USD_ENDINGS
 from torchface.mesh import Mesh, submesh
 from torchface.progress import Progress, silent
 from torchface.rig import BlendshapeRig

@@ -10,7 +10,7 @@ import torch
 
 from torchface.errors import NameMismatchError
 from torchface.files.whole_files import all_or_none, check_ending, check_writable, make_folder
-from torchface.io.usd import USD_ENDINGS
+from torchface.io.usd.usd_writing import USD_ENDINGS
 from torchface.io.weights.live_link_csv import not_in_live_link, save_live_link
 from torchface.io.weights.weight_csv import save_weights_csv
 from torchface.shape_names import ARKIT, mapping

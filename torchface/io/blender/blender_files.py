@@ -21,8 +21,8 @@ from torchface.io.gltf.corrective_extras import all_targets
 from torchface.io.scene_processes.reading_process import read_scene, run_process
 from torchface.io.scene_processes.scene_arrays import scene_mesh, scene_rig, scene_weights
 from torchface.io.scenes.weight_keys import WeightKeys
-from torchface.io.usd import write_usd_rig
 from torchface.io.usd.usd_reading import checked_size
+from torchface.io.usd.usd_writing import write_usd_rig
 from torchface.mesh import Mesh
 from torchface.rig import BlendshapeRig
 from torchface.take import Take

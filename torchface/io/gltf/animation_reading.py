@@ -37,13 +37,6 @@ def read_gltf_weights(path: str | Path) -> Take | None:
 
     Raises:
         FileFormatError: not glTF 2, broken, or keys that are no frames: out of order, or with gaps of ten frames.
-
-    Example:
-        >>> from torchface.io import save_mesh
-        >>> from torchface.synthetic import neutral_head
-        >>> save_mesh(neutral_head(texture=False), "still.glb")
-        >>> read_gltf_weights("still.glb") is None
-        True
     """
     document = read_document(path)
     weights: dict[str, np.ndarray] = {}

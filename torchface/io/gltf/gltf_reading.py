@@ -41,13 +41,6 @@ def read_gltf_rig(path: str | Path, unit: str = "m") -> BlendshapeRig:
 
     Raises:
         FileFormatError: not glTF 2, truncated, broken, or without morph targets.
-
-    Example:
-        >>> from torchface.io.gltf import write_gltf_rig
-        >>> rig = BlendshapeRig.from_tensors(torch.eye(3), torch.tensor([[0, 1, 2]]), torch.ones(1, 3, 3), ["jawOpen"])
-        >>> write_gltf_rig(rig, "actor.glb")
-        >>> read_gltf_rig("actor.glb").names
-        ('jawOpen',)
     """
     document = read_document(path)
     neutral, deltas, names = _read(document, millimetres_per(unit))
@@ -63,12 +56,6 @@ def read_gltf_mesh(path: str | Path, unit: str = "m") -> Mesh:
 
     Raises:
         FileFormatError: not glTF 2, truncated, broken, or without triangles.
-
-    Example:
-        >>> from torchface.io.gltf import save_gltf_mesh
-        >>> save_gltf_mesh(Mesh(torch.eye(3), torch.tensor([[0, 1, 2]])), "triangle.glb")
-        >>> read_gltf_mesh("triangle.glb").vertices.round(decimals=4).tolist() == torch.eye(3).tolist()
-        True
     """
     return _read(read_document(path), millimetres_per(unit))[0]
 

@@ -89,13 +89,6 @@ def read_gltf_detail(path: str | Path) -> DetailMaps | None:
 
     Raises:
         FileFormatError: not glTF 2, a broken list, images of different sizes, or more of them than the file can hold.
-
-    Example:
-        >>> from torchface.io import save_mesh
-        >>> from torchface.synthetic import neutral_head
-        >>> save_mesh(neutral_head(texture=False), "smooth.glb")
-        >>> read_gltf_detail("smooth.glb") is None
-        True
     """
     document = read_document(path)
     listed, mesh = _listed(document)

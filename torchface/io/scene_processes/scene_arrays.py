@@ -279,7 +279,8 @@ def _place_offsets(
 ) -> None:
     """Writes a shape's offsets to their rows of ``target`` (V,3), millimetres."""
     if rows is None and len(offsets) not in (0, len(target)):
-        raise FileFormatError(f"{location}: found {len(offsets)} offsets for {len(target)} points, expected one each")
+        expected = f"one for each of {len(target)} points"
+        raise FileFormatError(f"{location}: found {len(offsets)} offsets, expected {expected}")
     if rows is not None and len(rows) != len(offsets):
         raise FileFormatError(f"{location}: found {len(offsets)} offsets for {len(rows)} points, expected one each")
     if rows is not None and len(rows) and not 0 <= rows.min() <= rows.max() < len(target):

@@ -18,9 +18,6 @@ def require_usd() -> None:
 
     Raises:
         MissingExtraError: it is not.
-
-    Example:
-        >>> require_usd()  # raises MissingExtraError where usd-core is not installed
     """
     if importlib.util.find_spec("pxr") is None:
         raise MissingExtraError(

@@ -39,13 +39,6 @@ def read_usd_rig(path: str | Path, unit: str | None = None) -> BlendshapeRig:
         MissingExtraError: usd-core is not installed.
         FileFormatError: not USD, truncated, broken, animated otherwise than by blend shapes, composed of layers or
             images outside its folder, or without blend shapes.
-
-    Example:
-        >>> from torchface.io.usd import write_usd_rig
-        >>> rig = BlendshapeRig.from_tensors(torch.eye(3), torch.tensor([[0, 1, 2]]), torch.ones(1, 3, 3), ["jawOpen"])
-        >>> write_usd_rig(rig, "actor.usda")
-        >>> read_usd_rig("actor.usda").names
-        ('jawOpen',)
     """
     rig = scene_rig(read_stage(path), unit)
     if rig is None:
@@ -54,14 +47,7 @@ def read_usd_rig(path: str | Path, unit: str | None = None) -> BlendshapeRig:
 
 
 def read_usd_mesh(path: str | Path, unit: str | None = None) -> Mesh:
-    """The scene of a USD file as one mesh, blend shapes at rest; see :func:`read_usd_rig`.
-
-    Example:
-        >>> from torchface.io.usd import write_usd_mesh
-        >>> write_usd_mesh(Mesh(torch.eye(3), torch.tensor([[0, 1, 2]])), "triangle.usda")
-        >>> read_usd_mesh("triangle.usda").faces.tolist()
-        [[0, 1, 2]]
-    """
+    """The scene of a USD file as one mesh, blend shapes at rest; see :func:`read_usd_rig`."""
     return scene_mesh(read_stage(path), unit)
 
 
@@ -71,12 +57,6 @@ def read_usd_weights(path: str | Path) -> Take | None:
     Raises:
         MissingExtraError: usd-core is not installed.
         FileFormatError: as :func:`read_usd_rig`; or keys that are no frames.
-
-    Example:
-        >>> from torchface.io.usd import write_usd_mesh
-        >>> write_usd_mesh(Mesh(torch.eye(3), torch.tensor([[0, 1, 2]])), "still.usda")
-        >>> read_usd_weights("still.usda") is None
-        True
     """
     return scene_weights(read_stage(path))
 
@@ -119,13 +99,6 @@ def read_usd_detail(path: str | Path) -> DetailMaps | None:
     Raises:
         MissingExtraError: usd-core is not installed.
         FileFormatError: as of ``read_usd_rig``; images of different sizes, or more of them than the file can hold.
-
-    Example:
-        >>> from torchface.io import save_mesh
-        >>> from torchface.synthetic import neutral_head
-        >>> save_mesh(neutral_head(texture=False), "smooth.usdc")
-        >>> read_usd_detail("smooth.usdc") is None
-        True
     """
     scene = read_stage(path, "--maps")
     allowed = max(_UNPACKED_ALWAYS, _UNPACKED_PER_BYTE * scene.record["bytes"])

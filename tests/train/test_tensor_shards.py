@@ -9,7 +9,7 @@ import torch
 from safetensors.torch import save_file
 
 from torchface.errors import FileFormatError, ShapeError
-from torchface.files.shards import Shards
+from train.tensor_shards import Shards
 
 COUNTS = (3, 1, 4)
 VALUES = torch.arange(8 * 6, dtype=torch.float32).view(8, 2, 3)
