@@ -106,6 +106,7 @@ def save_normal_map(normals: Tensor, path: str | Path) -> None:
         ShapeError: not (3,H,W).
 
     Example:
+        >>> from torchface.geometry.meshes.normal_maps import decode_normals
         >>> tilted = torch.tensor([0.6, 0.0, 0.8])[:, None, None].repeat(1, 4, 4)
         >>> save_normal_map(tilted, "normals.png")
         >>> bool((decode_normals(load_image("normals.png")) - tilted).abs().max() < 1e-4)
