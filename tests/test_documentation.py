@@ -16,6 +16,8 @@ REPOSITORY = Path(__file__).resolve().parent.parent
 DOCS = REPOSITORY / "docs"
 PAGES = [REPOSITORY / "README.md", REPOSITORY / "CONTRIBUTING.md", *sorted(DOCS.rglob("*.md"))]
 _LINK = re.compile(r"\]\(([^)#\s]+)[^)]*\)")
+_ANCHOR = re.compile(r"\]\(([\w./-]*\.md)?#([\w-]+)\)")
+_HEADING = re.compile(r"^#+ (.+)$", re.MULTILINE)
 _BENCH = re.compile(r"\b(test_\w+\.py)\b")
 
 
@@ -33,6 +35,19 @@ def quote_figures() -> ModuleType:
 def test_links_lead_to_files(page: Path) -> None:
     text = re.sub(r"```.*?```", "", page.read_text(), flags=re.DOTALL)
     lost = [link for link in _LINK.findall(text) if "://" not in link and not (page.parent / link).exists()]
+    assert not lost
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(REPOSITORY)))
+def test_links_lead_to_headings(page: Path) -> None:
+    lost = []
+    for file, anchor in _ANCHOR.findall(page.read_text(encoding="utf-8")):
+        target = page.parent / file if file else page
+        if not target.exists():  # the test above names it
+            continue
+        headings = _HEADING.findall(re.sub(r"```.*?```", "", target.read_text(encoding="utf-8"), flags=re.DOTALL))
+        if anchor not in {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}:
+            lost.append(f"{file}#{anchor}")
     assert not lost
 
 
