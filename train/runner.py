@@ -14,9 +14,8 @@ import torch
 import tyro
 
 from torchface import zoo
-from torchface.cli.exit_messages import plain_errors
-from torchface.cli.plain_options import plain_options
-from torchface.cli.progress import progress_bars
+from torchface.cli.command_options import plain_options
+from torchface.cli.terminal import plain_errors, progress_bars
 from torchface.errors import ValueRangeError
 from torchface.files.job_lock import job_lock
 from torchface.files.whole_files import made_folder, make_folder

@@ -13,7 +13,7 @@ from rich.console import Console
 import torchface
 from torchface.attachment import Attachment
 from torchface.capture import MarkerSolver, WholeTakeSolver
-from torchface.cli import COMMANDS, GROUPS, main, progress
+from torchface.cli import COMMANDS, GROUPS, main, terminal
 from torchface.evaluation import weight_jitter
 from torchface.geometry.similarity import Similarity
 from torchface.io import load_rig, load_take, save_animation, save_mesh, save_rig, save_take
@@ -231,10 +231,10 @@ def test_an_attachment_without_a_rig_or_of_another_is_told_by_file(
 
 def test_an_error_leaves_no_spinner_behind(monkeypatch: pytest.MonkeyPatch) -> None:
     screen = StringIO()
-    monkeypatch.setattr(progress, "console", Console(file=screen, force_terminal=True, width=60))
+    monkeypatch.setattr(terminal, "console", Console(file=screen, force_terminal=True, width=60))
 
     def breaks() -> None:
-        with progress.progress_bars() as step:
+        with terminal.progress_bars() as step:
             step("done with")
             step("at this it breaks")
             raise ValueError("broken")
@@ -248,9 +248,9 @@ def test_an_error_leaves_no_spinner_behind(monkeypatch: pytest.MonkeyPatch) -> N
 
 def test_counted_steps_show_a_bar_and_a_rate(monkeypatch: pytest.MonkeyPatch) -> None:
     clock, screen = [0.0], StringIO()
-    monkeypatch.setattr(progress, "console", Console(file=screen, force_terminal=True, width=100))
-    monkeypatch.setattr(progress, "Bars", partial(progress.Bars, get_time=lambda: clock[0]))
-    with progress.progress_bars() as step:
+    monkeypatch.setattr(terminal, "console", Console(file=screen, force_terminal=True, width=100))
+    monkeypatch.setattr(terminal, "Bars", partial(terminal.Bars, get_time=lambda: clock[0]))
+    with terminal.progress_bars() as step:
         step("solving", 100, 300)  # a hundred are from an earlier run
         clock[0] = 4.0
         step("solving", 300, 300)
@@ -263,10 +263,10 @@ def test_counted_steps_show_a_bar_and_a_rate(monkeypatch: pytest.MonkeyPatch) ->
 
 def test_a_log_gets_a_line_a_step_and_none_when_quiet(monkeypatch: pytest.MonkeyPatch) -> None:
     clock, log = [0.0], StringIO()
-    monkeypatch.setattr(progress, "console", Console(file=log, width=100))
-    monkeypatch.setattr(progress.time, "monotonic", lambda: clock[0])
+    monkeypatch.setattr(terminal, "console", Console(file=log, width=100))
+    monkeypatch.setattr(terminal.time, "monotonic", lambda: clock[0])
     for quiet in (True, False):
-        with progress.progress_bars(quiet) as step:
+        with terminal.progress_bars(quiet) as step:
             for done in range(0, 100, 5):
                 clock[0] = 2.0 * done
                 step("registering scans", done, 100)

@@ -12,8 +12,7 @@ from matplotlib.figure import Figure
 from rich.table import Table
 
 from torchface.cli import main
-from torchface.cli.exit_messages import plain_errors
-from torchface.cli.progress import PlainConsole, print_path
+from torchface.cli.terminal import PlainConsole, plain_errors, print_path
 from torchface.errors import FileFormatError
 from torchface.files.whole_files import check_writable, make_folder
 from torchface.io import save_rig, save_take

@@ -15,25 +15,24 @@ from torchface import __version__
 from torchface.cli.annotate import annotate
 from torchface.cli.attach import attach
 from torchface.cli.calibrate import calibrate
+from torchface.cli.command_options import plain_options
 from torchface.cli.convert import convert
 from torchface.cli.demo import demo
 from torchface.cli.enhance import enhance
 from torchface.cli.evaluate import evaluate
 from torchface.cli.examples import examples
-from torchface.cli.exit_messages import plain_errors
 from torchface.cli.export import EXPORTS
 from torchface.cli.export_model import export_model
 from torchface.cli.fit import fit
 from torchface.cli.info import info
 from torchface.cli.live import live
 from torchface.cli.pick import pick
-from torchface.cli.plain_options import plain_options
-from torchface.cli.progress import PlainConsole
 from torchface.cli.register import register
 from torchface.cli.render import render
 from torchface.cli.retarget import retarget
 from torchface.cli.rig import rig
 from torchface.cli.solve import solve
+from torchface.cli.terminal import PlainConsole, plain_errors
 from torchface.cli.track import track
 from torchface.cli.train import train
 from torchface.cli.transfer import transfer

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from tyro.conf import Positional
 
-from torchface.cli.progress import Quiet, console, print_path, progress_bars
+from torchface.cli.terminal import Quiet, print_path, progress_bars, serve_page
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -83,11 +83,4 @@ def annotate(
 
         session = AnnotationSession(annotation.frames, annotation.folder, annotation.saved)
         editor = LandmarkEditor(session, video.stem, port)
-        console.print(
-            f"{len(annotation.saved)} of {len(annotation.frames)} frames are saved. Open this page; Ctrl+C ends."
-        )
-        print(editor.url, flush=True)
-        try:
-            editor.wait()
-        except KeyboardInterrupt:
-            editor.stop()
+        serve_page(editor, f"{len(annotation.saved)} of {len(annotation.frames)} frames are saved. ")

@@ -10,7 +10,7 @@ from rich.table import Table
 from rich.text import Text
 from tyro.conf import arg
 
-from torchface.cli.progress import console, print_path
+from torchface.cli.terminal import console, print_path
 from torchface.errors import AlignmentError
 
 if TYPE_CHECKING:

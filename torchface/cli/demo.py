@@ -7,7 +7,7 @@ from pathlib import Path
 
 from rich.table import Table
 
-from torchface.cli.progress import Quiet, console, print_path, progress_bars
+from torchface.cli.terminal import Quiet, console, print_path, progress_bars
 
 
 def demo(

@@ -9,7 +9,7 @@ from rich.table import Table
 from tyro.conf import Positional, arg
 
 from torchface.cli.batch_report import Cluster, Column, Jobs, TimeLimit, show_batch, skipped_lines
-from torchface.cli.progress import Quiet, console, print_path, progress_bars
+from torchface.cli.terminal import Quiet, console, print_path, progress_bars
 
 _COLUMNS = (
     Column("mean", "mean_mm", "{:.3f} mm"),

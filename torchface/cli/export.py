@@ -10,7 +10,7 @@ from rich.table import Table
 
 from torchface.cli.export_app import export_app
 from torchface.cli.export_enhancement import export_enhancement
-from torchface.cli.progress import Quiet, console, print_path, progress_bars
+from torchface.cli.terminal import Quiet, console, print_path, progress_bars
 
 if TYPE_CHECKING:
     from torchface.onnx import SolverReport

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from torchface.cli.progress import Quiet, print_lines, print_path, progress_bars
+from torchface.cli.terminal import Quiet, print_lines, print_path, progress_bars
 
 
 def export_enhancement(

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from rich.table import Table
 
-from torchface.cli.progress import Quiet, console, print_path, progress_bars
+from torchface.cli.terminal import Quiet, console, print_path, progress_bars
 
 
 def export_model(name: str, /, out: Path, quiet: Quiet = False) -> None:

@@ -8,7 +8,7 @@ from typing import Annotated
 from rich.table import Table
 from tyro.conf import Positional, arg
 
-from torchface.cli.progress import console
+from torchface.cli.terminal import console
 
 
 def info(

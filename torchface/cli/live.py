@@ -7,8 +7,8 @@ from typing import Annotated
 
 from tyro.conf import Positional, UseAppendAction, arg
 
-from torchface.cli.picture_size import picture_size
-from torchface.cli.progress import Quiet, console, print_lines, print_path, progress_bars
+from torchface.cli.command_options import picture_size
+from torchface.cli.terminal import Quiet, console, print_lines, print_path, progress_bars
 
 
 def live(

@@ -7,7 +7,7 @@ from typing import Literal
 
 from tyro.conf import Positional
 
-from torchface.cli.progress import Quiet, console, progress_bars
+from torchface.cli.terminal import Quiet, progress_bars, serve_page
 
 
 def pick(
@@ -43,39 +43,19 @@ def pick(
         port: The first port to try.
         quiet: Show no progress.
     """
-    from torchface.errors import FileFormatError
-    from torchface.io import load_mesh, load_rig
-    from torchface.io.rig_files import SCENE_ENDINGS
-    from torchface.io.rigs.ict_facekit import region
-    from torchface.mesh import Mesh, submesh
-    from torchface.rig import BlendshapeRig
+    from torchface.io import load_mesh
     from torchface.viz.browser.browser_page import HOST, free_port, import_viser
     from torchface.viz.browser.landmark_sets import IBUG_68, THESIS_12, custom_set
     from torchface.viz.browser.picker import Picker
-
-    def read() -> Mesh | BlendshapeRig:
-        if mesh.is_dir():
-            return load_rig(mesh, unit, part)
-        if mesh.suffix.lower() in SCENE_ENDINGS:
-            try:
-                return load_rig(mesh, unit, part)
-            except FileFormatError:  # no morph targets: a mesh
-                pass
-        picked_on = load_mesh(mesh, unit)
-        return picked_on if part is None else submesh(picked_on, region(picked_on, part)).mesh
+    from torchface.workflows.posed_mesh import load_neutral
 
     import_viser()
     free_port(HOST, port)
     with progress_bars(quiet) as progress:
         progress("reading")
-        head = read()
+        head, rig = load_neutral(mesh, unit, part)
         target = None if scan is None else load_mesh(scan, scan_unit)
         wanted = custom_set(names) if names else IBUG_68 if landmarks == "68" else THESIS_12
         progress("opening the page")
-        picker = Picker(head, target, out, wanted, mode, mesh.stem, port)
-    console.print("Open this page; Ctrl+C ends.")
-    print(picker.url, flush=True)
-    try:
-        picker.wait()
-    except KeyboardInterrupt:
-        picker.stop()
+        picker = Picker(rig or head, target, out, wanted, mode, mesh.stem, port)
+    serve_page(picker)

@@ -7,7 +7,7 @@ from pathlib import Path
 from tyro.conf import Positional
 
 from torchface.cli.batch_report import Cluster, Column, Jobs, TimeLimit, show_batch, skipped_lines
-from torchface.cli.progress import Quiet, progress_bars
+from torchface.cli.terminal import Quiet, progress_bars
 
 
 def register(

@@ -7,7 +7,7 @@ from typing import Annotated
 
 from tyro.conf import Positional, arg
 
-from torchface.cli.progress import Quiet, print_path, progress_bars
+from torchface.cli.terminal import Quiet, print_path, progress_bars
 
 
 def render(

@@ -7,7 +7,7 @@ from typing import Annotated
 
 from tyro.conf import Positional, arg
 
-from torchface.cli.progress import Quiet, console, print_lines, print_path, progress_bars
+from torchface.cli.terminal import Quiet, console, print_lines, print_path, progress_bars
 
 _MAX_NAMES = 12
 

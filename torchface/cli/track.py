@@ -9,8 +9,8 @@ from typing import Annotated, Literal
 from tyro.conf import Positional, arg
 
 from torchface.cli.batch_report import Cluster, Column, Jobs, TimeLimit, show_batch, skipped_lines
-from torchface.cli.picture_size import picture_size
-from torchface.cli.progress import Quiet, console, print_lines, print_path, progress_bars
+from torchface.cli.command_options import picture_size
+from torchface.cli.terminal import Quiet, console, print_lines, print_path, progress_bars
 
 _COLUMNS = (
     Column("frames", "frames", "{}"),

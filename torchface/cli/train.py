@@ -13,7 +13,7 @@ from types import ModuleType
 from rich.table import Table
 from rich.text import Text
 
-from torchface.cli.progress import PlainConsole
+from torchface.cli.terminal import PlainConsole
 from torchface.errors import FileFormatError, NameMismatchError
 from torchface.files.model_roots import is_checkout
 

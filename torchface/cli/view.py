@@ -6,7 +6,7 @@ from pathlib import Path
 
 from tyro.conf import Positional
 
-from torchface.cli.progress import Quiet, console, progress_bars
+from torchface.cli.terminal import Quiet, progress_bars, serve_page
 
 
 def view(
@@ -53,9 +53,4 @@ def view(
             take = load_take(weights)
         progress("opening the page")
         viewer = RigViewer(loaded, take, out, detail, rig.stem, port)
-    console.print("Open this page; Ctrl+C ends.")
-    print(viewer.url, flush=True)
-    try:
-        viewer.wait()
-    except KeyboardInterrupt:
-        viewer.stop()
+    serve_page(viewer)

@@ -10,7 +10,7 @@ from rich.table import Table
 from rich.text import Text
 from tyro.conf import Positional, arg
 
-from torchface.cli.progress import PlainConsole
+from torchface.cli.terminal import PlainConsole
 from torchface.escaped_text import visible
 
 SOME_DAMAGED = 1

@@ -9,7 +9,7 @@ from torchface.errors import FileFormatError
 from torchface.files.whole_files import check_ending, check_writable, make_folder
 from torchface.geometry.meshes.normal_maps import DetailMaps
 from torchface.geometry.meshes.region_maps import RegionMaps
-from torchface.io import load_animation, load_detail_maps, load_mesh, load_region_maps, load_rig, save_mesh
+from torchface.io import load_animation, load_detail_maps, load_region_maps, save_mesh
 from torchface.io.blender import BLENDER_ENDINGS, blender_program, read_blender_file, write_blender_file
 from torchface.io.mesh_files import MESH_ENDINGS
 from torchface.io.rig_files import GLTF_ENDINGS, SCENE_ENDINGS, check_rig_ending, write_rig
@@ -21,6 +21,7 @@ from torchface.mesh import Mesh, submesh
 from torchface.progress import Progress, silent
 from torchface.rig import BlendshapeRig
 from torchface.take import Take
+from torchface.workflows.posed_mesh import load_neutral
 from torchface.workflows.rig_names import Naming, naming_lines, renamed, renamed_detail
 
 
@@ -102,20 +103,12 @@ def _read(source: Path, unit: str | None, part: str | None) -> Converted:
     if suffix in BLENDER_ENDINGS:
         scene = read_blender_file(source, unit)
         mesh, rig, take = scene.mesh, scene.rig, scene.take
-    elif suffix in MESH_ENDINGS:
-        mesh, rig, take = load_mesh(source, unit), None, None
+        if part is not None:
+            keep = region(mesh, part)
+            mesh, rig = submesh(mesh, keep).mesh, None if rig is None else rig.part(keep)
     else:
-        try:
-            rig = load_rig(source, unit)
-        except FileFormatError:  # no shapes: a mesh; what is no mesh either raises its own error
-            if source.is_dir():
-                raise
-            rig = None
-        mesh = load_mesh(source, unit) if rig is None else rig.neutral
+        mesh, rig = load_neutral(source, unit, part)
         take = load_animation(source) if suffix in SCENE_ENDINGS and rig is not None else None
-    if part is not None:
-        keep = region(mesh, part)
-        mesh, rig = submesh(mesh, keep).mesh, None if rig is None else rig.part(keep)
     return Converted(mesh, rig, take, ())
 
 

@@ -23,6 +23,7 @@ from torchface.io.video.video_file import VIDEO_ENDINGS
 from torchface.mesh import Mesh
 from torchface.rig import BlendshapeRig
 from torchface.take import Take
+from torchface.workflows.posed_mesh import load_neutral
 from torchface.workflows.weight_files import weight_faults
 
 Rows = list[tuple[str, str]]
@@ -44,14 +45,10 @@ def describe(path: Path, attachment: Path | None = None, part: str | None = None
     """
     suffix = path.suffix.lower()
     if path.is_dir() or suffix in SCENE_ENDINGS:
-        try:
-            rig = load_rig(path, part=part)
-        except FileFormatError:
-            if path.is_dir():
-                raise
-            if attachment is not None:
-                raise
-            return _mesh_rows(load_mesh(path))
+        mesh, rig = load_neutral(path, part=part)
+        if rig is None and attachment is None:
+            return _mesh_rows(mesh)
+        rig = rig or load_rig(path, part=part)  # whose error says what is missing
         rows = [*_rig_rows(rig), *_animation_rows(path)]
         if attachment is not None:
             where = Attachment.load(attachment)

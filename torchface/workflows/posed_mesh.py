@@ -13,6 +13,7 @@ from torchface.io import load_mesh, load_rig, load_take
 from torchface.io.mesh_files import MESH_ENDINGS
 from torchface.io.rigs.ict_facekit import region
 from torchface.mesh import Mesh, submesh
+from torchface.rig import BlendshapeRig
 from torchface.shape_names import mapping, near_names
 
 
@@ -58,16 +59,14 @@ def load_posed(
         NameMismatchError: a mesh without shapes cannot be posed, or a name means no shape of the rig.
         ValueRangeError: the take holds no weights, or has no such frame.
     """
-    if path.suffix.lower() in MESH_ENDINGS:
-        if weights or take is not None:
+    if weights or take is not None:
+        if path.suffix.lower() in MESH_ENDINGS:
             raise NameMismatchError(f"{path}: found a mesh without shapes; a pose needs a rig (.glb or a folder)")
-        return _at_rest(path, part)
-    try:
-        rig = load_rig(path, part=part)
-    except FileFormatError:
-        if path.is_dir() or weights or take is not None:
-            raise
-        return _at_rest(path, part)  # a .glb without shapes is a mesh; what is no mesh either raises its own error
+        rig: BlendshapeRig | None = load_rig(path, part=part)
+    else:
+        neutral, rig = load_neutral(path, part=part)
+    if rig is None:
+        return Posed(neutral, neutral)
     if take is None:
         names = tuple(weights)
         matrix = mapping(names, rig.names)
@@ -86,7 +85,23 @@ def load_posed(
     return Posed(rig.neutral.with_vertices(rig(row[None].to(rig.deltas))[0]), rig.neutral)
 
 
-def _at_rest(path: Path, part: str | None) -> Posed:
-    mesh = load_mesh(path)
-    mesh = mesh if part is None else submesh(mesh, region(mesh, part)).mesh
-    return Posed(mesh, mesh)
+def load_neutral(path: Path, unit: str | None = None, part: str | None = None) -> tuple[Mesh, BlendshapeRig | None]:
+    """The mesh at rest of whatever holds a rig or a mesh, and the rig where there are shapes.
+
+    Args:
+        path: a mesh file, a rig file or a rig's folder.
+        unit: of its numbers, where it is not the format's own.
+        part: keep this annotated region only.
+
+    Raises:
+        FileFormatError: neither a rig nor a mesh; of a folder, no rig.
+    """
+    if path.suffix.lower() not in MESH_ENDINGS:
+        try:
+            rig = load_rig(path, unit, part)
+            return rig.neutral, rig
+        except FileFormatError:  # no shapes: a mesh; what is no mesh either raises its own error
+            if path.is_dir():
+                raise
+    mesh = load_mesh(path, unit)
+    return mesh if part is None else submesh(mesh, region(mesh, part)).mesh, None

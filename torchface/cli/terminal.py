@@ -1,12 +1,13 @@
-"""What a command shows while it works: a line for each step, with a bar and a rate where items are counted."""
+"""Output of commands on a terminal: steps with bars and rates, results, addresses of pages, errors."""
 
 from __future__ import annotations
 
+import os
 import sys
 import time
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 from rich.console import Console
 from rich.progress import BarColumn, ProgressColumn, SpinnerColumn, Task, TaskID, TimeElapsedColumn, TimeRemainingColumn
@@ -14,8 +15,12 @@ from rich.progress import Progress as Bars
 from rich.text import Text
 from tyro.conf import arg
 
+from torchface.errors import TorchfaceError
 from torchface.escaped_text import visible
 from torchface.progress import Progress, silent
+
+if TYPE_CHECKING:
+    from torchface.viz.browser.browser_page import BrowserPage
 
 
 class PlainConsole(Console):
@@ -159,3 +164,51 @@ class _Count(ProgressColumn):
 class _Remaining(TimeRemainingColumn):
     def render(self, task: Task) -> Text:
         return super().render(task) if task.fields["counted"] and not task.finished else Text()
+
+
+_MISTAKE, _STOPPED, _NOBODY_READS = 2, 130, 141  # the last is the status of SIGPIPE in shells
+
+
+def serve_page(page: BrowserPage, line: str = "") -> None:
+    """Prints a page's address and waits until it is closed, or for Ctrl-C, which closes it."""
+    console.print(f"{line}Open this page; Ctrl+C ends.")
+    print(page.url, flush=True)
+    try:
+        page.wait()
+    except KeyboardInterrupt:
+        page.stop()
+
+
+@contextmanager
+def plain_errors() -> Iterator[None]:
+    """Ends with a message and status 2 where the user made a mistake or a file cannot be used, with 130 on Ctrl-C.
+
+    What reads the output may stop doing so, as ``head`` does: that ends quietly, with 141.
+
+    Raises:
+        SystemExit: in place of what was raised inside.
+    """
+    try:
+        try:
+            yield
+        finally:
+            sys.stdout.flush()
+    except BrokenPipeError:
+        # What is left in the buffer would raise again at the end.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        raise SystemExit(_NOBODY_READS) from None
+    except TorchfaceError as error:
+        _say("error", str(error))
+        raise SystemExit(_MISTAKE) from None
+    except OSError as error:
+        if error.filename is None:
+            raise  # nothing that a user could look at
+        _say("error", f"{error.filename}: {error.strerror}")
+        raise SystemExit(_MISTAKE) from None
+    except KeyboardInterrupt:
+        _say("stopped", "what was not complete is not written")
+        raise SystemExit(_STOPPED) from None
+
+
+def _say(what: str, line: str) -> None:
+    console.print(Text(f"{what}:", "bold red"), line, highlight=False, soft_wrap=True)

@@ -1,7 +1,8 @@
-"""Options as people read them in help: what they take in plain words, and nothing of a default that is none."""
+"""Options of commands: their help in plain words, without a default that is none, and texts that are read as values."""
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from inspect import signature
 from pathlib import Path
@@ -43,3 +44,17 @@ def _word(kind: Any) -> str | None:
     if get_origin(given[0]) in (list, tuple) and (word := _WORDS.get(get_args(given[0])[0])):
         return f"[{word} ...]"
     return _WORDS.get(given[0])
+
+
+def picture_size(text: str) -> tuple[int, int]:
+    """Width and height of a text such as 1280x720.
+
+    Raises:
+        ValueRangeError: it is no such text.
+    """
+    from torchface.errors import ValueRangeError
+
+    match = re.fullmatch(r"([0-9]{1,5})x([0-9]{1,5})", text.strip().lower())
+    if match is None or not (int(match[1]) and int(match[2])):
+        raise ValueRangeError(f"--size: found {text[:40]!r}, expected WIDTHxHEIGHT in pixels, such as 1280x720")
+    return int(match[1]), int(match[2])
