@@ -60,7 +60,7 @@ def test_an_ending_without_animation_is_refused_before_any_work(
     words = ["--to", str(shot), "--out", str(tmp_path / "o.csv"), "--animation", str(tmp_path / "moved.obj")]
     with pytest.raises(SystemExit):
         main(["retarget", str(tmp_path / "w.csv"), *words])
-    assert "found the ending '.obj', expected .glb or .usd, .usda" in " ".join(capsys.readouterr().err.split())
+    assert "found the ending '.obj', expected .glb, .usd, .usda" in " ".join(capsys.readouterr().err.split())
     assert not (tmp_path / "o.csv").exists()
 
 
