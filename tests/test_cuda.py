@@ -13,13 +13,13 @@ from torchface import zoo
 from torchface.capture import DynamicsPrior, HelmetSolver, HybridSolver, MarkerSolver, ShapePrior, VideoSolver
 from torchface.capture.own_rig import solve_whole_take
 from torchface.capture.own_rig.head_pose import PoseTracker, track_pose
-from torchface.capture.own_rig.landmark_smoothing import LandmarkFilter, smooth_landmarks
 from torchface.capture.priors import adapt_dynamics
 from torchface.geometry.cameras.robust_pnp import robust_pnp
 from torchface.optim import BoxQP
 from torchface.rig import BlendshapeRig
 from torchface.synthetic import performer
 from torchface.synthetic.stages.marker_stage import place_markers
+from torchface.temporal.adaptive_kalman import LANDMARK_SETTINGS, AdaptiveFilter, adaptive_smoother
 
 pytestmark = pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU that torch sees")
 
@@ -118,9 +118,9 @@ def test_head_poses_and_filters(rig: BlendshapeRig) -> None:
     wanted = tensors_of(robust_pnp(points[17:48], landmarks[:, 17:48], intrinsics))
     for a, b in zip(wanted, found, strict=True):
         torch.testing.assert_close(b.cpu().double(), a.double(), rtol=1e-4, atol=1e-4)
-    smooth = smooth_landmarks(landmarks.cuda())
-    torch.testing.assert_close(smooth.cpu(), smooth_landmarks(landmarks), rtol=1e-6, atol=1e-6)
-    calm, calmed = LandmarkFilter(), LandmarkFilter()
+    smooth = adaptive_smoother(landmarks.cuda())
+    torch.testing.assert_close(smooth.cpu(), adaptive_smoother(landmarks), rtol=1e-6, atol=1e-6)
+    calm, calmed = (AdaptiveFilter(68, 2, LANDMARK_SETTINGS) for _ in range(2))
     poses, posed = PoseTracker(points, intrinsics), PoseTracker(points.cuda(), intrinsics.cuda())
     for frame in landmarks:  # filters go frame by frame
         a, b = calm.step(frame), calmed.step(frame.cuda())

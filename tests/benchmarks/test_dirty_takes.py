@@ -10,11 +10,12 @@ import torch
 from scipy.signal import find_peaks, peak_widths
 from torch import Tensor
 
+from planted.take_filters import filtered
 from torchface import Attachment, BlendshapeRig, Take, Track
 from torchface.capture import HelmetSolver, MarkerSolver, WholeTakeSolver, clean_take
 from torchface.evaluation import weight_jitter
 from torchface.synthetic.stages.marker_stage import LabelSwap, StageFlaws, record
-from torchface.temporal import one_euro_filter
+from torchface.temporal import OneEuroFilter
 
 Capture = tuple[BlendshapeRig, Attachment, list[Tensor]]
 EVERY = 6
@@ -175,7 +176,7 @@ def test_streamed_takes(real_capture: Capture) -> None:
     for which, true in enumerate(takes):
         recording = record(rig, attachment, true, torch.Generator().manual_seed(which), StageFlaws())
         alone = solver(markers_of(recording.take))
-        streamed = one_euro_filter(alone, 60.0)
+        streamed = filtered(OneEuroFilter(60.0), alone)
         jitters.append([weight_jitter(each) / weight_jitter(true) for each in (alone, streamed)])
         shares.append(error(streamed, true) / error(alone, true))
         late.append(frames_late(streamed, true))

@@ -16,12 +16,12 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from torchface.capture.own_rig.head_pose import STABLE_LANDMARKS, PoseTracker, filter_poses, measure_poses, smooth_poses
-from torchface.capture.own_rig.landmark_smoothing import LandmarkFilter
 from torchface.geometry.cameras.calibration import assumed_calibration
 from torchface.geometry.cameras.pnp import Pose, pixel_jacobian, solve_pnp
 from torchface.geometry.cameras.robust_pnp import robust_pnp
 from torchface.geometry.rotations import rotation_matrix, rotation_vector
 from torchface.synthetic import neutral_head
+from torchface.temporal.adaptive_kalman import LANDMARK_SETTINGS, AdaptiveFilter
 
 K = assumed_calibration(640, 480).intrinsics
 UPRIGHT = torch.diag(torch.tensor([1.0, -1, -1], dtype=torch.float64))
@@ -306,7 +306,7 @@ def test_poses_along_time() -> None:
 
 def test_what_a_live_frame_costs() -> None:
     points, _, _, pixels = filmed(1.5)
-    tracker, smoother = PoseTracker(points, K), LandmarkFilter()
+    tracker, smoother = PoseTracker(points, K), AdaptiveFilter(68, 2, LANDMARK_SETTINGS)
     for frame in pixels[:50]:
         tracker.step(smoother.step(frame))
     pose = seconds(lambda: [tracker.step(frame) for frame in pixels[50:]]) / (FRAMES - 50)

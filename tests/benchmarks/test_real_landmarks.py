@@ -18,7 +18,6 @@ from torch import Tensor
 from torchface import zoo
 from torchface.capture.own_rig import VideoSettings, VideoSolution, VideoSolver
 from torchface.capture.own_rig.face_points import LANDMARKS
-from torchface.capture.own_rig.landmark_smoothing import filter_landmarks
 from torchface.capture.own_rig.offset_estimate import estimate_offsets
 from torchface.capture.priors import DynamicsPrior, adapt_dynamics
 from torchface.geometry.cameras.calibration import assumed_calibration
@@ -26,6 +25,7 @@ from torchface.io import load_rig
 from torchface.io.rigs.ict_facekit import load_identity_modes
 from torchface.modeling import FitSettings, HeadModel, MorphableModel, fit_images
 from torchface.rig import BlendshapeRig
+from torchface.temporal.adaptive_kalman import LANDMARK_SETTINGS, adaptive_filter
 from torchface.workflows.track.track_models import load_priors
 
 pytestmark = [pytest.mark.real, pytest.mark.bench]
@@ -123,7 +123,7 @@ def test_real_landmarks(data: Path, ict_folder: Path) -> None:
     totals: dict[str, list[Row]] = {}
     for clip, (width, height, fps) in CLIPS.items():
         raw = torch.from_numpy(references[clip]).double()
-        landmarks = filter_landmarks(raw)
+        landmarks = adaptive_filter(raw, LANDMARK_SETTINGS)
         calibration = assumed_calibration(width, height)
         for head, actor in (("mean", rig), ("fitted", fitted(rig, modes, raw, (width, height)))):
             apart = VideoSettings(pixel_noise=0.5, relative_noise=0.025, steps=5)

@@ -29,7 +29,6 @@ from torchface.capture.anybody import (
 )
 from torchface.capture.anybody.examples.example_methods import ExampleMethod
 from torchface.capture.own_rig import VideoState
-from torchface.capture.own_rig.landmark_smoothing import LandmarkFilter
 from torchface.files.content_keys import content_key
 from torchface.files.whole_files import write_file
 from torchface.geometry.cameras.calibration import assumed_calibration
@@ -39,6 +38,7 @@ from torchface.onnx.webcam.face_reader import STATE, ReaderSettings, read_face
 from torchface.onnx.webcam.webcam_solver_graph import webcam_solver_model
 from torchface.shape_names import ARKIT, mapping
 from torchface.synthetic import performer
+from torchface.temporal.adaptive_kalman import LANDMARK_SETTINGS, AdaptiveFilter
 from torchface.workflows.track.track_inputs import solver_for
 from torchface.workflows.track.track_models import load_track_models
 from torchface.workflows.webcam.default_solver import default_webcam_solver
@@ -114,13 +114,13 @@ def video_solver(readings: list[FaceReading], fps: float, size: tuple[int, int])
     """``VideoSolver`` on the embedded performer's mean head, as ``torchface track --live`` runs it."""
     rig = performer(texture=False)
     solver = solver_for(rig, load_track_models(rig, fps=fps), assumed_calibration(*size))
-    smoother = LandmarkFilter()
+    smoother = AdaptiveFilter(68, 2, LANDMARK_SETTINGS)
     state: VideoState | None = None
 
     def step(reading: FaceReading) -> Tensor:
         nonlocal state
         sure = reading.trust.nan_to_num(0.0)
-        landmarks = smoother.step(reading.trusted_landmarks)
+        landmarks = smoother.step(reading.trusted_landmarks).float()
         if state is None and int((torch.isfinite(landmarks).all(1) & (sure > 0)).sum()) < _LEAST:
             return torch.zeros(len(rig.names))
         state = solver.step(state or solver.start(), landmarks, confidence=sure, interval=1 / fps)

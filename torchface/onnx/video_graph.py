@@ -9,7 +9,7 @@ from torch import Tensor, nn
 from torch.func import functional_call
 
 from torchface.capture.own_rig.face_points import LANDMARKS
-from torchface.capture.own_rig.reprojection import HeadState
+from torchface.capture.own_rig.gauss_newton import HeadState
 from torchface.capture.own_rig.solver_components import (
     DEFAULT_WEIGHT_STEP,
     INITIAL_ROTATION,
@@ -23,7 +23,7 @@ from torchface.capture.own_rig.weight_walk import faded, relative_trust, unseen_
 from torchface.capture.priors import AdaptedDynamicsPrior, DynamicsPrior
 from torchface.errors import ShapeError, ValueRangeError
 from torchface.geometry.cameras.affine_pose import affine_pose, orthonormal
-from torchface.onnx.gauss_newton_step import GaussNewtonStep
+from torchface.onnx.gauss_newton_step import GaussNewtonStep, frame_terms
 from torchface.optim.exported_operators import symmetric_inverse
 
 _MIN_LANDMARKS = 6
@@ -152,11 +152,9 @@ class VideoGraph(nn.Module):
             mean, information = self._walked(head, told, hidden, first)
         else:
             mean, information = self._expected(head, window, first, state)
-        points = self.step.points
-        distance = points.eyes_distance(head.rotation, head.translation, self.step.intrinsics)
-        noise = (self.settings.relative_noise * distance).clamp(min=self.settings.pixel_noise)
+        noise = self.step.solver.noise(head.rotation, head.translation)
         precision = torch.where(enough, trust.sqrt() / noise, 0.0)[None]
-        given = (found[None], precision, mean.weights, mean.rotation, mean.translation, information)
+        given = (found[None], precision, mean.weights, mean.rotation, mean.translation, information[None])
         solved, rows = self._solved(head, given, ~enough)
         # A face that is not seen stays as it was, or goes to rest.
         head = _where(enough, solved, HeadState(mean.weights, head.rotation, head.translation) if self.walks else head)
@@ -169,9 +167,10 @@ class VideoGraph(nn.Module):
         if self.walks:
             out.append(torch.where(started, hidden[0], torch.nan))
         if self.dynamics is not None:
-            H, gradient = self.step.data_terms(head, rows, *given)
-            covariance = symmetric_inverse(H)
-            estimate = nn.functional.pad(head.weights[0], (0, 6)) - covariance @ gradient
+            terms = frame_terms(*given)
+            energy = self.step.solver.seen(terms, head, rows) + terms.expected.energy(head)
+            covariance = symmetric_inverse(energy.H[0])
+            estimate = nn.functional.pad(head.weights[0], (0, 6)) - covariance @ energy.f[0]
             kept = torch.where(first, torch.full_like(window, torch.nan), window)
             window = torch.cat([kept, head.weights])[-self.window :]
             out += [window, estimate, 0.5 * (covariance + covariance.T)]
@@ -189,8 +188,8 @@ class VideoGraph(nn.Module):
         def unfinished(iteration: Tensor, settled: Tensor, *_: Tensor) -> Tensor:
             return (iteration < self.settings.steps) & ~settled
 
-        rows = self.step.chosen(head)
-        dual = torch.zeros_like(self.step.lower)
+        rows = self.step.solver.chosen(head)
+        dual = torch.zeros_like(self.initial_information[0])
         state = (head.weights, head.rotation, head.translation, dual, rows)
         # A loop takes no tensor twice, nor two that share memory.
         begin = torch.zeros((), dtype=torch.int64, device=settled.device)
@@ -204,13 +203,13 @@ class VideoGraph(nn.Module):
     def _affine_pose(self, found: Tensor, trust: Tensor) -> tuple[Tensor, Tensor]:
         """The pose (3,3), (3,) in which an affine camera sees the rig at rest as landmarks (68,2) are."""
         rays = torch.nn.functional.pad(found, (0, 1), value=1.0) @ self.to_rays
-        return affine_pose(self.step.rest[:LANDMARKS], rays[:, :2] / rays[:, 2:], trust)
+        return affine_pose(self.step.solver.rest[:LANDMARKS], rays[:, :2] / rays[:, 2:], trust)
 
     def _walked(self, head: HeadState, told: Tensor, hidden: Tensor, first: Tensor) -> tuple[HeadState, Tensor]:
         """The prediction for this frame from the last one's weights: the mean and its information (N+6,N+6)."""
         interval = self.settings.interval
         walked = walk_information(self.walk_variance, told, interval)[0]
-        information = torch.cat([walked, self.initial_information.diagonal()[-6:]]) * self.step.identity
+        information = torch.cat([walked, self.initial_information.diagonal()[-6:]]).diag()
         weights = torch.where(first, 0.0, head.weights * faded(hidden, interval))
         return (
             HeadState(weights, head.rotation, head.translation),
@@ -230,7 +229,7 @@ class VideoGraph(nn.Module):
         steps = torch.where(full, ahead[0].double() - filled[-1], 0.0)
         variance = torch.where(full, variance[0].double() / self.settings.dynamics_strength, DEFAULT_WEIGHT_STEP**2)
         mean = torch.where(first, 0.0, state["mean"] + nn.functional.pad(steps, (0, 6)))[None]
-        noise = torch.cat([variance, self.motion_variance]) * self.step.identity
+        noise = torch.cat([variance, self.motion_variance]).diag()
         covariance = torch.where(first, self.initial_covariance, state["covariance"] + noise)
         shapes = len(self.names)
         return head.moved(mean[:, :shapes], mean[:, shapes:]), symmetric_inverse(covariance)

@@ -2,8 +2,8 @@
 
 from torchface.temporal.adaptive_kalman import AdaptiveFilter, AdaptiveSettings, adaptive_filter, adaptive_smoother
 from torchface.temporal.interpolation import interpolated, nearest_rows
-from torchface.temporal.kalman import KalmanFilter, KalmanSettings, estimate_settings, kalman_filter, kalman_smoother
-from torchface.temporal.one_euro import OneEuroFilter, OneEuroSettings, one_euro_filter
+from torchface.temporal.kalman import KalmanFilter, KalmanSettings, kalman_smoother
+from torchface.temporal.one_euro import OneEuroFilter, OneEuroSettings
 from torchface.temporal.savitzky_golay import savitzky_golay
 
 __all__ = [
@@ -15,11 +15,8 @@ __all__ = [
     "OneEuroSettings",
     "adaptive_filter",
     "adaptive_smoother",
-    "estimate_settings",
     "interpolated",
-    "kalman_filter",
     "kalman_smoother",
     "nearest_rows",
-    "one_euro_filter",
     "savitzky_golay",
 ]

@@ -57,6 +57,11 @@ class AdaptiveSettings:
         return [KalmanSettings(noise, jerk, self.longest_gap, self.damping) for noise, jerk in pairs]
 
 
+# Lids and lips move more abruptly than a head does.
+LANDMARK_SETTINGS = AdaptiveSettings(jerk=(0.003, 0.01, 0.033, 0.11, 0.36, 1.2, 4.0))
+"""Of landmarks of a face some 100 to 600 pixels high, pixels."""
+
+
 class AdaptiveFilter:
     r"""A causal filter for P points of D channels, as smooth as each point's noise and motion ask for.
 

@@ -12,8 +12,6 @@ from torchface.errors import ShapeError, ValueRangeError
 
 # Deviation of the first velocity and acceleration, in measurement deviations a frame: nothing is known of them.
 _FIRST_VELOCITY, _FIRST_ACCELERATION = 30.0, 30.0
-_RATIOS = torch.logspace(-3, 0.5, 22, dtype=torch.float64)
-_MIN_FRAMES = 8
 
 
 @dataclass(frozen=True)
@@ -23,17 +21,17 @@ class KalmanSettings:
     Args:
         measurement: deviation of the measurements, in their unit (pixels, millimetres).
         jerk: deviation of what the acceleration changes by in a frame, in that unit a frame². Small makes the filter
-            smooth and slow, large quick and rough. See :func:`estimate_settings`.
+            smooth and slow, large quick and rough.
         longest_gap: frames without measurements that the causal filter bridges by prediction; then it waits for the
             next one and starts anew.
         damping: what is left of an acceleration after a frame; 1 is constant acceleration. What swings to and fro is
             predicted better with a little less, and does not run away in gaps.
 
     Example:
-        >>> step = torch.cat([torch.zeros(20, 1), torch.ones(5, 1)])
-        >>> calm = kalman_filter(step, KalmanSettings(measurement=1.0, jerk=0.001))
-        >>> quick = kalman_filter(step, KalmanSettings(measurement=1.0, jerk=1.0))
-        >>> bool(calm[20] < quick[20])
+        >>> calm, quick = (KalmanFilter(1, KalmanSettings(measurement=1.0, jerk=jerk)) for jerk in (0.001, 1.0))
+        >>> for frame in torch.cat([torch.zeros(20, 1), torch.ones(1, 1)]):
+        ...     slow, soon = calm.step(frame), quick.step(frame)
+        >>> bool(slow < soon)
         True
     """
 
@@ -160,29 +158,6 @@ class KalmanFilter:
         return self.state[:, 0]
 
 
-def kalman_filter(values: Tensor, settings: KalmanSettings | Sequence[KalmanSettings]) -> Tensor:
-    """Each frame from itself and those before it.
-
-    Args:
-        values: measurements (T,...), NaN for not seen.
-        settings: see :class:`KalmanSettings`; of all channels, or one a channel, in the order of ``values[0]``.
-
-    Returns:
-        Filtered values of the same shape and dtype. Gaps up to ``longest_gap`` are bridged; NaN before a channel was
-        first seen, and in longer gaps after that.
-
-    Example:
-        >>> generator = torch.Generator().manual_seed(0)
-        >>> noisy = torch.randn(200, 1, generator=generator)
-        >>> bool(kalman_filter(noisy, KalmanSettings(measurement=1.0, jerk=0.001))[50:].std() < 0.5)
-        True
-    """
-    curves = _checked(values)
-    running = KalmanFilter(curves.shape[1], settings)
-    # A frame needs the one before: a loop over frames, all channels at once.
-    return torch.stack([running.step(frame).clone() for frame in curves]).to(values.dtype).reshape(values.shape)
-
-
 def kalman_smoother(
     values: Tensor, settings: KalmanSettings | Sequence[KalmanSettings], intervals: Sequence[float] | None = None
 ) -> Tensor:
@@ -230,56 +205,6 @@ def kalman_smoother(
         state = torch.where(ahead[:, :1].isnan(), here, moved)
         smoothed.append(state[:, 0])
     return torch.stack(smoothed[::-1]).to(values.dtype).reshape(values.shape)
-
-
-def estimate_settings(values: Tensor, longest_gap: int = 10, calm: float = 0.7) -> KalmanSettings:
-    r"""The settings under which measurements are most likely, a little calmer.
-
-    For each ratio of jerk to measurement noise the scale of both follows from the innovations; the ratio with the
-    greatest likelihood wins. Real motion is smoother than white jerk, so that likelihood asks for more of it than
-    filtered values need: with 0.7 of it they are as exact and jitter a tenth less.
-
-    Args:
-        values: measurements (T,...) of channels that share their noise, NaN for not seen.
-        longest_gap: kept in the settings.
-        calm: share of the most likely jerk that is kept; 1 keeps all.
-
-    Raises:
-        ValueRangeError: fewer than eight frames, channels that do not move at all, or ``calm`` is not positive.
-
-    Source: maximum likelihood by prediction-error decomposition, Schweppe 1965.
-
-    Example:
-        >>> generator = torch.Generator().manual_seed(0)
-        >>> slow = torch.sin(torch.linspace(0, 6, 300))[:, None] + 0.2 * torch.randn(300, 1, generator=generator)
-        >>> round(estimate_settings(slow).measurement, 1)
-        0.2
-    """
-    curves = _checked(values)
-    if not 0 < calm < float("inf"):
-        raise ValueRangeError(f"estimate_settings: found calm {calm}, expected a positive share")
-    if len(curves) < _MIN_FRAMES:
-        raise ValueRangeError(f"estimate_settings: found {len(curves)} frames, expected at least {_MIN_FRAMES}")
-    channels, ratios = curves.shape[1], len(_RATIOS)
-    # All ratios at once: each channel is filtered under every one.
-    each = [KalmanSettings(1.0, ratio, len(curves)) for ratio in _RATIOS.tolist() for _ in range(channels)]
-    running = KalmanFilter(ratios * channels, each).to(curves.device)
-    squares, logs, count = curves.new_zeros(ratios), curves.new_zeros(ratios), 0
-    for frame in curves.repeat(1, ratios):
-        running.predict()
-        known = ~(frame.isnan() | running.state[:, 0].isnan())
-        variance = running.covariance[:, 0, 0] + 1.0
-        squared = torch.where(known, (frame - running.state[:, 0]).square() / variance, 0.0)
-        squares = squares + squared.reshape(ratios, -1).sum(1)
-        logs = logs + torch.where(known, variance.log(), 0.0).reshape(ratios, -1).sum(1)
-        count += int(known.sum()) // ratios
-        running.correct(frame)
-    if count == 0 or not bool((squares > 0).all()):
-        raise ValueRangeError("estimate_settings: found channels without noise or motion, expected measurements")
-    scale = squares / count
-    best = int((-0.5 * (count * scale.log() + logs)).argmax())
-    deviation = float(scale[best]) ** 0.5
-    return KalmanSettings(deviation, calm * float(_RATIOS[best]) * deviation, longest_gap)
 
 
 def _model(damping: float, interval: float) -> tuple[Tensor, Tensor]:

@@ -10,13 +10,11 @@ from torch import Tensor
 
 from torchface import zoo
 from torchface.capture.anybody import WebcamControls, WebcamSettings, WebcamSolver, WebcamState
-from torchface.capture.anybody.weight_filter import one_euro_step, usual_filter
 from torchface.errors import ShapeError, ValueRangeError
 from torchface.geometry.rotations import rotation_matrix
 from torchface.landmarks.images.face_reading import FaceReading
 from torchface.shape_names import ARKIT
 from torchface.synthetic import performer
-from torchface.temporal import one_euro_filter
 
 FPS = 15.0
 FOCAL = 554.256
@@ -205,16 +203,3 @@ def test_a_guided_calibration_finds_how_far_landmarks_go(
     assert float(state.gains[1].exp()) == pytest.approx(half, abs=0.15)
     assert float(state.weights[rows].mean()) > 0.9
     assert float(state.gains[[0, 2]].abs().max()) < 0.02
-
-
-def test_the_filter_by_seconds_is_the_filter_by_frames() -> None:
-    curve = torch.rand(40, 3, generator=torch.Generator().manual_seed(0)).double()
-    settings = usual_filter()
-    expected = one_euro_filter(curve, 30.0, settings)
-    value, speed, unit = curve[0], torch.zeros(3).double(), torch.ones(3).double()
-    half = torch.tensor(0.5).double()
-    for frame in range(1, len(curve)):
-        value, speed = one_euro_step(curve[frame], value, speed, torch.tensor(1 / 30).double(), half, unit)
-        torch.testing.assert_close(value, expected[frame])
-    plain, _ = one_euro_step(curve[0], value, speed, torch.tensor(1 / 30).double(), 0 * half, unit)
-    torch.testing.assert_close(plain, curve[0])

@@ -24,7 +24,6 @@ from torchface.capture.own_rig.head_pose import (
     smooth_poses,
     track_pose,
 )
-from torchface.capture.own_rig.landmark_smoothing import LandmarkFilter, filter_landmarks, smooth_landmarks
 from torchface.capture.own_rig.pose_filter import PoseFilterSettings
 from torchface.capture.priors import ShapePrior
 from torchface.geometry.cameras.calibration import CameraCalibration
@@ -34,7 +33,14 @@ from torchface.geometry.cameras.robust_pnp import robust_pnp
 from torchface.geometry.rotations import rotation_matrix
 from torchface.onnx.video_graph_export import synthetic_landmarks
 from torchface.synthetic import performer
-from torchface.temporal import KalmanFilter, KalmanSettings, estimate_settings, kalman_filter, kalman_smoother
+from torchface.temporal import (
+    AdaptiveFilter,
+    KalmanFilter,
+    KalmanSettings,
+    adaptive_filter,
+    adaptive_smoother,
+    kalman_smoother,
+)
 
 K = torch.tensor([[700.0, 0, 319.5], [0, 700.0, 239.5], [0, 0, 1]], dtype=torch.float64)
 
@@ -140,19 +146,16 @@ def test_head_poses(seen: tuple[Tensor, Tensor], device: str) -> None:
 def test_filters_along_time(seen: tuple[Tensor, Tensor], device: str) -> None:
     landmarks = seen[1][:, 25:33]
     settings = KalmanSettings(0.5, 0.1)
-    for filtered in (filter_landmarks, smooth_landmarks):
+    for filtered in (adaptive_filter, adaptive_smoother):
         check(filtered, device, landmarks)
-    check(lambda x: kalman_filter(x, settings), device, landmarks)
     check(lambda x: kalman_smoother(x, settings), device, landmarks)
-    noisy = landmarks[:, 0].nan_to_num(300.0).repeat(2, 1)
-    assert estimate_settings(noisy.to(device)) == estimate_settings(noisy)
 
 
 def test_running_filters_follow_what_they_are_given(seen: tuple[Tensor, Tensor], device: str) -> None:
     """A filter that began on the CPU goes on elsewhere."""
     frames = seen[1]
-    for make in (LandmarkFilter, lambda: KalmanFilter(68, KalmanSettings(0.5, 0.1))):
-        some = (lambda x: x) if make is LandmarkFilter else (lambda x: x[:, 0])
+    for make in (lambda: AdaptiveFilter(68, 2), lambda: KalmanFilter(68, KalmanSettings(0.5, 0.1))):
+        some = (lambda x: x) if isinstance(make(), AdaptiveFilter) else (lambda x: x[:, 0])
         ours, other = make(), make()
         for t, frame in enumerate(frames):
             expected = ours.step(some(frame))

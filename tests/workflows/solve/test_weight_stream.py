@@ -9,6 +9,7 @@ import pytest
 import torch
 from received_frames import decode_frame
 
+from planted.take_filters import filtered
 from torchface import BlendshapeRig, Take, Track, load_take, save_rig, save_take
 from torchface.capture import MarkerSolver
 from torchface.cli import main
@@ -18,7 +19,7 @@ from torchface.onnx.live_solver import LiveMarkerSolver
 from torchface.onnx.solver_graph_export import random_frames
 from torchface.shape_names import ARKIT
 from torchface.synthetic.stages.marker_stage import place_markers
-from torchface.temporal import OneEuroFilter, one_euro_filter
+from torchface.temporal import OneEuroFilter
 from torchface.workflows.solve.weight_stream import stream_markers
 
 
@@ -55,7 +56,8 @@ def test_smoothed_frames_know_only_those_before(dome_rig: BlendshapeRig) -> None
         ).weights
 
     single = sent(None)
-    torch.testing.assert_close(sent(OneEuroFilter(60.0)), one_euro_filter(single, 60.0), rtol=0, atol=1e-6)
+    expected = filtered(OneEuroFilter(60.0), single)
+    torch.testing.assert_close(sent(OneEuroFilter(60.0)), expected, rtol=0, atol=1e-6)
     assert weight_jitter(sent(OneEuroFilter(60.0))) < 0.5 * weight_jitter(single)
 
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from torch import Tensor
 
-from torchface.capture.own_rig.reprojection import HeadState
+from torchface.capture.own_rig.gauss_newton import HeadState
 from torchface.capture.own_rig.state_estimate import Expectation, StateEstimate
 from torchface.errors import ValueRangeError
 
@@ -105,11 +105,3 @@ class FrameTerms:
         mean = self.expected.mean
         own = (self.landmarks, self.precision, self.rotation, self.translation, self.expected.information)
         return (*own, mean.weights, mean.rotation, mean.translation)
-
-
-@dataclass(frozen=True, eq=False)
-class Solved:
-    """Weights and poses of B frames, and which point of the rig each landmark is in them, (B,68)."""
-
-    head: HeadState
-    rows: Tensor

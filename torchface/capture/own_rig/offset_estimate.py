@@ -9,9 +9,9 @@ from torch import Tensor
 
 from torchface.capture.own_rig.face_points import JAW, LANDMARKS
 from torchface.capture.own_rig.frame_states import FrameTerms
+from torchface.capture.own_rig.gauss_newton import HeadState, linearise
 from torchface.capture.own_rig.head_pose import measure_poses
 from torchface.capture.own_rig.landmark_offsets import LandmarkOffsets, offset_shares
-from torchface.capture.own_rig.reprojection import HeadState, linearise
 from torchface.capture.own_rig.state_estimate import Expectation
 from torchface.capture.own_rig.video_solver import VideoSolver
 from torchface.capture.priors import ShapePrior
@@ -161,10 +161,9 @@ def _mean_problem(
     found = landmarks.nan_to_num(0.0)
     information = solver.initial_information.double().diag().expand(len(found), -1, -1)
     terms = FrameTerms(found, precision, start.rotation, start.translation, Expectation(start, information))
-    solved = solver.solve(terms, start)
-    head = solved.head
+    head, rows = solver.solve(terms, start)
     K = solver.intrinsics.double()
-    at = linearise(solver.points, head, solved.rows, K, found, precision, solver.settings.contour_slide)
+    at = linearise(solver.points, head, rows, K, found, precision, solver.settings.contour_slide)
     residual, jacobian = at.residual.flatten(1), at.jacobian.flatten(1, 2)
     by_place = at.jacobian[..., -3:] @ head.rotation[:, None]  # in the rig's own axes
     shares = offset_shares(solver.names, head.weights)

@@ -53,9 +53,9 @@ class VideoSolverParts(nn.Module):
     side: Tensor
     corrective_basis: Tensor | None
     intrinsics: Tensor
-    landmark_weights: Tensor
     lower: Tensor
     upper: Tensor
+    landmark_weights: Tensor
     motion_variance: Tensor
     initial_information: Tensor
     l1_penalty: Tensor

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from torchface.capture.energy import Quadratic
-from torchface.capture.own_rig.reprojection import HeadState
+from torchface.capture.own_rig.gauss_newton import HeadState
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,28 +55,20 @@ class Expectation:
     mean: HeadState
     information: Tensor
 
-    def residual(self, head: HeadState) -> Tensor:
-        """From the mean to a state, (B,N+6)."""
-        motion = head.motion_from(self.mean.rotation, self.mean.translation)
-        return torch.cat([head.weights - self.mean.weights, motion], dim=1)
-
-    def quadratic(self, head: HeadState) -> Quadratic:
-        """Over the weights and the head's motion from a state."""
-        motion = head.motion_from(self.mean.rotation, self.mean.translation)
-        beyond = torch.cat([-self.mean.weights, motion], dim=1)
-        return Quadratic(self.information, (self.information @ beyond[..., None])[..., 0])
+    def energy(self, head: HeadState) -> Quadratic:
+        """Of a step (B,N+6) from a state."""
+        off = head.step_from(self.mean)
+        return Quadratic(self.information, (self.information @ off[..., None])[..., 0])
 
     def updated(self, head: HeadState, seen: Quadratic) -> StateEstimate:
         """After a frame whose landmarks were linearised at a state.
 
         Args:
             head: the state.
-            seen: the landmarks' energy, over the weights and the head's motion from there.
+            seen: the landmarks' energy, of a step from there.
 
         Source: Kalman 1960, in its information form.
         """
-        shapes = head.weights.shape[1]
-        both = seen + self.quadratic(head)
+        both = seen + self.energy(head)
         covariance = torch.cholesky_inverse(torch.linalg.cholesky(both.H))
-        least = -(covariance @ both.f[..., None])[..., 0]
-        return StateEstimate(head.moved(least[:, :shapes], least[:, shapes:]), covariance)
+        return StateEstimate(head.stepped(-(covariance @ both.f[..., None])[..., 0]), covariance)

@@ -9,8 +9,8 @@ from torch import Tensor
 
 from torchface.capture.own_rig.face_points import LANDMARKS
 from torchface.capture.own_rig.frame_states import FrameTerms, VideoSolution, VideoState
-from torchface.capture.own_rig.reprojection import HeadState
-from torchface.capture.own_rig.state_estimate import Expectation, StateEstimate
+from torchface.capture.own_rig.gauss_newton import HeadState
+from torchface.capture.own_rig.state_estimate import StateEstimate
 from torchface.capture.own_rig.video_solver import VideoSolver
 from torchface.capture.own_rig.weight_walk import frame_intervals
 from torchface.errors import ValueRangeError
@@ -157,8 +157,7 @@ def _smoothed(solver: VideoSolver, states: list[VideoState]) -> StateEstimate:
         led_to = solver.predicted(state, estimate)
         gain = torch.linalg.solve(led_to.covariance, estimate.covariance).transpose(1, 2)
         ahead = later[-1]
-        lifted = following.mean.moved(following.mean.weights + ahead.residual[:, :-6], ahead.residual[:, -6:])
-        surprise = Expectation(led_to.mean, led_to.covariance).residual(lifted)
+        surprise = following.mean.stepped(ahead.residual).step_from(led_to.mean)
         residual = (gain @ surprise[..., None])[..., 0]
         covariance = estimate.covariance + gain @ (ahead.covariance - led_to.covariance) @ gain.transpose(1, 2)
         later.append(_Later(residual, 0.5 * (covariance + covariance.transpose(1, 2))))
@@ -169,7 +168,7 @@ def _smoothed(solver: VideoSolver, states: list[VideoState]) -> StateEstimate:
         for name in ("weights", "rotation", "translation")
     )
     mean = HeadState(weights, rotation, translation)
-    return StateEstimate(mean.moved(weights + residual[:, :-6], residual[:, -6:]), covariance)
+    return StateEstimate(mean.stepped(residual), covariance)
 
 
 def _solved(solver: VideoSolver, states: list[VideoState], smoothed: StateEstimate) -> HeadState:
@@ -188,4 +187,5 @@ def _solved(solver: VideoSolver, states: list[VideoState], smoothed: StateEstima
         smoothed.mean.translation,
         expected,
     )
-    return solver.solve(terms, HeadState(begin, smoothed.mean.rotation, smoothed.mean.translation)).head
+    head, _ = solver.solve(terms, HeadState(begin, smoothed.mean.rotation, smoothed.mean.translation))
+    return head

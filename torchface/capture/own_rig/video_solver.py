@@ -2,32 +2,32 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import torch
 from torch import Tensor
+from torch.nn.functional import pad
 
 from torchface.capture.energy import Quadratic
 from torchface.capture.own_rig.face_points import LANDMARKS
-from torchface.capture.own_rig.frame_states import FrameTerms, Solved, VideoSolution, VideoState
-from torchface.capture.own_rig.reprojection import HeadState, linearise
+from torchface.capture.own_rig.frame_states import FrameTerms, VideoSolution, VideoState
+from torchface.capture.own_rig.gauss_newton import (
+    SLIDING_STEPS,
+    HeadState,
+    box_step,
+    energy_of_step,
+    linearise,
+)
 from torchface.capture.own_rig.solver_components import DEFAULT_WEIGHT_STEP, VideoSolverParts, check_not_negative
 from torchface.capture.own_rig.state_estimate import Expectation, StateEstimate
 from torchface.capture.own_rig.weight_walk import faded, frame_intervals, unseen_time, walk_information
 from torchface.errors import ShapeError, ValueRangeError
 from torchface.geometry.cameras.pnp import solve_pnp
-from torchface.optim.active_set import projected_newton
-from torchface.optim.box_problem import BoxProblem
 from torchface.optim.data_dependent import data_dependent
 from torchface.optim.fixed_point_gradient import attach_gradients
-from torchface.optim.warm_active_set import solve_from_active_set
 from torchface.progress import Progress, silent
 
 _MIN_LANDMARKS = 6
-_SLIDING_STEPS = 3
 _NEAR = 0.5  # of the eyes' distance
 _COARSEST, _FINEST = 1e-6, 1e-12  # residuals of a step's program
-_NEWTON_STEPS = 50
 
 
 class VideoSolver(VideoSolverParts):
@@ -166,7 +166,7 @@ class VideoSolver(VideoSolverParts):
 
     def start(self) -> VideoState:
         """The state before the first frame."""
-        return VideoState(None, None, self.lower.new_zeros(1, 0, len(self.names), dtype=torch.float64))
+        return VideoState(None, None, self.rest.new_zeros(1, 0, len(self.names), dtype=torch.float64))
 
     @data_dependent("torchface.onnx.VideoGraph, which `torchface export video-solver` writes")
     def step(
@@ -221,7 +221,7 @@ class VideoSolver(VideoSolverParts):
         if state.head is not None and not enough:
             weights = expected.mean.weights if self.walks else state.head.weights
             held = HeadState(weights, rotation, translation)
-            return self._handed_on(state, terms, expected, Solved(held, self._chosen(held)), enough, hidden)
+            return self._handed_on(state, terms, held, self.chosen(held), enough, hidden)
         # After a gap the tracked pose is nearer than where the head was left.
         near = (
             expected.mean
@@ -229,22 +229,15 @@ class VideoSolver(VideoSolverParts):
             else HeadState(expected.mean.weights, rotation, translation)
         )
         begin = expected.mean.weights if state.head is None else state.head.weights
-        solved = self.solve(terms, HeadState(begin.clamp(0, 1), near.rotation, near.translation).detached())
-        return self._handed_on(state, terms, expected, solved, enough, hidden)
+        start = HeadState(begin.clamp(0, 1), near.rotation, near.translation).mapped(torch.detach)
+        return self._handed_on(state, terms, *self.solve(terms, start), enough, hidden)
 
     def _handed_on(
-        self,
-        state: VideoState,
-        terms: FrameTerms,
-        expected: Expectation,
-        solved: Solved,
-        enough: bool,
-        hidden: Tensor,
+        self, state: VideoState, terms: FrameTerms, head: HeadState, rows: Tensor, enough: bool, hidden: Tensor
     ) -> VideoState:
-        head = solved.head
         if self.dynamics is None:
             return VideoState(head, None, state.window, enough, hidden)
-        estimate = expected.updated(head, self.seen(terms, head, solved.rows))
+        estimate = terms.expected.updated(head, self.seen(terms, head, rows))
         window = torch.cat([state.window, head.weights[:, None]], dim=1)[:, -self.dynamics.window :]
         return VideoState(head, estimate, window, enough, hidden)
 
@@ -279,76 +272,65 @@ class VideoSolver(VideoSolverParts):
             steps, variance = mean.double() - state.window[:, -1], variance.double() / self.settings.dynamics_strength
         return estimate.predicted(steps, variance, self.motion_variance.double())
 
-    def solve(self, terms: FrameTerms, start: HeadState) -> Solved:
-        """Weights (B,N) in [0,1] and poses of B frames on their own, from a start, float64."""
+    def solve(self, terms: FrameTerms, start: HeadState) -> tuple[HeadState, Tensor]:
+        """Weights (B,N) in [0,1] and poses of B frames on their own, from a start, float64.
+
+        Returns:
+            The states, and which of the rig's points each landmark is in them, (B,68).
+        """
+        exactness, box = (
+            min(max(0.1 * self.settings.tolerance, _FINEST), _COARSEST),
+            (self.lower.double(), self.upper.double()),
+        )
         # Steps are many and small; what tensors keep for derivatives is a fifth of their cost.
         with torch.inference_mode():
-            head, rows = start, self._chosen(start)
+            head, rows = start, self.chosen(start)
             for iteration in range(self.settings.steps):
-                # Which points the contour's landmarks are is settled first; later it could go back and forth.
-                if 0 < iteration < _SLIDING_STEPS:
-                    rows = self._chosen(head)
-                before, head = head, self._advanced(terms, head, rows)
+                if 0 < iteration < SLIDING_STEPS:
+                    rows = self.chosen(head)
+                before, head = head, box_step(self.energy(terms, head, rows), head, *box, exactness)
                 if float((head.weights - before.weights).abs().max()) < self.settings.tolerance:
                     break
         # Copies, as autograd refuses tensors that were made without it.
-        head, rows = HeadState(head.weights.clone(), head.rotation.clone(), head.translation.clone()), rows.clone()
+        head, rows = head.mapped(torch.clone), rows.clone()
         if torch.is_grad_enabled() and any(x.requires_grad for x in terms.tensors()):
             head = self._attached(terms, head, rows)
-        return Solved(head, rows)
+        return head, rows
 
-    def _chosen(self, head: HeadState) -> Tensor:
+    def chosen(self, head: HeadState) -> Tensor:
+        """Which of the rig's points each landmark is in B states, (B,68); see ``FacePoints.chosen``."""
         return self.points.chosen(head.weights, head.rotation, head.translation, self.intrinsics.double())
 
-    def _advanced(self, terms: FrameTerms, head: HeadState, rows: Tensor) -> HeadState:
-        """One Gauss-Newton step: a quadratic program, warm-started."""
-        shapes, lower, upper = len(self.names), self.lower.double(), self.upper.double()
-        energy = self.energy(terms, head, rows)
-        begin = torch.nn.functional.pad(head.weights, (0, 6))
-        exactness = min(max(0.1 * self.settings.tolerance, _FINEST), _COARSEST)
-        if len(begin) == 1:
-            H, f = energy.H[0], energy.f[0]
-            found = solve_from_active_set(H, f, lower, upper, begin[0], exactness, _NEWTON_STEPS)[None]
-        else:
-            H = 0.5 * (energy.H + energy.H.transpose(1, 2))
-            problem = BoxProblem.of(H, energy.f, lower, upper)
-            found = projected_newton(problem, begin, exactness, _NEWTON_STEPS)
-        return head.moved(found[:, :shapes], found[:, shapes:])
-
     def energy(self, terms: FrameTerms, head: HeadState, rows: Tensor) -> Quadratic:
-        """All terms about a state, over the weights and the head's motion from there, (B,N+6)."""
-        penalty = Quadratic(self.ridge.double().diag(), self.l1_penalty.double()[None])
-        total = self.seen(terms, head, rows) + terms.expected.quadratic(head) + penalty
-        return total if self.prior is None else total + _beside_motion(self.prior.energy(head.weights))
+        """All terms linearised at a state, of a step from there, (B,N+6)."""
+        ridge = self.ridge.double()
+        penalty = Quadratic(ridge.diag(), self.l1_penalty.double() + ridge * pad(head.weights, (0, 6)))
+        total = self.seen(terms, head, rows) + terms.expected.energy(head) + penalty
+        return total if self.prior is None else total + energy_of_step(self.prior.energy(head.weights), head.weights)
 
     def seen(self, terms: FrameTerms, head: HeadState, rows: Tensor) -> Quadratic:
-        """Landmarks and tracked poses, linearised at a state, over weights and motion from there, (B,N+6)."""
+        """Landmarks and tracked poses linearised at a state, of a step from there, (B,N+6)."""
         K, slide = self.intrinsics.double(), self.settings.contour_slide
         at = linearise(self.points, head, rows, K, terms.landmarks, terms.precision, slide)
-        data = at.quadratic(head.weights)
+        data = at.energy()
         if self.settings.pose_trust == 0:
             return data
-        shapes = len(self.names)
-        by_motion = at.jacobian[..., shapes:].flatten(1, 2)
+        by_motion = at.jacobian[..., -6:].flatten(1, 2)
         precision = self.settings.pose_trust * (by_motion.transpose(1, 2) @ by_motion)
-        residual = head.motion_from(terms.rotation, terms.translation)
-        H = torch.nn.functional.pad(precision, (shapes, 0, shapes, 0))
-        return data + Quadratic(H, torch.nn.functional.pad((precision @ residual[..., None])[..., 0], (shapes, 0)))
+        off = head.step_from(HeadState(head.weights, terms.rotation, terms.translation))[:, -6:]
+        shapes = len(self.names)
+        H = pad(precision, (shapes, 0, shapes, 0))
+        return data + Quadratic(H, pad((precision @ off[..., None])[..., 0], (shapes, 0)))
 
     def _attached(self, terms: FrameTerms, head: HeadState, rows: Tensor) -> HeadState:
         """The converged state as a differentiable function of the terms."""
-        shapes = len(self.names)
 
         def gradient(x: Tensor) -> Tensor:
-            near = head.moved(x[:, :shapes], x[:, shapes:])
-            energy = self.energy(terms, near, rows)
-            here = torch.nn.functional.pad(near.weights, (0, 6))
-            return (energy.H @ here[..., None])[..., 0] + energy.f
+            return self.energy(terms, head.moved(x[:, :-6], x[:, -6:]), rows).f
 
-        x = torch.nn.functional.pad(head.weights, (0, 6))
-        free = (x > self.lower) & (x < self.upper)
-        x = attach_gradients(gradient, x, free)
-        return head.moved(x[:, :shapes], x[:, shapes:])
+        x = pad(head.weights, (0, 6))
+        x = attach_gradients(gradient, x, (x > self.lower) & (x < self.upper))
+        return head.moved(x[:, :-6], x[:, -6:])
 
     def reprojection_errors(self, landmarks: Tensor, weights: Tensor, rotation: Tensor, translation: Tensor) -> Tensor:
         """Root mean square distance of seen landmarks (T,68,2) to the rig's, (T,), pixels; NaN where none is seen."""
@@ -412,15 +394,6 @@ class VideoSolver(VideoSolverParts):
         if confidence is not None:
             check_not_negative("confidence", confidence)
         return count
-
-
-def _beside_motion(weights: Quadratic) -> Quadratic:
-    """An energy of weights as one of weights and motion."""
-    return replace(
-        weights,
-        H=torch.nn.functional.pad(weights.H, (0, 6, 0, 6)),
-        f=torch.nn.functional.pad(weights.f, (0, 6)),
-    )
 
 
 def _finite(*tensors: Tensor) -> bool:

@@ -1,53 +1,51 @@
-"""A shape prior of Student's distributions as tensors of one size, for solvers that are exported."""
+"""A shape prior of Student's distributions with its products prepared, for solvers that are exported."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
+from torchface.capture.energy import Quadratic
 from torchface.capture.priors.shape_prior import ShapePrior
 from torchface.capture.priors.student_t import StudentDensity
 from torchface.errors import ValueRangeError
 
 
-@dataclass(frozen=True, eq=False)
-class StudentGroups:
-    """What the energy of a prior of G groups needs.
+class StudentGroups(nn.Module):
+    """The energy of a prior of G groups of N shapes.
 
     Args:
-        precisions: inverse scale matrices over all N shapes, zero beyond the group's, (G,N,N).
-        freedoms: degrees of freedom, (G,).
-        sizes: how many shapes, (G,).
+        prior: ``ShapePrior`` as ``ShapePrior.fit`` learns it.
+        strength: in place of the prior's own.
+
+    Raises:
+        ValueRangeError: the prior is none of Student's distributions.
     """
 
     precisions: Tensor
     freedoms: Tensor
     sizes: Tensor
 
-    @staticmethod
-    def of(prior: ShapePrior | None, shapes: int, like: Tensor) -> StudentGroups:
-        """Those of a prior, in the dtype of ``like``; no groups without a prior.
-
-        Raises:
-            ValueRangeError: the prior is none of Student's distributions.
-        """
-        parts = [] if prior is None else list(zip(prior.groups, prior.densities, strict=True))
-        precisions, freedoms = like.new_zeros(len(parts), shapes, shapes), like.new_zeros(len(parts))
-        for i, (group, density) in enumerate(parts):
+    def __init__(self, prior: ShapePrior, strength: float | None = None) -> None:
+        super().__init__()
+        self.strength = prior.strength if strength is None else strength
+        count, shapes = len(prior.groups), len(prior.names)
+        precisions, freedoms = torch.zeros(count, shapes, shapes).double(), torch.zeros(count).double()
+        for i, (group, density) in enumerate(zip(prior.groups, prior.densities, strict=True)):
             if type(prior) is not ShapePrior or not isinstance(density, StudentDensity):
                 raise ValueRangeError(
                     f"shape prior: found a {type(prior).__name__} of {type(density).__name__}, expected one of "
                     "Student's distributions, as ShapePrior.fit learns"
                 )
-            rows, factor = torch.tensor(group), density.factor.to(like)
+            rows, factor = torch.tensor(group), density.factor.double().cpu()
             precisions[i, rows[:, None], rows] = factor @ factor.T
             freedoms[i] = density.degrees_of_freedom
-        return StudentGroups(precisions, freedoms, like.new_tensor([len(group) for group, _ in parts]))
+        sizes = torch.tensor([float(len(group)) for group in prior.groups]).double()
+        for name, value in {"precisions": precisions, "freedoms": freedoms, "sizes": sizes}.items():
+            self.register_buffer(name, value.to(next(prior.buffers()).device))
 
-    def bound(self, weights: Tensor) -> Tensor:
-        """H (N,N) of the quadratic ``w H w / 2`` that touches the negative log density at weights (N,) from above."""
-        distance = (self.precisions @ weights) @ weights
-        factors = (self.freedoms + self.sizes) / (self.freedoms + distance)
-        return (factors[:, None, None] * self.precisions).sum(0)
+    def energy(self, weights: Tensor) -> Quadratic:
+        """As of ``ShapePrior.energy``, at weights (1,N) float64."""
+        distance = (self.precisions @ weights[0]) @ weights[0]
+        factors = self.strength * (self.freedoms + self.sizes) / (self.freedoms + distance)
+        return Quadratic((factors[:, None, None] * self.precisions).sum(0)[None], torch.zeros_like(weights))

@@ -9,7 +9,6 @@ from torch import Tensor
 
 from torchface.capture.own_rig import VideoSolution, VideoSolver
 from torchface.capture.own_rig.landmark_offsets import LandmarkOffsets
-from torchface.capture.own_rig.landmark_smoothing import filter_landmarks, smooth_landmarks
 from torchface.capture.own_rig.offset_estimate import estimate_offsets
 from torchface.capture.own_rig.take_solve import solve_take
 from torchface.capture.own_rig.weight_walk import frame_intervals
@@ -21,6 +20,7 @@ from torchface.geometry.cameras.distortion import undistort
 from torchface.landmarks.images.face_reading import FaceReading
 from torchface.progress import Progress
 from torchface.rig import BlendshapeRig
+from torchface.temporal.adaptive_kalman import LANDMARK_SETTINGS, adaptive_filter, adaptive_smoother
 from torchface.workflows.track.track_inputs import METHOD, TrackInputs
 from torchface.workflows.track.track_state import TrackState
 
@@ -44,8 +44,9 @@ def smoothed_landmarks(inputs: TrackInputs, reading: FaceReading, times: Tensor 
     """The landmarks (T,68,2) as a camera without distortion has them, filtered along time."""
     fps, count = inputs.clip.fps, len(reading.landmarks)
     intervals = None if times is None else [fps * step for step in frame_intervals(times, count, 1 / fps)]
-    smooth = smooth_landmarks if inputs.settings.whole_take else filter_landmarks
-    return smooth(undistort(reading.trusted_landmarks.double(), inputs.calibration), intervals=intervals).float()
+    smooth = adaptive_smoother if inputs.settings.whole_take else adaptive_filter
+    landmarks = undistort(reading.trusted_landmarks.double(), inputs.calibration)
+    return smooth(landmarks, LANDMARK_SETTINGS, intervals).float()
 
 
 def known_offsets(inputs: TrackInputs, out: Path) -> LandmarkOffsets | None:

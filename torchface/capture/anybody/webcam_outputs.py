@@ -1,4 +1,4 @@
-"""From a solved frame, or one without a face, to the state that is shown: held, relaxed, calmed."""
+"""Outputs of a webcam's frames: weights by ARKit's names, held and relaxed without a face, calmed with one."""
 
 from __future__ import annotations
 
@@ -8,17 +8,18 @@ import torch
 from torch import Tensor
 
 from torchface.capture.anybody.guided_gains import gain_factors
-from torchface.capture.anybody.webcam_state import PARTS, WebcamState
-from torchface.capture.anybody.weight_filter import one_euro_step
+from torchface.capture.anybody.webcam_state import WebcamState
 from torchface.geometry.rotations import rotation_matrix
+from torchface.temporal.one_euro import WEBCAM_ONE_EURO, one_euro_step
 
 _HOLD, _RELAX = 0.3, 0.5
 """For how long a lost face is held, and how long it then takes to rest, seconds."""
 _MISFIT, LOST_FIT = 0.06, 0.14  # of the eyes' distance
+_OCTAVES = 4.0  # of the filter's cutoff, between no smoothing to speak of and the most
 
 
 @dataclass(frozen=True, eq=False)
-class ShownOutputs:
+class OutputTables:
     """What outputs are made by.
 
     Args:
@@ -50,8 +51,8 @@ def lost_state(before: WebcamState, interval: Tensor) -> WebcamState:
     )
 
 
-def shown_state(
-    outputs: ShownOutputs,
+def calmed_state(
+    outputs: OutputTables,
     after: WebcamState,
     before: WebcamState,
     found: Tensor,
@@ -73,7 +74,9 @@ def shown_state(
     speeds = torch.where(first, 0.0, before.speeds)
     old = torch.cat([before.weights, torch.zeros_like(motion)])
     unit = outputs.filter_units
-    calm, speeds = one_euro_step(torch.cat([weights, motion]), old, speeds, interval, smoothing, unit)
+    latest, opening = torch.cat([weights, motion]), torch.exp2(_OCTAVES * (0.5 - smoothing))
+    calm, speeds = one_euro_step(latest, old, speeds, interval, WEBCAM_ONE_EURO, unit, opening)
+    calm = torch.where(smoothing > 0, calm, latest)
     rotation = torch.where(first, turned, rotation_matrix(calm[-6:-3]) @ before.rotation)
     translation = torch.where(first, pose[9:], before.translation + calm[-3:])
     fit = ((LOST_FIT - after.error) / (LOST_FIT - _MISFIT)).clamp(0, 1)
@@ -85,11 +88,3 @@ def shown_state(
         speeds=torch.where(found, speeds, after.speeds),
         tracked=torch.where(found, present * fit, 0.0),
     )
-
-
-def double_state(state: WebcamState) -> WebcamState:
-    return WebcamState(*(getattr(state, name).double() for name in PARTS))
-
-
-def chosen_state(condition: Tensor, one: WebcamState, other: WebcamState) -> WebcamState:
-    return WebcamState(*(torch.where(condition, getattr(one, name), getattr(other, name)) for name in PARTS))
