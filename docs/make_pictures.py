@@ -100,17 +100,17 @@ def fit_picture() -> torch.Tensor:
 
 
 def relight_picture() -> torch.Tensor:
-    """A film's frame, the same under the lamp's mirror image, and with face paint in the light that the frame told."""
+    """A frame of a video, the same with mirrored light, and with face paint in the frame's light."""
     rig = performer(draw_identities(1, torch.Generator().manual_seed(5))[0])
     weights = torch.zeros(1, len(rig.names))
     weights[0, rig.index(["mouthSmileLeft", "mouthSmileRight", "cheekSquintLeft", "cheekSquintRight"])] = 0.55
-    lamp = PointLight(
+    planted = PointLight(
         torch.tensor([0.13, 0.15, 0.2]), torch.tensor([1.0, 0.88, 0.74]), torch.tensor([-520.0, -280, 150])
     )
     stage = LightStageSettings(width=600, height=360, samples=3, noise=0.006, span=300.0)
     with tempfile.TemporaryDirectory() as folder:
         film = render_lit_video(
-            Path(folder) / "film.avi", rig, weights, lamp, 12.0, torch.Generator().manual_seed(2), stage
+            Path(folder) / "film.avi", rig, weights, planted, 12.0, torch.Generator().manual_seed(2), stage
         )
         frame = next(iter(open_video(film.video.path).color_frames()))
     vertices, camera, mesh = film.vertices[0], film.cameras[0], rig.neutral

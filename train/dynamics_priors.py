@@ -49,7 +49,7 @@ def learned_dynamics(settings: PriorSettings, material: Material, progress: Prog
     card = (
         f"Mean and variance of the next frame's weights from the last {window} frames at "
         f"{learn.fps:g} frames a second: Gaussian processes, one for each region of the face, and a noise that grows "
-        "with the motion. Holds a solve to how faces move and bridges frames without landmarks. "
+        "with the motion. Holds a solve to how faces move and interpolates frames without landmarks. "
         f"{limits(settings, material, 'The noise')} Windows carried noise of {settings.input_noise:g} a weight, in "
         "learning and in the test, as solved weights do. Errors are root mean squares in weights; the log likelihood "
         "leaves out its constant. The window was chosen on a take that was left out; the test takes took no part in "

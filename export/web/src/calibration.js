@@ -8,7 +8,7 @@ const STEPS = [
   { pose: 4, words: "Raise your eyebrows." },
   { pose: 5, words: "Shut your eyes until you hear the tone." },
 ];
-const SETTLE = 0.7; // seconds until somebody does what is asked; the graph is told only then
+const SETTLE = 0.7; // seconds until somebody does what is asked; the graph gets the pose only then
 const HOLD = 1.3; // seconds
 const LONGEST_STEP = 0.25; // seconds that one frame may count for
 

@@ -10,7 +10,7 @@ const WORDS = {
   NotReadableError: "The camera cannot be opened; another program may be using it. Close that, then try again.",
   AbortError: "The camera stopped before it gave a picture. Try again.",
 };
-const PATIENCE = 15_000; // milliseconds until a camera that gives no picture is given up
+const SILENT_AFTER = 15_000; // milliseconds without a picture after which a camera counts as silent
 
 /**
  * Opens the camera into a video element.
@@ -52,7 +52,7 @@ export function closeCamera(video, stream) {
 function firstPicture(video) {
   return new Promise((resolve, reject) => {
     const silent = new CameraError("The camera gives no pictures. Open its cover, unplug it and plug it in, or restart.");
-    const timer = setTimeout(() => reject(silent), PATIENCE);
+    const timer = setTimeout(() => reject(silent), SILENT_AFTER);
     const done = () => (clearTimeout(timer), resolve());
     video.addEventListener("loadeddata", done, { once: true }); // in a hidden tab too, where no frame is shown
     video.play().catch(() => {}); // one that may not play gives no picture, which the timer tells

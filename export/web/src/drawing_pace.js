@@ -50,7 +50,7 @@ export class DrawingPace {
   }
 }
 
-/** Waits until all that a WebGL 2 context was told is drawn. */
+/** Waits until a WebGL 2 context has drawn all its commands. */
 export async function drawn(context) {
   const fence = context.fenceSync(context.SYNC_GPU_COMMANDS_COMPLETE, 0);
   context.flush();

@@ -9,7 +9,7 @@ import { onFrame } from "./camera.js";
  * @param {Solver} solver with its graph loaded.
  * @param {() => object} controls what the sliders and the calibration say now.
  * @param {(solved: object) => void} show takes each answer.
- * @param {(error: Error) => void} fail is told why there are no more.
+ * @param {(error: Error) => void} fail gets the reason why there are no more frames.
  * @returns {{stop(): void}}
  */
 export function pumpFrames(video, solver, controls, show, fail) {
