@@ -53,8 +53,7 @@ def live(
     """
     from torchface.errors import FileFormatError
     from torchface.workflows.live.camera import list_cameras
-    from torchface.workflows.live.live_webcam import LiveSettings, go_live
-    from torchface.workflows.live.person_solver import person_solver
+    from torchface.workflows.live.live_anybody import LiveSettings, go_live, person_solver
 
     if cameras:
         found = list_cameras()

@@ -146,7 +146,7 @@ def _live(
     camera: str, rig: Path, address: str, out: Path | None, settings: object, seconds: float | None, quiet: bool
 ) -> None:
     from torchface.files.job_lock import job_lock
-    from torchface.workflows.live.live_track import track_live
+    from torchface.workflows.live.live_actor import track_live
     from torchface.workflows.track.track_files import WEIGHTS
     from torchface.workflows.track.track_inputs import TrackSettings
 

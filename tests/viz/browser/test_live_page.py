@@ -18,8 +18,8 @@ from torchface.rig import BlendshapeRig
 from torchface.viz.browser import live_page
 from torchface.viz.browser.live_page import camera_drawing
 from torchface.viz.browser.live_view import LiveView
-from torchface.workflows.live import live_webcam
-from torchface.workflows.live.live_webcam import LiveSettings, go_live
+from torchface.workflows.live import live_anybody
+from torchface.workflows.live.live_anybody import LiveSettings, go_live
 
 _HEIGHT = """
 const node = window.__viserMutable && window.__viserMutable.nodeRefFromName['/head/part0'];
@@ -61,9 +61,9 @@ class Opened:
     def __init__(self, folder: Path, rig: BlendshapeRig, patch: pytest.MonkeyPatch) -> None:
         self.source, self.solver, self.folder = Slow(), ShadeSolver(), folder
         save_rig(rig, folder / "balls.glb")
-        patch.setattr(live_webcam, "open_source", lambda *_: self.source)
-        patch.setattr(live_webcam, "shipped_detector", lambda: lambda picture: ())
-        patch.setattr(live_webcam, "RECORDINGS", folder / "kept")
+        patch.setattr(live_anybody, "open_source", lambda *_: self.source)
+        patch.setattr(live_anybody, "shipped_detector", lambda: lambda picture: ())
+        patch.setattr(live_anybody, "RECORDINGS", folder / "kept")
         patch.setattr(live_page, "_RATE", 5.0)  # a browser without a graphics card, beside other tests
         self.urls: list[str] = []
         settings = LiveSettings("0", folder / "balls.glb", port=0)

@@ -12,7 +12,7 @@ import torch
 from torchface.capture.anybody import WebcamControls
 from torchface.io.video import VideoFile, write_video
 from torchface.shape_names import ARKIT
-from torchface.workflows.live.solved_frames import LiveFrame
+from torchface.workflows.live.live_frames import LiveFrame
 
 JAW = ARKIT.index("jawOpen")
 SMILE = ARKIT.index("mouthSmileLeft")

@@ -21,15 +21,13 @@ from torchface.errors import FileFormatError, ValueRangeError
 from torchface.io.gltf.animation_reading import read_gltf_weights
 from torchface.shape_names import ARKIT
 from torchface.workflows.live import character as characters
-from torchface.workflows.live import live_webcam, person_solver
+from torchface.workflows.live import live_anybody
 from torchface.workflows.live.character import load_character
-from torchface.workflows.live.face_watch import FaceWatch
-from torchface.workflows.live.frame_log import FrameLog
-from torchface.workflows.live.guided_calibration import STEPS, GuidedCalibration
+from torchface.workflows.live.live_anybody import LiveSettings, go_live
 from torchface.workflows.live.live_figures import LiveFigures
 from torchface.workflows.live.live_session import LiveSession, Notes
-from torchface.workflows.live.live_webcam import LiveSettings, go_live
-from torchface.workflows.live.recordings import Recordings
+from torchface.workflows.live.recordings import FrameLog, Recordings
+from torchface.workflows.live.session_prompts import STEPS, FaceWatch, GuidedCalibration
 from torchface.workflows.live.weight_streams import WeightStreams
 
 
@@ -44,7 +42,7 @@ def dome(dome_rig: BlendshapeRig, tmp_path_factory: pytest.TempPathFactory) -> P
 @pytest.fixture(autouse=True)
 def one_face(monkeypatch: pytest.MonkeyPatch) -> None:
     """Nothing looks for faces in pictures of one shade."""
-    monkeypatch.setattr(live_webcam, "shipped_detector", lambda: lambda picture: ())
+    monkeypatch.setattr(live_anybody, "shipped_detector", lambda: lambda picture: ())
 
 
 def a_session(source: Endless, folder: Path, dome: Path, told: list[str]) -> tuple[LiveSession, Recordings]:
@@ -328,7 +326,7 @@ def test_a_receiver_that_is_not_there_is_told_once_with_the_figure() -> None:
 def test_the_command_plays_records_and_says_what_is_wrong(
     dome: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(person_solver, "person_solver", ShadeSolver)
+    monkeypatch.setattr(live_anybody, "person_solver", ShadeSolver)
     played = film(tmp_path / "film.avi", [0.5] * 4)
     out = tmp_path / "out"
     main(["live", str(played), "--character", str(dome), "--no-page", "--calibrate", "--record", str(out), "--quiet"])

@@ -30,7 +30,7 @@ from torchface.landmarks.images.tracking.landmark_tracker import LandmarkTracker
 from torchface.rendering.point_light import PointLight
 from torchface.shape_names import ARKIT, mapping
 from torchface.synthetic.head.performer import performer
-from torchface.workflows.live.live_track import track_live
+from torchface.workflows.live.live_actor import track_live
 from torchface.workflows.named_finders import load_finder
 from torchface.workflows.track import frame_readings
 from torchface.workflows.track.face_overlay import mesh_drawer, paint_drawer, undistorted

@@ -12,12 +12,10 @@ from torchface.capture.anybody import WebcamControls
 from torchface.errors import FileFormatError
 from torchface.progress import Progress, silent
 from torchface.viz.browser.live_view import LiveView
-from torchface.workflows.live.face_watch import FaceWatch
-from torchface.workflows.live.guided_calibration import GuidedCalibration
 from torchface.workflows.live.live_figures import LiveFigures
-from torchface.workflows.live.live_frames import FrameSource, Say
+from torchface.workflows.live.live_frames import FaceSolver, FrameSource, LiveFrame, Say, solved_frames
 from torchface.workflows.live.recordings import Recordings
-from torchface.workflows.live.solved_frames import FaceSolver, LiveFrame, solved_frames
+from torchface.workflows.live.session_prompts import FaceWatch, GuidedCalibration
 from torchface.workflows.live.weight_streams import WeightStreams
 
 _MAX_NOTES = 20

@@ -1,4 +1,4 @@
-"""An actor before a camera, solved for the actor's own rig frame by frame, and sent on."""
+"""An actor before a camera: landmarks, pose and the weights of the actor's own rig frame by frame, sent on."""
 
 from __future__ import annotations
 
@@ -7,20 +7,62 @@ from collections.abc import Sequence
 from contextlib import closing, nullcontext
 from pathlib import Path
 
+import numpy as np
+import torch
+
+from torchface.capture.anybody import WebcamControls
+from torchface.capture.own_rig import VideoState
+from torchface.capture.own_rig.landmark_offsets import LandmarkOffsets
 from torchface.errors import ValueRangeError
 from torchface.files.whole_files import all_or_none, make_folder
+from torchface.geometry.cameras.distortion import undistort
 from torchface.io.protocols.weight_sender import find_receiver
+from torchface.landmarks.images.tracking.landmark_tracker import LandmarkTracker
 from torchface.number_checks import checked_number
 from torchface.progress import Progress, silent
-from torchface.workflows.live.actor_solver import ActorSolver
-from torchface.workflows.live.frame_log import FrameLog
+from torchface.temporal.adaptive_kalman import LANDMARK_SETTINGS, AdaptiveFilter
 from torchface.workflows.live.live_figures import LiveFigures, LiveReport
-from torchface.workflows.live.live_frames import open_source
-from torchface.workflows.live.solved_frames import solved_frames
+from torchface.workflows.live.live_frames import LiveFrame, open_source, planes, solved_frames
+from torchface.workflows.live.recordings import FrameLog
 from torchface.workflows.live.weight_streams import WeightStreams
 from torchface.workflows.track.take_solution import OFFSETS, offsets_of
 from torchface.workflows.track.track_files import save_curves
-from torchface.workflows.track.track_inputs import TrackSettings, inputs_of, load_actor
+from torchface.workflows.track.track_inputs import TrackInputs, TrackSettings, inputs_of, load_actor
+
+_MIN_LANDMARKS = 6
+
+
+class ActorSolver:
+    """Landmarks, pose and weights one frame at a time.
+
+    Args:
+        inputs: of the camera.
+        offsets: between the rig's landmarks and those that the models find.
+    """
+
+    def __init__(self, inputs: TrackInputs, offsets: LandmarkOffsets | None = None) -> None:
+        self.names, models = inputs.actor.names, inputs.models
+        if models.finder is None:
+            raise ValueRangeError("--landmarks: found a table, expected what finds landmarks as the face moves")
+        self._tracker = LandmarkTracker(models.finder, models.appearance, face=inputs.settings.face)
+        self._calibration, self._filter = inputs.calibration, AdaptiveFilter(68, 2, LANDMARK_SETTINGS)
+        solver = inputs.solver()
+        self._solver = solver if offsets is None else solver.shifted(offsets)
+        self._state: VideoState | None = None
+
+    def step(self, picture: np.ndarray, interval: float | None, controls: WebcamControls) -> LiveFrame:
+        """Solves the next frame; before the first face all weights are 0. Of an actor nothing is learned on the way."""
+        reading = self._tracker.step(planes(picture))
+        trust = reading.trust
+        landmarks = self._filter.step(undistort(reading.trusted_landmarks, self._calibration)).to(reading.landmarks)
+        enough = int((torch.isfinite(landmarks).all(1) & (trust > 0)).sum()) >= _MIN_LANDMARKS
+        if self._state is None and not enough:
+            return LiveFrame(torch.zeros(len(self.names)), torch.full((3, 3), torch.nan), reading.landmarks)
+        before = self._state or self._solver.start()
+        self._state = self._solver.step(before, landmarks, confidence=trust, interval=interval)
+        weights, rotation = self._state.weights.detach().float(), self._state.rotation.detach().float()
+        return LiveFrame(weights, rotation, reading.landmarks)
+
 
 _DEFAULT = TrackSettings()
 

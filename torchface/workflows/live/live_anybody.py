@@ -4,25 +4,70 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from contextlib import ExitStack, closing
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
+import numpy as np
+import torch
+
+from torchface.capture.anybody import WebcamControls
 from torchface.errors import ValueRangeError
 from torchface.files.job_lock import job_lock
 from torchface.io.protocols.weight_sender import find_receiver
 from torchface.landmarks.images.boxes.network_detector import shipped_detector
 from torchface.number_checks import checked_number
+from torchface.onnx.webcam.webcam_session import WebcamSession
 from torchface.progress import Progress, silent
 from torchface.shape_names import ARKIT
 from torchface.workflows.live.camera import DEFAULT_SIZE
 from torchface.workflows.live.character import load_character
-from torchface.workflows.live.face_watch import FaceWatch
 from torchface.workflows.live.live_figures import LiveReport
-from torchface.workflows.live.live_frames import Say, open_source
+from torchface.workflows.live.live_frames import FaceSolver, LiveFrame, Say, open_source
 from torchface.workflows.live.live_session import LiveSession, Notes
 from torchface.workflows.live.recordings import Recordings, SavedTake
-from torchface.workflows.live.solved_frames import FaceSolver
+from torchface.workflows.live.session_prompts import FaceWatch
 from torchface.workflows.live.weight_streams import WeightStreams
+from torchface.workflows.webcam.webcam_graph import webcam_graph
+
+_USUAL = 1 / 30  # seconds
+
+
+class PersonSolver:
+    """Solves frames for ARKit's weights.
+
+    Args:
+        session: runs the graph.
+    """
+
+    def __init__(self, session: WebcamSession) -> None:
+        self._session = session
+        self._ever = False
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Of the weights."""
+        return self._session.names
+
+    def step(self, picture: np.ndarray, interval: float | None, controls: WebcamControls) -> LiveFrame:
+        """Solves the next frame; see :class:`torchface.workflows.live.live_frames.FaceSolver`."""
+        self._session.controls = controls
+        found = self._session.step(picture, _USUAL if interval is None else interval)
+        solved = LiveFrame(
+            found.weights, found.rotation, found.landmarks, found.iris, found.gaze, calibrated=found.calibrated
+        )
+        self._ever = (self._ever and not controls.reset) or solved.seen
+        # Before the first face the graph's head looks anywhere.
+        return solved if self._ever else replace(solved, rotation=torch.full((3, 3), torch.nan))
+
+
+def person_solver(progress: Progress) -> PersonSolver:
+    """A solver for whoever sits before a camera; the first time it is made, which takes a minute.
+
+    Raises:
+        FileFormatError: a model is damaged, or the cache cannot be written to.
+    """
+    return PersonSolver(WebcamSession(webcam_graph(progress)))
+
 
 RECORDINGS = Path("recordings")
 """Where the page's button records to, where no folder was named."""
