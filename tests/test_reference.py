@@ -27,7 +27,6 @@ UNSHOWN = {
         "io.blender.write_blender_file",
     ),
     "wants Node": ("workflows.browser_app.AppReport", "workflows.browser_app.export_app"),
-    "wants a network that the user brings": ("landmarks.YuNetDetector",),
     "wants a film of a painted face": (
         "capture.action_units.ActionUnitCurves",
         "capture.action_units.action_unit_curves",

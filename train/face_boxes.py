@@ -137,7 +137,7 @@ def _save(model: BoxNetwork, settings: Settings, measured: dict[str, float], cou
             f"on {settings.tested} scenes of {_TEST_SIZE} pixels with people that it had not seen. It has seen no "
             "photograph: in real ones small faces of groups are missed where cascades find them, boxes fit more "
             "loosely, and faces turned by more than 40 degrees are found best in turned copies of the picture "
-            "(`torchface.landmarks.images.boxes.turned_search.find_in_quarter_turns`)."
+            "(`torchface.landmarks.images.boxes.find_faces.find_in_quarter_turns`)."
         ),
     )
     zoo.save_model(

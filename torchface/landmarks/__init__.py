@@ -3,14 +3,9 @@
 from torchface.landmarks.images.appearance.appearance_model import AppearanceFit, AppearanceModel, AppearanceSettings
 from torchface.landmarks.images.boxes.box_network import BoxNetwork
 from torchface.landmarks.images.boxes.box_training import BoxTrainingSettings, LabelledPicture
-from torchface.landmarks.images.boxes.face_box import (
-    FaceBoxes,
-    HaarDetector,
-    NoFaceError,
-    YuNetDetector,
-    find_face,
-    find_faces,
-)
+from torchface.landmarks.images.boxes.face_box import FaceBoxes, NoFaceError
+from torchface.landmarks.images.boxes.find_faces import find_face, find_faces
+from torchface.landmarks.images.boxes.haar_detector import HaarDetector
 from torchface.landmarks.images.boxes.network_detector import NetworkDetector
 from torchface.landmarks.images.face_reading import FaceReading
 from torchface.landmarks.images.landmark_finder import LandmarkFinder
@@ -80,7 +75,6 @@ __all__ = [
     "UVLandmarkDetector",
     "UVLandmarks",
     "UnwrappedHead",
-    "YuNetDetector",
     "agreement",
     "appearance_image",
     "contour_correspondences",

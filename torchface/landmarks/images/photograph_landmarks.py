@@ -5,8 +5,8 @@ from __future__ import annotations
 from torch import Tensor
 
 from torchface.landmarks.images.appearance.appearance_model import AppearanceModel
-from torchface.landmarks.images.boxes.face_box import FaceDetector, NoFaceError, find_some_faces
-from torchface.landmarks.images.boxes.turned_search import find_faces_of_any_turn
+from torchface.landmarks.images.boxes.face_box import FaceDetector, NoFaceError
+from torchface.landmarks.images.boxes.find_faces import find_faces_of_any_turn, find_some_faces
 from torchface.landmarks.images.face_reading import FaceReading
 from torchface.landmarks.images.landmark_finder import LandmarkFinder
 from torchface.landmarks.images.tracking.settled_face import refined_face, settled_face

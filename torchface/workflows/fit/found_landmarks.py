@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from torchface.landmarks import FaceReading, NoFaceError, find_landmarks
-from torchface.landmarks.images.boxes.turned_search import find_faces_of_any_turn
+from torchface.landmarks.images.boxes.find_faces import find_faces_of_any_turn
 from torchface.workflows.named_finders import DEFAULT_LANDMARKS, load_finder
 
 UNSURE = 0.2

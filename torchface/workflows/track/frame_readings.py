@@ -13,7 +13,8 @@ from torchface.errors import ValueRangeError
 from torchface.io.landmarks.landmark_tables import load_landmark_table
 from torchface.io.video import VideoFile
 from torchface.io.video.blank_video import BlankVideo
-from torchface.landmarks.images.boxes.face_box import find_faces, overlaps
+from torchface.landmarks.images.boxes.face_box import overlaps
+from torchface.landmarks.images.boxes.find_faces import find_faces
 from torchface.landmarks.images.face_mesh_478 import landmarks_of_mesh
 from torchface.landmarks.images.face_reading import FaceReading
 from torchface.landmarks.images.ibug_68 import COUNT, box_around

@@ -16,8 +16,8 @@ from torchface.landmarks import BoxNetwork, BoxTrainingSettings, LabelledPicture
 from torchface.landmarks.images.boxes.box_network import FaceMaps, face_geometry
 from torchface.landmarks.images.boxes.box_training import box_loss
 from torchface.landmarks.images.boxes.face_box import FaceBoxes
+from torchface.landmarks.images.boxes.find_faces import find_in_quarter_turns
 from torchface.landmarks.images.boxes.network_detector import shipped_detector
-from torchface.landmarks.images.boxes.turned_search import find_in_quarter_turns
 
 FEW = BoxTrainingSettings(pictures=1440, batch=8, rate=2e-2, averaged=10, channels=(8, 12, 16, 16), blocks=(1, 1, 1, 1))
 

@@ -1,29 +1,25 @@
-"""Faces are found where they are, and only there; what is no network is refused."""
+"""Faces are found where they are, and only there."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
-import numpy as np
-import onnx
 import pytest
 import torch
 from torch import Tensor
 
-from torchface.errors import FileFormatError, ShapeError, ValueRangeError
+from torchface.errors import ShapeError, ValueRangeError
 from torchface.geometry.cameras.pinhole import look_at
 from torchface.io.images.image_files import load_image
 from torchface.io.landmarks.dlib_xml import load_dlib_faces
 from torchface.io.video import open_video
 from torchface.landmarks.images.boxes.face_box import (
     FaceBoxes,
-    HaarDetector,
     NoFaceError,
-    YuNetDetector,
-    find_face,
-    find_faces,
     overlaps,
 )
+from torchface.landmarks.images.boxes.find_faces import find_face, find_faces
+from torchface.landmarks.images.boxes.haar_detector import HaarDetector
 from torchface.landmarks.images.ibug_68 import box_around
 from torchface.rendering.clay_shading import render
 from torchface.synthetic import performer
@@ -107,79 +103,6 @@ def test_overlaps_are_shared_area_over_the_whole() -> None:
     boxes = torch.tensor([[0.0, 0, 2, 2], [1, 0, 2, 2], [5, 5, 1, 1]])
     expected = torch.tensor([[1, 1 / 3, 0], [1 / 3, 1, 0], [0, 0, 1]])
     assert torch.allclose(overlaps(boxes, boxes), expected)
-
-
-def yunet_like(path: Path, planted: tuple[float, ...]) -> Path:
-    """A network with YuNet's outputs that scores a cell of 8 x 8 pixels by its brightness.
-
-    ``planted`` are the ten numbers that say where the five points lie from the cell's corner, in cells.
-    """
-    nodes, outputs, constants = [], [], []
-
-    def constant(name: str, values: np.ndarray) -> str:
-        constants.append(onnx.numpy_helper.from_array(values, name))
-        return name
-
-    for stride in (8, 16, 32):
-        light = f"light{stride}"
-        first = np.zeros((1, 3, stride, stride), np.float32)
-        first[:] = 1 / (3 * 255 * stride * stride) if stride == 8 else 0
-        weights = constant(f"w{stride}", first)
-        nodes.append(onnx.helper.make_node("Conv", ["input", weights], [light], strides=[stride, stride]))
-        for name, rows in (("cls", 1), ("obj", 1), ("bbox", 4), ("kps", 10)):
-            slope = np.zeros((rows, 1, 1, 1), np.float32)
-            slope[:] = 1 if name in ("cls", "obj") else 0
-            offset = np.zeros(rows, np.float32)
-            if name == "kps":
-                offset[:] = planted
-            made = [
-                constant(f"{name}s{stride}", slope),
-                constant(f"{name}o{stride}", offset),
-                constant(f"{name}r{stride}", np.array([1, -1, rows], np.int64)),
-            ]
-            mid = f"{name}{stride}"
-            nodes.append(onnx.helper.make_node("Conv", [light, made[0], made[1]], [mid]))
-            nodes.append(onnx.helper.make_node("Transpose", [mid], [mid + "t"], perm=[0, 2, 3, 1]))
-            nodes.append(onnx.helper.make_node("Reshape", [mid + "t", made[2]], [f"{name}_{stride}"]))
-            outputs.append(
-                onnx.helper.make_tensor_value_info(f"{name}_{stride}", onnx.TensorProto.FLOAT, [1, None, rows])
-            )
-    image = onnx.helper.make_tensor_value_info("input", onnx.TensorProto.FLOAT, [1, 3, 160, 160])
-    graph = onnx.helper.make_graph(nodes, "faces", [image], outputs, constants)
-    model = onnx.helper.make_model(graph, opset_imports=[onnx.helper.make_opsetid("", 13)], ir_version=8)
-    path.write_bytes(model.SerializeToString())
-    return path
-
-
-def test_a_yunet_file_is_used_as_it_says(tmp_path: Path) -> None:
-    middle, reach = torch.tensor([0.5, 0.5]), 4.0
-    five = torch.tensor([[0.33, 0.374], [0.68, 0.374], [0.49, 0.572], [0.357, 0.758], [0.655, 0.758]])
-    detector = YuNetDetector(yunet_like(tmp_path / "y.onnx", tuple(((five - middle) * reach).flatten().tolist())))
-    image = torch.zeros(3, 160, 160, dtype=torch.uint8)
-    assert len(find_faces(image, detector)) == 0
-    image[:, 80:88, 40:48] = 255  # the cell whose corner is (40, 80); a box of 32 pixels round it is planted
-    faces = find_faces(image, detector)
-    assert len(faces) == 1
-    assert torch.allclose(faces.boxes[0], torch.tensor([24.0, 64, 32, 32]), atol=0.1)
-    assert float(faces.scores[0]) == pytest.approx(1.0, abs=0.01)
-
-
-def test_what_is_no_network_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(FileFormatError, match="cannot be read"):
-        YuNetDetector(tmp_path / "missing.onnx")
-    (tmp_path / "text.onnx").write_bytes(b"this is no network")
-    with pytest.raises(FileFormatError, match="no valid ONNX"):
-        YuNetDetector(tmp_path / "text.onnx")
-    (tmp_path / "empty.onnx").write_bytes(b"")
-    with pytest.raises(FileFormatError, match="0 bytes"):
-        YuNetDetector(tmp_path / "empty.onnx")
-    value = onnx.helper.make_tensor_value_info("x", onnx.TensorProto.FLOAT, [1])
-    other = onnx.helper.make_tensor_value_info("y", onnx.TensorProto.FLOAT, [1])
-    graph = onnx.helper.make_graph([onnx.helper.make_node("Relu", ["x"], ["y"])], "g", [value], [other])
-    model = onnx.helper.make_model(graph, opset_imports=[onnx.helper.make_opsetid("", 13)], ir_version=8)
-    (tmp_path / "other.onnx").write_bytes(model.SerializeToString())
-    with pytest.raises(FileFormatError, match=r"found outputs y, expected a YuNet network's \(cls_8"):
-        YuNetDetector(tmp_path / "other.onnx")
 
 
 @pytest.mark.real

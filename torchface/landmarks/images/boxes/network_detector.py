@@ -5,7 +5,6 @@ from __future__ import annotations
 import copy
 from functools import cache
 
-import cv2
 import numpy as np
 import torch
 from torch import Tensor, nn
@@ -15,11 +14,11 @@ from torchface.errors import ValueRangeError
 from torchface.files.model_roots import shipped_model
 from torchface.files.models import read_model
 from torchface.landmarks.images.boxes.box_network import BoxNetwork
-from torchface.landmarks.images.boxes.face_box import FaceBoxes, check_image, overlaps, sorted_boxes
+from torchface.landmarks.images.boxes.face_box import FaceBoxes, check_image, one_each, shrunk, sorted_boxes
 
 _MULTIPLE = 32  # pixels: the stride of the network's coarsest level
-_OVERLAP = 0.3  # of two boxes that are of one face
-_SHIPPED_SCORE = 0.55  # above the usual 0.4: four turns show four times as much that is no face
+_LEAST_SCORE, _LONGEST = 0.4, 640  # of a face, and pixels of the copy that is searched
+_SURE_SCORE = 0.55  # of the shipped network: four turns show four times as much that is no face
 
 
 class NetworkDetector:
@@ -40,7 +39,7 @@ class NetworkDetector:
         0
     """
 
-    def __init__(self, network: BoxNetwork, least_score: float = 0.4, longest: int = 640) -> None:
+    def __init__(self, network: BoxNetwork, least_score: float = _LEAST_SCORE, longest: int = _LONGEST) -> None:
         if not (0 < least_score < 1 and longest >= 64):
             raise ValueRangeError(
                 f"NetworkDetector: found score {least_score}, longest {longest}; expected (0,1), from 64"
@@ -56,10 +55,7 @@ class NetworkDetector:
         height, width = pixels.shape[1:]
         scale = min(1.0, self.longest / max(height, width))
         if scale < 1:
-            size = (max(1, round(width * scale)), max(1, round(height * scale)))
-            small = cv2.resize(
-                np.ascontiguousarray(pixels.permute(1, 2, 0).numpy()), size, interpolation=cv2.INTER_AREA
-            )
+            small = shrunk(np.ascontiguousarray(pixels.permute(1, 2, 0).numpy()), scale)
             pixels = torch.from_numpy(small).permute(2, 0, 1)
         ratio = torch.tensor([width / pixels.shape[2], height / pixels.shape[1]])
         faces = self._fused(_padded(pixels)[None].float() / 255)[0].clone()
@@ -67,9 +63,8 @@ class NetworkDetector:
         middle = (faces[:, :2] + 0.5) * ratio - 0.5
         side = faces[:, 2:3] * ratio.mean()
         boxes = torch.cat([middle - side / 2, side, side], 1)
-        alone = _one_each(boxes)
-        tilts = torch.atan2(faces[:, 5], faces[:, 4])
-        return sorted_boxes(boxes[alone], faces[alone, 3], tilts[alone])
+        best, tilts = one_each(boxes, faces[:, 3]), torch.atan2(faces[:, 5], faces[:, 4])
+        return sorted_boxes(boxes[best], faces[best, 3], tilts[best])
 
 
 @cache
@@ -80,7 +75,7 @@ def shipped_detector() -> NetworkDetector:
         FileFormatError: it is missing or damaged.
     """
     network = read_model(shipped_model("face_boxes"), {"face_boxes": BoxNetwork})
-    return NetworkDetector(network, _SHIPPED_SCORE)
+    return NetworkDetector(network, _SURE_SCORE)
 
 
 def _padded(pixels: Tensor) -> Tensor:
@@ -90,16 +85,6 @@ def _padded(pixels: Tensor) -> Tensor:
     rows = torch.arange(wanted[0]).clamp(max=height - 1)
     columns = torch.arange(wanted[1]).clamp(max=width - 1)
     return pixels[:, rows][:, :, columns]
-
-
-def _one_each(boxes: Tensor) -> Tensor:
-    """Rows of boxes (F,4), the likeliest first, that no likelier one overlaps."""
-    shared = overlaps(boxes, boxes) > _OVERLAP
-    kept: list[int] = []
-    for row in range(len(boxes)):  # at most K
-        if not shared[row, kept].any():
-            kept.append(row)
-    return torch.tensor(kept, dtype=torch.long)
 
 
 def without_normalisation(network: BoxNetwork) -> BoxNetwork:

@@ -9,15 +9,9 @@ from torch import Tensor
 
 from torchface.errors import ValueRangeError
 from torchface.landmarks.images.appearance.appearance_model import AppearanceModel
-from torchface.landmarks.images.boxes.face_box import (
-    FaceBoxes,
-    FaceDetector,
-    HaarDetector,
-    check_image,
-    find_faces,
-    overlaps,
-)
-from torchface.landmarks.images.boxes.turned_search import find_turned_faces
+from torchface.landmarks.images.boxes.face_box import FaceBoxes, FaceDetector, check_image, overlaps
+from torchface.landmarks.images.boxes.find_faces import find_faces, find_turned_faces
+from torchface.landmarks.images.boxes.haar_detector import STREAM, SURROUNDINGS, HaarDetector
 from torchface.landmarks.images.face_reading import FaceReading
 from torchface.landmarks.images.ibug_68 import turned_box
 from torchface.landmarks.images.landmark_finder import LandmarkFinder, find_in_box
@@ -98,7 +92,9 @@ class LandmarkTracker:
             raise ValueRangeError(f"face: found {face}, expected a number from 0")
         self.finder: LandmarkFinder = TreeFinder(finder) if isinstance(finder, LandmarkTrees) else finder
         self.appearance, self.face = appearance, face
-        self.detector = detector or HaarDetector(smallest=0.1, step=1.15)
+        self.detector = detector or HaarDetector(**STREAM)
+        haar = isinstance(self.detector, HaarDetector)
+        self._near_detector: FaceDetector = HaarDetector(**SURROUNDINGS) if haar else self.detector
         self.settings = settings or TrackingSettings()
         self.reset()
 
@@ -213,8 +209,7 @@ class LandmarkTracker:
         x, y, side = (float(value) for value in (box[0], box[1], box[2]))
         left, top = max(0, int(x - side / 2)), max(0, int(y - side / 2))
         piece = frame[..., top : int(y + 1.5 * side) + 1, left : int(x + 1.5 * side) + 1]
-        detector = HaarDetector(smallest=0.33, step=1.1) if isinstance(self.detector, HaarDetector) else self.detector
-        faces = find_faces(piece, detector)
+        faces = find_faces(piece, self._near_detector)
         corner = box.new_tensor([left, top, 0, 0])
         faces = FaceBoxes(faces.boxes + corner, faces.scores, faces.tilts)
         self._note_others(frame, faces, box)

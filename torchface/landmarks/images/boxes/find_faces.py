@@ -1,4 +1,4 @@
-"""Faces of any roll angle, by a detector of upright ones: on small copies of the image, each turned."""
+"""Searches of an image for faces: upright ones, those at any roll angle, one by its number."""
 
 from __future__ import annotations
 
@@ -12,18 +12,73 @@ from torch import Tensor
 from torchface.landmarks.images.boxes.face_box import (
     FaceBoxes,
     FaceDetector,
-    HaarDetector,
-    find_faces,
+    NoFaceError,
+    check_image,
     grey_pixels,
-    overlaps,
+    one_each,
+    shrunk,
     sorted_boxes,
 )
+from torchface.landmarks.images.boxes.haar_detector import PICTURE, TURNED, HaarDetector
 from torchface.landmarks.images.boxes.network_detector import shipped_detector
 
-_LONGEST = 480
+_TURNED_LONGEST = 480  # pixels of the copy that cascades are shown in turns
 _ANGLES = (40.0, -40.0, 90.0, -90.0, 180.0)
-_SAME = 0.3
 _CLEAR = 0.5  # least score: five turns show five times as much that is no face, and what is one scored 0.69 to 0.85
+
+
+def find_faces(image: Tensor, detector: FaceDetector | None = None) -> FaceBoxes:
+    """All faces in an image, the largest first; none is no error.
+
+    Args:
+        image: uint8 (H,W), or (3,H,W) red first.
+        detector: the shipped cascades if absent, profiles beside frontal faces.
+
+    Raises:
+        ShapeError: no such image.
+
+    Example:
+        >>> len(find_faces(torch.full((120, 160), 128, dtype=torch.uint8)).boxes)
+        0
+    """
+    check_image(image)
+    return (detector or HaarDetector(**PICTURE))(image)
+
+
+def find_face(image: Tensor, number: int = 0, detector: FaceDetector | None = None) -> Tensor:
+    """The box of one face: x, y, width, height, (4,) pixels; see :func:`find_some_faces`.
+
+    Example:
+        >>> from torchface.landmarks import NoFaceError
+        >>> try:
+        ...     box = find_face(torch.full((120, 160), 128, dtype=torch.uint8))
+        ... except NoFaceError as error:
+        ...     print(error)
+        image of 160 x 120: found no face, expected one at least
+    """
+    return find_some_faces(image, number, detector).boxes[number]
+
+
+def find_some_faces(image: Tensor, number: int = 0, detector: FaceDetector | None = None) -> FaceBoxes:
+    """All faces in an image, the largest first, one of this number among them.
+
+    Args:
+        image: uint8 (H,W), or (3,H,W) red first.
+        number: of the face that must be there, from 0.
+        detector: the shipped cascades if absent.
+
+    Raises:
+        NoFaceError: there are not so many.
+        ShapeError: no such image.
+    """
+    faces = find_faces(image, detector)
+    if not 0 <= number < len(faces):
+        found = "no face" if not len(faces) else f"{len(faces)} {'face' if len(faces) == 1 else 'faces'}"
+        raise NoFaceError(
+            f"image of {image.shape[-1]} x {image.shape[-2]}: found {found}, expected "
+            + ("one at least" if number == 0 else f"more than {number}")
+        )
+    return faces
 
 
 def find_faces_of_any_turn(image: Tensor, detector: FaceDetector | None = None) -> FaceBoxes:
@@ -42,7 +97,7 @@ def find_turned_faces(image: Tensor, detector: FaceDetector) -> FaceBoxes:
 
     Args:
         image: uint8 (H,W), or (3,H,W) red first.
-        detector: finds upright faces; one that tells tilts is believed on top of the turn. Before the cascades, which
+        detector: finds upright faces; one that states tilts is believed on top of the turn. Before the cascades, which
             know upright faces alone, the shipped network of face boxes is asked.
     """
     if isinstance(detector, HaarDetector):
@@ -53,7 +108,7 @@ def find_turned_faces(image: Tensor, detector: FaceDetector) -> FaceBoxes:
 
 
 def find_in_quarter_turns(image: Tensor, detector: FaceDetector) -> FaceBoxes:
-    """Faces at every roll angle, the largest first, by a detector that tells tilts but knows upright faces best.
+    """Faces at every roll angle, the largest first, by a detector that states tilts but knows upright faces best.
 
     Args:
         image: uint8 (H,W), or (3,H,W) red first.
@@ -62,24 +117,24 @@ def find_in_quarter_turns(image: Tensor, detector: FaceDetector) -> FaceBoxes:
     height, width = image.shape[-2:]
     boxes, scores, tilts = [], [], []
     for quarters in range(4):  # counter-clockwise; a detector is shown one image at a time
-        found = find_faces(image.rot90(quarters, (-2, -1)), detector)
-        sides = found.boxes[:, 2:]
-        x, y = (found.boxes[:, :2] + sides / 2).unbind(1)
+        faces = find_faces(image.rot90(quarters, (-2, -1)), detector)
+        sides = faces.boxes[:, 2:]
+        x, y = (faces.boxes[:, :2] + sides / 2).unbind(1)
         back = ((x, y), (width - 1 - y, x), (width - 1 - x, height - 1 - y), (y, height - 1 - x))[quarters]
         boxes.append(torch.cat([torch.stack(back, 1) - sides / 2, sides], 1))
-        scores.append(found.scores)
-        tilts.append(found.tilts + quarters * math.pi / 2)
-    return _best(torch.cat(boxes), torch.cat(scores), torch.cat(tilts))
+        scores.append(faces.scores)
+        tilts.append(faces.tilts + quarters * math.pi / 2)
+    return _joined(boxes, scores, tilts)
 
 
 def _find_in_turns(image: Tensor, detector: FaceDetector) -> FaceBoxes:
     """Faces turned by about 40, 90 or 180 degrees, by a detector of upright ones."""
     grey = grey_pixels(image)
-    scale = min(1.0, _LONGEST / max(grey.shape))
-    size = (max(1, round(grey.shape[1] * scale)), max(1, round(grey.shape[0] * scale)))
-    small = cv2.resize(grey, size, interpolation=cv2.INTER_AREA) if scale < 1 else grey
+    scale = min(1.0, _TURNED_LONGEST / max(grey.shape))
+    small = shrunk(grey, scale)
+    size = small.shape[::-1]
     if isinstance(detector, HaarDetector):
-        detector = replace(detector, profiles="never")
+        detector = replace(detector, **TURNED)
     ratio = torch.tensor([grey.shape[1] / size[0], grey.shape[0] / size[1]])
     boxes, scores, tilts = [torch.zeros(0, 4)], [torch.zeros(0)], [torch.zeros(0)]
     for degrees in _ANGLES:  # a detector is shown one image at a time
@@ -105,13 +160,11 @@ def _find_in_turns(image: Tensor, detector: FaceDetector) -> FaceBoxes:
         boxes.append(torch.cat([back - sides / 2, sides], 1))
         scores.append(found.scores)
         tilts.append(found.tilts + angle)
-    return _best(torch.cat(boxes), torch.cat(scores), torch.cat(tilts))
+    return _joined(boxes, scores, tilts)
 
 
-def _best(boxes: Tensor, scores: Tensor, tilts: Tensor) -> FaceBoxes:
+def _joined(boxes: list[Tensor], scores: list[Tensor], tilts: list[Tensor]) -> FaceBoxes:
     """One face where several turns show the same: that of the highest score."""
-    kept: list[int] = []
-    for i in scores.argsort(descending=True, stable=True).tolist():  # a few faces
-        if not kept or float(overlaps(boxes[i : i + 1], boxes[kept]).max()) < _SAME:
-            kept.append(i)
-    return sorted_boxes(boxes[kept], scores[kept], tilts[kept])
+    every, score, tilt = torch.cat(boxes), torch.cat(scores), torch.cat(tilts)
+    best = one_each(every, score)
+    return sorted_boxes(every[best], score[best], tilt[best])
