@@ -16,7 +16,6 @@ from torch import Tensor
 
 from torchface import zoo
 from torchface.errors import ValueRangeError
-from torchface.landmarks import agreement
 from torchface.landmarks.images.networks.eye_augmentation import EyeAugmentation, augmented_eyes
 from torchface.landmarks.images.networks.eye_network import EyeNetwork
 from torchface.landmarks.images.networks.eye_training import EyeSettings
@@ -109,10 +108,10 @@ def measures(model: EyeNetwork, pictures: StoredEyePictures, augmentation: EyeAu
     sure = (closed[:, 1] < 0.1) | (closed[:, 1] > 0.9)
     called, is_shut = closed[sure, 0] > 0.5, closed[sure, 1] > 0.5
     both = (called & is_shut).sum()
-    correlation, slope = agreement(gap[:, 0], gap[:, 1])
+    spread = torch.cov(gap.T)  # of gaps found and true
     return {
-        "lid gap, correlation": correlation,
-        "lid gap, slope": slope,
+        "lid gap, correlation": float(spread[0, 1] / (spread[0, 0] * spread[1, 1]).sqrt()),
+        "lid gap, slope": float(spread[0, 1] / spread[1, 1]),
         "irises, median error, % of the eye's width": 100 * float(torch.cat(irises)[seen].nanmedian()),
         "shut eyes found, %": 100 * float(both / is_shut.sum().clamp(min=1)),
         "eyes called shut that are, %": 100 * float(both / called.sum().clamp(min=1)),

@@ -14,23 +14,19 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from planted.landmark_measures import Agreement, agreement, find_blinks, lid_openings, mouth_gap
 from torchface.io.images.image_files import load_image
 from torchface.io.landmarks.dlib_xml import load_dlib_faces
 from torchface.io.landmarks.landmark_points import load_landmark_points
 from torchface.io.video import open_video
 from torchface.landmarks import (
-    Agreement,
     FaceBoxes,
     FaceReading,
     HaarDetector,
     LandmarkTracker,
     NoFaceError,
-    agreement,
-    find_blinks,
     find_landmarks,
     landmark_jitter,
-    lid_openings,
-    mouth_gap,
 )
 from torchface.landmarks.images.ibug_68 import INNER, box_around, relative_errors, tilt_around
 from torchface.landmarks.images.landmark_finder import LandmarkFinder

@@ -17,8 +17,8 @@ from torch import Tensor
 from webcam_clips import KEPT
 from webcam_solvers import SOLVERS, Solver, read_faces
 
+from planted.landmark_measures import Agreement, lid_openings, mouth_gap
 from torchface.files.whole_files import make_folder
-from torchface.landmarks import Agreement, lid_openings, mouth_gap
 from torchface.landmarks.images.face_reading import FaceReading
 from torchface.shape_names import ARKIT, mapping
 from torchface.synthetic import performer

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torchface.landmarks import Agreement, agreement
+from planted.landmark_measures import Agreement, agreement
 from torchface.shape_names import ARKIT
 from train.rendered_people.people import Person, closed_lids
 

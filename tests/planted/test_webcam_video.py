@@ -8,6 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from planted.landmark_measures import lid_openings, mouth_gap
 from planted.webcam_performance import (
     SittingSettings,
     WebcamPerformance,
@@ -17,7 +18,6 @@ from planted.webcam_performance import (
     with_speech,
 )
 from planted.webcam_video import WebcamFrame, WebcamSettings, posed_head, webcam_frames
-from torchface.landmarks import lid_openings, mouth_gap
 from torchface.shape_names import ARKIT
 from train.rendered_people.head_kind import performer_kind
 from train.rendered_people.looks import draw_looks

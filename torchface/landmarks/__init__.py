@@ -9,20 +9,12 @@ from torchface.landmarks.images.boxes.haar_detector import HaarDetector
 from torchface.landmarks.images.boxes.network_detector import NetworkDetector
 from torchface.landmarks.images.face_reading import FaceReading
 from torchface.landmarks.images.landmark_finder import LandmarkFinder
-from torchface.landmarks.images.landmark_measures import (
-    Agreement,
-    agreement,
-    find_blinks,
-    landmark_jitter,
-    lid_openings,
-    mouth_gap,
-)
 from torchface.landmarks.images.networks.eye_network import EyeFindings, EyeNetwork
 from torchface.landmarks.images.networks.landmark_network import LandmarkNetwork, NetworkLandmarks
 from torchface.landmarks.images.networks.landmark_training import NetworkSettings
 from torchface.landmarks.images.photograph_landmarks import find_landmarks
 from torchface.landmarks.images.tracking.landmark_tracker import LandmarkTracker
-from torchface.landmarks.images.tracking.video_landmarks import track_landmarks
+from torchface.landmarks.images.tracking.video_landmarks import landmark_jitter, track_landmarks
 from torchface.landmarks.images.trees.landmark_trees import LandmarkTrees
 from torchface.landmarks.images.trees.tree_finder import TreeFinder
 from torchface.landmarks.images.trees.tree_training import TreeSettings
@@ -40,7 +32,6 @@ from torchface.landmarks.scans.uv_landmark_names import UV_LANDMARK_NAMES, uv_la
 
 __all__ = [
     "UV_LANDMARK_NAMES",
-    "Agreement",
     "AppearanceFit",
     "AppearanceModel",
     "AppearanceSettings",
@@ -75,20 +66,16 @@ __all__ = [
     "UVLandmarkDetector",
     "UVLandmarks",
     "UnwrappedHead",
-    "agreement",
     "appearance_image",
     "contour_correspondences",
     "curvature_image",
-    "find_blinks",
     "find_face",
     "find_faces",
     "find_landmarks",
     "landmark_jitter",
-    "lid_openings",
     "line_image",
     "load_annotations",
     "load_detector",
-    "mouth_gap",
     "save_annotations",
     "save_detector",
     "scan_landmarks",

@@ -15,7 +15,7 @@ from torchface.capture.own_rig.weight_walk import HIDDEN
 from torchface.geometry.cameras.calibration import CameraCalibration
 from torchface.io.video import VideoFile
 from torchface.landmarks.images.face_reading import FaceReading
-from torchface.landmarks.images.landmark_measures import landmark_jitter
+from torchface.landmarks.images.tracking.video_landmarks import landmark_jitter
 from torchface.rendering.point_light import PointLight
 from torchface.rig import BlendshapeRig
 from torchface.workflows.track.track_inputs import TrackInputs

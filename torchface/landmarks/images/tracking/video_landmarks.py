@@ -1,4 +1,4 @@
-"""Landmarks of one face in all frames of a video."""
+"""Landmarks of one face in all frames of a video, and how much they tremble."""
 
 from __future__ import annotations
 
@@ -70,3 +70,31 @@ def track_landmarks(
         return Track(LANDMARK_NAMES, torch.zeros(0, COUNT, 2), torch.zeros(0, COUNT))
     take = FaceReading.stacked(readings)
     return Track(LANDMARK_NAMES, take.landmarks, take.confidence)
+
+
+def landmark_jitter(landmarks: Tensor) -> Tensor:
+    r"""How much landmarks tremble, in pixels.
+
+    .. math:: \sqrt{\tfrac16\, \operatorname{mean} (x_{t-1} - 2 x_t + x_{t+1})^2}
+
+    over all coordinates: the standard deviation of white noise on a motion of constant velocity. What accelerates
+    counts too: it is measured best on a still face.
+
+    Args:
+        landmarks: (T,L,2), pixels; NaN for not seen.
+
+    Returns:
+        A number; NaN where no landmark is seen in three frames in a row.
+
+    Raises:
+        ShapeError: not (T,L,2).
+
+    Example:
+        >>> steady = torch.arange(50.0)[:, None, None] * torch.ones(1, 68, 2)
+        >>> landmark_jitter(steady).item()  # a constant speed is none
+        0.0
+    """
+    if landmarks.ndim != 3 or landmarks.shape[2] != 2:
+        raise ShapeError(f"landmarks: found {tuple(landmarks.shape)}, expected (T,L,2)")
+    second = (landmarks[2:] - 2 * landmarks[1:-1] + landmarks[:-2]).double()
+    return (second.square().nanmean() / 6).sqrt()

