@@ -36,7 +36,7 @@ __all__ = [*_HOMES, "__version__"]
 
 if TYPE_CHECKING:
     from torchface.attachment import Attachment
-    from torchface.correctives.definitions import Corrective, Correctives
+    from torchface.correctives.corrective_shapes import Corrective, Correctives
     from torchface.errors import TorchfaceError
     from torchface.io import (
         load_mesh,

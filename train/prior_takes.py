@@ -16,7 +16,7 @@ from torchface.files.content_keys import content_key
 from torchface.progress import Progress, silent
 from torchface.shape_names import mapping
 from torchface.synthetic.stages.weight_curves import perform
-from torchface.workflows.solve.solve_take import SolveSettings, solve_markers
+from torchface.workflows.solve.solution import SolveSettings, solve_markers
 
 from .held_out import held_out_people
 from .kept_takes import KeptTake, TakesRead, TakeStore

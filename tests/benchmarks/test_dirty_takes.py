@@ -168,7 +168,7 @@ def frames_late(weights: Tensor, true: Tensor) -> float:
 
 @pytest.mark.real
 def test_streamed_takes(real_capture: Capture) -> None:
-    """Each frame smoothed by those before, as ``solve --stream`` sends it, beside the frames as they are solved."""
+    """Each frame smoothed by those before, as in a live session, beside the frames as they are solved."""
     rig, attachment, takes = real_capture
     solver = MarkerSolver(rig, attachment)
     print("\ntake | jitter over the true: alone  streamed | error over the unsmoothed | frames late")

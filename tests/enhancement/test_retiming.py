@@ -15,7 +15,8 @@ from torchface.enhancement import EnhancementModel
 from torchface.enhancement.animation_retiming import at_moments, retimed_moments
 from torchface.enhancement.timing.actor_timing import ActorTiming, LearnedTiming
 from torchface.enhancement.timing.motion_keyframes import find_keyframes
-from torchface.enhancement.timing.nearest_timing import interpolate, motion_progress, project_sequence
+from torchface.enhancement.timing.nearest_timing import motion_progress
+from torchface.enhancement.timing.retiming_path import project_sequence
 from torchface.errors import ShapeError, TorchfaceError, ValueRangeError
 
 
@@ -159,7 +160,7 @@ def test_keyframes_are_kept_exactly(model: EnhancementModel, database: Database)
     times = model.retime(keyframes, 12)
     assert times.shape == (len(model.region_names), 12)
     assert bool((times[:, 1:] >= times[:, :-1]).all())
-    frames = interpolate(keyframes, times, model.vertex_weights)
+    frames = at_moments(keyframes, times.double(), model.vertex_weights)
     assert torch.equal(frames[0], keyframes[0])
     assert torch.equal(frames[-1], keyframes[1])
 

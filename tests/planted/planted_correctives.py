@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from torchface.correctives.definitions import Corrective, Correctives
+from torchface.correctives.corrective_shapes import Corrective, Correctives
 from torchface.errors import ValueRangeError
 from torchface.number_checks import checked_count, checked_number
 from torchface.rig import BlendshapeRig

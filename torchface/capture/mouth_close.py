@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 
 import torch
 
-from torchface.correctives.definitions import Corrective, Correctives
+from torchface.correctives.corrective_shapes import Corrective, Correctives
 from torchface.errors import NameMismatchError, ValueRangeError
 from torchface.rig import BlendshapeRig
 from torchface.shape_names import arkit_sources

@@ -67,9 +67,8 @@ def attach(
     """
     from torchface.errors import ValueRangeError
     from torchface.files.job_lock import file_lock
-    from torchface.workflows.attach.attach_markers import AttachSettings
+    from torchface.workflows.attach.attach_markers import MOTIONS, AttachSettings, MotionJob
     from torchface.workflows.attach.attach_markers import attach as find_sites
-    from torchface.workflows.attach.motion_job import MOTIONS, MotionJob
     from torchface.workflows.batch.batch_items import check_folder, find_items, is_batch
     from torchface.workflows.batch.run_batch import BatchOptions, run_batch
     from torchface.workflows.marker_input import MarkerOptions

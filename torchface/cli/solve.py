@@ -73,16 +73,15 @@ def solve(
         slip: The helmet moves on the head: find its motion, and keep it out of the weights.
         clean: Find swapped labels, spikes and markers that drift or fell off, and repair what is safe.
         frame_by_frame: Solve every frame on its own, with the markers' noise in the curves. Otherwise the whole take is
-            solved at once: smooth curves, gaps bridged, fast motion keeps its height.
+            solved at once: smooth curves, gaps interpolated, fast motion keeps its height.
         video: What a head camera saw of painted patterns during the take; leads the shapes that markers hardly see.
         action_units: The classifier for the video, by name or folder; see `torchface train action_units`.
         video_labels: Where helmet, markers and regions are in the video, TOML; VIDEO with .toml for its ending if
             absent.
         table: What action units mean in the rig's shapes, TOML; built in for ARKit's and ICT-FaceKit's names.
         report: A folder for a page: the face playing, the error of each marker, what was wrong, every curve.
-        stream: Then send the frames in their own time: as Live Link Face does to udp://127.0.0.1:11111 for Unreal on
-            this machine, by the VMC protocol to vmc://HOST:PORT, or plain to osc://HOST:PORT/PREFIX. Each is smoothed
-            by those before it (not with --frame-by-frame).
+        stream: Then send the solved frames in their own time: as Live Link Face does to udp://127.0.0.1:11111 for
+            Unreal on this machine, by the VMC protocol to vmc://HOST:PORT, or plain to osc://HOST:PORT/PREFIX.
         sparsity: Pull of each weight toward zero, square millimetres; the default suits 0.3 mm noise.
         ridge: Quadratic pull of each weight toward zero, square millimetres.
         part: Keep this region of the rig only, such as face.
@@ -100,7 +99,8 @@ def solve(
     from torchface.workflows.batch.run_batch import BatchOptions, run_batch
     from torchface.workflows.marker_input import MARKER_TAKES, MarkerOptions
     from torchface.workflows.solve.head_camera import HeadCamera
-    from torchface.workflows.solve.solve_take import SolveSettings, TakeInputs, TakeOutputs, solve_take
+    from torchface.workflows.solve.solution import SolveSettings
+    from torchface.workflows.solve.solve_take import TakeInputs, TakeOutputs, solve_take
     from torchface.workflows.solve.take_job import TakeJob
 
     if labels is not None and labels.suffix.lower() == ".toml":

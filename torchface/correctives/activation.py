@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from torchface.correctives.definitions import MOST_DRIVERS, Corrective, check_definitions
+from torchface.correctives.corrective_shapes import MOST_DRIVERS, Corrective, check_definitions
 from torchface.errors import NameMismatchError
 
 ROUNDED = 3.2  # four fifths at the middle: as near to a straight rise and fall as a parabola comes

@@ -276,8 +276,8 @@ class EnhancementModel(nn.Module):
             fps: of these frames; the database's unless given.
 
         Returns:
-            How far each region has come in each frame, (R,frames), 0 first and 1 last, never falling; see
-            ``torchface.enhancement.timing.nearest_timing.interpolate``.
+            How far each region has come in each frame, (R,frames), 0 first and 1 last, never falling;
+            ``torchface.enhancement.animation_retiming.at_moments`` makes the motion of it.
 
         Raises:
             TopologyError: another number of vertices, or another order.

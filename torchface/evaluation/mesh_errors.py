@@ -26,13 +26,18 @@ def marker_rmse(rig: BlendshapeRig, attachment: Attachment, weights: Tensor, mar
         >>> marker_rmse(rig, nose, torch.zeros(1, len(rig.names)), seen[None]).round(decimals=3).tolist()
         [2.0]
     """
+    return marker_offsets(rig, attachment, weights, markers).square().sum(-1).nanmean(-1).sqrt()
+
+
+def marker_offsets(rig: BlendshapeRig, attachment: Attachment, weights: Tensor, markers: Tensor) -> Tensor:
+    """From each marker's site on the rig at weights (T,N) to the marker (T,M,3): (T,M,3), NaN where it is NaN."""
     faces = rig.neutral.faces
     basis = attachment.on(faces, rig.deltas)
-    solved = attachment.on(faces, rig.vertices) + torch.einsum("tn,nmc->tmc", weights.to(basis), basis)
+    sites = attachment.on(faces, rig.vertices) + torch.einsum("tn,nmc->tmc", weights.to(basis), basis)
     if rig.activation is not None and rig.corrective_deltas is not None:
-        more = attachment.on(faces, rig.corrective_deltas)
-        solved = solved + torch.einsum("tn,nmc->tmc", rig.activation(weights.to(more)), more)
-    return (solved - markers.to(basis)).square().sum(-1).nanmean(-1).sqrt()
+        corrections = attachment.on(faces, rig.corrective_deltas)
+        sites = sites + torch.einsum("tn,nmc->tmc", rig.activation(weights.to(corrections)), corrections)
+    return markers.to(basis) - sites
 
 
 def moved_vertices(rig: BlendshapeRig, weights: Tensor, keep: Tensor) -> Tensor:

@@ -14,8 +14,8 @@ from torchface.geometry.similarity import Similarity
 from torchface.mesh import Mesh
 from torchface.workflows.animated_meshes import AnimatedMesh
 from torchface.workflows.enhance import head_correspondence
+from torchface.workflows.enhance.coarse_input import other_topology
 from torchface.workflows.enhance.head_correspondence import HeadCorrespondence
-from torchface.workflows.enhance.mesh_input import other_topology
 
 MOUTH, DEPTH, DROP = 20.0, 8.0, 8.0
 

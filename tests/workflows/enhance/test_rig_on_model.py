@@ -14,7 +14,7 @@ from torchface.geometry.rotations import rotation_matrix
 from torchface.mesh import Mesh
 from torchface.progress import silent
 from torchface.rig import BlendshapeRig
-from torchface.workflows.enhance.rig_on_model import RigOnModel, lay_rig
+from torchface.workflows.enhance.rig_on_model import RigOnModel, rig_on_model
 
 
 @pytest.fixture(scope="module")
@@ -39,37 +39,39 @@ def pairs(actor: Actor, tmp_path_factory: pytest.TempPathFactory) -> tuple[Blend
 
 
 @pytest.fixture(scope="module")
-def laid(pairs: tuple[BlendshapeRig, Path], model: Mesh, tmp_path_factory: pytest.TempPathFactory) -> RigOnModel:
+def placed(pairs: tuple[BlendshapeRig, Path], model: Mesh, tmp_path_factory: pytest.TempPathFactory) -> RigOnModel:
     rig, path = pairs
-    return lay_rig(rig, Path("part.glb"), model, path, tmp_path_factory.mktemp("kept") / "found.safetensors", silent)
+    return rig_on_model(
+        rig, Path("part.glb"), model, path, tmp_path_factory.mktemp("kept") / "found.safetensors", silent
+    )
 
 
-def test_poses_of_another_topology_reach_the_dense_mesh(actor: Actor, laid: RigOnModel) -> None:
+def test_poses_of_another_topology_reach_the_dense_mesh(actor: Actor, placed: RigOnModel) -> None:
     heights = actor.rig.vertices[:, 1]
     shown = heights > heights.quantile(0.25)
     weights = actor.weights[[0, -1]]
-    dense = laid.dense(laid.rig(weights))
+    dense = placed.dense(placed.rig(weights))
     apart = (dense - actor.rig(weights)).norm(dim=-1)[:, shown]
     moved = (actor.rig(weights[1:]) - actor.rig.vertices).norm(dim=-1)[0, shown]
     assert float(apart[0].square().mean().sqrt()) < 0.05
     assert float(apart[1].square().mean().sqrt()) < 0.15 * float(moved.square().mean().sqrt())
-    assert laid.scale == pytest.approx(1, abs=1e-3)
+    assert placed.scale == pytest.approx(1, abs=1e-3)
 
 
-def test_what_the_model_has_at_its_vertices_is_read_at_the_rigs(actor: Actor, laid: RigOnModel, model: Mesh) -> None:
+def test_what_the_model_has_at_its_vertices_is_read_at_the_rigs(actor: Actor, placed: RigOnModel, model: Mesh) -> None:
     values = model.vertices.T
-    torch.testing.assert_close(laid.carried(values, model).T, laid.laid.vertices, atol=0.05, rtol=0)
-    sites = laid.sites()
+    torch.testing.assert_close(placed.carried(values, model).T, placed.neutral.vertices, atol=0.05, rtol=0)
+    sites = placed.sites()
     assert len(sites.unique()) == len(sites)
-    assert bool(laid.found.known[sites].all())
+    assert bool(placed.correspondence.known[sites].all())
 
 
 def test_a_rig_of_another_size_is_refused(actor: Actor, model: Mesh, tmp_path: Path) -> None:
     large = BlendshapeRig(actor.mesh.with_vertices(10 * actor.rig.vertices), 10 * actor.rig.deltas, actor.rig.names)
     with pytest.raises(AlignmentError, match=r"large\.glb"):
-        lay_rig(large, Path("large.glb"), model, None, tmp_path / "found.safetensors", silent)
+        rig_on_model(large, Path("large.glb"), model, None, tmp_path / "found.safetensors", silent)
     few = tmp_path / "few.csv"
     few.write_text("input,model\n1,1\n2,2\n")
     part = actor.rig.part(torch.arange(2000))
     with pytest.raises(ShapeError, match=r"few\.csv: found 2 pairs"):
-        lay_rig(part, Path("part.glb"), model, few, tmp_path / "found.safetensors", silent)
+        rig_on_model(part, Path("part.glb"), model, few, tmp_path / "found.safetensors", silent)

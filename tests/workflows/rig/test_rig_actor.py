@@ -94,7 +94,7 @@ def test_the_command_brings_the_planted_rig_back(actor: Actor, capsys: pytest.Ca
     main(["rig", *map(str, words), "--out", str(folder / "actor.glb"), "--quiet"])
     told = " ".join(capsys.readouterr().err.split())
     for fact in (
-        "laid on the scan by landmarks",
+        "aligned with the scan by landmarks",
         "of what faces outward",
         "_registration.png",
         "4 shapes transferred",

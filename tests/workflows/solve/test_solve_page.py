@@ -13,8 +13,8 @@ from torchface.capture import MarkerSolver, clean_take
 from torchface.evaluation import marker_rmse
 from torchface.geometry.meshes.proximity import SurfaceIndex
 from torchface.synthetic.stages.marker_stage import StageFlaws, place_markers, record
+from torchface.workflows.solve.solution import Solution, SolveReport
 from torchface.workflows.solve.solve_page import write_solve_page
-from torchface.workflows.solve.solve_take import Solution, SolveReport
 
 
 @pytest.fixture(scope="module")
@@ -39,10 +39,11 @@ def page(dome_rig: BlendshapeRig, tmp_path_factory: pytest.TempPathFactory) -> P
     assert solved.weights is not None
     assert cleanup.take.markers is not None
     markers = cleanup.take.markers.values
+    solution = Solution(dome_rig, solved, markers, sites, cleanup=cleanup)
     rmse = marker_rmse(dome_rig, sites, solved.weights.values[..., 0], markers)
-    report = SolveReport(solved, rmse, 0.9, None, 0.1, cleanup=cleanup, warnings=("M001 was never seen",))
-    solution = Solution(solved, markers, sites, None, None, cleanup, ())
-    return write_solve_page(tmp_path_factory.mktemp("report"), "take.c3d", report, dome_rig, solution)
+    assert torch.equal(solution.rmse, rmse)
+    report = SolveReport(solution, 0.9, 0.1, warnings=("M001 was never seen",))
+    return write_solve_page(tmp_path_factory.mktemp("report"), "take.c3d", report)
 
 
 def test_the_face_plays_and_stands_in_pictures(page: Path) -> None:

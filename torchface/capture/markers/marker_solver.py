@@ -14,7 +14,7 @@ from torchface.attachment import Attachment
 from torchface.capture.corrective_energy import CorrectiveEnergy, least_in_box
 from torchface.capture.energy import Quadratic, marker_term, ridge_term, sparsity_term
 from torchface.correctives.activation import CorrectiveActivation
-from torchface.correctives.definitions import Corrective, definitions_from_records
+from torchface.correctives.corrective_shapes import Corrective, definitions_from_records
 from torchface.errors import NameMismatchError, ShapeError, ValueRangeError
 from torchface.geometry.similarity import Similarity
 from torchface.optim import BoxQP, box_qp

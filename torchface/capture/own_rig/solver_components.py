@@ -17,7 +17,7 @@ from torchface.capture.own_rig.video_settings import VideoSettings
 from torchface.capture.own_rig.weight_walk import relative_trust
 from torchface.capture.priors import AdaptedDynamicsPrior, DynamicsPrior, ReciprocalPrior, ShapePrior
 from torchface.correctives.activation import CorrectiveActivation
-from torchface.correctives.definitions import definitions_from_records
+from torchface.correctives.corrective_shapes import definitions_from_records
 from torchface.errors import FileFormatError, NameMismatchError, ShapeError, ValueRangeError
 from torchface.files.documents import Value
 from torchface.rig import BlendshapeRig

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 import torch
-from scipy.optimize import isotonic_regression
 from torch import Tensor
 
+from torchface.enhancement.timing.retiming_path import project_sequence, segment_projections
 from torchface.errors import ShapeError, ValueRangeError
 from torchface.number_checks import checked_count
 
@@ -20,64 +19,6 @@ _STEPS = 128  # blends by which a captured motion's timing is read, at least
 _DRIFT = 0.05  # share of a sequence's range by which an extended motion may go back before it counts as another
 _DETOUR = 0.5  # what a captured way costs that is longer than the straight one, a length of distance
 _HOLD = 0.01  # share of the range within which the face counts as held
-
-
-@dataclass(frozen=True, eq=False)
-class SequenceProjection:
-    """Where the frames of one sequence lie on another.
-
-    Args:
-        times: on the other's timeline, from 0 to its number of frames minus 1, never falling, (m,).
-        distances: from the points at those times, (m,).
-    """
-
-    times: Tensor
-    distances: Tensor
-
-
-def project_sequence(alpha: Tensor, beta: Tensor) -> SequenceProjection:
-    r"""Projects a sequence onto another in order.
-
-    Each frame is projected onto each segment; the path that never goes back and has the least sum of distances is
-    found by dynamic programming. Frames that share a segment are put in order by isotonic regression.
-
-    .. math:: \min_P \sum_i E_{i,P(i)}, \quad P(i) \le P(i+1)
-
-    Args:
-        alpha: the frames, (m,D).
-        beta: the sequence to project onto, (n,D), of two frames at least.
-
-    Raises:
-        ShapeError: the shapes do not fit, or ``beta`` is no sequence.
-
-    Source: Facial Performance Enhancement Using Dynamic Shape Space Analysis, section 6.1, equations 5 and 6. Changed:
-    order is held inside segments too.
-    """
-    if alpha.ndim != 2 or beta.ndim != 2 or alpha.shape[1] != beta.shape[1] or len(beta) < 2 or len(alpha) < 1:
-        raise ShapeError(
-            f"project_sequence: found alpha {tuple(alpha.shape)} and beta {tuple(beta.shape)}, expected (m,D) and "
-            "(n,D) with a frame and two frames at least"
-        )
-    alpha, beta = alpha.double(), beta.double()
-    shares, distances = _segment_projections(alpha, beta)
-    best, came_from = distances[0], []
-    # A frame's best cost needs the frame's before: one step a frame.
-    for row in distances[1:]:
-        least, where = best.cummin(0)
-        came_from.append(where)
-        best = least + row
-    path = [int(best.argmin())]
-    for where in reversed(came_from):
-        path.append(int(where[path[-1]]))
-    segments = torch.tensor(path[::-1])
-    frames = torch.arange(len(alpha))
-    inside = shares[frames, segments]
-    for segment in segments.unique():  # runs differ in length
-        run = segments == segment
-        inside[run] = torch.from_numpy(isotonic_regression(inside[run].numpy()).x)
-    step = beta[segments + 1] - beta[segments]
-    nearest = beta[segments] + inside[:, None] * step
-    return SequenceProjection(segments + inside, (alpha - nearest).norm(dim=1))
 
 
 def nearest_timing(
@@ -170,30 +111,6 @@ def moving_regions(keyframes: Tensor, weights: Tensor) -> Tensor:
     return weights @ motion > _STILL**2 * motion.sum() * weights.mean(1)
 
 
-def interpolate(keyframes: Tensor, times: Tensor, vertex_weights: Tensor) -> Tensor:
-    """The motion between two keyframes at given times.
-
-    Args:
-        keyframes: (2,V,3).
-        times: how far each region has come in each frame, (R,T), 0 first and 1 last.
-        vertex_weights: the share of each region in each vertex, (R,V), of sum 1.
-
-    Returns:
-        (T,V,3); the first and the last are the keyframes exactly.
-
-    Raises:
-        ShapeError: the shapes do not fit.
-    """
-    if keyframes.ndim != 3 or len(keyframes) != 2 or times.shape[1] < 2 or len(times) != len(vertex_weights):
-        raise ShapeError(
-            f"interpolate: found keyframes {tuple(keyframes.shape)}, times {tuple(times.shape)} and weights "
-            f"{tuple(vertex_weights.shape)}, expected (2,V,3), (R,T) and (R,V)"
-        )
-    shares = (times[:, 1:-1].T.to(keyframes) @ vertex_weights.to(keyframes))[..., None]
-    between = torch.lerp(keyframes[:1], keyframes[1:], shares)
-    return torch.cat([keyframes[:1], between, keyframes[1:]])
-
-
 def motion_progress(motion: Tensor, frames: int) -> Tensor:
     """The timing of a captured motion: how far it has come from its first to its last pose, (frames,), never falling.
 
@@ -222,7 +139,7 @@ def _on_one_motion(pair: Tensor, captured: Tensor) -> tuple[Tensor, float]:
     The neutral stands at both ends of a sequence, and an expression is met on the way there and on the way back: by
     distance alone all four pairings are as good.
     """
-    shares, distances = _segment_projections(pair, captured)
+    shares, distances = segment_projections(pair, captured)
     steps = (captured[1:] - captured[:-1]).norm(dim=1)
     travelled = torch.cat([steps.new_zeros(1), steps.cumsum(0)])[:-1] + shares * steps
     way = travelled[1] - travelled[0][:, None]
@@ -251,17 +168,3 @@ def _turning(values: Tensor, extent: float) -> int:
     risen = (values - least > _DRIFT * extent).nonzero()[:, 0]
     end = int(risen[0]) if len(risen) else len(values) - 1
     return int((values <= least[end] + _HOLD * extent).nonzero()[0, 0])
-
-
-def _segment_projections(alpha: Tensor, beta: Tensor) -> tuple[Tensor, Tensor]:
-    """Where on each segment of beta each frame of alpha lies nearest, 0 to 1, and how far from it, (m,n-1) each."""
-    # By products of matrices, which take no memory in m n D; from beta's middle, which keeps their digits.
-    middle = beta.mean(0)
-    alpha, beta = alpha - middle, beta - middle
-    step = beta[1:] - beta[:-1]
-    length = step.square().sum(1)
-    along = alpha @ step.T - (beta[:-1] * step).sum(1)
-    shares = torch.where(length > 0, along / length.clamp(min=1e-300), torch.zeros_like(along)).clamp(0, 1)
-    offset = alpha.square().sum(1)[:, None] - 2 * alpha @ beta[:-1].T + beta[:-1].square().sum(1)
-    squared = offset - 2 * shares * along + shares.square() * length
-    return shares, squared.clamp(min=0).sqrt()

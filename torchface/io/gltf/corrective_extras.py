@@ -12,7 +12,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchface.correctives.definitions import Corrective, Correctives, definitions_from_records
+from torchface.correctives.corrective_shapes import Corrective, Correctives, definitions_from_records
 from torchface.errors import FileFormatError, NameMismatchError, ValueRangeError
 from torchface.io.gltf.gltf_document import Document
 from torchface.mesh import Mesh

@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchface.correctives.definitions import Corrective
+from torchface.correctives.corrective_shapes import Corrective
 from torchface.errors import TopologyError
 from torchface.files.whole_files import replaced_file
 from torchface.geometry.meshes.normal_maps import DetailMaps

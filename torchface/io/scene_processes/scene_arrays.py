@@ -26,7 +26,7 @@ import torch
 from numpy.typing import NDArray
 
 from torchface.color_space import to_srgb
-from torchface.correctives.definitions import Corrective
+from torchface.correctives.corrective_shapes import Corrective
 from torchface.errors import FileFormatError
 from torchface.escaped_text import visible
 from torchface.files.documents import parse_json

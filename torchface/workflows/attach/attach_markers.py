@@ -15,6 +15,7 @@ from torchface.capture.markers import AttachmentFit, Cleanup, check_attachment, 
 from torchface.capture.markers.attachment.attachment_fit import marker_paths
 from torchface.capture.markers.rest_pose import check_not_mirrored
 from torchface.errors import AlignmentError, FileFormatError, ValueRangeError
+from torchface.files.content_keys import content_key
 from torchface.files.whole_files import all_or_none, check_ending, check_writable, make_folder
 from torchface.io import load_rig
 from torchface.io.landmarks.picks import load_landmarks
@@ -24,8 +25,20 @@ from torchface.rendering.compositing import PICTURE_ENDINGS, save_rendered_image
 from torchface.rig import BlendshapeRig
 from torchface.take import Take, Track
 from torchface.viz.figures.site_views import errors_by_iteration, site_views
-from torchface.workflows.marker_input import DEFAULT_OPTIONS, MarkerOptions, pose_warnings, read_range_of_motion
+from torchface.workflows.batch.batch_items import BatchItem
+from torchface.workflows.batch.contact_sheet import small_picture
+from torchface.workflows.batch.outcomes import Made
+from torchface.workflows.marker_input import (
+    DEFAULT_OPTIONS,
+    MARKER_TAKES,
+    MarkerOptions,
+    pose_warnings,
+    read_range_of_motion,
+)
 
+MOTIONS = replace(MARKER_TAKES, done="attached")
+
+_METHOD = "attach batch/2"
 _SHOWN_NAMES = 8
 # A marker of which more is masked is not cleaned: what is wrong with it is said.
 _MAX_MASKED = 0.5
@@ -211,3 +224,43 @@ def attach(
             views = [site_views(loaded.neutral, before, after), errors_by_iteration(fit.errors)]
             save_rendered_image(sheet(views, 1), picture)
     return AttachReport(fit, torch.linalg.vector_norm(after - before, dim=1), cleanup, tuple(notes))
+
+
+@dataclass(frozen=True)
+class MotionJob:
+    """How the sites of each take are found; ``{name}`` in a path is the take's name.
+
+    Args:
+        rig, settings: see :func:`attach`.
+    """
+
+    rig: Path
+    settings: AttachSettings
+
+    def key(self, item: BatchItem) -> str:
+        """A key of all that the sites depend on."""
+        return content_key(_METHOD, take=item.path, settings=item.settings_of(self))
+
+    def run(self, item: BatchItem, out: Path) -> Made:
+        """Finds the sites of a take and writes ``NAME.json`` and a picture of them, ``NAME.png``.
+
+        Raises:
+            TorchfaceError: they cannot be found.
+        """
+        own, sites, picture = item.settings_of(self), out / f"{item.name}.json", out / f"{item.name}.png"
+        done = attach(own.rig, item.path, sites, own.settings, picture)
+        last = done.fit.errors[-1]
+        error = float(torch.as_tensor(last).mean())
+        return Made(
+            (sites, picture),
+            {
+                "error_mm": error,
+                "worst_mm": float(last.max()),
+                "markers": len(done.fit.attachment.triangles),
+                "frames": len(done.fit.weights),
+                "iterations": len(done.fit.errors),
+            },
+            f"{error:.2f} mm",
+            done.warnings,
+            small_picture(picture),
+        )

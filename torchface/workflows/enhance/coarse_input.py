@@ -1,9 +1,11 @@
-"""Which kind of input a path is, and how each becomes an animation of the model's dense mesh."""
+"""The inputs of an enhancement, of any kind, as animations of the model's dense mesh."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
+
+from torch import Tensor
 
 from torchface.attachment import Attachment
 from torchface.errors import FileFormatError, NameMismatchError, ValueRangeError
@@ -12,17 +14,22 @@ from torchface.io.markers.marker_csv import is_marker_header
 from torchface.io.tables.csv_table import TableReader
 from torchface.mesh import Mesh
 from torchface.progress import Progress
-from torchface.rig import BlendshapeRig
-from torchface.workflows.animated_meshes import load_animated
-from torchface.workflows.enhance.coarse_animation import CoarseAnimation, same_topology
+from torchface.workflows.animated_meshes import AnimatedMesh, load_animated
+from torchface.workflows.enhance.coarse_animation import (
+    CoarseAnimation,
+    check_finite,
+    known_rate,
+    rate_notes,
+    same_topology,
+)
 from torchface.workflows.enhance.head_correspondence import (
+    PLACE,
     HeadCorrespondence,
-    correspondence_notes,
     find_correspondence,
-    of_one_topology,
+    has_topology_of,
+    placed,
 )
 from torchface.workflows.enhance.marker_animation import MarkerSites, check_attachment, marker_animation
-from torchface.workflows.enhance.mesh_input import other_topology
 from torchface.workflows.marker_input import DEFAULT_OPTIONS, MarkerOptions
 from torchface.workflows.track.track_files import ANIMATION, SUMMARY
 
@@ -36,7 +43,7 @@ class InputSettings:
     Args:
         rig: what weights move, whose topology the meshes have, or on which the attachment's markers sit.
         attachment: where the markers sit, on the rig or on the model's mesh.
-        pairs: vertices of the input and where they lie on the model; registration tells if absent.
+        pairs: vertices of the input and where they lie on the model; found by registration if absent.
         part: keep this annotated region of the rig only.
         neutral: a frame of the markers with the face at rest.
         fps: frames a second of meshes, where their file does not say.
@@ -77,9 +84,10 @@ def read_coarse(path: Path, model: Mesh, settings: InputSettings, state: Path, p
     animated = load_animated(tracked_animation(path), settings.rig, settings.part)
     if has_topology_of(animated.neutral, model):
         return same_topology(animated, model, settings.fps)
-    found = find_correspondence(animated.neutral, model, settings.pairs, path, state / CORRESPONDENCE, progress)
+    state_file = state / CORRESPONDENCE
+    correspondence = find_correspondence(animated.neutral, model, settings.pairs, path, state_file, progress)
     progress("setting up the thin shell")
-    return other_topology(animated, model, found, settings.fps)
+    return other_topology(animated, model, correspondence, settings.fps)
 
 
 def is_markers(path: Path) -> bool:
@@ -90,17 +98,46 @@ def is_markers(path: Path) -> bool:
     return ending in (".c3d", ".trc") or (ending == ".csv" and is_marker_header(TableReader(path).header))
 
 
-def has_topology_of(mesh: Mesh, model: Mesh) -> bool:
-    """Whether two meshes have the same vertices and triangles."""
-    same = mesh.faces.shape == model.faces.shape and len(mesh.vertices) == len(model.vertices)
-    return same and bool((mesh.faces.cpu() == model.faces.cpu()).all())
-
-
 def tracked_animation(path: Path) -> Path:
     """Of the folder of a tracked video its animation, which brings the rig along; any other path as it is."""
     if path.is_dir() and (path / SUMMARY).is_file() and (path / ANIMATION).is_file():
         return path / ANIMATION
     return path
+
+
+def other_topology(
+    animated: AnimatedMesh, model: Mesh, correspondence: HeadCorrespondence, fps: float | None
+) -> CoarseAnimation:
+    """An animation of other vertices, spread over the model's by the thin shell.
+
+    Args:
+        animated: what moves.
+        model: the model's neutral.
+        correspondence: of ``animated.neutral`` with it.
+        fps: frames a second; as the file has them if absent.
+
+    Raises:
+        AlignmentError: fewer than 12 vertices have a place on the model.
+    """
+    carry = correspondence.carrier(animated.neutral, model, animated.path)
+
+    def read(begin: int, end: int) -> Tensor:
+        vertices = animated.read(begin, end)
+        check_finite(vertices, animated.path, 1, begin)
+        return carry(vertices)
+
+    assumed = [] if animated.rig is not None else [f"{animated.path.name} is taken to be at rest in its first frame"]
+    return CoarseAnimation(
+        animated.path,
+        "meshes of another topology",
+        animated.count,
+        read,
+        known_rate(animated, fps),
+        lambda begin, end: placed(correspondence.pose, animated.read(begin, end)),
+        animated.neutral.faces,
+        correspondence.residual,
+        (*rate_notes(animated, fps), *assumed, *correspondence.notes(animated.path), PLACE),
+    )
 
 
 def _markers(path: Path, model: Mesh, settings: InputSettings, state: Path, progress: Progress) -> CoarseAnimation:
@@ -112,17 +149,10 @@ def _markers(path: Path, model: Mesh, settings: InputSettings, state: Path, prog
         sites, notes = MarkerSites(attachment), list[str]()
     else:
         assert rig is not None
-        found = _rig_on_model(rig, model, settings, state, progress)
-        sites, notes = MarkerSites(attachment, rig, found), correspondence_notes(found, settings.rig or path)
+        source = settings.rig or path
+        state_file = state / CORRESPONDENCE
+        correspondence = find_correspondence(rig.neutral, model, settings.pairs, source, state_file, progress)
+        sites, notes = MarkerSites(attachment, rig, correspondence), correspondence.notes(source)
     progress("setting up the thin shell")
     animation = marker_animation(path, sites, model, settings.neutral, settings.markers)
     return replace(animation, notes=(*notes, *animation.notes))
-
-
-def _rig_on_model(
-    rig: BlendshapeRig, model: Mesh, settings: InputSettings, state: Path, progress: Progress
-) -> HeadCorrespondence:
-    if has_topology_of(rig.neutral, model):
-        return of_one_topology(rig.neutral, model)
-    source = settings.rig or Path("rig")
-    return find_correspondence(rig.neutral, model, settings.pairs, source, state / CORRESPONDENCE, progress)

@@ -24,8 +24,7 @@ from torchface.workflows.enhance.animation_targets import MEGABYTES, animation_t
 from torchface.workflows.enhance.coarse_animation import CoarseAnimation
 from torchface.workflows.enhance.coarse_input import InputSettings, read_coarse
 from torchface.workflows.enhance.enhance_views import drawn_frames, framed_model
-from torchface.workflows.enhance.enhanced_frames import SEQUENCE, EnhancedFrames, enhance_frames
-from torchface.workflows.enhance.retimed_animation import retimed_animation
+from torchface.workflows.enhance.enhanced_frames import SEQUENCE, EnhancedFrames, enhance_frames, retimed_animation
 
 STATE = "state"
 GLB, VIDEO, FRAMES, SUMMARY, MESHES = "enhanced.glb", "comparison.mp4", "frames.csv", "summary.json", "meshes"

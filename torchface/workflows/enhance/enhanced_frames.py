@@ -1,16 +1,19 @@
-"""Frame after frame through the model onto the disk; a run that was killed goes on behind what is there."""
+"""The frames of an animation enhanced onto the disk, in the actor's timing where asked for; a killed run continues."""
 
 from __future__ import annotations
 
+import math
 import shutil
 import time
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
 from torch import Tensor
 
 from torchface.enhancement import EnhancementModel
+from torchface.enhancement.animation_retiming import at_moments, retimed_moments
 from torchface.errors import FileFormatError
 from torchface.files.checkpoints import read_checkpoint, write_checkpoint
 from torchface.files.whole_files import make_folder
@@ -161,3 +164,41 @@ def _is_finished(path: Path, count: int, key: str) -> bool:
 
 def _piece(state: Path, begin: int) -> Path:
     return state / f"frames_{begin:06d}.safetensors"
+
+
+def retimed_animation(animation: CoarseAnimation, model: EnhancementModel, progress: Progress) -> CoarseAnimation:
+    """The animation with its keyframes where they are, and the motions between them in the actor's timing.
+
+    Raises:
+        TorchfaceError: a frame cannot be read.
+    """
+    step, features = piece_size(len(model.neutral)), []
+    for begin in range(0, animation.count, step):
+        progress("reading for the timing", begin, animation.count)
+        with torch.no_grad():
+            features.append(model.features(animation.read(begin, min(begin + step, animation.count))))
+    progress("timing the motions between keyframes")
+    moments = retimed_moments(model, torch.cat(features), animation.fps)
+    shares = model.vertex_weights
+
+    def read(begin: int, end: int) -> Tensor:
+        asked = moments[:, begin:end]
+        first = math.floor(float(asked.min()))
+        last = min(math.ceil(float(asked.max())) + 1, animation.count)
+        return at_moments(animation.read(first, last), asked - first, shares)
+
+    note = shift_note((moments - torch.arange(animation.count)).abs() / animation.fps, model.region_names)
+    return replace(animation, read=read, notes=(*animation.notes, note))
+
+
+def shift_note(shifts: Tensor, names: Sequence[str]) -> str:
+    """How far regions' frames (R,T) were moved in time, seconds, in words."""
+    if not float(shifts.max()) > 0:
+        return "retimed: no motion between keyframes was found; the timing is the input's"
+    furthest = shifts.amax(1)
+    region, moved = int(furthest.argmax()), shifts > 0
+    return (
+        f"retimed: motions between keyframes take the actor's timing; {float(moved.any(0).float().mean()):.0%} of the "
+        f"frames show another moment, {float(shifts[moved].mean()):.2f} s away in the mean and at most "
+        f"{float(furthest[region]):.2f} s ({names[region]})"
+    )

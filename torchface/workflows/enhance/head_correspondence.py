@@ -1,7 +1,8 @@
-"""Where the vertices of another topology lie on the model's dense mesh: by registration, or by given pairs."""
+"""The correspondence of another head with the model's dense mesh: by topology, registration, or given pairs."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -11,7 +12,7 @@ from torch import Tensor
 from torchface.attachment import Attachment
 from torchface.enhancement.coarse_level import coarse_level
 from torchface.enhancement.thin_shell import LEAST_POINTS, ThinShell
-from torchface.errors import FileFormatError, ShapeError, TopologyError, ValueRangeError
+from torchface.errors import AlignmentError, FileFormatError, ShapeError, TopologyError, ValueRangeError
 from torchface.files.checkpoints import read_checkpoint, write_checkpoint
 from torchface.files.content_keys import content_key
 from torchface.geometry.meshes.operators import vertex_normals
@@ -30,6 +31,9 @@ _MOST_POINTS = 5000
 _ALIKE = 0.5  # cosine between two surfaces that are to be one
 _COLUMNS = ("input", "model")
 
+PLACE = "the result stands where the model stands, not where the input does"
+"""What users read whose input has a space of its own."""
+
 
 @dataclass(frozen=True, eq=False)
 class HeadCorrespondence:
@@ -37,17 +41,57 @@ class HeadCorrespondence:
 
     Args:
         pose: from its space to the model's, a batch of one.
-        laid: its vertices at rest, bent onto the model's surface, (N,3), millimetres of the model's space.
+        bent: its vertices at rest, bent onto the model's surface, (N,3), millimetres of the model's space.
         known: which of them lie on that surface, (N,) bool.
-        residual: root mean square distance between ``laid`` and what the pose alone gives, of the known, millimetres.
-        how: what told, in words.
+        residual: root mean square distance between ``bent`` and what the pose alone gives, of the known, millimetres.
+        how: its vertices were found to lie there, in words; empty where they are the model's own.
     """
 
     pose: Similarity
-    laid: Tensor
+    bent: Tensor
     known: Tensor
     residual: float
-    how: str
+    how: str = ""
+
+    def notes(self, path: Path) -> list[str]:
+        """Lines for people to read on the head of a file.
+
+        Raises:
+            AlignmentError: it is another head, or its vertices stand in another order.
+        """
+        notes = residual_notes(self.residual, path)
+        if not self.how:
+            return notes
+        share = float(self.known.float().mean())
+        return [
+            f"{path.name}: {int(self.known.sum())} of {len(self.known)} vertices ({share:.0%}) have a place on the "
+            f"model by {self.how}; scaled by {float(self.pose.scale[0]):.3f}, bent by {self.residual:.2f} mm (root "
+            "mean square)",
+            *notes,
+        ]
+
+    def carrier(self, head: Mesh, model: Mesh, path: Path) -> Callable[[Tensor], Tensor]:
+        """What carries the head's vertices (t,N,3) to the model's (t,V,3), by the thin shell where they differ.
+
+        Args:
+            head: at rest.
+            model: the model's neutral.
+            path: of the head, for messages.
+
+        Raises:
+            AlignmentError: fewer than 12 vertices have a place on the model.
+        """
+        if not self.how:
+            return lambda vertices: placed(self.pose, vertices)
+        ids, sites = self.on_model(SurfaceIndex(model.vertices, model.faces), head.faces)
+        if len(ids) < LEAST_POINTS:
+            raise AlignmentError(
+                f"{path}: found {len(ids)} vertices with a place on the model, expected at least {LEAST_POINTS}; give "
+                "pairs (--pairs), or bring the input's neutral nearer to the model's"
+            )
+        shell = ThinShell(model.vertices, model.faces, sites)
+        rest = self.pose.apply(head.vertices[ids].double())[0]
+        return lambda vertices: shell.follow(placed(self.pose, vertices[:, ids]), rest)
 
     def on_model(self, surface: SurfaceIndex, faces: Tensor) -> tuple[Tensor, Attachment]:
         """At most 5,000 known vertices, spread evenly, (M,), and where they lie on the model's surface.
@@ -60,31 +104,31 @@ class HeadCorrespondence:
             faces: triangles of the head, (F,3).
         """
         ids = self.sparse_points(faces)
-        found = surface.nearest(self.laid[ids])
-        own = vertex_normals(self.laid.double(), faces)[ids]
-        alike = (own * surface.normals_at(found)).sum(-1) > _ALIKE
-        return ids[alike], Attachment(found.triangle[alike], found.barycentric[alike].float())
+        nearest = surface.nearest(self.bent[ids])
+        normals = vertex_normals(self.bent.double(), faces)[ids]
+        alike = (normals * surface.normals_at(nearest)).sum(-1) > _ALIKE
+        return ids[alike], Attachment(nearest.triangle[alike], nearest.barycentric[alike].float())
 
     def sparse_points(self, faces: Tensor) -> Tensor:
         """Numbers of at most 5,000 known vertices, spread evenly, (M,)."""
         ids = self.known.nonzero()[:, 0]
         if len(ids) <= _MOST_POINTS:
             return ids
-        level = coarse_level(self.laid, faces, int(_MOST_POINTS * len(self.known) / len(ids))).vertex_ids
+        level = coarse_level(self.bent, faces, int(_MOST_POINTS * len(self.known) / len(ids))).vertex_ids
         return level[self.known[level]][:_MOST_POINTS]
 
 
 def find_correspondence(
-    head: Mesh, model: Mesh, pairs: Path | None, path: Path, kept: Path, progress: Progress
+    head: Mesh, model: Mesh, pairs: Path | None, path: Path, state: Path, progress: Progress
 ) -> HeadCorrespondence:
-    """Lays a head at rest on the model's.
+    """Aligns a head at rest with the model's and bends it onto its surface.
 
     Args:
         head: of any topology, millimetres.
         model: the model's neutral.
-        pairs: places known by the user; by registration if absent.
+        pairs: places known by the user, for a head of another topology; by registration if absent.
         path: of the head, for messages.
-        kept: a file that keeps what was found for a later run of the same.
+        state: a file that keeps the correspondence for a later run of the same.
         progress: called with each step and how far it is.
 
     Raises:
@@ -92,41 +136,42 @@ def find_correspondence(
         ShapeError: too few pairs.
         TorchfaceError: the files do not fit each other.
     """
+    if has_topology_of(head, model):
+        vertices, target = head.vertices.double(), model.vertices.double()
+        pose = similarity_transform(vertices[None], target[None])
+        check_scale(float(pose.scale[0]), path)
+        residual = float((pose.apply(vertices[None])[0] - target).square().sum(-1).mean().sqrt())
+        return HeadCorrespondence(pose, model.vertices, torch.ones(len(vertices), dtype=torch.bool), residual)
     given = None if pairs is None else load_pairs(pairs, head, model)
     key = content_key(
         _METHOD, head=head.vertices, faces=head.faces, model=model.vertices, triangles=model.faces, given=given
     )
-    found = read_checkpoint(kept, key)
-    if found is None:
-        laid, pose, known = _by_registration(head, model, progress) if given is None else _by_pairs(head, model, *given)
-        found = {"laid": laid.float(), "known": known, **{name: part.double() for name, part in vars(pose).items()}}
-        write_checkpoint(kept, found, key)
-    pose = Similarity(found["scale"], found["rotation"], found["translation"])
+    parts = read_checkpoint(state, key)
+    if parts is None:
+        bent, pose, known = _by_registration(head, model, progress) if given is None else _by_pairs(head, model, *given)
+        parts = {"laid": bent.float(), "known": known, **{name: part.double() for name, part in vars(pose).items()}}
+        write_checkpoint(state, parts, key)
+    pose, bent, known = (
+        Similarity(parts["scale"], parts["rotation"], parts["translation"]),
+        parts["laid"],
+        parts["known"],
+    )
     check_scale(float(pose.scale[0]), path)
     rigid = pose.apply(head.vertices.double())[0]
-    known = found["known"]
-    residual = float((found["laid"].double() - rigid)[known].square().sum(-1).mean().sqrt())
+    residual = float((bent.double() - rigid)[known].square().sum(-1).mean().sqrt())
     how = "registration" if pairs is None else f"{len(given[0]) if given else 0} pairs of {pairs.name}"
-    return HeadCorrespondence(pose, found["laid"], known, residual, how)
+    return HeadCorrespondence(pose, bent, known, residual, how)
 
 
-def of_one_topology(head: Mesh, model: Mesh) -> HeadCorrespondence:
-    """A head whose vertices are the model's, in any place."""
-    own, target = head.vertices.double(), model.vertices.double()
-    pose = similarity_transform(own[None], target[None])
-    residual = float((pose.apply(own[None])[0] - target).square().sum(-1).mean().sqrt())
-    return HeadCorrespondence(pose, model.vertices, torch.ones(len(own), dtype=torch.bool), residual, "its topology")
+def has_topology_of(mesh: Mesh, model: Mesh) -> bool:
+    """Whether two meshes have the same vertices and triangles."""
+    same = mesh.faces.shape == model.faces.shape and len(mesh.vertices) == len(model.vertices)
+    return same and bool((mesh.faces.cpu() == model.faces.cpu()).all())
 
 
-def correspondence_notes(found: HeadCorrespondence, path: Path) -> list[str]:
-    """Lines for people to read; see :func:`~torchface.workflows.enhance.coarse_animation.residual_notes`."""
-    share = float(found.known.float().mean())
-    return [
-        f"{path.name}: {int(found.known.sum())} of {len(found.known)} vertices ({share:.0%}) have a place on the "
-        f"model by {found.how}; scaled by {float(found.pose.scale[0]):.3f}, bent by {found.residual:.2f} mm (root mean "
-        "square)",
-        *residual_notes(found.residual, path),
-    ]
+def placed(pose: Similarity, points: Tensor) -> Tensor:
+    """Points (t,N,3) moved by one similarity, float32."""
+    return (points.double() @ pose.rotation[0].T.double() * pose.scale[0] + pose.translation[0]).to(torch.float32)
 
 
 def load_pairs(path: Path, head: Mesh, model: Mesh) -> tuple[Tensor, Tensor]:
@@ -153,14 +198,14 @@ def load_pairs(path: Path, head: Mesh, model: Mesh) -> tuple[Tensor, Tensor]:
         numbers = torch.from_numpy(table.read(only=_COLUMNS).columns(_COLUMNS).copy())
         if not bool((numbers == numbers.round()).all()):
             raise FileFormatError(f"{path}: found a vertex number that is not whole, expected numbers from 0")
-        ids, own = numbers.long().unbind(1)
-        for name, rows, count in (("input", ids, len(head.vertices)), ("model", own, len(model.vertices))):
+        ids, targets = numbers.long().unbind(1)
+        for name, rows, count in (("input", ids, len(head.vertices)), ("model", targets, len(model.vertices))):
             if len(rows) and not 0 <= int(rows.min()) <= int(rows.max()) < count:
                 raise TopologyError(
                     f"{path}: found vertices {int(rows.min())} to {int(rows.max())} in the column {name}, expected 0 "
                     f"to {count - 1}"
                 )
-        points = model.vertices[own]
+        points = model.vertices[targets]
     else:
         raise FileFormatError(f"{path}: found the ending {path.suffix!r}, expected .csv or .json")
     if len(ids) < LEAST_POINTS:
@@ -173,22 +218,21 @@ def load_pairs(path: Path, head: Mesh, model: Mesh) -> tuple[Tensor, Tensor]:
 def _by_registration(head: Mesh, model: Mesh, progress: Progress) -> tuple[Tensor, Similarity, Tensor]:
     """The sparse head is bent onto the dense one: that takes seconds, the other way round minutes."""
     landmarks = None
-    both = [mesh.annotations for mesh in (head, model)]
-    marks = [None if one is None else one.landmarks for one in both]
+    marks = [None if mesh.annotations is None else mesh.annotations.landmarks for mesh in (head, model)]
     if marks[0] is not None and marks[1] is not None and len(marks[0]) == len(marks[1]):
         landmarks = marks[0], model.vertices[marks[1]].double()
 
-    def told(step: str, done: int = 0, total: int = 0) -> None:
-        progress("laying the input on the model", done, total)
+    def report(step: str, done: int = 0, total: int = 0) -> None:
+        progress("aligning the input with the model", done, total)
 
-    found = register(head, model, landmarks, texture_size=0, progress=told)
-    return found.mesh.vertices, found.pose, found.matched & (found.distance < _NEAR)
+    result = register(head, model, landmarks, texture_size=0, progress=report)
+    return result.mesh.vertices, result.pose, result.matched & (result.distance < _NEAR)
 
 
 def _by_pairs(head: Mesh, model: Mesh, ids: Tensor, points: Tensor) -> tuple[Tensor, Similarity, Tensor]:
     pose = similarity_transform(head.vertices[ids].double()[None], points.double()[None])
     posed = pose.apply(head.vertices.double())[0]
     offset = points - posed[ids].float()
-    laid = posed.float() + ThinShell(posed.float(), head.faces, ids).spread(offset[None])[0]
-    distance = SurfaceIndex(model.vertices, model.faces).nearest(laid).distance
-    return laid, pose, distance < _NEAR_BY_PAIRS
+    bent = posed.float() + ThinShell(posed.float(), head.faces, ids).spread(offset[None])[0]
+    distance = SurfaceIndex(model.vertices, model.faces).nearest(bent).distance
+    return bent, pose, distance < _NEAR_BY_PAIRS

@@ -20,8 +20,7 @@ from torchface.rig import BlendshapeRig
 from torchface.take import Take
 from torchface.temporal.interpolation import interpolated
 from torchface.workflows.enhance.coarse_animation import CoarseAnimation, check_scale
-from torchface.workflows.enhance.head_correspondence import HeadCorrespondence
-from torchface.workflows.enhance.mesh_input import PLACE, placed
+from torchface.workflows.enhance.head_correspondence import PLACE, HeadCorrespondence, placed
 from torchface.workflows.marker_input import MarkerOptions, read_markers
 
 _SAME_SIZE = 0.05
@@ -51,18 +50,18 @@ class MarkerSites:
         """
         if self.rig is None or self.correspondence is None:
             return self.attachment
-        points = self.attachment.on(self.rig.neutral.faces, self.correspondence.laid)
-        found = SurfaceIndex(model.vertices, model.faces).nearest(points)
-        far = found.distance > _FAR_MM
+        points = self.attachment.on(self.rig.neutral.faces, self.correspondence.bent)
+        nearest = SurfaceIndex(model.vertices, model.faces).nearest(points)
+        far = nearest.distance > _FAR_MM
         if far.any():
             names = [label for label, off in zip(self.attachment.labels or (), far.tolist(), strict=True) if off]
             raise AlignmentError(
-                f"attachment: found the sites of {', '.join(names[:5])} {float(found.distance.max()):.1f} mm from the "
-                f"model's surface, expected at most {_FAR_MM:g}; the rig is another head, or they sit where the model "
-                "has no surface"
+                f"attachment: found the sites of {', '.join(names[:5])} {float(nearest.distance.max()):.1f} mm from "
+                f"the model's surface, expected at most {_FAR_MM:g}; the rig is another head, or they sit where the "
+                "model has no surface"
             )
-        barycentric = found.barycentric.float()
-        return Attachment(found.triangle, barycentric, self.attachment.labels, self.attachment.residual)
+        barycentric = nearest.barycentric.float()
+        return Attachment(nearest.triangle, barycentric, self.attachment.labels, self.attachment.residual)
 
 
 def check_attachment(attachment: Attachment, path: Path, rig: BlendshapeRig | None, model: Mesh) -> bool:
@@ -91,8 +90,8 @@ def marker_animation(
 ) -> CoarseAnimation:
     """A take of markers, spread over the model by the thin shell.
 
-    A marker that is not seen in a frame holds nothing there. Frames that show fewer than 12 are bridged from those
-    before and after.
+    A marker that is not seen in a frame holds nothing there. Frames that show fewer than 12 are interpolated
+    from those before and after.
 
     Args:
         path: the take.
@@ -116,7 +115,7 @@ def marker_animation(
     shell = ThinShell(model.vertices, model.faces, attachment)
     pose = _pose(path, take, sites, shell, neutral)
     check_scale(float(pose.scale[0]), path)
-    markers, bridges = _without_gaps(placed(pose, take.markers.values), path)
+    markers, gap_notes = _without_gaps(placed(pose, take.markers.values), path)
     if attachment.residual is not None:
         markers = markers - attachment.residual.to(markers)
     rest, offsets = shell.rest, _distance_at_rest(shell, markers)
@@ -129,9 +128,9 @@ def marker_animation(
             f"{path}: found markers {offsets:.1f} mm (root mean square) from their sites where they come nearest, "
             f"expected at most {_MOST_AT_REST_MM:g}; the attachment or the rig is another one's, or labels are mixed up"
         )
-    found = [f"{len(attachment.triangles)} markers, {offsets:.2f} mm (root mean square) from their sites at rest"]
+    site_notes = [f"{len(attachment.triangles)} markers, {offsets:.2f} mm (root mean square) from their sites at rest"]
     if offsets > 3.0 and neutral is None:
-        found.append(
+        site_notes.append(
             f"warning: at rest the markers lie {offsets:.1f} mm from their sites; a frame with the face at rest "
             "(--neutral) or the attachment of this take (torchface attach) would keep that out of the motion"
         )
@@ -144,7 +143,7 @@ def marker_animation(
         lambda begin, end: markers[begin:end],
         None,
         offsets,
-        (*notes, *found, *bridges, PLACE),
+        (*notes, *site_notes, *gap_notes, PLACE),
     )
 
 
@@ -186,7 +185,7 @@ def _without_gaps(markers: Tensor, path: Path) -> tuple[Tensor, list[str]]:
     first = int((~enough).nonzero()[0, 0])
     return filled, [
         f"warning: {int((~enough).sum())} of {len(markers)} frames (the first {first}) show fewer than {LEAST_POINTS} "
-        "markers; they are bridged from the frames before and after"
+        "markers; they are interpolated from the frames before and after"
     ]
 
 

@@ -30,7 +30,7 @@ def bake_region_maps(
     """Bakes the actor's face at rest, and with each map of displacements everywhere at 1.
 
     Args:
-        mesh: the rig's neutral, laid on the model's, with texture coordinates.
+        mesh: the rig's neutral on the model's surface, with texture coordinates.
         model: the model's neutral.
         displacements: of the maps, (M,3,V), millimetres along two tangents and the normal of the model's neutral.
         shares: of the regions in the rig's vertices, (R,N).

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -29,14 +29,13 @@ from torchface.progress import Progress, silent
 from torchface.rig import BlendshapeRig
 from torchface.take import Take
 from torchface.workflows.enhance.coarse_animation import OTHER_ACTOR_MM
+from torchface.workflows.enhance.coarse_input import CORRESPONDENCE
 from torchface.workflows.enhance.enhance_animation import STATE, SUMMARY, load_model
-from torchface.workflows.enhance.head_correspondence import HeadCorrespondence
-from torchface.workflows.enhance.rig_on_model import RigOnModel, lay_rig
+from torchface.workflows.enhance.rig_on_model import RigOnModel, rig_on_model
 from torchface.workflows.enhance.wrinkle_baking import bake_region_maps
 
 GLB, BY_WEIGHTS, BY_VERTICES = "wrinkles.glb", "map_weights.onnx", "map_weights_of_vertices.onnx"
 TRACK, PICTURES = "map_weights.csv", "maps"
-_CORRESPONDENCE = "correspondence.safetensors"
 _FORMAT = "torchface.wrinkle-maps/1"
 _LEFT_OUT = 5  # of so many poses one is not learned from, to measure on
 _CHECKED = 20  # poses that the graphs are checked with
@@ -54,7 +53,7 @@ class WrinkleSettings:
         maps: how many.
         size: of each, texels a side.
         poses: that weights are learned from.
-        pairs: vertices of the rig and where they lie on the model; registration tells if absent.
+        pairs: vertices of the rig and where they lie on the model; found by registration if absent.
         part: keep this annotated region of the rig only.
         animation: weights that the ``.glb`` plays, with the maps' weights beside it.
     """
@@ -139,22 +138,22 @@ def _export(
     played = None if take is None or take.weights is None else rig.weights_from(take.weights).float()
     state = make_folder(out / STATE)
     surface = Mesh(model.neutral, model.faces)
-    laid = lay_rig(rig, rig_path, surface, settings.pairs, state / _CORRESPONDENCE, progress)
-    if laid.found.how == "its topology" and laid.found.residual > OTHER_ACTOR_MM:
-        model, laid, surface = _on_actor(model, laid)
-    shares = laid.carried(model.vertex_weights, surface)
-    poses, details = _taught(model, laid, shares, settings.poses, progress)
+    placed = rig_on_model(rig, rig_path, surface, settings.pairs, state / CORRESPONDENCE, progress)
+    if not placed.correspondence.how and placed.correspondence.residual > OTHER_ACTOR_MM:
+        model, placed, surface = _on_actor(model, placed)
+    shares = placed.carried(model.vertex_weights, surface)
+    poses, details = _taught(model, placed, shares, settings.poses, progress)
     progress("learning maps")
     basis = learn_wrinkle_basis(
         details, model.vertex_weights, vertex_areas(model.neutral, model.faces).float(), settings.maps
     )
-    wrinkles, missed_by_maps, missed = _learned(basis, details, laid, poses, shares, model.region_names, progress)
+    wrinkles, missed_by_maps, missed = _learned(basis, details, placed, poses, shares, model.region_names, progress)
     maps = bake_region_maps(
-        laid.laid, surface, basis.maps, shares, model.region_names, laid.scale, settings.size, progress
+        placed.neutral, surface, basis.maps, shares, model.region_names, placed.scale, settings.size, progress
     )
     progress("writing")
     products, graphs = _write(out, maps, wrinkles, rig, poses, take, played)
-    notes = list(laid.notes)
+    notes = list(placed.notes)
     if missed > _POORLY_SHOWN:
         notes.append(
             f"warning: the maps lack {missed:.0%} of the model's detail in poses that were not learned; more poses "
@@ -174,24 +173,22 @@ def _take(path: Path) -> Take:
     return take
 
 
-def _on_actor(model: EnhancementModel, laid: RigOnModel) -> tuple[EnhancementModel, RigOnModel, Mesh]:
+def _on_actor(model: EnhancementModel, placed: RigOnModel) -> tuple[EnhancementModel, RigOnModel, Mesh]:
     """The model's detail for the rig's own head."""
-    head = laid.dense(laid.rig.vertices[None])[0]
-    found = laid.found
-    own = HeadCorrespondence(found.pose, head, found.known, found.residual, found.how)
-    model = model.on_actor(head)
-    return model, RigOnModel(laid.rig, own, laid.dense, laid.notes), Mesh(head, model.faces)
+    head = placed.dense(placed.rig.vertices[None])[0]
+    placed = replace(placed, correspondence=replace(placed.correspondence, bent=head))
+    return model.on_actor(head), placed, Mesh(head, model.faces)
 
 
 def _taught(
-    model: EnhancementModel, laid: RigOnModel, shares: Tensor, count: int, progress: Progress
+    model: EnhancementModel, placed: RigOnModel, shares: Tensor, count: int, progress: Progress
 ) -> tuple[Tensor, LearnedBasis]:
     """Poses of the rig (K,N), and what the model adds to them."""
-    rig = laid.rig
+    rig = placed.rig
 
     def dense(weights: Tensor) -> Tensor:
         with torch.no_grad():
-            return laid.dense(rig(weights))
+            return placed.dense(rig(weights))
 
     shapes = []
     for number, one in enumerate(torch.eye(len(rig.names)).split(1)):  # a shape at a time bounds the memory
@@ -206,7 +203,7 @@ def _taught(
 def _learned(
     basis: WrinkleBasis,
     details: LearnedBasis,
-    laid: RigOnModel,
+    placed: RigOnModel,
     poses: Tensor,
     shares: Tensor,
     regions: tuple[str, ...],
@@ -214,18 +211,18 @@ def _learned(
 ) -> tuple[WrinkleWeights, float, float]:
     """Weights of the rig's vertices; what the maps lack, and what they lack with such weights."""
     progress("learning their weights")
-    weights, sites = basis.weights(details), laid.sites()
+    weights, sites = basis.weights(details), placed.sites()
     with torch.no_grad():
-        posed = torch.cat([laid.rig(some)[:, sites] for some in poses.split(16)])
+        posed = torch.cat([placed.rig(some)[:, sites] for some in poses.split(16)])
         # What a shape does that was never seen alone cannot be known: of the poses after these some are left out.
-        row = torch.arange(len(poses)) - len(laid.rig.names)
+        row = torch.arange(len(poses)) - len(placed.rig.names)
         left_out = (row >= 0) & (row % _LEFT_OUT == _LEFT_OUT - 1)
-        neutral, near = laid.rig.vertices[sites], shares[:, sites]
+        neutral, near = placed.rig.vertices[sites], shares[:, sites]
         measured = WrinkleWeights.fit(neutral, posed[~left_out], weights[~left_out], near, regions)
         rows = LearnedBasis(details.components, details.coefficients[left_out], details.lost_share)
         missed = basis.missed_share(measured(posed[left_out]), rows)
         wrinkles = WrinkleWeights.fit(neutral, posed, weights, near, regions)
-    return wrinkles.of_whole(sites, len(laid.rig.vertices)), basis.missed_share(weights[left_out], rows), missed
+    return wrinkles.of_whole(sites, len(placed.rig.vertices)), basis.missed_share(weights[left_out], rows), missed
 
 
 def _write(

@@ -20,18 +20,20 @@ from torchface.evaluation import (
 )
 from torchface.files.job_lock import within_job
 from torchface.files.whole_files import all_or_none
+from torchface.mesh import Annotations, Mesh
 from torchface.progress import Progress, silent
 from torchface.shape_names import mapping
 from torchface.viz.figures.heat_maps import round_maximum
 from torchface.workflows.animated_meshes import AnimatedMesh, load_animated
-from torchface.workflows.evaluate.compared_regions import compared_regions
-from torchface.workflows.evaluate.evaluate_tables import write_tables
-from torchface.workflows.evaluate.evaluation_record import ALL, Compared, Evaluation
+from torchface.workflows.evaluate.evaluation_record import ALL, Compared, Evaluation, write_tables
 from torchface.workflows.evaluate.scan_truth import ScanTruth, scan_truth
 
 _CHUNK = 32
 _MAX_DISTANCES = 2**29
 _SAME_RATE = 0.002
+_REACH = 0.4
+_GROUPS = ("round the jaw", "round the brows", "round the nose", "round the eyes", "round the mouth")
+_GROUP_OF_LANDMARK = (*[0] * 17, *[1] * 10, *[2] * 9, *[3] * 12, *[4] * 20)
 
 
 @dataclass(frozen=True)
@@ -46,8 +48,8 @@ class EvaluationSettings:
         scans: the truth is raw scans, which are registered first.
         landmarks: a folder of the scans' landmark files.
         unit: of the scans' files; each format's own if absent.
-        align: lay each frame of the result rigidly on the truth; if absent, on scans only, which have a space of
-            their own.
+        align: align each frame of the result rigidly with the truth; if absent, with scans only, which have a space
+            of their own.
         maximum: of the heat maps' scale, millimetres; the 95th percentile, rounded up, if absent.
     """
 
@@ -228,3 +230,23 @@ def _shapes(found: AnimatedMesh, true: AnimatedMesh, frames: Tensor) -> ShapeErr
         return None
     solved, actual = found.weights.values[frames, :, 0], true.weights.values[..., 0]
     return shape_errors(solved, found.weights.names, actual, true.weights.names)
+
+
+def compared_regions(mesh: Mesh) -> dict[str, Tensor]:
+    """Regions (V,) of a mesh to compare in: those it is annotated with, and those round its landmarks.
+
+    With 68 landmarks, the face's vertices are given to the brows, eyes, nose, mouth or jaw by the nearest landmark,
+    where that is nearer than two fifths of the distance between the outer corners of the eyes.
+    """
+    notes = mesh.annotations or Annotations()
+    regions = {name: mask.clone() for name, mask in notes.regions.items()}
+    if notes.landmarks is None or len(notes.landmarks) != len(_GROUP_OF_LANDMARK):
+        return regions
+    points = mesh.vertices[notes.landmarks].double()
+    nearest = torch.cdist(mesh.vertices.double(), points).min(1)
+    reach = _REACH * float((points[36] - points[45]).norm())
+    inside = (nearest.values <= reach) & notes.regions.get("face", torch.ones_like(nearest.indices, dtype=torch.bool))
+    group = torch.tensor(_GROUP_OF_LANDMARK)[nearest.indices]
+    for number, name in enumerate(_GROUPS):
+        regions.setdefault(name, inside & (group == number))
+    return regions

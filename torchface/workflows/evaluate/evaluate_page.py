@@ -45,8 +45,8 @@ def write_evaluation_page(evaluation: Evaluation, out: Path, height: int = 290) 
         sections.append(
             Section(
                 "Alignment",
-                f"Each frame was laid rigidly on the truth: rotated by {float(rotation.nanmedian()):.2f} degrees and "
-                f"moved by {float(translation.nanmedian()):.2f} mm in the median, by at most "
+                f"Each frame was aligned rigidly with the truth: rotated by {float(rotation.nanmedian()):.2f} degrees "
+                f"and moved by {float(translation.nanmedian()):.2f} mm in the median, by at most "
                 f"{float(rotation.nan_to_num().max()):.2f} degrees and {float(translation.nan_to_num().max()):.2f} mm.",
             )
         )

@@ -117,7 +117,7 @@ def scan_truth(
     """
     if result.rig is None:
         raise TopologyError(
-            f"{result.path}: found meshes without a rig, expected the rig whose neutral is laid on the scans (--rig)"
+            f"{result.path}: found meshes without a rig, expected the rig whose neutral the scans are of (--rig)"
         )
     settings = ScanSettings(landmarks, unit, texture_size=0)
     report = register_scans(result.neutral, scans, out, settings, progress=progress)

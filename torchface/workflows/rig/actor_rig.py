@@ -33,7 +33,7 @@ from torchface.modeling import (
     transfer_with_report,
 )
 from torchface.modeling.rigging.example_rigging import RiggingSchedule
-from torchface.modeling.rigging.scanned_examples import seen_example
+from torchface.modeling.rigging.part_clearance import Penetration, penetration
 from torchface.progress import Progress, silent
 from torchface.registration import Registration, dressed_as, hidden_parts, in_place_of, register
 from torchface.registration.landmark_files import landmark_file, load_scan_landmarks
@@ -41,9 +41,15 @@ from torchface.rendering.compositing import save_rendered_image
 from torchface.rig import BlendshapeRig
 from torchface.viz.figures.registration_views import registration_sheet
 from torchface.workflows.register.register_scans import load_shape_model
-from torchface.workflows.rig.expression_scans import LAYOUT, Expression, expressions_in, neutral_in, weights_row
-from torchface.workflows.rig.expression_side import check_side
-from torchface.workflows.rig.penetration_report import Penetration, penetration
+from torchface.workflows.rig.expression_scans import (
+    LAYOUT,
+    Expression,
+    check_side,
+    expressions_in,
+    neutral_in,
+    seen_example,
+    weights_row,
+)
 from torchface.workflows.rig_names import Naming, renamed, renamed_detail
 
 FIGURE_ENDING = "_registration.png"
@@ -108,7 +114,7 @@ class ActorReport:
     def lines(self) -> list[str]:
         """For people to read."""
         record = self.neutral.record
-        lines = [f"neutral: laid on the scan by {record.start}; {record.figures()}"]
+        lines = [f"neutral: aligned with the scan by {record.start}; {record.figures()}"]
         lines += [f"  note: {note}" for note in record.notes]
         lines.append(f"  figure: {self.figure}")
         lines.append(f"rig: {len(self.rig.vertices)} vertices, {len(self.rig.names)} shapes transferred")

@@ -1,20 +1,67 @@
-"""The result of a solve: weights, the markers as it used them, and its report."""
+"""The solution of a take's markers: aligned, cleaned, freed of slip and of what is left at rest, then solved."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import cached_property
 
+import torch
 from torch import Tensor
 
 from torchface.attachment import Attachment
+from torchface.capture import (
+    HelmetSolver,
+    HybridSolver,
+    MarkerSolver,
+    WholeTakeSolver,
+    align_take,
+    clean_take,
+    rest_residual,
+)
 from torchface.capture.markers import Cleanup, HelmetMotion
+from torchface.capture.markers.marker_solver import RIDGE, SPARSITY
+from torchface.evaluation.mesh_errors import marker_offsets
 from torchface.geometry.similarity import Similarity
+from torchface.progress import Progress, silent
 from torchface.rig import BlendshapeRig
-from torchface.take import Take
+from torchface.take import Take, Track, empty_frames
+from torchface.workflows.marker_input import pose_warnings
 from torchface.workflows.solve.head_camera import Predicted
+from torchface.workflows.solve.take_check import check_coverage, check_explained, fit_warnings
 from torchface.workflows.solve.weight_stream import StreamReport
 
+_SHOWN_SPANS = 6
 _SHOWN_DEFECTS = 12
+
+
+@dataclass(frozen=True)
+class SolveSettings:
+    """How a take is solved.
+
+    Args:
+        neutral: a frame with the face at rest, by which the take is aligned with the rig; by the whole take if absent
+            and ``align``.
+        align: align the take with the rig; otherwise its markers are in the rig's space already, unless ``neutral``
+            is given.
+        subtract_rest: subtract what is left at rest between markers and sites of an aligned take.
+        slip: the helmet moves on the head.
+        clean: find and repair swapped labels, spikes and markers that drift or fell off.
+        frame_by_frame: every frame on its own; otherwise the weights of the whole take at once, smooth over time. With
+            what a head camera saw every frame is on its own.
+        sparsity, ridge: see ``MarkerSolver``.
+        insist: solve what the rig does not explain, too.
+    """
+
+    neutral: int | None = None
+    align: bool = False
+    subtract_rest: bool = True
+    slip: bool = False
+    clean: bool = False
+    frame_by_frame: bool = False
+    sparsity: float = SPARSITY
+    ridge: float = RIDGE
+    insist: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -22,6 +69,7 @@ class Solution:
     """The solution of a take's markers.
 
     Args:
+        rig: that was solved.
         take: with the solved weights.
         markers: as the solve used them, (T,M,3), in rig space, without slip, bad samples NaN.
         attachment: the sites, with what was subtracted at rest; of the take's markers.
@@ -31,13 +79,32 @@ class Solution:
         warnings: what the user should know before they use the weights.
     """
 
+    rig: BlendshapeRig
     take: Take
     markers: Tensor
     attachment: Attachment
-    alignment: Similarity | None
-    motion: HelmetMotion | None
-    cleanup: Cleanup | None
-    warnings: tuple[str, ...]
+    alignment: Similarity | None = None
+    motion: HelmetMotion | None = None
+    cleanup: Cleanup | None = None
+    warnings: tuple[str, ...] = ()
+
+    @property
+    def weights(self) -> Tensor:
+        """The solved weights, (T,N)."""
+        assert self.take.weights is not None
+        return self.take.weights.values[..., 0]
+
+    @cached_property
+    def offsets(self) -> Tensor:
+        """From each marker's site on the solved face to the marker, (T,M,3), millimetres; NaN where not seen."""
+        residual = self.attachment.residual
+        markers = self.markers if residual is None else self.markers - residual.to(self.markers)
+        return marker_offsets(self.rig, self.attachment, self.weights, markers)
+
+    @property
+    def rmse(self) -> Tensor:
+        """Marker RMSE a frame, (T,), millimetres."""
+        return self.offsets.square().sum(-1).nanmean(-1).sqrt()
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,55 +112,46 @@ class SolveReport:
     """The report of a solve.
 
     Args:
-        take: the solved weights.
-        rmse: marker RMSE a frame, (T,), millimetres.
+        solution: of the take's markers.
         seen: fraction of the samples of the attachment's markers that were seen.
-        alignment: the similarity from marker space to rig space, where one was estimated.
         seconds: what the solve itself took.
-        motion: the helmet's, where it was asked for.
-        cleanup: what was wrong with the take, where that was asked for.
         predicted: what the head camera saw, where there was a video.
         sent: what was streamed, where that was asked for.
         warnings: what the user should know before they use the weights.
-        rig: what was solved, where it is to be shown.
     """
 
-    take: Take
-    rmse: Tensor
+    solution: Solution
     seen: float
-    alignment: Similarity | None
     seconds: float
-    motion: HelmetMotion | None = None
-    cleanup: Cleanup | None = None
     predicted: Predicted | None = None
     sent: StreamReport | None = None
     warnings: tuple[str, ...] = ()
-    rig: BlendshapeRig | None = None
 
     def lines(self) -> list[str]:
         """For people to read."""
-        frames, worst = len(self.rmse), float(self.rmse.nan_to_num().max())
-        lines = [
-            f"{frames} frames at {self.take.fps:g} a second, {100 * self.seen:.1f} % of the attachment's "
-            "marker samples seen",
-            f"marker RMSE: median {float(self.rmse.nanmedian()):.3f} mm, "
-            f"95th percentile {float(self.rmse.nanquantile(0.95)):.3f} mm, worst {worst:.3f} mm",
-            f"solved in {self.seconds:.2f} s, {1000 * self.seconds / max(frames, 1):.3f} ms a frame",
-        ]
-        if self.alignment is not None:
-            moved = self.alignment.translation[0].tolist()
-            lines.insert(
-                1,
-                f"alignment: scale {float(self.alignment.scale[0]):.4f}, moved by "
-                f"({moved[0]:.1f}, {moved[1]:.1f}, {moved[2]:.1f}) mm",
-            )
-        if self.motion is not None:
-            translation = float(self.motion.translation.norm(dim=1).max())
-            rotation = float(self.motion.degrees().norm(dim=1).max())
+        solution, rmse = self.solution, self.solution.rmse
+        frames, worst = len(rmse), float(rmse.nan_to_num().max())
+        lines = [f"warning: {warning}" for warning in self.warnings]
+        lines.append(
+            f"{frames} frames at {solution.take.fps:g} a second, {100 * self.seen:.1f} % of the attachment's "
+            "marker samples seen"
+        )
+        if solution.alignment is not None:
+            x, y, z = solution.alignment.translation[0].tolist()
+            scale = float(solution.alignment.scale[0])
+            lines.append(f"alignment: scale {scale:.4f}, moved by ({x:.1f}, {y:.1f}, {z:.1f}) mm")
+        lines.append(
+            f"marker RMSE: median {float(rmse.nanmedian()):.3f} mm, "
+            f"95th percentile {float(rmse.nanquantile(0.95)):.3f} mm, worst {worst:.3f} mm"
+        )
+        lines.append(f"solved in {self.seconds:.2f} s, {1000 * self.seconds / max(frames, 1):.3f} ms a frame")
+        if solution.motion is not None:
+            translation = float(solution.motion.translation.norm(dim=1).max())
+            rotation = float(solution.motion.degrees().norm(dim=1).max())
             lines.append(f"helmet: moved by up to {translation:.1f} mm and {rotation:.1f} degrees; not in the weights")
-        if self.cleanup is not None:
-            lines.append(f"cleanup: {self.cleanup.summary()}")
-            rows = self.cleanup.table(gaps=False)
+        if solution.cleanup is not None:
+            lines.append(f"cleanup: {solution.cleanup.summary()}")
+            rows = solution.cleanup.table(gaps=False)
             lines.extend(f"  {' '.join(cell for cell in row if cell)}" for row in rows[:_SHOWN_DEFECTS])
             if len(rows) > _SHOWN_DEFECTS:
                 lines.append(f"  and {len(rows) - _SHOWN_DEFECTS} more; the report (--report DIR) lists all")
@@ -102,6 +160,99 @@ class SolveReport:
             shapes = ", ".join(self.predicted.gamma.names) or "no shape"
             lines.append(f"video: predicts {shapes} in {100 * float(active.any(1).float().mean()):.0f} % of the frames")
             lines.extend(f"  {note}" for note in self.predicted.notes)
-        if self.sent is not None:
-            lines.extend(self.sent.lines())
-        return [*(f"warning: {warning}" for warning in self.warnings), *lines]
+        return [*lines, *([] if self.sent is None else self.sent.lines())]
+
+
+def solve_markers(
+    rig: BlendshapeRig,
+    attachment: Attachment,
+    take: Take,
+    settings: SolveSettings = SolveSettings(),
+    predicted: Predicted | None = None,
+    progress: Progress | None = None,
+) -> Solution:
+    """A take's weights: aligned with the rig, cleaned, freed of slip and of what is left at rest, solved.
+
+    Args:
+        rig: the performer's.
+        attachment: where the markers sit; markers match by label.
+        take: markers, in any space.
+        settings: which of these steps.
+        predicted: what a head camera saw, for the hybrid solve.
+        progress: called with each step and how far it is.
+
+    Raises:
+        AlignmentError: the rig does not explain the markers, unless the settings insist.
+        TorchfaceError: take and attachment do not fit each other, or the settings do not fit the take.
+    """
+    progress = progress or silent
+    whole = predicted is None and not settings.frame_by_frame
+    warnings = check_coverage(attachment, take, len(rig.names), settings.insist).warnings()
+
+    alignment = None
+    if settings.align or settings.neutral is not None:
+        progress("aligning the take with the rig")
+        alignment = align_take(rig, attachment, take, settings.neutral, settings.insist)
+        take = _moved(take, alignment.apply)
+    solver = MarkerSolver(rig, attachment, sparsity=settings.sparsity, ridge=settings.ridge)
+    fit = check_explained(solver, take, alignment is not None, settings.slip, settings.insist)
+    warnings += fit_warnings(fit, alignment is not None)
+    warnings += [] if alignment is None else pose_warnings(alignment)
+    warnings += _empty_frame_warnings(take)
+
+    cleanup = None
+    if settings.clean:
+        progress("looking for what is wrong with the take")
+        cleanup = clean_take(solver, take, settings.slip)
+        take = cleanup.take if whole else cleanup.filled
+
+    progress("solving")
+    steady, motion = _without_slip(rig, attachment, take, settings)
+    if settings.subtract_rest and alignment is not None:
+        attachment = rest_residual(rig, attachment, steady)
+        # Sites that are nearer to the markers show the helmet's motion better.
+        steady, motion = _without_slip(rig, attachment, take, settings)
+        solver = MarkerSolver(rig, attachment, sparsity=settings.sparsity, ridge=settings.ridge)
+    if predicted is not None:
+        solved = HybridSolver(solver).solve_take(steady, predicted.weights, predicted.gamma)
+    else:
+        solved = WholeTakeSolver(solver).solve_take(steady) if whole else solver.solve_take(steady)
+
+    assert steady.markers is not None
+    labels = tuple(label for label in attachment.labels or () if label in steady.markers.names)
+    markers = steady.markers.select(labels).values
+    if cleanup is not None and cleanup.take.markers is not None:  # what was filled in was not seen
+        markers = torch.where(torch.isnan(cleanup.take.markers.select(labels).values), torch.nan, markers)
+    sites = attachment.select(labels)
+    return Solution(rig, solved, markers, sites, alignment, motion, cleanup, tuple(warnings))
+
+
+def _moved(take: Take, move: Callable[[Tensor], Tensor]) -> Take:
+    """A take whose markers (T,M,3) are moved, in double precision."""
+    assert take.markers is not None
+    values = take.markers.values
+    return replace(take, markers=Track(take.markers.names, move(values.double()).to(values)))
+
+
+def _without_slip(
+    rig: BlendshapeRig, attachment: Attachment, take: Take, settings: SolveSettings
+) -> tuple[Take, HelmetMotion | None]:
+    """A take in rig space as a steady helmet would have seen it, and the helmet's motion; as it is without slip."""
+    if not settings.slip:
+        return take, None
+    _, motion = HelmetSolver(rig, attachment, None, settings.sparsity, settings.ridge).solve_take(take)
+    return _moved(take, motion.undo), motion
+
+
+def _empty_frame_warnings(take: Take) -> list[str]:
+    """Which frames show no marker: ``10 frames (120–128, 340)``; nothing where all show some."""
+    empty = empty_frames(take)
+    if not len(empty):
+        return []
+    rows = take.extras.get("frame_numbers", torch.arange(len(take)))[empty]
+    breaks = (rows.diff() > 1).nonzero()[:, 0].tolist()
+    firsts, lasts = [0, *(i + 1 for i in breaks)], [*breaks, len(rows) - 1]
+    spans = [(int(rows[a]), int(rows[b])) for a, b in zip(firsts, lasts, strict=True)]
+    shown = ", ".join(str(a) if a == b else f"{a}–{b}" for a, b in spans[:_SHOWN_SPANS])
+    more = f" and {len(spans) - _SHOWN_SPANS} more stretches" if len(spans) > _SHOWN_SPANS else ""
+    return [f"{len(rows)} frames ({shown}{more}) show no marker; their weights come from the frames before and after"]

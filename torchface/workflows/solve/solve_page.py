@@ -1,4 +1,4 @@
-"""The report of a solve: the face as it plays, marker errors on it and in a table, what was wrong, every curve."""
+"""The page of a solve: the face as it plays, marker errors on it and in a table, what was wrong, every curve."""
 
 from __future__ import annotations
 
@@ -35,76 +35,58 @@ _HEADING = ("markers", "frames", "seconds", "distance", "done")
 _MAX_ROWS = 60
 
 
-def write_solve_page(folder: Path, title: str, report: SolveReport, rig: BlendshapeRig, solution: Solution) -> Path:
+def write_solve_page(folder: Path, title: str, report: SolveReport) -> Path:
     """Writes the report's page and figures into a folder.
 
     Args:
         folder: where to; made if absent.
         title: what was solved.
         report: of the solve.
-        rig: whose face it is.
-        solution: the markers as the solve used them, and their sites.
 
     Returns:
         The page's path.
     """
-    take = report.take
-    assert take.weights is not None
+    solution = report.solution
+    fps, weights = solution.take.fps, solution.weights.float()
     make_folder(folder)
-    weights, names = take.weights.values[..., 0].float(), take.weights.names
-    offsets = _offsets(rig, solution, weights)
-    errors = offsets.norm(dim=-1)
     done = "; ".join(line for line in report.lines() if not line.startswith(("  ", "warning:")))
     sections = [
         Section(
             "The performance",
             "The solved face with the markers as the solve used them, coloured by their distance from their sites.",
-            figures=[("frames.png", _strip(rig, weights))],
-            markup=_player(folder, rig, solution, weights, errors, take.fps),
+            figures=[("frames.png", _strip(solution.rig, weights))],
+            markup=_player(folder, solution),
         ),
         Section("What was done", done),
-        *_marker_sections(rig, solution, offsets, report.rmse, take.fps),
+        *_marker_sections(solution),
     ]
     if report.warnings:
         sections.insert(0, Section("Warnings", "; ".join(report.warnings)))
-    if report.cleanup is not None:
-        sections.append(_defects(report.cleanup, take.fps))
-    if report.motion is not None:
-        curves = motion_curves(report.motion.translation, report.motion.degrees(), take.fps)
+    if solution.cleanup is not None:
+        sections.append(_defects(solution.cleanup, fps))
+    if solution.motion is not None:
+        curves = motion_curves(solution.motion.translation, solution.motion.degrees(), fps)
         text = "How the helmet moved against the head, in rig space; none of it is in the weights."
         sections.append(Section("Helmet", text, figures=[("helmet.png", curves)]))
     order = weights.amax(0).argsort(descending=True).tolist()
     figures = []
-    for number, first in enumerate(range(0, len(order), _CURVES_A_FIGURE)):
-        rows_of_page = order[first : first + _CURVES_A_FIGURE]
-        part = weights[:, rows_of_page]
-        label = [names[i] for i in rows_of_page]
-        figures.append((f"weights{number + 1}.png", weight_curves(part, None, label, take.fps, len(label))))
+    for number, first in enumerate(range(0, len(order), _CURVES_A_FIGURE), start=1):
+        rows = order[first : first + _CURVES_A_FIGURE]
+        names = [solution.rig.names[i] for i in rows]
+        figures.append((f"weights{number}.png", weight_curves(weights[:, rows], None, names, fps, len(names))))
     sections.append(Section("Weights", "Every shape's curve, the strongest first.", figures=figures))
     return write_page(folder, f"Solve of {title}", sections)
 
 
-def _offsets(rig: BlendshapeRig, solution: Solution, weights: Tensor) -> Tensor:
-    """From each marker's site on the solved face to the marker, (T,M,3), millimetres; NaN where not seen."""
-    sites, faces = solution.attachment, rig.neutral.faces
-    rest = sites.on(faces, rig.vertices)
-    if sites.residual is not None:
-        rest = rest + sites.residual.to(rest)
-    basis = sites.on(faces, rig.deltas)
-    moved = torch.einsum("tn,nmc->tmc", weights.to(basis), basis)
-    if rig.activation is not None and rig.corrective_deltas is not None:
-        more = sites.on(faces, rig.corrective_deltas)
-        moved = moved + torch.einsum("tn,nmc->tmc", rig.activation(weights.to(more)), more)
-    return solution.markers.float() - rest - moved
-
-
-def _player(folder: Path, rig: BlendshapeRig, solution: Solution, weights: Tensor, errors: Tensor, fps: float) -> str:
+def _player(folder: Path, solution: Solution) -> str:
+    rig, weights = solution.rig, solution.weights.float()
+    errors = solution.offsets.norm(dim=-1)
     active = weights.std(0).argsort(descending=True)[:_ACTIVE].tolist()
     markers = Markers(solution.markers.float(), errors, _scale(errors))
     panels = [Panel("solved", 0, markers=True), Panel("from the side", 0, markers=True, yaw=_SIDE)]
     curves = tuple(rig.names[i] for i in active)
     played = Played("solved", rig, weights)
-    return write_player(Player([played], panels, fps, curves=curves, markers=markers), folder)
+    return write_player(Player([played], panels, solution.take.fps, curves=curves, markers=markers), folder)
 
 
 def _scale(errors: Tensor) -> float:
@@ -128,10 +110,8 @@ def _strip(rig: BlendshapeRig, weights: Tensor) -> Tensor:
     return sheet([image(frame) for frame in sorted(set(chosen))], _SHOWN_FRAMES)
 
 
-def _marker_sections(
-    rig: BlendshapeRig, solution: Solution, offsets: Tensor, rmse: Tensor, fps: float
-) -> list[Section]:
-    labels = solution.attachment.labels or ()
+def _marker_sections(solution: Solution) -> list[Section]:
+    rig, labels, offsets = solution.rig, solution.attachment.labels or (), solution.offsets
     errors = offsets.norm(dim=-1)
     each = errors.square().nanmean(0).sqrt()
     bias = offsets.nanmean(0).norm(dim=-1)
@@ -158,7 +138,7 @@ def _marker_sections(
         tables.append(Table(heading, rows[_WORST_MARKERS:], f"the other {len(rows) - _WORST_MARKERS} markers"))
     return [
         Section("Error of each marker", text, tables, [("marker_map.png", figure)]),
-        Section("Marker error over time", figures=[("error.png", error_curve(rmse, fps))]),
+        Section("Marker error over time", figures=[("error.png", error_curve(solution.rmse, solution.take.fps))]),
     ]
 
 
@@ -166,8 +146,8 @@ def _defects(cleanup: Cleanup, fps: float) -> Section:
     """What was wrong by kind, swaps first; gaps, of which there may be hundreds, a marker a row."""
     tables = []
     for kind, title in _KINDS.items():
-        found = sorted((d for d in cleanup.defects if d.kind == kind), key=lambda d: -d.size)
-        rows = [_row(defect, fps) for defect in found]
+        defects = sorted((d for d in cleanup.defects if d.kind == kind), key=lambda d: -d.size)
+        rows = [_row(defect, fps) for defect in defects]
         if rows:
             tables.append(Table((title, *_HEADING[1:]), rows[:_MAX_ROWS]))
         if len(rows) > _MAX_ROWS:

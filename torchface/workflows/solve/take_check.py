@@ -1,4 +1,4 @@
-"""Checks of a marker take against a rig and an attachment: what is refused, and what only warned of."""
+"""Checks of a marker take against a rig and an attachment, which refuse or warn."""
 
 from __future__ import annotations
 
@@ -70,23 +70,24 @@ def check_coverage(attachment: Attachment, take: Take, shapes: int, insist: bool
     enough = math.ceil(shapes / _COORDINATES)
     typical = float(count.double().median()) if len(count) else 0.0
     poor = int(((count > 0) & (count < enough)).sum()) if typical >= enough else 0
-    found = Coverage(len(labels), int(seen.any(0).sum()), shapes, poor)
-    if found.refused and not insist:
+    coverage = Coverage(len(labels), int(seen.any(0).sum()), shapes, poor)
+    if coverage.refused and not insist:
         missing = [label for label in labels if label not in known.names]
         raise NameMismatchError(
-            f"{_source(take)}: found {found.present} of the attachment's {found.markers} markers (not "
-            f"{', '.join(missing[:4])}, ...), expected at least {min(enough, found.markers)} for {shapes} shapes; are "
+            f"{_source(take)}: found {coverage.present} of the attachment's {len(labels)} markers (not "
+            f"{', '.join(missing[:4])}, ...), expected at least {min(enough, len(labels))} for {shapes} shapes; are "
             f"they called otherwise in the take (--labels map.csv)? {_INSIST}"
         )
-    return found
+    return coverage
 
 
-def check_explained(solver: MarkerSolver, take: Take, slip: bool, insist: bool = False) -> FitCheck:
+def check_explained(solver: MarkerSolver, take: Take, aligned: bool, slip: bool, insist: bool = False) -> FitCheck:
     """How well a rig explains a take's markers.
 
     Args:
-        solver: rig, attachment and alignment.
-        take: markers, all known to the solver.
+        solver: rig and attachment.
+        take: markers in rig space, all known to the solver.
+        aligned: the take was aligned with the rig.
         slip: the helmet's motion will be taken out.
         insist: refuse nothing.
 
@@ -95,9 +96,6 @@ def check_explained(solver: MarkerSolver, take: Take, slip: bool, insist: bool =
     """
     assert take.markers is not None
     markers = solver.arrange(take.markers).double()
-    aligned = solver.alignment is not None
-    if solver.alignment is not None:
-        markers = solver.alignment.apply(markers)
     fit = check_fit(torch.cat([solver.rest[..., None], solver.every_basis], dim=2), markers, slip)
     if fit.refused and not insist:
         raise AlignmentError(
@@ -129,16 +127,18 @@ def _cause(fit: FitCheck, aligned: bool) -> str:
         )
     if fit.cause == "alignment":
         advice = "the frame of --neutral is not at rest: --align does without one" if aligned else "add --align"
-        return f"laid on the rig they lie {fit.corrected:.2g} mm from it, so the take is in another space: {advice}"
+        return (
+            f"aligned with the rig they lie {fit.corrected:.2g} mm from it, so the take is in another space: {advice}"
+        )
     if fit.cause == "mirror":
         return (
-            f"mirrored and laid on the rig they lie {fit.corrected:.2g} mm from it, so the coordinates are left-handed "
-            "(add --flip x, y or z, or leave it out if it is given; --align if the take is not in the rig's space), or "
-            "the labels of left and right are swapped (--labels)"
+            f"mirrored and aligned with the rig they lie {fit.corrected:.2g} mm from it, so the coordinates are "
+            "left-handed (add --flip x, y or z, or leave it out if it is given; --align if the take is not in the "
+            "rig's space), or the labels of left and right are swapped (--labels)"
         )
     if fit.cause == "slip":
         return f"without the motion of the helmet against the head {fit.corrected:.2g} mm are left: add --slip"
-    tried = "the take is laid on the rig" if aligned else "turning, moving and scaling the take does not help"
+    tried = "the take is aligned with the rig" if aligned else "turning, moving and scaling the take does not help"
     return (
         f"{tried}, so the attachment or the rig is another one's, or labels are mixed up: look at the sites "
         "(torchface view), find them anew (torchface attach)"

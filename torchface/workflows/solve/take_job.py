@@ -13,7 +13,8 @@ from torchface.workflows.batch.contact_sheet import face_picture
 from torchface.workflows.batch.outcomes import Made
 from torchface.workflows.marker_input import DEFAULT_OPTIONS, MarkerOptions
 from torchface.workflows.solve.head_camera import HeadCamera
-from torchface.workflows.solve.solve_take import SolveSettings, TakeInputs, TakeOutputs, solve_take
+from torchface.workflows.solve.solution import SolveSettings
+from torchface.workflows.solve.solve_take import TakeInputs, TakeOutputs, solve_take
 
 _METHOD = "solve/1"
 
@@ -58,40 +59,29 @@ class TakeJob:
         Raises:
             TorchfaceError: it cannot be solved.
         """
-        weights, animation, live_link = (
-            out / f"{item.name}.csv",
-            item.path_of(self.animation),
-            item.path_of(self.live_link),
-        )
         camera = None if self.camera is None else item.settings_of(self.camera)
-        rig, attachment, options = (
-            item.path_of(self.rig),
-            item.path_of(self.attachment),
-            item.settings_of(self.options),
-        )
-        done = solve_take(
-            TakeInputs(rig, item.path, attachment, self.part, camera, options),
-            TakeOutputs(weights, animation, live_link, item.path_of(self.report)),
-            self.settings,
-        )
-        assert done.rig is not None
-        assert done.take.weights is not None
-        values = done.take.weights.values[..., 0]
-        shown = values[values.norm(dim=1).argmax()].to(done.rig.deltas)
+        files = item.path_of(self.rig), item.path, item.path_of(self.attachment)
+        inputs = TakeInputs(*files, self.part, camera, item.settings_of(self.options))
+        weights, report = out / f"{item.name}.csv", item.path_of(self.report)
+        outputs = TakeOutputs(weights, item.path_of(self.animation), item.path_of(self.live_link), report)
+        done = solve_take(inputs, outputs, self.settings)
+        solution = done.solution
+        rig, values, rmse = solution.rig, solution.weights, solution.rmse
+        strongest = values[values.norm(dim=1).argmax()].to(rig.deltas)
         with torch.no_grad():
-            picture = face_picture(done.rig.neutral.with_vertices(done.rig(shown[None])[0]))
-        median = float(done.rmse.nanmedian())
+            picture = face_picture(rig.neutral.with_vertices(rig(strongest[None])[0]))
+        median = float(rmse.nanmedian())
         return Made(
             (weights,),
             {
                 "rmse_mm": median,
-                "rmse_p95_mm": float(done.rmse.nanquantile(0.95)),
+                "rmse_p95_mm": float(rmse.nanquantile(0.95)),
                 "seen": done.seen,
-                "frames": len(done.take),
-                "fps": float(done.take.fps),
+                "frames": len(solution.take),
+                "fps": float(solution.take.fps),
                 "solve_seconds": done.seconds,
             },
-            f"{median:.2f} mm, {len(done.take)} frames",
+            f"{median:.2f} mm, {len(solution.take)} frames",
             done.warnings,
             picture,
         )

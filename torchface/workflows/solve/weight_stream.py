@@ -1,4 +1,4 @@
-"""Frames of weights sent in their own time, solved as they come."""
+"""Frames of weights sent in their own time."""
 
 from __future__ import annotations
 
@@ -12,8 +12,6 @@ from torch import Tensor
 
 from torchface.errors import ValueRangeError
 from torchface.io.protocols.weight_sender import open_sender
-from torchface.onnx.live_solver import LiveMarkerSolver
-from torchface.temporal import OneEuroFilter
 
 
 @dataclass(frozen=True, eq=False)
@@ -22,7 +20,7 @@ class StreamReport:
 
     Args:
         weights: of each frame, (T,N).
-        latency: from when the frame was due to its packet on the way, what solves it included, (T,), milliseconds.
+        latency: from when the frame was due to its packet on the way, (T,), milliseconds.
     """
 
     weights: Tensor
@@ -37,32 +35,6 @@ class StreamReport:
         ]
 
 
-def stream_markers(
-    solver: LiveMarkerSolver,
-    frames: Iterable[Tensor],
-    fps: float,
-    address: str,
-    clock: Callable[[], float] = time.perf_counter,
-    wait: Callable[[float], None] = time.sleep,
-    smoothing: OneEuroFilter | None = None,
-) -> StreamReport:
-    """Solves frames one at a time and sends each at its time.
-
-    Args:
-        solver: for these markers.
-        frames: (M,3) each, millimetres, NaN for not seen; from a take or as they come in.
-        fps, address, clock, wait: see :func:`stream_weights`.
-        smoothing: calms the weights from frame to frame; none if absent.
-
-    Raises:
-        ValueRangeError: the address is none, or there was no frame.
-    """
-    weights = (solver.step(markers) for markers in frames)
-    if smoothing is not None:
-        weights = (smoothing.step(frame) for frame in weights)
-    return stream_weights(weights, solver.names, fps, address, clock, wait)
-
-
 def stream_weights(
     frames: Iterable[Tensor],
     names: Sequence[str],
@@ -74,7 +46,7 @@ def stream_weights(
     """Sends frames of weights, each at its time.
 
     Args:
-        frames: (N,) each; each is asked for when it is due.
+        frames: (N,) each; each is taken when it is due.
         names: of the weights.
         fps: frames a second; a frame that comes too early waits, one that comes too late goes at once.
         address: where to and how; see :func:`torchface.io.open_sender`.

@@ -13,7 +13,7 @@ from torchface.enhancement import EnhancementModel
 from torchface.enhancement.animation_retiming import at_moments, retimed_moments
 from torchface.io.meshes.mesh_sequence import MeshSequenceWriter
 from torchface.progress import silent
-from torchface.workflows.enhance import retimed_animation
+from torchface.workflows.enhance import enhanced_frames
 from torchface.workflows.enhance.coarse_input import InputSettings, read_coarse
 
 
@@ -24,9 +24,9 @@ def test_pieces_are_those_of_the_whole(actor: Actor, tmp_path: Path, monkeypatch
     path = tmp_path / "meshes.safetensors"
     with MeshSequenceWriter(path, len(frames), frames.shape[1], actor.mesh.faces) as writer:
         writer.append(frames)
-    monkeypatch.setattr(retimed_animation, "piece_size", lambda vertices: 5)
+    monkeypatch.setattr(enhanced_frames, "piece_size", lambda vertices: 5)
     given = read_coarse(path, actor.mesh, InputSettings(), tmp_path, silent)
-    found = retimed_animation.retimed_animation(given, model, silent)
+    found = enhanced_frames.retimed_animation(given, model, silent)
     with torch.no_grad():
         moments = retimed_moments(model, model.features(frames), given.fps)
         whole = at_moments(frames, moments, model.vertex_weights)
@@ -39,8 +39,8 @@ def test_pieces_are_those_of_the_whole(actor: Actor, tmp_path: Path, monkeypatch
 
 def test_the_report_says_which_region_moved_in_time_and_how_far() -> None:
     shifts = torch.tensor([[0.0, 0.1, 0.0, 0.0], [0.0, 0.3, 0.2, 0.0]])
-    note = retimed_animation.shift_note(shifts, ("brow", "mouth"))
+    note = enhanced_frames.shift_note(shifts, ("brow", "mouth"))
     assert "50% of the frames" in note
     assert "0.20 s away in the mean" in note
     assert "0.30 s (mouth)" in note
-    assert "no motion" in retimed_animation.shift_note(torch.zeros(2, 4), ("brow", "mouth"))
+    assert "no motion" in enhanced_frames.shift_note(torch.zeros(2, 4), ("brow", "mouth"))
