@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import torch
 from rig_samples import corrective_sheet, quad_sheet, sheet_rig, sheet_take
-from test_gltf_parts import head
+from test_primitive_writing import head
 
 from torchface.geometry.meshes.normal_maps import DetailMaps
 from torchface.geometry.meshes.operators import vertex_normals

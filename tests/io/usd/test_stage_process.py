@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 from mutation import mutated
 from rig_samples import sheet_rig, sheet_take
-from test_usd_scenes import ANIMATION, QUAD, SHAPES, head, mesh_prim, usda
+from test_usd_reading import ANIMATION, QUAD, SHAPES, head, mesh_prim, usda
 
 from torchface.errors import FileFormatError, MissingExtraError, TorchfaceError
 from torchface.io import load_animation, load_mesh, load_rig, save_animation, save_rig

@@ -20,7 +20,7 @@ from torchface.capture.priors import ShapePrior
 from torchface.errors import FileFormatError, MissingExtraError, NameMismatchError
 
 COMMIT = "1" * 40
-FILES = Path(__file__).resolve().parent.parent / "models" / "shape_prior"
+FILES = Path(__file__).resolve().parents[2] / "models" / "shape_prior"
 
 
 class Hub(BaseHTTPRequestHandler):

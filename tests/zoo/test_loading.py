@@ -17,7 +17,7 @@ from torchface.capture.priors import ShapePrior
 from torchface.errors import NameMismatchError, ValueRangeError
 from torchface.modeling.morphable.morphable_model import MorphableModel
 
-REPOSITORY = Path(__file__).resolve().parent.parent
+REPOSITORY = Path(__file__).resolve().parents[2]
 
 
 def shipped() -> dict[str, type]:

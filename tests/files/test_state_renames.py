@@ -30,7 +30,7 @@ from torchface.errors import FileFormatError
 from torchface.files.models import CARD, DESCRIPTION, STATE, read_record, write_model
 from torchface.files.state_renames import CONFIG_RENAMES, STATE_RENAMES, current_config, current_state_keys
 
-REPOSITORY = Path(__file__).resolve().parent.parent
+REPOSITORY = Path(__file__).resolve().parents[2]
 ABOUT = zoo.ModelCard("MIT", "noise", {}, "python -m train.none")
 NAMES = ("jawOpen", "mouthPucker", "browInnerUp")
 
