@@ -104,7 +104,7 @@ def evaluate(
         truth = torch.cat([scene.faces[:, :2] - side / 2, side, side], 1)
         shared = overlaps(truth, seen.boxes)
         wrong += int((shared < _NOTHING).all(0).sum())
-        for row in (~scene.doubtful).nonzero()[:, 0].tolist():
+        for row in (~scene.uncertain).nonzero()[:, 0].tolist():
             faces += 1
             if len(seen) and float(shared[row].max()) > _SAME:
                 found += 1

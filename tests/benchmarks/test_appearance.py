@@ -37,9 +37,9 @@ from planted.portrait_video import (
 from torchface import zoo
 from torchface.landmarks import AppearanceModel, AppearanceSettings
 from torchface.landmarks.images.appearance.shape_modes import planar_pose
+from torchface.landmarks.images.box_landmarks import appearance_landmarks
 from torchface.landmarks.images.boxes.face_box import grey_pixels
 from torchface.landmarks.images.ibug_68 import box_around
-from torchface.landmarks.images.tracking.settled_face import appearance_landmarks
 from torchface.synthetic import draw_identities, performer
 
 LEARNED, TESTED, ACTORS = len(EXPRESSIONS), 45, (3, 4, 5)

@@ -21,8 +21,7 @@ from torchface.errors import FileFormatError, ShapeError, TorchfaceError, ValueR
 from torchface.io.landmarks.landmark_points import load_landmark_points
 from torchface.io.video import VideoFile, write_video
 from torchface.landmarks import AppearanceModel
-from torchface.landmarks.images.appearance.annotated_frames import load_annotated_frames
-from torchface.landmarks.images.appearance.frame_choice import choose_frames
+from torchface.landmarks.images.appearance.annotated_frames import choose_frames, load_annotated_frames
 from torchface.synthetic import performer
 from torchface.viz.browser.annotation_session import AnnotationSession
 from torchface.workflows import annotate_video

@@ -32,7 +32,7 @@ def fit(
 
     A head model is fitted to 68 landmarks in each photograph: identity, expression, poses and focal length at once.
     Landmarks that no file gives are found; they are written as .pts beside OUT, to be looked at and corrected.
-    All photographs show one person with one expression; profiles beside a front view tell how far things stand out.
+    All photographs show one person with one expression; profiles beside a front view show how far things stand out.
     The skin that they show becomes the rig's texture. Beside OUT lies an image for each photograph: it, the fit over
     it, and the landmarks, found green and fitted red; and its camera as .toml, for `torchface track --camera` where the
     video is from the same.
@@ -64,7 +64,7 @@ def fit(
     """
     from torchface.files.job_lock import file_lock
     from torchface.modeling import FitSettings
-    from torchface.workflows.fit.given_landmarks import is_landmark_file
+    from torchface.workflows.fit.fit_landmarks import is_landmark_file
     from torchface.workflows.fit.photograph_rig import PhotographSettings, fit_photographs
     from torchface.workflows.rig_names import naming_lines
 

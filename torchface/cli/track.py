@@ -75,8 +75,8 @@ def track(
         face: Which of several faces to follow, from 0, the largest first.
         whole_take: Smooth landmarks over all frames, those after each too; with --dynamics the weights as well.
         part: Keep this region of the rig only, such as face.
-        overlay: overlay.mp4: the rig as opaque clay beside the picture, with what is doubtful tinted; half through over
-            it; or none.
+        overlay: overlay.mp4: the rig as opaque clay beside the picture, parts of low confidence tinted; half through
+            over it; or none.
         fps: Frames a second of a .csv of landmarks without VIDEO; by its times if absent.
         size: WIDTHxHEIGHT of the pictures that such landmarks were found in; the camera's if absent.
         live: A camera's number, such as 0, or a video file that is played in its own time.

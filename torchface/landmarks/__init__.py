@@ -1,6 +1,7 @@
 """Landmarks on faces: in images, and on scans unwrapped into UV space."""
 
 from torchface.landmarks.images.appearance.appearance_model import AppearanceFit, AppearanceModel, AppearanceSettings
+from torchface.landmarks.images.box_landmarks import find_landmarks
 from torchface.landmarks.images.boxes.box_network import BoxNetwork
 from torchface.landmarks.images.boxes.box_training import BoxTrainingSettings, LabelledPicture
 from torchface.landmarks.images.boxes.face_box import FaceBoxes, NoFaceError
@@ -12,7 +13,6 @@ from torchface.landmarks.images.landmark_finder import LandmarkFinder
 from torchface.landmarks.images.networks.eye_network import EyeFindings, EyeNetwork
 from torchface.landmarks.images.networks.landmark_network import LandmarkNetwork, NetworkLandmarks
 from torchface.landmarks.images.networks.landmark_training import NetworkSettings
-from torchface.landmarks.images.photograph_landmarks import find_landmarks
 from torchface.landmarks.images.tracking.landmark_tracker import LandmarkTracker
 from torchface.landmarks.images.tracking.video_landmarks import landmark_jitter, track_landmarks
 from torchface.landmarks.images.trees.landmark_trees import LandmarkTrees

@@ -15,8 +15,7 @@ from torchface.files.documents import read_json, write_json
 from torchface.files.whole_files import make_folder
 from torchface.io.landmarks.landmark_points import load_landmark_points
 from torchface.io.video import VideoFile, open_video
-from torchface.landmarks.images.appearance.annotated_frames import AnnotatedFrame, save_annotated_frame
-from torchface.landmarks.images.appearance.frame_choice import choose_frames
+from torchface.landmarks.images.appearance.annotated_frames import AnnotatedFrame, choose_frames, save_annotated_frame
 
 PROPOSALS = "proposals.json"
 _FORMAT = "torchface proposals 2"

@@ -147,17 +147,17 @@ def face_scene(
     """
     settings = settings or SceneSettings()
     block, place = divmod(number, _SCENES * _VIEWS)
-    image, faces, doubtful = _staged(people, block * _SCENES + place % _SCENES, settings, seed)
+    image, faces, uncertain = _staged(people, block * _SCENES + place % _SCENES, settings, seed)
     if place // _SCENES % 2:
         image = np.ascontiguousarray(image[:, ::-1])
         faces = faces * torch.tensor([-1.0, 1, 1, -1]) + torch.tensor([settings.size - 1.0, 0, 0, 0])
     stored = _photographed(image, np.random.default_rng((seed, number, 1)))
-    return LabelledPicture(torch.from_numpy(stored).permute(2, 0, 1).contiguous(), faces, doubtful)
+    return LabelledPicture(torch.from_numpy(stored).permute(2, 0, 1).contiguous(), faces, uncertain)
 
 
 @lru_cache(maxsize=2 * _SCENES)  # each is shown again soon
 def _staged(people: ScenePeople, number: int, settings: SceneSettings, seed: int) -> tuple[np.ndarray, Tensor, Tensor]:
-    """A scene before it is taken (S,S,3), its faces (F,4), and which are doubtful (F,)."""
+    """A scene before it is taken (S,S,3), its faces (F,4), and which are uncertain (F,)."""
     rng = np.random.default_rng((seed, number, 0))
     size = settings.size
     image = clutter(size, size, rng)
@@ -178,8 +178,8 @@ def _staged(people: ScenePeople, number: int, settings: SceneSettings, seed: int
     told = torch.from_numpy(np.array(faces, dtype=np.float32).reshape(-1, 4))
     inside = np.array([_share_inside(face, size) for face in faces])
     kept = torch.from_numpy(seen >= _DOUBTFUL) if faces else torch.zeros(0, dtype=torch.bool)
-    doubtful = (seen < _FOUND) | (inside < _WHOLE) | (told[:, 2].numpy() < settings.smallest * 1.15)
-    return image, told[kept], torch.from_numpy(doubtful.astype(bool))[kept]
+    uncertain = (seen < _FOUND) | (inside < _WHOLE) | (told[:, 2].numpy() < settings.smallest * 1.15)
+    return image, told[kept], torch.from_numpy(uncertain.astype(bool))[kept]
 
 
 def _crowd(people: int) -> np.ndarray:

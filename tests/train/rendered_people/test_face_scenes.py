@@ -34,8 +34,8 @@ def test_faces_are_where_scenes_say_and_turned_as_they_say(people: CutOuts) -> N
     right = count = 0
     for number in range(200):
         scene = face_scene(people, number, settings, seed=4)
-        for (x, y, side, angle), doubtful in zip(scene.faces.tolist(), scene.doubtful.tolist(), strict=True):
-            if doubtful:
+        for (x, y, side, angle), uncertain in zip(scene.faces.tolist(), scene.uncertain.tolist(), strict=True):
+            if uncertain:
                 continue
             up = np.array([np.sin(angle), -np.cos(angle)]) * 0.3 * side
             ends = (np.array([x, y]) + sign * up for sign in (1, -1))

@@ -21,7 +21,7 @@ SECONDS = 4.0
 """For each expression, if nothing else is asked for."""
 
 _READY = 0.5  # the share of that time in which the person gets into the expression
-_PATIENCE = 10.0  # seconds more where a camera sees no face
+_MORE = 10.0  # seconds more where a camera sees no face
 _LEAST = 3
 
 Say = Callable[[str], None]
@@ -35,7 +35,7 @@ def guided_examples(
 
     Args:
         camera: a camera's number, or a video file that was recorded to the same clock, read at once.
-        say: told what to do, and to count down.
+        say: called with what the person should do, and the count-down.
         seconds: for each expression.
         landmarks: what finds landmarks.
 
@@ -49,7 +49,7 @@ def guided_examples(
         source = open_source(camera, say)
         try:
             frames = ((came, tracker.step(planes(frame)).landmarks) for came, frame in source.frames())
-            return _session(frames, say, seconds, camera, _PATIENCE)
+            return _session(frames, say, seconds, camera, _MORE)
         finally:
             source.close()
     video = open_video(Path(camera))
@@ -58,14 +58,14 @@ def guided_examples(
 
 
 def _session(
-    frames: Iterator[tuple[float, Tensor]], say: Say, seconds: float, camera: str, patience: float
+    frames: Iterator[tuple[float, Tensor]], say: Say, seconds: float, camera: str, more: float
 ) -> ExampleShapes:
     expressions = paper_expressions()
     shown = []
     started: float | None = None
     for number, one in enumerate(expressions):
         say(f"{number + 1} of {len(expressions)}, {one.name}: {one.prompt}")
-        window, started = _held(frames, started, seconds, patience, say)
+        window, started = _held(frames, started, seconds, more, say)
         if len(window) < _LEAST:
             raise NoFaceError(_lost(camera, one, started is None, len(window)))
         shown.append(calmest(torch.stack(window)))
@@ -74,24 +74,24 @@ def _session(
 
 
 def _held(
-    frames: Iterator[tuple[float, Tensor]], started: float | None, seconds: float, patience: float, say: Say
+    frames: Iterator[tuple[float, Tensor]], started: float | None, seconds: float, more: float, say: Say
 ) -> tuple[list[Tensor], float | None]:
     """Landmarks while an expression is held, and when it ended; None where the frames did."""
     window: list[Tensor] = []
-    told = math.ceil(_READY * seconds) + 1
+    announced = math.ceil(_READY * seconds) + 1
     for came, landmarks in frames:
         started = came if started is None else started
         since = came - started
         left = math.ceil(_READY * seconds - since)
-        if 0 < left < told:
+        if 0 < left < announced:
             say(f"  {left}")
-            told = left
-        elif left <= 0 < told:
+            announced = left
+        elif left <= 0 < announced:
             say("  hold")
-            told = 0
+            announced = 0
         if since >= _READY * seconds and bool(torch.isfinite(landmarks).all()):
             window.append(landmarks)
-        if since >= seconds and (len(window) >= _LEAST or since >= seconds + patience):
+        if since >= seconds and (len(window) >= _LEAST or since >= seconds + more):
             # A clock that goes on from expression to expression, unless a face was waited for.
             return window, (started + seconds if since < seconds + 1 else came)
     return window, None

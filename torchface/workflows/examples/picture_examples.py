@@ -30,7 +30,7 @@ def picture_examples(
             ``jawOpen.png``, digits before a name left out), any order and choice that has a neutral; otherwise the
             paper's 16 in its order.
         landmarks: what finds landmarks.
-        progress: told how far it is.
+        progress: called with how far it is.
 
     Raises:
         FileFormatError: no pictures, or one that is none.

@@ -12,7 +12,7 @@ from torchface.errors import AlignmentError
 from torchface.landmarks import NoFaceError
 from torchface.modeling import ImageFit
 from torchface.modeling.photographs.one_person import same_person
-from torchface.workflows.fit.found_landmarks import PhotographLandmarks, find_in_photographs
+from torchface.workflows.fit.fit_landmarks import PhotographLandmarks, find_in_photographs
 
 MISFIT = 0.045
 """Of the eyes' distance: given landmarks that lie further from the fit are remarked on."""
@@ -27,7 +27,7 @@ pairs of two people a quarter below -3 and half below 1.6.
 _NEAR = 0.5
 
 BareFit = Callable[[Tensor, list[int]], ImageFit]
-"""Fits the template's shapes to landmarks (J,68,2) of photographs by their numbers, and lays no skin."""
+"""Fits the template's shapes to landmarks (J,68,2) of photographs by their numbers, without skin."""
 
 
 def eyes_distances(landmarks: Tensor) -> Tensor:

@@ -22,17 +22,23 @@ from torchface.registration import dressed_as, hidden_parts
 from torchface.rendering.compositing import save_rendered_image
 from torchface.rig import BlendshapeRig
 from torchface.workflows.fit.fit_checks import eyes_distances, landmark_lines, one_person_lines
+from torchface.workflows.fit.fit_landmarks import (
+    DEFAULT_LANDMARKS,
+    PhotographLandmarks,
+    check_inside,
+    find_in_photographs,
+    landmarks_of,
+    warn_if_stored_turned,
+)
 from torchface.workflows.fit.fit_model import load_head_model, matching
 from torchface.workflows.fit.fit_overlay import overlay
-from torchface.workflows.fit.found_landmarks import DEFAULT_LANDMARKS, PhotographLandmarks, find_in_photographs
-from torchface.workflows.fit.given_landmarks import check_inside, landmarks_of, warn_if_stored_turned
 from torchface.workflows.rig.actor_rig import check_out
 from torchface.workflows.rig_names import Naming, renamed
 
 
 @dataclass(frozen=True)
 class PhotographSettings:
-    """What a fit to photographs on disk may be told besides the photographs.
+    """Settings of a fit to photographs on disk.
 
     Args:
         fit: the noise of landmarks, the priors on faces, the skin.
@@ -161,8 +167,8 @@ def fit_photographs(
         remarks += landmark_lines(photographs, images, marks, fit, settings.landmark_model, bare)
     # Photographs show little of eyeballs and teeth: parts of their own keep the template's skin.
     unseen = hidden_parts(rig.neutral, torch.zeros(len(rig.vertices), dtype=torch.bool))
-    worn = dressed_as(fit.mesh, rig.neutral, unseen)
-    transferred = transfer_with_report(rig, worn, progress=progress)
+    dressed = dressed_as(fit.mesh, rig.neutral, unseen)
+    transferred = transfer_with_report(rig, dressed, progress=progress)
     progress("writing the rig and the overlays")
     overlays = tuple(out.with_name(f"{out.stem}_{i + 1}_{path.stem}.png") for i, path in enumerate(photographs))
     with all_or_none():

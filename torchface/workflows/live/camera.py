@@ -35,7 +35,7 @@ class Camera:
 
     Args:
         number: of the device, from 0.
-        say: told of a change of size or rate, and why the frames ended.
+        say: called with a change of size or rate, and why the frames ended.
         size: width and height to ask for.
 
     Raises:
@@ -145,7 +145,7 @@ class Camera:
 
 
 class _Pace:
-    """Tells when frames come markedly faster or slower than they did."""
+    """Notices when frames come markedly faster or slower than they did."""
 
     def __init__(self) -> None:
         self._told: float | None = None  # measured: what a camera says of its rate is often wrong
@@ -169,7 +169,7 @@ class _Pace:
 
 
 def list_cameras() -> dict[int, str]:
-    """Cameras by number, with their names where the system tells them."""
+    """Cameras by number, with their names where the system gives them."""
     if sys.platform == "linux":
         found = {}
         for folder in Path("/sys/class/video4linux").glob("video*"):

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-_LEAST, _MOST, _STEP = 0.05, 60_000.0, 1.01  # milliseconds; what is told is within 1 %
+_LEAST, _MOST, _STEP = 0.05, 60_000.0, 1.01  # milliseconds; what is reported is within 1 %
 _BINS = math.ceil(math.log(_MOST / _LEAST) / math.log(_STEP))
 _RECENT, _MOST_RECENT = 2.0, 256  # seconds, frames
 

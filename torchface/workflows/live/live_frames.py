@@ -27,7 +27,7 @@ Say = Callable[[str], None]
 class FrameSource(Protocol):
     """Where frames come from.
 
-    ``video`` tells rate and size, ``dropped`` how many frames came while another was worked on.
+    ``video`` holds rate and size, ``dropped`` how many frames came while another was worked on.
     """
 
     @property
@@ -88,7 +88,7 @@ def open_source(camera: str, say: Say, size: tuple[int, int] = DEFAULT_SIZE, eve
 
     Args:
         camera: ``"0"``, ``"1"``, ... or a path.
-        say: told what happens to the camera on the way.
+        say: called with what happens to the camera on the way.
         size: width and height to ask a camera for.
         every: give every frame of a video, however late.
 

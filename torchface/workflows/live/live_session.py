@@ -23,14 +23,14 @@ _FIGURES_INTERVAL = 0.25  # seconds
 
 
 class Notes:
-    """What the user was told, the last few; each is told on at once."""
+    """Notes for the user: each is said at once, the last few are kept."""
 
     def __init__(self, say: Say) -> None:
         self._say = say
         self._kept: deque[str] = deque(maxlen=_MAX_NOTES)
 
     def __call__(self, note: str) -> None:
-        """Tells and keeps a sentence."""
+        """Says and keeps a sentence."""
         self._kept.append(note)
         self._say(note)
 
@@ -47,8 +47,8 @@ class LiveSession:
         solver: by ARKit's names.
         streams: where weights are sent to.
         recordings: what keeps them when asked to.
-        notes: told what the user should know.
-        prompt: told what a guided calibration asks for, each time that changes.
+        notes: called with what the user should know.
+        prompt: called with what a guided calibration asks for, each time that changes.
         watch: counts faces now and then.
     """
 

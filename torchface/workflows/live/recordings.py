@@ -35,7 +35,7 @@ class FrameLog:
     """A temporary file in a folder, a row of numbers a frame; it goes when the log is closed.
 
     Args:
-        folder: where there is room; it must exist.
+        folder: where there is space; it must exist.
         names: of the weights, (N,).
 
     Raises:

@@ -19,7 +19,7 @@ class WeightStreams:
         addresses: see :func:`torchface.io.open_sender`.
         names: of the weights, (N,).
         fps: frames a second.
-        say: told once a receiver that refuses packets, or that the network no longer reaches.
+        say: called once with a receiver that refuses packets, or that the network no longer reaches.
 
     Raises:
         ValueRangeError: an address is none, or its host is not known or not reached.

@@ -21,7 +21,7 @@ from torchface.workflows.track.track_result import Tracked
 
 _CHUNK = 8
 _HEIGHT = 480  # pixels of the two pictures
-_ROOM = 0.3  # of the face's height, round it
+_BORDER = 0.3  # of the face's height, round it
 _SURE = 0.5  # landmarks of at least this confidence are not marked
 _REACH = 12.0  # millimetres round a landmark that are marked with it
 _FOUND, _SUSPECT, _WORDS = (60, 230, 60), (236, 92, 40), (225, 225, 225)
@@ -106,10 +106,10 @@ def head_window(tracked: Tracked) -> Camera:
     projected = rays @ tracked.calibration.intrinsics.double().T
     pixels = projected[..., :2] / projected[..., 2:].clamp(min=1.0)
     low, high = pixels.amin(1), pixels.amax(1)
-    room = _ROOM * (high - low).amax(1).median()
+    border = _BORDER * (high - low).amax(1).median()
     # A frame or two in which the pose went astray do not shrink all others.
-    first, last = low.quantile(0.02, 0) - room, high.quantile(0.98, 0) + room
-    first[1] -= room  # the landmarks end at the brows
+    first, last = low.quantile(0.02, 0) - border, high.quantile(0.98, 0) + border
+    first[1] -= border  # the landmarks end at the brows
     size = (last - first).clamp(min=16.0)
     size[0] = size[0].clamp(min=float(0.75 * size[1]))
     size[1] = size[1].clamp(min=float(0.6 * size[0]))

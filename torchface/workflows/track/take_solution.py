@@ -79,7 +79,7 @@ def offsets_of(path: Path, inputs: TrackInputs) -> LandmarkOffsets:
 
 
 def new_offsets(inputs: TrackInputs, solver: VideoSolver, landmarks: Tensor, trust: Tensor) -> LandmarkOffsets | None:
-    """The offsets of a take's smoothed landmarks (T,68,2), trusted (T,68); None where it is too short to tell."""
+    """The offsets of a take's smoothed landmarks (T,68,2), trusted (T,68); None where it is too short."""
     return estimate_offsets(solver, landmarks, trust, _rig_digest(inputs.actor), _finder_digest(inputs))
 
 

@@ -40,7 +40,7 @@ def write_curves(tracked: Tracked, out: Path) -> dict[str, Path]:
     """Writes the weights, how sure they are, the landmarks with the head's pose beside them, the offsets and the
     animation; gives the files by what they are.
 
-    How sure each weight is stands in a file of its own, laid out as the weights are: a column beside them would be a
+    How sure each weight is stands in a file of its own, arranged as the weights are: a column beside them would be a
     shape to whatever else reads them, and could not say which part of the face is hidden.
     """
     fps, weights = tracked.video.fps, tracked.solution.weights.detach().float()

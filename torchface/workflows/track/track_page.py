@@ -123,10 +123,10 @@ def _face_box(tracked: Tracked, frames: list[int]) -> tuple[int, int, int, int]:
     pixels = torch.cat([camera_at(tracked, t).project(tracked.rig(weights[t : t + 1])[0, marks].double())
                         for t in frames])  # fmt: skip
     low, high = pixels.amin(0), pixels.amax(0)
-    room = _MARGIN * float((high - low).max())
+    border = _MARGIN * float((high - low).max())
     video = tracked.video
-    x0, y0 = max(0, int(low[0] - room)), max(0, int(low[1] - room))
-    x1, y1 = min(video.width, int(high[0] + room) + 1), min(video.height, int(high[1] + room) + 1)
+    x0, y0 = max(0, int(low[0] - border)), max(0, int(low[1] - border))
+    x1, y1 = min(video.width, int(high[0] + border) + 1), min(video.height, int(high[1] + border) + 1)
     return (x0, y0, x1, y1) if x1 - x0 > 8 and y1 - y0 > 8 else (0, 0, video.width, video.height)
 
 

@@ -38,7 +38,7 @@ class Tracked:
         landmarks: the reading's as a camera without distortion has them, filtered along time, (T,68,2), pixels.
         solution: weights and refined poses.
         times: when each frame is shown, (T,) seconds, where the frame rate varies; even at the video's if absent.
-        offsets: between the rig's landmarks and those found; None where the take is too short to tell.
+        offsets: between the rig's landmarks and those found; None where the take is too short for an estimate.
         faces: how many there are in the first frame.
         reused: frames whose readings were known from an earlier run.
         seconds: what each step took, by its name.

@@ -13,10 +13,10 @@ from torchface.errors import FileFormatError, ShapeError, ValueRangeError
 from torchface.geometry.cameras.pinhole import look_at
 from torchface.landmarks.images.appearance.annotated_frames import (
     AnnotatedFrame,
+    choose_frames,
     load_annotated_frames,
     save_annotated_frame,
 )
-from torchface.landmarks.images.appearance.frame_choice import choose_frames
 from torchface.synthetic import performer
 
 

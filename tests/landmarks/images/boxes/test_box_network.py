@@ -146,24 +146,24 @@ def test_folded_normalisation_changes_nothing() -> None:
     torch.testing.assert_close(found.boxes[likeliest, 2], expected[0, 2], atol=1e-3, rtol=1e-4)
 
 
-def test_the_loss_is_least_at_the_truth_and_leaves_doubtful_faces_out() -> None:
+def test_the_loss_is_least_at_the_truth_and_leaves_uncertain_faces_out() -> None:
     faces = torch.tensor([[[52.0, 44.0, 30.0, 0.3], [20.0, 80.0, 16.0, 0.0]]])
-    doubtful = torch.tensor([[False, True]])
+    uncertain = torch.tensor([[False, True]])
     planted = Planted(faces[0, :1]).maps(torch.zeros(1, 3, 96, 96))
     geometry = torch.zeros(1, 5, 12, 12)
     for row in range(12):
         for column in range(12):
             geometry[0, :, row, column] = face_geometry(faces[0, 0], torch.tensor([float(column), float(row)]))
-    best = float(box_loss(FaceMaps(planted.centre * 3, geometry), faces, doubtful))
+    best = float(box_loss(FaceMaps(planted.centre * 3, geometry), faces, uncertain))
     assert best < 0.05
     larger = geometry.clone()
     larger[:, 2] += 0.3
-    assert float(box_loss(FaceMaps(planted.centre * 3, larger), faces, doubtful)) > best + 0.3
+    assert float(box_loss(FaceMaps(planted.centre * 3, larger), faces, uncertain)) > best + 0.3
     there = planted.centre * 3
-    there[0, 0, 10, 2] = 9.0  # the doubtful one is said to be there
-    assert float(box_loss(FaceMaps(there, geometry), faces, doubtful)) == pytest.approx(best, abs=1e-6)
+    there[0, 0, 10, 2] = 9.0  # the uncertain one is said to be there
+    assert float(box_loss(FaceMaps(there, geometry), faces, uncertain)) == pytest.approx(best, abs=1e-6)
     there[0, 0, 1, 10] = 9.0  # where nobody is
-    assert float(box_loss(FaceMaps(there, geometry), faces, doubtful)) > best + 1
+    assert float(box_loss(FaceMaps(there, geometry), faces, uncertain)) > best + 1
 
 
 def test_a_killed_run_ends_where_it_would_have_ended(tmp_path: Path) -> None:

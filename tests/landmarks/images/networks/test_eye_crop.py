@@ -6,12 +6,12 @@ import pytest
 import torch
 
 from torchface.errors import ShapeError
+from torchface.landmarks.images.face_crop import cut_crops
 from torchface.landmarks.images.ibug_68 import MIRROR_68
 from torchface.landmarks.images.networks.eye_crop import (
     CROP_HEIGHT,
     CROP_WIDTH,
     EYE_LANDMARKS,
-    cut_eyes,
     eye_transforms,
     moved,
     picture_transforms,
@@ -55,7 +55,7 @@ def test_cut_eyes_show_what_lies_there(face: torch.Tensor) -> None:
         x, y = landmarks[row].round().long().tolist()
         image[number, y - 1 : y + 2, x - 1 : x + 2] = 255
     transforms = eye_transforms(landmarks)
-    crops = cut_eyes(image, transforms)
+    crops = cut_crops(image, transforms, 48, 32)
     assert crops.shape == (2, 3, CROP_HEIGHT, CROP_WIDTH)
     corners = moved(landmarks[[36, 45]][:, None], transforms)[:, 0]
     for number, crop in enumerate(crops):

@@ -13,7 +13,7 @@ from torch import Tensor
 _FOREHEAD = 0.9
 _BROWS, _JAW, _NOSE = slice(17, 27), slice(0, 17), 30
 # What is above and what is below an opening, held apart while triangles are chosen: a closed mouth or eye has no inside
-# to cut. The outer lips make room for the inner ones.
+# to cut. The outer lips leave space for the inner ones.
 _LIPS = (((61, 49, 50), (67, 58, 59)), ((62, 51), (66, 57)), ((63, 52, 53), (65, 55, 56)))
 _LIDS = (((37,), (41,)), ((38,), (40,)), ((43,), (47,)), ((44,), (46,)))
 CONTOURS = (tuple(range(48, 60)), tuple(range(60, 68)), tuple(range(36, 42)), tuple(range(42, 48)))
@@ -23,7 +23,7 @@ CONTOURS = (tuple(range(48, 60)), tuple(range(60, 68)), tuple(range(36, 42)), tu
 def with_forehead(landmarks: Tensor, jaw_margin: float = 0.0) -> Tensor:
     """The 68 and ten points over the brows that follow them: (B,68,2) to (B,78,2), linear.
 
-    Brows lie on the border of the 68; without skin above them nothing tells where their upper edge is.
+    Brows lie on the border of the 68; without skin above them their upper edge cannot be found.
 
     Args:
         landmarks: (B,68,2).

@@ -111,7 +111,7 @@ def learn_shape_modes(
 
 
 def procrustes_mean(shapes: Tensor) -> tuple[Tensor, Tensor]:
-    """The mean (L,2) of shapes (M,L,2) without their poses, upright as the first is, and they laid on it (M,L,2)."""
+    """The mean (L,2) of shapes (M,L,2) without their poses, upright as the first is, and they aligned to it (M,L,2)."""
     mean = _unit(shapes[0])
     for _ in range(_ITERATIONS):
         aligned = planar_pose(mean, shapes).undo(shapes)

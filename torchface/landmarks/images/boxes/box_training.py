@@ -30,7 +30,7 @@ class LabelledPicture:
     Args:
         image: uint8 (3,H,W), red first.
         faces: x and y of the centre, side, pixels, roll angle, radians, (F,4); see ``ibug_68.turned_box``.
-        doubtful: whether a face may be found or not, (F,): hidden, cut by the border, small.
+        uncertain: whether a face may be found or not, (F,): hidden, cut by the border, small.
 
     Example:
         >>> face = torch.tensor([[60.0, 50.0, 40.0, 0.0]])  # x, y, side, roll
@@ -41,7 +41,7 @@ class LabelledPicture:
 
     image: Tensor
     faces: Tensor
-    doubtful: Tensor
+    uncertain: Tensor
 
 
 class Pictures(Protocol):
@@ -109,11 +109,11 @@ class BoxTrainingSettings:
 
 
 class _Batch(NamedTuple):
-    """Images uint8 (B,3,H,W), faces (B,F,4), NaN where a picture has fewer, and which are doubtful (B,F)."""
+    """Images uint8 (B,3,H,W), faces (B,F,4), NaN where a picture has fewer, and which are uncertain (B,F)."""
 
     images: Tensor
     faces: Tensor
-    doubtful: Tensor
+    uncertain: Tensor
 
 
 def fit_boxes(
@@ -127,13 +127,13 @@ def fit_boxes(
 ) -> BoxNetwork:
     """See :meth:`BoxNetwork.fit`."""
     settings, progress = settings or BoxTrainingSettings(), progress or silent
-    with torch.random.fork_rng([]):
+    with torch.random.fork_rng([]):  # the first weights alone
         torch.manual_seed(settings.seed)
         model = BoxNetwork(settings.channels, settings.blocks)
 
     def loss(batch: _Batch, _: float) -> tuple[Tensor, float]:
         images = (batch.images.to(device).float() / 255).to(memory_format=torch.channels_last)
-        found = box_loss(model.maps(images), batch.faces.to(device), batch.doubtful.to(device))
+        found = box_loss(model.maps(images), batch.faces.to(device), batch.uncertain.to(device))
         return found, float(found.detach())
 
     key = content_key("box_training/2", config=model.config, source=source or {})
@@ -145,21 +145,21 @@ def _drawn(pictures: Pictures, size: int, step: int) -> _Batch:
     return _collate([pictures(number) for number in range(step * size, (step + 1) * size)])
 
 
-def box_loss(maps: FaceMaps, faces: Tensor, doubtful: Tensor) -> Tensor:
+def box_loss(maps: FaceMaps, faces: Tensor, uncertain: Tensor) -> Tensor:
     """Focal loss of the centres, L1 distance of the geometry; one number.
 
-    Cells of doubtful faces count neither way.
+    Cells of uncertain faces count neither way.
 
     Args:
         maps: of B images.
         faces: centre, side, roll angle, (B,F,4), NaN for none.
-        doubtful: (B,F).
+        uncertain: (B,F).
 
     Source: Law and Deng 2018; Zhou, Wang, Krähenbühl 2019.
     """
     height, width = maps.centre.shape[-2:]
     there = torch.isfinite(faces).all(-1)
-    sure = there & ~doubtful
+    sure = there & ~uncertain
     middle = (faces[..., :2].nan_to_num(-1e4) + 0.5) / STRIDE - 0.5
     side = faces[..., 2].nan_to_num(1.0) / STRIDE
     x, y = torch.arange(width).to(side), torch.arange(height).to(side)
@@ -171,7 +171,7 @@ def box_loss(maps: FaceMaps, faces: Tensor, doubtful: Tensor) -> Tensor:
     best, owner = heat.amax(1), heat.argmax(1)  # (B,h,w)
     own = (squared < 0.25).logical_and(sure[..., None, None]).any(1)
     reach = (cell - middle[:, :, None, None]).abs().amax(-1) < 0.6 * side[..., None, None]
-    unknown = (reach & (there & doubtful)[..., None, None]).any(1)
+    unknown = (reach & (there & uncertain)[..., None, None]).any(1)
     counted = own | (~unknown)
     logit = maps.centre[:, 0]
     likely = logit.sigmoid()
@@ -194,8 +194,8 @@ def box_loss(maps: FaceMaps, faces: Tensor, doubtful: Tensor) -> Tensor:
 def _collate(pictures: Sequence[LabelledPicture]) -> _Batch:
     most = max(1, *(len(one.faces) for one in pictures))
     faces = torch.full((len(pictures), most, 4), torch.nan)
-    doubtful = torch.zeros(len(pictures), most, dtype=torch.bool)
+    uncertain = torch.zeros(len(pictures), most, dtype=torch.bool)
     for row, one in enumerate(pictures):  # each has as many faces as it has
         faces[row, : len(one.faces)] = one.faces
-        doubtful[row, : len(one.faces)] = one.doubtful
-    return _Batch(torch.stack([one.image for one in pictures]), faces, doubtful)
+        uncertain[row, : len(one.faces)] = one.uncertain
+    return _Batch(torch.stack([one.image for one in pictures]), faces, uncertain)

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from torchface.landmarks.images.networks.eye_crop import EYE_LANDMARKS, eye_transforms, moved
-from torchface.landmarks.images.networks.picture_augmentation import with_light
+from torchface.landmarks.images.networks.picture_augmentation import with_blur, with_light
 
 _SHUT, _OPEN = 10.0, 28.0  # square millimetres of eyeball up to which an eye is shut, and from which it is not
 
@@ -207,11 +207,11 @@ def _with_occluders(
             cv2.ellipse(cover, (*at.astype(int).tolist(),), axes, math.degrees(way), 0, 360, 1.0, -1, cv2.LINE_AA)
             cover = cv2.GaussianBlur(cover, (0, 0), uniform(0.5, 4)).astype(np.float32)
             tone, share = np.array([0.9, 0.95, 1.0]) * uniform(0.6, 1.0), uniform(0.2, 1.0)
-        laid = share * cover[..., None]
-        picture[:] = picture * (1 - laid) + np.clip(tone, 0, 1) * laid
+        opacity = share * cover[..., None]
+        picture[:] = picture * (1 - opacity) + np.clip(tone, 0, 1) * opacity
         spots = points[number].round().long()
         x, y = spots[:, 0].clamp(0, width - 1), spots[:, 1].clamp(0, height - 1)
-        covered[number] = torch.from_numpy((laid[y, x, 0] > 0.6).astype(np.float32))
+        covered[number] = torch.from_numpy((opacity[y, x, 0] > 0.6).astype(np.float32))
     return torch.from_numpy(drawn).permute(0, 3, 1, 2), covered
 
 
@@ -222,15 +222,7 @@ def _as_cameras_store(images: Tensor, settings: EyeAugmentation, generator: torc
     def rand(*shape: int) -> Tensor:
         return torch.rand(*shape, generator=generator)
 
-    soft = (rand(count) < 0.4).nonzero()[:, 0]
-    if len(soft):
-        sigma = (0.3 + 1.7 * rand(len(soft), 1) ** 2).expand(-1, 2)
-        images[soft] = kornia.filters.gaussian_blur2d(images[soft], (9, 9), sigma)
-    moving = (rand(count) < 0.12).nonzero()[:, 0]
-    if len(moving):
-        images[moving] = kornia.filters.motion_blur(
-            images[moving], 7, 360 * rand(len(moving)), torch.zeros(len(moving))
-        )
+    images = with_blur(images, generator, 0.4, 1.7)
     far, coded = rand(count) < settings.far, rand(count) < 0.5
     small, large = (math.log(size) for size in settings.sizes)
     share = torch.where(far, (large + (small - large) * rand(count)).exp(), 1.0)

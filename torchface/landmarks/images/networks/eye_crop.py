@@ -6,7 +6,6 @@ import torch
 from torch import Tensor
 
 from torchface.errors import ShapeError
-from torchface.landmarks.images.face_crop import cut_crops
 
 CROP_WIDTH, CROP_HEIGHT = 48, 32
 """Pixels of an eye's crop."""
@@ -85,20 +84,3 @@ def picture_transforms(transforms: Tensor) -> Tensor:
 def moved(points: Tensor, transforms: Tensor) -> Tensor:
     """Points (...,P,2) through affine maps (...,2,3)."""
     return points @ transforms[..., :2].transpose(-1, -2) + transforms[..., None, :, 2]
-
-
-def cut_eyes(image: Tensor, transforms: Tensor, width: int = CROP_WIDTH, height: int = CROP_HEIGHT) -> Tensor:
-    """The crops of a face's eyes; beyond the border the border's pixels go on.
-
-    Args:
-        image: uint8 (H,W), or (3,H,W) red first.
-        transforms: (2,2,3), see :func:`eye_transforms`.
-        width, height: pixels of the crops.
-
-    Returns:
-        uint8 (2,3,h,w), red first; a grey image gives three alike.
-
-    Raises:
-        ShapeError: no such image.
-    """
-    return cut_crops(image, transforms.double(), width, height)

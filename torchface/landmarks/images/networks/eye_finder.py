@@ -12,11 +12,11 @@ import torch
 from torch import Tensor
 
 from torchface.errors import ShapeError
+from torchface.landmarks.images.face_crop import cut_crops
 from torchface.landmarks.images.face_reading import FaceReading
 from torchface.landmarks.images.landmark_finder import LandmarkFinder, finder_name
 from torchface.landmarks.images.networks.eye_crop import (
     EYE_LANDMARKS,
-    cut_eyes,
     eye_transforms,
     moved,
     picture_transforms,
@@ -85,7 +85,7 @@ class EyeFinder:
         scale = math.hypot(*transforms[0, 0, :2].tolist())  # NaN where there is no face
         if not 0 < scale * LEAST <= self.width:
             return face
-        eyes = self.network(cut_eyes(image, transforms, self.width, self.height).float() / 255)
+        eyes = self.network(cut_crops(image, transforms, self.width, self.height).float() / 255)
         back = picture_transforms(transforms)
         points = moved(torch.cat([eyes.landmarks, eyes.iris[:, None]], 1).double(), back).float()
         lid_deviation = eyes.deviation[:, :6] / scale

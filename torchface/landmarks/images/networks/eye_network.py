@@ -54,14 +54,14 @@ class EyeNetwork(nn.Module):
 
     .. math:: x_l = \sum_p \mathrm{softmax}(h_l)_p \, p
 
-    with :math:`h_l` the heat map of point l at half of the crop's resolution. Features under the heat maps tell how far
-    off each point may be; with those of the whole crop, how far the eye is open, and whether it is shut or hidden.
+    with :math:`h_l` the heat map of point l at half of the crop's resolution. Features under the heat maps give the
+    deviation of each point; with those of the whole crop, how far the eye is open, and whether it is shut or hidden.
 
     Args:
         width, height: of a crop, pixels; multiples of 8.
         channels: at a half, a quarter and an eighth of the resolution.
         blocks: residual blocks there.
-        hidden: units between features and what is told of the whole eye.
+        hidden: units between features and what is read of the whole eye.
 
     Source: Newell, Yang, Deng 2016 (encoder and decoder); Sun et al. 2018 (means of heat maps).
 

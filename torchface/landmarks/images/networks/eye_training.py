@@ -14,11 +14,12 @@ from torch.utils.data import Dataset
 from torchface.files.content_keys import content_key
 from torchface.landmarks.images.networks.eye_augmentation import EyeAugmentation, EyeCrops, EyeLabels, augmented_eyes
 from torchface.landmarks.images.networks.eye_network import STRIDE, EyeNetwork
-from torchface.landmarks.images.networks.heat_map_losses import (
+from torchface.landmarks.images.networks.heat_map_training import (
     check_pictures,
     draw_numbers,
     gap_loss,
     heat_loss,
+    new_network,
     point_loss,
 )
 from torchface.optim import DescentRun, DescentSettings, DescentTask, descend
@@ -64,19 +65,11 @@ def fit_eyes(
         (68, 2), (12,), (2, 2), (2,), (2,),
     )  # fmt: skip
     settings = settings or EyeSettings()
-    if network is None:
-        with torch.random.fork_rng([]):
-            torch.manual_seed(settings.seed)
-            network = EyeNetwork()
-    chosen = network
-
-    def loss(crops: EyeCrops, share: float) -> tuple[Tensor, float]:
-        return _loss(chosen, crops, settings, share, device)
-
+    network = network or new_network(EyeNetwork, settings.seed)
     learned = {"gap": settings.gap, "heat": settings.heat, "augmentation": settings.augmentation}
     task = DescentTask(
         partial(_crops, pictures, (network.width, network.height), settings),
-        loss,
+        partial(_loss, network, settings, device),
         content_key(_METHOD, settings=learned, config=network.config),
         "training on eyes",
         "pixels off",
@@ -92,7 +85,7 @@ def _crops(pictures: Dataset[tuple[Tensor, ...]], size: tuple[int, int], setting
 
 
 def _loss(
-    network: EyeNetwork, crops: EyeCrops, settings: EyeSettings, share: float, device: str | torch.device
+    network: EyeNetwork, settings: EyeSettings, device: str | torch.device, crops: EyeCrops, share: float
 ) -> tuple[Tensor, float]:
     """The loss of a batch, and the mean distance of what can be seen, pixels."""
     images, truth = crops.images.to(device, memory_format=torch.channels_last), crops.points.to(device)

@@ -46,8 +46,8 @@ class LandmarkNetwork(nn.Module):
 
     .. math:: x_l = \sum_p \mathrm{softmax}(h_l)_p \, p
 
-    with :math:`h_l` the heat map of landmark l at a quarter of the crop's resolution. Features under the heat map tell
-    how far off the landmark may be, and whether something hides it.
+    with :math:`h_l` the heat map of landmark l at a quarter of the crop's resolution. Features under the heat map give
+    the deviation to be expected of the landmark, and whether something hides it.
 
     Args:
         size: of a crop, pixels a side; a multiple of 16.

@@ -12,11 +12,12 @@ from torch.nn.functional import binary_cross_entropy, binary_cross_entropy_with_
 from torch.utils.data import Dataset
 
 from torchface.files.content_keys import content_key
-from torchface.landmarks.images.networks.heat_map_losses import (
+from torchface.landmarks.images.networks.heat_map_training import (
     check_pictures,
     draw_numbers,
     gap_loss,
     heat_loss,
+    new_network,
     point_loss,
 )
 from torchface.landmarks.images.networks.landmark_network import STRIDE, LandmarkNetwork
@@ -63,19 +64,11 @@ def fit_landmarks(
     """See :meth:`LandmarkNetwork.fit`."""
     check_pictures(pictures, "uint8 (4,H,W), landmarks (68,2) and visibility (68,)", (68, 2), (68,))
     settings = settings or NetworkSettings()
-    if network is None:
-        with torch.random.fork_rng([]):
-            torch.manual_seed(settings.seed)
-            network = LandmarkNetwork()
-    chosen = network
-
-    def loss(crops: Crops, share: float) -> tuple[Tensor, float]:
-        return _loss(chosen, crops, settings, share, device)
-
+    network = network or new_network(LandmarkNetwork, settings.seed)
     learned = {"pair": settings.pair, "heat": settings.heat, "augmentation": settings.augmentation}
     task = DescentTask(
         partial(_crops, pictures, network.size, network.margin, settings),
-        loss,
+        partial(_loss, network, settings, device),
         content_key(_METHOD, settings=learned, config=network.config),
         "training the network",
         "pixels off",
@@ -92,7 +85,7 @@ def _crops(
 
 
 def _loss(
-    network: LandmarkNetwork, crops: Crops, settings: NetworkSettings, share: float, device: str | torch.device
+    network: LandmarkNetwork, settings: NetworkSettings, device: str | torch.device, crops: Crops, share: float
 ) -> tuple[Tensor, float]:
     """The loss of a batch, and the mean distance of what can be seen, pixels."""
     images, truth = crops.images.to(device, memory_format=torch.channels_last), crops.landmarks.to(device)

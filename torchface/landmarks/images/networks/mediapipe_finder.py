@@ -47,7 +47,7 @@ class MediaPipeFinder:
     """Finds landmarks by MediaPipe's refined face mesh, version 0.10.14, whose wheel holds its models.
 
     Each face is shown to it upright and at one size, every frame for itself, so that its answer depends on nothing
-    else. It tells no deviation and no visibility: every landmark has the confidence 0.8 and is visible; the presence is
+    else. It gives no deviation and no visibility: every landmark has the confidence 0.8 and is visible; the presence is
     1 where it sees a face and 0 where it does not. It runs in another process, which ends with this one.
 
     Args:
@@ -63,7 +63,7 @@ class MediaPipeFinder:
 
     def __init__(self, python: str | Path | None = None) -> None:
         self.python = _python(python)
-        self._told = tempfile.TemporaryFile()  # noqa: SIM115  lives as long as the process that writes it
+        self._errors = tempfile.TemporaryFile()  # noqa: SIM115  lives as long as the process that writes it
         script = str(Path(mediapipe_process.__file__).resolve())
         environment = {**os.environ, "GLOG_minloglevel": "3", "TF_CPP_MIN_LOG_LEVEL": "3"}
         try:
@@ -71,12 +71,12 @@ class MediaPipeFinder:
                 [str(self.python), "-I", script],
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
-                stderr=self._told,
+                stderr=self._errors,
                 env=environment,
             )
         except OSError as error:
             raise MissingExtraError(f"{self.python}: cannot be run ({error}); {_how()}") from error
-        self._end = weakref.finalize(self, _stop, self._process, self._told)
+        self._end = weakref.finalize(self, _stop, self._process, self._errors)
         try:
             self._answer(_START_SECONDS)
         except MediaPipeError as error:
@@ -133,9 +133,9 @@ class MediaPipeFinder:
 
     def _failed(self, what: str) -> MediaPipeError:
         said = ""
-        if not self._told.closed:
-            self._told.seek(max(0, self._told.seek(0, os.SEEK_END) - 4096))
-            lines = self._told.read().decode("utf-8", "replace").strip().splitlines()
+        if not self._errors.closed:
+            self._errors.seek(max(0, self._errors.seek(0, os.SEEK_END) - 4096))
+            lines = self._errors.read().decode("utf-8", "replace").strip().splitlines()
             said = f": {lines[-1].strip()[:200]}" if lines else ""
         return MediaPipeError(f"mediapipe: its process under {self.python} {what}{said}")
 
@@ -156,7 +156,7 @@ def _how() -> str:
     return f"install it beside torchface with: {_INSTALL}"
 
 
-def _stop(process: subprocess.Popen[bytes], told: IO[bytes]) -> None:
+def _stop(process: subprocess.Popen[bytes], errors: IO[bytes]) -> None:
     """Ends the process: what comes in ends, and if that is not enough it is killed."""
     for pipe in (process.stdin, process.stdout):
         if pipe is not None:
@@ -167,4 +167,4 @@ def _stop(process: subprocess.Popen[bytes], told: IO[bytes]) -> None:
     except subprocess.TimeoutExpired:
         process.kill()
         process.wait()
-    told.close()
+    errors.close()

@@ -97,12 +97,12 @@ def augmented(
     turn = torch.where(rand(count) < 0.25, 45 * (2 * rand(count) - 1), settings.turn * randn(count).clamp(-2.5, 2.5))
     side = box[:, 2] * margin * (settings.scale * (2 * rand(count) - 1)).exp()
     shift = settings.shift * randn(count, 2).clamp(-2.5, 2.5)
-    # Half of what shows no face shows one where none is looked for; the network is to tell the two apart.
+    # Half of what shows no face shows one where none is looked for; the network learns to distinguish the two.
     astray = (present == 0) & (rand(count) < 0.5)
     way = torch.nn.functional.normalize(randn(count, 2), dim=1)
     shift = torch.where(astray[:, None], way * (0.55 + 0.5 * rand(count, 1)), shift)
     side = torch.where(astray & (rand(count) < 0.3), side * 2.6, side)
-    # A face that stands on its side or its head in the crop is in the wrong place too: its tilt is not the one told.
+    # A face that stands on its side or its head in the crop is in the wrong place too: its tilt is not the one stated.
     overturned = astray & (rand(count) < 0.5)
     turn = torch.where(overturned, 75 + 210 * rand(count), turn)
     shift = torch.where(overturned[:, None], 0.05 * way, shift)
@@ -203,7 +203,7 @@ def _with_occluders(
 
 
 def _covered(picture: np.ndarray, cover: np.ndarray, where: Tensor, hard: bool, uniform: Uniform) -> np.ndarray:
-    """A picture (S,S,3) with a tone laid over the covered part: black, the skin's own with shading, or any colour."""
+    """A picture (S,S,3) with a tone over the covered part: black, the skin's own with shading, or any colour."""
     size = len(cover)
     if hard and uniform(0, 1) < 0.7:
         tone = np.zeros((1, 1, 3), dtype=np.float32)
@@ -233,7 +233,7 @@ def _hair(picture: np.ndarray, uniform: Uniform) -> None:
 
 
 def with_light(images: Tensor, generator: torch.Generator, grey_share: float = 0.15) -> Tensor:
-    """Images (B,3,H,W) brighter, darker, of more or less contrast and colour, as lamps and cameras differ.
+    """Images (B,3,H,W) brighter, darker, of more or less contrast and colour, as lights and cameras differ.
 
     Args:
         images: in [0,1].
@@ -255,23 +255,35 @@ def with_light(images: Tensor, generator: torch.Generator, grey_share: float = 0
     return (grey + saturation * (images - grey)).clamp(0, 1)
 
 
+def with_blur(images: Tensor, generator: torch.Generator, share: float, widest: float) -> Tensor:
+    """Images (B,3,H,W) of which a share is out of focus, and an eighth moves.
+
+    Args:
+        images: in [0,1]; changed in place.
+        generator: decides everything.
+        share: of images out of focus.
+        widest: standard deviation of their blur beyond 0.3, pixels, at most.
+    """
+    count = len(images)
+    soft = (torch.rand(count, generator=generator) < share).nonzero()[:, 0]
+    if len(soft):
+        sigma = (0.3 + widest * torch.rand(len(soft), 1, generator=generator) ** 2).expand(-1, 2)
+        images[soft] = kornia.filters.gaussian_blur2d(images[soft], (9, 9), sigma)
+    moving = (torch.rand(count, generator=generator) < 0.12).nonzero()[:, 0]
+    if len(moving):
+        angle = 360 * torch.rand(len(moving), generator=generator)
+        images[moving] = kornia.filters.motion_blur(images[moving], 7, angle, torch.zeros(len(moving)))
+    return images
+
+
 def _photographed(images: Tensor, settings: AugmentationSettings, generator: torch.Generator) -> Tensor:
-    """What lamps, lenses, sensors and codecs make of crops (B,3,S,S)."""
+    """What lights, lenses, sensors and codecs make of crops (B,3,S,S)."""
     count, _, size, _ = images.shape
 
     def rand(*shape: int) -> Tensor:
         return torch.rand(*shape, generator=generator)
 
-    images = with_light(images, generator, settings.grey)
-    soft = (rand(count) < 0.45).nonzero()[:, 0]
-    if len(soft):
-        sigma = (0.3 + 1.3 * rand(len(soft), 1) ** 2).expand(-1, 2)
-        images[soft] = kornia.filters.gaussian_blur2d(images[soft], (9, 9), sigma)
-    moving = (rand(count) < 0.12).nonzero()[:, 0]
-    if len(moving):
-        images[moving] = kornia.filters.motion_blur(
-            images[moving], 7, 360 * rand(len(moving)), torch.zeros(len(moving))
-        )
+    images = with_blur(with_light(images, generator, settings.grey), generator, 0.45, 1.3)
     noise = (0.045 * rand(count, 1, 1, 1) ** 2) * torch.randn(images.shape, generator=generator)
     images = (images + noise).clamp(0, 1)
     small = (rand(count) < 0.3).nonzero()[:, 0].tolist()

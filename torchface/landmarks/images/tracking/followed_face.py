@@ -106,7 +106,7 @@ class FollowedFace:
 
 
 def face_look(image: Tensor, landmarks: Tensor) -> Tensor:
-    """A face's colours, upright and small, about their mean: enough to tell two people of one video apart.
+    """A face's colours, upright and small, about their mean: enough to distinguish two people of one video.
 
     Args:
         image: uint8 (H,W), or (3,H,W) red first.
@@ -117,7 +117,7 @@ def face_look(image: Tensor, landmarks: Tensor) -> Tensor:
     """
     box, tilt = turned_box(landmarks)
     crop = cut_crop(image, crop_transform(box, float(tilt), _SIZE, _MARGIN), _SIZE).float()
-    # The mean of all colours goes, not that of each: how red a face is beside how blue tells people apart.
+    # The mean of all colours goes, not that of each: how red a face is beside how blue differs between people.
     flat = (crop - crop.mean()).flatten()
     return flat / flat.norm().clamp(min=1e-6)
 

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from torchface.errors import ValueRangeError
 from torchface.landmarks.images.appearance.appearance_model import AppearanceModel
+from torchface.landmarks.images.box_landmarks import refined_face, settled_face
 from torchface.landmarks.images.boxes.face_box import FaceBoxes, FaceDetector, check_image, overlaps
 from torchface.landmarks.images.boxes.find_faces import find_faces, find_turned_faces
 from torchface.landmarks.images.boxes.haar_detector import STREAM, SURROUNDINGS, HaarDetector
@@ -16,7 +17,6 @@ from torchface.landmarks.images.face_reading import FaceReading
 from torchface.landmarks.images.ibug_68 import turned_box
 from torchface.landmarks.images.landmark_finder import LandmarkFinder, find_in_box
 from torchface.landmarks.images.tracking.followed_face import FollowedFace, face_place
-from torchface.landmarks.images.tracking.settled_face import refined_face, settled_face
 from torchface.landmarks.images.trees.landmark_trees import LandmarkTrees
 from torchface.landmarks.images.trees.tree_finder import TreeFinder
 

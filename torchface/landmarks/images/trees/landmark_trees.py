@@ -212,7 +212,7 @@ def initial_shapes(mean: Tensor, boxes: Tensor) -> Tensor:
 
 
 def similarity_to(mean: Tensor, shapes: Tensor) -> Tensor:
-    """Scale times rotation (B,2,2) that lays the mean shape (L,2) on shapes (B,L,2) with least squared error."""
+    """Scale times rotation (B,2,2) that aligns the mean shape (L,2) with shapes (B,L,2) with least squared error."""
     mean = mean - mean.mean(0)
     centred = shapes - shapes.mean(1, keepdim=True)
     energy = mean.square().sum()
