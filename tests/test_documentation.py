@@ -64,8 +64,8 @@ def test_readme_quotes_the_figures_that_were_kept(quote_figures: ModuleType) -> 
 
 def test_a_figure_is_quoted_between_its_marks(quote_figures: ModuleType) -> None:
     text = "takes <!-- bench time -->9 s<!-- / --> and <!-- bench size -->1 MB<!-- / -->"
-    told = quote_figures.quoted(text, {"bench": {"time": "2 s", "size": "3 MB"}})
-    assert told == "takes <!-- bench time -->2 s<!-- / --> and <!-- bench size -->3 MB<!-- / -->"
+    filled = quote_figures.quoted(text, {"bench": {"time": "2 s", "size": "3 MB"}})
+    assert filled == "takes <!-- bench time -->2 s<!-- / --> and <!-- bench size -->3 MB<!-- / -->"
     with pytest.raises(KeyError):
         quote_figures.quoted(text, {"bench": {"time": "2 s"}})
 

@@ -50,23 +50,23 @@ _RUNTIME_EXCEPTION = (
 
 def installed(requirements: list[str]) -> dict[str, Distribution]:
     """What these requirements install, as far as it is installed here, by canonical name."""
-    found: dict[str, Distribution] = {}
+    packages: dict[str, Distribution] = {}
     waiting = [Requirement(text) for text in requirements]
     while waiting:
         requirement = waiting.pop()
         name = canonicalize_name(requirement.name)
-        if name in found:
+        if name in packages:
             continue
         try:
-            found[name] = distribution(requirement.name)
+            packages[name] = distribution(requirement.name)
         except PackageNotFoundError:
             continue
-        needed = map(Requirement, found[name].requires or [])
+        needed = map(Requirement, packages[name].requires or [])
         extras = requirement.extras or {""}
         waiting += [
             one for one in needed if not one.marker or any(one.marker.evaluate({"extra": extra}) for extra in extras)
         ]
-    return found
+    return packages
 
 
 def gpl_libraries(files: Sequence[PackagePath]) -> Iterator[str]:
@@ -98,8 +98,8 @@ def packages() -> dict[str, list[PackagePath]]:
     """The files of everything that the core and the extras install, by package."""
     project = tomllib.loads((REPOSITORY / "pyproject.toml").read_text())["project"]
     extras = project["optional-dependencies"].values()
-    found = installed([*project["dependencies"], *(requirement for extra in extras for requirement in extra)])
-    return {name: package.files or [] for name, package in found.items()}
+    present = installed([*project["dependencies"], *(requirement for extra in extras for requirement in extra)])
+    return {name: package.files or [] for name, package in present.items()}
 
 
 def test_what_the_core_needs_is_here(packages: dict[str, list[PackagePath]]) -> None:
@@ -108,13 +108,13 @@ def test_what_the_core_needs_is_here(packages: dict[str, list[PackagePath]]) -> 
 
 
 def test_no_wheel_holds_a_gpl_library_that_is_not_named(packages: dict[str, list[PackagePath]]) -> None:
-    found = {name: libraries for name, one in packages.items() if (libraries := list(gpl_libraries(one)))}
-    assert set(found) <= {"av", "bpy"}, found
+    gpl = {name: libraries for name, one in packages.items() if (libraries := list(gpl_libraries(one)))}
+    assert set(gpl) <= {"av", "bpy"}, gpl
 
 
 def test_no_licence_text_is_the_gpl_that_is_not_named(packages: dict[str, list[PackagePath]]) -> None:
-    found = {name: texts for name, one in packages.items() if (texts := list(licence_texts(one, _GPL_TEXT)))}
-    assert set(found) <= set(GPL_PARTS), found
+    gpl = {name: texts for name, one in packages.items() if (texts := list(licence_texts(one, _GPL_TEXT)))}
+    assert set(gpl) <= set(GPL_PARTS), gpl
     lesser = {name: texts for name, one in packages.items() if (texts := list(licence_texts(one, _LGPL_TEXT)))}
     assert set(lesser) <= set(GPL_PARTS) | set(LGPL_PARTS), lesser
 

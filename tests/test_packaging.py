@@ -1,4 +1,4 @@
-"""What a user installs: the wheel brings the command, the type marker, the zoo and its recipes, nothing of tests."""
+"""The wheel that a user installs: it holds the command, the type marker, the zoo and its recipes, and no tests."""
 
 import json
 import shutil
@@ -26,8 +26,8 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
     if built.returncode != 0 and "No matching distribution" in built.stderr:
         pytest.skip("the build backend cannot be installed here")
     assert built.returncode == 0, built.stderr
-    (found,) = folder.glob("torchface-*.whl")
-    return found
+    (built_wheel,) = folder.glob("torchface-*.whl")
+    return built_wheel
 
 
 @pytest.fixture(scope="module")
@@ -44,12 +44,12 @@ def python(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
         check=True,
     )
     asked = [python, "-c", "import sysconfig; print(sysconfig.get_path('purelib'))"]
-    own = subprocess.run(asked, capture_output=True, text=True, check=True).stdout.strip()
+    packages = subprocess.run(asked, capture_output=True, text=True, check=True).stdout.strip()
     # A path in a .pth file is looked through after the environment's own, and its .pth files (an editable install's
     # among them) are not read.
-    Path(own, "borrowed.pth").write_text(sysconfig.get_path("purelib") + "\n")
-    Path(own, "pyproject.toml").write_bytes((REPOSITORY / "pyproject.toml").read_bytes())
-    shutil.copytree(REPOSITORY / "models" / "head", Path(own, "models", "strangers_head"))
+    Path(packages, "borrowed.pth").write_text(sysconfig.get_path("purelib") + "\n")
+    Path(packages, "pyproject.toml").write_bytes((REPOSITORY / "pyproject.toml").read_bytes())
+    shutil.copytree(REPOSITORY / "models" / "head", Path(packages, "models", "strangers_head"))
     return python
 
 
@@ -82,9 +82,9 @@ def test_a_recipe_of_the_wheel_learns(python: Path, tmp_path: Path) -> None:
     words = ["train", "marker_solver", "--markers", "20", "--frames", "30", "--out", "models/own"]
     code = f"import sys, torchface.cli; torchface.cli.main({words}); print('train' in sys.modules)"
     code += "\nimport torchface._train.landmark_network  # with the people that it learns from"
-    told = run(python, code, tmp_path)
-    assert "mean error of a weight" in told
-    assert told.endswith("False\n")
+    printed = run(python, code, tmp_path)
+    assert "mean error of a weight" in printed
+    assert printed.endswith("False\n")
     assert (tmp_path / "models" / "own" / "model.toml").is_file()
 
 

@@ -66,13 +66,13 @@ UNSHOWN = {
 @cache
 def public_names() -> dict[str, Any]:
     """What each public path leads to."""
-    found = {}
+    names = {}
     for path in sorted(LIBRARY.rglob("*.py")):
         if "\n__all__ = " in path.read_text(encoding="utf-8"):
             parts = ("torchface", *path.relative_to(LIBRARY).with_suffix("").parts)
             module = importlib.import_module(".".join(parts).removesuffix(".__init__"))
-            found.update({f"{module.__name__}.{name}": getattr(module, name) for name in module.__all__})
-    return found
+            names.update({f"{module.__name__}.{name}": getattr(module, name) for name in module.__all__})
+    return names
 
 
 def resolved(path: str) -> Any:
