@@ -24,6 +24,7 @@ from enhancement_comparison import (
     PAPER,
     RIDGE,
     SHOWN,
+    STRAIN,
     Bench,
     Measured,
     bench_of,
@@ -34,6 +35,27 @@ from enhancement_pictures import compared
 from enhancement_scenes import FPS
 
 from torchface.enhancement.matching.region_projection import RegionProjection
+
+FIGURES = {
+    "performer": {
+        NEAREST: (0.880, 0.948),
+        HOLISTIC: (0.688, 0.729),
+        FOUR: (0.588, 0.851),
+        OURS: (0.522, 0.533),
+        LEARNED: (0.139, 0.233),
+        RIDGE: (0.145, 0.233),
+        MOTION: (0.630, 0.659),
+        STRAIN: (0.613, 0.632),
+        NEAREST + PAIRS: (0.228, 0.332),
+        HOLISTIC + PAIRS: (0.207, 0.271),
+        FOUR + PAIRS: (0.156, 0.213),
+        OURS + PAIRS: (0.155, 0.212),
+        LEARNED + PAIRS: (0.137, 0.167),
+        RIDGE + PAIRS: (0.149, 0.161),
+    },
+    "ict": {LEARNED: (0.083, 0.166), LEARNED + PAIRS: (0.061, 0.103), NEAREST + PAIRS: (0.138, 0.236)},
+}
+"""Fine part and normals in docs/benchmarks.md, shares of the smoothed input's."""
 
 pytestmark = [pytest.mark.real, pytest.mark.usefixtures("one_thread")]
 
@@ -49,7 +71,7 @@ def measured(bench: Bench) -> Measured:
 
 
 def test_table(bench: Bench, measured: Measured) -> None:
-    """The table: every method on takes that no database frame is of."""
+    """The table: every method on takes that no database frame is of; what docs/benchmarks.md states of it holds."""
     scene = bench.scene
     print(f"\n{scene.name}: {len(scene.neutral):,} vertices, {len(scene.frames)} database frames of "
           f"{int(scene.sequences.max()) + 1} sequences, {sum(map(len, scene.truth))} test frames")  # fmt: skip
@@ -62,6 +84,9 @@ def test_table(bench: Bench, measured: Measured) -> None:
     outside = torch.cat([bench.model.enhance(shown).outside for shown in scene.coarse]).float().mean(0).tolist()
     told = [f"{name} {share:.0%}" for name, share in zip(bench.model.region_names, outside, strict=True)]
     print(f"frames said to be outside the database's range: {', '.join(told)}")
+    for name, (fine, angle) in FIGURES[scene.name].items():
+        row = shares(bench, measured, name)
+        assert (row.fine, row.angle) == pytest.approx((fine, angle), abs=0.01), name
 
 
 def test_every_region(bench: Bench, measured: Measured) -> None:
@@ -100,7 +125,7 @@ def test_bars(bench: Bench, measured: Measured) -> None:
 
 
 def test_pictures(bench: Bench) -> None:
-    """The liveliest frame of each test take: smooth input, ours, truth, and others, to be looked at."""
+    """The liveliest frame of each test take, drawn: ours is near the truth where the smooth input lacks most."""
     for number, (coarse, truth) in enumerate(zip(bench.scene.coarse, bench.scene.truth, strict=True)):
         lacking = bench.ruler.fine(bench.smooth(coarse) - truth).square().sum((1, 2))
         frame = int(lacking.argmax())
@@ -111,6 +136,9 @@ def test_pictures(bench: Bench) -> None:
         errors = {name: bench.ruler.fine((shown - truth[frame])[None])[0].norm(dim=1)
                   for name, shown in columns.items() if name != "truth"}  # fmt: skip
         compared(f"{bench.scene.name}, test take {number}", bench.scene.performer.neutral, columns, errors)
+        sizes = {name: float(error.square().mean().sqrt()) for name, error in errors.items()}
+        print(f"{bench.scene.name}, test take {number}: " + ", ".join(f"{n} {v:.4f} mm" for n, v in sizes.items()))
+        assert sizes[LEARNED] < 0.3 * sizes["smooth input"]
 
 
 def test_outside_is_told(bench: Bench) -> None:
