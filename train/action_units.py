@@ -36,7 +36,7 @@ class Settings(RecipeSettings):
     """What the recipe does.
 
     Args:
-        video: Head-camera videos, one a performer; the first performer's face is what the others are laid on.
+        video: Head-camera videos, one a performer; the others' faces are warped to the first performer's.
         labels: What is in each of them, as TOML.
         test_video: Videos of performers to test on.
         test_labels: What is in each of those.
@@ -148,9 +148,9 @@ def save(
         data=f"{frames} frames of {len(labels)} head-camera videos.",
         metrics=metrics,
         text=(
-            f"Action units {', '.join(classifier.units)} told from strokes of reflective paint in a head-camera video, "
-            "frame by frame, each at one of a few levels of intensity. It knows no other units, and combinations only "
-            "as far as they were performed. Accuracy is of unit and level together, of performers left out, or of "
+            f"Action units {', '.join(classifier.units)} recognised by strokes of reflective paint in a head-camera "
+            "video, frame by frame, each at one of a few levels of intensity. It knows no other units, and "
+            "combinations only as far as they were performed. Accuracy is of unit and level together, of performers left out, or of "
             "repetitions left out where there is one performer; other performers' is the share of frames in which "
             "every unit is within a level of their own labels."
         ),

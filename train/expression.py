@@ -42,7 +42,7 @@ class Settings(RecipeSettings):
         neutral_components: How many, at most; None chooses by leaving out one after the other.
         offset_components: Likewise.
         ridge: As a share of the neutrals' mean variance a component; None chooses it.
-        align: Lay each expression onto its neutral by what does not move, rotation and translation only.
+        align: Align each expression with its neutral by what does not move, rotation and translation only.
         compared: Leave one out for the table of errors; of more than a hundred people the last fifty together.
         pictured: How many of those left out, the first, are shown with what each method makes of them.
     """
@@ -138,7 +138,7 @@ def entries(folder: Path) -> list[Path]:
 
 
 def read(path: Path, settings: Settings) -> BlendshapeRig:
-    """One person's expressions, laid onto the neutral."""
+    """One person's expressions, aligned with the neutral."""
     rig = selected(load_rig(path), settings.expressions)
     if not settings.align:
         return rig

@@ -118,7 +118,7 @@ def compare(
 
 @dataclass(frozen=True, eq=False)
 class _Learned:
-    """What those who are left tell: their mean and a regression."""
+    """What the others predict: their mean and a regression."""
 
     mean: BlendshapeRig
     model: ExpressionRegression

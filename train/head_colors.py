@@ -55,7 +55,7 @@ class Balanced:
 
 
 def balanced_colors(colors: Samples, template: Mesh, white_balance: bool, progress: Progress) -> Samples:
-    """The colours, freed from casts that are told from some thousands of vertices, weighted by their texels."""
+    """The colours, freed from casts that are estimated at some thousands of vertices, weighted by their texels."""
     if not white_balance:
         return colors
     weights = texture_areas(template) if template.uvs is not None else torch.ones(len(template.vertices))

@@ -24,7 +24,7 @@ from .recipe_settings import RecipeSettings
 from .runner import Recipe, Run, metric_lines, recipe
 
 _TESTED_PERFORMERS = 20
-_MANY, _FOLDS, _MIN_FOLDS = 100, 10, 3  # meshes; of fewer than the first, a tenth tells too little
+_MANY, _FOLDS, _MIN_FOLDS = 100, 10, 3  # meshes; of fewer than the first, a tenth says too little
 _MEASURES = (
     "; generalisation leaves one head out at a time; specificity is how far its random heads lie from the nearest it "
     "has learned from (root mean squares over the vertices)."
@@ -104,7 +104,7 @@ def train(settings: Settings, run: Run) -> Trained:
     gathered = gather(source, held_out, work, template, progress)
     count = len(gathered.shapes) - gathered.held_out
     progress(f"{count} heads to learn from, {gathered.held_out} to test on")
-    progress("laying the heads on each other")
+    progress("aligning the heads with each other")
     learn, test = laid(gathered, settings.scale)
     progress("fitting the shape")
     shape = MorphableModel.fit(learn, settings.components, work / "shape", progress)

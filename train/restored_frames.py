@@ -33,7 +33,7 @@ class Shown:
 
 @dataclass(frozen=True, eq=False)
 class Restored:
-    """One frame, laid on the neutral.
+    """One frame, aligned with the neutral.
 
     Args:
         truth: as captured, (V,3), millimetres.
@@ -58,8 +58,8 @@ def restored(model: EnhancementModel, frames: Shown, number: int) -> Restored:
         found = model.enhance(truth)
     else:
         smooth = frames.coarse.read(number, number + 1)
-        laid = similarity_transform(smooth, model.neutral[None], scale=False)
-        truth, smooth = laid.apply(truth), laid.apply(smooth)
+        pose = similarity_transform(smooth, model.neutral[None], scale=False)
+        truth, smooth = pose.apply(truth), pose.apply(smooth)
         found = model.enhance(smooth)
     return Restored(truth[0], smooth[0], found.vertices[0], float(found.outside.float().mean()))
 

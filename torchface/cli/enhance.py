@@ -43,7 +43,7 @@ def enhance(
 
     INPUT is markers (.c3d, .trc, .csv, with --attachment), weights (.csv, with --rig), an animated .glb, a mesh
     sequence (.safetensors), a folder of meshes, a frame each, or the folder of `torchface track`. Meshes of the model's
-    topology pass straight; others are laid on the model by registration, or by --pairs.
+    topology pass straight; others are registered to the model, or by --pairs.
 
     Writes into OUT: enhanced.safetensors (every frame's mesh), enhanced.glb, comparison.mp4, frames.csv (how near the
     model comes, by region), summary.json and the report index.html. Killed and started again, it goes on where it was.

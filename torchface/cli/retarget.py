@@ -25,8 +25,8 @@ def retarget(
 ) -> None:
     """Carry weights over to another rig by what its shapes are called, or by a table.
 
-    A mouthClose that opens the jaw itself, as in rigs for Audio2Face, is told from ARKit's by the chin, and its weight
-    taken from jawOpen's, or back; not where the table drives either.
+    A mouthClose that opens the jaw itself, as in rigs for Audio2Face, is distinguished from ARKit's by the chin. Its
+    weight is subtracted from jawOpen's, or added to it; not where the table drives either.
 
     Args:
         weights: Live Link Face CSV, or frame,time,<shape>,...

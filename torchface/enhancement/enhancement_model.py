@@ -52,7 +52,7 @@ class Enhancement:
 class EnhancementModel(nn.Module):
     r"""Gives coarse animations of a dense head the wrinkles, creases and colours of a captured actor.
 
-    A frame a is laid on the neutral and split, :math:`\ell = d_0 + \mathrm{LowPass}(a - d_0)`. The deformation
+    A frame a is aligned with the neutral and split, :math:`\ell = d_0 + \mathrm{LowPass}(a - d_0)`. The deformation
     gradients of :math:`\ell`, in the mean over patches, are projected by region onto convex combinations of the
     database's; the same combinations of the database's details, blended over the regions' soft borders, go onto
     :math:`\ell` in the place of what a itself had beyond it; lids that a shows itself stay, see ``InputLids``.

@@ -149,7 +149,7 @@ def vertex_errors(found: Tensor, true: Tensor) -> Tensor:
 
 @dataclass(frozen=True, eq=False)
 class RigidAlignment:
-    """Frames laid on true ones.
+    """Frames aligned with true ones.
 
     Args:
         vertices: the moved frames, (T,V,3).
@@ -183,8 +183,8 @@ def rigidly_aligned(found: Tensor, true: Tensor) -> RigidAlignment:
 
     Example:
         >>> scan = torch.tensor([[[0.0, 0, 0], [9, 0, 0], [0, 5, 0], [0, 0, 2]]])
-        >>> laid = rigidly_aligned(scan + 40.0, scan)
-        >>> bool(vertex_errors(laid.vertices, scan).max() < 1e-4)
+        >>> aligned = rigidly_aligned(scan + 40.0, scan)
+        >>> bool(vertex_errors(aligned.vertices, scan).max() < 1e-4)
         True
     """
     motion = similarity_transform(found, true.to(found), scale=False)

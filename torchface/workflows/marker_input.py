@@ -98,7 +98,7 @@ def _flipped(values: Tensor, axis: str) -> Tensor:
 
 
 def pose_warnings(alignment: Similarity) -> list[str]:
-    """What the scale at which a take was laid on a rig says against them; nothing where it is a head's."""
+    """Warnings where the scale of a take's alignment with a rig is no head's."""
     scale = float(alignment.scale[0])
     if MIN_HEAD_SCALE <= scale <= MAX_HEAD_SCALE:
         return []

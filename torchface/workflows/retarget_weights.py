@@ -87,9 +87,9 @@ def retarget_weights(
         shapes = shape_map(played.weights.names, target.names, rules)
     except NameMismatchError as error:
         raise NameMismatchError(f"{table or weights}: {error}") from error
-    moved, told = _mouth_closed(retarget_take(played, shapes), rig, target, rules or {})
+    moved, notes = _mouth_closed(retarget_take(played, shapes), rig, target, rules or {})
     progress("writing")
-    written = [*faults, *told, *write_weights(moved, files.out, files.live_link)]
+    written = [*faults, *notes, *write_weights(moved, files.out, files.live_link)]
     if files.animation is not None:
         make_folder(files.animation.parent)
         save_animation(target, moved, files.animation)
@@ -99,7 +99,7 @@ def retarget_weights(
 def _mouth_closed(
     take: Take, source: BlendshapeRig | None, target: BlendshapeRig, ruled: Collection[str]
 ) -> tuple[Take, list[str]]:
-    """The take in the convention of the target's ``mouthClose``, and what the user is told.
+    """The take in the convention of the target's ``mouthClose``, and notes for the user.
 
     Args:
         take: weights by the target's names.

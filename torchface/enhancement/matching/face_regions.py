@@ -38,11 +38,11 @@ class Regions:
     """Where each region of a face counts, and how much.
 
     Args:
-        names: of the regions, such as ``mouth_left``, or ``region_03`` where no landmarks tell the place. Left is the
+        names: of the regions, such as ``mouth_left``, or ``region_03`` where no landmarks show the place. Left is the
             actor's left.
         weights: of each region at each triangle, (R,F), in [0,1]: 1 inside, less outside.
         voluntary: (R,) bool, whether the actor moves the region at will: mouth and brows. False for all where no
-            landmarks tell.
+            landmarks are given.
     """
 
     names: tuple[str, ...]

@@ -1,4 +1,4 @@
-"""Names of regions by where they lie on a face, told from its landmarks."""
+"""Names of regions by where they lie on a face, by its landmarks."""
 
 from __future__ import annotations
 

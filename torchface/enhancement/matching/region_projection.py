@@ -15,7 +15,7 @@ from torchface.optim.simplex_qp import SimplexQP
 RIDGE = 1e-4
 """Of the mean squared norm of the database's features."""
 
-_HELD_OUT = 200  # frames at most that limits are told from
+_HELD_OUT = 200  # frames at most that limits are estimated from
 _QUANTILE, _MARGIN = 0.95, 2.0
 _LEAST_LIMIT, _MOST_LIMIT = 0.1, 0.75  # of the database's spread
 _FAINT = 1e-3  # of a region's largest weight of a patch: fainter patches are left out

@@ -125,7 +125,7 @@ def motion_progress(motion: Tensor, frames: int) -> Tensor:
     blends = torch.lerp(motion[:1].double(), motion[-1:].double(), asked[:, None])
     times = project_sequence(blends, motion).times
     times[0], times[-1] = 0, len(motion) - 1
-    # A jump leaves several blends at one time: the least of slopes lets them be told apart.
+    # A jump leaves several blends at one time: the least of slopes keeps them apart.
     times = (times + 1e-6 * asked) * ((len(motion) - 1) / (len(motion) - 1 + 1e-6))
     moments = np.linspace(0, len(motion) - 1, frames)
     progress = torch.from_numpy(np.interp(moments, times.numpy(), asked.numpy()))

@@ -79,7 +79,7 @@ def taught_details(
         model: the actor's.
         read: frames (t,V,3) from one number up to another, without it, on the model's mesh, millimetres.
         count: of frames.
-        progress: told of frames.
+        progress: called with each step and how far it is.
 
     Returns:
         Displacements (count,3V) along two tangents and the normal, as components and coefficients.

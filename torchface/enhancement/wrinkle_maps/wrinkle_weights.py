@@ -21,7 +21,7 @@ ROTATION_STEPS = 7
 """Of the iteration that finds how the head is turned: a matrix half strained away is a rotation to all digits."""
 
 _COMPONENTS = 12
-_LEAST_MOTION = 0.3  # millimetres, root mean square: what moves less in a region is not told from rounding
+_LEAST_MOTION = 0.3  # millimetres, root mean square: what moves less in a region may be rounding
 _AT_REST = 3  # how often the neutral is learned, whose weights are known to be zero
 _SAME_NEUTRAL = 0.01  # millimetres
 _REACHES = (0.5, 1.0, 2.0, 4.0)  # of a kernel, in units of the poses' spread
@@ -31,8 +31,8 @@ _RIDGES = (1e-2, 1e-1, 1.0)
 class WrinkleWeights(nn.Module):
     r"""Weights of wrinkle maps, by region, of a rig's vertices.
 
-    The pose is laid on the neutral (the rotation nearest to the best linear map from the neutral); each region sees few
-    principal components z of the displacements in it and nothing else; the weights are
+    The pose is aligned with the neutral (the rotation nearest to the best linear map from the neutral); each region
+    sees few principal components z of the displacements in it and nothing else; the weights are
 
     .. math:: w = \operatorname{clip}_{[0,1]}\bigl(g(z) - g(0)\bigr), \quad g(z) = A z +
         \sum_k \alpha_k \exp\bigl(-\lVert z - z_k \rVert^2 / 2 \ell^2\bigr),
@@ -211,8 +211,8 @@ class WrinkleWeights(nn.Module):
         affine = torch.linalg.solve(centred.T @ centred, centred.T)
         turns = nearest_rotation((affine @ poses).float()).double()
         # A row of the turn takes a coordinate of the pose to one of the neutral's.
-        laid = poses @ turns.transpose(1, 2)
-        moved = laid - laid.mean(1, keepdim=True) - centred
+        aligned = poses @ turns.transpose(1, 2)
+        moved = aligned - aligned.mean(1, keepdim=True) - centred
         rows = [affine]
         for share in shares:  # each has axes of its own
             root = (share / share.sum().clamp(min=1e-12)).sqrt()[:, None]

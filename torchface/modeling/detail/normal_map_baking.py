@@ -84,7 +84,7 @@ class NormalMap:
         normals: unit vectors in tangent space (see ``torchface.geometry.meshes.tangent_space``), (3,H,W).
         hit: the texels that the scan covers, (H,W) bool; the others are flat.
         heights: by which the scan stands out of the mesh along the normal, millimetres, (H,W); 0 where not hit.
-        alignment: how the scan was laid on the mesh; none where it was given.
+        alignment: how the scan was aligned with the mesh; none where it was given.
         statistics: what the rays found.
     """
 
@@ -111,7 +111,7 @@ def bake_normal_map(
 ) -> NormalMap:
     """Writes the normals of a high-resolution scan into a map for a mesh of the same face and expression.
 
-    The scan is laid on the mesh. From each texel's point two rays go along the interpolated normal, outward and
+    The scan is aligned with the mesh. From each texel's point two rays go along the interpolated normal, outward and
     inward; the nearer hit whose smooth normal deviates by no more than ``maximum_angle`` counts, and that normal is
     written in the mesh's tangent space. Texels without such a hit stay flat, (0, 0, 1).
 

@@ -31,7 +31,7 @@ _SEED = 0
 
 @dataclass(frozen=True, eq=False)
 class ScanAlignment:
-    """How a scan was laid on a mesh.
+    """The alignment of a scan with a mesh.
 
     Args:
         similarity: scan space to mesh space, a batch of one.
@@ -68,8 +68,8 @@ def align_scan(
         >>> from torchface.synthetic import neutral_head
         >>> head = neutral_head(texture=False)
         >>> ids = head.landmarks[::8]
-        >>> laid = align_scan(head, head.with_vertices(head.vertices + 30.0), (ids, head.vertices[ids] + 30.0))
-        >>> laid.similarity.translation.round().tolist()
+        >>> aligned = align_scan(head, head.with_vertices(head.vertices + 30.0), (ids, head.vertices[ids] + 30.0))
+        >>> aligned.similarity.translation.round().tolist()
         [[-30.0, -30.0, -30.0]]
     """
     check_unit(
@@ -186,7 +186,7 @@ def _automatic(mesh: Mesh, target: _Target, scale: bool) -> ScanAlignment:
         )
     if best.near < _MIN_NEAR or best.overlap < _MIN_OVERLAP:
         raise AlignmentError(
-            f"scan: no pose found by itself that lays it on the mesh (best: {best.near:.0%} of the overlap within "
+            f"scan: no pose found by itself that aligns it with the mesh (best: {best.near:.0%} of the overlap within "
             f"{_NEAR:g} mm); expected scan and mesh of one face in one expression, triangles counter-clockwise seen "
             "from outside, or at least three correspondences"
         )

@@ -69,7 +69,7 @@ def iris_color(mesh: Mesh, images: Sequence[Tensor], cameras: Sequence[Camera]) 
 
 
 def with_part_colors(mesh: Mesh, iris: Tensor | None) -> Mesh:
-    """A mesh with vertex colours whose parts wear what they are made of, and whose eyeballs wear the iris in front.
+    """A mesh with vertex colours whose parts have those of their materials, and whose eyeballs have the iris in front.
 
     Args:
         mesh: a head with colours.

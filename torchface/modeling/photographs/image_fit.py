@@ -152,7 +152,7 @@ def fit_images(
     fit = _result(problem, state, rig.neutral, mean, modes, deltas, sizes)
     if images is None:
         return fit
-    progress("laying the photographs on the head")
+    progress("projecting the photographs onto the head")
     skin = photographed_skin(fit.posed, model.color, images, fit.cameras, settings.texture_size, settings.masked)
     return replace(fit, mesh=skin.on(fit.mesh), posed=skin.on(fit.posed), color=skin.fit)
 

@@ -47,7 +47,7 @@ class FitSettings:
         max_iterations: of Gauss-Newton.
         transfers: how often shapes are transferred to the head found; 0 keeps the template's.
         texture_size: of the skin, texels a side; 0 makes no texture.
-        masked: only skin and the face's features are laid on the head; see ``photographed_skin``.
+        masked: only skin and the face's features are projected onto the head; see ``photographed_skin``.
 
     Raises:
         ValueRangeError: a setting is NaN, infinite or out of its range.

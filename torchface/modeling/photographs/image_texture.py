@@ -28,7 +28,7 @@ class Skin:
     fit: ColorFit | None
 
     def on(self, mesh: Mesh) -> Mesh:
-        """A mesh that wears it; one without a layout or a colour model keeps its own."""
+        """A mesh with it; one without a layout or a colour model keeps its own."""
         colors = mesh.colors if self.colors is None else self.colors
         return replace(mesh, colors=colors, texture=mesh.texture if self.texture is None else self.texture)
 
@@ -49,11 +49,11 @@ def photographed_skin(
         images: photographs, (3,H,W) each.
         cameras: one each.
         size: of the texture, texels a side; 0 makes none.
-        masked: lay only skin and the face's features on the head; else also hair, clothes and what stands behind.
+        masked: project only skin and the face's features onto the head; else also hair, clothes and what stands behind.
 
     Returns:
-        With texture coordinates: the photographs laid on the head, and where none shows it the colour model, else the
-        template's skin; of a template without colours, parts such as teeth wear what they are made of, and the irises
+        With texture coordinates: the photographs projected onto the head, where none shows it the colour model, else
+        the template's skin; of a template without colours, parts such as teeth have their material's, and the irises
         their colour in the photographs. Without: the colour model's colours.
     """
     fit = None if color is None else fit_colors(color, posed, images, cameras)
@@ -62,15 +62,15 @@ def photographed_skin(
         return Skin(base, None, fit)
     confidence = skin_shares(posed, images, cameras) if masked and _has_landmarks(posed) else None
     if base is not None:
-        laid = photo_texture(posed, images, cameras, size, base, confidence)
-        return Skin(laid.colors, laid.image, fit)
+        texture = photo_texture(posed, images, cameras, size, base, confidence)
+        return Skin(texture.colors, texture.image, fit)
     parts = part_vertices(posed)
     if parts.any() and not parts.all():
         confidence = torch.ones(len(images), len(parts)) if confidence is None else confidence
         confidence = torch.where(parts, 0.0, confidence)
-    laid = photo_texture(posed, images, cameras, size, base, confidence)
-    worn = with_part_colors(replace(posed, colors=laid.colors), iris_color(posed, images, cameras))
-    return Skin(worn.colors, laid.image, fit)
+    texture = photo_texture(posed, images, cameras, size, base, confidence)
+    colored = with_part_colors(replace(posed, colors=texture.colors), iris_color(posed, images, cameras))
+    return Skin(colored.colors, texture.image, fit)
 
 
 def _has_landmarks(mesh: Mesh) -> bool:

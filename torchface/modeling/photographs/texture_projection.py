@@ -52,7 +52,7 @@ def photo_texture(
     base: Tensor | None = None,
     confidence: Tensor | None = None,
 ) -> PhotoTexture:
-    """Lays photographs on a head.
+    """Projects photographs onto a head.
 
     Each texel takes the photographs that see it, the squarest most. Weights, made on the vertices, go to zero over
     the mesh before a photograph ends, so that no edge of one shows, also not where the layout is cut. What photographs

@@ -33,8 +33,9 @@ def place_parts(template: BlendshapeRig, neutral: Mesh, parts: InnerParts) -> Me
     r"""A head at rest with the template's parts fitted into it, whatever places they had.
 
     Hard parts of a group move together by a similarity, so that eyeballs stay round and teeth keep their form: the
-    head's, laid on the skin around them, then the translation :math:`\tau` and the growth :math:`\sigma` that give the
-    skin before each vertex p the thickness :math:`t_p` that it has in the template, from the group's middle outward,
+    head's, moved with the skin around them, then the translation :math:`\tau` and the growth :math:`\sigma` that
+    give the skin before each vertex p the thickness :math:`t_p` that it has in the template, from the group's middle
+    outward,
 
     .. math:: \min_{\tau,\sigma} \sum_p w_p (t'_p(\tau,\sigma) - t_p)^2
         + \tau^T \Lambda \tau + \lambda_\sigma \sigma^2
@@ -68,18 +69,18 @@ def place_parts(template: BlendshapeRig, neutral: Mesh, parts: InnerParts) -> Me
     found = neutral.vertices.detach().cpu().double()
     body = (parts.label == parts.body).nonzero()[:, 0]
     whole = similarity_transform(rest[None, body], found[None, body])
-    laid = whole.apply(rest[None])[0]
-    placed = _following(laid, found, parts, body)
+    aligned = whole.apply(rest[None])[0]
+    placed = _following(aligned, found, parts, body)
     for group in parts.group.unique().tolist():  # one mouth, two eyes
         own = parts.group == group
         bones = parts.vertices[own & parts.hard]
         if len(bones) == 0:
             continue
-        fitted = _fitted(laid, found, bones, parts)
-        placed[bones] = fitted.apply(laid[None, bones])[0]
+        fitted = _fitted(aligned, found, bones, parts)
+        placed[bones] = fitted.apply(aligned[None, bones])[0]
         shells = parts.vertices[own & ~parts.hard]
         middle = placed[bones].mean(0)
-        height = fitted.scale[0] * (laid[shells] - laid[bones].mean(0)).norm(dim=-1)
+        height = fitted.scale[0] * (aligned[shells] - aligned[bones].mean(0)).norm(dim=-1)
         outward = placed[shells] - middle
         kept = outward.norm(dim=-1).clamp(height - _MAX_DROP, height + _MAX_RISE)
         placed[shells] = middle + torch.nn.functional.normalize(outward, dim=-1) * kept[:, None]
@@ -89,33 +90,33 @@ def place_parts(template: BlendshapeRig, neutral: Mesh, parts: InnerParts) -> Me
     return neutral.with_vertices(placed.to(neutral.vertices))
 
 
-def _following(laid: Tensor, found: Tensor, parts: InnerParts, body: Tensor) -> Tensor:
+def _following(aligned: Tensor, found: Tensor, parts: InnerParts, body: Tensor) -> Tensor:
     """Every part carried along by the body's nearest vertices."""
     placed = found.clone()
     rest = (parts.label != parts.body).nonzero()[:, 0]
     if len(rest) == 0:
         return placed
-    distance, nearest = cKDTree(laid[body].numpy()).query(laid[rest].numpy(), k=min(_HOSTS, len(body)))
+    distance, nearest = cKDTree(aligned[body].numpy()).query(aligned[rest].numpy(), k=min(_HOSTS, len(body)))
     distances = torch.from_numpy(distance).view(len(rest), -1)
     hosts = body[torch.from_numpy(nearest).view(len(rest), -1)]
     weights = 1 / (distances + 0.1 * distances.amax(1, keepdim=True) + 1e-6) ** 2
     weights = weights / weights.sum(1, keepdim=True)
-    placed[rest] = laid[rest] + ((found - laid)[hosts] * weights[..., None]).sum(1)
+    placed[rest] = aligned[rest] + ((found - aligned)[hosts] * weights[..., None]).sum(1)
     return placed
 
 
-def _fitted(laid: Tensor, found: Tensor, bones: Tensor, parts: InnerParts) -> Similarity:
-    """The similarity that takes a group's hard parts from where the template laid on the head has them."""
-    middle = laid[bones].mean(0)
-    wanted = _SkinBefore.of(laid, parts.skin, middle, laid[bones])
+def _fitted(aligned: Tensor, found: Tensor, bones: Tensor, parts: InnerParts) -> Similarity:
+    """The similarity that takes a group's hard parts from where the template aligned with the head has them."""
+    middle = aligned[bones].mean(0)
+    wanted = _SkinBefore.of(aligned, parts.skin, middle, aligned[bones])
     thin = wanted.thickness[wanted.met].clamp(min=0)
     use = wanted.met & (wanted.thickness < (float(thin.quantile(_THIN)) if len(thin) else 0.0) + _THICKER)
     around = parts.skin[wanted.triangle[use]].unique()
     if len(around) < _MIN_VERTICES:
         around = parts.skin.unique()
-    # Lids tell little of an eyeball's size and nothing of its rotation: both are the whole head's.
-    centre = middle + (found - laid)[around].mean(0)
-    offsets = laid[bones[use]] - middle
+    # Lids show little of an eyeball's size and nothing of its rotation: both are the whole head's.
+    centre = middle + (found - aligned)[around].mean(0)
+    offsets = aligned[bones[use]] - middle
     state = torch.zeros(4, dtype=torch.float64)
     prior = 1 / torch.tensor([*_TRANSLATION_DEVIATION, _SCALE_DEVIATION], dtype=torch.float64).square()
     for _ in range(_MAX_ITERATIONS if bool(use.any()) else 0):

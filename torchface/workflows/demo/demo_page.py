@@ -82,7 +82,7 @@ def scene_rows(result: DemoResult) -> list[tuple[str, str]]:
         ("shapes, vertices", f"{len(result.rig.names)}, {len(scene.head.vertices):,}"),
         ("markers, share of samples missing", f"{len(markers.names)}, {100 * missing:.1f} %"),
         ("marker noise, RMSE that it alone makes", f"{FLAWS.noise:g} mm a coordinate, {(3**0.5) * FLAWS.noise:.2f} mm"),
-        ("shapes that these markers tell apart", f"{len(_distinguishable(result))} of {len(result.rig.names)}"),
+        ("shapes that these markers distinguish", f"{len(_distinguishable(result))} of {len(result.rig.names)}"),
         ("the solve of the whole take", f"{result.seconds:.1f} s"),
     ]
 
@@ -126,7 +126,7 @@ def write_demo_page(result: DemoResult, out: Path, progress: Progress | None = N
         Section("The performance", _story(result), markup=markup),
         Section(
             "One frame",
-            "The true and the solved face, and the distance between them. No marker tells where eyes look.",
+            "The true and the solved face, and the distance between them. No marker shows where eyes look.",
             figures=[("frame_1.png", frame_figure)],
         ),
         Section(
@@ -140,7 +140,7 @@ def write_demo_page(result: DemoResult, out: Path, progress: Progress | None = N
         ),
         Section(
             "Curves",
-            f"{_CURVE_SECONDS:g} s of the {len(active)} most active shapes that the markers tell apart.",
+            f"{_CURVE_SECONDS:g} s of the {len(active)} most active shapes that the markers distinguish.",
             figures=[("curves.png", curves)],
         ),
         Section(
@@ -164,7 +164,7 @@ def write_demo_page(result: DemoResult, out: Path, progress: Progress | None = N
         ),
         Section(
             "Error of each shape",
-            "Of the shapes that the markers tell apart.",
+            "Of the shapes that the markers distinguish.",
             figures=[
                 (
                     "weight_error.png",
@@ -224,7 +224,7 @@ def _seen_rows(result: DemoResult) -> list[tuple[str, str]]:
     """What the markers see, what they mix up, what they do not see."""
     seen = result.seen
     distinct = [name for name in result.rig.names if name not in {*seen.unseen, *seen.ambiguous}]
-    rows = [("tell apart", distinct), ("confuse with others", seen.ambiguous), ("do not see", seen.unseen)]
+    rows = [("distinguish", distinct), ("confuse with others", seen.ambiguous), ("do not see", seen.unseen)]
     return [(what, f"{len(shapes)}: {_both_sides(shapes)}") for what, shapes in rows if shapes]
 
 

@@ -32,7 +32,7 @@ class CoarseAnimation:
         fps: frames a second.
         shown: what the file itself holds of these frames, in the same place: (t,N,3), NaN where a point was not seen.
         shown_faces: triangles of that, (G,3); None where it is points.
-        residual: root mean square distance of its face at rest from the model's, laid on one another, millimetres; None
+        residual: root mean square distance of its face at rest from the model's, aligned with it, millimetres; None
             where it holds no face at rest.
         notes: lines for people to read; warnings begin with ``warning: ``.
         head: its own head at rest in the model's vertices, (V,3), where that is another person's.
@@ -63,8 +63,8 @@ def same_topology(animated: AnimatedMesh, model: Mesh, fps: float | None) -> Coa
     at_rest = animated.neutral.vertices[None] if animated.rig is not None else some
     target = model.vertices.expand_as(at_rest)
     check_scale(float((_size(target) / _size(at_rest).clamp(min=1e-9)).median()), animated.path)
-    laid = similarity_transform(at_rest, target)
-    left = (laid.apply(at_rest) - target).square().sum(-1).mean(-1).sqrt()
+    pose = similarity_transform(at_rest, target)
+    left = (pose.apply(at_rest) - target).square().sum(-1).mean(-1).sqrt()
     residual = float(left.min())  # without a rest pose, of the frame that comes nearest to one
     notes = residual_notes(residual, animated.path)
 
@@ -136,8 +136,8 @@ def residual_notes(residual: float, path: Path) -> list[str]:
     """
     if residual > NO_HEAD_MM:
         raise AlignmentError(
-            f"{path}: found vertices {residual:.1f} mm (root mean square) from the model's at rest, laid on one "
-            f"another, expected at most {NO_HEAD_MM:g}; they stand in another order, or it is another head"
+            f"{path}: found vertices {residual:.1f} mm (root mean square) from the model's at rest, aligned "
+            f"with it, expected at most {NO_HEAD_MM:g}; they stand in another order, or it is another head"
         )
     if residual > OTHER_ACTOR_MM:
         return [

@@ -198,14 +198,14 @@ def _write_glb(found: EnhancedFrames, mesh: Mesh, fps: float, path: Path, megaby
     size = path.stat().st_size / 1e6
     if targets.kind == "frames":
         return f"{path.name}: {size:.0f} MB, a sparse morph target a frame, exact"
-    told = (
+    note = (
         f"{path.name}: {size:.0f} MB, {len(targets.deltas)} morph targets (principal components) for "
         f"{len(found.sequence)} frames, {targets.rms:.3f} mm from them (root mean square; worst frame "
         f"{targets.largest:.3f})"
     )
     if targets.rms > _BADLY_SHOWN_MM:
-        told = f"warning: {told}; --glb-megabytes above {megabytes:g} would show more, {SEQUENCE} holds all"
-    return told
+        note = f"warning: {note}; --glb-megabytes above {megabytes:g} would show more, {SEQUENCE} holds all"
+    return note
 
 
 def _write_video(
@@ -218,12 +218,12 @@ def _write_video(
 ) -> None:
     count, step, drawn = drawn_frames(animation, model, found, mesh)
 
-    def told():  # type: ignore[no-untyped-def]
+    def pictures():  # type: ignore[no-untyped-def]
         for number, picture in enumerate(drawn, 1):
             yield picture
             progress("drawing the video", number, count)
 
-    write_video(told(), path, animation.fps / step)
+    write_video(pictures(), path, animation.fps / step)
 
 
 def _write_tables(done: Enhanced, out: Path) -> None:

@@ -275,12 +275,12 @@ class _Actor:
                 found = self.registered(guess, expression.path, marks, texture_size=0)
                 moved = (guess.vertices - neutral.vertices).norm(dim=-1)
                 steady = found.matched / (1 + (moved / _FOLLOWS) ** 2)
-                laid = in_place_of(found.mesh, guess, steady.double())
-                check_side(actor, expression.weights, laid.vertices, found.matched & matched)
+                aligned = in_place_of(found.mesh, guess, steady.double())
+                check_side(actor, expression.weights, aligned.vertices, found.matched & matched)
             except TorchfaceError as error:
                 self.skipped.append(f"example {expression.path.name}: {error}")
                 continue
-            vertices.append(seen_example(laid, guess.vertices, found.matched & matched))
+            vertices.append(seen_example(aligned, guess.vertices, found.matched & matched))
             weights.append(expression.weights)
             used.append(expression.name)
         if not used:

@@ -27,7 +27,7 @@ LAYOUT = (
     "jawOpen.obj, jawOpen=0.6+mouthSmileLeft=0.5.obj"
 )
 
-# Millimetres between an expression and its mirror image where the two are told apart at all.
+# Millimetres between an expression and its mirror image where the two are distinguished at all.
 _TELLING = 1.0
 _LEAST_VERTICES = 20
 # Of the way from the middle between the two: 1 is what was asked for, -1 its mirror image; a weak expression is near 0.
@@ -156,7 +156,7 @@ def check_side(actor: BlendshapeRig, weights: Tensor, found: Tensor, seen: Tenso
     of the expression a asked for and its mirror image a', along the skin's normals: what both sides do alike does not
     count, nor does what slides along the skin, which no registration sees.
 
-    A head alone looks like another head when it is mirrored; an expression of one side tells.
+    A head alone looks like another head when it is mirrored; an expression of one side does not.
 
     Args:
         actor: the transferred rig.
