@@ -151,8 +151,8 @@ def save(
             f"Action units {', '.join(classifier.units)} recognised by strokes of reflective paint in a head-camera "
             "video, frame by frame, each at one of a few levels of intensity. It knows no other units, and "
             "combinations only as far as they were performed. Accuracy is of unit and level together, of performers "
-            "left out, or of repetitions left out where there is one performer; other performers' is the share of frames in which "
-            "every unit is within a level of their own labels."
+            "left out, or of repetitions left out where there is one performer; other performers' is the share of "
+            "frames in which every unit is within a level of their own labels."
         ),
     )
     zoo.save_model(classifier, settings.out, card)
