@@ -1,0 +1,45 @@
+"""Regions are read where they are; a video without them is refused."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from planted.camera_stage import RecordedSession
+from torchface.capture.action_units import RegionVideo, read_regions
+from torchface.capture.action_units.painted_regions import region_grid, sample_regions
+from torchface.errors import FileFormatError, NameMismatchError, ShapeError, ValueRangeError
+from torchface.io.video import write_video
+
+
+def test_a_region_of_its_own_size_is_a_cut() -> None:
+    frames = torch.rand(3, 40, 50, generator=torch.Generator().manual_seed(0))
+    grid = region_grid({"a": (9.5, 4.5, 25.5, 20.5)}, ["a"], 16, 50, 40)
+    still = torch.eye(2, 3).expand(3, 2, 3)
+    torch.testing.assert_close(sample_regions(frames, grid, still)[:, 0], frames[:, 5:21, 10:26])
+    moved = still.clone()
+    moved[:, :, 2] = torch.tensor([3.0, -2.0])
+    torch.testing.assert_close(sample_regions(frames, grid, moved)[:, 0], frames[:, 3:19, 13:29])
+
+
+def test_bad_input_is_named(session: RecordedSession, regions: RegionVideo, tmp_path) -> None:  # type: ignore[no-untyped-def]
+    video, labels = session.video, session.labels
+    outside = replace(labels, regions=dict(labels.regions, mouth=(60.0, 100.0, 130.0, 150.0)))
+    with pytest.raises(ValueRangeError, match=r"region 'mouth' is .* inside the image of 128 x 170"):
+        read_regions(video, outside, ["mouth"])
+    with pytest.raises(NameMismatchError, match="found no chin"):
+        read_regions(video, labels, ["chin"])
+    cheek = replace(labels, regions={"cheek": (30.0, 85.0, 42.0, 97.0)})
+    with pytest.raises(ValueRangeError, match="'cheek' shows no painted pattern"):
+        read_regions(video, cheek, ["cheek"])
+    with pytest.raises(ShapeError, match=rf"found {labels.frames} frames, expected {labels.frames + 5} as its labels"):
+        read_regions(video, replace(labels, frames=labels.frames + 5), ["mouth"])
+    path = tmp_path / "broken.avi"
+    path.write_bytes(video.path.read_bytes()[:200_000])
+    with pytest.raises(FileFormatError, match="could be decoded"):
+        read_regions(path, labels, ["mouth"])
+    black = write_video([torch.zeros(labels.frames, 170, 128, dtype=torch.uint8)], tmp_path / "black.avi", 20.0)
+    with pytest.raises(ValueRangeError, match="no painted pattern"):
+        read_regions(black, labels, ["mouth"])
