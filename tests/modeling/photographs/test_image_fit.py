@@ -19,7 +19,6 @@ from torchface.io.landmarks.dlib_xml import load_dlib_faces
 from torchface.io.landmarks.landmark_points import load_landmark_points
 from torchface.io.rigs.ict_facekit import load_identity_modes
 from torchface.mesh import Mesh
-from torchface.modeling import FitSettings, HeadModel, MorphableModel, fit_images
 from torchface.modeling.morphable.head_model import HeadModel
 from torchface.modeling.morphable.morphable_model import MorphableModel
 from torchface.modeling.photographs.image_fit import ImageFit, fit_images
