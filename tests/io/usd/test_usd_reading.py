@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from torchface.correctives import Corrective
-from torchface.io import load_animation, load_mesh, load_rig
+from torchface.io import load_animation, load_mesh, load_rig, save_rig
 from torchface.io.images.image_files import save_image
 
 pytestmark = pytest.mark.usefixtures("same_process")
@@ -200,3 +200,19 @@ def test_of_two_textures_the_first_is_taken_and_the_other_told(tmp_path: Path) -
         mesh = load_mesh(path)
     assert mesh.texture.max() == 0
     assert mesh.polygons.tolist() == [[0, 1, 2, 3], [4, 5, 6, 7]]  # quads stay quads where meshes are joined
+
+
+@pytest.mark.real
+def test_a_real_head_comes_back_through_glb_and_usdc_vertex_by_vertex(ict_folder: Path, tmp_path: Path) -> None:
+    rig = load_rig(ict_folder, part="face", shapes=("jawOpen", "mouthSmile_R"))
+    save_rig(rig, tmp_path / "head.glb")
+    save_rig(load_rig(tmp_path / "head.glb"), tmp_path / "head.usdc")
+    found = load_rig(tmp_path / "head.usdc")
+    assert found.names == rig.names
+    assert (found.vertices - rig.vertices).abs().max() <= 1e-4
+    assert (found.deltas - rig.deltas).abs().max() <= 1e-4
+    assert (found.neutral.polygons == rig.neutral.polygons).all()
+    corners, expected = found.neutral.uvs[found.neutral.uv_faces], rig.neutral.uvs[rig.neutral.uv_faces]
+    assert (corners - expected).abs().max() <= 1e-6  # glTF counts v from the top
+    assert list(found.neutral.annotations.regions) == list(rig.neutral.annotations.regions)
+    assert (tmp_path / "head.usdc").stat().st_size < 1.1 * (tmp_path / "head.glb").stat().st_size

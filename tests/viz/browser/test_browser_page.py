@@ -1,3 +1,8 @@
+"""The page of the viewer: who reaches it, which port it takes, and what is saved from it."""
+
+from __future__ import annotations
+
+import errno
 import socket
 import sys
 from collections.abc import Iterator
@@ -13,6 +18,7 @@ from torchface.errors import MissingExtraError, NameMismatchError, ValueRangeErr
 from torchface.io import load_take
 from torchface.rig import BlendshapeRig
 from torchface.take import Take, Track
+from torchface.viz.browser.browser_page import LAST_PORT, free_port
 from torchface.viz.browser.rig_viewer import RigViewer
 
 on_linux = pytest.mark.skipif(not Path("/proc/net/tcp").exists(), reason="asks Linux who listens at which address")
@@ -106,3 +112,43 @@ def test_a_take_that_cannot_be_played_is_refused(ball_rig: BlendshapeRig) -> Non
         RigViewer(ball_rig, Take(60.0, markers=Track(("a",), torch.zeros(2, 1, 3))), port=0)
     with pytest.raises(NameMismatchError, match="wiggleEars"):
         RigViewer(ball_rig, Take(60.0, weights=Track(("wiggleEars",), torch.zeros(2, 1, 1))), port=0)
+
+
+HOST = "127.0.0.1"
+
+
+@pytest.mark.parametrize("port", [-1, 65536, 99999, 10**30, 80.0, float("nan")])
+def test_what_is_no_port_is_refused(port: int) -> None:
+    with pytest.raises(ValueRangeError, match=r"port: found .*, expected a whole number from 0 to 65535"):
+        free_port(HOST, port)
+
+
+def test_a_port_in_use_is_passed_over() -> None:
+    with socket.socket() as taken:
+        taken.bind((HOST, 0))
+        taken.listen()
+        port = taken.getsockname()[1]
+        assert port < free_port(HOST, port) <= port + 100
+    assert free_port(HOST, 0) == 0
+
+
+def test_no_permission_and_no_port_left_are_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    tried: list[int] = []
+
+    def refuse(number: int) -> type[socket.socket]:
+        class Refused(socket.socket):
+            def bind(self, address: tuple[str, int]) -> None:  # type: ignore[override]
+                tried.append(address[1])
+                raise OSError(number, "refused")
+
+        return Refused
+
+    monkeypatch.setattr(socket, "socket", refuse(errno.EACCES))
+    with pytest.raises(
+        ValueRangeError, match="port: found 80, which this user may not listen on; expected one from 1024"
+    ):
+        free_port(HOST, 80)
+    monkeypatch.setattr(socket, "socket", refuse(errno.EADDRINUSE))
+    with pytest.raises(ValueRangeError, match=f"port: found 65500 to {LAST_PORT} in use"):
+        free_port(HOST, 65500)
+    assert tried == [80, *range(65500, LAST_PORT + 1)]

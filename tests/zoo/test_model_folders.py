@@ -30,7 +30,7 @@ from torchface.landmarks import UVLandmarkDetector, load_detector, save_detector
 from torchface.modeling.morphable.head_model import HeadModel
 from torchface.modeling.morphable.morphable_model import MorphableModel
 
-REPOSITORY = Path(__file__).resolve().parent.parent
+REPOSITORY = Path(__file__).resolve().parents[2]
 CARD = zoo.ModelCard("MIT", "nothing but noise", {"error": 0.25}, "python -m train.none")
 
 
