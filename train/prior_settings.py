@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 
 from torchface import BlendshapeRig
 from torchface.capture.priors import DynamicsPrior, ShapePrior
-from torchface.capture.priors.seen_frames import MOST_FRAMES
+from torchface.capture.priors.take_frames import MOST_FRAMES
 
 from .prior_takes import PriorTakes, split
 from .recipe_settings import RecipeSettings

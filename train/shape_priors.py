@@ -14,7 +14,7 @@ from torchface.capture.priors import (
     automatic_bandwidth,
     face_halves,
 )
-from torchface.capture.priors.seen_frames import SeenFrames
+from torchface.capture.priors.take_frames import TakeFrames
 from torchface.progress import Progress
 
 from .prior_figures import choice_picture
@@ -108,11 +108,11 @@ def _automatic(takes: PriorTakes, seed: int) -> list[float]:
 
 def _some(takes: PriorTakes, seed: int) -> Tensor:
     """The frames that a Parzen window is made of, (F,N): all, or of very many some that are drawn."""
-    return SeenFrames(takes.weights, len(takes.names)).some(seed=seed)
+    return TakeFrames(takes.weights, len(takes.names)).some(seed=seed)
 
 
 def _gaussian(takes: PriorTakes, group: Sequence[int]) -> GaussianMixture:
-    return GaussianMixture.single(SeenFrames(takes.weights, len(takes.names), tuple(group))).double()
+    return GaussianMixture.fit(TakeFrames(takes.weights, len(takes.names), tuple(group))).double()
 
 
 def _mean_log_density(prior: ShapePrior, takes: PriorTakes) -> float:

@@ -11,7 +11,6 @@ from torchface.capture.own_rig.frame_states import FrameTerms
 from torchface.capture.own_rig.gauss_newton import SLIDING_STEPS, HeadState, split_step
 from torchface.capture.own_rig.state_estimate import Expectation
 from torchface.capture.own_rig.video_solver import VideoSolver
-from torchface.capture.priors.student_groups import StudentGroups
 
 _SPLITTING_STEPS = 40
 
@@ -30,7 +29,7 @@ class GaussNewtonStep(nn.Module):
 
     def __init__(self, solver: VideoSolver) -> None:
         super().__init__()
-        groups = None if solver.prior is None else StudentGroups(solver.prior)
+        groups = None if solver.prior is None else solver.prior.prepared()
         self.solver = copy.deepcopy(solver).double()
         self.solver.prior, self.solver.dynamics = groups, None  # type: ignore[assignment]
         self.register_buffer("upper", self.solver.rest.new_ones(len(solver.names)))

@@ -16,9 +16,8 @@ from torchface.capture import DynamicsPrior, DynamicsSettings
 from torchface.capture.energy import Quadratic
 from torchface.capture.priors import face_regions, resampled, windows_of
 from torchface.capture.priors.gaussian_process import GaussianProcesses, Kernel, Statistics, posterior, whitening_of
-from torchface.capture.priors.kernel_training import fitted_kernel
-from torchface.capture.priors.left_out_process import LeftOutProcess
 from torchface.capture.priors.motion_features import motion_basis
+from torchface.capture.priors.process_training import LeftOutProcess, fitted_kernel
 from torchface.errors import FileFormatError, NameMismatchError, ShapeError, ValueRangeError
 from torchface.io import load_take
 from torchface.synthetic.stages.weight_curves import perform

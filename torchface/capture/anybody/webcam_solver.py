@@ -30,7 +30,6 @@ from torchface.capture.own_rig.face_points import EYE_CORNERS, JAW, LANDMARKS, F
 from torchface.capture.own_rig.gauss_newton import HeadState, Linearised, energy_of_step, linearise, split_step
 from torchface.capture.own_rig.weight_walk import faded, relative_trust, unseen_time, walk_information
 from torchface.capture.priors import ShapePrior
-from torchface.capture.priors.student_groups import StudentGroups
 from torchface.errors import NameMismatchError
 from torchface.geometry.cameras.affine_pose import affine_pose, orthonormal
 from torchface.geometry.cameras.calibration import ASSUMED_FIELD_OF_VIEW
@@ -164,7 +163,7 @@ class WebcamSolver(nn.Module):
             raise NameMismatchError(
                 f"rig: found none of ARKit's shapes among {', '.join(rig.names[:5])}, expected some"
             )
-        self.prior = None if prior is None else StudentGroups(prior, self.settings.prior_strength)
+        self.prior = None if prior is None else prior.prepared(self.settings.prior_strength)
         self.layout = StateLayout(len(rig.names), self.settings.coefficients)
         called = _arkit_names(rig.names)
         rest, basis = self.person.rest[:LANDMARKS], self.person.basis[:LANDMARKS]

@@ -11,8 +11,8 @@ from torch import Tensor, nn
 
 from torchface.capture.energy import Quadratic, gaussian_term
 from torchface.capture.priors.dynamics_prior import DynamicsPrior
-from torchface.capture.priors.learned_names import name_matrices, require_same_names
 from torchface.capture.priors.motion_features import newest_frames, same_rate
+from torchface.capture.priors.name_translation import name_matrices, require_same_names
 from torchface.errors import FileFormatError, ValueRangeError
 
 _MAX_RATIO = 8.0

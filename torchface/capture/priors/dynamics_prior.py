@@ -3,20 +3,21 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any
 
 import torch
 from torch import Tensor, nn
 
 from torchface.capture.energy import Quadratic, gaussian_term
 from torchface.capture.priors.gaussian_process import GaussianProcesses
-from torchface.capture.priors.learned_names import require_same_names
 from torchface.capture.priors.motion_features import motion_basis, moving_parts, newest_frames
 from torchface.capture.priors.motion_noise import MotionNoise
+from torchface.capture.priors.name_translation import require_same_names
 from torchface.errors import FileFormatError, ShapeError, ValueRangeError
 from torchface.files.documents import Value
+from torchface.progress import Progress
 
 _MAX_NUMBERS = 2**26
 _MAX_WINDOW = 120
@@ -112,9 +113,6 @@ class DynamicsPrior(nn.Module):
         (True, True)
     """
 
-    fit: ClassVar[Callable[..., DynamicsPrior]]
-    """:func:`fit_dynamics_prior`, bound where this package begins."""
-
     center: Tensor
     coefficients: Tensor
     feature_scale: Tensor
@@ -160,6 +158,69 @@ class DynamicsPrior(nn.Module):
         group_index = torch.tensor([index[row] for row in range(count)], dtype=torch.int64, device="cpu")
         self.register_buffer("basis", basis, persistent=False)
         self.register_buffer("group_index", group_index, persistent=False)
+
+    @classmethod
+    def fit(
+        cls,
+        takes: Sequence[Tensor],
+        names: Sequence[str],
+        window: int = 4,
+        *,
+        fps: float = 60.0,
+        groups: Sequence[Sequence[int]] | None = None,
+        input_noise: float = 0.0,
+        settings: DynamicsSettings | None = None,
+        progress: Progress | None = None,
+    ) -> DynamicsPrior:
+        """Learns from takes, with cross-validation over takes that are left out in turn.
+
+        The kernels' hyperparameters maximise the bound of the marginal likelihood (``gpytorch``). The gain of the
+        processes and the noise are those that predict left-out takes best; of a single take its quarters are left out,
+        of more than a hundred takes a hundredth at a time.
+
+        Takes are read one after the other, in four passes that add up means, normal equations and statistics of the
+        processes: memory is that of a few times the longest take's windows. What cannot be added up is learned from
+        windows that are drawn from all: the hyperparameters from ``settings.subset``, the noise from 40,000 where there
+        are more.
+
+        Args:
+            takes: weights of each take, (T,N), all at one frame rate (see ``resampled``), a list or what reads them
+                from a disk; windows with a NaN are left out.
+            names: of the N shapes.
+            window: J, at least 1.
+            fps: frames a second of the takes.
+            groups: :func:`face_regions` if absent.
+            input_noise: standard deviation of noise that is added to the windows, not to what follows them: a prior
+                for windows of solved weights should expect as much noise as these have, or it keeps their errors.
+            settings: of the learning.
+            progress: called with each step and how far it is.
+
+        Raises:
+            ShapeError: no takes, of another number of shapes, or too short for the window.
+            ValueRangeError: no window without a NaN, or a setting out of range.
+
+        Source: thesis 4.2.10 and the appendix "Learning the prior".
+
+        Example:
+            >>> take = torch.linspace(0, 12, 120).sin()[:, None].square()
+            >>> quick = DynamicsSettings(inducing=8, subset=60, iterations=2)
+            >>> prior = DynamicsPrior.fit([take], ["jawOpen"], window=2, settings=quick).double()
+            >>> rising = take[10:12].double()
+            >>> bool(prior(rising[None])[0] > rising[-1])
+            True
+        """
+        from torchface.capture.priors.dynamics_training import fit_dynamics_prior
+
+        return fit_dynamics_prior(
+            takes,
+            names,
+            window,
+            fps=fps,
+            groups=groups,
+            input_noise=input_noise,
+            settings=settings,
+            progress=progress,
+        )
 
     def forward(self, windows: Tensor) -> tuple[Tensor, Tensor]:
         """Mean and variance of the next frame.

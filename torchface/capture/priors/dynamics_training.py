@@ -9,16 +9,13 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from torchface.capture.priors.autoregression import Autoregression
 from torchface.capture.priors.dynamics_prior import DynamicsPrior, DynamicsSettings, UsualMotion
 from torchface.capture.priors.gaussian_process import GaussianProcesses
-from torchface.capture.priors.kernel_training import fitted_kernel
-from torchface.capture.priors.left_out_process import LeftOutProcess
 from torchface.capture.priors.motion_features import face_regions, motion_basis, moving_parts
 from torchface.capture.priors.motion_noise import MotionNoise
-from torchface.capture.priors.running_moments import RunningMoments
-from torchface.capture.priors.seen_frames import MOST_FRAMES, drawn_rows
-from torchface.capture.priors.take_windows import FOLDS, Part, TakeWindows
+from torchface.capture.priors.process_training import LeftOutProcess, fitted_kernel
+from torchface.capture.priors.take_frames import MOST_FRAMES, drawn_rows
+from torchface.capture.priors.take_windows import FOLDS, Autoregression, Part, RunningMoments, TakeWindows
 from torchface.errors import ShapeError, ValueRangeError
 from torchface.progress import Progress, silent
 
@@ -74,43 +71,7 @@ def fit_dynamics_prior(
     settings: DynamicsSettings | None = None,
     progress: Progress | None = None,
 ) -> DynamicsPrior:
-    """Learns from takes, with cross-validation over takes that are left out in turn.
-
-    The kernels' hyperparameters maximise the bound of the marginal likelihood (``gpytorch``). The gain of
-    the processes and the noise are those that predict left-out takes best; of a single take its quarters are left out,
-    of more than a hundred takes a hundredth at a time.
-
-    Takes are read one after the other, in four passes that add up means, normal equations and statistics of the
-    processes: memory is that of a few times the longest take's windows. What cannot be added up is learned from
-    windows that are drawn from all: the hyperparameters from ``settings.subset``, the noise from 40,000 where there
-    are more.
-
-    Args:
-        takes: weights of each take, (T,N), all at one frame rate (see ``resampled``), a list or what reads them from a
-            disk; windows with a NaN are left out.
-        names: of the N shapes.
-        window: J, at least 1.
-        fps: frames a second of the takes.
-        groups: :func:`face_regions` if absent.
-        input_noise: standard deviation of noise that is added to the windows, not to what follows them: a prior
-            for windows of solved weights should expect as much noise as these have, or it keeps their errors.
-        settings: of the learning.
-        progress: called with each step and how far it is.
-
-    Raises:
-        ShapeError: no takes, of another number of shapes, or too short for the window.
-        ValueRangeError: no window without a NaN, or a setting out of range.
-
-    Source: thesis 4.2.10 and the appendix "Learning the prior".
-
-    Example:
-        >>> take = torch.linspace(0, 12, 120).sin()[:, None].square()
-        >>> quick = DynamicsSettings(inducing=8, subset=60, iterations=2)
-        >>> prior = fit_dynamics_prior([take], ["jawOpen"], window=2, settings=quick).double()
-        >>> rising = take[10:12].double()
-        >>> bool(prior(rising[None])[0] > rising[-1])
-        True
-    """
+    """See ``DynamicsPrior.fit``."""
     names, settings = tuple(names), settings or DynamicsSettings()
     regions = tuple(tuple(group) for group in (face_regions(names) if groups is None else groups))
     progress = progress or silent

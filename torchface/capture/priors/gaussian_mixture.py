@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from torchface.capture.priors.parzen_window import checked_sizes
+from torchface.capture.priors.parzen_window import checked_samples, checked_sizes
 from torchface.errors import ShapeError, ValueRangeError
 
 _MAX_ITERATIONS, _TOLERANCE = 200, 1e-5
@@ -48,52 +48,50 @@ class GaussianMixture(nn.Module):
             self.register_buffer(name, value.detach().float())
 
     @classmethod
-    def fit(cls, samples: Tensor, components: int = 1, floor: float = 1e-4, seed: int = 0) -> GaussianMixture:
-        """Fits by scikit-learn's expectation maximisation from k-means, in float64; of all samples at once.
+    def fit(
+        cls, samples: Tensor | Iterable[Tensor], components: int = 1, floor: float = 1e-4, seed: int = 0
+    ) -> GaussianMixture:
+        """One Gaussian in closed form, several by scikit-learn's expectation maximisation from k-means, in float64.
 
         Args:
-            samples: weights, (T,D).
+            samples: weights, (T,D); or parts of them, of which one Gaussian is learned in two passes, several from all
+                at once.
             components: K.
             floor: added to each variance.
             seed: of the k-means.
 
         Raises:
-            ShapeError: fewer samples than components, or fewer than two.
+            ShapeError: fewer samples than components, or fewer than two; or no parts.
             ValueRangeError: NaN, or settings out of range.
         """
-        if samples.ndim != 2 or len(samples) < max(components, 2):
-            raise ShapeError(
-                f"samples: found {tuple(samples.shape)}, expected (T,D) with at least {max(components, 2)}"
-            )
-        if not torch.isfinite(samples).all():
-            raise ValueRangeError("samples: found NaN or infinity, expected weights")
         if components < 1 or not floor > 0:
             raise ValueRangeError(
                 f"Gaussian mixture: found {components} components and floor {floor}, expected at least one, and a "
                 "positive variance"
             )
+        parts: Iterable[Tensor] = (checked_samples(samples),) if isinstance(samples, Tensor) else samples
+        if components == 1:
+            return cls._single(parts, floor)
+        together = torch.cat(list(parts))
+        if len(together) < components:
+            raise ShapeError(f"samples: found {tuple(together.shape)}, expected (T,D) with at least {components}")
         from sklearn.mixture import GaussianMixture as Fitted  # takes a second, and only training needs it
 
         fitted = Fitted(components, reg_covar=floor, tol=_TOLERANCE, max_iter=_MAX_ITERATIONS, random_state=seed)
-        fitted.fit(samples.detach().cpu().double().numpy())
+        fitted.fit(together.detach().cpu().double().numpy())
         means, precisions, weights = map(torch.from_numpy, (fitted.means_, fitted.precisions_, fitted.weights_))
         return cls(means, torch.linalg.cholesky(precisions), weights.log())
 
     @classmethod
-    def single(cls, parts: Iterable[Tensor], floor: float = 1e-4) -> GaussianMixture:
-        """One Gaussian, as :meth:`fit` finds it, of samples that come in parts (T,D); they are gone through twice.
-
-        Raises:
-            ShapeError: there is no sample.
-        """
+    def _single(cls, parts: Iterable[Tensor], floor: float) -> GaussianMixture:
         count, total = 0, torch.zeros(())
         for part in parts:
-            count, total = count + len(part), total + part.double().sum(0)
+            count, total = count + len(part), total + part.detach().double().sum(0)
         if not count:
             raise ShapeError("samples: found none, expected parts (T,D)")
         mean, scatter = total / count, torch.zeros(())
         for part in parts:
-            away = part.double() - mean
+            away = part.detach().double() - mean
             scatter = scatter + away.T @ away
         covariance = scatter / count
         covariance.diagonal().add_(floor)

@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from torchface.capture.priors.squared_distances import squared_distances
+from torchface.capture.priors.gaussian_process import squared_distances
 from torchface.errors import FileFormatError, ShapeError, ValueRangeError
 from torchface.files.documents import Value
 from torchface.optim.mean_shift import mean_shift
@@ -61,7 +61,7 @@ class ParzenDensity(nn.Module):
             ShapeError: fewer than two samples.
             ValueRangeError: NaN, or samples that are all the same.
         """
-        _check_samples(samples)
+        checked_samples(samples)
         width = automatic_bandwidth(samples, seed=seed) if bandwidth is None else bandwidth
         if not 0 < width < math.inf:
             raise ValueRangeError(f"bandwidth: found {width}, expected a positive number; are all samples the same?")
@@ -124,7 +124,7 @@ def automatic_bandwidth(samples: Tensor, quantile: float = 0.3, seed: int = 0) -
         >>> round(automatic_bandwidth(wide) / automatic_bandwidth(dense))
         10
     """
-    _check_samples(samples)
+    checked_samples(samples)
     generator = torch.Generator().manual_seed(seed)
     some = samples.double()[torch.randperm(len(samples), generator=generator)[:_MAX_SAMPLES]]
     nearest = max(int(quantile * len(some)), 1)
@@ -143,8 +143,10 @@ def checked_sizes(config: Mapping[str, Any], *names: str) -> tuple[int, ...]:
     return sizes
 
 
-def _check_samples(samples: Tensor) -> None:
+def checked_samples(samples: Tensor) -> Tensor:
+    """Samples (T,D), at least two and finite; otherwise ``ShapeError`` or ``ValueRangeError``."""
     if samples.ndim != 2 or len(samples) < 2:
         raise ShapeError(f"samples: found {tuple(samples.shape)}, expected (T,D) with at least two")
     if not torch.isfinite(samples).all():
         raise ValueRangeError("samples: found NaN or infinity, expected weights")
+    return samples

@@ -12,11 +12,11 @@ from torch import Tensor, nn
 
 from torchface.capture.energy import Quadratic
 from torchface.capture.priors.gaussian_mixture import GaussianMixture
-from torchface.capture.priors.learned_names import name_matrices, require_same_names
+from torchface.capture.priors.name_translation import name_matrices, require_same_names
 from torchface.capture.priors.parzen_window import ParzenDensity
-from torchface.capture.priors.seen_frames import SeenFrames
-from torchface.capture.priors.student_t import PARTING_VARIANCE, StudentDensity
-from torchface.errors import FileFormatError, ShapeError
+from torchface.capture.priors.student_t import PARTING_VARIANCE, StudentDensity, StudentGroups
+from torchface.capture.priors.take_frames import TakeFrames
+from torchface.errors import FileFormatError, ShapeError, ValueRangeError
 from torchface.number_checks import LARGEST_WEIGHT, checked_number
 
 _UPPER = re.compile(r"(eye|brow|pupil)", re.IGNORECASE)
@@ -123,10 +123,10 @@ class ShapePrior(nn.Module):
             ShapeError: no takes, or of another number of shapes.
             ValueRangeError: fewer than two frames with all weights.
         """
-        SeenFrames(takes, len(names)).count()
+        TakeFrames(takes, len(names)).count()
         groups = (tuple(range(len(names))),) if groups is None else groups
-        seen = [SeenFrames(takes, len(names), tuple(group)) for group in groups]
-        return cls(names, groups, [StudentDensity.fit_parts(frames) for frames in seen], STRENGTH)
+        seen = [TakeFrames(takes, len(names), tuple(group)) for group in groups]
+        return cls(names, groups, [StudentDensity.fit(frames) for frames in seen], STRENGTH)
 
     def log_density(self, weights: Tensor) -> Tensor:
         """:math:`\\sum_g \\log p_g` of weights (B,N), (B,)."""
@@ -160,6 +160,21 @@ class ShapePrior(nn.Module):
     def _check(self, weights: Tensor) -> None:
         if weights.ndim != 2 or weights.shape[1] != len(self.names):
             raise ShapeError(f"weights: found {tuple(weights.shape)}, expected (B,{len(self.names)})")
+
+    def prepared(self, strength: float | None = None) -> StudentGroups:
+        """The same energy for solvers that are exported, or one of another strength.
+
+        Raises:
+            ValueRangeError: the prior is none of Student's distributions, as :meth:`fit` learns.
+        """
+        densities = [density for density in self.densities if isinstance(density, StudentDensity)]
+        if type(self) is not ShapePrior or len(densities) < len(self.groups):
+            kinds = " and ".join(sorted({type(density).__name__ for density in self.densities}))
+            raise ValueRangeError(
+                f"shape prior: found a {type(self).__name__} of {kinds}, expected one of Student's distributions, as "
+                "ShapePrior.fit learns"
+            )
+        return StudentGroups(self.groups, densities, self.strength if strength is None else strength)
 
     def widened(self, variance: Tensor) -> ShapePrior:
         """The prior with a variance (N,) added to each weight: what it says less of, and goes with others less."""
@@ -293,7 +308,7 @@ class ReciprocalPrior(ShapePrior):
 
         Source: thesis 4.2.8.
         """
-        together = SeenFrames(takes, len(names)).some(seed=seed)
+        together = TakeFrames(takes, len(names)).some(seed=seed)
         groups = face_halves(names) if groups is None else groups
         return cls(names, groups, [ParzenDensity.fit(together[:, list(group)], seed=seed) for group in groups])
 

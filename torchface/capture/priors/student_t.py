@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import torch
 from torch import Tensor, nn
 
-from torchface.capture.priors.parzen_window import checked_sizes
+from torchface.capture.energy import Quadratic
+from torchface.capture.priors.parzen_window import checked_samples, checked_sizes
 from torchface.errors import FileFormatError, ShapeError, ValueRangeError
 
 _ITERATIONS = 50
@@ -50,39 +51,25 @@ class StudentDensity(nn.Module):
         self.register_buffer("degrees_of_freedom", torch.as_tensor(degrees_of_freedom).detach().float().reshape(()))
 
     @classmethod
-    def fit(cls, samples: Tensor, degrees_of_freedom: float = 10.0, floor: float = PARTING_VARIANCE) -> StudentDensity:
+    def fit(
+        cls,
+        samples: Tensor | Iterable[Tensor],
+        degrees_of_freedom: float = 10.0,
+        floor: float = PARTING_VARIANCE,
+    ) -> StudentDensity:
         r"""The likeliest :math:`\Sigma`, by expectation maximisation in float64.
 
         Args:
-            samples: weights, (T,D).
+            samples: weights, (T,D); or parts of them, finite, that are gone through anew for every iteration, at most
+                fifty times: memory is that of the largest.
             degrees_of_freedom: :math:`\nu`.
             floor: added to each variance.
 
         Raises:
-            ShapeError: fewer than two samples.
+            ShapeError: fewer than two samples, or no parts.
             ValueRangeError: NaN, or settings that are not positive.
         """
-        if samples.ndim != 2 or len(samples) < 2:
-            raise ShapeError(f"samples: found {tuple(samples.shape)}, expected (T,D) with at least two")
-        if not torch.isfinite(samples).all():
-            raise ValueRangeError("samples: found NaN or infinity, expected weights")
-        return cls.fit_parts((samples,), degrees_of_freedom, floor)
-
-    @classmethod
-    def fit_parts(
-        cls, parts: Iterable[Tensor], degrees_of_freedom: float = 10.0, floor: float = PARTING_VARIANCE
-    ) -> StudentDensity:
-        r"""What :meth:`fit` learns, of samples that come in parts: memory is that of the largest.
-
-        Args:
-            parts: finite weights (T,D); gone through anew for every iteration, at most fifty times.
-            degrees_of_freedom: :math:`\nu`.
-            floor: added to each variance.
-
-        Raises:
-            ShapeError: there are no parts.
-            ValueRangeError: settings that are not positive.
-        """
+        parts: Iterable[Tensor] = (checked_samples(samples),) if isinstance(samples, Tensor) else samples
         if not 0 < degrees_of_freedom < math.inf or not 0 < floor < math.inf:
             raise ValueRangeError(
                 f"Student density: found {degrees_of_freedom} degrees of freedom and floor {floor}, "
@@ -169,3 +156,37 @@ def _sample_weights(x: Tensor, precision: Tensor | None, degrees_of_freedom: flo
     if precision is None:
         return torch.ones(len(x), dtype=x.dtype, device=x.device)
     return (degrees_of_freedom + x.shape[1]) / (degrees_of_freedom + ((x @ precision) * x).sum(1))
+
+
+class StudentGroups(nn.Module):
+    """The energy of Student's distributions of G groups of shapes, its products prepared: for exported solvers.
+
+    Args:
+        groups: rows of the N shapes, one tuple a density; every shape in one group.
+        densities: one a group.
+        strength: of the energy.
+    """
+
+    precisions: Tensor
+    freedoms: Tensor
+    sizes: Tensor
+
+    def __init__(self, groups: Sequence[Sequence[int]], densities: Sequence[StudentDensity], strength: float) -> None:
+        super().__init__()
+        self.strength = strength
+        like = densities[0].factor.double()
+        sizes = like.new_tensor([float(len(group)) for group in groups])
+        shapes = int(sizes.sum())
+        precisions = like.new_zeros(len(groups), shapes, shapes)
+        for precision, group, density in zip(precisions, groups, densities, strict=True):
+            rows, factor = torch.tensor(group, device=like.device), density.factor.double()
+            precision[rows[:, None], rows] = factor @ factor.T
+        freedoms = torch.stack([density.degrees_of_freedom for density in densities]).double()
+        for name, value in {"precisions": precisions, "freedoms": freedoms, "sizes": sizes}.items():
+            self.register_buffer(name, value)
+
+    def energy(self, weights: Tensor) -> Quadratic:
+        """As of ``ShapePrior.energy``, at weights (1,N) float64."""
+        distance = (self.precisions @ weights[0]) @ weights[0]
+        factors = self.strength * (self.freedoms + self.sizes) / (self.freedoms + distance)
+        return Quadratic((factors[:, None, None] * self.precisions).sum(0)[None], torch.zeros_like(weights))

@@ -16,7 +16,7 @@ _SHUFFLED = 2**22
 
 
 @dataclass(frozen=True, eq=False)
-class SeenFrames:
+class TakeFrames:
     """The frames in which every weight is known, of takes that are read anew each time.
 
     Args:
