@@ -39,7 +39,6 @@ UNSHOWN = {
         "landmarks.AutomaticLandmarks",
         "landmarks.FaceFrame",
         "landmarks.ScanLandmarks",
-        "landmarks.contour_correspondences",
         "landmarks.scan_landmarks",
     ),
     "takes seconds": (

@@ -16,16 +16,16 @@ from torchface import TorchfaceError, zoo
 from torchface.capture import ActionUnitClassifier
 from torchface.capture.action_units import GROUPS, RegionGroup, RegionVideo, TrainingSettings, classify, read_regions
 from torchface.capture.action_units.classifier import group_regions
-from torchface.capture.action_units.classifier_evaluation import (
+from torchface.io.action_labels import ActionLabels, load_action_labels
+from torchface.io.video import open_video
+from torchface.rendering.compositing import headed, save_rendered_image, sheet
+
+from .classifier_evaluation import (
     Split,
     cross_validation,
     labelled_intensities,
     level_agreement,
 )
-from torchface.io.action_labels import ActionLabels, load_action_labels
-from torchface.io.video import open_video
-from torchface.rendering.compositing import headed, save_rendered_image, sheet
-
 from .model_cards import model_card
 from .recipe_settings import RecipeSettings
 from .runner import Recipe, Run, metric_lines, recipe

@@ -12,7 +12,6 @@ import torch
 from torchface import Mesh, load_mesh
 from torchface.errors import FileFormatError, TopologyError
 from torchface.files.content_keys import content_key
-from torchface.geometry.generalised_procrustes import aligned, generalised_procrustes
 from torchface.geometry.meshes.unit_check import check_unit, extent
 from torchface.geometry.sample_batches import MovedSamples, SampleRange, Samples, blocks
 from torchface.geometry.similarity import Similarity, similarity_transform
@@ -24,6 +23,7 @@ from torchface.synthetic import draw_identities, neutral_head
 from torchface.workflows.batch.batch_items import find_items
 from torchface.workflows.register.register_scans import SCANS
 
+from .generalised_procrustes import aligned, generalised_procrustes
 from .rendered_people.complexion import complexion_colors, draw_complexions
 
 _METHOD = "gathered heads/3"

@@ -18,8 +18,8 @@ from torchface.shape_names import mapping
 from torchface.synthetic.stages.weight_curves import perform
 from torchface.workflows.solve.solution import SolveSettings, solve_markers
 
-from .held_out import held_out_people
-from .kept_takes import KeptTake, TakesRead, TakeStore
+from .people_split import held_out_people
+from .take_store import StoredTake, TakesRead, TakeStore
 
 _METHOD = "takes of priors/1"
 _SUFFIXES = (".csv", ".c3d", ".trc")
@@ -96,11 +96,11 @@ def read_takes(
         raise FileFormatError(f"{folder}: found no take, expected files ending in {', '.join(_SUFFIXES)}")
     solver = content_key(_METHOD, rig=_content(rig), attachment=attachment)
     store = TakeStore(work, len(paths))
-    first: KeptTake | None = None
+    first: StoredTake | None = None
     for number, path in enumerate(paths):
         progress(f"reading {path.name}", number + 1, len(paths))
         key = content_key(_METHOD, file=path, fps=fps, solver=solver)
-        take = store.kept(key, lambda path=path, rate=fps: _read(path, rate, rig, attachment, progress))  # type: ignore[misc]
+        take = store.stored(key, lambda path=path, rate=fps: _read(path, rate, rig, attachment, progress))  # type: ignore[misc]
         if first is None:
             first, fps = take, take.fps
         _check_names(first.names, take.names, paths[0], path)
@@ -111,7 +111,7 @@ def read_takes(
 
 def _read(
     path: Path, fps: float | None, rig: BlendshapeRig | None, attachment: Attachment | None, progress: Progress
-) -> KeptTake:
+) -> StoredTake:
     """The weights of a file, clipped, at a frame rate."""
     take, solved = load_take(path), False
     if take.weights is None and take.markers is not None:
@@ -133,7 +133,7 @@ def _read(
     fps = take.fps if fps is None else fps
     if abs(take.fps - fps) > _SAME_RATE * fps:
         values = resampled(values, take.fps, fps)
-    return KeptTake(take.weights.names, fps, values.clamp(0.0, 1.0), solved)
+    return StoredTake(take.weights.names, fps, values.clamp(0.0, 1.0), solved)
 
 
 def synthetic_takes(
@@ -143,15 +143,15 @@ def synthetic_takes(
     progress, rate = progress or silent, 60.0 if fps is None else fps
     store = TakeStore(work, count)
 
-    def made(number: int) -> KeptTake:
+    def made(number: int) -> StoredTake:
         track = perform(frames, torch.Generator().manual_seed(seed + number), rate).weights
         assert track is not None
-        return KeptTake(track.names, rate, track.values[..., 0], False)
+        return StoredTake(track.names, rate, track.values[..., 0], False)
 
-    first: KeptTake | None = None
+    first: StoredTake | None = None
     for number in range(count):
         key = content_key(_METHOD, frames=frames, seed=seed + number, fps=rate)
-        take = store.kept(key, lambda number=number: made(number))  # type: ignore[misc]
+        take = store.stored(key, lambda number=number: made(number))  # type: ignore[misc]
         first = take if first is None else first
         progress("making takes up", number + 1, count)
     assert first is not None
@@ -159,7 +159,7 @@ def synthetic_takes(
     return _stored(store, first, labels, labels)
 
 
-def _stored(store: TakeStore, first: KeptTake, labels: Sequence[str], people: Sequence[str]) -> PriorTakes:
+def _stored(store: TakeStore, first: StoredTake, labels: Sequence[str], people: Sequence[str]) -> PriorTakes:
     found = store.takes()
     return PriorTakes(first.names, first.fps, found, labels, found.frames, people, store.solved)
 

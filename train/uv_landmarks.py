@@ -24,15 +24,15 @@ from torchface.landmarks import (
     scan_landmarks,
     unwrap,
 )
-from torchface.landmarks.scans.detector_evaluation import ScanErrors, draw_result, error_table, landmark_errors
 from torchface.progress import Progress, silent
 from torchface.rendering.compositing import save_rendered_image, sheet
 
 from .annotated_scans import AnnotatedScan, annotated_scans, scanned_performers, shown_people
-from .held_out import held_out_people
 from .model_cards import model_card
+from .people_split import held_out_people
 from .recipe_settings import RecipeSettings
 from .runner import Recipe, Run, metric_lines, recipe
+from .scan_landmark_errors import ScanErrors, draw_result, error_table, landmark_errors
 
 _TESTED_PERFORMERS = 20
 

@@ -28,7 +28,6 @@ from torchface.capture.action_units import (
     read_regions,
 )
 from torchface.capture.action_units.classifier import GroupClassifier, group_regions
-from torchface.capture.action_units.classifier_evaluation import cross_validation, level_agreement
 from torchface.capture.action_units.classifier_training import label_group
 from torchface.capture.action_units.painted_pattern import Method
 from torchface.capture.action_units.weight_targets import action_unit_curves
@@ -37,6 +36,7 @@ from torchface.io.video import open_video
 from torchface.landmarks.scans.hog import HogLayout, cell_map
 from torchface.onnx import export_action_units
 from torchface.synthetic import draw_identities
+from train.classifier_evaluation import cross_validation, level_agreement
 
 FILMS = Path(__file__).resolve().parents[2] / "out" / "action_unit_films"
 NAMES = group_regions(GROUPS)

@@ -17,7 +17,7 @@ from torchface.enhancement.detail.low_pass import LowPass
 from torchface.synthetic.head.identity import IDENTITY
 from torchface.synthetic.head.performer import performer
 from torchface.synthetic.stages.wrinkles import WrinkledPerformer
-from torchface.synthetic.stages.wrinkles.performer_face import captured_skin
+from torchface.synthetic.stages.wrinkles.wrinkled_performer import captured_skin
 
 pytestmark = [pytest.mark.real, pytest.mark.usefixtures("one_thread")]
 VERTICES, FRAMES = 10_556, 200  # whole rounds of subdivision: the same mesh whatever the head

@@ -35,7 +35,7 @@ from torchface.attachment import Attachment
 from torchface.capture import MarkerSolver, VideoSolver
 from torchface.enhancement.thin_shell import ThinShell
 from torchface.geometry.cameras.pinhole import look_at
-from torchface.geometry.meshes.proximity import SurfaceIndex
+from torchface.geometry.meshes.surface_index import SurfaceIndex
 from torchface.rig import BlendshapeRig
 
 pytestmark = [pytest.mark.real, pytest.mark.usefixtures("one_thread")]

@@ -10,7 +10,7 @@ import torch
 from torchface.attachment import Attachment
 from torchface.enhancement.thin_shell import ThinShell
 from torchface.geometry.meshes.operators import vertex_normals
-from torchface.geometry.meshes.proximity import SurfaceIndex
+from torchface.geometry.meshes.surface_index import SurfaceIndex
 from torchface.synthetic.stages.marker_stage import place_markers
 from torchface.synthetic.stages.wrinkles import WrinkledPerformer
 

@@ -22,8 +22,9 @@ from torchface.landmarks import (
     AutomaticLandmarks,
     LandmarkPairs,
     UVLandmarkDetector,
-    contour_correspondences,
+    scan_landmarks,
 )
+from torchface.landmarks.scans.landmark_pairs import scan_pairs, template_features
 from torchface.registration import register
 from torchface.registration.scan_preparation import Landmarks
 from torchface.rendering.compositing import headed, save_rendered_image, sheet
@@ -89,7 +90,9 @@ def table(detector: UVLandmarkDetector) -> Table:
     errors: dict[str, list[Tensor]] = {}
     for seed in range(300, 300 + SCANS):
         made = case(seed)
-        pairs = contour_correspondences(detector, template, made.scan.mesh).above(SURE)
+        pairs = scan_pairs(
+            template_features(template, detector), scan_landmarks(detector, made.scan.mesh), made.scan.mesh
+        ).above(SURE)
         ways: dict[str, Landmarks | None] = {"none": None, "twelve": some(pairs, UV_LANDMARK_NAMES)}
         ways["twelve, lines"] = (pairs.vertices, pairs.points)
         for name, landmarks in ways.items():

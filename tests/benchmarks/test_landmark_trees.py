@@ -21,7 +21,7 @@ from torchface.landmarks import LandmarkTrees, TreeSettings
 from torchface.landmarks.images.ibug_68 import MIRROR_68, relative_errors
 from torchface.onnx import export_model
 from train.annotated_faces import Faces, load_faces, rendered_faces
-from train.landmarks import evaluate
+from train.landmark_trees import evaluate
 
 LEARN, TEST = 300, 150
 SETTINGS = TreeSettings(cascades=8, trees=60, depth=5, oversampling=10, rotation=0, gamma=0, noise=0)

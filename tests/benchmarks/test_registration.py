@@ -20,7 +20,7 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 from torchface.geometry.meshes.operators import border_vertices, vertex_normals
-from torchface.geometry.meshes.proximity import SurfaceIndex
+from torchface.geometry.meshes.surface_index import SurfaceIndex
 from torchface.io import IdentityModes, load_identity_modes
 from torchface.mesh import Mesh
 from torchface.modeling import MorphableModel

@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from torchface import load_mesh
-from torchface.geometry.meshes.proximity import SurfaceIndex
+from torchface.geometry.meshes.surface_index import SurfaceIndex
 from torchface.io.landmarks.landmark_points import load_landmark_points
 from torchface.landmarks import (
     UV_LANDMARK_NAMES,
@@ -20,9 +20,9 @@ from torchface.landmarks import (
     scan_landmarks,
     uv_landmarks_from_ibug,
 )
-from torchface.landmarks.scans.detector_evaluation import draw_result, error_table, landmark_errors
 from torchface.rendering.compositing import save_rendered_image, sheet
 from train.annotated_scans import AnnotatedScan, scanned_performers
+from train.scan_landmark_errors import draw_result, error_table, landmark_errors
 from train.uv_landmarks import fit
 
 LEARN, TEST = 30, 20

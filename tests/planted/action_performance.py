@@ -9,7 +9,6 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torchface.errors import NameMismatchError, ValueRangeError
 from torchface.io.action_labels import Performed
 
 MOVES: dict[str, dict[str, float]] = {
@@ -51,14 +50,6 @@ class PerformanceSettings:
     unevenness: float = 0.04
     habits: float = 0.08
 
-    def __post_init__(self) -> None:
-        if self.repetitions < 0 or self.combination_repetitions < 0:
-            raise ValueRangeError(f"performance: found {self.repetitions} repetitions, expected none or more")
-        for name in ("fps", "pace"):
-            value = getattr(self, name)
-            if not (math.isfinite(value) and value > 0):
-                raise ValueRangeError(f"performance: {name} is {value}, expected a positive number")
-
 
 @dataclass(frozen=True, eq=False)
 class ActionPerformance:
@@ -90,17 +81,8 @@ def perform_action_units(
         names: of the rig's shapes, N; those of ``MOVES`` must be among them.
         generator: where timing, strength and the performer's habits come from.
         settings: how the session runs.
-
-    Raises:
-        NameMismatchError: the rig lacks a shape, or a combination names an unknown unit.
     """
     names = tuple(names)
-    lacking = sorted({shape for moves in MOVES.values() for shape in moves} - set(names))
-    if lacking:
-        raise NameMismatchError(f"names: found no {', '.join(lacking)}; expected the shapes that action units move")
-    unknown = {unit for units in settings.combinations for unit in units} - set(MOVES)
-    if unknown:
-        raise NameMismatchError(f"combinations: found {sorted(unknown)}, expected units of {', '.join(MOVES)}")
 
     def uniform(low: float, high: float) -> float:
         return low + (high - low) * float(torch.rand((), generator=generator))

@@ -17,7 +17,6 @@ from planted.head_camera_images import MARKER_RADIUS, HeadCameraRenderer
 from planted.helmet_camera import HELMET_POINT, CameraFlaws, helmet_camera, shaken_cameras
 from planted.reflective_paint import reflective_paint
 from torchface.attachment import Attachment
-from torchface.errors import ShapeError
 from torchface.geometry.cameras.pinhole import Camera
 from torchface.geometry.meshes.operators import vertex_normals
 from torchface.io.action_labels import ActionLabels, Box, save_action_labels
@@ -104,11 +103,6 @@ def record_session(
         settings: how.
         progress: called with each step and how far it is.
         attachment: of the markers, those on the sides of the face among them; ``stage_markers`` if absent.
-
-    Raises:
-        FileFormatError: the folder cannot be written to.
-        NameMismatchError: the attachment lacks a marker on a side of the face.
-        TopologyError: the attachment belongs to another mesh.
     """
     folder = Path(folder)
     rig = performer(identity, texture=True)
@@ -226,14 +220,7 @@ def render_video(
         rotation, translation: world to camera in each frame, (T,3,3) and (T,3).
         flaws: of the camera.
         generator: of the noise.
-
-    Raises:
-        ShapeError: weights and camera motion differ in length.
     """
-    if not len(weights) == len(rotation) == len(translation):
-        raise ShapeError(
-            f"video: found {len(weights)} frames of weights and {len(rotation)} of camera, expected as many"
-        )
     _, ways = replace(camera, rotation=torch.eye(3), translation=torch.zeros(3)).rays()
     shape = ways.shape[:2]
     shade = _vignette(shape, flaws.vignette)

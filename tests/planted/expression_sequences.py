@@ -12,9 +12,6 @@ from scipy.ndimage import gaussian_filter1d
 from scipy.signal import find_peaks
 from torch import Tensor
 
-from torchface.errors import NameMismatchError, ShapeError, ValueRangeError
-from torchface.number_checks import check_rate
-
 _SMOOTHING = 0.1  # seconds
 _PROMINENCE = 0.1  # of the range of a take's activity: what rises by less from both its valleys is no expression
 _SHORTEST = 0.5  # seconds
@@ -35,16 +32,6 @@ def expression_sequences(weights: Tensor, names: Sequence[str], fps: float) -> t
 
     Returns:
         Slices of the frames, which may be none.
-
-    Raises:
-        ShapeError: ``weights`` are not (T,N) with one name a column.
-        NameMismatchError: no shape but gaze and blinks.
-        ValueRangeError: a weight is NaN or infinite, or ``fps`` is no rate.
-
-    Example:
-        >>> rise = torch.sin(torch.linspace(0, 6.2832, 121))[:, None] ** 2
-        >>> expression_sequences(rise, ["jawOpen"], fps=60.0)
-        (slice(0, 60, None), slice(60, 120, None))
     """
     activity = _activity(weights, names, fps)
     span = float(np.ptp(activity)) if len(activity) else 0.0
@@ -67,24 +54,9 @@ def from_neutral_to_neutral(weights: Tensor, names: Sequence[str], fps: float) -
         weights: (T,N), at least three frames, such as one of ``expression_sequences``.
         names: of the shapes.
         fps: frames a second.
-
-    Raises:
-        ShapeError: not (T,N) with one name a column, or fewer than three frames.
-        NameMismatchError: no shape but gaze and blinks.
-        ValueRangeError: a weight is NaN or infinite, ``fps`` is no rate, or no frame is more active than its ends.
-
-    Example:
-        >>> rise = 0.1 + torch.sin(torch.linspace(0, 3.1416, 61))[:, None]
-        >>> piece = from_neutral_to_neutral(rise, ["jawOpen"], fps=60.0)
-        >>> piece[[0, -1]].tolist(), bool((piece[30] == rise[30]).all())
-        ([[0.0], [0.0]], True)
     """
     activity = _activity(weights, names, fps)
-    if len(weights) < 3:
-        raise ShapeError(f"weights: found {len(weights)} frames, expected at least 3")
     above = (activity - np.linspace(activity[0], activity[-1], len(activity))).clip(min=0)
-    if above.max() < _STILL:
-        raise ValueRangeError("weights: no frame is more active than the first and last; expected an expression")
     share = above / activity.clip(min=_STILL)
     share[[0, -1]] = 0
     scale = torch.from_numpy(share / share[above.argmax()]).clamp(max=1)
@@ -93,13 +65,6 @@ def from_neutral_to_neutral(weights: Tensor, names: Sequence[str], fps: float) -
 
 def _activity(weights: Tensor, names: Sequence[str], fps: float) -> NDArray[np.float64]:
     """The sum of the weights of each frame without gaze and blinks, (T,), smoothed by a tenth of a second."""
-    check_rate(fps, "fps", ValueRangeError)
-    if weights.ndim != 2 or weights.shape[1] != len(names):
-        raise ShapeError(f"weights: found {tuple(weights.shape)}, expected (T,{len(names)})")
-    if not torch.isfinite(weights).all():
-        raise ValueRangeError("weights: found NaN or infinite weights, expected finite ones; fill the gaps first")
     counted = torch.tensor([not name.lower().startswith(_NOT_EXPRESSIONS) for name in names])
-    if not counted.any():
-        raise NameMismatchError(f"names: found {', '.join(names[:5])}, ...; expected shapes beside gaze and blinks")
     total: NDArray[np.float64] = weights[:, counted].double().sum(1).cpu().numpy()
     return np.asarray(gaussian_filter1d(total, _SMOOTHING * fps)) if len(total) else total

@@ -5,7 +5,6 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from torchface.errors import ShapeError
 from torchface.synthetic.head.head_annotations import head_annotations
 from torchface.synthetic.head.identity import mean_vertices, ramp
 from torchface.synthetic.head.skin_texture import texel_values
@@ -19,12 +18,7 @@ def face_paint(size: int = 1024) -> Tensor:
 
     Args:
         size: pixels a side.
-
-    Raises:
-        ShapeError: fewer than 16 or more than 4096.
     """
-    if not 16 <= size <= 4096:
-        raise ShapeError(f"face paint: found {size} pixels a side, expected 16 to 4096")
     regions = head_annotations().regions
     lips = (regions["upper_lip"] | regions["lower_lip"]).float()[:, None]
     covered, values = texel_values(size, torch.cat([mean_vertices().float(), lips], dim=1))

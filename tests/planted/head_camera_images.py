@@ -7,7 +7,6 @@ from torch import Tensor
 
 from planted.helmet_camera import helmet_plates
 from torchface.attachment import Attachment
-from torchface.errors import ShapeError
 from torchface.geometry.meshes.operators import vertex_normals
 from torchface.rendering.clay_shading import sample_texture
 from torchface.rendering.raycast import RayCaster
@@ -26,15 +25,12 @@ class HeadCameraRenderer:
         rig: a performer with skin.
         paint: share of paint on its skin texture, (size,size).
         attachment: of the markers.
-
-    Raises:
-        ShapeError: the rig has no skin.
     """
 
     def __init__(self, rig: BlendshapeRig, paint: Tensor, attachment: Attachment) -> None:
         mesh = rig.neutral
-        if mesh.texture is None or mesh.uvs is None or mesh.uv_faces is None:
-            raise ShapeError("video: the rig has no skin, expected performer(identity, texture=True)")
+        assert mesh.uvs is not None
+        assert mesh.uv_faces is not None
         front = ((rig.vertices[:, 2] > -10) & (rig.vertices[:, 1] > -150))[mesh.faces].all(1)
         used, self.faces = mesh.faces[front].unique(return_inverse=True)
         self.rest, self.deltas = rig.vertices[used].double(), rig.deltas[:, used].double()

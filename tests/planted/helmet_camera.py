@@ -8,7 +8,6 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torchface.errors import ValueRangeError
 from torchface.geometry.cameras.pinhole import Camera, look_at
 
 HELMET_POINT = (0.0, 70.0, 99.0)
@@ -43,11 +42,6 @@ class CameraFlaws:
     vignette: float = 0.25
     shake_rotation: float = 0.35
     shake_translation: float = 0.7
-
-    def __post_init__(self) -> None:
-        for name, value in vars(self).items():
-            if not (math.isfinite(value) and value >= 0):
-                raise ValueRangeError(f"camera flaws: {name} is {value}, expected a finite number of at least 0")
 
 
 def helmet_camera(width: int = 192, height: int = 256) -> Camera:

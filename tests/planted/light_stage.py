@@ -11,7 +11,6 @@ import torch
 from torch import Tensor
 
 from torchface.color_space import to_linear, to_srgb
-from torchface.errors import ShapeError, ValueRangeError
 from torchface.geometry.cameras.pinhole import Camera, look_at
 from torchface.geometry.meshes.operators import vertex_normals
 from torchface.geometry.rotations import rotation_matrix
@@ -51,11 +50,6 @@ class LightStageSettings:
     shininess: float = 24.0
     samples: int = 2
     noise: float = 0.01
-
-    def __post_init__(self) -> None:
-        for name, value in vars(self).items():
-            if not (math.isfinite(value) and value >= 0) or (name in ("width", "height", "samples") and value < 1):
-                raise ValueRangeError(f"light stage: {name} is {value}, expected a finite number that is not negative")
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,14 +97,8 @@ def render_lit_video(
         generator: of motion and noise.
         settings: how.
         progress: called with each step and how far it is.
-
-    Raises:
-        ShapeError: the weights are not (T,N), or the rig has no skin.
-        FileFormatError: the file cannot be written.
     """
     progress = progress or silent
-    if weights.ndim != 2 or weights.shape[1] != len(rig.names) or len(weights) == 0:
-        raise ShapeError(f"weights: found {tuple(weights.shape)}, expected (T,{len(rig.names)})")
     cameras = turning_cameras(rig, len(weights), fps, generator, settings)
 
     def images() -> Iterator[Tensor]:
@@ -152,13 +140,10 @@ def turning_cameras(
 
 
 def lit_image(mesh: Mesh, camera: Camera, light: PointLight, settings: LightStageSettings) -> Tensor:
-    """What the camera sees of a mesh with skin, linear light, (3,H,W): Lambert, Blinn's gloss, cast shadows.
-
-    Raises:
-        ShapeError: the mesh has no texture.
-    """
-    if mesh.texture is None or mesh.uvs is None or mesh.uv_faces is None:
-        raise ShapeError("light stage: found a mesh without skin, expected performer(identity, texture=True)")
+    """What the camera sees of a mesh with skin, linear light, (3,H,W): Lambert, Blinn's gloss, cast shadows."""
+    assert mesh.texture is not None
+    assert mesh.uvs is not None
+    assert mesh.uv_faces is not None
     vertices = mesh.vertices.double()
     caster = RayCaster(vertices, mesh.faces)
     origins, ways = camera.rays(settings.samples)

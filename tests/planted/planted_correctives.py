@@ -6,8 +6,6 @@ import torch
 from torch import Tensor
 
 from torchface.correctives.corrective_shapes import Corrective, Correctives
-from torchface.errors import ValueRangeError
-from torchface.number_checks import checked_count, checked_number
 from torchface.rig import BlendshapeRig
 
 _IN_BETWEENS, _TRIPLES = 0.1, 0.15
@@ -29,12 +27,7 @@ def planted_correctives(rig: BlendshapeRig, count: int, size: float = 0.3, seed:
         count: C, how many.
         size: :math:`s`.
         seed: of the draw.
-
-    Raises:
-        ValueRangeError: the rig's shapes overlap in fewer ways than that.
     """
-    checked_count("planted_correctives: count", count, 1)
-    checked_number("planted_correctives: size", size, above=True)
     generator = torch.Generator().manual_seed(seed)
     reach = rig.deltas.detach().norm(dim=-1)
     shapes = len(rig.names)
@@ -43,10 +36,6 @@ def planted_correctives(rig: BlendshapeRig, count: int, size: float = 0.3, seed:
     groups: list[tuple[int, ...]] = [(i,) for i in torch.randperm(shapes, generator=generator)[:betweens].tolist()]
     for drivers, wanted in ((3, triples), (2, count - betweens - triples)):
         groups += _overlapping(reach, drivers, wanted, generator)
-    if len(groups) < count:
-        raise ValueRangeError(
-            f"planted_correctives: found {len(groups)} ways in which {shapes} shapes overlap, expected {count}"
-        )
     directions = torch.nn.functional.normalize(torch.randn(count, 3, generator=generator), dim=1)
     definitions, deltas = [], []
     for number, group in enumerate(groups):

@@ -8,7 +8,6 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torchface.errors import ShapeError, ValueRangeError
 from torchface.geometry.cameras.pinhole import look_at
 from torchface.geometry.rotations import rotation_matrix
 from torchface.progress import Progress, silent
@@ -58,13 +57,6 @@ class PortraitSettings:
     blur: float = 0.6
     noise: float = 0.02
 
-    def __post_init__(self) -> None:
-        for name, value in vars(self).items():
-            if not (math.isfinite(value) and value >= 0) or (name in ("width", "height") and value < 16):
-                raise ValueRangeError(
-                    f"portrait video: {name} is {value}, expected a finite number that is not negative"
-                )
-
 
 @dataclass(frozen=True, eq=False)
 class PortraitVideo:
@@ -90,16 +82,9 @@ def render_portrait_video(
         generator: of poses, wall and noise.
         settings: how.
         progress: called with each step and how far it is.
-
-    Raises:
-        ShapeError: the weights are not (T,N), or the rig has no landmarks.
     """
     progress = progress or silent
-    if weights.ndim != 2 or weights.shape[1] != len(rig.names):
-        raise ShapeError(f"weights: found {tuple(weights.shape)}, expected (T,{len(rig.names)})")
     ids = None if rig.neutral.annotations is None else rig.neutral.annotations.landmarks
-    if ids is None:
-        raise ShapeError("rig: found no annotated landmarks, expected 68")
     size = (settings.height, settings.width)
     middle = rig.vertices[ids].double().mean(0)
     camera = look_at(middle + torch.tensor([0.0, 12.0, -20.0]), 0.0, 0.0, 250.0, settings.width, settings.height, 24.0)
@@ -124,18 +109,12 @@ def render_portrait_video(
 
 
 def expression_weights(names: tuple[str, ...], expressions: list[dict[str, float]]) -> Tensor:
-    """Weights (M,N) of expressions by shape name; a name without ``Left`` or ``Right`` means both sides.
-
-    Raises:
-        ValueRangeError: an expression names a shape that is not there.
-    """
+    """Weights (M,N) of expressions by shape name; a name without ``Left`` or ``Right`` means both sides."""
     column = {name: i for i, name in enumerate(names)}
     weights = torch.zeros(len(expressions), len(names))
     for row, expression in enumerate(expressions):
         for name, value in expression.items():
             found = [one for one in (name, f"{name}Left", f"{name}Right") if one in column]
-            if not found:
-                raise ValueRangeError(f"expression: found the shape {name!r}, expected one of the rig's")
             weights[row, [column[one] for one in found]] = value
     return weights
 

@@ -11,7 +11,6 @@ import torch
 from torch import Tensor
 
 from planted.webcam_performance import SittingSettings, WebcamPerformance, gaze_of, sitting
-from torchface.errors import ValueRangeError
 from torchface.geometry.cameras.pinhole import Camera
 from torchface.progress import Progress, silent
 from torchface.shape_names import ARKIT
@@ -52,13 +51,6 @@ class WebcamSettings:
     blur: float = 0.55
     noise: float = 3.0
     quality: int = 80
-
-    def __post_init__(self) -> None:
-        if min(self.width, self.height) < 64 or not self.focal > 0 or not 1 <= self.quality <= 100:
-            raise ValueRangeError(
-                f"webcam: found {self.width} x {self.height} pixels, focal length {self.focal}, quality "
-                f"{self.quality}; expected 64 pixels a side or more, a positive length, a quality of 1 to 100"
-            )
 
     @property
     def intrinsics(self) -> Tensor:

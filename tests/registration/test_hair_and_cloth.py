@@ -12,7 +12,7 @@ from torchface.geometry.meshes.operators import vertex_normals
 from torchface.geometry.similarity import Similarity
 from torchface.mesh import Mesh
 from torchface.registration import Registration, register
-from torchface.registration.ears import find_ears
+from torchface.registration.hair_and_cloth import find_ears
 from torchface.registration.scan_completion import completed_colors, completed_form
 from torchface.synthetic.head.performer import performer
 

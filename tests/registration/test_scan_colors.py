@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from torchface.geometry.meshes.uv_raster import rasterise_uvs
+from torchface.geometry.meshes.rasterization import rasterise_uvs
 from torchface.mesh import Mesh
 from torchface.registration import register
 

@@ -11,11 +11,11 @@ import torch
 from torch import Tensor
 
 from torchface.geometry.meshes.operators import triangle_cross
-from torchface.geometry.meshes.proximity import SurfaceIndex
+from torchface.geometry.meshes.surface_index import SurfaceIndex
 from torchface.io import load_identity_modes, load_mesh
 from torchface.io.landmarks.landmark_points import load_landmark_points
 from torchface.mesh import Mesh
-from torchface.registration import FULL_SCHEDULE, Registration, register
+from torchface.registration import Level, Registration, Schedule, Stage, register
 from torchface.registration.scan_preparation import Landmarks
 
 
@@ -93,7 +93,14 @@ def test_a_planted_deformation_is_recovered(mask: Mesh, truth: Tensor, registere
 def test_the_full_system_of_the_paper_comes_to_the_same(
     mask: Mesh, scan: Mesh, landmarks: Landmarks, truth: Tensor, registered: Registration
 ) -> None:
-    full = register(mask, scan, landmarks, schedule=FULL_SCHEDULE)
+    stages = (
+        Stage(Level.VERTICES, 18.0, 10.0, 30.0, iterations=4),
+        Stage(Level.VERTICES, 5.0, 10.0, 20.0),
+        Stage(Level.VERTICES, 1.2, 5.0, 12.0, iterations=2, contact_weight=2.0),
+        Stage(Level.VERTICES, 0.3, 2.0, 8.0, iterations=2, contact_weight=2.0),
+        Stage(Level.VERTICES, 0.2, 1.0, 5.0, iterations=2, contact_weight=2.0),
+    )
+    full = register(mask, scan, landmarks, schedule=Schedule(stages))
     assert float((full.mesh.vertices - registered.mesh.vertices).norm(dim=1).mean()) < 0.5
     assert float(error(registered, truth).mean()) < 1.15 * float(error(full, truth).mean())
 

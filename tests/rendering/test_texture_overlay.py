@@ -16,7 +16,7 @@ from torchface.geometry.cameras.calibration import CameraCalibration
 from torchface.geometry.cameras.distortion import distort
 from torchface.geometry.cameras.pinhole import Camera
 from torchface.geometry.meshes.operators import triangle_normals
-from torchface.geometry.meshes.uv_raster import rasterise_uvs
+from torchface.geometry.meshes.rasterization import rasterise_uvs
 from torchface.mesh import Mesh
 from torchface.rendering.pixel_coverage import footprint
 from torchface.rendering.point_light import PointLight

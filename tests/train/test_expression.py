@@ -14,9 +14,8 @@ from torchface.modeling import ExpressionRegression, ExpressionSettings
 from torchface.progress import silent
 from train import expression as recipe
 from train import expression_table, people_samples
-from train.expression import Settings, Trained, fit, gather, train
+from train.expression import Settings, Trained, fit, gather, settle, train
 from train.expression_table import METHODS
-from train.settled_expressions import settle
 
 
 def turned(points: torch.Tensor, seed: int) -> torch.Tensor:

@@ -9,28 +9,26 @@ from pathlib import Path
 import pytest
 import torch
 
+from planted.scan_files import write_scans
 from torchface import zoo
 from torchface.errors import FileFormatError, TopologyError, TorchfaceError, ValueRangeError
-from torchface.geometry.meshes.proximity import SurfaceIndex
+from torchface.geometry.meshes.surface_index import SurfaceIndex
 from torchface.geometry.similarity import Similarity
 from torchface.io import load_mesh
 from torchface.landmarks import (
     AutomaticLandmarks,
     DetectorSettings,
     UVLandmarkDetector,
-    contour_correspondences,
     load_annotations,
-    load_detector,
     scan_landmarks,
 )
-from torchface.landmarks.scans.detector_evaluation import landmark_errors
 from torchface.landmarks.scans.hog import HogLayout
-from torchface.landmarks.scans.landmark_pairs import template_features
+from torchface.landmarks.scans.landmark_pairs import scan_pairs, template_features
 from torchface.landmarks.scans.uv_landmark_names import LINES
 from torchface.synthetic import draw_identities, neutral_head, performer
-from torchface.synthetic.stages.scan_photographs import Photography
-from torchface.synthetic.stages.scanner import ScannerSettings, eyes_closed, write_scans
+from torchface.synthetic.stages.scanner import Photography, ScannerSettings, eyes_closed
 from train import uv_landmarks as recipe
+from train.scan_landmark_errors import landmark_errors
 from train.uv_landmarks import Settings, Trained, train
 
 pytest.importorskip("safetensors")
@@ -72,7 +70,7 @@ def test_landmarks_of_the_scan_held_out_are_found(trained: tuple[Trained, Path])
 def test_the_model_on_disk_finds_the_same(trained: tuple[Trained, Path], folder: Path) -> None:
     result, out = trained
     assert {p.name for p in out.iterdir()} == {"model.toml", "state.safetensors", "CARD.md", "held_out.png"}
-    again = load_detector(out)
+    again = zoo.get_model(out, UVLandmarkDetector)
     assert zoo.get_model(out).config == again.config
     described = zoo.describe(out)
     assert described.size < 2 * 2**20
@@ -89,7 +87,9 @@ def test_pairs_lie_on_the_scan_near_the_truth(trained: tuple[Trained, Path], fol
     scan = load_mesh(folder / "scan_003.obj")
     truth = load_annotations(folder / "annotations.json")["scan_003.obj"]
     template = neutral_head(texture=False)
-    pairs = contour_correspondences(trained[0].detector, template, scan)
+    pairs = scan_pairs(
+        template_features(template, trained[0].detector), scan_landmarks(trained[0].detector, scan), scan
+    )
     assert set(LINES) <= set(pairs.names)
     assert SurfaceIndex(scan.vertices, scan.faces).nearest(pairs.points).distance.max() < 3.0
     for name in LINES:

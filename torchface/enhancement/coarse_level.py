@@ -13,7 +13,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from torchface.geometry.meshes.operators import edges
-from torchface.geometry.meshes.proximity import triangle_coordinates
+from torchface.geometry.meshes.surface_index import triangle_coordinates
 
 _BEYOND = 0.6  # how far past a triangle's side its slope is followed, as a part of the triangle
 

@@ -55,10 +55,8 @@ class MovedSamples:
 
     def read(self, begin: int, end: int) -> Tensor:
         """See :class:`Samples`."""
-        part = slice(begin, end)
-        pose = Similarity(self.poses.scale[part], self.poses.rotation[part], self.poses.translation[part])
         read = self.samples.read(begin, end)
-        return pose.apply(read.double()).to(read)
+        return self.poses[begin:end].apply(read.double()).to(read)
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from torchface.errors import ShapeError
+from torchface.geometry.rotations import cross_matrix
 
 __all__ = ["Similarity", "similarity_transform"]
 
@@ -37,6 +38,25 @@ class Similarity:
     def apply_vectors(self, vectors: Tensor) -> Tensor:
         """Rotated and scaled, not translated: for deltas (..., B,N,3)."""
         return self.scale.to(vectors)[:, None, None] * (vectors @ self.rotation.transpose(-1, -2).to(vectors))
+
+    def __getitem__(self, rows: Tensor | slice) -> Similarity:
+        """Some of the batch."""
+        return Similarity(self.scale[rows], self.rotation[rows], self.translation[rows])
+
+    def moved(self, turn: Tensor, growth: Tensor, shift: Tensor, centre: Tensor) -> Similarity:
+        r"""Followed by a small motion: turned and grown about a centre, then shifted.
+
+        .. math:: x \mapsto c + g\, e^{[\omega]} (s R x + t - c) + d
+
+        Args:
+            turn: :math:`\omega`, axis times angle, (B,3).
+            growth: :math:`g`, (B,).
+            shift: :math:`d`, (B,3).
+            centre: :math:`c`, (B,3).
+        """
+        rotation = torch.linalg.matrix_exp(cross_matrix(turn))
+        arm = growth[:, None] * (rotation @ (self.translation - centre)[..., None])[..., 0]
+        return Similarity(self.scale * growth, rotation @ self.rotation, centre + arm + shift)
 
     def inverse(self) -> Similarity:
         """The similarity that undoes this one."""

@@ -21,10 +21,9 @@ from torchface.landmarks.images.trees.tree_training import TreeSettings
 from torchface.landmarks.scans.contours import Contour, TraceSettings, trace_contour
 from torchface.landmarks.scans.curvature_image import curvature_image
 from torchface.landmarks.scans.cylinder import CylinderLayout, UnwrappedHead, unwrap
-from torchface.landmarks.scans.detector_files import load_detector, save_detector
 from torchface.landmarks.scans.detector_settings import DetectorSettings
 from torchface.landmarks.scans.face_frame import FaceFrame
-from torchface.landmarks.scans.landmark_pairs import AutomaticLandmarks, LandmarkPairs, contour_correspondences
+from torchface.landmarks.scans.landmark_pairs import AutomaticLandmarks, LandmarkPairs
 from torchface.landmarks.scans.scan_annotations import ScanAnnotation, load_annotations, save_annotations
 from torchface.landmarks.scans.scan_landmarks import ScanLandmarks, appearance_image, line_image, scan_landmarks
 from torchface.landmarks.scans.uv_detector import LineExamples, UVLandmarkDetector, UVLandmarks
@@ -67,7 +66,6 @@ __all__ = [
     "UVLandmarks",
     "UnwrappedHead",
     "appearance_image",
-    "contour_correspondences",
     "curvature_image",
     "find_face",
     "find_faces",
@@ -75,9 +73,7 @@ __all__ = [
     "landmark_jitter",
     "line_image",
     "load_annotations",
-    "load_detector",
     "save_annotations",
-    "save_detector",
     "scan_landmarks",
     "trace_contour",
     "track_landmarks",

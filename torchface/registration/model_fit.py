@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
@@ -10,7 +9,8 @@ import torch
 from torch import Tensor
 
 from torchface.errors import ShapeError, TopologyError
-from torchface.geometry.meshes.proximity import SurfaceIndex
+from torchface.geometry.meshes.surface_index import SurfaceIndex
+from torchface.geometry.rotations import cross_matrix
 from torchface.geometry.similarity import Similarity, similarity_transform
 from torchface.mesh import Mesh
 from torchface.registration.nonrigid.correspondence import correspondences, evenly_spread
@@ -159,24 +159,14 @@ def fit_to_scan(
         downhill[7:] -= coefficients
         step = torch.linalg.solve(matrix + torch.diag(prior), downhill)
         coefficients = (coefficients + step[7:]).clamp(-_MAX_COEFFICIENT, _MAX_COEFFICIENT)
-        pose = _moved(pose, step[:7], centre)
+        growth = step[6:7].clamp(-0.1, 0.1).exp()
+        pose = pose.moved(step[None, :3], growth, step[None, 3:6], centre[None])
     return ModelFit(pose.apply(mean + torch.tensordot(coefficients, modes, 1))[0], coefficients, pose, noise)
 
 
 def _jacobian(modes: Tensor, current: Tensor, ids: Tensor, pose: Similarity, centre: Tensor) -> Tensor:
     """How vertices ``ids`` move with a turn and a growth about the centre, a shift, and the modes, (n,3,7+K)."""
     arm = current[ids] - centre
-    zero = torch.zeros(len(ids), dtype=torch.float64)
-    x, y, z = arm.unbind(1)
-    rotation_step = torch.stack([zero, z, -y, -z, zero, x, y, -x, zero], dim=1).reshape(-1, 3, 3)
-    translation_step = torch.eye(3, dtype=torch.float64).expand(len(ids), 3, 3)
+    shift = torch.eye(3, dtype=torch.float64).expand(len(ids), 3, 3)
     moved = pose.apply_vectors(modes[:, ids].reshape(1, -1, 3))[0].reshape(len(modes), len(ids), 3)
-    return torch.cat([rotation_step, translation_step, arm[:, :, None], moved.permute(1, 2, 0)], dim=2)
-
-
-def _moved(pose: Similarity, step: Tensor, centre: Tensor) -> Similarity:
-    x, y, z = step[:3].tolist()
-    rotation_step = torch.matrix_exp(torch.tensor([[0, -z, y], [z, 0, -x], [-y, x, 0]], dtype=torch.float64))
-    grow = math.exp(min(max(float(step[6]), -0.1), 0.1))
-    translation = centre + grow * (rotation_step @ (pose.translation[0] - centre)) + step[3:6]
-    return Similarity(pose.scale * grow, rotation_step @ pose.rotation, translation[None])
+    return torch.cat([-cross_matrix(arm), shift, arm[:, :, None], moved.permute(1, 2, 0)], dim=2)

@@ -69,8 +69,7 @@ class Fit:
     def best(self, count: int) -> Fit:
         """The best fitting ones, best first."""
         order = self.fit.argsort(descending=True, stable=True)[:count]
-        pose = Similarity(self.pose.scale[order], self.pose.rotation[order], self.pose.translation[order])
-        return Fit(pose, self.fit[order])
+        return Fit(self.pose[order], self.fit[order])
 
 
 def rigid_icp(
@@ -96,10 +95,9 @@ def rigid_icp(
 
     Source: Chen, Medioni 1992 (across the surface); Rusinkiewicz, Levoy 2001; thesis 3.2.3, figure 16.
     """
-    s, rotation, translation = start.scale.double(), start.rotation.double(), start.translation.double()
-    lowest, highest = s * MIN_HEAD_SCALE, s * MAX_HEAD_SCALE
+    pose = Similarity(start.scale.double(), start.rotation.double(), start.translation.double())
+    lowest, highest = pose.scale * MIN_HEAD_SCALE, pose.scale * MAX_HEAD_SCALE
     for reach in reaches:
-        pose = Similarity(s, rotation, translation)
         moved, targets, normals, weights = _planes(samples, scan, pose, reach)
         if landmarks is not None:
             extra = _landmark_planes(landmarks, pose, len(samples.points))
@@ -115,17 +113,9 @@ def rigid_icp(
         size = matrix.diagonal(dim1=1, dim2=2)
         matrix = matrix + torch.diag_embed(_DAMPING * size + 1e-9 * size.amax(1, keepdim=True) + 1e-12)
         step = torch.linalg.solve(matrix, (weighted * left[..., None]).sum(1))
-        rotation_step = torch.linalg.matrix_exp(_skew(step[:, :3]))
-        grow = (1 + step[:, 6]).clamp(0.9, 1.1) if scale else torch.ones_like(s)
-        grow = (s * grow).clamp(lowest, highest) / s
-        # About the centre: x -> c + g T (x - c) + t.
-        translation = (
-            centre[:, 0]
-            + grow[:, None] * (rotation_step @ (translation - centre[:, 0])[..., None])[..., 0]
-            + step[:, 3:6]
-        )
-        rotation, s = rotation_step @ rotation, s * grow
-    pose = Similarity(s, rotation, translation)
+        growth = (1 + step[:, 6]).clamp(0.9, 1.1) if scale else torch.ones_like(pose.scale)
+        growth = (pose.scale * growth).clamp(lowest, highest) / pose.scale
+        pose = pose.moved(step[:, :3], growth, step[:, 3:6], centre[:, 0])
     return Fit(pose, _planes(samples, scan, pose, reaches[-1])[3].mean(1))
 
 
@@ -179,12 +169,6 @@ def _landmark_planes(
     normals = torch.eye(3, dtype=torch.float64).repeat(len(landmarks[0]), 1).expand_as(moved)
     weight = _LANDMARK_WEIGHT * count / moved.shape[1]
     return moved, targets, normals, torch.full(moved.shape[:2], weight, dtype=torch.float64)
-
-
-def _skew(vector: Tensor) -> Tensor:
-    x, y, z = vector.unbind(-1)
-    zero = torch.zeros_like(x)
-    return torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], dim=-1).reshape(-1, 3, 3)
 
 
 def _rotations(count: int) -> Tensor:

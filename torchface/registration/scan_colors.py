@@ -11,9 +11,8 @@ from torch import Tensor
 
 from torchface.errors import TopologyError
 from torchface.geometry.meshes.operators import vertex_normals
-from torchface.geometry.meshes.proximity import SurfacePoints
-from torchface.geometry.meshes.uv_margin import laid_out
-from torchface.geometry.meshes.uv_raster import interpolate, rasterise_uvs
+from torchface.geometry.meshes.rasterization import interpolate, rasterise_uvs
+from torchface.geometry.meshes.surface_index import SurfacePoints
 from torchface.mesh import Mesh
 from torchface.rendering.clay_shading import sample_texture
 from torchface.rendering.raycast import RayCaster
@@ -133,7 +132,7 @@ def resampled_texture(mesh: Mesh, colors: Tensor, shown: Tensor, source: ScanCol
     triangle, barycentric, found = _along_normals(source, points[wanted], normals[wanted])
     rows = wanted[found]
     values[rows] = torch.lerp(values[rows], source.at(triangle[found], barycentric[found]), share[rows])
-    return laid_out(values.clamp(0, 1), texels)
+    return texels.image(values.clamp(0, 1))
 
 
 def _along_normals(source: ScanColors, points: Tensor, normals: Tensor) -> tuple[Tensor, Tensor, Tensor]:

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from torchface.errors import AlignmentError, ShapeError, TopologyError, ValueRangeError
 from torchface.geometry.meshes.operators import components, triangle_areas, triangle_cross
-from torchface.geometry.meshes.proximity import SurfaceIndex
+from torchface.geometry.meshes.surface_index import SurfaceIndex
 from torchface.geometry.meshes.unit_check import check_unit, extent
 from torchface.geometry.mirrored_points import check_mirrored
 from torchface.geometry.similarity import Similarity, similarity_transform

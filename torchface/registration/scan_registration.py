@@ -11,7 +11,7 @@ from torch import Tensor
 
 from torchface.errors import AlignmentError, ShapeError
 from torchface.geometry.meshes.operators import edges, vertex_normals
-from torchface.geometry.meshes.proximity import SurfaceIndex, SurfacePoints
+from torchface.geometry.meshes.surface_index import SurfaceIndex, SurfacePoints
 from torchface.geometry.similarity import MAX_HEAD_SCALE, MIN_HEAD_SCALE, Similarity
 from torchface.mesh import Mesh
 from torchface.progress import Progress, silent
@@ -21,8 +21,9 @@ from torchface.registration.nonrigid.correspondence import evenly_spread, expose
 from torchface.registration.nonrigid.deformer import Deformer
 from torchface.registration.nonrigid.landmark_pull import LandmarkPull
 from torchface.registration.nonrigid.lip_contact import contact_pull
+from torchface.registration.nonrigid.registration_record import RegistrationRecord
 from torchface.registration.nonrigid.schedule import DEFAULT_SCHEDULE, Schedule
-from torchface.registration.nonrigid.stage_record import RegistrationRecord
+from torchface.registration.nonrigid.unfolding import grown
 from torchface.registration.rigid_icp import Samples, ScanPoints, find_pose, rigid_icp
 from torchface.registration.scan_colors import (
     ScanColors,
@@ -335,8 +336,7 @@ def _completed(
         folded = faces[deformer.folded_triangles()].flatten()
         around = torch.zeros_like(unseen)
         around[folded[~cover.features[folded]]] = True
-        around[faces[around[faces].any(-1)].flatten()] = True
-        around &= ~cover.features
+        around = grown(around, faces) & ~cover.features
         if not around.any():
             break
         unseen = torch.stack([unseen, around, *(ear for ear in cover.ears if (ear & around).any())]).any(0)

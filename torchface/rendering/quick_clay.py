@@ -11,9 +11,9 @@ from torch import Tensor
 
 from torchface.geometry.cameras.pinhole import Camera
 from torchface.geometry.meshes.operators import vertex_normals
+from torchface.geometry.meshes.rasterization import DrawnPixels, rasterise
 from torchface.mesh import Mesh
 from torchface.rendering.clay_shading import vertex_openness
-from torchface.rendering.rasterization import DrawnPixels, rasterize
 
 BACKGROUND = (38, 40, 44)
 _CLAY, _TINT = (205, 180, 163), (236, 92, 40)
@@ -95,7 +95,7 @@ class QuickClay:
             return image  # before or behind the lens there is no picture of a face
         nearness = 1 / points[:, 2]
         pixels = (points @ camera.intrinsics.double().T)[:, :2] * nearness[:, None]
-        drawn = rasterize(pixels, nearness, self.faces, camera.height, camera.width)
+        drawn = rasterise(pixels, nearness, self.faces, camera.height, camera.width)
         light = drawn.of_vertices(self._light(points.float()), self.faces)
         row = self.part[drawn.triangle] * _TINT_LEVELS
         if tint is not None:

@@ -24,13 +24,13 @@ from torchface.capture.action_units import (
     load_shape_table,
     read_regions,
 )
-from torchface.capture.action_units.classifier_evaluation import cross_validation, level_agreement
 from torchface.capture.action_units.classifier_training import intensity_levels, label_group
 from torchface.capture.action_units.gabor import GaborBank
 from torchface.capture.action_units.one_vs_one_svm import OneVsOne
 from torchface.capture.action_units.weight_targets import smooth_intensities
 from torchface.errors import FileFormatError, NameMismatchError, ShapeError, ValueRangeError
 from torchface.onnx import export_action_units
+from train.classifier_evaluation import cross_validation, level_agreement
 
 
 def planted(session: RecordedSession, units: tuple[str, ...]) -> torch.Tensor:

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from torchface.attachment import Attachment
 from torchface.geometry.meshes.operators import vertex_normals
-from torchface.geometry.meshes.proximity import SurfaceIndex
+from torchface.geometry.meshes.surface_index import SurfaceIndex
 from torchface.rig import BlendshapeRig
 
 _STEPS = 12

@@ -11,7 +11,7 @@ import trimesh
 from torchface.errors import ShapeError, ValueRangeError
 from torchface.geometry.similarity import Similarity
 from torchface.landmarks.scans.curvature_image import curvature_image
-from torchface.landmarks.scans.cylinder import CylinderLayout, unwrap
+from torchface.landmarks.scans.cylinder import CylinderLayout, fill_holes, unwrap
 from torchface.mesh import Mesh
 
 SMALL = CylinderLayout(size=128, pitch=2.0, radius=90.0)
@@ -104,3 +104,25 @@ def test_what_cannot_be_unwrapped_is_refused() -> None:
         unwrap(ball(100.0), Similarity(torch.ones(2), torch.eye(3).expand(2, 3, 3), torch.zeros(2, 3)), SMALL)
     with pytest.raises(ValueRangeError, match="more than once round"):
         CylinderLayout(size=1024, pitch=2.0)
+
+
+def test_known_pixels_stay_and_holes_follow_what_is_around() -> None:
+    x, y = torch.meshgrid(torch.arange(65.0), torch.arange(48.0), indexing="xy")
+    image = torch.stack([0.01 * x, 0.5 + 0.002 * y])
+    mask = torch.ones(48, 65, dtype=torch.bool)
+    mask[10:22, 30:41] = False
+    mask[:, 60:] = False
+    filled = fill_holes(image * mask, mask)
+    assert torch.equal(filled[:, mask], (image * mask)[:, mask])
+    hole = torch.zeros_like(mask)
+    hole[10:22, 30:41] = True
+    assert (filled[:, hole] - image[:, hole]).abs().max() < 0.06
+    low, high = image[0][mask].aminmax()
+    assert filled[0].min() >= low - 1e-6
+    assert filled[0].max() <= high + 1e-6
+
+
+def test_one_known_pixel_fills_everything() -> None:
+    mask = torch.zeros(17, 9, dtype=torch.bool)
+    mask[3, 4] = True
+    assert torch.allclose(fill_holes(mask.float()[None] * 0.7, mask), torch.full((1, 17, 9), 0.7))

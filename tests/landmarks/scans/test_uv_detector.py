@@ -10,9 +10,9 @@ import torch
 from safetensors.torch import load, save
 from torch import Tensor
 
+from torchface import zoo
 from torchface.errors import FileFormatError, ShapeError, ValueRangeError
 from torchface.landmarks import LineExamples
-from torchface.landmarks.scans.detector_files import load_detector, save_detector
 from torchface.landmarks.scans.detector_settings import DetectorSettings
 from torchface.landmarks.scans.hog import HogLayout
 from torchface.landmarks.scans.uv_detector import UVLandmarkDetector
@@ -20,6 +20,7 @@ from torchface.landmarks.scans.uv_detector import UVLandmarkDetector
 NAMES = ("cross", "ring", "corner")
 SETTINGS = DetectorSettings(hog=HogLayout(stride=4), responses=50)
 SIZE = 160
+CARD = zoo.ModelCard("MIT", "drawn marks", {"error": 1.5}, "none")
 
 
 def stamp(image: Tensor, kind: str, x: float, y: float) -> None:
@@ -81,10 +82,8 @@ def test_a_featureless_image_gives_the_usual_place_without_confidence(detector: 
 
 
 def test_state_and_config_rebuild_the_detector(detector: UVLandmarkDetector, tmp_path: Path) -> None:
-    pytest.importorskip("safetensors")
-    pytest.importorskip("tomli_w")
-    save_detector(detector, tmp_path / "model", {"errors": {"mean": 1.5}})
-    again = load_detector(tmp_path / "model")
+    zoo.save_model(detector, tmp_path / "model", CARD)
+    again = zoo.get_model(tmp_path / "model")
     assert again.config == detector.config
     image, _ = drawn(70)
     first, second = detector(image[None]), again(image[None])
@@ -100,7 +99,7 @@ def test_a_model_saved_under_the_old_names_loads(tmp_path: Path) -> None:
         torch.stack(images), torch.stack(places), NAMES, "curvature", SETTINGS, lines=LineExamples(lines)
     )
     folder = tmp_path / "model"
-    save_detector(fitted, folder)
+    zoo.save_model(fitted, folder, CARD)
     path, text = folder / "state.safetensors", (folder / "model.toml").read_text()
     old = {"line_statistics": "courses", "line_profiles": "looks", "corner_deviation": "looseness"}
     before = path.read_bytes()
@@ -113,7 +112,7 @@ def test_a_model_saved_under_the_old_names_loads(tmp_path: Path) -> None:
         assert now in text
         text = text.replace(now, then)
     (folder / "model.toml").write_text(text)
-    again = load_detector(folder)
+    again = zoo.get_model(folder)
     assert again.appearance == "curvature"
     assert again.line_statistics.abs().max() > 0
     for key, value in fitted.state_dict().items():
@@ -121,25 +120,23 @@ def test_a_model_saved_under_the_old_names_loads(tmp_path: Path) -> None:
 
 
 def test_files_that_lie_are_refused(detector: UVLandmarkDetector, tmp_path: Path) -> None:
-    pytest.importorskip("safetensors")
-    pytest.importorskip("tomli_w")
     folder = tmp_path / "model"
-    save_detector(detector, folder)
+    zoo.save_model(detector, folder, CARD)
     text = (folder / "model.toml").read_text()
     (folder / "model.toml").write_text(text.replace("images = 8", "images = 800000000"))
     with pytest.raises(FileFormatError, match="do not fit"):
-        load_detector(folder)
+        zoo.get_model(folder)
     (folder / "model.toml").write_text(text.replace("images = 8", "images = 7"))
     with pytest.raises(FileFormatError, match="do not fit"):
-        load_detector(folder)
+        zoo.get_model(folder)
     (folder / "model.toml").write_text(text.replace("uv_landmarks", "morphable"))
-    with pytest.raises(FileFormatError, match="morphable"):
-        load_detector(folder)
+    with pytest.raises(FileFormatError):
+        zoo.get_model(folder)
     (folder / "model.toml").write_text(text)
     state = (folder / "state.safetensors").read_bytes()
     (folder / "state.safetensors").write_bytes(state[: len(state) // 2])
     with pytest.raises(FileFormatError, match="cut off"):
-        load_detector(folder)
+        zoo.get_model(folder)
 
 
 def test_a_missing_landmark_is_left_out_of_the_statistics() -> None:

@@ -13,8 +13,8 @@ from torch import Tensor
 
 from torchface.errors import AlignmentError, ShapeError, TopologyError, ValueRangeError
 from torchface.geometry.meshes.operators import vertex_normals
+from torchface.geometry.meshes.rasterization import interpolate, rasterise_uvs
 from torchface.geometry.meshes.tangent_space import from_tangent_space, tangent_space
-from torchface.geometry.meshes.uv_raster import interpolate, rasterise_uvs
 from torchface.geometry.similarity import Similarity
 from torchface.io import load_rig
 from torchface.mesh import Mesh, submesh

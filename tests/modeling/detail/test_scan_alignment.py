@@ -12,8 +12,8 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from torchface.geometry.meshes.operators import vertex_normals
+from torchface.geometry.meshes.rasterization import interpolate, rasterise_uvs
 from torchface.geometry.meshes.tangent_space import from_tangent_space, tangent_space
-from torchface.geometry.meshes.uv_raster import interpolate, rasterise_uvs
 from torchface.mesh import Mesh, fan_triangulation, submesh
 from torchface.modeling.detail.normal_map_baking import NormalMap, bake_normal_map
 from torchface.rig import BlendshapeRig

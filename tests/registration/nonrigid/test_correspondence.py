@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import torch
 
-from torchface.geometry.meshes.proximity import SurfaceIndex
+from torchface.geometry.meshes.surface_index import SurfaceIndex
 from torchface.mesh import Mesh
 from torchface.registration.nonrigid.correspondence import correspondences, evenly_spread, exposed_vertices
 

@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from torchface.geometry.meshes.proximity import SurfaceIndex
+from torchface.geometry.meshes.surface_index import SurfaceIndex
 from torchface.mesh import Annotations, Mesh
 from torchface.registration import register
 

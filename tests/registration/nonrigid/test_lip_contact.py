@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from torchface.geometry.meshes.proximity import SurfaceIndex
+from torchface.geometry.meshes.surface_index import SurfaceIndex
 from torchface.mesh import Annotations, Mesh
 from torchface.registration import DEFAULT_SCHEDULE, Registration, register
 from torchface.registration.nonrigid.lip_contact import contact_pull

@@ -14,8 +14,7 @@ from torchface.capture.markers import observability
 from torchface.errors import ValueRangeError
 from torchface.io import load_rig
 from torchface.synthetic import draw_identities, performer
-from torchface.synthetic.stages.landmarks_by_shape import landmarks_by_shape
-from torchface.synthetic.stages.makeup_layout import makeup_layout
+from torchface.synthetic.stages.makeup_layout import landmarks_by_shape, makeup_layout
 from torchface.synthetic.stages.marker_stage import place_markers
 
 EYES_AND_BROWS = ("forehead", "brow", "lids", "infraorbital")

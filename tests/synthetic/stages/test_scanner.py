@@ -9,9 +9,10 @@ import pytest
 import torch
 import trimesh
 
+from planted.scan_files import write_scans
 from torchface.errors import ValueRangeError
 from torchface.geometry.meshes.operators import border_vertices, components, triangle_normals
-from torchface.geometry.meshes.proximity import SurfaceIndex
+from torchface.geometry.meshes.surface_index import SurfaceIndex
 from torchface.io import load_mesh
 from torchface.io.landmarks.landmark_points import load_landmark_points
 from torchface.landmarks.scans.scan_annotations import load_annotations
@@ -21,8 +22,7 @@ from torchface.rendering.clay_shading import sample_texture
 from torchface.synthetic import performer
 from torchface.synthetic.stages.depth_fusion import DepthNoise, fuse, surface_net
 from torchface.synthetic.stages.hair_and_collar import Dress
-from torchface.synthetic.stages.scan_photographs import Photography
-from torchface.synthetic.stages.scanner import RawScan, ScannerSettings, eyes_closed, scan_head, write_scans
+from torchface.synthetic.stages.scanner import Photography, RawScan, ScannerSettings, eyes_closed, scan_head
 from torchface.synthetic.stages.subdivision import catmull_clark, finely_coloured
 
 COARSE = ScannerSettings(voxel=3.0, detail=3.0, photography=Photography(height=200))

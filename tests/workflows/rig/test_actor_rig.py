@@ -19,7 +19,7 @@ from torchface.io import load_detail_maps, load_rig, save_mesh, save_rig
 from torchface.io.landmarks.picks import Correspondences, save_correspondences
 from torchface.mesh import Mesh
 from torchface.modeling import MorphableModel
-from torchface.registration import dressed_as, hidden_parts
+from torchface.registration import hidden_parts, with_template_skin
 from torchface.rig import BlendshapeRig
 from torchface.synthetic.head.neutral_head import neutral_head
 from torchface.workflows.rig.actor_rig import RigOptions, rig_actor
@@ -239,7 +239,7 @@ def test_hidden_eyeballs_and_the_mouth_keep_the_templates_skin_and_nothing_else_
     assert not hidden[template.landmarks].any()
     assert template.annotations is not None
     assert hidden[template.annotations.regions["mouth_interior"]].all()
-    worn = dressed_as(black, white, hidden)
+    worn = with_template_skin(black, white, hidden)
     assert worn.colors is not None
     assert worn.texture is not None
     assert torch.equal(worn.colors[:, 0] == 1, hidden)
@@ -250,4 +250,4 @@ def test_hidden_eyeballs_and_the_mouth_keep_the_templates_skin_and_nothing_else_
     of_hidden = hidden[template.faces].all(1)
     assert float(values[of_hidden].mean()) > 0.9
     assert float(values[~of_hidden].mean()) < 0.02
-    assert dressed_as(black, white, ~everything) is black
+    assert with_template_skin(black, white, ~everything) is black

@@ -11,7 +11,7 @@ import torch
 from torchface import Attachment, BlendshapeRig, Take, Track
 from torchface.capture import MarkerSolver, clean_take
 from torchface.evaluation import marker_rmse
-from torchface.geometry.meshes.proximity import SurfaceIndex
+from torchface.geometry.meshes.surface_index import SurfaceIndex
 from torchface.synthetic.stages.marker_stage import StageFlaws, place_markers, record
 from torchface.workflows.solve.solution import Solution, SolveReport
 from torchface.workflows.solve.solve_page import write_solve_page

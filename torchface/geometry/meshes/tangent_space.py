@@ -15,7 +15,7 @@ from torch import Tensor
 
 from torchface.errors import ShapeError
 from torchface.geometry.meshes.operators import corners
-from torchface.geometry.meshes.uv_raster import interpolate
+from torchface.geometry.meshes.rasterization import interpolate
 
 
 @dataclass(frozen=True, eq=False)

@@ -22,9 +22,9 @@ class VertexGraph:
         one = torch.ones(len(self.first), dtype=torch.float64)
         self.degree = degree.index_add(0, self.first, one).index_add(0, self.second, one).clamp(min=1)
 
-    def sum(self, values: Tensor) -> Tensor:
-        """Of each vertex's neighbours, (V,C)."""
-        total = torch.zeros_like(values).index_add_(0, self.first, values[self.second])
+    def sum(self, values: Tensor, itself: bool = False) -> Tensor:
+        """Of the values (V,...) of each vertex's neighbours, and of the vertex itself if asked for, (V,...)."""
+        total = (values.clone() if itself else torch.zeros_like(values)).index_add_(0, self.first, values[self.second])
         return total.index_add_(0, self.second, values[self.first])
 
     def smoothed(self, values: Tensor, weights: Tensor, iterations: int) -> Tensor:

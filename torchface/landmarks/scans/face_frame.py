@@ -11,8 +11,7 @@ from torch import Tensor, nn
 from torchface.errors import ShapeError, ValueRangeError
 from torchface.geometry.similarity import Similarity, similarity_transform
 from torchface.landmarks.scans.cylinder import CylinderLayout, unwrap
-from torchface.landmarks.scans.nose_search import nose_candidates, protrusion
-from torchface.landmarks.scans.pose_search import PoseSearch, find_pose, misfit, refine
+from torchface.landmarks.scans.pose_search import PoseSearch, find_pose, misfit, nose_candidates, protrusion, refine
 from torchface.landmarks.scans.surface_sample import sample_surface
 from torchface.landmarks.scans.uv_landmark_names import MIRRORED, UV_LANDMARK_NAMES
 from torchface.mesh import Mesh
@@ -183,7 +182,7 @@ def _into_frame(mean: Tensor) -> Tensor:
 
 
 def _row(poses: Similarity, row: int) -> Similarity:
-    return Similarity(poses.scale[row : row + 1], poses.rotation[row : row + 1], poses.translation[row : row + 1])
+    return poses[row : row + 1]
 
 
 def _stack(poses: Sequence[Similarity]) -> Similarity:

@@ -12,19 +12,10 @@ from torchface.geometry.similarity import Similarity
 from torchface.landmarks.scans.face_frame import FaceFrame
 from torchface.landmarks.scans.scan_landmarks import ScanLandmarks, scan_landmarks
 from torchface.landmarks.scans.uv_detector import UVLandmarkDetector
-from torchface.landmarks.scans.uv_landmark_names import LINES, UV_LANDMARK_NAMES, uv_landmarks_from_ibug
+from torchface.landmarks.scans.uv_landmark_names import IBUG_ROWS, LINES, UV_LANDMARK_NAMES, uv_landmarks_from_ibug
 from torchface.mesh import Mesh
 
 _SAME_LINE = 12.0
-_UV_LANDMARKS_IN_IBUG = {"nose": 30, "between_eyes": 27, "mouth_top": 51, "mouth_bottom": 57}
-_CORNERS_IN_IBUG = {
-    "right_eye_outer": 36,
-    "right_eye_inner": 39,
-    "left_eye_inner": 42,
-    "left_eye_outer": 45,
-    "right_mouth_corner": 48,
-    "left_mouth_corner": 54,
-}
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,22 +126,8 @@ def scan_pairs(features: TemplateFeatures, found: ScanLandmarks, scan: Mesh) -> 
     )
 
 
-def contour_correspondences(
-    detector: UVLandmarkDetector, template: Mesh, scan: Mesh, pose: Similarity | None = None
-) -> LandmarkPairs:
-    """Pairs of template vertex and scan point: the twelve landmarks and what lies along lips and lids.
-
-    Args:
-        detector: fitted with a frame.
-        template: a face, millimetres; annotations are used where it has them.
-        scan: millimetres, in any pose.
-        pose: a rough one, from the scan's space to the detector's frame, where it is known.
-    """
-    return scan_pairs(template_features(template, detector), scan_landmarks(detector, scan, pose), scan)
-
-
 def _annotated_landmarks(template: Mesh, ibug: Tensor) -> dict[str, int]:
-    named = {name: int(ibug[row]) for name, row in {**_UV_LANDMARKS_IN_IBUG, **_CORNERS_IN_IBUG}.items()}
+    named = {name: int(ibug[row]) for name, row in IBUG_ROWS.items()}
     named_points = uv_landmarks_from_ibug(template.vertices[ibug].double())
     for name in ("right_cheek", "left_cheek"):
         distance = (template.vertices.double() - named_points[UV_LANDMARK_NAMES.index(name)]).norm(dim=-1)

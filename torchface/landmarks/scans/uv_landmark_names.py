@@ -33,7 +33,7 @@ LINES = {
 }
 """The traced lines and the landmarks at their ends, the one on the image's left first."""
 
-_IBUG = {
+IBUG_ROWS = {
     "nose": 30,
     "between_eyes": 27,
     "right_eye_outer": 36,
@@ -45,6 +45,8 @@ _IBUG = {
     "mouth_top": 51,
     "mouth_bottom": 57,
 }
+"""The rows of iBUG's 68 that ten of the twelve are; cheeks lie between others."""
+
 _CHEEKS = {"right_cheek": (36, 48, 3), "left_cheek": (45, 54, 13)}
 
 
@@ -73,7 +75,7 @@ def uv_landmarks_from_ibug(points: Tensor) -> Tensor:
     if points.ndim < 2 or points.shape[-2] != 68:
         raise ShapeError(f"uv_landmarks_from_ibug: found {tuple(points.shape)}, expected (...,68,D)")
     rows = [
-        points[..., _IBUG[name], :] if name in _IBUG else points[..., list(_CHEEKS[name]), :].mean(-2)
+        points[..., IBUG_ROWS[name], :] if name in IBUG_ROWS else points[..., list(_CHEEKS[name]), :].mean(-2)
         for name in UV_LANDMARK_NAMES
     ]
     return torch.stack(rows, dim=-2)

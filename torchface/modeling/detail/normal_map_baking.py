@@ -12,8 +12,8 @@ from torch import Tensor
 from torchface.errors import ShapeError, TopologyError, ValueRangeError
 from torchface.geometry.meshes.normal_maps import DetailMaps, encode_normals, flat_normal_map
 from torchface.geometry.meshes.operators import vertex_normals
+from torchface.geometry.meshes.rasterization import TexelMap, interpolate, rasterise_uvs
 from torchface.geometry.meshes.tangent_space import TangentSpace, tangent_space, to_tangent_space
-from torchface.geometry.meshes.uv_raster import TexelMap, interpolate, rasterise_uvs
 from torchface.geometry.similarity import Similarity
 from torchface.mesh import Mesh
 from torchface.modeling.detail.scan_alignment import Correspondences, ScanAlignment, align_scan

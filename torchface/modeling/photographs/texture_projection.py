@@ -11,8 +11,7 @@ from torch import Tensor
 from torchface.errors import AlignmentError, ShapeError, TopologyError
 from torchface.geometry.cameras.pinhole import Camera
 from torchface.geometry.meshes.operators import border_vertices, components, edges, vertex_normals
-from torchface.geometry.meshes.uv_margin import laid_out
-from torchface.geometry.meshes.uv_raster import rasterise_uvs
+from torchface.geometry.meshes.rasterization import rasterise_uvs
 from torchface.geometry.meshes.vertex_graph import VertexGraph
 from torchface.mesh import Mesh
 from torchface.rendering.camera_visibility import Shown, shown_in
@@ -137,7 +136,7 @@ def photo_texture(
     under = texels.interpolate(filled, faces)
     share = texels.interpolate(alpha[:, None], faces) * (total > 0)
     values = torch.lerp(under, values / total.clamp(min=1e-9), share).clamp(0, 1)
-    return PhotoTexture(laid_out(values, texels), colors.clamp(0, 1).float(), alpha.float())
+    return PhotoTexture(texels.image(values), colors.clamp(0, 1).float(), alpha.float())
 
 
 def _outer_border(vertices: Tensor, faces: Tensor) -> Tensor:

@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from torchface.geometry.meshes.operators import components, triangle_normals, vertex_normals
-from torchface.geometry.meshes.proximity import SurfaceIndex
+from torchface.geometry.meshes.surface_index import SurfaceIndex
 from torchface.geometry.similarity import similarity_transform
 from torchface.mesh import Mesh
 from torchface.rendering.raycast import RayCaster

@@ -16,13 +16,13 @@ from torchface.correctives.corrective_shapes import Correctives
 from torchface.errors import ValueRangeError
 from torchface.geometry.meshes.contact import ContactPairs
 from torchface.geometry.meshes.deformation import degenerate_triangles, triangle_frames
-from torchface.geometry.meshes.operators import components, vertex_normals
-from torchface.geometry.meshes.reconstruction import (
+from torchface.geometry.meshes.gradient_reconstruction import (
     GradientReconstruction,
     PreparedReconstruction,
     SoftConstraints,
     offset_constraints,
 )
+from torchface.geometry.meshes.operators import components, vertex_normals
 from torchface.geometry.similarity import Similarity, similarity_transform
 from torchface.mesh import Mesh
 from torchface.modeling.rigging.lid_and_lip_closing import Seams, find_seams

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from torchface.geometry.meshes.operators import vertex_normals
-from torchface.geometry.meshes.proximity import SurfaceIndex
+from torchface.geometry.meshes.surface_index import SurfaceIndex
 from torchface.rendering.raycast import RayCaster
 
 _LIFT = 0.05

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from torchface.errors import ValueRangeError
 from torchface.geometry.meshes.operators import triangle_areas
-from torchface.geometry.meshes.proximity import SurfaceIndex
+from torchface.geometry.meshes.surface_index import SurfaceIndex
 from torchface.registration.nonrigid.correspondence import (
     Correspondences,
     correspondences,
@@ -22,11 +22,11 @@ from torchface.registration.nonrigid.correspondence import (
 from torchface.registration.nonrigid.landmark_pull import LandmarkPull
 from torchface.registration.nonrigid.linear_step import Contacts, Data, LinearStep
 from torchface.registration.nonrigid.lip_contact import ContactPull
+from torchface.registration.nonrigid.registration_record import StageRecord
 from torchface.registration.nonrigid.schedule import Level, Schedule, Stage
-from torchface.registration.nonrigid.stage_record import StageRecord
 from torchface.registration.nonrigid.stiffness import identity_maps, linked_edges, positions, stiffness_rows
 from torchface.registration.nonrigid.subspace import Subspace, all_maps, graph, translations
-from torchface.registration.nonrigid.unfolding import turned_over, unfolded
+from torchface.registration.nonrigid.unfolding import grown, turned_over, unfolded
 from torchface.rendering.raycast import RayCaster
 
 _AREA_OF_ONE = 10.0
@@ -107,9 +107,7 @@ class Deformer:
                 break
             around = torch.zeros(len(self.rest), dtype=torch.bool)
             around[self.faces[folded].flatten()] = True
-            for _ in range(circle):
-                around[self.faces[around[self.faces].any(-1)].flatten()] = True
-            self._folded |= around
+            self._folded |= grown(around, self.faces, circle)
             self.maps = start
             record = self._attempt(stage, number, space, vertices)
         return replace(record, seconds=time.perf_counter() - begin)

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from torchface.geometry.meshes.contact import ContactFinder
 from torchface.geometry.meshes.operators import vertex_normals
-from torchface.geometry.meshes.proximity import SurfaceIndex
+from torchface.geometry.meshes.surface_index import SurfaceIndex
 from torchface.mesh import Mesh
 from torchface.rendering.raycast import RayCaster
 

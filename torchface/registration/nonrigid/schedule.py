@@ -67,7 +67,7 @@ class Stage:
 
 @dataclass(frozen=True)
 class Schedule:
-    """A whole registration.
+    """A whole registration; with ``Level.VERTICES`` in every stage it is the paper's.
 
     Args:
         stages: in order; stiffness falls, the weight of the landmarks with it.
@@ -113,14 +113,3 @@ DEFAULT_SCHEDULE = Schedule(
     )
 )
 """For heads of any resolution."""
-
-FULL_SCHEDULE = Schedule(
-    (
-        Stage(Level.VERTICES, 18.0, 10.0, 30.0, iterations=4),
-        Stage(Level.VERTICES, 5.0, 10.0, 20.0),
-        Stage(Level.VERTICES, 1.2, 5.0, 12.0, iterations=2, contact_weight=2.0),
-        Stage(Level.VERTICES, 0.3, 2.0, 8.0, iterations=2, contact_weight=2.0),
-        Stage(Level.VERTICES, 0.2, 1.0, 5.0, iterations=2, contact_weight=2.0),
-    )
-)
-"""An affine map a vertex from start to end, as in the paper: slower, and the measure for the default."""

@@ -44,12 +44,12 @@ def unfolded(rest: Tensor, current: Tensor, faces: Tensor) -> Tensor:
             break
         inside = torch.zeros(len(rest), dtype=torch.bool)
         inside[faces[folded].flatten()] = True
-        inside = _grown(inside, faces, circle)
+        inside = grown(inside, faces, circle)
         label = components(faces[inside[faces].all(-1)], len(rest))
         moved = best.clone()
         for patch in label[inside].unique():  # a patch a turn: they are a few
             own = inside & (label == patch)
-            around = _grown(own, faces, _AROUND) & ~inside
+            around = grown(own, faces, _AROUND) & ~inside
             if int(around.sum()) >= 4:
                 moved[own] = _by_neighbours(rest[own], rest[around], best[around])
         left = int(turned_over(rest, moved, faces).sum())
@@ -58,7 +58,8 @@ def unfolded(rest: Tensor, current: Tensor, faces: Tensor) -> Tensor:
     return best
 
 
-def _grown(mask: Tensor, faces: Tensor, rings: int) -> Tensor:
+def grown(mask: Tensor, faces: Tensor, rings: int = 1) -> Tensor:
+    """A mask (V,) with so many rings of triangles around it."""
     mask = mask.clone()
     for _ in range(rings):
         mask[faces[mask[faces].any(-1)].flatten()] = True

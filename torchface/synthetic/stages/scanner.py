@@ -3,42 +3,40 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 
 import torch
 from torch import Tensor
 
 from torchface.errors import NameMismatchError, ValueRangeError
-from torchface.files.documents import write_json
-from torchface.files.whole_files import all_or_none, made_folder
-from torchface.geometry.meshes.operators import components, corners
-from torchface.geometry.meshes.proximity import SurfaceIndex
-from torchface.io.mesh_files import save_mesh
+from torchface.geometry.cameras.pinhole import Camera, look_at
+from torchface.geometry.meshes.operators import components, corners, triangle_normals
+from torchface.geometry.meshes.surface_index import SurfaceIndex
 from torchface.landmarks.scans.contours import evenly_spaced
 from torchface.landmarks.scans.landmark_pairs import template_features
-from torchface.landmarks.scans.scan_annotations import ScanAnnotation, save_annotations
+from torchface.landmarks.scans.scan_annotations import ScanAnnotation
 from torchface.landmarks.scans.uv_landmark_names import LINES, UV_LANDMARK_NAMES, uv_landmarks_from_ibug
 from torchface.mesh import Mesh
+from torchface.rendering.clay_shading import Lighting, render
+from torchface.rendering.raycast import RayCaster
 from torchface.rig import BlendshapeRig
 from torchface.synthetic.stages.depth_fusion import DepthNoise, fuse
 from torchface.synthetic.stages.hair_and_collar import Dress, dressed
-from torchface.synthetic.stages.scan_photographs import Photography, photographed
 from torchface.synthetic.stages.subdivision import finely_coloured
 
 _DISTANCE = 520.0
 _VIEWS = tuple((yaw, pitch) for pitch in (-14.0, 22.0) for yaw in (-100.0, -65.0, -32.0, 0.0, 32.0, 65.0, 100.0))
 _LINE_POINTS = 60
-_MENPO_GROUPS = (
-    ("chin", range(17)),
-    ("leyebrow", range(17, 22)),
-    ("reyebrow", range(22, 27)),
-    ("nose", range(27, 36)),
-    ("leye", range(36, 42)),
-    ("reye", range(42, 48)),
-    ("mouth", range(48, 68)),
-)
+_YAWS = (0.0, -55.0, 55.0)
+_FLASH = Lighting(lights=(((0.3, 0.3, 0.9), 0.35), ((-0.4, 0.1, 0.8), 0.2)), ambient=0.5, occlusion_rays=0, gloss=0.03)
+
+
+@dataclass(frozen=True)
+class Photography:
+    """How images are taken: ``height`` pixels that cover ``span`` millimetres."""
+
+    height: int = 900
+    span: float = 330.0
 
 
 @dataclass(frozen=True)
@@ -137,7 +135,7 @@ def scan_head(head: Mesh, seed: int, settings: ScannerSettings | None = None) ->
     fused = Mesh(*fuse(subject, _eyes(centre), settings.voxel, settings.noise, generator))
     fused = _torn(fused, landmarks, settings, generator)
     if settings.photography is not None:
-        fused = photographed(fused, subject, centre, settings.photography)
+        fused = _photographed(fused, subject, centre, settings.photography)
     rotation, translation = _pose(settings.any_pose, generator)
 
     def moved(points: Tensor) -> Tensor:
@@ -151,37 +149,40 @@ def scan_head(head: Mesh, seed: int, settings: ScannerSettings | None = None) ->
     return RawScan(mesh, moved(landmarks), truth, rotation, translation - rotation @ centre)
 
 
-def write_scan(scan: RawScan, folder: str | Path, name: str) -> Path:
-    """Writes ``name.obj`` with its material and image, and ``name.ljson`` with the 68 landmarks, as menpo does.
+def _photographed(scan: Mesh, subject: Mesh, centre: Tensor, photography: Photography) -> Mesh:
+    """A scan with a texture and texture coordinates.
 
-    Returns:
-        The path of the OBJ file.
+    Args:
+        scan: the fused surface, in the subject's place.
+        subject: what stood before the cameras, with colours or a texture.
+        centre: of the face, (3,).
+        photography: how images are taken.
     """
-    folder = Path(folder)
-    groups = [{"label": label, "mask": list(rows)} for label, rows in _MENPO_GROUPS]
-    landmarks = {"points": scan.ibug.tolist(), "connectivity": []}
-    document = {"version": 2, "labels": groups, "landmarks": landmarks}
-    with made_folder(folder), all_or_none():
-        write_json(folder / f"{name}.ljson", document, indent=None)
-        save_mesh(scan.mesh, folder / f"{name}.obj")
-    return folder / f"{name}.obj"
+    width = round(photography.height * 0.8)
+    cameras = [look_at(centre, yaw, 0.0, photography.span, width, photography.height) for yaw in _YAWS]
+    texture = torch.cat([render(subject, camera, lighting=_FLASH, samples=1) for camera in cameras], dim=2)
+    best = _best_view(scan, cameras)
+    pixels = torch.stack([camera.project(scan.vertices.double()) for camera in cameras])
+    wide = texture.shape[2]
+    u = (pixels[..., 0].clamp(0, width - 1) + 0.5 + width * torch.arange(len(cameras))[:, None]) / wide
+    v = 1 - (pixels[..., 1].clamp(0, photography.height - 1) + 0.5) / photography.height
+    uvs = torch.stack([u, v], dim=-1).float()
+    rows = scan.faces + best[:, None] * len(scan.vertices)
+    used, uv_faces = rows.unique(return_inverse=True)
+    return replace(scan, texture=texture, uvs=uvs.view(-1, 2)[used], uv_faces=uv_faces)
 
 
-def write_scans(
-    heads: Iterable[Mesh], folder: str | Path, settings: ScannerSettings | None = None, seed: int = 0
-) -> list[Path]:
-    """Scans heads one by one into a folder: ``scan_000.obj`` and so on, and ``annotations.json`` with the truth.
-
-    Returns:
-        The paths of the OBJ files.
-    """
-    paths, annotations = [], {}
-    for i, head in enumerate(heads):
-        scan = scan_head(head, seed + i, settings)
-        paths.append(write_scan(scan, folder, f"scan_{i:03d}"))
-        annotations[paths[-1].name] = scan.annotation
-    save_annotations(annotations, Path(folder) / "annotations.json")
-    return paths
+def _best_view(scan: Mesh, cameras: list[Camera]) -> Tensor:
+    """The camera (F,) that sees a triangle most frontally, one whose view is free before one whose view is not."""
+    middle = torch.stack(corners(scan.vertices.double(), scan.faces)).mean(0)
+    normals = triangle_normals(scan.vertices.double(), scan.faces)
+    caster = RayCaster(scan.vertices, scan.faces)
+    scores = []
+    for camera in cameras:
+        toward = torch.nn.functional.normalize(camera.centre.double() - middle, dim=-1)
+        hidden = caster.occluded(middle + 0.5 * normals + 0.5 * toward, toward)
+        scores.append((normals * toward).sum(-1) - 2.0 * hidden)
+    return torch.stack(scores).argmax(0)
 
 
 def _truth(head: Mesh, landmarks: Tensor) -> ScanAnnotation:

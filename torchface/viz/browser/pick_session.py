@@ -12,7 +12,7 @@ from torch import Tensor
 
 from torchface.attachment import Attachment
 from torchface.errors import ValueRangeError
-from torchface.geometry.meshes.proximity import SurfaceIndex
+from torchface.geometry.meshes.surface_index import SurfaceIndex
 from torchface.io.landmarks.picks import Correspondences, LandmarkVertices
 from torchface.mesh import Mesh
 from torchface.rendering.raycast import RayCaster

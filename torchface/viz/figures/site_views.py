@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from torchface.geometry.meshes.operators import corners
-from torchface.geometry.meshes.proximity import SurfaceIndex
+from torchface.geometry.meshes.surface_index import SurfaceIndex
 from torchface.mesh import Mesh
 from torchface.rendering.clay_shading import render
 from torchface.rendering.compositing import from_figure, sheet

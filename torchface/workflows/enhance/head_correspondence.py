@@ -16,7 +16,7 @@ from torchface.errors import AlignmentError, FileFormatError, ShapeError, Topolo
 from torchface.files.checkpoints import read_checkpoint, write_checkpoint
 from torchface.files.content_keys import content_key
 from torchface.geometry.meshes.operators import vertex_normals
-from torchface.geometry.meshes.proximity import SurfaceIndex
+from torchface.geometry.meshes.surface_index import SurfaceIndex
 from torchface.geometry.similarity import Similarity, similarity_transform
 from torchface.io.landmarks.picks import load_correspondences
 from torchface.io.tables.csv_table import TableReader

@@ -13,7 +13,7 @@ from torchface.capture import align_take
 from torchface.capture.markers.rest_pose import check_not_collinear, check_not_mirrored
 from torchface.enhancement.thin_shell import LEAST_POINTS, ThinShell, rigid_motion
 from torchface.errors import AlignmentError, ShapeError, TopologyError, ValueRangeError
-from torchface.geometry.meshes.proximity import SurfaceIndex
+from torchface.geometry.meshes.surface_index import SurfaceIndex
 from torchface.geometry.similarity import Similarity, similarity_transform
 from torchface.mesh import Mesh
 from torchface.rig import BlendshapeRig

@@ -10,8 +10,8 @@ import torch
 from torch import Tensor
 
 from torchface.enhancement.detail.low_pass import small_part_triangles
-from torchface.geometry.meshes.proximity import SurfaceIndex
-from torchface.geometry.meshes.uv_raster import interpolate
+from torchface.geometry.meshes.rasterization import interpolate
+from torchface.geometry.meshes.surface_index import SurfaceIndex
 from torchface.mesh import Mesh
 from torchface.progress import Progress
 from torchface.rig import BlendshapeRig

@@ -6,8 +6,8 @@ import torch
 from torch import Tensor
 
 from torchface.enhancement.detail.detail_encodings import DisplacementDetail
+from torchface.geometry.meshes.rasterization import rasterise_uvs
 from torchface.geometry.meshes.region_maps import RegionMaps
-from torchface.geometry.meshes.uv_raster import rasterise_uvs
 from torchface.geometry.similarity import Similarity
 from torchface.mesh import Mesh
 from torchface.modeling.detail.normal_map_baking import NormalMap, bake_normal_map, dilate

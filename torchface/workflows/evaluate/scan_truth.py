@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from torchface.errors import AlignmentError, TopologyError
-from torchface.geometry.meshes.proximity import SurfaceIndex
+from torchface.geometry.meshes.surface_index import SurfaceIndex
 from torchface.geometry.rotations import rotation_matrix
 from torchface.io import load_mesh
 from torchface.progress import Progress

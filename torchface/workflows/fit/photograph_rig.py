@@ -18,7 +18,7 @@ from torchface.modeling import FitSettings, ImageFit, fit_images, transfer_with_
 from torchface.modeling.photographs.landmark_view import JAW
 from torchface.number_checks import checked_count
 from torchface.progress import Progress, silent
-from torchface.registration import dressed_as, hidden_parts
+from torchface.registration import hidden_parts, with_template_skin
 from torchface.rendering.compositing import save_rendered_image
 from torchface.rig import BlendshapeRig
 from torchface.workflows.fit.fit_checks import eyes_distances, landmark_lines, one_person_lines
@@ -167,7 +167,7 @@ def fit_photographs(
         remarks += landmark_lines(photographs, images, marks, fit, settings.landmark_model, bare)
     # Photographs show little of eyeballs and teeth: parts of their own keep the template's skin.
     unseen = hidden_parts(rig.neutral, torch.zeros(len(rig.vertices), dtype=torch.bool))
-    dressed = dressed_as(fit.mesh, rig.neutral, unseen)
+    dressed = with_template_skin(fit.mesh, rig.neutral, unseen)
     transferred = transfer_with_report(rig, dressed, progress=progress)
     progress("writing the rig and the overlays")
     overlays = tuple(out.with_name(f"{out.stem}_{i + 1}_{path.stem}.png") for i, path in enumerate(photographs))

@@ -44,7 +44,7 @@ class ScanSettings:
             is registered without landmarks.
         unit: of the scans' files; if absent metres for glTF, millimetres for the others.
         schedule, texture_size: see ``register``.
-        detector: a landmark detector for the scans without landmarks, by name or folder; see ``load_detector``.
+        detector: a landmark detector for the scans without landmarks, by name or folder; see ``zoo.get_model``.
         model: of faces in the template's topology, which each registration starts from; see ``register``.
 
     Raises:

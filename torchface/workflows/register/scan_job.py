@@ -11,16 +11,17 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from torchface import zoo
 from torchface.files.content_keys import content_key
 from torchface.io import load_mesh, save_mesh
 from torchface.io.meshes.named_files import named_files
-from torchface.landmarks.scans.detector_files import load_detector
+from torchface.landmarks import UVLandmarkDetector
 from torchface.landmarks.scans.landmark_pairs import AutomaticLandmarks
 from torchface.mesh import Annotations, Mesh
-from torchface.registration.in_place import in_place_of
 from torchface.registration.landmark_files import landmark_file, load_scan_landmarks
 from torchface.registration.model_fit import LinearShape
 from torchface.registration.nonrigid.schedule import Schedule
+from torchface.registration.registered_mesh import in_place_of
 from torchface.registration.scan_registration import Registration, register
 from torchface.rendering.clay_shading import render
 from torchface.rendering.compositing import sheet
@@ -153,7 +154,9 @@ class ScanJob:
 
     @cached_property
     def _detector(self) -> AutomaticLandmarks | None:
-        return None if self.detector is None else AutomaticLandmarks(load_detector(self.detector), self.template)
+        if self.detector is None:
+            return None
+        return AutomaticLandmarks(zoo.get_model(self.detector, UVLandmarkDetector), self.template)
 
     def __reduce__(self) -> tuple[Any, ...]:
         # Tensors would travel through shared memory, which containers keep small; arrays are copied.

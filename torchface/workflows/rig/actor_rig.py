@@ -15,7 +15,7 @@ from torchface.files.whole_files import all_or_none, check_writable, make_folder
 from torchface.geometry.meshes.normal_maps import DetailMaps
 from torchface.io import load_mesh, load_rig, save_rig
 from torchface.io.rig_files import check_rig_ending
-from torchface.landmarks.scans.detector_files import load_detector
+from torchface.landmarks import UVLandmarkDetector
 from torchface.landmarks.scans.landmark_pairs import AutomaticLandmarks
 from torchface.mesh import Mesh
 from torchface.modeling import (
@@ -35,7 +35,7 @@ from torchface.modeling import (
 from torchface.modeling.rigging.example_rigging import RiggingSchedule
 from torchface.modeling.rigging.part_clearance import Penetration, penetration
 from torchface.progress import Progress, silent
-from torchface.registration import Registration, dressed_as, hidden_parts, in_place_of, register
+from torchface.registration import Registration, hidden_parts, in_place_of, register, with_template_skin
 from torchface.registration.landmark_files import landmark_file, load_scan_landmarks
 from torchface.rendering.compositing import save_rendered_image
 from torchface.rig import BlendshapeRig
@@ -204,7 +204,7 @@ def _rig_actor(
     neutral = _at_rest(rig, shown, _upright(registration, rig.neutral))
     parts = inner_parts(rig)
     neutral = place_parts(rig, neutral, parts)
-    neutral = dressed_as(neutral, rig.neutral, hidden_parts(rig.neutral, registration.matched))
+    neutral = with_template_skin(neutral, rig.neutral, hidden_parts(rig.neutral, registration.matched))
     transferred = transfer_with_report(rig, neutral, progress=progress)
     actor: BlendshapeRig = transferred.rig
     learned: ExampleRig | None = None
@@ -258,7 +258,7 @@ class _Actor:
         marks = None if landmarks is None else load_scan_landmarks(landmarks, mesh, scan, options.unit)
         detector = None
         if marks is None and options.detector is not None:
-            detector = AutomaticLandmarks(load_detector(zoo.find(options.detector)), mesh)
+            detector = AutomaticLandmarks(zoo.get_model(options.detector, UVLandmarkDetector), mesh)
         return register(mesh, read, marks, model=model, detector=detector, texture_size=texture_size)
 
     def learned(

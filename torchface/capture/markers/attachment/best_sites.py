@@ -18,7 +18,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torchface.geometry.meshes.proximity import triangle_coordinates
+from torchface.geometry.meshes.surface_index import triangle_coordinates
 
 # Where few weights move, C is singular; a ten-thousandth of a weight a frame changes no distance that counts.
 _MIN_MOMENT = 1e-8

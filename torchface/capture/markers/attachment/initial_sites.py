@@ -10,7 +10,7 @@ from torchface.capture.markers.rest_pose import check_not_collinear
 from torchface.capture.markers.surface_motion import SurfaceMotion
 from torchface.errors import AlignmentError, ValueRangeError
 from torchface.geometry.meshes.operators import vertex_normals
-from torchface.geometry.meshes.proximity import SurfaceIndex
+from torchface.geometry.meshes.surface_index import SurfaceIndex
 from torchface.registration.rigid_icp import Samples, ScanPoints, find_pose
 from torchface.rig import BlendshapeRig
 from torchface.take import Take

@@ -7,8 +7,7 @@ from dataclasses import dataclass
 
 from torch import Tensor
 
-from torchface.geometry.meshes.uv_margin import laid_out
-from torchface.geometry.meshes.uv_raster import rasterise_uvs
+from torchface.geometry.meshes.rasterization import rasterise_uvs
 from torchface.mesh import Mesh
 
 _SIDE = 512
@@ -44,4 +43,4 @@ def painted(mesh: Mesh, rows: Tensor, values: Tensor, color: Callable[[Tensor], 
     if not bool(((corners >= tile) & (corners <= tile + 1)).all()):
         return Paint(None, color(values).float())
     texels = rasterise_uvs(mesh.uvs.double() - tile, mesh.uv_faces[rows], side, side)
-    return Paint(laid_out(color(texels.interpolate(values, mesh.faces[rows])), texels), None)
+    return Paint(texels.image(color(texels.interpolate(values, mesh.faces[rows]))), None)

@@ -8,7 +8,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from torchface.geometry.meshes.uv_raster import rasterise_uvs
+from torchface.geometry.meshes.rasterization import rasterise_uvs
 from torchface.io.gltf.part_colors.eyes import painted_eye, stands_alone
 from torchface.io.gltf.part_colors.lashes import painted_lashes
 from torchface.io.gltf.part_colors.painting import Paint

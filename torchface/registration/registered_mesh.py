@@ -1,4 +1,4 @@
-"""The skin of a registered face where the scan has shown none: eyeballs behind lids, the mouth behind lips."""
+"""A registered face at its template's place, with the template's material where the scan shows none."""
 
 from __future__ import annotations
 
@@ -8,12 +8,33 @@ import torch
 from torch import Tensor
 
 from torchface.geometry.meshes.operators import components
-from torchface.geometry.meshes.uv_raster import rasterise_uvs
+from torchface.geometry.meshes.rasterization import rasterise_uvs
+from torchface.geometry.similarity import similarity_transform
 from torchface.io.gltf.region_materials import part_material
 from torchface.mesh import Mesh
 
 _SEEN = 0.05
 _SEAM = 4
+
+
+def in_place_of(mesh: Mesh, template: Mesh, weights: Tensor | None = None) -> Mesh:
+    """A mesh rotated and translated, without scaling, to where a template of the same topology is.
+
+    Args:
+        mesh: V vertices.
+        template: V vertices.
+        weights: how much each vertex counts, (V,); equal if absent.
+
+    Example:
+        >>> from torchface.synthetic import neutral_head
+        >>> head = neutral_head(texture=False)
+        >>> moved = in_place_of(head.with_vertices(head.vertices + 50), head)
+        >>> torch.allclose(moved.vertices, head.vertices, atol=1e-3)
+        True
+    """
+    own, other = mesh.vertices.double(), template.vertices.double()
+    pose = similarity_transform(own[None], other[None], None if weights is None else weights[None], scale=False)
+    return mesh.with_vertices(pose.apply(own[None])[0].to(mesh.vertices))
 
 
 def hidden_parts(mesh: Mesh, matched: Tensor) -> Tensor:
@@ -45,8 +66,8 @@ def hidden_parts(mesh: Mesh, matched: Tensor) -> Tensor:
     return result
 
 
-def dressed_as(mesh: Mesh, template: Mesh, hidden: Tensor) -> Mesh:
-    """A mesh whose hidden parts wear the template's skin; its own where the template has none.
+def with_template_skin(mesh: Mesh, template: Mesh, hidden: Tensor) -> Mesh:
+    """A mesh whose hidden parts have the template's colours; the mesh's where the template has none.
 
     Args:
         mesh: registered, with the template's topology and texture coordinates.
@@ -59,7 +80,7 @@ def dressed_as(mesh: Mesh, template: Mesh, hidden: Tensor) -> Mesh:
         >>> head = neutral_head(texture=False)
         >>> black, white = (replace(head, colors=torch.full_like(head.vertices, grey)) for grey in (0.0, 1.0))
         >>> eyeball = head.annotations.regions["eyeball_left"]
-        >>> bool((dressed_as(black, white, eyeball).colors[:, 0] == eyeball).all())
+        >>> bool((with_template_skin(black, white, eyeball).colors[:, 0] == eyeball).all())
         True
     """
     if not hidden.any():

@@ -1,4 +1,4 @@
-"""``torchface train landmarks --data DIR... --out models/NAME``: 68 landmarks of faces in images.
+"""``torchface train landmark_trees --data DIR... --out models/NAME``: 68 landmarks of faces in images.
 
 A folder of iBUG's kind holds images with a ``.pts`` beside each; a dlib ``.xml`` names its images itself.
 ``--performers 2000`` learns from so many rendered images of synthetic people, alone or besides the data.
@@ -18,8 +18,8 @@ from torchface.landmarks.images.ibug_68 import relative_errors
 from torchface.progress import Progress, silent
 
 from .annotated_faces import NO_FACES, Faces, load_faces, rendered_faces
-from .held_out import held_out_people
 from .model_cards import model_card
+from .people_split import held_out_people
 from .recipe_settings import RecipeSettings
 from .rendered_people.portraits import FaceImageSettings
 from .runner import Recipe, Run, metric_lines, recipe

@@ -10,7 +10,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from torchface.errors import ShapeError, ValueRangeError
-from torchface.geometry.meshes.operators import border_edges, corners, vertex_normals
+from torchface.geometry.meshes.operators import border_edges, border_vertices, corners, vertex_normals
 
 _FIRST_CANDIDATES = 12
 _PAIRS_AT_ONCE = 2**19
@@ -146,11 +146,7 @@ class SurfaceIndex:
     def on_border(self, surface: SurfacePoints) -> Tensor:
         """Whether each point lies on an edge that only one triangle has, or at its ends, (Q,) bool."""
         if self._border is None:
-            edge = border_edges(self.faces)
-            vertex = torch.zeros(len(self.vertices), dtype=torch.bool)
-            for corner in range(3):
-                vertex[self.faces[edge[:, corner]][:, [c for c in range(3) if c != corner]].flatten()] = True
-            self._border = edge, vertex[self.faces]
+            self._border = border_edges(self.faces), border_vertices(self.faces, len(self.vertices))[self.faces]
         edge, vertex = self._border
         at_edge = (surface.barycentric < _ON_EDGE) & edge[surface.triangle]
         at_vertex = (surface.barycentric > 1 - _ON_EDGE) & vertex[surface.triangle]

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from torchface.errors import ShapeError, ValueRangeError
 from torchface.geometry.meshes.operators import border_vertices
-from torchface.geometry.meshes.proximity import SurfaceIndex
+from torchface.geometry.meshes.surface_index import SurfaceIndex
 
 SQUARE = torch.tensor([[0.0, 0, 0], [2, 0, 0], [2, 2, 0], [0, 2, 0], [1, 1, 0]])
 FAN = torch.tensor([[0, 1, 4], [1, 2, 4], [2, 3, 4], [3, 0, 4]])

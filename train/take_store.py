@@ -18,8 +18,8 @@ from .tensor_shards import Shards
 
 
 @dataclass(frozen=True, eq=False)
-class KeptTake:
-    """A take as it is kept.
+class StoredTake:
+    """A take as it is stored.
 
     Args:
         names: of the N shapes.
@@ -108,7 +108,7 @@ class TakeStore:
         self.solved = 0
         """How many takes so far were solved from markers."""
 
-    def kept(self, key: str, make: Callable[[], KeptTake]) -> KeptTake:
+    def stored(self, key: str, make: Callable[[], StoredTake]) -> StoredTake:
         """The next take; it is made where there is none of this key, or a damaged one."""
         path = self._paths[self._done]
         found = _unpacked(read_checkpoint(path, key))
@@ -124,13 +124,13 @@ class TakeStore:
         return TakesOnDisk(self._paths[: self._done])
 
 
-def _packed(take: KeptTake) -> dict[str, Tensor]:
+def _packed(take: StoredTake) -> dict[str, Tensor]:
     told = json.dumps({"names": take.names, "fps": take.fps, "solved": take.solved}).encode()
     return {"weights": take.weights.float(), "told": torch.frombuffer(bytearray(told), dtype=torch.uint8)}
 
 
-def _unpacked(found: dict[str, Tensor] | None) -> KeptTake | None:
+def _unpacked(found: dict[str, Tensor] | None) -> StoredTake | None:
     if found is None:
         return None
     told = json.loads(bytes(found["told"].tolist()))
-    return KeptTake(tuple(told["names"]), float(told["fps"]), found["weights"].double(), bool(told["solved"]))
+    return StoredTake(tuple(told["names"]), float(told["fps"]), found["weights"].double(), bool(told["solved"]))

@@ -14,10 +14,10 @@ from torchface.errors import FileFormatError, TorchfaceError
 from torchface.landmarks import LandmarkTrees, TreeSettings
 from torchface.landmarks.images.ibug_68 import box_around
 from torchface.rendering.compositing import save_rendered_image
-from train import landmarks as recipe
+from train import landmark_trees as recipe
 from train.annotated_faces import Faces, load_faces, rendered_faces
-from train.held_out import held_out_people
-from train.landmarks import Settings, evaluate, train
+from train.landmark_trees import Settings, evaluate, train
+from train.people_split import held_out_people
 from train.rendered_people.portraits import FaceImage, FaceImageSettings, face_images
 
 FEW = TreeSettings(cascades=3, trees=15, depth=3, features=80, test_splits=10, oversampling=6, components=10)

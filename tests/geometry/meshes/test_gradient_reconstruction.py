@@ -9,7 +9,7 @@ from scipy.spatial import Delaunay
 
 from torchface.errors import ShapeError, ValueRangeError
 from torchface.geometry.meshes.deformation import deformation_gradients, triangle_frames
-from torchface.geometry.meshes.reconstruction import GradientReconstruction, offset_constraints
+from torchface.geometry.meshes.gradient_reconstruction import GradientReconstruction, offset_constraints
 
 
 def sheet(seed: int, count: int = 30) -> tuple[torch.Tensor, torch.Tensor]:

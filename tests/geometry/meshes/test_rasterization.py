@@ -1,11 +1,14 @@
-"""Texels and their triangles, against points drawn in the triangles and against areas."""
+"""Texels against points in triangles and areas; pixels of a picture beside the rays through them."""
 
 import pytest
 import torch
 from scipy.spatial import Delaunay
 
 from torchface.errors import ShapeError, TopologyError, ValueRangeError
-from torchface.geometry.meshes.uv_raster import rasterise_uvs
+from torchface.geometry.cameras.pinhole import look_at
+from torchface.geometry.meshes.rasterization import rasterise, rasterise_uvs
+from torchface.rendering.raycast import RayCaster
+from torchface.synthetic import performer
 
 
 def layout(count: int = 200, seed: int = 0) -> tuple[torch.Tensor, torch.Tensor]:
@@ -72,3 +75,32 @@ def test_bad_layouts_are_refused() -> None:
     corner = torch.tensor([[0.0, 0], [1, 0], [0, 1]])
     with pytest.raises(TopologyError, match="times over"):
         rasterise_uvs(corner, torch.tensor([[0, 1, 2]]).repeat(10**5, 1), 1024, 1024)
+
+
+def test_pixels_show_what_rays_hit() -> None:
+    rig = performer()
+    vertices, faces = rig.vertices.double(), rig.neutral.faces
+    camera = look_at(vertices.mean(0), 35.0, 10.0, width=160, height=200)
+    seen = vertices @ camera.rotation.T + camera.translation
+    drawn = rasterise(camera.project(vertices), 1 / seen[:, 2], faces, 200, 160)
+    origins, ways = (one.reshape(-1, 3) for one in camera.rays())
+    hits = RayCaster(vertices, faces).cast(origins, ways)
+    a, b, c = (vertices[faces[hits.triangle.clamp(min=0), k]] for k in range(3))
+    front = (hits.triangle >= 0) & ((torch.linalg.cross(b - a, c - a) * ways).sum(1) < 0)
+    covered = torch.full((160 * 200,), -1)
+    covered[drawn.pixel] = drawn.triangle
+    assert len(drawn.pixel.unique()) == len(drawn.pixel)
+    assert float((covered[front] == hits.triangle[front]).float().mean()) > 0.995
+    assert int((covered[hits.triangle < 0] >= 0).sum()) < 10
+    depth = torch.full((160 * 200,), torch.nan, dtype=torch.float64)
+    depth[drawn.pixel] = 1 / drawn.nearness.double()
+    true = (hits.distance[:, None] * ways) @ camera.rotation.T
+    both = front & (covered == hits.triangle)
+    torch.testing.assert_close(depth[both], true[both, 2], atol=0.05, rtol=0)
+
+
+def test_nothing_behind_and_nothing_broken_is_drawn() -> None:
+    points = torch.tensor([[2.0, 2], [2, 8], [8, 2], [torch.nan, 3]])
+    near = torch.ones(4)
+    assert len(rasterise(points, near, torch.tensor([[0, 1, 2]]), 10, 10).pixel) == 28
+    assert len(rasterise(points, near, torch.tensor([[0, 2, 1], [0, 1, 3]]), 10, 10).pixel) == 0

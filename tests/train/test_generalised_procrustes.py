@@ -9,8 +9,8 @@ from scipy.spatial.transform import Rotation
 
 from torchface.errors import ShapeError, ValueRangeError
 from torchface.geometry import sample_batches as module
-from torchface.geometry.generalised_procrustes import aligned, generalised_procrustes
 from torchface.geometry.sample_batches import SampleRange, SamplesInMemory, blocks
+from train.generalised_procrustes import aligned, generalised_procrustes
 
 
 @pytest.fixture(scope="module")

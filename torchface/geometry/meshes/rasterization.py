@@ -1,0 +1,300 @@
+"""Triangles drawn into pixels: the texels of a layout, and pictures that must be quick, nearest in front."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchface.errors import ShapeError, TopologyError, ValueRangeError
+
+_ON_EDGE = 1e-6  # texels; a centre on the edge of two triangles belongs to both
+_LEAST_TEXEL_AREA = 1e-9  # square texels, twice
+_MAX_OVERLAP = 64
+_SLACK = 1e-3  # pixels: neighbours overlap by this, so that no pixel on a shared edge falls between them
+_LEAST_AREA = 1e-6  # square pixels, twice
+_LEVEL = 1e-9
+_BATCH = 2**21  # pixels of triangles at once, which bounds the memory
+_RINGS = 4  # texels of margin around the charts
+
+
+@dataclass(frozen=True, eq=False)
+class TexelMap:
+    """The M texels of a texture that lie in a triangle; the rest of the texture is outside the charts.
+
+    Args:
+        height, width: of the texture.
+        texels: row-major indices, first row on top, ascending, (M,) int64.
+        triangles: (M,) int64.
+        barycentric: of the texel's centre in its triangle, (M,3) float64.
+    """
+
+    height: int
+    width: int
+    texels: Tensor
+    triangles: Tensor
+    barycentric: Tensor
+
+    def interpolate(self, values: Tensor, faces: Tensor) -> Tensor:
+        """Values (V,C) at triangle corners ``faces`` (F,3), interpolated at the texels, (M,C)."""
+        return interpolate(values, faces[self.triangles], self.barycentric)
+
+    def mask(self) -> Tensor:
+        """(H,W) bool."""
+        mask = torch.zeros(self.height * self.width, dtype=torch.bool, device=self.texels.device)
+        mask[self.texels] = True
+        return mask.view(self.height, self.width)
+
+    def image(self, values: Tensor, rings: int = _RINGS) -> Tensor:
+        """A texture (C,H,W) float32 of values (M,C) at the texels, with a margin so that no background shows at seams.
+
+        Around the charts stands the mean of the neighbours that have a colour, ring by ring; beyond that the mean of
+        all.
+
+        Args:
+            values: of each texel.
+            rings: how many texels wide the margin is.
+        """
+        channels = values.shape[1]
+        image = torch.zeros(channels, self.height * self.width, dtype=torch.float32)
+        image[:, self.texels] = values.T.float()
+        image = image.reshape(1, channels, self.height, self.width)
+        filled = self.mask()[None, None].float()
+        background = values.float().mean(0) if len(values) else torch.zeros(channels, dtype=torch.float32)
+        for _ in range(rings):  # a ring of texels at a time
+            count = torch.nn.functional.avg_pool2d(filled, 3, 1, 1, count_include_pad=True)
+            mean = torch.nn.functional.avg_pool2d(image * filled, 3, 1, 1) / count.clamp(min=1e-6)
+            image = torch.where(filled > 0, image, torch.where(count > 0, mean, image))
+            filled = (count > 1e-6).float()
+        return torch.where(filled > 0, image, background.reshape(1, channels, 1, 1))[0].contiguous()
+
+
+def interpolate(values: Tensor, corners: Tensor, barycentric: Tensor) -> Tensor:
+    """Values (V,C) at corners (M,3), weighted by barycentric coordinates (M,3): (M,C)."""
+    # Corner by corner: gathering (M,3,C) first takes thrice the time.
+    result = values[corners[:, 0]] * barycentric[:, :1]
+    for k in (1, 2):
+        result += values[corners[:, k]] * barycentric[:, k : k + 1]
+    return result
+
+
+def rasterise_uvs(uvs: Tensor, uv_faces: Tensor, height: int, width: int) -> TexelMap:
+    """Finds for every texel the triangle that its centre lies in.
+
+    The centre of texel (row, column) is at :math:`u = (column + 1/2)/W`, :math:`v = 1 - (row + 1/2)/H`. Where
+    triangles overlap, the first one has the texel. What lies outside the unit square is left out.
+
+    Args:
+        uvs: texture coordinates, origin at the lower left, (U,2).
+        uv_faces: their rows at each triangle's corners, (F,3) int64.
+        height, width: texels.
+
+    Raises:
+        ShapeError: a tensor has the wrong shape, or a side is not positive.
+        ValueRangeError: a texture coordinate is NaN or infinite.
+        TopologyError: triangles overlap so much that this is no layout.
+    """
+    if uvs.ndim != 2 or uvs.shape[1] != 2 or uv_faces.ndim != 2 or uv_faces.shape[1] != 3:
+        raise ShapeError(f"uvs: found {tuple(uvs.shape)} and {tuple(uv_faces.shape)}, expected (U,2) and (F,3)")
+    if height < 1 or width < 1:
+        raise ShapeError(f"texture size: found {height} x {width}, expected at least 1 x 1")
+    if not torch.isfinite(uvs).all():
+        bad = int((~torch.isfinite(uvs)).any(1).sum())
+        raise ValueRangeError(f"uvs: {bad} of {len(uvs)} are NaN or infinite; expected none")
+    upright = torch.stack([uvs[:, 0], 1 - uvs[:, 1]]).detach().cpu().double().numpy()
+    points = (upright * [[width], [height]] - 0.5).clip(-1e7, 1e7)
+    planes = _Planes.of(points, uv_faces.cpu().numpy(), height, width, _ON_EDGE, _LEAST_TEXEL_AREA)
+    _refuse_overlap(int(planes.rows.sum()), height * width)
+    owner = np.full(height * width, -1)
+    covered = 0
+    for row, column, plane in planes.samples(width, _ON_EDGE):
+        covered += len(row)
+        _refuse_overlap(covered, len(owner))
+        row *= width
+        row += column
+        owner[row[::-1]] = plane[::-1]  # of triangles that overlap the first is written last
+    texels = np.flatnonzero(owner >= 0)
+    triangles = planes.triangle[owner[texels]]
+    corners = points[:, uv_faces.cpu().numpy()[triangles]]
+    found = (texels, triangles, _barycentric(corners, np.stack([texels % width, texels // width]).astype(float)))
+    return TexelMap(height, width, *(torch.from_numpy(part).to(uvs.device) for part in found))
+
+
+def _barycentric(corners: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Signed shares of the area, (M,3), of points (2,M) in triangles (2,M,3); relative to a corner, for slivers."""
+    (x1, y1), (x2, y2), (x, y) = (corners[:, :, 1], corners[:, :, 2], points) - corners[:, :, 0]
+    area = x1 * y2 - y1 * x2
+    second, third = (x * y2 - y * x2) / area, (x1 * y - y1 * x) / area
+    return np.stack([1 - second - third, second, third], axis=1)
+
+
+def _refuse_overlap(work: int, texels: int) -> None:
+    if work > _MAX_OVERLAP * max(texels, 2**16):
+        raise TopologyError(
+            f"uvs: triangles cover the texture {work / texels:.0f} times over, expected a layout whose charts "
+            f"do not overlap (at most {_MAX_OVERLAP} times)"
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class DrawnPixels:
+    """The pixels that a mesh covers.
+
+    Args:
+        pixel: row-major index in the image, each once, (S,) int64.
+        triangle: in front there, (S,) int64.
+        barycentric: of the pixel's centre in the image, three times (S,) float32.
+        nearness: as the corners', interpolated, (S,) float32.
+    """
+
+    pixel: Tensor
+    triangle: Tensor
+    barycentric: tuple[Tensor, Tensor, Tensor]
+    nearness: Tensor
+
+    def of_vertices(self, values: Tensor, faces: Tensor) -> Tensor:
+        """Values (V,) of vertices at the pixels, (S,), linear in the image."""
+        corners = faces[self.triangle].unbind(1)
+        first, second, third = (values[corner] * share for corner, share in zip(corners, self.barycentric, strict=True))
+        return first + second + third
+
+
+def rasterise(points: Tensor, nearness: Tensor, faces: Tensor, height: int, width: int) -> DrawnPixels:
+    """What of a mesh each pixel of an image shows.
+
+    Every triangle is cut into rows of pixels and each row into pixels, all at once; where several cover one, the
+    nearest stays. Triangles that are seen from behind, or have a corner that is not finite, are left out.
+
+    Args:
+        points: the vertices in the image (V,2), pixels, centres at integers, x right, y down.
+        nearness: larger is nearer, linear in the image, as the inverse depth is, (V,).
+        faces: (F,3) int64, counter-clockwise as seen from in front.
+        height, width: of the image, pixels.
+
+    Raises:
+        ShapeError: points and nearness do not fit each other, or faces are not (F,3).
+    """
+    if points.ndim != 2 or points.shape[1] != 2 or nearness.shape != points.shape[:1]:
+        raise ShapeError(f"points: found {tuple(points.shape)} and {tuple(nearness.shape)}, expected (V,2) and (V,)")
+    if faces.ndim != 2 or faces.shape[1] != 3:
+        raise ShapeError(f"faces: found {tuple(faces.shape)}, expected (F,3)")
+    xy, near = points.detach().cpu().double().numpy().T.copy(), nearness.detach().cpu().double().numpy()
+    triangles = faces.cpu().numpy()
+    # Rows count downward: what is counter-clockwise on the mesh is clockwise here.
+    planes = _Planes.of(xy, triangles, height, width, _SLACK, _LEAST_AREA, facing=True)
+    across, down, rest = (near[triangles[planes.triangle].T][:, None] * planes.edges).sum(0)
+    row, column, plane = next(planes.samples(width, _SLACK, None))
+    value = (across[plane] * column + (down[plane] * row + rest[plane])).astype(np.float32)
+    pixel = row * width + column
+    kept = _nearest(pixel, value, height * width)
+    row, column, plane = row[kept], column[kept], plane[kept]
+    first, second = (
+        (a[plane] * column + (b[plane] * row + c[plane])).clip(0, 1).astype(np.float32) for a, b, c in planes.edges[:2]
+    )
+    third = np.maximum(1 - first - second, 0)
+    return DrawnPixels(
+        torch.from_numpy(pixel[kept]),
+        torch.from_numpy(planes.triangle[plane]),
+        (torch.from_numpy(first), torch.from_numpy(second), torch.from_numpy(third)),
+        torch.from_numpy(value[kept]),
+    )
+
+
+def _nearest(pixel: np.ndarray, nearness: np.ndarray, count: int) -> np.ndarray:
+    """Which samples are the nearest of their pixel, one a pixel."""
+    best = np.full(count, -np.inf, np.float32)
+    np.maximum.at(best, pixel, nearness)
+    winners = np.flatnonzero(nearness >= best[pixel])
+    chosen = np.full(count, -1)
+    chosen[pixel[winners]] = winners  # of samples that are equally near, one
+    return chosen[chosen >= 0]
+
+
+@dataclass(frozen=True, eq=False)
+class _Planes:
+    """P triangles that may cover a pixel, with linear functions ``a x + b y + c`` of the pixel.
+
+    Args:
+        triangle: their numbers, (P,) int64.
+        edges: of each corner's barycentric coordinate a, b and c, (3,3,P).
+        first, rows: the first row that each touches, and how many, (P,).
+    """
+
+    triangle: np.ndarray
+    edges: np.ndarray
+    first: np.ndarray
+    rows: np.ndarray
+
+    @classmethod
+    def of(
+        cls,
+        points: np.ndarray,
+        faces: np.ndarray,
+        height: int,
+        width: int,
+        slack: float,
+        least_area: float,
+        facing: bool = False,
+    ) -> _Planes:
+        """Of points (2,V) and faces (F,3); with ``facing`` clockwise ones are left out, as rows count downward."""
+        x, y = points
+        corners = faces.T.copy()
+        (x0, x1, x2), (y0, y1, y2) = x[corners], y[corners]
+        with np.errstate(invalid="ignore"):
+            area = (x2 - x0) * (y1 - y0) - (x1 - x0) * (y2 - y0)
+            size = area if facing else np.abs(area)
+        solid = np.flatnonzero((size > least_area) & (size < np.inf))
+        (x0, x1, x2), (y0, y1, y2) = x[corners[:, solid]], y[corners[:, solid]]
+        low, high = np.minimum(np.minimum(y0, y1), y2), np.maximum(np.maximum(y0, y1), y2)
+        left, right = np.minimum(np.minimum(x0, x1), x2), np.maximum(np.maximum(x0, x1), x2)
+        inside = (high >= -slack) & (low <= height - 1 + slack) & (right >= -slack) & (left <= width - 1 + slack)
+        low, high, triangle = low[inside], high[inside], solid[inside]
+        corners = corners[:, triangle]
+        xs, ys, share = x[corners], y[corners], 1 / area[triangle]
+        edges = np.empty((3, 3, len(triangle)))
+        for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
+            edges[i] = (ys[k] - ys[j]) * share, (xs[j] - xs[k]) * share, (xs[k] * ys[j] - xs[j] * ys[k]) * share
+        first = np.ceil(low - slack).clip(0, height).astype(np.int64)
+        last = np.floor(high + slack).clip(-1, height - 1).astype(np.int64)
+        return cls(triangle, edges, first, (last - first + 1).clip(0))
+
+    def samples(
+        self, width: int, slack: float, batch: int | None = _BATCH
+    ) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+        """Row and column of every pixel that a triangle covers, and which of the P it is; each (S,) int64, by triangle.
+
+        Args:
+            width: of the image, pixels.
+            slack: that triangles are wider by, pixels.
+            batch: about how many pixels are given at once, the last triangles' first; all if absent.
+        """
+        plane, row = _expanded(self.rows, self.first)
+        left, right = np.full(len(plane), -np.inf), np.full(len(plane), np.inf)
+        for a, b, c in self.edges:  # the three borders of every row
+            level = np.abs(a) < _LEVEL  # such an edge bounds no row
+            inverse = -1 / np.where(level, 1, a)
+            crossing = (b * inverse)[plane] * row + (c * inverse)[plane]
+            begins, ends = (a >= _LEVEL)[plane], (a <= -_LEVEL)[plane]
+            np.maximum(left, crossing, out=left, where=begins)
+            np.minimum(right, crossing, out=right, where=ends)
+        begin = np.ceil(left - slack).clip(0, width).astype(np.int64)
+        end = np.floor(right + slack).clip(-1, width - 1).astype(np.int64)
+        count = (end - begin + 1).clip(0)
+        total = count.cumsum()
+        pixels = int(total[-1]) if len(total) else 0
+        cuts = [0, *np.searchsorted(total, np.arange(batch or pixels, pixels, batch or 1)), len(count)]
+        for start, stop in reversed(list(pairwise(cuts))):
+            piece = slice(start, stop)
+            span, column = _expanded(count[piece], begin[piece])
+            yield row[piece][span], column, plane[piece][span]
+
+
+def _expanded(counts: np.ndarray, first: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """For each of some runs of ``counts`` whole numbers: which run, and the numbers from its first on."""
+    run = np.repeat(np.arange(len(counts)), counts)
+    shift = first - (np.cumsum(counts) - counts)
+    return run, np.arange(len(run)) + shift[run]
