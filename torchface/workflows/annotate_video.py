@@ -132,7 +132,7 @@ def _images(video: VideoFile, numbers: list[int]) -> dict[int, Tensor]:
         FileFormatError: the video is shorter.
         ValueRangeError: they do not fit into memory.
     """
-    wanted, found = set(numbers), {}
+    wanted, images = set(numbers), {}
     most = _MAX_PIXEL_BYTES // (3 * video.width * video.height)
     if len(wanted) > most:
         raise ValueRangeError(
@@ -141,13 +141,13 @@ def _images(video: VideoFile, numbers: list[int]) -> dict[int, Tensor]:
         )
     for number, frame in enumerate(video.color_frames()):
         if number in wanted:
-            found[number] = frame.clone()  # not the chunk that it came in
-            if len(found) == len(wanted):
+            images[number] = frame.clone()  # not the chunk that it came in
+            if len(images) == len(wanted):
                 break
-    missing = wanted - set(found)
+    missing = wanted - set(images)
     if missing:
         raise FileFormatError(f"{video.path}: found no frame {min(missing)}, expected the video that was tracked")
-    return found
+    return images
 
 
 def _identity(video: VideoFile) -> dict[str, Any]:

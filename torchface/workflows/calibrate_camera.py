@@ -193,10 +193,10 @@ def find_corners(image: Tensor, board: Board) -> Tensor | None:
     scale = min(1.0, _DETECTED_AT / max(grey.shape))
     small = grey if scale == 1.0 else cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
     flags = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_ACCURACY
-    good, found = cv2.findChessboardCornersSB(small, (board.columns, board.rows), flags=flags)
-    if not good or found is None or len(found) != board.columns * board.rows:
+    good, grid_corners = cv2.findChessboardCornersSB(small, (board.columns, board.rows), flags=flags)
+    if not good or grid_corners is None or len(grid_corners) != board.columns * board.rows:
         return None
-    corners = (found.reshape(-1, 1, 2) + 0.5) / scale - 0.5
+    corners = (grid_corners.reshape(-1, 1, 2) + 0.5) / scale - 0.5
     if scale < 1.0:
         grid = corners.reshape(board.rows, board.columns, 2)
         gap = min(float(np.linalg.norm(np.diff(grid, axis=axis), axis=-1).min()) for axis in (0, 1))

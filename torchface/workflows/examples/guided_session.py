@@ -61,16 +61,16 @@ def _session(
     frames: Iterator[tuple[float, Tensor]], say: Say, seconds: float, camera: str, more: float
 ) -> ExampleShapes:
     expressions = paper_expressions()
-    shown = []
+    faces = []
     started: float | None = None
-    for number, one in enumerate(expressions):
-        say(f"{number + 1} of {len(expressions)}, {one.name}: {one.prompt}")
+    for number, expression in enumerate(expressions):
+        say(f"{number + 1} of {len(expressions)}, {expression.name}: {expression.prompt}")
         window, started = _held(frames, started, seconds, more, say)
         if len(window) < _LEAST:
-            raise NoFaceError(_lost(camera, one, started is None, len(window)))
-        shown.append(calmest(torch.stack(window)))
+            raise NoFaceError(_lost(camera, expression, started is None, len(window)))
+        faces.append(calmest(torch.stack(window)))
     say("done")
-    return shown_examples([one.name for one in expressions], torch.stack(shown))
+    return shown_examples([expression.name for expression in expressions], torch.stack(faces))
 
 
 def _held(
@@ -106,6 +106,6 @@ def calmest(landmarks: Tensor) -> Tensor:
     return landmarks[int(motion.argmin())]
 
 
-def _lost(camera: str, one: ExampleExpression, ended: bool, found: int) -> str:
+def _lost(camera: str, expression: ExampleExpression, ended: bool, count: int) -> str:
     why = "the frames ended" if ended else "expected a face that stays in the picture"
-    return f"{camera}: found a face in {found} frames while {one.name} was asked for; {why}"
+    return f"{camera}: found a face in {count} frames while {expression.name} was asked for; {why}"

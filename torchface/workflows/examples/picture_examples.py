@@ -40,19 +40,19 @@ def picture_examples(
     files = _files(pictures)
     names = _names(files)
     finder = load_finder(landmarks, photographs=True).finder
-    found, sides = [], []
+    faces, sides = [], []
     for number, (path, name) in enumerate(zip(files, names, strict=True)):  # pictures differ in size
         progress("finding landmarks", number, len(files))
         pixels = (load_image(path)[:3].clamp(0, 1) * 255).round().to(torch.uint8)
         try:
-            found.append(find_landmarks(pixels, finder).landmarks)
+            faces.append(find_landmarks(pixels, finder).landmarks)
         except NoFaceError as error:
             raise NoFaceError(f"{path}: {str(error).partition(': ')[2]}; it should show {name}") from error
         sides.append(pixels.shape[1:])
     progress("finding landmarks", len(files), len(files))
     height = sides[names.index(NEUTRAL)][0]
     # The same picture in another resolution shows the same face.
-    scaled = [points * (height / side[0]) for points, side in zip(found, sides, strict=True)]
+    scaled = [points * (height / side[0]) for points, side in zip(faces, sides, strict=True)]
     return shown_examples(names, torch.stack(scaled))
 
 

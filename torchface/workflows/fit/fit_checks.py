@@ -98,11 +98,11 @@ def landmark_lines(
             continue
         name = photographs[i].name
         said = f"{name}: the given landmarks do not fit well, residual {misfit:.1%} of the eyes' distance"
-        found = _found_there(photographs[i], images[i], marks[i], finder)
-        if found is None:
+        reading = _found_there(photographs[i], images[i], marks[i], finder)
+        if reading is None:
             lines.append(f"{said}; {finder} finds no face there to compare with; look at them in the image of the fit")
             continue
-        other = float(misfits(bare(found.confident[None], [i]))[0])
+        other = float(misfits(bare(reading.confident[None], [i]))[0])
         lines.append(
             f"{said}; those that {finder} finds have {other:.1%}; look at both in the images of the fit"
             + (", and leave out --landmarks to take the found ones" if other < misfit else "")
@@ -112,8 +112,8 @@ def landmark_lines(
 
 def _found_there(photograph: Path, image: Tensor, marks: Tensor, finder: str | Path) -> PhotographLandmarks | None:
     """Found landmarks of the face that has given ones."""
-    seen = marks[torch.isfinite(marks).all(-1)]
-    middle, size = seen.mean(0), (seen.amax(0) - seen.amin(0)).amax()
+    known = marks[torch.isfinite(marks).all(-1)]
+    middle, size = known.mean(0), (known.amax(0) - known.amin(0)).amax()
     try:
         first = find_in_photographs([photograph], [image], finder)[0]
         centres = first.boxes[:, :2] + first.boxes[:, 2:] / 2

@@ -62,15 +62,15 @@ def is_landmark_file(path: Path) -> bool:
 
 def _rows_of(table: Path, photographs: Sequence[Path]) -> list[Tensor]:
     """A row of a table for each photograph."""
-    found = load_landmark_table(table)
-    if len(found.points) != len(photographs):
+    marks = load_landmark_table(table)
+    if len(marks.points) != len(photographs):
         raise NameMismatchError(
-            f"{table}: found landmarks of {len(found.points)} photographs, expected the {len(photographs)} given"
+            f"{table}: found landmarks of {len(marks.points)} photographs, expected the {len(photographs)} given"
         )
     rows = []
     for i, photograph in enumerate(photographs):  # a photograph at a time: they differ in size
         height, width = load_image(photograph).shape[-2:]
-        points = found.pixels(width, height)[i].double()
+        points = marks.pixels(width, height)[i].double()
         rows.append(points if len(points) == COUNT else landmarks_of_mesh(points))
     return rows
 
@@ -225,16 +225,16 @@ def find_in_photographs(
         NameMismatchError: the model is of another kind.
     """
     finder = load_finder(model, photographs=True, option="landmark model").finder
-    found = []
+    readings = []
     for path, image in zip(photographs, images, strict=True):  # one photograph at a time: they differ in size
         pixels = (image[:3].clamp(0, 1) * 255).round().to(torch.uint8)
         faces = find_faces_of_any_turn(pixels)
         try:
-            seen = find_landmarks(pixels, finder, face or 0, lambda _, faces=faces: faces)  # type: ignore[misc]
+            reading = find_landmarks(pixels, finder, face or 0, lambda _, faces=faces: faces)  # type: ignore[misc]
         except NoFaceError as error:
             raise NoFaceError(
                 f"{path}: {str(error).partition(': ')[2]}; give another photograph, or landmarks with --landmarks"
             ) from error
         size = (pixels.shape[2], pixels.shape[1])
-        found.append(PhotographLandmarks(path, str(model), seen, face or 0, faces.boxes, size))
-    return found
+        readings.append(PhotographLandmarks(path, str(model), reading, face or 0, faces.boxes, size))
+    return readings

@@ -16,17 +16,17 @@ _LIGHT = Lighting(occlusion_rays=0)
 _FOUND, _FIT = (0.1, 1.0, 0.2), (1.0, 0.1, 0.1)
 
 
-def overlay(fit: ImageFit, view: int, image: Tensor, found: Tensor) -> Tensor:
+def overlay(fit: ImageFit, view: int, image: Tensor, marks: Tensor) -> Tensor:
     """A photograph, the fit over it, and the landmarks: found green, fitted red; (3,H,W), cut to the head.
 
     Args:
         fit: of I photographs.
         view: which of them.
         image: it, (3,H,W).
-        found: its landmarks, (68,2).
+        marks: its landmarks, (68,2).
     """
-    camera, place = _cut(fit.cameras[view], found)
-    piece = _sampled(image, place)
+    camera, corner = _cut(fit.cameras[view], marks)
+    piece = _sampled(image, corner)
     mesh = fit.posed
     drawn = render(_clay(mesh), camera, lighting=_LIGHT, samples=1)
     origins, directions = camera.rays()
@@ -34,8 +34,8 @@ def overlay(fit: ImageFit, view: int, image: Tensor, found: Tensor) -> Tensor:
     hit = (caster.cast(origins.reshape(-1, 3), directions.reshape(-1, 3)).triangle >= 0).view(_OVER, _OVER)
     over = torch.where(hit, (1 - _SHARE) * piece + _SHARE * drawn, piece)
     dotted = piece
-    for points, color in ((found, _FOUND), (fit.landmarks[view], _FIT)):
-        dotted = _dotted(dotted, (points - place[:2]) * place[2], color)
+    for points, color in ((marks, _FOUND), (fit.landmarks[view], _FIT)):
+        dotted = _dotted(dotted, (points - corner[:2]) * corner[2], color)
     return torch.cat([piece, over, dotted], dim=2)
 
 
@@ -44,10 +44,10 @@ def _clay(mesh: Mesh) -> Mesh:
     return Mesh(mesh.vertices, mesh.faces)
 
 
-def _cut(camera: Camera, found: Tensor) -> tuple[Camera, Tensor]:
+def _cut(camera: Camera, marks: Tensor) -> tuple[Camera, Tensor]:
     """The camera of a square piece around the landmarks, and where that lies: left, top, pixels of it a pixel (3,)."""
-    seen = found[torch.isfinite(found).all(-1)]
-    low, high = seen.amin(0), seen.amax(0)
+    known = marks[torch.isfinite(marks).all(-1)]
+    low, high = known.amin(0), known.amax(0)
     side = float((high - low).max()) * (1 + 2 * _MARGIN)
     corner, scale = (low + high) / 2 - side / 2, _OVER / side
     zoom = torch.eye(3, dtype=torch.float64)
@@ -57,9 +57,9 @@ def _cut(camera: Camera, found: Tensor) -> tuple[Camera, Tensor]:
     return piece, torch.cat([corner, torch.tensor([scale], dtype=torch.float64)])
 
 
-def _sampled(image: Tensor, place: Tensor) -> Tensor:
-    steps = torch.arange(_OVER, dtype=torch.float64) / place[2]
-    y, x = torch.meshgrid(steps + place[1], steps + place[0], indexing="ij")
+def _sampled(image: Tensor, piece: Tensor) -> Tensor:
+    steps = torch.arange(_OVER, dtype=torch.float64) / piece[2]
+    y, x = torch.meshgrid(steps + piece[1], steps + piece[0], indexing="ij")
     height, width = image.shape[1:]
     uv = torch.stack([(x + 0.5) / width, 1 - (y + 0.5) / height], dim=-1).reshape(-1, 2)
     return sample_texture(image, uv).T.reshape(3, _OVER, _OVER)

@@ -103,8 +103,8 @@ class FittedHead:
         lines += self.remarks
         lines.append(f"identity: largest coefficient {float(fit.coefficients.abs().max()):.2f} standard deviations")
         strongest = fit.weights.argsort(descending=True)[:5].tolist()
-        shown = [f"{self.rig.names[k]} {float(fit.weights[k]):.2f}" for k in strongest if float(fit.weights[k]) > 0.05]
-        lines.append(f"expression: {', '.join(shown) or 'none'}")
+        listed = [f"{self.rig.names[k]} {float(fit.weights[k]):.2f}" for k in strongest if float(fit.weights[k]) > 0.05]
+        lines.append(f"expression: {', '.join(listed) or 'none'}")
         if fit.color is not None:
             lines.append(f"colour model: {float(fit.color.error.mean()):.3f} off, of 1 a channel")
         lines.append(f"rig: {len(self.rig.vertices)} vertices, {len(self.rig.names)} shapes transferred")

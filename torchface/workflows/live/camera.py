@@ -171,15 +171,15 @@ class _Pace:
 def list_cameras() -> dict[int, str]:
     """Cameras by number, with their names where the system gives them."""
     if sys.platform == "linux":
-        found = {}
+        cameras = {}
         for folder in Path("/sys/class/video4linux").glob("video*"):
             try:
                 number, first = int(folder.name.removeprefix("video")), (folder / "index").read_text().strip() == "0"
                 if first:  # the others are a camera's metadata
-                    found[number] = (folder / "name").read_text(errors="replace").strip()[:80]
+                    cameras[number] = (folder / "name").read_text(errors="replace").strip()[:80]
             except (OSError, ValueError):
                 continue
-        return dict(sorted(found.items()))
+        return dict(sorted(cameras.items()))
     cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
     return {number: "" for number in range(_MAX_PROBED) if _opens(number)}
 

@@ -51,9 +51,9 @@ class PersonSolver:
     def step(self, picture: np.ndarray, interval: float | None, controls: WebcamControls) -> LiveFrame:
         """Solves the next frame; see :class:`torchface.workflows.live.live_frames.FaceSolver`."""
         self._session.controls = controls
-        found = self._session.step(picture, _USUAL if interval is None else interval)
+        answer = self._session.step(picture, _USUAL if interval is None else interval)
         solved = LiveFrame(
-            found.weights, found.rotation, found.landmarks, found.iris, found.gaze, calibrated=found.calibrated
+            answer.weights, answer.rotation, answer.landmarks, answer.iris, answer.gaze, calibrated=answer.calibrated
         )
         self._ever = (self._ever and not controls.reset) or solved.seen
         # Before the first face the graph's head looks anywhere.
@@ -151,8 +151,8 @@ def go_live(
         every = settings.record is not None  # a film that is recorded loses no frame
         source = stack.enter_context(closing(open_source(settings.camera, notes, settings.size, every)))
         streams = stack.enter_context(WeightStreams(settings.addresses, ARKIT, source.video.fps, notes))
-        place = settings.record or RECORDINGS
-        recordings = Recordings(place, character, source.video.path.name, source.video.fps)
+        folder = settings.record or RECORDINGS
+        recordings = Recordings(folder, character, source.video.path.name, source.video.fps)
         watch = FaceWatch(lambda picture: len(shipped_detector()(picture)))
         prompt: Say = (lambda words: None) if settings.page else say
         session = LiveSession(source, solver, streams, recordings, notes, prompt, watch)

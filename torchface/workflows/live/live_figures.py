@@ -29,8 +29,8 @@ class LiveFigures:
         self.frames += 1
         self.found += seen
         latency = 1000 * (gone - came)
-        place = math.log(max(latency, _LEAST) / _LEAST) / math.log(_STEP)
-        self._histogram[min(int(place), _BINS)] += 1
+        step = math.log(max(latency, _LEAST) / _LEAST) / math.log(_STEP)
+        self._histogram[min(int(step), _BINS)] += 1
         self._recent.append((gone, latency))
         while gone - self._recent[0][0] > _RECENT:
             self._recent.popleft()
@@ -39,8 +39,8 @@ class LiveFigures:
         """From a frame's arrival to its packets on the way, milliseconds; 0 before the first."""
         if self.frames == 0:
             return 0.0
-        place = int(np.searchsorted(self._histogram.cumsum(), max(1, math.ceil(quantile * self.frames))))
-        return _LEAST * _STEP ** (place + 0.5)
+        bin_number = int(np.searchsorted(self._histogram.cumsum(), max(1, math.ceil(quantile * self.frames))))
+        return _LEAST * _STEP ** (bin_number + 0.5)
 
     @property
     def seconds(self) -> float:

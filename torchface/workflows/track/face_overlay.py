@@ -83,8 +83,8 @@ def video_light(tracked: Tracked) -> PointLight:
     Raises:
         AlignmentError: the frames show too little of the face.
     """
-    rig, shown = tracked.rig, tracked.seen.nonzero()[:, 0]
-    wanted = shown[torch.linspace(0, len(shown) - 1, min(_LIGHT_FRAMES, len(shown))).round().long()].tolist()
+    rig, visible = tracked.rig, tracked.seen.nonzero()[:, 0]
+    wanted = visible[torch.linspace(0, len(visible) - 1, min(_LIGHT_FRAMES, len(visible))).round().long()].tolist()
     frames, at = [], 0
     for chunk in tracked.video.color_chunks(_CHUNK):
         frames += [chunk[t - at] for t in wanted if at <= t < at + len(chunk)]
@@ -143,13 +143,13 @@ def shade_over(frame: Tensor, vertices: Tensor, faces: Tensor, camera: Camera) -
     origins, ways = part.rays()
     origins, ways = origins.reshape(-1, 3), ways.reshape(-1, 3)
     hits = RayCaster(vertices, faces).cast(origins, ways)
-    seen = hits.triangle >= 0
-    normals = vertex_normals(vertices, faces)[faces[hits.triangle[seen]]]
-    normals = torch.nn.functional.normalize((normals * hits.barycentric[seen][..., None]).sum(1), dim=-1)
-    light = (normals * ways[seen]).sum(1).abs()
+    hit = hits.triangle >= 0
+    normals = vertex_normals(vertices, faces)[faces[hits.triangle[hit]]]
+    normals = torch.nn.functional.normalize((normals * hits.barycentric[hit][..., None]).sum(1), dim=-1)
+    light = (normals * ways[hit]).sum(1).abs()
     drawn = torch.zeros(len(ways), 4)
-    drawn[seen, :3] = ((0.15 + 0.85 * light)[:, None] * torch.tensor(_SKIN, dtype=torch.float64)).float()
-    drawn[seen, 3] = _STRENGTH
+    drawn[hit, :3] = ((0.15 + 0.85 * light)[:, None] * torch.tensor(_SKIN, dtype=torch.float64)).float()
+    drawn[hit, 3] = _STRENGTH
     layer = drawn.view(part.height, part.width, 4).permute(2, 0, 1)[None]
     if step > 1:
         layer = torch.nn.functional.interpolate(layer, scale_factor=step, mode="bilinear", align_corners=False)

@@ -99,10 +99,10 @@ def side_by_side_drawer(tracked: Tracked) -> Callable[[int, Tensor], Tensor]:
 
 def head_window(tracked: Tracked) -> Camera:
     """The camera of the part of the image where the head is in a take, ``_HEIGHT`` pixels high; its pose is none's."""
-    seen = tracked.seen.nonzero()[:, 0]
+    visible = tracked.seen.nonzero()[:, 0]
     marks = tracked.rig.vertices[tracked.rig.neutral.landmarks].double()
     rotation, translation = (getattr(tracked.solution, name).detach().double() for name in ("rotation", "translation"))
-    rays = torch.einsum("tij,lj->tli", rotation[seen], marks) + translation[seen, None]
+    rays = torch.einsum("tij,lj->tli", rotation[visible], marks) + translation[visible, None]
     projected = rays @ tracked.calibration.intrinsics.double().T
     pixels = projected[..., :2] / projected[..., 2:].clamp(min=1.0)
     low, high = pixels.amin(1), pixels.amax(1)

@@ -42,7 +42,7 @@ def load_annotated_frames(folder: str | Path) -> list[AnnotatedFrame]:
         raise FileFormatError(f"{folder}: found no such folder, expected one with images and .pts files")
     frames = []
     for path in sorted(folder.glob("*.pts")):
-        image_path = next((found for end in IMAGE_ENDINGS if (found := path.with_suffix(end)).is_file()), None)
+        image_path = next((image for end in IMAGE_ENDINGS if (image := path.with_suffix(end)).is_file()), None)
         if image_path is None:
             raise FileFormatError(f"{path}: found no image beside it, expected {path.stem}.png or another")
         points = load_landmark_points(path).ibug()

@@ -245,20 +245,20 @@ class AppearanceModel(nn.Module):
         grey = grey_images(images)
         if initial.shape != (len(grey), COUNT, 2):
             raise ShapeError(f"initial: found {tuple(initial.shape)}, expected {(len(grey), COUNT, 2)}")
-        found = torch.full_like(initial, torch.nan)
+        refined = torch.full_like(initial, torch.nan)
         before, after = initial.new_full((2, len(initial)), torch.inf)
-        seen = torch.isfinite(initial).flatten(1).all(1) & (initial.flatten(1).std(1) > 0)
-        if seen.any():
-            crops, points = grey[seen], initial[seen].to(self.mean_shape)
+        usable = torch.isfinite(initial).flatten(1).all(1) & (initial.flatten(1).std(1) > 0)
+        if usable.any():
+            crops, points = grey[usable], initial[usable].to(self.mean_shape)
             first = points
             for level in self.levels:
                 crop = self.crop(crops, points, float(level.scale))
                 points = crop.pose.apply(self._refine_level(level, crop, crop.pose.undo(points)))
             # Both in the last crop: what is compared has been seen alike, and was computed once.
-            before[seen] = self._error_in(crop, first).to(initial)
-            after[seen] = self._error_in(crop, points).to(initial)
-            found[seen] = points.to(initial)
-        return AppearanceFit(found, after, before)
+            before[usable] = self._error_in(crop, first).to(initial)
+            after[usable] = self._error_in(crop, points).to(initial)
+            refined[usable] = points.to(initial)
+        return AppearanceFit(refined, after, before)
 
     def error(self, images: Tensor, landmarks: Tensor) -> Tensor:
         """How badly faces at these landmarks (B,68,2) look like the person, (B,), at the finest resolution."""
@@ -294,30 +294,30 @@ class AppearanceModel(nn.Module):
 
     def _refine_level(self, level: AppearanceLevel, crop: FaceCrop, initial: Tensor) -> Tensor:
         """The best landmarks, by residual and shape, of an initial guess and what its steps lead to; crop pixels."""
-        found = best = initial
-        state = self._shape(found)[1]
-        lowest = found.new_full((len(found),), torch.inf)
+        points = best = initial
+        state = self._shape(points)[1]
+        lowest = points.new_full((len(points),), torch.inf)
         precision = torch.cat([self.deviations.new_zeros(4), self.deviations.pow(-2)])
         terms = level.curvature_terms()
         still = torch.zeros_like(lowest, dtype=torch.bool)
         for iteration in range(self.settings.iterations + 1):
-            residual = level.residual(level.sample(crop.features, self._points(found)))
+            residual = level.residual(level.sample(crop.features, self._points(points)))
             energy = residual.left.square().sum((1, 2)) / level.noise + (precision * state.square()).sum(1)
             better = energy < lowest
-            best = torch.where(better[:, None, None], found, best)
+            best = torch.where(better[:, None, None], points, best)
             lowest = torch.where(better, energy, lowest)
             still = still | ~(energy < _ASTRAY * lowest)
             if iteration == self.settings.iterations or still.all():
                 break
-            moved = (level.step(residual, state, precision, terms) @ self.motions.flatten(1)).view_as(found)
-            warp = self._linear_parts(found)
-            pose, shape = self._shape(found - (warp * moved[:, :, None]).sum(3))
+            moved = (level.step(residual, state, precision, terms) @ self.motions.flatten(1)).view_as(points)
+            warp = self._linear_parts(points)
+            pose, shape = self._shape(points - (warp * moved[:, :, None]).sum(3))
             ahead = self._landmarks(pose, shape)
             still = still | ~self._plausible(ahead, pose, level)
-            ahead = torch.where(still[:, None, None], found, ahead)
+            ahead = torch.where(still[:, None, None], points, ahead)
             state = torch.where(still[:, None], state, shape)
-            still = still | ((ahead - found).flatten(1).abs().amax(1) < _STILL)
-            found = ahead
+            still = still | ((ahead - points).flatten(1).abs().amax(1) < _STILL)
+            points = ahead
         return best
 
     def _plausible(self, landmarks: Tensor, pose: PlanarPose, level: AppearanceLevel) -> Tensor:

@@ -48,11 +48,11 @@ def learn_appearance(
         _lay_out(model, level, resolution, grid)
     textures: list[list[Tensor]] = [[] for _ in grids]
     for number, (image, truth) in enumerate(zip(grey, landmarks, strict=True)):  # sizes differ
-        for level, grid, found in zip(model.levels, grids, textures, strict=True):
-            found.append(_textures(model, level, grid, image[None], truth[None]))
+        for level, grid, level_textures in zip(model.levels, grids, textures, strict=True):
+            level_textures.append(_textures(model, level, grid, image[None], truth[None]))
         progress("warping the images", number + 1, len(grey))
-    for level, found in zip(model.levels, textures, strict=True):
-        _learn_textures(model, level, torch.stack(found))
+    for level, level_textures in zip(model.levels, textures, strict=True):
+        _learn_textures(model, level, torch.stack(level_textures))
     return model.eval()
 
 
@@ -82,7 +82,7 @@ def _textures(model: AppearanceModel, level: AppearanceLevel, grid: FaceGrid, im
     points = with_forehead(crop.pose.undo(truth), model.settings.jaw_margin)
     corners = points[:, level.corner]
     middle = sample_pixels(crop.features, (corners * level.weight[..., None]).sum(2))
-    found = [middle]
+    parts = [middle]
     for axis in (0, 1):
         # The grid counts in places; a pixel is 1/spacing of one.
         step = grid.gradient[..., axis, None] / model.settings.spacing
@@ -90,8 +90,8 @@ def _textures(model: AppearanceModel, level: AppearanceLevel, grid: FaceGrid, im
             sample_pixels(crop.features, (corners * (level.weight[..., None] + way * step)).sum(2))
             for way in (1.0, -1.0)
         )
-        found.append((ahead - behind) / 2)
-    return torch.cat(found)
+        parts.append((ahead - behind) / 2)
+    return torch.cat(parts)
 
 
 def _learn_textures(model: AppearanceModel, level: AppearanceLevel, textures: Tensor) -> None:

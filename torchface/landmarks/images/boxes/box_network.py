@@ -172,12 +172,12 @@ class BoxNetwork(nn.Module):
         peaks = likely * torch.where(max_pool2d(likely, 3, 1, 1) == likely, 1.0, BESIDE_A_PEAK)
         column = geometry[:, :1] + torch.arange(peaks.shape[3]).to(peaks)
         row = geometry[:, 1:2] + torch.arange(peaks.shape[2]).to(peaks)[:, None]
-        said = torch.cat([column, row, geometry[:, 2:]], 1).flatten(2)
+        cell = torch.cat([column, row, geometry[:, 2:]], 1).flatten(2)
         scores, cells = peaks.flatten(1).topk(self.faces, dim=1)
-        own = said.gather(2, cells[:, None].expand(-1, 5, -1)).transpose(1, 2)
-        middle = STRIDE * (own[..., :2] + 0.5) - 0.5
-        side = TYPICAL_SIDE * own[..., 2:3].clamp(-LOG_SIDES, LOG_SIDES).exp()
-        angle = own[..., 3:] / own[..., 3:].square().sum(-1, keepdim=True).clamp(min=1e-12).sqrt()
+        face = cell.gather(2, cells[:, None].expand(-1, 5, -1)).transpose(1, 2)
+        middle = STRIDE * (face[..., :2] + 0.5) - 0.5
+        side = TYPICAL_SIDE * face[..., 2:3].clamp(-LOG_SIDES, LOG_SIDES).exp()
+        angle = face[..., 3:] / face[..., 3:].square().sum(-1, keepdim=True).clamp(min=1e-12).sqrt()
         return torch.cat([middle, side, scores[..., None], angle], -1)
 
 

@@ -133,8 +133,8 @@ def fit_boxes(
 
     def loss(batch: _Batch, _: float) -> tuple[Tensor, float]:
         images = (batch.images.to(device).float() / 255).to(memory_format=torch.channels_last)
-        found = box_loss(model.maps(images), batch.faces.to(device), batch.uncertain.to(device))
-        return found, float(found.detach())
+        value = box_loss(model.maps(images), batch.faces.to(device), batch.uncertain.to(device))
+        return value, float(value.detach())
 
     key = content_key("box_training/2", config=model.config, source=source or {})
     task = DescentTask(partial(_drawn, pictures, settings.batch), loss, key)
@@ -169,17 +169,17 @@ def box_loss(maps: FaceMaps, faces: Tensor, uncertain: Tensor) -> Tensor:
     spread = (_SPREAD * side).clamp(min=_LEAST_SPREAD)[..., None, None]
     heat = torch.exp(-squared / (2 * spread.square())) * sure[..., None, None]
     best, owner = heat.amax(1), heat.argmax(1)  # (B,h,w)
-    own = (squared < 0.25).logical_and(sure[..., None, None]).any(1)
+    centred = (squared < 0.25).logical_and(sure[..., None, None]).any(1)
     reach = (cell - middle[:, :, None, None]).abs().amax(-1) < 0.6 * side[..., None, None]
     unknown = (reach & (there & uncertain)[..., None, None]).any(1)
-    counted = own | (~unknown)
+    counted = centred | (~unknown)
     logit = maps.centre[:, 0]
     likely = logit.sigmoid()
     positive = -(1 - likely).square() * logsigmoid(logit)
     negative = -((1 - best) ** 4) * likely.square() * logsigmoid(-logit)
-    count = own.sum().clamp(min=1)
-    centre = torch.where(own, positive, negative)[counted].sum() / count
-    described = (best > _DESCRIBED) & ~(unknown & ~own)
+    count = centred.sum().clamp(min=1)
+    centre = torch.where(centred, positive, negative)[counted].sum() / count
+    described = (best > _DESCRIBED) & ~(unknown & ~centred)
     image, row, column = described.nonzero(as_tuple=True)
     chosen = faces[image, owner[image, row, column]]
     wanted = face_geometry(chosen, cell[row, column])

@@ -149,17 +149,17 @@ def _find_in_turns(image: Tensor, detector: FaceDetector) -> FaceBoxes:
         shift = torch.tensor([(width - 1) / 2, (height - 1) / 2], dtype=torch.float64) - turn @ middle
         way = torch.cat([turn, shift[:, None]], 1).numpy()
         turned = cv2.warpAffine(small, way, (width, height), flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-        found = find_faces(torch.from_numpy(turned), detector)
-        clear = found.scores >= _CLEAR
-        found = FaceBoxes(found.boxes[clear], found.scores[clear], found.tilts[clear])
-        if not len(found):
+        faces = find_faces(torch.from_numpy(turned), detector)
+        clear = faces.scores >= _CLEAR
+        faces = FaceBoxes(faces.boxes[clear], faces.scores[clear], faces.tilts[clear])
+        if not len(faces):
             continue
-        at = (found.boxes[:, :2] + found.boxes[:, 2:] / 2).double()
+        at = (faces.boxes[:, :2] + faces.boxes[:, 2:] / 2).double()
         back = (((at - shift) @ turn).float() + 0.5) * ratio - 0.5
-        sides = found.boxes[:, 2:] * ratio.mean()
+        sides = faces.boxes[:, 2:] * ratio.mean()
         boxes.append(torch.cat([back - sides / 2, sides], 1))
-        scores.append(found.scores)
-        tilts.append(found.tilts + angle)
+        scores.append(faces.scores)
+        tilts.append(faces.tilts + angle)
     return _joined(boxes, scores, tilts)
 
 

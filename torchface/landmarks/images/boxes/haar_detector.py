@@ -76,8 +76,8 @@ class HaarDetector:
         boxes, counts = self._search("haarcascade_frontalface_alt2.xml", small)
         if self.profiles == "always" or (self.profiles == "alone" and not len(boxes)):
             for mirrored in (False, True):
-                shown = np.ascontiguousarray(small[:, ::-1]) if mirrored else small
-                aside, agreed = self._search("haarcascade_profileface.xml", shown)
+                searched = np.ascontiguousarray(small[:, ::-1]) if mirrored else small
+                aside, agreed = self._search("haarcascade_profileface.xml", searched)
                 aside = _as_frontal(aside)
                 if mirrored:
                     aside[:, 0] = small.shape[1] - 1 - aside[:, 0] - aside[:, 2]

@@ -152,10 +152,10 @@ def _jittered(
     )
     shift = torch.where(present[:, None] > 0, shift, beside)
     cosine, sine = zoom * turn.cos(), zoom * turn.sin()
-    own = torch.stack([torch.stack([cosine, sine], -1), torch.stack([-sine, cosine], -1)], dim=1)
+    jitter = torch.stack([torch.stack([cosine, sine], -1), torch.stack([-sine, cosine], -1)], dim=1)
     middle = (size - 1) / 2
-    linear = own @ transforms[..., :2]
-    offset = (own @ (transforms[..., 2:] - middle[:, None]))[..., 0] + middle + shift
+    linear = jitter @ transforms[..., :2]
+    offset = (jitter @ (transforms[..., 2:] - middle[:, None]))[..., 0] + middle + shift
     return torch.cat([linear, offset[..., None]], -1)
 
 
@@ -228,9 +228,9 @@ def _as_cameras_store(images: Tensor, settings: EyeAugmentation, generator: torc
     share = torch.where(far, (large + (small - large) * rand(count)).exp(), 1.0)
     quality, grain = (25 + 70 * rand(count)).long(), 0.06 * rand(count) ** 2
     sharp = rand(count) < 0.2
-    found = images.permute(0, 2, 3, 1).contiguous().numpy()
+    pictures = images.permute(0, 2, 3, 1).contiguous().numpy()
     for number in range(count):  # sizes differ
-        picture = found[number]
+        picture = pictures[number]
         size = (max(6, round(width * float(share[number]))), max(4, round(height * float(share[number]))))
         if far[number]:
             picture = cv2.resize(picture, size, interpolation=cv2.INTER_AREA)
@@ -248,5 +248,5 @@ def _as_cameras_store(images: Tensor, settings: EyeAugmentation, generator: torc
             picture = np.clip(1.6 * picture - 0.6 * cv2.GaussianBlur(picture, (0, 0), 1.0), 0, 1)
         if far[number]:
             picture = cv2.resize(picture, (width, height), interpolation=cv2.INTER_LINEAR)
-        found[number] = picture
-    return torch.from_numpy(found).permute(0, 3, 1, 2)
+        pictures[number] = picture
+    return torch.from_numpy(pictures).permute(0, 3, 1, 2)

@@ -128,12 +128,17 @@ def merged_lids(
             f"{tuple(visibility.shape)}, expected (...,68,2), (...,2,6,2) and (...,2)"
         )
     share = ((visibility - HIDDEN) / (SEEN - HIDDEN)).clamp(0, 1)[..., None]
-    own, theirs = 1 / deviation[..., 36:48].square(), (share / lid_deviation.square()).flatten(-2)[..., list(PLACES)]
-    both = own + theirs
-    places = (own[..., None] * landmarks[..., 36:48, :] + theirs[..., None] * _ordered(lids)) / both[..., None]
+    face_weight, eye_weight = (
+        1 / deviation[..., 36:48].square(),
+        (share / lid_deviation.square()).flatten(-2)[..., list(PLACES)],
+    )
+    total = face_weight + eye_weight
+    places = (face_weight[..., None] * landmarks[..., 36:48, :] + eye_weight[..., None] * _ordered(lids)) / total[
+        ..., None
+    ]
     return (
         torch.cat([landmarks[..., :36, :], places, landmarks[..., 48:, :]], -2),
-        torch.cat([deviation[..., :36], 1 / both.sqrt(), deviation[..., 48:]], -1),
+        torch.cat([deviation[..., :36], 1 / total.sqrt(), deviation[..., 48:]], -1),
     )
 
 

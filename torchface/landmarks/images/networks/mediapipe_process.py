@@ -29,8 +29,8 @@ def serve(incoming: BinaryIO, outgoing: BinaryIO) -> None:
         pixels = _read(incoming, 3 * height * width)
         if len(pixels) < 3 * height * width:
             return
-        found = mesh.process(np.frombuffer(pixels, np.uint8).reshape(height, width, 3)).multi_face_landmarks
-        points = [(point.x, point.y) for point in found[0].landmark] if found else []
+        faces = mesh.process(np.frombuffer(pixels, np.uint8).reshape(height, width, 3)).multi_face_landmarks
+        points = [(point.x, point.y) for point in faces[0].landmark] if faces else []
         _send(outgoing, np.asarray(points, dtype="<f4").tobytes())
 
 

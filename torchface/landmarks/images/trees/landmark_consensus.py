@@ -101,19 +101,19 @@ def consensus(
     if not 1 <= side <= _MAX_SIDE:
         raise ValueRangeError(f"box: found {box.tolist()}, expected a face of 1 to {_MAX_SIDE} pixels")
     resized, scale, corner = _cut(image.cpu().numpy(), box, side, settings.side)
-    seen = torch.from_numpy(resized)[None, None].to(trees.mean) / 255
+    piece = torch.from_numpy(resized)[None, None].to(trees.mean) / 255
     middle = ((box[:2] + box[2:] / 2).to(trees.mean) + 0.5 - corner.to(trees.mean)) * scale.to(trees.mean) - 0.5
     starts = _starts(trees.mean, middle, settings, tilt)
-    mirrored_pair = torch.cat([one.expand(len(starts), -1, -1, -1) for one in (seen, seen.flip(-1))])
-    last = seen.shape[-1] - 1
-    found = trees.refine(mirrored_pair, torch.cat([starts, _mirrored(starts, last)]))
-    found = torch.cat([found[: len(starts)], _mirrored(found[len(starts) :], last)])
-    found = (found + 0.5) / scale.to(found) + corner.to(found) - 0.5
-    median = found.median(0).values
-    distance = (found - median).norm(dim=-1, keepdim=True) / side
+    mirrored_pair = torch.cat([one.expand(len(starts), -1, -1, -1) for one in (piece, piece.flip(-1))])
+    last = piece.shape[-1] - 1
+    shapes = trees.refine(mirrored_pair, torch.cat([starts, _mirrored(starts, last)]))
+    shapes = torch.cat([shapes[: len(starts)], _mirrored(shapes[len(starts) :], last)])
+    shapes = (shapes + 0.5) / scale.to(shapes) + corner.to(shapes) - 0.5
+    median = shapes.median(0).values
+    distance = (shapes - median).norm(dim=-1, keepdim=True) / side
     weight = 1 / (1 + (distance / _OUTLYING).square())
-    mean = (found * weight).sum(0) / weight.sum(0)
-    return Consensus(mean, ((found - mean) / side).square().sum(-1).mean(0).sqrt())
+    mean = (shapes * weight).sum(0) / weight.sum(0)
+    return Consensus(mean, ((shapes - mean) / side).square().sum(-1).mean(0).sqrt())
 
 
 def tilt_of(trees: LandmarkTrees, landmarks: Tensor) -> float:

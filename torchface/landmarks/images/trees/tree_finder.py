@@ -64,18 +64,18 @@ class TreeFinder:
         """See :class:`~torchface.landmarks.images.landmark_finder.LandmarkFinder`."""
         corner, piece = _piece(image, box)
         grey = grey_pixels(piece)
-        found = consensus(self.trees, torch.from_numpy(grey), box - corner, tilt, self.starts)
-        visibility = _visibility(grey, found.landmarks, float((box[2] * box[3]).sqrt()))
-        landmarks = found.landmarks.float() + corner[:2].to(found.landmarks).float()
-        confidence = found.confidence.float() * visibility
+        agreed = consensus(self.trees, torch.from_numpy(grey), box - corner, tilt, self.starts)
+        visibility = _visibility(grey, agreed.landmarks, float((box[2] * box[3]).sqrt()))
+        landmarks = agreed.landmarks.float() + corner[:2].to(agreed.landmarks).float()
+        confidence = agreed.confidence.float() * visibility
         return FaceReading.of_confidence(
-            landmarks, confidence, visibility, torch.tensor(presence_of(found)), box.float()
+            landmarks, confidence, visibility, torch.tensor(presence_of(agreed)), box.float()
         )
 
 
-def presence_of(found: Consensus) -> float:
+def presence_of(agreed: Consensus) -> float:
     """How likely a consensus is one on a face."""
-    return float(1 / (1 + (found.dispersion.mean() / _EVEN) ** _STEEPNESS))
+    return float(1 / (1 + (agreed.dispersion.mean() / _EVEN) ** _STEEPNESS))
 
 
 def _visibility(grey: np.ndarray, landmarks: Tensor, side: float) -> Tensor:
