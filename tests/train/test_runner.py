@@ -28,7 +28,7 @@ from train.settings_files import read_settings, write_settings
 
 RECIPES = (
     "action_units", "appearance", "enhancement", "expression", "eye_network", "face_boxes", "landmark_network",
-    "landmarks", "marker_solver", "morphable", "priors", "uv_landmarks",
+    "landmark_trees", "marker_solver", "morphable", "priors", "uv_landmarks",
 )  # fmt: skip
 
 
