@@ -12,6 +12,7 @@ from torch import Tensor
 from planted.planted_correctives import planted_correctives
 from torchface import Attachment, BlendshapeRig
 from torchface.capture import HybridSolver, MarkerSolver
+from torchface.correctives import Corrective, Correctives
 from torchface.errors import ValueRangeError
 from torchface.onnx.corrective_graph import CorrectiveGraph, HybridCorrectiveGraph
 from torchface.onnx.corrective_model import corrective_model
@@ -69,6 +70,28 @@ def test_onnx_runtime_computes_the_graph(solver: MarkerSolver) -> None:
     start = torch.rand(3, 10, generator=torch.Generator().manual_seed(1))
     (found,) = session.run(None, {"markers": shown.numpy(), "previous": start.numpy()})
     assert (torch.from_numpy(found) - graph(shown, start)).abs().max() < 1e-5
+
+
+def test_onnx_runtime_computes_products_of_up_to_eight_shapes(solver: MarkerSolver) -> None:
+    rig = performer(texture=False).select(solver.names)
+    names = rig.names
+    definitions = tuple(Corrective(f"of_{count}", names[10 - count :]) for count in (2, 4, 8))
+    definitions += (Corrective("half", names[:1], 0.5),)
+    deltas = 0.5 * rig.deltas[: len(definitions)].roll(1, 2)
+    rig = BlendshapeRig(rig.neutral, rig.deltas, names, Correctives(deltas, definitions))
+    moved = (rig.deltas.norm(dim=-1).amax(0) > 1).nonzero()[:, 0]
+    attachment = Attachment.from_vertices(rig.neutral, moved[:: len(moved) // 40][:40])
+    full = MarkerSolver(rig, attachment)
+    graph = CorrectiveGraph(full, steps=3)
+    session = onnxruntime.InferenceSession(
+        corrective_model(graph).SerializeToString(), providers=["CPUExecutionProvider"]
+    )
+    weights = 0.5 + 0.5 * torch.rand(4, 10, generator=torch.Generator().manual_seed(1))
+    shown, start = full.points(weights).float(), 0.5 * weights
+    (found,) = session.run(None, {"markers": shown.numpy(), "previous": start.numpy()})
+    assert (torch.from_numpy(found) - graph(shown, start)).abs().max() < 1e-5
+    exact = MarkerSolver(rig, attachment, sparsity=0.0, ridge=1e-9)(shown)
+    assert (exact - weights).abs().max() < 1e-3
 
 
 def predictions(frames: int) -> tuple[Tensor, Tensor]:

@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from torchface.correctives.corrective_shapes import MOST_DRIVERS, Corrective, check_definitions
+from torchface.correctives.corrective_shapes import Corrective, check_definitions
 from torchface.errors import NameMismatchError
 
 ROUNDED = 3.2  # four fifths at the middle: as near to a straight rise and fall as a parabola comes
@@ -59,9 +59,10 @@ class CorrectiveActivation(nn.Module):
             if definition.name in row:
                 raise NameMismatchError(f"corrective {definition.name!r}: found a shape of that name, expected another")
         one = len(names)  # the row of a factor of 1
-        padded = [[row[driver] for driver in d.drivers] + [one] * (MOST_DRIVERS - len(d.drivers)) for d in definitions]
+        most = max((len(definition.drivers) for definition in definitions), default=1)
+        padded = [[row[driver] for driver in d.drivers] + [one] * (most - len(d.drivers)) for d in definitions]
         # On the CPU also where a solver is being rebuilt without memory: no state brings these.
-        drivers = torch.tensor(padded, dtype=torch.int64, device="cpu").view(-1, MOST_DRIVERS)
+        drivers = torch.tensor(padded, dtype=torch.int64, device="cpu").view(-1, most)
         flat = drivers.flatten()
         # Pairs of a corrective and a driver, by driver: row i of the derivative's transpose holds those of shape i.
         pairs = flat.argsort(stable=True)[: int((flat < one).sum())]
@@ -86,17 +87,20 @@ class CorrectiveActivation(nn.Module):
         return activation.index_copy(1, self.in_betweens, self._along(w, *self.knots.to(weights).T))
 
     def derivative(self, weights: Tensor) -> Tensor:
-        """Derivatives (B,C,3) of the activations by the weights of their drivers, at a kink those within the box."""
-        factors = self._factors(weights)
-        first, second, third = factors.split(1, -1)
-        slopes = torch.cat([second * third, first * third, first * second], -1)
+        """Derivatives (B,C,K) of the activations by the weights of their K drivers, at a kink those within the box."""
+        factors = self._factors(weights).unbind(-1)
+        before, after = [torch.ones_like(factors[0])], [torch.ones_like(factors[0])]
+        for first, last in zip(factors[:-1], factors[:0:-1], strict=True):  # as many as drivers, eight at most
+            before.append(before[-1] * first)
+            after.append(after[-1] * last)
+        slopes = torch.stack([left * right for left, right in zip(before, reversed(after), strict=True)], -1)
         slopes = slopes.masked_fill(self.drivers == self.shapes, 0.0)
         if not len(self.in_betweens):
             return slopes
         w = weights[:, self.drivers[self.in_betweens, 0]]
         slope = self._slope_along(w, *self.knots.to(weights).T)
-        none = torch.zeros_like(slope)
-        return slopes.index_copy(1, self.in_betweens, torch.stack([slope, none, none], -1))
+        own = torch.nn.functional.pad(slope[..., None], (0, slopes.shape[-1] - 1))
+        return slopes.index_copy(1, self.in_betweens, own)
 
     def jacobian(self, weights: Tensor) -> Tensor:
         """All derivatives, (B,C,N) at weights (B,N); differentiable."""
@@ -108,13 +112,13 @@ class CorrectiveActivation(nn.Module):
         r"""The product :math:`(\partial a / \partial w)^\top Z` (B,N,K), by its few numbers that are not zero.
 
         Args:
-            derivative: (B,C,3), as :meth:`derivative` gives it.
+            derivative: (B,C,K), as :meth:`derivative` gives it.
             matrix: :math:`Z`, (C,K) for all frames or (B,C,K).
         """
         count, pairs = len(derivative), len(self.pairs)
         values = derivative.flatten(1)[:, self.pairs]
         frames = torch.arange(count, device=matrix.device)[:, None]
-        rows = (self.pairs // MOST_DRIVERS).expand(count, -1)
+        rows = (self.pairs // self.drivers.shape[1]).expand(count, -1)
         if matrix.ndim == 3:
             rows = rows + frames * len(self.definitions)
         # Where a face is at rest in most shapes, most products of the others are 0.
@@ -152,7 +156,7 @@ class CorrectiveActivation(nn.Module):
         return [definition.record() for definition in self.definitions]
 
     def expressions(self) -> list[str]:
-        """The activations in words that Blender's drivers, Maya and Python know, of the drivers' weights w0, w1, w2.
+        """The activations in words that Blender's drivers, Maya and Python know, of drivers' weights w0, w1 and so on.
 
         Example:
             >>> CorrectiveActivation([Corrective("ab", ("a", "b")), Corrective("a4", ("a",), 0.4)], "ab").expressions()

@@ -13,8 +13,8 @@ from torch import Tensor
 from torchface.errors import NameMismatchError, ShapeError, ValueRangeError
 from torchface.number_checks import checked_number
 
-MOST_DRIVERS = 3
-"""A combination shape is driven by two shapes or by three."""
+MOST_DRIVERS = 8
+"""A combination shape is driven by two to eight shapes."""
 
 
 @dataclass(frozen=True)
@@ -23,11 +23,11 @@ class Corrective:
 
     Args:
         name: as no other corrective and no shape of the rig is called.
-        drivers: names of shapes: two or three of a combination, whose weights are multiplied; one of an in-between.
+        drivers: names of shapes: two to eight of a combination, whose weights are multiplied; one of an in-between.
         peak: of an in-between, the driver's weight at which it is fully on, between 0 and 1.
 
     Raises:
-        NameMismatchError: no driver, more than three, or one twice.
+        NameMismatchError: no driver, more than eight, or one twice.
         ValueRangeError: an in-between whose peak is not between 0 and 1, or a combination with a peak.
 
     Example:
@@ -51,7 +51,7 @@ class Corrective:
         count = len(self.drivers)
         if not 1 <= count <= MOST_DRIVERS:
             raise NameMismatchError(
-                f"{place}: found a product of {count} shapes, expected two or three, or one and a peak"
+                f"{place}: found a product of {count} shapes, expected two to {MOST_DRIVERS}, or one and a peak"
             )
         if len(set(self.drivers)) < count:
             raise NameMismatchError(f"{place}: found a driver twice in {', '.join(self.drivers)}; expected each once")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import reduce
 
 import onnx
 import torch
@@ -148,10 +149,12 @@ class _Writer:
         names = [self.build.constant(f"drivers_{k}", row) for k, row in enumerate(drivers)]
         return [self.op("Gather", padded, name, axis=1) for name in names]
 
+    def _product(self, factors: list[str]) -> str:
+        return reduce(lambda first, second: self.op("Mul", first, second), factors or [self.ones])
+
     def _activation(self, w: str, rounded: bool) -> str:
         op = self.op
-        first, second, third = self._factors(w)
-        product = op("Mul", op("Mul", first, second), third)
+        product = self._product(self._factors(w))
         if not len(self.graph.activation.in_betweens):
             return product
         along, left, peak, right = self._along(w)
@@ -165,8 +168,8 @@ class _Writer:
 
     def _jacobian(self, w: str, rounded: bool) -> str:
         op, activation = self.op, self.graph.activation
-        first, second, third = self._factors(w)
-        slopes = [op("Mul", second, third), op("Mul", first, third), op("Mul", first, second)]
+        factors = self._factors(w)
+        slopes = [self._product([*factors[:k], *factors[k + 1 :]]) for k in range(len(factors))]
         if len(activation.in_betweens):
             own = op("MatMul", self._slope_along(w, rounded), self._spread)
             slopes[0] = op("Add", op("Mul", slopes[0], self._products), own)

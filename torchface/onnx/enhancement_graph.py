@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import reduce
+from operator import mul
 from pathlib import Path
 
 import onnx
@@ -87,11 +89,10 @@ def _activations(graph: ValueGraph, weights: Value, activation: CorrectiveActiva
     products = [row for row in range(len(activation.drivers)) if row not in between]
     found = []
     if products:
-        # The third driver of two is a column of ones after the weights.
+        # A driver that a combination lacks is a column of ones after the weights.
         padded = graph.cat(weights, weights.rows(0, 1, axis=1) * 0.0 + 1.0, axis=1)
         columns = activation.drivers[products].unbind(1)
-        first, second, third = (graph.op("Gather", padded, column.tolist(), axis=1) for column in columns)
-        found.append(first * second * third)
+        found.append(reduce(mul, (graph.op("Gather", padded, column.tolist(), axis=1) for column in columns)))
     if between:
         own = graph.op("Gather", weights, activation.drivers[between, 0].tolist(), axis=1)
         low, peak, high = activation.knots.float().unbind(1)

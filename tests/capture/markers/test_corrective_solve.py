@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import time
 from pathlib import Path
 
 import numpy as np
@@ -200,3 +201,39 @@ def test_a_real_take_on_a_real_rig_with_correctives(ict_folder: Path, performanc
     ours, linear = solver(seen), solver.without_correctives()(seen)
     far, further = (float((rig(w) - rig(weights)).norm(dim=-1).mean()) for w in (ours, linear))
     assert far < 0.85 * further
+
+
+@pytest.mark.real
+@pytest.mark.parametrize("levels", [2, 3])
+def test_the_toy_set_of_refined_inverse_rigging_is_solved(levels: int, data: Path) -> None:
+    with np.load(data / "peers" / "refined_inverse_rigging.npz") as stored:
+        arrays = {name: torch.from_numpy(stored[name]) for name in stored.files}
+    names = [f"shape_{i}" for i in range(60)]
+    definitions, deltas = [], []
+    for level in range(1, levels + 1):  # products of two, three and four shapes
+        for row, drivers in enumerate(arrays[f"drivers{level}"].tolist()):
+            definitions.append(Corrective(f"level{level}_{row}", tuple(names[i] for i in drivers)))
+        deltas.append(arrays[f"level{level}"].unflatten(1, (-1, 3)))
+    rest = arrays["neutral"].view(-1, 3)
+    rig = BlendshapeRig.from_tensors(
+        rest,
+        torch.arange(len(rest)).view(-1, 3),
+        arrays["deltas"].T.reshape(60, -1, 3),
+        names,
+        Correctives(torch.cat(deltas), tuple(definitions)),
+    )
+    weights = arrays["weights"]
+    attachment = Attachment.from_vertices(rig.neutral, torch.arange(len(rest)))
+    solver = MarkerSolver(rig, attachment)
+    seen = rig(weights)
+    solver(seen[:2])
+    begin = time.process_time()
+    found = solver(seen)
+    spent = 1000 * (time.process_time() - begin) / len(seen)
+    ours, theirs = (float((w - weights).abs().mean()) for w in (found, arrays["their_weights_levels12"]))
+    active = [float((w > 1e-3).sum(1).double().mean()) for w in (found, weights)]
+    print(f"\n{levels} levels: error {ours:.4f} ({theirs:.4f} theirs, of two), active {active}, {spent:.2f} ms a frame")
+    assert ours < 0.1 * theirs
+    assert abs(active[0] - active[1]) < 0.5
+    exact = MarkerSolver(rig, attachment, sparsity=0.0, ridge=1e-9)(seen)
+    assert (exact - weights).abs().max() < 1e-4

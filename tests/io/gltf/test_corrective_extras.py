@@ -12,9 +12,11 @@ import pytest
 import torch
 from rig_samples import corrective_sheet, sheet_rig
 
+from torchface.correctives import Corrective, Correctives
 from torchface.errors import FileFormatError
 from torchface.io import load_rig, save_animation, save_rig
 from torchface.io.gltf.animation_reading import read_gltf_weights
+from torchface.rig import BlendshapeRig
 from torchface.take import Take, Track
 
 
@@ -33,6 +35,24 @@ def test_a_rig_with_correctives_comes_back(name: str, tmp_path: Path) -> None:
     again = load_rig(tmp_path / f"again_{name}").correctives
     assert again is not None
     assert (again.deltas - found.correctives.deltas).abs().max() < 1e-4
+
+
+@pytest.mark.parametrize("name", ["rig.glb", "rig.usdc", "folder"])
+@pytest.mark.parametrize("drivers", [4, 8])
+def test_products_of_up_to_eight_shapes_come_back(drivers: int, name: str, tmp_path: Path) -> None:
+    sheet, names = sheet_rig(), tuple("abcdefgh")
+    deltas = torch.randn(9, len(sheet.vertices), 3, generator=torch.Generator().manual_seed(6))
+    product = Correctives(deltas[8:], (Corrective("product", names[8 - drivers :]),))
+    rig = BlendshapeRig(sheet.neutral, deltas[:8], names, product)
+    weights = 0.5 + 0.5 * torch.rand(4, 8, generator=torch.Generator().manual_seed(7))
+    linear = rig.without_correctives()(weights)
+    expected = linear + weights[:, 8 - drivers :].prod(1)[:, None, None] * deltas[8]
+    torch.testing.assert_close(rig(weights), expected)
+    save_rig(rig, tmp_path / name)
+    found = load_rig(tmp_path / name)
+    assert found.correctives is not None
+    assert found.correctives.definitions == product.definitions
+    assert (found(weights) - expected).abs().max() < 1e-2
 
 
 def test_an_animation_drives_the_correctives_and_reads_back_without_them(tmp_path: Path) -> None:
@@ -79,7 +99,7 @@ def _row(**changes: Any) -> Callable[[list[Any]], None]:
         (_row(drivers=["jawOpen"]), "peak: found None"),
         (_row(drivers=["jawOpen"], peak=2), "peak: found 2"),
         (_row(drivers=["jawOpen"], peak=[0.5]), "of an in-between a peak"),
-        (_row(drivers=["jawOpen"] * 4), "a product of 4 shapes"),
+        (_row(drivers=["jawOpen"] * 9), "a product of 9 shapes"),
         (_row(drivers="jawOpen"), "a list of drivers' names"),
         (_row(drivers=[1, 2]), "a list of drivers' names"),
         (_row(name=None), "a list of drivers' names"),
