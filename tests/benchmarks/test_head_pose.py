@@ -15,13 +15,12 @@ import torch
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from torchface.capture.own_rig.head_pose import STABLE_LANDMARKS, PoseTracker, filter_poses, measure_poses, smooth_poses
+from torchface.capture.own_rig.head_pose import STABLE_LANDMARKS
 from torchface.geometry.cameras.calibration import assumed_calibration
-from torchface.geometry.cameras.pnp import Pose, pixel_jacobian, solve_pnp
+from torchface.geometry.cameras.pnp import pixel_jacobian, solve_pnp
 from torchface.geometry.cameras.robust_pnp import robust_pnp
 from torchface.geometry.rotations import rotation_matrix, rotation_vector
 from torchface.synthetic import neutral_head
-from torchface.temporal.adaptive_kalman import LANDMARK_SETTINGS, AdaptiveFilter
 
 K = assumed_calibration(640, 480).intrinsics
 UPRIGHT = torch.diag(torch.tensor([1.0, -1, -1], dtype=torch.float64))
@@ -159,8 +158,8 @@ def show(title: str, rows: dict[str, Row]) -> None:
         print(f"{name:36} {row.milliseconds:9.3f} {row.median:16.3f} {row.tail:7.2f} {row.wrong:8.1%} {row.far:11.2f}")
 
 
-def robust(points: Tensor, pixels: Tensor, initial: Pose | None = None, **settings: object) -> Found:
-    found = robust_pnp(points, pixels, K, initial=initial, **settings)  # type: ignore[arg-type]
+def robust(points: Tensor, pixels: Tensor, **settings: float | Tensor) -> Found:
+    found = robust_pnp(points, pixels, K, **settings)  # type: ignore[arg-type]
     return Found(found.pose.rotation, found.pose.translation, found.inliers)
 
 
@@ -172,11 +171,8 @@ def spoiled(pixels: Tensor, share: float = 0.3) -> Tensor:
     return torch.where(wrong[..., None], pixels + residual, pixels)
 
 
-@pytest.mark.parametrize(
-    ("scene", "slower"),
-    [("68 landmarks", 4.0), ("13 landmarks", 1.5), ("13, any pose", 1.5), ("13, any pose, flat face", 1.5)],
-)
-def test_many_frames_at_once_beside_opencv(scene: str, slower: float, print_machine: Callable[..., None]) -> None:
+@pytest.mark.parametrize("scene", ["68 landmarks", "13 landmarks", "13, any pose", "13, any pose, flat face"])
+def test_many_frames_at_once_beside_opencv(scene: str, print_machine: Callable[..., None]) -> None:
     if "any" in scene:
         points, rotation, translation, pixels = turned_far(0.15 if "flat" in scene else 1.0)
     else:
@@ -192,16 +188,16 @@ def test_many_frames_at_once_beside_opencv(scene: str, slower: float, print_mach
         rows[f"{name}, refined"] = Row.of(spent, found, rotation, translation)
     print_machine("opencv-contrib-python-headless")
     show(f"{scene}, 1 px of noise, 30 % of them up to 150 px wrong, {FRAMES} frames", rows)
-    ours, quick = rows["torchface, all frames at once"], rows["cv2 AP3P, refined"]
+    ours, alike = rows["torchface, all frames at once"], rows["cv2 AP3P, 4,000 draws, refined"]
     for name, row in rows.items():
         if "4,000" not in name and "USAC" not in name:
             assert ours.median <= row.median
             assert ours.wrong <= row.wrong
-    assert ours.milliseconds < slower * quick.milliseconds
+    assert ours.milliseconds < 1.5 * alike.milliseconds
 
 
 def test_one_frame_at_a_time_beside_opencv(print_machine: Callable[..., None]) -> None:
-    """Thirteen landmarks, from nothing, and ours from the pose of the frame before: OpenCV's RANSACs take no start."""
+    """Thirteen landmarks. torchface refines what OpenCV's AP3P finds with 4,000 draws."""
     stable = list(STABLE_LANDMARKS)
     points, rotation, translation, clean = filmed(1.0)
     points, clean = points[stable], clean[:, stable]
@@ -211,24 +207,13 @@ def test_one_frame_at_a_time_beside_opencv(print_machine: Callable[..., None]) -
             with torch.inference_mode():
                 return joined([robust(points, frame[None]) for frame in pixels[:FEW]])
 
-        def followed(pixels: Tensor = pixels) -> Found:
-            steps: list[Found] = []
-            with torch.inference_mode():
-                for frame in pixels[:FEW]:
-                    before = steps and Pose(steps[-1].rotation, steps[-1].translation, torch.zeros(1).double())
-                    steps.append(robust(points, frame[None], before or None, threshold=8.0))
-            return joined(steps)
-
-        rows = {}
-        for name, solve in (("torchface", alone), ("torchface, from the frame before", followed)):
-            found, spent = timed(solve)
-            rows[name] = Row.of(spent, found, rotation[:FEW], translation[:FEW])
+        found, spent = timed(alone)
+        rows = {"torchface": Row.of(spent, found, rotation[:FEW], translation[:FEW])}
         for name, peer in PEERS.items():
             found, spent = timed(lambda peer=peer, pixels=pixels: peer.poses(points, pixels))  # type: ignore[misc]
             rows[f"{name}, refined"] = Row.of(spent, found, rotation, translation)
         print_machine("opencv-contrib-python-headless")
         show(f"one frame at a time, 13 landmarks, 1 px of noise, {scene}", rows)
-        # OpenCV is the quicker one here, and by much; what a live frame may cost is held below.
         assert rows["torchface"].wrong <= rows["cv2 AP3P, refined"].wrong
 
 
@@ -283,34 +268,3 @@ def test_temples_that_are_off_beside_opencv(print_machine: Callable[..., None]) 
     ours = "torchface, temples weigh 1/4"
     assert all(jumps[ours][0] < jumps[name][0] for name in PEERS)
     assert jumps[ours][0] < 1.05 * jumps[ours][1]
-
-
-def test_poses_along_time() -> None:
-    print(f"\n{'motion':>8} {'':12} {'jitter: rotation':>17} {'translation':>12} {'error: degrees':>15} {'mm':>6}")
-    for size in (1.0, 0.2, 0.0):
-        points, rotation, translation, pixels = filmed(1.5, size)
-        raw = measure_poses(points, pixels, K)
-        unfiltered = None
-        for name, poses in (("unfiltered", raw), ("live", filter_poses(raw)), ("whole video", smooth_poses(raw))):
-            turn = rotation_vector(poses.rotation @ rotation.transpose(1, 2))[20:]
-            move = (poses.translation - translation)[20:]
-            jitter = [float(each.diff(n=2, dim=0).square().mean().sqrt()) for each in (turn, move)]
-            unfiltered = unfiltered or jitter
-            error = float(turn.norm(dim=1).square().mean().sqrt().rad2deg()), float(move.square().sum(1).mean().sqrt())
-            print(
-                f"{size:8.1f} {name:12} {jitter[0] / unfiltered[0] - 1:17.1%} {jitter[1] / unfiltered[1] - 1:12.1%} "
-                f"{error[0]:15.3f} {error[1]:6.2f}"
-            )
-            assert name != "live" or max(jitter[0] / unfiltered[0], jitter[1] / unfiltered[1]) < 0.4
-
-
-def test_what_a_live_frame_costs() -> None:
-    points, _, _, pixels = filmed(1.5)
-    tracker, smoother = PoseTracker(points, K), AdaptiveFilter(68, 2, LANDMARK_SETTINGS)
-    for frame in pixels[:50]:
-        tracker.step(smoother.step(frame))
-    pose = seconds(lambda: [tracker.step(frame) for frame in pixels[50:]]) / (FRAMES - 50)
-    marks = seconds(lambda: [smoother.step(frame) for frame in pixels[50:]]) / (FRAMES - 50)
-    print(f"\na live frame: head pose {1e3 * pose:.2f} ms, 68 landmarks filtered {1e3 * marks:.2f} ms")
-    assert pose < 0.02
-    assert marks < 0.01

@@ -16,15 +16,7 @@ from torch import Tensor
 from torch.utils._pytree import tree_leaves
 
 from torchface.capture.own_rig import VideoSettings, VideoSolver, solve_whole_take
-from torchface.capture.own_rig.head_pose import (
-    PoseSettings,
-    PoseTracker,
-    filter_poses,
-    measure_poses,
-    smooth_poses,
-    track_pose,
-)
-from torchface.capture.own_rig.pose_filter import PoseFilterSettings
+from torchface.capture.own_rig.head_pose import measure_poses
 from torchface.capture.priors import ShapePrior
 from torchface.geometry.cameras.calibration import CameraCalibration
 from torchface.geometry.cameras.distortion import undistort
@@ -130,17 +122,7 @@ def test_robust_pnp(seen: tuple[Tensor, Tensor], device: str) -> None:
 
 
 def test_head_poses(seen: tuple[Tensor, Tensor], device: str) -> None:
-    few = PoseSettings(filter=PoseFilterSettings((0.6,), (1e-4, 1e-3), (0.03,), longest_gap=0))
-
-    def poses(points: Tensor, pixels: Tensor, intrinsics: Tensor) -> Any:
-        measured = measure_poses(points, pixels, intrinsics, settings=few)
-        ways = (measured, filter_poses(measured, few), smooth_poses(measured, few))
-        ways = (*ways, track_pose(points, pixels[2:5], intrinsics, settings=few))
-        tracker = PoseTracker(points, intrinsics, few)
-        live = [tracker.step(frame) for frame in pixels[2:4]]
-        return [part for way in (*ways, *live) for part in vars(way).values() if isinstance(part, Tensor)]
-
-    check(poses, device, *seen, K)
+    check(lambda *given: list(vars(measure_poses(*given)).values()), device, *seen, K)
 
 
 def test_filters_along_time(seen: tuple[Tensor, Tensor], device: str) -> None:

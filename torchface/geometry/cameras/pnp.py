@@ -74,30 +74,6 @@ def solve_pnp(
     return best
 
 
-def pose_covariance(
-    points: Tensor, rotation: Tensor, translation: Tensor, intrinsics: Tensor, weights: Tensor | None = None
-) -> Tensor:
-    r"""The covariance of poses of least squares, where every pixel has a standard deviation of one.
-
-    .. math:: \Sigma = \Big( \sum_i w_i J_i^\top J_i \Big)^{-1}, \qquad
-        J = \frac{\partial \pi(K (\exp([\theta]) R x + t + m))}{\partial (\theta, m)}
-
-    Args:
-        points: x, (N,3), millimetres.
-        rotation, translation: world to camera, (B,3,3) and (B,3).
-        intrinsics: K, (3,3) or (B,3,3).
-        weights: w, (B,N); equal if absent.
-
-    Returns:
-        Covariance of the rotation in the camera's frame, radians, and of the translation, millimetres, (B,6,6) float64.
-
-    Source: first-order propagation of noise, Hartley and Zisserman 2004, 5.2.
-    """
-    jacobian = _jacobian(points.double() @ rotation.transpose(-1, -2), translation, intrinsics.double())[1]
-    weighted = jacobian if weights is None else jacobian * weights.double().repeat_interleave(2, dim=1)[..., None]
-    return torch.linalg.inv(weighted.transpose(-1, -2) @ jacobian)
-
-
 def pixel_jacobian(seen: Tensor, intrinsics: Tensor) -> tuple[Tensor, Tensor]:
     """Pixels (B,N,2) of points (B,N,3) in the camera's frame, and their derivatives: (B,N,2,3)."""
     image = seen @ intrinsics.transpose(-1, -2)
