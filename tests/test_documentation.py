@@ -74,8 +74,8 @@ def test_every_page_names_the_same_version() -> None:
     version = torchface.__version__
     assert f"\nversion: {version}\n" in (REPOSITORY / "CITATION.cff").read_text(encoding="utf-8")
     assert f"torchface-{version}-py3-none-any.whl" in (DOCS / "install.md").read_text(encoding="utf-8")
-    (newest, *_) = re.findall(r"^## \[(.+?)\]", (REPOSITORY / "CHANGELOG.md").read_text(encoding="utf-8"), re.MULTILINE)
-    assert newest == version
+    releases = re.findall(r"^## \[(.+?)\]", (REPOSITORY / "CHANGELOG.md").read_text(encoding="utf-8"), re.MULTILINE)
+    assert next(each for each in releases if each != "Unreleased") == version
 
 
 def test_pre_commit_runs_the_checks_of_make_lint() -> None:
