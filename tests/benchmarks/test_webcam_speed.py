@@ -24,7 +24,7 @@ from onnx import ModelProto, TensorProto
 
 from torchface.landmarks.images.networks.mediapipe_finder import PYTHON
 from torchface.onnx.graph_values import OPSET, Value, ValueGraph
-from torchface.onnx.landmark_network_graph import landmark_network_model
+from torchface.onnx.network_graphs import network_model
 from torchface.onnx.webcam.eye_reader import read_eyes
 from torchface.onnx.webcam.face_search import SearchSettings, search
 from torchface.onnx.webcam.picture_pieces import cut_square
@@ -142,7 +142,7 @@ def test_the_whole_way_is_quick_and_small(data: Path, tmp_path: Path) -> None:
     rows = {
         "box search, 640 x 480": part(box, {"image": frames[0]}, (7,)),
         "crop of a face of 200 pixels": part(crop, {"image": picture, "place": place}, (1, 3, side, side)),
-        "landmark network": milliseconds(landmark_network_model(network).SerializeToString(), crops),
+        "landmark network": milliseconds(network_model(network).SerializeToString(), crops),
         "both eyes": part(eyes, marks, (2, 2)),
     }
     rows["picture to reading, face followed"] = whole(reading, frames, 30)[0]

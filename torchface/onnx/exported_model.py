@@ -5,12 +5,13 @@ from __future__ import annotations
 import json
 import logging
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from typing import Any
 
+import numpy as np
 import onnx
 import torch
-from onnx import helper
+from onnx import TensorProto, helper, numpy_helper
 from torch import Tensor, nn
 
 from torchface.onnx.graph_builder import IR_VERSION
@@ -44,7 +45,10 @@ def exported_model(
     # Loaded here: it takes a second, and solvers that run graphs have no need of it.
     from onnxscript import ir
 
-    shapes = tuple(dict(enumerate((sizes or {}).get(name, ()))) or None for name in inputs)
+    shapes = tuple(
+        {axis: size or torch.export.Dim.STATIC for axis, size in enumerate((sizes or {}).get(name, ()))} or None
+        for name in inputs
+    )
     # It warns of missing torchvision, whose operators no graph here has.
     log = logging.getLogger("torch.onnx._internal.exporter._registration")
     level = log.level
@@ -77,6 +81,8 @@ def exported_model(
         ir.passes.common.ClearMetadataAndDocStringPass(),
     )(program.model)
     _with_known_casts(program.model)
+    for node in ir.traversal.RecursiveGraphIterator(program.model.graph):
+        node.name = None
     model = program.model_proto
     del model.graph.value_info[:], model.metadata_props[:]
     for value in (*model.graph.input, *model.graph.output):
@@ -85,6 +91,21 @@ def exported_model(
     helper.set_model_props(
         model, {key: value if isinstance(value, str) else json.dumps(value) for key, value in metadata.items()}
     )
+    onnx.checker.check_model(model, full_check=True)
+    return model
+
+
+def half_stored(model: onnx.ModelProto, names: Collection[str]) -> onnx.ModelProto:
+    """A graph whose named constants are halves in the file; ONNX Runtime widens them when it loads."""
+    casts = []
+    for value in model.graph.initializer:
+        if value.name in names:
+            name, half = value.name, numpy_helper.to_array(value).astype(np.float16)
+            value.CopyFrom(numpy_helper.from_array(half, f"{name} half"))
+            casts.append(helper.make_node("Cast", [value.name], [name], to=TensorProto.FLOAT))
+    nodes = [*casts, *model.graph.node]
+    del model.graph.node[:]
+    model.graph.node.extend(nodes)
     onnx.checker.check_model(model, full_check=True)
     return model
 

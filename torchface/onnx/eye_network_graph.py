@@ -3,63 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from pathlib import Path
 
-import onnx
 import torch
 from torch import nn
 
-from torchface import __version__
+from torchface.landmarks.images.folded_normalisation import without_normalisation
 from torchface.landmarks.images.networks.eye_network import DEVIATION_RANGE, LEAST_SPREAD, POINTS, STRIDE, EyeNetwork
 from torchface.landmarks.images.networks.heat_maps import cell_places
-from torchface.onnx.checked_export import ExportReport, write_checked
 from torchface.onnx.graph_builder import GraphBuilder
-from torchface.onnx.network_nodes import convolution, crop_cases, doubled, folded, heat_points, layers, with_context
+from torchface.onnx.network_nodes import convolution, doubled, heat_points, layers, with_context
 
 _OUTPUTS: dict[str, tuple[int, ...]] = {
     "landmarks": (6, 2), "iris": (2,), "deviation": (POINTS,), "openness": (), "closed": (), "visibility": ()
 }  # fmt: skip
-_PARITY = {"landmarks": 0.1, "iris": 0.1, "deviation": 0.1, "openness": 0.01, "closed": 0.01, "visibility": 0.01}
-_UNITS = {name: "pixels" if name in ("landmarks", "iris", "deviation") else "of 1" for name in _OUTPUTS}
-
-
-def export_eye_network(model: EyeNetwork, path: str | Path, facts: Mapping[str, object] | None = None) -> ExportReport:
-    """Writes an eye network as ONNX, its weights in half precision, and checks it.
-
-    The graph takes ``eyes`` (B,3,h,w) in [0,1], red first: crops as ``eye_transforms`` cuts them, left eyes mirrored.
-    It gives ``landmarks`` (B,6,2), ``iris`` (B,2) and ``deviation`` (B,7), pixels of the crop, ``openness`` (B,), and
-    ``closed`` and ``visibility`` (B,) in [0,1].
-
-    Args:
-        model: what to export.
-        path: the file to write.
-        facts: further metadata, such as licence and data.
-
-    Raises:
-        ValueRangeError: ONNX Runtime and PyTorch differ; nothing is written.
-    """
-    model = model.eval()
-    cases = crop_cases(model, "eyes", (model.height, model.width), (1, 2))
-    return write_checked(eye_network_model(model, facts), path, cases, _PARITY, _UNITS)
-
-
-def eye_network_model(model: EyeNetwork, facts: Mapping[str, object] | None = None) -> onnx.ModelProto:
-    """The graph, its batch normalisations folded into the convolutions before them, built node by node."""
-    build = GraphBuilder()
-    eye_nodes(build, model, "eyes", {name: name for name in _OUTPUTS})
-    return build.model(
-        "eye_network",
-        {"eyes": ("batch", 3, model.height, model.width)},
-        {name: ("batch", *shape) for name, shape in _OUTPUTS.items()},
-        {
-            "task": "eye_network",
-            "eyes": "red, green, blue, 0 to 1; left eyes mirrored",
-            "landmarks": "outer corner, two of the upper lid, inner corner, two of the lower lid",
-            "units": "pixels of the crop",
-            "version": __version__,
-            **(facts or {}),
-        },
-    )
 
 
 def eye_nodes(build: GraphBuilder, model: EyeNetwork, eyes: str, outputs: Mapping[str, str]) -> None:
@@ -71,7 +27,7 @@ def eye_nodes(build: GraphBuilder, model: EyeNetwork, eyes: str, outputs: Mappin
         eyes: the value that holds crops, (B,3,h,w) in [0,1].
         outputs: what the values of the network's findings shall be called, by their names in ``EyeFindings``.
     """
-    net = folded(model, EyeNetwork.from_config(model.config))
+    net = without_normalisation(model)
     op = build.op
 
     def constant(name: str, value: torch.Tensor | float | tuple[int, ...]) -> str:

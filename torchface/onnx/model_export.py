@@ -18,11 +18,9 @@ from torchface.onnx.checked_export import ExportReport
 from torchface.onnx.dynamics_prior_graph import export_dynamics_prior
 from torchface.onnx.example_graph_export import ExampleReport, export_example_solver
 from torchface.onnx.expression_graph import export_expression_regression
-from torchface.onnx.eye_network_graph import export_eye_network
-from torchface.onnx.face_box_graph import export_box_network
 from torchface.onnx.head_decoder_graph import export_head_decoder
-from torchface.onnx.landmark_network_graph import export_landmark_network
 from torchface.onnx.landmark_trees_graph import export_landmark_trees
+from torchface.onnx.network_graphs import export_network
 from torchface.onnx.solver_graph_export import SolverReport, export_marker_solver
 from torchface.onnx.uv_landmark_graph import export_landmark_bank
 from torchface.onnx.video_graph_export import VideoReport, write_video_solver
@@ -55,12 +53,8 @@ def export_model(
         return export_expression_regression(model, path, facts)
     if isinstance(model, UVLandmarkDetector):
         return export_landmark_bank(model, path, facts)
-    if isinstance(model, LandmarkNetwork):
-        return export_landmark_network(model, path, facts)
-    if isinstance(model, EyeNetwork):
-        return export_eye_network(model, path, facts)
-    if isinstance(model, BoxNetwork):
-        return export_box_network(model, path, facts)
+    if isinstance(model, LandmarkNetwork | EyeNetwork | BoxNetwork):
+        return export_network(model, path, facts)
     if isinstance(model, LandmarkTrees):
         return export_landmark_trees(model, path, facts)
     if isinstance(model, DynamicsPrior):

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import NamedTuple, TypeVar
 
 import torch
 from torch import Tensor, nn
-from torch.nn.utils.fusion import fuse_conv_bn_eval
 
 from torchface.landmarks.images.networks.heat_maps import ResidualBlock
 from torchface.onnx.graph_builder import GraphBuilder
@@ -28,24 +26,6 @@ class HeatPoints(NamedTuple):
     points: str
     squared_spread: str
     features: str
-
-
-def folded(model: Network, twin: Network) -> Network:
-    """A network with its batch normalisations folded into the convolutions before them.
-
-    Args:
-        model: in evaluation mode.
-        twin: another of the same configuration, which takes over its state.
-    """
-    twin.load_state_dict(model.state_dict())
-    twin.eval()
-    for part in twin.modules():
-        if isinstance(part, nn.Sequential):
-            for at in range(len(part) - 1):
-                first, second = part[at], part[at + 1]
-                if isinstance(first, nn.Conv2d) and isinstance(second, nn.BatchNorm2d):
-                    part[at], part[at + 1] = fuse_conv_bn_eval(first, second), nn.Identity()
-    return twin
 
 
 def layers(build: GraphBuilder, part: nn.Module, value: str) -> str:
@@ -108,17 +88,3 @@ def heat_points(
     spread = op("Max", spread, build.constant(f"{prefix}zero", 0.0))
     cells = op("Reshape", features, build.constant(f"{prefix}cells", (0, heat.in_channels, -1)))
     return HeatPoints(points, spread, op("MatMul", share, op("Transpose", cells, perm=[0, 2, 1])))
-
-
-def crop_cases(
-    model: nn.Module, name: str, size: tuple[int, int], batches: Sequence[int]
-) -> list[tuple[Inputs, Inputs]]:
-    """Smooth random crops (B,3,height,width), and what a network finds in them, to hold a graph against."""
-    generator = torch.Generator().manual_seed(0)
-    cases = []
-    for batch in batches:
-        coarse = torch.rand(batch, 3, size[0] // 8, size[1] // 8, generator=generator)
-        crops = nn.functional.interpolate(coarse, size, mode="bilinear")
-        with torch.no_grad():
-            cases.append(({name: crops}, model(crops)._asdict()))
-    return cases

@@ -6,6 +6,8 @@ from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 
+import onnx
+
 from torchface import zoo
 from torchface.errors import NameMismatchError, ValueRangeError
 from torchface.landmarks import LandmarkNetwork, LandmarkTrees
@@ -17,8 +19,7 @@ from torchface.landmarks.images.networks.mediapipe_finder import MediaPipeFinder
 from torchface.landmarks.images.networks.onnx_finder import graph_finder, onnx_finder
 from torchface.landmarks.images.trees.landmark_consensus import ConsensusSettings
 from torchface.landmarks.images.trees.tree_finder import PHOTOGRAPH, TreeFinder
-from torchface.onnx.eye_network_graph import eye_network_model
-from torchface.onnx.landmark_network_graph import landmark_network_model
+from torchface.workflows.cached_graph import cached_graph
 
 __all__ = ["NamedFinder", "load_finder"]
 
@@ -90,7 +91,7 @@ def network_finder(network: LandmarkNetwork, name: str, photographs: bool = Fals
         name: what messages call it.
         photographs: show it each crop's mirror image too.
     """
-    finder = graph_finder(landmark_network_model(network).SerializeToString(), Path(name))
+    finder = graph_finder(_graph(network), Path(name))
     if photographs:
         finder = replace(finder, network=BothSides(finder.network))
     return EyedFinder(finder, eye_finder())
@@ -99,4 +100,13 @@ def network_finder(network: LandmarkNetwork, name: str, photographs: bool = Fals
 @cache
 def eye_finder() -> EyeFinder:
     """What reads lids and irises off the eyes of faces whose landmarks are known: the zoo's ``eye_network``."""
-    return graph_eye_finder(eye_network_model(zoo.get_model(EYES, EyeNetwork)).SerializeToString())
+    return graph_eye_finder(_graph(zoo.get_model(EYES, EyeNetwork)))
+
+
+def _graph(network: LandmarkNetwork | EyeNetwork) -> bytes:
+    def make() -> onnx.ModelProto:
+        from torchface.onnx.network_graphs import network_model
+
+        return network_model(network)
+
+    return cached_graph("networks", make, ("onnx", "landmarks/images/networks"), network=network)

@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-import copy
 from functools import cache
 
 import numpy as np
 import torch
-from torch import Tensor, nn
-from torch.nn.utils.fusion import fuse_conv_bn_eval
+from torch import Tensor
 
 from torchface.errors import ValueRangeError
 from torchface.files.model_roots import shipped_model
 from torchface.files.models import read_model
 from torchface.landmarks.images.boxes.box_network import BoxNetwork
 from torchface.landmarks.images.boxes.face_box import FaceBoxes, check_image, one_each, shrunk, sorted_boxes
+from torchface.landmarks.images.folded_normalisation import without_normalisation
 
 _MULTIPLE = 32  # pixels: the stride of the network's coarsest level
 _LEAST_SCORE, _LONGEST = 0.4, 640  # of a face, and pixels of the copy that is searched
@@ -47,6 +46,7 @@ class NetworkDetector:
         self.network = network
         self.least_score, self.longest = least_score, longest
         self._fused = without_normalisation(network).float()  # images are
+        self._fused.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
 
     @torch.inference_mode()
     def __call__(self, image: Tensor) -> FaceBoxes:
@@ -85,14 +85,3 @@ def _padded(pixels: Tensor) -> Tensor:
     rows = torch.arange(wanted[0]).clamp(max=height - 1)
     columns = torch.arange(wanted[1]).clamp(max=width - 1)
     return pixels[:, rows][:, :, columns]
-
-
-def without_normalisation(network: BoxNetwork) -> BoxNetwork:
-    """A copy that computes the same with batch normalisation folded into the convolutions before it."""
-    fused = copy.deepcopy(network).eval()
-    for module in fused.modules():
-        if isinstance(module, nn.Sequential) and len(module) == 2 and isinstance(module[1], nn.BatchNorm2d):
-            convolution = module[0]
-            assert isinstance(convolution, nn.Conv2d)
-            module[0], module[1] = fuse_conv_bn_eval(convolution, module[1]), nn.Identity()
-    return fused.to(memory_format=torch.channels_last)  # type: ignore[call-overload]

@@ -151,7 +151,7 @@ def graph_eye_finder(content: bytes) -> EyeFinder:
     """The finder of an eye network's graph, in ONNX Runtime on one thread.
 
     Args:
-        content: what ``torchface.onnx.eye_network_graph.eye_network_model`` makes.
+        content: what ``torchface.onnx.network_graphs.network_model`` exports.
     """
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = options.inter_op_num_threads = 1

@@ -1,4 +1,4 @@
-"""The graph of the network of face boxes gives what the network gives, for images of every size."""
+"""Graphs of the networks that read images give what the networks give; face boxes for images of every size."""
 
 from __future__ import annotations
 
@@ -11,8 +11,9 @@ import pytest
 import torch
 
 from torchface.landmarks import BoxNetwork
+from torchface.landmarks.images.networks.eye_network import EyeNetwork
 from torchface.onnx import export_model
-from torchface.onnx.face_box_graph import FACE_VALUES
+from torchface.onnx.network_graphs import FACE_VALUES
 
 
 @pytest.fixture(scope="module")
@@ -43,3 +44,16 @@ def test_other_sizes_than_it_was_exported_with(network: BoxNetwork, tmp_path: Pa
     assert facts["task"] == "face_boxes"
     assert facts["values"] == str(list(FACE_VALUES)).replace("'", '"')
     assert facts["licence"] == "MIT"
+
+
+def test_eyes_in_a_small_file(tmp_path: Path) -> None:
+    torch.manual_seed(0)
+    network = EyeNetwork()
+    for module in network.modules():  # statistics and heads as after training, not as at birth
+        if isinstance(module, torch.nn.BatchNorm2d):
+            module.running_mean.normal_(0, 0.2)  # type: ignore[union-attr, operator]
+            module.running_var.uniform_(0.5, 2)  # type: ignore[union-attr, operator]
+    torch.nn.init.normal_(network.local, 0, 0.3)
+    report = export_model(network, tmp_path / "eyes.onnx")
+    assert set(report.parity) == {"landmarks", "iris", "deviation", "openness", "closed", "visibility"}
+    assert (tmp_path / "eyes.onnx").stat().st_size < 165_000

@@ -1,0 +1,125 @@
+"""ONNX export of the networks that read images: landmarks, eyes, face boxes."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import onnx
+import torch
+from torch import Tensor, nn
+
+from torchface import __version__
+from torchface.landmarks.images.boxes.box_network import BoxNetwork
+from torchface.landmarks.images.folded_normalisation import without_normalisation
+from torchface.landmarks.images.networks.eye_network import EyeFindings, EyeNetwork
+from torchface.landmarks.images.networks.landmark_network import LandmarkNetwork, NetworkLandmarks
+from torchface.onnx.checked_export import ExportReport, write_checked
+from torchface.onnx.exported_model import exported_model, half_stored
+
+ImageNetwork = LandmarkNetwork | EyeNetwork | BoxNetwork
+
+FACE_VALUES = ("x", "y", "side", "score", "cosine", "sine")
+"""What the graph of face boxes gives for a face, in this order."""
+
+_PIXELS = {"landmarks", "iris", "deviation", "faces"}
+
+
+@dataclass(frozen=True)
+class _Form:
+    """The graph of a network.
+
+    Args:
+        images: the input's name.
+        sizes: names of the input's axes that may have any size.
+        example: an input, 2 images or more.
+        parity: by output, how far ONNX Runtime may be from PyTorch.
+        metadata: what the graph is for.
+    """
+
+    images: str
+    sizes: tuple[str | None, ...]
+    example: Tensor
+    parity: Mapping[str, float]
+    metadata: Mapping[str, object]
+
+
+def _form(network: ImageNetwork) -> _Form:
+    if isinstance(network, LandmarkNetwork):
+        facts = {"landmarks": "iBUG 68", "image": "red, green, blue, 0 to 1", "crop": str(network.margin)}
+        parity = dict(zip(NetworkLandmarks._fields, (0.1, 0.1, 0.01, 0.01), strict=True))
+        shape = (network.size, network.size)
+        return _Form("image", ("batch",), _cloudy(*shape), parity, facts | {"units": "pixels of the crop"})
+    if isinstance(network, EyeNetwork):
+        facts = {
+            "eyes": "red, green, blue, 0 to 1; left eyes mirrored",
+            "landmarks": "outer corner, two of the upper lid, inner corner, two of the lower lid",
+            "units": "pixels of the crop",
+        }
+        parity = {name: 0.1 if name in _PIXELS else 0.01 for name in EyeFindings._fields}
+        return _Form("eyes", ("batch",), _cloudy(network.height, network.width), parity, facts)
+    given = {"values": list(FACE_VALUES), "units": "pixels", "multiple": 32}
+    return _Form("images", ("batch", None, "height", "width"), _cloudy(192, 256), {"faces": 2e-3}, given)
+
+
+def export_network(network: ImageNetwork, path: str | Path, facts: Mapping[str, object] | None = None) -> ExportReport:
+    """Writes a network that reads images as ONNX, and checks it.
+
+    The graph of a ``LandmarkNetwork`` takes ``image`` (B,3,S,S): faces' boxes enlarged by the metadata's ``crop`` and
+    turned upright. It gives ``landmarks`` (B,68,2) and ``deviation`` (B,68), pixels of the crop, ``visibility`` (B,68)
+    and ``presence`` (B,) in [0,1].
+
+    That of an ``EyeNetwork`` takes ``eyes`` (B,3,h,w): crops as ``eye_transforms`` cuts them, left eyes mirrored. It
+    gives ``landmarks`` (B,6,2), ``iris`` (B,2) and ``deviation`` (B,7), pixels of the crop, ``openness`` (B,), and
+    ``closed`` and ``visibility`` (B,) in [0,1].
+
+    That of a ``BoxNetwork`` takes ``images`` (B,3,H,W), 64 pixels a side at least and best a multiple of 32. It gives
+    ``faces`` (B,K,6), the likeliest first: x and y of the centre and side of the box, pixels, score in [0,1], cosine
+    and sine of the roll angle, clockwise as the image is seen. What is no face has a score near 0.
+
+    Images are red, green, blue in [0,1]. Weights of the first two are stored in half precision.
+
+    Args:
+        network: what to export.
+        path: the file to write.
+        facts: further metadata, such as licence and data.
+
+    Raises:
+        ValueRangeError: ONNX Runtime and PyTorch differ; nothing is written.
+    """
+    form, cases = _form(network.eval()), []
+    smaller = form.example[..., : form.example.shape[-1] - 64] if "width" in form.sizes else form.example
+    for images in (form.example[:1], form.example, smaller):
+        with torch.no_grad():
+            found = network(images)
+        named = {"faces": found} if isinstance(found, Tensor) else found._asdict()
+        cases.append(({form.images: images}, named))
+    units = {name: "pixels" if name in _PIXELS else "of 1" for name in form.parity}
+    return write_checked(network_model(network, facts), path, cases, form.parity, units)
+
+
+def network_model(network: ImageNetwork, facts: Mapping[str, object] | None = None) -> onnx.ModelProto:
+    """The graph; see :func:`export_network`."""
+    form = _form(network)
+    task = {LandmarkNetwork: "landmark_network", EyeNetwork: "eye_network", BoxNetwork: "face_boxes"}[type(network)]
+    fused = without_normalisation(network)
+    model = exported_model(
+        fused,
+        {form.images: form.example},
+        list(form.parity),
+        {"task": task, **form.metadata, "version": __version__, **(facts or {})},
+        {form.images: form.sizes},
+    )
+    return model if isinstance(network, BoxNetwork) else half_stored(model, halves(fused))
+
+
+def halves(network: nn.Module, prefix: str = "") -> set[str]:
+    """Names of the weights that are stored in half precision: all but biases."""
+    return {prefix + name for name, value in network.named_parameters() if value.ndim > 1 and not name.endswith("bias")}
+
+
+def _cloudy(height: int, width: int) -> Tensor:
+    """Two smooth random images."""
+    coarse = torch.rand(2, 3, height // 8, width // 8, generator=torch.Generator().manual_seed(0))
+    return nn.functional.interpolate(coarse, (height, width), mode="bilinear")

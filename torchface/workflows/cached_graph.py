@@ -1,0 +1,42 @@
+"""Cache of ONNX graphs: each is exported once, and anew where its models or its code have changed."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from pathlib import Path
+
+import onnx
+import torch
+
+import torchface
+from torchface.errors import FileFormatError
+from torchface.files.cache_folder import cache_folder
+from torchface.files.content_keys import content_key
+from torchface.files.whole_files import all_or_none, read_file, write_file
+
+
+def cached_graph(kind: str, make: Callable[[], onnx.ModelProto], code: Sequence[str], **models: object) -> bytes:
+    """A graph's file: from the cache where it is there and whole, else exported; kept if the cache can be written to.
+
+    Args:
+        kind: of the graph, a plain name.
+        make: exports it, in seconds to a minute.
+        code: folders of this package whose code says what becomes of the models.
+        models: what the graph is made of, as :func:`~torchface.files.content_keys.content_key` takes it.
+    """
+    package = Path(torchface.__file__).parent
+    sources = {one: sorted((package / one).rglob("*.py")) for one in code}
+    key = content_key(f"{kind} 2", torch=str(torch.__version__), sources=sources, models=models)[:32]
+    with suppress(FileFormatError):  # not there, or damaged
+        path = cache_folder(kind) / f"{key}.onnx"
+        content = read_file(path)
+        if read_file(path.with_suffix(".sha256")).decode("ascii", "replace") == hashlib.sha256(content).hexdigest():
+            return content
+    content = make().SerializeToString()
+    with suppress(FileFormatError), all_or_none():
+        path = cache_folder(kind) / f"{key}.onnx"
+        write_file(path, content)
+        write_file(path.with_suffix(".sha256"), hashlib.sha256(content).hexdigest().encode())
+    return content
