@@ -17,6 +17,7 @@ from torchface.cli.attach import attach
 from torchface.cli.calibrate import calibrate
 from torchface.cli.command_options import plain_options
 from torchface.cli.convert import convert
+from torchface.cli.corrective import corrective
 from torchface.cli.demo import demo
 from torchface.cli.enhance import enhance
 from torchface.cli.evaluate import evaluate
@@ -46,6 +47,7 @@ COMMANDS: dict[str, Callable[..., None]] = {
     "rig": rig,
     "fit": fit,
     "transfer": transfer,
+    "corrective": corrective,
     "attach": attach,
     "solve": solve,
     "track": track,

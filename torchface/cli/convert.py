@@ -16,6 +16,7 @@ def convert(
     unit: str | None = None,
     part: str | None = None,
     names: Literal["arkit"] | None = None,
+    at: tuple[str, ...] = (),
     quiet: Quiet = False,
 ) -> None:
     """Write a rig with its animation, or a mesh, as another kind of file, FBX and Blender's own among them.
@@ -31,12 +32,15 @@ def convert(
         unit: Unit of FILE (mm, cm, m) where it is not the format's own.
         part: Keep this region only, such as face.
         names: Names of the written shapes. "arkit": ARKit's where the rig's mean the same. All keep theirs if absent.
+        at: Write the mesh in this pose, such as mouthSmileLeft=1 jawOpen=0.7, instead of the rig.
         quiet: Show no progress.
     """
     from torchface.workflows.convert_file import convert_file
+    from torchface.workflows.posed_mesh import pose_weights
 
     with progress_bars(quiet) as progress:
-        done = convert_file(source, out, unit, part, names, progress)
+        pose = pose_weights(" ".join(at).split())
+        done = convert_file(source, out, unit, part, names, progress, pose)
     shapes = 0 if done.rig is None else len(done.rig.names)
     frames = "" if done.take is None else f", {len(done.take)} frames at {done.take.fps:g} a second"
     console.print(f"{shapes} shapes, {len(done.mesh.vertices):,} vertices{frames}", highlight=False)

@@ -32,6 +32,11 @@ from torchface.modeling.rigging.open_eyed_neutral import open_eyes
 from torchface.modeling.rigging.part_clearance import clear_parts
 from torchface.modeling.rigging.part_placement import place_parts
 from torchface.modeling.rigging.penetration import InnerParts, inner_parts, shape_depths
+from torchface.modeling.rigging.sculpted_corrective import (
+    SculptedCorrective,
+    corrective_from_sculpt,
+    sculpt_misalignment,
+)
 
 __all__ = [
     "BakeSettings",
@@ -51,12 +56,14 @@ __all__ = [
     "PhotoTexture",
     "RiggingSchedule",
     "ScanAlignment",
+    "SculptedCorrective",
     "TransferReport",
     "TransferredRig",
     "align_scan",
     "bake_normal_map",
     "clear_parts",
     "color_casts",
+    "corrective_from_sculpt",
     "detail_maps",
     "fit_colors",
     "fit_images",
@@ -67,6 +74,7 @@ __all__ = [
     "place_parts",
     "rig_from_examples",
     "rig_from_neutral",
+    "sculpt_misalignment",
     "shape_depths",
     "texture_areas",
     "transfer_deformation",

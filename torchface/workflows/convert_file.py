@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -21,7 +22,7 @@ from torchface.mesh import Mesh, submesh
 from torchface.progress import Progress, silent
 from torchface.rig import BlendshapeRig
 from torchface.take import Take
-from torchface.workflows.posed_mesh import load_neutral
+from torchface.workflows.posed_mesh import load_neutral, posed_mesh
 from torchface.workflows.rig_names import Naming, naming_lines, renamed, renamed_detail
 
 
@@ -49,6 +50,7 @@ def convert_file(
     part: str | None = None,
     names: Naming | None = None,
     progress: Progress | None = None,
+    pose: Mapping[str, float] | None = None,
 ) -> Converted:
     """Reads whatever holds a rig or a mesh and writes it as ``out``'s ending says.
 
@@ -60,6 +62,7 @@ def convert_file(
         part: keep this annotated region only.
         names: how shapes are called in ``out``; see ``rig_names``.
         progress: called with each step.
+        pose: weights by name, to write the mesh in that pose instead of the rig.
 
     Raises:
         MissingExtraError: Blender or usd-core is needed, and is not installed.
@@ -76,7 +79,11 @@ def convert_file(
     else:
         check_writable(folder=out)
     progress("reading")
-    source_rig = _read(source, unit, part)
+    source_rig = read_source(source, unit, part)
+    if pose:
+        if source_rig.rig is None:
+            raise FileFormatError(f"{source}: found a mesh without shapes, expected a rig for a pose")
+        source_rig = Converted(posed_mesh(source_rig.rig, pose), None, None, ())
     progress("writing")
     make_folder(out.parent)
     if source_rig.rig is None:
@@ -85,20 +92,25 @@ def convert_file(
         save_mesh(source_rig.mesh, out)
         return source_rig
     rig = renamed(source_rig.rig, names)
-    detail: DetailMaps | RegionMaps | None = None
-    notes: list[str] = []
-    if part is None and source.suffix.lower() in GLTF_ENDINGS and (by_region := load_region_maps(source)) is not None:
-        if out.suffix.lower() == ".glb":
-            detail = by_region
-        else:
-            notes.append(f"{out.name} has no place for wrinkle maps by region, which are left out; .glb has")
-    if part is None and source.suffix.lower() in SCENE_ENDINGS and detail is None:
-        detail = renamed_detail(load_detail_maps(source), source_rig.rig, names)
-    notes += _write(rig, source_rig.take, detail, out)
+    detail, notes = (None, []) if part is not None else maps_for(source, out)
+    if isinstance(detail, DetailMaps):
+        detail = renamed_detail(detail, source_rig.rig, names)
+    notes += write_source(rig, source_rig.take, detail, out)
     return Converted(rig.neutral, rig, source_rig.take, (*naming_lines(source_rig.rig, names), *notes))
 
 
-def _read(source: Path, unit: str | None, part: str | None) -> Converted:
+def maps_for(source: Path, out: Path) -> tuple[DetailMaps | RegionMaps | None, list[str]]:
+    """The wrinkle maps of a rig's file that ``out`` has a place for, and lines on those that it has none for."""
+    notes = []
+    if source.suffix.lower() in GLTF_ENDINGS and (by_region := load_region_maps(source)) is not None:
+        if out.suffix.lower() == ".glb":
+            return by_region, []
+        notes.append(f"{out.name} has no place for wrinkle maps by region, which are left out; .glb has")
+    return (load_detail_maps(source) if source.suffix.lower() in SCENE_ENDINGS else None), notes
+
+
+def read_source(source: Path, unit: str | None = None, part: str | None = None) -> Converted:
+    """A mesh, its shapes and their animation, as far as a file has them."""
     suffix = source.suffix.lower()
     if suffix in BLENDER_ENDINGS:
         scene = read_blender_file(source, unit)
@@ -112,7 +124,7 @@ def _read(source: Path, unit: str | None, part: str | None) -> Converted:
     return Converted(mesh, rig, take, ())
 
 
-def _write(rig: BlendshapeRig, take: Take | None, detail: DetailMaps | RegionMaps | None, out: Path) -> list[str]:
+def write_source(rig: BlendshapeRig, take: Take | None, detail: DetailMaps | RegionMaps | None, out: Path) -> list[str]:
     """Writes the rig with what ``out`` has a place for; says what it has none for."""
     suffix, notes = out.suffix.lower(), []
     if take is not None and not suffix:

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import torch
+from torch import Tensor
 
 from torchface.errors import FileFormatError, NameMismatchError, ValueRangeError
 from torchface.io import load_mesh, load_rig, load_take
@@ -68,21 +69,35 @@ def load_posed(
     if rig is None:
         return Posed(neutral, neutral)
     if take is None:
-        names = tuple(weights)
-        matrix = mapping(names, rig.names)
-        unknown = [name for name, used in zip(names, matrix.any(0), strict=True) if not used]
-        if unknown:
-            hint = near_names(unknown, rig.names)
-            raise NameMismatchError(f"weights: found {', '.join(unknown)}; expected shapes of the rig: {hint}")
-        row = matrix @ torch.tensor([weights[name] for name in names])
-    else:
-        track = load_take(take).weights
-        if track is None:
-            raise ValueRangeError(f"{take}: found no weights, expected a weight take such as Live Link Face's")
-        if not 0 <= frame < len(track):
-            raise ValueRangeError(f"{take}: found {len(track)} frames, expected frame {frame} among them")
-        row = rig.weights_from(track.frames(slice(frame, frame + 1)))[0]
+        return Posed(posed_mesh(rig, weights), rig.neutral)
+    track = load_take(take).weights
+    if track is None:
+        raise ValueRangeError(f"{take}: found no weights, expected a weight take such as Live Link Face's")
+    if not 0 <= frame < len(track):
+        raise ValueRangeError(f"{take}: found {len(track)} frames, expected frame {frame} among them")
+    row = rig.weights_from(track.frames(slice(frame, frame + 1)))[0]
     return Posed(rig.neutral.with_vertices(rig(row[None].to(rig.deltas))[0]), rig.neutral)
+
+
+def pose_row(rig: BlendshapeRig, weights: Mapping[str, float]) -> Tensor:
+    """Weights (N,) of a rig by name, in any of the spellings that ``torchface.shape_names`` reads.
+
+    Raises:
+        NameMismatchError: a name means no shape of the rig.
+    """
+    names = tuple(weights)
+    matrix = mapping(names, rig.names)
+    unknown = [name for name, used in zip(names, matrix.any(0), strict=True) if not used]
+    if unknown:
+        hint = near_names(unknown, rig.names)
+        raise NameMismatchError(f"weights: found {', '.join(unknown)}; expected shapes of the rig: {hint}")
+    return (matrix @ torch.tensor([weights[name] for name in names])).to(rig.deltas)
+
+
+def posed_mesh(rig: BlendshapeRig, weights: Mapping[str, float]) -> Mesh:
+    """The rig's mesh in a pose; see :func:`pose_row`."""
+    with torch.no_grad():
+        return rig.neutral.with_vertices(rig(pose_row(rig, weights)[None])[0])
 
 
 def load_neutral(path: Path, unit: str | None = None, part: str | None = None) -> tuple[Mesh, BlendshapeRig | None]:

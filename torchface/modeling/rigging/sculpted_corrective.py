@@ -1,0 +1,251 @@
+"""A corrective made from a sculpted mesh: what an artist changes where a rig's shapes act together or half-way."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torchface.correctives import Corrective, Correctives
+from torchface.errors import AlignmentError, NameMismatchError, TopologyError, ValueRangeError
+from torchface.geometry.meshes.unit_check import check_unit, extent
+from torchface.geometry.similarity import Similarity, similarity_transform
+from torchface.mesh import Mesh
+from torchface.rig import BlendshapeRig
+
+# Millimetres: less is what files round; a shift of less moves nothing that is seen.
+_CHANGED, _SHIFTED = 1e-3, 0.05
+# A motion of the whole mesh leaves less than this share of the median distance where it is all that the median shows.
+_EXPLAINED = 0.1
+_SAME_PEAK = 1e-4
+# Of the mesh's extent, the median distance at which it is no sculpt of this rig; heads differ by less.
+_FAR = 0.03
+# Of the change's square, what a change of the drivers' weights explains where the pose was another one.
+_ANOTHER_POSE = 0.7
+_ITERATIONS = 30
+
+
+@dataclass(frozen=True, eq=False)
+class SculptedCorrective:
+    """A rig with a corrective that was made from a sculpt.
+
+    Args:
+        rig: with the corrective.
+        definition: of the corrective.
+        activation: how far it is on at the pose.
+        change: what the sculpt changes at the pose, (V,3), millimetres.
+        within: correctives of more shapes, all of its own among them, whose poses the new one changes too.
+    """
+
+    rig: BlendshapeRig
+    definition: Corrective
+    activation: float
+    change: Tensor
+    within: tuple[str, ...]
+
+    def lines(self) -> list[str]:
+        """What the sculpt changes, for people to read."""
+        far = self.change.norm(dim=-1)
+        moved = far > _CHANGED
+        when = " x ".join(self.definition.drivers)
+        when += "" if self.definition.peak is None else f" at {self.definition.peak:g}"
+        found = [
+            f"{self.definition.name} ({when}): the sculpt changes {int(moved.sum()):,} of {len(far):,} vertices, by up "
+            f"to {float(far.max()):.3g} mm, {float(far[moved].mean()):.3g} in the mean{self._where(far)}"
+        ]
+        if self.activation < 0.999:
+            found.append(
+                f"the corrective is {self.activation:.3g} on at this pose; where it is fully on it moves vertices by "
+                f"up to {float(far.max()) / self.activation:.3g} mm"
+            )
+        deltas = self.rig.deltas[self.rig.index(self.definition.drivers)].flatten(1).cpu().double()
+        steps = torch.linalg.lstsq(deltas.T, self.change.flatten()[:, None], driver="gelsd").solution[:, 0]
+        if float((steps @ deltas).square().sum()) > _ANOTHER_POSE * float(self.change.square().sum()):
+            other = " ".join(
+                f"{name}{step:+.2f}" for name, step in zip(self.definition.drivers, steps.tolist(), strict=True)
+            )
+            found.append(f"warning: {other} is most of the change; was the mesh sculpted at another pose?")
+        if self.within:
+            found.append(f"warning: it acts at the poses of {', '.join(self.within)} too, whose faces it changes")
+        return found
+
+    def _where(self, far: Tensor) -> str:
+        notes = self.rig.neutral.annotations
+        regions = {} if notes is None else notes.regions
+        means = {name: float(far[mask].mean()) for name, mask in regions.items() if bool(mask.any())}
+        most = [name for name in sorted(means, key=lambda name: -means[name])[:3] if means[name] > _CHANGED]
+        if most:
+            return f"; most in {', '.join(f'{name} ({means[name]:.2g} mm)' for name in most)}"
+        middle = (far[:, None] * self.rig.vertices.to(far)).sum(0) / far.sum()
+        return f"; about ({', '.join(f'{value:.0f}' for value in middle.tolist())}) mm"
+
+
+def corrective_from_sculpt(
+    rig: BlendshapeRig, weights: Tensor, sculpt: Tensor, name: str | None = None, replace: bool = False
+) -> SculptedCorrective:
+    r"""The rig with a corrective that makes it show a sculpt at a pose, and that is 0 where one of its drivers is.
+
+    .. math:: D = \frac{s - A'(w)}{a(w)}
+
+    with the rig A' that has the corrective with a delta of 0, so that other correctives act as they will beside it. The
+    drivers are the shapes whose weight is not 0: two to eight are a combination; one below 1 is an in-between whose
+    peak is its weight.
+
+    Args:
+        rig: N shapes, V vertices.
+        weights: the pose, (N,), in [0,1].
+        sculpt: vertices (V,3) in the rig's order, millimetres.
+        name: of the corrective; if absent its drivers' joined by ``_``, an in-between's with its peak in percent.
+        replace: take the place of a corrective that acts at the same combination or peak.
+
+    Raises:
+        ShapeError: ``sculpt`` is of another size.
+        ValueRangeError: a weight outside [0,1], none above 0, one alone at 1, or a sculpt that changes nothing.
+        NameMismatchError: more than eight drivers, a name that is taken, or a corrective that acts there already.
+
+    Example:
+        >>> face, names = torch.eye(3), ["smile", "jaw"]
+        >>> rig = BlendshapeRig.from_tensors(face, torch.tensor([[0, 1, 2]]), torch.ones(2, 3, 3), names)
+        >>> made = corrective_from_sculpt(rig, torch.tensor([1.0, 0.5]), face + 2.5)
+        >>> made.definition.name, made.rig(torch.tensor([[1.0, 0.5]]))[0, 0].tolist()
+        ('smile_jaw', [3.5, 2.5, 2.5])
+    """
+    weights, sculpt = weights.detach().cpu().double(), sculpt.detach().cpu().double()
+    rows = weights.nonzero()[:, 0].tolist()
+    pose = " ".join(f"{rig.names[row]}={float(weights[row]):.4g}" for row in rows)
+    if not rows or not bool(((weights >= 0) & (weights <= 1)).all()):
+        raise ValueRangeError(f"pose: found {pose or 'no weight'}, expected weights above 0 and at most 1")
+    peak = float(f"{float(weights[rows[0]]):.6g}") if len(rows) == 1 else None  # as it was given
+    if peak == 1:
+        raise ValueRangeError(
+            f"pose: found {pose} alone, which is the shape itself; expected two shapes, or a weight below 1"
+        )
+    drivers = tuple(rig.names[row] for row in rows)
+    old = () if rig.correctives is None else rig.correctives.definitions
+    place = next((row for row, one in enumerate(old) if _acts_at(one, drivers, peak)), len(old))
+    if place < len(old):
+        if not replace:
+            raise NameMismatchError(
+                f"corrective: found {old[place].name!r}, which acts at {pose} already; expected none: --replace "
+                "(replace=True) puts the sculpt in its place"
+            )
+        name, drivers, peak = name or old[place].name, old[place].drivers, old[place].peak
+    title = name or "_".join(drivers) + ("" if peak is None else f"_{100 * peak:.3g}")
+    definition = Corrective(title, drivers, peak)
+    definitions = (*old[:place], definition, *old[place + 1 :])
+    neutral = rig.neutral.to("cpu").with_vertices(rig.vertices.detach().cpu().double())
+    deltas = sculpt.new_zeros(len(definitions), *neutral.vertices.shape)
+    if rig.correctives is not None:
+        deltas[: len(old)] = rig.correctives.deltas.detach().cpu()
+    before = BlendshapeRig(neutral, rig.deltas.detach().cpu(), rig.names, rig.correctives)(weights[None])[0]
+    change = sculpt - before
+    if float(change.norm(dim=-1).max()) < _CHANGED:
+        raise ValueRangeError(f"sculpt: found the face that the rig shows at {pose}, expected a change of it")
+    deltas[place] = 0.0
+    bare = BlendshapeRig(neutral, rig.deltas.detach().cpu(), rig.names, Correctives(deltas, definitions))
+    assert bare.activation is not None
+    activation = float(bare.activation(weights[None])[0, place])
+    deltas[place] = (sculpt - bare(weights[None])[0]) / activation
+    made = Correctives(deltas.to(rig.deltas), definitions)
+    more = () if peak is not None else tuple(one.name for one in old if set(one.drivers) > set(drivers))
+    return SculptedCorrective(
+        BlendshapeRig(rig.neutral, rig.deltas, rig.names, made), definition, activation, change, more
+    )
+
+
+def _acts_at(definition: Corrective, drivers: tuple[str, ...], peak: float | None) -> bool:
+    if set(definition.drivers) != set(drivers):
+        return False
+    return peak is None or abs((definition.peak or 0.0) - peak) < _SAME_PEAK
+
+
+def sculpt_misalignment(shown: Tensor, sculpt: Tensor) -> Similarity | None:
+    r"""The motion of the whole mesh that a sculpt contains beside its change, if most vertices show it.
+
+    .. math:: \min_{s,R,t} \sum_v \lVert s R x_v + t - y_v \rVert
+
+    by reweighted least squares: the vertices that the artist changed, less than half, do not count.
+
+    Args:
+        shown: vertices x of the rig at the pose, (V,3), millimetres.
+        sculpt: y, (V,3).
+
+    Returns:
+        The similarity (B = 1) that removes it from the sculpt; none if most vertices lie where the rig shows them, or
+        no motion brings them there.
+
+    Source: Weiszfeld 1937, for points under a similarity.
+
+    Example:
+        >>> face = torch.randn(50, 3)
+        >>> sculpt_misalignment(face, face + 5).translation.round().tolist()
+        [[-5.0, -5.0, -5.0]]
+    """
+    x, y = shown[None].double(), sculpt[None].double()
+    before = (x - y).norm(dim=-1)
+    if float(before.median()) < _SHIFTED:
+        return None
+    weights, found = torch.ones_like(before), similarity_transform(y, x)
+    for _ in range(_ITERATIONS):  # each needs the distances of the one before
+        weights = 1 / (found.apply(y) - x).norm(dim=-1).clamp(min=_CHANGED)
+        found = similarity_transform(y, x, weights)
+    left = float((found.apply(y) - x).norm(dim=-1).median())
+    return found if left < _EXPLAINED * float(before.median()) else None
+
+
+def checked_sculpt(path: object, sculpt: Mesh, rig: BlendshapeRig, shown: Tensor, align: str | None) -> Tensor:
+    """The vertices of a sculpt (V,3) in place.
+
+    Args:
+        path: of the sculpt, for messages.
+        sculpt: as it was read.
+        rig: of V vertices.
+        shown: what the rig shows at the pose, (V,3).
+        align: ``"remove"`` a motion of the whole mesh, ``"keep"`` it as part of the sculpt, or refuse it if absent.
+
+    Raises:
+        TopologyError: another topology or order of vertices.
+        ValueRangeError: another unit.
+        AlignmentError: the whole mesh has moved.
+    """
+    ours = rig.neutral
+    if len(sculpt.vertices) != len(ours.vertices):
+        raise TopologyError(
+            f"{path}: found {len(sculpt.vertices):,} vertices, expected the rig's {len(ours.vertices):,}"
+        )
+    both = ours.polygons is not None and sculpt.polygons is not None
+    found, expected = (_rows(mesh.polygons if both else mesh.faces) for mesh in (sculpt, ours))
+    if lost := len(expected - found):
+        raise TopologyError(
+            f"{path}: found other vertices at {lost:,} of the rig's {len(expected):,} faces; expected the rig's "
+            "topology and its order of vertices (export it, sculpt, and export again without reordering)"
+        )
+    size = extent(shown)
+    check_unit(str(path), sculpt.vertices, size, "the rig", 0.5, 2.0)
+    motion = None if align == "keep" else sculpt_misalignment(shown, sculpt.vertices)
+    placed = sculpt.vertices if motion is None else motion.apply(sculpt.vertices.double())[0]
+    far = float((placed - shown.to(placed)).norm(dim=-1).median())
+    if far > _FAR * size:
+        raise TopologyError(
+            f"{path}: found half of the vertices {far:.3g} mm and more from where the rig shows them, expected a "
+            "sculpt of this rig in its order of vertices"
+        )
+    if motion is None:
+        return placed
+    if align == "remove":
+        return placed
+    undone = motion.inverse()
+    trace = float(undone.rotation[0].diagonal().sum())
+    angle = torch.rad2deg(torch.acos(torch.tensor((trace - 1) / 2).clamp(-1, 1)))
+    shift = (undone.apply(shown.double())[0] - shown).mean(0).norm()
+    raise AlignmentError(
+        f"{path}: found the whole mesh moved by {float(shift):.3g} mm, turned by {float(angle):.2g} degrees and scaled "
+        f"by {float(undone.scale):.5g} beside what is sculpted, expected it where the rig is; --align remove takes "
+        "that out, --align keep takes it as part of the sculpt"
+    )
+
+
+def _rows(faces: Tensor | None) -> set[tuple[int, ...]]:
+    assert faces is not None
+    return {tuple(vertex for vertex in row if vertex >= 0) for row in faces.sort(1).values.tolist()}
