@@ -5,6 +5,7 @@ __all__ = [
     "FileFormatError",
     "MissingExtraError",
     "NameMismatchError",
+    "NoShapesError",
     "ShapeError",
     "TopologyError",
     "TorchfaceError",
@@ -61,6 +62,21 @@ class FileFormatError(TorchfaceError):
         Traceback (most recent call last):
             ...
         torchface.errors.FileFormatError: head.obj: found no vertex (line 'v x y z'), expected an OBJ mesh
+    """
+
+
+class NoShapesError(FileFormatError):
+    """A file is whole and holds a mesh, but no blend shape: no rig.
+
+    Example:
+        >>> from torchface import load_rig
+        >>> from torchface.io import save_mesh
+        >>> from torchface.synthetic import neutral_head
+        >>> save_mesh(neutral_head(texture=False), "head.glb")
+        >>> load_rig("head.glb")
+        Traceback (most recent call last):
+            ...
+        torchface.errors.NoShapesError: head.glb: found no morph target in its one mesh, expected at least one for a rig
     """
 
 

@@ -10,6 +10,7 @@ from typing import ClassVar
 
 import torch
 
+from torchface.cli.command_options import OutputPath
 from torchface.errors import ValueRangeError
 
 CPU_ALONE = ("cpu",)
@@ -29,7 +30,7 @@ class RecipeSettings:
         licence: Under which the model may be used; what that which it has learned from allows, if absent.
     """
 
-    out: Path = Path("models/mine")
+    out: OutputPath = Path("models/mine")
     seed: int = 0
     device: str | None = None
     resume: bool = True

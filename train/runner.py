@@ -14,7 +14,7 @@ import torch
 import tyro
 
 from torchface import zoo
-from torchface.cli.command_options import plain_options
+from torchface.cli.command_options import inputs_kept, plain_options
 from torchface.cli.terminal import plain_errors, progress_bars
 from torchface.errors import ValueRangeError
 from torchface.files.job_lock import job_lock
@@ -123,7 +123,8 @@ class Recipe(Generic[Settings, Trained]):
         """
         with plain_errors():
             chosen = self.chosen(list(sys.argv[1:] if arguments is None else arguments))
-            with job_lock(chosen.out), progress_bars() as progress:
+            kept = inputs_kept(self.settings, vars(chosen))
+            with kept, job_lock(chosen.out), progress_bars() as progress:
                 trained = self.train(chosen, progress)
             for line in self.lines(chosen, trained):
                 print(line)

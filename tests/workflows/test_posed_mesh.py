@@ -1,14 +1,21 @@
 """A posed rig is the rig at those weights, from whatever file it lies in."""
 
+import json
+import math
+import re
+from functools import partial
 from pathlib import Path
 
 import pytest
 import torch
+from rig_samples import corrective_sheet
 
-from torchface.errors import NameMismatchError, ValueRangeError
+from torchface.errors import FileFormatError, NameMismatchError, ValueRangeError
 from torchface.io import save_mesh, save_rig, save_take
 from torchface.rig import BlendshapeRig
 from torchface.take import Take, Track
+from torchface.workflows.convert_file import convert_file
+from torchface.workflows.describe_file import describe
 from torchface.workflows.posed_mesh import load_posed, pose_weights
 
 
@@ -39,3 +46,41 @@ def test_what_cannot_be_posed_is_said(dome_rig: BlendshapeRig, tmp_path: Path) -
     for word in ("jawOpen", "=1", "jawOpen=wide", "jawOpen=nan", "jawOpen=1e9"):
         with pytest.raises(ValueRangeError, match="expected NAME=NUMBER"):
             pose_weights([word])
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"drivers": ["jawOpen", "jaw_smile"]}, "a cycle, jaw_smile"),
+        ({"drivers": ["jawOpen"], "peak": math.nan}, "'jaw_smile': peak: found nan"),
+        ({"drivers": ["jawOpen", "gone"]}, "'jaw_smile' and no morph target 'gone'"),
+        ({"drivers": [f"shape{i}" for i in range(5000)]}, "'jaw_smile': found a product of 5000"),
+    ],
+    ids=["cycle", "NaN peak", "missing target", "5,000 drivers"],
+)
+@pytest.mark.parametrize("ending", [".glb", ".usda"])
+def test_a_broken_corrective_is_an_error_and_no_rig_without_shapes(
+    ending: str, change: dict[str, object], message: str, tmp_path: Path
+) -> None:
+    path = tmp_path / f"rig{ending}"
+    save_rig(corrective_sheet(), path)
+    data = path.read_bytes()
+    if ending == ".glb":
+        length = int.from_bytes(data[12:16], "little")
+        root = json.loads(data[20 : 20 + length])
+        root["meshes"][0]["extras"]["torchface"]["correctives"][0].update(change)
+        text = json.dumps(root).encode()
+        text += b" " * (-len(text) % 4)
+        body = len(text).to_bytes(4, "little") + b"JSON" + text + data[20 + length :]
+        path.write_bytes(data[:8] + (12 + len(body)).to_bytes(4, "little") + body)
+    else:
+        notes = re.search(r"string torchface = '(.*correctives.*)'$", data.decode(), re.MULTILINE)
+        assert notes is not None
+        record = json.loads(notes[1])
+        record["correctives"][0].update(change)
+        path.write_text(data.decode().replace(notes[1], json.dumps(record)))
+    convert = partial(convert_file, path, tmp_path / "out.obj")
+    for read in (convert,) if ending == ".usda" else (convert, partial(describe, path), partial(load_posed, path, {})):
+        with pytest.raises(FileFormatError, match=message):
+            read()
+    assert not (tmp_path / "out.obj").exists()

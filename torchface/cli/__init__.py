@@ -15,7 +15,7 @@ from torchface import __version__
 from torchface.cli.annotate import annotate
 from torchface.cli.attach import attach
 from torchface.cli.calibrate import calibrate
-from torchface.cli.command_options import plain_options
+from torchface.cli.command_options import checked
 from torchface.cli.convert import convert
 from torchface.cli.corrective import corrective
 from torchface.cli.demo import demo
@@ -109,19 +109,19 @@ def main(arguments: Sequence[str] | None = None) -> None:
             raise SystemExit(0 if words else 2)
         _check_command(words[0])
         if words[:1] == ["export"] and words[1:] and words[1] not in EXPORTS and not words[1].startswith("-"):
-            tyro.cli(plain_options(export_model), prog="torchface export", args=words[1:])
+            tyro.cli(checked(export_model), prog="torchface export", args=words[1:])
         elif words[0] == "train":
             train(words[1:])
         elif words[0] in GROUPS:
             group = GROUPS[words[0]]
             tyro.extras.subcommand_cli_from_dict(
-                {name: plain_options(command) for name, command in group.commands.items()},
+                {name: checked(command) for name, command in group.commands.items()},
                 prog=f"torchface {words[0]}",
                 description=group.description,
                 args=words[1:],
             )
         else:
-            commands = {name: plain_options(command) for name, command in COMMANDS.items()}
+            commands = {name: checked(command) for name, command in COMMANDS.items()}
             tyro.extras.subcommand_cli_from_dict(commands, prog="torchface", description=DESCRIPTION, args=words)
 
 

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 from tyro.conf import Positional
 
+from torchface.cli.command_options import OutputPath
 from torchface.cli.terminal import Quiet, print_path, progress_bars, serve_page
 
 if TYPE_CHECKING:
@@ -17,7 +18,7 @@ if TYPE_CHECKING:
 
 def annotate(
     video: Positional[Path],
-    out: Path,
+    out: OutputPath,
     landmarks: str = "landmark_network",
     count: int = 15,
     face: int = 0,

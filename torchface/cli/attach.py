@@ -8,6 +8,7 @@ from typing import Annotated, Literal
 from tyro.conf import Positional, arg
 
 from torchface.cli.batch_report import Cluster, Column, Jobs, TimeLimit, show_batch, skipped_lines
+from torchface.cli.command_options import OptionalOutputPath, OutputPath
 from torchface.cli.terminal import Quiet, print_lines, print_path, progress_bars
 
 _COLUMNS = (
@@ -21,10 +22,10 @@ _COLUMNS = (
 def attach(
     rig: Annotated[Positional[Path], arg(metavar="RIG")],
     rom: Annotated[Positional[tuple[Path, ...]], arg(metavar="ROM...")],
-    out: Path = Path("attachment.json"),
+    out: OutputPath = Path("attachment.json"),
     initial: Path | None = None,
     standoff: bool = False,
-    picture: Path | None = None,
+    picture: OptionalOutputPath = None,
     part: str | None = None,
     labels: Path | None = None,
     frames: str | None = None,

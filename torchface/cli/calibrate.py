@@ -8,13 +8,14 @@ from typing import Annotated
 
 from tyro.conf import Positional, arg
 
+from torchface.cli.command_options import OutputPath
 from torchface.cli.terminal import Quiet, console, print_path, progress_bars
 from torchface.errors import ValueRangeError
 
 
 def calibrate(
     images: Annotated[Positional[tuple[Path, ...]], arg(metavar="IMAGE...")],
-    out: Path = Path("camera.toml"),
+    out: OutputPath = Path("camera.toml"),
     corners: str = "9x6",
     square: float = 25.0,
     quiet: Quiet = False,

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import AbstractContextManager
+from dataclasses import dataclass
+from functools import wraps
 from inspect import signature
 from pathlib import Path
 from types import NoneType, UnionType
@@ -14,7 +17,65 @@ from tyro.conf import arg
 _WORDS = {Path: "PATH", str: "TEXT", int: "NUMBER", float: "NUMBER"}
 
 
+@dataclass(frozen=True)
+class Output:
+    """The mark of an option that names what a command writes; every other path is an input, which is kept.
+
+    Args:
+        files: names of the files in it that a command writes, where it is a folder.
+    """
+
+    files: tuple[str, ...] = ()
+
+
+OutputPath = Annotated[Path, Output()]
+OptionalOutputPath = Annotated[Path | None, Output()]
+"""A file or folder that a command writes; see :class:`Output`."""
+
 Command = TypeVar("Command", bound=Callable[..., Any])
+
+
+def checked(command: Callable[..., None]) -> Callable[..., None]:
+    """The command with plain options, refused before any work where an output is one of its inputs."""
+    plain_options(command)
+
+    @wraps(command)
+    def run(*values: Any, **options: Any) -> None:
+        with inputs_kept(command, signature(command).bind(*values, **options).arguments):
+            command(*values, **options)
+
+    return run
+
+
+def inputs_kept(command: Callable[..., Any], values: Mapping[str, Any]) -> AbstractContextManager[None]:
+    """What ``kept_inputs`` refuses, of a command or a dataclass of settings and the values of its options."""
+    from torchface.files.input_files import kept_inputs
+
+    inputs: list[Path] = []
+    outputs: list[tuple[str, Path]] = []
+    hints = get_type_hints(command, include_extras=True)
+    for name, parameter in signature(command).parameters.items():
+        value = values.get(name, parameter.default)
+        if (output := _output(hints[name])) is None:
+            inputs += _paths(value)
+            continue
+        option = f"--{name.replace('_', '-')}"
+        for path in _paths(value):
+            outputs += [(option, path), *((option, path / file) for file in output.files)]
+    return kept_inputs(inputs, outputs)
+
+
+def _output(hint: Any) -> Output | None:
+    """The mark of an option's type, if it has one."""
+    return next((note for note in getattr(hint, "__metadata__", ()) if isinstance(note, Output)), None)
+
+
+def _paths(value: Any) -> Iterator[Path]:
+    if isinstance(value, (str, Path)):
+        yield Path(value)
+    elif isinstance(value, (list, tuple)):
+        for part in value:
+            yield from _paths(part)
 
 
 def plain_options(command: Command) -> Command:

@@ -7,12 +7,13 @@ from typing import Annotated, Literal
 
 from tyro.conf import Positional, arg
 
+from torchface.cli.command_options import OutputPath
 from torchface.cli.terminal import Quiet, console, print_lines, print_path, progress_bars
 
 
 def convert(
     source: Annotated[Positional[Path], arg(metavar="FILE")],
-    out: Annotated[Positional[Path], arg(metavar="OUT")],
+    out: Annotated[Positional[OutputPath], arg(metavar="OUT")],
     unit: str | None = None,
     part: str | None = None,
     names: Literal["arkit"] | None = None,

@@ -4,17 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Annotated
 
 from rich.table import Table
 
+from torchface.cli.command_options import Output
 from torchface.cli.terminal import Quiet, console, print_path, progress_bars
+
+_FILES = ("template.glb", "neutral.obj", "actor.glb", "attachment.json", "take.c3d", "weights.csv", "animation.glb")
 
 
 def demo(
     template: Path | None = None,
     take: Path | None = None,
     target: Path | None = None,
-    out: Path = Path("out/demo"),
+    out: Annotated[Path, Output(_FILES)] = Path("out/demo"),
     seed: int = 1,
     quiet: Quiet = False,
 ) -> None:

@@ -8,16 +8,20 @@ from typing import Annotated, Literal
 from tyro.conf import Positional, arg
 
 from torchface.cli.batch_report import Cluster, Column, Jobs, TimeLimit, show_batch, skipped_lines
+from torchface.cli.command_options import Output
 from torchface.cli.terminal import Quiet, print_lines, print_path, progress_bars
 
 _COLUMNS = (Column("frames", "frames", "{}"), Column("unlike any seen", "outside", "{:.0%}"))
+
+
+_FILES = ("enhanced.safetensors", "enhanced.glb", "comparison.mp4", "frames.csv")
 
 
 def enhance(
     animation: Annotated[Positional[tuple[Path, ...]], arg(metavar="INPUT...")],
     *,
     model: str,
-    out: Path = Path("out/enhanced"),
+    out: Annotated[Path, Output(_FILES)] = Path("out/enhanced"),
     rig: Path | None = None,
     attachment: Path | None = None,
     pairs: Path | None = None,

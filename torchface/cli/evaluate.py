@@ -9,6 +9,7 @@ from rich.table import Table
 from tyro.conf import Positional, arg
 
 from torchface.cli.batch_report import Cluster, Column, Jobs, TimeLimit, show_batch, skipped_lines
+from torchface.cli.command_options import Output
 from torchface.cli.terminal import Quiet, console, print_path, progress_bars
 
 _COLUMNS = (
@@ -19,10 +20,13 @@ _COLUMNS = (
 )
 
 
+_FILES = ("regions.csv", "frames.csv", "shapes.csv")
+
+
 def evaluate(
     result: Annotated[Positional[Path], arg(metavar="RESULT")],
     truth: Annotated[Positional[tuple[Path, ...]], arg(metavar="TRUTH...")],
-    out: Path = Path("out/evaluation"),
+    out: Annotated[Path, Output(_FILES)] = Path("out/evaluation"),
     rig: Path | None = None,
     truth_rig: Path | None = None,
     part: str | None = None,

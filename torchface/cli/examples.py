@@ -7,13 +7,14 @@ from typing import Annotated
 
 from tyro.conf import Positional, arg
 
+from torchface.cli.command_options import OutputPath
 from torchface.cli.terminal import Quiet, console, print_lines, print_path, progress_bars
 
 
 def examples(
     pictures: Annotated[Positional[tuple[Path, ...]], arg(metavar="PICTURES")] = (),
     *,
-    out: Path,
+    out: OutputPath,
     camera: str | None = None,
     rig: Path | None = None,
     paper: bool = False,

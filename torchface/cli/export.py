@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Literal
 
 from rich.table import Table
 
+from torchface.cli.command_options import OutputPath
 from torchface.cli.export_app import export_app
 from torchface.cli.export_enhancement import export_enhancement
 from torchface.cli.terminal import Quiet, console, print_path, progress_bars
@@ -16,7 +17,7 @@ if TYPE_CHECKING:
     from torchface.onnx import SolverReport
 
 
-def solver(rig: Path, attachment: Path, out: Path, part: str | None = None, quiet: Quiet = False) -> None:
+def solver(rig: Path, attachment: Path, out: OutputPath, part: str | None = None, quiet: Quiet = False) -> None:
     """Write the marker solve of one rig and one marker layout as an ONNX file, and check it.
 
     Inputs of the graph: `markers` (B,M,3), millimetres, NaN where not seen, and `previous` (B,N), the weights of the
@@ -36,7 +37,7 @@ def solver(rig: Path, attachment: Path, out: Path, part: str | None = None, quie
     _write_solver(export_solver, rig, attachment, out, part, quiet)
 
 
-def hybrid_solver(rig: Path, attachment: Path, out: Path, part: str | None = None, quiet: Quiet = False) -> None:
+def hybrid_solver(rig: Path, attachment: Path, out: OutputPath, part: str | None = None, quiet: Quiet = False) -> None:
     """Write the hybrid solve of one rig and one marker layout as an ONNX file, and check it.
 
     As `torchface export solver`, with two inputs more: `predicted` (B,N), weights in [0,1] that a classifier says, and
@@ -74,7 +75,7 @@ def _write_solver(
     print_path(out)
 
 
-def action_units(model: str, out: Path, quiet: Quiet = False) -> None:
+def action_units(model: str, out: OutputPath, quiet: Quiet = False) -> None:
     """Write an action unit classifier as an ONNX file, and check it.
 
     Inputs of the graph: `regions` (B,R,h,w), painted patterns in [0,1], and `rest` (R,h,w), the same of the face at
@@ -105,7 +106,7 @@ def action_units(model: str, out: Path, quiet: Quiet = False) -> None:
 def video_solver(
     rig: Path,
     camera: Path,
-    out: Path,
+    out: OutputPath,
     prior: str | None = None,
     dynamics: str | None = None,
     fps: float | None = None,
@@ -163,7 +164,7 @@ def video_solver(
 
 def examples(
     examples: Path,
-    out: Path,
+    out: OutputPath,
     solver: Literal["all-at-once", "regional", "model"] = "all-at-once",
     quiet: Quiet = False,
 ) -> None:
@@ -208,7 +209,7 @@ def examples(
     print_path(out)
 
 
-def webcam(out: Path, quiet: Quiet = False) -> None:
+def webcam(out: OutputPath, quiet: Quiet = False) -> None:
     """Write the whole way from a webcam's picture to ARKit's 52 weights as one ONNX file, and check it.
 
     Inputs of the graph: `image`, uint8 (rows, columns, 3 or 4 channels), red first, `interval`, seconds since the

@@ -3,13 +3,22 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Annotated
 
 from rich.table import Table
 
+from torchface.cli.command_options import Output
 from torchface.cli.terminal import Quiet, console, print_path, progress_bars
 
+_FILES = ("character.glb",)
 
-def export_app(out: Path, character: Path | None = None, webcam: Path | None = None, quiet: Quiet = False) -> None:
+
+def export_app(
+    out: Annotated[Path, Output(_FILES)],
+    character: Path | None = None,
+    webcam: Path | None = None,
+    quiet: Quiet = False,
+) -> None:
     """Write the app in the browser: a folder that any static host serves, in which a webcam moves a character.
 
     Everything runs on the user's machine; the page sends nothing. To try it: `python -m http.server --directory OUT`,

@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Annotated
 
+from torchface.cli.command_options import Output
 from torchface.cli.terminal import Quiet, print_lines, print_path, progress_bars
+
+_FILES = ("wrinkles.glb", "map_weights.csv")
 
 
 def export_enhancement(
     *,
     model: str,
     rig: Path,
-    out: Path,
+    out: Annotated[Path, Output(_FILES)],
     maps: int = 4,
     size: int = 1024,
     poses: int = 300,

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 from rich.table import Table
 
+from torchface.cli.command_options import OutputPath
 from torchface.cli.terminal import Quiet, console, print_path, progress_bars
 
 
-def export_model(name: str, /, out: Path, quiet: Quiet = False) -> None:
+def export_model(name: str, /, out: OutputPath, quiet: Quiet = False) -> None:
     """Write a model of the zoo, or of a folder, as an ONNX file, and check it against PyTorch.
 
     A head model gives the decoder (coefficients to vertices and colours), an expression regression the offsets of a

@@ -8,13 +8,14 @@ from typing import Annotated, Literal
 
 from tyro.conf import Positional, arg
 
+from torchface.cli.command_options import OutputPath
 from torchface.cli.terminal import Quiet, console, print_path, progress_bars
 
 
 def fit(
     photographs: Annotated[Positional[tuple[Path, ...]], arg(metavar="PHOTO...")],
     model: str,
-    out: Path,
+    out: OutputPath,
     landmarks: tuple[str, ...] = (),
     landmark_model: str = "landmark_network",
     template: Path | None = None,

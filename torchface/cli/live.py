@@ -7,8 +7,10 @@ from typing import Annotated
 
 from tyro.conf import Positional, UseAppendAction, arg
 
-from torchface.cli.command_options import picture_size
+from torchface.cli.command_options import Output, picture_size
 from torchface.cli.terminal import Quiet, console, print_lines, print_path, progress_bars
+
+_FILES = ("weights.csv", "live_link.csv", "animation.glb")
 
 
 def live(
@@ -18,7 +20,7 @@ def live(
     mapping: Path | None = None,
     calibrate: bool = False,
     to: UseAppendAction[tuple[str, ...]] = (),
-    record: Path | None = None,
+    record: Annotated[Path | None, Output(_FILES)] = None,
     page: bool = True,
     port: int = 8080,
     size: str = "640x480",

@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
 from tyro.conf import Positional
 
+from torchface.cli.command_options import Output
 from torchface.cli.terminal import Quiet, progress_bars, serve_page
+
+_FILES = ("landmarks.json", "annotated.glb", "attachment.json", "correspondences.json")
 
 
 def pick(
     mesh: Positional[Path],
     scan: Positional[Path | None] = None,
-    out: Path = Path("picks"),
+    out: Annotated[Path, Output(_FILES)] = Path("picks"),
     mode: Literal["landmarks", "markers", "correspondences"] = "landmarks",
     landmarks: Literal["68", "12"] = "68",
     names: tuple[str, ...] = (),

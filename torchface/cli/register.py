@@ -7,13 +7,14 @@ from pathlib import Path
 from tyro.conf import Positional
 
 from torchface.cli.batch_report import Cluster, Column, Jobs, TimeLimit, show_batch, skipped_lines
+from torchface.cli.command_options import OutputPath
 from torchface.cli.terminal import Quiet, progress_bars
 
 
 def register(
     template: Positional[Path],
     scans: Positional[tuple[Path, ...]],
-    out: Path,
+    out: OutputPath,
     landmarks: Path | None = None,
     part: str | None = None,
     unit: str | None = None,

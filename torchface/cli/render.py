@@ -7,12 +7,13 @@ from typing import Annotated
 
 from tyro.conf import Positional, arg
 
+from torchface.cli.command_options import OutputPath
 from torchface.cli.terminal import Quiet, print_path, progress_bars
 
 
 def render(
     path: Annotated[Positional[Path], arg(metavar="FILE")],
-    out: Path = Path("out/render.png"),
+    out: OutputPath = Path("out/render.png"),
     weights: tuple[str, ...] = (),
     take: Path | None = None,
     frame: int = 0,

@@ -7,6 +7,7 @@ from typing import Annotated
 
 from tyro.conf import Positional, arg
 
+from torchface.cli.command_options import OptionalOutputPath, OutputPath
 from torchface.cli.terminal import Quiet, console, print_lines, print_path, progress_bars
 
 _MAX_NAMES = 12
@@ -17,9 +18,9 @@ def retarget(
     to: Path,
     from_: Annotated[Path | None, arg(name="from")] = None,
     table: Path | None = None,
-    out: Path = Path("out/retargeted.csv"),
-    live_link: Path | None = None,
-    animation: Path | None = None,
+    out: OutputPath = Path("out/retargeted.csv"),
+    live_link: OptionalOutputPath = None,
+    animation: OptionalOutputPath = None,
     part: str | None = None,
     quiet: Quiet = False,
 ) -> None:

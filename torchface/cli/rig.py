@@ -8,6 +8,7 @@ from typing import Annotated, Literal
 from tyro.conf import Positional, arg
 
 from torchface.cli.batch_report import Cluster, Column, Jobs, TimeLimit, show_batch, skipped_lines
+from torchface.cli.command_options import OutputPath
 from torchface.cli.terminal import Quiet, console, print_path, progress_bars
 
 _COLUMNS = (
@@ -21,7 +22,7 @@ _COLUMNS = (
 def rig(
     scan: Annotated[Positional[tuple[Path, ...]], arg(metavar="SCAN...")],
     template: Path,
-    out: Path,
+    out: OutputPath,
     landmarks: Path | None = None,
     examples: Path | None = None,
     detail: Path | None = None,

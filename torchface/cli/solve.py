@@ -8,6 +8,7 @@ from typing import Annotated, Literal
 from tyro.conf import Positional, arg
 
 from torchface.cli.batch_report import Cluster, Column, Jobs, TimeLimit, show_batch, skipped_lines
+from torchface.cli.command_options import OptionalOutputPath, OutputPath
 from torchface.cli.terminal import Quiet, print_lines, print_path, progress_bars
 
 _COLUMNS = (
@@ -22,9 +23,9 @@ def solve(
     rig: Annotated[Positional[Path], arg(metavar="RIG")],
     take: Annotated[Positional[tuple[Path, ...]], arg(metavar="TAKE...")],
     attachment: Path,
-    out: Path = Path("out/weights.csv"),
-    live_link: Path | None = None,
-    animation: Path | None = None,
+    out: OutputPath = Path("out/weights.csv"),
+    live_link: OptionalOutputPath = None,
+    animation: OptionalOutputPath = None,
     neutral: Annotated[int | None, arg(aliases=["--neutral-frame"])] = None,
     align: bool = False,
     keep_rest: bool = False,
@@ -35,7 +36,7 @@ def solve(
     action_units: str | None = None,
     video_labels: Path | None = None,
     table: Path | None = None,
-    report: Path | None = None,
+    report: OptionalOutputPath = None,
     stream: str | None = None,
     sparsity: float | None = None,
     ridge: float | None = None,

@@ -9,7 +9,7 @@ from typing import Annotated, Literal
 from tyro.conf import Positional, arg
 
 from torchface.cli.batch_report import Cluster, Column, Jobs, TimeLimit, show_batch, skipped_lines
-from torchface.cli.command_options import picture_size
+from torchface.cli.command_options import Output, picture_size
 from torchface.cli.terminal import Quiet, console, print_lines, print_path, progress_bars
 
 _COLUMNS = (
@@ -18,13 +18,15 @@ _COLUMNS = (
     Column("landmarks off by", "error_px", "{:.2f} px"),
     Column("jitter", "jitter_px", "{:.2f} px"),
 )
+_TABLES = ("weights.csv", "confidence.csv", "live_link.csv", "landmarks.csv", "landmark_offsets.json")
+_FILES = (*_TABLES, "animation.glb", "overlay.mp4")
 
 
 def track(
     video: Annotated[Positional[tuple[Path, ...]], arg(metavar="VIDEO...")] = (),
     *,
     rig: Path,
-    out: Path | None = None,
+    out: Annotated[Path | None, Output(_FILES)] = None,
     landmarks: str = "landmark_network",
     appearance: str | None = None,
     prior: str = "shape_prior",

@@ -7,13 +7,14 @@ from typing import Annotated, Literal
 
 from tyro.conf import Positional, arg
 
+from torchface.cli.command_options import OutputPath
 from torchface.cli.terminal import Quiet, console, print_path, progress_bars
 
 
 def transfer(
     template: Annotated[Positional[Path], arg(metavar="TEMPLATE")],
     neutral: Annotated[Positional[Path], arg(metavar="NEUTRAL")],
-    out: Path,
+    out: OutputPath,
     part: str | None = None,
     unit: str | None = None,
     names: Literal["arkit"] | None = None,

@@ -6,13 +6,14 @@ from pathlib import Path
 
 from tyro.conf import Positional
 
+from torchface.cli.command_options import OptionalOutputPath
 from torchface.cli.terminal import Quiet, progress_bars, serve_page
 
 
 def view(
     rig: Positional[Path],
     weights: Positional[Path | None] = None,
-    out: Path | None = None,
+    out: OptionalOutputPath = None,
     part: str | None = None,
     port: int = 8080,
     quiet: Quiet = False,

@@ -13,6 +13,7 @@ from contextvars import ContextVar
 from pathlib import Path
 
 from torchface.errors import FileFormatError
+from torchface.files.input_files import check_no_input, note_read
 from torchface.files.temporary_files import new_temporary, remove_left_over, temporary_name
 from torchface.files.write_errors import unmade, unsettled, unwritten
 
@@ -40,6 +41,7 @@ def read_file(path: str | Path, largest: int = LARGEST_FILE) -> bytes:
             raise FileFormatError(f"{path}: found an empty file, expected content")
         if size > largest:
             raise FileFormatError(f"{path}: found {size} bytes, expected at most {largest}")
+        note_read(path)
         return path.read_bytes()
     except (OSError, ValueError) as error:  # ValueError: a NUL in the name
         raise FileFormatError(f"{path}: cannot be read ({error})") from error
@@ -119,6 +121,7 @@ def delete_file(path: Path) -> None:
     Raises:
         FileFormatError: it cannot be deleted.
     """
+    check_no_input(path)
     waiting = _waiting.get()
     if waiting is not None:
         waiting.append((None, path))
@@ -208,6 +211,7 @@ def check_writable(*files: Path | None, folder: Path | None = None) -> None:
 
 @contextmanager
 def _replaced(path: Path) -> Iterator[tuple[int, Path]]:
+    check_no_input(path)
     try:
         mode = _permissions(path)
         if _is_time_to_look(path.parent):

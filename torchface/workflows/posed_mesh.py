@@ -9,7 +9,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from torchface.errors import FileFormatError, NameMismatchError, ValueRangeError
+from torchface.errors import NameMismatchError, NoShapesError, ValueRangeError
 from torchface.io import load_mesh, load_rig, load_take
 from torchface.io.mesh_files import MESH_ENDINGS
 from torchface.io.rigs.ict_facekit import region
@@ -109,14 +109,13 @@ def load_neutral(path: Path, unit: str | None = None, part: str | None = None) -
         part: keep this annotated region only.
 
     Raises:
-        FileFormatError: neither a rig nor a mesh; of a folder, no rig.
+        FileFormatError: neither a rig nor a mesh, or its shapes are broken; of a folder, no rig.
     """
     if path.suffix.lower() not in MESH_ENDINGS:
         try:
             rig = load_rig(path, unit, part)
             return rig.neutral, rig
-        except FileFormatError:  # no shapes: a mesh; what is no mesh either raises its own error
-            if path.is_dir():
-                raise
+        except NoShapesError:
+            pass
     mesh = load_mesh(path, unit)
     return mesh if part is None else submesh(mesh, region(mesh, part)).mesh, None

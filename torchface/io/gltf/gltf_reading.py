@@ -13,7 +13,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from torchface.errors import FileFormatError
+from torchface.errors import FileFormatError, NoShapesError
 from torchface.geometry.meshes.uv_seams import merge_equal_rows
 from torchface.io.gltf.corrective_extras import rig_of_targets, scene_correctives
 from torchface.io.gltf.gltf_document import Document, read_document
@@ -40,14 +40,14 @@ def read_gltf_rig(path: str | Path, unit: str = "m") -> BlendshapeRig:
         unit: what the file's numbers are; glTF says metres.
 
     Raises:
-        FileFormatError: not glTF 2, truncated, broken, or without morph targets.
+        FileFormatError: not glTF 2, truncated, broken; ``NoShapesError`` without morph targets.
     """
     document = read_document(path)
     neutral, deltas, names = _read(document, millimetres_per(unit))
     if not names:
         count = len(document.objects("meshes"))
         meshes = f"its {count} meshes" if count != 1 else "its one mesh"
-        raise FileFormatError(f"{path}: found no morph target in {meshes}, expected at least one for a rig")
+        raise NoShapesError(f"{path}: found no morph target in {meshes}, expected at least one for a rig")
     return rig_of_targets(document, neutral, deltas, names, scene_correctives(document))
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from torchface.errors import FileFormatError, NameMismatchError, ShapeError
+from torchface.errors import FileFormatError, NameMismatchError, NoShapesError, ShapeError
 from torchface.files.whole_files import LARGEST_FILE
 from torchface.geometry.meshes.normal_maps import DetailMaps, decode_normals
 from torchface.io.images.image_files import decode_image
@@ -42,7 +42,7 @@ def read_usd_rig(path: str | Path, unit: str | None = None) -> BlendshapeRig:
     """
     rig = scene_rig(read_stage(path), unit)
     if rig is None:
-        raise FileFormatError(f"{path}: found no blend shape on its meshes, expected at least one for a rig")
+        raise NoShapesError(f"{path}: found no blend shape on its meshes, expected at least one for a rig")
     return rig
 
 

@@ -1,0 +1,185 @@
+"""Every command refuses an output that is one of its inputs, before any work, and leaves the input as it was."""
+
+import os
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+from inspect import Parameter, getdoc, signature
+from pathlib import Path
+from typing import Any, get_args, get_origin, get_type_hints
+
+import pytest
+import tyro
+from tyro.conf import arg
+
+from torchface.cli import COMMANDS, GROUPS, main
+from torchface.cli.command_options import Output, checked
+from torchface.cli.export_model import export_model
+
+ALL = {
+    **{(name,): command for name, command in COMMANDS.items()},
+    **{(name, second): command for name, group in GROUPS.items() for second, command in group.commands.items()},
+    ("export",): export_model,
+}
+WRITES = re.compile(
+    r"to write|[Aa]lso write|[Aa]lso draw|Folder for|folder (to|for)|into this folder|Where Save writes"
+)
+
+
+@dataclass(frozen=True)
+class Option:
+    name: str
+    hint: Any
+    parameter: Parameter
+
+    @property
+    def output(self) -> Output | None:
+        return next((note for note in getattr(self.hint, "__metadata__", ()) if isinstance(note, Output)), None)
+
+    @property
+    def holds(self) -> set[type]:
+        """The kinds of values in its type, such as Path."""
+        return set(kinds(self.hint))
+
+    def words(self, value: str) -> list[str]:
+        notes = getattr(self.hint, "__metadata__", ())
+        if self.parameter.kind is Parameter.POSITIONAL_ONLY or tyro.conf.Positional[int].__metadata__[0] in notes:
+            return [value]
+        named = [note.name for note in notes if isinstance(note, type(arg())) and note.name]
+        return [f"--{(named or [self.name.replace('_', '-')])[0]}", value]
+
+
+def kinds(hint: Any) -> Iterator[type]:
+    for part in get_args(hint)[: 1 if hasattr(hint, "__metadata__") else None]:
+        yield from kinds(part)
+    if get_origin(hint) is None and isinstance(hint, type):
+        yield hint
+
+
+def options_of(command: Any) -> list[Option]:
+    hints = get_type_hints(command, include_extras=True)
+    return [Option(name, hints[name], parameter) for name, parameter in signature(command).parameters.items()]
+
+
+def inputs_of(command: Any) -> list[Option]:
+    return [option for option in options_of(command) if Path in option.holds and option.output is None]
+
+
+CASES = [
+    (words, command, output, given)
+    for words, command in ALL.items()
+    for output in options_of(command)
+    if output.output is not None
+    for given in inputs_of(command)
+]
+
+
+def words_for(words: tuple[str, ...], command: Any, values: dict[str, Path], folder: Path) -> list[str]:
+    """A command line with values of some options, and plausible ones of all others that must be given."""
+    line = list(words)
+    positional, named = [], []
+    for option in options_of(command):
+        if option.name in values:
+            value = str(values[option.name])
+        elif option.parameter.default is not Parameter.empty:
+            continue
+        elif Path in option.holds:
+            other = folder / f"other_{option.name}.glb"
+            if option.output is None:
+                other.write_bytes(b"other")
+            value = str(other)
+        else:
+            value = "name"
+        given = option.words(value)
+        (positional if len(given) == 1 else named).append(given)
+    return line + [word for words in (*positional, *named) for word in words]
+
+
+def test_the_commands_are_looked_through() -> None:
+    assert len(CASES) > 60
+    assert {words for words, *_ in CASES} >= {("solve",), ("retarget",), ("convert",), ("export", "solver"), ("view",)}
+
+
+@pytest.mark.parametrize("words", ALL)
+def test_what_a_help_text_calls_written_is_marked_as_an_output(words: tuple[str, ...]) -> None:
+    command = ALL[words]
+    text = getdoc(command) or ""
+    for option in options_of(command):
+        found = re.search(rf"^\s+{option.name}: (.*(?:\n {{8,}}.*)*)", text, re.MULTILINE)
+        if Path in option.holds and found is not None and (option.name == "out" or WRITES.search(found[1])):
+            assert option.output is not None, f"torchface {' '.join(words)}: {option.name}: OutputPath"
+
+
+@pytest.mark.parametrize(
+    ("words", "command", "output", "given"),
+    CASES,
+    ids=lambda value: getattr(value, "name", "_".join(map(str, value)) if isinstance(value, tuple) else ""),
+)
+def test_an_output_that_is_an_input_is_refused_before_any_work(
+    words: tuple[str, ...],
+    command: Any,
+    output: Option,
+    given: Option,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    path = tmp_path / "same.csv"
+    path.write_bytes(b"content")
+    with pytest.raises(SystemExit) as ended:
+        main(words_for(words, command, {output.name: path, given.name: path}, tmp_path))
+    assert ended.value.code == 2
+    said = " ".join(capsys.readouterr().err.split())
+    assert "is the input" in said
+    assert path.read_bytes() == b"content"
+
+
+@pytest.mark.parametrize("kind", ["symbolic link", "hard link", "link to the folder", "way round"])
+def test_another_name_of_the_same_file_is_the_same(
+    kind: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = tmp_path / "takes"
+    folder.mkdir()
+    take, other = folder / "take.csv", folder / "other.csv"
+    take.write_text("frame,time,jawOpen\n0,0,0.5\n")
+    if kind == "symbolic link":
+        other.symlink_to(take)
+    elif kind == "hard link":
+        os.link(take, other)
+    elif kind == "link to the folder":
+        (tmp_path / "linked").symlink_to(folder)
+        other = tmp_path / "linked" / "take.csv"
+    else:
+        other = tmp_path / "takes" / ".." / "takes" / "take.csv"
+    rig = tmp_path / "rig.glb"
+    rig.write_bytes(b"no rig is read")
+    with pytest.raises(SystemExit):
+        main(["retarget", str(take), "--to", str(rig), "--out", str(other)])
+    assert "is the input" in " ".join(capsys.readouterr().err.split())
+    assert take.read_text().startswith("frame")
+
+
+def test_two_outputs_of_one_name_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    take = tmp_path / "take.csv"
+    take.write_text("frame,time,jawOpen\n0,0,0.5\n")
+    both = ("--out", str(tmp_path / "out.csv"), "--live-link", str(tmp_path / "out.csv"))
+    with pytest.raises(SystemExit):
+        main(["retarget", str(take), "--to", str(tmp_path / "rig.glb"), *both])
+    assert "--out names too" in " ".join(capsys.readouterr().err.split())
+
+
+def test_a_file_that_a_command_writes_into_its_folder_is_refused_as_an_input(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    landmarks = tmp_path / "landmarks.csv"
+    landmarks.write_text("frame,timestamp,confidence,success,x_0,y_0\n1,0,1,1,2,3\n")
+    with pytest.raises(SystemExit):
+        main(["track", "--rig", str(tmp_path / "rig.glb"), "--landmarks", str(landmarks), "--out", str(tmp_path)])
+    assert "landmarks.csv, which is the input" in " ".join(capsys.readouterr().err.split())
+
+
+def test_the_check_leaves_the_command_as_it_is() -> None:
+    def command(source: Path, out: Path = Path("out.csv")) -> None:
+        """Does nothing."""
+
+    assert signature(checked(command)) == signature(command)
+    assert checked(command).__doc__ == "Does nothing."
