@@ -69,10 +69,9 @@ class NoShapesError(FileFormatError):
     """A file is whole and holds a mesh, but no blend shape: no rig.
 
     Example:
-        >>> from torchface import load_rig
+        >>> from torchface import Mesh, load_rig
         >>> from torchface.io import save_mesh
-        >>> from torchface.synthetic import neutral_head
-        >>> save_mesh(neutral_head(texture=False), "head.glb")
+        >>> save_mesh(Mesh(torch.eye(3), torch.tensor([[0, 1, 2]])), "head.glb")
         >>> load_rig("head.glb")
         Traceback (most recent call last):
             ...

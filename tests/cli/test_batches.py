@@ -82,7 +82,7 @@ def test_what_many_would_write_over_one_another_is_refused(stage: Path, capsys: 
         (("--out", stage / "weights.csv"), "found {0}/weights.csv, a file, for the results of a folder"),
         (("--out", stage / "out", "--animation", stage / "a.glb"), "one place for the results of many"),
         (("--out", stage / "out", "--stream", "udp://127.0.0.1:9"), "found many takes"),
-        (("--out", stage / "takes"), "which holds takes"),
+        (("--out", stage / "takes"), "{0}/takes, which is the input"),
     ):
         run(*words, *more, status=2)
         assert message.format(stage) in capsys.readouterr().err.replace("\n", " ")

@@ -96,7 +96,7 @@ def test_mistakes_end_with_a_message_and_status_2(brought: Path, capsys: pytest.
         ([template, str(brought / "scans" / "crate.stl"), "--out", out], "none of 1 scans could be registered"),
         ([str(brought / "points.ply"), scans, "--out", out], "no face, expected at least one"),
         ([str(brought / "none.obj"), scans, "--out", out], "none.obj"),
-        ([template, scans, "--out", template], "cannot be made"),
+        ([template, scans, "--out", template], "which is the input"),
         ([template, scans, "--out", scans], "expected another folder"),
         ([template, scans, "--out", out, "--unit", "yards"], "yards"),
     ]
