@@ -75,7 +75,8 @@ def check_no_input(path: Path) -> None:
 
 
 def _refused(what: str, source: Path) -> FileFormatError:
-    return FileFormatError(f"{what}, which is the input {source}, expected another place: it would be lost")
+    kind = "folder" if source.is_dir() else "file"
+    return FileFormatError(f"{what}, which is the input {source}, expected another {kind}: it would be lost")
 
 
 def _identity(path: Path) -> Identity | None:
