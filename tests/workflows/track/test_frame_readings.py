@@ -82,6 +82,24 @@ def test_a_table_without_enough_landmarks_is_refused_by_its_name(
         track_video(None, take[0], tmp_path / "out", settings)
 
 
+def test_a_wild_landmark_is_left_out_and_named(take: tuple[Path, Path, Tensor], tmp_path: Path) -> None:
+    """20,000 pixels in one frame of one landmark change no other frame, and no other landmark's weights."""
+    rig, table, _ = take
+    header, *rows = (line.split(",") for line in table.read_text().splitlines())
+    rows[3][[name.strip() for name in header].index("x_33")] = "20000"
+    (tmp_path / "wild.csv").write_text("\n".join(",".join(row) for row in [header, *rows]))
+    settings = TrackSettings(landmarks=table, size=(WIDTH, HEIGHT))
+    clean = track_video(None, rig, tmp_path / "clean", settings)
+    wild = track_video(None, rig, tmp_path / "out", replace(settings, landmarks=tmp_path / "wild.csv"))
+    assert float((wild.solution.weights - clean.solution.weights).abs().max()) < 0.02
+    assert "1 landmarks in 1 frames lie where no face has them" in "\n".join(wild.lines())
+    assert "landmark 33 of frame 3" in "\n".join(wild.lines())
+    assert not clean.outlier_lines()
+    assert abs(wild.jitter - clean.jitter) < 0.1
+    confidence = load_landmark_table(tmp_path / "out" / "landmarks.csv").confidence
+    assert (confidence == 0).nonzero().tolist() == [[3, 33]]
+
+
 def test_tables_that_do_not_fit_are_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     table = tmp_path / "take.csv"
     points = 100 + 100 * torch.rand(COUNT, 68, 2, generator=torch.Generator().manual_seed(0))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 
 import torch
 from torch import Tensor
@@ -90,6 +90,10 @@ class FaceReading:
     def stacked(cls, readings: Sequence[FaceReading]) -> FaceReading:
         """A take's reading (T,...) of its frames', one at least."""
         return cls(*(torch.stack([getattr(one, part.name) for one in readings]) for part in fields(cls)))
+
+    def doubted(self, landmarks: Tensor) -> FaceReading:
+        """The same with no confidence in some of the landmarks, (...,68) bool."""
+        return replace(self, deviation=torch.where(landmarks, torch.inf, self.deviation))
 
     @property
     def found(self) -> Tensor:

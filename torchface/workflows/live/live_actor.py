@@ -13,6 +13,7 @@ import torch
 from torchface.capture.anybody import WebcamControls
 from torchface.capture.own_rig import VideoState
 from torchface.capture.own_rig.landmark_offsets import LandmarkOffsets
+from torchface.capture.own_rig.outlier_landmarks import landmark_reach, outlier_landmarks
 from torchface.errors import ValueRangeError
 from torchface.files.whole_files import all_or_none, make_folder
 from torchface.geometry.cameras.distortion import undistort
@@ -49,10 +50,13 @@ class ActorSolver:
         solver = inputs.solver()
         self._solver = solver if offsets is None else solver.shifted(offsets)
         self._state: VideoState | None = None
+        self._reach = landmark_reach(inputs.actor)
 
     def step(self, picture: np.ndarray, interval: float | None, controls: WebcamControls) -> LiveFrame:
         """Solves the next frame; before the first face all weights are 0. Of an actor nothing is learned on the way."""
         reading = self._tracker.step(planes(picture))
+        outliers = outlier_landmarks(*self._reach, reading.landmarks[None], reading.trust[None])[0]
+        reading = reading.doubted(outliers)
         trust = reading.trust
         landmarks = self._filter.step(undistort(reading.trusted_landmarks, self._calibration)).to(reading.landmarks)
         enough = int((torch.isfinite(landmarks).all(1) & (trust > 0)).sum()) >= _MIN_LANDMARKS

@@ -10,6 +10,7 @@ from torch import Tensor
 from torchface.capture.own_rig import VideoSolution, VideoSolver
 from torchface.capture.own_rig.landmark_offsets import LandmarkOffsets
 from torchface.capture.own_rig.offset_estimate import estimate_offsets
+from torchface.capture.own_rig.outlier_landmarks import landmark_reach, outlier_landmarks
 from torchface.capture.own_rig.take_solve import solve_take
 from torchface.capture.own_rig.weight_walk import frame_intervals
 from torchface.errors import FileFormatError, ValueRangeError
@@ -38,6 +39,11 @@ def frame_times(inputs: TrackInputs, count: int) -> Tensor | None:
         return None
     missing = torch.arange(1, max(count - len(times), 0) + 1, dtype=times.dtype)
     return torch.cat([times, times[-1] + missing / inputs.clip.fps])[:count]
+
+
+def outliers_of(inputs: TrackInputs, reading: FaceReading) -> Tensor:
+    """Landmarks where no face has them, (T,68) bool; see :func:`outlier_landmarks`."""
+    return outlier_landmarks(*landmark_reach(inputs.actor), reading.landmarks, reading.trust, inputs.clip.fps)
 
 
 def smoothed_landmarks(inputs: TrackInputs, reading: FaceReading, times: Tensor | None) -> Tensor:

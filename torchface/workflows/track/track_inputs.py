@@ -29,7 +29,7 @@ from torchface.workflows.track.track_models import (
     load_track_models,
 )
 
-METHOD = "track/5"
+METHOD = "track/6"
 """Of the keys; another number where the same inputs, or pieces of another length, come to give other results."""
 
 Overlay = Literal["side", "over", "none"]

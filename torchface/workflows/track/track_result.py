@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from math import nan
 from pathlib import Path
 
 import torch
@@ -44,6 +45,7 @@ class Tracked:
         seconds: what each step took, by its name.
         products: the files, by what they are.
         light: of the video, where a texture was put on the face.
+        outliers: landmarks that lie where no face has them, and so are not trusted, (T,68) bool; none if absent.
     """
 
     inputs: TrackInputs
@@ -57,6 +59,7 @@ class Tracked:
     seconds: dict[str, float] = field(default_factory=dict)
     products: dict[str, Path] = field(default_factory=dict)
     light: PointLight | None = None
+    outliers: Tensor | None = None
 
     def __len__(self) -> int:
         return len(self.landmarks)
@@ -98,7 +101,21 @@ class Tracked:
     @property
     def jitter(self) -> float:
         """How much the landmarks tremble, pixels."""
-        return float(landmark_jitter(self.reading.landmarks))
+        marks = self.reading.landmarks
+        return float(landmark_jitter(marks if self.outliers is None else marks.where(~self.outliers[..., None], nan)))
+
+    def outlier_lines(self) -> list[str]:
+        """Which landmarks lie where no face has them, if any."""
+        if self.outliers is None or not bool(self.outliers.any()):
+            return []
+        places = self.outliers.nonzero().tolist()
+        named = ", ".join(f"landmark {mark} of frame {frame}" for frame, mark in places[:_MAX_NAMED])
+        more = f" and {len(places) - _MAX_NAMED} more" if len(places) > _MAX_NAMED else ""
+        frames = int(self.outliers.any(1).sum())
+        return [
+            f"{len(places)} landmarks in {frames} frames lie where no face has them and were left out: {named}{more} "
+            "(landmarks.csv gives them a confidence of 0)"
+        ]
 
     def suspect_spans(self) -> list[tuple[int, int, str]]:
         """First and last frame of each span without a face, or with landmarks of low confidence in the mean."""
@@ -137,6 +154,7 @@ class Tracked:
             f"landmarks: jitter {self.jitter:.2f} px; to the solved rig's: median {float(errors.nanmedian()):.2f} px, "
             f"95th percentile {float(errors.nanquantile(0.95)):.2f} px",
         ]
+        lines.extend(self.outlier_lines())
         if self.times is not None:
             lines.append(
                 f"variable frame rate: {self.inputs.rate_varies}; weights.csv and animation.glb have the frames' own "

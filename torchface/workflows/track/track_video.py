@@ -25,6 +25,7 @@ from torchface.workflows.track.take_solution import (
     known_offsets,
     new_offsets,
     new_solution,
+    outliers_of,
     smoothed_landmarks,
     solution_key,
 )
@@ -75,6 +76,8 @@ def _track(inputs: TrackInputs, out: Path, filmed: bool, progress: Progress) -> 
         seconds.clear()
     times = frame_times(inputs, len(reading.landmarks))
     with _timed(seconds, "smoothing"):
+        outliers = outliers_of(inputs, reading)
+        reading = reading.doubted(outliers)
         landmarks = smoothed_landmarks(inputs, reading, times)
     trust, solver = reading.trust, inputs.solver(inputs.clip.fps)
     offsets = known_offsets(inputs, out)
@@ -88,7 +91,7 @@ def _track(inputs: TrackInputs, out: Path, filmed: bool, progress: Progress) -> 
         with _timed(seconds, "weights"):
             solution = new_solution(inputs, solver, landmarks, trust, times, progress)
         keep_solution(state, key, solution)
-    tracked = Tracked(inputs, reading, landmarks, solution, times, offsets, faces, reused, seconds)
+    tracked = Tracked(inputs, reading, landmarks, solution, times, offsets, faces, reused, seconds, outliers=outliers)
     with all_or_none():
         tracked.products.update(write_curves(tracked, out))
     if filmed and inputs.settings.overlay != "none":
