@@ -45,7 +45,7 @@ def test_points_of_the_mesh_come_back_in_pixels(tmp_path: Path, monkeypatch: pyt
     assert found.presence == 1
     process = finder._process
     finder.close()
-    assert process.poll() is not None
+    assert not process.alive
     with pytest.raises(MediaPipeError, match="was closed"):
         finder(IMAGE, BOX)
 

@@ -5,14 +5,8 @@ from __future__ import annotations
 import importlib.util
 import os
 import struct
-import subprocess
 import sys
-import tempfile
-import threading
-import weakref
-from contextlib import suppress
 from pathlib import Path
-from typing import IO
 
 import numpy as np
 import torch
@@ -24,6 +18,7 @@ from torchface.landmarks.images.face_mesh_478 import MESH_POINTS, landmarks_of_m
 from torchface.landmarks.images.face_reading import FaceReading, box_side
 from torchface.landmarks.images.ibug_68 import COUNT
 from torchface.landmarks.images.networks import mediapipe_process
+from torchface.landmarks.images.networks.answering_process import AnsweringProcess
 
 PYTHON = "TORCHFACE_MEDIAPIPE_PYTHON"
 """The environment variable that names the Python with MediaPipe."""
@@ -63,36 +58,28 @@ class MediaPipeFinder:
 
     def __init__(self, python: str | Path | None = None) -> None:
         self.python = _python(python)
-        self._errors = tempfile.TemporaryFile()  # noqa: SIM115  lives as long as the process that writes it
         script = str(Path(mediapipe_process.__file__).resolve())
         environment = {**os.environ, "GLOG_minloglevel": "3", "TF_CPP_MIN_LOG_LEVEL": "3"}
+        name = f"mediapipe: its process under {self.python}"
         try:
-            self._process = subprocess.Popen(
-                [str(self.python), "-I", script],
-                stdin=subprocess.PIPE,
-                stdout=subprocess.PIPE,
-                stderr=self._errors,
-                env=environment,
-            )
+            command = [str(self.python), "-I", script]
+            self._process = AnsweringProcess(command, name, MediaPipeError, environment)
         except OSError as error:
             raise MissingExtraError(f"{self.python}: cannot be run ({error}); {_how()}") from error
-        self._end = weakref.finalize(self, _stop, self._process, self._errors)
         try:
-            self._answer(_START_SECONDS)
+            with self._process.within(_START_SECONDS):
+                self._answer()
         except MediaPipeError as error:
-            self._end()
+            self.close()
             raise MissingExtraError(f"{error}; {_how()}") from error
 
     def __call__(self, image: Tensor, box: Tensor, tilt: float = 0.0) -> FaceReading:
         """See :class:`~torchface.landmarks.images.landmark_finder.LandmarkFinder`."""
         transform = crop_transform(box, tilt, _SIZE, _MARGIN)
         crop = np.ascontiguousarray(cut_crop(image, transform, _SIZE).permute(1, 2, 0).numpy())
-        try:
-            self._pipe(self._process.stdin).write(struct.pack("<II", _SIZE, _SIZE) + crop.tobytes())
-            self._pipe(self._process.stdin).flush()
-        except OSError as error:
-            raise self._failed("has ended") from error
-        points = self._answer(_ANSWER_SECONDS)
+        with self._process.within(_ANSWER_SECONDS):
+            self._process.send(struct.pack("<II", _SIZE, _SIZE) + crop.tobytes())
+            points = self._answer()
         nothing = torch.zeros(COUNT)
         if not len(points):
             middle = (box[:2] + box[2:] / 2).float().expand(COUNT, 2).clone()
@@ -103,41 +90,15 @@ class MediaPipeFinder:
 
     def close(self) -> None:
         """Ends the process."""
-        self._end()
+        self._process.close()
 
-    def _answer(self, seconds: float) -> Tensor:
+    def _answer(self) -> Tensor:
         """The next points (478,2) or (0,2), in shares of the crop."""
-        late = threading.Timer(seconds, self._process.kill)
-        late.daemon = True
-        late.start()
-        try:
-            head = self._read(4)
-            count = struct.unpack("<I", head)[0] if len(head) == 4 else None
-            if count not in (0, MESH_POINTS):
-                what = f"gave {count} points, expected {MESH_POINTS}" if count is not None else "has ended"
-                raise self._failed(what if late.is_alive() else f"gave no answer in {seconds:g} seconds")
-            content = self._read(8 * count)
-            if len(content) < 8 * count:
-                raise self._failed("has ended in the midst of an answer")
-        finally:
-            late.cancel()
+        (count,) = struct.unpack("<I", self._process.receive(4, "has ended"))
+        if count not in (0, MESH_POINTS):
+            raise self._process.failed(f"gave {count} points, expected {MESH_POINTS}")
+        content = self._process.receive(8 * count)
         return torch.from_numpy(np.frombuffer(content, "<f4").astype(np.float32).reshape(-1, 2))
-
-    def _read(self, count: int) -> bytes:
-        return self._pipe(self._process.stdout).read(count)
-
-    def _pipe(self, pipe: IO[bytes] | None) -> IO[bytes]:
-        if pipe is None or pipe.closed:
-            raise self._failed("was closed")
-        return pipe
-
-    def _failed(self, what: str) -> MediaPipeError:
-        said = ""
-        if not self._errors.closed:
-            self._errors.seek(max(0, self._errors.seek(0, os.SEEK_END) - 4096))
-            lines = self._errors.read().decode("utf-8", "replace").strip().splitlines()
-            said = f": {lines[-1].strip()[:200]}" if lines else ""
-        return MediaPipeError(f"mediapipe: its process under {self.python} {what}{said}")
 
 
 def _python(python: str | Path | None) -> Path:
@@ -154,17 +115,3 @@ def _python(python: str | Path | None) -> Path:
 
 def _how() -> str:
     return f"install it beside torchface with: {_INSTALL}"
-
-
-def _stop(process: subprocess.Popen[bytes], errors: IO[bytes]) -> None:
-    """Ends the process: what comes in ends, and if that is not enough it is killed."""
-    for pipe in (process.stdin, process.stdout):
-        if pipe is not None:
-            with suppress(OSError):  # it has ended before what was written was read
-                pipe.close()
-    try:
-        process.wait(2)
-    except subprocess.TimeoutExpired:
-        process.kill()
-        process.wait()
-    errors.close()

@@ -2,9 +2,15 @@
 
 from __future__ import annotations
 
+import json
 import math
+import os
+import struct
+import sys
+import tempfile
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -14,7 +20,10 @@ from torchface.errors import FileFormatError
 from torchface.files.whole_files import read_file
 from torchface.landmarks.images.face_crop import CROP_MARGIN
 from torchface.landmarks.images.ibug_68 import COUNT
-from torchface.landmarks.images.networks.crop_finder import CropFinder
+from torchface.landmarks.images.networks import graph_process
+from torchface.landmarks.images.networks.answering_process import AnsweringProcess
+from torchface.landmarks.images.networks.crop_finder import CropFinder, CropNetwork
+from torchface.landmarks.images.networks.graph_process import signature
 
 if TYPE_CHECKING:
     import onnxruntime
@@ -31,8 +40,23 @@ _EXPECTED = (
 )
 
 
-def onnx_finder(path: str | Path) -> CropFinder:
-    """A finder that runs an ONNX graph in ONNX Runtime, on one thread.
+@dataclass(frozen=True)
+class GraphLimits:
+    """What a foreign graph may take.
+
+    Args:
+        load_seconds: until it is read, optimised and has answered one crop.
+        answer_seconds: for each crop after that.
+        megabytes: of memory, beside ONNX Runtime's own; not enforced on macOS and Windows.
+    """
+
+    load_seconds: float = 60.0
+    answer_seconds: float = 20.0
+    megabytes: int = 2048
+
+
+def onnx_finder(path: str | Path, limits: GraphLimits | None = None) -> CropFinder:
+    """A finder that runs an ONNX graph in ONNX Runtime, on one thread, in a process of its own.
 
     The graph takes ``image`` (B,3,S,S) float32 in [0,1], red first: the face's box, enlarged by the number that the
     graph's metadata hold as ``crop`` (1.25 if none) and turned upright. It gives ``landmarks`` (B,68,2), their standard
@@ -40,16 +64,19 @@ def onnx_finder(path: str | Path) -> CropFinder:
 
     Args:
         path: the file; weights lie in it.
+        limits: of time and memory.
 
     Raises:
-        FileFormatError: it is no ONNX graph, or one of other inputs and outputs; the message says which it has.
+        FileFormatError: it is no ONNX graph, or one of other inputs and outputs, which the message names; or it takes
+            more time or memory than the limits.
     """
-    path = Path(path)
-    return graph_finder(read_file(path, _MAX_BYTES), path)
+    path, limits = Path(path), limits or GraphLimits()
+    runner = _ForeignGraph(read_file(path, _MAX_BYTES), path, limits)
+    return _finder(runner.signature, runner, path)
 
 
 def graph_finder(content: bytes, path: Path) -> CropFinder:
-    """The finder of a graph that was read or made already; see :func:`onnx_finder`.
+    """The finder of a graph of this library's own making, run in this process; see :func:`onnx_finder`.
 
     Args:
         content: of an ONNX file.
@@ -60,14 +87,14 @@ def graph_finder(content: bytes, path: Path) -> CropFinder:
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = options.inter_op_num_threads = 1
     options.log_severity_level = 4
-    try:
-        session = onnxruntime.InferenceSession(content, options, providers=["CPUExecutionProvider"])
-    except Exception as error:  # ONNX Runtime has an exception class a fault, and none above them
-        raise FileFormatError(
-            f"{path}: cannot be used as an ONNX graph ({_short(error)}); expected one that finds landmarks"
-        ) from error
-    size = _checked_size(session, path)
-    finder = CropFinder(_Runner(session, path), size, _margin(session, path), path.name)
+    session = onnxruntime.InferenceSession(content, options, providers=["CPUExecutionProvider"])
+    return _finder(signature(session), _OwnGraph(session), path)
+
+
+def _finder(declared: dict[str, Any], network: CropNetwork, path: Path) -> CropFinder:
+    """The finder of a graph that declares what is expected, and gives it for one crop."""
+    size = _checked_size(declared, path)
+    finder = CropFinder(network, size, _margin(declared["crop"], path), path.name)
     trial = finder.network(torch.full((1, 3, size, size), 0.5))
     for output, (name, shape) in zip(trial, _OUTPUTS.items(), strict=True):
         if output.shape != (1, *shape):
@@ -75,38 +102,74 @@ def graph_finder(content: bytes, path: Path) -> CropFinder:
     return finder
 
 
-class _Runner:
-    """The graph as a function of crops."""
+@dataclass(frozen=True, eq=False)
+class _OwnGraph:
+    """A graph as a function of crops."""
 
-    def __init__(self, session: onnxruntime.InferenceSession, path: Path) -> None:
-        self.session, self.path = session, path
+    session: onnxruntime.InferenceSession
 
     def __call__(self, crops: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        try:
-            outputs = self.session.run(list(_OUTPUTS), {"image": crops.float().contiguous().numpy()})
-        except Exception as error:  # see above
-            raise FileFormatError(f"{self.path}: the graph cannot be run ({_short(error)}); {_EXPECTED}") from error
+        outputs = self.session.run(list(_OUTPUTS), {"image": crops.float().contiguous().numpy()})
         landmarks, deviation, visibility, presence = (torch.from_numpy(np.asarray(one)) for one in outputs)
         return landmarks, deviation, visibility, presence
 
 
-def _checked_size(session: onnxruntime.InferenceSession, path: Path) -> int:
+class _ForeignGraph:
+    """A graph in a process of its own as a function of crops."""
+
+    def __init__(self, content: bytes, path: Path, limits: GraphLimits) -> None:
+        self.path, self.limits = path, limits
+        self._folder = tempfile.TemporaryDirectory(prefix="torchface-graph-")  # files that it names are not there
+        script = str(Path(graph_process.__file__).resolve())
+        command = [sys.executable, "-I", script, str(limits.megabytes)]
+        name = f"{path}: the graph, run in a process of at most {limits.megabytes} MB,"
+        environment = {**os.environ, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
+        self._process = AnsweringProcess(command, name, FileFormatError, environment, self._folder.name)
+        self._seconds = limits.load_seconds
+        head, _ = self._asked(content)
+        if "error" in head:
+            raise FileFormatError(
+                f"{path}: cannot be used as an ONNX graph ({head['error']}); expected one that finds landmarks"
+            )
+        self.signature = head
+
+    def __call__(self, crops: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        head, content = self._asked(graph_process.packed(crops.float().numpy()))
+        if "error" in head:
+            raise FileFormatError(f"{self.path}: the graph cannot be run ({head['error']}); {_EXPECTED}")
+        self._seconds = self.limits.answer_seconds
+        numbers = np.frombuffer(content, "<f4").astype(np.float32)
+        parts = np.split(numbers, np.cumsum([math.prod(shape) for shape in head["shapes"]])[:-1])
+        landmarks, deviation, visibility, presence = (
+            torch.from_numpy(part.reshape(shape)) for part, shape in zip(parts, head["shapes"], strict=True)
+        )
+        return landmarks, deviation, visibility, presence
+
+    def _asked(self, content: bytes) -> tuple[dict[str, Any], bytes]:
+        with self._process.within(self._seconds):
+            self._process.send(struct.pack("<Q", len(content)) + content)
+            (count,) = struct.unpack("<I", self._process.receive(4, "ended"))
+            head = json.loads(self._process.receive(count))
+            return head, self._process.receive(4 * sum(math.prod(shape) for shape in head.get("shapes", ())))
+
+
+def _checked_size(declared: dict[str, Any], path: Path) -> int:
     """S, of a graph that declares what is expected."""
-    inputs, outputs = session.get_inputs(), {one.name: one for one in session.get_outputs()}
+    inputs, outputs = declared["inputs"], {name: (shape, kind) for name, shape, kind in declared["outputs"]}
     fits = (
-        [one.name for one in inputs] == ["image"]
+        [name for name, _, _ in inputs] == ["image"]
         and set(outputs) >= set(_OUTPUTS)
-        and inputs[0].type == "tensor(float)"
-        and _is_shape(inputs[0].shape, (3, None, None))
-        and inputs[0].shape[2] == inputs[0].shape[3]
-        and all(outputs[name].type == "tensor(float)" for name in _OUTPUTS)
-        and all(_is_shape(outputs[name].shape, shape) for name, shape in _OUTPUTS.items())
+        and inputs[0][2] == "tensor(float)"
+        and _is_shape(inputs[0][1], (3, None, None))
+        and inputs[0][1][2] == inputs[0][1][3]
+        and all(outputs[name][1] == "tensor(float)" for name in _OUTPUTS)
+        and all(_is_shape(outputs[name][0], shape) for name, shape in _OUTPUTS.items())
     )
     if not fits:
-        found = ", ".join(f"{one.name} {_told(one.shape)} {one.type}" for one in inputs[:4])
-        given = ", ".join(f"{one.name} {_told(one.shape)} {one.type}" for one in list(outputs.values())[:6])
+        found = ", ".join(f"{name} {_told(shape)} {kind}" for name, shape, kind in inputs[:4])
+        given = ", ".join(f"{name} {_told(shape)} {kind}" for name, (shape, kind) in list(outputs.items())[:6])
         raise FileFormatError(f"{path}: found inputs {found or 'none'}; outputs {given or 'none'}; {_EXPECTED}")
-    size = inputs[0].shape[2]
+    size = inputs[0][1][2]
     if not (isinstance(size, int) and _SIZES[0] <= size <= _SIZES[1]):
         raise FileFormatError(f"{path}: found crops of {size!r} pixels, expected a fixed {_SIZES[0]} to {_SIZES[1]}")
     return size
@@ -124,8 +187,8 @@ def _told(shape: list[int | str | None]) -> str:
     return "(" + ",".join("?" if one is None else str(one)[:12] for one in shape[:6]) + ")"
 
 
-def _margin(session: onnxruntime.InferenceSession, path: Path) -> float:
-    text = session.get_modelmeta().custom_metadata_map.get("crop", str(CROP_MARGIN))
+def _margin(crop: str | None, path: Path) -> float:
+    text = str(CROP_MARGIN) if crop is None else crop
     try:
         margin = float(text)
     except ValueError:
@@ -135,7 +198,3 @@ def _margin(session: onnxruntime.InferenceSession, path: Path) -> float:
             f"{path}: found the metadata crop {text[:40]!r}, expected a number from {_MARGINS[0]} to {_MARGINS[1]}"
         )
     return margin
-
-
-def _short(error: Exception) -> str:
-    return " ".join(str(error).split())[:160]
