@@ -39,7 +39,7 @@ from torchface.modeling import ExpressionRegression, ExpressionSettings
 from torchface.modeling.morphable.head_model import HeadModel
 from torchface.modeling.morphable.morphable_model import MorphableModel
 from torchface.onnx import HybridGraph, SolverGraph
-from torchface.optim import BoxQP
+from torchface.optim import BoxQP, ProjectedGradient
 from torchface.synthetic import performer
 
 SOLVER = {"vmap": "batches", "jacrev": "jacobian", "torch.compile": "gap"}
@@ -284,6 +284,9 @@ def helmet(solver: HelmetSolver, markers: Tensor) -> tuple[Tensor, ...]:
 EXAMPLES: dict[str, Example] = {
     "BoxQP": Example(
         box_qp, lambda: (random(10, 6, seed=3).float() - 1,), cells={"torch.compile": "gap", "torch.export": "no"}
+    ),
+    "ProjectedGradient": Example(
+        lambda n: ProjectedGradient(box_qp(n).H, steps=60), lambda: (random(10, 6, seed=3).float() - 1,)
     ),
     "MarkerSolver": Example(
         marker_solver, lambda: (seen_markers(rig()),), cells={**SOLVER, "torch.export": "SolverGraph"}

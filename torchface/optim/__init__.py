@@ -2,6 +2,7 @@
 
 from torchface.optim.box_qp import BoxQP, box_qp
 from torchface.optim.gradient_descent import DescentRun, DescentSettings, DescentTask, descend
+from torchface.optim.projected_gradient import ProjectedGradient
 from torchface.optim.simplex_qp import SimplexQP, simplex_qp
 
 __all__ = [
@@ -9,6 +10,7 @@ __all__ = [
     "DescentRun",
     "DescentSettings",
     "DescentTask",
+    "ProjectedGradient",
     "SimplexQP",
     "box_qp",
     "descend",

@@ -21,22 +21,22 @@ _NEAR_BOUND = 1e3
 _STEEPEST = 1e30
 
 
-def checked_hessian(H: Tensor) -> Tensor:
+def checked_hessian(H: Tensor, name: str = "box_qp") -> Tensor:
     """The symmetric part of H in float64, after every check that needs no f."""
     if H.ndim not in (2, 3) or H.shape[-1] != H.shape[-2] or H.shape[-1] == 0:
-        raise ShapeError(f"box_qp: found H {tuple(H.shape)}, expected (N,N) or (B,N,N)")
+        raise ShapeError(f"{name}: found H {tuple(H.shape)}, expected (N,N) or (B,N,N)")
     if H.dtype not in TOLERANCE:
-        raise ValueRangeError(f"box_qp: found H of {H.dtype}, expected float32 or float64")
+        raise ValueRangeError(f"{name}: found H of {H.dtype}, expected float32 or float64")
     exact = H.detach().double()
     if not torch.isfinite(exact).all():
-        raise ValueRangeError("box_qp: H holds NaN or infinite entries, expected finite ones")
+        raise ValueRangeError(f"{name}: H holds NaN or infinite entries, expected finite ones")
     precision = torch.finfo(H.dtype).eps * H.shape[-1]
     largest = exact.abs().amax((-1, -2)) if exact.numel() else exact.new_zeros(len(exact))
     skew = (exact - exact.transpose(-1, -2)).abs().amax((-1, -2)) if exact.numel() else largest
     # Only the symmetric part counts, and an H of float32 that went to double precision keeps its rounding.
     if (skew > 100 * torch.finfo(torch.float32).eps * H.shape[-1] * largest).any():
         raise ValueRangeError(
-            f"box_qp: H is not symmetric: entries differ from their mirror images by up to {float(skew.max()):.3g}"
+            f"{name}: H is not symmetric: entries differ from their mirror images by up to {float(skew.max()):.3g}"
         )
     exact = 0.5 * (exact + exact.transpose(-1, -2))
     scale = metric(exact).rsqrt()
@@ -45,21 +45,23 @@ def checked_hessian(H: Tensor) -> Tensor:
     if (torch.linalg.cholesky_ex(lifted)[1] > 0).any():
         least = float(torch.linalg.eigvalsh(exact).min())
         raise ValueRangeError(
-            f"box_qp: H is not positive semidefinite: found the eigenvalue {least:.3g}, expected none below 0"
+            f"{name}: H is not positive semidefinite: found the eigenvalue {least:.3g}, expected none below 0"
         )
     return exact
 
 
-def checked_bounds(lower: float | Tensor, upper: float | Tensor, H: Tensor) -> tuple[Tensor, Tensor]:
+def checked_bounds(
+    lower: float | Tensor, upper: float | Tensor, H: Tensor, name: str = "box_qp"
+) -> tuple[Tensor, Tensor]:
     variables = H.shape[-1]
     bounds = []
-    for name, bound in (("lower", lower), ("upper", upper)):
+    for which, bound in (("lower", lower), ("upper", upper)):
         bound = torch.as_tensor(bound, dtype=torch.float64, device=H.device).detach()
         if bound.ndim and bound.shape != (variables,):
-            raise ShapeError(f"box_qp: found {name} {tuple(bound.shape)}, expected a number or ({variables},)")
+            raise ShapeError(f"{name}: found {which} {tuple(bound.shape)}, expected a number or ({variables},)")
         bounds.append(bound.expand(variables).contiguous())
     low, high = bounds
-    check_box("box_qp", low, high)
+    check_box(name, low, high)
     return low, high
 
 
@@ -67,18 +69,18 @@ def checked_tolerance(tolerance: float | None, dtype: torch.dtype) -> float:
     return TOLERANCE[dtype] if tolerance is None else checked_number("box_qp: tolerance", tolerance, 0.0, _COARSEST)
 
 
-def check_vectors(H: Tensor, f: Tensor, start: Tensor | None) -> None:
+def check_vectors(H: Tensor, f: Tensor, start: Tensor | None, name: str = "box_qp") -> None:
     if f.ndim != 2 or f.shape[1] != H.shape[-1] or (H.ndim == 3 and len(H) != len(f)):
         wanted = f"({len(H)},{H.shape[-1]})" if H.ndim == 3 else f"(B,{H.shape[-1]})"
-        raise ShapeError(f"box_qp: found f {tuple(f.shape)}, expected {wanted} for H {tuple(H.shape)}")
+        raise ShapeError(f"{name}: found f {tuple(f.shape)}, expected {wanted} for H {tuple(H.shape)}")
     if f.dtype != H.dtype:
-        raise ValueRangeError(f"box_qp: found f of {f.dtype} and H of {H.dtype}, expected the same")
+        raise ValueRangeError(f"{name}: found f of {f.dtype} and H of {H.dtype}, expected the same")
     if start is not None and start.shape != f.shape:
-        raise ShapeError(f"box_qp: found start {tuple(start.shape)}, expected {tuple(f.shape)}")
-    for name, vectors in (("f", f), ("start", start)):
+        raise ShapeError(f"{name}: found start {tuple(start.shape)}, expected {tuple(f.shape)}")
+    for which, vectors in (("f", f), ("start", start)):
         if vectors is not None and not torch.isfinite(vectors).all():
             bad = (~torch.isfinite(vectors)).any(1).nonzero()[:, 0].tolist()
-            raise ValueRangeError(f"box_qp: {name} holds NaN or infinite entries in rows {bad[:5]}")
+            raise ValueRangeError(f"{name}: {which} holds NaN or infinite entries in rows {bad[:5]}")
 
 
 def check_slope(problem: BoxProblem) -> None:

@@ -15,7 +15,7 @@ Array: TypeAlias = "np.ndarray"
 # Numbers in the matrices that an accelerator factors at once.
 _CHUNK_NUMBERS = 2**25
 # Added to the scaled diagonal, so that semidefinite blocks factor; raised a thousandfold where they do not.
-_RIDGE = 1e-13
+RIDGE = 1e-13
 _RIDGE_TRIES = 5
 
 
@@ -31,7 +31,7 @@ def solve_free(H: Tensor, diagonal: Tensor, free: Tensor, right: Tensor, damping
     """
     scale = diagonal.rsqrt()
     scaled = H * scale[..., :, None] * scale[..., None, :]
-    ridge = right.new_full((len(right),), _RIDGE) if damping is None else damping.clamp(min=_RIDGE)
+    ridge = right.new_full((len(right),), RIDGE) if damping is None else damping.clamp(min=RIDGE)
     solve = _solved_one_by_one if right.device.type == "cpu" else _solved_at_once
     return solve(scaled, free, right * scale, ridge) * scale
 
@@ -56,7 +56,7 @@ def _solution(matrix: Array, ids: Array, side: Array, ridge: float) -> Array:
         _, x, failed = dposv(block.T, side.take(ids), lower=1, overwrite_a=1, overwrite_b=1)
         if not failed:
             break
-        ridge = max(1e3 * ridge, 1e3 * _RIDGE)
+        ridge = max(1e3 * ridge, 1e3 * RIDGE)
     return x
 
 
@@ -99,7 +99,7 @@ def _factored_solve(block: Tensor, right: Tensor) -> Tensor:
     """Solves a system each, (B,S), of blocks (B,S,S); with a ridge where factoring fails."""
     factor, failures = torch.linalg.cholesky_ex(block)
     solved, failed = torch.cholesky_solve(right[..., None], factor)[..., 0], failures > 0
-    ridge = _RIDGE
+    ridge = RIDGE
     for _ in range(_RIDGE_TRIES):
         rows = failed.nonzero()[:, 0]
         if not len(rows):

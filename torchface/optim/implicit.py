@@ -11,7 +11,7 @@ from torch.autograd.function import once_differentiable
 
 from torchface.errors import TraceError
 from torchface.optim.box_problem import metric
-from torchface.optim.free_variables import solve_free
+from torchface.optim.free_variables import RIDGE, solve_free
 
 Solve = Callable[[Tensor, Tensor, Tensor, Tensor], Tensor]
 """Of H, f and the bounds, tensors that no transform wraps."""
@@ -70,6 +70,22 @@ class BoxSolution(torch.autograd.Function):
         H = _one_each(H, dims[0], info.batch_size, f.shape[1])
         x: Tensor = BoxSolution.apply(H, f.flatten(0, 1), lower, upper, solve)
         return x.unflatten(0, f.shape[:2]), 0
+
+
+def free_step(H: Tensor, f: Tensor, x: Tensor, free: Tensor) -> Tensor:
+    r"""The step :math:`-H_{FF}^{-1} (Hx + f)_F` of free variables, 0 elsewhere, (B,N), with derivatives of any order.
+
+    It carries the derivatives of :math:`x_F`, which the solution x (B,N) itself is given without.
+    """
+    exact = _symmetric(H.double())
+    slope = torch.where(free, _times(exact, x.double()) + f.double(), 0.0)
+    if not (torch.compiler.is_compiling() or torch.compiler.is_exporting()):
+        solved: Tensor = _FreeSolution.apply(exact, free, slope)
+        return -solved.to(x.dtype)
+    # The same of operations that a graph can hold.
+    both = free[..., :, None] & free[..., None, :]
+    lifted = torch.where(both, exact, 0.0) + torch.diag_embed(torch.where(free, RIDGE * metric(exact), 1.0))
+    return -torch.linalg.solve(lifted, slope[..., None])[..., 0].to(x.dtype)
 
 
 class _FreeSolution(torch.autograd.Function):

@@ -12,6 +12,7 @@ from torchface import Attachment, BlendshapeRig, Take, Track
 from torchface.capture import MarkerSolver
 from torchface.errors import NameMismatchError, ShapeError, TopologyError, ValueRangeError
 from torchface.geometry.similarity import Similarity
+from torchface.optim import ProjectedGradient
 
 
 def performed(rig: BlendshapeRig, attachment: Attachment, frames: int = 50) -> tuple[Tensor, Tensor]:
@@ -131,3 +132,24 @@ def test_a_moved_solver_solves_in_its_new_precision(setting: tuple[MarkerSolver,
     solver, weights, markers = setting
     solver(markers)
     torch.testing.assert_close(solver.double()(markers), weights, rtol=0, atol=1e-4)
+
+
+def test_a_program_of_ones_own_finds_the_same_weights(small_rig: BlendshapeRig, small_attachment: Attachment) -> None:
+    """With gaps and without, differentiable, and there again in a solver made of config and state."""
+    _, markers = performed(small_rig, small_attachment, 8)
+    markers[::3, :9] = torch.nan
+    wanted = MarkerSolver(small_rig, small_attachment)(markers)
+    solver = MarkerSolver(small_rig, small_attachment, program=ProjectedGradient(steps=3000, tolerance=1e-9))
+    torch.testing.assert_close(solver(markers), wanted, rtol=0, atol=1e-6)
+    markers.requires_grad_()
+    slopes = [
+        torch.autograd.grad(some(markers).square().sum(), markers)[0].nan_to_num(0.0)
+        for some in (solver, MarkerSolver(small_rig, small_attachment))
+    ]
+    torch.testing.assert_close(*slopes, rtol=1e-4, atol=1e-6)
+    again = MarkerSolver.from_config(solver.config)
+    again.load_state_dict(solver.state_dict())
+    assert again.program is not None
+    assert again.program.steps == 3000
+    with pytest.raises(ValueRangeError, match="program: found"):
+        MarkerSolver(small_rig, small_attachment, program=ProjectedGradient(upper=2.0))

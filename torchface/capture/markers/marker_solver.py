@@ -17,7 +17,7 @@ from torchface.correctives.activation import CorrectiveActivation
 from torchface.correctives.corrective_shapes import Corrective, definitions_from_records
 from torchface.errors import NameMismatchError, ShapeError, ValueRangeError
 from torchface.geometry.similarity import Similarity
-from torchface.optim import BoxQP, box_qp
+from torchface.optim import BoxQP, ProjectedGradient, box_qp
 from torchface.optim.data_dependent import data_dependent
 from torchface.optim.prepared_tensors import Prepared
 from torchface.rig import BlendshapeRig
@@ -56,10 +56,12 @@ class MarkerSolver(nn.Module):
         sparsity: :math:`\beta`, mm² a marker for a weight of 1; see ``sparsity_by_rule``. A tensor of one number is
             kept as a parameter (``nn.Parameter``) or a buffer, and the weights are differentiable in it.
         ridge: :math:`\varepsilon`, mm² a marker for a squared weight of 1; as ``sparsity``.
+        program: solves the quadratic programs in place of ``box_qp``: without an H of its own, bounds 0 and 1. With
+            correctives it solves what their Gauss-Newton starts from.
 
     Raises:
         TopologyError: the attachment belongs to another mesh.
-        ValueRangeError: ``sparsity`` or ``ridge`` is negative or not finite.
+        ValueRangeError: ``sparsity`` or ``ridge`` is negative or not finite, or ``program`` has an H or other bounds.
         ShapeError: ``alignment`` holds more than one similarity, or ``sparsity`` or ``ridge`` more than one number.
 
     Source: thesis 4.1.3, 4.1.4 and appendix.
@@ -79,6 +81,7 @@ class MarkerSolver(nn.Module):
     basis: Tensor
     rest: Tensor
     corrective_basis: Tensor | None
+    program: ProjectedGradient | None
 
     def __init__(
         self,
@@ -87,9 +90,15 @@ class MarkerSolver(nn.Module):
         alignment: Similarity | None = None,
         sparsity: float | Tensor = SPARSITY,
         ridge: float | Tensor = RIDGE,
+        program: ProjectedGradient | None = None,
     ) -> None:
         super().__init__()
         attachment.check(rig.neutral)
+        own = program is not None and (
+            program.H is not None or bool((program.lower != 0).any() | (program.upper != 1).any())
+        )
+        if own:
+            raise ValueRangeError(f"program: found {program}, expected none of H or bounds, as of ProjectedGradient()")
         faces = rig.neutral.faces
         rest = attachment.on(faces, rig.vertices)
         if attachment.residual is not None:
@@ -99,6 +108,7 @@ class MarkerSolver(nn.Module):
         if rig.correctives is not None:
             moved = attachment.on(faces, rig.correctives.deltas).permute(1, 2, 0).contiguous()
             self._correct(rig.correctives.definitions, moved)
+        self.program = program
 
     def _register(
         self,
@@ -122,6 +132,7 @@ class MarkerSolver(nn.Module):
             moved = None if alignment is None else getattr(alignment, name).to(rest)
             self.register_buffer(f"alignment_{name}", moved)
         self.activation: CorrectiveActivation | None = None
+        self.program = None
         self.register_buffer("corrective_basis", None)
         self._prepared: dict[float, Prepared[BoxQP]] = {}
         self._prepared_rows: Prepared[tuple[Tensor, Tensor]] = Prepared()
@@ -153,6 +164,7 @@ class MarkerSolver(nn.Module):
             "ridge": penalty_value(self.ridge),
             "aligned": self.alignment is not None,
             **({} if self.activation is None else {"correctives": self.activation.records()}),
+            **({} if self.program is None else {"program": self.program.config}),
             # In the state, with their shapes.
             "tensors": {
                 name: list(value.shape)
@@ -189,6 +201,8 @@ class MarkerSolver(nn.Module):
         if "correctives" in config:
             definitions = definitions_from_records(config["correctives"])
             self._correct(definitions, torch.zeros(len(labels), 3, len(definitions)))
+        if "program" in config:
+            self.program = ProjectedGradient(**config["program"])
         return self
 
     @property
@@ -268,7 +282,10 @@ class MarkerSolver(nn.Module):
             energy = self._linear_energy(markers[chunk])
             rows.append(chunk)
             guess = None if initial is None else initial[chunk]
-            parts.append(box_qp(energy.H, energy.f, 0.0, 1.0, guess, tolerance))
+            if self.program is None:
+                parts.append(box_qp(energy.H, energy.f, 0.0, 1.0, guess, tolerance))
+            else:
+                parts.append(self.program(energy.f, energy.H, guess))
         weights = markers.new_zeros(len(markers), len(self.names), dtype=torch.float64)
         return weights.index_copy(0, torch.cat(rows), torch.cat(parts)).to(markers.dtype)
 
@@ -309,7 +326,9 @@ class MarkerSolver(nn.Module):
         """Weights (B,N), float64, for markers without gaps: one H, factored on first use."""
         offset = self.rest.double() - self._in_rig_space(markers.double())
         f = (2.0 / len(self.rest)) * (offset.flatten(1) @ self.basis.double().flatten(0, 1)) + self.sparsity
-        return self._shared(tolerance)(f, initial)
+        return (
+            self._shared(tolerance)(f, initial) if self.program is None else self.program(f, self._hessian(), initial)
+        )
 
     def _corrected(self, markers: Tensor, gaps: Tensor, initial: Tensor | None, tolerance: float) -> Tensor:
         """Weights (B,N), float64, with correctives: Gauss-Newton from the answer without, or from a guess (B,N)."""
@@ -354,7 +373,7 @@ class MarkerSolver(nn.Module):
             return self
         linear = copy.copy(self)
         linear._buffers = {**self._buffers, "corrective_basis": None}
-        linear._modules = {}
+        linear._modules = {} if self.program is None else {"program": self.program}
         linear.activation = None
         return linear
 
