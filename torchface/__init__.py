@@ -32,9 +32,30 @@ _HOMES = {
     "save_take": "torchface.io",
 }
 
-__all__ = [*_HOMES, "__version__"]
+_PACKAGES = ("capture", "enhancement", "io", "landmarks", "modeling", "optim", "registration", "zoo")
+
+__all__ = [  # in letters, not computed: checkers of types read it
+    "Annotations",
+    "Attachment",
+    "BlendshapeRig",
+    "Corrective",
+    "Correctives",
+    "Mesh",
+    "Take",
+    "TorchfaceError",
+    "Track",
+    "__version__",
+    "load_mesh",
+    "load_rig",
+    "load_take",
+    "save_animation",
+    "save_mesh",
+    "save_rig",
+    "save_take",
+]
 
 if TYPE_CHECKING:
+    from torchface import capture, enhancement, io, landmarks, modeling, optim, registration, zoo
     from torchface.attachment import Attachment
     from torchface.correctives.corrective_shapes import Corrective, Correctives
     from torchface.errors import TorchfaceError
@@ -53,10 +74,12 @@ if TYPE_CHECKING:
 
 
 def __getattr__(name: str) -> Any:
+    if name in _PACKAGES:
+        return import_module(f"torchface.{name}")
     if name not in _HOMES:
         raise AttributeError(f"module 'torchface' has no attribute {name!r}")
     return getattr(import_module(_HOMES[name]), name)
 
 
 def __dir__() -> list[str]:
-    return sorted(__all__)
+    return sorted([*__all__, *_PACKAGES])
