@@ -7,6 +7,7 @@ from typing import Annotated, Literal
 
 from tyro.conf import Positional, arg
 
+from torchface.cli.command_options import OutputPath
 from torchface.cli.terminal import Quiet, print_lines, print_path, progress_bars
 
 
@@ -14,7 +15,7 @@ def corrective(
     rig: Annotated[Positional[Path], arg(metavar="RIG")],
     at: tuple[str, ...],
     sculpt: Path,
-    out: Path,
+    out: OutputPath,
     name: str | None = None,
     unit: str | None = None,
     align: Literal["remove", "keep"] | None = None,

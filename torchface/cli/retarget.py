@@ -40,7 +40,7 @@ def retarget(
             each of the target's shapes is one of ARKit's, otherwise frame,time,<shape>,... with the target's own names.
         live_link: Also write Live Link Face CSV whatever the target's names are: halves are merged, shapes that ARKit
             does not have are left out.
-        animation: Also write the target rig with this animation as .glb or USD.
+        animation: Also write the target rig with this animation as .glb, USD or .ma (Maya).
         part: Keep this region of the target rig only, such as face.
         quiet: Show no progress.
     """

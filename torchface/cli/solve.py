@@ -67,7 +67,7 @@ def solve(
             frame,time,<shape>,... with the rig's own names.
         live_link: Also write Live Link Face CSV whatever the rig's names are: halves are merged, shapes that ARKit does
             not have are left out.
-        animation: Also write the rig with this animation as .glb or USD.
+        animation: Also write the rig with this animation as .glb, USD or .ma (Maya).
         neutral: A frame with the face at rest: the take is moved onto the rig by it (rotation, translation, scale).
         align: Move the take onto the rig without a neutral frame. With neither, markers are in the rig's space.
         keep_rest: Do not subtract what is left at rest between a moved take and the rig.

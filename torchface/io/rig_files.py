@@ -13,6 +13,7 @@ from torchface.io.gltf.animation_reading import read_gltf_weights
 from torchface.io.gltf.gltf_reading import read_gltf_rig
 from torchface.io.gltf.gltf_writing import write_gltf_rig
 from torchface.io.gltf.wrinkle_maps import read_gltf_detail
+from torchface.io.maya.maya_writing import MAYA_ENDING, write_maya_rig
 from torchface.io.rigs.ict_facekit import is_ict_folder, load_ict_facekit, region
 from torchface.io.rigs.rig_folder import load_obj_folder, save_obj_folder
 from torchface.io.scenes.weight_keys import ShapeMatch, WeightKeys, weight_keys
@@ -25,6 +26,8 @@ from torchface.take import Take
 GLTF_ENDINGS = (".glb", ".gltf")
 SCENE_ENDINGS = (*GLTF_ENDINGS, *USD_ENDINGS)
 """Files that may hold a rig, or a mesh without shapes."""
+ANIMATION_ENDINGS = (".glb", *USD_ENDINGS, MAYA_ENDING)
+"""Files that a rig is written to with an animation."""
 
 
 def load_rig(
@@ -81,8 +84,9 @@ def save_rig(rig: BlendshapeRig, path: str | Path, detail: DetailMaps | RegionMa
     Args:
         rig: the rig.
         path: a ``.glb`` (metres; parts that regions name have materials of their own; shapes are sparse morph targets,
-            correctives among them); a ``.usda``, ``.usdc``, ``.usd`` or ``.usdz``; or a name without an ending, for a
-            folder of ``neutral.obj`` and an OBJ a shape. It appears only when it is complete.
+            correctives among them); a ``.usda``, ``.usdc``, ``.usd`` or ``.usdz``; a ``.ma`` for Maya, which
+            ``load_rig`` does not read; or a name without an ending, for a folder of ``neutral.obj`` and an OBJ a shape.
+            It appears only when it is complete.
         detail: wrinkle maps of its shapes, or of its regions, for ``.glb`` alone.
 
     Raises:
@@ -109,10 +113,14 @@ def write_rig(
     if suffix == ".glb":
         write_gltf_rig(rig, path, detail, keys)
     elif isinstance(detail, RegionMaps):
-        kind = "a USD file" if suffix in USD_ENDINGS else "a folder of OBJ files"
+        kind = f"a {suffix} file" if suffix else "a folder of OBJ files"
         raise FileFormatError(f"{path}: found wrinkle maps by region for {kind}, expected .glb for them")
     elif suffix in USD_ENDINGS:
         write_usd_rig(rig, path, keys, detail)
+    elif suffix == MAYA_ENDING:
+        if detail is not None:
+            raise FileFormatError(f"{path}: found wrinkle maps for a {suffix} file, expected .glb or USD for them")
+        write_maya_rig(rig, path, keys)
     else:
         save_obj_folder(rig, path, detail)
 
@@ -127,7 +135,7 @@ def save_animation(
     Args:
         rig: the rig.
         take: with ``weights``; names are matched by ``shape_names.mapping``.
-        path: a ``.glb``, or ``.usda``, ``.usdc``, ``.usd`` or ``.usdz``; it appears only when it is complete.
+        path: a ``.glb``, ``.usda``, ``.usdc``, ``.usd``, ``.usdz`` or ``.ma``; it appears only when it is complete.
         detail: wrinkle maps of the rig's shapes, or of its regions, for ``.glb`` alone.
 
     Returns:
@@ -146,7 +154,7 @@ def save_animation(
         >>> save_animation(rig, take, "take.glb")
         ShapeMatch(driven=('jawOpen',), missing=(), unused=('tongueOut',))
     """
-    check_ending(path, ".glb", *USD_ENDINGS)
+    check_ending(path, *ANIMATION_ENDINGS)
     keys, match = weight_keys(rig, take)
     write_rig(rig, path, detail, keys)
     return match
@@ -207,12 +215,12 @@ def check_rig_ending(path: str | Path) -> None:
     """Refuses what no rig can be written to.
 
     Raises:
-        FileFormatError: another ending than ``.glb``, USD's and none, which stands for a folder of OBJ files.
+        FileFormatError: another ending than ``.glb``, USD's, ``.ma`` and none, which stands for a folder of OBJ files.
         MissingExtraError: USD, and usd-core is not installed.
     """
     suffix = Path(path).suffix.lower()
-    if suffix not in ("", ".glb", *USD_ENDINGS):
-        known = ", ".join((".glb", *USD_ENDINGS))
+    if suffix not in ("", *ANIMATION_ENDINGS):
+        known = ", ".join(ANIMATION_ENDINGS)
         raise FileFormatError(
             f"{path}: found the ending {suffix!r}, expected {known}, or none for a folder of OBJ files"
         )

@@ -12,12 +12,12 @@ from torchface.geometry.meshes.normal_maps import DetailMaps
 from torchface.geometry.meshes.region_maps import RegionMaps
 from torchface.io import load_animation, load_detail_maps, load_region_maps, save_mesh
 from torchface.io.blender import BLENDER_ENDINGS, blender_program, read_blender_file, write_blender_file
+from torchface.io.maya.maya_writing import MAYA_ENDING, maya_notes
 from torchface.io.mesh_files import MESH_ENDINGS
-from torchface.io.rig_files import GLTF_ENDINGS, SCENE_ENDINGS, check_rig_ending, write_rig
+from torchface.io.rig_files import ANIMATION_ENDINGS, GLTF_ENDINGS, SCENE_ENDINGS, check_rig_ending, write_rig
 from torchface.io.rigs.ict_facekit import region
 from torchface.io.scenes.weight_keys import weight_keys
 from torchface.io.usd.usd_library import require_usd
-from torchface.io.usd.usd_writing import USD_ENDINGS
 from torchface.mesh import Mesh, submesh
 from torchface.progress import Progress, silent
 from torchface.rig import BlendshapeRig
@@ -56,8 +56,8 @@ def convert_file(
 
     Args:
         source: a rig or mesh, ``.fbx`` or ``.blend``.
-        out: ``.glb``, USD, ``.fbx``, ``.blend``, or a name without an ending for a folder of OBJ files; for what has no
-            shapes any mesh's ending.
+        out: ``.glb``, USD, ``.ma``, ``.fbx``, ``.blend``, or a name without an ending for a folder of OBJ files; for
+            what has no shapes any mesh's ending.
         unit: of the source's numbers, where it is not the format's own.
         part: keep this annotated region only.
         names: how shapes are called in ``out``; see ``rig_names``.
@@ -74,7 +74,7 @@ def convert_file(
     if {source.suffix.lower(), out.suffix.lower()} & set(BLENDER_ENDINGS):
         blender_program()
     if out.suffix:
-        check_ending(out, ".glb", *USD_ENDINGS, *BLENDER_ENDINGS, *MESH_ENDINGS)
+        check_ending(out, *ANIMATION_ENDINGS, *BLENDER_ENDINGS, *MESH_ENDINGS)
         check_writable(out)
     else:
         check_writable(folder=out)
@@ -87,7 +87,7 @@ def convert_file(
     progress("writing")
     make_folder(out.parent)
     if source_rig.rig is None:
-        if out.suffix.lower() in BLENDER_ENDINGS or not out.suffix:
+        if out.suffix.lower() in (*BLENDER_ENDINGS, MAYA_ENDING, ""):
             raise FileFormatError(f"{source}: found a mesh without shapes, expected a rig to write {out.name} from")
         save_mesh(source_rig.mesh, out)
         return source_rig
@@ -130,7 +130,7 @@ def write_source(rig: BlendshapeRig, take: Take | None, detail: DetailMaps | Reg
     if take is not None and not suffix:
         notes.append("a folder of OBJ files has no place for the animation, which is left out")
         take = None
-    if isinstance(detail, DetailMaps) and suffix in BLENDER_ENDINGS:
+    if isinstance(detail, DetailMaps) and suffix in (*BLENDER_ENDINGS, MAYA_ENDING):
         notes.append(f"{suffix} has no place for the wrinkle maps of {len(detail.names)} shapes, which are left out")
         detail = None
     keys = None if take is None else weight_keys(rig, take)[0]
@@ -140,6 +140,8 @@ def write_source(rig: BlendshapeRig, take: Take | None, detail: DetailMaps | Reg
             f"{suffix} has no correctives: the {len(rig.correctives.names)} are shape keys of their own, {moved}; "
             ".blend has drivers for them"
         )
+    if suffix == MAYA_ENDING:
+        notes += maya_notes(rig, keys)
     if suffix in BLENDER_ENDINGS:
         write_blender_file(rig, out, keys)
     else:

@@ -10,7 +10,7 @@ import torch
 
 from torchface.errors import NameMismatchError
 from torchface.files.whole_files import all_or_none, check_ending, check_writable, make_folder
-from torchface.io.usd.usd_writing import USD_ENDINGS
+from torchface.io.rig_files import ANIMATION_ENDINGS
 from torchface.io.weights.live_link_csv import not_in_live_link, save_live_link
 from torchface.io.weights.weight_csv import save_weights_csv
 from torchface.shape_names import ARKIT, mapping
@@ -26,7 +26,7 @@ class WeightFiles:
 
     Args:
         out: the weights, see :func:`write_weights`.
-        animation: the rig with this animation, ``.glb`` or USD, if wanted.
+        animation: the rig with this animation, ``.glb``, USD or ``.ma``, if wanted.
         live_link: Live Link Face's CSV whatever the names are, if wanted.
     """
 
@@ -41,7 +41,7 @@ class WeightFiles:
                 check_ending(table, ".csv")
         check_writable(self.out, self.live_link, self.animation, folder=folder)
         if self.animation is not None:
-            check_ending(self.animation, ".glb", *USD_ENDINGS)
+            check_ending(self.animation, *ANIMATION_ENDINGS)
 
 
 def weight_faults(weights: Track) -> list[str]:

@@ -249,13 +249,13 @@ def _shapes(usd: Any, stage: Any, mesh: Mesh, targets: Sequence[_Target], tokens
         poses = [moves(target.delta), *(moves(reached) for _, _, reached in target.between)]
         rows = np.flatnonzero(np.any([(moved != 0) | (rotated != 0) for moved, rotated in poses], axis=(0, 2)))
         rows = rows if len(rows) else np.zeros(1, np.int64)  # Blender leaves a shape without any offset out
-        shape = usd.UsdSkel.BlendShape.Define(stage, f"{_MESH}/{_free(usd.Tf.MakeValidIdentifier(token), used)}")
+        shape = usd.UsdSkel.BlendShape.Define(stage, f"{_MESH}/{free_name(usd.Tf.MakeValidIdentifier(token), used)}")
         shape.CreateOffsetsAttr(_vectors(usd, metres(poses[0][0][rows])))
         shape.CreateNormalOffsetsAttr(_vectors(usd, poses[0][1][rows]))
         shape.CreatePointIndicesAttr(usd.Vt.IntArray.FromNumpy(rows.astype(np.int32)))
         names: set[str] = set()
         for (name, weight, _), (moved, rotated) in zip(target.between, poses[1:], strict=True):
-            between = shape.CreateInbetween(_free(usd.Tf.MakeValidIdentifier(name), names))
+            between = shape.CreateInbetween(free_name(usd.Tf.MakeValidIdentifier(name), names))
             between.SetWeight(weight)
             between.SetOffsets(_vectors(usd, metres(moved[rows])))
             between.CreateNormalOffsetsAttr(_vectors(usd, rotated[rows]))
@@ -293,10 +293,10 @@ def _bind(usd: Any, stage: Any, prim: Any, tokens: list[str], shapes: list[Any],
 def _tokens(names: Sequence[str]) -> list[str]:
     """The names as USD's tokens, which may be neither empty nor hold a NUL, no token twice."""
     used: set[str] = set()
-    return [_free(name.replace("\0", "") or "shape", used) for name in names]
+    return [free_name(name.replace("\0", "") or "shape", used) for name in names]
 
 
-def _free(name: str, used: set[str]) -> str:
+def free_name(name: str, used: set[str]) -> str:
     """``name``, or with the first number behind it that makes it new."""
     free, number = name, 2
     while free in used:
