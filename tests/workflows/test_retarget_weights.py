@@ -4,10 +4,13 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import pytest
 import torch
 
-from torchface import Take, Track, save_rig, save_take
+from torchface import BlendshapeRig, Take, Track, load_take, save_rig, save_take
 from torchface.capture.mouth_close import with_jaw_in_mouth_close
+from torchface.cli import main
+from torchface.io.images.image_files import load_image
 from torchface.synthetic import performer
 from torchface.workflows.retarget_weights import retarget_weights
 from torchface.workflows.weight_files import WeightFiles
@@ -35,3 +38,29 @@ def test_the_jaw_is_opened_once(tmp_path: Path) -> None:
     ruled = retarget_weights(tmp_path / "take.csv", tmp_path / "other.glb", written, table=table)
     assert ruled.take.weights is not None
     torch.testing.assert_close(ruled.take.weights.values[..., 0], weights, atol=1e-4, rtol=0)
+
+
+def test_a_map_is_learned_from_poses_kept_and_drawn(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    whole = performer(texture=False)
+    creature = whole.select(["jawOpen", "mouthPucker", "browInnerUp"])
+    creature = BlendshapeRig(creature.neutral, creature.deltas, ("Maw", "Snout", "Horns"))
+    save_rig(creature, tmp_path / "creature.glb")
+    weights = torch.tensor([[0.8, 0.5], [0.2, 0.0]])
+    save_take(Take(60.0, weights=Track(("jawOpen", "browInnerUp"), weights[..., None])), tmp_path / "take.csv")
+    (tmp_path / "poses.toml").write_text(
+        "[roar]\nfrom = {jawOpen = 1.0}\nto = {Maw = 0.9, Snout = 0.2}\n"
+        "[wonder]\nfrom = {browInnerUp = 1.0}\nto = {Horns = 0.7}\n"
+    )
+    take, rig, out = (str(tmp_path / name) for name in ("take.csv", "creature.glb", "out.csv"))
+    main(["retarget", take, "--to", rig, "--poses", str(tmp_path / "poses.toml"), "--out", out])
+    told = " ".join(capsys.readouterr().err.split())
+    assert "3 factors for 3 shapes from 2 poses, which they give within 0.000" in told
+    found = load_take(out).weights
+    expected = torch.stack([0.9 * weights[:, 0], 0.2 * weights[:, 0], 0.7 * weights[:, 1]], 1)
+    assert (found.values[..., 0] - expected).abs().max() < 2e-3
+    main(["retarget", take, "--to", rig, "--table", str(tmp_path / "out_table.toml"), "--out", str(tmp_path / "b.csv")])
+    torch.testing.assert_close(load_take(tmp_path / "b.csv").weights.values, found.values)
+    picture = load_image(tmp_path / "out_poses.png")
+    left, right = picture[:, :, : picture.shape[2] // 2], picture[:, :, picture.shape[2] // 2 :]
+    assert picture.shape[2] > 400
+    assert (left - right).abs().max() > 0.3  # two poses

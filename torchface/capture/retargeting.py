@@ -11,11 +11,11 @@ import torch
 from torch import Tensor
 
 from torchface.errors import NameMismatchError, ShapeError, ValueRangeError
-from torchface.files.documents import Value, read_toml
+from torchface.files.documents import Value, read_toml, write_toml
 from torchface.shape_names import mapping, near_names, spelled_as
 from torchface.take import Take, Track
 
-__all__ = ["ShapeMap", "ShapeRule", "load_shape_rules", "retarget_take", "shape_map"]
+__all__ = ["ShapeMap", "ShapeRule", "load_shape_rules", "retarget_take", "save_shape_rules", "shape_map"]
 
 _MAX_FACTORS = 8
 
@@ -208,6 +208,23 @@ def load_shape_rules(path: str | Path) -> dict[str, ShapeRule]:
         {'jawOpen': 0.5}
     """
     return {name: _rule(entry) for name, entry in read_toml(path).table().items()}
+
+
+def save_shape_rules(rules: Mapping[str, ShapeRule], path: str | Path) -> None:
+    """Writes a mapping table; see :func:`load_shape_rules`.
+
+    Example:
+        >>> save_shape_rules({"jawDrop": ShapeRule({"jawOpen": 0.5}, upper=0.8)}, "table.toml")
+        >>> load_shape_rules("table.toml")["jawDrop"].upper
+        0.8
+    """
+    document = {}
+    for name, rule in rules.items():
+        limits = {limit: getattr(rule, limit) for limit in ("gain", "lower", "upper")}
+        changed = {limit: value for limit, value in limits.items() if value != getattr(ShapeRule, limit)}
+        sums = {"sum": dict(rule.sum)} if rule.sum or not rule.product else {}
+        document[name] = sums | ({"product": list(rule.product)} if rule.product else {}) | changed
+    write_toml(path, document)
 
 
 def _rule(entry: Value) -> ShapeRule:

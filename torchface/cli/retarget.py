@@ -18,6 +18,7 @@ def retarget(
     to: Path,
     from_: Annotated[Path | None, arg(name="from")] = None,
     table: Path | None = None,
+    poses: Path | None = None,
     out: OutputPath = Path("out/retargeted.csv"),
     live_link: OptionalOutputPath = None,
     animation: OptionalOutputPath = None,
@@ -36,6 +37,9 @@ def retarget(
             it the names in WEIGHTS are taken as they are.
         table: Mapping table, TOML: a [shape] of the target rig each, with sum = {source = factor} and/or
             product = [sources], and gain, lower, upper.
+        poses: Example poses from which the table is learned, TOML or CSV: for each pose weights of the source (from)
+            and of the target rig (to). OUT_table.toml keeps what was learned, OUT_poses.png shows the poses and what
+            the table gives. Shapes in --table are not learned.
         out: The weights to write, with the timecode and the head and eye rotations of WEIGHTS: Live Link Face CSV if
             each of the target's shapes is one of ARKit's, otherwise frame,time,<shape>,... with the target's own names.
         live_link: Also write Live Link Face CSV whatever the target's names are: halves are merged, shapes that ARKit
@@ -50,12 +54,13 @@ def retarget(
 
     with file_lock(out, ".csv"), progress_bars(quiet) as progress:
         files = WeightFiles(out, animation, live_link)
-        done = retarget_weights(weights, to, files, from_, table, part, progress)
+        done = retarget_weights(weights, to, files, from_, table, part, progress, poses)
     driven = len(done.shapes.to_names) - len(done.shapes.undriven)
     console.print(f"{len(done.take)} frames; {driven} of {len(done.shapes.to_names)} shapes driven")
     for what, names in (("nothing drives", done.shapes.undriven), ("drives nothing:", done.shapes.unused)):
         if names:
             more = f" and {len(names) - _MAX_NAMES} more" if len(names) > _MAX_NAMES else ""
             console.print(f"{what} {', '.join(names[:_MAX_NAMES])}{more}", highlight=False)
+    print_lines(done.notes)
     print_lines(f"warning: {warning}" for warning in done.warnings)
     print_path(out)

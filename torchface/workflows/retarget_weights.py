@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
 
+from torchface.capture.example_poses import LearnedRules, learn_shape_rules, load_example_poses
 from torchface.capture.mouth_close import (
     CLOSE,
     JAW,
@@ -16,14 +17,22 @@ from torchface.capture.mouth_close import (
     jaw_out_of_mouth_close,
     mouth_close_of,
 )
-from torchface.capture.retargeting import ShapeMap, load_shape_rules, retarget_take, shape_map
+from torchface.capture.retargeting import (
+    ShapeMap,
+    load_shape_rules,
+    retarget_take,
+    save_shape_rules,
+    shape_map,
+)
 from torchface.errors import NameMismatchError, ValueRangeError
 from torchface.files.whole_files import make_folder
 from torchface.io import load_rig, load_take, save_animation
 from torchface.progress import Progress, silent
+from torchface.rendering.compositing import save_rendered_image
 from torchface.rig import BlendshapeRig
 from torchface.shape_names import arkit_sources, mapping
 from torchface.take import Take, Track
+from torchface.viz.figures.pose_pairs import pose_pairs
 from torchface.workflows.weight_files import WeightFiles, check_live_link, weight_faults, write_weights
 
 
@@ -34,12 +43,14 @@ class Retargeted:
     Args:
         take: weights by the target's names.
         shapes: what drove what.
-        warnings: what a file leaves out.
+        warnings: what a file leaves out, what examples do not determine.
+        notes: what was learned of examples.
     """
 
     take: Take
     shapes: ShapeMap
     warnings: tuple[str, ...]
+    notes: tuple[str, ...] = ()
 
 
 def retarget_weights(
@@ -50,6 +61,7 @@ def retarget_weights(
     table: Path | None = None,
     part: str | None = None,
     progress: Progress | None = None,
+    poses: Path | None = None,
 ) -> Retargeted:
     """Reads, maps, writes; see ``torchface retarget --help`` for the arguments.
 
@@ -82,18 +94,45 @@ def retarget_weights(
         # By the rig's own spelling, which is what a table names.
         played = replace(played, weights=Track(rig.names, rig.weights_from(played.weights)[..., None]))
     assert played.weights is not None
-    rules = None if table is None else load_shape_rules(table)
+    said: tuple[str, ...] = ()
+    rules = {} if table is None else load_shape_rules(table)
+    if poses is not None:
+        learned, said = _learned(poses, played.weights.names, target, files.out)
+        rules, faults = learned.rules | rules, [*faults, *learned.notes]
     try:
         shapes = shape_map(played.weights.names, target.names, rules)
     except NameMismatchError as error:
-        raise NameMismatchError(f"{table or weights}: {error}") from error
-    moved, notes = _mouth_closed(retarget_take(played, shapes), rig, target, rules or {})
+        raise NameMismatchError(f"{table or poses or weights}: {error}") from error
+    moved, notes = _mouth_closed(retarget_take(played, shapes), rig, target, rules)
     progress("writing")
     written = [*faults, *notes, *write_weights(moved, files.out, files.live_link)]
     if files.animation is not None:
         make_folder(files.animation.parent)
         save_animation(target, moved, files.animation)
-    return Retargeted(moved, shapes, tuple(written))
+    return Retargeted(moved, shapes, tuple(written), said)
+
+
+def _learned(
+    path: Path, names: Sequence[str], target: BlendshapeRig, out: Path
+) -> tuple[LearnedRules, tuple[str, ...]]:
+    """Rules from example poses, kept as a table and drawn beside the weights, and lines for people to read."""
+    examples = load_example_poses(path)
+    try:
+        learned = learn_shape_rules(examples, names, target.names)
+    except (NameMismatchError, ValueRangeError) as error:
+        raise type(error)(f"{path}: {error}") from error
+    off = (learned.found - learned.wanted).abs()
+    pose, shape = divmod(int(off.argmax()), off.shape[1])
+    factors = sum(len(rule.sum) for rule in learned.rules.values())
+    table, picture = (out.with_name(f"{out.stem}_{what}") for what in ("table.toml", "poses.png"))
+    make_folder(out.parent)
+    save_shape_rules(learned.rules, table)
+    titles = [example.name for example in examples]
+    save_rendered_image(pose_pairs(target, titles, learned.wanted, learned.found), picture)
+    return learned, (
+        f"{table}: {factors} factors for {len(learned.rules)} shapes from {len(examples)} poses, which they give "
+        f"within {float(off.max()):.3f} ({target.names[shape]} in {titles[pose]}); drawn in {picture}",
+    )
 
 
 def _mouth_closed(
