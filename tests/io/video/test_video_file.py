@@ -6,6 +6,7 @@ import os
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from fractions import Fraction
 from pathlib import Path
 
 import av
@@ -176,6 +177,37 @@ def test_a_real_video_is_read_whole(data: Path) -> None:
     frames = torch.cat(list(video.chunks(32)))
     assert frames.shape == (72, 360, 640)
     assert 0.1 < (frames / 255).mean() < 0.9
+
+
+def squeezed(path: Path, aspect: Fraction) -> Path:
+    """A white disc of 40 pixels in a black frame of 96 x 64 square ones, stored in pixels of an aspect."""
+    wide, high = (96 / aspect, 64) if aspect > 1 else (96, 64 * aspect)
+    x, y = np.meshgrid((np.arange(int(wide)) + 0.5) * 96 / wide - 48, (np.arange(int(high)) + 0.5) * 64 / high - 32)
+    pixels = np.repeat(((x**2 + y**2 < 400) * np.uint8(255))[..., None], 3, -1)
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream("mpeg4", rate=25)
+        stream.width, stream.height, stream.pix_fmt, stream.bit_rate = int(wide), int(high), "yuv420p", 2**24
+        stream.codec_context.sample_aspect_ratio = aspect
+        for _ in range(2):
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(pixels, "rgb24")))
+        container.mux(stream.encode(None))
+    return path
+
+
+@pytest.mark.parametrize("ending", ["mp4", "mkv"])
+@pytest.mark.parametrize("aspect", [Fraction(2), Fraction(3, 2), Fraction(1, 2), Fraction(1)])
+def test_anamorphic_pixels_become_square(aspect: Fraction, ending: str, tmp_path: Path) -> None:
+    video = open_video(squeezed(tmp_path / f"film.{ending}", aspect))
+    assert (video.width, video.height, video.pixel_aspect) == (96, 64, float(aspect))
+    for frame in video.frames():
+        disc = frame > 127
+        assert abs(int(disc.any(0).sum()) - 40) <= 2
+        assert abs(int(disc.any(1).sum()) - 40) <= 2
+
+
+def test_pixels_of_an_absurd_aspect_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(FileFormatError, match=r"found pixels 6 times as wide as high, expected 0.25 to 4"):
+        open_video(squeezed(tmp_path / "film.mkv", Fraction(6)))
 
 
 @pytest.mark.real

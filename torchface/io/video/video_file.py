@@ -25,6 +25,7 @@ from torchface.io.video.video_packets import (
     quarter_turns,
     read_packets,
     reason,
+    square_size,
 )
 from torchface.number_checks import check_rate
 
@@ -46,9 +47,10 @@ class VideoFile:
     Args:
         path: the file.
         fps: frames a second.
-        width, height: pixels, upright: a phone's rotation is applied.
+        width, height: pixels, upright and square: a phone's rotation and an anamorphic video's aspect are applied.
         count: frames that are shown; of a file that is cut off, those its header promises.
         even: whether frames must come at an even rate; else what reads them asks ``uneven_seconds`` when they come.
+        pixel_aspect: how many times as wide as high the stored pixels are.
 
     Example:
         >>> from torchface.io.video import write_video
@@ -63,6 +65,7 @@ class VideoFile:
     height: int
     count: int
     even: bool = True
+    pixel_aspect: float = 1.0
 
     def uneven_seconds(self) -> tuple[Tensor | None, str]:
         """When each frame is shown, (count,) float64 from 0, and how the rate varies; None where it is even.
@@ -207,12 +210,13 @@ def open_video(path: str | Path) -> VideoFile:
             raise FileFormatError(
                 f"{path}: no frame can be decoded{''.join(errors[:1])}; expected a video of a codec that FFmpeg knows"
             )
+        aspect = float(stream.sample_aspect_ratio or 1)
         declared = stream.frames or round((container.duration or 0) / pyav().time_base * fps)
     whole = len(packets.seconds) + packets.hidden >= 0.99 * declared - 1
     count = len(packets.seconds) if whole else declared - packets.hidden
     if not 1 <= count <= _MAX_FRAMES:
         raise FileFormatError(f"{path}: its header says {count} frames, expected a positive number")
-    return VideoFile(path, fps, frame.shape[1], frame.shape[0], count)
+    return VideoFile(path, fps, frame.shape[1], frame.shape[0], count, pixel_aspect=aspect)
 
 
 def _rgb_frames(container: InputContainer, stream: VideoStream, errors: list[str]) -> Iterator[np.ndarray]:
@@ -223,7 +227,8 @@ def _rgb_frames(container: InputContainer, stream: VideoStream, errors: list[str
         try:
             for frame in stream.decode(packet):
                 frames_beside(path, codec, frame.width, frame.height, frame.format.padded_bits_per_pixel)
-                rgb = reformatter.reformat(frame, format="rgb24", interpolation=bicubic)
+                width, height = square_size(path, stream, frame.width, frame.height)
+                rgb = reformatter.reformat(frame, width, height, format="rgb24", interpolation=bicubic)
                 yield np.ascontiguousarray(np.rot90(rgb.to_ndarray(), quarter_turns(frame)))
         except (av.FFmpegError, ValueError) as error:
             errors.append(f" ({reason(error)})")

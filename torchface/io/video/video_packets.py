@@ -98,6 +98,27 @@ def quarter_turns(frame: VideoFrame) -> int:
     return round(frame.rotation / 90)
 
 
+def square_size(path: Path, stream: VideoStream, width: int, height: int) -> tuple[int, int]:
+    """The size at which a stored frame has square pixels: what is narrow in it is made wider, nothing narrower.
+
+    Raises:
+        FileFormatError: its pixels are more than four times as wide as high or as high as wide, or it is too large.
+    """
+    ratio = float(stream.sample_aspect_ratio or 1)
+    if not 1 / _MAX_ASPECT <= ratio <= _MAX_ASPECT:
+        raise FileFormatError(
+            f"{path}: found pixels {ratio:g} times as wide as high, expected {1 / _MAX_ASPECT:g} to {_MAX_ASPECT:g}"
+        )
+    wide, high = round(width * max(ratio, 1.0)), round(height * max(1 / ratio, 1.0))
+    if wide > _MAX_SIDE or high > _MAX_SIDE or wide * high > _MAX_PIXELS:
+        raise FileFormatError(
+            f"{path}: found frames of {width} x {height} pixels, {wide} x {high} square ones, expected at most "
+            f"{_MAX_SIDE} a side and {_MAX_PIXELS} in all"
+        )
+    return wide, high
+
+
+_MAX_ASPECT = 4.0
 _MAX_BYTES = 2**36
 _MAX_SIDE = 8192
 _MAX_PIXELS = 4096 * 4096

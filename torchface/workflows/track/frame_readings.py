@@ -99,6 +99,12 @@ def given_reading(path: Path, clip: VideoFile) -> FaceReading:
         landmarks = landmarks_of_mesh(landmarks)
         confidence, visibility = (landmarks_of_mesh(one[..., None])[..., 0] for one in (confidence, visibility))
     _check_inside(landmarks, clip, path)
+    if clip.pixel_aspect != 1 and not table.shares:
+        warnings.warn(
+            f"{path}: {clip.path.name} is anamorphic: its pixels are {clip.pixel_aspect:.3g} times as wide as high; "
+            f"the landmarks are taken as of {clip.width} x {clip.height} square ones",
+            stacklevel=2,
+        )
     boxes = box_around(landmarks)
     if not isinstance(clip, BlankVideo):
         _compare_with_pictures(boxes, clip, path)

@@ -155,6 +155,11 @@ class Tracked:
             f"95th percentile {float(errors.nanquantile(0.95)):.2f} px",
         ]
         lines.extend(self.outlier_lines())
+        if self.video.pixel_aspect != 1:
+            lines.append(
+                f"anamorphic video: its pixels are {self.video.pixel_aspect:.3g} times as wide as high; landmarks and "
+                f"camera are of its {self.video.width} x {self.video.height} square ones"
+            )
         if self.times is not None:
             lines.append(
                 f"variable frame rate: {self.inputs.rate_varies}; weights.csv and animation.glb have the frames' own "
