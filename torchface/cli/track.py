@@ -35,6 +35,7 @@ def track(
     camera: Path | None = None,
     texture: Path | None = None,
     face: int = 0,
+    one_person: bool = False,
     whole_take: bool = False,
     part: str | None = None,
     overlay: Literal["side", "over", "none"] = "side",
@@ -75,6 +76,7 @@ def track(
         camera: The camera's calibration, as `torchface calibrate` writes it; a focal length is assumed without.
         texture: An image to put on the face in the overlay, in the rig's texture coordinates, under the video's light.
         face: Which of several faces to follow, from 0, the largest first.
+        one_person: All frames show the actor: solve those after a cut too in which the face looks like another's.
         whole_take: Smooth landmarks over all frames, those after each too; with --dynamics the weights as well.
         part: Keep this region of the rig only, such as face.
         overlay: overlay.mp4: the rig as opaque clay beside the picture, parts of low confidence tinted; half through
@@ -111,6 +113,7 @@ def track(
         fps,
         None if size is None else picture_size(size),
         offsets,
+        one_person,
     )
     if live is not None:
         _live(live, rig, stream, out, settings, seconds, quiet)

@@ -6,7 +6,7 @@ import json
 import math
 import shutil
 import socket
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import pytest
@@ -253,7 +253,7 @@ def test_pieces_of_other_runs_and_damaged_ones_are_thrown_away(tmp_path: Path) -
     piece = FaceReading(torch.rand(4, 68, 2), torch.rand(4, 68), torch.ones(4, 68), torch.ones(4))
     state = TrackState(tmp_path, "a")
     for _ in range(3):
-        state.append(piece, torch.zeros(3))
+        state.append(piece, torch.rand(4, 1200), torch.zeros(3))
     assert TrackState(tmp_path, "a").done == 12
     files = sorted((tmp_path / FOLDER).glob("*.safetensors"))
     files[1].write_bytes(files[1].read_bytes()[:-1000] + bytes(1000))
@@ -381,6 +381,27 @@ def test_of_several_faces_the_one_asked_for_is_followed(filmed: Filmed, tmp_path
     told = " ".join(tracked.lines())
     assert "2 faces in the first frame" in told
     assert "camera: none given; assumed a field of view of 60 degrees" in told
+
+
+def test_a_cut_to_another_face_is_said_and_not_solved(filmed: Filmed, tmp_path: Path) -> None:
+    """The other one has a longer face of another colour, under another light."""
+    frames = torch.stack(list(open_video(filmed.video).color_frames()))
+    longer = torch.nn.functional.interpolate(frames.float(), scale_factor=(1.1, 1.0), mode="bilinear", antialias=True)
+    light = torch.tensor([0.7, 0.8, 1.0])[:, None, None] * torch.linspace(1, 0.35, frames.shape[3])
+    other = (longer[:, :, 6 : 6 + frames.shape[2]] * light).round().to(torch.uint8)
+    write_video([frames, other], tmp_path / "cut.avi", 30.0)
+    tracked = track_video(tmp_path / "cut.avi", filmed.rig, tmp_path / "out", QUICK)
+    assert [(span.first, span.last) for span in tracked.others] == [(FRAMES, 2 * FRAMES - 1)]
+    assert f"frames {FRAMES} to {2 * FRAMES - 1} show another face" in "\n".join(tracked.lines())
+    assert (FRAMES, 2 * FRAMES - 1, "another face") in tracked.suspect_spans()
+    confidence = load_take(tmp_path / "out" / "confidence.csv").weights
+    assert confidence is not None
+    assert confidence.values[:FRAMES].mean() > 0.5
+    assert (confidence.values[FRAMES:] == 0).all()
+    insisted = track_video(tmp_path / "cut.avi", filmed.rig, tmp_path / "out", replace(QUICK, one_person=True))
+    assert not insisted.others
+    assert insisted.reused == 2 * FRAMES
+    assert insisted.solution.confidence[FRAMES:].mean() > 0.5
 
 
 def test_a_played_video_is_sent_frame_by_frame(filmed: Filmed, tmp_path: Path) -> None:

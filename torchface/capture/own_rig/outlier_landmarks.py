@@ -64,20 +64,29 @@ def outlier_landmarks(
             f"{tuple(trust.shape)}, expected ({LANDMARKS},3), (T,{LANDMARKS},2) and (T,{LANDMARKS})"
         )
     with torch.no_grad():
-        q = landmarks.detach().double()
-        seen = torch.isfinite(q).all(-1) & (trust > 0)
-        weight = torch.where(seen, trust.double().clamp(max=1.0), 0.0)
-        weight[seen.sum(1) < _MIN_LANDMARKS] = 0.0
-        residual = _residuals(rest.to(q), torch.where(seen[..., None], q, 0.0), weight)
-        judged = weight > 0
-        allowed = torch.full_like(reach.to(q), _MARGIN)
+        residual = landmark_residuals(rest, landmarks, trust)
+        judged = torch.isfinite(residual).all(-1)
+        allowed = torch.full_like(reach.to(residual), _MARGIN)
         allowed[:JAW] = _CONTOUR_MARGIN
-        eyes = (rest[EYE_CORNERS[0]] - rest[EYE_CORNERS[1]]).norm().to(q)
-        outliers = judged & ~(residual.norm(dim=-1) <= allowed + _COMBINED * reach.to(q) / eyes)
+        eyes = (rest[EYE_CORNERS[0]] - rest[EYE_CORNERS[1]]).norm().to(residual)
+        outliers = judged & ~(residual.norm(dim=-1) <= allowed + _COMBINED * reach.to(residual) / eyes)
         if fps is not None:
             usual = _running_median(torch.where((judged & ~outliers)[..., None], residual, torch.nan))
             outliers |= judged & ((residual - usual).norm(dim=-1) > max(_LONE, _LONE_MOTION / fps))
     return outliers
+
+
+def landmark_residuals(rest: Tensor, landmarks: Tensor, trust: Tensor) -> Tensor:
+    """Where landmarks (T,68,2) lie beside the robust fit of a rig's (68,3) to each frame, in distances of the eyes.
+
+    (T,68,2) float64; NaN for those that are not trusted (T,68), and in frames with fewer than eight that are.
+    """
+    q = landmarks.detach().double()
+    seen = torch.isfinite(q).all(-1) & (trust > 0)
+    weight = torch.where(seen, trust.double().clamp(max=1.0), 0.0)
+    weight[seen.sum(1) < _MIN_LANDMARKS] = 0.0
+    residual = _residuals(rest.to(q), torch.where(seen[..., None], q, 0.0), weight)
+    return torch.where((weight > 0)[..., None], residual, torch.nan)
 
 
 def _residuals(rest: Tensor, q: Tensor, weight: Tensor) -> Tensor:

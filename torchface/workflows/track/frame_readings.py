@@ -67,13 +67,14 @@ def _track(inputs: TrackInputs, finder: LandmarkFinder, state: TrackState, progr
             at += sum(1 for _ in piece)
             progress("tracking landmarks", at, max(clip.count, at))
             continue
-        readings = []
+        readings, looks = [], []
         for frame in piece:  # a frame's box is the one before's
             with naming_the_frame(at):
                 readings.append(tracker.step(frame))
+            looks.append(tracker.look)
             at += 1
             progress("tracking landmarks", at, max(clip.count, at))
-        state.append(FaceReading.stacked(readings), tracker.memory)
+        state.append(FaceReading.stacked(readings), torch.stack(looks), tracker.memory)
     return faces
 
 

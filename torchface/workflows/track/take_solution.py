@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 
 import torch
 from torch import Tensor
 
 from torchface.capture.own_rig import VideoSolution, VideoSolver
+from torchface.capture.own_rig.another_face import AnotherFace, other_faces
 from torchface.capture.own_rig.landmark_offsets import LandmarkOffsets
 from torchface.capture.own_rig.offset_estimate import estimate_offsets
-from torchface.capture.own_rig.outlier_landmarks import landmark_reach, outlier_landmarks
+from torchface.capture.own_rig.outlier_landmarks import landmark_reach, landmark_residuals, outlier_landmarks
 from torchface.capture.own_rig.take_solve import solve_take
 from torchface.capture.own_rig.weight_walk import frame_intervals
 from torchface.errors import FileFormatError, ValueRangeError
@@ -41,9 +43,33 @@ def frame_times(inputs: TrackInputs, count: int) -> Tensor | None:
     return torch.cat([times, times[-1] + missing / inputs.clip.fps])[:count]
 
 
-def outliers_of(inputs: TrackInputs, reading: FaceReading) -> Tensor:
-    """Landmarks where no face has them, (T,68) bool; see :func:`outlier_landmarks`."""
-    return outlier_landmarks(*landmark_reach(inputs.actor), reading.landmarks, reading.trust, inputs.clip.fps)
+@dataclass(frozen=True, eq=False)
+class JudgedReading:
+    """A reading (T,...) with no confidence in what is not the actor's face.
+
+    Args:
+        reading: the rest of it as it was.
+        outliers: landmarks where no face has them, (T,68) bool; see :func:`outlier_landmarks`.
+        others: spans of frames that show another face than the first ones; see :func:`other_faces`.
+    """
+
+    reading: FaceReading
+    outliers: Tensor
+    others: list[AnotherFace]
+
+
+def judged_reading(inputs: TrackInputs, reading: FaceReading, looks: Tensor | None) -> JudgedReading:
+    """The reading without outliers and other faces; faces' looks are (T,C), None where nobody looked at pictures."""
+    rest, reach = landmark_reach(inputs.actor)
+    outliers = outlier_landmarks(rest, reach, reading.landmarks, reading.trust, inputs.clip.fps)
+    reading, others = reading.doubted(outliers), list[AnotherFace]()
+    if looks is not None and not inputs.settings.one_person:
+        relative = landmark_residuals(rest, reading.landmarks, reading.trust)
+        others = other_faces(looks, relative, reading.trust, reading.box)
+    for span in others:
+        frames = torch.arange(len(outliers))
+        reading = reading.doubted(((frames >= span.first) & (frames <= span.last))[:, None])
+    return JudgedReading(reading, outliers, others)
 
 
 def smoothed_landmarks(inputs: TrackInputs, reading: FaceReading, times: Tensor | None) -> Tensor:
@@ -101,6 +127,7 @@ def solution_key(
         rig=_rig_digest(inputs.actor),
         calibration=inputs.calibration,
         whole_take=inputs.settings.whole_take,
+        one_person=inputs.settings.one_person,
         solver=solver.settings,
         offsets=torch.zeros(0) if offsets is None else offsets.millimetres,
         seconds=torch.zeros(0) if times is None else times,

@@ -81,6 +81,7 @@ def summary(tracked: Tracked) -> dict[str, object]:
         "found": int(tracked.seen.sum()),
         "landmarks_found_by": tracked.finder,
         "landmarks_left_out": 0 if tracked.outliers is None else int(tracked.outliers.sum()),
+        "frames_of_another_face": sum(span.last - span.first + 1 for span in tracked.others),
         "jitter_px": tracked.jitter,
         "reprojection_median_px": float(errors.nanmedian()),
         "reprojection_95_px": float(errors.nanquantile(0.95)),

@@ -57,6 +57,7 @@ class TrackSettings:
             goes over the face.
         fps: frames a second of a table of landmarks without a video; by its times if absent.
         size: width and height of the pictures that such landmarks were found in; the camera's if absent.
+        one_person: all frames show the actor, also those in which the face looks like another's.
         offsets: a file of fixed offsets between this rig's landmarks and this finder's; those in the folder of results,
             or estimated with the take, if absent.
     """
@@ -74,6 +75,7 @@ class TrackSettings:
     fps: float | None = None
     size: tuple[int, int] | None = None
     offsets: Path | None = None
+    one_person: bool = False
 
 
 @dataclass(frozen=True, eq=False)

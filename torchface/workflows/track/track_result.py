@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from math import nan
 from pathlib import Path
@@ -10,6 +11,7 @@ import torch
 from torch import Tensor
 
 from torchface.capture.own_rig import VideoSolution
+from torchface.capture.own_rig.another_face import AnotherFace
 from torchface.capture.own_rig.head_pose import STABLE_LANDMARKS
 from torchface.capture.own_rig.landmark_offsets import LandmarkOffsets
 from torchface.capture.own_rig.weight_walk import HIDDEN
@@ -46,6 +48,7 @@ class Tracked:
         products: the files, by what they are.
         light: of the video, where a texture was put on the face.
         outliers: landmarks that lie where no face has them, and so are not trusted, (T,68) bool; none if absent.
+        others: spans of frames that show another face, which are not solved.
     """
 
     inputs: TrackInputs
@@ -60,6 +63,7 @@ class Tracked:
     products: dict[str, Path] = field(default_factory=dict)
     light: PointLight | None = None
     outliers: Tensor | None = None
+    others: Sequence[AnotherFace] = ()
 
     def __len__(self) -> int:
         return len(self.landmarks)
@@ -118,14 +122,16 @@ class Tracked:
         ]
 
     def suspect_spans(self) -> list[tuple[int, int, str]]:
-        """First and last frame of each span without a face, or with landmarks of low confidence in the mean."""
+        """First and last frame of each span with no face, with another, or with landmarks of low mean confidence."""
         reading = self.reading
         sure = (reading.confidence * reading.visibility).nan_to_num().mean(1) * reading.presence.nan_to_num()
         kind = torch.where(self.seen, (sure < _SURE).long(), 2)
+        for span in self.others:
+            kind[span.first : span.last + 1] = 3
         runs, counts = kind.unique_consecutive(return_counts=True)
         ends = counts.cumsum(0)
         return [
-            (end - count, end - 1, ("", "low confidence", "no face")[run])
+            (end - count, end - 1, ("", "low confidence", "no face", "another face")[run])
             for run, count, end in zip(runs.tolist(), counts.tolist(), ends.tolist(), strict=True)
             if run
         ]
@@ -155,6 +161,12 @@ class Tracked:
             f"95th percentile {float(errors.nanquantile(0.95)):.2f} px",
         ]
         lines.extend(self.outlier_lines())
+        lines.extend(
+            f"frames {span.first} to {span.last} show another face than the first frames (its look correlates by "
+            f"{span.likeness:.2f}, eyes and nose lie {100 * span.apart:.1f} % of the eyes' distance apart): they are "
+            "not solved and have no confidence (--one-person solves them)"
+            for span in self.others
+        )
         if self.video.pixel_aspect != 1:
             lines.append(
                 f"anamorphic video: its pixels are {self.video.pixel_aspect:.3g} times as wide as high; landmarks and "

@@ -20,7 +20,7 @@ FOLDER = "state"
 """Where it lies in the folder of results."""
 
 _RECORD = "track.json"
-_METHOD = "tracked frames/6"
+_METHOD = "tracked frames/7"
 _MAX_PIECE_BYTES = 2**28
 _PARTS = fields(FaceReading)
 
@@ -41,6 +41,7 @@ class TrackState:
         self.folder = Path(out) / FOLDER
         self.key = key
         self._pieces: list[FaceReading] = []
+        self._looks: list[Tensor] = []
         self.memory = torch.zeros(0, dtype=torch.float64)
         """The tracker's after the frames that are kept."""
         self._take_up()
@@ -58,16 +59,26 @@ class TrackState:
             for part in _PARTS
         ))  # fmt: skip
 
-    def append(self, piece: FaceReading, memory: Tensor) -> None:
-        """Keeps the reading of the next frames (T,...), and the tracker's memory after them.
+    def looks(self) -> Tensor:
+        """How the face looks in all frames that are kept, (T,C) of unit length; NaN where it was not found."""
+        looks = torch.cat(self._looks).float()
+        return torch.where(looks.any(1, keepdim=True), looks / looks.norm(dim=1, keepdim=True), torch.nan)
+
+    def append(self, piece: FaceReading, looks: Tensor, memory: Tensor) -> None:
+        """Keeps the reading of the next frames (T,...), their looks (T,C), and the tracker's memory after them.
 
         Raises:
             FileFormatError: the folder cannot be written to.
         """
         make_folder(self.folder)
         self.memory = memory
-        write_checkpoint(self._path(len(self._pieces)), {**vars(piece), "memory": memory}, self._piece_key())
+        # A byte a number is enough for a correlation.
+        largest = looks.abs().amax(1, keepdim=True).clamp(min=1e-9)
+        coarse = (127 * looks / largest).nan_to_num(0.0).round().to(torch.int8)
+        parts = {**vars(piece), "look": coarse, "memory": memory}
+        write_checkpoint(self._path(len(self._pieces)), parts, self._piece_key())
         self._pieces.append(piece)
+        self._looks.append(coarse)
 
     def is_current(self, product: Path, key: str) -> bool:
         """Whether a file is there, was made from what ``key`` says, and is as it was made; warns of a damaged one."""
@@ -92,6 +103,7 @@ class TrackState:
             if folder.is_dir() and not any(folder.iterdir()):
                 folder.rmdir()
         self._pieces.clear()
+        self._looks.clear()
 
     def _take_up(self) -> None:
         for left_over in self.folder.glob(".*.part"):
@@ -112,9 +124,10 @@ class TrackState:
             )
             return None
         tensors = read_checkpoint(path, self._piece_key())
-        if tensors is None or set(tensors) != {"memory", *(part.name for part in _PARTS)}:
+        if tensors is None or set(tensors) != {"memory", "look", *(part.name for part in _PARTS)}:
             return None
         self.memory = tensors.pop("memory")
+        self._looks.append(tensors.pop("look"))
         return FaceReading(**tensors)
 
     def _piece_key(self) -> str:

@@ -20,12 +20,12 @@ from torchface.workflows.track.frame_readings import read_frames
 from torchface.workflows.track.overlay_video import write_overlay
 from torchface.workflows.track.take_solution import (
     frame_times,
+    judged_reading,
     keep_solution,
     kept_solution,
     known_offsets,
     new_offsets,
     new_solution,
-    outliers_of,
     smoothed_landmarks,
     solution_key,
 )
@@ -76,8 +76,8 @@ def _track(inputs: TrackInputs, out: Path, filmed: bool, progress: Progress) -> 
         seconds.clear()
     times = frame_times(inputs, len(reading.landmarks))
     with _timed(seconds, "smoothing"):
-        outliers = outliers_of(inputs, reading)
-        reading = reading.doubted(outliers)
+        judged = judged_reading(inputs, reading, None if inputs.models.finder is None else state.looks())
+        reading = judged.reading
         landmarks = smoothed_landmarks(inputs, reading, times)
     trust, solver = reading.trust, inputs.solver(inputs.clip.fps)
     offsets = known_offsets(inputs, out)
@@ -91,7 +91,19 @@ def _track(inputs: TrackInputs, out: Path, filmed: bool, progress: Progress) -> 
         with _timed(seconds, "weights"):
             solution = new_solution(inputs, solver, landmarks, trust, times, progress)
         keep_solution(state, key, solution)
-    tracked = Tracked(inputs, reading, landmarks, solution, times, offsets, faces, reused, seconds, outliers=outliers)
+    tracked = Tracked(
+        inputs,
+        reading,
+        landmarks,
+        solution,
+        times,
+        offsets,
+        faces,
+        reused,
+        seconds,
+        outliers=judged.outliers,
+        others=judged.others,
+    )
     with all_or_none():
         tracked.products.update(write_curves(tracked, out))
     if filmed and inputs.settings.overlay != "none":

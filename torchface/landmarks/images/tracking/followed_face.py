@@ -16,6 +16,9 @@ _LOOK = 3 * _SIZE * _SIZE
 _LEARNED = 0.1  # of how a face looks now that is taken up by what is known of its look
 _NEAR, _SMALLER, _LARGER = 0.75, 0.6, 1.6  # sides of the box, and factors of its size
 
+LOOK = _LOOK
+"""Numbers of a look."""
+
 MEMORY = 5 + 3 + _LOOK + 4
 """Numbers that a followed face is packed into."""
 
@@ -29,6 +32,7 @@ class FollowedFace:
         anchor: where the finder's box lies as the face sees it: its middle from the upright box's (2,) in sides of
             that, and its size by that's; (3,).
         look: its colours, upright and small, (1200,) of unit length.
+        latest_look: the same in the last frame that showed it; not packed.
         missed: frames in a row without it.
         frames: seen so far.
         unconfirmed: checks in a row in which the detector saw no face at its place.
@@ -42,6 +46,7 @@ class FollowedFace:
     frames: int = 0
     unconfirmed: int = 0
     crowded: bool = False
+    latest_look: Tensor | None = None
 
     def pack(self) -> Tensor:
         """All of it as a tensor (1212,) float64; NaN for unknown."""
@@ -97,7 +102,7 @@ class FollowedFace:
 
     def learn_look(self, image: Tensor, landmarks: Tensor, least: float) -> None:
         """Takes up a share of how the face looks now, unless others are about and it looks less like itself."""
-        look = face_look(image, landmarks)
+        look = self.latest_look = face_look(image, landmarks)
         if self.look is None:
             self.look = look
         elif not self.crowded or float(self.look @ look) >= least:

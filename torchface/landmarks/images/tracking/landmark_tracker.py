@@ -16,7 +16,7 @@ from torchface.landmarks.images.boxes.haar_detector import STREAM, SURROUNDINGS,
 from torchface.landmarks.images.face_reading import FaceReading
 from torchface.landmarks.images.ibug_68 import turned_box
 from torchface.landmarks.images.landmark_finder import LandmarkFinder, find_in_box
-from torchface.landmarks.images.tracking.followed_face import FollowedFace, face_place
+from torchface.landmarks.images.tracking.followed_face import LOOK, FollowedFace, face_place
 from torchface.landmarks.images.trees.landmark_trees import LandmarkTrees
 from torchface.landmarks.images.trees.tree_finder import TreeFinder
 
@@ -106,6 +106,13 @@ class LandmarkTracker:
     def memory(self) -> Tensor:
         """What the next frame needs of those before it, (1212,) float64."""
         return self._followed.pack()
+
+    @property
+    def look(self) -> Tensor:
+        """How the face looks in the latest frame, (1200,) of unit length; NaN where it was not found."""
+        followed = self._followed
+        lost = followed.latest_look is None or followed.missed > 0
+        return torch.full((LOOK,), torch.nan) if lost else followed.latest_look
 
     def resume(self, memory: Tensor) -> None:
         """Goes on as a tracker would that has just had this :attr:`memory`, (1212,).
