@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import importlib.util
 import json
 import re
@@ -55,6 +56,15 @@ def test_benchmarks_that_pages_name_are_there() -> None:
     named = {name for page in PAGES for name in _BENCH.findall(page.read_text())}
     lost = [name for name in named if not any((REPOSITORY / "tests").rglob(name))]
     assert not lost
+
+
+def test_limits_that_a_page_names_are_the_code_s() -> None:
+    page = (DOCS / "concepts" / "what_torchface_notices.md").read_text()
+    named = re.findall(r"`(\w+)` = (\S+) in `([\w/]+)\.py`", page)
+    assert len(named) > 5
+    for name, value, file in named:
+        module = importlib.import_module(f"torchface.{file.replace('/', '.')}")
+        assert getattr(module, name) == float(value), f"{file}: {name}"
 
 
 def test_readme_quotes_the_figures_that_were_kept(quote_figures: ModuleType) -> None:

@@ -31,6 +31,7 @@ def attach(
     frames: str | None = None,
     unit: Literal["mm", "cm", "m", "in"] | None = None,
     flip: Literal["x", "y", "z"] | None = None,
+    scale: Literal["held", "free"] | None = None,
     insist: bool = False,
     jobs: Jobs = 1,
     cluster: Cluster = None,
@@ -62,6 +63,8 @@ def attach(
         frames: Use the frames A:B of the take only, from A up to, not including, B; counted from 0.
         unit: What the take's coordinates are in: mm, cm, m or in; else what the file says (CSV: millimetres).
         flip: Negate this axis of the take's coordinates: for takes exported in left-handed axes, which are mirrored.
+        scale: Of the take against the rig: held at 1, or free, to be estimated. Held where the unit is known (C3D, TRC,
+            --unit), if absent.
         insist: Write the sites although the rig does not explain the markers, or the take leaves most of them
             uncertain.
         quiet: Show no progress.
@@ -74,7 +77,7 @@ def attach(
     from torchface.workflows.batch.run_batch import BatchOptions, run_batch
     from torchface.workflows.marker_input import MarkerOptions
 
-    settings = AttachSettings(initial, standoff, part, MarkerOptions(unit, labels, frames, flip), insist)
+    settings = AttachSettings(initial, standoff, part, MarkerOptions(unit, labels, frames, flip, scale), insist)
     if cluster is not None or is_batch(rom, MOTIONS):
         check_folder(out)
         if picture is not None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -45,6 +46,7 @@ def solve(
     frames: str | None = None,
     unit: Literal["mm", "cm", "m", "in"] | None = None,
     flip: Literal["x", "y", "z"] | None = None,
+    scale: Literal["held", "free"] | None = None,
     insist: bool = False,
     jobs: Jobs = 1,
     cluster: Cluster = None,
@@ -68,7 +70,8 @@ def solve(
         live_link: Also write Live Link Face CSV whatever the rig's names are: halves are merged, shapes that ARKit does
             not have are left out.
         animation: Also write the rig with this animation as .glb, USD or .ma (Maya).
-        neutral: A frame with the face at rest: the take is moved onto the rig by it (rotation, translation, scale).
+        neutral: A frame with the face at rest: the take is moved onto the rig by it (rotation and translation; --scale
+            for the scale).
         align: Move the take onto the rig without a neutral frame. With neither, markers are in the rig's space.
         keep_rest: Do not subtract what is left at rest between a moved take and the rig.
         slip: The helmet moves on the head: find its motion, and keep it out of the weights.
@@ -91,6 +94,8 @@ def solve(
         frames: Solve the frames A:B of the take only, from A up to, not including, B; counted from 0.
         unit: What the take's coordinates are in: mm, cm, m or in; else what the file says (CSV: millimetres).
         flip: Negate this axis of the take's coordinates: for takes exported in left-handed axes, which are mirrored.
+        scale: Of the take against the rig: held at 1, or free, to be estimated. Held where the unit is known (C3D, TRC,
+            --unit), if absent.
         insist: Write weights although the rig does not explain the markers.
         quiet: Show no progress.
     """
@@ -110,9 +115,12 @@ def solve(
         raise ValueRangeError("solve: found one of --video and --action-units, expected both or neither")
     camera = None if video is None or action_units is None else HeadCamera(video, action_units, video_labels, table)
 
-    terms = {name: value for name, value in (("sparsity", sparsity), ("ridge", ridge)) if value is not None}
-    settings = SolveSettings(neutral, align, not keep_rest, slip, clean, frame_by_frame, **terms, insist=insist)
-    options = MarkerOptions(unit, labels, frames, flip)
+    settings = SolveSettings(neutral, align, not keep_rest, slip, clean, frame_by_frame, insist=insist)
+    if sparsity is not None:
+        settings = replace(settings, sparsity=sparsity)
+    if ridge is not None:
+        settings = replace(settings, ridge=ridge)
+    options = MarkerOptions(unit, labels, frames, flip, scale)
     if cluster is not None or is_batch(take, MARKER_TAKES):
         if stream is not None:
             raise ValueRangeError("--stream: found many takes, expected one that is sent")

@@ -6,6 +6,7 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Literal
 
 import torch
 from torch import Tensor
@@ -14,7 +15,7 @@ from torchface.attachment import Attachment
 from torchface.capture.markers import match_labels, own_labels
 from torchface.capture.markers.rig_fit_check import unit_of_scale
 from torchface.errors import NameMismatchError, ValueRangeError
-from torchface.geometry.similarity import MAX_HEAD_SCALE, MIN_HEAD_SCALE, Similarity
+from torchface.geometry.similarity import MAX_HEAD_SCALE, MIN_HEAD_SCALE
 from torchface.io import load_take
 from torchface.io.markers.label_maps import load_label_map
 from torchface.io.markers.marker_csv import is_marker_header
@@ -22,6 +23,11 @@ from torchface.io.tables.csv_table import TableReader
 from torchface.io.take_files import MARKER_ENDINGS
 from torchface.take import Take, Track
 from torchface.workflows.batch.batch_items import ItemKind
+
+# Of the six real takes on ICT's rig, with slip, gaps, 0.3 mm of noise and 12 to 100 markers, the scale is 1 within
+# 0.0024; with markers 2 mm off the skin 0.988, with two labels exchanged in 9 % of the frames 1 within 0.0015.
+MAX_SCALE_DIFFERENCE = 0.01
+"""A take of the rig's own performer in true units fits it at scale 1, within this."""
 
 _SHOWN = 6
 _AXES = "xyz"
@@ -37,12 +43,20 @@ class MarkerOptions:
         labels: a table that maps the take's labels to the attachment's.
         frames: ``A:B``, the frames from A up to, not including, B; all if absent.
         flip: ``x``, ``y`` or ``z``, the axis whose coordinates are negated: a take in left-handed axes is mirrored.
+        scale: of an alignment with the rig: ``held`` at 1 or ``free``; held where the unit is known, if absent.
     """
 
     unit: str | None = None
     labels: Path | None = None
     frames: str | None = None
     flip: str | None = None
+    scale: Literal["held", "free"] | None = None
+
+    def frees_scale(self, path: Path) -> bool:
+        """Whether an alignment estimates the scale of the markers in this file: C3D and TRC state their unit."""
+        if self.scale is not None:
+            return self.scale == "free"
+        return self.unit is None and path.suffix.lower() not in MARKER_ENDINGS
 
 
 DEFAULT_OPTIONS = MarkerOptions()
@@ -97,16 +111,26 @@ def _flipped(values: Tensor, axis: str) -> Tensor:
     return values * torch.tensor([-1.0 if name == axis else 1.0 for name in _AXES]).to(values)
 
 
-def pose_warnings(alignment: Similarity) -> list[str]:
-    """Warnings where the scale of a take's alignment with a rig is no head's."""
-    scale = float(alignment.scale[0])
-    if MIN_HEAD_SCALE <= scale <= MAX_HEAD_SCALE:
+def scale_warnings(scale: float, held: bool) -> list[str]:
+    """Warnings where the scale that fits a take to its performer's rig best is not 1.
+
+    Args:
+        scale: of the best alignment.
+        held: the take was aligned at scale 1 all the same.
+    """
+    if abs(scale - 1) <= MAX_SCALE_DIFFERENCE:
         return []
-    unit = unit_of_scale(scale)
-    why = f"the take seems to be in {unit} (--unit {unit})" if unit else "the labels, the take or the rig are others"
+    unit = unit_of_scale(scale) if not MIN_HEAD_SCALE <= scale <= MAX_HEAD_SCALE else ""
+    why = (
+        f"the take seems to be in {unit} (--unit {unit})"
+        if unit
+        else "the take's unit, its labels or the rig are others, or the markers' centres stand off the skin "
+        "(attach --standoff)"
+    )
+    more = "; it was held at 1: --scale free takes the other" if held else ""
     return [
-        f"the take fits the rig at {scale:.3g} times its size, heads differ by {MIN_HEAD_SCALE} to {MAX_HEAD_SCALE} "
-        f"times: {why}"
+        f"the take fits the rig at {scale:.4g} times its size, expected 1 within {100 * MAX_SCALE_DIFFERENCE:g} %: "
+        f"{why}{more}"
     ]
 
 

@@ -20,7 +20,7 @@ from torchface.io import load_take, save_rig, save_take
 from torchface.rig import BlendshapeRig
 from torchface.synthetic.stages.marker_stage import StageFlaws, place_markers, record
 from torchface.take import Take, Track
-from torchface.workflows.marker_input import pose_warnings
+from torchface.workflows.marker_input import scale_warnings
 from torchface.workflows.solve.take_check import check_coverage
 
 FRAMES = 120
@@ -127,12 +127,33 @@ def test_a_mirrored_take_is_refused_and_flipped_by_hand(stage: Path, capsys: pyt
     torch.testing.assert_close(again.values, right.values, atol=5e-3, rtol=0)
 
 
-def test_a_scale_that_is_no_heads_is_told(stage: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    for factor, said in ((0.75, "at 1.33 times its size"), (0.1, "the take seems to be in cm (--unit cm)")):
+def aligned_scale(said: str) -> float:
+    return float(said.split("alignment: scale ")[1].split(",")[0])
+
+
+def test_the_scale_is_held_where_the_unit_is_known_and_warned_of(
+    stage: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    each = ("--align", "--frame-by-frame")
+    for factor, said in ((0.75, "at 1.33"), (0.98, "at 1.02"), (0.1, "the take seems to be in cm (--unit cm)")):
         take = changed(stage, "small.c3d", lambda markers, f=factor: f * markers)  # type: ignore[misc]
-        solve(stage, take, "--align", "--frame-by-frame")
-        assert said in " ".join(capsys.readouterr().err.split())
-    assert pose_warnings(Similarity(torch.tensor([1.07]), torch.eye(3)[None], torch.zeros(1, 3))) == []
+        solve(stage, take, *each, "--scale", "free")
+        told = " ".join(capsys.readouterr().err.split())
+        assert said in told
+        assert "held" not in told
+        assert abs(aligned_scale(told) * factor - 1) < 0.01
+    small = changed(stage, "small.c3d", lambda markers: 0.98 * markers)
+    solve(stage, small, *each)
+    told = " ".join(capsys.readouterr().err.split())
+    assert "warning: the take fits the rig at 1.02" in told
+    assert "it was held at 1: --scale free" in told
+    assert aligned_scale(told) == 1.0
+    # A CSV has no unit unless one is given.
+    table = changed(stage, "small.csv", lambda markers: 0.98 * markers)
+    for more, scale in (((), 1 / 0.98), (("--unit", "mm"), 1.0)):
+        solve(stage, table, *each, *more)
+        assert abs(aligned_scale(" ".join(capsys.readouterr().err.split())) - scale) < 3e-3
+    assert scale_warnings(1.009, held=True) == []
 
 
 def test_a_take_that_fits_is_solved_without_a_warning(stage: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import torch
 from torch import Tensor
 
@@ -19,6 +21,11 @@ _FILL_ITERATIONS = 12
 _FREE_RIDGE = 1e-4
 _FIRST_RIDGE, _LAST_RIDGE, _ANNEALING_ITERATIONS = 3.0, 0.01, 20
 _MAX_ITERATIONS, _TOLERANCE = 80, 1e-3
+# At first only samples farther from their sites than this are left out, mm; then the take's own limits count.
+_FIRST_LIMIT = 30.0
+_LIMIT_RATIO, _MIN_LIMIT, _MAX_LIMIT_RATIO = 5.0, 2.0, 2.0
+# A marker farther from its site than this multiple of the median, and at least so many millimetres, is an outlier.
+_OUTLIER_RATIO, _OUTLIER_DISTANCE, _POINT_ITERATIONS = 3.0, 4.0, 8
 
 
 def solve_weights(
@@ -60,7 +67,7 @@ def solve_weights(
 
 
 def pose_step(
-    paths: Tensor, pose: Similarity, on_rig: Tensor, outward: Tensor | None = None
+    paths: Tensor, pose: Similarity, on_rig: Tensor, outward: Tensor | None = None, scale: bool = True
 ) -> tuple[Similarity, float]:
     r"""The similarity that aligns a take's markers with points of the moving rig, least squares over all frames.
 
@@ -71,12 +78,14 @@ def pose_step(
         pose: the present one.
         on_rig: :math:`p`, (T,M,3).
         outward: :math:`n`, (T,M,3), where h is asked for.
+        scale: estimate s; otherwise it stays.
 
     Returns:
         The similarity and h; without ``outward`` the exact one and 0; with it one Gauss-Newton step from ``pose``.
     """
     if outward is None:
-        return similarity_transform(paths.reshape(1, -1, 3), on_rig.reshape(1, -1, 3)), 0.0
+        found = similarity_transform(pose.scale * paths.reshape(1, -1, 3), on_rig.reshape(1, -1, 3), scale=scale)
+        return replace(found, scale=pose.scale * found.scale), 0.0
     moved = pose.apply(paths)
     seen = ~torch.isnan(moved[..., 0])
     y, residual, n = moved[seen], (on_rig - moved)[seen], outward[seen]
@@ -84,7 +93,11 @@ def pose_step(
     arm = y - centre
     axes = torch.eye(3, dtype=y.dtype, device=y.device).expand(len(y), 3, 3)
     rows = torch.cat([cross_matrix(arm), axes, arm[:, None], -n[:, None]], dim=1)
+    if not scale:
+        rows[:, 6] = 0.0
     matrix = torch.einsum("pic,pjc->ij", rows, rows)
+    if not scale:
+        matrix[6, 6] = 1.0
     step = torch.linalg.solve(matrix, torch.einsum("pic,pc->i", rows, residual))
     return transformed_pose(pose, centre, step[:3], step[3:6], 1 + step[6]), float(step[7])
 
@@ -98,24 +111,34 @@ def transformed_pose(
     return Similarity(pose.scale * scale, matrix @ pose.rotation, moved[None])
 
 
-def pose_of_take(affine: Tensor, paths: Tensor) -> Similarity:
+def pose_of_take(affine: Tensor, paths: Tensor, scale: bool = True) -> Similarity:
     """The similarity that aligns a take's markers with a rig, alternating with the weights of all frames.
+
+    Samples far from their sites, such as those of exchanged labels, are left out of both steps; the limit falls with
+    the ridge, so that an expression that the weights do not follow yet is not taken for them.
 
     Args:
         affine: of the sites, (M,3,N+1), millimetres of rig space.
         paths: markers (T,M,3), millimetres of any space, NaN for not seen; every frame shows some.
+        scale: estimate the scale; otherwise it is 1.
 
     Returns:
         Marker space to rig space.
     """
     rest = affine[..., 0]
-    pose = similarity_transform(paths.nanmean(0)[None], rest[None])
+    pose = pose_of_points(paths.nanmedian(0).values, rest, scale)
     weights, before = None, rest
+    inlier = torch.ones_like(paths[..., :1], dtype=torch.bool)
     for number in range(_MAX_ITERATIONS):
         annealed = min(number / (_ANNEALING_ITERATIONS - 1), 1.0)
         ridge = _FIRST_RIDGE * (_LAST_RIDGE / _FIRST_RIDGE) ** annealed
-        weights = solve_weights(affine, pose.apply(paths), ridge, weights)
-        pose, _ = pose_step(paths, pose, torch.einsum("mcn,tn->tmc", affine, with_one(weights)))
+        moved = pose.apply(paths)
+        weights = solve_weights(affine, torch.where(inlier, moved, torch.nan), ridge, weights)
+        on_rig = torch.einsum("mcn,tn->tmc", affine, with_one(weights))
+        distance = (moved - on_rig).norm(dim=-1)
+        limit = sample_limits(distance).clamp(min=_FIRST_LIMIT * (1 - annealed))
+        inlier = (distance <= limit)[..., None]
+        pose, _ = pose_step(torch.where(inlier, paths, torch.nan), pose, on_rig, scale=scale)
         # Converged where the sites at rest stay.
         sites = pose.inverse().apply(rest)[0]
         converged = float(((sites - before).norm(dim=1) * pose.scale).max()) < _TOLERANCE
@@ -125,15 +148,40 @@ def pose_of_take(affine: Tensor, paths: Tensor) -> Similarity:
     return pose
 
 
+def pose_of_points(points: Tensor, target: Tensor, scale: bool = True) -> Similarity:
+    """The similarity of markers (M,3) to points (M,3), over the inliers among them; NaN for not seen."""
+    inlier = torch.ones(len(target), dtype=torch.bool)
+    for _ in range(_POINT_ITERATIONS):
+        pose = similarity_transform(points[None], target[None], inlier[None].double(), scale)
+        inlier = inlier_markers((pose.apply(points)[0] - target).norm(dim=1))
+    return pose
+
+
+def inlier_markers(error: Tensor) -> Tensor:
+    """Which markers (M,) sit on the skin, by their root mean square distance to their sites (M,), millimetres."""
+    return error <= max(_OUTLIER_RATIO * float(error.nanmedian()), _OUTLIER_DISTANCE)
+
+
+def sample_limits(distance: Tensor) -> Tensor:
+    """The distance beyond which a sample of each marker is an outlier, (M,): five times its median, at least 2 mm.
+
+    Args:
+        distance: of each sample from its expected place, (T,M), millimetres; NaN for what does not count.
+    """
+    own = (_LIMIT_RATIO * distance.nanmedian(0).values.nan_to_num(0.0)).clamp(min=_MIN_LIMIT)
+    # A marker that is an outlier much of the time must not set its own limit.
+    return torch.minimum(own, _MAX_LIMIT_RATIO * own.median())
+
+
 def check_not_mirrored(paths: Tensor, rest: Tensor, name: str = "markers") -> None:
-    """Raises ``AlignmentError`` where the mirror image of a take's mean fits the sites clearly better.
+    """Raises ``AlignmentError`` where the mirror image of a take's median fits the sites clearly better.
 
     Args:
         paths: markers (T,M,3), NaN for not seen.
         rest: their sites, (M,3).
         name: of the take, for messages.
     """
-    found = check_mirrored(paths.nanmean(0), rest)
+    found = check_mirrored(paths.nanmedian(0).values, rest)
     if found.mirrored:
         raise AlignmentError(
             f"{name}: the markers are a mirror image of their sites: {found.figures()} are left; the coordinates are "

@@ -128,7 +128,7 @@ def check_fit(affine: Tensor, markers: Tensor, slip: bool = False) -> FitCheck:
         return found
     if int((~torch.isnan(few).any(-1).all(0)).sum()) < 3:
         return _uncorrected(found)
-    if check_mirrored(few.nanmean(0), rest).mirrored:
+    if check_mirrored(few.nanmedian(0).values, rest).mirrored:
         flipped = few * few.new_tensor([-1.0, 1.0, 1.0])
         pose = pose_of_take(affine, flipped)
         return replace(found, cause="mirror", corrected=_distance(affine, pose.apply(flipped)))
@@ -160,7 +160,7 @@ def _with_slip(affine: Tensor, markers: Tensor, found: FitCheck) -> FitCheck:
 
 def _is_elsewhere(pose: Similarity, markers: Tensor, radius: float) -> bool:
     """Whether a similarity moves markers (T,M,3) farther, or changes their size by more, than a helmet's slip would."""
-    mean = markers.nanmean(0)
+    mean = markers.nanmedian(0).values
     mean = mean[~torch.isnan(mean).any(-1)]
     translation = float((pose.apply(mean)[0] - mean).mean(0).norm())
     angle = math.acos(min(max((float(pose.rotation[0].diagonal().sum()) - 1) / 2, -1.0), 1.0))

@@ -9,9 +9,15 @@ from torch import Tensor
 
 from torchface.attachment import Attachment
 from torchface.capture.markers.marker_solver import MarkerSolver, check_labels
-from torchface.capture.markers.rest_pose import check_not_collinear, check_not_mirrored, pose_of_take
+from torchface.capture.markers.rest_pose import (
+    check_not_collinear,
+    check_not_mirrored,
+    pose_of_points,
+    pose_of_take,
+    sample_limits,
+)
 from torchface.errors import ValueRangeError
-from torchface.geometry.similarity import Similarity, similarity_transform
+from torchface.geometry.similarity import Similarity
 from torchface.rig import BlendshapeRig
 from torchface.take import Take
 
@@ -19,7 +25,12 @@ _FRAMES = 240
 
 
 def align_take(
-    rig: BlendshapeRig, attachment: Attachment, take: Take, neutral_frame: int | None = None, insist: bool = False
+    rig: BlendshapeRig,
+    attachment: Attachment,
+    take: Take,
+    neutral_frame: int | None = None,
+    insist: bool = False,
+    scale: bool = True,
 ) -> Similarity:
     r"""The similarity that moves a take's markers into the rig's space; every take has its own.
 
@@ -28,15 +39,19 @@ def align_take(
 
     .. math:: \min_{s,R,t,\,w} \sum_{t,m} \lVert s R y_{tm} + t - b_m - B_m w_t \rVert^2, \quad 0 \le w \le 1
 
+    Samples that stay far from their sites do not count, so exchanged labels and spikes do not move it.
+
     Args:
         rig: the performer's.
         attachment: where the markers sit; markers match by label, and a ``residual`` is added to the sites.
         take: markers (T,M,3), millimetres of any space.
         neutral_frame: a frame with the face at rest.
         insist: also align markers that are a mirror image of their sites, as well as turning can.
+        scale: estimate the scale; otherwise it is 1, as it is for the performer's own rig and a take in true
+            millimetres.
 
     Returns:
-        One similarity, marker space to rig space, scale included, float64.
+        One similarity, marker space to rig space, float64.
 
     Raises:
         NameMismatchError: the take has no markers, or one that the attachment does not know.
@@ -69,12 +84,11 @@ def align_take(
                 f"neutral frame: found a take of {len(paths)} frames, expected frame {neutral_frame} among them"
             )
         frame = paths[neutral_frame]
-        pose = similarity_transform(frame[None], rest[None])
         check_not_collinear(frame[~torch.isnan(frame).any(-1)])
-        return pose
-    check_not_collinear(paths.nanmean(0))
+        return pose_of_points(frame, rest, scale)
+    check_not_collinear(paths.nanmedian(0).values)
     few = paths[:: max(1, len(paths) // _FRAMES)]
-    return pose_of_take(affine, few[~torch.isnan(few).any(-1).all(1)])
+    return pose_of_take(affine, few[~torch.isnan(few).any(-1).all(1)], scale)
 
 
 def rest_residual(
@@ -85,7 +99,7 @@ def rest_residual(
     .. math:: r_m = \frac{1}{|T_m|} \sum_{t \in T_m} (s R y_{tm} + t - p_m(w_t))
 
     A marker's error of its site, or its stand-off, then no longer biases the weights of any frame. The mean
-    is over the whole solved take, since a take may hold no neutral frame.
+    is over the whole solved take, since a take may hold no neutral frame, without samples far from the marker's median.
 
     Args:
         rig: the performer's.
@@ -119,7 +133,9 @@ def rest_residual(
         markers = markers[shown].double()
         on_rig = solver.points(solver(markers))
         moved = markers if alignment is None else alignment.apply(markers)
-        residual = (moved - on_rig).nanmean(0)
+        residual = moved - on_rig
+        steady = (residual - residual.nanmedian(0).values).norm(dim=-1)
+        residual = torch.where((steady <= sample_limits(steady))[..., None], residual, torch.nan).nanmean(0)
         before = torch.zeros_like(residual) if attachment.residual is None else attachment.residual.double()
         attachment = replace(attachment, residual=(before + residual.nan_to_num(0.0)).float())
     return attachment

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from torchface.attachment import Attachment
-from torchface.capture import MarkerSolver, clean_take, fit_attachment
+from torchface.capture import MarkerSolver, align_take, clean_take, fit_attachment
 from torchface.capture.markers import AttachmentFit, Cleanup, check_attachment, sites_by_shape
 from torchface.capture.markers.attachment.attachment_fit import marker_paths
 from torchface.capture.markers.rest_pose import check_not_mirrored
@@ -32,8 +32,8 @@ from torchface.workflows.marker_input import (
     DEFAULT_OPTIONS,
     MARKER_TAKES,
     MarkerOptions,
-    pose_warnings,
     read_range_of_motion,
+    scale_warnings,
 )
 
 MOTIONS = replace(MARKER_TAKES, done="attached")
@@ -42,6 +42,8 @@ _METHOD = "attach batch/2"
 _SHOWN_NAMES = 8
 # A marker of which more is masked is not cleaned: what is wrong with it is said.
 _MAX_MASKED = 0.5
+# A common distance from the skin is advised where it leaves less than this part of the markers' error.
+_STANDOFF_RATIO = 0.95
 _INSIST = "--insist writes the sites all the same"
 
 
@@ -130,7 +132,12 @@ def load_sites(path: Path, mesh: Mesh, owner: str | Path = "the mesh") -> Attach
 
 
 def cleaned_fit(
-    rig: BlendshapeRig, take: Take, start: Attachment, standoff: bool, progress: Progress | None = None
+    rig: BlendshapeRig,
+    take: Take,
+    start: Attachment,
+    standoff: bool,
+    progress: Progress | None = None,
+    free_scale: bool = True,
 ) -> tuple[AttachmentFit, Cleanup]:
     """Sites from a range of motion that may have swapped labels, spikes and markers that drift: fitted, and where
     something is wrong with the take cleaned with these sites and fitted again. What does not fit is not refused.
@@ -139,12 +146,23 @@ def cleaned_fit(
         TorchfaceError: take and first guess do not fit each other, or the take shows no motion.
     """
     progress = progress or silent
-    fit = fit_attachment(rig, take, start, standoff, progress, insist=True)
+    fit = fit_attachment(rig, take, start, standoff, progress, insist=True, scale=free_scale)
     progress("looking for what is wrong with the take")
     cleanup = clean_take(MarkerSolver(rig, fit.attachment, fit.alignment), take, slip=fit.motion is not None)
     if any(defect.kind != "gap" for defect in cleanup.defects):
-        fit = fit_attachment(rig, _usable(cleanup, take), start, standoff, progress, insist=True)
+        fit = fit_attachment(rig, _usable(cleanup, take), start, standoff, progress, insist=True, scale=free_scale)
     return fit, cleanup
+
+
+def _standoff_hint(
+    rig: BlendshapeRig, take: Take, start: Attachment, settings: AttachSettings, fit: AttachmentFit
+) -> str:
+    """Advice where sites do not explain a take and a common distance from the skin, which was not asked for, does."""
+    if settings.standoff or settings.options.scale == "free":
+        return ""
+    lifted = fit_attachment(rig, take, start, standoff=True, insist=True, scale=False)
+    better = float(lifted.errors[-1].median()) < _STANDOFF_RATIO * float(fit.errors[-1].median())
+    return f"; the markers stand {lifted.standoff:.1f} mm off the skin: add --standoff" if better else ""
 
 
 def _usable(cleanup: Cleanup, take: Take) -> Take:
@@ -206,14 +224,20 @@ def attach(
     elif not settings.insist:
         sites = start.on(loaded.neutral.faces, loaded.vertices)
         check_not_mirrored(marker_paths(take, start), sites, str(rom))
-    fit, cleanup = cleaned_fit(loaded, take, start, settings.standoff, progress)
-    notes = [*notes, *pose_warnings(fit.alignment)]
+    free_scale = settings.options.frees_scale(rom)
+    fit, cleanup = cleaned_fit(loaded, take, start, settings.standoff, progress, free_scale)
+    free = fit.alignment
+    if not free_scale:
+        fitted = fit.attachment if settings.standoff else replace(fit.attachment, residual=None)
+        free = align_take(loaded, fitted, take, insist=True)
+    notes = [*notes, *scale_warnings(float(free.scale[0]), not free_scale)]
     try:
         check_attachment(fit, loaded)
     except (AlignmentError, ValueRangeError) as error:
+        why = f"{error}{_standoff_hint(loaded, take, start, settings, fit)}"
         if not settings.insist:
-            raise type(error)(f"{rom}: {error}; {_INSIST}") from None
-        notes = [*notes, str(error)]
+            raise type(error)(f"{rom}: {why}; {_INSIST}") from None
+        notes = [*notes, why]
     faces, vertices = loaded.neutral.faces, loaded.vertices
     before, after = start.on(faces, vertices), fit.attachment.on(faces, vertices)
     progress("writing")

@@ -26,11 +26,13 @@ from torchface.geometry.similarity import Similarity
 from torchface.progress import Progress, silent
 from torchface.rig import BlendshapeRig
 from torchface.take import Take, Track, empty_frames
-from torchface.workflows.marker_input import pose_warnings
+from torchface.workflows.marker_input import scale_warnings
 from torchface.workflows.solve.head_camera import Predicted
 from torchface.workflows.solve.take_check import check_coverage, check_explained, fit_warnings
 from torchface.workflows.solve.weight_stream import StreamReport
 
+# A take is cleaned again where its alignment moves a site farther after the first cleaning, mm.
+_REALIGNED = 0.1
 _SHOWN_SPANS = 6
 _SHOWN_DEFECTS = 12
 
@@ -51,6 +53,7 @@ class SolveSettings:
             what a head camera saw every frame is on its own.
         sparsity, ridge: see ``MarkerSolver``.
         insist: solve what the rig does not explain, too.
+        free_scale: an alignment estimates the take's scale; otherwise it is 1.
     """
 
     neutral: int | None = None
@@ -62,6 +65,7 @@ class SolveSettings:
     sparsity: float = SPARSITY
     ridge: float = RIDGE
     insist: bool = False
+    free_scale: bool = True
 
 
 @dataclass(frozen=True, eq=False)
@@ -189,25 +193,35 @@ def solve_markers(
     whole = predicted is None and not settings.frame_by_frame
     warnings = check_coverage(attachment, take, len(rig.names), settings.insist).warnings()
 
-    alignment = None
+    alignment, raw = None, take
     if settings.align or settings.neutral is not None:
         progress("aligning the take with the rig")
-        alignment = align_take(rig, attachment, take, settings.neutral, settings.insist)
-        take = _moved(take, alignment.apply)
+        alignment = align_take(rig, attachment, raw, settings.neutral, settings.insist, settings.free_scale)
+        take = _moved(raw, alignment.apply)
     solver = MarkerSolver(rig, attachment, sparsity=settings.sparsity, ridge=settings.ridge)
     fit = check_explained(solver, take, alignment is not None, settings.slip, settings.insist)
     warnings += fit_warnings(fit, alignment is not None)
-    warnings += [] if alignment is None else pose_warnings(alignment)
     warnings += _empty_frame_warnings(take)
 
     cleanup = None
     if settings.clean:
         progress("looking for what is wrong with the take")
         cleanup = clean_take(solver, take, settings.slip)
+        if alignment is not None and any(defect.kind != "gap" for defect in cleanup.defects):
+            # What was wrong with the take moved its alignment, and the alignment its cleaning.
+            repaired = _moved(cleanup.take, alignment.inverse().apply)
+            better = align_take(rig, attachment, repaired, settings.neutral, settings.insist, settings.free_scale)
+            rest = solver.rest.double()
+            if float((better.apply(alignment.inverse().apply(rest)[0]) - rest).norm(dim=-1).max()) > _REALIGNED:
+                cleanup = clean_take(solver, _moved(raw, better.apply), settings.slip)
+                alignment = better
         take = cleanup.take if whole else cleanup.filled
 
     progress("solving")
     steady, motion = _without_slip(rig, attachment, take, settings)
+    if alignment is not None:
+        free = alignment if settings.free_scale else align_take(rig, attachment, steady, insist=True)
+        warnings += scale_warnings(float(free.scale[0]), not settings.free_scale)
     if settings.subtract_rest and alignment is not None:
         attachment = rest_residual(rig, attachment, steady)
         # Sites that are nearer to the markers show the helmet's motion better.

@@ -85,6 +85,7 @@ def solve_take(
     span = frame_span(inputs.options.frames, len(take))
     if settings.neutral is not None:
         settings = replace(settings, neutral=_within(settings.neutral, span))
+    settings = replace(settings, free_scale=inputs.options.frees_scale(inputs.take))
     camera, predicted = inputs.camera, None
     if camera is not None:
         predicted = predicted_curves(camera, take, rig.names, progress).frames(span)

@@ -11,6 +11,7 @@ from torchface.attachment import Attachment
 from torchface.capture.markers import FitCheck, MarkerSolver, check_fit
 from torchface.errors import AlignmentError, NameMismatchError
 from torchface.take import Take
+from torchface.workflows.marker_input import MAX_SCALE_DIFFERENCE
 
 _COORDINATES = 3  # of a marker
 _MIN_PRESENT, _USUAL_PRESENT = 0.5, 0.9
@@ -126,6 +127,10 @@ def _cause(fit: FitCheck, aligned: bool) -> str:
             f"--unit {fit.unit}, and --align if it is not in the rig's space"
         )
     if fit.cause == "alignment":
+        assert fit.similarity is not None
+        factor = float(fit.similarity.scale[0])
+        if aligned and abs(factor - 1) > MAX_SCALE_DIFFERENCE:
+            return f"at {factor:.4g} times its size the take lies {fit.corrected:.2g} mm from it: add --scale free"
         advice = "the frame of --neutral is not at rest: --align does without one" if aligned else "add --align"
         return (
             f"aligned with the rig they lie {fit.corrected:.2g} mm from it, so the take is in another space: {advice}"

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from torchface.capture.markers.attachment.site_uncertainty import SiteUncertainty
+from torchface.capture.markers.rest_pose import inlier_markers
 from torchface.capture.markers.rig_fit_check import DOUBTFUL_SHARE
 from torchface.errors import AlignmentError, ValueRangeError
 
@@ -15,14 +16,7 @@ from torchface.errors import AlignmentError, ValueRangeError
 # whose shapes are a fifth wrong 0.09 or 0.16; with markers 2 mm off the skin 0.13, since the scale takes most of that
 # up; with the rig of a similar head 0.3 to 0.4, of any other 0.7 to 0.9.
 MAX_OFF_SKIN = 0.3
-# A marker farther from its site than this multiple of the median, and at least so many millimetres, is an outlier.
-_OUTLIER_RATIO, _OUTLIER_DISTANCE = 3.0, 4.0
 _SHOWN = 6
-
-
-def inlier_markers(error: Tensor) -> Tensor:
-    """Which markers (M,) sit on the skin, by their root mean square distance to their sites (M,), millimetres."""
-    return error <= max(_OUTLIER_RATIO * float(error.median()), _OUTLIER_DISTANCE)
 
 
 def check_sites(

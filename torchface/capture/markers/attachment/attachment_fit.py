@@ -8,24 +8,23 @@ import torch
 from torch import Tensor
 
 from torchface.attachment import Attachment
-from torchface.capture.markers.attachment.attachment_check import check_sites, inlier_markers, mean_radius
+from torchface.capture.markers.attachment.attachment_check import check_sites, mean_radius
 from torchface.capture.markers.attachment.frame_poses import MIN_MARKERS, frame_poses, solve_frames
 from torchface.capture.markers.attachment.site_iterations import LAST_RIDGE, FitState, SiteSolver
 from torchface.capture.markers.attachment.site_search import SiteSearch
 from torchface.capture.markers.attachment.site_uncertainty import SiteUncertainty
 from torchface.capture.markers.helmet_solver import HelmetMotion
 from torchface.capture.markers.marker_solver import check_labels
-from torchface.capture.markers.rest_pose import check_not_collinear, check_not_mirrored
+from torchface.capture.markers.rest_pose import check_not_collinear, check_not_mirrored, pose_of_points
 from torchface.capture.markers.surface_motion import SurfaceMotion, with_one
 from torchface.errors import ValueRangeError
-from torchface.geometry.similarity import Similarity, similarity_transform
+from torchface.geometry.similarity import Similarity
 from torchface.progress import Progress, silent
 from torchface.rig import BlendshapeRig
 from torchface.take import Take
 
 _LAST_ITERATIONS, _TOLERANCE = 6, 1e-3
 _COARSE_FRAMES, _CAREFUL_FRAMES, _JOINT_FRAMES = 240, 60, 120
-_FIRST_POSE_ITERATIONS = 8
 _MIN_MOTION = 0.3
 
 
@@ -61,6 +60,7 @@ def fit_attachment(
     standoff: bool = False,
     progress: Progress | None = None,
     insist: bool = False,
+    scale: bool = True,
 ) -> AttachmentFit:
     r"""The marker sites that explain a range-of-motion take best.
 
@@ -82,6 +82,7 @@ def fit_attachment(
         standoff: estimate one distance h of all marker centres from the skin; otherwise it is 0.
         progress: called with each step and how far it is.
         insist: also return sites that the take leaves mostly uncertain, or that do not explain the markers.
+        scale: estimate the take's scale; otherwise it is 1, as it is for the performer's own rig in true millimetres.
 
     Returns:
         An ``AttachmentFit``, markers in the order of ``initial``.
@@ -113,10 +114,10 @@ def fit_attachment(
     paths = marker_paths(rom, initial)
     motion = SurfaceMotion.of(rig, normals=standoff)
     initial_points = motion.at(motion.points, initial)[..., 0]
-    solver = SiteSolver(motion, SiteSearch(motion, initial), initial_points, standoff)
+    solver = SiteSolver(motion, SiteSearch(motion, initial), initial_points, standoff, scale)
     if not insist:
         check_not_mirrored(paths, initial_points, str(rom.extras.get("source", "take")))
-    pose = _first_pose(paths, initial_points)
+    pose = pose_of_points(paths.nanmedian(0).values, initial_points, scale)
     _check_motion(pose.apply(paths))
     shown = paths[~torch.isnan(paths).any(-1).all(1)]
     few = _spread(shown, _COARSE_FRAMES)
@@ -186,7 +187,7 @@ def marker_paths(take: Take, attachment: Attachment) -> Tensor:
             f"markers: {len(unseen)} of {len(labels)} are seen in no frame ({names}), expected each at least once; "
             "leave them out of the attachment (Attachment.select)"
         )
-    check_not_collinear(paths.nanmean(0))
+    check_not_collinear(paths.nanmedian(0).values)
     return paths
 
 
@@ -227,16 +228,6 @@ def _result(
 
 def _spread(paths: Tensor, count: int) -> Tensor:
     return paths[:: max(1, len(paths) // count)]
-
-
-def _first_pose(paths: Tensor, initial_points: Tensor) -> Similarity:
-    """The similarity of the take's mean to the initial guess, over inlier markers."""
-    mean, inlier = paths.nanmean(0), torch.ones(len(initial_points), dtype=torch.bool)
-    for _ in range(_FIRST_POSE_ITERATIONS):
-        pose = similarity_transform(mean[None], initial_points[None], inlier[None].double())
-        distance = (pose.apply(mean)[0] - initial_points).norm(dim=1)
-        inlier = inlier_markers(distance)
-    return pose
 
 
 def _helmet_motion(steady: Similarity, pose: Similarity, shown: Tensor, pivot: Tensor) -> HelmetMotion:

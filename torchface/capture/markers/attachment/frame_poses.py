@@ -54,11 +54,11 @@ def without_motion(pose: Similarity, motion: Tensor, pivot: Tensor) -> Similarit
 
 
 def better_pose(
-    paths: Tensor, pose: Similarity, on_rig: Tensor, outward: Tensor | None = None
+    paths: Tensor, pose: Similarity, on_rig: Tensor, outward: Tensor | None = None, scale: bool = True
 ) -> tuple[Similarity, float]:
     """``pose_step`` for one pose; of poses a frame only the scale, each about its frame's mean, and the stand-off."""
     if len(pose.scale) == 1:
-        return pose_step(paths, pose, on_rig, outward)
+        return pose_step(paths, pose, on_rig, outward, scale)
     moved = pose.apply(paths)
     missing = torch.isnan(moved)
     centre = moved.nanmean(1, keepdim=True)
@@ -67,7 +67,10 @@ def better_pose(
     rows = arm.flatten()[None]
     if outward is not None:
         rows = torch.cat([rows, torch.where(missing, 0.0, -outward).flatten()[None]])
-    step = torch.linalg.solve(rows @ rows.T, rows @ residual.flatten())
+    matrix, gradient = rows @ rows.T, rows @ residual.flatten()
+    if not scale:
+        matrix[0], matrix[:, 0], matrix[0, 0], gradient[0] = 0.0, 0.0, 1.0, 0.0
+    step = torch.linalg.solve(matrix, gradient)
     return scaled(pose, 1 + step[0], centre[:, 0]), float(step[1]) if outward is not None else 0.0
 
 

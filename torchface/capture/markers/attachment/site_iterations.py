@@ -8,7 +8,6 @@ import torch
 from torch import Tensor
 
 from torchface.attachment import Attachment
-from torchface.capture.markers.attachment.attachment_check import inlier_markers
 from torchface.capture.markers.attachment.best_sites import PathMoments, best_sites
 from torchface.capture.markers.attachment.frame_poses import (
     MIN_MARKERS,
@@ -21,7 +20,7 @@ from torchface.capture.markers.attachment.frame_poses import (
 from torchface.capture.markers.attachment.site_curvature import ARM, SitesOnTake, TakeCurvature, pose_columns
 from torchface.capture.markers.attachment.site_search import SiteSearch
 from torchface.capture.markers.attachment.site_uncertainty import SITE_PRIOR, SiteUncertainty, site_uncertainty
-from torchface.capture.markers.rest_pose import transformed_pose
+from torchface.capture.markers.rest_pose import inlier_markers, transformed_pose
 from torchface.capture.markers.surface_motion import SurfaceMotion, with_one
 from torchface.geometry.similarity import Similarity
 from torchface.progress import Progress
@@ -34,6 +33,8 @@ _JOINT_ITERATIONS, _JOINT_TOLERANCE = 6, 5e-3
 _MAX_SITE_STEP, _MAX_WEIGHT_STEP = 3.0, 0.3
 # A marker farther from its site than so many times the median is left out while the others converge.
 _OUTLIER_RATIO = 1.3
+# Curvature that holds the scale where it is.
+_HELD = 1e15
 # The helmet slips where a rigid motion a frame leaves less than this part of the residual.
 _SLIP_RATIO, _MOTION_ITERATIONS = 0.85, 6
 
@@ -65,12 +66,14 @@ class SiteSolver:
         search: for candidate triangles.
         initial: the initial guess of the sites at rest, (M,3), millimetres.
         standoff: estimate the markers' distance from the skin.
+        scale: estimate the take's scale.
     """
 
     motion: SurfaceMotion
     search: SiteSearch
     initial: Tensor
     standoff: bool
+    scale: bool = True
 
     def at(self, state: FitState) -> Tensor:
         """Affine maps of the sites (M,3,N+1)."""
@@ -97,7 +100,7 @@ class SiteSolver:
         if self.standoff:
             assert self.motion.normals is not None
             outward = torch.einsum("mcn,tn->tmc", self.motion.at(self.motion.normals, state.sites), extended)[:, rows]
-        pose, height_step = better_pose(paths[:, rows], pose, on_rig[:, rows], outward)
+        pose, height_step = better_pose(paths[:, rows], pose, on_rig[:, rows], outward, self.scale)
         state = replace(state, pose=pose, height=state.height + height_step, weights=weights)
         return self._with_best_sites(paths, state, on_rig, affine[..., 0], wide=False)
 
@@ -128,6 +131,8 @@ class SiteSolver:
         offset = torch.einsum("mkc,mc->mk", tangents[..., 0], self.initial[rows] - affine[rows, :, 0])
         precision = affine.new_zeros(len(curvature.gradient))
         precision[: 2 * len(rows)] = self._prior_weight(state)
+        if not self.scale:
+            precision[-1] = _HELD
         gradient = torch.zeros_like(precision)
         gradient[: 2 * len(rows)] = self._prior_weight(state) * offset.flatten()
         step, change = curvature.step(precision, gradient)

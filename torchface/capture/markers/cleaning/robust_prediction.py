@@ -9,13 +9,12 @@ from torch import Tensor
 
 from torchface.capture.markers.helmet_solver import rigid_columns
 from torchface.capture.markers.marker_solver import MarkerSolver, penalty_value
+from torchface.capture.markers.rest_pose import sample_limits
 from torchface.optim import BoxQP
 
 # Samples with a larger residual are left out of the next iteration, mm; then the take's own limit counts.
 _ANNEALED_LIMITS = (20.0, 12.0, 8.0, 6.0, 5.0)
 _LAST_ITERATIONS, _FIRST_FILL_ITERATIONS = 4, 6
-_LIMIT_RATIO, _MIN_LIMIT = 5.0, 2.0
-_MAX_LIMIT_RATIO = 2.0
 _MAX_BIAS = 2.0
 _RIDGE, _MOTION_RIDGE = 1e-2, 1e-4
 _TOLERANCE = 3e-6
@@ -88,10 +87,7 @@ def predict_markers(
         bias = fits.nanmedian(0).values.nan_to_num(0.0)
         bias = bias * (_MAX_BIAS / bias.norm(dim=1, keepdim=True).clamp(min=_MAX_BIAS))
         distance = (residual - bias).norm(dim=-1)
-        median = torch.where(distance <= limit, distance, torch.nan).nanmedian(0).values.nan_to_num(0.0)
-        own = (_LIMIT_RATIO * median).clamp(min=_MIN_LIMIT)
-        # A marker that is an outlier much of the time must not set its own limit.
-        own = torch.minimum(own, _MAX_LIMIT_RATIO * own.median())
+        own = sample_limits(torch.where(distance <= limit, distance, torch.nan))
         if ignored is not None:
             own = torch.where(ignored, torch.minimum(own, own.median()), own)
         ceiling = _ANNEALED_LIMITS[number] if number < len(_ANNEALED_LIMITS) else 0.0

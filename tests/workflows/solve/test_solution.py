@@ -1,0 +1,97 @@
+"""A take with faults solves as well as the same take without them, or the user is told."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+from torch import Tensor
+
+from torchface import Attachment, BlendshapeRig, Take, Track
+from torchface.geometry.similarity import Similarity
+from torchface.synthetic.stages.marker_stage import StageFlaws, place_markers, record
+from torchface.synthetic.stages.weight_curves import perform
+from torchface.workflows.solve.solution import Solution, SolveSettings, solve_markers
+
+Capture = tuple[BlendshapeRig, Attachment, list[Tensor]]
+AS_IN_THE_HOW_TO = SolveSettings(align=True, clean=True, slip=True, free_scale=False)
+
+
+@pytest.fixture(scope="module")
+def stage(performer_rig: BlendshapeRig) -> Capture:
+    """The embedded performer, 60 markers on it, and 200 frames of its weights."""
+    weights = perform(200, torch.Generator().manual_seed(4)).weights
+    assert weights is not None
+    return performer_rig, place_markers(performer_rig, 60), [performer_rig.weights_from(weights)]
+
+
+@pytest.fixture(scope="module")
+def performer_rig() -> BlendshapeRig:
+    from torchface.synthetic import performer
+
+    return performer(texture=False)
+
+
+def recorded(capture: Capture, which: int = 0, frames: int = 200, seed: int = 0) -> tuple[Take, Tensor]:
+    """A take through a helmet that slips, somewhere else on the stage, in millimetres; and its true weights."""
+    rig, sites, takes = capture
+    flaws = StageFlaws(noise=0.3, slip_translation=4, slip_rotation=2)
+    true = takes[which][:frames]
+    take = record(rig, sites, true, torch.Generator().manual_seed(seed), flaws).take
+    assert take.markers is not None
+    angle = torch.tensor(0.8)
+    turn = torch.tensor([[angle.cos(), 0, angle.sin()], [0, 1, 0], [-angle.sin(), 0, angle.cos()]])
+    space = Similarity(torch.ones(1), turn[None], torch.tensor([[100.0, -900.0, 40.0]]))
+    return replace(take, markers=Track(take.markers.names, space.apply(take.markers.values))), true
+
+
+def exchanged(take: Take, pair: tuple[int, int], first: int, last: int) -> Take:
+    """Two labels exchanged from one frame to before another."""
+    assert take.markers is not None
+    values = take.markers.values.clone()
+    values[first:last, list(pair)] = values[first:last, list(pair[::-1])]
+    return replace(take, markers=Track(take.markers.names, values))
+
+
+def mesh_error(rig: BlendshapeRig, solution: Solution, true: Tensor) -> float:
+    """Root mean square distance of the solved vertices, as a part of their motion."""
+    deltas = rig.deltas.flatten(1)
+    return float(((solution.weights - true)[::5] @ deltas).norm() / (true[::5] @ deltas).norm())
+
+
+_CLEAN: dict[tuple[int, int, int], float] = {}
+
+
+def clean_error(capture: Capture, which: int, frames: int) -> float:
+    """The error of a take without faults, solved once."""
+    key = id(capture), which, frames
+    if key not in _CLEAN:
+        rig, sites, _ = capture
+        take, true = recorded(capture, which, frames)
+        _CLEAN[key] = mesh_error(rig, solve_markers(rig, sites, take, AS_IN_THE_HOW_TO), true)
+    return _CLEAN[key]
+
+
+def check_exchanged(capture: Capture, pair: tuple[int, int], share: float, which: int, frames: int) -> None:
+    rig, sites, _ = capture
+    take, true = recorded(capture, which, frames)
+    dirty = exchanged(take, pair, frames // 3, frames // 3 + round(share * frames))
+    found = solve_markers(rig, sites, dirty, AS_IN_THE_HOW_TO)
+    assert mesh_error(rig, found, true) < 1.1 * clean_error(capture, which, frames)
+    assert found.alignment is not None
+    assert found.alignment.scale == 1.0
+    assert found.warnings == ()
+
+
+@pytest.mark.parametrize(("pair", "share"), [((0, 30), 0.09), ((2, 41), 0.3), ((5, 17), 0.02)])
+def test_labels_exchanged_in_part_of_the_take_cost_nothing(stage: Capture, pair: tuple[int, int], share: float) -> None:
+    check_exchanged(stage, pair, share, 0, 200)
+
+
+@pytest.mark.real
+@pytest.mark.parametrize(("pair", "share"), [((1, 57), 0.09), ((20, 83), 0.02)])
+def test_labels_exchanged_in_part_of_a_real_take_cost_nothing(
+    real_capture: Capture, pair: tuple[int, int], share: float
+) -> None:
+    check_exchanged(real_capture, pair, share, 0, 300)
