@@ -6,6 +6,7 @@ import json
 import math
 import shutil
 import socket
+import warnings
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -36,6 +37,7 @@ from torchface.workflows.track import frame_readings
 from torchface.workflows.track.face_overlay import mesh_drawer, paint_drawer, undistorted
 from torchface.workflows.track.head_rotations import head_angles
 from torchface.workflows.track.overlay_video import head_window
+from torchface.workflows.track.take_solution import known_offsets
 from torchface.workflows.track.track_inputs import TrackInputs, TrackSettings
 from torchface.workflows.track.track_models import TrackModels, load_track_models
 from torchface.workflows.track.track_page import write_track_page
@@ -381,6 +383,28 @@ def test_of_several_faces_the_one_asked_for_is_followed(filmed: Filmed, tmp_path
     told = " ".join(tracked.lines())
     assert "2 faces in the first frame" in told
     assert "camera: none given; assumed a field of view of 60 degrees" in told
+
+
+def test_offsets_of_another_person_are_said(done: Done, filmed: Filmed, tmp_path: Path) -> None:
+    inputs, own = done.tracked.inputs, done.tracked.offsets
+    assert own is not None
+    assert (own.video, own.source) == (inputs.reading_key, "film.avi")
+    generator = torch.Generator().manual_seed(0)
+    other = replace(own, millimetres=own.millimetres + 2 * torch.randn(68, 3, generator=generator), video="another")
+    other.save(tmp_path / "other.json")
+    replace(other, millimetres=own.millimetres).save(tmp_path / "same.json")
+    out = tmp_path / "out"
+    shutil.copytree(done.out, out)
+    settings = TrackSettings(camera=filmed.camera, overlay="none")
+    with pytest.warns(UserWarning, match=r"other.json: the offsets of film.avi lie 3\.\d mm from those .* correlate"):
+        tracked = track_video(filmed.video, filmed.rig, out, replace(settings, offsets=tmp_path / "other.json"))
+    assert tracked.offsets is not None
+    torch.testing.assert_close(tracked.offsets.millimetres, other.rounded().millimetres)  # as the user has it
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        track_video(filmed.video, filmed.rig, out, replace(settings, offsets=tmp_path / "same.json"))
+    assert known_offsets(inputs, done.out) is not None
+    assert known_offsets(inputs, out) is None  # it holds those of another video now
 
 
 def test_a_cut_to_another_face_is_said_and_not_solved(filmed: Filmed, tmp_path: Path) -> None:

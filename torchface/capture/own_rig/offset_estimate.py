@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -147,7 +147,7 @@ def _split(
         found = box_qp(likely, (f + penalty)[None], lower, upper)[0]
         expression = found[:count]
     noise = min(mean.noise, before.noise)
-    return LandmarkOffsets(found[count:].view(-1, 3), noise, before.rig, before.finder), found[:count]
+    return replace(before, millimetres=found[count:].view(-1, 3), noise=noise), found[:count]
 
 
 def _mean_problem(

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import warnings
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
@@ -82,7 +83,7 @@ def smoothed_landmarks(inputs: TrackInputs, reading: FaceReading, times: Tensor 
 
 
 def known_offsets(inputs: TrackInputs, out: Path) -> LandmarkOffsets | None:
-    """The offsets that the user gives, or those of an earlier take in the folder of results; None where there are none.
+    """The offsets that the user gives, or those of this video in the folder of results; None where there are none.
 
     Raises:
         FileFormatError: what the user gives is no such file.
@@ -93,9 +94,10 @@ def known_offsets(inputs: TrackInputs, out: Path) -> LandmarkOffsets | None:
     if not (out / OFFSETS).is_file():
         return None
     try:
-        return offsets_of(out / OFFSETS, inputs)
+        offsets = offsets_of(out / OFFSETS, inputs)
     except (FileFormatError, ValueRangeError):
         return None  # another rig's, or damaged: made anew
+    return offsets if offsets.video == inputs.reading_key else None
 
 
 def offsets_of(path: Path, inputs: TrackInputs) -> LandmarkOffsets:
@@ -112,7 +114,20 @@ def offsets_of(path: Path, inputs: TrackInputs) -> LandmarkOffsets:
 
 def new_offsets(inputs: TrackInputs, solver: VideoSolver, landmarks: Tensor, trust: Tensor) -> LandmarkOffsets | None:
     """The offsets of a take's smoothed landmarks (T,68,2), trusted (T,68); None where it is too short."""
-    return estimate_offsets(solver, landmarks, trust, _rig_digest(inputs.actor), _finder_digest(inputs))
+    offsets = estimate_offsets(solver, landmarks, trust, _rig_digest(inputs.actor), _finder_digest(inputs))
+    return None if offsets is None else replace(offsets, video=inputs.reading_key, source=inputs.clip.path.name)
+
+
+def warn_of_offsets(given: LandmarkOffsets, own: LandmarkOffsets | None, inputs: TrackInputs) -> None:
+    """Warns where the offsets that the user gives are not those that the take itself shows: another person's, say."""
+    if own is not None and (off := given.mismatch(own)) is not None:
+        of = f" of {given.source}" if given.source else ""
+        warnings.warn(
+            f"{inputs.settings.offsets}: the offsets{of} lie {off[0]:.1f} mm from those that {inputs.clip.path.name} "
+            f"itself shows, and correlate by {off[1]:.2f}; those of one person's takes lie less than 0.6 mm apart or "
+            "correlate by more than 0.9: are they another person's? They are used; without --offsets the take's are",
+            stacklevel=2,
+        )
 
 
 def solution_key(

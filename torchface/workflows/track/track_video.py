@@ -28,6 +28,7 @@ from torchface.workflows.track.take_solution import (
     new_solution,
     smoothed_landmarks,
     solution_key,
+    warn_of_offsets,
 )
 from torchface.workflows.track.track_files import OVERLAY, SUMMARY, summary, write_curves
 from torchface.workflows.track.track_inputs import METHOD, TrackInputs, TrackSettings, load_inputs
@@ -81,9 +82,12 @@ def _track(inputs: TrackInputs, out: Path, filmed: bool, progress: Progress) -> 
         landmarks = smoothed_landmarks(inputs, reading, times)
     trust, solver = reading.trust, inputs.solver(inputs.clip.fps)
     offsets = known_offsets(inputs, out)
-    if offsets is None:
+    if offsets is None or offsets.video != inputs.reading_key:
         with _timed(seconds, "offsets"):
-            offsets = new_offsets(inputs, solver, landmarks, trust)
+            own = new_offsets(inputs, solver, landmarks, trust)
+        if offsets is not None:
+            warn_of_offsets(offsets, own, inputs)
+        offsets = offsets or own
     solver = solver if offsets is None else solver.shifted(offsets)
     key = solution_key(inputs, solver, offsets, times)
     solution = kept_solution(state, key)

@@ -110,9 +110,8 @@ class LandmarkTracker:
     @property
     def look(self) -> Tensor:
         """How the face looks in the latest frame, (1200,) of unit length; NaN where it was not found."""
-        followed = self._followed
-        lost = followed.latest_look is None or followed.missed > 0
-        return torch.full((LOOK,), torch.nan) if lost else followed.latest_look
+        look = self._followed.latest_look
+        return torch.full((LOOK,), torch.nan) if look is None or self._followed.missed > 0 else look
 
     def resume(self, memory: Tensor) -> None:
         """Goes on as a tracker would that has just had this :attr:`memory`, (1212,).
