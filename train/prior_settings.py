@@ -26,8 +26,8 @@ class PriorSettings(RecipeSettings):
 
     Args:
         takes: Folder of takes, or of a folder of takes for each person.
-        performances: Learn from so many synthetic takes of the embedded performer instead.
-        frames: Of each synthetic take.
+        performances: Learn from takes of so many people made by code instead.
+        frames: Of each such take.
         kind: shape (Student's t-distribution), reciprocal (the paper's 1/P over a Parzen window),
             dynamics, or both (shape and dynamics).
         rig: The rig that the priors are for: its names, and marker takes are solved with it.
@@ -117,9 +117,8 @@ def limits(settings: PriorSettings, material: Material, at_once: str = "") -> st
         silent += f" Solves and predictions are of {TRIED} of the test takes, evenly spread."
     if settings.takes is None:
         return (
-            "It has learned from synthetic takes only: twelve gestures with smooth ramps, blinks, glances and "
-            "syllables of an actor made by code. Good for trying the tools, for tests and for footage of that "
-            "performer; real faces combine and time their shapes in ways it has never seen, so "
-            f"learn another prior from real takes for them.{silent}"
+            "It has learned from takes made by code: action units go together as coded films of people have them, with "
+            "speech, blinks and glances. No real person's weights are in it; one's own takes make a better prior of "
+            f"one's own actor.{silent}"
         )
     return f"Good for faces that move as those of these takes do, with a rig of these names.{silent}"

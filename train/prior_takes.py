@@ -15,13 +15,13 @@ from torchface.errors import FileFormatError, NameMismatchError, ShapeError, Val
 from torchface.files.content_keys import content_key
 from torchface.progress import Progress, silent
 from torchface.shape_names import mapping
-from torchface.synthetic.stages.weight_curves import perform
 from torchface.workflows.solve.solution import SolveSettings, solve_markers
 
+from .people_performances import converse
 from .people_split import held_out_people
 from .take_store import StoredTake, TakesRead, TakeStore
 
-_METHOD = "takes of priors/1"
+_METHOD = "takes of priors/2"
 _SUFFIXES = (".csv", ".c3d", ".trc")
 _SAME_RATE = 1e-3  # relative; 59.94 and 60 frames a second are not the same, rounding is
 
@@ -139,12 +139,12 @@ def _read(
 def synthetic_takes(
     count: int, frames: int, seed: int, work: Path, fps: float | None = None, progress: Progress | None = None
 ) -> PriorTakes:
-    """Takes of the embedded performer, kept in a folder as by :func:`read_takes`; each draws from a seed of its own."""
+    """Takes of people made by code (:func:`converse`), kept in a folder as by :func:`read_takes`; each draws from a seed of its own."""
     progress, rate = progress or silent, 60.0 if fps is None else fps
     store = TakeStore(work, count)
 
     def made(number: int) -> StoredTake:
-        track = perform(frames, torch.Generator().manual_seed(seed + number), rate).weights
+        track = converse(frames, torch.Generator().manual_seed(seed + number), rate).weights
         assert track is not None
         return StoredTake(track.names, rate, track.values[..., 0], False)
 
@@ -155,7 +155,7 @@ def synthetic_takes(
         first = take if first is None else first
         progress("making takes up", number + 1, count)
     assert first is not None
-    labels = [f"made up {i}" for i in range(count)]
+    labels = [f"person {i}" for i in range(count)]
     return _stored(store, first, labels, labels)
 
 

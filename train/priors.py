@@ -1,7 +1,7 @@
 """``torchface train priors --takes DIR --out models/NAME``: which weights faces have, and how they go on.
 
 From weight takes (Live Link Face, CSV), or from marker takes (C3D, TRC, CSV) with ``--rig`` and ``--attachment``: they
-are laid on the rig and solved first. ``--performances 12`` learns from synthetic takes of the embedded performer
+are aligned with the rig and solved first. ``--performances 60`` learns from takes of so many people made by code
 instead, and needs no file. ``--names`` and ``--rig`` make a prior for a rig's own names out of takes with ARKit's.
 """
 
@@ -89,7 +89,7 @@ def _save(found: LearnedPrior, settings: Settings, material: Material) -> None:
     learn, test = material.learn, material.test
     frames = sum(learn.frames)
     if settings.takes is None:
-        source = f"{len(learn.weights)} synthetic takes of the embedded performer, {frames} frames; no person's."
+        source = f"{len(learn.weights)} takes of people made by code, {frames} frames; no real person's."
     else:
         solved = ", solved from markers" if learn.solved else ""
         source = f"{len(learn.weights)} takes of {settings.takes.name}, {frames} frames{solved}."
