@@ -5,12 +5,12 @@ from pathlib import Path
 import pytest
 import torch
 from torch import Tensor
-from train.people_performances import EPISODES, SHAPES, converse
 
 from torchface import load_take, zoo
 from torchface.capture.priors import ShapePrior
 from torchface.shape_names import ARKIT, mapping
 from torchface.synthetic.stages import perform
+from train.people_performances import EPISODES, SHAPES, converse
 
 
 @pytest.fixture(scope="module")
@@ -70,7 +70,9 @@ def test_real_takes_are_likelier_than_under_a_prior_of_gestures(performances: li
     prior = zoo.get_model("shape_prior").double()
     gestures = [perform(1200, torch.Generator().manual_seed(seed)).weights for seed in range(6)]
     matrix = mapping(ARKIT, prior.names).double()
-    of_gestures = ShapePrior.fit([g.values[..., 0].double() @ matrix.T for g in gestures if g is not None], prior.names).double()
+    of_gestures = ShapePrior.fit(
+        [g.values[..., 0].double() @ matrix.T for g in gestures if g is not None], prior.names
+    ).double()
     for path in performances:
         track = load_take(path).weights
         assert track is not None
