@@ -139,7 +139,7 @@ def _read(
 def synthetic_takes(
     count: int, frames: int, seed: int, work: Path, fps: float | None = None, progress: Progress | None = None
 ) -> PriorTakes:
-    """Takes of people made by code (:func:`converse`), kept in a folder as by :func:`read_takes`; each draws from a seed of its own."""
+    """Takes of people made by code (``converse``), kept in a folder as by :func:`read_takes`; each has its own seed."""
     progress, rate = progress or silent, 60.0 if fps is None else fps
     store = TakeStore(work, count)
 
