@@ -37,12 +37,10 @@ def shown_people(names: Sequence[str]) -> list[str]:
     return [str(PurePath(name).parent) if len(PurePath(name).parts) > 1 else name for name in names]
 
 
-def scanned_performers(
-    count: int, seed: int, progress: Progress | None = None, voxel: float = _VOXEL
-) -> list[AnnotatedScan]:
+def scanned_performers(count: int, seed: int, progress: Progress | None = None) -> list[AnnotatedScan]:
     """Raw textured scans of embedded performers with closed eyes, and the truth about them."""
     progress = progress or silent
-    settings, scans = ScannerSettings(voxel=voxel), []
+    settings, scans = ScannerSettings(voxel=_VOXEL), []
     for i, identity in enumerate(draw_identities(count, torch.Generator().manual_seed(seed))):
         scan = scan_head(eyes_closed(performer(identity)), 1000 * seed + i, settings)
         scans.append(AnnotatedScan(f"performer {i:03d}", scan.mesh, scan.annotation))

@@ -18,6 +18,9 @@ from torchface.viz import modes_figure, random_figure
 from torchface.viz.figures.face_views import FRONT, THREE_QUARTER
 from torchface.viz.figures.model_figures import head_views
 
+_STEPS = 6
+_DEVIATIONS = 3.0
+_MODES = 5
 _FAR = 5.0
 """Times as far from the mean as heads are: well outside the data."""
 
@@ -65,13 +68,13 @@ def draw(
         save_rendered_image(picture(), folder / f"{name}.png")
 
 
-def color_modes_figure(model: HeadModel, count: int = 5, deviations: float = 3.0) -> Tensor:
+def color_modes_figure(model: HeadModel) -> Tensor:
     """The mean face between -3σ and +3σ of the first modes of colour, a row a mode."""
     if model.color is None:
         return sheet([head_views(model, model.template(), "no colours")], 1)
     still, cells = torch.zeros(model.shape.count), []
-    for mode in range(min(count, model.color.count)):
-        for amount in (-deviations, 0.0, deviations):
+    for mode in range(min(_MODES, model.color.count)):
+        for amount in (-_DEVIATIONS, 0.0, _DEVIATIONS):
             coefficients = torch.zeros(model.color.count)
             coefficients[mode] = amount
             label = "mean" if amount == 0 else f"colour {mode + 1}, {amount:+g} sd"
@@ -79,33 +82,33 @@ def color_modes_figure(model: HeadModel, count: int = 5, deviations: float = 3.0
     return sheet(cells, 3)
 
 
-def morph_figure(model: HeadModel, steps: int = 6, seed: int = 1) -> Tensor:
+def morph_figure(model: HeadModel, seed: int = 1) -> Tensor:
     """The straight line from one random head to another (figure 23)."""
     generator = torch.Generator().manual_seed(seed)
     paths = []
     for part in (model.shape, model.color):
         ends = None if part is None else part.sample(2, generator)
-        paths.append(None if part is None or ends is None else part.interpolate(ends[0], ends[1], steps))
+        paths.append(None if part is None or ends is None else part.interpolate(ends[0], ends[1], _STEPS))
     shapes, colors = paths
     assert shapes is not None
-    heads = [model.mesh(shapes[i], None if colors is None else colors[i]) for i in range(steps)]
-    labels = [f"{i / (steps - 1):.0%}" for i in range(steps)]
+    heads = [model.mesh(shapes[i], None if colors is None else colors[i]) for i in range(_STEPS)]
+    labels = [f"{i / (_STEPS - 1):.0%}" for i in range(_STEPS)]
     return sheet(
         [head_views(model, mesh, label, (THREE_QUARTER,)) for mesh, label in zip(heads, labels, strict=True)], 6
     )
 
 
-def extrapolation_figure(model: HeadModel, deviations: float = _FAR, seed: int = 2) -> Tensor:
+def extrapolation_figure(model: HeadModel, seed: int = 2) -> Tensor:
     """One random head where the model was learned, and the same direction followed far outside (figure 22)."""
     direction = torch.nn.functional.normalize(model.shape.sample(1, torch.Generator().manual_seed(seed))[0], dim=0)
     root = model.shape.count**0.5  # how far heads of the model lie from the mean
-    amounts = (0.0, root, deviations * root)
-    labels = ("mean", "a head of the model", f"{deviations:g} times as far")
+    amounts = (0.0, root, _FAR * root)
+    labels = ("mean", "a head of the model", f"{_FAR:g} times as far")
     cells = [head_views(model, model.mesh(a * direction), label) for a, label in zip(amounts, labels, strict=True)]
     return sheet(cells, 3)
 
 
-def quality_figure(quality: ModelQuality, unit: str = "mm") -> Tensor:
+def quality_figure(quality: ModelQuality) -> Tensor:
     """Compactness, generalisation and specificity over the number of components."""
     figure = Figure(figsize=(12, 3.4), dpi=100, layout="constrained")
     panels = figure.subplots(1, 3)
@@ -113,8 +116,8 @@ def quality_figure(quality: ModelQuality, unit: str = "mm") -> Tensor:
     reach = 1.1 * max(quality.nearest, float(quality.specificity.max()))
     curves = (
         ("compactness", quality.compactness, "explained variance", (0, 1.02)),
-        ("generalisation, one left out", quality.generalisation, f"error ({unit})", (0, None)),
-        ("specificity", quality.specificity, f"distance to the nearest sample ({unit})", (0, reach)),
+        ("generalisation, one left out", quality.generalisation, "error (mm)", (0, None)),
+        ("specificity", quality.specificity, "distance to the nearest sample (mm)", (0, reach)),
     )
     for axes, (title, values, label, limits) in zip(panels, curves, strict=True):
         axes.plot(numbers, values, color="#1f5fa8", marker="o" if len(numbers) < 15 else None, markersize=3)

@@ -46,7 +46,7 @@ def test_a_far_lamp_is_a_direction() -> None:
 
 
 def test_what_stands_between_throws_a_shadow() -> None:
-    """A small square over a large one, a lamp above: the shadow is the small one's image, twice as large."""
+    """A small square over a large one, a source above: the shadow is the small one's image, twice as large."""
     square = torch.tensor([[-1.0, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]])
     vertices = torch.cat([100 * square, 10 * square + torch.tensor([0.0, 0, 50])])
     faces = torch.tensor([[0, 1, 2], [0, 2, 3], [4, 5, 6], [4, 6, 7]])

@@ -1,4 +1,4 @@
-"""Paint sits where the skin is, in the light of the film; a relit face looks as if filmed under the other lamp."""
+"""Paint sits where the skin is, in the light of the film; a relit face looks as if filmed under the other source."""
 
 from __future__ import annotations
 
@@ -184,7 +184,7 @@ def test_edges_are_covered_by_their_share(rig: BlendshapeRig, cameras: tuple[Cam
     assert int(((found > 0.1) & (found < 0.9)).sum()) > 200
 
 
-def test_a_relit_face_looks_as_under_the_other_lamp(rig: BlendshapeRig, cameras: tuple[Camera, ...]) -> None:
+def test_a_relit_face_looks_as_under_the_other_source(rig: BlendshapeRig, cameras: tuple[Camera, ...]) -> None:
     other = PointLight(torch.tensor([0.3, 0.3, 0.3]), torch.tensor([0.5, 0.6, 0.7]), torch.tensor([500.0, -200, 200]))
     mesh = rig.neutral
     for camera in cameras[::2]:

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from torchface import BlendshapeRig, Take, Track, load_take, save_rig, save_take
-from torchface.capture.mouth_close import with_jaw_in_mouth_close
+from torchface.capture.mouth_close_conventions import with_jaw_in_mouth_close
 from torchface.cli import main
 from torchface.io.images.image_files import load_image
 from torchface.synthetic import performer

@@ -7,7 +7,7 @@ import math
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Protocol, Self, TypeVar
+from typing import Any, TypeVar
 
 import torch
 from torch import Tensor, nn
@@ -22,18 +22,6 @@ FORMAT = 1
 DESCRIPTION, STATE, CARD = "model.toml", "state.safetensors", "CARD.md"
 MAX_CARD_BYTES = 2**18
 _TEXTS = ("kind", "sha256", "licence", "data", "recipe", "url")
-
-
-class Learned(Protocol):
-    """What a class needs so that it can be saved: its own description, and the way back from it."""
-
-    @property
-    def config(self) -> dict[str, Any]: ...
-
-    @classmethod
-    def from_config(cls, config: dict[str, Any]) -> Self:
-        """A model that has learned nothing yet; may be asked for on the meta device."""
-        ...
 
 
 @dataclass(frozen=True)

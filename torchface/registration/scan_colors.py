@@ -40,7 +40,7 @@ class ScanColors:
 
     def at(self, triangle: Tensor, barycentric: Tensor) -> Tensor:
         """Colours (Q,3) at barycentric coordinates (Q,3) of rows (Q,) of ``faces``."""
-        rows, barycentric = self.face_ids[triangle], self._own_order(triangle, barycentric)
+        rows, barycentric = self.face_ids[triangle], self._own_order(barycentric)
         scan = self.scan
         if scan.texture is not None and scan.uvs is not None and scan.uv_faces is not None:
             uv = interpolate(scan.uvs.cpu().double(), scan.uv_faces.cpu()[rows], barycentric)
@@ -48,7 +48,7 @@ class ScanColors:
         assert scan.colors is not None
         return interpolate(scan.colors.cpu().double(), scan.faces.cpu()[rows], barycentric).float()
 
-    def _own_order(self, triangle: Tensor, barycentric: Tensor) -> Tensor:
+    def _own_order(self, barycentric: Tensor) -> Tensor:
         """Barycentric coordinates in the order of the scan's own corners: turned triangles have them backwards."""
         corner = self.scan.vertices.cpu().double()[self.scan.faces.cpu()[self.face_ids[:1], 0]]
         same = torch.equal(corner, self.vertices[self.faces[:1, 0]])

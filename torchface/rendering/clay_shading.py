@@ -174,11 +174,11 @@ def _shade(
     return (albedo * light[:, None] + lighting.gloss * highlight[:, None]).float()
 
 
-def vertex_openness(mesh: Mesh, lighting: Lighting = DEFAULT_LIGHTING) -> Tensor:
-    """The share of the hemisphere over each vertex that is free within the lighting's reach, (V,) in [0,1]."""
+def vertex_openness(mesh: Mesh) -> Tensor:
+    """The share of the hemisphere over each vertex that is free within the default lighting's reach, (V,) in [0,1]."""
     normals = vertex_normals(mesh.vertices.double(), mesh.faces)
     points = mesh.vertices.double() + 0.05 * normals
-    return _openness(RayCaster(mesh.vertices, mesh.faces), points, normals, lighting).float().clamp(0, 1)
+    return _openness(RayCaster(mesh.vertices, mesh.faces), points, normals, DEFAULT_LIGHTING).float().clamp(0, 1)
 
 
 def _openness(caster: RayCaster, points: Tensor, normals: Tensor, lighting: Lighting) -> Tensor:

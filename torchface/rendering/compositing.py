@@ -49,14 +49,14 @@ def caption(image: Tensor, text: str, size: int = 16) -> Tensor:
     return torch.cat([image, _line(image.shape[2], text, size)], dim=1)
 
 
-def headed(image: Tensor, text: str, size: int = 16) -> Tensor:
+def headed(image: Tensor, text: str) -> Tensor:
     """The image (3,H,W) with a line of text over it.
 
     Example:
         >>> tuple(headed(torch.zeros(3, 40, 60), "black").shape)
         (3, 66, 60)
     """
-    return torch.cat([_line(image.shape[2], text, size), image], dim=1)
+    return torch.cat([_line(image.shape[2], text, 16), image], dim=1)
 
 
 def _line(width: int, text: str, size: int) -> Tensor:

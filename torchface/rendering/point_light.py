@@ -25,14 +25,14 @@ _OFF_THE_SKIN = 0.4  # millimetres; a ray that starts on the skin would hit it
 class PointLight:
     r"""Light from one point and from everywhere, linear, standing still beside the camera.
 
-    Light and surface meet only in products (:math:`I_a K_a` and :math:`I_p K_d`): an image cannot tell a bright lamp
+    Light and surface meet only in products (:math:`I_a K_a` and :math:`I_p K_d`): an image cannot tell a bright source
     on dark skin from a dim one on bright skin. The coefficients K are therefore 1, and what is here are the products
     beside the albedo that was given. Distance does not dim the light.
 
     Args:
         ambient: :math:`I_a` of red, green, blue, (3,); 1 shows the albedo as it is.
         intensity: :math:`I_p`, (3,); 1 shows the albedo as it is where the light comes straight on.
-        position: of the lamp in the camera's frame (x right, y down, z forward), (3,), millimetres.
+        position: of the source in the camera's frame (x right, y down, z forward), (3,), millimetres.
 
     Raises:
         ShapeError: a tensor is not (3,).
@@ -41,8 +41,8 @@ class PointLight:
     Source: thesis 4.2.11, equation 66.
 
     Example:
-        >>> lamp = PointLight.directional(torch.ones(3), torch.ones(3), torch.tensor([0.0, -1.0, 0.0]))
-        >>> lamp.toward(torch.zeros(1, 3)).round(decimals=3).abs().tolist()  # from above, y down
+        >>> source = PointLight.directional(torch.ones(3), torch.ones(3), torch.tensor([0.0, -1.0, 0.0]))
+        >>> source.toward(torch.zeros(1, 3)).round(decimals=3).abs().tolist()  # from above, y down
         [[0.0, 1.0, 0.0]]
     """
 
@@ -66,7 +66,7 @@ class PointLight:
         return PointLight(ambient, intensity, MAX_DISTANCE * torch.nn.functional.normalize(direction, dim=0))
 
     def toward(self, points: Tensor) -> Tensor:
-        """Unit vectors L from points (...,3) in the camera's frame to the lamp."""
+        """Unit vectors L from points (...,3) in the camera's frame to the source."""
         return torch.nn.functional.normalize(self.position.to(points) - points, dim=-1)
 
 
@@ -79,7 +79,7 @@ def irradiance(points: Tensor, normals: Tensor, light: PointLight, lit: Tensor |
         points: in the camera's frame, (...,3), millimetres.
         normals: unit, (...,3).
         light: see :class:`PointLight`.
-        lit: the share of the lamp that each point sees, (...,); all if absent.
+        lit: the share of the source that each point sees, (...,); all if absent.
 
     Returns:
         Linear light of red, green, blue, (...,3).
@@ -93,7 +93,7 @@ def irradiance(points: Tensor, normals: Tensor, light: PointLight, lit: Tensor |
 
 
 def lit_by(position: Tensor, caster: RayCaster, points: Tensor, normals: Tensor) -> Tensor:
-    """Whether each point (Q,3) faces a lamp at ``position`` (3,) with nothing of the mesh between, (Q,) bool.
+    """Whether each point (Q,3) faces a source at ``position`` (3,) with nothing of the mesh between, (Q,) bool.
 
     Args:
         position: in the frame of the points, millimetres.

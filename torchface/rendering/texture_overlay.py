@@ -158,7 +158,7 @@ def relight(
     .. math:: C' = C\; \frac{I'_a + I'_p \max(0, N \cdot L')\, s'}{I_a + I_p \max(0, N \cdot L)\, s}
 
     in linear light, so that pores, beard and colour stay; no albedo is needed. At most ten times as bright: noise of
-    black shadows is no skin. Highlights of the old lamp stay where they were.
+    black shadows is no skin. Highlights of the old source stay where they were.
 
     Args:
         frame: (3,H,W) sRGB, uint8 or in [0,1].
@@ -201,7 +201,7 @@ def relight(
 
 
 def _soft_shadow(covered: Footprint, light: PointLight) -> Tensor:
-    """The share of the lamp that samples see, (S,); edges are soft, as those of lamps with a size and lenses."""
+    """The share of the source that samples see, (S,); edges are soft, as those of sources with a size and lenses."""
     lit = lit_by(light.position, covered.caster, covered.points, covered.normals)
     return covered.softened(lit[:, None])[:, 0]
 

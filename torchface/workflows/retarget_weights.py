@@ -10,7 +10,7 @@ from pathlib import Path
 import torch
 
 from torchface.capture.example_poses import LearnedRules, learn_shape_rules, load_example_poses
-from torchface.capture.mouth_close import (
+from torchface.capture.mouth_close_conventions import (
     CLOSE,
     JAW,
     jaw_into_mouth_close,

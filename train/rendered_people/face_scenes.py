@@ -223,7 +223,7 @@ def _stand(
     matrix = np.array([[cosine, -sine, 0.0], [sine, cosine, 0.0]])
     matrix[:, 2] = place - matrix[:, :2] @ middle
     if rng.random() < 0.9:
-        _dress(image, owner, picture, matrix, number, rng)
+        _dress(image, owner, picture, matrix, rng)
     light = (rng.uniform(0.6, 1.3) * (1 + rng.normal(0, 0.05, 3))).astype(np.float32)
     _paint(image, owner, picture, matrix, light, -2 if broken else number)
     hull = _scaled(hull, whole, picture.shape[0]) @ matrix[:, :2].T + matrix[:, 2]
@@ -258,7 +258,7 @@ def _scaled(points: np.ndarray, before: int, after: int) -> np.ndarray:
 
 
 def _dress(
-    image: np.ndarray, owner: np.ndarray, picture: np.ndarray, matrix: np.ndarray, number: int, rng: np.random.Generator
+    image: np.ndarray, owner: np.ndarray, picture: np.ndarray, matrix: np.ndarray, rng: np.random.Generator
 ) -> None:
     """A trunk under a cut-out: it ends at its picture's lower edge, which no person does."""
     side = picture.shape[0]

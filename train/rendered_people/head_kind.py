@@ -26,6 +26,7 @@ from torchface.synthetic.head.identity import IDENTITY, draw_identities, mean_ve
 from torchface.synthetic.head.performer import SHAPES, performer
 from torchface.synthetic.head.skin_texture import vertex_marks
 
+_WAVES = 10
 SKIN, TEETH, GUMS, EYEBALL, SOCKET = range(5)
 """What a triangle is made of."""
 _SHARED = [*range(4, 13), *range(27, 68)]  # landmarks that both kinds of heads mean alike
@@ -97,13 +98,12 @@ def performer_kind() -> HeadKind:
     )
 
 
-def people_kind(rig: BlendshapeRig, modes: IdentityModes, spread: float = 1.0) -> HeadKind:
+def people_kind(rig: BlendshapeRig, modes: IdentityModes) -> HeadKind:
     """ICT-FaceKit's heads: identity modes of people and their expressions.
 
     Args:
         rig: the whole head with its expressions.
         modes: of identity, of the same topology.
-        spread: standard deviation of the modes' coefficients.
 
     Raises:
         ShapeError: the rig is not ICT-FaceKit's whole head.
@@ -143,7 +143,7 @@ def people_kind(rig: BlendshapeRig, modes: IdentityModes, spread: float = 1.0) -
     rest = (modes.neutral.vertices.double() + shift).float()
 
     def draw(generator: torch.Generator) -> DrawnHead:
-        coefficients = spread * torch.randn(len(modes.names), generator=generator).clamp(-2.5, 2.5)
+        coefficients = torch.randn(len(modes.names), generator=generator).clamp(-2.5, 2.5)
         head = rest + torch.tensordot(coefficients, modes.deltas, dims=1)
         middle = head[notes.landmarks].mean(0)
         stretch = 1 + torch.tensor([0.045, 0.04, 0.04]) * torch.randn(3, generator=generator).clamp(-2, 2)
@@ -199,14 +199,14 @@ def _eye_canonical(placed: Tensor, regions: dict[str, Tensor], canonical: Tensor
     return moved
 
 
-def _lumpy(vertices: Tensor, canonical: Tensor, generator: torch.Generator, waves: int = 10) -> Tensor:
+def _lumpy(vertices: Tensor, canonical: Tensor, generator: torch.Generator) -> Tensor:
     """A head moved by a smooth random field of 60 to 150 mm, nearly the same on both sides."""
     folded = canonical.clone().float()
     folded[:, 0] = folded[:, 0].abs() + 0.15 * folded[:, 0]
-    heading = torch.nn.functional.normalize(torch.randn(waves, 3, generator=generator), dim=-1)
-    length = 60 + 90 * torch.rand(waves, 1, generator=generator)
-    phase = folded @ (heading * (2 * math.pi / length)).T + 2 * math.pi * torch.rand(waves, generator=generator)
-    field = phase.sin() @ torch.randn(waves, 3, generator=generator) * (_LUMP * math.sqrt(2 / waves))
+    heading = torch.nn.functional.normalize(torch.randn(_WAVES, 3, generator=generator), dim=-1)
+    length = 60 + 90 * torch.rand(_WAVES, 1, generator=generator)
+    phase = folded @ (heading * (2 * math.pi / length)).T + 2 * math.pi * torch.rand(_WAVES, generator=generator)
+    field = phase.sin() @ torch.randn(_WAVES, 3, generator=generator) * (_LUMP * math.sqrt(2 / _WAVES))
     field[:, 0] = (
         field[:, 0] * torch.from_numpy(np.sign(canonical[:, 0].numpy())).float() * (folded[:, 0] / 25).clamp(max=1)
     )

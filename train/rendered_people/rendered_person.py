@@ -1,4 +1,4 @@
-"""What a camera sees of someone: the colour of each pixel under lamps, and how far away it is."""
+"""What a camera sees of someone: the colour of each pixel under light sources, and how far away it is."""
 
 from __future__ import annotations
 

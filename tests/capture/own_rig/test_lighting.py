@@ -45,7 +45,7 @@ def performed(rig: BlendshapeRig, frames: int, generator: torch.Generator) -> Te
 
 
 def planted(centre: Tensor, generator: torch.Generator) -> PointLight:
-    """A lamp somewhere before the face, 0.3 to 3 m away, neither too weak nor too coloured."""
+    """A source somewhere before the face, 0.3 to 3 m away, neither too weak nor too coloured."""
     heading = torch.nn.functional.normalize(torch.randn(3, generator=generator), dim=0)
     heading[2] = -heading[2].abs() - 0.25
     amount = torch.rand(8, generator=generator)
@@ -70,7 +70,7 @@ def middle(mesh: Mesh, camera: Camera) -> Tensor:
 
 
 def angle(fit: LightFit, light: PointLight, centre: Tensor) -> float:
-    """Between where the found and the planted lamp are seen from the face, degrees."""
+    """Between where the found and the planted source are seen from the face, degrees."""
     return math.degrees(math.acos(min(1.0, float(fit.light.toward(centre) @ light.toward(centre)))))
 
 
@@ -138,7 +138,7 @@ def test_light_from_far_away_is_found_far_away(lit: tuple[Mesh, Camera, PointLig
 def test_shadow_of_the_nose_is_modelled_not_explained_away(
     lit: tuple[Mesh, Camera, PointLight, Tensor], found: LightFit
 ) -> None:
-    """Vertices turned to the lamp that the head itself shades are dark and still inliers."""
+    """Vertices turned to the source that the head itself shades are dark and still inliers."""
     (mesh, camera, light, _), fit = lit, found
     points = in_camera_frame(camera, mesh.vertices)
     facing = (vertex_normals(points, mesh.faces) * light.toward(points)).sum(1) > 0.3

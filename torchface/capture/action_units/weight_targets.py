@@ -124,7 +124,6 @@ def smooth_intensities(
     intensities: Tensor,
     units: Sequence[str],
     windows: Mapping[str, int] = WINDOWS,
-    order: int = 2,
     fps: float = _RATE,
 ) -> Tensor:
     """A classifier's levels as continuous curves in [0,1].
@@ -133,7 +132,6 @@ def smooth_intensities(
         intensities: (T,A).
         units: their names, A.
         windows: of the Savitzky-Golay filter by unit, frames at 60 a second; ``WINDOW`` for the others.
-        order: of its polynomial.
         fps: frames a second; a window lasts as long at any rate.
 
     Raises:
@@ -144,7 +142,7 @@ def smooth_intensities(
     if intensities.ndim != 2 or intensities.shape[1] != len(units):
         raise ShapeError(f"intensities: found {tuple(intensities.shape)}, expected (T,{len(units)})")
     frames = [max(round(windows.get(unit, WINDOW) * fps / _RATE), _MIN_WINDOW) for unit in units]
-    curves = [savitzky_golay(intensities[:, a].double(), window, order) for a, window in enumerate(frames)]
+    curves = [savitzky_golay(intensities[:, a].double(), window, 2) for a, window in enumerate(frames)]
     return torch.stack(curves, dim=1).clamp(0, 1).float()
 
 

@@ -3,7 +3,6 @@
 from torchface.capture.anybody.examples.example_expressions import (
     ExampleExpression,
     character_matrix,
-    head_angles,
     paper_expressions,
 )
 from torchface.capture.anybody.examples.example_methods import AllAtOnce, ExampleMethod, Regional
@@ -38,7 +37,6 @@ __all__ = [
     "WebcamState",
     "character_matrix",
     "example_remarks",
-    "head_angles",
     "landmark_observability",
     "paper_examples",
     "paper_expressions",

@@ -1,4 +1,4 @@
-"""The light that a face is filmed in, from its albedo and the frame: ambient, and one lamp with its place."""
+"""The light that a face is filmed in, from its albedo and the frame: ambient light and one point source."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torchface.capture.own_rig.lamp_search import LampFit, find_lamp, information
+from torchface.capture.own_rig.light_search import SourceFit, find_source, information
 from torchface.capture.own_rig.skin_samples import SeenSkin, seen_skin
 from torchface.errors import ShapeError, ValueRangeError
 from torchface.geometry.cameras.calibration import CameraCalibration
@@ -27,14 +27,14 @@ class LightFit:
 
     Args:
         light: in the camera's frame; its strengths belong to the albedo that was given.
-        direction: unit, from the middle of what was seen toward the lamp, camera's frame, (3,).
-        distance: of the lamp from there, millimetres; 100,000 is the directional limit. A face is small beside a
-            room: how far away a lamp stands is found roughly, where it shines from well.
+        direction: unit, from the middle of what was seen toward the source, camera's frame, (3,).
+        distance: of the source from there, millimetres; 100,000 is the directional limit. A face is small beside a
+            room: how far away a source stands is found roughly, where it shines from well.
         deviation: of the direction, degrees, as the curvature of the objective and the inliers' errors tell; infinite
-            where no lamp shows. Wrong geometry and wrong albedo come on top.
+            where no source shows. Wrong geometry and wrong albedo come on top.
         errors: difference between shaded albedo and frame, sRGB, Euclidean, (T,V); NaN where not seen.
         visible: vertices that a frame shows squarely, (T,V).
-        lit: those of them that the lamp reaches, (T,V).
+        lit: those of them that the source reaches, (T,V).
         inliers: those that the light explains: no highlight, foreign shadow, hair or wrong albedo, (T,V).
     """
 
@@ -62,21 +62,20 @@ def estimate_light(
     weights: Tensor | None = None,
     calibration: CameraCalibration | None = None,
 ) -> LightFit:
-    r"""The ambient light, the lamp's strength and the lamp's place under which an albedo looks as the frame shows it.
+    r"""The ambient light, and the source's strength and position, under which an albedo looks as the frame shows it.
 
     .. math:: \min_{I_a, I_p, L} \sum_v a_v\, \phi\big( \lVert g(T_v (I_a + I_p \max(0, N_v \cdot L_v)\, s_v))
         - C_v \rVert \big), \qquad I_a, I_p \ge 0
 
-    over the vertices that the camera sees. s is 0 where the mesh stands between vertex and lamp, a the pixels that a
+    over the vertices that the camera sees. s is 0 where the mesh stands between vertex and source, a the pixels that a
     vertex covers, g the sRGB coding (light adds up in linear values: colours are decoded first), :math:`\phi` Geman
     and McClure's function of a width taken from the residuals, so that highlights, foreign shadows and hair count
-    little. What the lamp's gloss adds (Blinn's highlight, at most 0.3 of the lamp) is estimated with the rest, or the
-    broad part of it would pass for light, and left out of the answer. Directions all round are tried; from the best,
-    Gauss-Newton moves the lamp while the strengths, linear and not negative, are eliminated (variable projection), and
-    shadows are cast anew in each step. Only products of light
-    and reflectance can be told: see :class:`PointLight`.
+    little. Blinn's highlight, at most 0.3 of the source, is estimated with the rest, or its broad part would pass for
+    light, and left out of the answer. Directions all round are tried; from the best, Gauss-Newton moves the source
+    while the strengths, linear and not negative, are eliminated (variable projection), and shadows are cast anew in
+    each step. Only products of light and reflectance are found: see :class:`PointLight`.
 
-    Camera and lamp are taken to stand still while the head moves, so the light of the first frame holds for the
+    Camera and source are taken to stand still while the head moves, so the light of the first frame holds for the
     others. Several frames of one light may be given together; each turn of the head narrows it down.
 
     Args:
@@ -91,7 +90,7 @@ def estimate_light(
         calibration: of a lens that bends the image; none if absent.
 
     Returns:
-        See :class:`LightFit`. Where the frames show no lamp, its strength is 0.
+        See :class:`LightFit`. Where the frames show no source, its strength is 0.
 
     Raises:
         ShapeError: shapes that do not belong together.
@@ -109,11 +108,11 @@ def estimate_light(
     seen = seen_skin(
         images, posed.detach().cpu(), faces.cpu(), albedo.detach().cpu().float(), cameras, count, calibration
     )
-    return _result(seen, find_lamp(seen), len(frames), len(albedo))
+    return _result(seen, find_source(seen), len(frames), len(albedo))
 
 
-def _result(seen: SeenSkin, fit: LampFit, frames: int, vertices: int) -> LightFit:
-    position = fit.lamp.position(seen.centre)
+def _result(seen: SeenSkin, fit: SourceFit, frames: int, vertices: int) -> LightFit:
+    position = fit.source.position(seen.centre)
     sizes = fit.residuals.norm(dim=1)
     trusted = fit.trust > _OUTLIER
     errors = torch.full((frames, vertices), torch.nan)
@@ -129,7 +128,7 @@ def _result(seen: SeenSkin, fit: LampFit, frames: int, vertices: int) -> LightFi
         covariance = noise * torch.linalg.pinv(H + 1e-12 * torch.eye(3, dtype=H.dtype))
         deviation = math.degrees(math.sqrt(max(float(covariance[:2, :2].trace()), 0.0)))
     light = PointLight(fit.ambient.float(), fit.intensity.float(), position.float())
-    return LightFit(light, fit.lamp.direction.float(), 1 / fit.lamp.nearness, deviation, errors, *masks)
+    return LightFit(light, fit.source.direction.float(), 1 / fit.source.nearness, deviation, errors, *masks)
 
 
 def _check(

@@ -58,7 +58,7 @@ class SeenSkin:
         return (self.area[:, None] * self.points).sum(0) / self.area.sum()
 
     def lit_by(self, position: Tensor) -> Tensor:
-        """Which of the vertices a lamp at a position (3,) reaches, (Q,) bool."""
+        """Which of the vertices a source at a position (3,) reaches, (Q,) bool."""
         lit = torch.zeros(len(self.points), dtype=torch.bool)
         for t, caster in enumerate(self.casters):  # a frame at a time: each has a mesh of its own
             rows = (self.frame == t).nonzero()[:, 0]

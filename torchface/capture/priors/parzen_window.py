@@ -14,6 +14,7 @@ from torchface.errors import FileFormatError, ShapeError, ValueRangeError
 from torchface.files.documents import Value
 from torchface.optim.mean_shift import mean_shift
 
+_QUANTILE = 0.3
 _MAX_NUMBERS = 2**28
 _MAX_SAMPLES = 1000
 
@@ -109,12 +110,11 @@ class ParzenDensity(nn.Module):
         return cls(torch.zeros(*checked_sizes(config, "centers", "dimensions")), 1.0)
 
 
-def automatic_bandwidth(samples: Tensor, quantile: float = 0.3, seed: int = 0) -> float:
+def automatic_bandwidth(samples: Tensor, seed: int = 0) -> float:
     """The mean distance from a sample to its k-th nearest neighbour, k a fraction of all samples.
 
     Args:
         samples: (T,D); of more than a thousand, a thousand are drawn.
-        quantile: that fraction.
         seed: of the draw.
 
     Source: thesis 4.2.8; the rule of scikit-learn's ``estimate_bandwidth``.
@@ -127,7 +127,7 @@ def automatic_bandwidth(samples: Tensor, quantile: float = 0.3, seed: int = 0) -
     checked_samples(samples)
     generator = torch.Generator().manual_seed(seed)
     some = samples.double()[torch.randperm(len(samples), generator=generator)[:_MAX_SAMPLES]]
-    nearest = max(int(quantile * len(some)), 1)
+    nearest = max(int(_QUANTILE * len(some)), 1)
     return float(torch.cdist(some, some).kthvalue(nearest, dim=1).values.mean())
 
 

@@ -21,7 +21,7 @@ from torchface.enhancement.matching.patches import (
 from torchface.enhancement.matching.region_names import named_regions
 from torchface.errors import ShapeError, ValueRangeError
 from torchface.geometry.meshes.operators import components, corners, edges, triangle_areas
-from torchface.number_checks import checked_count, checked_number
+from torchface.number_checks import checked_count
 
 SIGMA = 10.0
 """Standard deviation of the regions' borders, millimetres."""
@@ -87,7 +87,6 @@ def regions_of_motion(
     faces: Tensor,
     count: int = 13,
     landmarks: Tensor | None = None,
-    sigma: float = SIGMA,
     seed: int = 0,
 ) -> Regions:
     """Regions of correlated motion, from the motion of patches.
@@ -102,7 +101,6 @@ def regions_of_motion(
         faces: (F,3) int64.
         count: of regions.
         landmarks: vertex ids of the 68 iBUG landmarks.
-        sigma: of the borders, millimetres.
         seed: of the clustering.
 
     Returns:
@@ -115,7 +113,6 @@ def regions_of_motion(
     Source: Tena, De la Torre, Matthews 2011; Facial Performance Enhancement Using Dynamic Shape Space Analysis,
     section 4.3.
     """
-    checked_number("sigma", sigma, 0.0, above=True)
     checked_count("count", count, 3 if landmarks is not None else 1)
     if motion.ndim != 3 or motion.shape[1] != int(patches.max()) + 1 or len(patches) != len(faces):
         raise ShapeError(
@@ -149,7 +146,7 @@ def regions_of_motion(
         labels[mask] = number
     labels = _connected(labels, links, middles)
     names, voluntary = named_regions(labels, count, neutral, faces, landmarks, tuple(eyes))
-    return Regions(names, soft_weights(labels, count, neutral, faces, sigma), voluntary)
+    return Regions(names, soft_weights(labels, count, neutral, faces, SIGMA), voluntary)
 
 
 def _midline(neutral: Tensor, landmarks: Tensor | None) -> float:

@@ -44,19 +44,18 @@ def captured_poses(model: EnhancementModel, shapes: Tensor) -> Tensor:
     return box_qp((gram + gram.T) / (2 * scale) + ridge, -(shown @ own.T) / scale).float()
 
 
-def teaching_poses(captured: Tensor, areas_moved: Tensor, count: int, seed: int = 0) -> Tensor:
+def teaching_poses(captured: Tensor, areas_moved: Tensor, count: int) -> Tensor:
     """Poses that weights are learned from: the actor's own, and mixtures of two of them, region by region.
 
     Args:
         captured: the actor's poses, (K,N).
         areas_moved: how much each shape moves each region, (R,N).
         count: of poses, at least one a shape and some of the actor's.
-        seed: of the mixtures.
 
     Returns:
         (count,N): each shape alone; then the actor's poses, evenly picked; half of the rest are mixtures.
     """
-    generator = torch.Generator().manual_seed(seed)
+    generator = torch.Generator().manual_seed(0)
     shapes = captured.shape[1]
     left = max(0, count - shapes)
     own = captured[torch.linspace(0, len(captured) - 1, min(len(captured), (left + 1) // 2)).round().long().unique()]

@@ -216,11 +216,11 @@ def quoted(names: Sequence[str], limit: int = 5) -> str:
     return listed + (f" and {len(names) - limit} more" if len(names) > limit else "")
 
 
-def write_table(path: str | Path, header: Sequence[str], rows: Iterable[Sequence[str]], line_end: str = "\n") -> None:
+def write_table(path: str | Path, header: Sequence[str], rows: Iterable[Sequence[str]]) -> None:
     """Writes what ``TableReader`` reads, row by row; the file appears only when it is complete."""
     try:
         with replaced_file(path) as temporary, temporary.open("w", encoding="utf-8", newline="") as text:
-            writer = csv.writer(text, lineterminator=line_end)
+            writer = csv.writer(text, lineterminator="\n")
             writer.writerow(header)
             writer.writerows(rows)
     except UnicodeEncodeError as error:

@@ -35,7 +35,7 @@ class Timing:
     gaps: tuple[tuple[int, int], ...]
 
 
-def read_timecodes(texts: Sequence[str], path: Path, first_row: int = 2) -> Timing:
+def read_timecodes(texts: Sequence[str], path: Path) -> Timing:
     """The timing of a take from its timecodes.
 
     ``FF`` counts frames of the timecode's base (60 for a 59.94 fps take), which is where it falls back to 0 as the

@@ -15,6 +15,7 @@ from torchface.landmarks.scans.uv_detector import UVLandmarkDetector
 from torchface.landmarks.scans.uv_landmark_names import IBUG_ROWS, LINES, UV_LANDMARK_NAMES, uv_landmarks_from_ibug
 from torchface.mesh import Mesh
 
+_LINE_POINTS = 24
 _SAME_LINE = 12.0
 
 
@@ -60,7 +61,7 @@ class TemplateFeatures:
     lines: dict[str, tuple[Tensor, Tensor]]
 
 
-def template_features(template: Mesh, detector: UVLandmarkDetector | None = None, points: int = 24) -> TemplateFeatures:
+def template_features(template: Mesh, detector: UVLandmarkDetector | None = None) -> TemplateFeatures:
     """The twelve landmarks and the three lines on a template.
 
     Annotated iBUG landmarks are taken where there are 68. Lines are taken from the pairs of vertices that touch when
@@ -71,7 +72,6 @@ def template_features(template: Mesh, detector: UVLandmarkDetector | None = None
     Args:
         template: a face, millimetres.
         detector: asked where annotations are missing.
-        points: how many points a traced line gives.
 
     Raises:
         ValueRangeError: something is neither annotated nor is there a detector that sees the template.
@@ -91,7 +91,7 @@ def template_features(template: Mesh, detector: UVLandmarkDetector | None = None
     landmarks = _annotated_landmarks(template, ibug) if ibug is not None else _nearest(template, found)
     lines = _lines_of_contacts(template, pairs, landmarks) if pairs is not None else {}
     if found is not None:
-        lines = {**_lines_of_traces(template, found, points), **lines}
+        lines = {**_lines_of_traces(template, found, _LINE_POINTS), **lines}
     return TemplateFeatures(landmarks, lines)
 
 

@@ -13,6 +13,8 @@ from torchface.geometry.rotations import rotation_matrix
 from torchface.geometry.similarity import Similarity
 from torchface.landmarks.scans.surface_sample import SurfaceSample
 
+_QUERIES = 3000
+_CANDIDATES = 40
 _REACH = 12.0  # millimetres; what is further away is as wrong as it gets
 _NEAR, _FAR = 9.0, 26.0  # millimetres round a point that may be a nose
 _APART = 9.0  # millimetres between two such points
@@ -54,16 +56,14 @@ def protrusion(points: Tensor, normals: Tensor, queries: Tensor) -> tuple[Tensor
     return mean, direction
 
 
-def nose_candidates(surface: SurfaceSample, count: int = 40, queries: int = 3000) -> NoseCandidates:
+def nose_candidates(surface: SurfaceSample) -> NoseCandidates:
     """The points of a scan that stand out most, no two close together; hair, ears and collars are among them.
 
     Args:
         surface: the scan's sample.
-        count: how many.
-        queries: how many of the sample's points are looked at.
     """
-    thinned = slice(0, 4 * queries)
-    looked = surface.points[:queries]
+    thinned = slice(0, 4 * _QUERIES)
+    looked = surface.points[:_QUERIES]
     height, direction = protrusion(surface.points[thinned], surface.normals[thinned], looked)
     order = height.argsort(descending=True)
     looked, direction = looked[order], direction[order]
@@ -71,7 +71,7 @@ def nose_candidates(surface: SurfaceSample, count: int = 40, queries: int = 3000
     apart = torch.cdist(looked, looked) > _APART
     free = torch.ones(len(looked), dtype=torch.bool)
     taken: list[int] = []
-    while len(taken) < count and bool(free.any()):
+    while len(taken) < _CANDIDATES and bool(free.any()):
         best = int(free.nonzero()[0, 0])
         taken.append(best)
         free &= apart[best]

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from torchface.errors import ValueRangeError
 from torchface.geometry.similarity import Similarity
-from torchface.landmarks.scans.contours import Contour, TraceSettings, trace_contour
+from torchface.landmarks.scans.contours import Contour, trace_contour
 from torchface.landmarks.scans.curvature_image import curvature_image
 from torchface.landmarks.scans.cylinder import CylinderLayout, UnwrappedHead, unwrap
 from torchface.landmarks.scans.line_shape import LineShape
@@ -101,7 +101,6 @@ def scan_landmarks(
     detector: UVLandmarkDetector,
     scan: Mesh,
     pose: Similarity | None = None,
-    trace: TraceSettings | None = None,
 ) -> ScanLandmarks:
     """Finds the twelve landmarks and traces lips and lids on a scan.
 
@@ -109,7 +108,6 @@ def scan_landmarks(
         detector: fitted with a frame.
         scan: millimetres, in any pose.
         pose: a rough one, from the scan's space to the detector's frame; searched for if absent.
-        trace: how to trace lines.
 
     Raises:
         ValueRangeError: the detector has no frame, no face is found, or the scan lacks the texture it needs.
@@ -128,21 +126,17 @@ def scan_landmarks(
     contours = trace_lines(
         line_image(head, detector.appearance),
         dict(zip(detector.names, pixels, strict=True)),
-        trace,
         detector.line_shapes(),
     )
     return ScanLandmarks(detector.names, points, found.confidence[0], pixels, contours, head, image)
 
 
 def trace_lines(
-    image: Tensor,
-    corners: dict[str, Tensor],
-    trace: TraceSettings | None = None,
-    shapes: dict[str, LineShape] | None = None,
+    image: Tensor, corners: dict[str, Tensor], shapes: dict[str, LineShape] | None = None
 ) -> dict[str, Contour]:
     """Every line of ``LINES`` whose two corners (2,) are there, the one on the left further left."""
     found, usual = {}, shapes or {}
     for name, (left, right) in LINES.items():
         if left in corners and right in corners and float(corners[right][0] - corners[left][0]) >= 3:
-            found[name] = trace_contour(image, corners[left], corners[right], trace, usual.get(name))
+            found[name] = trace_contour(image, corners[left], corners[right], shape=usual.get(name))
     return found

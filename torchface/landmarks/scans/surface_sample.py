@@ -12,6 +12,7 @@ from torchface.errors import ValueRangeError
 from torchface.geometry.meshes.operators import components, corners, triangle_areas, triangle_cross
 from torchface.mesh import Mesh
 
+_POINTS = 20000
 _CRUMB = 0.05  # parts smaller than this share of the largest are left out
 
 
@@ -33,7 +34,7 @@ class SurfaceSample:
         return torch.from_numpy(distance).view(shape), rows.view(shape)
 
 
-def sample_surface(mesh: Mesh, count: int = 20000, seed: int = 0) -> SurfaceSample:
+def sample_surface(mesh: Mesh) -> SurfaceSample:
     """Area-weighted random points on a scan's large connected parts, normals made to point outward.
 
     Normals that point inward on the whole (a scan turned inside out) are flipped: those of a head point away from the
@@ -41,8 +42,6 @@ def sample_surface(mesh: Mesh, count: int = 20000, seed: int = 0) -> SurfaceSamp
 
     Args:
         mesh: a scan, millimetres.
-        count: how many points.
-        seed: of the random numbers; the same scan gives the same points.
 
     Raises:
         ValueRangeError: the scan has no area.
@@ -55,10 +54,12 @@ def sample_surface(mesh: Mesh, count: int = 20000, seed: int = 0) -> SurfaceSamp
     part = components(faces, len(vertices))[faces[:, 0]]
     part_area = torch.zeros(int(part.max()) + 1, dtype=torch.float64).index_add_(0, part, area)
     area = area * (part_area >= _CRUMB * part_area.max())[part]
-    generator = torch.Generator().manual_seed(seed)
-    pick = torch.searchsorted(area.cumsum(0), torch.rand(count, generator=generator, dtype=torch.float64) * area.sum())
+    generator = torch.Generator().manual_seed(0)
+    pick = torch.searchsorted(
+        area.cumsum(0), torch.rand(_POINTS, generator=generator, dtype=torch.float64) * area.sum()
+    )
     pick = pick.clamp(max=len(faces) - 1)
-    first, second = torch.rand(2, count, 1, generator=generator, dtype=torch.float64)
+    first, second = torch.rand(2, _POINTS, 1, generator=generator, dtype=torch.float64)
     root = first.sqrt()
     a, b, c = corners(vertices, faces[pick])
     points = (1 - root) * a + root * (1 - second) * b + root * second * c

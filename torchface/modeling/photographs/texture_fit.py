@@ -13,11 +13,12 @@ from torchface.geometry.cameras.pinhole import Camera
 from torchface.geometry.meshes.operators import vertex_normals
 from torchface.mesh import Mesh
 from torchface.modeling.morphable.morphable_model import MorphableModel
-from torchface.number_checks import LARGEST_WEIGHT, checked_number
+from torchface.number_checks import checked_number
 from torchface.optim import box_qp
 from torchface.rendering.camera_visibility import shown_in
 from torchface.rendering.raycast import RayCaster
 
+_STRENGTH = 0.1 / 0.05  # of the model's own distribution beside one vertex at a colour error of 0.05
 _SQUARELY = 0.2  # cosine; what is seen more obliquely is blurred and mixed with what stands behind
 _MIN_ERROR = 0.01  # of full white: below it the colour error counts squared, so that it has a derivative
 _MIN_VERTICES = 50
@@ -50,7 +51,6 @@ def fit_colors(
     cameras: Sequence[Camera],
     lighting: bool = True,
     bound: float = 3.0,
-    prior: float = 0.1,
 ) -> ColorFit:
     r"""The coefficients of a colour model under which a head resembles its photographs.
 
@@ -68,7 +68,6 @@ def fit_colors(
         cameras: one each.
         lighting: estimate each photograph's light.
         bound: on each coefficient, standard deviations.
-        prior: weight of the model's own distribution beside one vertex at a colour error of 0.05.
 
     Raises:
         ShapeError: not one camera an image, or an image of another size than its camera's.
@@ -96,16 +95,14 @@ def fit_colors(
             f"fit_colors: found a model of {tuple(model.mean.shape)} for a mesh of {len(mesh.vertices)} vertices"
         )
     checked_number("fit_colors: bound", bound, above=True)
-    checked_number("fit_colors: prior", prior, 0.0, LARGEST_WEIGHT)
     views = _shown_vertices(mesh, images, cameras)
     mean, modes = model.mean.cpu().double(), model.modes.cpu().double()
     coefficients = torch.zeros(len(modes), dtype=torch.float64)
     light = torch.zeros(len(views), 3, 4, dtype=torch.float64)
     light[..., 0] = 1.0
-    strength = prior / 0.05
     before = torch.inf
     for _ in range(_MAX_ITERATIONS):
-        H, f, total = strength * torch.eye(len(modes), dtype=torch.float64), torch.zeros_like(coefficients), 0.0
+        H, f, total = _STRENGTH * torch.eye(len(modes), dtype=torch.float64), torch.zeros_like(coefficients), 0.0
         for i, view in enumerate(views):  # photographs: each shows other vertices
             albedo = mean[view.ids] + torch.einsum("l,lvc->vc", coefficients, modes[:, view.ids])
             shade = view.basis @ light[i].T
@@ -119,7 +116,7 @@ def fit_colors(
             H, f = H + (A * w) @ A.T, f + (A * w) @ b
             total += float((view.share * (albedo * shade - view.colors).norm(dim=-1)).sum())
         coefficients = box_qp(H, f[None], -bound, bound, start=coefficients[None])[0]
-        energy = total + 0.5 * strength * float(coefficients.square().sum())
+        energy = total + 0.5 * _STRENGTH * float(coefficients.square().sum())
         if abs(before - energy) < _DONE * energy:
             break
         before = energy

@@ -84,13 +84,13 @@ def exposed_vertices(vertices: Tensor, faces: Tensor, opening: float) -> Tensor:
     return present & (hits.distance > opening).to(present.device)
 
 
-def evenly_spread(vertices: Tensor, candidates: Tensor, count: int, seed: int = 0) -> Tensor:
+def evenly_spread(vertices: Tensor, candidates: Tensor, count: int) -> Tensor:
     """About ``count`` of the candidate ids (n,), spread over space: one a cell of a grid, ascending."""
     if len(candidates) <= count:
         return candidates
     points = vertices[candidates].double()
     low, high = points.amin(0), points.amax(0)
-    order = torch.randperm(len(candidates), generator=torch.Generator().manual_seed(seed))
+    order = torch.randperm(len(candidates), generator=torch.Generator().manual_seed(0))
     fine, coarse = float((high - low).max()) / 2000, float((high - low).max())
     chosen = candidates
     for _ in range(18):  # bisection of the cell's size

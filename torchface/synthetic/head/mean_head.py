@@ -38,7 +38,6 @@ from torchface.synthetic.head.topology import (
 )
 
 GUIDE_WIDTH = 74.0
-CAP_ELEVATION = 54.0
 
 # Row, then the guide curve that the row follows round the head: height in front, at the side, at the back; depth in
 # front, at the side, at the back; tilt of the outward ray in front, at the side, at the back (degrees).
@@ -224,7 +223,7 @@ def _neighbours(quads: Tensor, count: int) -> Tensor:
     return torch.sparse_coo_tensor(pairs.T, 1 / degree[pairs[:, 0]], (count, count), check_invariants=False).coalesce()
 
 
-def _relax(t: Topology, vertices: Tensor, iterations: int = 6) -> None:
+def _relax(t: Topology, vertices: Tensor) -> None:
     """Evens the grid out along the form; ring systems come later, so only quads between grid and crown count."""
     present = torch.zeros(t.half_count, dtype=torch.bool)
     present[t.grid[t.grid >= 0]] = True
@@ -234,7 +233,7 @@ def _relax(t: Topology, vertices: Tensor, iterations: int = 6) -> None:
     fixed = ~present
     for edge in (t.grid[-1], *(t.rings[name][0] for name in t.rings)):
         fixed[edge] = True
-    for _ in range(iterations):
+    for _ in range(6):
         mean = average @ vertices
         step = torch.where(fixed[:, None], vertices, 0.5 * vertices + 0.5 * mean)
         step[~fixed] = project(step[~fixed], 1)

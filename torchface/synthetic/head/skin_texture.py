@@ -18,6 +18,7 @@ from torchface.synthetic.head.signed_distance import EYE_CENTRE
 from torchface.synthetic.head.topology import EYE_RIM, MOUTH_BORDER, MOUTH_CONTACT, topology
 from torchface.synthetic.head.uv_layout import unwrapping
 
+_SIZE = 1024
 SKIN = (0.86, 0.665, 0.565)
 LIPS = (0.70, 0.40, 0.37)
 HAIR = (0.20, 0.145, 0.115)
@@ -25,19 +26,15 @@ _MARKS = 8
 
 
 @lru_cache(maxsize=2)
-def skin_texture(size: int = 1024) -> Tensor:
-    """The skin every performer wears, (3,size,size), first row on top.
-
-    Args:
-        size: pixels a side.
-    """
-    covered, values = texel_values(size, torch.cat([mean_vertices().float(), vertex_marks()], dim=1))
+def skin_texture() -> Tensor:
+    """The skin texture of every performer, (3,1024,1024), first row on top."""
+    covered, values = texel_values(_SIZE, torch.cat([mean_vertices().float(), vertex_marks()], dim=1))
     color = _paint(values[:, :3], values[:, 3:])
-    image = torch.zeros(size * size, 3)
+    image = torch.zeros(_SIZE * _SIZE, 3)
     image[covered] = color
     # What no triangle covers repeats its nearest neighbour, so that no border colour bleeds in.
-    nearest = distance_transform_edt(~covered.view(size, size).numpy(), return_distances=False, return_indices=True)
-    image = image.view(size, size, 3)[torch.from_numpy(nearest[0]), torch.from_numpy(nearest[1])]
+    nearest = distance_transform_edt(~covered.view(_SIZE, _SIZE).numpy(), return_distances=False, return_indices=True)
+    image = image.view(_SIZE, _SIZE, 3)[torch.from_numpy(nearest[0]), torch.from_numpy(nearest[1])]
     return image.permute(2, 0, 1).contiguous()
 
 

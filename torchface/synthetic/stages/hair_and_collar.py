@@ -11,6 +11,8 @@ from torch import Tensor
 from torchface.geometry.meshes.operators import vertex_normals
 from torchface.mesh import Mesh
 
+_WAVES = 14
+
 
 @dataclass(frozen=True)
 class Dress:
@@ -64,13 +66,13 @@ def _hair_share(vertices: Tensor, eyes: Tensor, ears: Tensor, hairline: float) -
     return ((vertices[:, 1] - line) / 9.0).clamp(0, 1) * (vertices[:, 1] > ears[1] - 90)
 
 
-def _lumps(points: Tensor, generator: torch.Generator, shortest: float, longest: float, waves: int = 14) -> Tensor:
+def _lumps(points: Tensor, generator: torch.Generator, shortest: float, longest: float) -> Tensor:
     """A smooth random field of about unit size, (N,)."""
-    heading = torch.nn.functional.normalize(torch.randn(waves, 3, generator=generator, dtype=torch.float64), dim=-1)
-    draw = torch.rand(waves, 2, generator=generator, dtype=torch.float64)
+    heading = torch.nn.functional.normalize(torch.randn(_WAVES, 3, generator=generator, dtype=torch.float64), dim=-1)
+    draw = torch.rand(_WAVES, 2, generator=generator, dtype=torch.float64)
     length = shortest * (longest / shortest) ** draw[:, 0]
     phase = points @ (heading * (2 * math.pi / length)[:, None]).T + 2 * math.pi * draw[:, 1]
-    return phase.sin().sum(1) * math.sqrt(2 / waves)
+    return phase.sin().sum(1) * math.sqrt(2 / _WAVES)
 
 
 def _collar(

@@ -18,10 +18,12 @@ from torchface.rendering.raycast import RayCaster
 from torchface.rig import BlendshapeRig
 from torchface.take import Take, Track
 
+_VISIBLE_FROM = 75.0
+
 __all__ = ["LabelSwap", "Recording", "StageFlaws", "place_markers", "record"]
 
 
-def place_markers(rig: BlendshapeRig, count: int = 100, visible_from: float = 75.0) -> Attachment:
+def place_markers(rig: BlendshapeRig, count: int = 100) -> Attachment:
     """Markers spread over the skin that moves, denser where it moves more, as a make-up artist would set them.
 
     The spots are vertices of the largest connected part that some shape moves by at least a millimetre, that
@@ -32,7 +34,6 @@ def place_markers(rig: BlendshapeRig, count: int = 100, visible_from: float = 75
         rig: any rig; a region ``face`` in its annotations narrows the choice, and lid rims and contact vertices are
             left out, where annotated.
         count: how many, M.
-        visible_from: largest angle between a spot's normal and the viewing direction, degrees.
 
     Returns:
         An attachment (M,) with labels ``M001``, ...
@@ -55,7 +56,7 @@ def place_markers(rig: BlendshapeRig, count: int = 100, visible_from: float = 75
     skin = part == part[faces.flatten()].mode().values
     allowed = skin & (amplitude > 1.0)
     normals = vertex_normals(vertices, faces)
-    allowed &= normals[:, 2] > math.cos(math.radians(visible_from))
+    allowed &= normals[:, 2] > math.cos(math.radians(_VISIBLE_FROM))
     # Lashes and the video over the eye, parts of their own, hide no marker.
     allowed &= ~RayCaster(vertices, faces[skin[faces[:, 0]]]).occluded(
         vertices + 0.1 * normals, torch.tensor([0.0, 0, 1]).double().expand_as(vertices)

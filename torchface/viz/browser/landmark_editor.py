@@ -16,6 +16,8 @@ from torchface.viz.browser.browser_page import BrowserPage, icon
 from torchface.viz.browser.html_lists import caption, pick_list
 from torchface.viz.browser.landmark_sets import IBUG_68
 
+_CORNERS = 20
+
 if TYPE_CHECKING:
     import viser
 
@@ -262,11 +264,11 @@ class LandmarkEditor(BrowserPage):
             client.camera.look_at = (x, y, 0.0)
 
 
-def _disc(radius: float, corners: int = 20) -> tuple[np.ndarray, np.ndarray]:
+def _disc(radius: float) -> tuple[np.ndarray, np.ndarray]:
     """A round plate in the plane of x and y: vertices and triangles."""
-    angle = np.linspace(0, 2 * np.pi, corners, endpoint=False)
-    rim = radius * np.stack([np.cos(angle), np.sin(angle), np.zeros(corners)], axis=1)
+    angle = np.linspace(0, 2 * np.pi, _CORNERS, endpoint=False)
+    rim = radius * np.stack([np.cos(angle), np.sin(angle), np.zeros(_CORNERS)], axis=1)
     vertices = np.concatenate([np.zeros((1, 3)), rim]).astype(np.float32)
-    following = np.roll(np.arange(corners), -1)
-    faces = np.stack([np.zeros(corners, dtype=int), 1 + np.arange(corners), 1 + following], axis=1)
+    following = np.roll(np.arange(_CORNERS), -1)
+    faces = np.stack([np.zeros(_CORNERS, dtype=int), 1 + np.arange(_CORNERS), 1 + following], axis=1)
     return vertices, faces.astype(np.uint32)

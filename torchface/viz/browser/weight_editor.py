@@ -12,6 +12,9 @@ from torchface.errors import NameMismatchError, ShapeError, ValueRangeError
 from torchface.shape_names import mirror
 from torchface.take import Take, Track
 
+_FPS = 60.0
+_ACTIVE = 0.01
+
 
 class WeightEditor:
     r"""Weights (T,N) and the frame in view.
@@ -105,17 +108,17 @@ class WeightEditor:
         """Gives every frame back what was loaded."""
         self.weights.copy_(self._loaded)
 
-    def active(self, threshold: float = 0.01) -> list[tuple[str, float]]:
-        """Shapes of the frame in view whose weight is at least ``threshold`` in size, largest first."""
+    def active(self) -> list[tuple[str, float]]:
+        """Shapes of the frame in view whose weight is at least 0.01 in size, largest first."""
         pose = self.pose
         order = pose.abs().argsort(descending=True, stable=True).tolist()
-        return [(self.names[i], float(pose[i])) for i in order if abs(float(pose[i])) >= threshold]
+        return [(self.names[i], float(pose[i])) for i in order if abs(float(pose[i])) >= _ACTIVE]
 
-    def to_take(self, source: Take | None = None, fps: float = 60.0) -> Take:
+    def to_take(self, source: Take | None = None) -> Take:
         """The weights as a take, with rate, timecode and extras of the take that they came from."""
         track = Track(self.names, self.weights[..., None].clone())
         if source is None:
-            return Take(fps, weights=track)
+            return Take(_FPS, weights=track)
         return replace(source, markers=None, landmarks=None, weights=track)
 
     def _window(self) -> tuple[slice, Tensor]:

@@ -39,7 +39,7 @@ def framing(mesh: Mesh, aspect: float = 0.8) -> tuple[Tensor, float]:
     return centre, margin * float(torch.maximum(high[1] - low[1], (high[0] - low[0]) / aspect))
 
 
-def frame_face(mesh: Mesh, yaw: float = FRONT, pitch: float = 0.0, width: int = 400, height: int = 500) -> Camera:
+def frame_face(mesh: Mesh, yaw: float = FRONT, width: int = 400, height: int = 500) -> Camera:
     """A camera that frames the face: round its landmarks or ``face`` region where annotated, else the whole mesh.
 
     Example:
@@ -50,7 +50,7 @@ def frame_face(mesh: Mesh, yaw: float = FRONT, pitch: float = 0.0, width: int = 
         True
     """
     centre, span = framing(mesh, width / height)
-    return look_at(centre, yaw, pitch, span=span, width=width, height=height)
+    return look_at(centre, yaw, 0.0, span=span, width=width, height=height)
 
 
 def face_views(

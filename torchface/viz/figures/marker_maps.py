@@ -20,6 +20,8 @@ from torchface.viz.figures.face_views import FRONT, clay_colors, color_bar, fram
 from torchface.viz.figures.region_colors import as_seen
 from torchface.viz.figures.site_views import facing
 
+_NAMED = 8
+
 __all__ = ["marker_map"]
 
 SIDE = 55.0
@@ -27,9 +29,7 @@ _WIDTH, _HEIGHT = 520, 650
 _NOT_KNOWN = (0.55, 0.55, 0.55)
 
 
-def marker_map(
-    mesh: Mesh, points: Tensor, errors: Tensor, maximum: float, labels: Sequence[str], named: int = 8
-) -> Tensor:
+def marker_map(mesh: Mesh, points: Tensor, errors: Tensor, maximum: float, labels: Sequence[str]) -> Tensor:
     """Errors of markers (M,), millimetres, at their points (M,3) on a mesh, the worst by name; (3,H,W).
 
     Grey is a marker without an error (NaN), for which none was seen.
@@ -44,7 +44,7 @@ def marker_map(
     """
     colors = heat_colors(errors.nan_to_num(0.0), maximum).numpy()
     colors[errors.isnan().numpy()] = _NOT_KNOWN
-    worst = set(errors.nan_to_num(-1.0).argsort(descending=True)[:named].tolist())
+    worst = set(errors.nan_to_num(-1.0).argsort(descending=True)[:_NAMED].tolist())
     named_labels = ["" if i not in worst or errors.isnan()[i] else label for i, label in enumerate(labels)]
     views = _views(mesh, points, colors, named_labels)
     scale = color_bar(maximum, "mm, root mean square", _HEIGHT, (0.12, 0.2, 0.2, 0.6), extend="max")

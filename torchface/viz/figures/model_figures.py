@@ -11,16 +11,19 @@ from torchface.rendering.clay_shading import Lighting
 from torchface.rendering.compositing import caption, sheet
 from torchface.viz.figures.face_views import FRONT, THREE_QUARTER, face_views
 
+_HEADS = 12
+_DEVIATIONS = 3.0
+_MODES = 5
 _WIDTH, _HEIGHT = 220, 275
 _LIGHT = Lighting(occlusion_rays=0)  # seventy faces a model: shadows in creases would take most of the time
 
 
-def modes_figure(model: HeadModel, count: int = 5, deviations: float = 3.0) -> Tensor:
+def modes_figure(model: HeadModel) -> Tensor:
     """The mean between -3σ and +3σ of the first modes of shape, a row a mode, each from two sides (figure 20)."""
     rows = []
-    for mode in range(min(count, model.shape.count)):
+    for mode in range(min(_MODES, model.shape.count)):
         row = []
-        for amount in (-deviations, 0.0, deviations):
+        for amount in (-_DEVIATIONS, 0.0, _DEVIATIONS):
             coefficients = torch.zeros(model.shape.count)
             coefficients[mode] = amount
             label = "mean" if amount == 0 else f"mode {mode + 1}, {amount:+g} sd"
@@ -29,10 +32,10 @@ def modes_figure(model: HeadModel, count: int = 5, deviations: float = 3.0) -> T
     return sheet(rows, 3)
 
 
-def random_figure(model: HeadModel, count: int = 12, seed: int = 0) -> Tensor:
+def random_figure(model: HeadModel, seed: int = 0) -> Tensor:
     """Random heads of the model (figure 21)."""
     generator = torch.Generator().manual_seed(seed)
-    heads = [random_head(model, generator) for _ in range(count)]
+    heads = [random_head(model, generator) for _ in range(_HEADS)]
     return sheet([head_views(model, mesh, None, (THREE_QUARTER,)) for mesh in heads], 6)
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 
 import torch
 from matplotlib.collections import LineCollection
@@ -23,10 +22,10 @@ from torchface.viz.figures.region_colors import drawn_triangles
 _LIFT = 0.5
 
 
-def site_views(mesh: Mesh, before: Tensor, after: Tensor, yaws: Sequence[float] = (FRONT, THREE_QUARTER)) -> Tensor:
+def site_views(mesh: Mesh, before: Tensor, after: Tensor) -> Tensor:
     """Sites before and after (M,3) on views of a face, joined by lines, those that face the viewer; (3,H,W)."""
     images = []
-    for yaw in yaws:
+    for yaw in (FRONT, THREE_QUARTER):
         camera = frame_face(mesh, yaw, width=560, height=700)
         front = facing(mesh, after, yaw)
         old, new = camera.project(before[front].double()), camera.project(after[front].double())

@@ -205,7 +205,6 @@ def run_demo(
     scene: Scene,
     out: Path,
     seed: int = 0,
-    flaws: StageFlaws = FLAWS,
     progress: Progress | None = None,
 ) -> DemoResult:
     """Plays a scene and writes every file of the main job into a folder.
@@ -214,14 +213,13 @@ def run_demo(
         scene: see ``embedded_scene`` and ``scene_from``.
         out: the folder; made if absent.
         seed: of noise and gaps.
-        flaws: of the stage.
         progress: called with each step and how far it is.
 
     Returns:
         A ``DemoResult``; ``torchface.workflows.demo.demo_page.write_demo_page`` makes the report of it.
     """
     with within_job(out):
-        return _run_demo(scene, out, seed, flaws, progress or silent)
+        return _run_demo(scene, out, seed, FLAWS, progress or silent)
 
 
 def _run_demo(scene: Scene, out: Path, seed: int, flaws: StageFlaws, progress: Progress) -> DemoResult:

@@ -101,12 +101,10 @@ def figures(tracked: Tracked) -> list[tuple[str, str]]:
     return rows
 
 
-def frames_sheet(
-    tracked: Tracked, draw: Callable[[int, Tensor], Tensor], most: int = SHOWN, cut: bool = True
-) -> Tensor:
+def frames_sheet(tracked: Tracked, draw: Callable[[int, Tensor], Tensor], cut: bool = True) -> Tensor:
     """Frames spread over the video as ``draw`` makes frame number t, (3,H,W), cut to the face unless they are."""
     count = len(tracked)
-    wanted = torch.linspace(0, count - 1, min(most, count)).round().long().unique().tolist()
+    wanted = torch.linspace(0, count - 1, min(SHOWN, count)).round().long().unique().tolist()
     cells, at = [], 0
     box = _face_box(tracked, wanted) if cut else None
     for chunk in tracked.video.color_chunks():

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 
-import torch
 from torch import Tensor
 
 from torchface.errors import NameMismatchError
@@ -72,7 +71,7 @@ def character_matrix(names: Sequence[str], shapes: Sequence[str]) -> Tensor:
     """The matrix (M,N) that turns weights of examples into weights of a character's shapes, by name.
 
     The paper's expressions become the shapes of ARKit that they mean, other examples the shape of their own name;
-    those that turn the head move no shape, see :func:`head_angles`. Order and count need not agree. Clamp what comes
+    those that turn the head move no shape. Order and count need not agree. Clamp what comes
     out to [0,1]: two expressions may share a shape.
 
     Args:
@@ -98,15 +97,3 @@ def character_matrix(names: Sequence[str], shapes: Sequence[str]) -> Tensor:
             f"({', '.join(list(names)[:5])}, ...) moves any, expected ARKit's names; see torchface retarget"
         )
     return matrix
-
-
-def head_angles(names: Sequence[str]) -> Tensor:
-    """Yaw and roll of the head in degrees that a weight of 1 of each example means, (N,2).
-
-    Example:
-        >>> names = [expression.name for expression in paper_expressions()]
-        >>> head_angles(names)[-2:].tolist()
-        [[0.0, 15.0], [0.0, -15.0]]
-    """
-    known = {one.name: (one.yaw, one.roll) for one in paper_expressions()}
-    return torch.tensor([known.get(name, (0.0, 0.0)) for name in names])

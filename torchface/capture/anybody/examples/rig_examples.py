@@ -26,15 +26,12 @@ _DISTANCE = 600.0  # millimetres from the camera to the face, as one sits before
 _NECK = (0.0, -60.0, -90.0)  # millimetres from between the eyes to where a head turns about
 
 
-def rig_examples(
-    rig: BlendshapeRig, names: Sequence[str] | None = None, landmark_vertices: Tensor | None = None
-) -> ExampleShapes:
+def rig_examples(rig: BlendshapeRig, names: Sequence[str] | None = None) -> ExampleShapes:
     """A rig's own shapes as examples, and after them the four of the paper that turn and tilt the head.
 
     Args:
         rig: with its 68 landmarks annotated, unless they are given.
         names: of the shapes to take; all that move a landmark by more than rounding if absent.
-        landmark_vertices: (68,), in iBUG's order.
 
     Raises:
         NameMismatchError: the rig lacks a shape.
@@ -45,7 +42,7 @@ def rig_examples(
         >>> rig_examples(performer(texture=False), ["jawOpen", "browInnerUp"]).names
         ('jawOpen', 'browInnerUp', 'rotate_left', 'rotate_right', 'tilt_left', 'tilt_right')
     """
-    marks = _marks(rig, landmark_vertices)
+    marks = _marks(rig)
     moves = rig.deltas[:, marks].norm(dim=-1).amax(1) > 1e-4
     taken = [name for name, seen in zip(rig.names, moves.tolist(), strict=True) if seen] if names is None else names
     if not taken:
@@ -57,12 +54,11 @@ def rig_examples(
     return _examples(rig, marks, poses, torch.cat([weights, weights.new_zeros(len(turns), len(rig.names))]))
 
 
-def paper_examples(rig: BlendshapeRig, landmark_vertices: Tensor | None = None) -> ExampleShapes:
+def paper_examples(rig: BlendshapeRig) -> ExampleShapes:
     """The paper's 15 expressions, in its order, as a rig with ARKit's shapes shows them.
 
     Args:
         rig: with its 68 landmarks annotated, unless they are given.
-        landmark_vertices: (68,), in iBUG's order.
 
     Raises:
         NameMismatchError: the rig has no shape that one of the expressions means.
@@ -74,7 +70,7 @@ def paper_examples(rig: BlendshapeRig, landmark_vertices: Tensor | None = None) 
         >>> len(examples.names), examples.names[0]
         (15, 'brow_lower_left')
     """
-    marks = _marks(rig, landmark_vertices)
+    marks = _marks(rig)
     shown = [one for one in paper_expressions() if one.name != NEUTRAL]
     weights = character_matrix([one.name for one in shown], rig.names).to(rig.deltas).T.clamp(0, 1)
     still = [one.name for one, row in zip(shown, weights, strict=True) if one.shapes and not bool(row.any())]
@@ -85,11 +81,9 @@ def paper_examples(rig: BlendshapeRig, landmark_vertices: Tensor | None = None) 
     return _examples(rig, marks, shown, weights)
 
 
-def _marks(rig: BlendshapeRig, landmark_vertices: Tensor | None) -> Tensor:
+def _marks(rig: BlendshapeRig) -> Tensor:
     annotations = rig.neutral.annotations
-    marks = landmark_vertices
-    if marks is None and annotations is not None:
-        marks = annotations.landmarks
+    marks = None if annotations is None else annotations.landmarks
     if marks is None or marks.shape != (68,):
         found = "no landmarks" if marks is None else f"{tuple(marks.shape)}"
         raise ShapeError(f"rig: found {found}, expected the 68 of iBUG annotated: torchface pick")

@@ -16,8 +16,6 @@ _BROWS, _JAW, _NOSE = slice(17, 27), slice(0, 17), 30
 # to cut. The outer lips leave space for the inner ones.
 _LIPS = (((61, 49, 50), (67, 58, 59)), ((62, 51), (66, 57)), ((63, 52, 53), (65, 55, 56)))
 _LIDS = (((37,), (41,)), ((38,), (40,)), ((43,), (47,)), ((44,), (46,)))
-CONTOURS = (tuple(range(48, 60)), tuple(range(60, 68)), tuple(range(36, 42)), tuple(range(42, 48)))
-"""Lips outside and inside, and the two eyes: closed lines that no triangle may cross."""
 
 
 def with_forehead(landmarks: Tensor, jaw_margin: float = 0.0) -> Tensor:

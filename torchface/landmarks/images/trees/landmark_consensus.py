@@ -14,7 +14,7 @@ from torch import Tensor
 from torchface.errors import ShapeError, ValueRangeError
 from torchface.landmarks.images.face_reading import confidence_of
 from torchface.landmarks.images.ibug_68 import MIRROR_68
-from torchface.landmarks.images.trees.landmark_trees import LandmarkTrees, initial_shapes, similarity_to
+from torchface.landmarks.images.trees.landmark_trees import LandmarkTrees, initial_shapes
 
 REACH = 1.1
 """How far the image that trees are shown reaches from the middle of a box, in its sides."""
@@ -114,12 +114,6 @@ def consensus(
     weight = 1 / (1 + (distance / _OUTLYING).square())
     mean = (shapes * weight).sum(0) / weight.sum(0)
     return Consensus(mean, ((shapes - mean) / side).square().sum(-1).mean(0).sqrt())
-
-
-def tilt_of(trees: LandmarkTrees, landmarks: Tensor) -> float:
-    """How far landmarks (L,2) are turned against the trees' mean shape, radians, clockwise as the image is seen."""
-    rotation = similarity_to(trees.mean, landmarks[None].to(trees.mean))[0]
-    return math.atan2(float(rotation[1, 0]), float(rotation[0, 0]))
 
 
 def _cut(grey: np.ndarray, box: Tensor, side: float, wanted: int) -> tuple[np.ndarray, Tensor, Tensor]:

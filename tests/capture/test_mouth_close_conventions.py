@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from torchface import BlendshapeRig, Track, load_rig, load_take
-from torchface.capture.mouth_close import (
+from torchface.capture.mouth_close_conventions import (
     jaw_into_mouth_close,
     jaw_out_of_mouth_close,
     mouth_close_of,

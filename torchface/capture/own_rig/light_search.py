@@ -1,4 +1,4 @@
-"""The search for a lamp: directions all round, then Gauss-Newton with the strengths eliminated, shadows cast anew."""
+"""The search for a light source: directions all round, then Gauss-Newton with the strengths eliminated."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ _LEAST_WIDTH = 3.0 / 255  # sRGB; a few steps of the file are no outlier
 _WIDTH = 2.5  # medians of the residuals; some 3.7 deviations of normal noise in three channels
 _STARTS, _KEPT, _APART = 100, 3, 30.0  # directions tried, refined, and degrees between those
 _FEW = 700  # vertices that are enough to tell a good direction from a bad one
-_USUAL = 1000.0  # millimetres at which lamps are looked for first
-_NEAREST = 250.0  # millimetres; nearer, a lamp would be in the image, and soft light would pass for such a one
-_MAX_GLOSS = 0.3  # beside the lamp's strength; more would be a mirror, and could pass for light from the front
-_SHININESS = 16.0  # Blinn's exponent; skin under a soft lamp
+_USUAL = 1000.0  # millimetres at which sources are looked for first
+_NEAREST = 250.0  # millimetres; nearer, a source would be in the image, and soft light would pass for such a one
+_MAX_GLOSS = 0.3  # beside the source's strength; more would be a mirror, and could pass for light from the front
+_SHININESS = 16.0  # Blinn's exponent; skin under a soft source
 _NARROWING = (1.0, 0.5)
 _ROUNDS, _ROUNDS_NEAR, _STEPS, _DONE = 10, 3, 20, 1e-4
 
 
 @dataclass(frozen=True, eq=False)
-class Lamp:
+class LightSource:
     """A unit direction (3,) from the middle of what was seen, and the inverse of the distance from there, 1/mm."""
 
     direction: Tensor
@@ -38,21 +38,21 @@ class Lamp:
 
 
 @dataclass(frozen=True, eq=False)
-class LampFit:
-    """A lamp and what comes with it.
+class SourceFit:
+    """A source and what comes with it.
 
     Args:
-        lamp: where it stands.
+        source: where it stands.
         factors: of the columns, none negative, (3,3).
-        lit: 1 where the lamp reaches, else 0, (Q,).
-        columns: how vertices look under ambient light, under the lamp without gloss, under the lamp with all the gloss
-            that skin has, (3,Q,3).
+        lit: 1 where the source reaches, else 0, (Q,).
+        columns: how vertices look under ambient light, under the source without gloss, and with all the gloss that
+            skin has, (3,Q,3).
         residuals: shaded albedo minus frame, sRGB, (Q,3); 0 where blown out.
         trust: robust weight of each vertex, in (0,1], (Q,).
         cost: the objective.
     """
 
-    lamp: Lamp
+    source: LightSource
     factors: Tensor
     lit: Tensor
     columns: Tensor
@@ -67,7 +67,7 @@ class LampFit:
 
     @property
     def intensity(self) -> Tensor:
-        """Strength of the lamp, (3,)."""
+        """Strength of the source, (3,)."""
         return self.factors[1] + self.factors[2]
 
     @property
@@ -76,26 +76,26 @@ class LampFit:
         return _MAX_GLOSS * self.factors[2]
 
 
-def find_lamp(seen: SeenSkin) -> LampFit:
-    """The lamp that explains best what was seen; see ``estimate_light``."""
+def find_source(seen: SeenSkin) -> SourceFit:
+    """The source that explains best what was seen; see ``estimate_light``."""
     starts, width = _starts(seen.thinned(_FEW))
     found = [_settled(seen, start, width) for start in starts]  # a few; each casts its own shadows
     return min(found, key=lambda one: (_width(one.residuals, seen), one.cost))
 
 
-def information(seen: SeenSkin, fit: LampFit) -> Tensor:
+def information(seen: SeenSkin, fit: SourceFit) -> Tensor:
     """Curvature of the objective over two angles across the direction (radians) and the nearness, (3,3)."""
     return _normal_equations(seen, fit)[0]
 
 
-def _starts(seen: SeenSkin) -> tuple[list[LampFit], float]:
+def _starts(seen: SeenSkin) -> tuple[list[SourceFit], float]:
     """The best of directions all round, some degrees apart, and the robust estimator's width at the very best."""
     number = torch.arange(_STARTS, dtype=torch.float64)
     z = 1 - 2 * (number + 0.5) / _STARTS
     azimuth = number * math.pi * (3 - math.sqrt(5))
     directions = torch.stack([(1 - z * z).sqrt() * azimuth.cos(), (1 - z * z).sqrt() * azimuth.sin(), z], dim=1)
-    lamps = [Lamp(direction, 1 / _USUAL) for direction in directions]
-    tried = [_with_factors(seen, lamp) for lamp in lamps]  # a lamp at a time: each casts its own shadows
+    sources = [LightSource(direction, 1 / _USUAL) for direction in directions]
+    tried = [_with_factors(seen, source) for source in sources]  # a source at a time: each casts its own shadows
     width = min(_width(one.residuals, seen) for one in tried)
     costs = torch.tensor([_cost(one.residuals, seen, width) for one in tried])
     chosen: list[int] = []
@@ -105,7 +105,7 @@ def _starts(seen: SeenSkin) -> tuple[list[LampFit], float]:
     return [tried[i] for i in chosen[:_KEPT]], width
 
 
-def _settled(seen: SeenSkin, start: LampFit, width: float) -> LampFit:
+def _settled(seen: SeenSkin, start: SourceFit, width: float) -> SourceFit:
     """Refined with an estimator that narrows, so that a large foreign shadow lets go; at last as wide as what is left.
 
     What is left at the median, not the objective, then says which start was right: each has its own outliers.
@@ -115,13 +115,13 @@ def _settled(seen: SeenSkin, start: LampFit, width: float) -> LampFit:
     return _refined(seen, start, min(width, _width(start.residuals, seen)))
 
 
-def _refined(seen: SeenSkin, start: LampFit, width: float) -> LampFit:
+def _refined(seen: SeenSkin, start: SourceFit, width: float) -> SourceFit:
     """Levenberg's steps over direction and nearness; the strengths are at their optimum all the time."""
-    now, damping = _with_factors(seen, start.lamp, width, start.factors), 1e-3
+    now, damping = _with_factors(seen, start.source, width, start.factors), 1e-3
     H, g = _normal_equations(seen, now)
     for _ in range(_STEPS):
         step = -torch.linalg.solve(H + damping * H.diagonal().clamp(min=1e-9).diag(), g)
-        then = _with_factors(seen, _moved(now.lamp, step, 1 / MAX_DISTANCE, 1 / _NEAREST), width, now.factors)
+        then = _with_factors(seen, _moved(now.source, step, 1 / MAX_DISTANCE, 1 / _NEAREST), width, now.factors)
         if then.cost >= now.cost:  # too far, or shadows that fell otherwise
             damping *= 8
             if damping > 1e4:
@@ -134,11 +134,11 @@ def _refined(seen: SeenSkin, start: LampFit, width: float) -> LampFit:
     return now
 
 
-def _moved(lamp: Lamp, step: Tensor, least: float, most: float) -> Lamp:
+def _moved(source: LightSource, step: Tensor, least: float, most: float) -> LightSource:
     """Across the direction by at most half a radian, and in nearness within bounds."""
     direction_step = step[:2] * min(1.0, 0.5 / max(float(step[:2].norm()), 1e-12))
-    direction = torch.nn.functional.normalize(lamp.direction + direction_step @ _tangents(lamp.direction), dim=0)
-    return Lamp(direction, min(max(lamp.nearness + float(step[2]) / _USUAL, least), most))
+    direction = torch.nn.functional.normalize(source.direction + direction_step @ _tangents(source.direction), dim=0)
+    return LightSource(direction, min(max(source.nearness + float(step[2]) / _USUAL, least), most))
 
 
 def _tangents(direction: Tensor) -> Tensor:
@@ -149,13 +149,15 @@ def _tangents(direction: Tensor) -> Tensor:
     return torch.stack([first, torch.linalg.cross(direction, first)])
 
 
-def _with_factors(seen: SeenSkin, lamp: Lamp, width: float | None = None, factors: Tensor | None = None) -> LampFit:
-    """The best factors for a lamp, by reweighted least squares from some, else from plain least squares.
+def _with_factors(
+    seen: SeenSkin, source: LightSource, width: float | None = None, factors: Tensor | None = None
+) -> SourceFit:
+    """The best factors for a source, by reweighted least squares from some, else from plain least squares.
 
     Without a width the residuals themselves give one, anew in each round: from afar, most look like outliers.
     """
-    lit = seen.lit_by(lamp.position(seen.centre)).double()
-    reflected = _reflected(seen, lamp)
+    lit = seen.lit_by(source.position(seen.centre)).double()
+    reflected = _reflected(seen, source)
     diffuse, gloss = seen.albedo * (lit * reflected.falling)[:, None], (lit * reflected.gloss)[:, None].expand(-1, 3)
     columns = torch.stack([seen.albedo, diffuse, diffuse + _MAX_GLOSS * gloss])
     coded = to_srgb(seen.colors)
@@ -175,14 +177,14 @@ def _with_factors(seen: SeenSkin, lamp: Lamp, width: float | None = None, factor
         factors = _factors(columns, shaded - residuals * slope, weight)
         shaded, residuals, trust = compared(factors)
     cost = math.nan if width is None else _cost(residuals, seen, width)
-    return LampFit(lamp, factors, lit, columns, residuals, trust, cost)
+    return SourceFit(source, factors, lit, columns, residuals, trust, cost)
 
 
 @dataclass(frozen=True, eq=False)
 class _Reflection:
     """Cosine of the falling light and Blinn's highlight at Q vertices, as if nothing threw a shadow, (Q,) each.
 
-    ``falling_moved`` and ``gloss_moved``, (Q,3), are their derivatives by the two angles across the lamp's direction
+    ``falling_moved`` and ``gloss_moved``, (Q,3), are their derivatives by the two angles across the source's direction
     and by its nearness in units of that of the usual distance.
     """
 
@@ -192,9 +194,9 @@ class _Reflection:
     gloss_moved: Tensor
 
 
-def _reflected(seen: SeenSkin, lamp: Lamp) -> _Reflection:
+def _reflected(seen: SeenSkin, source: LightSource) -> _Reflection:
     aside = seen.points - seen.centre
-    way = lamp.direction - lamp.nearness * aside
+    way = source.direction - source.nearness * aside
     length = way.norm(dim=1, keepdim=True)
     toward = way / length
     between = toward - torch.nn.functional.normalize(seen.points, dim=1)
@@ -204,9 +206,11 @@ def _reflected(seen: SeenSkin, lamp: Lamp) -> _Reflection:
     faces = (cosine > 0).double()
 
     def moved(slope: Tensor) -> Tensor:
-        """By the lamp's place, where ``slope`` (Q,3) is by the unit vector toward it."""
+        """By the source's place, where ``slope`` (Q,3) is by the unit vector toward it."""
         across = (slope - (slope * toward).sum(1, keepdim=True) * toward) / length
-        return torch.cat([across @ _tangents(lamp.direction).T, -(across * aside).sum(1, keepdim=True) / _USUAL], dim=1)
+        return torch.cat(
+            [across @ _tangents(source.direction).T, -(across * aside).sum(1, keepdim=True) / _USUAL], dim=1
+        )
 
     tilt = (seen.normals - shine[:, None] * half) / width
     steep = faces * _SHININESS * shine ** (_SHININESS - 1)
@@ -236,9 +240,9 @@ def _factors(columns: Tensor, wanted: Tensor, weight: Tensor) -> Tensor:
     return (best * scale).T
 
 
-def _normal_equations(seen: SeenSkin, fit: LampFit) -> tuple[Tensor, Tensor]:
-    """H (3,3) and g (3,) of the lamp's place, with the strengths' directions projected out (variable projection)."""
-    reflected = _reflected(seen, fit.lamp)
+def _normal_equations(seen: SeenSkin, fit: SourceFit) -> tuple[Tensor, Tensor]:
+    """H (3,3) and g (3,) of the source's place, with the strengths' directions projected out (variable projection)."""
+    reflected = _reflected(seen, fit.source)
     slope = _slope((fit.factors[:, None] * fit.columns).sum(0))
     root = (seen.valid * (seen.area * fit.trust)[:, None]).sqrt()
     H, g = torch.zeros(3, 3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64)
