@@ -234,10 +234,6 @@ def submesh(mesh: Mesh, keep: Tensor) -> Submesh:
         mesh: the whole.
         keep: a boolean mask (V,) or vertex ids (K,) int64; order of the whole is kept.
 
-    Raises:
-        ShapeError: the mask is not (V,).
-        ValueRangeError: nothing is kept.
-
     Example:
         >>> square = torch.tensor([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
         >>> piece = submesh(Mesh(square, torch.tensor([[0, 1, 2], [0, 2, 3]])), torch.tensor([0, 2, 3]))

@@ -36,9 +36,6 @@ def checked_number(
         above: the range is open at ``least``.
         error: what is raised.
 
-    Raises:
-        TorchfaceError: ``error``, for NaN, infinity, a number out of range, or what is no number.
-
     Example:
         >>> checked_number("ridge", 0.5)
         0.5

@@ -238,9 +238,6 @@ def _merged_correctives(correctives: Correctives, renamed: Mapping[str, str]) ->
     Args:
         correctives: of the rig before.
         renamed: for each shape what it is called afterwards; a shape that is not in it keeps its name.
-
-    Raises:
-        NameMismatchError: two drivers of one combination became one shape.
     """
     groups: dict[tuple[str, ...], list[int]] = {}
     for row, definition in enumerate(correctives.definitions):

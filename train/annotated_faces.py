@@ -64,9 +64,6 @@ def load_faces(path: Path, folders_are_people: bool = False) -> Faces:
     Args:
         path: of either.
         folders_are_people: pictures of a folder show one person; else each shows its own, a mirrored copy the same.
-
-    Raises:
-        FileFormatError: neither of both, no annotated face in it, or an image is missing.
     """
     found: list[tuple[Path, Tensor]] = []
     if path.suffix.lower() == ".xml":

@@ -80,10 +80,6 @@ def read_capture(folder: Path, neutral: Path | None) -> Capture:
         folder: of OBJ, PLY, STL or OFF meshes, ``.glb`` animations, mesh sequences (``.safetensors``) and ``.npz``
             files with ``vertices`` (T,V,3), millimetres, and ``faces`` (F,3).
         neutral: a mesh file; ``neutral.*`` in the folder if absent.
-
-    Raises:
-        FileFormatError: no such folder, no frames, no neutral, or a broken file.
-        TopologyError: a sequence is of another mesh than the neutral.
     """
     if not folder.is_dir():
         raise FileFormatError(f"{folder}: found no such folder, expected one of sequences of meshes")
@@ -166,11 +162,6 @@ def gather(capture: Capture, path: Path, progress: Progress) -> tuple[MeshSequen
 
     Returns:
         The frames, and the number of each frame's sequence, (K,) int64.
-
-    Raises:
-        ValueRangeError: a frame holds NaN.
-        TopologyError: a frame has another number of vertices.
-        FileFormatError: a file cannot be read, or the disk is full.
     """
     counts = torch.tensor([sequence.count for sequence in capture.sequences])
     numbers = torch.arange(len(counts)).repeat_interleave(counts)

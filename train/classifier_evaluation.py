@@ -124,9 +124,6 @@ def level_agreement(found: Tensor, truth: Tensor, levels: int = 4) -> dict[str, 
     Returns:
         ``exact`` and ``within_one``: the fraction of frames in which every unit is at the true level, or at most one
         level from it; ``active_within_one``: the same over frames in which a unit is at level 1 at least in truth.
-
-    Raises:
-        ShapeError: the shapes differ.
     """
     if found.shape != truth.shape or found.ndim != 2:
         raise ShapeError(f"intensities: found {tuple(found.shape)} and {tuple(truth.shape)}, expected (T,A) twice")

@@ -61,9 +61,6 @@ class StoredEyePictures(Dataset[tuple[Tensor, ...]]):
     Args:
         paths: of the files, in their order.
         begin, end: which of the pictures; all to the last if ``end`` is absent.
-
-    Raises:
-        FileFormatError: a file is missing or holds something else.
     """
 
     def __init__(self, paths: Sequence[Path], begin: int = 0, end: int | None = None) -> None:

@@ -35,9 +35,6 @@ class StoredPictures(Dataset[tuple[Tensor, ...]]):
     Args:
         paths: of the files, in their order.
         count: how many of the pictures, the first; all if absent.
-
-    Raises:
-        FileFormatError: a file is missing or holds something else.
     """
 
     def __init__(self, paths: Sequence[Path], count: int | None = None) -> None:
@@ -65,9 +62,6 @@ class StoredCutOuts:
     Args:
         paths: of the files, in their order.
         begin, end: which of the pictures; all to the last if ``end`` is absent.
-
-    Raises:
-        FileFormatError: a file is missing or holds something else.
     """
 
     def __init__(self, paths: Sequence[Path], begin: int = 0, end: int | None = None) -> None:

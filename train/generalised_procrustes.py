@@ -52,10 +52,6 @@ def generalised_procrustes(
         initial_mean: where the mean is to lie, (V,3); where the first shape lies if absent.
         progress: called with each step and how far it is.
 
-    Raises:
-        ShapeError: no (M,V,3), or an initial mean or weights that do not fit.
-        ValueRangeError: a shape holds NaN or infinity.
-
     Source: Gower 1975; thesis 3.2.4.
     """
     progress = progress or silent

@@ -93,10 +93,6 @@ def gather(source: Source, held_out: int, work: Path, template: Mesh | None, pro
         work: the folder of the files.
         template: of the same topology; says where the heads are to stand. The first mesh, upright, if absent.
         progress: called with each step and how far it is.
-
-    Raises:
-        TopologyError: a mesh has another topology than the template.
-        ValueRangeError: a mesh is in another unit than the template, or the template than millimetres.
     """
     first = source.read(0)
     name = source.names[0] if template is None else "template"

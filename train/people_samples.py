@@ -136,9 +136,6 @@ def gather(
         work: folder of the files.
         where: the people are from, for messages.
         progress: called with each step and how far it is.
-
-    Raises:
-        TorchfaceError: people of different topology, or without an expression that all have.
     """
     make_folder(work)
     first = read(0)

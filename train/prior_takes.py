@@ -81,11 +81,6 @@ def read_takes(
         rig: of the performer of marker takes.
         attachment: where the markers sit on the rig.
         progress: called with each step and how far it is.
-
-    Raises:
-        FileFormatError: there are no takes, or one cannot be read.
-        NameMismatchError: two takes have different shapes, or a take has markers and there is no rig or attachment.
-        ValueRangeError: a take holds NaN, or neither weights nor markers.
     """
     progress = progress or silent
     if not folder.is_dir():
@@ -174,9 +169,6 @@ def renamed(takes: PriorTakes, names: Sequence[str]) -> tuple[PriorTakes, tuple[
 
     Returns:
         The takes, each renamed as it is read, and the shapes that they say nothing of, which stay at 0.
-
-    Raises:
-        NameMismatchError: the takes have none of the shapes.
     """
     matrix = mapping(takes.names, names).double()
     silent = tuple(name for name, row in zip(names, matrix, strict=True) if not row.any())

@@ -31,9 +31,6 @@ def read_settings(path: Path, kind: type[Settings]) -> Settings:
     Args:
         path: of a TOML file.
         kind: a dataclass.
-
-    Raises:
-        FileFormatError: there is no such file, it names what is no setting, or a value is of another kind.
     """
     return _table(read_toml(path), kind)
 

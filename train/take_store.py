@@ -67,9 +67,6 @@ class TakesOnDisk(Sequence[Tensor]):
 
     Args:
         paths: of the files.
-
-    Raises:
-        FileFormatError: a file is missing or damaged.
     """
 
     def __init__(self, paths: Sequence[Path]) -> None:

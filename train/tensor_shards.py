@@ -25,10 +25,6 @@ class Shards:
     Args:
         paths: of the files, in the order of the rows; at least one.
         names: of the tensors, of as many rows each, one at least, in every file.
-
-    Raises:
-        FileFormatError: a file is missing, cut off, without one of the tensors, or they have another form than in the
-            first file.
     """
 
     def __init__(self, paths: Sequence[Path], names: Sequence[str]) -> None:

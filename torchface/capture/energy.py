@@ -25,9 +25,6 @@ class Quadratic:
         H: (N,N) for all frames, or (B,N,N).
         f: (B,N), or (1,N) for all frames.
         constant: :math:`c`, (B,) or (1,); it moves no minimum, it makes energies comparable.
-
-    Raises:
-        ShapeError: the parts do not fit each other.
     """
 
     H: Tensor
@@ -76,10 +73,6 @@ def marker_term(basis: Tensor, rest: Tensor, targets: Tensor) -> Quadratic:
 
     Returns:
         The term in mm² a marker. A frame without any marker gets a term of zero.
-
-    Raises:
-        ShapeError: the shapes do not fit each other.
-        ValueRangeError: a target is infinite.
 
     Source: thesis 4.1.4, equation 33, and appendix, with f's factor 2 and the sign of its targets restored.
     """

@@ -29,9 +29,6 @@ class CorrectiveActivation(nn.Module):
         definitions: C correctives.
         names: of the N shapes.
 
-    Raises:
-        NameMismatchError: a driver is no shape, or a corrective has a shape's name.
-
     Example:
         >>> both = CorrectiveActivation([Corrective("ab", ("a", "b")), Corrective("a50", ("a",), 0.5)], ["a", "b"])
         >>> both(torch.tensor([[0.5, 1.0], [0.75, 0.0]])).tolist()

@@ -50,9 +50,6 @@ def at_moments(frames: Tensor, moments: Tensor, vertex_weights: Tensor) -> Tenso
 
     Returns:
         (T,V,3).
-
-    Raises:
-        ShapeError: the shapes do not fit.
     """
     if frames.ndim != 3 or len(moments) != len(vertex_weights) or vertex_weights.shape[1] != frames.shape[1]:
         raise ShapeError(

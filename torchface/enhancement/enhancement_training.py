@@ -123,11 +123,6 @@ def learn_frames(
         key: of the settings; with the frames' own content it says whether a checkpoint is of this run.
         folder: of the checkpoint; none is kept if absent.
         progress: called with the frames that are done.
-
-    Raises:
-        ValueRangeError: a frame holds NaN.
-        TopologyError: a frame does not look like the neutral's mesh.
-        FileFormatError: the disk is full, or the frames' file cannot be read.
     """
     frames, coarse = performance.frames, performance.coarse
     count, size = len(frames), encoder.detail.size

@@ -49,11 +49,6 @@ class ThinShell:
         bending: :math:`k_b`, square millimetres.
         level: vertices at most on which the shell is solved; 30,000, or twelve a point, if absent.
 
-    Raises:
-        ShapeError: fewer than 12 points.
-        TopologyError: a point is not on the mesh.
-        ValueRangeError: the constants are negative, or the points do not hold the shell.
-
     Source: facial_performance_enhancement 5.1; Bickel, Lang, Botsch, Otaduy, Gross 2008, section 3.
     """
 
@@ -119,9 +114,6 @@ class ThinShell:
 
         Returns:
             (T,V,3), millimetres; NaN in frames where fewer than 12 points were seen.
-
-        Raises:
-            ShapeError: not (T,M,3).
         """
         seen = torch.isfinite(displacements).all(-1)
         self._check(displacements, seen)
@@ -151,9 +143,6 @@ class ThinShell:
 
         Returns:
             (T,V,3), millimetres; NaN in frames where fewer than 12 points were seen.
-
-        Raises:
-            ShapeError: not (T,M,3).
         """
         seen = torch.isfinite(points).all(-1).cpu()
         self._check(points, seen)
@@ -229,9 +218,6 @@ def rigid_motion(rest: Tensor, points: Tensor) -> Similarity:
     Returns:
         The motion of every frame from rest, scale 1: least squares in which a point that is :math:`r` from where the
         motion has it counts as :math:`1 / (1 + (r / 3)^2)`.
-
-    Raises:
-        ShapeError: a frame shows fewer than three points.
     """
     every = rest.expand_as(points)
     pose = similarity_transform(every, points, scale=False)

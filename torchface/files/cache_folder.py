@@ -16,9 +16,6 @@ def cache_folder(kind: str) -> Path:
 
     Args:
         kind: a plain name, such as ``app``.
-
-    Raises:
-        FileFormatError: it cannot be made.
     """
     return make_folder(_root() / kind)
 

@@ -24,9 +24,6 @@ def write_checkpoint(path: Path, tensors: Mapping[str, Tensor], key: str) -> Non
         path: of the file; its folder must be there.
         tensors: by name.
         key: of what the tensors were made of, see :func:`~torchface.files.content_keys.content_key`.
-
-    Raises:
-        FileFormatError: the file cannot be written.
     """
     packed = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
     write_file(path, save(packed, {"format": _FORMAT, "key": key, "content": _content(packed)}))

@@ -28,9 +28,6 @@ def content_key(method: str, **inputs: object) -> str:
 
     Returns:
         Sixty-four hex digits.
-
-    Raises:
-        TypeError: an input is of another kind.
     """
     digest = hashlib.sha256()
     for part in (method, __version__, inputs):

@@ -145,9 +145,6 @@ def read_json(path: str | Path, marker: str | None = None, max_bytes: int = _MAX
         path: of the file.
         marker: what its field ``format`` must be.
         max_bytes: a larger file is refused.
-
-    Raises:
-        FileFormatError: the file is missing, too large, no JSON or of another format.
     """
     return _read(path, parse_json, "JSON", marker, max_bytes)
 

@@ -19,9 +19,6 @@ def import_extra(module: str, package: str, extra: str, job: str) -> Any:
         package: what users know it as, such as ``scikit-learn``.
         extra: of torchface, that installs it.
         job: what needs it, for the message.
-
-    Raises:
-        MissingExtraError: it is not installed.
     """
     try:
         return importlib.import_module(module)

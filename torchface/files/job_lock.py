@@ -35,10 +35,6 @@ def job_lock(folder: str | Path) -> Iterator[Path]:
 
     Returns:
         The folder.
-
-    Raises:
-        ValueRangeError: another run is writing into it.
-        FileFormatError: it cannot be made or written to.
     """
     folder = Path(folder)
     path = folder.resolve() / LOCK
@@ -61,10 +57,6 @@ def file_lock(file: str | Path, *endings: str) -> Iterator[Path]:
 
     Returns:
         The file.
-
-    Raises:
-        ValueRangeError: another run is writing it.
-        FileFormatError: it has another ending, or its folder cannot be made or written to.
     """
     file = Path(file)
     if endings:

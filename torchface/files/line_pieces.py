@@ -22,9 +22,6 @@ def line_pieces(
         start: where to begin.
         end: where to stop; the end of the text if absent.
         unread: beginnings of lines that nobody reads: those of any length are left out.
-
-    Raises:
-        FileFormatError: a line is longer than a piece.
     """
     end = len(data) if end is None else end
     while start < end:

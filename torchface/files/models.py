@@ -67,10 +67,6 @@ def write_model(
 
     Returns:
         The record as written.
-
-    Raises:
-        FileFormatError: the folder cannot be written to.
-        ValueRangeError: the state or a metric is not finite.
     """
     odd = [name for name, value in record.metrics.items() if not math.isfinite(value)]
     if odd:
@@ -120,9 +116,6 @@ def read_model(folder: str | Path, kinds: Mapping[str, type[Model]]) -> Model:
 
     The kind is looked up in ``kinds``; no file names code. The module is built without memory first, and its state
     held against the file's size, header and hash, in this order, before anything is read into it.
-
-    Raises:
-        FileFormatError: a file is missing, cut off, damaged, of a newer format or another kind, or does not fit.
     """
     folder = Path(folder)
     record = _known_record(folder, kinds)

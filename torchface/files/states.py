@@ -29,9 +29,6 @@ def pack_state(state: Mapping[str, Tensor], half: Collection[str] = ()) -> bytes
     Args:
         state: finite tensors by name.
         half: names of float tensors that are stored in half precision.
-
-    Raises:
-        ValueRangeError: a tensor is NaN or infinite, also in half precision, or ``half`` names none of the state.
     """
     unknown = sorted(set(half) - set(state))
     if unknown:
@@ -60,9 +57,6 @@ def read_state(
         expected: the module's own state; tensors on the meta device will do.
         size: how many bytes the file should have.
         kind: of the model, for keys that were renamed; see ``state_renames``.
-
-    Raises:
-        FileFormatError: the file is cut off, is no safetensors file, holds other tensors than the module has, or NaN.
     """
     try:
         check_size(path, size)

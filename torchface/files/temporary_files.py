@@ -40,9 +40,6 @@ def new_temporary(path: Path, mode: int = 0o666) -> tuple[int, Path]:
 
     Returns:
         The descriptor and the temporary path.
-
-    Raises:
-        OSError: it cannot be made.
     """
     while True:
         temporary = temporary_name(path)

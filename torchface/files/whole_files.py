@@ -72,9 +72,6 @@ def replaced_file(path: str | Path) -> Iterator[Path]:
 
     Returns:
         The temporary path: an empty file beside ``path``.
-
-    Raises:
-        FileFormatError: it cannot be written; an ``OSError`` of the block is taken for one of its writing.
     """
     with _replaced(Path(path)) as (_, temporary):
         yield temporary
@@ -86,9 +83,6 @@ def all_or_none() -> Iterator[None]:
 
     An error before leaves all that was there before, an error while they do brings it back. Whatever reads one of them
     inside the block finds the one before.
-
-    Raises:
-        FileFormatError: they cannot be put into their places.
     """
     if (whole := _waiting.get()) is not None:  # a part of a larger whole
         begin = len(whole)
@@ -170,9 +164,6 @@ def check_ending(path: str | Path, *endings: str) -> None:
     Args:
         path: of the file.
         endings: those that it may have, with their dots, lower case; upper case will do, too.
-
-    Raises:
-        FileFormatError: another ending, or none.
 
     Example:
         >>> check_ending("weights.CSV", ".csv")

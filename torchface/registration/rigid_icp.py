@@ -123,9 +123,6 @@ def find_pose(samples: Samples, scan: ScanPoints) -> Fit:
     """The similarity that lays the template on the scan, found from starts in all directions.
 
     Few points of the template from 400 rotations, then more of them from the best of these, and all from the best few.
-
-    Raises:
-        AlignmentError: even the best fits badly.
     """
     all_rotations = _rotations(_ROTATIONS)
     one = torch.ones(len(all_rotations), dtype=torch.float64)

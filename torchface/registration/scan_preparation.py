@@ -120,14 +120,7 @@ def check_same_hand(own: Tensor, points: Tensor, name: str = "landmarks") -> Non
 
 
 def check_landmarks(landmarks: Landmarks, template: Mesh, scan: SurfaceIndex) -> tuple[Landmarks, Similarity, str]:
-    """The landmarks that can be used, the similarity they give, and a note of what was left out ("" if nothing).
-
-    Raises:
-        ShapeError: not (L,) and (L,3), or fewer than three are left.
-        TopologyError: a vertex id outside the template.
-        ValueRangeError: they lie on a line, or off the scan.
-        AlignmentError: no similarity brings the template's landmarks near the scan's, or only a reflection does.
-    """
+    """The landmarks that can be used, the similarity they give, and a note of what was left out ("" if nothing)."""
     ids, points = landmarks[0].detach().cpu(), landmarks[1].detach().cpu().double()
     if ids.ndim != 1 or points.shape != (len(ids), 3) or ids.dtype != torch.int64:
         raise ShapeError(

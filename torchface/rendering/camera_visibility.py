@@ -47,9 +47,6 @@ def shown_in(
         points: millimetres.
         normals: unit.
         calibration: of a lens that bends the image; none if absent.
-
-    Raises:
-        ShapeError: the image is not of the camera's size.
     """
     if image.ndim != 3 or image.shape != (3, camera.height, camera.width):
         raise ShapeError(f"images: found {tuple(image.shape)}, expected (3,{camera.height},{camera.width})")

@@ -61,11 +61,6 @@ class FacePaint:
             mesh: with texture coordinates.
             texture: red, green, blue (sRGB) and alpha, (4,h,w), uint8 or in [0,1], first row on top; alpha 0 leaves
                 the video as it is.
-
-        Raises:
-            TopologyError: the mesh has no texture coordinates.
-            ShapeError: the texture is not (4,h,w).
-            ValueRangeError: its values are outside of [0,1].
         """
         if mesh.uvs is None or mesh.uv_faces is None:
             raise TopologyError("overlay: found a mesh without texture coordinates, expected some to paint by")
@@ -123,10 +118,6 @@ def overlay(
     Returns:
         A frame of the same kind; the same where the face lies outside.
 
-    Raises:
-        ShapeError: the frame is not of the camera's size, or the vertices are not the mesh's.
-        ValueRangeError: NaN in the vertices.
-
     Source: thesis 4.2.11 and figure 80.
     """
     image = _checked(frame, vertices, paint.mesh, camera)
@@ -173,10 +164,6 @@ def relight(
 
     Returns:
         A frame of the same kind.
-
-    Raises:
-        ShapeError: the frame is not of the camera's size, or vertices or share are not the mesh's.
-        ValueRangeError: NaN in the vertices.
 
     Source: thesis 4.2.11 and figure 80.
     """

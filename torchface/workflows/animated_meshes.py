@@ -73,11 +73,6 @@ def load_animated(path: Path, rig: Path | None = None, part: str | None = None) 
             names.
         rig: what weights move, or the rig whose topology the meshes have.
         part: keep this annotated region only, such as ``face``.
-
-    Raises:
-        FileFormatError: the file is none of these, or broken.
-        NameMismatchError: weights without a rig, or for other shapes; or no such part.
-        TopologyError: the meshes of a folder differ in topology, or have another one than the rig.
     """
     loaded = None if rig is None else load_rig(rig)
     ending = path.suffix.lower()

@@ -54,10 +54,6 @@ def prepare_annotation(video: Path, folder: Path, track: Tracker, count: int = 1
         track: finds the landmarks; called only where it must be.
         count: how many frames.
         key: of what the tracker's landmarks depend on beside the video.
-
-    Raises:
-        FileFormatError: the video cannot be decoded, or the folder holds proposals for another one.
-        ValueRangeError: the face was never found, or the count is out of range.
     """
     if not 1 <= count <= _MAX_FRAMES:
         raise ValueRangeError(f"count: found {count}, expected 1 to {_MAX_FRAMES}")
@@ -89,9 +85,6 @@ def write_proposals(annotation: Annotation) -> list[Path]:
 
     Returns:
         The files with landmarks, new and old.
-
-    Raises:
-        FileFormatError: the folder cannot be written to.
     """
     paths = []
     for frame in annotation.frames:

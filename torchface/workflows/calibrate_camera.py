@@ -39,9 +39,6 @@ class Board:
     Args:
         columns, rows: of inner corners, where four squares meet.
         square: a square's side, millimetres.
-
-    Raises:
-        ValueRangeError: fewer than three corners a side, or a side that is not positive.
     """
 
     columns: int = 9
@@ -159,9 +156,6 @@ def find_boards(
         images: names and images, uint8 (H,W), of one size.
         board: the checkerboard.
         progress: called with the number of images done.
-
-    Raises:
-        ShapeError: the images differ in size.
     """
     views: list[View] = []
     left_out: list[tuple[str, str]] = []
@@ -216,9 +210,6 @@ def calibrate_views(views: Sequence[View], board: Board, left_out: Sequence[tupl
         views: with the board, of one size.
         board: the checkerboard.
         left_out: images without it, and why; those left out here are added.
-
-    Raises:
-        AlignmentError: fewer than five views, views that are all parallel, or ones that leave the focal length open.
     """
     left = list(left_out)
     _check_count(views, left)

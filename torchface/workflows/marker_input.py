@@ -80,11 +80,6 @@ def read_markers(path: Path, labels: Sequence[str] | None, options: MarkerOption
         path: ``.c3d``, ``.trc`` or ``.csv``.
         labels: the attachment's; all labelled markers of the file where there is none.
         options: unit and label map.
-
-    Raises:
-        ValueRangeError: the file holds no markers.
-        NameMismatchError: its labels are not the attachment's.
-        FileFormatError: a file is damaged.
     """
     take = load_take(path, options.unit)
     if take.markers is None:
@@ -143,9 +138,6 @@ def read_range_of_motion(
         path: ``.c3d``, ``.trc`` or ``.csv``.
         initial: sites to begin with, if there are any.
         options: unit, label map, frames.
-
-    Raises:
-        TorchfaceError: as ``read_markers`` and ``frame_span``.
     """
     take, notes = read_markers(path, None if initial is None else initial.labels, options)
     take = take.frames(frame_span(options.frames, len(take)))

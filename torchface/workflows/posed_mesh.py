@@ -55,10 +55,6 @@ def load_posed(
         take: the pose from a frame of a weight take instead.
         frame: which.
         part: keep this annotated region only.
-
-    Raises:
-        NameMismatchError: a mesh without shapes cannot be posed, or a name means no shape of the rig.
-        ValueRangeError: the take holds no weights, or has no such frame.
     """
     if weights or take is not None:
         if path.suffix.lower() in MESH_ENDINGS:

@@ -63,13 +63,7 @@ def retarget_weights(
     progress: Progress | None = None,
     poses: Path | None = None,
 ) -> Retargeted:
-    """Reads, maps, writes; see ``torchface retarget --help`` for the arguments.
-
-    Raises:
-        ValueRangeError: the file holds no weights.
-        NameMismatchError: the names do not fit.
-        TorchfaceError: any file is broken.
-    """
+    """Reads, maps, writes; see ``torchface retarget --help`` for the arguments."""
     progress = progress or silent
     files.check()
     progress("reading")

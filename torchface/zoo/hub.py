@@ -60,13 +60,7 @@ def hub_reference(text: str) -> HubReference | None:
 
 
 def fetch_description(reference: HubReference) -> Path:
-    """A folder on this machine with a repository's ``model.toml`` and ``CARD.md``.
-
-    Raises:
-        MissingExtraError: ``huggingface_hub`` is not installed.
-        NameMismatchError: there is no such repository or revision, or this user has no access to it.
-        FileFormatError: it has another layout, a file is too large, or it cannot be reached and was not fetched before.
-    """
+    """A folder on this machine with a repository's ``model.toml`` and ``CARD.md``."""
     folder = _fetched(reference, DESCRIPTION, _MAX_DESCRIPTION_BYTES).parent
     _fetch_card(reference)
     return folder
@@ -77,9 +71,6 @@ def fetch_model(reference: HubReference) -> Path:
 
     The description is read first. The state is fetched only where its kind is known and its size is what the
     description says and no more than the config asks for; whoever loads it checks its hash.
-
-    Raises:
-        as :func:`fetch_description`; and FileFormatError: the state is not what the description says.
     """
     folder = _fetched(reference, DESCRIPTION, _MAX_DESCRIPTION_BYTES).parent
     record = check_claims(folder, KINDS)

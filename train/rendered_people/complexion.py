@@ -42,9 +42,6 @@ def complexion_colors(complexions: Tensor) -> Tensor:
 
     Returns:
         sRGB colours (N,V,3) of ``neutral_head()``'s vertices, in [0,1].
-
-    Raises:
-        ShapeError: no (N,6).
     """
     if complexions.ndim != 2 or complexions.shape[1] != len(COMPLEXION):
         raise ShapeError(f"complexions: found {tuple(complexions.shape)}, expected (N,{len(COMPLEXION)})")

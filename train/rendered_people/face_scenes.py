@@ -55,9 +55,6 @@ class CutOuts:
     Args:
         pictures: red, green, blue, and 0 where nobody is, uint8 (N,4,S,S).
         landmarks: iBUG's 68 of each, (N,68,2) pixels.
-
-    Raises:
-        ShapeError: they do not fit each other.
     """
 
     pictures: Tensor

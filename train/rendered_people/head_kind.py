@@ -104,9 +104,6 @@ def people_kind(rig: BlendshapeRig, modes: IdentityModes) -> HeadKind:
     Args:
         rig: the whole head with its expressions.
         modes: of identity, of the same topology.
-
-    Raises:
-        ShapeError: the rig is not ICT-FaceKit's whole head.
     """
     notes = rig.neutral.annotations
     if notes is None or notes.landmarks is None or "eyeball_left" not in notes.regions:

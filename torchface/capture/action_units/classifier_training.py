@@ -232,10 +232,6 @@ def intensity_levels(images: Tensor, at_rest: Tensor, levels: int = 4, seed: int
     Returns:
         (T,) int64 from 0 to ``levels - 1``.
 
-    Raises:
-        ShapeError: ``at_rest`` is not (T,), or no frame is at rest.
-        ValueRangeError: fewer frames than levels, or frames that do not differ.
-
     Source: thesis 4.1.11.
     """
     if at_rest.shape != images.shape[:1] or not bool(at_rest.any()):

@@ -55,10 +55,6 @@ class OneVsOne(nn.Module):
             features: (T,K).
             classes: (T,) int64; every class from 0 to C-1 occurs.
             penalty: C of the machine, the penalty of a margin violation.
-
-        Raises:
-            ShapeError: the shapes do not fit.
-            ValueRangeError: a class never occurs.
         """
         count = self.first_class.shape[1]
         if features.shape != (len(classes), self.weight.shape[1]):

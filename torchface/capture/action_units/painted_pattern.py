@@ -50,9 +50,6 @@ def pattern_levels(neutral: Tensor, names: Sequence[str]) -> PatternLevels:
         neutral: regions of an image of the face at rest, (R,h,w) in [0,1].
         names: of the regions.
 
-    Raises:
-        ValueRangeError: a region shows no pattern: too little contrast, or too much or too little of it.
-
     Source: Otsu 1979; thesis 4.1.9.
     """
     skin, paint = [], []
@@ -100,9 +97,6 @@ def neutral_flow(own: Tensor, reference: Tensor, method: Method = "dis") -> Tens
 
     Returns:
         u, (R,h,w,2), pixels of the region, x first.
-
-    Raises:
-        ShapeError: the patterns differ in shape.
 
     Source: Farnebäck 2003; Kroeger et al. 2016; thesis 4.1.12.
     """

@@ -56,10 +56,6 @@ def region_grid(boxes: Mapping[str, Box], names: Sequence[str], size: int, width
         names: which regions, R, in which order.
         size: pixels a side that every region is brought to.
         width, height: of the image.
-
-    Raises:
-        NameMismatchError: a region has no box.
-        ValueRangeError: a box reaches out of the image.
     """
     lacking = [name for name in names if name not in boxes]
     if lacking:
@@ -85,9 +81,6 @@ def sample_regions(frames: Tensor, grid: Tensor, transforms: Tensor) -> Tensor:
         frames: (t,H,W), floats.
         grid: pixels of the neutral image, (R,h,w,2).
         transforms: neutral image to frame, (t,2,3).
-
-    Raises:
-        ShapeError: the shapes do not fit.
     """
     if frames.ndim != 3 or grid.ndim != 4 or transforms.shape != (len(frames), 2, 3):
         raise ShapeError(

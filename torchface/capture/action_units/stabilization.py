@@ -27,9 +27,6 @@ class PointTracker:
         helmet: a point of the helmet, (2,), pixels.
         markers: (M,2), pixels.
 
-    Raises:
-        AlignmentError: a point lies outside the image, or there is nothing to track there.
-
     Source: Lucas and Kanade 1981, Bouguet 2001; thesis 4.1.10.
     """
 
@@ -119,10 +116,6 @@ def steady_transforms(reference: Tensor, tracked: Tensor) -> Tensor:
 
     Returns:
         (T,2,3): a pixel (x,y,1) of the reference is at ``transform @ (x,y,1)`` in frame t.
-
-    Raises:
-        ShapeError: the shapes do not fit, or fewer than two points.
-        AlignmentError: a point was lost in more than a fifth of the frames.
     """
     if reference.ndim != 2 or len(reference) < 2 or tracked.shape[1:] != reference.shape:
         raise ShapeError(f"points: found {tuple(reference.shape)} and {tuple(tracked.shape)}, expected (P,2), (T,P,2)")

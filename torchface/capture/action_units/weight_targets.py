@@ -134,9 +134,6 @@ def smooth_intensities(
         windows: of the Savitzky-Golay filter by unit, frames at 60 a second; ``WINDOW`` for the others.
         fps: frames a second; a window lasts as long at any rate.
 
-    Raises:
-        ShapeError: ``intensities`` is not (T,A).
-
     Source: thesis 4.1.12.
     """
     if intensities.ndim != 2 or intensities.shape[1] != len(units):

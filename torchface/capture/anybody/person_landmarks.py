@@ -38,9 +38,6 @@ class PersonLandmarks(nn.Module):
         identity_modes: what a standard deviation of each of K ways of being another person adds to the landmarks,
             (K,68,3), millimetres; what finders differ by alone if absent.
         coefficients: D, at most 204.
-
-    Raises:
-        ShapeError: the rig has no landmarks, or the modes are others.
     """
 
     rest: Tensor
@@ -145,9 +142,6 @@ def likeliest_differences(identity_modes: Tensor | None, count: int) -> tuple[Te
     Returns:
         What a standard deviation of each adds to each landmark, (68,3,D), millimetres, and the variance of a coordinate
         that they leave out, (68,), mm².
-
-    Raises:
-        ShapeError: the modes are not (K,68,3), or not 1 to 204 coefficients.
     """
     modes = torch.zeros(0, LANDMARKS, 3) if identity_modes is None else identity_modes.detach().cpu()
     if modes.shape[1:] != (LANDMARKS, 3) or not 1 <= count <= 3 * LANDMARKS:

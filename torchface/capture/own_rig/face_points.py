@@ -53,10 +53,6 @@ class FacePoints:
             rig: N shapes.
             landmark_vertices: vertex ids in iBUG's order, (68,).
             slides: contour landmarks slide; otherwise they stay at their vertices, visible or not.
-
-        Raises:
-            ShapeError: not 68 vertices.
-            ValueRangeError: a vertex that the rig lacks.
         """
         count = len(rig.vertices)
         marks = landmark_vertices.detach().long().to(rig.vertices.device)

@@ -77,10 +77,6 @@ def measure_poses(
     Returns:
         ``HeadPoses``. Frames with fewer than six stable landmarks that agree are not found.
 
-    Raises:
-        ShapeError: the shapes do not fit each other.
-        AlignmentError: no frame has enough.
-
     Source: thesis 4.2.4.
     """
     settings = settings or PoseSettings()

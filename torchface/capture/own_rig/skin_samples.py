@@ -100,10 +100,6 @@ def seen_skin(
         cameras: one a frame.
         weights: of the vertices, (V,); 0 leaves one out.
         calibration: of a lens that bends the image.
-
-    Raises:
-        AlignmentError: too few are to be seen.
-        ValueRangeError: a black face, or an albedo that is the frame's own.
     """
     parts, casters = [], []
     for t, camera in enumerate(cameras):  # a frame at a time: each has a mesh of its own

@@ -179,13 +179,7 @@ class VideoSolverParts(nn.Module):
 
     @classmethod
     def from_config(cls, config: Mapping[str, Any]) -> VideoSolverParts:
-        """A solver of zeros for the state to be loaded into, without the rig it came from.
-
-        Raises:
-            NameMismatchError: a name is no text or there twice, or a prior is for other shapes.
-            FileFormatError: a size or a prior is not what it should be.
-            ValueRangeError: a setting is not.
-        """
+        """A solver of zeros for the state to be loaded into, without the rig it came from."""
         names = config["names"]
         if not isinstance(names, list) or not all(isinstance(n, str) for n in names) or len(set(names)) < len(names):
             raise NameMismatchError(f"names: found {names!r:.80}, expected a list of distinct names")

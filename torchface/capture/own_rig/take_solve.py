@@ -43,10 +43,6 @@ def solve_take(
         whole_take: each frame is solved from all frames, with a dynamics prior; without one, frames that show no face
             lie between those before and after.
         progress: called with how many frames are solved.
-
-    Raises:
-        ShapeError: the shapes do not fit each other.
-        ValueRangeError: no frame shows six trusted landmarks, or times do not rise.
     """
     if seconds is not None and solver.dynamics is not None:
         frame_intervals(seconds, len(landmarks), solver.settings.interval)  # checks them

@@ -17,9 +17,6 @@ def name_matrices(learned: Sequence[str], names: Sequence[str]) -> tuple[Tensor,
 
     See :func:`torchface.shape_names.mapping`; a shape of the rig that the prior has not learned has a row of zeros in
     the second.
-
-    Raises:
-        NameMismatchError: less than half of the rig's shapes are among those learned.
     """
     there, back = mapping(names, learned), mapping(learned, names)
     known = back.any(1)

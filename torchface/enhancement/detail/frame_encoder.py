@@ -71,10 +71,6 @@ class FrameAlignment:
 
         Returns:
             Displacements (B,V,3), and the similarity of scale 1 from where the frames were.
-
-        Raises:
-            AlignmentError: their size is not the neutral's: another unit.
-            TopologyError: their vertices do not lie as the neutral's: another order.
         """
         count, vertices, _ = frames.shape
         # The first vertex goes to the origin before any rounding to means.

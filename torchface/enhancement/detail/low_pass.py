@@ -65,9 +65,6 @@ class LowPass:
 
         Returns:
             (B,V,C), of the same dtype and device.
-
-        Raises:
-            ShapeError: they are not of this mesh.
         """
         if displacements.ndim != 3 or displacements.shape[1] != len(self._masses):
             raise ShapeError(f"low_pass: found {tuple(displacements.shape)}, expected (B,{len(self._masses)},C)")

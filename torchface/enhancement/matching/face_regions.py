@@ -106,10 +106,6 @@ def regions_of_motion(
     Returns:
         The regions; each is connected but for parts of the mesh that hang on nothing.
 
-    Raises:
-        ShapeError: shapes do not fit each other.
-        ValueRangeError: too little moves for so many regions, or a number is out of its range.
-
     Source: Tena, De la Torre, Matthews 2011; Facial Performance Enhancement Using Dynamic Shape Space Analysis,
     section 4.3.
     """

@@ -46,9 +46,6 @@ def motion_clusters(
     Returns:
         The cluster of each patch, (P,), from 0 to ``count`` - 1.
 
-    Raises:
-        ValueRangeError: nothing moves, or there are fewer patches that move than clusters.
-
     Source: Tena, De la Torre, Matthews 2011, Interactive region-based linear 3D face models, section 3.
     """
     pairs = _joined(pairs, centres)

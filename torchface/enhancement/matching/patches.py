@@ -35,10 +35,6 @@ def grow_patches(faces: Tensor, vertex_count: int, size: int = 100, seed: int = 
         The patch of each triangle, (F,) int64, numbered from 0 without gaps. Every patch is connected by edges, and
         every part of the mesh has one at least.
 
-    Raises:
-        ShapeError: no triangles, or a triangle has a vertex that the mesh has not.
-        ValueRangeError: the size or the seed is no whole number in its range.
-
     Source: Facial Performance Enhancement Using Dynamic Shape Space Analysis, section 4.2.
     """
     checked_count("size", size, 1)

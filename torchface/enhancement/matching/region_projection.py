@@ -77,9 +77,6 @@ class RegionProjection:
         ridge: :math:`\epsilon`, as a share of the database's mean squared distance from its mean.
         temporal: :math:`\tau`, likewise; frames are then solved one after the other.
 
-    Raises:
-        ShapeError: the shapes do not fit each other.
-
     Source: Facial Performance Enhancement Using Dynamic Shape Space Analysis, equations 2 and 3; the last two terms
     are not in it.
     """
@@ -108,9 +105,6 @@ class RegionProjection:
         Args:
             features: of the frames, (T,P,9); differentiable.
             previous: weights of the frame before the first, (R,K).
-
-        Raises:
-            ShapeError: the features are of other patches.
         """
         if features.ndim != 3 or features.shape[1:] != (self.patch_count, len(_UNITS)):
             raise ShapeError(f"features: found {tuple(features.shape)}, expected (T,{self.patch_count},9)")

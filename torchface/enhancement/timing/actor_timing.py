@@ -47,10 +47,6 @@ class ActorTiming:
         sequences: the number of each captured frame's sequence, (K,).
         weights: of patches in each region, (R,P).
         fps: of the captured frames.
-
-    Raises:
-        ShapeError: the shapes do not fit.
-        ValueRangeError: no sequence has two frames.
     """
 
     def __init__(self, database: Tensor, sequences: Tensor, weights: Tensor, fps: float) -> None:
@@ -66,10 +62,6 @@ class ActorTiming:
             keyframes: features of both, (2,P,C).
             frames: at even distance, both keyframes counted.
             length: of the motion, in frames of the database.
-
-        Raises:
-            ShapeError: features of other patches.
-            ValueRangeError: the keyframes are equal, or fewer than two frames.
         """
         checked_count("frames", frames, 2)
         checked_number("length", length, above=True)
@@ -127,9 +119,6 @@ class LearnedTiming:
 
         Returns:
             None where the region has fewer than ``LEAST_MOTIONS`` motions.
-
-        Raises:
-            ShapeError: the shapes do not fit.
         """
         if database.ndim != 3 or sequences.shape != database.shape[:1] or region.shape != database.shape[1:2]:
             raise ShapeError(
@@ -164,10 +153,6 @@ class LearnedTiming:
             keyframes: features of both, (2,P,C).
             frames: at even distance, both keyframes counted, at least 2.
             length: of the motion, in frames of the database.
-
-        Raises:
-            ShapeError: features of other patches.
-            ValueRangeError: the keyframes are equal in this region.
         """
         checked_count("frames", frames, 2)
         checked_number("length", length, above=True)

@@ -36,9 +36,6 @@ def project_sequence(alpha: Tensor, beta: Tensor) -> SequenceProjection:
         alpha: the frames, (m,D).
         beta: the sequence to project onto, (n,D), of two frames at least.
 
-    Raises:
-        ShapeError: the shapes do not fit, or ``beta`` is no sequence.
-
     Source: Facial Performance Enhancement Using Dynamic Shape Space Analysis, section 6.1, equations 5 and 6. Changed:
     order is held inside segments too.
     """

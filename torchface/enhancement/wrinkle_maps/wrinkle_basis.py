@@ -77,10 +77,6 @@ def learn_wrinkle_basis(
         areas: of the vertices, (V,).
         count: M, of maps.
 
-    Raises:
-        ShapeError: they are not of the same vertices.
-        ValueRangeError: there is no detail, or fewer frames than maps.
-
     Source: Ding, Li, Jordan 2010, Convex and semi-nonnegative matrix factorizations.
     """
     checked_count("maps", count, 1)

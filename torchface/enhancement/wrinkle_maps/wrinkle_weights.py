@@ -117,10 +117,6 @@ class WrinkleWeights(nn.Module):
             region_names: of the regions.
             sites: vertices to look at, (S,); some 2,000, evenly picked, if absent.
             components: numbers that are kept a region.
-
-        Raises:
-            ShapeError: the shapes do not fit each other.
-            ValueRangeError: NaN or infinity, or fewer than two poses.
         """
         regions, vertices = region_weights.shape
         shapes = poses.shape[1:] == neutral.shape == (vertices, 3) and weights.shape[:2] == (len(poses), regions)
@@ -260,9 +256,6 @@ class RigWrinkles(nn.Module):
     Args:
         wrinkles: learned for the rig.
         rig: with or without correctives.
-
-    Raises:
-        TopologyError: it is another rig's.
     """
 
     moved: Tensor

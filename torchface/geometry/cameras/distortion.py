@@ -27,9 +27,6 @@ def distort(pixels: Tensor, calibration: CameraCalibration) -> Tensor:
     Returns:
         Pixels in the camera's images, (...,2).
 
-    Raises:
-        ShapeError: the last dimension is not 2.
-
     Source: Brown 1966, as in OpenCV; thesis 4.2.4.
     """
     K, coefficients = _parts(pixels, calibration)
@@ -49,9 +46,6 @@ def undistort(pixels: Tensor, calibration: CameraCalibration) -> Tensor:
     Returns:
         Pixels of the pinhole camera, (...,2); NaN so far outside of the calibrated image that the model folds back
         and nothing is seen there.
-
-    Raises:
-        ShapeError: the last dimension is not 2.
 
     Source: thesis 4.2.4.
     """

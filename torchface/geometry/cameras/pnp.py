@@ -51,11 +51,6 @@ def solve_pnp(
     Returns:
         ``Pose(rotation (B,3,3), translation (B,3), errors (B,))`` in float64.
 
-    Raises:
-        ShapeError: the shapes do not fit each other.
-        ValueRangeError: fewer than four points are seen, or a point or weight is not finite.
-        AlignmentError: the points seen lie on a line, or no pose has them all in front of the camera.
-
     Source: thesis 3.2.5, equation 12; DeMenthon and Davis 1995.
     """
     x, q, K, w = _checked(points, pixels, intrinsics, weights)

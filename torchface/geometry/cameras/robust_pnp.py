@@ -59,10 +59,6 @@ def robust_pnp(
         ``RobustPose(pose, inliers (B,N))`` in float64. Frames with fewer than four points seen, or four that agree,
         have no pose: NaN.
 
-    Raises:
-        ShapeError: the shapes do not fit each other.
-        ValueRangeError: the threshold is not positive, or a point or weight not finite.
-
     Source: Ke and Roumeliotis 2017 (AP3P); Fischler and Bolles 1981; thesis 4.2.4.
     """
     x, q, K, w = _checked(points, pixels, intrinsics, weights)

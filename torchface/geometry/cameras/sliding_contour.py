@@ -47,9 +47,6 @@ def level_curves(vertices: Tensor, faces: Tensor, starts: Tensor) -> LevelCurves
 
     Returns:
         For each start the crossings of its height with the mesh's edges on its side of the face, not behind it.
-
-    Raises:
-        ShapeError: the shapes are not as above.
     """
     if vertices.ndim != 2 or vertices.shape[1] != 3 or faces.ndim != 2 or faces.shape[1] != 3 or starts.ndim != 1:
         raise ShapeError(

@@ -87,10 +87,6 @@ class GradientReconstruction:
 
         Returns:
             Vertices (N,V,3), float64.
-
-        Raises:
-            ShapeError: a shape is not as above.
-            ValueRangeError: a value is NaN or infinite.
         """
         self._check(gradients, positions, pinned)
         prepared = self.prepare(pinned, constraints)

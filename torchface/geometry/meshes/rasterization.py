@@ -92,11 +92,6 @@ def rasterise_uvs(uvs: Tensor, uv_faces: Tensor, height: int, width: int) -> Tex
         uvs: texture coordinates, origin at the lower left, (U,2).
         uv_faces: their rows at each triangle's corners, (F,3) int64.
         height, width: texels.
-
-    Raises:
-        ShapeError: a tensor has the wrong shape, or a side is not positive.
-        ValueRangeError: a texture coordinate is NaN or infinite.
-        TopologyError: triangles overlap so much that this is no layout.
     """
     if uvs.ndim != 2 or uvs.shape[1] != 2 or uv_faces.ndim != 2 or uv_faces.shape[1] != 3:
         raise ShapeError(f"uvs: found {tuple(uvs.shape)} and {tuple(uv_faces.shape)}, expected (U,2) and (F,3)")
@@ -174,9 +169,6 @@ def rasterise(points: Tensor, nearness: Tensor, faces: Tensor, height: int, widt
         nearness: larger is nearer, linear in the image, as the inverse depth is, (V,).
         faces: (F,3) int64, counter-clockwise as seen from in front.
         height, width: of the image, pixels.
-
-    Raises:
-        ShapeError: points and nearness do not fit each other, or faces are not (F,3).
     """
     if points.ndim != 2 or points.shape[1] != 2 or nearness.shape != points.shape[:1]:
         raise ShapeError(f"points: found {tuple(points.shape)} and {tuple(nearness.shape)}, expected (V,2) and (V,)")

@@ -46,9 +46,6 @@ class SurfaceIndex:
     Args:
         vertices: (V,3), millimetres.
         faces: (F,3) int64, at least one; triangles without area count as the segments or points that they are.
-
-    Raises:
-        ShapeError: there is no triangle.
     """
 
     def __init__(self, vertices: Tensor, faces: Tensor) -> None:

@@ -59,9 +59,6 @@ def tangent_space(vertices: Tensor, faces: Tensor, uvs: Tensor, uv_faces: Tensor
         uv_faces: (F,3) int64.
         normals: unit vertex normals, (V,3).
 
-    Raises:
-        ShapeError: the tensors do not belong together.
-
     Source: Mikkelsen 2008, Simulation of Wrinkled Surfaces Revisited; glTF 2.0 specification, 3.7.2.1 and 3.9.3.
     """
     if vertices.shape != normals.shape or faces.shape != uv_faces.shape:

@@ -34,9 +34,6 @@ def check_unit(name: str, points: Tensor, beside: float, what: str, least: float
         beside: the extent to be expected, millimetres; see :func:`extent`.
         what: has that extent, such as ``"a template"``.
         least, most: the ratios of the extents that are taken.
-
-    Raises:
-        ValueRangeError: the extent is out of these.
     """
     size = extent(points)
     ratio = size / max(beside, 1e-30)

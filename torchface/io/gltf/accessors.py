@@ -33,9 +33,6 @@ def read_floats(
         where: who asks, for errors.
         types: what D may be, such as ``("VEC3",)``.
         count: the C that it must be.
-
-    Raises:
-        FileFormatError: another type or count, data outside the buffer, NaN or infinity.
     """
     accessor = document.item("accessors", index, where)
     rows = _read(document, accessor, f"accessors[{index}]", types, count)

@@ -34,9 +34,6 @@ def read_gltf_weights(path: str | Path) -> Take | None:
         weights (T,N,1), by the names of the morph targets. Of several meshes with a shape of one name the first's
         weights count; correctives follow the others and are left out. Frames that come unevenly have their times in
         ``extras["seconds"]``, from 0.
-
-    Raises:
-        FileFormatError: not glTF 2, broken, or keys that are no frames: out of order, or with gaps of ten frames.
     """
     document = read_document(path)
     weights: dict[str, np.ndarray] = {}

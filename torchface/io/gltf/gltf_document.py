@@ -230,9 +230,6 @@ def glb_pieces(root: dict[str, Any], buffers: BufferWriter, source: str | Path =
         root: nodes, meshes, materials and what else the document has.
         buffers: of its accessors.
         source: names it in errors.
-
-    Raises:
-        FileFormatError: it would pass the format's 4 GB.
     """
     root = {
         "asset": {"version": "2.0", "generator": "torchface"},

@@ -49,11 +49,6 @@ def write_gltf_rig(
         detail: wrinkle maps of its shapes, see ``torchface.io.gltf.wrinkle_maps``, or of its regions, see
             ``torchface.io.gltf.region_textures``.
         keys: an animation of its shapes, linear between keys.
-
-    Raises:
-        FileFormatError: the folder cannot be written to.
-        TopologyError: the mesh has no triangle, or wrinkle maps and no texture coordinates.
-        NameMismatchError: a wrinkle map belongs to no shape of the rig.
     """
     _write(path, rig.neutral, *all_targets(rig), keys and _with_correctives(rig, keys), detail, _definitions(rig))
 

@@ -33,9 +33,6 @@ def instances(document: Document) -> list[Instance]:
     """What the default scene shows; without a scene all root nodes, without nodes all meshes.
 
     A skinned mesh stands where its skeleton's rest pose puts it, so its node does not move it.
-
-    Raises:
-        FileFormatError: nodes in a cycle or with two parents, a broken transform, or more than 4096 instances.
     """
     meshes = document.objects("meshes")
     nodes = document.objects("nodes")

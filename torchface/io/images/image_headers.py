@@ -69,9 +69,6 @@ def read_header(data: bytes, source: str) -> ImageHeader | None:
     Args:
         data: the whole file.
         source: names it in errors.
-
-    Raises:
-        FileFormatError: a kind that is not read, a broken header, or a file built to exhaust a decoder.
     """
     try:
         if data.startswith(_PNG):

@@ -67,10 +67,6 @@ def decode_samples(data: bytes, source: str, planes: int = 3) -> Samples:
         data: the whole file.
         source: names it in errors.
         planes: that the caller makes of it.
-
-    Raises:
-        FileFormatError: no image, a broken one, one of a kind that is not read, a decompression bomb, or floating-point
-            values outside [0,1].
     """
     header = read_header(data, source)
     if header is None:

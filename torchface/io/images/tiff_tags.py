@@ -40,9 +40,6 @@ def first_directory(data: bytes, source: str) -> dict[int, tuple[int, ...]]:
     Args:
         data: a TIFF or BigTIFF, or the content of an EXIF block.
         source: names it in errors.
-
-    Raises:
-        FileFormatError: it is cut off, or its tags claim more than there is.
     """
     values: dict[int, tuple[int, ...]] = {}
     try:

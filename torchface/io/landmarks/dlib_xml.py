@@ -47,9 +47,6 @@ def load_dlib_faces(path: str | Path) -> list[LabelledFace]:
     Returns:
         The faces in the file's order; those without landmarks have points (0,2). Boxes marked to be ignored are left
         out.
-
-    Raises:
-        FileFormatError: not XML, entities, or not dlib's layout.
     """
     path = Path(path)
     reader = _Reader(path)

@@ -67,9 +67,6 @@ def load_landmark_table(path: str | Path) -> LandmarkTable:
     Args:
         path: the file, of one face.
 
-    Raises:
-        FileFormatError: the columns are others, a frame has several rows, or a cell is no number.
-
     Source: OpenFace wiki, "Output Format"; py-feat's ``Fex``.
     """
     path = Path(path)

@@ -37,9 +37,6 @@ def load_landmarks_csv(path: str | Path) -> Take:
     Returns:
         landmarks (T,L,2) in pixels, float32, with the frame's confidence for each.
 
-    Raises:
-        FileFormatError: a landmark lacks one of its columns, a row has another number of cells, or a cell is no number.
-
     Source: OpenFace wiki, "Output Format".
     """
     path = Path(path)
@@ -78,11 +75,6 @@ def save_landmarks_csv(take: Take, path: str | Path) -> None:
     Args:
         take: landmarks (T,L,2), pixels.
         path: the file; it appears only when it is complete.
-
-    Raises:
-        ValueRangeError: the take has no landmarks, infinite positions, or an absurd rate.
-        NameMismatchError: a name is empty, or begins or ends in a blank.
-        ShapeError: a kept column has another length than the take.
 
     Source: OpenFace wiki, "Output Format".
     """

@@ -57,11 +57,6 @@ def load_c3d(path: str | Path, unit: str | None = None) -> Take:
     Returns:
         markers in millimetres, float32.
 
-    Raises:
-        FileFormatError: the file is damaged or cut off, holds no point or no frame or not one seen position, or its
-            unit, axes or rate are unknown.
-        ValueRangeError: ``unit`` is unknown.
-
     Source: The C3D File Format User Guide, Motion Lab Systems.
     """
     path = Path(path)
@@ -184,10 +179,6 @@ def save_c3d(take: Take, path: str | Path) -> None:
     Args:
         take: markers (T,M,3), millimetres, at most 65,535; labels of at most 255 bytes.
         path: the file; it appears only when it is complete.
-
-    Raises:
-        ValueRangeError: the take has no markers, infinite positions, too many frames or points, or an absurd rate.
-        NameMismatchError: a label is empty, too long, or begins or ends in a blank.
 
     Source: The C3D File Format User Guide, Motion Lab Systems.
     """

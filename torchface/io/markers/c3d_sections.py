@@ -161,9 +161,6 @@ def pack_sections(header: Header, groups: dict[str, dict[str, Parameter]], path:
     """Header and parameter section for data that begin right behind them, Intel byte order.
 
     Both ``header.data_block`` and ``POINT:DATA_START`` are filled in here.
-
-    Raises:
-        ValueRangeError: the parameters need more than the 255 blocks that the format has for them.
     """
 
     def section(data_block: int) -> bytes:

@@ -23,9 +23,6 @@ def load_label_map(path: str | Path) -> dict[str, str]:
         Jane:*,
 
     The heading may be left out; an empty second cell leaves the marker out, or all markers of a subject.
-
-    Raises:
-        FileFormatError: the file is no such table, or has a label of the take twice.
     """
     path = Path(path)
     try:

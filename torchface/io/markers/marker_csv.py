@@ -33,10 +33,6 @@ def load_markers_csv(path: str | Path, unit: str | None = None) -> Take:
 
     Returns:
         markers in millimetres, float32.
-
-    Raises:
-        FileFormatError: a marker lacks one of its columns, a row has another number of cells, or a cell is no number.
-        ValueRangeError: ``unit`` is unknown.
     """
     path = Path(path)
     factor = millimetres("mm", path, "unit", unit)
@@ -62,10 +58,6 @@ def save_markers_csv(take: Take, path: str | Path) -> None:
     Args:
         take: markers (T,M,3), millimetres. What else it holds is left out.
         path: the file; it appears only when it is complete.
-
-    Raises:
-        ValueRangeError: the take has no markers, infinite positions, or an absurd rate.
-        NameMismatchError: a label is empty, or begins or ends in a blank.
     """
     path = Path(path)
     labels, positions = values_to_write(take.markers, "marker positions", 3, path)

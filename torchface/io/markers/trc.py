@@ -42,11 +42,6 @@ def load_trc(path: str | Path, unit: str | None = None) -> Take:
     Returns:
         markers in millimetres, float32.
 
-    Raises:
-        FileFormatError: the header lacks a field, counts disagree with the rows, a row has another number of cells, or
-            a cell is no number.
-        ValueRangeError: ``unit`` is unknown.
-
     Source: OpenSim documentation, "Marker (.trc) Files".
     """
     path = Path(path)
@@ -123,10 +118,6 @@ def save_trc(take: Take, path: str | Path) -> None:
     Args:
         take: markers (T,M,3), millimetres.
         path: the file; it appears only when it is complete.
-
-    Raises:
-        ValueRangeError: the take has no markers, infinite positions, or an absurd rate.
-        NameMismatchError: a label is empty, begins or ends in a blank, or holds a tab or a line break.
 
     Source: OpenSim documentation, "Marker (.trc) Files".
     """

@@ -27,10 +27,6 @@ def read_obj(path: str | Path, unit: str = "mm") -> Mesh:
     Args:
         path: the file; its material library and image are looked for beside it, never outside its folder.
         unit: the file's unit, ``"mm"``, ``"cm"`` or ``"m"``.
-
-    Raises:
-        FileFormatError: not an OBJ, no face, a number that is none, NaN, or an image that cannot be read.
-        TopologyError: a face names a vertex that is not there.
     """
     path, scale = Path(path), millimetres_per(unit)
     statements = read_statements(path, read_file(path))
@@ -52,10 +48,6 @@ def read_obj_vertices(path: str | Path, neutral: Mesh, topology: bytes | None, u
         neutral: the mesh at rest.
         topology: ``face_bytes`` of the neutral's file; a shape with the same bytes there is not parsed further.
         unit: the file's unit.
-
-    Raises:
-        FileFormatError: not an OBJ, or NaN.
-        TopologyError: another number of vertices, or other faces.
     """
     path, data = Path(path), read_file(path)
     table = read_vertices(path, data)
@@ -99,9 +91,6 @@ def write_obj_shapes(mesh: Mesh, shapes: Iterable[tuple[str, Tensor]], neutral: 
         mesh: the neutral, as ``write_obj`` wrote it.
         shapes: the name and the vertices (V,3) of each; its file is called so.
         neutral: the mesh's own file.
-
-    Raises:
-        FileFormatError: the folder cannot be written to.
     """
     surface, material = _surface_lines(mesh), _material_line(mesh, Path(neutral))
     with all_or_none():

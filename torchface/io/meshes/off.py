@@ -25,9 +25,6 @@ def read_off(path: str | Path, unit: str = "mm") -> Mesh:
     Args:
         path: the file.
         unit: the file's unit, ``"mm"``, ``"cm"`` or ``"m"``.
-
-    Raises:
-        FileFormatError: not an OFF, truncated, without faces, a face names a vertex that is not there, or NaN.
     """
     path, scale = Path(path), millimetres_per(unit)
     lines = _filled_lines(path, read_file(path))

@@ -25,10 +25,6 @@ def read_ply(path: str | Path, unit: str = "mm") -> Mesh:
     Args:
         path: the file.
         unit: the file's unit, ``"mm"``, ``"cm"`` or ``"m"``.
-
-    Raises:
-        FileFormatError: not a PLY, truncated, without faces, or with NaN.
-        TopologyError: a face names a vertex that is not there.
     """
     path, scale = Path(path), millimetres_per(unit)
     tables, elements = read_tables(path, read_file(path), ("vertex", "face"))

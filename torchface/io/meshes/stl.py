@@ -29,9 +29,6 @@ def read_stl(path: str | Path, unit: str = "mm") -> Mesh:
     Args:
         path: the file.
         unit: the file's unit, ``"mm"``, ``"cm"`` or ``"m"``.
-
-    Raises:
-        FileFormatError: not an STL, truncated, without triangles, or with NaN.
     """
     from trimesh.exchange.stl import load_stl_binary  # takes a while to import
 

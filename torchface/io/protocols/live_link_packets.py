@@ -24,9 +24,6 @@ class ArkitWeights:
 
     Args:
         names: of the weights that come, (N,).
-
-    Raises:
-        NameMismatchError: not one name is one of ARKit's.
     """
 
     def __init__(self, names: Sequence[str]) -> None:
@@ -61,10 +58,6 @@ class LiveLinkPackets:
         names: of the weights that come, (N,); any rig's names that ARKit's can be had from.
         fps: frames a second.
         subject: the name under which the receiver lists the face.
-
-    Raises:
-        ValueRangeError: ``fps`` is no camera's.
-        NameMismatchError: not one name is one of ARKit's.
 
     Example:
         >>> (packet,) = LiveLinkPackets(["jawOpen"], fps=60.0)(torch.tensor([0.5]), None)

@@ -32,9 +32,6 @@ class VmcPackets:
         names: of the weights that come, (N,); any rig's names that ARKit's can be had from.
         clock: what time it is, seconds.
 
-    Raises:
-        NameMismatchError: not one name is one of ARKit's.
-
     Source: Virtual Motion Capture Protocol, marionette specification, protocol.vmc.info.
     """
 
@@ -66,9 +63,6 @@ class OscPackets:
     Args:
         names: of the weights that come, (N,).
         prefix: of the addresses; ``/torchface`` if empty.
-
-    Raises:
-        NameMismatchError: a name that no OSC address can hold.
     """
 
     def __init__(self, names: Sequence[str], prefix: str = "") -> None:

@@ -48,9 +48,6 @@ def parse_address(address: str) -> StreamAddress:
         StreamAddress(scheme='udp', host='127.0.0.1', port=11111, path='')
         >>> parse_address("vmc://localhost").port
         39539
-
-    Raises:
-        ValueRangeError: the text is no such address.
     """
     match = _ADDRESS.fullmatch(address)
     if match is None or match["scheme"] not in _SCHEMES:

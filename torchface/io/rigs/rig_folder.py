@@ -82,10 +82,6 @@ def save_obj_folder(rig: BlendshapeRig, folder: str | Path, detail: DetailMaps |
         rig: the rig.
         folder: made where it is missing; what it holds of the same rig is replaced when all is written.
         detail: wrinkle maps of its shapes.
-
-    Raises:
-        NameMismatchError: a shape's name is no file's name, or a wrinkle map belongs to no shape.
-        FileFormatError: the folder holds another rig's OBJ files, or cannot be written to.
     """
     folder = Path(folder)
     _check_names(rig, folder)

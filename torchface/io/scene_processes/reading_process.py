@@ -25,9 +25,6 @@ def read_scene(command: Sequence[str], path: Path, reader: str, seconds: float) 
         path: the file.
         reader: what reads it, for errors.
         seconds: of time that it may take.
-
-    Raises:
-        FileFormatError: it refused the file, crashed, or was ended at a limit.
     """
     with tempfile.TemporaryDirectory(prefix="torchface-scene-") as folder:
         said = run_process([*command, str(path.absolute()), folder], f"{path}", reader, seconds)

@@ -90,10 +90,6 @@ def scene_rig(scene: Scene, unit: str | None = None) -> BlendshapeRig | None:
     Args:
         scene: what was found.
         unit: of the file's numbers; what the file says if absent.
-
-    Raises:
-        FileFormatError: numbers that are NaN, out of range, or that unpack to far more than the file; or correctives
-            that no rig can have.
     """
     pieces = _pieces(scene, unit)
     names = all_names(pieces)

@@ -55,9 +55,6 @@ class TableReader:
 
     Args:
         path: the file, UTF-8, its first row the header.
-
-    Raises:
-        FileFormatError: the file cannot be read, is no text, has no header, or names a column twice.
     """
 
     def __init__(self, path: str | Path) -> None:
@@ -97,9 +94,6 @@ class TableReader:
             texts: columns that are kept as they stand; every other holds numbers.
             is_blank: whether a row may be short of cells; the missing ones count as empty.
             only: columns of numbers that are read, where others may hold anything; all if absent.
-
-        Raises:
-            FileFormatError: a row has too few or too many cells, or a number is none, or is infinite.
         """
         width = len(self.header)
         text_cells: dict[str, list[str]] = {name: [] for name in texts}
@@ -176,9 +170,6 @@ def parse_numbers(cells: Sequence[str], names: Sequence[str], where: str) -> lis
         cells: one a column.
         names: of the columns, for messages.
         where: file and row, which begin a message.
-
-    Raises:
-        FileFormatError: a cell is no number.
     """
     joined = "".join(cells)
     if joined.isascii() and "_" not in joined:  # Python would take 1_000 and other scripts' digits for numbers

@@ -50,9 +50,6 @@ def rate_of_keys(times: np.ndarray, error: Callable[[str, str], FileFormatError]
     Args:
         times: of the keys.
         error: makes an error of what was found and what was expected.
-
-    Raises:
-        FileFormatError: keys out of order, with gaps of ten frames, or at a rate that no film has.
     """
     if len(times) == 1:
         return DEFAULT_RATE, None

@@ -28,9 +28,6 @@ def read_numbered(reader: TableReader, texts: Sequence[str] = ()) -> tuple[Table
 
     The rate is that of the first and last row's numbers and times. Numbers other than 0, 1, ... go to
     ``extras["frame_numbers"]``, dropped frames as (row, how many) to ``extras["gaps"]``.
-
-    Raises:
-        FileFormatError: as ``TableReader.read``, or numbers and times do not rise.
     """
     if not is_numbered(reader.header):
         raise FileFormatError(f"{reader.path}: found a header of other columns, expected it to begin with frame,time")

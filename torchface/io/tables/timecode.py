@@ -41,9 +41,6 @@ def read_timecodes(texts: Sequence[str], path: Path) -> Timing:
     ``FF`` counts frames of the timecode's base (60 for a 59.94 fps take), which is where it falls back to 0 as the
     seconds rise; a take without such a place has base 60 if it fits. ``;`` before ``FF`` marks drop-frame timecode.
     The rate is the base over the mean step of the timecodes, gaps left out. Midnight is crossed.
-
-    Raises:
-        FileFormatError: a timecode is none, or they never rise.
     """
     seconds = np.empty(len(texts), np.int64)
     frames = np.empty(len(texts))

@@ -22,11 +22,6 @@ def values_to_write(track: Track | None, what: str, width: int, path: Path) -> t
         what: what it holds, for messages, such as ``"marker positions"``.
         width: D.
         path: the file, for messages.
-
-    Raises:
-        ValueRangeError: there is no track, or none of its values, or one is infinite.
-        ShapeError: its values are not (T,C,D).
-        NameMismatchError: a name is empty or would not come back as it is.
     """
     if track is None or track.values.shape[:2].numel() == 0:
         raise ValueRangeError(f"{path}: found a take without {what}, expected some to write")

@@ -46,9 +46,6 @@ def extract(path: Path, limit: Callable[[int], None]) -> tuple[dict[str, Any], d
     Args:
         path: the root layer, or a package.
         limit: told the bytes of all files so far, before the next is opened.
-
-    Raises:
-        Refused: the file is broken, names layers outside its folder, has no mesh, or its topology is animated.
     """
     from pxr import Usd, UsdGeom
 

@@ -34,11 +34,6 @@ def read_usd_rig(path: str | Path, unit: str | None = None) -> BlendshapeRig:
     Args:
         path: ``.usd``, ``.usda``, ``.usdc`` or ``.usdz``; what it references lies in its folder or below.
         unit: what the file's numbers are, where its ``metersPerUnit`` is wrong.
-
-    Raises:
-        MissingExtraError: usd-core is not installed.
-        FileFormatError: not USD, truncated, broken, animated otherwise than by blend shapes, composed of layers or
-            images outside its folder, or without blend shapes.
     """
     rig = scene_rig(read_stage(path), unit)
     if rig is None:

@@ -61,12 +61,6 @@ def write_usd_rig(
             complete.
         keys: an animation of its shapes, by way of ``skel:animationSource``; a frame is a time code.
         detail: wrinkle maps of its shapes; see ``wrinkle_prims``.
-
-    Raises:
-        MissingExtraError: usd-core is not installed.
-        FileFormatError: the folder cannot be written to.
-        TopologyError: the mesh has no triangle, or wrinkle maps and no texture coordinates.
-        NameMismatchError: a wrinkle map belongs to no shape of the rig.
     """
     if detail is not None:
         check_detail(detail, rig.neutral, rig.names)

@@ -23,9 +23,6 @@ def check_even_rate(path: Path, seconds: np.ndarray, fps: float) -> None:
     Args:
         path: for the message.
         seconds, fps: as of :func:`rate_changes`.
-
-    Raises:
-        FileFormatError: the message says how frames last and how to convert the file.
     """
     changes = rate_changes(seconds, fps)
     if changes:

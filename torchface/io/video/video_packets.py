@@ -146,10 +146,6 @@ def open_container(path: Path) -> Iterator[tuple[InputContainer, VideoStream]]:
     FFmpeg would also follow playlists that name other files and addresses: the demuxer is named here, by the file's
     first bytes. No frame of more than 4096 x 4096 pixels is decoded, nor one of which as many as the codec may hold
     take more than 490 MiB, or 18 times the file.
-
-    Raises:
-        FileFormatError: the file is missing, no video, of a codec that is not there, or of absurd size.
-        MissingExtraError: PyAV is not installed.
     """
     av = pyav()
     demuxer = _demuxer(path)
@@ -186,9 +182,6 @@ def frames_beside(path: Path, codec: str, width: int, height: int, bits: int) ->
         codec: FFmpeg's name.
         width, height: pixels.
         bits: of a pixel.
-
-    Raises:
-        FileFormatError: as many frames as the codec may refer to would take more than a file of this size may.
     """
     pixels, size = width * height, path.stat().st_size
     frame = max(1, pixels * bits // 8)

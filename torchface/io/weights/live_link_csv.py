@@ -62,10 +62,6 @@ def load_live_link(path: str | Path) -> Take:
     Returns:
         weights (T,52,1), float32, which holds the app's ten decimals without loss; ``timecode``; ``extras``.
 
-    Raises:
-        FileFormatError: a column is missing, a row has another number of cells, a cell is no number, a timecode is
-            none.
-
     Source: Epic Games, "Recording Face Animation on iOS Device", CSV of Live Link Face.
     """
     path = Path(path)

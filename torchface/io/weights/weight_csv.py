@@ -33,9 +33,6 @@ def load_weights_csv(path: str | Path) -> Take:
 
     Returns:
         weights (T,N,1), float32, names as the file spells them.
-
-    Raises:
-        FileFormatError: there is no shape, a row has another number of cells, or a cell is no number.
     """
     path = Path(path)
     reader = TableReader(path)
@@ -65,11 +62,6 @@ def save_weights_csv(take: Take, path: str | Path) -> None:
     Args:
         take: weights (T,N,1). What else it holds is left out.
         path: the file; it appears only when it is complete.
-
-    Raises:
-        ValueRangeError: the take has no weights, infinite ones, or an absurd rate.
-        ShapeError: a kept rotation has another length than the take.
-        NameMismatchError: a name is empty, begins or ends in a blank, or would be taken for another column.
     """
     path = Path(path)
     names, values = values_to_write(take.weights, "weights", 1, path)

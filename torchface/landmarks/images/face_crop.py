@@ -30,10 +30,6 @@ def crop_transform(box: Tensor, tilt: float, size: int, margin: float = CROP_MAR
 
     Returns:
         (2,3) float64, pixel centres at integers in both.
-
-    Raises:
-        ShapeError: no such box.
-        ValueRangeError: the box is NaN, empty, or absurdly large, or the tilt is not finite.
     """
     if box.shape != (4,):
         raise ShapeError(f"box: found {tuple(box.shape)}, expected (4,)")
@@ -61,9 +57,6 @@ def cut_crop(image: Tensor, transform: Tensor, size: int) -> Tensor:
 
     Returns:
         uint8 (3,S,S), red first; a grey image gives three alike.
-
-    Raises:
-        ShapeError: no such image.
     """
     return cut_crops(image, transform[None], size, size)[0]
 
@@ -78,9 +71,6 @@ def cut_crops(image: Tensor, transforms: Tensor, width: int, height: int) -> Ten
 
     Returns:
         uint8 (N,3,h,w), red first.
-
-    Raises:
-        ShapeError: no such image.
     """
     check_image(image)
     rows, columns = image.shape[-2:]

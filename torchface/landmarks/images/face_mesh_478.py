@@ -31,9 +31,6 @@ def landmarks_of_mesh(points: Tensor) -> Tensor:
 
     Returns:
         (...,68,D).
-
-    Raises:
-        ShapeError: another count of points.
     """
     if points.ndim < 2 or points.shape[-2] not in (FACE_POINTS, MESH_POINTS):
         raise ShapeError(f"mesh points: found {tuple(points.shape)}, expected (...,{MESH_POINTS},D)")

@@ -44,9 +44,6 @@ def tilt_around(landmarks: Tensor) -> Tensor:
 
     Returns:
         (...,) radians, clockwise as the image is seen, 0 for an upright face; NaN where landmarks are missing.
-
-    Raises:
-        ShapeError: not (...,68,2).
     """
     if landmarks.shape[-2:] != (68, 2):
         raise ShapeError(f"landmarks: found {tuple(landmarks.shape)}, expected (...,68,2)")
@@ -69,9 +66,6 @@ def box_around(landmarks: Tensor, tilt: float = 0.0) -> Tensor:
 
     Returns:
         x, y, width, height, (...,4) pixels; NaN where brows, nose, eyes and mouth are all missing.
-
-    Raises:
-        ShapeError: not (...,68,2).
     """
     if landmarks.shape[-2:] != (68, 2):
         raise ShapeError(f"landmarks: found {tuple(landmarks.shape)}, expected (...,68,2)")
@@ -114,9 +108,6 @@ def relative_errors(found: Tensor, truth: Tensor) -> Tensor:
 
     Args:
         found, truth: iBUG's 68, (B,68,2), pixels; rows where one of them is NaN are left out.
-
-    Raises:
-        ShapeError: not (B,68,2) twice.
     """
     if found.shape != truth.shape or truth.ndim != 3 or truth.shape[1:] != (68, 2):
         raise ShapeError(f"landmarks: found {tuple(found.shape)} and {tuple(truth.shape)}, expected (B,68,2) twice")

@@ -24,9 +24,6 @@ class HogLayout:
         cell: side of a cell, pixels; the window holds (window/cell)² of them.
         bins: orientations, over half a turn (a gradient and its opposite are one).
         stride: a window is described at every ``stride``-th pixel.
-
-    Raises:
-        ValueRangeError: the window is no even number of cells, or the stride does not divide a cell.
     """
 
     window: int = 32
@@ -67,9 +64,6 @@ def cell_map(images: Tensor, layout: HogLayout) -> Tensor:
 
     Returns:
         (B,bins,H/stride+1,W/stride+1).
-
-    Raises:
-        ShapeError: not (B,C,H,W).
 
     Source: Dalal and Triggs 2005.
     """

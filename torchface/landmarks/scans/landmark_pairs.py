@@ -72,9 +72,6 @@ def template_features(template: Mesh, detector: UVLandmarkDetector | None = None
     Args:
         template: a face, millimetres.
         detector: asked where annotations are missing.
-
-    Raises:
-        ValueRangeError: something is neither annotated nor is there a detector that sees the template.
     """
     notes = template.annotations
     ibug = None if notes is None or notes.landmarks is None or len(notes.landmarks) != 68 else notes.landmarks

@@ -42,9 +42,6 @@ def sample_surface(mesh: Mesh) -> SurfaceSample:
 
     Args:
         mesh: a scan, millimetres.
-
-    Raises:
-        ValueRangeError: the scan has no area.
     """
     vertices = mesh.vertices.detach().cpu().double()
     faces = mesh.faces.cpu()

@@ -74,11 +74,6 @@ def principal_components(
             and damaged ones are computed again. In the end the files are removed.
         progress: called with each step and how far it is.
 
-    Raises:
-        ShapeError: fewer than two samples.
-        ValueRangeError: NaN or infinity, or samples that are all the same.
-        FileFormatError: the checkpoint cannot be written.
-
     Source: thesis 3.2.4, equation 8; Turk, Pentland 1991.
     """
     count, vertices, channels = samples.shape

@@ -21,13 +21,7 @@ _INSIDE = 0.5
 
 
 def checked_landmark_vertices(model: HeadModel, rig: BlendshapeRig) -> Tensor:
-    """The landmark vertices (68,), of the rig, or of the model where the rig has none.
-
-    Raises:
-        TopologyError: model and rig have other triangles, or a vertex is none of theirs.
-        ValueRangeError: landmarks are annotated nowhere.
-        ShapeError: not (68,) int64.
-    """
+    """The landmark vertices (68,), of the rig, or of the model where the rig has none."""
     faces = rig.neutral.faces
     if len(model.shape.mean) != len(rig.vertices) or not torch.equal(model.faces.cpu(), faces.cpu()):
         raise TopologyError(

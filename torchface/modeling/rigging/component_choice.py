@@ -52,9 +52,6 @@ def choose_components(
         outputs: (M,E).
         input_components, output_components, ridge: what is not to be chosen; numbers above what the data hold count
             as all of them.
-
-    Raises:
-        ShapeError: fewer than three samples: with one left out, the others do not show how they differ.
     """
     if len(inputs) < 3 or len(inputs) != len(outputs):
         raise ShapeError(f"found {len(inputs)} inputs and {len(outputs)} outputs, expected as many, three at least")

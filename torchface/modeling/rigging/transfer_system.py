@@ -44,9 +44,6 @@ class ShapeTransfer:
         source: the template: N shapes, V vertices, millimetres.
         target: the new neutral, of the same topology.
         contact_weight: how firmly lids and lips keep their gap; 0 leaves that out.
-
-    Raises:
-        ValueRangeError: the target has collapsed to a point.
     """
 
     def __init__(self, source: BlendshapeRig, target: Mesh, contact_weight: float) -> None:

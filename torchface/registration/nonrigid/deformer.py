@@ -91,9 +91,6 @@ class Deformer:
         Where triangles turn over, as in an ear that hair covers, the correspondences and landmarks around them are
         dropped from here on and the stage starts again. Slivers, which turn at the least motion, are left to
         ``unfold``.
-
-        Raises:
-            ValueRangeError: no correspondence stands the tests.
         """
         begin, start = time.perf_counter(), self.maps
         space = self._graph if stage.level is Level.GRAPH else self._spaces[stage.level]

@@ -194,9 +194,6 @@ def landmarks_by_shape(rig: BlendshapeRig) -> Tensor:
 
     Args:
         rig: with shapes whose names mean ARKit's; see ``torchface.shape_names.mapping``.
-
-    Raises:
-        ValueRangeError: too few shapes have such names.
     """
     known = performer(texture=False)
     ours, here = _centres(known), _centres(rig)

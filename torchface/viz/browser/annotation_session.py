@@ -19,9 +19,6 @@ class AnnotationSession:
         frames: images with the landmarks to start from.
         folder: where :meth:`save` writes to.
         saved: names of frames whose landmarks are the user's own already.
-
-    Raises:
-        ShapeError: no frame.
     """
 
     def __init__(self, frames: Sequence[AnnotatedFrame], folder: str | Path, saved: Sequence[str] = ()) -> None:
@@ -77,9 +74,6 @@ class AnnotationSession:
             place: where to, (2,) pixels; kept inside the image.
             reach: r, pixels, d being the distance at which another one was when this one was grabbed; 0 moves this one
                 alone.
-
-        Raises:
-            ValueRangeError: none is grabbed, or the place is not finite.
         """
         if self._grabbed is None:
             raise ValueRangeError("drag: found no landmark grabbed, expected grab() first")

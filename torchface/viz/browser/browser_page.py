@@ -51,10 +51,6 @@ def start_server(label: str, token: str, port: int = 8080) -> viser.ViserServer:
         label: heads the panel, and names the browser's tab.
         token: what the page's address must name: other users of this machine do not know it.
         port: the first to try; 0 takes any that is free.
-
-    Raises:
-        MissingExtraError: viser is not installed.
-        ValueRangeError: no such port, or none from there is free.
     """
     viser = import_viser()
     port = free_port(HOST, port)
@@ -80,9 +76,6 @@ class BrowserPage:
     Args:
         label: heads the panel.
         port: the first to try, 0 for any.
-
-    Raises:
-        MissingExtraError: viser is not installed.
     """
 
     def __init__(self, label: str, port: int) -> None:
@@ -240,9 +233,6 @@ def free_port(host: str, first: int) -> int:
     Args:
         host: the address to listen on.
         first: 0 to 65535.
-
-    Raises:
-        ValueRangeError: no such port, this user may not listen on it, or all of a hundred are in use.
     """
     checked_count("port", first, 0, LAST_PORT)
     if first == 0:

@@ -57,9 +57,6 @@ class LandmarkEditor(BrowserPage):
         session: the frames.
         label: heads the panel.
         port: the first to try, 0 for any.
-
-    Raises:
-        MissingExtraError: viser is not installed.
     """
 
     def __init__(self, session: AnnotationSession, label: str = "torchface annotate", port: int = 8080) -> None:

@@ -38,9 +38,6 @@ class LivePage(BrowserPage):
         desk: the session.
         label: heads the panel.
         port: the first to try, 0 for any.
-
-    Raises:
-        MissingExtraError: viser is not installed.
     """
 
     def __init__(

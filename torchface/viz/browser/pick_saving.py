@@ -33,10 +33,6 @@ def save_picks(session: PickSession, folder: str | Path, rig: BlendshapeRig | No
 
     Returns:
         The files written.
-
-    Raises:
-        ValueRangeError: nothing is picked.
-        FileFormatError: the folder cannot be written to.
     """
     folder, picks = Path(folder), session.picks
     picked = [vertex for vertex in picks.landmarks if vertex is not None]

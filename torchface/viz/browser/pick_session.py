@@ -117,9 +117,6 @@ class PickSession:
         """Adds a marker site; mirrored also its mirror image, unless the two would lie within a millimetre.
 
         Without a label they are called ``marker000`` and on. Returns the labels.
-
-        Raises:
-            ValueRangeError: the label is taken.
         """
         places = [point]
         if mirrored:

@@ -41,9 +41,6 @@ class Picker(BrowserPage):
         mode: what the first click picks: one of ``MODES``.
         label: heads the panel.
         port: the first to try, 0 for any.
-
-    Raises:
-        MissingExtraError: viser is not installed.
     """
 
     def __init__(

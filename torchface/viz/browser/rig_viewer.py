@@ -43,11 +43,6 @@ class RigViewer(BrowserPage):
         detail: wrinkle maps of the rig's shapes, shown while the head rests.
         label: heads the panel.
         port: the first to try, 0 for any.
-
-    Raises:
-        MissingExtraError: viser is not installed.
-        ValueRangeError: the take holds no weights.
-        NameMismatchError: the take names no shape of the rig.
     """
 
     def __init__(

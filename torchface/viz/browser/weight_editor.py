@@ -29,10 +29,6 @@ class WeightEditor:
         weights: (T,N), finite; one frame of zeros if absent.
         spread: frames on each side that an edit takes along.
         symmetric: an edit of a left shape sets its right twin to the same value, and the other way round.
-
-    Raises:
-        ShapeError: ``weights`` is not (T,N) with T at least 1.
-        ValueRangeError: a weight is NaN or infinite.
     """
 
     def __init__(

@@ -105,9 +105,6 @@ def write_player(player: Player, folder: Path, name: str = "performance") -> str
 
     Returns:
         HTML that plays it in a page of this folder, for ``Section.markup``.
-
-    Raises:
-        ShapeError: the takes differ in frames, vertices or shapes.
     """
     first = player.takes[0]
     for take in player.takes:

@@ -115,9 +115,6 @@ def find_items(inputs: Sequence[str | Path], kind: ItemKind) -> FoundItems:
 
     Files of another kind in a folder are left out and named; what may belong to an item (images, landmarks, tables) is
     left alone.
-
-    Raises:
-        FileFormatError: nothing is named, or a folder holds none.
     """
     files: dict[Path, None] = {}
     left_out = []

@@ -61,9 +61,6 @@ def in_processes(
         out: the folder of results.
         count: of processes.
         time_limit: seconds that an item may take.
-
-    Raises:
-        ValueRangeError: processes do not start.
     """
     limit = inf if time_limit is None else time_limit
     waiting = deque(items)

@@ -100,10 +100,6 @@ def on_cluster(
         out: the folder of results, where all machines see it.
         address: of the cluster.
         time_limit: seconds that an item may take.
-
-    Raises:
-        MissingExtraError: ray is not installed.
-        ValueRangeError: no cluster answers.
     """
     ray = _import_ray()
     started_here = not ray.is_initialized()

@@ -111,12 +111,6 @@ def run_batch(
         options: where the items are worked on.
         progress: called with how many items are done, and of how many; those of an earlier run count at once.
         finished: called with each item's outcome, those of an earlier run first.
-
-    Raises:
-        FileFormatError: ``out`` cannot be written to, or its disk is full; what is finished is kept.
-        ValueRangeError: options that make no sense, ``out`` holds items, another run is writing into it, or there is
-            no cluster at that address.
-        MissingExtraError: a cluster is asked for and ray is not installed.
     """
     options.check()
     folder, progress = Path(out).resolve(), progress or silent

@@ -28,9 +28,6 @@ def built_page(progress: Progress) -> Path:
 
     A wheel may bring it. Else Node builds it from ``export/web``, with the packages of its ``package-lock.json``, and
     it is kept in the cache under the content of these sources.
-
-    Raises:
-        MissingExtraError: it has to be built, and Node or npm is missing or too old, or one of them failed.
     """
     sources = page_sources()
     if sources.name == _IN_WHEEL and (sources / "dist" / "index.html").is_file():

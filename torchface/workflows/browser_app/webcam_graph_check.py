@@ -23,9 +23,6 @@ def check_webcam_graph(data: bytes, path: str | Path) -> None:
     Args:
         data: the file's bytes.
         path: names it in errors.
-
-    Raises:
-        FileFormatError: it is no ONNX file, or another graph.
     """
     wanted = f"expected the graph of torchface export webcam ({', '.join(_INPUTS)} to {', '.join(_OUTPUTS)})"
     options = onnxruntime.SessionOptions()

@@ -154,10 +154,6 @@ def scene_from(template: Path | None, take: Path | None, target: Path | None, se
         take: a weight take, such as a Live Link Face CSV.
         target: a neutral of the template's topology; its true rig is then the template's deltas on it.
         seed: decides the head and whatever else is drawn.
-
-    Raises:
-        ValueRangeError: a template that has no identity modes needs a target; a take must hold weights.
-        TopologyError: the target has other triangles than the template.
     """
     played = None if take is None else _weight_take(take)
     generator = torch.Generator().manual_seed(seed)

@@ -69,11 +69,6 @@ def read_coarse(path: Path, model: Mesh, settings: InputSettings, state: Path, p
         settings: what belongs to the input.
         state: a folder for what a later run may take up.
         progress: called with each step and how far it is.
-
-    Raises:
-        NameMismatchError: markers without an attachment, or weights without a rig.
-        AlignmentError: it does not lie on the model: another size, actor, or order of vertices.
-        TorchfaceError: a file is broken, or they do not fit each other.
     """
     progress("reading the input")
     if is_markers(path):
@@ -115,9 +110,6 @@ def other_topology(
         model: the model's neutral.
         correspondence: of ``animated.neutral`` with it.
         fps: frames a second; as the file has them if absent.
-
-    Raises:
-        AlignmentError: fewer than 12 vertices have a place on the model.
     """
     carry = correspondence.carrier(animated.neutral, model, animated.path)
 

@@ -128,9 +128,6 @@ def enhance_animation(
     Writes ``enhanced.safetensors``, ``enhanced.glb``, ``comparison.mp4``, ``frames.csv``, ``summary.json``, ``meshes/``
     and ``colors.safetensors`` where asked for or known;
     :func:`torchface.workflows.enhance.enhance_page.write_enhance_page` makes the report.
-
-    Raises:
-        TorchfaceError: a file is broken or does not fit the others, or the disk is full.
     """
     with within_job(out), made_folder(out / STATE) as state:
         return _enhance(path, model_name, out, state, settings, progress or silent)

@@ -77,10 +77,6 @@ def enhance_frames(
         state: a folder for what a killed run leaves to the next.
         key: of everything that the frames come from; what another key left is made anew.
         progress: called with each step and how far it is.
-
-    Raises:
-        FileFormatError: the disk is full; what is finished stays for another run.
-        TorchfaceError: a frame cannot be read.
     """
     make_folder(out)
     make_folder(state)

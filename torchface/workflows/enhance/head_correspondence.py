@@ -77,9 +77,6 @@ class HeadCorrespondence:
             head: at rest.
             model: the model's neutral.
             path: of the head, for messages.
-
-        Raises:
-            AlignmentError: fewer than 12 vertices have a place on the model.
         """
         if not self.how:
             return lambda vertices: placed(self.pose, vertices)
@@ -130,11 +127,6 @@ def find_correspondence(
         path: of the head, for messages.
         state: a file that keeps the correspondence for a later run of the same.
         progress: called with each step and how far it is.
-
-    Raises:
-        AlignmentError: no pose is found, or it is another head.
-        ShapeError: too few pairs.
-        TorchfaceError: the files do not fit each other.
     """
     if has_topology_of(head, model):
         vertices, target = head.vertices.double(), model.vertices.double()
@@ -182,11 +174,6 @@ def load_pairs(path: Path, head: Mesh, model: Mesh) -> tuple[Tensor, Tensor]:
             pick`` writes it, with the input's mesh for the template and the model's for the scan.
         head: the input at rest.
         model: the model at rest.
-
-    Raises:
-        FileFormatError: the file is neither.
-        TopologyError: a vertex is not there.
-        ShapeError: fewer than 12.
     """
     if path.suffix.lower() == ".json":
         picked = load_correspondences(path)

@@ -99,11 +99,6 @@ def marker_animation(
         model: the model's neutral.
         neutral: a frame with the face at rest, from which motion counts; else from the sites.
         options: unit, labels, axes.
-
-    Raises:
-        AlignmentError: the markers do not lie on the sites in any pose, or are of another size, or mirrored.
-        ShapeError: no frame shows 12 markers.
-        TorchfaceError: the take is broken, or its labels are others.
     """
     take, notes = read_markers(path, sites.attachment.labels, options)
     assert take.markers is not None

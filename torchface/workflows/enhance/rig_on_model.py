@@ -74,10 +74,6 @@ def rig_on_model(
         pairs: vertices of the rig and where they lie on the model; found by registration if absent.
         state: a file that keeps the correspondence for a later run of the same.
         progress: called with each step and how far it is.
-
-    Raises:
-        AlignmentError: it does not lie on the model, or is of another size.
-        TorchfaceError: the files do not fit each other.
     """
     correspondence = find_correspondence(rig.neutral, model, pairs, path, state, progress)
     progress("setting up the thin shell")

@@ -38,10 +38,6 @@ def bake_region_maps(
         scale: from the rig's millimetres to the model's.
         size: of the maps, texels a side.
         progress: called with each step and how far it is.
-
-    Raises:
-        TopologyError: the mesh has no texture coordinates.
-        ValueRangeError: a size that makes no sense.
     """
     still = Similarity(
         torch.ones(1, dtype=torch.float64),

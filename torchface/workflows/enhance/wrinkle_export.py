@@ -109,13 +109,7 @@ def export_wrinkles(
     settings: WrinkleSettings = WrinkleSettings(),
     progress: Progress | None = None,
 ) -> ExportedWrinkles:
-    """Learns, bakes and writes; see ``torchface export enhancement --help`` for the arguments.
-
-    Raises:
-        TopologyError: the rig has no texture coordinates.
-        AlignmentError: the rig does not lie on the model.
-        TorchfaceError: a file is broken or does not fit the others, or the disk is full.
-    """
+    """Learns, bakes and writes; see ``torchface export enhancement --help`` for the arguments."""
     progress = silent if progress is None else progress
     checked_count("--maps", settings.maps, 1, MOST_MAPS)
     checked_count("--size", settings.size, *SIZES)

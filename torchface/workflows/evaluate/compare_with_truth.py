@@ -119,10 +119,6 @@ def compare(
         true: of its topology.
         settings: which frames, and how.
         scans: the truth's scans, where it was registered to such.
-
-    Raises:
-        ShapeError: the frames do not fit.
-        ValueRangeError: there is nothing to compare, or too much.
     """
     frames = _frames(found, true, settings.frames)
     aligned = scans is not None if settings.align is None else settings.align

@@ -109,11 +109,6 @@ def scan_truth(
         landmarks: a folder of landmark files named as the scans.
         unit: of the scans; each format's own if absent.
         progress: called with each step and how far it is.
-
-    Raises:
-        TopologyError: the result is meshes without a rig.
-        AlignmentError: a scan could not be registered.
-        FileFormatError: there is no scan.
     """
     if result.rig is None:
         raise TopologyError(

@@ -38,10 +38,6 @@ def guided_examples(
         say: called with what the person should do, and the count-down.
         seconds: for each expression.
         landmarks: what finds landmarks.
-
-    Raises:
-        FileFormatError: there is no such camera or video.
-        NoFaceError: no face while an expression was shown, or the frames ended before all were.
     """
     checked_number("--seconds", seconds, 0.1, 60.0)
     tracker = LandmarkTracker(load_finder(landmarks).finder)

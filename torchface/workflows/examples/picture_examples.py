@@ -31,11 +31,6 @@ def picture_examples(
             paper's 16 in its order.
         landmarks: what finds landmarks.
         progress: called with how far it is.
-
-    Raises:
-        FileFormatError: no pictures, or one that is none.
-        NameMismatchError: names that are not known, twice or without a neutral.
-        NoFaceError: a picture shows no face.
     """
     files = _files(pictures)
     names = _names(files)

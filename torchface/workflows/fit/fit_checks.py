@@ -48,9 +48,6 @@ def one_person_lines(photographs: Sequence[Path], marks: Tensor, bare: BareFit, 
         marks: their landmarks, (I,68,2).
         bare: see there.
         insist: report it only.
-
-    Raises:
-        AlignmentError: they do not, and nobody insists.
     """
     if len(photographs) < 2:
         return []

@@ -33,11 +33,6 @@ def landmarks_of(photographs: Sequence[Path], files: Sequence[Path], face: int |
         files: of landmarks; a table has a row a photograph.
         face: which of several in an XML, from 0, numbered as where no file is given: as they are detected, the largest
             first; after them those that are not detected.
-
-    Raises:
-        NameMismatchError: another number of files than of photographs, or an XML that does not say which face.
-        FileFormatError: a broken file, or points that are no pixels.
-        ShapeError: not 68 landmarks.
     """
     if not photographs:
         raise NameMismatchError("fit: found no photograph, expected one at least")
@@ -82,9 +77,6 @@ def check_inside(photographs: Sequence[Path], landmarks: Tensor, sizes: Sequence
         photographs: image files, P.
         landmarks: (P,L,2) pixels; NaN where there is none.
         sizes: width and height of each photograph, upright.
-
-    Raises:
-        ValueRangeError: the message names the photograph.
     """
     for photograph, points, (width, height) in zip(photographs, landmarks, sizes, strict=True):  # sizes differ
         points = points[points.isfinite().all(-1)]
@@ -219,10 +211,6 @@ def find_in_photographs(
         images: they, (3,H,W) in [0,1].
         model: of landmarks, by name or folder.
         face: which one of each, from 0, the largest first; the largest if absent.
-
-    Raises:
-        NoFaceError: a photograph shows no face, or not so many.
-        NameMismatchError: the model is of another kind.
     """
     finder = load_finder(model, photographs=True, option="landmark model").finder
     readings = []

@@ -33,10 +33,6 @@ def matching(
         model: of heads.
         template: a rig; the one that travels with the model if absent, else the embedded performer.
         part: an annotated region, such as ``"face"``, that both are cut to; a model of that part alone stays as it is.
-
-    Raises:
-        TopologyError: the rig has another topology than the model.
-        NameMismatchError: no such part.
     """
     source, rig = "the model's own rig", model.rig
     if template is not None:

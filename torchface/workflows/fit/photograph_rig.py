@@ -50,9 +50,6 @@ class PhotographSettings:
         landmark_model: finds landmarks where no file gives them; by name or folder.
         names: of the written shapes; see ``rig_names.renamed``.
         insist: also where photographs do not seem to show one person.
-
-    Raises:
-        ValueRangeError: ``face`` is no whole number from 0 on.
     """
 
     fit: FitSettings = field(default_factory=FitSettings)
@@ -129,14 +126,6 @@ def fit_photographs(
         out: the ``.glb`` or folder to write, see ``save_rig``; overlays are written beside it.
         settings: whose shapes, which lens, which face of several.
         progress: called with each step and how far it is.
-
-    Raises:
-        AlignmentError: photographs show different people.
-        NoFaceError: landmarks are to be found where no face is.
-        FileFormatError: ``out`` has another ending or cannot be written to, or a file is broken.
-        NameMismatchError: landmarks do not show which photograph or face they are of.
-        ValueRangeError: most landmarks lie outside their photograph.
-        TorchfaceError: landmarks or model are of no use; see ``fit_images``.
     """
     progress = progress or silent
     check_out(out)

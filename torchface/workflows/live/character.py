@@ -60,10 +60,6 @@ def load_character(path: Path | None = None, table: Path | None = None) -> Chara
     Args:
         path: a ``.glb``, or what else holds a rig; the embedded performer if absent.
         table: for shapes of other names than ARKit's; see :func:`torchface.capture.retargeting.load_shape_rules`.
-
-    Raises:
-        FileFormatError: a file is broken, without morph targets, or larger than 200 MB.
-        NameMismatchError: no shape's name is known, or the table names unknown shapes.
     """
     if path is None:
         name, rig = "the embedded performer", performer()

@@ -90,10 +90,6 @@ def track_live(
         settings: models, calibration, face.
         seconds: after which it ends; until it is interrupted (Ctrl-C) or the video ends if absent.
         progress: called with the number of frames sent.
-
-    Raises:
-        ValueRangeError: an address is none, the rig lacks landmarks, or no frame came.
-        FileFormatError: the camera or the video cannot be opened.
     """
     progress, notes = progress or silent, list[str]()
     for address in addresses:

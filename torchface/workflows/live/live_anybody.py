@@ -121,12 +121,6 @@ def go_live(
 
     Returns:
         The figures, and what was recorded.
-
-    Raises:
-        ValueRangeError: an address is none, or no frame came.
-        NameMismatchError: the character has no shape of a known name.
-        FileFormatError: a file is broken, or the camera cannot be opened.
-        MissingExtraError: the page's package is not installed.
     """
     progress = progress or silent
     for address in settings.addresses:

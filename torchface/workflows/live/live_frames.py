@@ -49,9 +49,6 @@ class PlayedVideo:
     Args:
         path: of the file; its frame rate may vary.
         every: give each frame, however late, as for a recording; else those that come too late are dropped.
-
-    Raises:
-        FileFormatError: it cannot be opened.
     """
 
     def __init__(self, path: Path, every: bool = False) -> None:
@@ -91,9 +88,6 @@ def open_source(camera: str, say: Say, size: tuple[int, int] = DEFAULT_SIZE, eve
         say: called with what happens to the camera on the way.
         size: width and height to ask a camera for.
         every: give every frame of a video, however late.
-
-    Raises:
-        FileFormatError: there is no such camera, it gives no frame, or the file is no video.
     """
     if re.fullmatch("[0-9]{1,3}", camera):
         return Camera(int(camera), say, size)

@@ -37,9 +37,6 @@ class FrameLog:
     Args:
         folder: where there is space; it must exist.
         names: of the weights, (N,).
-
-    Raises:
-        FileFormatError: the folder cannot be written to.
     """
 
     def __init__(self, folder: Path, names: tuple[str, ...]) -> None:
@@ -75,9 +72,6 @@ class FrameLog:
 
         Args:
             fps: where times do not say: of a single frame.
-
-        Raises:
-            ValueRangeError: there is none.
         """
         if self.count == 0:
             raise ValueRangeError("recording: found no frame, expected at least one")

@@ -20,10 +20,6 @@ class WeightStreams:
         names: of the weights, (N,).
         fps: frames a second.
         say: called once with a receiver that refuses packets, or that the network no longer reaches.
-
-    Raises:
-        ValueRangeError: an address is none, or its host is not known or not reached.
-        NameMismatchError: a protocol cannot carry weights by these names.
     """
 
     def __init__(self, addresses: Sequence[str], names: Sequence[str], fps: float, say: Callable[[str], None]) -> None:

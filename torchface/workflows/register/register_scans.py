@@ -46,9 +46,6 @@ class ScanSettings:
         schedule, texture_size: see ``register``.
         detector: a landmark detector for the scans without landmarks, by name or folder; see ``zoo.get_model``.
         model: of faces in the template's topology, which each registration starts from; see ``register``.
-
-    Raises:
-        ValueRangeError: an unknown unit, or a texture of a size that makes no sense.
     """
 
     landmarks: str | Path | None = None
@@ -84,12 +81,6 @@ def register_scans(
         options: how many processes, or which cluster, and how long each scan may take.
         progress: called with how many scans are done, and of how many; those of an earlier run count at once.
         finished: called with each scan's outcome, those of an earlier run first.
-
-    Raises:
-        FileFormatError: no scan is named or found, or ``out`` cannot be written to.
-        TopologyError, ValueRangeError: a template that nothing can be registered with.
-        ValueRangeError: another run writing into ``out``, or no cluster there.
-        MissingExtraError: a cluster is asked for and ray is not installed.
     """
     landmarks, detector, model = settings.landmarks, settings.detector, settings.model
     check_template(template)

@@ -167,11 +167,6 @@ def rig_actor(
             ``neutral``.
         options: how the files are read and what is made of them.
         progress: called with each step and how far it is.
-
-    Raises:
-        FileFormatError: ``out`` has another ending or cannot be written to, or a file is broken.
-        AlignmentError: not one example, or not one scan of details, could be used.
-        TorchfaceError: neutral scan, template or an option is of no use.
     """
     check_out(out)
     with file_lock(out):

@@ -80,12 +80,6 @@ def expressions_in(folder: Path, names: Sequence[str]) -> list[Expression]:
     Args:
         folder: scans, and ``weights.csv`` where the names do not give it.
         names: the rig's shapes.
-
-    Raises:
-        FileFormatError: no such folder, a table without the column ``scan`` or with two rows for a file, or a file
-            that it names and that is not there.
-        NameMismatchError: a name that means no shape of the rig.
-        ValueRangeError: a weight outside [0,1], or an expression without any.
     """
     if not folder.is_dir():
         raise FileFormatError(f"{folder}: found no such folder, expected one with scans: {LAYOUT}")
@@ -163,9 +157,6 @@ def check_side(actor: BlendshapeRig, weights: Tensor, found: Tensor, seen: Tenso
         weights: of the expression, (N,).
         found: the registered vertices, aligned with the rig, (V,3).
         seen: vertices that the scan shows, (V,) bool.
-
-    Raises:
-        AlignmentError: it is clearly the mirror image.
     """
     weights = weights.to(actor.deltas)
     swapped = weights[mirror(actor.names).to(weights.device)]
@@ -209,9 +200,6 @@ def seen_example(
 
     Returns:
         vertices (V,3), in the dtype of ``expected``.
-
-    Raises:
-        ShapeError: the shapes differ.
     """
     count = len(found.vertices)
     if expected.shape != (count, 3) or seen.shape != (count,):

@@ -77,10 +77,6 @@ def export_webcam(out: str | Path, progress: Progress | None = None) -> WebcamRe
     Args:
         out: the file to write; it appears only when it is complete and checked.
         progress: called with each step.
-
-    Raises:
-        FileFormatError: the file or the cache cannot be written.
-        ValueRangeError: ONNX Runtime and PyTorch differ; nothing is written.
     """
     out, progress = Path(out), progress or silent
     check_writable(out)

@@ -93,10 +93,6 @@ def choose_frames(landmarks: Tensor, count: int = 15, confidence: Tensor | None 
 
     Returns:
         Frame numbers in the order of choice, the neutral one first, int64.
-
-    Raises:
-        ShapeError: not (T,68,2).
-        ValueRangeError: fewer than one frame asked for, or the face was never found.
     """
     if landmarks.ndim != 3 or landmarks.shape[1:] != (68, 2):
         raise ShapeError(f"landmarks: found {tuple(landmarks.shape)}, expected (T,68,2)")

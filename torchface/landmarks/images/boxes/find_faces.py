@@ -66,10 +66,6 @@ def find_some_faces(image: Tensor, number: int = 0, detector: FaceDetector | Non
         image: uint8 (H,W), or (3,H,W) red first.
         number: of the face that must be there, from 0.
         detector: the shipped cascades if absent.
-
-    Raises:
-        NoFaceError: there are not so many.
-        ShapeError: no such image.
     """
     faces = find_faces(image, detector)
     if not 0 <= number < len(faces):

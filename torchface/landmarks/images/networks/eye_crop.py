@@ -40,9 +40,6 @@ def eye_transforms(landmarks: Tensor, width: int = CROP_WIDTH, height: int = CRO
     Returns:
         (...,2,2,3), the person's right eye first; pixel centres at integers in both. NaN where landmarks are.
 
-    Raises:
-        ShapeError: not (...,68,2).
-
     Example:
         >>> from torchface.synthetic import performer
         >>> rig = performer(texture=False)

@@ -77,9 +77,6 @@ class EyeFinder:
         Args:
             image: uint8 (H,W), or (3,H,W) red first.
             face: landmarks, deviation, visibility and presence are read.
-
-        Raises:
-            ShapeError: no such image.
         """
         transforms = eye_transforms(face.landmarks.double(), self.width, self.height)
         scale = math.hypot(*transforms[0, 0, :2].tolist())  # NaN where there is no face
@@ -118,9 +115,6 @@ def merged_lids(
 
     Returns:
         Landmarks (...,68,2) and their deviation (...,68).
-
-    Raises:
-        ShapeError: shapes that do not belong together.
     """
     if landmarks.shape[-2:] != (68, 2) or lids.shape[-3:] != (2, 6, 2) or visibility.shape[-1:] != (2,):
         raise ShapeError(

@@ -23,9 +23,6 @@ def check_pictures(pictures: Dataset[tuple[Tensor, ...]], expected: str, *shapes
         pictures: gives tuples of uint8 (B,4,H,W) and labels for numbers (B,).
         expected: the form of its tuples, for the message.
         shapes: of one picture's labels.
-
-    Raises:
-        ShapeError: it is another data set.
     """
     count: int = len(pictures)  # type: ignore[arg-type]  # data sets by number have a length
     rgba, *labels = pictures[torch.arange(min(count, 1))]

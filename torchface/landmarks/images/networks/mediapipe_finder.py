@@ -48,10 +48,6 @@ class MediaPipeFinder:
     Args:
         python: the Python that has the package; what the environment variable ``TORCHFACE_MEDIAPIPE_PYTHON`` names, or
             the running one, if absent.
-
-    Raises:
-        MissingExtraError: there is none; the message says how to install it.
-        MediaPipeError: it could not be started.
     """
 
     name = "mediapipe"

@@ -85,10 +85,6 @@ def consensus(
         box: x, y, width, height of the face, (4,) pixels; it may reach out of the image.
         tilt: of the face, radians, clockwise as the image is seen.
         settings: from where the trees start.
-
-    Raises:
-        ShapeError: no such image or box.
-        ValueRangeError: the box is NaN, empty, or absurdly large.
     """
     settings = settings or ConsensusSettings()
     if image.ndim != 2 or image.dtype != torch.uint8:
