@@ -11,12 +11,14 @@ from torch import Tensor
 
 from torchface.files.whole_files import make_folder
 from torchface.geometry.sample_batches import Samples, blocks
-from torchface.modeling import HeadModel, ModelQuality, MorphableModel
+from torchface.modeling import HeadModel, MorphableModel
 from torchface.progress import Progress
 from torchface.rendering.compositing import from_figure, save_rendered_image, sheet
 from torchface.viz import modes_figure, random_figure
 from torchface.viz.figures.face_views import FRONT, THREE_QUARTER
 from torchface.viz.figures.model_figures import head_views
+
+from .model_quality import ModelQuality
 
 _STEPS = 6
 _DEVIATIONS = 3.0

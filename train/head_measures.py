@@ -5,7 +5,9 @@ from __future__ import annotations
 import torch
 
 from torchface.geometry.sample_batches import SampleRange, Samples, blocks
-from torchface.modeling import HeadModel, ModelQuality, MorphableModel, model_quality
+from torchface.modeling import HeadModel, MorphableModel
+
+from .model_quality import ModelQuality, model_quality
 
 _MEASURED = 500  # heads; leaving one out takes an eigensystem of so many for each
 

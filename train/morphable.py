@@ -16,7 +16,7 @@ from torchface.io import load_ict_facekit, load_identity_modes
 from torchface.io.rig_files import SCENE_ENDINGS
 from torchface.io.rigs.ict_facekit import region
 from torchface.mesh import submesh
-from torchface.modeling import HeadModel, ModelQuality, MorphableModel
+from torchface.modeling import HeadModel, MorphableModel
 from torchface.progress import Progress
 
 from .head_colors import fitted_colors
@@ -24,6 +24,7 @@ from .head_figures import draw
 from .head_measures import card_text, cross_validated, head_quality, measured
 from .head_samples import Source, gather, laid, performers, registered, vertex_colored
 from .model_cards import model_card
+from .model_quality import ModelQuality
 from .recipe_settings import RecipeSettings
 from .runner import Recipe, Run, metric_lines, recipe
 

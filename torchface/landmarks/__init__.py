@@ -19,13 +19,18 @@ from torchface.landmarks.images.trees.landmark_trees import LandmarkTrees
 from torchface.landmarks.images.trees.tree_finder import TreeFinder
 from torchface.landmarks.images.trees.tree_training import TreeSettings
 from torchface.landmarks.scans.contours import Contour, TraceSettings, trace_contour
-from torchface.landmarks.scans.curvature_image import curvature_image
 from torchface.landmarks.scans.cylinder import CylinderLayout, UnwrappedHead, unwrap
 from torchface.landmarks.scans.detector_settings import DetectorSettings
 from torchface.landmarks.scans.face_frame import FaceFrame
 from torchface.landmarks.scans.landmark_pairs import AutomaticLandmarks, LandmarkPairs
 from torchface.landmarks.scans.scan_annotations import ScanAnnotation, load_annotations, save_annotations
-from torchface.landmarks.scans.scan_landmarks import ScanLandmarks, appearance_image, line_image, scan_landmarks
+from torchface.landmarks.scans.scan_landmarks import (
+    ScanLandmarks,
+    appearance_image,
+    curvature_image,
+    line_image,
+    scan_landmarks,
+)
 from torchface.landmarks.scans.uv_detector import LineExamples, UVLandmarkDetector, UVLandmarks
 from torchface.landmarks.scans.uv_landmark_names import UV_LANDMARK_NAMES, uv_landmarks_from_ibug
 

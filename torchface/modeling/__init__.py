@@ -8,9 +8,7 @@ from torchface.modeling.detail.normal_map_baking import (
     detail_maps,
 )
 from torchface.modeling.detail.scan_alignment import ScanAlignment, align_scan
-from torchface.modeling.morphable.color_casts import color_casts, texture_areas, without_cast
 from torchface.modeling.morphable.head_model import HeadModel, Heads
-from torchface.modeling.morphable.model_quality import ModelQuality, model_quality
 from torchface.modeling.morphable.morphable_model import MorphableModel
 from torchface.modeling.photographs.image_fit import ImageFit, fit_images
 from torchface.modeling.photographs.image_solve import FitSettings
@@ -50,7 +48,6 @@ __all__ = [
     "Heads",
     "ImageFit",
     "InnerParts",
-    "ModelQuality",
     "MorphableModel",
     "NormalMap",
     "PhotoTexture",
@@ -62,13 +59,11 @@ __all__ = [
     "align_scan",
     "bake_normal_map",
     "clear_parts",
-    "color_casts",
     "corrective_from_sculpt",
     "detail_maps",
     "fit_colors",
     "fit_images",
     "inner_parts",
-    "model_quality",
     "open_eyes",
     "photo_texture",
     "place_parts",
@@ -76,8 +71,6 @@ __all__ = [
     "rig_from_neutral",
     "sculpt_misalignment",
     "shape_depths",
-    "texture_areas",
     "transfer_deformation",
     "transfer_with_report",
-    "without_cast",
 ]

@@ -10,8 +10,8 @@ import trimesh
 
 from torchface.errors import ShapeError, ValueRangeError
 from torchface.geometry.similarity import Similarity
-from torchface.landmarks.scans.curvature_image import curvature_image
 from torchface.landmarks.scans.cylinder import CylinderLayout, fill_holes, unwrap
+from torchface.landmarks.scans.scan_landmarks import curvature_image
 from torchface.mesh import Mesh
 
 SMALL = CylinderLayout(size=128, pitch=2.0, radius=90.0)

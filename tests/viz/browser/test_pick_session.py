@@ -10,8 +10,8 @@ from torchface.io.landmarks.picks import load_correspondences, load_landmarks
 from torchface.mesh import Annotations, Mesh
 from torchface.rig import BlendshapeRig
 from torchface.viz.browser.landmark_sets import IBUG_68, THESIS_12, custom_set
-from torchface.viz.browser.pick_saving import save_picks
 from torchface.viz.browser.pick_session import PickSession, SurfacePoint
+from torchface.viz.browser.picker import save_picks
 
 EARS = custom_set(["chin", "left ear", "right ear"])
 

@@ -34,8 +34,7 @@ from torchface.synthetic import draw_identities, performer
 from torchface.synthetic.head.identity import anatomy
 from torchface.workflows.fit.fit_checks import one_person_lines
 from torchface.workflows.fit.fit_landmarks import PhotographLandmarks, check_inside, landmarks_of, warn_if_stored_turned
-from torchface.workflows.fit.fit_model import load_head_model, matching
-from torchface.workflows.fit.photograph_rig import PhotographSettings, fit_photographs
+from torchface.workflows.fit.photograph_rig import PhotographSettings, fit_photographs, load_head_model, matching
 from train.rendered_people.complexion import complexion_colors, draw_complexions
 
 YAWS = (-35.0, 0.0, 35.0)

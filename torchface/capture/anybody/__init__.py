@@ -7,10 +7,9 @@ from torchface.capture.anybody.examples.example_expressions import (
 )
 from torchface.capture.anybody.examples.example_methods import AllAtOnce, ExampleMethod, Regional
 from torchface.capture.anybody.examples.example_shapes import ExampleShapes
-from torchface.capture.anybody.examples.example_solver import ExampleFit, ExampleSolver
+from torchface.capture.anybody.examples.example_solver import ExampleFit, ExampleSolver, landmark_observability
 from torchface.capture.anybody.examples.landmark_model import LandmarkModel
 from torchface.capture.anybody.examples.landmark_objectives import Distances, SquaredDistances
-from torchface.capture.anybody.examples.landmark_observability import landmark_observability
 from torchface.capture.anybody.examples.landmark_placement import LandmarkBoxes, SolvedSimilarity
 from torchface.capture.anybody.examples.rig_examples import paper_examples, rig_examples
 from torchface.capture.anybody.examples.shown_examples import example_remarks, shown_examples

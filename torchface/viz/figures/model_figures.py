@@ -13,15 +13,14 @@ from torchface.viz.figures.face_views import FRONT, THREE_QUARTER, face_views
 
 _HEADS = 12
 _DEVIATIONS = 3.0
-_MODES = 5
 _WIDTH, _HEIGHT = 220, 275
 _LIGHT = Lighting(occlusion_rays=0)  # seventy faces a model: shadows in creases would take most of the time
 
 
-def modes_figure(model: HeadModel) -> Tensor:
+def modes_figure(model: HeadModel, count: int = 5) -> Tensor:
     """The mean between -3σ and +3σ of the first modes of shape, a row a mode, each from two sides (figure 20)."""
     rows = []
-    for mode in range(min(_MODES, model.shape.count)):
+    for mode in range(min(count, model.shape.count)):
         row = []
         for amount in (-_DEVIATIONS, 0.0, _DEVIATIONS):
             coefficients = torch.zeros(model.shape.count)

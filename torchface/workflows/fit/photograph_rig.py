@@ -9,18 +9,22 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+from torchface import zoo
+from torchface.errors import TopologyError
 from torchface.files.whole_files import all_or_none
 from torchface.geometry.cameras.calibration import CameraCalibration
-from torchface.io import save_calibration, save_rig
+from torchface.io import load_rig, save_calibration, save_rig
 from torchface.io.images.image_files import load_image
 from torchface.io.landmarks.landmark_points import save_pts
-from torchface.modeling import FitSettings, ImageFit, fit_images, transfer_with_report
+from torchface.io.rigs.ict_facekit import region
+from torchface.modeling import FitSettings, HeadModel, ImageFit, fit_images, transfer_with_report
 from torchface.modeling.photographs.landmark_view import JAW
 from torchface.number_checks import checked_count
 from torchface.progress import Progress, silent
 from torchface.registration import hidden_parts, with_template_skin
 from torchface.rendering.compositing import save_rendered_image
 from torchface.rig import BlendshapeRig
+from torchface.synthetic import performer
 from torchface.workflows.fit.fit_checks import eyes_distances, landmark_lines, one_person_lines
 from torchface.workflows.fit.fit_landmarks import (
     DEFAULT_LANDMARKS,
@@ -30,10 +34,55 @@ from torchface.workflows.fit.fit_landmarks import (
     landmarks_of,
     warn_if_stored_turned,
 )
-from torchface.workflows.fit.fit_model import load_head_model, matching
 from torchface.workflows.fit.fit_overlay import overlay
 from torchface.workflows.rig.actor_rig import check_out
 from torchface.workflows.rig_names import Naming, renamed
+
+
+def load_head_model(name_or_path: str | Path) -> HeadModel:
+    """A head model by name or folder, see ``zoo.get_model``.
+
+    Raises:
+        NameMismatchError: there is none of this name, or it is of another kind.
+    """
+    return zoo.get_model(name_or_path, HeadModel)
+
+
+def matching(
+    model: HeadModel, template: Path | None = None, part: str | None = None
+) -> tuple[HeadModel, BlendshapeRig]:
+    """A model, and the rig whose shapes its heads are to have, of one topology.
+
+    Args:
+        model: of heads.
+        template: a rig; the one that travels with the model if absent, else the embedded performer.
+        part: an annotated region, such as ``"face"``, that both are cut to; a model of that part alone stays as it is.
+    """
+    source, rig = "the model's own rig", model.rig
+    if template is not None:
+        source, rig = str(template), load_rig(template)
+    elif rig is None:
+        source, rig = "the embedded performer", performer()
+    parts = {} if rig.neutral.annotations is None else rig.neutral.annotations.regions
+    if part is not None:
+        keep = region(rig.neutral, part)
+        if same_topology(model, rig):
+            model = model.part(keep)
+        rig = rig.part(keep)
+    if same_topology(model, rig):
+        return model, rig
+    count = len(model.shape.mean)
+    fitting = [name for name, mask in parts.items() if part is None and int(mask.sum()) == count]
+    hint = "; name a rig with --template whose topology is the model's" if template is None else ""
+    raise TopologyError(
+        f"{source}: found {len(rig.vertices)} vertices and {len(rig.neutral.faces)} triangles, expected the model's "
+        f"{count} and {len(model.faces)}" + (f"; try --part {fitting[0]}" if fitting else hint)
+    )
+
+
+def same_topology(model: HeadModel, rig: BlendshapeRig) -> bool:
+    """Whether a model's heads have the rig's triangles."""
+    return len(rig.vertices) == len(model.shape.mean) and torch.equal(rig.neutral.faces, model.faces.cpu())
 
 
 @dataclass(frozen=True)

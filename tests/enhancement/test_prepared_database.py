@@ -7,7 +7,7 @@ import torch
 
 from torchface.enhancement import CapturedPerformance, EnhancementModel
 from torchface.enhancement.detail.low_pass import LowPass
-from torchface.enhancement.input_lids import InputLids
+from torchface.enhancement.prepared_database import InputLids
 from torchface.synthetic.head.performer import performer
 
 UPPER, LOWER = {"right": (37, 38), "left": (43, 44)}, {"right": (41, 40), "left": (47, 46)}

@@ -8,7 +8,7 @@ import torch
 from torchface.errors import ShapeError
 from torchface.geometry.sample_batches import SamplesInMemory
 from torchface.modeling import MorphableModel
-from torchface.modeling.morphable.model_quality import model_quality
+from train.model_quality import model_quality
 
 
 @pytest.fixture(scope="module")

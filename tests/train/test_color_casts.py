@@ -10,8 +10,8 @@ import torch
 from torchface.color_space import to_linear, to_srgb
 from torchface.errors import ShapeError, TopologyError, ValueRangeError
 from torchface.modeling import MorphableModel
-from torchface.modeling.morphable.color_casts import color_casts, texture_areas, without_cast
 from torchface.synthetic import neutral_head
+from train.color_casts import color_casts, texture_areas, without_cast
 from train.rendered_people.complexion import complexion_colors, draw_complexions
 
 
