@@ -22,8 +22,7 @@ from torchface.cli.demo import demo
 from torchface.cli.enhance import enhance
 from torchface.cli.evaluate import evaluate
 from torchface.cli.examples import examples
-from torchface.cli.export import EXPORTS
-from torchface.cli.export_model import export_model
+from torchface.cli.export import EXPORTS, export_model
 from torchface.cli.fit import fit
 from torchface.cli.info import info
 from torchface.cli.live import live

@@ -6,12 +6,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-from rich.table import Table
-
 from torchface.cli.command_options import OutputPath
-from torchface.cli.export_app import export_app
-from torchface.cli.export_enhancement import export_enhancement
-from torchface.cli.terminal import Quiet, console, print_path, progress_bars
+from torchface.cli.terminal import Quiet, console, print_lines, print_path, print_table, progress_bars
 
 if TYPE_CHECKING:
     from torchface.onnx import SolverReport
@@ -56,7 +52,7 @@ def hybrid_solver(rig: Path, attachment: Path, out: OutputPath, part: str | None
 
 
 def _write_solver(
-    export: Callable[..., SolverReport], rig: Path, attachment: Path, out: Path, part: str | None, quiet: bool
+    export: Callable[..., SolverReport], rig: Path, attachment: Path, out: OutputPath, part: str | None, quiet: bool
 ) -> None:
     from torchface.attachment import Attachment
     from torchface.files.job_lock import file_lock
@@ -68,10 +64,7 @@ def _write_solver(
         where.check(loaded.neutral, attachment, rig)
         progress("exporting and checking")
         report = export(loaded, where, out)
-    table = Table(show_header=False)
-    for row in report.rows():
-        table.add_row(*row)
-    console.print(table)
+    print_table(report.rows())
     print_path(out)
 
 
@@ -96,10 +89,7 @@ def action_units(model: str, out: OutputPath, quiet: Quiet = False) -> None:
         classifier = zoo.get_model(model, ActionUnitClassifier)
         progress("exporting and checking")
         report = export_action_units(classifier, out)
-    table = Table(show_header=False)
-    for row in report.rows():
-        table.add_row(*row)
-    console.print(table)
+    print_table(report.rows())
     print_path(out)
 
 
@@ -153,10 +143,7 @@ def video_solver(
             raise FileFormatError(f"{landmarks}: found no landmarks, expected the landmarks.csv of torchface track")
         progress("exporting and checking")
         report = export_video_solver(loaded, calibration, out, priors.shapes, priors.dynamics, video=video)
-    table = Table(show_header=False)
-    for row in report.rows():
-        table.add_row(*row)
-    console.print(table)
+    print_table(report.rows())
     if priors.unlearned:
         console.print(f"the priors say nothing of {', '.join(priors.unlearned)}", soft_wrap=True)
     print_path(out)
@@ -202,10 +189,7 @@ def examples(
         made = ExampleSolver(shapes, methods[solver]())
         progress("exporting and checking")
         report = export_example_solver(made, out)
-    table = Table(show_header=False)
-    for row in report.rows():
-        table.add_row(*row)
-    console.print(table)
+    print_table(report.rows())
     print_path(out)
 
 
@@ -228,10 +212,110 @@ def webcam(out: OutputPath, quiet: Quiet = False) -> None:
 
     with file_lock(out, ".onnx"), progress_bars(quiet) as progress:
         report = export_webcam(out, progress)
-    table = Table(show_header=False)
-    for row in report.rows():
-        table.add_row(*row)
-    console.print(table)
+    print_table(report.rows())
+    print_path(out)
+
+
+def export_app(out: OutputPath, character: Path | None = None, webcam: Path | None = None, quiet: Quiet = False) -> None:
+    """Write the app in the browser: a folder that any static host serves, in which a webcam moves a character.
+
+    Everything runs on the user's machine; the page sends nothing. To try it: `python -m http.server --directory OUT`,
+    then open http://localhost:8000. Elsewhere a camera needs https. Where the page is not part of this installation, it
+    is built once, which takes Node with npm and the network.
+
+    Args:
+        out: The folder to write; an earlier app in it is replaced.
+        character: A .glb, or another rig, whose shapes have ARKit's names; the embedded performer if absent.
+        webcam: The graph from picture to weights, as `torchface export webcam` writes it; that one if absent.
+        quiet: Show no progress.
+    """
+    from torchface.workflows.browser_app import export_app as write
+
+    with progress_bars(quiet) as progress:
+        report = write(out, character, webcam, progress)
+    print_table(report.rows())
+    if report.still:
+        console.print(f"no face moves {', '.join(report.still)}", soft_wrap=True)
+    print_path(out)
+
+
+def export_enhancement(
+    *,
+    model: str,
+    rig: Path,
+    out: OutputPath,
+    maps: int = 4,
+    size: int = 1024,
+    poses: int = 300,
+    animation: Path | None = None,
+    pairs: Path | None = None,
+    part: str | None = None,
+    quiet: Quiet = False,
+) -> None:
+    """Write an actor's wrinkles as maps for a rig, with ONNX graphs that give the maps' weights every frame.
+
+    Writes into OUT: wrinkles.glb (the rig, its normal map at rest, and the wrinkle maps of normals and heights with the
+    masks of the regions, listed in `extras.torchface.wrinkleRegions`), map_weights.onnx (`weights` (B,N) of the rig's
+    shapes to `map_weights` (B,R,M)), map_weights_of_vertices.onnx (the same of `vertices` (B,V,3), millimetres), maps/
+    (every map as a PNG of 16 bits) and summary.json (how much of the actor's detail the maps show). How an engine
+    blends them: export/README.md.
+
+    Args:
+        model: The actor's model, by name or folder; see `torchface train enhancement`.
+        rig: The rig that the engine moves, with texture coordinates; of any topology.
+        out: Folder for everything.
+        maps: How many wrinkle maps; each region has a weight for each.
+        size: Of each map, texels a side.
+        poses: Of the rig, for which the model is asked for wrinkles and that the weights are learned from.
+        animation: Weights (.csv) that wrinkles.glb plays; then map_weights.csv holds the maps' weights of every frame.
+        pairs: Where vertices of the rig lie on the model; see `torchface enhance`. By registration if absent.
+        part: Keep this region of the rig only, such as face.
+        quiet: Show no progress.
+    """
+    from torchface.files.job_lock import job_lock
+    from torchface.workflows.enhance.wrinkle_export import WrinkleSettings, export_wrinkles
+
+    settings = WrinkleSettings(maps, size, poses, pairs, part, animation)
+    with job_lock(out), progress_bars(quiet) as progress:
+        done = export_wrinkles(model, rig, out, settings, progress)
+    print_lines(done.lines())
+    for path in done.products.values():
+        print_path(path)
+
+
+def export_model(name: str, /, out: OutputPath, quiet: Quiet = False) -> None:
+    """Write a model of the zoo, or of a folder, as an ONNX file, and check it against PyTorch.
+
+    A head model gives the decoder (coefficients to vertices and colours), an expression regression the offsets of a
+    neutral face, UV landmarks the bank of filters, face landmarks the trees (grey image and boxes to 68 points),
+    face boxes the network (colour image to boxes and roll angles), a marker solver the solve, a dynamics prior mean and
+    deviation of the next frame's weights. Names, units, licence, data and what was measured are in the file's metadata.
+
+    Args:
+        name: Of the model, or its folder.
+        out: The .onnx file to write.
+        quiet: Show no progress.
+    """
+    from torchface import zoo
+    from torchface.files.job_lock import file_lock
+    from torchface.onnx import export_model as export
+
+    with file_lock(out, ".onnx"), progress_bars(quiet) as progress:
+        progress("loading the model")
+        record = zoo.describe(name)
+        model = zoo.get_model(name)
+        facts = {
+            "model": record.name,
+            "kind": record.kind,
+            "licence": record.licence,
+            "data": record.data,
+            "metrics": record.metrics,
+            "recipe": record.recipe,
+            "sha256": record.sha256,
+        }
+        progress("exporting and checking")
+        report = export(model, out, facts)
+    print_table(report.rows())
     print_path(out)
 
 

@@ -5,10 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated
 
-from rich.table import Table
 from tyro.conf import Positional, arg
 
-from torchface.cli.terminal import console
+from torchface.cli.terminal import print_table
 
 
 def info(
@@ -24,7 +23,4 @@ def info(
     """
     from torchface.workflows.describe_file import describe
 
-    table = Table(title=str(path), show_header=False)
-    for row in describe(path, attachment, part):
-        table.add_row(*row)
-    console.print(table)
+    print_table(describe(path, attachment, part), str(path))

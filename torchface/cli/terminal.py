@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 from rich.console import Console
 from rich.progress import BarColumn, ProgressColumn, SpinnerColumn, Task, TaskID, TimeElapsedColumn, TimeRemainingColumn
 from rich.progress import Progress as Bars
+from rich.table import Table
 from rich.text import Text
 from tyro.conf import arg
 
@@ -46,6 +47,14 @@ Quiet = Annotated[bool, arg(aliases=["-q"])]
 """The option of every command that shows progress."""
 
 _LOG_INTERVAL = 30.0  # seconds between two lines of one step where the output is not a terminal
+
+
+def print_table(rows: Iterable[tuple[str, ...]], title: str | None = None) -> None:
+    """Prints rows of what and how much as a table without a head."""
+    table = Table(title=title, show_header=False)
+    for row in rows:
+        table.add_row(*row)
+    console.print(table)
 
 
 def print_path(path: object) -> None:

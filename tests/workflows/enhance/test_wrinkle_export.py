@@ -12,7 +12,7 @@ import pytest
 import torch
 
 from tests.workflows.enhance.conftest import FRAMES, Actor
-from torchface.cli.export_enhancement import export_enhancement
+from torchface.cli.export import export_enhancement
 from torchface.errors import FileFormatError, TopologyError, ValueRangeError
 from torchface.geometry.meshes.normal_maps import normal_slopes
 from torchface.io import load_region_maps, load_rig, save_rig
