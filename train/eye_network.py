@@ -88,7 +88,7 @@ def evaluate(model: EyeNetwork, pictures: StoredEyePictures) -> dict[str, float]
 
 @torch.no_grad()
 def measures(model: EyeNetwork, pictures: StoredEyePictures, augmentation: EyeAugmentation) -> dict[str, float]:
-    """Of eyes that nothing hides: how well the lids' gap is told, how far off irises are, and which are called shut."""
+    """Of eyes that nothing hides: how well the lids' gap is measured, how far off irises are, which are shut."""
     generator = torch.Generator().manual_seed(0)
     gaps, irises, shut, visible = [], [], [], []
     for start in range(0, len(pictures), _TEST_BATCH):
@@ -96,12 +96,12 @@ def measures(model: EyeNetwork, pictures: StoredEyePictures, augmentation: EyeAu
         for eye in range(2):
             eyes = torch.full((len(part),), eye)
             crops = augmented_eyes(part.rgba, part.labels, eyes, model.width, model.height, generator, augmentation)
-            told = model(crops.images)
+            read = model(crops.images)
             width = (crops.points[:, 0] - crops.points[:, 3]).norm(dim=1)
-            gaps.append(torch.stack([_gap(told.landmarks), _gap(crops.points)], 1))
-            off = (told.iris - crops.points[:, 6]).norm(dim=1) / width
+            gaps.append(torch.stack([_gap(read.landmarks), _gap(crops.points)], 1))
+            off = (read.iris - crops.points[:, 6]).norm(dim=1) / width
             irises.append(torch.where(crops.seen[:, 6] > 0, off, torch.nan))
-            shut.append(torch.stack([told.closed, crops.closed], 1))
+            shut.append(torch.stack([read.closed, crops.closed], 1))
             visible.append(crops.visibility > 0.9)
     seen = torch.cat(visible)
     gap, closed = torch.cat(gaps)[seen], torch.cat(shut)[seen]

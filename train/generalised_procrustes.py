@@ -1,4 +1,4 @@
-"""Many shapes in correspondence laid on each other."""
+"""Alignment of many shapes in correspondence with their mean."""
 
 from __future__ import annotations
 
@@ -8,9 +8,11 @@ import torch
 from torch import Tensor
 
 from torchface.errors import ShapeError, ValueRangeError
-from torchface.geometry.sample_batches import MovedSamples, Samples, blocks
+from torchface.geometry.sample_batches import Samples, blocks
 from torchface.geometry.similarity import Similarity, similarity_transform
 from torchface.progress import Progress, silent
+
+from .sample_views import MovedSamples
 
 _TOLERANCE = 1e-3
 _MAX_ITERATIONS = 20

@@ -10,12 +10,13 @@ from torch import Tensor
 
 from torchface import Mesh
 from torchface.errors import ValueRangeError
-from torchface.geometry.sample_batches import SampleRange, Samples, blocks
+from torchface.geometry.sample_batches import Samples, blocks
 from torchface.modeling import MorphableModel
 from torchface.progress import Progress
 
 from .color_casts import color_casts, texture_areas, without_cast
 from .head_samples import Gathered
+from .sample_views import SampleRange
 
 _CAST_VERTICES = 4000
 _CAST_SAMPLES = 6_000_000

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import torch
 
-from torchface.geometry.sample_batches import SampleRange, Samples, blocks
+from torchface.geometry.sample_batches import Samples, blocks
 from torchface.modeling import HeadModel, MorphableModel
 
 from .model_quality import ModelQuality, model_quality
+from .sample_views import SampleRange
 
 _MEASURED = 500  # heads; leaving one out takes an eigensystem of so many for each
 
@@ -25,7 +26,7 @@ def head_quality(heads: Samples, count: int, components: int, seed: int) -> Mode
 def cross_validated(heads: Samples, folds: int, components: int | None) -> dict[str, float]:
     """How far heads lie from models of the others: each is left out once, in so many turns.
 
-    All heads were laid on each other together.
+    All heads were aligned together.
     """
     samples = torch.cat([heads.read(*block) for block in blocks(heads)])
     fold_of = torch.arange(len(samples)) % folds

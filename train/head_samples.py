@@ -1,4 +1,4 @@
-"""What the recipe for head models learns from: meshes gathered on disk, laid on each other, freed from colour casts."""
+"""Samples for head models: meshes gathered on disk, aligned with each other, freed from colour casts."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from torchface import Mesh, load_mesh
 from torchface.errors import FileFormatError, TopologyError
 from torchface.files.content_keys import content_key
 from torchface.geometry.meshes.unit_check import check_unit, extent
-from torchface.geometry.sample_batches import MovedSamples, SampleRange, Samples, blocks
+from torchface.geometry.sample_batches import Samples, blocks
 from torchface.geometry.similarity import Similarity, similarity_transform
 from torchface.io import MeshSequence, MeshSequenceWriter
 from torchface.io.meshes.named_files import named_files
@@ -25,6 +25,7 @@ from torchface.workflows.register.register_scans import SCANS
 
 from .generalised_procrustes import aligned, generalised_procrustes
 from .rendered_people.complexion import complexion_colors, draw_complexions
+from .sample_views import MovedSamples, SampleRange
 
 _METHOD = "gathered heads/3"
 _LEAST_EXTENT, _MOST_EXTENT = 0.4, 2.5  # of a head beside the template, of one topology
@@ -159,7 +160,7 @@ def upright(mesh: Mesh) -> Mesh:
 
 
 def laid(gathered: Gathered, scale: bool) -> tuple[Samples, Samples]:
-    """The heads to learn from on their common mean, and those to test on laid on it."""
+    """The heads to learn from on their common mean, and those to test on aligned with it."""
     total, count = len(gathered.shapes), len(gathered.shapes) - gathered.held_out
     learn = SampleRange(gathered.shapes, 0, count)
     found = generalised_procrustes(learn, scale, initial_mean=gathered.template.vertices)

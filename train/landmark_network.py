@@ -92,7 +92,7 @@ def evaluate(model: LandmarkNetwork, pictures: StoredPictures, first: int) -> di
 
 
 def measures(found: Tensor, truth: Tensor, visible: Tensor) -> dict[str, float]:
-    """Errors of landmarks (M,68,2) that can be seen (M,68), and how far the lids' opening is told.
+    """Errors of landmarks (M,68,2) that can be seen (M,68), and how far the lids' opening is measured.
 
     The opening is the mean distance of two pairs of lid landmarks; slope and correlation are those of what was found
     against the truth.
@@ -105,8 +105,8 @@ def measures(found: Tensor, truth: Tensor, visible: Tensor) -> dict[str, float]:
     def opened(points: Tensor) -> Tensor:
         return torch.stack([(points[:, a] - points[:, b]).norm(dim=-1) for a, b in _LIDS], 1)[frontal].flatten()
 
-    told, true = opened(found), opened(truth)
-    both = torch.cov(torch.stack([true, told]))
+    read, true = opened(found), opened(truth)
+    both = torch.cov(torch.stack([true, read]))
     return {
         "mean error of inner landmarks, % of the distance of the eyes' outer corners": 100
         * float((errors * weight).sum() / weight.sum()),

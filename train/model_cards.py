@@ -12,7 +12,7 @@ from torchface import zoo
 
 from .recipe_settings import RecipeSettings, recipe_name
 
-_NOT_TOLD = ("out", "device", "resume", "seed")  # what does not change the model, or is told in its place
+_NOT_TOLD = ("out", "device", "resume", "seed")  # what does not change the model, or is stated in its place
 
 
 def model_card(

@@ -14,9 +14,10 @@ from torchface import BlendshapeRig, Mesh, TorchfaceError
 from torchface.files.checkpoints import read_checkpoint, write_checkpoint
 from torchface.files.content_keys import content_key
 from torchface.files.whole_files import make_folder
-from torchface.geometry.sample_batches import SampleRange, Samples, SamplesInMemory, SamplesWithout, blocks
+from torchface.geometry.sample_batches import Samples, SamplesInMemory, blocks
 from torchface.progress import Progress
 
+from .sample_views import SampleRange, SamplesWithout
 from .tensor_shards import Shards
 
 _METHOD = "people of expressions/1"

@@ -72,7 +72,7 @@ class SyntheticVideo:
         rig: with the shapes of the takes.
         intrinsics: of the camera, (3,3), pixels.
         landmarks: (B,68,2), pixels, with noise.
-        rotation: of the head, which no solver is told, (B,3,3).
+        rotation: of the head, which no solver is given, (B,3,3).
         truth: the frames' weights, (B,N).
     """
 

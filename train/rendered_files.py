@@ -27,7 +27,7 @@ class Rendering:
     """What is rendered.
 
     Args:
-        render: the pictures of a file; a function of a module, so that processes can be told of it.
+        render: the pictures of a file; a function of a module, so that processes can import it.
         method: name and version; files of another one are not taken up.
         prefix: of the files' names.
         what: it shows, in a word, for the progress.

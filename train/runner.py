@@ -146,11 +146,11 @@ class Recipe(Generic[Settings, Trained]):
                 default = read_settings(Path(given), self.settings)
                 del flags[place : place + (1 if "=" in word else 2)]
                 break
-        told = (self.description or "") + _CONFIG
+        text = (self.description or "") + _CONFIG
         name = f"torchface train {recipe_name(self.settings)}"
         if default is None:
-            return tyro.cli(self.settings, prog=name, description=told, args=flags)
-        return tyro.cli(self.settings, prog=name, description=told, args=flags, default=default)
+            return tyro.cli(self.settings, prog=name, description=text, args=flags)
+        return tyro.cli(self.settings, prog=name, description=text, args=flags, default=default)
 
 
 def metric_lines(metrics: Mapping[str, float], number: str = "8.3f") -> list[str]:

@@ -122,12 +122,12 @@ class TakeStore:
 
 
 def _packed(take: StoredTake) -> dict[str, Tensor]:
-    told = json.dumps({"names": take.names, "fps": take.fps, "solved": take.solved}).encode()
-    return {"weights": take.weights.float(), "told": torch.frombuffer(bytearray(told), dtype=torch.uint8)}
+    facts = json.dumps({"names": take.names, "fps": take.fps, "solved": take.solved}).encode()
+    return {"weights": take.weights.float(), "facts": torch.frombuffer(bytearray(facts), dtype=torch.uint8)}
 
 
 def _unpacked(found: dict[str, Tensor] | None) -> StoredTake | None:
     if found is None:
         return None
-    told = json.loads(bytes(found["told"].tolist()))
-    return StoredTake(tuple(told["names"]), float(told["fps"]), found["weights"].double(), bool(told["solved"]))
+    facts = json.loads(bytes(found["facts"].tolist()))
+    return StoredTake(tuple(facts["names"]), float(facts["fps"]), found["weights"].double(), bool(facts["solved"]))

@@ -37,9 +37,9 @@ def tell(begin, start, passes=1):
     print(json.dumps(found))
 """
 HEADS = """
-from torchface.geometry.sample_batches import SampleRange
 from torchface.io import MeshSequence
 from torchface.modeling import MorphableModel
+from train.sample_views import SampleRange
 begin, start, passes = peak(), time.process_time(), []
 MorphableModel.fit(SampleRange(MeshSequence(sys.argv[2]), 0, int(sys.argv[1])), int(sys.argv[3]),
              progress=lambda step, done, total: passes.append(done / total))

@@ -9,8 +9,9 @@ from scipy.spatial.transform import Rotation
 
 from torchface.errors import ShapeError, ValueRangeError
 from torchface.geometry import sample_batches as module
-from torchface.geometry.sample_batches import SampleRange, SamplesInMemory, blocks
+from torchface.geometry.sample_batches import SamplesInMemory, blocks
 from train.generalised_procrustes import aligned, generalised_procrustes
+from train.sample_views import SampleRange
 
 
 @pytest.fixture(scope="module")

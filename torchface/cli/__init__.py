@@ -88,7 +88,7 @@ GROUPS = {
         EXPORTS,
     ),
     "zoo": Group(
-        "Tell which learned models there are and whether they are whole: `torchface zoo --help`.",
+        "List the learned models there are and whether they are whole: `torchface zoo --help`.",
         "What learned models there are, what is known of them, and whether they are whole.",
         ZOO,
     ),

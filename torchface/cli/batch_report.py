@@ -45,13 +45,13 @@ class Column(NamedTuple):
 
 
 def skipped_lines(quiet: bool) -> Callable[[Outcome], None]:
-    """A function that tells each item as it is skipped; nothing when quiet."""
+    """A function that reports each item as it is skipped; nothing when quiet."""
 
-    def tell(outcome: Outcome) -> None:
+    def report(outcome: Outcome) -> None:
         if not outcome.done and not quiet:
             console.print(Text("skipped", "yellow"), f"{outcome.item.path.name}: {outcome.error}", highlight=False)
 
-    return tell
+    return report
 
 
 def show_batch(report: BatchReport, columns: Sequence[Column], worst_by: str = "", legend: str = "") -> None:

@@ -59,7 +59,7 @@ def recipes_package() -> ModuleType:
     if not (is_checkout(checkout, _PACKAGE.name) and folder.is_dir()):
         raise FileFormatError(f"{_PACKAGE / '_train'}: found no recipes, expected those that come with torchface")
     if str(checkout) not in sys.path:
-        sys.path.append(str(checkout))  # processes that recipes start are told of it
+        sys.path.append(str(checkout))  # processes that recipes start find it there
     package = import_module(_IN_CHECKOUT)
     if Path(package.__file__ or "").resolve().parent != folder:
         raise FileFormatError(f"{package.__file__}: found another package 'train', expected {folder}")

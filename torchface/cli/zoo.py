@@ -22,7 +22,7 @@ def list_models() -> None:
     """List the learned models: name, kind, size, licence, and what each is in a line.
 
     Those that come with torchface and those in $TORCHFACE_HOME; on standard output. A damaged one is listed as such,
-    with what was found. `torchface zoo describe NAME` tells more of one, `torchface zoo verify` reads every file.
+    with what was found. `torchface zoo describe NAME` shows more of one, `torchface zoo verify` reads every file.
     """
     from torchface import zoo
     from torchface.zoo.model_folders import all_names
@@ -53,7 +53,7 @@ def list_models() -> None:
 
 
 def describe(name: Annotated[Positional[str], arg(metavar="NAME")]) -> None:
-    """Tell what is known of one learned model, without loading it.
+    """Show what is known of one learned model, without loading it.
 
     Its kind and class, size, licence, the data that it has learned from, what was measured on data held out, the
     command that makes it again, where it lies and comes from, and the sha256 of its state; on standard output.

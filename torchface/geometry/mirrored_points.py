@@ -11,7 +11,7 @@ from torchface.geometry.similarity import similarity_transform
 
 # Of labelled markers on a real face the wrong hand leaves 10 to 100 times the distance of the right one, 30 to 65 mm,
 # with 12 markers as with 100; a head's landmarks on another head's five times and more. Points in a plane, which no
-# fit can tell from their mirror image, leave the same twice.
+# fit can distinguish from their mirror image, leave the same twice.
 _CLEARLY_LESS = 0.5
 _LEAST_SHARE = 0.05  # of the points' mean distance from their centre: below it there is nothing to explain
 

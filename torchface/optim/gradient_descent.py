@@ -95,7 +95,7 @@ class DescentTask(Generic[Batch]):
 
 @dataclass(frozen=True, eq=False)
 class DescentRun:
-    """Where a network descends, and who is told.
+    """The folder and the reports of a descent.
 
     Args:
         progress: called with each step and how far it is.
@@ -127,7 +127,7 @@ def descend(
         network: goes on from its weights.
         task: what it learns.
         settings: how many steps, and how.
-        run: where, and who is told.
+        run: its folder and reports.
 
     Returns:
         The running mean of the weights, in evaluation mode, on the CPU.

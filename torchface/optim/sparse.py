@@ -45,7 +45,7 @@ class SparseCholesky:
             raise ValueRangeError("SparseCholesky: the matrix holds NaN or infinite entries; expected none")
         if self.size == 0:
             return
-        # QDLDL asks for every diagonal entry, and factors indefinite matrices too: the pivots' signs tell.
+        # QDLDL asks for every diagonal entry, and factors indefinite matrices too: the pivots' signs show it.
         if not (upper.diagonal() > 0).all():
             raise ValueRangeError("SparseCholesky: a diagonal entry is not positive; expected a definite matrix")
         try:

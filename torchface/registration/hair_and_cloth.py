@@ -34,7 +34,7 @@ _MIN_COUNT = 20
 
 
 class Cover:
-    """Tells which vertices of a template have a place on the scan that is not the person's skin.
+    """Finds which vertices of a template have a place on the scan that is not the person's skin.
 
     Skin is what has the colour of brows, nose, mouth and cheeks together, lit more or less. Only what lies away from
     the features of the face (further than some 25 mm from their landmarks) can be covered: beards, brows and lips

@@ -58,7 +58,7 @@ class HasShape(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class ModelFit:
-    """A model laid on a scan.
+    """A model aligned with a scan.
 
     Args:
         vertices: (V,3) float64, in the scan's space.
@@ -116,7 +116,7 @@ def fit_to_scan(
     Args:
         model: mean and modes.
         faces: of the template.
-        start: the template laid on the scan, (V,3) float64.
+        start: the template aligned with the scan, (V,3) float64.
         exposed: vertices that look for a correspondence, ids.
         scan: the surface.
         landmarks: template vertices (L,) and where they belong (L,3) float64; none of them is needed.

@@ -20,7 +20,7 @@ _MIN_COUNT = 4
 def completed_form(rest: Tensor, current: Tensor, faces: Tensor, unseen: Tensor, shown: Tensor) -> Tensor:
     r"""Vertices (V,3), the unseen ones where the template has them, bent to go on smoothly from those around.
 
-    The template is laid on what the scan shows by a similarity. The offset y from there to the registered vertices
+    A similarity aligns the template with what the scan shows. The offset y from there to the registered vertices
     goes on over the unseen ones as a thin plate does, and fades with the distance, :math:`\ell` = 80 mm:
 
     .. math:: \min_y \int \lVert \Delta y \rVert^2 + \ell^{-4} \lVert y \rVert^2
@@ -29,8 +29,8 @@ def completed_form(rest: Tensor, current: Tensor, faces: Tensor, unseen: Tensor,
         rest: the template, (V,3) float64.
         current: registered, (V,3) float64.
         faces: (F,3) int64.
-        unseen: whose places the scan does not tell, (V,) bool; the rest of the mesh stays.
-        shown: whose places it tells, (V,) bool: they lay the template.
+        unseen: whose positions the scan does not show, (V,) bool; the rest of the mesh stays.
+        shown: whose positions it shows, (V,) bool: they align the template.
 
     Source: Botsch and Sorkine 2008 (thin plates over a mesh).
     """

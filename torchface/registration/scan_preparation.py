@@ -63,7 +63,7 @@ def prepare_scan(scan: Mesh, template: Mesh) -> PreparedScan:
 
     Raises:
         TopologyError: the scan is empty or tiny.
-        ValueRangeError: it has no area, or its extent tells another unit than millimetres.
+        ValueRangeError: it has no area, or its extent shows another unit than millimetres.
     """
     found = len(scan.faces)
     if found < _LEAST_TRIANGLES:

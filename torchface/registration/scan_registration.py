@@ -51,7 +51,7 @@ _MAX_COMPLETIONS = 6
 _MIN_MET = 0.1  # share of what faces outward; scans of faces alone under templates of whole heads give a quarter
 
 Detector = Callable[[Mesh, Mesh, Similarity], Landmarks | None]
-"""Finds landmarks by itself: given the template laid on the scan, the scan, and the similarity from the one's own
+"""Finds landmarks by itself: given the template aligned with the scan, the scan, and the similarity from the one's own
 space to the other's; gives template vertex ids and scan points, or nothing."""
 
 
@@ -63,7 +63,7 @@ class Registration:
         mesh: the scan's face in the template's topology, in the scan's place, with the scan's colours.
         pose: the similarity that first laid the template on the scan, a batch of one.
         distance: of each vertex to the scan, (V,) float64, millimetres; beyond 10 mm it may be a little too long.
-        matched: which vertices' places the scan tells, (V,) bool; the others follow their neighbours.
+        matched: which vertices' positions the scan shows, (V,) bool; the others follow their neighbours.
         record: what was done.
         coefficients: of the model that the registration started from, (K,), where one was given.
     """
@@ -268,7 +268,7 @@ def _scale_notes(pose: Similarity) -> list[str]:
     if MIN_HEAD_SCALE <= scale <= MAX_HEAD_SCALE:
         return []
     return [
-        f"the template was laid on the scan at {scale:.3g} times its size, heads differ by {MIN_HEAD_SCALE} to "
+        f"the template was aligned with the scan at {scale:.3g} times its size, heads differ by {MIN_HEAD_SCALE} to "
         f"{MAX_HEAD_SCALE} times: are both in millimetres, and the landmarks this scan's?"
     ]
 

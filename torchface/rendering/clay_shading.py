@@ -28,7 +28,7 @@ class Lighting:
     Args:
         lights: direction toward the light in the camera's frame (right, up, toward the viewer) and its strength.
         ambient: light from everywhere, dimmed where other parts of the mesh stand close.
-        occlusion_rays: rays a pixel to tell how close; 0 leaves the dimming out.
+        occlusion_rays: rays a pixel that measure how close; 0 leaves the dimming out.
         occlusion_reach: millimetres beyond which a surface no longer dims.
         gloss: strength of the highlight.
 

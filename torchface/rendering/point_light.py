@@ -25,8 +25,8 @@ _OFF_THE_SKIN = 0.4  # millimetres; a ray that starts on the skin would hit it
 class PointLight:
     r"""Light from one point and from everywhere, linear, standing still beside the camera.
 
-    Light and surface meet only in products (:math:`I_a K_a` and :math:`I_p K_d`): an image cannot tell a bright source
-    on dark skin from a dim one on bright skin. The coefficients K are therefore 1, and what is here are the products
+    Light and surface meet only in products (:math:`I_a K_a` and :math:`I_p K_d`): a bright source on dark skin looks
+    like a dim one on bright skin. The coefficients K are therefore 1, and what is here are the products
     beside the albedo that was given. Distance does not dim the light.
 
     Args:

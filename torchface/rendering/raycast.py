@@ -64,23 +64,3 @@ class RayCaster:
             raise ShapeError(f"rays: found {tuple(origins.shape)} and {tuple(directions.shape)}, expected (R,3) twice")
         starts = (origins - self._centre).numpy().astype(np.float32, copy=False)
         return np.ascontiguousarray(starts), np.ascontiguousarray(directions.numpy().astype(np.float32, copy=False))
-
-
-def openness(
-    caster: RayCaster, starts: Tensor, normals: Tensor, generator: torch.Generator, count: int, reach: float
-) -> Tensor:
-    """The share of the hemisphere over each point that is free within reach, by a few rays a point, (R,) float64.
-
-    Args:
-        caster: of what may be in the way.
-        starts, normals: of the points, a little above the surface, (R,3).
-        generator: of the rays' directions.
-        count: rays a point.
-        reach: millimetres.
-    """
-    free = torch.zeros(len(starts))
-    for _ in range(count):  # a ray of each point a turn
-        way = normals + torch.nn.functional.normalize(torch.randn(normals.shape, generator=generator).double(), dim=-1)
-        way = torch.nn.functional.normalize(way + 1e-6, dim=-1)
-        free += caster.distances(starts, way, reach)
-    return free.double() / (count * reach)

@@ -229,7 +229,7 @@ def _checked(frame: Tensor, vertices: Tensor, mesh: Mesh, camera: Camera) -> Ten
 
 
 def _as(frame: Tensor, image: Tensor, linear: Tensor, pixel: Tensor) -> Tensor:
-    """The image with the pixels changed that something was laid on, in the frame's kind; the others stay exactly."""
+    """The image with the pixels changed that were painted, in the frame's kind; the others stay exactly."""
     touched = pixel.unique()
     result = image.reshape(3, -1).clone()
     result[:, touched] = to_srgb(linear.reshape(3, -1)[:, touched].clamp(0, 1))

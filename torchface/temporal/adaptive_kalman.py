@@ -24,7 +24,7 @@ class AdaptiveSettings:
         calm: share of each motion's credit that goes to the next calmer one: what is most likely still jitters more
             than eyes forgive, and a little calmer is hardly less exact.
         memory: frames after which a forecast counts 1/e.
-        longest_gap: frames without measurements that are bridged; then the filter waits and starts anew.
+        longest_gap: frames without measurements that are predicted; then the filter waits and starts anew.
 
     Example:
         >>> len(AdaptiveSettings(measurement=(0.5, 1.0), jerk=(0.01, 0.1, 1.0)).combinations())
@@ -161,7 +161,7 @@ def adaptive_smoother(
 ) -> Tensor:
     """Points (T,P,D) from all frames, those after each too, under the noise and motion that are most likely of each.
 
-    Gaps are bridged up to ``longest_gap`` frames; longer ones, and what is before the first measurement, stay NaN.
+    Gaps are filled up to ``longest_gap`` frames; longer ones, and what is before the first measurement, stay NaN.
     ``intervals`` are T, each from the frame before, in frames of the usual length; 1 if absent.
 
     Source: Rauch, Tung, Striebel 1965.

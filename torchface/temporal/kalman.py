@@ -165,7 +165,7 @@ def kalman_smoother(
 
     Args:
         values: measurements (T,...), NaN for not seen.
-        settings: see :class:`KalmanSettings`, of all channels or one a channel; all gaps are bridged, whatever
+        settings: see :class:`KalmanSettings`, of all channels or one a channel; all gaps are filled, whatever
             ``longest_gap`` is.
         intervals: from the frame before to each of T frames, in frames of the usual length; 1 if absent.
 

@@ -172,11 +172,11 @@ def _staged(people: ScenePeople, number: int, settings: SceneSettings, seed: int
         if rng.random() < 0.22:
             _occlude(image, owner, hull, rng)
     seen = np.array([_share_seen(owner, hull, number) for number, hull in enumerate(hulls)])
-    told = torch.from_numpy(np.array(faces, dtype=np.float32).reshape(-1, 4))
+    faces_there = torch.from_numpy(np.array(faces, dtype=np.float32).reshape(-1, 4))
     inside = np.array([_share_inside(face, size) for face in faces])
     kept = torch.from_numpy(seen >= _DOUBTFUL) if faces else torch.zeros(0, dtype=torch.bool)
-    uncertain = (seen < _FOUND) | (inside < _WHOLE) | (told[:, 2].numpy() < settings.smallest * 1.15)
-    return image, told[kept], torch.from_numpy(uncertain.astype(bool))[kept]
+    uncertain = (seen < _FOUND) | (inside < _WHOLE) | (faces_there[:, 2].numpy() < settings.smallest * 1.15)
+    return image, faces_there[kept], torch.from_numpy(uncertain.astype(bool))[kept]
 
 
 def _crowd(people: int) -> np.ndarray:

@@ -15,7 +15,7 @@ from torchface.geometry.meshes.operators import vertex_normals
 from torchface.landmarks.images.ibug_68 import box_around
 from torchface.progress import Progress, silent
 from torchface.rendering.clay_shading import sample_texture
-from torchface.rendering.raycast import RayCaster, openness
+from torchface.rendering.raycast import RayCaster
 from torchface.rig import BlendshapeRig
 from torchface.synthetic.head.head_annotations import head_annotations
 from torchface.synthetic.head.identity import IDENTITY, draw_identities, mean_vertices, ramp
@@ -25,6 +25,7 @@ from torchface.synthetic.stages.weight_curves import GESTURES
 from .backdrops import backdrop, photographed, uniform
 from .complexion import complexion_colors, draw_complexions
 from .portrait_geometry import Hairdo, annotated_landmarks, hair_share, portrait, widened
+from .rendered_person import openness
 
 _SENSITIVITY = torch.tensor([0.35, 0.5, 0.15])
 # What people in photographs have more or less of than the mean head, standard deviations: width, most of all.

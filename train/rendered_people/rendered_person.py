@@ -11,7 +11,7 @@ from torchface.color_space import to_linear, to_srgb
 from torchface.geometry.cameras.pinhole import Camera
 from torchface.geometry.meshes.operators import vertex_normals
 from torchface.rendering.gaussian_blur import gaussian_blur
-from torchface.rendering.raycast import RayCaster, openness
+from torchface.rendering.raycast import RayCaster
 
 from .backdrops import uniform
 from .head_kind import EYEBALL, GUMS, SKIN, TEETH
@@ -54,9 +54,9 @@ def render_person(
         person: whose head it is.
         scene: all that can be seen.
         camera: from where.
-        generator: of the lamps and the exposure.
-        rays: of the few rays a point that tell open places from hollow ones; ``generator`` if absent. With one of their
-            own the lamps are the same however much of the picture someone fills.
+        generator: of the light sources and the exposure.
+        rays: of the few rays a point that distinguish open places from hollow ones; ``generator`` if absent. With one
+            of their own the light sources are the same however much of the picture someone fills.
         exposure: another picture's; if absent it is drawn, for how light the skin and the eyes' whites are.
     """
     height, width = camera.height, camera.width
@@ -215,3 +215,23 @@ def visible_points(distance: Tensor, camera: Camera, points: Tensor, pixels: Ten
     near = -torch.nn.functional.max_pool2d(-patch, 3, 1, 1)[0, 0]
     far = torch.nn.functional.max_pool2d(torch.where(torch.isfinite(patch), patch, 1e9), 3, 1, 1)[0, 0]
     return torch.isfinite(near[y, x]) & (far[y, x] > depth - behind)
+
+
+def openness(
+    caster: RayCaster, starts: Tensor, normals: Tensor, generator: torch.Generator, count: int, reach: float
+) -> Tensor:
+    """The share of the hemisphere over each point that is free within reach, by a few rays a point, (R,) float64.
+
+    Args:
+        caster: of what may be in the way.
+        starts, normals: of the points, a little above the surface, (R,3).
+        generator: of the rays' directions.
+        count: rays a point.
+        reach: millimetres.
+    """
+    free = torch.zeros(len(starts))
+    for _ in range(count):  # a ray of each point a turn
+        way = normals + torch.nn.functional.normalize(torch.randn(normals.shape, generator=generator).double(), dim=-1)
+        way = torch.nn.functional.normalize(way + 1e-6, dim=-1)
+        free += caster.distances(starts, way, reach)
+    return free.double() / (count * reach)

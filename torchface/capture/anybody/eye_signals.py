@@ -1,4 +1,4 @@
-"""What openness, irises and corners of the eyes tell: how far lids are open, and where the eyes look."""
+"""Signals of the eyes from openness, irises and corners: how far lids are open, and where the eyes look."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ _DOWNWARD = 0.2  # how quickly the open level falls beside how it rises: blinks 
 
 @dataclass(frozen=True, eq=False)
 class EyeSignals:
-    """What a frame tells of the eyes, the person's right one first.
+    """Signals of the eyes in a frame, the person's right one first.
 
     Args:
         open: openness beside the person's own, 1 open as at rest, 0 shut, (2,).

@@ -22,7 +22,7 @@ class VideoSolution:
         errors: root mean square distance of the seen landmarks to the rig's, (T,), pixels; NaN where none is seen.
         solved: frames with at least six landmarks, (T,) bool; the others keep the weights of the frame before,
             or in a whole take lie between those before and after.
-        confidence: how much of what could tell of each weight was seen, (T,N) in [0,1].
+        confidence: share of what shows each weight that was seen, (T,N) in [0,1].
     """
 
     weights: Tensor

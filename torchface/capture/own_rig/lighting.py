@@ -30,7 +30,7 @@ class LightFit:
         direction: unit, from the middle of what was seen toward the source, camera's frame, (3,).
         distance: of the source from there, millimetres; 100,000 is the directional limit. A face is small beside a
             room: how far away a source stands is found roughly, where it shines from well.
-        deviation: of the direction, degrees, as the curvature of the objective and the inliers' errors tell; infinite
+        deviation: of the direction, degrees, as the curvature of the objective and the inliers' errors show; infinite
             where no source shows. Wrong geometry and wrong albedo come on top.
         errors: difference between shaded albedo and frame, sRGB, Euclidean, (T,V); NaN where not seen.
         visible: vertices that a frame shows squarely, (T,V).

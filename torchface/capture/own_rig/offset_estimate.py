@@ -21,7 +21,7 @@ from torchface.optim.box_qp import box_qp
 _FRAMES, _ROUNDS, _REWEIGHTINGS = 40, 3, 3
 _STABLE = 10
 # Standard deviations of offsets to each other, millimetres: finders put the contour where the head's edge is, and brows
-# where hair is; eyes, nose and lips are drawn sharply. How large they are altogether the take tells.
+# where hair is; eyes, nose and lips are drawn sharply. How large they are altogether is estimated from the take.
 _CONTOUR, _BROWS, _INNER = 5.0, 3.0, 2.0
 _LEAST_SCALE, _MOST_SCALE = 0.02, 2.0
 _RESEMBLANCE = 1.5  # people differ from rigs more along what expressions move, which is left out of the measure
@@ -34,7 +34,7 @@ _FREE = 1e3
 
 @dataclass(frozen=True, eq=False)
 class _Mean:
-    """What all frames together tell of a constant expression (N) and of offsets (204), the heads' poses left to each.
+    """What all frames together say of a constant expression (N) and of offsets (204), the heads' poses left to each.
 
     Args:
         H, gradient: of half the squared residual, in units of ``_MODEL_ERROR``, (N+204,N+204) and (N+204,).
@@ -57,7 +57,7 @@ def estimate_offsets(
     rig: str = "",
     finder: str = "",
 ) -> LandmarkOffsets | None:
-    r"""The offsets of a rig's landmarks that a take tells, jointly with its poses and weights.
+    r"""The offsets of a rig's landmarks that a take shows, jointly with its poses and weights.
 
     A residual that stays the same in all frames is a fixed offset, or an expression that never ends. Both are looked
     for at once, and each is paid for once and not once a frame,
@@ -79,7 +79,7 @@ def estimate_offsets(
         rig, finder: digests to be kept with the offsets.
 
     Returns:
-        The offsets and the noise that is left; None where fewer than ten frames show a face, which is too few to tell
+        The offsets and the noise that is left; None where fewer than ten frames show a face, which are too few
         an expression from an offset.
 
     Source: Candès, Wakin and Boyd 2008 for the penalty.
@@ -203,7 +203,7 @@ def _scale(share: Tensor, residual: Tensor, jacobian: Tensor, weight: Tensor, de
 
 
 def _varying_noise(solver: VideoSolver, residual: Tensor, weight: Tensor, share: Tensor, head: HeadState) -> float:
-    """The noise that inner landmarks' residuals (B,136) tell, as a share of the eyes' distance, on the safe side.
+    """The noise that inner landmarks' residuals (B,136) show, as a share of the eyes' distance, on the safe side.
 
     What they have in common in all frames is no noise.
     """

@@ -74,7 +74,7 @@ def solve_whole_take(
 ) -> VideoSolution:
     r"""Weights and poses of consecutive frames, each from all of them.
 
-    The solver runs forward; then what later frames tell goes back,
+    The solver runs forward; then what later frames say goes back,
 
     .. math:: x_t \leftarrow x_t + G_t (x_{t+1} - x^-_{t+1}), \quad G_t = P_t (P^-_{t+1})^{-1}
 
@@ -82,7 +82,7 @@ def solve_whole_take(
     of it, under the prior and the bounds.
 
     Args:
-        solver: with a dynamics prior; without one no frame tells of another.
+        solver: with a dynamics prior; without one no frame says anything of another.
         landmarks, rotation, translation, confidence, progress: as of ``VideoSolver.forward``.
 
     Raises:

@@ -9,7 +9,7 @@ from torch import Tensor, nn
 
 from torchface.errors import ShapeError
 
-# Directions of the inducing points that the kernel tells apart by less than this are left out: float32 cannot.
+# Directions of the inducing points that the kernel distinguishes by less than this are left out: float32 cannot.
 _MIN_EIGENVALUE = 1e-6
 
 

@@ -65,7 +65,7 @@ def fitted_kernel(inputs: Tensor, targets: Tensor, inducing: Tensor, active: Ten
 class LeftOutProcess:
     """Cross-validation of a process in two passes over parts of a few folds; no frame is kept.
 
-    In the first pass ``learn`` takes each part, then ``settle`` solves; in the second ``predict`` tells what the other
+    In the first pass ``learn`` takes each part, then ``settle`` solves; in the second ``predict`` gives what the other
     folds make of a part, and ``compare`` how well. Memory is two matrices a fold.
 
     Args:

@@ -15,7 +15,7 @@ __all__ = ["Camera", "look_at"]
 MAX_SIDE = 16384
 """Pixels that an image may have a side."""
 MAX_ANGLE = 36000.0
-"""Degrees; beyond a hundred turns rounding tells."""
+"""Degrees; beyond a hundred turns rounding errors show."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -26,7 +26,7 @@ def extent(points: Tensor) -> float:
 
 
 def check_unit(name: str, points: Tensor, beside: float, what: str, least: float, most: float) -> None:
-    """Refuses points whose extent tells another unit than millimetres.
+    """Refuses points whose extent shows another unit than millimetres.
 
     Args:
         name: of the points, for the message.

@@ -84,7 +84,7 @@ def read_blender_file(path: str | Path, unit: str | None = None) -> BlenderScene
 
     Vertices and polygons keep the order that Blender gives them; a scene of several meshes gets a region a mesh.
     Objects that are hidden, subdivision, and on meshes with shape keys other modifiers are left out; of what is shown
-    and has no place in a rig a ``UserWarning`` tells.
+    and has no place in a rig a ``UserWarning`` reports.
 
     Args:
         path: ``.fbx`` or ``.blend``.
@@ -138,7 +138,7 @@ def write_blender_file(rig: BlendshapeRig, path: str | Path, keys: WeightKeys | 
 
 
 def _notes(rig: BlendshapeRig, names: tuple[str, ...], keys: WeightKeys | None) -> dict[str, Any]:
-    """What Blender is told beside the USD file; see ``writing_in_blender.py``."""
+    """What Blender gets beside the USD file; see ``writing_in_blender.py``."""
     ranges = torch.tensor([0.0, 1.0]).repeat(len(names), 1)
     if keys is not None:  # Blender holds weights to what the sliders show
         ranges = torch.stack([keys.weights.amin(0).clamp(max=0), keys.weights.amax(0).clamp(min=1)], 1)

@@ -25,7 +25,7 @@ def read_gltf_weights(path: str | Path) -> Take | None:
     """The weights that a file's animations give its shapes, one frame a key; none where nothing moves shapes.
 
     Each mesh has the weights of the first animation that moves it: some programs write one animation of several objects
-    as several, others write several takes of the same face. Of what is left out a ``UserWarning`` tells.
+    as several, others write several takes of the same face. A ``UserWarning`` reports what is left out.
 
     Args:
         path: a ``.glb`` or ``.gltf`` whose keys are a film's frames, as :func:`torchface.save_animation` writes them.

@@ -58,7 +58,7 @@ class Samples:
 def decode_samples(data: bytes, source: str, planes: int = 3) -> Samples:
     """The image in ``data``, turned as its EXIF orientation says.
 
-    What decoding takes, with the image as float32 after it, is told from the header and kept below 480 MiB or 18 bytes
+    What decoding takes, with the image as float32 after it, is known from the header and kept below 480 MiB or 18 bytes
     for a byte of the file, and below 1.5 GiB where each eight pixels have a byte, as photographs and textures of 30 to
     80 megapixels do; and an image of more than 4096 x 4096 pixels needs a byte for every hundred of them. So no file
     of some kilobytes unpacks to gigabytes.

@@ -32,7 +32,7 @@ class _Entry:
 
 
 def first_directory(data: bytes, source: str) -> dict[int, tuple[int, ...]]:
-    """The whole numbers of those tags of a TIFF's first directory that tell what its pixels are.
+    """The whole numbers of those tags of a TIFF's first directory that describe its pixels.
 
     Decoders copy what each tag points at, and thousands of tags may point at one place: a directory that claims more
     bytes than the file has is refused.
@@ -95,7 +95,7 @@ def _entries(data: bytes, source: str) -> tuple[str, list[_Entry]]:
 
 
 def exif_orientation(exif: bytes, source: str) -> int:
-    """EXIF's orientation, 1 (upright) to 8; 1 where none is told, and where the block is damaged, as viewers do."""
+    """EXIF's orientation, 1 (upright) to 8; 1 where there is none, and where the block is damaged, as viewers do."""
     try:
         return plausible_orientation(first_directory(exif.removeprefix(b"Exif\0\0"), source))
     except FileFormatError:
@@ -103,6 +103,6 @@ def exif_orientation(exif: bytes, source: str) -> int:
 
 
 def plausible_orientation(tags: dict[int, tuple[int, ...]]) -> int:
-    """The orientation that tags tell, 1 to 8; another number, which viewers ignore too, is 1."""
+    """The orientation of tags, 1 to 8; another number, which viewers ignore too, is 1."""
     number = tags.get(ORIENTATION, (1,))[0]
     return number if 1 <= number <= 8 else 1

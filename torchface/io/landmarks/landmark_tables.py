@@ -60,7 +60,7 @@ def load_landmark_table(path: str | Path) -> LandmarkTable:
 
     Columns ``x_0``, ``y_0``, ... or ``x0``, ``y0``, ... hold 68 landmarks, or 468 or 478 points of MediaPipe's mesh, in
     pixels or in shares of the image. ``frame`` puts rows in their place, frames between that are missing were not seen;
-    ``success`` 0 was not seen either. ``confidence`` or py-feat's ``FaceScore`` tell how sure a frame is,
+    ``success`` 0 was not seen either. ``confidence`` or py-feat's ``FaceScore`` say how sure a frame is,
     ``confidence_0``, ... and ``visibility_0``, ... each landmark, ``timestamp`` or ``time`` (seconds) the rate. Other
     columns are passed over.
 

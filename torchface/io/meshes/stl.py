@@ -36,7 +36,7 @@ def read_stl(path: str | Path, unit: str = "mm") -> Mesh:
     data = read_file(path)
     count = int.from_bytes(data[80:84], "little")
     size = _HEADER + count * _RECORD
-    # A binary file may begin with "solid" too: its length tells.
+    # A binary file may begin with "solid" too: its length decides.
     if len(data) == size and count:
         points = np.asarray(load_stl_binary(BytesIO(data))["vertices"], np.float64)
     elif data.lstrip()[:5].lower() == b"solid" and b"\0" not in data[:_HEADER]:

@@ -18,7 +18,7 @@ _FOREIGN = ("PXR_PLUGINPATH_NAME", "PXR_AR_DEFAULT_SEARCH_PATH", "PYTHONSTARTUP"
 
 
 def read_scene(command: Sequence[str], path: Path, reader: str, seconds: float) -> Scene:
-    """What ``command PATH FOLDER`` finds in a file; what it left out is told as ``UserWarning``.
+    """What ``command PATH FOLDER`` finds in a file; what it left out is reported as ``UserWarning``.
 
     Args:
         command: leaves a scene in the folder; see ``torchface.io.scene_processes.scene_arrays``.

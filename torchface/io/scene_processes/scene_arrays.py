@@ -64,7 +64,7 @@ class Scene:
     arrays: Mapping[str, NDArray[Any]]
 
     def warn_of_left_out(self) -> None:
-        """Tells by ``UserWarning`` what the process left out."""
+        """Reports by ``UserWarning`` what the process left out."""
         for what in self.record["left_out"]:
             warnings.warn(f"{self.path}: left out: {visible(what)}", stacklevel=3)
 

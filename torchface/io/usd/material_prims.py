@@ -17,7 +17,7 @@ from torchface.io.images.image_files import encode_png
 from torchface.mesh import Mesh
 
 PAINTED = "torchface_painted"
-"""The key of a material's ``customData`` that tells an image made for a part that had none from the mesh's texture."""
+"""The key of a material's ``customData`` that marks an image made for a part that had none from the mesh's texture."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -45,7 +45,7 @@ def extract(path: Path, limit: Callable[[int], None]) -> tuple[dict[str, Any], d
 
     Args:
         path: the root layer, or a package.
-        limit: told the bytes of all files so far, before the next is opened.
+        limit: called with the bytes of all files so far, before the next is opened.
     """
     from pxr import Usd, UsdGeom
 

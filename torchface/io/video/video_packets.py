@@ -126,7 +126,7 @@ _BYTES_ALWAYS, _BYTES_PER_BYTE = 490 * 2**20, 18
 _REFERENCES = {"h264": 16, "hevc": 16, "vvc": 16, "vp9": 8, "libdav1d": 10, "av1": 10, "libaom-av1": 10}
 _FEW_REFERENCES = 3  # of other codecs, those that keep every frame whole among them
 _CONVERTED_BYTES = 6  # a pixel, as red, green and blue and in the chunk that is given
-_USUAL_BITS = 12  # a pixel, where only a frame will tell
+_USUAL_BITS = 12  # a pixel, known only from a frame
 _MOV_BOXES = (b"ftyp", b"moov", b"mdat", b"wide", b"free", b"skip")
 
 

@@ -190,7 +190,7 @@ def _lines_of_traces(template: Mesh, found: ScanLandmarks, points: int) -> dict[
 
 
 class AutomaticLandmarks:
-    """Finds pairs for ``register``: called with the template laid on a scan, the scan, and the similarity from the
+    """Finds pairs for ``register``: called with the template aligned with a scan, the scan, and the similarity from the
     template's own space to the scan's; gives template vertex ids (K,) and scan points (K,3).
 
     Only sure pairs are given. Where the image is unlike those learned from (open eyes, another skin), filters agree

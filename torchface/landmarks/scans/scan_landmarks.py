@@ -127,8 +127,7 @@ def appearance_image(head: UnwrappedHead, appearance: str) -> Tensor:
 
 
 def line_image(head: UnwrappedHead, appearance: str) -> Tensor:
-    """The image (C,S,S) in which such a detector traces lines: lips and lids are finer than what tells a landmark
-    from its surroundings.
+    """The image (C,S,S) in which such a detector traces lines: lips and lids are finer than landmarks.
 
     Example:
         >>> from torchface.landmarks import CylinderLayout, unwrap

@@ -63,7 +63,7 @@ class UVLandmarkDetector(nn.Module):
     over the clusters c that mean shift makes of the good ones among every filter's best 200 matches.
 
     Beyond the thesis, a found place is weighed against the usual one by its error, for its size, when each
-    training image was searched with the filters of the others: a landmark that filters cannot tell (a cheek without
+    training image was searched with the filters of the others: a landmark that filters cannot find (a cheek without
     texture) stays near its usual place,
 
     .. math:: x = \mu + \Sigma (\Sigma + r^2 \tfrac{s}{|c|} I)^{-1} (\hat{x} - \mu)

@@ -38,7 +38,7 @@ class Deformer:
     """A template on its way to a scan; vertices in ``hidden`` (V,) have no place there, and follow the others.
 
     Args:
-        vertices: the template laid on the scan, (V,3) float64.
+        vertices: the template aligned with the scan, (V,3) float64.
         faces: its triangles.
         scan: the surface.
         landmarks: what is known of where vertices belong; none of them is needed.
@@ -150,7 +150,7 @@ class Deformer:
         )
 
     def folded_triangles(self) -> Tensor:
-        """Mask (F,) of the triangles that have turned by more than 90° since the template was laid on the scan."""
+        """Mask (F,) of the triangles that have turned by more than 90° since the template was aligned with the scan."""
         return turned_over(self.rest, self.current, self.faces)
 
     def unfold(self) -> None:

@@ -31,7 +31,7 @@ class LandmarkPull:
 
     @staticmethod
     def of(vertices: Tensor, points: Tensor, template: Mesh) -> LandmarkPull:
-        """With the contour told by the template's 68 landmarks, where it has as many."""
+        """With the contour given by the template's 68 landmarks, where it has as many."""
         contour = torch.zeros(len(vertices), dtype=torch.bool)
         known = None if template.annotations is None else template.annotations.landmarks
         if known is not None and len(known) == 68:

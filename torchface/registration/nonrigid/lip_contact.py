@@ -27,7 +27,7 @@ class ContactPull:
 
     Args:
         pairs: (K,2) int64.
-        offsets: from the first to the second with the template laid on the scan, (K,3) float64.
+        offsets: from the first to the second with the template aligned with the scan, (K,3) float64.
     """
 
     pairs: Tensor
@@ -63,7 +63,7 @@ def contact_pull(laid: Tensor, template: Mesh) -> ContactPull:
 
     Args:
         laid: the template's vertices on the scan, (V,3) float64.
-        template: its own size tells what is close.
+        template: its size decides what is close.
     """
     notes = template.annotations
     named = None if notes is None else notes.contacts

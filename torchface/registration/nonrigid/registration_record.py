@@ -1,4 +1,4 @@
-"""What a registration tells about itself."""
+"""Record of a registration."""
 
 from __future__ import annotations
 
@@ -46,10 +46,10 @@ class RegistrationRecord:
         stages: in order.
         notes: what was found in the input and what was done about it, for people to read.
         median_distance: of the exposed vertices that found the scan, to it, millimetres.
-        matched: share of the template's vertices whose place the scan tells; the others follow their neighbours.
+        matched: share of the template's vertices whose position the scan shows; the others follow their neighbours.
         seconds: wall-clock.
         far_distance: as the median, but the 95th percentile.
-        shown: share of what faces outward, whose place the scan tells.
+        shown: share of what faces outward, whose position the scan shows.
         covered: share of what faces outward that lies under hair, cloth or on an ear in pieces: the template's.
         stretch: by which share of its length the 95th percentile of the edges that the scan shows has grown or shrunk
             beyond the whole.

@@ -195,7 +195,7 @@ _FIELDS: tuple[tuple[str, str, float, float, Field], ...] = (
      * ramp(-p[:, 1], 105, 150)[:, None]),
 )  # fmt: skip
 
-# These four move lids and eyeball only; their fields are laid on the lid rings below.
+# These four move lids and eyeball only; their fields are placed on the lid rings below.
 _EYE_PARAMETERS: tuple[tuple[str, str, float, float], ...] = (
     ("eye_width", "length of the opening between the lids, mm", 30, 1.3),
     ("eye_opening", "height of the opening between the lids, mm from the mean", 0, 0.75),

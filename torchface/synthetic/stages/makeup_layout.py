@@ -1,6 +1,6 @@
 """Where a make-up artist sets markers: by muscles and action units, symmetric, each with its name.
 
-A site is a weighted sum of the 68 landmarks, laid on the skin. The tables hold the subject's right side and the
+A site is a weighted sum of the 68 landmarks, projected onto the skin. The tables hold the subject's right side and the
 midline; the left side is the mirror image.
 """
 
@@ -146,7 +146,7 @@ def makeup_layout(rig: BlendshapeRig) -> MakeupLayout:
 
     Brows and the frontalis above them (action units 1, 2, 4), lids (5, 7, 45), the orbicularis beside and below the eye
     (6), nose (9), nasolabial fold (10, 11, 12), the contour of both lips (15 to 28), chin (17), jaw line (26, 27, 29,
-    30), and few on forehead, temples and nasal root that hardly move, which tell the head's motion.
+    30), and few on forehead, temples and nasal root that hardly move, which show the head's motion.
 
     Args:
         rig: with 68 iBUG landmarks in its annotations; without, they are found from shapes with ARKit's names.

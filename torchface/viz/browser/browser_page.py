@@ -188,7 +188,7 @@ _SAME = 5e-4
 
 
 class SharedInput:
-    """A slider, dropdown or checkbox of the page, which tells changes by the user from those by the program.
+    """A slider, dropdown or checkbox of the page, which distinguishes changes by the user from those by the program.
 
     Args:
         handle: viser's.

@@ -27,7 +27,7 @@ class LiveView:
         prompt: what a guided calibration asks for; empty without one.
         left: seconds until it asks for the next.
         recording: seconds that are recorded; None without a recording.
-        notes: sentences that the user was told, newest last.
+        notes: sentences shown to the user, newest last.
     """
 
     picture: np.ndarray

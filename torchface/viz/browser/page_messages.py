@@ -1,4 +1,4 @@
-"""What a browser may tell a page: the messages that the page is made for, with finite numbers and values that fit."""
+"""Messages that a page accepts from a browser: those that it is made for, with finite numbers and values that fit."""
 
 from __future__ import annotations
 

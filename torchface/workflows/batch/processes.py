@@ -74,8 +74,8 @@ def in_processes(
                 workers[pipe] = _Worker(process)
                 started.append(process)
             overdue = [w.since + limit - time.monotonic() for w in workers.values() if w.item is not None]
-            patience = min(overdue, default=inf)
-            ready = wait(list(workers), None if patience == inf else max(patience, 0.0))
+            timeout = min(overdue, default=inf)
+            ready = wait(list(workers), None if timeout == inf else max(timeout, 0.0))
             for pipe in cast("list[Connection]", ready):
                 worker = workers[pipe]
                 try:

@@ -29,7 +29,7 @@ _PORT = 6379
 _SECONDS_TO_ANSWER, _SECONDS_TO_JOIN = 3.0, 14.0
 _JOIN = """
 import logging, sys, ray
-print(flush=True)  # loading takes long on a busy machine, and tells nothing about the cluster
+print(flush=True)  # loading takes long on a busy machine, and says nothing about the cluster
 ray.init(address=sys.argv[1], log_to_driver=False, logging_level=logging.ERROR)
 """
 _GRACE = 10.0  # seconds
@@ -53,14 +53,14 @@ def check_cluster(address: str) -> None:
         try:
             assert process.stdout is not None
             process.stdout.readline()  # loaded, or ended
-            told = process.communicate(timeout=_SECONDS_TO_JOIN)[1].decode(errors="replace").strip().splitlines()
+            output = process.communicate(timeout=_SECONDS_TO_JOIN)[1].decode(errors="replace").strip().splitlines()
         except subprocess.TimeoutExpired as error:
             why = f"it did not let this process join within {_SECONDS_TO_JOIN:g} seconds"
             raise _none_there(address, why) from error
         finally:
             process.kill()
     if process.returncode:
-        raise _none_there(address, (told or [f"status {process.returncode}"])[-1][:300])
+        raise _none_there(address, (output or [f"status {process.returncode}"])[-1][:300])
 
 
 def _check_answers(address: str) -> None:
@@ -160,7 +160,7 @@ def _set_alarm(seconds: float) -> None:
 
 
 def _give_up(item: BatchItem, out: Path, time_limit: float) -> None:
-    """Ends this process; the record tells the driver, to whom the end looks like a lost machine, that it was meant."""
+    """Ends this process; the record shows the driver, to whom the end looks like a lost machine, that it was meant."""
     try:
         write_record(too_long(item, time_limit), "", out, {})
     finally:

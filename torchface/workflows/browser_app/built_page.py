@@ -91,10 +91,12 @@ def _node() -> tuple[str, str]:
     wanted = f"Node {_LEAST_NODE[0]}.{_LEAST_NODE[1]} or newer with npm (https://nodejs.org), once, to build the page"
     if node is None or npm is None:
         raise MissingExtraError(f"the app: found no {'node' if node is None else 'npm'}, expected {wanted}")
-    told = subprocess.run([node, "--version"], capture_output=True, text=True, check=False, timeout=60).stdout.strip()
-    version = re.match(r"v(\d+)\.(\d+)", told)
+    printed = subprocess.run(
+        [node, "--version"], capture_output=True, text=True, check=False, timeout=60
+    ).stdout.strip()
+    version = re.match(r"v(\d+)\.(\d+)", printed)
     if version is None or (int(version[1]), int(version[2])) < _LEAST_NODE:
-        raise MissingExtraError(f"the app: found Node {told or 'that does not run'} ({node}), expected {wanted}")
+        raise MissingExtraError(f"the app: found Node {printed or 'that does not run'} ({node}), expected {wanted}")
     return node, npm
 
 

@@ -244,8 +244,8 @@ def _of_name(what: str, name: object, kinds: Mapping[str, Any]) -> Any:
 def landmark_observability(solver: ExampleSolver, noise: float = 0.5) -> Observability:
     """What 68 landmarks in a picture can see of a solver's examples; see :func:`weight_observability`.
 
-    What the placement explains, where it is solved for, tells no shapes apart: so a head that tilts is not seen beside
-    :class:`SolvedSimilarity`, which says the roll itself.
+    What the placement explains, where it is solved for, does not distinguish shapes: a head that tilts is not seen
+    beside :class:`SolvedSimilarity`, which gives the roll itself.
 
     Args:
         solver: examples and placement.

@@ -34,7 +34,7 @@ class LandmarkModel(nn.Module):
         + \beta \sum_k w_k + \varepsilon \lVert w \rVert^2
 
     in units of the eyes' distance. Both are small, and the second has one matrix for all frames. What noise does beside
-    the components is not followed. Its tensors are float64: weights are told from thousandths of a pixel.
+    the components is not followed. Its tensors are float64: weights follow from thousandths of a pixel.
 
     Args:
         mean: :math:`m`, (68,2), pixels of the examples.
