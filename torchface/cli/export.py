@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
-from torchface.cli.command_options import OutputPath
+from torchface.cli.command_options import Output, OutputPath
 from torchface.cli.terminal import Quiet, console, print_lines, print_path, print_table, progress_bars
 
 if TYPE_CHECKING:
@@ -52,7 +52,7 @@ def hybrid_solver(rig: Path, attachment: Path, out: OutputPath, part: str | None
 
 
 def _write_solver(
-    export: Callable[..., SolverReport], rig: Path, attachment: Path, out: OutputPath, part: str | None, quiet: bool
+    export: Callable[..., SolverReport], rig: Path, attachment: Path, out: Path, part: str | None, quiet: bool
 ) -> None:
     from torchface.attachment import Attachment
     from torchface.files.job_lock import file_lock
@@ -216,7 +216,12 @@ def webcam(out: OutputPath, quiet: Quiet = False) -> None:
     print_path(out)
 
 
-def export_app(out: OutputPath, character: Path | None = None, webcam: Path | None = None, quiet: Quiet = False) -> None:
+def export_app(
+    out: Annotated[Path, Output(("character.glb",))],
+    character: Path | None = None,
+    webcam: Path | None = None,
+    quiet: Quiet = False,
+) -> None:
     """Write the app in the browser: a folder that any static host serves, in which a webcam moves a character.
 
     Everything runs on the user's machine; the page sends nothing. To try it: `python -m http.server --directory OUT`,
@@ -243,7 +248,7 @@ def export_enhancement(
     *,
     model: str,
     rig: Path,
-    out: OutputPath,
+    out: Annotated[Path, Output(("wrinkles.glb", "map_weights.csv"))],
     maps: int = 4,
     size: int = 1024,
     poses: int = 300,
