@@ -1,4 +1,4 @@
-"""Where markers sit on a mesh: a triangle and barycentric coordinates each."""
+"""Sites of markers on a mesh: a triangle and barycentric coordinates each."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How weights go on: a prior learned from takes, its window chosen by predictions of a take left out."""
+"""Dynamics priors learned from takes; the window is chosen by predictions of a take left out."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a model of heads' colours learns from: each scan freed from its cast; and the model of them."""
+"""Colours of heads for a model: each scan freed from its cast; and the model of them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What is measured of a head model: on heads held out, on heads left out in turn, and of its random heads."""
+"""Measures of a head model: on heads held out, on heads left out in turn, and of its random heads."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a recipe says of its model: the command that makes it again, its settings, what was measured."""
+"""Card of a recipe's model: the command that makes it again, its settings, what was measured."""
 
 from __future__ import annotations
 

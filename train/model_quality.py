@@ -1,4 +1,4 @@
-"""How good a morphable model is: compactness, generalisation, specificity."""
+"""Quality of a morphable model: compactness, generalisation, specificity."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Who is held out for the test: people, never single pictures, scans or takes of someone who is learned from."""
+"""People held out for the test: never single pictures, scans or takes of someone who is learned from."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the recipe of priors does, and what both kinds of priors learn from."""
+"""Settings of the recipe of priors, and what both kinds of priors learn from."""
 
 from __future__ import annotations
 

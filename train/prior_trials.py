@@ -1,4 +1,4 @@
-"""What a prior is worth on takes that it has not seen: predictions of frames, and solves from a few points."""
+"""Trials of a prior on takes that it has not seen: predictions of frames, and solves from a few points."""
 
 from __future__ import annotations
 

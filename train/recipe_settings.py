@@ -1,4 +1,4 @@
-"""What every recipe's settings have in common: the same words mean the same everywhere."""
+"""Settings of all recipes: the same words mean the same everywhere."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a run measures on the way: a table on disk, TensorBoard where it is installed, and curves."""
+"""Log of a run: a table on disk, TensorBoard where it is installed, and curves."""
 
 from __future__ import annotations
 

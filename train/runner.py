@@ -1,4 +1,4 @@
-"""What every recipe does: flags and files to settings, one run at a time, log, what was measured printed."""
+"""Runner of all recipes: flags and files to settings, one run at a time, log, what was measured printed."""
 
 from __future__ import annotations
 

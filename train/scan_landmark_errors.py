@@ -1,4 +1,4 @@
-"""How far found landmarks and lines are from the true ones, in pixels and millimetres, and an image of both."""
+"""Errors of found landmarks and lines against the true ones, in pixels and millimetres, and an image of both."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Which weights faces have: a prior learned from takes, its strength and width chosen by trial solves."""
+"""Shape priors learned from takes; strength and width are chosen by trial solves."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What points on a face can see of the weights that move them: rank, conditioning, and shapes that look alike."""
+"""Observability of weights by points on a face: rank, conditioning, and shapes that look alike."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How far correctives are on at given weights, and what that changes with them."""
+"""Activation of correctives at given weights, and its derivatives."""
 
 from __future__ import annotations
 

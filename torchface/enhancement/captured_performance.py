@@ -1,4 +1,4 @@
-"""What an actor did before a scanner: the frames that an enhancement learns from."""
+"""An actor's captured frames, from which an enhancement learns."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How an enhancement splits frames and finds detail, and how large it is."""
+"""Settings of an enhancement: how it splits frames and finds detail, and how large it is."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What is computed once of an actor's database: filters, projections, the learned map, timing."""
+"""Values computed once of an actor's database: filters, projections, the learned map, timing."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How far a solved performance is from the true one: in weights, at the markers, over the whole mesh."""
+"""Errors of a solved performance against the true one: in weights, at the markers, over the whole mesh."""
 
 from torchface.evaluation.error_figures import ErrorFigures, error_figures, region_figures
 from torchface.evaluation.mesh_errors import (

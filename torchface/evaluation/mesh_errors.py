@@ -1,4 +1,4 @@
-"""How far a solved performance is from the true one at the markers and over the whole mesh."""
+"""Errors of a solved performance against the true one at the markers and over the whole mesh."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How far solved weights, and the shapes of a rig, are from the true ones."""
+"""Errors of solved weights, and of a rig's shapes, against the true ones."""
 
 from __future__ import annotations
 

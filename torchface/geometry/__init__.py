@@ -1,1 +1,1 @@
-"""What meshes, cameras and rotations compute of themselves; nothing here depends on faces, files or learning."""
+"""Geometry of meshes, cameras and rotations; nothing here depends on faces, files or learning."""

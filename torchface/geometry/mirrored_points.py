@@ -1,4 +1,4 @@
-"""Whether points were mirrored on their way, as left-handed axes or swapped sides do."""
+"""Check for points mirrored on their way, as left-handed axes or swapped sides do."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What is in a head-camera video: where to look, and which action units were performed when, as TOML."""
+"""Labels of a head-camera video as TOML: where to look, and which action units were performed when."""
 
 from __future__ import annotations
 

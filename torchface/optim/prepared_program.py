@@ -1,4 +1,4 @@
-"""What box-constrained quadratic programs of one H and bounds need, prepared once for many calls."""
+"""Values of box-constrained quadratic programs of one H and bounds, prepared once for many calls."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What is computed once from tensors and kept until they change."""
+"""Values computed once from tensors and kept until they change."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What hides a person's skin on a scan: hair and cloth, known by their colour, and ears that came out in pieces."""
+"""Hair and cloth on a scan, which hide the skin: found by their colour; and ears that came out in pieces."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Where a template lies on a scan before it bends: by landmarks, or found by its shape alone, in any pose."""
+"""Pose of a template on a scan before it bends: by landmarks, or by its shape alone, in any pose."""
 
 from __future__ import annotations
 

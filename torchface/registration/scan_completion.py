@@ -1,4 +1,4 @@
-"""What a scan does not show, taken from the template: form and colours that go over into what it does show."""
+"""Completion of a scan by the template: shape and colours that pass over into those of the scan."""
 
 from __future__ import annotations
 

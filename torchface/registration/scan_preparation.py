@@ -1,4 +1,4 @@
-"""What is wrong with a scan and its landmarks, mended where that is safe and said where it is not."""
+"""Faults of a scan and its landmarks: repaired where that is safe, reported where it is not."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What of a head a photograph shows, and how squarely."""
+"""Visibility of a head's vertices in a photograph, and how squarely they are seen."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Which pixels of an image a mesh covers, with what of it, and by what share at its edges."""
+"""Coverage of an image's pixels by a mesh: with which part of it, and by what share at its edges."""
 
 from __future__ import annotations
 

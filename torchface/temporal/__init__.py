@@ -1,4 +1,4 @@
-"""What time does to signals: smoothing and filtering along frames."""
+"""Smoothing and filtering of signals along frames."""
 
 from torchface.temporal.adaptive_kalman import AdaptiveFilter, AdaptiveSettings, adaptive_filter, adaptive_smoother
 from torchface.temporal.interpolation import interpolated, nearest_rows

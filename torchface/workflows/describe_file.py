@@ -1,4 +1,4 @@
-"""What a file holds, in rows for people to read."""
+"""Contents of a file, in rows for people to read."""
 
 from __future__ import annotations
 

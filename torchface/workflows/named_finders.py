@@ -1,4 +1,4 @@
-"""What finds landmarks, by the name that a user gives it."""
+"""Landmark finders by the names that a user gives."""
 
 from __future__ import annotations
 

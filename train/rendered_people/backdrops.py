@@ -1,4 +1,4 @@
-"""What stands behind a face in an image, and what a camera does to it: structure, blur, noise, compression."""
+"""Backdrops of a face in an image, and a camera's effects: structure, blur, noise, compression."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What someone looks like beside the form of the head: skin, hair, brows, beard, make-up, glasses, clothes."""
+"""Looks of someone beside the shape of the head: skin, hair, brows, beard, make-up, glasses, clothes."""
 
 from __future__ import annotations
 

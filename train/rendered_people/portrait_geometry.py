@@ -1,4 +1,4 @@
-"""What a portrait shows besides the bare head: hair, curtains of hair, teeth, shoulders; and the visible jaw line."""
+"""Geometry of a portrait besides the bare head: hair, teeth, shoulders; and the visible jaw line."""
 
 from __future__ import annotations
 

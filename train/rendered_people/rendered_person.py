@@ -1,4 +1,4 @@
-"""What a camera sees of someone: the colour of each pixel under light sources, and how far away it is."""
+"""Rendering of a person: the colour of each pixel under light sources, and its depth."""
 
 from __future__ import annotations
 

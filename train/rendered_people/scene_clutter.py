@@ -1,4 +1,4 @@
-"""What else is in a picture: coloured walls, shapes, stripes, writing, skin, hands, cloth, screens; no faces."""
+"""Clutter of a picture: coloured walls, shapes, stripes, writing, skin, hands, cloth, screens; no faces."""
 
 from __future__ import annotations
 

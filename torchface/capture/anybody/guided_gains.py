@@ -1,4 +1,4 @@
-"""How far a person's face goes beside the rig's: gains of groups of shapes, by poses that are asked for."""
+"""Gains of a person's groups of shapes relative to the rig, from poses that are asked for."""
 
 from __future__ import annotations
 

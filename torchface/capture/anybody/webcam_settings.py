@@ -1,4 +1,4 @@
-"""What the terms of the webcam's solve weigh, and how quickly it learns a person."""
+"""Settings of the webcam's solve: the weights of its terms, and how quickly it learns a person."""
 
 from __future__ import annotations
 

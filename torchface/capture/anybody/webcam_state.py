@@ -1,4 +1,4 @@
-"""What a webcam's frames hand on, as named tensors and as one vector; and what the user asks for meanwhile."""
+"""State of a webcam's solve between frames, as named tensors and as one vector, and the user's controls."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Which label of a take is which marker of an attachment, as recorders write labels."""
+"""Matching of a take's labels with an attachment's markers, as recorders write labels."""
 
 from __future__ import annotations
 

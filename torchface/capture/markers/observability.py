@@ -1,4 +1,4 @@
-"""What a marker layout can see of a rig."""
+"""Observability of a rig's shapes by a layout of markers."""
 
 from __future__ import annotations
 

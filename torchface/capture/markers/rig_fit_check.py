@@ -1,4 +1,4 @@
-"""Whether a rig explains the markers of a take, and if not, the cause whose correction helps most."""
+"""Check that a rig explains the markers of a take; if not, the cause whose correction helps most."""
 
 from __future__ import annotations
 

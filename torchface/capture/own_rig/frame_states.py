@@ -1,4 +1,4 @@
-"""What the solve of a video's frames takes, hands on and gives."""
+"""Inputs, states and results of the solve of a video's frames."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What frames show of a face's vertices, beside the albedo that they are known to have."""
+"""Samples of the skin in frames: colours of vertices beside their known albedo."""
 
 from __future__ import annotations
 

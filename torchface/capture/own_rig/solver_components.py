@@ -1,4 +1,4 @@
-"""What a video solver is made of: the rig's points, the camera, priors and settings; and how they are kept."""
+"""Components of a video solver: the rig's points, the camera, priors and settings; and how they are kept."""
 
 from __future__ import annotations
 

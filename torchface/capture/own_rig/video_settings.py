@@ -1,4 +1,4 @@
-"""What the terms of the video solve weigh, and when its steps end: alike for files, cameras and exported graphs."""
+"""Settings of the video solve, alike for files, cameras and exported graphs: weights of terms, ends of steps."""
 
 from __future__ import annotations
 

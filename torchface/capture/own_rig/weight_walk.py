@@ -1,4 +1,4 @@
-"""How weights go on where no dynamics prior says so: a random walk, and rest for what stays hidden."""
+"""Motion of weights without a dynamics prior: a random walk, and rest for shapes that stay hidden."""
 
 from __future__ import annotations
 

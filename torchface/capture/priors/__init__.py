@@ -1,4 +1,4 @@
-"""What faces do, learned from takes: which weights, and how they go on."""
+"""Priors learned from takes: which weights faces have, and how they change."""
 
 from torchface.capture.priors.adapted_dynamics import AdaptedDynamicsPrior, adapt_dynamics
 from torchface.capture.priors.dynamics_prior import DynamicsPrior, DynamicsSettings

@@ -1,4 +1,4 @@
-"""What a thousand frames' details have in common: few components in half precision, learned a block at a time."""
+"""Basis of a thousand frames' details: few components in half precision, learned a block at a time."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What turns and what stretches in a deformation gradient, and nine numbers for both that can be blended."""
+"""Rotation and stretch of deformation gradients, as nine numbers that can be blended."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How a smooth deformation turns and stretches the surface at every vertex, and in the mean over patches."""
+"""Frames of a smooth deformation: rotation and stretch at every vertex, and in the mean over patches."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a database's detail changes by where frames lie beyond it: a linear map, region by region."""
+"""Linear map, region by region, of the detail that frames beyond the database have."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Which patches of a face move together: connected clusters, mirrored where face and motion are."""
+"""Clusters of a face's patches that move together: connected, and mirrored where face and motion are."""
 
 from __future__ import annotations
 

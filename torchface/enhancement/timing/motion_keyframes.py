@@ -1,4 +1,4 @@
-"""Where a motion turns and where it holds: the keyframes between which it is timed."""
+"""Keyframes between which a motion is timed: where it turns and where it holds."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What an actor's model teaches the wrinkle maps of a rig: poses to learn from, and their detail."""
+"""Poses from which the wrinkle maps of a rig are learned, and their detail by the actor's model."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Where a lens bends what an ideal pinhole camera would see, and the way back."""
+"""Lens distortion: from an ideal pinhole camera's pixels to a real one's, and back."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Where a camera stands, from points that it sees: the perspective-n-point problem."""
+"""Pose of a camera from points that it sees: the perspective-n-point problem."""
 
 from __future__ import annotations
 

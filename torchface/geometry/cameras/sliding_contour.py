@@ -1,4 +1,4 @@
-"""Where a face ends before the background: points that slide over the skin as the head rotates."""
+"""Outline of a face before the background: points that slide over the skin as the head rotates."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Where a surface meets itself in a pose: lids that close, lips that touch."""
+"""Contacts of a surface with itself in a pose: lids that close, lips that touch."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How triangles deform: gradients with a fourth vertex, and the sparse operator that computes them from vertices."""
+"""Deformation gradients of triangles with a fourth vertex, and the sparse operator that computes them."""
 
 from __future__ import annotations
 

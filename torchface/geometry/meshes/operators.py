@@ -1,4 +1,4 @@
-"""What a triangle mesh computes of itself: normals, areas, edges, borders, parts. All functions are batched."""
+"""Operators of a triangle mesh: normals, areas, edges, borders, parts. All functions are batched."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a displacement field over a thin shell costs, linearised at rest: stretching and bending as sparse matrices."""
+"""Energies of a displacement over a thin shell, linearised at rest: stretching and bending as sparse matrices."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Whether two meshes of people can be in one unit: heads differ by less than units do."""
+"""Check that two meshes of people can be in one unit: heads differ by less than units do."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What Blender runs to read: as a script of its own, or of a Python with ``bpy``; never imported by the library.
+"""Script that Blender, or a Python with ``bpy``, runs to read; never imported by the library.
 
 ``reading_in_blender.py FILE FOLDER`` opens an FBX or Blender file and writes ``scene.json`` and ``arrays.npz`` (see
 ``torchface.io.scene_processes.scene_arrays``) into the folder, or ``refused.json``, a list of what was found and what

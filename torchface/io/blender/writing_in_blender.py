@@ -1,4 +1,4 @@
-"""What Blender runs to write: as a script of its own, or of a Python with ``bpy``; never imported by the library.
+"""Script that Blender, or a Python with ``bpy``, runs to write; never imported by the library.
 
 ``writing_in_blender.py USD FILE NOTES`` opens a USD file of one mesh and writes it as FBX or Blender file. NOTES is
 JSON: ``fps``, ``names`` of all shape keys, ``ranges``, the least and the largest weight of each, and ``correctives``,

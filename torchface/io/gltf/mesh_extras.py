@@ -1,4 +1,4 @@
-"""What glTF has no place for, in ``mesh.extras.torchface``: polygons and annotations, as compact JSON."""
+"""Extras in ``mesh.extras.torchface`` that glTF has no place for: polygons and annotations, as compact JSON."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the parts of a head are made of, by the names of the regions that they are annotated as."""
+"""Materials of the parts of a head, by the names of the regions that they are annotated as."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What an image file says of itself before a pixel is decoded: its kind, size, samples and orientation."""
+"""Headers of image files, read before a pixel is decoded: kind, size, samples and orientation."""
 
 from __future__ import annotations
 

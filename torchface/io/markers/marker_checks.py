@@ -1,4 +1,4 @@
-"""What all marker files have in common: units, labels, and what a take of markers must hold."""
+"""Checks of all marker files: units, labels, and the numbers of a take of markers."""
 
 from __future__ import annotations
 

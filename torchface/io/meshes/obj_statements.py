@@ -1,4 +1,4 @@
-"""What the lines of an OBJ say, as arrays: read piece by piece, since words take far more memory than their text."""
+"""Statements of an OBJ as arrays: read piece by piece, since words take far more memory than their text."""
 
 from __future__ import annotations
 

@@ -1,1 +1,1 @@
-"""What files of scenes share: pieces of a rig put together, and weights as keys of its animation."""
+"""Parts of all scene files: pieces of a rig put together, and weights as keys of its animation."""

@@ -1,4 +1,4 @@
-"""What of a take can be written to a file: values, names and kept columns."""
+"""Checks of a take that is written to a file: values, names and kept columns."""
 
 from __future__ import annotations
 

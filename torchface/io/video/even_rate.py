@@ -1,4 +1,4 @@
-"""Whether a video's frames come at an even rate."""
+"""Evenness of a video's frame rate."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a video's compressed packets say: when each frame is shown, and how large the key frames are."""
+"""Packets of a video: when each frame is shown, and how large the key frames are."""
 
 from __future__ import annotations
 

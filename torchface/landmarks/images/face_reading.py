@@ -1,4 +1,4 @@
-"""What was read of a face, in one picture or in those of a take."""
+"""Reading of a face, in one picture or in those of a take."""
 
 from __future__ import annotations
 

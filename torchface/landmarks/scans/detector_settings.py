@@ -1,4 +1,4 @@
-"""How landmarks are matched in UV space."""
+"""Settings of the matching of landmarks in UV space."""
 
 from __future__ import annotations
 

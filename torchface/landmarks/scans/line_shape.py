@@ -1,4 +1,4 @@
-"""How a line between two corners usually runs, and its grey profile: learned from annotated lines."""
+"""Usual course of a line between two corners, and its grey profile: learned from annotated lines."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What scores a filter gives at its landmark in other images, and elsewhere: two Gaussians a filter."""
+"""Statistics of a filter's scores at its landmark in other images, and elsewhere: two Gaussians a filter."""
 
 from __future__ import annotations
 

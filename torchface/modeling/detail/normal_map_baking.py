@@ -1,4 +1,4 @@
-"""What a high-resolution scan shows and a face mesh is too coarse to hold, as a normal map in texture space."""
+"""Baking of normal maps: detail that a high-resolution scan shows and a face mesh is too coarse to hold."""
 
 from __future__ import annotations
 

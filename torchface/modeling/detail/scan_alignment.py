@@ -1,4 +1,4 @@
-"""Where a scan lies on a mesh of the same face: by picked points, or found by itself."""
+"""Alignment of a scan with a mesh of the same face: by picked points, or by itself."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Which part of a photographed head is skin: neither hair nor clothes, nor what stands behind a misplaced ear."""
+"""Mask of a photographed head's skin: neither hair nor clothes, nor what stands behind a misplaced ear."""
 
 from __future__ import annotations
 

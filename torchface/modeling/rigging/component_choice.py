@@ -1,4 +1,4 @@
-"""How many components a regression between two sets of samples should have, by cross-validation in sample space."""
+"""Choice of a regression's numbers of components, by cross-validation in sample space."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What is read of a face's two eyes in a picture, as values of a graph."""
+"""Reading of a face's two eyes in a picture, as values of a graph."""
 
 from __future__ import annotations
 

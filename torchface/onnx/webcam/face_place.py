@@ -1,4 +1,4 @@
-"""Where a face is in a picture, as values of a graph: middle, side and roll angle of the square round it.
+"""Place of a face in a picture, as values of a graph: middle, side and roll angle of the square round it.
 
 A place is (5,): x and y of the middle, side, cosine and sine of the roll angle, clockwise as the picture is seen.
 """

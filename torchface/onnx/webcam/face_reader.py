@@ -1,4 +1,4 @@
-"""What is read of one face in a webcam's pictures, frame after frame, as values of a graph."""
+"""Reading of one face in a webcam's pictures, frame after frame, as values of a graph."""
 
 from __future__ import annotations
 

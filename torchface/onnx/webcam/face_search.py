@@ -1,4 +1,4 @@
-"""Which of the faces that the box network finds in a picture is meant, as values of a graph."""
+"""Choice among the faces that the box network finds in a picture, as values of a graph."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Which scan point each template vertex goes to, and which are refused: border, normal, distance."""
+"""Correspondences of template vertices with scan points, and those refused: border, normal, distance."""
 
 from __future__ import annotations
 

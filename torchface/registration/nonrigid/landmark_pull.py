@@ -1,4 +1,4 @@
-"""What landmarks pull: points of the face in full, those of its contour as far as the surface agrees."""
+"""Pull of landmarks: points of the face in full, those of its contour as far as the surface agrees."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a registration does in which order, as data."""
+"""Schedule of a registration, as data."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Which affine maps a stage may choose from: all, those of a coarse graph, or translations on top of given ones."""
+"""Affine maps that a stage chooses from: all, those of a coarse graph, or translations on top of given ones."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What is laid into the form's openings, ring by ring from the block's border: lids, lips, nostrils, ears, eyeballs."""
+"""Openings of the face, ring by ring from the block's border: lids, lips, nostrils, ears, eyeballs."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What is known of the head's vertices: 68 landmarks, regions, pairs that touch."""
+"""Annotations of the head's vertices: 68 landmarks, regions, pairs that touch."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What makes one head differ from another: measurable parameters, each a smooth field over the mean head."""
+"""Identity of a head: measurable parameters, each a smooth field over the mean head."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a scan shows besides the face: hair as lumps on the scalp, and a collar round the neck."""
+"""Hair and collar of a scanned head: lumps on the scalp, and cloth round the neck."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Where a make-up artist sets markers: by muscles and action units, symmetric, each with its name.
+"""Layout of markers as a make-up artist sets them: by muscles and action units, symmetric, each with its name.
 
 A site is a weighted sum of the 68 landmarks, projected onto the skin. The tables hold the subject's right side and the
 midline; the left side is the mirror image.

@@ -1,4 +1,4 @@
-"""What the panel lists, as HTML; names from files are escaped."""
+"""Lists of a page's panel as HTML; names from files are escaped."""
 
 from __future__ import annotations
 

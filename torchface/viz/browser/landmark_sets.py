@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from torchface.landmarks.images.ibug_68 import MIRROR_68
+
 
 @dataclass(frozen=True)
 class LandmarkSet:
@@ -23,20 +25,6 @@ def _numbered(part: str, count: int) -> list[str]:
     return [f"{part} {i}" for i in range(1, count + 1)]
 
 
-def _reversed_pairs(first: int, last: int) -> dict[int, int]:
-    """Rows first..last of a row of points that runs from one side of the face to the other."""
-    return {row: first + last - row for row in range(first, last + 1)}
-
-
-def _mirror_68() -> tuple[int, ...]:
-    twins = {row: row for row in range(68)}
-    twins |= _reversed_pairs(0, 16) | _reversed_pairs(17, 26) | _reversed_pairs(31, 35)
-    eyes = {36: 45, 37: 44, 38: 43, 39: 42, 40: 47, 41: 46}
-    twins |= eyes | {twin: row for row, twin in eyes.items()}
-    twins |= _reversed_pairs(48, 54) | _reversed_pairs(55, 59) | _reversed_pairs(60, 64) | _reversed_pairs(65, 67)
-    return tuple(twins[row] for row in range(68))
-
-
 IBUG_68 = LandmarkSet(
     (
         *_numbered("jaw line", 17),
@@ -49,7 +37,7 @@ IBUG_68 = LandmarkSet(
         *_numbered("outer lip", 12),
         *_numbered("inner lip", 8),
     ),
-    _mirror_68(),
+    MIRROR_68,
 )
 """iBUG's 68 in their order, which begins at the performer's right ear."""
 

@@ -1,4 +1,4 @@
-"""What a live page shows, and what it may ask for."""
+"""View of a live page: what it shows, and what it may ask for."""
 
 from __future__ import annotations
 

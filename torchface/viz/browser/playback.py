@@ -1,4 +1,4 @@
-"""Which frame of a take is due at which moment."""
+"""Playback of a take: the frame that is due at a moment."""
 
 from __future__ import annotations
 

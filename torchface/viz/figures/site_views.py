@@ -1,4 +1,4 @@
-"""Where markers sat on a face and where they sit now, and how their error fell."""
+"""Views of markers' sites before and after a fit, and how their error fell."""
 
 from __future__ import annotations
 

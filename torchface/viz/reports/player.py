@@ -1,4 +1,4 @@
-"""What the player in a page plays, as scripts that a page opened from disk may load."""
+"""Data of the player in a page, as scripts that a page opened from disk may load."""
 
 from __future__ import annotations
 

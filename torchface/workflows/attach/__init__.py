@@ -1,1 +1,1 @@
-"""Where markers sit on a rig, found from ranges of motion."""
+"""Sites of markers on a rig, found from ranges of motion."""

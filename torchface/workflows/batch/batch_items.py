@@ -1,4 +1,4 @@
-"""Which files and folders a command is to work on, one by one, and what each is called."""
+"""Items of a batch: files and folders that a command works on, one by one, and their names."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What became of one item: in memory, as a JSON record below its results, as a row of the table."""
+"""Outcome of one item: in memory, as a JSON record below its results, as a row of the table."""
 
 from __future__ import annotations
 

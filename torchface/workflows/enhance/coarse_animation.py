@@ -1,4 +1,4 @@
-"""What is to be enhanced: an animation in the vertices of the model's dense mesh, whatever it came from."""
+"""Coarse animation to be enhanced, in the vertices of the model's dense mesh, whatever it came from."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What speaks against a fit: landmarks that do not fit, photographs that do not show one person."""
+"""Checks of a fit: landmarks that do not fit, photographs that do not show one person."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What tracking a video gave, and what there is to say of it."""
+"""Result of tracking a video, and its report."""
 
 from __future__ import annotations
 

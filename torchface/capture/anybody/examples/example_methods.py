@@ -1,4 +1,4 @@
-"""Two ways to solve landmarks for the weights of examples: all shapes at once, or the head first, then regions."""
+"""Methods that solve landmarks for the weights of examples: all shapes at once, or the head first, then regions."""
 
 from __future__ import annotations
 

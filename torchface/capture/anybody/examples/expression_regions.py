@@ -1,4 +1,4 @@
-"""Which part of the face an example shape belongs to: the head as a whole, brows, eyes or mouth."""
+"""Regions of example shapes: the head as a whole, brows, eyes or mouth."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What 68 landmarks say of blendshape weights: linear equations, a frame each, and their weighted least squares."""
+"""Linear equations of blendshape weights from 68 landmarks, a frame each, and their weighted least squares."""
 
 from __future__ import annotations
 

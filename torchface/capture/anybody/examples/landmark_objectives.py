@@ -1,4 +1,4 @@
-"""What a solve from landmarks minimises: squared distances, or distances as they are, each with its penalties."""
+"""Objectives of a solve from landmarks: squared distances, or distances as they are, each with its penalties."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Where and how large a face lies in the picture, as a solve from its landmarks takes it into account."""
+"""Placement of a face in the picture, position and size, in a solve from its landmarks."""
 
 from __future__ import annotations
 

@@ -1,1 +1,1 @@
-"""Where markers sit on a rig: first guess, fit to a range of motion, uncertainty, refusal."""
+"""Sites of markers on a rig: first guess, fit to a range of motion, uncertainty, refusal."""

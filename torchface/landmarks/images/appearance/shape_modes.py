@@ -1,4 +1,4 @@
-"""How the landmarks of one face move: a mean shape, modes with their deviations, and similarities apart from both."""
+"""Modes of one face's landmarks: a mean shape, modes with their deviations, and similarities apart from both."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the trainings of networks with heat maps share: first weights, batches, losses of places, gaps and maps."""
+"""Parts of all trainings of networks with heat maps: first weights, batches, losses of places, gaps and maps."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a tracker keeps of the face that it follows: its place, the finder's box beside it, its look, and counts."""
+"""State of a face that a tracker follows: its place, the finder's box beside it, its look, and counts."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Where a face wrinkles: curved lines on the skin, with how deep and how wide it folds there."""
+"""Lines of a face's wrinkles: curves on the skin, with how deep and how wide it folds there."""
 
 from __future__ import annotations
 
