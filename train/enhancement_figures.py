@@ -16,8 +16,8 @@ from torchface.files.whole_files import make_folder
 from torchface.geometry.meshes.operators import vertex_normals
 from torchface.progress import Progress
 from torchface.rendering.compositing import caption, headed, save_rendered_image, sheet
+from torchface.viz.figures.error_maps import error_views, round_maximum
 from torchface.viz.figures.face_views import face_views
-from torchface.viz.figures.heat_maps import error_views, round_maximum
 
 from .restored_frames import Restored, Shown, restored
 

@@ -18,7 +18,7 @@ from torch import Tensor
 from torchface import zoo
 from torchface.capture.own_rig import VideoSettings, VideoSolution, VideoSolver
 from torchface.capture.own_rig.face_points import LANDMARKS
-from torchface.capture.own_rig.offset_estimate import estimate_offsets
+from torchface.capture.own_rig.landmark_offset_estimate import estimate_offsets
 from torchface.capture.priors import DynamicsPrior, adapt_dynamics
 from torchface.geometry.cameras.calibration import assumed_calibration
 from torchface.io import load_rig

@@ -12,8 +12,8 @@ from torch import Tensor
 from torchface import zoo
 from torchface.capture.own_rig import VideoSettings, VideoSolver
 from torchface.capture.own_rig.face_points import FacePoints
+from torchface.capture.own_rig.landmark_offset_estimate import estimate_offsets
 from torchface.capture.own_rig.landmark_offsets import LandmarkOffsets, shifted_points
-from torchface.capture.own_rig.offset_estimate import estimate_offsets
 from torchface.capture.priors import ShapePrior
 from torchface.errors import FileFormatError, ValueRangeError
 from torchface.geometry.rotations import rotation_matrix

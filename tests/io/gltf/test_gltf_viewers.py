@@ -18,7 +18,7 @@ from torchface.geometry.meshes.normal_maps import DetailMaps
 from torchface.geometry.meshes.operators import vertex_normals
 from torchface.geometry.meshes.tangent_space import tangent_space
 from torchface.io import load_rig, save_animation, save_mesh, save_rig
-from torchface.io.gltf.part_colors.surfaces import surfaces
+from torchface.io.gltf.part_textures.head_primitives import surfaces
 from torchface.mesh import Mesh
 from torchface.rig import BlendshapeRig
 from torchface.synthetic import performer

@@ -19,8 +19,8 @@ from torchface.geometry.meshes.normal_maps import DetailMaps
 from torchface.geometry.meshes.operators import vertex_normals
 from torchface.io import load_detail_maps, load_mesh, load_rig, save_animation, save_mesh, save_rig
 from torchface.io.gltf.animation_reading import read_gltf_weights
-from torchface.io.gltf.part_colors.eyes import eye_centre
-from torchface.io.gltf.part_colors.surfaces import painted_lashes, surfaces
+from torchface.io.gltf.part_textures.head_primitives import painted_lashes, surfaces
+from torchface.io.gltf.part_textures.iris_texture import eye_centre
 from torchface.io.gltf.region_materials import EYELASHES
 from torchface.mesh import Annotations, Mesh
 from torchface.rig import BlendshapeRig

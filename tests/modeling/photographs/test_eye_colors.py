@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from torchface.geometry.cameras.pinhole import look_at
-from torchface.io.gltf.part_colors.eyes import painted_eye
+from torchface.io.gltf.part_textures.iris_texture import painted_eye
 from torchface.mesh import Mesh
 from torchface.modeling.photographs.eye_colors import iris_color, part_vertices, with_part_colors
 from torchface.rendering.clay_shading import Lighting, render

@@ -13,8 +13,8 @@ from torch import Tensor
 from torchface.errors import ShapeError, TopologyError, TorchfaceError, ValueRangeError
 from torchface.mesh import Mesh
 from torchface.modeling.rigging.deformation_transfer import transfer_with_report
+from torchface.modeling.rigging.example_gradients import example_shares, personal_part, shape_stiffness
 from torchface.modeling.rigging.example_rigging import RiggingSchedule, angles_between, rig_from_examples
-from torchface.modeling.rigging.example_shapes import example_shares, personal_part, shape_stiffness
 from torchface.optim import box_qp
 from torchface.rig import BlendshapeRig
 from torchface.synthetic import draw_identities, performer

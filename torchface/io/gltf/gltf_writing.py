@@ -20,8 +20,8 @@ from torchface.io.gltf.buffers import BufferWriter
 from torchface.io.gltf.corrective_extras import all_targets, write_correctives
 from torchface.io.gltf.gltf_document import glb_pieces
 from torchface.io.gltf.mesh_extras import write_extras, write_order
-from torchface.io.gltf.part_colors.eyes import eye_centre
-from torchface.io.gltf.part_colors.surfaces import surfaces
+from torchface.io.gltf.part_textures.head_primitives import surfaces
+from torchface.io.gltf.part_textures.iris_texture import eye_centre
 from torchface.io.gltf.primitive_writing import MaterialWriter, PrimitiveWriter, metres
 from torchface.io.gltf.region_textures import write_region_maps
 from torchface.io.gltf.wrinkle_maps import corner_tangents, write_detail

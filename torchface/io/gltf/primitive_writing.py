@@ -13,7 +13,7 @@ from torchface.color_space import to_linear
 from torchface.geometry.meshes.operators import vertex_normals
 from torchface.geometry.meshes.uv_seams import Split
 from torchface.io.gltf.buffers import BufferWriter
-from torchface.io.gltf.part_colors.surfaces import Surface
+from torchface.io.gltf.part_textures.head_primitives import Surface
 from torchface.io.gltf.region_materials import SKIN
 from torchface.io.images.image_files import encode_png
 from torchface.io.length_units import millimetres_per

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchface.color_space import to_linear
-from torchface.io.gltf.part_colors.surfaces import Surface, surfaces
+from torchface.io.gltf.part_textures.head_primitives import Surface, surfaces
 from torchface.io.gltf.region_materials import PartMaterial
 from torchface.io.images.image_files import encode_png
 from torchface.mesh import Mesh

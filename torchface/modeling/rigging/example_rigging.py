@@ -14,7 +14,7 @@ from torchface.errors import ShapeError, TopologyError, ValueRangeError
 from torchface.geometry.meshes.deformation import deformation_gradients, gradient_operator
 from torchface.mesh import Mesh
 from torchface.modeling.rigging.deformation_transfer import CONTACT_WEIGHT, TransferReport, transfer_report
-from torchface.modeling.rigging.example_shapes import example_shares, personal_part, shape_stiffness
+from torchface.modeling.rigging.example_gradients import example_shares, personal_part, shape_stiffness
 from torchface.modeling.rigging.transfer_system import ShapeTransfer
 from torchface.number_checks import LARGEST_WEIGHT, checked_count, checked_number
 from torchface.optim import box_qp

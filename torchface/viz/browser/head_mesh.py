@@ -17,7 +17,7 @@ from torchface.geometry.meshes.normal_maps import encode_normals
 from torchface.geometry.meshes.uv_seams import split_at_seams
 from torchface.io.gltf.buffers import BufferWriter
 from torchface.io.gltf.gltf_document import glb_pieces
-from torchface.io.gltf.part_colors.surfaces import ColorSource, Surface
+from torchface.io.gltf.part_textures.head_primitives import ColorSource, Surface
 from torchface.io.gltf.primitive_writing import PrimitiveWriter
 from torchface.io.gltf.region_materials import SKIN
 from torchface.io.length_units import millimetres_per

@@ -7,7 +7,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from torchface.io.gltf.part_colors.surfaces import parts_without_texels
+from torchface.io.gltf.part_textures.head_primitives import parts_without_texels
 from torchface.io.gltf.region_materials import EYEBALL, IRIS, part_material
 from torchface.mesh import Mesh
 from torchface.rendering.clay_shading import CLAY

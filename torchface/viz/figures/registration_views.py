@@ -15,8 +15,8 @@ from torchface.registration.scan_registration import Registration
 from torchface.rendering.clay_shading import render
 from torchface.rendering.compositing import headed, sheet
 from torchface.rendering.raycast import RayCaster
+from torchface.viz.figures.error_maps import error_colors
 from torchface.viz.figures.face_views import FRONT, PROFILE, THREE_QUARTER, color_bar, frame_face
-from torchface.viz.figures.heat_maps import error_colors
 
 
 def registration_sheet(

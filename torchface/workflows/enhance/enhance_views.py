@@ -21,8 +21,8 @@ from torchface.mesh import Annotations, Mesh
 from torchface.rendering.clay_shading import render
 from torchface.rendering.compositing import caption, heat_colors, sheet
 from torchface.rendering.quick_clay import QuickClay
+from torchface.viz.figures.error_maps import error_colors, round_maximum
 from torchface.viz.figures.face_views import clay_colors, color_bar, frame_face
-from torchface.viz.figures.heat_maps import error_colors, round_maximum
 from torchface.workflows.enhance.coarse_animation import CoarseAnimation
 from torchface.workflows.enhance.enhanced_frames import EnhancedFrames
 

@@ -23,7 +23,7 @@ from torchface.files.whole_files import all_or_none
 from torchface.mesh import Annotations, Mesh
 from torchface.progress import Progress, silent
 from torchface.shape_names import mapping
-from torchface.viz.figures.heat_maps import round_maximum
+from torchface.viz.figures.error_maps import round_maximum
 from torchface.workflows.animated_meshes import AnimatedMesh, load_animated
 from torchface.workflows.evaluate.evaluation_record import ALL, Compared, Evaluation, write_tables
 from torchface.workflows.evaluate.scan_truth import ScanTruth, scan_truth

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from torchface.viz.figures.curves import error_curve, named_bars
-from torchface.viz.figures.heat_maps import GREEN_TO_RED, compared_views, error_views
+from torchface.viz.figures.error_maps import GREEN_TO_RED, compared_views, error_views
 from torchface.viz.reports.report_page import Section, Table, write_page
 from torchface.workflows.evaluate.evaluation_record import Compared, Evaluation
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from torchface.errors import FileFormatError
 from torchface.files.content_keys import content_key
-from torchface.viz.figures.heat_maps import error_colors
+from torchface.viz.figures.error_maps import error_colors
 from torchface.workflows.animated_meshes import is_animation
 from torchface.workflows.batch.batch_items import SCAN_ENDINGS, BatchItem, ItemKind
 from torchface.workflows.batch.contact_sheet import face_picture

@@ -25,8 +25,8 @@ from torchface.registration.registered_mesh import in_place_of
 from torchface.registration.scan_registration import Registration, register
 from torchface.rendering.clay_shading import render
 from torchface.rendering.compositing import sheet
+from torchface.viz.figures.error_maps import error_colors
 from torchface.viz.figures.face_views import frame_face
-from torchface.viz.figures.heat_maps import error_colors
 from torchface.viz.figures.registration_views import lines_on_clay
 from torchface.workflows.batch.batch_items import BatchItem
 from torchface.workflows.batch.contact_sheet import HEIGHT, WIDTH

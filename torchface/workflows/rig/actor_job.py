@@ -12,7 +12,7 @@ from torchface.files.content_keys import content_key
 from torchface.io.meshes.named_files import named_files
 from torchface.registration.landmark_files import landmark_file
 from torchface.rendering.compositing import sheet
-from torchface.viz.figures.heat_maps import error_colors
+from torchface.viz.figures.error_maps import error_colors
 from torchface.workflows.batch.batch_items import SCAN_ENDINGS, BatchItem, ItemKind
 from torchface.workflows.batch.batch_job import model_content
 from torchface.workflows.batch.contact_sheet import face_picture

@@ -11,8 +11,8 @@ from torch import Tensor
 
 from torchface.capture.own_rig import VideoSolution, VideoSolver
 from torchface.capture.own_rig.another_face import AnotherFace, other_faces
+from torchface.capture.own_rig.landmark_offset_estimate import estimate_offsets
 from torchface.capture.own_rig.landmark_offsets import LandmarkOffsets
-from torchface.capture.own_rig.offset_estimate import estimate_offsets
 from torchface.capture.own_rig.outlier_landmarks import landmark_reach, landmark_residuals, outlier_landmarks
 from torchface.capture.own_rig.take_solve import solve_take
 from torchface.capture.own_rig.weight_walk import frame_intervals

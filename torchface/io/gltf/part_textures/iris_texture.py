@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from torchface.geometry.meshes.operators import components
-from torchface.io.gltf.part_colors.painting import Paint, painted
+from torchface.io.gltf.part_textures.texture_painting import Paint, painted
 from torchface.io.gltf.region_materials import CORNEA, EYEBALL, IRIS, SCLERA, PartMaterial
 from torchface.mesh import Mesh
 
