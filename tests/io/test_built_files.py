@@ -24,8 +24,8 @@ from torchface.io import (
 )
 from torchface.io.action_labels import load_action_labels
 from torchface.io.gltf.animation_reading import read_gltf_weights
+from torchface.io.gltf.detail_textures import read_gltf_detail
 from torchface.io.gltf.gltf_reading import read_gltf_rig
-from torchface.io.gltf.wrinkle_maps import read_gltf_detail
 from torchface.io.landmarks.dlib_xml import load_dlib_faces
 from torchface.landmarks.scans.scan_annotations import load_annotations
 

@@ -25,7 +25,7 @@ def corrective(
     """Make a corrective of a rig from a sculpted mesh: what the artist changed where shapes act together.
 
     At the pose the written rig shows the sculpt; where one of the pose's shapes is off, nothing changes. One shape
-    below 1 gives an in-between. Animation and wrinkle maps of RIG stay.
+    below 1 gives an in-between. Animation and detail maps of RIG stay.
 
     Args:
         rig: .glb, USD, .fbx, .blend, a folder of OBJ files, or ICT-FaceKit's FaceXModel folder.

@@ -18,7 +18,7 @@ def view(
     port: int = 8080,
     quiet: Quiet = False,
 ) -> None:
-    """Show a rig in the browser: a slider a shape, symmetric editing, playback of a take, wrinkle maps,
+    """Show a rig in the browser: a slider a shape, symmetric editing, playback of a take, detail maps,
     saving edited weights.
 
     The page is at 127.0.0.1, no other machine can open it, and none but who knows the whole address that is printed.

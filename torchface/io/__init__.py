@@ -1,7 +1,7 @@
 """Files in and out: meshes, rigs, takes; lengths become millimetres coming in and the file's unit going out."""
 
 from torchface.io.camera_files import load_calibration, save_calibration
-from torchface.io.gltf.region_textures import load_region_maps
+from torchface.io.gltf.wrinkle_textures import load_region_maps
 from torchface.io.images.image_files import load_image, save_image, save_image16, save_normal_map
 from torchface.io.landmarks.landmark_points import load_landmark_points, save_pts
 from torchface.io.landmarks.picks import (

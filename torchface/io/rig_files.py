@@ -1,4 +1,4 @@
-"""Rigs, their animations and wrinkle maps by path: glTF, USD, a folder of OBJ files, ICT-FaceKit's folder."""
+"""Rigs, their animations and detail maps by path: glTF, USD, a folder of OBJ files, ICT-FaceKit's folder."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ from torchface.files.whole_files import check_ending
 from torchface.geometry.meshes.normal_maps import DetailMaps
 from torchface.geometry.meshes.region_maps import RegionMaps
 from torchface.io.gltf.animation_reading import read_gltf_weights
+from torchface.io.gltf.detail_textures import read_gltf_detail
 from torchface.io.gltf.gltf_reading import read_gltf_rig
 from torchface.io.gltf.gltf_writing import write_gltf_rig
-from torchface.io.gltf.wrinkle_maps import read_gltf_detail
 from torchface.io.maya.maya_writing import MAYA_ENDING, write_maya_rig
 from torchface.io.rigs.ict_facekit import is_ict_folder, load_ict_facekit, region
 from torchface.io.rigs.rig_folder import load_obj_folder, save_obj_folder
@@ -87,12 +87,12 @@ def save_rig(rig: BlendshapeRig, path: str | Path, detail: DetailMaps | RegionMa
             correctives among them); a ``.usda``, ``.usdc``, ``.usd`` or ``.usdz``; a ``.ma`` for Maya, which
             ``load_rig`` does not read; or a name without an ending, for a folder of ``neutral.obj`` and an OBJ a shape.
             It appears only when it is complete.
-        detail: wrinkle maps of its shapes, or of its regions, for ``.glb`` alone.
+        detail: detail maps of its shapes, or of its regions, for ``.glb`` alone.
 
     Raises:
         FileFormatError: another ending, a folder that holds another rig, or one that cannot be written to.
-        TopologyError: for a file the mesh has no triangle, or wrinkle maps and no texture coordinates.
-        NameMismatchError: a wrinkle map belongs to no shape of the rig, or a shape's name is no file's name.
+        TopologyError: for a file the mesh has no triangle, or detail maps and no texture coordinates.
+        NameMismatchError: a detail map belongs to no shape of the rig, or a shape's name is no file's name.
         MissingExtraError: USD, and usd-core is not installed.
 
     Example:
@@ -114,12 +114,12 @@ def write_rig(
         write_gltf_rig(rig, path, detail, keys)
     elif isinstance(detail, RegionMaps):
         kind = f"a {suffix} file" if suffix else "a folder of OBJ files"
-        raise FileFormatError(f"{path}: found wrinkle maps by region for {kind}, expected .glb for them")
+        raise FileFormatError(f"{path}: found detail maps by region for {kind}, expected .glb for them")
     elif suffix in USD_ENDINGS:
         write_usd_rig(rig, path, keys, detail)
     elif suffix == MAYA_ENDING:
         if detail is not None:
-            raise FileFormatError(f"{path}: found wrinkle maps for a {suffix} file, expected .glb or USD for them")
+            raise FileFormatError(f"{path}: found detail maps for a {suffix} file, expected .glb or USD for them")
         write_maya_rig(rig, path, keys)
     else:
         save_obj_folder(rig, path, detail)
@@ -136,13 +136,13 @@ def save_animation(
         rig: the rig.
         take: with ``weights``; names are matched by ``shape_names.mapping``.
         path: a ``.glb``, ``.usda``, ``.usdc``, ``.usd``, ``.usdz`` or ``.ma``; it appears only when it is complete.
-        detail: wrinkle maps of the rig's shapes, or of its regions, for ``.glb`` alone.
+        detail: detail maps of the rig's shapes, or of its regions, for ``.glb`` alone.
 
     Returns:
         ``ShapeMatch(driven, missing, unused)``.
 
     Raises:
-        NameMismatchError: no channel drives any shape, or a wrinkle map belongs to none.
+        NameMismatchError: no channel drives any shape, or a detail map belongs to none.
         ValueRangeError: the take has no weights or no frame, or a weight is NaN.
         FileFormatError: another ending, or the folder cannot be written to.
         MissingExtraError: USD, and usd-core is not installed.
@@ -189,7 +189,7 @@ def load_animation(path: str | Path) -> Take | None:
 
 
 def load_detail_maps(path: str | Path) -> DetailMaps | None:
-    """The wrinkle maps of a rig's file; none where it has neither such maps nor a normal texture.
+    """The detail maps of a rig's file; none where it has neither such maps nor a normal texture.
 
     Args:
         path: a ``.glb``, ``.gltf`` or USD file.

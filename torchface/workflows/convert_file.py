@@ -100,12 +100,12 @@ def convert_file(
 
 
 def maps_for(source: Path, out: Path) -> tuple[DetailMaps | RegionMaps | None, list[str]]:
-    """The wrinkle maps of a rig's file that ``out`` has a place for, and lines on those that it has none for."""
+    """The detail maps of a rig's file that ``out`` has a place for, and lines on those that it has none for."""
     notes = []
     if source.suffix.lower() in GLTF_ENDINGS and (by_region := load_region_maps(source)) is not None:
         if out.suffix.lower() == ".glb":
             return by_region, []
-        notes.append(f"{out.name} has no place for wrinkle maps by region, which are left out; .glb has")
+        notes.append(f"{out.name} has no place for detail maps by region, which are left out; .glb has")
     return (load_detail_maps(source) if source.suffix.lower() in SCENE_ENDINGS else None), notes
 
 
@@ -131,7 +131,7 @@ def write_source(rig: BlendshapeRig, take: Take | None, detail: DetailMaps | Reg
         notes.append("a folder of OBJ files has no place for the animation, which is left out")
         take = None
     if isinstance(detail, DetailMaps) and suffix in (*BLENDER_ENDINGS, MAYA_ENDING):
-        notes.append(f"{suffix} has no place for the wrinkle maps of {len(detail.names)} shapes, which are left out")
+        notes.append(f"{suffix} has no place for the detail maps of {len(detail.names)} shapes, which are left out")
         detail = None
     keys = None if take is None else weight_keys(rig, take)[0]
     if suffix == ".fbx" and rig.correctives is not None:

@@ -17,7 +17,7 @@ def renamed(rig: BlendshapeRig, names: Naming | None) -> BlendshapeRig:
 
 
 def renamed_detail(detail: DetailMaps | None, rig: BlendshapeRig, names: Naming | None) -> DetailMaps | None:
-    """Wrinkle maps for ``renamed(rig, names)``."""
+    """Detail maps for ``renamed(rig, names)``."""
     if names is None or detail is None:
         return detail
     return detail.merged({name: [rig.names[row] for row in rows] for name, rows in arkit_sources(rig.names).items()})

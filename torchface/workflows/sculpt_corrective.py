@@ -44,7 +44,7 @@ def sculpt_corrective(
     options: SculptOptions | None = None,
     progress: Progress | None = None,
 ) -> tuple[SculptedCorrective, list[str]]:
-    """Reads a rig, its animation and its wrinkle maps, adds a corrective, writes all of it.
+    """Reads a rig, its animation and its detail maps, adds a corrective, writes all of it.
 
     Args:
         path: the rig's file.

@@ -114,7 +114,7 @@ def test_what_maya_cannot_hold_is_refused_or_said(tmp_path: Path) -> None:
         save_rig(twice, tmp_path / "rig.ma")
     assert not list(tmp_path.iterdir())
     maps = DetailMaps(("jawOpen",), torch.zeros(1, 3, 4, 4), None)
-    with pytest.raises(FileFormatError, match=r"wrinkle maps for a \.ma file"):
+    with pytest.raises(FileFormatError, match=r"detail maps for a \.ma file"):
         save_rig(rig, tmp_path / "rig.ma", maps)
 
 

@@ -18,13 +18,13 @@ from torchface.geometry.meshes.region_maps import RegionMaps
 from torchface.geometry.meshes.uv_seams import split_at_seams
 from torchface.io.gltf.buffers import BufferWriter
 from torchface.io.gltf.corrective_extras import all_targets, write_correctives
+from torchface.io.gltf.detail_textures import corner_tangents, write_detail
 from torchface.io.gltf.gltf_document import glb_pieces
 from torchface.io.gltf.mesh_extras import write_extras, write_order
 from torchface.io.gltf.part_textures.head_primitives import surfaces
 from torchface.io.gltf.part_textures.iris_texture import eye_centre
 from torchface.io.gltf.primitive_writing import MaterialWriter, PrimitiveWriter, metres
-from torchface.io.gltf.region_textures import write_region_maps
-from torchface.io.gltf.wrinkle_maps import corner_tangents, write_detail
+from torchface.io.gltf.wrinkle_textures import write_region_maps
 from torchface.io.length_units import millimetres_per
 from torchface.io.scenes.weight_keys import WeightKeys
 from torchface.mesh import Mesh
@@ -46,8 +46,8 @@ def write_gltf_rig(
     Args:
         rig: the rig.
         path: the file; it appears only when it is complete.
-        detail: wrinkle maps of its shapes, see ``torchface.io.gltf.wrinkle_maps``, or of its regions, see
-            ``torchface.io.gltf.region_textures``.
+        detail: detail maps of its shapes, see ``torchface.io.gltf.detail_textures``, or of its regions, see
+            ``torchface.io.gltf.wrinkle_textures``.
         keys: an animation of its shapes, linear between keys.
     """
     _write(path, rig.neutral, *all_targets(rig), keys and _with_correctives(rig, keys), detail, _definitions(rig))

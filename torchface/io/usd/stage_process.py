@@ -2,7 +2,7 @@
 
 ``python stage_process.py FILE FOLDER`` writes ``scene.json`` and ``arrays.npz`` (see
 ``torchface.io.scene_processes.scene_arrays``) into the folder, or ``refused.json``, a list of what was found and what
-was expected; with ``--maps`` before FILE those of its wrinkle maps (see ``extract_maps``). OpenUSD is C++ that trusts
+was expected; with ``--maps`` before FILE those of its detail maps (see ``extract_maps``). OpenUSD is C++ that trusts
 its files: here a crash, a count of gigabytes or an endless composition ends a process that has nothing to lose.
 """
 
@@ -83,7 +83,7 @@ def extract(path: Path, limit: Callable[[int], None]) -> tuple[dict[str, Any], d
 
 
 def extract_maps(path: Path, limit: Callable[[int], None]) -> tuple[dict[str, Any], dict[str, Any]]:
-    """The wrinkle maps of the first mesh that has some: names of ``shapes``, and images, encoded.
+    """The detail maps of the first mesh that has some: names of ``shapes``, and images, encoded.
 
     Images are named ``0``, ``1`` and so on by the shape that they belong to, and ``neutral``. Arguments and errors as
     of :func:`extract`.
@@ -395,7 +395,7 @@ class _MeshReader:
         return found
 
     def maps(self) -> tuple[list[str], dict[str, Any]]:
-        """The shapes that have wrinkle maps, and the images, encoded, by their numbers and ``neutral``."""
+        """The shapes that have detail maps, and the images, encoded, by their numbers and ``neutral``."""
         from pxr import Sdf, UsdShade
 
         listed = self._noted_maps()
@@ -412,7 +412,7 @@ class _MeshReader:
             if found:
                 missing = [name for number, (_, name) in enumerate(listed) if f"{number}" not in found]
                 if missing:
-                    raise Refused(f"{self.place}: no texture {_shown(missing[0])}", "one for each wrinkle map noted")
+                    raise Refused(f"{self.place}: no texture {_shown(missing[0])}", "one for each detail map noted")
                 return [shape for shape, _ in listed], found
         return [], {}
 

@@ -89,7 +89,7 @@ _UNPACKED_ALWAYS, _UNPACKED_PER_BYTE = 2**28, 1024  # as of glTF's
 
 
 def read_usd_detail(path: str | Path) -> DetailMaps | None:
-    """The wrinkle maps of a USD file; none where it has neither such maps nor a normal texture.
+    """The detail maps of a USD file; none where it has neither such maps nor a normal texture.
 
     Raises:
         MissingExtraError: usd-core is not installed.
@@ -100,7 +100,7 @@ def read_usd_detail(path: str | Path) -> DetailMaps | None:
     images: dict[str, Tensor] = {}
     unpacked = 0
     for name, data in scene.arrays.items():
-        image = decode_image(data.tobytes(), f"{path}: its wrinkle map {name}")
+        image = decode_image(data.tobytes(), f"{path}: its detail map {name}")
         unpacked += 4 * image.numel()
         if unpacked > allowed:
             raise FileFormatError(f"{path}: found maps that unpack to {unpacked} bytes, expected at most {allowed}")
@@ -111,7 +111,7 @@ def read_usd_detail(path: str | Path) -> DetailMaps | None:
     maps = [images[f"{row}"] for row in range(len(scene.record["shapes"]))]
     if len({normals.shape for normals in images.values()}) > 1:
         sizes = sorted({f"{normals.shape[2]}x{normals.shape[1]}" for normals in images.values()})
-        raise FileFormatError(f"{path}: found wrinkle maps of {' and '.join(sizes[:3])} pixels, expected one size")
+        raise FileFormatError(f"{path}: found detail maps of {' and '.join(sizes[:3])} pixels, expected one size")
     stacked = torch.stack(maps) if neutral is None or maps else neutral.new_zeros(0, *neutral.shape)
     try:
         return DetailMaps(tuple(scene.record["shapes"]), stacked, neutral)

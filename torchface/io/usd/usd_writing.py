@@ -23,14 +23,14 @@ from torchface.files.whole_files import all_or_none, replaced_file, write_file
 from torchface.files.write_errors import unwritten
 from torchface.geometry.meshes.normal_maps import DetailMaps
 from torchface.io.gltf.corrective_extras import write_correctives
+from torchface.io.gltf.detail_textures import check_detail
 from torchface.io.gltf.mesh_extras import write_extras
 from torchface.io.gltf.primitive_writing import MIN_MOVE, MIN_ROTATION, metres, shading_normals
-from torchface.io.gltf.wrinkle_maps import check_detail
 from torchface.io.meshes.polygons import corners_of_polygons
 from torchface.io.scenes.weight_keys import WeightKeys
+from torchface.io.usd.detail_prims import write_wrinkles
 from torchface.io.usd.material_prims import write_materials
 from torchface.io.usd.usd_library import usd_library
-from torchface.io.usd.wrinkle_prims import write_wrinkles
 from torchface.mesh import Mesh
 from torchface.rig import BlendshapeRig
 
@@ -60,7 +60,7 @@ def write_usd_rig(
             them, and images of eyes and lashes that no texture shows; ``.usdz`` holds all. It appears only when it is
             complete.
         keys: an animation of its shapes, by way of ``skel:animationSource``; a frame is a time code.
-        detail: wrinkle maps of its shapes; see ``wrinkle_prims``.
+        detail: detail maps of its shapes; see ``detail_prims``.
     """
     if detail is not None:
         check_detail(detail, rig.neutral, rig.names)

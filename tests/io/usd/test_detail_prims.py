@@ -74,10 +74,10 @@ def test_what_does_not_fit_is_named(tmp_path: Path) -> None:
     save_rig(rig, tmp_path / "rig.usda", detail())
     text = (tmp_path / "rig.usda").read_text()
     (tmp_path / "rig.usda").write_text(text.replace('def Shader "wrinkles_1"', 'def Shader "gone"'))
-    with pytest.raises(FileFormatError, match="no texture wrinkles_1, expected one for each wrinkle map noted"):
+    with pytest.raises(FileFormatError, match="no texture wrinkles_1, expected one for each detail map noted"):
         load_detail_maps(tmp_path / "rig.usda")
     (tmp_path / "rig.usda").write_text(text.replace("rig_wrinkles_1.png", "rig.png"))
-    with pytest.raises(FileFormatError, match="found wrinkle maps of 12x8 and 8x4 pixels, expected one size"):
+    with pytest.raises(FileFormatError, match="found detail maps of 12x8 and 8x4 pixels, expected one size"):
         load_detail_maps(tmp_path / "rig.usda")
 
 

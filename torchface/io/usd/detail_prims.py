@@ -1,4 +1,4 @@
-"""Wrinkle maps in USD: the neutral's as the normal of the face's material, the shapes' as further textures of it.
+"""Detail maps in USD: the neutral's as the normal of the face's material, the shapes' as further textures of it.
 
 Each is a ``UsdUVTexture`` in the material. Those of shapes are connected to nothing, as ``UsdPreviewSurface`` has no
 place for them; the mesh's ``customData`` names them: ``"wrinkleMaps": [{"shape": ..., "texture": name of the prim}]``

@@ -21,8 +21,8 @@ from torch import Tensor
 from torchface.geometry.meshes.normal_maps import decode_normals, encode_normals
 from torchface.geometry.meshes.region_maps import RegionMaps
 from torchface.io.gltf.buffers import BufferWriter
+from torchface.io.gltf.detail_textures import TextureReader, list_of_first_mesh, normal_texture
 from torchface.io.gltf.gltf_document import Document, read_document
-from torchface.io.gltf.wrinkle_maps import TextureReader, list_of_first_mesh, normal_texture
 from torchface.io.images.image_files import encode_png
 
 _KEY = "wrinkleRegions"

@@ -17,7 +17,7 @@ from PIL import Image
 from rig_samples import sheet_rig
 from torch import Tensor
 
-import torchface.io.gltf.wrinkle_maps
+import torchface.io.gltf.detail_textures
 from torchface.errors import FileFormatError, NameMismatchError, ShapeError, TopologyError
 from torchface.geometry.meshes.normal_maps import DetailMaps, decode_normals
 from torchface.io import (
@@ -146,7 +146,7 @@ def test_broken_lists_are_refused(tmp_path: Path) -> None:
 def test_a_list_that_unpacks_to_more_than_the_file_can_hold_is_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(torchface.io.gltf.wrinkle_maps, "_UNPACKED_ALWAYS", 2**20)
+    monkeypatch.setattr(torchface.io.gltf.detail_textures, "_UNPACKED_ALWAYS", 2**20)
     rig = sheet_rig()
     flat = torch.zeros(1, 3, 256, 256)
     flat[:, 2] = 1

@@ -1,4 +1,4 @@
-"""Wrinkle maps in a ``.glb``: the neutral's as the material's normal texture, where every viewer shows it; the shapes'
+"""Detail maps in a ``.glb``: the neutral's as the material's normal texture, where every viewer shows it; the shapes'
 as further textures, which ``mesh.extras.torchface.wrinkleMaps`` lists as ``{"shape": name, "texture": index}``.
 
 With the neutral's map come the tangents of ``torchface.geometry.meshes.tangent_space``, which are MikkTSpace's; the
@@ -63,7 +63,7 @@ def check_detail(detail: DetailMaps, mesh: Mesh, names: Sequence[str]) -> None:
         NameMismatchError: a map belongs to no shape.
     """
     if mesh.uvs is None:
-        raise TopologyError("detail: found wrinkle maps for a mesh without texture coordinates, expected uvs")
+        raise TopologyError("detail: found detail maps for a mesh without texture coordinates, expected uvs")
     missing = [name for name in detail.names if name not in names]
     if missing:
         raise NameMismatchError(f"detail: the rig has no shape {', '.join(map(repr, missing[:5]))}")
@@ -76,7 +76,7 @@ def corner_tangents(mesh: Mesh) -> NDArray[np.float32]:
         TopologyError: the mesh has no texture coordinates.
     """
     if mesh.uvs is None or mesh.uv_faces is None:
-        raise TopologyError("detail: found wrinkle maps for a mesh without texture coordinates, expected uvs")
+        raise TopologyError("detail: found detail maps for a mesh without texture coordinates, expected uvs")
     points, faces = mesh.vertices.detach().cpu().double(), mesh.faces.cpu()
     normals = vertex_normals(points, faces)
     space = tangent_space(points, faces, mesh.uvs.detach().cpu().double(), mesh.uv_faces.cpu(), normals)
@@ -85,7 +85,7 @@ def corner_tangents(mesh: Mesh) -> NDArray[np.float32]:
 
 
 def read_gltf_detail(path: str | Path) -> DetailMaps | None:
-    """The wrinkle maps of a ``.glb``; none where it has neither such maps nor a normal texture.
+    """The detail maps of a ``.glb``; none where it has neither such maps nor a normal texture.
 
     Raises:
         FileFormatError: not glTF 2, a broken list, images of different sizes, or more of them than the file can hold.
