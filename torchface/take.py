@@ -69,7 +69,7 @@ class Track:
         return Track(tuple(names), self.values[:, ids], None if self.confidence is None else self.confidence[:, ids])
 
     def frames(self, rows: slice | Tensor) -> Track:
-        """Some of the frames."""
+        """Some of the frames, by rows (T',)."""
         return Track(self.names, self.values[rows], None if self.confidence is None else self.confidence[rows])
 
 

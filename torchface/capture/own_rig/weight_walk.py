@@ -51,7 +51,7 @@ def walk_information(variance: Tensor, told: Tensor, interval: float | Tensor) -
 
 
 def frame_intervals(seconds: Tensor | None, count: int, interval: float) -> list[float]:
-    """Seconds from the frame before to each of T frames; the first frame has the usual interval.
+    """Seconds (T,) from the frame before to each of T frames; the first frame has the usual interval.
 
     Raises:
         ShapeError: not one time a frame.

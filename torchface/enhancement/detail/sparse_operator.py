@@ -40,7 +40,7 @@ class SparseOperator:
         return self  # it never changes
 
     def multiplied(self, columns: Tensor, transposed: bool) -> Tensor:
-        """Products with the matrix, or with its transpose."""
+        """Products of columns (N,C) with the matrix, or with its transpose."""
         key = columns.dtype, columns.device, transposed
         if key not in self._prepared:
             self._prepared[key] = _as_tensor(self._matrix.T.tocsr() if transposed else self._matrix, columns)

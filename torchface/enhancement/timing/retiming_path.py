@@ -67,7 +67,7 @@ def project_sequence(alpha: Tensor, beta: Tensor) -> SequenceProjection:
 
 
 def segment_projections(alpha: Tensor, beta: Tensor) -> tuple[Tensor, Tensor]:
-    """Where on each segment of beta each frame of alpha lies nearest, 0 to 1, and how far from it, (m,n-1) each."""
+    """Where on each segment of beta (n,D) each frame of alpha (m,D) lies nearest, 0 to 1, and how far, (m,n-1) each."""
     # By products of matrices, which take no memory in m n D; from beta's middle, which keeps their digits.
     middle = beta.mean(0)
     alpha, beta = alpha - middle, beta - middle

@@ -49,7 +49,7 @@ class LandmarkPoints:
     source: str = "landmarks"
 
     def ibug(self) -> Tensor:
-        """The points in iBUG's order of 68: jaw, brows, nose, eyes, mouth, each from the viewer's left.
+        """The points (68,2) in iBUG's order: jaw, brows, nose, eyes, mouth, each from the viewer's left.
 
         A file with groups is read by them, whatever the order of its rows; groups beside those are left aside,
         and menpo's ``all`` alone means the file's order.

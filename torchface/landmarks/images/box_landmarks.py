@@ -30,7 +30,7 @@ def settled_face(finder: LandmarkFinder, image: Tensor, box: Tensor, tilt: float
 
 
 def refined_face(face: FaceReading, image: Tensor, appearance: AppearanceModel | None) -> FaceReading:
-    """A face whose landmarks are refined as the person looks."""
+    """A face whose landmarks are refined by the person's appearance in an image (C,H,W)."""
     if appearance is None:
         return face
     return replace(

@@ -118,8 +118,8 @@ class FaceReading:
 
     @property
     def trusted_landmarks(self) -> Tensor:
-        """The landmarks, NaN where they are not trusted at all: what is hidden is a guess, that a filter would carry on
-        into the frames after."""
+        """The landmarks (...,68,2), NaN where they are not trusted at all: hidden ones are guesses, which a filter would
+        carry on into the frames after."""
         return torch.where(self.trust[..., None] > 0, self.landmarks, torch.nan)
 
 

@@ -92,7 +92,7 @@ class InnerParts:
         return self.standing(vertices).depth
 
     def standing(self, vertices: Tensor) -> Standing:
-        """``depth`` with where each vertex has come through."""
+        """``depth`` of vertices (V,3), with where each has come through."""
         vertices = vertices.detach().cpu().double()
         points = vertices[self.vertices]
         offsets = points - self.middles(vertices)[self.group]

@@ -32,7 +32,7 @@ def modes_figure(model: HeadModel, count: int = 5) -> Tensor:
 
 
 def random_figure(model: HeadModel, seed: int = 0) -> Tensor:
-    """Random heads of the model (figure 21)."""
+    """Random heads of the model (figure 21), (3,H,W)."""
     generator = torch.Generator().manual_seed(seed)
     heads = [random_head(model, generator) for _ in range(_HEADS)]
     return sheet([head_views(model, mesh, None, (THREE_QUARTER,)) for mesh in heads], 6)

@@ -73,7 +73,7 @@ class LandmarkBoxes:
         )
 
     def placement(self, landmarks: Tensor, neutral: Tensor, free: Tensor) -> Placement:
-        """The placement that the boxes say."""
+        """The placement of landmarks (B,68,2) by their boxes and the neutral's (68,2)."""
         scale, translation, _ = self._boxes(landmarks, neutral)
         return Placement(torch.diag_embed(scale), translation)
 
