@@ -118,7 +118,7 @@ class FaceReading:
 
     @property
     def trusted_landmarks(self) -> Tensor:
-        """The landmarks (...,68,2), NaN where they are not trusted at all: hidden ones are guesses, which a filter would
+        """The landmarks (...,68,2), NaN where they are not trusted at all: hidden ones are guesses, which filters would
         carry on into the frames after."""
         return torch.where(self.trust[..., None] > 0, self.landmarks, torch.nan)
 
