@@ -26,7 +26,7 @@ UNSHOWN = {
         "io.blender.read_blender_file",
         "io.blender.write_blender_file",
     ),
-    "wants Node": ("workflows.browser_app.AppReport", "workflows.browser_app.app_folder"),
+    "wants Node": ("workflows.browser_app.AppReport", "workflows.browser_app.export_app"),
     "wants a film of a painted face": (
         "capture.action_units.ActionUnitCurves",
         "capture.action_units.action_unit_curves",
