@@ -113,7 +113,9 @@ def test_transfer_writes_arkits_names_and_a_folder_in_the_templates_order(
     assert torch.equal(actor.neutral.polygons, dome_rig.neutral.polygons)
     with pytest.raises(SystemExit):
         run("transfer", shoot / "halves.glb", shoot / "neutral.obj", "--out", shoot / "actor.fbx")
-    assert "expected .glb, .usd, .usda, .usdc, .usdz, .ma, or none for a folder" in " ".join(capsys.readouterr().err.split())
+    assert "expected .glb, .usd, .usda, .usdc, .usdz, .ma, or none for a folder" in " ".join(
+        capsys.readouterr().err.split()
+    )
 
 
 def test_render_and_info_and_export(shoot: Path, capsys: pytest.CaptureFixture[str]) -> None:
