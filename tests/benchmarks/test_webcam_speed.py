@@ -12,7 +12,6 @@ import re
 import subprocess
 import sys
 import time
-from collections.abc import Callable
 from pathlib import Path
 
 import cv2
@@ -20,17 +19,15 @@ import numpy as np
 import onnxruntime
 import pytest
 import torch
-from onnx import ModelProto, TensorProto
+from torch import Tensor, nn
 
 from torchface.landmarks.images.networks.mediapipe_finder import PYTHON
-from torchface.onnx.graph_values import OPSET, Value, ValueGraph
 from torchface.onnx.network_graphs import network_model
-from torchface.onnx.webcam.eye_reader import read_eyes
-from torchface.onnx.webcam.face_search import SearchSettings, search
-from torchface.onnx.webcam.picture_pieces import cut_square
-from torchface.onnx.webcam.webcam_model import webcam_model
+from torchface.onnx.webcam.webcam_model import WebcamGraph, webcam_model
 from torchface.onnx.webcam.webcam_session import WebcamSession
-from torchface.workflows.webcam.webcam_graph import webcam_graph, webcam_networks
+from torchface.onnx.webcam.webcam_solver_graph import WebcamAnswer
+from torchface.shape_names import ARKIT
+from torchface.workflows.webcam.webcam_graph import webcam_graph, webcam_module
 
 EXAMPLE = Path(__file__).resolve().parents[2] / "export" / "README.md"
 WEBCAM, NEAR = "webcam/again.mkv", "single_face.mp4"
@@ -73,24 +70,14 @@ def milliseconds(model: bytes, inputs: dict[str, np.ndarray]) -> float:
     return quiet(times[3:])
 
 
-def part(make: Callable[[ValueGraph], Value], inputs: dict[str, np.ndarray], shape: tuple[int | str, ...]) -> float:
-    """Of a piece of the graph."""
-    graph = ValueGraph()
-    graph.build.op("Identity", make(graph).name, output="out")
-    kinds = {name: TensorProto.UINT8 for name, value in inputs.items() if value.dtype == np.uint8}
-    given = {name: value.shape for name, value in inputs.items()}
-    model = graph.root.model("part", given, {"out": shape}, {}, OPSET, kinds)
-    return milliseconds(model.SerializeToString(), inputs)
+class Reading(nn.Module):
+    """The graph's part that reads a face."""
 
+    state_size = 1
 
-def no_solver() -> ModelProto:
-    """A solver that solves nothing."""
-    graph = ValueGraph()
-    shapes = {"weights": (52,), "rotation": (3, 3), "translation": (3,), "gaze": (2, 2), "calibrated": ()}
-    for name, shape in shapes.items():
-        graph.build.op("Identity", graph.as_value(torch.zeros(shape)).name, output=name)
-    graph.build.op("Identity", "state", output="next_state")
-    return graph.root.model("none", {"state": (1,)}, {**shapes, "next_state": (1,)}, {}, OPSET)
+    def forward(self, *given: Tensor) -> WebcamAnswer:
+        nothing = torch.zeros(len(ARKIT)), torch.eye(3), torch.zeros(3), torch.zeros(2, 2)
+        return WebcamAnswer(*nothing, given[3], given[3], given[3], given[-1])
 
 
 def whole(model: bytes, frames: list[np.ndarray], fps: float) -> tuple[float, float]:
@@ -114,37 +101,15 @@ def clip(path: Path) -> list[np.ndarray]:
 @pytest.mark.bench
 @pytest.mark.real
 def test_the_whole_way_is_quick_and_small(data: Path, tmp_path: Path) -> None:
-    content, networks = webcam_graph(), webcam_networks()
+    content, module = webcam_graph(), webcam_module()
     near, frames = clip(data / "video" / NEAR), clip(data / "video" / WEBCAM)
-    picture, size = near[40], (640, 480)
-    place = np.array([297, 188, 198, 1, 0], np.float32)
-    session = WebcamSession(content)
-    for frame in near[:41]:
-        found = session.step(frame, 1 / 30)
-    marks = {"image": picture, "marks": found.landmarks.numpy(), "deviation": np.ones(68, np.float32)}
-    empty = [np.full((480, 640, 3), 90, np.uint8)] * 30
-    network, side = networks.landmarks, networks.landmarks.size
-    crops = {"image": np.random.default_rng(0).random((1, 3, side, side), np.float32)}
-    reading = webcam_model(networks, no_solver()).SerializeToString()
-
-    def box(graph: ValueGraph) -> Value:
-        no = graph.as_value(torch.zeros(1))
-        place = graph.as_value(torch.zeros(5))
-        return search(graph.value("image"), networks.boxes, SearchSettings(), place, no > 1.0, no)
-
-    def crop(graph: ValueGraph) -> Value:
-        return cut_square(graph.value("image"), graph.value("place"), network.size, network.margin)
-
-    def eyes(graph: ValueGraph) -> Value:
-        return read_eyes(graph.value("image"), graph.value("marks"), graph.value("deviation"), networks.eyes).iris
+    size, empty = (640, 480), [np.full((480, 640, 3), 90, np.uint8)] * 30
+    network = module.reader.landmarks
+    crops = {"image": np.random.default_rng(0).random((1, 3, network.size, network.size), np.float32)}
+    reading = webcam_model(WebcamGraph(module.reader, Reading())).SerializeToString()
 
     print("\nmilliseconds of processor time, one thread (quietest tenth of frames)")
-    rows = {
-        "box search, 640 x 480": part(box, {"image": frames[0]}, (7,)),
-        "crop of a face of 200 pixels": part(crop, {"image": picture, "place": place}, (1, 3, side, side)),
-        "landmark network": milliseconds(network_model(network).SerializeToString(), crops),
-        "both eyes": part(eyes, marks, (2, 2)),
-    }
+    rows = {"landmark network": milliseconds(network_model(network).SerializeToString(), crops)}
     rows["picture to reading, face followed"] = whole(reading, frames, 30)[0]
     rows["whole, nobody there"] = whole(content, empty, 30)[0]
     for name, shown in {WEBCAM: frames, f"{NEAR}, enlarged": [cv2.resize(one, size) for one in near]}.items():

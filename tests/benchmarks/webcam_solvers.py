@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -12,7 +11,6 @@ from pathlib import Path
 import numpy as np
 import onnxruntime
 import torch
-from onnx import ModelProto, TensorProto
 from safetensors.torch import load_file, save
 from torch import Tensor
 
@@ -33,8 +31,7 @@ from torchface.files.content_keys import content_key
 from torchface.files.whole_files import write_file
 from torchface.geometry.cameras.calibration import assumed_calibration
 from torchface.landmarks.images.face_reading import READ_BY_NETWORKS, FaceReading
-from torchface.onnx.graph_values import OPSET, ValueGraph
-from torchface.onnx.webcam.face_reader import STATE, ReaderSettings, read_face
+from torchface.landmarks.images.frame_reader.face_reader import STATE, FaceReader
 from torchface.onnx.webcam.webcam_solver_graph import webcam_solver_model
 from torchface.shape_names import ARKIT, mapping
 from torchface.synthetic import performer
@@ -68,40 +65,19 @@ Solver = Callable[[list[FaceReading], float, tuple[int, int]], Solved]
 
 def read_faces(frames: Tensor, fps: float, kept: Path) -> list[FaceReading]:
     """What the shipped networks read of a face in frames uint8 (T,3,H,W), as in a webcam's model; kept in a folder."""
-    model = _reader().SerializeToString()
-    key = content_key("faces read/2", model=hashlib.sha256(model).hexdigest(), frames=frames, fps=fps)[:16]
+    reader = FaceReader(webcam_networks()).eval()
+    key = content_key("faces read/3", reader=reader, frames=frames, fps=fps)[:16]
     path = kept / f"{key}.safetensors"
     if not path.is_file():
-        session = onnxruntime.InferenceSession(model, _one_thread(), providers=["CPUExecutionProvider"])
-        state, rows = np.zeros(STATE, np.float32), []
+        state, rows = torch.zeros(STATE), []
         for frame in frames:  # a frame's place is the next one's
-            given = {"image": frame.permute(1, 2, 0).contiguous().numpy(), "interval": np.float32([1 / fps])}
-            *row, state = session.run(None, given | {"state": state})
-            rows.append(row)
-        tables = {
-            name: torch.from_numpy(np.stack(column))
-            for name, column in zip(READ_BY_NETWORKS, zip(*rows, strict=True), strict=True)
-        }
-        write_file(path, save(tables))
+            with torch.inference_mode():
+                reading, state = reader(frame.permute(1, 2, 0), torch.tensor(1 / fps), state)
+            rows.append(reading)
+        taken = FaceReading.stacked(rows)
+        write_file(path, save({name: getattr(taken, name).clone() for name in READ_BY_NETWORKS}))
     stored = load_file(path)
-    stored["presence"] = stored["presence"].reshape(-1)
     return [FaceReading(**{name: values[row] for name, values in stored.items()}) for row in range(len(frames))]
-
-
-def _reader() -> ModelProto:
-    """The part of a webcam's model that reads a face."""
-    graph = ValueGraph()
-    image, interval, state = (graph.value(name) for name in ("image", "interval", "state"))
-    read = read_face(graph, image, interval, state, webcam_networks(), ReaderSettings())
-    for name in (*READ_BY_NETWORKS, "state"):
-        graph.build.op("Identity", getattr(read, name).name, output=f"read_{name}")
-    shapes = {
-        "landmarks": (68, 2), "deviation": (68,), "visibility": (68,), "presence": (1,), "iris": (2, 2),
-        "openness": (2,), "closed": (2,), "eye_visibility": (2,), "state": (STATE,),
-    }  # fmt: skip
-    outputs = {f"read_{name}": shape for name, shape in shapes.items()}
-    inputs = {"image": ("height", "width", "channels"), "interval": (1,), "state": (STATE,)}
-    return graph.root.model("reader", inputs, outputs, {}, OPSET, {"image": TensorProto.UINT8})
 
 
 def _one_thread() -> onnxruntime.SessionOptions:

@@ -1,63 +1,48 @@
-"""A webcam's graph whose solver is planted, and a face to show it."""
+"""A webcam's graph whose reader and solver are planted."""
 
 from __future__ import annotations
 
 import pytest
 import torch
-from onnx import ModelProto
-from torch import Tensor
+from torch import Tensor, nn
 
-from torchface import zoo
-from torchface.geometry.cameras.pinhole import look_at
-from torchface.onnx.graph_values import OPSET, Value, ValueGraph
-from torchface.onnx.webcam.face_reader import WebcamNetworks
-from torchface.onnx.webcam.webcam_model import webcam_model
-from torchface.rendering.clay_shading import Lighting, render
+from torchface.landmarks import FaceReading
+from torchface.landmarks.images.frame_reader.face_reader import STATE
+from torchface.landmarks.images.frame_reader.picture_pieces import picture_size
+from torchface.onnx.webcam.webcam_model import WebcamGraph, webcam_model
+from torchface.onnx.webcam.webcam_solver_graph import WebcamAnswer
 from torchface.shape_names import ARKIT
-from torchface.synthetic import performer
+
+
+class PlantedReader(nn.Module):
+    """Sees a face over the whole picture, as sure as the picture's first pixel is red, and counts frames."""
+
+    def forward(self, image: Tensor, interval: Tensor, state: Tensor) -> tuple[FaceReading, Tensor]:
+        marks = torch.linspace(0, 1, 136).view(68, 2) * picture_size(image)
+        sure, both = torch.ones(68), torch.ones(2)
+        presence = image[0, 0, 0].float() / 255
+        after = torch.cat([state[:3] + 1, torch.zeros(STATE - 3)])
+        return FaceReading(marks, sure, sure, presence, marks[::67], both, both, both), after
+
+
+class PlantedSolver(nn.Module):
+    """Counts frames and gives the first weight what the landmarks' mean column is."""
+
+    state_size = 2
+
+    def forward(self, *given: Tensor) -> WebcamAnswer:
+        landmarks, (size, interval, controls, state) = given[0], given[-4:]
+        weights = torch.cat([landmarks[:, 0].mean()[None], torch.zeros(len(ARKIT) - 1)])
+        gaze = torch.stack([size, size])
+        return WebcamAnswer(weights, torch.eye(3), controls[:3], gaze, interval, interval, interval, state + 1)
 
 
 @pytest.fixture(scope="session")
-def portrait() -> tuple[Tensor, Tensor]:
-    """A performer's head on grey, (3,150,150), and its landmarks (68,2)."""
-    rig = performer()
-    marks = rig.neutral.landmarks
-    camera = look_at(rig.vertices[marks].double().mean(0), 0.0, 0.0, 330.0, 150, 150)
-    picture = render(rig.neutral, camera, background=(0.3, 0.35, 0.4), lighting=Lighting(occlusion_rays=0), samples=1)
-    return (picture.clamp(0, 1) * 255).byte(), camera.project(rig.vertices[marks].double()).float()
+def solver() -> PlantedSolver:
+    return PlantedSolver()
 
 
 @pytest.fixture(scope="session")
-def networks() -> WebcamNetworks:
-    """The zoo's."""
-    return WebcamNetworks(*(zoo.get_model(name) for name in ("face_boxes", "landmark_network", "eye_network")))
-
-
-@pytest.fixture(scope="session")
-def webcam_file(networks: WebcamNetworks) -> bytes:
-    """The graph with a planted solver."""
-    return webcam_model(networks, planted_solver(), facts={"licence": "MIT"}).SerializeToString()
-
-
-def planted_solver() -> ModelProto:
-    """A solver that counts frames and gives the first weight what the landmarks' mean column is."""
-    graph = ValueGraph()
-    state = graph.value("state")
-    column = graph.value("landmarks").rows(0, 1, axis=1).reduced("ReduceMean", 0)
-    weights = graph.either(  # a branch that uses constants from outside
-        graph.value("interval").shaped(1) > 0.0,
-        lambda: graph.cat(column, torch.zeros(len(ARKIT) - 1)),
-        lambda: graph.as_value(torch.zeros(len(ARKIT))),
-    )
-    outputs: dict[str, tuple[Value, tuple[int, ...]]] = {
-        "weights": (weights, (len(ARKIT),)),
-        "rotation": (graph.as_value(torch.eye(3)), (3, 3)),
-        "translation": (graph.value("controls").rows(0, 3), (3,)),
-        "gaze": (graph.as_value(torch.zeros(2, 2)), (2, 2)),
-        "calibrated": (graph.value("interval"), ()),
-        "next_state": (state + 1.0, (2,)),
-    }
-    for name, (value, _) in outputs.items():
-        graph.build.op("Identity", value.name, output=name)
-    inputs = {"landmarks": (68, 2), "controls": (5,), "interval": (), "state": (2,)}
-    return graph.root.model("planted", inputs, {name: shape for name, (_, shape) in outputs.items()}, {}, OPSET)
+def webcam_file(solver: PlantedSolver) -> bytes:
+    """The graph."""
+    return webcam_model(WebcamGraph(PlantedReader(), solver), {"licence": "MIT"}).SerializeToString()

@@ -46,7 +46,7 @@ class WebcamSolverGraph(nn.Module):
 
     def __init__(self, solver: WebcamSolver) -> None:
         super().__init__()
-        self.solver = solver
+        self.solver, self.state_size = solver, solver.layout.length
 
     def forward(self, *given: Tensor) -> WebcamAnswer:
         """The frame's answer, of ``INPUTS`` in their order."""

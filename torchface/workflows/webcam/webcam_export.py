@@ -10,22 +10,17 @@ from pathlib import Path
 import cv2
 import numpy as np
 import torch
-from torch import Tensor
 
-from torchface.capture.anybody import WebcamControls, WebcamSolver
+from torchface.capture.anybody import WebcamControls
 from torchface.errors import ValueRangeError
 from torchface.files.whole_files import check_writable, write_file
 from torchface.geometry.cameras.pinhole import look_at
-from torchface.landmarks.images.face_crop import crop_transform, cut_crop, from_crop
-from torchface.landmarks.images.face_reading import READ_BY_NETWORKS, FaceReading
-from torchface.landmarks.images.networks.eye_finder import EyeFinder
-from torchface.onnx.webcam.face_reader import STATE
-from torchface.onnx.webcam.webcam_session import WebcamFrame, WebcamSession
+from torchface.onnx.webcam.webcam_model import OUTPUTS, WebcamGraph
+from torchface.onnx.webcam.webcam_session import WebcamSession
 from torchface.progress import Progress, silent
 from torchface.rendering.clay_shading import render
 from torchface.synthetic import performer
-from torchface.workflows.webcam.default_solver import default_webcam_solver
-from torchface.workflows.webcam.webcam_graph import WebcamNetworks, webcam_graph, webcam_networks
+from torchface.workflows.webcam.webcam_graph import webcam_graph, webcam_module
 
 _FPS = 30.0
 _SIZE = (240, 320)  # rows, columns
@@ -85,7 +80,7 @@ def export_webcam(out: str | Path, progress: Progress | None = None) -> WebcamRe
     progress("rendering a video to check it with")
     frames = _rendered_frames(_FRAMES)
     progress("comparing ONNX Runtime with PyTorch")
-    landmarks, weights = webcam_parity(session, webcam_networks(), default_webcam_solver(), frames)
+    landmarks, weights = webcam_parity(session, webcam_module(), frames)
     for name, gap in {"landmarks": landmarks, "weights": weights}.items():
         if not gap <= _LARGEST_GAP[name]:
             raise ValueRangeError(
@@ -117,15 +112,13 @@ def _rendered_frames(count: int) -> list[np.ndarray]:
     return frames
 
 
-def webcam_parity(
-    session: WebcamSession, networks: WebcamNetworks, solver: WebcamSolver, frames: Sequence[np.ndarray]
-) -> tuple[float, float]:
-    """How far the graph is from the same networks and solver in PyTorch, each frame from the graph's own state.
+def webcam_parity(session: WebcamSession, graph: WebcamGraph, frames: Sequence[np.ndarray]) -> tuple[float, float]:
+    """How far the session is from the module in PyTorch, each frame from the session's own state.
 
     Args:
         session: runs the graph, from where it is.
-        networks, solver: what the graph was made of.
-        frames: uint8 (H,W,3), of a face that moves little from one to the next.
+        graph: what it was exported from.
+        frames: uint8 (H,W,3).
 
     Returns:
         The largest mean distance of a frame's landmarks, over that of the eyes' outer corners; and the largest
@@ -133,42 +126,15 @@ def webcam_parity(
     """
     gaps: list[tuple[float, float]] = []
     for frame in frames:  # each takes the state of the one before
-        before = session.state
+        given = torch.from_numpy(frame), torch.tensor(1 / _FPS), WebcamControls().tensor(), session.state
         found = session.step(frame, 1 / _FPS)
-        if before[8] > 0.5 and found.presence > 0:
-            gaps.append(_gap(frame, before, found, networks, solver))
+        with torch.inference_mode():
+            expected = dict(zip(OUTPUTS, graph(*given), strict=True))
+        if found.presence > 0:
+            marks = expected["landmarks"]
+            apart = (found.landmarks - marks).norm(dim=1).mean() / (marks[36] - marks[45]).norm()
+            gaps.append((float(apart), float((found.weights - expected["weights"]).abs().max())))
     return tuple(max(column) for column in zip(*gaps, strict=True)) if gaps else (float("inf"), float("inf"))
-
-
-def _gap(
-    frame: np.ndarray, before: Tensor, found: WebcamFrame, networks: WebcamNetworks, solver: WebcamSolver
-) -> tuple[float, float]:
-    """Of one frame, from the graph's state before it."""
-    read = _read(torch.from_numpy(frame).permute(2, 0, 1), before[:STATE].double(), networks)
-    given = [getattr(read, name).float() for name in READ_BY_NETWORKS]
-    height, width = frame.shape[:2]
-    extra = [torch.tensor([width, height]).float(), torch.tensor(1 / _FPS), WebcamControls().tensor(), before[STATE:]]
-    with torch.inference_mode():
-        weights = solver.layout.unpack(solver(*given, *extra).clone()).weights
-    apart = (found.landmarks - read.landmarks).norm(dim=1).mean() / (read.landmarks[36] - read.landmarks[45]).norm()
-    return float(apart), float((found.weights - weights).abs().max())
-
-
-@torch.inference_mode()
-def _read(image: Tensor, state: Tensor, networks: WebcamNetworks) -> FaceReading:
-    """What PyTorch reads of a picture (3,H,W) where the graph looks for its face."""
-    place, anchor = state[:5], state[5:8]
-    turn = torch.stack([place[3], -place[4], place[4], place[3]]).view(2, 2)
-    side = place[2] * anchor[2]
-    middle = place[:2] + place[2] * (turn @ anchor[:2])
-    box = torch.cat([middle - side / 2, side.expand(2)])
-    network = networks.landmarks
-    way = crop_transform(box, float(torch.atan2(place[4], place[3])), network.size, network.margin)
-    crop = cut_crop(image, way, network.size)
-    marks, deviation, visibility, presence = (one[0] for one in network(crop[None].float() / 255))
-    scale = float(side) * network.margin / network.size
-    face = FaceReading(from_crop(marks, way), deviation * scale, visibility, presence)
-    return EyeFinder(networks.eyes, networks.eyes.width, networks.eyes.height)(image, face)
 
 
 def _enlarged(frames: Sequence[np.ndarray]) -> list[np.ndarray]:

@@ -6,9 +6,10 @@ import onnx
 
 from torchface import zoo
 from torchface.landmarks import BoxNetwork, LandmarkNetwork
+from torchface.landmarks.images.frame_reader.face_reader import FaceReader, WebcamNetworks
 from torchface.landmarks.images.networks.eye_network import EyeNetwork
-from torchface.onnx.webcam.webcam_model import WebcamNetworks, webcam_model
-from torchface.onnx.webcam.webcam_solver_graph import webcam_solver_model
+from torchface.onnx.webcam.webcam_model import WebcamGraph, webcam_model
+from torchface.onnx.webcam.webcam_solver_graph import WebcamSolverGraph
 from torchface.progress import Progress, silent
 from torchface.workflows.cached_graph import cached_graph
 from torchface.workflows.track.track_models import DEFAULT_PRIOR
@@ -33,6 +34,15 @@ def webcam_networks() -> WebcamNetworks:
     )
 
 
+def webcam_module() -> WebcamGraph:
+    """What the graph is exported from.
+
+    Raises:
+        NameMismatchError: a model of the zoo is of another kind.
+    """
+    return WebcamGraph(FaceReader(webcam_networks()), WebcamSolverGraph(default_webcam_solver()))
+
+
 def webcam_graph(progress: Progress | None = None) -> bytes:
     """The graph's file: from the cache where it is there and whole, else made, which takes a minute.
 
@@ -44,7 +54,6 @@ def webcam_graph(progress: Progress | None = None) -> bytes:
     def make() -> onnx.ModelProto:
         (progress or silent)("making the webcam's graph, once")
         licences = {name: zoo.describe(name).licence for name in MODELS}
-        solver = webcam_solver_model(default_webcam_solver())
-        return webcam_model(webcam_networks(), solver, facts={"licence": "MIT", "licences": licences})
+        return webcam_model(webcam_module(), {"licence": "MIT", "licences": licences})
 
     return cached_graph("webcam", make, _CODE, models={name: zoo.find(name) for name in MODELS})

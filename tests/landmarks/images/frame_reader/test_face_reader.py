@@ -1,0 +1,133 @@
+"""One face in a camera's pictures: it is kept, lost and found; its eyes are read as the library reads them."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from torch import Tensor
+
+from torchface import zoo
+from torchface.geometry.cameras.pinhole import look_at
+from torchface.landmarks import FaceReading, LandmarkTracker
+from torchface.landmarks.images.boxes.network_detector import shipped_detector
+from torchface.landmarks.images.frame_reader.eye_reader import read_eyes
+from torchface.landmarks.images.frame_reader.face_reader import STATE, FaceReader, WebcamNetworks
+from torchface.landmarks.images.ibug_68 import relative_errors
+from torchface.landmarks.images.networks.crop_finder import CropFinder
+from torchface.landmarks.images.networks.eye_finder import EyeFinder
+from torchface.rendering.clay_shading import Lighting, render
+from torchface.synthetic import performer
+
+
+@pytest.fixture(scope="module")
+def portrait() -> tuple[Tensor, Tensor]:
+    """A performer's head on grey, (3,150,150), and its landmarks (68,2)."""
+    rig = performer()
+    marks = rig.neutral.landmarks
+    camera = look_at(rig.vertices[marks].double().mean(0), 0.0, 0.0, 330.0, 150, 150)
+    picture = render(rig.neutral, camera, background=(0.3, 0.35, 0.4), lighting=Lighting(occlusion_rays=0), samples=1)
+    return (picture.clamp(0, 1) * 255).byte(), camera.project(rig.vertices[marks].double()).float()
+
+
+@pytest.fixture(scope="module")
+def reader() -> FaceReader:
+    """With the zoo's networks."""
+    networks = WebcamNetworks(*(zoo.get_model(name) for name in ("face_boxes", "landmark_network", "eye_network")))
+    return FaceReader(networks).eval()
+
+
+class Webcam:
+    """A reader with the state that it hands on."""
+
+    def __init__(self, reader: FaceReader) -> None:
+        self.reader, self.state = reader, torch.zeros(STATE)
+
+    @torch.inference_mode()
+    def step(self, frame: Tensor, interval: float = 1 / 30) -> FaceReading:
+        found, self.state = self.reader(frame.permute(1, 2, 0), torch.tensor(interval), self.state)
+        return found
+
+
+@pytest.fixture
+def webcam(reader: FaceReader) -> Webcam:
+    return Webcam(reader)
+
+
+def test_eyes_are_read_as_the_library_reads_them(portrait: tuple[Tensor, Tensor], reader: FaceReader) -> None:
+    """Lids, irises, and what is told of each eye; of eyes too small to be seen nothing."""
+    picture, marks = portrait
+    sure, names = torch.ones(68), ("landmarks", "deviation", "iris", "openness", "closed", "eye_visibility")
+    finder = EyeFinder(reader.eyes, reader.eyes.width, reader.eyes.height)
+    for size in (1.0, 0.05):
+        face = FaceReading(size * marks, torch.linspace(0.5, 2.0, 68), sure, sure[0])
+        with torch.inference_mode():
+            expected, found = finder(picture, face), read_eyes(picture.permute(1, 2, 0), face, reader.eyes)
+        for name in names:
+            torch.testing.assert_close(
+                getattr(found, name), getattr(expected, name), atol=0.05, rtol=0, equal_nan=True, msg=name
+            )
+    assert found.iris.isnan().all()
+    assert (found.eye_visibility == 0).all()
+
+
+def scene(portrait: Tensor, *corners: tuple[int, int], size: tuple[int, int] = (240, 400)) -> Tensor:
+    """Portraits at corners (column, row) on an empty wall."""
+    frame = torch.tensor([76, 89, 102], dtype=torch.uint8)[:, None, None].expand(3, *size).clone()
+    for left, top in corners:
+        frame[:, top : top + portrait.shape[1], left : left + portrait.shape[2]] = portrait
+    return frame
+
+
+def column(face: FaceReading) -> float:
+    return float(face.landmarks[:, 0].mean())
+
+
+def test_a_face_is_followed_as_the_library_follows_it(webcam: Webcam, portrait: tuple[Tensor, Tensor]) -> None:
+    network = zoo.get_model("landmark_network")
+    tracker = LandmarkTracker(CropFinder(network, network.size, network.margin), detector=shipped_detector())
+    head, truth = portrait
+    for left in (60, 66, 72, 95, 95):
+        frame = scene(head, (left, 50))
+        found, theirs = webcam.step(frame), tracker.step(frame).landmarks
+        assert found.presence > 0.9
+        assert relative_errors(found.landmarks[None], theirs[None]) < 0.01
+        assert relative_errors(found.landmarks[None], truth[None] + torch.tensor([left, 50.0])) < 0.06
+        assert (found.iris - found.landmarks[torch.tensor([[36, 39], [42, 45]])].mean(1)).abs().max() < 5
+    clear = torch.cat([frame, torch.zeros(1, *frame.shape[1:], dtype=torch.uint8)])
+    before = webcam.state
+    once = webcam.step(frame).landmarks
+    webcam.state = before
+    assert torch.equal(webcam.step(clear).landmarks, once)
+
+
+def test_it_stays_with_the_largest_and_finds_it_again(webcam: Webcam, portrait: tuple[Tensor, Tensor]) -> None:
+    head, _ = portrait
+    small = torch.nn.functional.interpolate(head[None].float(), (110, 110), mode="area")[0].byte()
+
+    def both(large: Tensor, other: Tensor) -> Tensor:
+        frame = scene(large, (20, 40))
+        frame[:, 60 : 60 + other.shape[1], 220 : 220 + other.shape[2]] = other
+        return frame
+
+    assert column(webcam.step(both(head, small))) < 190
+    assert column(webcam.step(both(head, small))) < 190
+    assert column(webcam.step(both(small, head))) < 190  # now the other is larger, and not it
+    for _ in range(4):
+        gone = webcam.step(scene(head))
+        assert gone.presence == 0
+        assert gone.landmarks.isnan().all()
+        assert gone.iris.isnan().all()
+        assert webcam.state.isfinite().all()
+    assert column(webcam.step(both(small, head))) < 190  # the one that is where it was, though another is larger
+    webcam.state = torch.zeros(STATE)
+    assert column(webcam.step(both(small, head))) > 190  # forgotten: the largest
+
+
+def test_whatever_is_shown_is_read_safely(webcam: Webcam, portrait: tuple[Tensor, Tensor]) -> None:
+    frame = scene(portrait[0], (60, 50))
+    expected = webcam.step(frame).landmarks
+    other_camera = webcam.step(frame[:, 30:, 40:260]).landmarks
+    assert relative_errors(other_camera[None], expected[None] - torch.tensor([40.0, 30.0])) < 0.02
+    for size in ((64, 64), (1, 1), (2000, 40)):
+        assert webcam.step(torch.zeros(3, *size, dtype=torch.uint8)).presence == 0
+        assert webcam.state.isfinite().all()

@@ -1,0 +1,184 @@
+"""What is read of one face in a camera's pictures, frame after frame."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import torch
+from torch import Tensor, nn
+
+from torchface.landmarks.images.boxes.box_network import BoxNetwork
+from torchface.landmarks.images.face_reading import FaceReading, confidence_of
+from torchface.landmarks.images.folded_normalisation import without_normalisation
+from torchface.landmarks.images.frame_reader.eye_reader import read_eyes
+from torchface.landmarks.images.frame_reader.face_place import overlap, place_around, plausible, relation, sought
+from torchface.landmarks.images.frame_reader.face_search import FOUND, SearchSettings, search
+from torchface.landmarks.images.frame_reader.picture_pieces import cut_square, from_square, picture_size
+from torchface.landmarks.images.ibug_68 import COUNT
+from torchface.landmarks.images.networks.eye_network import EyeNetwork
+from torchface.landmarks.images.networks.landmark_network import LandmarkNetwork
+
+STATE = 15
+"""Numbers that a reader hands on."""
+
+_FAR, _LOOSE = 0.75, 0.25  # shared share of two places
+_LONGEST = 0.5  # seconds: after a longer break the face may be anywhere
+_ANYWHERE = (32.0, 32.0, 64.0, 1.0, 0.0)  # a place, where there is none to look at
+_SHRUNK, _GROWN = 0.6, 1.6  # of a face from one picture to the next
+_LONG = 1e3  # seconds
+
+
+@dataclass(frozen=True)
+class ReaderSettings:
+    """When a face counts as found and as lost.
+
+    Args:
+        new: presence from which what the box network finds is a face.
+        vague: mean confidence of the landmarks under which it is none, and under which one that is followed is doubted.
+        sure: presence from which nothing is asked about a face that is followed.
+        likely: presence from which it is kept though the box network sees none.
+        least: presence under which it is lost at once.
+        doubt: seconds of presence below ``sure`` and the like after which the box network is asked, again and again.
+        patience: seconds for which a lost face is waited for at its place before another of several is taken.
+        eager: seconds after a face was lost in which every frame is searched.
+        pause: seconds between searches afterwards.
+        smallest: pixels a side of the box round a face, at least.
+        search: where faces are looked for.
+    """
+
+    new: float = 0.6
+    vague: float = 0.5
+    sure: float = 0.9
+    likely: float = 0.5
+    least: float = 0.1
+    doubt: float = 0.25
+    patience: float = 0.3
+    eager: float = 0.5
+    pause: float = 0.1
+    smallest: float = 12.0
+    search: SearchSettings = field(default_factory=SearchSettings)
+
+
+@dataclass(frozen=True, eq=False)
+class WebcamNetworks:
+    """What read faces.
+
+    Args:
+        boxes: finds faces in pictures.
+        landmarks: finds landmarks in a face.
+        eyes: finds lids and irises in an eye.
+    """
+
+    boxes: BoxNetwork
+    landmarks: LandmarkNetwork
+    eyes: EyeNetwork
+
+
+class FaceReader(nn.Module):
+    """One face in the next picture of a camera.
+
+    A face is looked for in the square round where it was in the picture before, turned as it was and as it lay to the
+    landmarks when it was found: one that moved far is looked at once more. Without one the box network looks for it.
+    Tensor operations alone: it is exported as it is.
+
+    Args:
+        networks: what read it.
+        settings: when a face counts as found and as lost.
+    """
+
+    def __init__(self, networks: WebcamNetworks, settings: ReaderSettings | None = None) -> None:
+        super().__init__()
+        self.settings = settings or ReaderSettings()
+        self.boxes, self.landmarks = without_normalisation(networks.boxes), without_normalisation(networks.landmarks)
+        self.eyes = without_normalisation(networks.eyes)
+
+    def forward(self, image: Tensor, interval: Tensor, state: Tensor) -> tuple[FaceReading, Tensor]:
+        """The face in a picture, and what the reader of the next picture takes.
+
+        Args:
+            image: uint8 (H,W,C), 3 channels or 4, red first.
+            interval: seconds since the picture before, (), finite and positive.
+            state: what the reader of the picture before left, (STATE,); zeros before the first.
+
+        Returns:
+            The reading, landmarks and irises of NaN, visibility and presence of 0 without a face; the state (STATE,).
+        """
+        settings = self.settings
+        place, anchor, size = state[:5], state[5:8], picture_size(image)
+        following, missing, doubt, since, attempt = state[8:13].unbind()
+        same = (size == state[13:]).all()
+        # Another picture size is another camera: its face may be anywhere.
+        place = place * same
+        followed = (following > 0.5) & same & (interval <= _LONGEST)
+        asked = followed & (doubt >= settings.doubt) & (since >= settings.doubt)
+        lost_now = ~followed & ((missing <= settings.eager) | (since >= settings.pause))
+        searched = asked | lost_now
+        found = _either(
+            searched,
+            lambda image, place, waiting, attempt: search(image, self.boxes, settings.search, place, waiting, attempt),
+            lambda image, place, waiting, attempt: torch.zeros(FOUND),
+            (image, place, missing < settings.patience, attempt),
+        )
+        there = found[5] > 0.5
+        begin = torch.where(followed, sought(place, anchor), found[:5])
+        ready = plausible(begin, size, settings.smallest) & (followed | there)
+        first = torch.where(ready, begin, torch.tensor(_ANYWHERE))
+        # The network runs on every picture, as ONNX Runtime makes it half as fast inside of a branch.
+        seen = self._look(image, first)
+        moved = place_around(seen[: 2 * COUNT].view(COUNT, 2))
+        before = torch.where(followed, place, first)
+        shared = overlap(before[:2], before[2], moved)
+        # Boxes of the box network fit loosely, but what lies beside them is not their face.
+        again = (followed & (shared < _FAR)) | (~followed & (shared >= _LOOSE))
+        again = again & ready & plausible(moved, size, settings.smallest)
+        looked = torch.where(again, torch.where(followed, sought(moved, anchor), moved), first)
+        seen = _either(
+            again,
+            lambda image, looked, seen: self._look(image, looked),
+            lambda image, looked, seen: seen.clone(),
+            (image, looked, seen),
+        )
+        marks, deviation, visibility, presence = seen.split([2 * COUNT, COUNT, COUNT, 1])
+        marks, presence = marks.view(COUNT, 2), presence[0]
+        own = place_around(marks)
+        growth = own[2] / place[2].clamp(min=1)
+        vague = confidence_of(deviation / own[2].clamp(min=1)).mean() < settings.vague
+        confirmed = found[6] > 0.5
+        kept = ((presence >= settings.likely) & ~vague) | ~asked | confirmed
+        kept = kept & (presence >= settings.least) & (growth > _SHRUNK) & (growth < _GROWN)
+        good = (followed & kept) | (~followed & ~vague & (presence >= settings.new))
+        good = good & ready & plausible(own, size, settings.smallest)
+        clear = ((presence >= settings.sure) & ~vague) | confirmed
+        refused = lost_now & there & ~good
+        counts = [
+            good.float(),
+            torch.where(good, 0.0, (missing + interval).clamp(max=_LONG)),
+            torch.where(good & ~clear, doubt + interval, 0.0),
+            torch.where(searched, 0.0, (since + interval).clamp(max=_LONG)),
+            torch.where(refused, attempt + 1, 0.0),
+        ]
+        anchor = torch.where(good & ~followed, relation(own, looked), anchor)
+        after = torch.cat([torch.where(good, own, place), anchor, torch.stack(counts), size])
+        face = read_eyes(image, FaceReading(marks, deviation, visibility, presence), self.eyes)
+        nothing = dict.fromkeys(("landmarks", "iris", "openness", "closed"), torch.nan)
+        nothing |= dict.fromkeys(("visibility", "presence", "eye_visibility"), 0.0)
+        parts = {name: torch.where(good, getattr(face, name), value) for name, value in nothing.items()}
+        return FaceReading(deviation=face.deviation, **parts), after
+
+    def _look(self, image: Tensor, place: Tensor) -> Tensor:
+        """What the network finds in the square round a place: landmarks, deviation, visibility, presence in one row."""
+        network = self.landmarks
+        found = network(cut_square(image, place, network.size, network.margin))
+        marks = from_square(found.landmarks[0], place, network.size, network.margin)
+        deviation = found.deviation[0] * place[2] * (network.margin / network.size)
+        return torch.cat([marks.flatten(), deviation, found.visibility[0], found.presence])
+
+
+def _either(
+    condition: Tensor, then: Callable[..., Tensor], otherwise: Callable[..., Tensor], given: tuple[Tensor, ...]
+) -> Tensor:
+    """What one of two functions gives, of which the other does not run."""
+    if torch.compiler.is_exporting():
+        return torch.cond(condition, then, otherwise, given)  # type: ignore[no-any-return]
+    return (then if bool(condition) else otherwise)(*given)
