@@ -1,4 +1,4 @@
-"""What is read of a face's two eyes in a picture: ``EyeFinder`` without a choice by values."""
+"""Reading of a face's two eyes in a picture: ``EyeFinder`` without a choice by values."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Where a face is in a picture: middle, side and roll angle of the square round it.
+"""Place of a face in a picture: middle, side and roll angle of the square round it.
 
 A place is (5,): x and y of the middle, side, cosine and sine of the roll angle, clockwise as the picture is seen.
 """

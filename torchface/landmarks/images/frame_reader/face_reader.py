@@ -1,4 +1,4 @@
-"""What is read of one face in a camera's pictures, frame after frame."""
+"""Reading of one face in a camera's pictures, frame after frame."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Which of the faces that the box network finds in a picture is meant."""
+"""Choice among the faces that the box network finds in a picture."""
 
 from __future__ import annotations
 
