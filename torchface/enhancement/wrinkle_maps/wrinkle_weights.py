@@ -152,7 +152,7 @@ class WrinkleWeights(nn.Module):
 
     def forward(self, vertices: Tensor) -> Tensor:
         """Weights of the maps, (T,R,M), in [0,1], of the rig's vertices (T,V,3), millimetres, in any rigid place."""
-        return self.of_moments(self.moments(vertices[:, self.sites] - self.neutral))
+        return self.of_moments(self.moments(vertices.index_select(1, self.sites) - self.neutral))
 
     def predict(self, vertices: Tensor) -> Tensor:
         """As :meth:`forward`, which an engine has as a graph, with its input checked.
@@ -189,10 +189,11 @@ class WrinkleWeights(nn.Module):
         """Components of the displacements in each region, (R,T,q), of moments (T,3+3Rq,3)."""
         # In double precision, as a turn of a millionth moves a whole head's sums more than some wrinkle does.
         turn = nearest_rotation((self.resting[:3] + moments[:, :3]).double())
-        beyond = (turn - torch.eye(3, dtype=turn.dtype, device=turn.device)).to(moments)[:, None, None]
+        upright = torch.eye(3, dtype=turn.dtype, device=turn.device)
+        beyond, upright = (turn - upright).to(moments)[:, None, None], upright.to(moments)
         shape = (self.centers.shape[0], self.centers.shape[2], 3)
         moved, still = moments[:, 3:].unflatten(1, shape), self.resting[3:].unflatten(0, shape)
-        return (moved.diagonal(dim1=-2, dim2=-1).sum(-1) + ((moved + still) * beyond).sum((-1, -2))).transpose(0, 1)
+        return (moved * upright + (moved + still) * beyond).sum((-1, -2)).transpose(0, 1)
 
     def _value(self, scores: Tensor) -> Tensor:
         """What regression says of scores (R,T,q), (R,T,M)."""
