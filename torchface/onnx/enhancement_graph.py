@@ -50,6 +50,7 @@ def wrinkle_weights_model(
     wrinkles: WrinkleWeights | RigWrinkles, facts: Mapping[str, object] | None = None
 ) -> onnx.ModelProto:
     """The graph of the module."""
+    size: tuple[int, ...]
     if isinstance(wrinkles, RigWrinkles):
         learned, name, size = wrinkles.wrinkles, "weights", (len(wrinkles.names),)
         about: dict[str, object] = {"units": "weights in [0,1]", "shapes": list(wrinkles.names)}
