@@ -1,5 +1,7 @@
 """Take and Track: frames agree, channels go by name."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 
@@ -65,3 +67,72 @@ def test_frames_without_a_marker_are_found() -> None:
     assert empty_frames(take).tolist() == [1, 3]
     with pytest.raises(ValueRangeError, match="take: found no markers"):
         empty_frames(Take(60.0))
+
+
+def uneven() -> Take:
+    seconds = torch.tensor([3.0, 3.1, 3.3, 3.35, 3.4], dtype=torch.float64)
+    weights = Track(("a",), (10 * seconds - 30).float()[:, None, None], torch.ones(5, 1))
+    columns = {"HeadYaw": 2 * seconds, "note": tuple("abcde")}
+    return Take(10.0, weights=weights, timecode=tuple("vwxyz"), extras={"columns": columns}, seconds=seconds)
+
+
+def test_times_are_those_given_or_even() -> None:
+    take = uneven()
+    torch.testing.assert_close(take.times, torch.tensor([0, 0.1, 0.3, 0.35, 0.4], dtype=torch.float64))
+    assert take.duration == pytest.approx(0.5)
+    assert take.clock.equal(take.seconds)
+    even = Take(10.0, weights=take.weights, extras={"frame_numbers": torch.arange(100, 105)})
+    torch.testing.assert_close(even.times, torch.arange(5, dtype=torch.float64) / 10)
+    torch.testing.assert_close(even.clock, torch.arange(100, 105, dtype=torch.float64) / 10)
+    assert even.duration == 0.5
+    assert Take(10.0).duration == 0
+    cut = take.frames(slice(2, 4))
+    assert cut.seconds.tolist() == [3.3, 3.35]
+    assert "uneven times, up to 0.2 s apart" in repr(take)
+
+
+@pytest.mark.parametrize("seconds", [[0, 1], [0, 1, 1, 2, 3], [0, 1, 2, 3, float("nan")], [4, 3, 2, 1, 0]])
+def test_times_that_do_not_rise_are_refused(seconds: list[float]) -> None:
+    with pytest.raises(ValueRangeError, match=r"expected \(5,\), rising"):
+        replace(uneven(), seconds=torch.tensor(seconds))
+
+
+@pytest.mark.parametrize("fps", [10.0, 25.0, 7.0])
+def test_resampling_keeps_lines_and_the_length(fps: float) -> None:
+    even = uneven().resampled(fps)
+    assert (even.fps, even.seconds, even.timecode) == (fps, None, None)
+    torch.testing.assert_close(even.weights.values.flatten().double(), 10 * even.times, atol=1e-6, rtol=0)
+    torch.testing.assert_close(even.extras["columns"]["HeadYaw"], 6 + 2 * even.times)
+    assert "note" not in even.extras["columns"]
+    assert 0.4 - 1 / fps < float(even.times[-1]) <= 0.4 + 1e-9
+    assert even.resampled(fps) is even
+
+
+def test_resampling_leaves_what_is_not_seen() -> None:
+    values = torch.tensor([0.0, torch.nan, 2.0, 3.0, 4.0])[:, None, None]
+    take = Take(10.0, weights=Track(("a",), values)).resampled(20.0)
+    assert take.weights.values.isnan().flatten().nonzero().flatten().tolist() == [1, 2, 3]
+    with pytest.raises(ValueRangeError, match="found 0 frames a second"):
+        take.resampled(0)
+
+
+def test_on_a_grid_the_frames_are_the_same_and_others_empty() -> None:
+    take = uneven()
+    even, rows = take.on_grid()
+    assert even.fps == 20.0
+    assert rows.tolist() == [0, 2, 6, 7, 8]
+    assert even.weights.values[rows].equal(take.weights.values)
+    empty = [row for row in range(len(even)) if row not in rows]
+    assert bool(even.weights.values[empty].isnan().all())
+    assert even.weights.confidence[empty].tolist() == [[0]] * 4
+    torch.testing.assert_close(even.times[rows], take.times)
+    same, all_rows = even.on_grid()
+    assert len(same) == len(even)
+    assert all_rows.equal(torch.arange(len(even)))
+
+
+def test_the_frame_nearest_to_each_moment_is_shown() -> None:
+    take = uneven()
+    off = (take.times[:, None] - torch.arange(5) / 10).abs()
+    torch.testing.assert_close(off[take.even_rows(), torch.arange(5)], off.amin(0))
+    assert Take(10.0, weights=uneven().weights).even_rows().tolist() == [0, 1, 2, 3, 4]

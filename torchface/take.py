@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any
 
 import torch
@@ -11,6 +12,8 @@ from torch import Tensor
 
 from torchface.errors import NameMismatchError, ShapeError, ValueRangeError
 from torchface.number_checks import check_rate
+from torchface.temporal.frame_grid import check_gaps, frame_grid
+from torchface.temporal.interpolation import frames_beside, values_at
 
 _WIDTHS = {"markers": 3, "landmarks": 2, "weights": 1}
 
@@ -84,16 +87,20 @@ class Take:
         weights: values (T,N,1), blendshape weights.
         timecode: one text a frame, as the file had it.
         extras: what else the file holds (columns by name, device, subject), kept for writing it back.
+        seconds: when each frame is shown, (T,), rising, from any beginning, where frames come unevenly (a camera of
+            variable rate, dropped frames); absent where ``fps`` come a second.
 
     Raises:
         ShapeError: the tracks differ in length, or a track's values are not of its kind's width.
-        ValueRangeError: ``fps`` is no rate of a camera, 0.01 to 10,000.
+        ValueRangeError: ``fps`` is no rate of a camera, 0.01 to 10,000; or ``seconds`` do not rise.
 
     Example:
         >>> weights = Track(("jawOpen",), torch.linspace(0, 1, 60)[:, None, None])
         >>> take = Take(fps=30.0, weights=weights)
-        >>> len(take.frames(slice(0, 15)).weights.values) / take.fps
+        >>> take.frames(slice(0, 15)).duration
         0.5
+        >>> Take(30.0, weights=weights.frames(slice(0, 3)), seconds=torch.tensor([5.0, 5.5, 6.5])).times.tolist()
+        [0.0, 0.5, 1.5]
     """
 
     fps: float
@@ -102,6 +109,7 @@ class Take:
     weights: Track | None = None
     timecode: tuple[str, ...] | None = None
     extras: dict[str, Any] = field(default_factory=dict)
+    seconds: Tensor | None = None
 
     def __post_init__(self) -> None:
         check_rate(self.fps, "take", ValueRangeError)
@@ -118,20 +126,39 @@ class Take:
         }
         if len(set(lengths.values())) > 1:
             raise ShapeError(f"take: found frame counts {lengths}, expected the same for all")
+        if self.seconds is not None:
+            seconds = torch.as_tensor(self.seconds).detach().cpu().double()
+            if seconds.shape != (len(self),) or not bool(torch.isfinite(seconds).all() & (seconds.diff() > 0).all()):
+                raise ValueRangeError(f"take: found times {tuple(seconds.shape)}, expected ({len(self)},), rising")
+            object.__setattr__(self, "seconds", seconds)
 
-    def uneven_seconds(self) -> Tensor | None:
-        """When each frame is shown, (T,) float64, rising, where ``extras["seconds"]`` says; else frames come evenly.
+    @property
+    def times(self) -> Tensor:
+        """When each frame is shown, seconds after the first one, (T,) float64, even or not."""
+        if self.seconds is None:
+            return torch.arange(len(self), dtype=torch.float64) / self.fps
+        return self.seconds - self.seconds[:1]
 
-        Raises:
-            ValueRangeError: that is of another length, or does not rise.
-        """
-        seconds = self.extras.get("seconds")
-        if seconds is None:
-            return None
-        seconds = torch.as_tensor(seconds).detach().cpu().double()
-        if seconds.shape != (len(self),) or not bool((seconds.diff() > 0).all()):
-            raise ValueRangeError(f"take: found times {tuple(seconds.shape)}, expected ({len(self)},), rising")
-        return seconds
+    @property
+    def clock(self) -> Tensor:
+        """When each frame is shown by its time or frame number, seconds since the recording began, (T,) float64."""
+        if self.seconds is not None:
+            return self.seconds
+        numbers = self.extras.get("frame_numbers")
+        return self.times + (0.0 if numbers is None or not len(numbers) else float(numbers[0]) / self.fps)
+
+    @property
+    def duration(self) -> float:
+        """Seconds from the first frame to the end of the last one."""
+        return len(self) / self.fps if self.seconds is None else float(self.times[-1:].sum()) + 1 / self.fps
+
+    @property
+    def rate(self) -> str:
+        """How often frames come, in words."""
+        if self.seconds is None:
+            return f"{self.fps:g} a second"
+        longest = float(self.seconds.diff().max()) if len(self) > 1 else 0.0
+        return f"about {self.fps:g} a second at uneven times, up to {longest:.3g} s apart"
 
     def __len__(self) -> int:
         for track in (self.markers, self.landmarks, self.weights, self.timecode):
@@ -140,7 +167,7 @@ class Take:
         return 0
 
     def __repr__(self) -> str:
-        parts = [f"{len(self)} frames at {self.fps:g} a second"]
+        parts = [f"{len(self)} frames at {self.rate}"]
         for what in ("markers", "landmarks", "weights"):
             track = getattr(self, what)
             if track is not None:
@@ -161,7 +188,81 @@ class Take:
             None if track is None else track.frames(rows) for track in (self.markers, self.landmarks, self.weights)
         )
         timecode = None if self.timecode is None else self.timecode[rows]
-        return Take(self.fps, markers, landmarks, weights, timecode, _cut_extras(self.extras, rows, len(self)))
+        extras = _cut_extras(self.extras, rows, len(self))
+        seconds = None if self.seconds is None else self.seconds[rows]
+        return Take(self.fps, markers, landmarks, weights, timecode, extras, seconds)
+
+    def resampled(self, fps: float | None = None) -> Take:
+        """The take with frames at an even rate over the same time, linear in between: for what needs one.
+
+        A value is NaN where one of the two frames beside it is. Timecodes, frame numbers and texts are left out.
+
+        Args:
+            fps: frames a second; the take's own if absent.
+
+        Raises:
+            ValueRangeError: ``fps`` is no rate of a camera, or gaps are so long that nearly all frames would lie there.
+
+        Example:
+            >>> weights = Track(("jawOpen",), torch.tensor([0.0, 0.5, 1.5])[:, None, None])
+            >>> take = Take(2.0, weights=weights, seconds=torch.tensor([0.0, 0.5, 1.5]))
+            >>> take.resampled().weights.values.flatten().tolist()
+            [0.0, 0.5, 1.0, 1.5]
+        """
+        fps = check_rate(self.fps if fps is None else fps, "fps", ValueRangeError)
+        if self.seconds is None and fps == self.fps:
+            return self
+        if len(self) < 2:
+            return replace(self, fps=fps, seconds=None)
+        times = self.times
+        check_gaps(times, fps)
+        at = torch.arange(int(float(times[-1]) * fps + 1e-6) + 1, dtype=torch.float64) / fps
+
+        def moved(values: Tensor) -> Tensor:
+            return values_at(values, times.to(values.device), at.to(values.device))
+
+        columns = {
+            name: moved(column) for name, column in self.extras.get("columns", {}).items() if isinstance(column, Tensor)
+        }
+        return replace(self._moved(fps, moved, moved), extras={"columns": columns} if columns else {})
+
+    def even_rows(self) -> Tensor:
+        """Which frame is nearest at each moment of an even rate, (T',) int64: for pictures and players."""
+        if self.seconds is None or len(self) < 2:
+            return torch.arange(len(self))
+        times = self.times
+        check_gaps(times, self.fps)
+        before, fraction = frames_beside(times, torch.arange(round(float(times[-1]) * self.fps) + 1) / self.fps)
+        return before + (fraction > 0.5)
+
+    def on_grid(self) -> tuple[Take, Tensor]:
+        """The take with frames at an even rate, and which of them are its own, (T,) int64; the others show nothing.
+
+        For methods that need an even rate and go without frames: nothing is interpolated, no value changes.
+
+        Raises:
+            ValueRangeError: gaps are so long that nearly all frames would lie there.
+        """
+        if self.seconds is None or len(self) < 2:
+            return replace(self, seconds=None), torch.arange(len(self))
+        rate, rows = frame_grid(self.seconds, self.fps)
+        count = int(rows[-1]) + 1
+
+        def spread(values: Tensor, empty: float) -> Tensor:
+            return values.new_full((count, *values.shape[1:]), empty).index_copy(0, rows.to(values.device), values)
+
+        return self._moved(rate, partial(spread, empty=torch.nan), partial(spread, empty=0.0)), rows
+
+    def _moved(self, fps: float, values: Callable[[Tensor], Tensor], confidence: Callable[[Tensor], Tensor]) -> Take:
+        """An even take of the tracks, with each one's values and confidence changed."""
+
+        def moved(track: Track | None) -> Track | None:
+            if track is None:
+                return None
+            sure = None if track.confidence is None else confidence(track.confidence)
+            return Track(track.names, values(track.values), sure)
+
+        return Take(fps, moved(self.markers), moved(self.landmarks), moved(self.weights))
 
 
 def _cut_extras(extras: dict[str, Any], rows: slice, count: int) -> dict[str, Any]:
@@ -174,10 +275,6 @@ def _cut_extras(extras: dict[str, Any], rows: slice, count: int) -> dict[str, An
         cut["columns"] = {name: column[rows] for name, column in extras["columns"].items()}
     if "blendshape_count" in extras:
         cut["blendshape_count"] = extras["blendshape_count"][rows]
-    if "seconds" in extras:
-        cut["seconds"] = extras["seconds"][rows]
-    if "gaps" in extras:
-        cut["gaps"] = tuple((row - rows.start, lost) for row, lost in extras["gaps"] if rows.start < row < rows.stop)
     return cut
 
 

@@ -10,7 +10,6 @@ import torch
 from torch import Tensor
 
 from torchface import Attachment, BlendshapeRig, load_take
-from torchface.capture.priors import resampled
 from torchface.errors import FileFormatError, NameMismatchError, ShapeError, ValueRangeError
 from torchface.files.content_keys import content_key
 from torchface.progress import Progress, silent
@@ -126,8 +125,10 @@ def _read(
             "expected weights in all"
         )
     fps = take.fps if fps is None else fps
-    if abs(take.fps - fps) > _SAME_RATE * fps:
-        values = resampled(values, take.fps, fps)
+    if take.seconds is not None or abs(take.fps - fps) > _SAME_RATE * fps:
+        even = take.resampled(fps).weights
+        assert even is not None
+        values = even.values[..., 0].double()
     return StoredTake(take.weights.names, fps, values.clamp(0.0, 1.0), solved)
 
 

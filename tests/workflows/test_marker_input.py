@@ -109,16 +109,16 @@ def test_a_cut_take_keeps_what_belongs_to_its_frames() -> None:
     extras = {
         "columns": {"HeadYaw": torch.arange(6.0), "note": tuple("abcdef")},
         "blendshape_count": tuple(range(6)),
-        "gaps": ((1, 2), (4, 3)),
         "device": "phone",
     }
-    cut = Take(60.0, weights=track, timecode=tuple("uvwxyz"), extras=extras).frames(slice(3, 5))
+    seconds = torch.tensor([0, 0.3, 0.4, 0.5, 0.9, 1.0])
+    cut = Take(60.0, weights=track, timecode=tuple("uvwxyz"), extras=extras, seconds=seconds).frames(slice(3, 5))
     assert cut.weights is not None
     assert cut.weights.values.flatten().tolist() == [3, 4]
     assert cut.timecode == ("x", "y")
     assert cut.extras["columns"]["HeadYaw"].tolist() == [3, 4]
     assert cut.extras["columns"]["note"] == ("d", "e")
     assert cut.extras["blendshape_count"] == (3, 4)
-    assert cut.extras["gaps"] == ((1, 3),)
+    assert cut.seconds.tolist() == seconds[3:5].double().tolist()
     assert cut.extras["frame_numbers"].tolist() == [3, 4]
     assert cut.extras["device"] == "phone"

@@ -43,7 +43,7 @@ def convert(
         pose = pose_weights(" ".join(at).split())
         done = convert_file(source, out, unit, part, names, progress, pose)
     shapes = 0 if done.rig is None else len(done.rig.names)
-    frames = "" if done.take is None else f", {len(done.take)} frames at {done.take.fps:g} a second"
+    frames = "" if done.take is None else f", {len(done.take)} frames at {done.take.rate}"
     console.print(f"{shapes} shapes, {len(done.mesh.vertices):,} vertices{frames}", highlight=False)
     print_lines(done.notes)
     print_path(out)

@@ -31,6 +31,7 @@ def evaluate(
     truth_rig: Path | None = None,
     part: str | None = None,
     frames: tuple[int, ...] | None = None,
+    by_number: bool = False,
     scans: bool = False,
     landmarks: Path | None = None,
     unit: str | None = None,
@@ -65,6 +66,7 @@ def evaluate(
         truth_rig: The rig that the truth's weights move; --rig if absent.
         part: Keep this region only, such as face.
         frames: Which of the result's frames, from 0, the truth's are, in order; all if absent.
+        by_number: Compare the first frame with the first, and so on, whatever their times say.
         scans: TRUTH is raw scans, in files or folders.
         landmarks: A folder of landmark files named as the scans; see `torchface register`.
         unit: Unit of the scans (mm, cm, m) where it is not the format's own.
@@ -89,7 +91,7 @@ def evaluate(
         raise ValueRangeError("evaluate: found --align and --as-is, expected one of the two")
     checked_count("--height", height, *PICTURE_HEIGHTS)
     choice = True if align else False if as_is else None
-    settings = EvaluationSettings(rig, truth_rig, part, frames, scans, landmarks, unit, choice, scale)
+    settings = EvaluationSettings(rig, truth_rig, part, frames, scans, landmarks, unit, choice, scale, by_number)
     if cluster is not None or is_batch([result], RESULTS):
         if len(truth) != 1:
             raise ValueRangeError(f"truth: found {len(truth)} places for many results, expected one")

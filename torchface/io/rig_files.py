@@ -167,12 +167,12 @@ def load_animation(path: str | Path) -> Take | None:
         path: a ``.glb``, ``.gltf`` or USD file whose keys are a film's frames, as :func:`save_animation` writes them.
 
     Returns:
-        weights (T,N,1), by the names of the shapes; correctives follow them and are left out. Frames that come unevenly
-        have their times in ``extras["seconds"]``, from 0.
+        weights (T,N,1), by the names of the shapes; correctives follow them and are left out. Keys that come unevenly
+        keep their times.
 
     Raises:
-        FileFormatError: another kind of file, broken, or keys that are no frames: out of order, or with gaps of ten
-            frames.
+        FileFormatError: another kind of file, broken, or keys out of order, or with gaps of ten frames where they are
+            not joined by straight lines.
         MissingExtraError: USD, and usd-core is not installed.
 
     Example:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
@@ -21,7 +21,7 @@ from torchface.io.tables.numbered_csv import is_numbered
 from torchface.io.weights.live_link_csv import is_live_link
 from torchface.mesh import Mesh, submesh
 from torchface.rig import BlendshapeRig
-from torchface.take import Track
+from torchface.take import Take, Track
 
 _FORMS = "weights as .csv, an animated .glb or .usdc, a mesh sequence as .safetensors, a mesh, or a folder of meshes"
 
@@ -38,6 +38,8 @@ class AnimatedMesh:
         fps: frames a second, where that is known.
         weights: what moves it, where that is known.
         rig: of its topology, where one came with it.
+        take: of the weights, where there is one, with the times of its frames.
+        numbered: whether its frames are numbered from a beginning that others may share.
     """
 
     path: Path
@@ -47,6 +49,8 @@ class AnimatedMesh:
     fps: float | None = None
     weights: Track | None = None
     rig: BlendshapeRig | None = None
+    take: Take | None = None
+    numbered: bool = False
 
     def require_topology_of(self, other: AnimatedMesh, hint: str = "") -> None:
         """Checks that both have the same vertices and triangles.
@@ -136,12 +140,18 @@ def _of_weights(path: Path, rig: BlendshapeRig | None) -> AnimatedMesh:
     take = load_take(path)
     if take.weights is None:
         raise ValueRangeError(f"{path}: found no weights, expected a take of them")
-    return _moved(path, rig, take.weights, take.fps)
+    return replace(moved_mesh(path, rig, take), numbered=is_numbered(TableReader(path).header))
 
 
-def _moved(path: Path, rig: BlendshapeRig, track: Track, fps: float) -> AnimatedMesh:
+def moved_mesh(path: Path, rig: BlendshapeRig, take: Take) -> AnimatedMesh:
+    """A rig that a take's weights move.
+
+    Raises:
+        NameMismatchError: they are of other shapes.
+    """
+    assert take.weights is not None
     try:
-        weights = rig.weights_from(track).to(rig.deltas)
+        weights = rig.weights_from(take.weights).to(rig.deltas)
     except NameMismatchError as error:
         raise NameMismatchError(f"{path}: {error}") from error
 
@@ -150,14 +160,14 @@ def _moved(path: Path, rig: BlendshapeRig, track: Track, fps: float) -> Animated
             return rig(weights[begin:end])
 
     own = Track(rig.names, weights[..., None])
-    return AnimatedMesh(path, rig.neutral, len(weights), read, fps, own, rig)
+    return AnimatedMesh(path, rig.neutral, len(weights), read, take.fps, own, rig, take)
 
 
 def _of_scene(path: Path, rig: BlendshapeRig | None) -> AnimatedMesh:
     take = load_animation(path)
     if take is None or take.weights is None:
         return _of_meshes(path, [path], rig)
-    return _moved(path, load_rig(path), take.weights, take.fps)
+    return moved_mesh(path, load_rig(path), take)
 
 
 def _of_sequence(path: Path, rig: BlendshapeRig | None) -> AnimatedMesh:
@@ -213,4 +223,4 @@ def _kept(whole: AnimatedMesh, keep: Tensor) -> AnimatedMesh:
     def read(begin: int, end: int) -> Tensor:
         return whole.read(begin, end)[:, piece.vertex_ids]
 
-    return AnimatedMesh(whole.path, piece.mesh, whole.count, read, whole.fps, whole.weights, rig)
+    return replace(whole, neutral=piece.mesh, read=read, rig=rig)

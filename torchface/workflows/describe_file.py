@@ -132,13 +132,13 @@ def _animation_rows(path: Path) -> Rows:
     order = peaks.argsort(descending=True)[:_MAX_NAMED].tolist()
     peak = ", ".join(f"{take.weights.names[row]} {float(peaks[row]):.2f}" for row in order if peaks[row] > 0)
     return [
-        ("animation", f"{len(take)} frames at {take.fps:g} a second, {len(take) / take.fps:.1f} s"),
+        ("animation", f"{len(take)} frames at {take.rate}, {take.duration:.1f} s"),
         ("largest weights", peak or "none above 0"),
     ]
 
 
 def _take_rows(take: Take) -> Rows:
-    rows = [("frames", f"{len(take)} at {take.fps:g} a second, {len(take) / take.fps:.1f} s")]
+    rows = [("frames", f"{len(take)} at {take.rate}, {take.duration:.1f} s")]
     if take.timecode:
         rows.append(("timecode", f"{take.timecode[0]} to {take.timecode[-1]}"))
     for kind in ("markers", "landmarks", "weights"):

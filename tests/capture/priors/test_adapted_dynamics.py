@@ -15,7 +15,6 @@ from torchface.capture.priors import (
     StudentDensity,
     adapt_dynamics,
     face_halves,
-    resampled,
     unlearned,
     windows_of,
 )
@@ -23,6 +22,7 @@ from torchface.capture.priors.student_t import PARTING_VARIANCE
 from torchface.errors import NameMismatchError, ShapeError, ValueRangeError
 from torchface.shape_names import mapping
 from torchface.synthetic.stages.weight_curves import perform
+from torchface.take import Take
 
 NAMES = ("browInnerUp", "eyeBlinkLeft", "jawOpen", "cheekPuff", "tongueOut")
 SPLIT = ("jawOpen", "browInnerUp_L", "browInnerUp_R", "eyeBlink_L", "cheekPuff")
@@ -148,7 +148,7 @@ def test_another_rate_is_predicted_as_surely_as_it_says(learned: DynamicsPrior, 
     track = perform(800, torch.Generator().manual_seed(7)).weights
     assert track is not None
     adapted = adapt_dynamics(learned, track.names, fps)
-    windows, following = windows_of(resampled(track.values[..., 0], 60.0, fps), adapted.window)
+    windows, following = windows_of(Take(60.0, weights=track).resampled(fps).weights.values[..., 0], adapted.window)
     windows = windows + 0.005 * torch.randn(windows.shape, generator=torch.Generator().manual_seed(2))
     mean, variance = adapted(windows.to(learned.center))
     error = mean - following

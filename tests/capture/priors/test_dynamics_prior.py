@@ -14,7 +14,7 @@ from torch import Tensor
 from torchface import zoo
 from torchface.capture import DynamicsPrior, DynamicsSettings
 from torchface.capture.energy import Quadratic
-from torchface.capture.priors import face_regions, resampled, windows_of
+from torchface.capture.priors import face_regions, windows_of
 from torchface.capture.priors.gaussian_process import GaussianProcesses, Kernel, Statistics, posterior, whitening_of
 from torchface.capture.priors.motion_features import motion_basis
 from torchface.capture.priors.process_training import LeftOutProcess, fitted_kernel
@@ -227,17 +227,6 @@ def test_windows_and_their_basis() -> None:
     gap = torch.arange(12.0).reshape(6, 2)
     gap[0, 1] = torch.nan
     assert len(windows_of(gap, 2)[0]) == 3
-
-
-def test_resampling_keeps_lines() -> None:
-    line = torch.arange(61.0)[:, None] * torch.tensor([[1.0, -2.0]])
-    half = resampled(line, 60, 30)
-    torch.testing.assert_close(half, line[::2])
-    other = resampled(line, 60, 25)
-    torch.testing.assert_close(other[:, 0], torch.arange(len(other)) * 2.4)
-    assert resampled(line, 60, 60) is line
-    with pytest.raises(ValueRangeError, match=r"found 0 frames a second, expected 0\.01 to 10000"):
-        resampled(line, 60, 0)
 
 
 def test_regions_hold_every_shape_once() -> None:

@@ -48,17 +48,15 @@ def test_weights_and_rate_come_back(fps: float, tmp_path: Path) -> None:
 def test_uneven_frames_come_back_at_their_times(tmp_path: Path) -> None:
     rig, seconds = sheet_rig(), torch.tensor([0.0, 0.033, 0.067, 0.2, 0.234, 0.266])
     weights = torch.rand(6, len(rig.names), 1, generator=torch.Generator().manual_seed(0))
-    save_animation(
-        rig, Take(30.0, weights=Track(rig.names, weights), extras={"seconds": seconds}), tmp_path / "take.glb"
-    )
+    save_animation(rig, Take(30.0, weights=Track(rig.names, weights), seconds=seconds), tmp_path / "take.glb")
     found = read_gltf_weights(tmp_path / "take.glb")
     assert found is not None
     assert found.fps == pytest.approx(1 / 0.034, rel=1e-3)  # the usual step's
-    torch.testing.assert_close(found.uneven_seconds(), seconds.double(), atol=1e-6, rtol=0)
+    torch.testing.assert_close(found.seconds, seconds.double(), atol=1e-6, rtol=0)
     save_animation(rig, found, tmp_path / "again.glb")
     again = read_gltf_weights(tmp_path / "again.glb")
     assert again is not None
-    torch.testing.assert_close(again.uneven_seconds(), found.uneven_seconds())
+    torch.testing.assert_close(again.seconds, found.seconds)
 
 
 def test_the_first_animation_that_moves_shapes_is_the_take(tmp_path: Path) -> None:
@@ -71,13 +69,24 @@ def test_the_first_animation_that_moves_shapes_is_the_take(tmp_path: Path) -> No
     assert torch.equal(found.weights.values, expected.weights.values)
 
 
-def test_key_poses_are_no_frames(tmp_path: Path) -> None:
-    rig = sheet_rig()
+def test_keys_far_apart_keep_their_times(tmp_path: Path) -> None:
+    rig, seconds = sheet_rig(), torch.tensor([0.0, 0.1, 0.2, 1.7])
     weights = torch.rand(4, len(rig.names), 1, generator=torch.Generator().manual_seed(0))
-    take = Take(30.0, weights=Track(rig.names, weights), extras={"seconds": torch.tensor([0.0, 0.1, 0.2, 1.7])})
-    save_animation(rig, take, tmp_path / "take.glb")
-    with pytest.raises(FileFormatError, match=r"found keys 1\.5\d* s apart, the median being 0\.1"):
-        read_gltf_weights(tmp_path / "take.glb")
+    save_animation(rig, Take(10.0, weights=Track(rig.names, weights), seconds=seconds), tmp_path / "take.glb")
+    found = read_gltf_weights(tmp_path / "take.glb")
+    torch.testing.assert_close(found.times, seconds.double(), atol=1e-6, rtol=0)
+    assert found.fps == 10
+
+
+def test_keys_far_apart_without_straight_lines_between_are_refused(tmp_path: Path) -> None:
+    rig, seconds = sheet_rig(), torch.tensor([0.0, 0.1, 0.2, 1.7])
+    weights = torch.rand(4, len(rig.names), 1, generator=torch.Generator().manual_seed(0))
+    path = tmp_path / "take.glb"
+    save_animation(rig, Take(10.0, weights=Track(rig.names, weights), seconds=seconds), path)
+    data = path.read_bytes()
+    (sampler,) = json.loads(data[20 : 20 + int.from_bytes(data[12:16], "little")])["animations"][0]["samplers"]
+    with pytest.raises(FileFormatError, match=r"STEP keys up to 1\.5 s apart, .* bake the animation"):
+        read_gltf_weights(edited(path, {"samplers": [sampler | {"interpolation": "STEP"}]}))
 
 
 def test_a_rig_at_rest_plays_nothing(tmp_path: Path) -> None:

@@ -45,13 +45,13 @@ def test_columns_are_matched_by_name(tmp_path: Path) -> None:
     assert take.markers.values.tolist() == [[[1, 2, 3], [10, 20, 30]]]
 
 
-def test_dropped_frames_are_reported_and_do_not_change_the_rate(tmp_path: Path) -> None:
+def test_dropped_frames_leave_the_others_their_times_and_the_rate(tmp_path: Path) -> None:
     (tmp_path / "take.csv").write_text(_GOOD.replace("2,0.04", "5,0.1"))
     take = load_markers_csv(tmp_path / "take.csv")
     assert take.fps == 50
-    assert take.extras["gaps"] == ((2, 3),)
+    torch.testing.assert_close(take.seconds, torch.tensor([0, 0.02, 0.1], dtype=torch.float64), atol=1e-9, rtol=0)
     save_markers_csv(take, tmp_path / "again.csv")
-    assert load_markers_csv(tmp_path / "again.csv").extras["gaps"] == ((2, 3),)
+    assert load_markers_csv(tmp_path / "again.csv").seconds.equal(take.seconds)
 
 
 @pytest.mark.parametrize(
@@ -65,7 +65,7 @@ def test_dropped_frames_are_reported_and_do_not_change_the_rate(tmp_path: Path) 
         ("1.5", "1_5", r"row 2, column 'nose_x': found '1_5', expected a number"),
         ("1.5", "-inf", r"row 2, column 'nose_x': found '-inf', expected a number"),
         (",7,8,9", ",7,8", r"row 3: found 7 cells, expected 8"),
-        ("1,0.02", "1,0", r"found time 0.0 after 0.0, expected rising"),
+        ("1,0.02", "1,0", r"found time 0 after 0 in frame 2, expected rising"),
         ("1,0.02", ",0.02", r"frame 2: found no frame number or no time"),
         ("2,0.04", "2,0.00004", r"found time .* expected rising|found 50000.0 frames a second"),
         ("\n0,0.0,1.5,2,3,4,5,6\n1,0.02,,,,7,8,9\n2,0.04,1,2,3,4,nan,6", "", r"found a header and no rows"),

@@ -47,12 +47,15 @@ def test_a_file_as_opensim_writes_it_is_read(line_end: str, tmp_path: Path) -> N
     assert metres.markers.values[0, 1].tolist() == [4000, 5000, 6000]
 
 
-def test_dropped_frames_are_reported_and_numbers_kept(tmp_path: Path) -> None:
-    (tmp_path / "take.trc").write_text(_OPENSIM.replace("\n3\t0.03", "\n7\t0.1"))
+def test_dropped_frames_leave_the_others_their_times_and_numbers(tmp_path: Path) -> None:
+    (tmp_path / "take.trc").write_text(_OPENSIM.replace("\n3\t0.03337", "\n7\t0.10010"))
     take = load_trc(tmp_path / "take.trc")
-    assert take.extras["gaps"] == ((2, 4),)
+    assert take.fps == 59.94
+    assert (take.times - torch.tensor([0, 1, 6]) / 59.94).abs().max() < 1e-6
     save_trc(take, tmp_path / "again.trc")
-    assert load_trc(tmp_path / "again.trc").extras["frame_numbers"].tolist() == [1, 2, 7]
+    again = load_trc(tmp_path / "again.trc")
+    assert again.extras["frame_numbers"].tolist() == [1, 2, 7]
+    assert again.times.equal(take.times)
 
 
 @pytest.mark.parametrize(

@@ -132,7 +132,7 @@ def test_an_animation_from_frame_1001_is_one_from_its_start(tmp_path: Path) -> N
     assert take.fps == 25
     assert take.weights.names == ("wide", "open")  # what is no shape of a mesh is left out
     assert take.weights.values[..., 0].tolist() == [[0, 0], [0.5, 0.25], [1, 0]]
-    assert take.uneven_seconds() is None
+    assert take.seconds is None
 
 
 def test_in_betweens_of_other_programs_are_correctives(tmp_path: Path) -> None:

@@ -94,7 +94,7 @@ def test_uneven_frames_keep_their_times(dome: Path, tmp_path: Path) -> None:
             log.append(came, torch.full((52,), i / 8), torch.zeros(9))
         take = log.take(30.0)
         assert take.fps == pytest.approx(5 / 0.42)
-        seconds = take.uneven_seconds()
+        seconds = take.seconds
         assert seconds is not None
         np.testing.assert_allclose(seconds, times - 1000, atol=1e-9)
     recordings = Recordings(tmp_path / "out", load_character(dome), "planted", 30.0)
@@ -105,7 +105,7 @@ def test_uneven_frames_keep_their_times(dome: Path, tmp_path: Path) -> None:
     recordings.finish()
     table = np.loadtxt(tmp_path / "out" / "weights.csv", delimiter=",", skiprows=1, usecols=(1,))
     np.testing.assert_allclose(table, times - 1000, atol=1e-6)
-    keys = read_gltf_weights(tmp_path / "out" / "animation.glb").uneven_seconds()
+    keys = read_gltf_weights(tmp_path / "out" / "animation.glb").seconds
     assert keys is not None
     np.testing.assert_allclose(keys, times - 1000, atol=1e-6)
     assert json.loads((tmp_path / "out" / "summary.json").read_text())["even"] is False
@@ -116,7 +116,7 @@ def test_even_frames_make_an_even_take(tmp_path: Path) -> None:
         for i in range(50):
             log.append(12345.678 + i / 29.97, torch.zeros(52), torch.zeros(9))
         take = log.take(1.0)
-        assert take.uneven_seconds() is None
+        assert take.seconds is None
         assert take.fps == 29.97
     assert list(tmp_path.iterdir()) == []
     with FrameLog(tmp_path, ARKIT) as log, pytest.raises(ValueRangeError, match="found no frame"):

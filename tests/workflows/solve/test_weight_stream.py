@@ -46,6 +46,22 @@ def test_frames_arrive_in_their_order_and_time(receiver: socket.socket) -> None:
     assert torch.equal(torch.stack([torch.as_tensor(frame.weights)[: len(ARKIT)] for frame in frames]), weights)
 
 
+def test_frames_at_uneven_times_go_out_at_these(receiver: socket.socket) -> None:
+    times, now = [0.0, 0.1, 0.15, 0.9, 1.0], [100.0]
+    begun: list[float] = []
+
+    def wait(seconds: float) -> None:
+        now[0] += seconds
+
+    def frames() -> Iterator[torch.Tensor]:
+        for _ in times:
+            begun.append(now[0] - 100)
+            yield torch.zeros(len(ARKIT))
+
+    stream_weights(frames(), ARKIT, 30.0, address(receiver), lambda: now[0], wait, times)
+    assert begun == pytest.approx(times)
+
+
 def test_no_frames(receiver: socket.socket) -> None:
     with pytest.raises(ValueRangeError, match="no frame"):
         stream_weights([], ARKIT, 60.0, address(receiver))

@@ -63,7 +63,7 @@ def test_weights_are_written_at_the_frames_own_times(
         np.testing.assert_allclose([float(row[column]) for row in rows], TIMES, atol=1e-4)
     read_back = read_gltf_weights(tmp_path / "animation.glb")
     assert read_back is not None
-    np.testing.assert_allclose(read_back.extras["seconds"].numpy(), TIMES, atol=1e-4)
+    np.testing.assert_allclose(read_back.seconds.numpy(), TIMES, atol=1e-4)
     with (tmp_path / "live_link.csv").open() as file:
         codes = [row["Timecode"] for row in csv.DictReader(file)]
     base = round(tracked.video.fps)

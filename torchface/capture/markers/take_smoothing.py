@@ -18,6 +18,7 @@ from torchface.number_checks import LARGEST_WEIGHT, check_rate, checked_number
 from torchface.optim.data_dependent import data_dependent
 from torchface.take import Take, Track
 from torchface.temporal import interpolated
+from torchface.temporal.frame_grid import frame_grid
 
 SMOOTHNESS = 10.0
 """At 60 frames a second, mm² a marker for a squared second difference of 1: noise of 0.3 mm hardly shows."""
@@ -98,16 +99,24 @@ class WholeTakeSolver(nn.Module):
         """
         if take.markers is None:
             raise NameMismatchError("take: has no markers, expected a track of them")
-        weights = self(self.markers.arrange(take.markers), take.fps)
+        weights = self(self.markers.arrange(take.markers), take.fps, take.seconds)
         return replace(take, weights=Track(self.markers.names, weights[..., None]))
 
     @data_dependent("torchface.onnx.SolverGraph for frame by frame, which `torchface export solver` writes")
-    def forward(self, markers: Tensor, fps: float = _REFERENCE_FPS) -> Tensor:
+    def forward(self, markers: Tensor, fps: float = _REFERENCE_FPS, seconds: Tensor | None = None) -> Tensor:
         """Weights (T,N) for the markers (T,M,3) of consecutive frames, NaN for not seen; without derivatives.
+
+        Frames that come unevenly are solved on an even grid whose other frames show nothing, so that curves bend in
+        seconds and not in frames.
+
+        Args:
+            markers: of the frames.
+            fps: frames a second.
+            seconds: when each is shown, (T,), rising, where they come unevenly.
 
         Raises:
             ShapeError: ``markers`` is not (T,M,3).
-            ValueRangeError: no frame shows any marker, or a coordinate is infinite.
+            ValueRangeError: no frame shows any marker, or a coordinate is infinite; or nearly all would be gaps.
             TraceError: ``markers`` ask for gradients.
         """
         if markers.requires_grad and torch.is_grad_enabled():
@@ -122,7 +131,15 @@ class WholeTakeSolver(nn.Module):
             raise ValueRangeError(f"markers: found none in any of {len(markers)} frames, expected some")
         solve = self._solve if self.markers.activation is None else self._solve_corrected
         with torch.no_grad():
-            return solve(markers.double(), *self._scaled(fps)).to(markers.dtype)
+            if seconds is None or len(markers) < 2:
+                return solve(markers.double(), *self._scaled(fps)).to(markers.dtype)
+            rate, rows = frame_grid(seconds, fps)
+            rows = rows.to(markers.device)
+            grid = markers.new_full((int(rows[-1]) + 1, *markers.shape[1:]), torch.nan, dtype=torch.float64)
+            grid[rows] = markers.double()
+            smoothness, huber_threshold = self._scaled(rate)
+            # A finer grid has more second differences a second, and no more frames that show something.
+            return solve(grid, smoothness * fps / rate, huber_threshold)[rows].to(markers.dtype)
 
     def energy(self, markers: Tensor, weights: Tensor, fps: float = _REFERENCE_FPS) -> float:
         """What the solve minimises, over all frames."""

@@ -3,7 +3,7 @@
 from torchface.capture.priors.adapted_dynamics import AdaptedDynamicsPrior, adapt_dynamics
 from torchface.capture.priors.dynamics_prior import DynamicsPrior, DynamicsSettings
 from torchface.capture.priors.gaussian_mixture import GaussianMixture
-from torchface.capture.priors.motion_features import face_regions, resampled, windows_of
+from torchface.capture.priors.motion_features import face_regions, windows_of
 from torchface.capture.priors.name_translation import unlearned
 from torchface.capture.priors.parzen_window import ParzenDensity, automatic_bandwidth
 from torchface.capture.priors.shape_prior import ReciprocalPrior, ShapePrior, face_halves
@@ -22,7 +22,6 @@ __all__ = [
     "automatic_bandwidth",
     "face_halves",
     "face_regions",
-    "resampled",
     "unlearned",
     "windows_of",
 ]

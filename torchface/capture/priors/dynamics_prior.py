@@ -184,7 +184,7 @@ class DynamicsPrior(nn.Module):
         are more.
 
         Args:
-            takes: weights of each take, (T,N), all at one frame rate (see ``resampled``), a list or what reads them
+            takes: weights of each take, (T,N), all at one frame rate (``Take.resampled``), a list or what reads them
                 from a disk; windows with a NaN are left out.
             names: of the N shapes.
             window: J, at least 1.

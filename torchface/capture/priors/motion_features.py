@@ -9,7 +9,6 @@ import torch
 from torch import Tensor
 
 from torchface.errors import ShapeError, ValueRangeError
-from torchface.number_checks import check_rate
 
 _REGIONS = (r"eye_?look|pupil", r"eye", r"brow", r"cheek|nose", r"")
 _MAX_ORDERS = 3
@@ -106,32 +105,3 @@ def windows_of(weights: Tensor, window: int) -> tuple[Tensor, Tensor]:
 def same_rate(fps: float, other: float) -> bool:
     """Whether two frame rates count as the same: 59.94 and 60 frames a second do, 25 and 24 do not."""
     return abs(fps - other) <= _SAME_RATE * fps
-
-
-def resampled(weights: Tensor, from_fps: float, to_fps: float) -> Tensor:
-    """A take at another frame rate, by linear interpolation; a NaN spreads to the frames beside it.
-
-    Args:
-        weights: (T,N).
-        from_fps: frames a second that it has.
-        to_fps: frames a second that it should have.
-
-    Returns:
-        (T',N), over the same time.
-
-    Raises:
-        ValueRangeError: a rate is no camera's.
-
-    Example:
-        >>> resampled(torch.tensor([[0.0], [1.0], [2.0]]), from_fps=30.0, to_fps=60.0).flatten().tolist()
-        [0.0, 0.5, 1.0, 1.5, 2.0]
-    """
-    for fps in (from_fps, to_fps):
-        check_rate(fps, "take", ValueRangeError)
-    if from_fps == to_fps or len(weights) < 2:
-        return weights
-    count = int((len(weights) - 1) * to_fps / from_fps + 1e-9) + 1
-    place = torch.arange(count, dtype=torch.float64, device=weights.device) * (from_fps / to_fps)
-    before = place.floor().long().clamp(max=len(weights) - 2)
-    fraction = (place - before).to(weights)[:, None]
-    return torch.lerp(weights[before], weights[before + 1], fraction)

@@ -15,10 +15,12 @@ from torchface.io.gltf.accessors import read_floats
 from torchface.io.gltf.corrective_extras import scene_correctives
 from torchface.io.gltf.gltf_document import Document, read_document
 from torchface.io.gltf.primitive_reading import read_target_names
-from torchface.io.tables.frame_rates import rate_of_keys
+from torchface.io.tables.frame_rates import key_times
 from torchface.take import Take, Track
 
-_CUBIC = "CUBICSPLINE"
+_LINEAR, _CUBIC = "LINEAR", "CUBICSPLINE"
+# Of the median; keys further apart are poses, which a program blends by curves that are not read.
+_LONGEST_STEP = 10.0
 
 
 def read_gltf_weights(path: str | Path) -> Take | None:
@@ -32,8 +34,7 @@ def read_gltf_weights(path: str | Path) -> Take | None:
 
     Returns:
         weights (T,N,1), by the names of the morph targets. Of several meshes with a shape of one name the first's
-        weights count; correctives follow the others and are left out. Frames that come unevenly have their times in
-        ``extras["seconds"]``, from 0.
+        weights count; correctives follow the others and are left out. Keys that come unevenly keep their times.
     """
     document = read_document(path)
     weights: dict[str, np.ndarray] = {}
@@ -71,9 +72,9 @@ def read_gltf_weights(path: str | Path) -> Take | None:
         return None
     stacked = np.stack(list(weights.values()), axis=1)
     location = f"animations[{first}]"
-    rate, seconds = rate_of_keys(times, lambda found, expected: document.error(location, found, expected))
-    extras = {} if seconds is None else {"seconds": seconds}
-    return Take(rate, weights=Track(tuple(weights), torch.from_numpy(stacked.copy())[..., None]), extras=extras)
+    keys = key_times(times, lambda found, expected: document.error(location, found, expected))
+    track = Track(tuple(weights), torch.from_numpy(stacked.copy())[..., None])
+    return Take(keys.fps, weights=track, seconds=keys.seconds)
 
 
 def _weight_channels(
@@ -107,7 +108,12 @@ def _channel(
     if not names:
         raise document.error(f"{location}.target.node", "a mesh without morph targets", "one with them")
     times = read_floats(document, sampler.get("input"), f"{location}.input", ("SCALAR",))[:, 0]
-    each = 3 if sampler.get("interpolation") == _CUBIC else 1  # a cubic key is tangent, value, tangent
+    way = sampler.get("interpolation", _LINEAR)
+    steps = np.diff(times.astype(np.float64))
+    if way != _LINEAR and len(steps) and steps.max() > _LONGEST_STEP * np.median(steps):
+        found = f"{visible(str(way)[:40])} keys up to {steps.max():.4g} s apart, most {np.median(steps):.4g}"
+        raise document.error(location, found, "frames, or straight lines between keys: bake the animation")
+    each = 3 if way == _CUBIC else 1  # a cubic key is tangent, value, tangent
     count = len(times) * len(names) * each
     values = read_floats(document, sampler.get("output"), f"{location}.output", ("SCALAR",), count)[:, 0]
     values = values.reshape(len(times), each, len(names))[:, each // 2]

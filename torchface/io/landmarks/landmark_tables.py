@@ -12,9 +12,9 @@ import torch
 from torch import Tensor
 
 from torchface.errors import FileFormatError
+from torchface.io.landmarks.openface_csv import openface_times
 from torchface.io.tables.csv_table import Table, TableReader, quoted
 from torchface.io.tables.frame_rates import numbering_extras
-from torchface.io.tables.numbered_csv import rate_of
 
 COUNTS = (68, 468, 478)
 """Points a frame: iBUG's landmarks; MediaPipe's mesh without and with irises."""
@@ -38,6 +38,7 @@ class LandmarkTable:
         visibility: (T,N) in [0,1]; 1 where the table does not say.
         presence: (T,) in [0,1]; 1 where the table does not say, 0 where nothing is seen.
         fps: frames a second by the table's times, if it has any.
+        seconds: when each frame is shown, (T,) from 0, where they come unevenly.
         shares: whether points are shares of the image.
     """
 
@@ -46,6 +47,7 @@ class LandmarkTable:
     visibility: Tensor
     presence: Tensor
     fps: float | None
+    seconds: Tensor | None
     shares: bool
 
     def pixels(self, width: int, height: int) -> Tensor:
@@ -100,12 +102,14 @@ def load_landmark_table(path: str | Path) -> LandmarkTable:
         presence[rows] = _shares(table, [_PRESENCE], path)[:, 0]
     confidence[unseen], visibility[unseen], presence[unseen.all(1)] = 0, 0, 0
     shares = len(known) > 0 and float(np.abs(known).max()) < _SHARES
+    fps, seconds = _times(table, rows, path)
     return LandmarkTable(
         torch.from_numpy(points),
         torch.from_numpy(confidence),
         torch.from_numpy(visibility),
         torch.from_numpy(presence),
-        _rate(table, path),
+        fps,
+        seconds,
         shares,
     )
 
@@ -160,11 +164,21 @@ def _shares(table: Table, names: Sequence[str], path: Path) -> np.ndarray:
     return values
 
 
-def _rate(table: Table, path: Path) -> float | None:
-    """Frames a second, where the table has times that rise."""
+def _times(table: Table, rows: np.ndarray, path: Path) -> tuple[float | None, Tensor | None]:
+    """Frames a second, and when all frames are shown where rows are not, of a table with times.
+
+    Frames without a row are shown evenly between those beside them.
+    """
     name = next((name for name in _TIMES if name in table.names), None)
-    if name is None or len(table.numbers) < 2:
-        return None
+    if name is None or len(rows) < 2:
+        return None, None
     times = table.column(name)
-    frames = table.column(_FRAME) if _FRAME in table.names else np.arange(len(times), dtype=np.float64)
-    return rate_of(frames, times, path) if bool(np.all(np.diff(times) > 0)) else None
+    if not np.isfinite(times).any():
+        return None, None
+    found, _ = openface_times(rows + 1.0, times, path)
+    if found.seconds is None or np.allclose(found.seconds.diff().numpy() * found.fps, np.diff(rows)):
+        return found.fps, None  # dropped frames have rows of their own
+    seconds = np.interp(np.arange(rows[-1] + 1), rows, found.seconds - found.seconds[0])
+    before = (np.arange(rows[0]) - rows[0]) / found.fps
+    seconds[: rows[0]] = before
+    return found.fps, torch.from_numpy(seconds - seconds[0])

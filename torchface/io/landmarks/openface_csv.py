@@ -2,20 +2,26 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 
 from torchface.errors import FileFormatError, NameMismatchError, ValueRangeError
 from torchface.io.tables.csv_table import TableReader, number_texts, quoted, write_table
-from torchface.io.tables.frame_rates import frame_numbers, numbering_extras
-from torchface.io.tables.numbered_csv import rate_of
+from torchface.io.tables.frame_rates import FrameTimes, frame_numbers
+from torchface.io.tables.numbered_csv import numbered_times
 from torchface.io.tables.track_checks import kept_columns, values_to_write
 from torchface.number_checks import check_rate
 from torchface.take import Take, Track
 
+UNKNOWN_RATE = 30.0
+"""Frames a second of landmarks whose video's rate was not known to what found them."""
+
+_OPENCV_RATE = 1000.0
 _FRAME, _TIME, _CONFIDENCE, _SUCCESS = "frame", "timestamp", "confidence", "success"
 
 
@@ -29,7 +35,7 @@ def load_landmarks_csv(path: str | Path) -> Take:
 
     A landmark ``n`` is the columns ``x_n`` and ``y_n``; a frame of ``success`` 0 was not seen: NaN. Every other column
     (gaze, pose, 3D points, action units) is in ``extras["columns"]`` by name, (T,) float64. Frame numbers other than
-    1, 2, ... are kept in ``extras["frame_numbers"]``, dropped frames in ``extras["gaps"]``.
+    1, 2, ... are kept in ``extras["frame_numbers"]``; frames that come unevenly keep their times.
 
     Args:
         path: the file, of one face.
@@ -50,8 +56,7 @@ def load_landmarks_csv(path: str | Path) -> Take:
         )
     reader.require([_FRAME, _TIME, *columns])
     table = reader.read()
-    fps = rate_of(table.column(_FRAME), table.column(_TIME), path)
-    extras = numbering_extras(table.column(_FRAME), first=1, where=str(path))
+    times, extras = openface_times(table.column(_FRAME), table.column(_TIME), path)
     positions = table.columns(columns, np.float32).reshape(-1, len(names), 2)
     unseen = np.isnan(positions).any(2)
     if _SUCCESS in table.names:
@@ -63,7 +68,28 @@ def load_landmarks_csv(path: str | Path) -> Take:
     if _CONFIDENCE in table.names:
         confidence = torch.from_numpy(table.column(_CONFIDENCE).astype(np.float32))[:, None].repeat(1, len(names))
     track = Track(names, torch.from_numpy(positions), confidence)
-    return Take(fps, landmarks=track, extras={**extras, **({"columns": others} if others else {})})
+    extras |= {"columns": others} if others else {}
+    return Take(times.fps, landmarks=track, extras=extras, seconds=times.seconds)
+
+
+def openface_times(numbers: np.ndarray, times: np.ndarray, path: Path) -> tuple[FrameTimes, dict[str, Any]]:
+    """When frames by numbers (T,) and timestamps (T,) are shown, and what to keep of the numbers.
+
+    Where a video's rate varies, OpenCV may say 1,000 frames a second, and OpenFace writes timestamps by it: then the
+    rate is unknown, and :data:`UNKNOWN_RATE` is taken, with a ``UserWarning``.
+
+    Raises:
+        FileFormatError: as of ``numbered_times``.
+    """
+    found, extras = numbered_times(numbers, times, path, first=1)
+    if found.fps != _OPENCV_RATE:
+        return found, extras
+    warnings.warn(
+        f"{path}: found {_OPENCV_RATE:g} frames a second, which OpenCV says of videos whose rate it does not know, "
+        f"expected a camera's; {UNKNOWN_RATE:g} are taken",
+        stacklevel=3,
+    )
+    return numbered_times(numbers, numbers / UNKNOWN_RATE, path, first=1)
 
 
 def save_landmarks_csv(take: Take, path: str | Path) -> None:
@@ -90,8 +116,7 @@ def save_landmarks_csv(take: Take, path: str | Path) -> None:
     confidence = take.landmarks.confidence
     level = torch.ones(len(take)) if confidence is None else confidence.detach().cpu().double().mean(1).float()
     numbers = frame_numbers(take, first=1)
-    seconds = take.uneven_seconds()
-    times = [(number - numbers[0]) / fps for number in numbers] if seconds is None else seconds.tolist()
+    times = [(number - numbers[0]) / fps for number in numbers] if take.seconds is None else take.seconds.tolist()
     coordinates = [number_texts(values[:, :, axis].reshape(-1)) for axis in (0, 1)]
     others = [number_texts(column.detach().cpu().to(torch.float64).numpy()) for column in columns.values()]
     levels, width = number_texts(level.numpy()), len(names)

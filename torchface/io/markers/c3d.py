@@ -31,7 +31,7 @@ from torchface.io.markers.c3d_sections import (
 )
 from torchface.io.markers.marker_checks import marker_take, millimetres, unique_labels
 from torchface.io.tables.csv_table import quoted
-from torchface.io.tables.frame_rates import frame_numbers, simplest_rate
+from torchface.io.tables.frame_rates import FrameTimes, frame_numbers, simplest_rate
 from torchface.io.tables.track_checks import values_to_write
 from torchface.number_checks import check_rate
 from torchface.take import Take
@@ -80,7 +80,7 @@ def load_c3d(path: str | Path, unit: str | None = None) -> Take:
     positions[np.abs(positions) > np.finfo(np.float32).max] = np.nan
     first = _first_frame(sections)
     extras = {} if first == 1 else {"frame_numbers": torch.arange(first, first + len(positions))}
-    return marker_take(path, fps, _labels(sections, int(points)), positions, extras)
+    return marker_take(path, FrameTimes(fps, None), _labels(sections, int(points)), positions, extras)
 
 
 def _number(sections: Sections, name: str, default: float) -> float:
@@ -174,7 +174,8 @@ def _axes(sections: Sections, path: Path) -> np.ndarray | None:
 def save_c3d(take: Take, path: str | Path) -> None:
     """Writes the markers of a take as a C3D file: Intel floats, millimetres, y up; what is NaN gets residual -1.
 
-    What else the take holds is left out. Frame numbers that ``load_c3d`` kept are written again.
+    What else the take holds is left out. Frame numbers that ``load_c3d`` kept are written again. Frames that were
+    dropped are written as frames that show nothing, for C3D has one rate.
 
     Args:
         take: markers (T,M,3), millimetres, at most 65,535; labels of at most 255 bytes.
@@ -183,10 +184,19 @@ def save_c3d(take: Take, path: str | Path) -> None:
     Source: The C3D File Format User Guide, Motion Lab Systems.
     """
     path = Path(path)
+    numbers = frame_numbers(take, first=1)
+    if take.seconds is not None:  # C3D has one rate: frames that were dropped are frames that show nothing
+        first, given = numbers[0], take
+        take, _ = given.on_grid()
+        if take.fps != given.fps:
+            raise ValueRangeError(
+                f"{path}: found frames {given.rate}, expected an even rate for C3D: write .csv or .trc, or "
+                "take.resampled()"
+            )
+        numbers = range(first, first + len(take))
     labels, positions = values_to_write(take.markers, "marker positions", 3, path)
     fps = check_rate(take.fps, f"{path}: the take", ValueRangeError)
     frames, points = positions.shape[:2]
-    numbers = frame_numbers(take, first=1)
     first, last = numbers[0], numbers[0] + frames - 1
     if numbers[-1] != last or first < 1:  # C3D numbers its frames without gaps
         first, last = 1, frames

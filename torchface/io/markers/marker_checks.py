@@ -11,6 +11,7 @@ import torch
 
 from torchface.errors import FileFormatError, ValueRangeError
 from torchface.io.tables.csv_table import quoted
+from torchface.io.tables.frame_rates import FrameTimes
 from torchface.take import Take, Track
 
 UNITS = {"mm": 1.0, "cm": 10.0, "m": 1000.0, "in": 25.4}
@@ -67,7 +68,9 @@ def unique_labels(labels: Sequence[str]) -> tuple[str, ...]:
     return tuple(unique)
 
 
-def marker_take(path: Path, fps: float, labels: Sequence[str], values: np.ndarray, extras: dict[str, Any]) -> Take:
+def marker_take(
+    path: Path, times: FrameTimes, labels: Sequence[str], values: np.ndarray, extras: dict[str, Any]
+) -> Take:
     """A take of markers (T,M,3) in millimetres as read from ``path``; a marker with a NaN coordinate was not seen.
 
     Raises:
@@ -85,4 +88,5 @@ def marker_take(path: Path, fps: float, labels: Sequence[str], values: np.ndarra
             "expected at least one position"
         )
     values[unseen] = np.nan
-    return Take(fps, markers=Track(tuple(labels), torch.from_numpy(values)), extras={"source": str(path), **extras})
+    markers = Track(tuple(labels), torch.from_numpy(values))
+    return Take(times.fps, markers=markers, extras={"source": str(path), **extras}, seconds=times.seconds)

@@ -25,7 +25,7 @@ def load_markers_csv(path: str | Path, unit: str | None = None) -> Take:
     """Reads markers from CSV with the header ``frame,time,<label>_x,<label>_y,<label>_z,...``.
 
     One row a frame; times in seconds; an empty cell is a marker not seen. The rate is that of numbers and times;
-    numbers other than 0, 1, ... go to ``extras["frame_numbers"]``, dropped frames to ``extras["gaps"]``.
+    frames that come unevenly keep their times. Numbers other than 0, 1, ... go to ``extras["frame_numbers"]``.
 
     Args:
         path: the file, y up.
@@ -45,11 +45,11 @@ def load_markers_csv(path: str | Path, unit: str | None = None) -> Take:
     labels = tuple(dict.fromkeys(name[:-2] for name in reader.header[2:]))
     columns = [label + axis for label in labels for axis in _AXES]
     reader.require(columns)
-    table, fps, extras = read_numbered(reader)
+    table, times, extras = read_numbered(reader)
     positions = table.columns(columns).reshape(-1, len(labels), 3)
     positions *= factor
     del table  # a long take fits the memory once, not three times
-    return marker_take(path, fps, labels, positions, extras)
+    return marker_take(path, times, labels, positions, extras)
 
 
 def save_markers_csv(take: Take, path: str | Path) -> None:

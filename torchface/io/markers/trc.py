@@ -20,7 +20,7 @@ from torchface.io.tables.csv_table import (
     parse_numbers,
     quoted,
 )
-from torchface.io.tables.frame_rates import frame_numbers, numbering_extras
+from torchface.io.tables.frame_rates import TimeSource, file_error, frame_numbers, frame_times, numbering_extras
 from torchface.io.tables.track_checks import values_to_write
 from torchface.number_checks import check_rate
 from torchface.take import Take
@@ -32,8 +32,7 @@ def load_trc(path: str | Path, unit: str | None = None) -> Take:
     """Reads a TRC file; a marker whose cells are empty or NaN was not seen.
 
     Empty and repeated labels are made distinct (:func:`torchface.io.markers.marker_checks.unique_labels`). Frame
-    numbers other than 1, 2, ... are kept in ``extras["frame_numbers"]``, dropped frames as (row, how many) in
-    ``extras["gaps"]``.
+    numbers other than 1, 2, ... are kept in ``extras["frame_numbers"]``; frames that come unevenly keep their times.
 
     Args:
         path: the file, y up as OpenSim has it.
@@ -77,7 +76,8 @@ def load_trc(path: str | Path, unit: str | None = None) -> Take:
         numbers.extend(_row(line.split("\t"), columns, f"{path}: row {number}"))
     table = np.frombuffer(numbers).reshape(count, len(columns))
     extras = numbering_extras(table[:, 0], first=1, where=str(path))
-    return marker_take(path, fps, unique_labels(labels), _scaled(table[:, 2:], factor), extras)
+    times = frame_times(table[:, 1], TimeSource(file_error(path), table[:, 0], fps))
+    return marker_take(path, times, unique_labels(labels), _scaled(table[:, 2:], factor), extras)
 
 
 def _filled_lines(path: Path, data: bytes) -> Iterator[tuple[int, str]]:
@@ -139,6 +139,7 @@ def save_trc(take: Take, path: str | Path) -> None:
     ]
     cells = number_texts(positions.reshape(-1))
     width = 3 * markers
+    times = [(number - numbers[0]) / fps for number in numbers] if take.seconds is None else take.seconds.tolist()
     for row, number in enumerate(numbers):
-        lines.append(f"{number}\t{(number - numbers[0]) / fps!r}\t" + "\t".join(cells[row * width : (row + 1) * width]))
+        lines.append(f"{number}\t{times[row]!r}\t" + "\t".join(cells[row * width : (row + 1) * width]))
     write_file(path, ("\n".join(lines) + "\n").encode("utf-8", "replace"))

@@ -37,7 +37,7 @@ from torchface.io.images.image_files import decode_image
 from torchface.io.length_units import millimetres_per
 from torchface.io.meshes.polygons import pad_polygons
 from torchface.io.scenes.scene_pieces import Piece, all_names, join_deltas, join_meshes, joined_size
-from torchface.io.tables.frame_rates import rate_of_keys
+from torchface.io.tables.frame_rates import key_times
 from torchface.mesh import Mesh, fan_triangulation
 from torchface.rig import BlendshapeRig
 from torchface.take import Take, Track
@@ -200,9 +200,9 @@ def scene_weights(scene: Scene) -> Take | None:
     def error(found: str, expected: str) -> FileFormatError:
         return FileFormatError(f"{scene.path}: animation: found {found}, expected {expected}")
 
-    rate, seconds = rate_of_keys(times - times[0], error)
+    keys = key_times(times - times[0], error)
     track = Track(tuple(renamed[names[column]] for column in columns), torch.from_numpy(weights.copy())[..., None])
-    return Take(rate, weights=track, extras={} if seconds is None else {"seconds": seconds})
+    return Take(keys.fps, weights=track, seconds=keys.seconds)
 
 
 def _piece(scene: Scene, number: int, unit: str | None) -> Piece:

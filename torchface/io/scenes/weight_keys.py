@@ -72,11 +72,8 @@ def weight_keys(rig: BlendshapeRig, take: Take) -> tuple[WeightKeys, ShapeMatch]
             f"take: none of its {len(track.names)} channels ({', '.join(track.names[:5])}, ...) drives one of the "
             f"rig's {len(rig.names)} shapes ({', '.join(rig.names[:5])}, ...)"
         )
-    times = take.uneven_seconds()
-    if times is None:
-        times = torch.arange(len(values), dtype=torch.float64) / take.fps
     by_shape, by_channel = drives.any(1).tolist(), drives.any(0).tolist()
-    return WeightKeys(times.double(), values @ matrix.T.to(values), take.fps), ShapeMatch(
+    return WeightKeys(take.times, values @ matrix.T.to(values), take.fps), ShapeMatch(
         tuple(name for name, is_driven in zip(rig.names, by_shape, strict=True) if is_driven),
         tuple(name for name, is_driven in zip(rig.names, by_shape, strict=True) if not is_driven),
         tuple(name for name, is_used in zip(track.names, by_channel, strict=True) if not is_used),

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from fractions import Fraction
 from typing import Any
 
@@ -24,9 +26,12 @@ DEFAULT_RATE = 60.0
 """Frames a second of a file of one frame at time 0, from which none follows."""
 
 _MAX_FRAME_NUMBER = 2**32 - 1
-_UNEVEN = 0.01
-# Cameras drop a few frames in a row. Keys further apart are poses that a program blends: baked, they are frames.
-_LONGEST_GAP = 10.0
+_UNEVEN, _LIKE = 0.02, 0.2  # of a frame: so far from an even rate, and from the length of one
+_FULL, _MILLISECOND = 1e-9, 1e-3
+_NEAR = 0.002  # by which clocks and stated rates differ; 60 and 60000/1001 do by 0.001
+_DIGITS = (1e-2, 1e-3, 1e-4, 1e-5, 1e-6)
+_SLOWEST = 3.0  # seconds from frame to frame: no film's, while milliseconds of 240 frames a second are beyond
+_UNITS = ("milliseconds", "microseconds", "nanoseconds")
 
 
 def simplest_rate(rate: float, agrees: Callable[[float], bool]) -> float:
@@ -43,41 +48,148 @@ def simplest_rate(rate: float, agrees: Callable[[float], bool]) -> float:
     return next((candidate for candidate in (*usual, *fractions) if candidate > 0 and agrees(candidate)), rate)
 
 
-def rate_of_keys(times: np.ndarray, error: Callable[[str, str], FileFormatError]) -> tuple[float, torch.Tensor | None]:
-    """Frames a second of an animation's keys at ``times`` (T,), seconds in single precision; and when each is shown,
-    (T,) from 0, where they come unevenly.
+@dataclass(frozen=True)
+class FrameTimes:
+    """When a file's frames are shown; ``Take.fps`` and ``Take.seconds`` of it."""
+
+    fps: float
+    seconds: torch.Tensor | None
+
+
+@dataclass(frozen=True)
+class TimeSource:
+    """What is known of times before they are looked at.
 
     Args:
-        times: of the keys.
         error: makes an error of what was found and what was expected.
+        numbers: of the frames, (T,), rising, where the file has them.
+        rate: frames a second that the file states.
+        resolution: seconds by which times are rounded; seen in them if absent.
+        seconds: whether the format itself says that times are seconds.
     """
+
+    error: Callable[[str, str], FileFormatError]
+    numbers: np.ndarray | None = None
+    rate: float | None = None
+    resolution: float | None = None
+    seconds: bool = False
+
+
+def file_error(where: object) -> Callable[[str, str], FileFormatError]:
+    """Makes errors that begin with a file's name or a place in it."""
+    return lambda found, expected: FileFormatError(f"{where}: found {found}, expected {expected}")
+
+
+def frame_times(times: np.ndarray, source: TimeSource) -> FrameTimes:
+    """The rate of frames, and when each is shown where they do not come evenly: of every file that has times.
+
+    Frames that lie on an even grid, dropped ones left out, get its times exactly; others keep the file's. Times in
+    milliseconds or finer are repaired with a ``UserWarning``.
+
+    Args:
+        times: of the frames, (T,), seconds.
+        source: what is known of them.
+    """
+    times = np.asarray(times, np.float64)
+    if not np.isfinite(times).all():
+        row = int(np.flatnonzero(~np.isfinite(times))[0])
+        raise source.error(f"no time in frame {row + 1}", "one in every row")
     if len(times) == 1:
-        return DEFAULT_RATE, None
-    steps = np.diff(times.astype(np.float64))
-    usual = float(np.median(steps))
-    if not (steps.min() > 0 and steps.max() <= _LONGEST_GAP * usual):
-        worst = float(steps.min() if not steps.min() > 0 else steps.max())
-        raise error(
-            f"keys {worst} s apart, the median being {usual:.6f}",
-            f"frames, rising and at most {_LONGEST_GAP:.0f} steps apart: bake the animation",
+        number = 0.0 if source.numbers is None else float(source.numbers[0])
+        rate = source.rate or (
+            number / times[0] if times[0] > 0 and number > 0 and not source.seconds else DEFAULT_RATE
         )
-    step = (float(times[-1]) - float(times[0])) / (len(times) - 1)
-    even = bool(np.abs(steps - step).max() <= _UNEVEN * step)
-    slack = 2 * float(np.spacing(np.float32(times[-1])))
-    step = step if even else usual
-    rate = simplest_rate(1 / step, lambda other: abs((len(times) - 1) * (1 / other - step)) <= slack)
+        return FrameTimes(_checked(rate, source), None)
+    steps = np.diff(times)
+    if (steps < 0).any():
+        row = int(np.flatnonzero(steps < 0)[0])
+        raise source.error(
+            f"time {times[row + 1]:.10g} after {times[row]:.10g} in frame {row + 2}",
+            "rising times: sort the rows by time, or cut the take there",
+        )
+    if not (steps > 0).any():
+        raise source.error(f"one time, {times[0]:.10g}, in all of {len(times)} frames", "rising times")
+    times = times if source.seconds else _in_seconds(times, source)
+    resolution = _resolution(times) if source.resolution is None else source.resolution
+    repeated = not (np.diff(times) > 0).all()
+    for numbers in (source.numbers, _counted(times), np.arange(len(times)) if repeated else None):
+        if numbers is None or not (np.diff(numbers) > 0).all():
+            continue
+        count, duration = float(numbers[-1] - numbers[0]), float(times[-1] - times[0])
+        place = (numbers - numbers[0]) / count
+        if np.abs(times - times[0] - place * duration).max() <= _UNEVEN * duration / count + resolution:
+            rate = _checked(_rate(count, duration, resolution, source.rate), source)
+            even = count == len(times) - 1
+            return FrameTimes(rate, None if even else torch.from_numpy(times[0] + (numbers - numbers[0]) / rate))
+    if repeated:  # more than by rounding
+        row = int(np.flatnonzero(np.diff(times) == 0)[0])
+        raise source.error(
+            f"time {times[row + 1]:.10g} after {times[row]:.10g} in frame {row + 2}",
+            "rising times: keep one row of each time",
+        )
+    steps = np.diff(times)
+    if source.rate is not None and np.abs(steps * source.rate - 1).min() <= _LIKE:
+        return FrameTimes(source.rate, torch.from_numpy(times))
+    return FrameTimes(_checked(_rate(1.0, float(np.median(steps)), resolution, None), source), torch.from_numpy(times))
+
+
+def key_times(times: np.ndarray, error: Callable[[str, str], FileFormatError]) -> FrameTimes:
+    """When the keys of an animation at ``times`` (T,), seconds in single precision, are shown, from 0."""
+    times = times.astype(np.float64) - float(times[0])
+    resolution = 2 * float(np.spacing(np.float32(times[-1])))
+    return frame_times(times, TimeSource(error, resolution=resolution, seconds=True))
+
+
+def _checked(rate: float, source: TimeSource) -> float:
     if not MIN_FPS <= rate <= MAX_FPS:
-        raise error(f"{rate:.4g} frames a second", f"{MIN_FPS} to {MAX_FPS:.0f}")
-    return rate, None if even else torch.from_numpy(times.astype(np.float64) - float(times[0]))
+        raise source.error(f"{rate:.6g} frames a second", f"{MIN_FPS} to {MAX_FPS:.0f}")
+    return rate
 
 
-def frame_gaps(steps: np.ndarray) -> tuple[tuple[int, int], ...]:
-    """Where frames were dropped, as (row, how many are missing before it); ``steps`` (T-1,) are frames from row to row.
+def _rate(count: float, duration: float, resolution: float, stated: float | None) -> float:
+    """The rate that is stated, where it is near; else the simplest one at which so many frames take so long, as far as
+    times are known."""
+    if stated is not None and abs(count / stated - duration) <= max(resolution, _NEAR * duration):
+        return stated
+    rate = count / duration
+    written = float(Fraction(rate).limit_denominator(10))
+    if abs(rate - written) <= _FULL * rate:
+        return written
+    rounding = resolution if resolution <= max(_MILLISECOND, _NEAR * duration) else _FULL
+    for digits in (_FULL, rounding):
+        simple = simplest_rate(rate, lambda other, d=digits: abs(count / other - duration) <= d)  # type: ignore[misc]
+        if simple != rate:
+            return simple
+    return rate
 
-    A negative count says that the numbering, or the clock, falls back there.
-    """
-    missing = np.rint(steps).astype(np.int64) - 1
-    return tuple((int(row) + 1, int(missing[row])) for row in np.flatnonzero(missing))
+
+def _in_seconds(times: np.ndarray, source: TimeSource) -> np.ndarray:
+    """Times in seconds, where their steps say that they are in thousandths, or thousandths of these."""
+    steps = np.diff(times)
+    usual, unit = float(np.median(steps[steps > 0])), 0
+    while usual >= _SLOWEST and unit < len(_UNITS):
+        usual, unit = usual / 1000, unit + 1
+    if unit == 0:
+        return times
+    what = f"frames {float(np.median(steps[steps > 0])):.6g} apart"
+    warnings.warn(str(source.error(what, "seconds")) + f"; they are taken for {_UNITS[unit - 1]}", stacklevel=4)
+    return times / 1000.0**unit
+
+
+def _resolution(times: np.ndarray) -> float:
+    """The coarsest power of ten, up to a hundredth, of which all times are multiples."""
+    for digits in _DIGITS:
+        if np.abs(np.rint(times / digits) * digits - times).max() <= _FULL * max(1.0, float(np.abs(times).max())):
+            return digits
+    return 0.0
+
+
+def _counted(times: np.ndarray) -> np.ndarray:
+    """Frame numbers (T,) that steps of the usual length give; they do not rise where times are no frames."""
+    steps = np.diff(times)
+    usual = float(np.median(steps[steps > 0]))
+    near = steps[np.abs(steps - usual) < usual / 2]
+    return np.concatenate([[0.0], np.cumsum(np.rint(steps / near.mean()))])
 
 
 def numbering_extras(numbers: np.ndarray, first: int, where: str) -> dict[str, Any]:
@@ -98,11 +210,7 @@ def numbering_extras(numbers: np.ndarray, first: int, where: str) -> dict[str, A
         )
     if len(numbers) == 0 or (numbers[0] == first and np.all(steps == 1)):
         return {}
-    extras: dict[str, Any] = {"frame_numbers": torch.from_numpy(numbers.astype(np.int64))}
-    gaps = frame_gaps(steps)
-    if gaps:
-        extras["gaps"] = gaps
-    return extras
+    return {"frame_numbers": torch.from_numpy(numbers.astype(np.int64))}
 
 
 def frame_numbers(take: Take, first: int) -> Sequence[int]:

@@ -10,12 +10,18 @@ import numpy as np
 
 from torchface.errors import FileFormatError, ValueRangeError
 from torchface.io.tables.csv_table import Table, TableReader, number_texts, write_table
-from torchface.io.tables.frame_rates import DEFAULT_RATE, frame_numbers, numbering_extras, simplest_rate
+from torchface.io.tables.frame_rates import (
+    FrameTimes,
+    TimeSource,
+    file_error,
+    frame_numbers,
+    frame_times,
+    numbering_extras,
+)
 from torchface.number_checks import check_rate
 from torchface.take import Take
 
 COLUMNS = ("frame", "time")
-_FULL, _MILLISECONDS = 1e-9, 1e-3
 
 
 def is_numbered(header: Sequence[str]) -> bool:
@@ -23,41 +29,26 @@ def is_numbered(header: Sequence[str]) -> bool:
     return tuple(name.lower() for name in header[:2]) == COLUMNS
 
 
-def read_numbered(reader: TableReader, texts: Sequence[str] = ()) -> tuple[Table, float, dict[str, Any]]:
-    """All rows, the frame rate, and what to keep of the frame numbers; the columns ``texts`` are kept as they stand.
+def read_numbered(reader: TableReader, texts: Sequence[str] = ()) -> tuple[Table, FrameTimes, dict[str, Any]]:
+    """All rows, when their frames are shown, and what to keep of the frame numbers; the columns ``texts`` are kept as
+    they stand.
 
-    The rate is that of the first and last row's numbers and times. Numbers other than 0, 1, ... go to
-    ``extras["frame_numbers"]``, dropped frames as (row, how many) to ``extras["gaps"]``.
+    Numbers other than 0, 1, ... go to ``extras["frame_numbers"]``.
     """
     if not is_numbered(reader.header):
         raise FileFormatError(f"{reader.path}: found a header of other columns, expected it to begin with frame,time")
     table = reader.read(texts)
-    frames, times = table.numbers[:, 0], table.numbers[:, 1]
-    return table, rate_of(frames, times, reader.path), numbering_extras(frames, first=0, where=str(reader.path))
+    times, extras = numbered_times(table.numbers[:, 0], table.numbers[:, 1], reader.path, first=0)
+    return table, times, extras
 
 
-def rate_of(frames: np.ndarray, times: np.ndarray, path: Path) -> float:
-    """Frames a second by frame numbers (T,) and times in seconds (T,)."""
-    if not np.isfinite(times).all() or not np.isfinite(frames).all():
-        row = int(np.flatnonzero(~np.isfinite(times + frames))[0])
+def numbered_times(numbers: np.ndarray, times: np.ndarray, path: Path, first: int) -> tuple[FrameTimes, dict[str, Any]]:
+    """When frames by numbers (T,) and times (T,) are shown, and what to keep of numbers other than ``first``, ..."""
+    if not np.isfinite(times + numbers).all():
+        row = int(np.flatnonzero(~np.isfinite(times + numbers))[0])
         raise FileFormatError(f"{path}: frame {row + 1}: found no frame number or no time, expected both in every row")
-    if len(times) == 1:
-        return check_rate(frames[0] / times[0], str(path)) if times[0] > 0 and frames[0] > 0 else DEFAULT_RATE
-    if np.any(np.diff(times) <= 0):
-        row = int(np.flatnonzero(np.diff(times) <= 0)[0])
-        raise FileFormatError(f"{path}: found time {times[row + 1]} after {times[row]}, expected rising times")
-    count, duration = frames[-1] - frames[0], times[-1] - times[0]
-    rate = check_rate(count / duration, f"{path}: times")
-    for digits in (_FULL, _MILLISECONDS):  # trackers write times to the millisecond
-
-        def agrees(other: float, digits: float = digits) -> bool:
-            return bool(abs(count / other - duration) <= digits)
-
-        if np.abs(np.rint(times / digits) * digits - times).max() <= _FULL * max(1.0, abs(times[-1])):
-            simple = simplest_rate(rate, agrees)
-            if simple != rate:
-                return simple
-    return rate
+    extras = numbering_extras(numbers, first, str(path))
+    return frame_times(times, TimeSource(file_error(path), numbers)), extras
 
 
 def write_numbered(
@@ -74,8 +65,7 @@ def write_numbered(
     """
     fps = check_rate(take.fps, f"{path}: the take", ValueRangeError)
     numbers = frame_numbers(take, first=0)
-    seconds = take.uneven_seconds()
-    times = [number / fps for number in numbers] if seconds is None else seconds.tolist()
+    times = [number / fps for number in numbers] if take.seconds is None else take.seconds.tolist()
     rows = (  # written as they are made: an hour's cells would fill the memory
         [
             str(number),

@@ -2,20 +2,23 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from torch import Tensor
 
 from torchface.errors import FileFormatError
 from torchface.io.tables.csv_table import quoted
-from torchface.io.tables.frame_rates import COMMON_RATES, frame_gaps
+from torchface.io.tables.frame_rates import COMMON_RATES, TimeSource, file_error, frame_times
 from torchface.number_checks import check_rate
 
 _PATTERN = re.compile(r"([0-9]{1,2}):([0-9]{1,2}):([0-9]{1,2})([:;])([0-9]{1,3}(?:\.[0-9]{1,9})?)")
 _DAY = 24 * 3600
+_USUAL = 60
 _BASES = (24, 25, 30, 48, 50, 60, 72, 90, 96, 100, 120, 240)
 _TOLERANCE = 0.002  # 60 and 60000/1001 differ by 0.001
 
@@ -27,12 +30,12 @@ class Timing:
     Args:
         fps: frames a second, a usual rate where the clock runs within 0.2 % of one.
         measured: what the clock itself says.
-        gaps: dropped frames as (row, how many are missing before it); negative where the clock falls back.
+        seconds: when each frame is shown, (T,) from 0, where they come unevenly.
     """
 
     fps: float
     measured: float
-    gaps: tuple[tuple[int, int], ...]
+    seconds: Tensor | None
 
 
 def read_timecodes(texts: Sequence[str], path: Path) -> Timing:
@@ -63,19 +66,33 @@ def read_timecodes(texts: Sequence[str], path: Path) -> Timing:
         rate_of_base, day = base * 1000 / 1001, day - base // 15 * 1296
     if len(texts) == 1:
         fps = check_rate(rate_of_base, str(path))
-        return Timing(fps, fps, ())
+        return Timing(fps, fps, None)
     steps = np.diff(clock)
     steps = np.where(steps < -day / 2, steps + day, steps)
     if not np.any(steps > 0):
         raise FileFormatError(
             f"{path}: found {len(texts)} timecodes from {texts[0]} on that never rise, expected a clock"
         )
+    if np.any(steps < 0):
+        row = int(np.flatnonzero(steps < 0)[0])
+        raise FileFormatError(
+            f"{path}: found the timecode {texts[row + 1]} in frame {row + 2} after {texts[row]}, expected a clock that "
+            "goes on: sort the rows by time, or cut the take there"
+        )
     typical = float(np.median(steps[steps > 0]))
     step = float(steps[np.abs(steps - typical) < typical / 2].mean())
     measured = rate_of_base / step
     usual = min(COMMON_RATES, key=lambda rate: abs(rate - measured))
-    fps = usual if abs(measured / usual - 1) <= _TOLERANCE else measured
-    return Timing(check_rate(fps, f"{path}: timecodes"), measured, frame_gaps(steps / step))
+    fps = check_rate(usual if abs(measured / usual - 1) <= _TOLERANCE else measured, f"{path}: timecodes")
+    since = np.concatenate([[0.0], np.cumsum(steps)]) / rate_of_base
+    source = TimeSource(file_error(path), rate=fps, resolution=_digits(texts) / rate_of_base, seconds=True)
+    found = frame_times(since, source)
+    return Timing(found.fps, measured, found.seconds)
+
+
+def _digits(texts: Sequence[str]) -> float:
+    """The part of a frame that timecodes are rounded to."""
+    return 10.0 ** -max(len(text.partition(".")[2]) for text in texts)
 
 
 def _base(seconds: np.ndarray, frames: np.ndarray, drop: bool) -> int:
@@ -83,26 +100,35 @@ def _base(seconds: np.ndarray, frames: np.ndarray, drop: bool) -> int:
     steps = within[(rise == 0) & (within > 0)]
     falls = (rise == 1) & (within < 0) & ~(drop & (seconds[1:] % 60 == 0))  # where numbers are dropped FF falls less
     wraps = (frames[:-1] - frames[1:])[falls]
-    if len(steps) and len(wraps):
-        # Where frames were dropped FF falls by less: only the largest falls equal the base.
-        typical = float(np.median(steps))
-        base = round(float(np.median(wraps[wraps > wraps.max() - typical])) + typical)
-        if base > frames.max():
-            return base
-    first = 30 if drop else 60
-    return next((base for base in (first, *_BASES) if base > frames.max()), 1000)
+    bases = [base for base in ((30, _USUAL) if drop else (_USUAL, *_BASES)) if base > frames.max()]
+    if not len(steps) or not len(wraps):
+        return next(iter(bases), 1000)
+    # Where frames were dropped FF falls by less: only the largest falls are the base less a usual step.
+    typical = float(np.median(steps))
+    fall = round(float(np.median(wraps[wraps > wraps.max() - typical])) + typical)
+    bases += [fall] if fall > frames.max() else []
+
+    def fault(base: int) -> float:
+        """How far the steps over a second's end are from those within one."""
+        over = base - wraps
+        return math.inf if over.min() <= 0 else float(np.abs(np.clip(over, steps.min(), steps.max()) - over).mean())
+
+    least = min(map(fault, bases), default=math.inf)
+    return next((base for base in bases if fault(base) <= least + typical / 2), 1000)
 
 
 def write_timecodes(count: int, fps: float, first: int = 0) -> tuple[str, ...]:
-    """Timecodes of ``count`` frames from number ``first`` on, 0 at midnight, in thousandths of the base's frames."""
-    base = max(1, round(fps))
+    """Timecodes of ``count`` frames from number ``first`` on, 0 at midnight, in thousandths of the base's frames.
+
+    The base is the rate, and 60 where too few frames come for a second's end to show it.
+    """
+    base = max(1, round(fps)) if count > fps else _USUAL
     return _texts(np.rint(np.arange(first, first + count) * (1000 * base / fps)), base)
 
 
-def timecodes_at(seconds: np.ndarray, fps: float) -> tuple[str, ...]:
-    """Timecodes of times (T,), 0 at midnight, in thousandths of frames of the nearest whole rate."""
-    base = max(1, round(fps))
-    return _texts(np.rint(seconds * (1000 * base)), base)
+def timecodes_at(seconds: np.ndarray) -> tuple[str, ...]:
+    """Timecodes of times (T,), 0 at midnight, in thousandths of sixtieths: what a reader takes, whatever the steps."""
+    return _texts(np.rint(seconds * (1000 * _USUAL)), _USUAL)
 
 
 def _texts(ticks: np.ndarray, base: int) -> tuple[str, ...]:

@@ -15,14 +15,23 @@ _GREY = 96
 
 @dataclass(frozen=True)
 class BlankVideo(VideoFile):
-    """Plain grey frames; the path names what they stand for, such as a table of landmarks."""
+    """Plain grey frames; the path names what they stand for, such as a table of landmarks.
+
+    Args:
+        seconds: when each is shown, (count,) from 0, where they come unevenly.
+    """
+
+    seconds: Tensor | None = None
 
     def check(self) -> None:
         """There is nothing to refuse."""
 
     def uneven_seconds(self) -> tuple[Tensor | None, str]:
-        """There are no times but even ones."""
-        return None, ""
+        """The times given, and how far they are apart."""
+        if self.seconds is None:
+            return None, ""
+        steps = self.seconds.diff()
+        return self.seconds, f"frames {float(steps.min()):.3g} to {float(steps.max()):.3g} s apart"
 
     def _decoded(self) -> Iterator[np.ndarray]:
         frame = np.full((self.height, self.width, 3), _GREY, np.uint8)

@@ -53,8 +53,9 @@ def load_live_link(path: str | Path) -> Take:
 
     - ``columns``: every other column by name: rotations in radians and numbers (T,) float64, text as a tuple;
     - ``blendshape_count``: the column of that name, one whole number a frame;
-    - ``measured_fps``: what the clock says before it is rounded to a usual rate;
-    - ``gaps``: dropped frames as (row, how many are missing before it), if any. They are not filled.
+    - ``measured_fps``: what the clock says before it is rounded to a usual rate.
+
+    Frames that were dropped are not filled: the others keep their times.
 
     Args:
         path: the CSV file that the app wrote.
@@ -92,10 +93,10 @@ def load_live_link(path: str | Path) -> Take:
         "columns": columns,
         "blendshape_count": _counts(table.texts[spelling[_COUNT]], path),
         "measured_fps": timing.measured,
-        **({"gaps": timing.gaps} if timing.gaps else {}),
     }
     weights = torch.from_numpy(table.columns(names, np.float32))[..., None]
-    return Take(timing.fps, weights=Track(names, weights), timecode=table.texts[spelling[_TIMECODE]], extras=extras)
+    timecode = table.texts[spelling[_TIMECODE]]
+    return Take(timing.fps, weights=Track(names, weights), timecode=timecode, extras=extras, seconds=timing.seconds)
 
 
 def _numbers_or_texts(cells: tuple[str, ...]) -> torch.Tensor | tuple[str, ...]:
@@ -144,10 +145,9 @@ def save_live_link(take: Take, path: str | Path) -> None:
     names, values = values_to_write(take.weights, "weights", 1, path)
     names, values = _as_arkit(names, values[..., 0], path)
     check_rate(take.fps, f"{path}: the take", ValueRangeError)
-    seconds = take.uneven_seconds()
     timecodes = take.timecode
-    if timecodes is None and seconds is not None:
-        timecodes = timecodes_at(seconds.numpy(), take.fps)
+    if timecodes is None and take.seconds is not None:
+        timecodes = timecodes_at(take.seconds.numpy())
     timecodes = timecodes or write_timecodes(len(take), take.fps, max(0, frame_numbers(take, first=0)[0]))
     try:
         read_timecodes(timecodes, path)

@@ -23,9 +23,9 @@ _TIMECODE = "timecode"
 def load_weights_csv(path: str | Path) -> Take:
     """Reads weights from CSV with the header ``frame,time,<shape>,...``.
 
-    One row a frame; times in seconds; an empty cell is NaN. The rate is that of numbers and times; numbers other than
-    0, 1, ... go to ``extras["frame_numbers"]``, dropped frames to ``extras["gaps"]``. A column ``timecode`` and head
-    and eye rotations by Live Link Face's names (``HeadYaw``, ...) are no shapes: they go to ``timecode`` and to
+    One row a frame; times in seconds; an empty cell is NaN. The rate is that of numbers and times; frames that come
+    unevenly keep their times. Numbers other than 0, 1, ... go to ``extras["frame_numbers"]``. A column ``timecode`` and
+    head and eye rotations by Live Link Face's names (``HeadYaw``, ...) are no shapes: they go to ``timecode`` and to
     ``extras["columns"]``, where :func:`torchface.io.weights.live_link_csv.load_live_link` has them.
 
     Args:
@@ -40,17 +40,18 @@ def load_weights_csv(path: str | Path) -> Take:
         raise FileFormatError(f"{path}: found {len(reader.header)} columns, expected frame,time,<shape>,...")
     if "" in reader.header:
         raise FileFormatError(f"{path}: found a column without a name, expected every shape's name in the header")
-    table, fps, extras = read_numbered(reader, [_TIMECODE] if _TIMECODE in reader.header else [])
+    table, times, extras = read_numbered(reader, [_TIMECODE] if _TIMECODE in reader.header else [])
     names = tuple(name for name in table.names[2:] if name not in ROTATIONS)
     if not names:
         raise FileFormatError(f"{path}: found no shape among the columns, expected frame,time,<shape>,...")
     columns = {name: torch.from_numpy(table.column(name).copy()) for name in table.names if name in ROTATIONS}
     values = torch.from_numpy(table.columns(names, np.float32))[..., None]
     return Take(
-        fps,
+        times.fps,
         weights=Track(names, values),
         timecode=table.texts.get(_TIMECODE),
         extras=extras | ({"columns": columns} if columns else {}),
+        seconds=times.seconds,
     )
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from bisect import bisect_right
 from dataclasses import dataclass, replace
 
 
@@ -16,6 +17,7 @@ class Playback:
         loop: begin again at the end.
         started: when it was set playing; stopped if absent.
         origin: the frame at that moment, or the frame it stands at.
+        times: when each frame is shown, seconds after the first, where they come unevenly.
     """
 
     frames: int
@@ -24,6 +26,7 @@ class Playback:
     loop: bool = True
     started: float | None = None
     origin: int = 0
+    times: tuple[float, ...] | None = None
 
     @property
     def playing(self) -> bool:
@@ -39,6 +42,9 @@ class Playback:
         """
         if self.started is None:
             return self.origin
+        if self.times is not None:
+            at = self.times[self.origin] + (now - self.started) * self.speed + 1e-6
+            return bisect_right(self.times, at % (self.times[-1] + 1 / self.fps) if self.loop else at) - 1
         # A small tolerance: (now - started) * fps of a whole frame may come out a rounding below it.
         elapsed = self.origin + int((now - self.started) * self.fps * self.speed + 1e-6)
         return elapsed % self.frames if self.loop else min(elapsed, self.frames - 1)

@@ -59,7 +59,8 @@ class RigViewer(BrowserPage):
         weights = None if take is None or take.weights is None else rig.weights_from(take.weights)
         self.rig, self.take, self.out = rig, take, Path(out)
         self.editor = WeightEditor(rig.names, weights, spread=0 if weights is None else _SPREAD, symmetric=True)
-        self.playback = Playback(len(self.editor), 60.0 if take is None else take.fps)
+        times = None if take is None or take.seconds is None else tuple(take.times.tolist())
+        self.playback = Playback(len(self.editor), 60.0 if take is None else take.fps, times=times)
         self._moved_at = self._panel_at = float("-inf")
         self._panel_due = False
         super().__init__(label, port)
@@ -229,7 +230,7 @@ class RigViewer(BrowserPage):
 
 def _time_line(frame: int, frames: int, take: Take) -> str:
     code = "" if take.timecode is None else f" · {take.timecode[frame]}"
-    return caption(f"{frame} of {frames - 1} · {frame / take.fps:.2f} s{code}")
+    return caption(f"{frame} of {frames - 1} · {float(take.times[frame]):.2f} s{code}")
 
 
 GROUPS = ("brows", "eyes", "jaw", "mouth", "cheeks", "nose", "other")

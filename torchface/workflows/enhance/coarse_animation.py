@@ -12,6 +12,7 @@ from torch import Tensor
 from torchface.errors import AlignmentError, ValueRangeError
 from torchface.geometry.similarity import MAX_HEAD_SCALE, MIN_HEAD_SCALE, similarity_transform
 from torchface.mesh import Mesh
+from torchface.take import Take
 from torchface.workflows.animated_meshes import AnimatedMesh
 
 DEFAULT_FPS = 30.0
@@ -90,6 +91,14 @@ def same_topology(animated: AnimatedMesh, model: Mesh, fps: float | None) -> Coa
 def _size(vertices: Tensor) -> Tensor:
     """Root mean square distance from the middle, which no order of the vertices changes, (t,)."""
     return (vertices - vertices.mean(1, keepdim=True)).square().sum(-1).mean(-1).sqrt()
+
+
+def resampling_note(path: Path, take: Take, even: Take) -> str:
+    """Says that frames were brought to an even rate."""
+    return (
+        f"{path}: found {len(take)} frames {take.rate}; brought to {len(even)} at an even {even.fps:g} a second, "
+        "linear in between"
+    )
 
 
 def known_rate(animated: AnimatedMesh, fps: float | None) -> float:

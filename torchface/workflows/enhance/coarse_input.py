@@ -14,12 +14,13 @@ from torchface.io.markers.marker_csv import is_marker_header
 from torchface.io.tables.csv_table import TableReader
 from torchface.mesh import Mesh
 from torchface.progress import Progress
-from torchface.workflows.animated_meshes import AnimatedMesh, load_animated
+from torchface.workflows.animated_meshes import AnimatedMesh, load_animated, moved_mesh
 from torchface.workflows.enhance.coarse_animation import (
     CoarseAnimation,
     check_finite,
     known_rate,
     rate_notes,
+    resampling_note,
     same_topology,
 )
 from torchface.workflows.enhance.head_correspondence import (
@@ -76,13 +77,24 @@ def read_coarse(path: Path, model: Mesh, settings: InputSettings, state: Path, p
     for name, value in (("--attachment", settings.attachment), ("--neutral", settings.neutral)):
         if value is not None:
             raise ValueRangeError(f"{path}: found {name} and no markers, expected a .c3d, .trc or .csv of markers")
-    animated = load_animated(tracked_animation(path), settings.rig, settings.part)
+    animated, notes = _even(load_animated(tracked_animation(path), settings.rig, settings.part), settings.fps)
     if has_topology_of(animated.neutral, model):
-        return same_topology(animated, model, settings.fps)
+        coarse = same_topology(animated, model, settings.fps)
+        return replace(coarse, notes=(*notes, *coarse.notes))
     state_file = state / CORRESPONDENCE
     correspondence = find_correspondence(animated.neutral, model, settings.pairs, path, state_file, progress)
     progress("setting up the thin shell")
-    return other_topology(animated, model, correspondence, settings.fps)
+    coarse = other_topology(animated, model, correspondence, settings.fps)
+    return replace(coarse, notes=(*notes, *coarse.notes))
+
+
+def _even(animated: AnimatedMesh, fps: float | None) -> tuple[AnimatedMesh, list[str]]:
+    """The animation at an even rate, which the model's timing and the results have, and what is to be said of it."""
+    take = animated.take
+    if take is None or take.seconds is None or animated.rig is None:
+        return animated, []
+    even = take.resampled(fps)
+    return moved_mesh(animated.path, animated.rig, even), [resampling_note(animated.path, take, even)]
 
 
 def is_markers(path: Path) -> bool:

@@ -19,7 +19,7 @@ from torchface.mesh import Mesh
 from torchface.rig import BlendshapeRig
 from torchface.take import Take
 from torchface.temporal.interpolation import interpolated
-from torchface.workflows.enhance.coarse_animation import CoarseAnimation, check_scale
+from torchface.workflows.enhance.coarse_animation import CoarseAnimation, check_scale, resampling_note
 from torchface.workflows.enhance.head_correspondence import PLACE, HeadCorrespondence, placed
 from torchface.workflows.marker_input import MarkerOptions, read_markers
 
@@ -101,6 +101,11 @@ def marker_animation(
         options: unit, labels, axes.
     """
     take, notes = read_markers(path, sites.attachment.labels, options)
+    if take.seconds is not None:
+        if neutral is not None and 0 <= neutral < len(take):
+            neutral = int((take.resampled().times - take.times[neutral]).abs().argmin())
+        uneven, take = take, take.resampled()
+        notes = [*notes, resampling_note(path, uneven, take)]
     assert take.markers is not None
     attachment = sites.on_model(model).select(take.markers.names)
     if len(attachment.triangles) < LEAST_POINTS:

@@ -246,7 +246,10 @@ def _write(
     with torch.no_grad():
         values = by_rig(played).flatten(1)
     header = [f"{region}.{name}" for region in maps.regions for name in facts["maps"]]
-    rows = ([f"{t / take.fps:.6g}", *(f"{value:.5g}" for value in row)] for t, row in enumerate(values.tolist()))
+    rows = (
+        [f"{time:.6g}", *(f"{value:.5g}" for value in row)]
+        for time, row in zip(take.times.tolist(), values.tolist(), strict=True)
+    )
     write_table(out / TRACK, ["seconds", *header], rows)
     return products | {"map weights of the animation": out / TRACK}, graphs
 

@@ -31,6 +31,7 @@ from torchface.workflows.evaluate.scan_truth import ScanTruth, scan_truth
 _CHUNK = 32
 _MAX_DISTANCES = 2**29
 _SAME_RATE = 0.002
+_SAME_FRAME = 0.25  # of a frame by which times may differ
 _REACH = 0.4
 _GROUPS = ("round the jaw", "round the brows", "round the nose", "round the eyes", "round the mouth")
 _GROUP_OF_LANDMARK = (*[0] * 17, *[1] * 10, *[2] * 9, *[3] * 12, *[4] * 20)
@@ -51,6 +52,7 @@ class EvaluationSettings:
         align: align each frame of the result rigidly with the truth; if absent, with scans only, which have a space
             of their own.
         maximum: of the heat maps' scale, millimetres; the 95th percentile, rounded up, if absent.
+        by_number: the first frame is compared with the first, and so on, whatever their times.
     """
 
     rig: Path | None = None
@@ -62,6 +64,7 @@ class EvaluationSettings:
     unit: str | None = None
     align: bool | None = None
     maximum: float | None = None
+    by_number: bool = False
 
 
 def evaluate(
@@ -120,11 +123,9 @@ def compare(
         settings: which frames, and how.
         scans: the truth's scans, where it was registered to such.
     """
-    frames = _frames(found, true, settings.frames)
+    frames, true_rows, paired = _pairs(found, true, settings)
     aligned = scans is not None if settings.align is None else settings.align
-    notes = [] if scans is None else list(scans.notes)
-    if found.fps is not None and true.fps is not None and abs(found.fps / true.fps - 1) > _SAME_RATE:
-        notes.append(f"found {found.fps:g} and {true.fps:g} frames a second; frames were compared by their number")
+    notes = [*([] if scans is None else scans.notes), *paired]
     if len(frames) * len(found.neutral.vertices) > _MAX_DISTANCES:
         raise ValueRangeError(
             f"{found.path}: found {len(frames)} frames of {len(found.neutral.vertices)} vertices, more than "
@@ -133,7 +134,7 @@ def compare(
     errors, rotation, translation, surface = [], [], [], []
     for begin in range(0, len(frames), _CHUNK):  # some frames at a time: all of a take's vertices fill the memory
         rows = frames[begin : begin + _CHUNK]
-        a, b, motion = _pair(found, true, rows, begin, aligned)
+        a, b, motion = _pair(found, true, rows, true_rows[begin : begin + _CHUNK], aligned)
         errors.append(vertex_errors(a, b))
         if motion is not None:
             rotation.append(motion[0])
@@ -160,15 +161,52 @@ def compare(
         found.fps or true.fps,
         distances,
         figures,
-        _shapes(found, true, frames),
+        _shapes(found, true, frames, true_rows),
         aligned,
         torch.cat(rotation) if rotation else None,
         torch.cat(translation) if translation else None,
-        tuple(_shown(found, true, frames, distances, aligned)),
+        tuple(_shown(found, true, (frames, true_rows), distances, aligned)),
         round_maximum(figures[ALL].percentile_95) if maximum is None else maximum,
         tuple(notes),
         error_figures(torch.cat(surface)) if surface else None,
     )
+
+
+def _pairs(found: AnimatedMesh, true: AnimatedMesh, settings: EvaluationSettings) -> tuple[Tensor, Tensor, list[str]]:
+    """Frames of the result and of the truth that are compared, (K,) each, and what is to be said of them."""
+    if settings.frames is not None or settings.by_number or found.take is None or true.take is None:
+        frames = _frames(found, true, settings.frames)
+        return frames, torch.arange(len(frames)), _rate_notes(found, true)
+    a, b = found.take, true.take
+    numbered = found.numbered and true.numbered
+    here, there = (take.clock if numbered else take.times for take in (a, b))
+    shifted = abs(float(here[0] - there[0])) * a.fps > _SAME_FRAME
+    if not shifted and (found.count != true.count or (a.seconds is None and b.seconds is None)):
+        frames = _frames(found, true, None)
+        return frames, torch.arange(len(frames)), _rate_notes(found, true)
+    nearest = torch.searchsorted((here[1:] + here[:-1]) / 2, there)
+    same = (here[nearest] - there).abs() * max(a.fps, b.fps) <= _SAME_FRAME
+    rows, true_rows = nearest[same], same.nonzero()[:, 0]
+    spans = [f"{float(times[0]):.3f} to {float(times[-1]):.3f} s" for times in (here, there)]
+    if len(rows) < min(found.count, true.count):
+        worst = int((here[nearest] - there).abs().argmax())
+        raise ValueRangeError(
+            f"{found.path}: found {found.count} frames from {spans[0]}, expected the times of the {true.count} of "
+            f"{true.path}, {spans[1]}: {len(rows)} have one, and frame {worst} of the truth is "
+            f"{float((here[nearest] - there)[worst].abs()):.3f} s from the nearest; or say which frames of the result "
+            "they are (--frames), or compare the first with the first (--by-number)"
+        )
+    if len(rows) == found.count == true.count:
+        return rows, true_rows, []
+    spans = [f"{int(numbers[0])} to {int(numbers[-1])}" for numbers in (rows, true_rows)]
+    note = f"{len(rows)} frames at the same times were compared, {spans[0]} of the result with {spans[1]} of the truth"
+    return rows, true_rows, [note]
+
+
+def _rate_notes(found: AnimatedMesh, true: AnimatedMesh) -> list[str]:
+    if found.fps is None or true.fps is None or abs(found.fps / true.fps - 1) <= _SAME_RATE:
+        return []
+    return [f"found {found.fps:g} and {true.fps:g} frames a second; frames were compared by their number"]
 
 
 def _frames(found: AnimatedMesh, true: AnimatedMesh, chosen: tuple[int, ...] | None) -> Tensor:
@@ -189,13 +227,11 @@ def _frames(found: AnimatedMesh, true: AnimatedMesh, chosen: tuple[int, ...] | N
 
 
 def _pair(
-    found: AnimatedMesh, true: AnimatedMesh, rows: Tensor, begin: int, aligned: bool
+    found: AnimatedMesh, true: AnimatedMesh, rows: Tensor, true_rows: Tensor, aligned: bool
 ) -> tuple[Tensor, Tensor, tuple[Tensor, Tensor] | None]:
     """Vertices (t,V,3) of the result's frames and of the truth's, and the rotation and translation of the former."""
-    first, last = int(rows.min()), int(rows.max()) + 1
-    together = last - first == len(rows) and bool((rows == torch.arange(first, last)).all())
-    a = found.read(first, last) if together else torch.cat([found.read(r, r + 1) for r in rows.tolist()])
-    b = true.read(begin, begin + len(rows)).to(a)
+    a = _read(found, rows)
+    b = _read(true, true_rows).to(a)
     if not aligned:
         return a, b, None
     usable = (torch.isfinite(a) & torch.isfinite(b)).all(2).sum(1) >= 3
@@ -208,7 +244,15 @@ def _pair(
     return moved, b, (rotation, translation)
 
 
-def _shown(found: AnimatedMesh, true: AnimatedMesh, frames: Tensor, errors: Tensor, aligned: bool) -> list[Compared]:
+def _read(animated: AnimatedMesh, rows: Tensor) -> Tensor:
+    first, last = int(rows.min()), int(rows.max()) + 1
+    together = last - first == len(rows) and bool((rows == torch.arange(first, last)).all())
+    return animated.read(first, last) if together else torch.cat([animated.read(r, r + 1) for r in rows.tolist()])
+
+
+def _shown(
+    found: AnimatedMesh, true: AnimatedMesh, pairs: tuple[Tensor, Tensor], errors: Tensor, aligned: bool
+) -> list[Compared]:
     """The frame of median error and the worst one."""
     mean = errors.nanmean(1)
     order = mean.nan_to_num(-1.0).argsort()
@@ -216,15 +260,15 @@ def _shown(found: AnimatedMesh, true: AnimatedMesh, frames: Tensor, errors: Tens
     picked = dict.fromkeys([int(order[(len(order) - 1) // 2]), int(order[-1])])
     shown = []
     for row in picked:
-        a, b, _ = _pair(found, true, frames[row : row + 1], row, aligned)
-        shown.append(Compared(int(frames[row]), a[0], b[0], errors[row]))
+        a, b, _ = _pair(found, true, pairs[0][row : row + 1], pairs[1][row : row + 1], aligned)
+        shown.append(Compared(int(pairs[0][row]), a[0], b[0], errors[row]))
     return shown
 
 
-def _shapes(found: AnimatedMesh, true: AnimatedMesh, frames: Tensor) -> ShapeErrors | None:
+def _shapes(found: AnimatedMesh, true: AnimatedMesh, frames: Tensor, true_rows: Tensor) -> ShapeErrors | None:
     if found.weights is None or true.weights is None or not mapping(found.weights.names, true.weights.names).any():
         return None
-    solved, actual = found.weights.values[frames, :, 0], true.weights.values[..., 0]
+    solved, actual = found.weights.values[frames, :, 0], true.weights.values[true_rows, :, 0]
     return shape_errors(solved, found.weights.names, actual, true.weights.names)
 
 

@@ -86,7 +86,7 @@ class FrameLog:
             even = torch.arange(self.count).double() / round(fps, 3)
             if float((even - seconds).abs().max()) <= _EVEN:
                 return Take(round(fps, 3), weights=track, extras={"columns": columns})
-        return Take(fps, weights=track, extras={"columns": columns, "seconds": seconds})
+        return Take(fps, weights=track, extras={"columns": columns}, seconds=seconds)
 
     def close(self) -> None:
         """Deletes the file."""
@@ -204,15 +204,14 @@ class Recordings:
         assert take.weights is not None
         rig = self._character.rig
         moved = replace(take, weights=Track(rig.names, self._character.weights(take.weights.values[..., 0])[..., None]))
-        seconds = take.uneven_seconds()
         summary = {
             "format": _FORMAT,
             "source": self._source,
             "character": self._character.name,
             "frames": len(take),
             "fps": round(take.fps, 3),
-            "even": seconds is None,
-            "seconds": round((len(take) - 1) / take.fps, 3),
+            "even": take.seconds is None,
+            "seconds": round(float(take.times[-1]), 3),
             "found": found,
             "files": [WEIGHTS, LIVE_LINK, ANIMATION],
         }

@@ -90,7 +90,7 @@ def resampled_curves(curves: ActionUnitCurves, take: Take) -> Predicted:
     notes = []
     if abs(curves.fps - take.fps) > _SAME_RATE * take.fps:
         notes.append(f"video of {curves.fps:g} frames a second brought to the take's {take.fps:g}")
-    at = torch.arange(len(take), dtype=torch.float64) * (curves.fps / take.fps)
+    at = take.times * curves.fps
     before = at.floor().long().clamp(max=len(weights) - 1)
     after = (before + 1).clamp(max=len(weights) - 1)
     fraction = (at - before).clamp(0, 1).to(weights)[:, None]

@@ -137,8 +137,7 @@ class SolveReport:
         frames, worst = len(rmse), float(rmse.nan_to_num().max())
         lines = [f"warning: {warning}" for warning in self.warnings]
         lines.append(
-            f"{frames} frames at {solution.take.fps:g} a second, {100 * self.seen:.1f} % of the attachment's "
-            "marker samples seen"
+            f"{frames} frames at {solution.take.rate}, {100 * self.seen:.1f} % of the attachment's marker samples seen"
         )
         if solution.alignment is not None:
             x, y, z = solution.alignment.translation[0].tolist()

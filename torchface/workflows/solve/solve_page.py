@@ -48,6 +48,7 @@ def write_solve_page(folder: Path, title: str, report: SolveReport) -> Path:
     """
     solution = report.solution
     fps, weights = solution.take.fps, solution.weights.float()
+    shown = solution.take.even_rows()
     make_folder(folder)
     done = "; ".join(line for line in report.lines() if not line.startswith(("  ", "warning:")))
     sections = [
@@ -65,7 +66,7 @@ def write_solve_page(folder: Path, title: str, report: SolveReport) -> Path:
     if solution.cleanup is not None:
         sections.append(_defects(solution.cleanup, fps))
     if solution.motion is not None:
-        curves = motion_curves(solution.motion.translation, solution.motion.degrees(), fps)
+        curves = motion_curves(solution.motion.translation[shown], solution.motion.degrees()[shown], fps)
         text = "How the helmet moved against the head, in rig space; none of it is in the weights."
         sections.append(Section("Helmet", text, figures=[("helmet.png", curves)]))
     order = weights.amax(0).argsort(descending=True).tolist()
@@ -73,16 +74,17 @@ def write_solve_page(folder: Path, title: str, report: SolveReport) -> Path:
     for number, first in enumerate(range(0, len(order), _CURVES_A_FIGURE), start=1):
         rows = order[first : first + _CURVES_A_FIGURE]
         names = [solution.rig.names[i] for i in rows]
-        figures.append((f"weights{number}.png", weight_curves(weights[:, rows], None, names, fps, len(names))))
+        figures.append((f"weights{number}.png", weight_curves(weights[shown][:, rows], None, names, fps, len(names))))
     sections.append(Section("Weights", "Every shape's curve, the strongest first.", figures=figures))
     return write_page(folder, f"Solve of {title}", sections)
 
 
 def _player(folder: Path, solution: Solution) -> str:
-    rig, weights = solution.rig, solution.weights.float()
-    errors = solution.offsets.norm(dim=-1)
+    rows = solution.take.even_rows()
+    rig, weights = solution.rig, solution.weights.float()[rows]
+    errors = solution.offsets.norm(dim=-1)[rows]
     active = weights.std(0).argsort(descending=True)[:_ACTIVE].tolist()
-    markers = Markers(solution.markers.float(), errors, _scale(errors))
+    markers = Markers(solution.markers.float()[rows], errors, _scale(errors))
     panels = [Panel("solved", 0, markers=True), Panel("from the side", 0, markers=True, yaw=_SIDE)]
     curves = tuple(rig.names[i] for i in active)
     played = Played("solved", rig, weights)
@@ -129,6 +131,7 @@ def _marker_sections(solution: Solution) -> list[Section]:
     heading = ("marker", "RMSE", "constant part", "95th percentile", "seen")
     points = solution.attachment.on(rig.neutral.faces, rig.vertices)
     figure = marker_map(rig.neutral, points, each, round_maximum(1.5 * float(each.nanmedian())), labels)
+    over_time = solution.rmse[solution.take.even_rows()]
     text = (
         "Worst first. A constant part that makes up most of an error speaks of a site that is wrong (see torchface "
         "attach), the rest of noise, swaps and shapes that the rig lacks."
@@ -138,7 +141,7 @@ def _marker_sections(solution: Solution) -> list[Section]:
         tables.append(Table(heading, rows[_WORST_MARKERS:], f"the other {len(rows) - _WORST_MARKERS} markers"))
     return [
         Section("Error of each marker", text, tables, [("marker_map.png", figure)]),
-        Section("Marker error over time", figures=[("error.png", error_curve(solution.rmse, solution.take.fps))]),
+        Section("Marker error over time", figures=[("error.png", error_curve(over_time, solution.take.fps))]),
     ]
 
 

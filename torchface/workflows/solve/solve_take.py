@@ -110,7 +110,8 @@ def solve_take(
         write_solve_page(outputs.report, inputs.take.name, report)
     if outputs.stream is not None:
         progress(f"sending to {outputs.stream}")
-        sent = stream_weights(solution.weights, rig.names, solution.take.fps, outputs.stream)
+        solved = solution.take
+        sent = stream_weights(solution.weights, rig.names, solved.fps, outputs.stream, times=solved.times.tolist())
         report = replace(report, sent=sent)
     return report
 

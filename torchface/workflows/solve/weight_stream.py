@@ -42,6 +42,7 @@ def stream_weights(
     address: str,
     clock: Callable[[], float] = time.perf_counter,
     wait: Callable[[float], None] = time.sleep,
+    times: Sequence[float] | None = None,
 ) -> StreamReport:
     """Sends frames of weights, each at its time.
 
@@ -51,6 +52,7 @@ def stream_weights(
         fps: frames a second; a frame that comes too early waits, one that comes too late goes at once.
         address: where to and how; see :func:`torchface.io.open_sender`.
         clock, wait: what time it is, and to let it pass, in seconds.
+        times: when each frame is due, seconds after the first; ``fps`` a second if absent.
 
     Raises:
         ValueRangeError: the address is none, or there was no frame.
@@ -61,7 +63,9 @@ def stream_weights(
     with closing(open_sender(address, names, fps)) as sender:
         begin = clock()
         while True:
-            early = begin + len(sent) / fps - clock()
+            row = len(sent)
+            due = row / fps if times is None or row >= len(times) else times[row]
+            early = begin + due - clock()
             if early > 0:
                 wait(early)
             came = clock()

@@ -45,12 +45,12 @@ def write_curves(tracked: Tracked, out: Path) -> dict[str, Path]:
     """
     fps, weights = tracked.video.fps, tracked.solution.weights.detach().float()
     angles = rotation_columns(tracked.solution.rotation)
-    when = {} if tracked.times is None else {"seconds": tracked.times}
-    take = Take(fps, weights=Track(tracked.rig.names, weights[..., None]), extras={"columns": angles} | when)
+    when = tracked.times
+    take = Take(fps, weights=Track(tracked.rig.names, weights[..., None]), extras={"columns": angles}, seconds=when)
     products = {**save_curves(take, out), "landmarks": out / LANDMARKS, "animation": out / ANIMATION}
     products["confidence"] = out / CONFIDENCE
     sure = tracked.solution.confidence.detach().float() * tracked.seen[:, None]
-    save_weights_csv(Take(fps, weights=Track(tracked.rig.names, sure[..., None]), extras=when), products["confidence"])
+    save_weights_csv(Take(fps, weights=Track(tracked.rig.names, sure[..., None]), seconds=when), products["confidence"])
     if tracked.offsets is None:
         delete_file(out / OFFSETS)
     else:
@@ -65,7 +65,7 @@ def write_curves(tracked: Tracked, out: Path) -> dict[str, Path]:
         columns |= {f"{kind}_{name}": each[:, i] for i, name in enumerate(LANDMARK_NAMES)}
     columns["presence"] = reading.presence
     track = Track(LANDMARK_NAMES, reading.landmarks, reading.confidence)
-    save_landmarks_csv(Take(fps, landmarks=track, extras={"columns": columns} | when), products["landmarks"])
+    save_landmarks_csv(Take(fps, landmarks=track, extras={"columns": columns}, seconds=when), products["landmarks"])
     save_animation(tracked.rig, take, products["animation"])
     return products
 

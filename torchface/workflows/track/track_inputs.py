@@ -36,7 +36,7 @@ Overlay = Literal["side", "over", "none"]
 """The opaque rig beside the picture, the mesh half through over it, or no video."""
 
 _SIDES = (1, 2**16)
-_AT_ITS_TIMES = "solved at the frames' own times; the overlay and live_link.csv's timecodes run at the mean rate"
+_AT_ITS_TIMES = "solved at the frames' own times; the overlay runs at the mean rate"
 
 
 @dataclass(frozen=True)
@@ -210,7 +210,8 @@ def _clip(video: Path | None, settings: TrackSettings) -> VideoFile:
         )
     if not all(_SIDES[0] <= side <= _SIDES[1] for side in size):
         raise ValueRangeError(f"--size: found {size[0]}x{size[1]}, expected {_SIDES[0]} to {_SIDES[1]} pixels a side")
-    return BlankVideo(path, rate, *size, len(table.points))
+    seconds = None if settings.fps is not None else table.seconds
+    return BlankVideo(path, rate, *size, len(table.points), seconds=seconds)
 
 
 def _calibration(clip: VideoFile, camera: Path | None) -> CameraCalibration:

@@ -175,7 +175,7 @@ class Tracked:
         if self.times is not None:
             lines.append(
                 f"variable frame rate: {self.inputs.rate_varies}; weights.csv and animation.glb have the frames' own "
-                f"times, the overlay and the timecodes run at {self.video.fps:.2f} frames a second"
+                f"times, the overlay runs at {self.video.fps:.2f} frames a second"
             )
         if self.calibration.assumed:
             lines.append(

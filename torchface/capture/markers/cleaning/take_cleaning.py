@@ -151,7 +151,7 @@ def clean_take(solver: MarkerSolver, take: Take, slip: bool = False) -> Cleanup:
     masked[bad] = torch.nan
     # A marker that the take lacks has no gaps.
     present = [i for i, label in enumerate(labels) if label in track.names]
-    expected = _expected_alone(prediction, masked) if slip else _expected_over_time(solver, masked, take.fps)
+    expected = _expected_alone(prediction, masked) if slip else _expected_over_time(solver, masked, take)
     filled, gaps = _fill(masked, bad, expected, labels, present, take.fps)
     defects += gaps
     back = alignment.inverse().apply if alignment is not None else (lambda points: points)
@@ -227,12 +227,13 @@ def _expected_alone(prediction: Prediction, seen: Tensor) -> Tensor:
     return torch.where(empty[:, None, None], torch.nan, prediction.expected)
 
 
-def _expected_over_time(solver: MarkerSolver, seen: Tensor, fps: float) -> Tensor:
+def _expected_over_time(solver: MarkerSolver, seen: Tensor, take: Take) -> Tensor:
     """Markers (T,M,3) on the rig after batch smoothing, in rig space: neighbouring frames bridge a gap."""
     if bool(torch.isnan(seen).any(-1).all()):
         return solver.rest.double().expand_as(seen)
     alignment = solver.alignment
-    weights = WholeTakeSolver(solver)(seen if alignment is None else alignment.inverse().apply(seen), fps)
+    markers = seen if alignment is None else alignment.inverse().apply(seen)
+    weights = WholeTakeSolver(solver)(markers, take.fps, take.seconds)
     on_rig = solver.points(weights)
     return on_rig + (seen - on_rig).nanmedian(0).values.nan_to_num(0.0)
 

@@ -1,0 +1,93 @@
+"""Times of frames: even where they are, as the file has them where not, repaired or refused where they are none."""
+
+from __future__ import annotations
+
+import warnings
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from torchface.errors import FileFormatError
+from torchface.io.tables.frame_rates import FrameTimes, TimeSource, file_error, frame_times, key_times
+
+
+def read(times: np.ndarray, numbers: np.ndarray | None = None, rate: float | None = None) -> FrameTimes:
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        return frame_times(times, TimeSource(file_error("take.csv"), numbers, rate))
+
+
+@pytest.mark.parametrize("fps", [24.0, 25.0, 30000 / 1001, 30.0, 50.0, 60000 / 1001, 60.0, 120.0, 240.0])
+@pytest.mark.parametrize("digits", [2, 3, 4, 12])
+def test_an_even_rate_stays_even_however_times_are_rounded(fps: float, digits: int) -> None:
+    if digits == 2 and fps > 60:
+        return
+    found = read(np.round(np.arange(500) / fps, digits), np.arange(500))
+    assert found.seconds is None
+    assert found.fps == pytest.approx(fps, rel=1e-3 if digits == 2 else 1e-4)
+
+
+@given(st.lists(st.integers(1, 5), min_size=4, max_size=60), st.sampled_from([24.0, 60000 / 1001, 120.0]))
+def test_dropped_frames_are_on_the_grid_exactly(steps: list[int], fps: float) -> None:
+    numbers = np.cumsum([0, *[1] * 60, *steps])
+    for given_numbers in (numbers, None):
+        found = read(np.round(numbers / fps, 6), given_numbers)
+        assert found.fps == fps
+        expected = torch.from_numpy(numbers / fps)
+        assert (found.seconds is None) == (max(steps) == 1)
+        if found.seconds is not None:
+            torch.testing.assert_close(found.seconds, expected, atol=1e-9, rtol=0)
+
+
+@given(st.integers(0, 2**32 - 1))
+def test_times_of_a_variable_rate_are_kept(seed: int) -> None:
+    times = np.cumsum(np.random.default_rng(seed).uniform(0.2, 3, 50)) / 30
+    found = read(times, np.arange(50))
+    assert found.seconds is not None
+    np.testing.assert_array_equal(found.seconds.numpy(), times)
+
+
+@pytest.mark.parametrize(("scale", "unit"), [(1e3, "milliseconds"), (1e6, "microseconds"), (1e9, "nanoseconds")])
+@pytest.mark.parametrize("fps", [24.0, 60.0, 240.0])
+def test_finer_units_are_recognised_and_said(scale: float, unit: str, fps: float) -> None:
+    with pytest.warns(UserWarning, match=rf"take.csv: found frames .* apart, expected seconds; .* taken for {unit}"):
+        found = frame_times(np.arange(100) / fps * scale, TimeSource(file_error("take.csv"), np.arange(100)))
+    assert found.fps == pytest.approx(fps, rel=1e-5)
+    assert found.seconds is None
+
+
+def test_a_format_in_seconds_may_have_keys_far_apart() -> None:
+    found = key_times(np.array([0, 4, 8, 20], np.float32), file_error("take.glb"))
+    assert found.seconds is not None
+    assert found.seconds.tolist() == [0, 4, 8, 20]
+
+
+def test_times_that_repeat_by_rounding_alone_are_even() -> None:
+    found = read(np.round(np.arange(50) / 240, 2), np.arange(50))
+    assert found.seconds is None
+    assert found.fps == pytest.approx(240, rel=0.03)
+
+
+@pytest.mark.parametrize(
+    ("times", "message"),
+    [
+        ([0, 0.1, 0.05, 0.2], r"found time 0.05 after 0.1 in frame 3, expected rising times: sort the rows"),
+        ([0.3, 0.2, 0.1, 0], "found time 0.2 after 0.3 in frame 2"),
+        ([0, 0.1, np.nan, 0.2], "found no time in frame 3"),
+        ([0, 0.1, 0.2, 0.2, 0.35], "found time 0.2 after 0.2 in frame 4, expected rising times: keep one row"),
+        ([1, 1, 1, 1], "found one time, 1, in all of 4 frames"),
+        ([0, 1e-6, 2e-6, 3e-6], "found 1e.06 frames a second"),
+    ],
+)
+def test_what_is_no_time_is_refused(times: list[float], message: str) -> None:
+    with pytest.raises(FileFormatError, match=rf"take.csv: {message}"):
+        read(np.array(times))
+
+
+def test_a_single_frame_has_the_rate_that_is_stated() -> None:
+    assert read(np.array([0.0]), np.array([1.0]), 48.0) == FrameTimes(48.0, None)
+    assert read(np.array([0.5]), np.array([12.0])) == FrameTimes(24.0, None)
+    assert read(np.array([0.0])) == FrameTimes(60.0, None)
