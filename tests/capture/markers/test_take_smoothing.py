@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 import torch
 from torch import Tensor
@@ -13,6 +15,7 @@ from torchface.errors import NameMismatchError, ShapeError, ValueRangeError
 from torchface.geometry.similarity import Similarity
 from torchface.optim import box_qp
 from torchface.synthetic.stages.marker_stage import StageFlaws, record
+from torchface.temporal.interpolation import values_at
 
 Performance = tuple[BlendshapeRig, Attachment, list[Tensor]]
 
@@ -133,3 +136,40 @@ def test_takes_by_label_in_another_space_and_bad_input(
         WholeTakeSolver(whole.markers, smoothness=-1)
     with pytest.raises(ValueRangeError, match="fps: found 0"):
         whole(take.markers.values, 0)
+
+
+def test_curves_bend_in_seconds_where_frames_were_dropped(performance: Performance) -> None:
+    rig, attachment, takes = performance
+    true = takes[0][:240]
+    markers = record(rig, attachment, true, torch.Generator().manual_seed(1)).take.markers
+    assert markers is not None
+    keep = torch.rand(240, generator=torch.Generator().manual_seed(3)) > 0.2
+    keep[100:130] = False
+    keep[0] = True
+    rows = keep.nonzero().flatten()
+    whole = WholeTakeSolver(MarkerSolver(rig, attachment))
+    gaps = markers.values.masked_fill(~keep[:, None, None], torch.nan)
+    expected = whole(gaps, 60.0)[rows]
+    left = Track(markers.names, markers.values[rows])
+    take = Take(60.0, markers=left, seconds=5 + rows.double() / 60)
+    solved = whole.solve_take(take)
+    torch.testing.assert_close(solved.weights.values[..., 0], expected, atol=1e-6, rtol=0)
+    assert solved.seconds.equal(take.seconds)
+    shrunk = whole.solve_take(replace(take, seconds=None)).weights.values[..., 0]
+    error = (expected - true[rows]).abs().mean()
+    assert error < (shrunk - true[rows]).abs().mean()
+
+
+def test_a_variable_rate_is_solved_as_well_as_an_even_one(performance: Performance) -> None:
+    rig, attachment, takes = performance
+    true = takes[0][:240]
+    even = torch.arange(240, dtype=torch.float64) / 60
+    steps = torch.rand(150, generator=torch.Generator().manual_seed(3), dtype=torch.float64).mul(2).add(0.5)
+    seconds = steps.cumsum(0) / 60
+    seconds = seconds[seconds < even[-1]]
+    there = values_at(true, even, seconds)
+    record_of = lambda weights: record(rig, attachment, weights, torch.Generator().manual_seed(1)).take.markers  # noqa: E731
+    whole = WholeTakeSolver(MarkerSolver(rig, attachment))
+    base = (whole(record_of(true).values, 60.0) - true).abs().mean()
+    solved = whole(record_of(there).values, 60.0, seconds)
+    assert (solved - there).abs().mean() < 1.3 * base

@@ -12,7 +12,7 @@ import pytest
 import torch
 import trimesh
 
-from torchface import BlendshapeRig, Mesh, Take, Track, load_mesh, save_animation, save_mesh, save_rig
+from torchface import BlendshapeRig, Mesh, Take, Track, load_mesh, load_rig, save_animation, save_mesh, save_rig
 from torchface.cli import main
 from torchface.errors import FileFormatError, NameMismatchError, ShapeError, TopologyError, ValueRangeError
 from torchface.geometry.rotations import rotation_matrix
@@ -194,3 +194,43 @@ def test_raw_scans_are_registered_once_and_then_compared(
     assert all("known from an earlier run" in note for note in worse.notes)
     registered = load_mesh(folder / "out" / "registered" / "s0.glb")
     assert torch.equal(registered.faces, rig.neutral.faces)
+
+
+def test_frames_are_compared_with_those_of_their_times(folder: Path, weights: torch.Tensor) -> None:
+    many = torch.rand(180, 4, generator=torch.Generator().manual_seed(1))
+    whole = Take(60.0, weights=Track(NAMES, many[..., None]))
+    save_weights_csv(whole, folder / "whole.csv")
+    save_weights_csv(whole.frames(slice(0, 40)), folder / "first.csv")
+    save_weights_csv(whole.frames(slice(100, 140)), folder / "later.csv")
+    settings = EvaluationSettings(rig=folder / "rig.glb")
+    with pytest.raises(
+        ValueRangeError, match=r"found 40 frames from 0.000 to 0.650 s, .* 1.667 to 2.317 s: 0 have one"
+    ):
+        evaluate(folder / "first.csv", [folder / "later.csv"], folder / "out", settings)
+    by_number = evaluate(
+        folder / "first.csv", [folder / "later.csv"], folder / "out", replace(settings, by_number=True)
+    )
+    assert by_number.frames.tolist() == list(range(40))
+    assert by_number.regions[ALL].largest > 1
+    found = evaluate(folder / "later.csv", [folder / "whole.csv"], folder / "out", settings)
+    assert found.regions[ALL].largest < 1e-4
+    assert any(
+        "40 frames at the same times were compared, 0 to 39 of the result with 100 to 139" in n for n in found.notes
+    )
+
+
+def test_frames_of_a_variable_rate_are_compared_at_their_times(folder: Path) -> None:
+    many = torch.rand(40, 4, generator=torch.Generator().manual_seed(1))
+    seconds = (
+        torch.rand(40, generator=torch.Generator().manual_seed(2), dtype=torch.float64).mul(0.05).add(0.01).cumsum(0)
+    )
+    take = Take(30.0, weights=Track(NAMES, many[..., None]), seconds=seconds)
+    save_weights_csv(take, folder / "uneven.csv")
+    save_animation(load_rig(folder / "rig.glb"), take, folder / "uneven.glb")
+    save_weights_csv(replace(take, seconds=None), folder / "even.csv")
+    settings = EvaluationSettings(rig=folder / "rig.glb")
+    assert (
+        evaluate(folder / "uneven.csv", [folder / "uneven.glb"], folder / "out", settings).regions[ALL].largest < 1e-4
+    )
+    with pytest.raises(ValueRangeError, match=r"s from the nearest; .*--by-number"):
+        evaluate(folder / "even.csv", [folder / "uneven.csv"], folder / "out", settings)
