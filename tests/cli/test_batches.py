@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import csv
 import json
+import os
+import shutil
+import sys
 from pathlib import Path
 
 import pytest
@@ -74,6 +77,23 @@ def test_a_folder_of_takes_is_solved_as_each_alone(
         assert alone.read_bytes() == (out / f"{name}.csv").read_bytes()
     run(*words, status=1)
     assert "3 known from an earlier run" in " ".join(capsys.readouterr().err.split())
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="names of files are Unicode elsewhere")
+def test_a_name_that_is_no_unicode_ends_no_batch(stage: Path, tmp_path: Path) -> None:
+    takes = tmp_path / "takes"
+    takes.mkdir()
+    odd = os.fsdecode(b"c\xffd")
+    for name in ("calm", odd):
+        shutil.copy(stage / "takes" / "calm.c3d", takes / f"{name}.c3d")
+    out = tmp_path / "out"
+    words = ("solve", stage / "rig.glb", takes, "--attachment", stage / "sites_calm.json", "--out", out, "--quiet")
+    for _ in range(2):  # and the second time from the record
+        main([str(word) for word in words])
+        found = rows(out)
+        assert {row["status"] for row in found.values()} == {"done"}
+        assert set(found) == {"calm", "c\\udcffd"}
+    assert (out / f"{odd}.csv").read_bytes() == (out / "calm.csv").read_bytes()
 
 
 def test_what_many_would_write_over_one_another_is_refused(stage: Path, capsys: pytest.CaptureFixture[str]) -> None:

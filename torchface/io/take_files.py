@@ -13,6 +13,7 @@ from torchface.io.markers.trc import load_trc, save_trc
 from torchface.io.tables.csv_table import TableReader, quoted
 from torchface.io.tables.numbered_csv import is_numbered
 from torchface.io.weights.live_link_csv import are_live_link_shapes, is_live_link, load_live_link, save_live_link
+from torchface.io.weights.usual_units import in_usual_units
 from torchface.io.weights.weight_csv import load_weights_csv, save_weights_csv
 from torchface.take import Take
 
@@ -32,7 +33,8 @@ def load_take(path: str | Path, unit: str | None = None) -> Take:
     ``frame,timestamp,...,x_0,...``      landmarks, :func:`torchface.io.landmarks.openface_csv.load_landmarks_csv`
     ==================================== =====================================================
 
-    A frame in which no marker was seen loads as NaN; :func:`torchface.take.empty_frames` finds it.
+    A frame in which no marker was seen loads as NaN; :func:`torchface.take.empty_frames` finds it. Weights in percent
+    and rotations in degrees are converted, with a ``UserWarning``.
 
     Args:
         path: the file.
@@ -58,11 +60,11 @@ def load_take(path: str | Path, unit: str | None = None) -> Take:
         return load_trc(path, unit)
     header = TableReader(path).header
     if is_live_link(header):
-        return load_live_link(path)
+        return in_usual_units(load_live_link(path), path)
     if is_marker_header(header):
         return load_markers_csv(path, unit)
     if is_numbered(header):
-        return load_weights_csv(path)
+        return in_usual_units(load_weights_csv(path), path)
     if is_landmark_header(header):
         return load_landmarks_csv(path)
     raise FileFormatError(

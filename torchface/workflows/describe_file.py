@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import onnx
@@ -29,7 +30,7 @@ from torchface.workflows.weight_files import weight_faults
 Rows = list[tuple[str, str]]
 
 _MAX_LENGTH = 240
-_MAX_NAMED = 8
+_MAX_NAMED, _MAX_LISTED = 8, 10
 
 
 def describe(path: Path, attachment: Path | None = None, part: str | None = None) -> Rows:
@@ -148,7 +149,7 @@ def _take_rows(take: Take) -> Rows:
         visible = torch.isfinite(track.values).all(-1).float()
         empty = int((visible.sum(1) == 0).sum())
         rows += [
-            (kind, f"{len(track.names)}: {', '.join(track.names)}"),
+            (kind, _named(track.names)),
             (f"{kind} seen", f"{100 * float(visible.mean()):.2f} %, {empty} frames without any"),
         ]
     if take.weights is not None:
@@ -162,7 +163,7 @@ def _take_rows(take: Take) -> Rows:
 
 def _attachment_rows(attachment: Attachment) -> Rows:
     return [
-        ("markers", f"{len(attachment.triangles)}: {', '.join(attachment.labels or ())}"),
+        ("markers", _named(attachment.labels or ()) if attachment.labels else str(len(attachment.triangles))),
         ("made for topology", attachment.fingerprint or "not recorded"),
     ]
 
@@ -184,6 +185,12 @@ def _graph_rows(path: Path) -> Rows:
         ("size", f"{len(data):,} bytes"),
         *((entry.key, _shortened(entry.value)) for entry in model.metadata_props),
     ]
+
+
+def _named(names: Sequence[str]) -> str:
+    """How many, and what the first are called."""
+    more = f" and {len(names) - _MAX_LISTED} more" if len(names) > _MAX_LISTED else ""
+    return f"{len(names)}: {', '.join(names[:_MAX_LISTED])}{more}"
 
 
 def _shortened(text: str) -> str:

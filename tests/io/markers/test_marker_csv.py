@@ -10,6 +10,7 @@ from hypothesis import given, settings
 from mutation import check_reader
 from take_strategies import check_refused, marker_takes, round_trip, same
 
+from torchface import load_take
 from torchface.errors import FileFormatError
 from torchface.io.markers.marker_csv import load_markers_csv, save_markers_csv
 from torchface.take import Take
@@ -87,3 +88,25 @@ def test_bytes_that_are_no_text_are_refused(tmp_path: Path) -> None:
 def test_a_mutated_marker_csv_is_read_or_refused(tmp_path: Path) -> None:
     (tmp_path / "good.csv").write_text(_GOOD)
     check_reader(load_markers_csv, [tmp_path / "good.csv"], ".csv")
+
+
+@pytest.mark.parametrize("axes", ["_x _y _z", ".x .y .z", ":X :Y :Z", "-x -y -z", " X  Y  Z", "X Y Z", "_X _Y _Z"])
+def test_other_separators_and_capitals_are_markers_too(axes: str, tmp_path: Path) -> None:
+    ends = [" X", " Y", " Z"] if axes.startswith(" ") else axes.split()
+    labels = [f"M{i:03d}" for i in range(106)]
+    header = ["frame", "time", *(label + end for label in labels for end in ends)]
+    values = torch.randn(4, 106, 3, generator=torch.Generator().manual_seed(0)) * 60
+    rows = [[str(n), repr(n / 60), *(repr(v) for v in row.flatten().tolist())] for n, row in enumerate(values)]
+    (tmp_path / "take.csv").write_text("\n".join(",".join(row) for row in [header, *rows]) + "\n")
+    take = load_take(tmp_path / "take.csv")
+    assert take.weights is None
+    assert take.markers is not None
+    assert take.markers.names == tuple(labels)
+    torch.testing.assert_close(take.markers.values, values)
+
+
+def test_shapes_that_end_in_an_axis_are_weights(tmp_path: Path) -> None:
+    (tmp_path / "take.csv").write_text("frame,time,lookX,lookY,jaw\n0,0,0.5,0.5,0.1\n1,0.1,0.5,0.5,0.1\n")
+    take = load_take(tmp_path / "take.csv")
+    assert take.weights is not None
+    assert take.weights.names == ("lookX", "lookY", "jaw")

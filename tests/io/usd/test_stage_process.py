@@ -6,6 +6,9 @@ import importlib.util
 import os
 import random
 import shutil
+import signal
+import subprocess
+import sys
 import zipfile
 from contextlib import suppress
 from pathlib import Path
@@ -256,3 +259,36 @@ def test_a_full_disk_leaves_what_was_there(ending: str, tmp_path: Path, monkeypa
         save_rig(sheet_rig(), path)
     assert path.read_bytes() == b"before"
     assert [one.name for one in tmp_path.iterdir()] == [path.name]
+
+
+def test_many_prims_are_refused_before_they_are_composed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from pxr import Usd
+
+    monkeypatch.setattr(stage_process, "_MAX_PRIMS", 50)
+    monkeypatch.setattr(Usd.Stage, "Open", None)
+    usda(tmp_path / "many.usda", "".join(f'def Xform "p{i}" {{\ndef Xform "q" {{\n}}\n}}\n' for i in range(30)))
+    with pytest.raises(stage_process.Refused, match="more than 50 prims"):
+        stage_process.extract(tmp_path / "many.usda", lambda size: None)
+
+
+CHILD = (
+    "import sys; from torchface.io.usd.stage_process import end_in_time; end_in_time({}); print('ready', flush=True); "
+)
+WAITS = "import os; os.read(os.pipe()[0], 1)"
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="the system tells of a parent's end on Linux alone")
+def test_the_process_ends_with_the_one_that_started_it() -> None:
+    starts = f"import subprocess, sys; subprocess.run([sys.executable, '-c', {CHILD.format(100) + WAITS!r}])"
+    parent = subprocess.Popen([sys.executable, "-c", starts], stdout=subprocess.PIPE)
+    assert parent.stdout is not None
+    assert parent.stdout.readline() == b"ready\n"
+    parent.kill()
+    assert parent.stdout.read() == b""  # ends when no process holds the other end
+    parent.wait()
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="no such signal")
+def test_the_process_ends_in_time_whatever_it_waits_for() -> None:
+    done = subprocess.run([sys.executable, "-c", CHILD.format(1) + WAITS], stdout=subprocess.PIPE, timeout=60)
+    assert done.returncode == -signal.SIGALRM

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -13,16 +14,24 @@ from torchface.io.tables.track_checks import values_to_write
 from torchface.take import Take
 
 _AXES = ("_x", "_y", "_z")
+_CHANNEL = re.compile(r"(.+?)[_.:\- ]?([xyzXYZ])")
 
 
 def is_marker_header(header: Sequence[str]) -> bool:
-    """Whether a header looks like markers: most of its channels end in ``_x``, ``_y`` or ``_z``."""
+    """Whether a header looks like markers: most of its channels end in ``_x``, ``_y`` or ``_z``, or all of them are
+    triples that end so with another separator or none."""
     channels = header[2:]
-    return is_numbered(header) and 2 * sum(name.endswith(_AXES) for name in channels) > len(channels)
+    if not is_numbered(header) or not channels:
+        return False
+    if 2 * sum(name.endswith(_AXES) for name in channels) > len(channels):
+        return True
+    labels = _labels(channels)
+    return labels is not None and len(channels) == 3 * len(labels)
 
 
 def load_markers_csv(path: str | Path, unit: str | None = None) -> Take:
-    """Reads markers from CSV with the header ``frame,time,<label>_x,<label>_y,<label>_z,...``.
+    """Reads markers from CSV with the header ``frame,time,<label>_x,<label>_y,<label>_z,...``; also ``<label>.x``,
+    ``<label>:X``, ``<label> X``, ``<label>X``.
 
     One row a frame; times in seconds; an empty cell is a marker not seen. The rate is that of numbers and times;
     frames that come unevenly keep their times. Numbers other than 0, 1, ... go to ``extras["frame_numbers"]``.
@@ -37,19 +46,32 @@ def load_markers_csv(path: str | Path, unit: str | None = None) -> Take:
     path = Path(path)
     factor = millimetres("mm", path, "unit", unit)
     reader = TableReader(path)
-    ends = {name[-2:] for name in reader.header[2:]} - set(_AXES)
-    if not is_numbered(reader.header) or ends:
+    found = _labels(reader.header[2:])
+    if not is_numbered(reader.header) or found is None:
         raise FileFormatError(
             f"{path}: found the columns {quoted(reader.header)}, expected frame,time,<label>_x,<label>_y,<label>_z,..."
         )
-    labels = tuple(dict.fromkeys(name[:-2] for name in reader.header[2:]))
-    columns = [label + axis for label in labels for axis in _AXES]
+    labels = tuple(found)
+    columns = [found[label].get(axis, f"{label}_{axis}") for label in labels for axis in "xyz"]
     reader.require(columns)
     table, times, extras = read_numbered(reader)
     positions = table.columns(columns).reshape(-1, len(labels), 3)
     positions *= factor
     del table  # a long take fits the memory once, not three times
     return marker_take(path, times, labels, positions, extras)
+
+
+def _labels(channels: Sequence[str]) -> dict[str, dict[str, str]] | None:
+    """The columns of each label by axis; none where a channel ends in no axis, or stands twice."""
+    labels: dict[str, dict[str, str]] = {}
+    for channel in channels:
+        match = _CHANNEL.fullmatch(channel)
+        if match is None:
+            return None
+        axes = labels.setdefault(match[1], {})
+        if axes.setdefault(match[2].lower(), channel) != channel:
+            return None
+    return labels
 
 
 def save_markers_csv(take: Take, path: str | Path) -> None:

@@ -61,6 +61,6 @@ def run_process(command: Sequence[str], what: str, reader: str, seconds: float) 
     if done.returncode < 0:
         with suppress(ValueError):
             how = signal.Signals(-done.returncode).name
-    if how in ("SIGXCPU", "SIGKILL"):
-        how += ", the limit of processor time or memory"
+    if how in ("SIGXCPU", "SIGKILL", "SIGALRM"):
+        how += ", the limit of time or memory"
     raise FileFormatError(f"{what}: {reader} ended with {how}{said}; expected a whole file that its size explains")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
+import re
 from array import array
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -23,6 +24,8 @@ _MAX_ROW = 2**22
 _MAX_NUMBER = float(np.finfo(np.float32).max)
 _SHARED_TEXT = 3  # letters; there are few texts so short, and a table may hold each a million times
 _BLOCK = 2**20
+_FORMULA = re.compile(r"'*[=+\-@]")
+_RUN = ("=", "@", "'")  # a number may begin with a sign
 
 
 @dataclass(frozen=True)
@@ -61,7 +64,7 @@ class TableReader:
         self.path = Path(path)
         self._lines = TextLines(self.path, read_file(path, MAX_TABLE_BYTES))
         self._rows = csv.reader(self._lines)
-        self.header = tuple(cell.strip() for cell in self._next() or ())
+        self.header = tuple(_unescaped(cell.strip()) for cell in self._next() or ())
         if not any(self.header):
             raise FileFormatError(f"{path}: found no header, expected the names of the columns in the first row")
         twice = [name for name, count in Counter(self.header).items() if count > 1]
@@ -113,7 +116,7 @@ class TableReader:
                     f"{self.path}: row {self._rows.line_num}: found {len(cells)} cells, expected {width}"
                 )
             for i in text_columns:
-                text = cells[i].strip()
+                text = _unescaped(cells[i].strip())
                 text_cells[self.header[i]].append(text if len(text) > _SHARED_TEXT else shared.setdefault(text, text))
             wanted = [cells[i] for i in number_columns]
             numbers.extend(parse_numbers(wanted, names, f"{self.path}: row {self._rows.line_num}"))
@@ -207,13 +210,26 @@ def quoted(names: Sequence[str], limit: int = 5) -> str:
     return listed + (f" and {len(names) - limit} more" if len(names) > limit else "")
 
 
-def write_table(path: str | Path, header: Sequence[str], rows: Iterable[Sequence[str]]) -> None:
-    """Writes what ``TableReader`` reads, row by row; the file appears only when it is complete."""
+def _escaped(name: str) -> str:
+    """A cell that no spreadsheet takes for a formula to run."""
+    return f"'{name}" if _FORMULA.match(name) else name
+
+
+def _unescaped(cell: str) -> str:
+    return cell[1:] if cell[:1] == "'" and _FORMULA.match(cell) else cell
+
+
+def write_table(path: str | Path, header: Sequence[str], rows: Iterable[Sequence[str]], line_end: str = "\n") -> None:
+    """Writes what ``TableReader`` reads, row by row; the file appears only when it is complete.
+
+    Names in the header, and cells that begin with ``=`` or ``@``, which a spreadsheet would run, get an apostrophe
+    before them, which ``TableReader`` takes away.
+    """
     try:
         with replaced_file(path) as temporary, temporary.open("w", encoding="utf-8", newline="") as text:
-            writer = csv.writer(text, lineterminator="\n")
-            writer.writerow(header)
-            writer.writerows(rows)
+            writer = csv.writer(text, lineterminator=line_end)
+            writer.writerow(map(_escaped, header))
+            writer.writerows([_escaped(cell) if cell[:1] in _RUN else cell for cell in row] for row in rows)
     except UnicodeEncodeError as error:
         raise NameMismatchError(f"{path}: found a name that is no valid Unicode ({error.reason})") from error
 

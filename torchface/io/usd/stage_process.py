@@ -25,6 +25,8 @@ ENDINGS = (".usd", ".usda", ".usdc", ".usdz")
 _MEMORY_ALWAYS, _MEMORY_A_BYTE = 500 * 2**20, 20
 _OUTPUT_ALWAYS, _OUTPUT_A_BYTE = 2**27, 8
 _SECONDS_ALWAYS, _SECONDS_A_MEGABYTE = 5, 2
+_WALL_ALWAYS, _WALL_A_MEGABYTE = 120, 10
+_PR_SET_PDEATHSIG = 1  # of Linux
 _MAX_LAYERS, _MAX_PRIMS, _MAX_MESHES = 256, 200_000, 4096
 _LARGEST_FILE = 2**31
 _NOTES, _PAINTED, _WRINKLE_MAPS = "torchface", "torchface_painted", "wrinkleMaps"
@@ -126,7 +128,7 @@ class _Layers:
 
     def __init__(self, root: Path, limit: Callable[[int], None]) -> None:
         self.root, self.folder, self.limit = root, os.path.realpath(root.parent), limit
-        self.size = 0
+        self.size = self.prims = 0
         self.known: set[str] = set()
         self.images: list[str] = []
         self.left_out: list[str] = []
@@ -153,7 +155,18 @@ class _Layers:
             layer = Sdf.Layer.FindOrOpen(identifier)
             if layer is None:
                 raise Refused(f"a layer that cannot be read, {_shown(identifier)}", "USD")
+            self._count_prims(layer)
             pending += [self.inside(layer, name) for name in layer.GetCompositionAssetDependencies() if name]
+
+    def _count_prims(self, layer: Any) -> None:
+        """Refuses prims that would fill the memory: composed in little of it, OpenUSD crashes, or waits for ever."""
+        pending = [layer.pseudoRoot]
+        while pending:
+            children = pending.pop().nameChildren
+            self.prims += len(children)
+            if self.prims > _MAX_PRIMS:
+                raise Refused(f"more than {_MAX_PRIMS} prims", "a rig")
+            pending += children
 
     def inside(self, layer: Any, name: str) -> str:
         """The full name of a layer or an image that a layer names; refused where it is outside."""
@@ -588,8 +601,24 @@ def _addresses() -> int:
     return int(status.read_text().split()[0]) * os.sysconf("SC_PAGESIZE")
 
 
+def end_in_time(seconds: int) -> None:
+    """Has the system end this process after so long, and at once when the one that started it is gone: what waits for a
+    lock in C++ notices neither."""
+    if sys.platform == "win32":
+        return
+    import signal
+
+    signal.signal(signal.SIGALRM, signal.SIG_DFL)
+    signal.alarm(seconds)
+    if sys.platform == "linux":
+        import ctypes
+
+        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, int(signal.SIGKILL))
+
+
 def main(path: Path, folder: Path, what: Callable[..., tuple[dict[str, Any], dict[str, Any]]]) -> None:
     """Reads ``path`` and writes what came of it into ``folder``."""
+    end_in_time(int(_WALL_ALWAYS + _WALL_A_MEGABYTE * path.stat().st_size / 2**20))
     from pxr import Ar, Sdf, Tf, Usd, UsdGeom, UsdShade, UsdSkel  # noqa: F401  all of them before the limits hold
 
     start = _addresses()

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from torchface.errors import FileFormatError
+from torchface.escaped_text import visible
 from torchface.files.content_keys import file_digest
 from torchface.files.documents import Value, read_json, write_json
 from torchface.files.whole_files import make_folder
@@ -144,7 +145,8 @@ def write_summary(outcomes: Sequence[Outcome], path: Path) -> None:
         remarks = outcome.error or "; ".join(outcome.notes)
         status = _DONE if outcome.done else _SKIPPED
         seconds = (f"{outcome.seconds:.2f}", f"{outcome.processor_seconds:.2f}")
-        rows.append([outcome.name, status, *seconds, str(outcome.item.path), results, remarks, *cells])
+        row = [outcome.name, status, *seconds, str(outcome.item.path), results, remarks, *cells]
+        rows.append([visible(cell) for cell in row])  # names of files need not be Unicode
     write_table(path, [*_COLUMNS, *columns], rows)
 
 

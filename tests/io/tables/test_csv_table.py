@@ -1,0 +1,51 @@
+"""Cells that a spreadsheet would run are written as text, and come back as they were."""
+
+from __future__ import annotations
+
+import csv
+from pathlib import Path
+
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from torchface import Take, Track, load_take, save_take
+from torchface.io.tables.csv_table import TableReader, write_table
+
+NAMES = ("=cmd|' /C calc'!A0", "@SUM(1)", "+x", "-y", "'=quoted", "''@twice", "'plain", "jawOpen")
+
+
+def test_names_that_are_formulas_come_back_and_none_is_run(tmp_path: Path) -> None:
+    weights = torch.rand(3, len(NAMES), 1, generator=torch.Generator().manual_seed(0))
+    save_take(Take(30.0, weights=Track(NAMES, weights)), tmp_path / "take.csv")
+    found = load_take(tmp_path / "take.csv").weights
+    assert found is not None
+    assert found.names == NAMES
+    assert found.values.equal(weights)
+    with (tmp_path / "take.csv").open(newline="") as file:
+        header = next(csv.reader(file))
+    assert not [cell for cell in header if cell[:1] in "=+-@"]
+
+
+@given(st.lists(st.text("=@+-'ab", min_size=1, max_size=6), min_size=1, max_size=4))
+def test_every_text_comes_back(texts: list[str]) -> None:
+    import tempfile
+
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder, "table.csv")
+        write_table(path, ["name", "number"], [[text, "-0.5"] for text in texts])
+        table = TableReader(path).read(["name"])
+        for text, line in zip(texts, path.read_text().splitlines()[1:], strict=True):
+            assert text[0] not in "=@" or line.lstrip('"').startswith("'")
+    assert table.texts["name"] == tuple(texts)
+    assert table.numbers.flatten().tolist() == [-0.5] * len(texts)
+
+
+@pytest.mark.parametrize("name", ["=a", "@b", "-c"])
+def test_markers_named_so_come_back(name: str, tmp_path: Path) -> None:
+    take = Take(60.0, markers=Track((name,), torch.rand(2, 1, 3)))
+    save_take(take, tmp_path / "take.csv")
+    found = load_take(tmp_path / "take.csv").markers
+    assert found is not None
+    assert found.names == (name,)
