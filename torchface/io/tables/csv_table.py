@@ -219,7 +219,7 @@ def _unescaped(cell: str) -> str:
     return cell[1:] if cell[:1] == "'" and _FORMULA.match(cell) else cell
 
 
-def write_table(path: str | Path, header: Sequence[str], rows: Iterable[Sequence[str]], line_end: str = "\n") -> None:
+def write_table(path: str | Path, header: Sequence[str], rows: Iterable[Sequence[str]]) -> None:
     """Writes what ``TableReader`` reads, row by row; the file appears only when it is complete.
 
     Names in the header, and cells that begin with ``=`` or ``@``, which a spreadsheet would run, get an apostrophe
@@ -227,7 +227,7 @@ def write_table(path: str | Path, header: Sequence[str], rows: Iterable[Sequence
     """
     try:
         with replaced_file(path) as temporary, temporary.open("w", encoding="utf-8", newline="") as text:
-            writer = csv.writer(text, lineterminator=line_end)
+            writer = csv.writer(text, lineterminator="\n")
             writer.writerow(map(_escaped, header))
             writer.writerows([_escaped(cell) if cell[:1] in _RUN else cell for cell in row] for row in rows)
     except UnicodeEncodeError as error:
