@@ -29,7 +29,7 @@ def attach(
     part: str | None = None,
     labels: Path | None = None,
     frames: str | None = None,
-    unit: Literal["mm", "cm", "m", "in"] | None = None,
+    unit: Literal["um", "mm", "cm", "m", "in"] | None = None,
     flip: Literal["x", "y", "z"] | None = None,
     scale: Literal["held", "free"] | None = None,
     insist: bool = False,
@@ -61,7 +61,7 @@ def attach(
             each; an empty second cell leaves the marker out, with Jane:* all of a subject's. Unlabelled points and
             subjects' prefixes (Actor:M001) are left out without it.
         frames: Use the frames A:B of the take only, from A up to, not including, B; counted from 0.
-        unit: What the take's coordinates are in: mm, cm, m or in; else what the file says (CSV: millimetres).
+        unit: What the take's coordinates are in: um, mm, cm, m or in; else what the file says (CSV: millimetres).
         flip: Negate this axis of the take's coordinates: for takes exported in left-handed axes, which are mirrored.
         scale: Of the take against the rig: held at 1, or free, to be estimated. Held where the unit is known (C3D, TRC,
             --unit), if absent.

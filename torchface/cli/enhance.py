@@ -29,7 +29,7 @@ def enhance(
     neutral: int | None = None,
     fps: float | None = None,
     labels: Path | None = None,
-    unit: Literal["mm", "cm", "m", "in"] | None = None,
+    unit: Literal["um", "mm", "cm", "m", "in"] | None = None,
     flip: Literal["x", "y", "z"] | None = None,
     meshes: Literal["none", "obj", "ply"] = "none",
     no_glb: bool = False,

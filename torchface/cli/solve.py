@@ -44,7 +44,7 @@ def solve(
     part: str | None = None,
     labels: Path | None = None,
     frames: str | None = None,
-    unit: Literal["mm", "cm", "m", "in"] | None = None,
+    unit: Literal["um", "mm", "cm", "m", "in"] | None = None,
     flip: Literal["x", "y", "z"] | None = None,
     scale: Literal["held", "free"] | None = None,
     insist: bool = False,
@@ -92,7 +92,7 @@ def solve(
         labels: What the take's labels are called in the attachment: CSV, a row LABEL OF THE TAKE,LABEL OF THE
             ATTACHMENT each; an empty second cell leaves the marker out, with Jane:* all of a subject's.
         frames: Solve the frames A:B of the take only, from A up to, not including, B; counted from 0.
-        unit: What the take's coordinates are in: mm, cm, m or in; else what the file says (CSV: millimetres).
+        unit: What the take's coordinates are in: um, mm, cm, m or in; else what the file says (CSV: millimetres).
         flip: Negate this axis of the take's coordinates: for takes exported in left-handed axes, which are mirrored.
         scale: Of the take against the rig: held at 1, or free, to be estimated. Held where the unit is known (C3D, TRC,
             --unit), if absent.

@@ -106,16 +106,17 @@ def _flipped(values: Tensor, axis: str) -> Tensor:
     return values * torch.tensor([-1.0 if name == axis else 1.0 for name in _AXES]).to(values)
 
 
-def scale_warnings(scale: float, held: bool) -> list[str]:
+def scale_warnings(scale: float, held: bool, read_as: str | None = None) -> list[str]:
     """Warnings where the scale that fits a take to its performer's rig best is not 1.
 
     Args:
         scale: of the best alignment.
         held: the take was aligned at scale 1 all the same.
+        read_as: the unit that its markers were read in, where it is known.
     """
     if abs(scale - 1) <= MAX_SCALE_DIFFERENCE:
         return []
-    unit = unit_of_scale(scale) if not MIN_HEAD_SCALE <= scale <= MAX_HEAD_SCALE else ""
+    unit = unit_of_scale(scale, read_as) if not MIN_HEAD_SCALE <= scale <= MAX_HEAD_SCALE else ""
     why = (
         f"the take seems to be in {unit} (--unit {unit})"
         if unit

@@ -126,6 +126,9 @@ def test_sites_of_other_markers_are_refused_wherever_the_take_lies(performance: 
 def test_units_by_scale() -> None:
     found = [unit_of_scale(scale) for scale in (1.0, 1.1, 930.0, 9.6, 25.0, 0.1, 0.0011, 3.0, 0.0)]
     assert found == ["", "", "m", "cm", "in", "mm", "mm", "", ""]
+    assert [unit_of_scale(0.001, unit) for unit in ("mm", "m", "cm")] == ["um", "mm", ""]
+    assert [unit_of_scale(0.1, unit) for unit in ("mm", "cm")] == ["", "mm"]
+    assert [unit_of_scale(1000.0, unit) for unit in ("mm", "um")] == ["m", "mm"]
 
 
 @pytest.mark.real

@@ -110,3 +110,11 @@ def test_shapes_that_end_in_an_axis_are_weights(tmp_path: Path) -> None:
     take = load_take(tmp_path / "take.csv")
     assert take.weights is not None
     assert take.weights.names == ("lookX", "lookY", "jaw")
+
+
+def test_micrometres_are_read_where_they_are_asked_for(tmp_path: Path) -> None:
+    (tmp_path / "take.csv").write_text("frame,time,a_x,a_y,a_z\n0,0,1000,2500,-500\n")
+    take = load_take(tmp_path / "take.csv", unit="um")
+    assert take.markers is not None
+    assert take.markers.values.flatten().tolist() == [1, 2.5, -0.5]
+    assert take.extras["unit"] == "um"

@@ -23,7 +23,7 @@ TRIED_SHARE, DOUBTFUL_SHARE, REFUSED_SHARE = 0.015, 0.035, 0.1
 _MIN_RADIUS = 40.0
 # A correction names the cause if it leaves less than this part of the distance.
 _CORRECTED = 0.5
-_UNITS = {"m": 1000.0, "in": 25.4, "cm": 10.0}
+_UNITS = {"m": 1000.0, "in": 25.4, "cm": 10.0, "mm": 1.0, "um": 0.001}
 _UNIT_TOLERANCE = 1.25
 # Beyond this no helmet slips: half the radius of the sites, or half a radian.
 _MAX_SLIP, _MAX_SLIP_ANGLE = 0.5, 0.5
@@ -43,6 +43,7 @@ class FitCheck:
             empty where nothing is.
         corrected: the distance without that cause, millimetres; NaN where no correction helps.
         similarity: that aligns the markers with the rig best, (1,).
+        read_as: the unit that the markers were read in, where it is known.
 
     Example:
         >>> check = FitCheck(distance=60.0, radius=70.0, cause="mirror", corrected=0.4)
@@ -55,6 +56,7 @@ class FitCheck:
     cause: str = ""
     corrected: float = math.nan
     similarity: Similarity | None = None
+    read_as: str | None = None
 
     @property
     def limit(self) -> float:
@@ -85,7 +87,7 @@ class FitCheck:
         """What the coordinates seem to be in that were read as millimetres; ``mm`` if they are too large."""
         if self.similarity is None:
             return "mm"
-        return unit_of_scale(float(self.similarity.scale[0])) or "mm"
+        return unit_of_scale(float(self.similarity.scale[0]), self.read_as) or "mm"
 
 
 def check_fit(affine: Tensor, markers: Tensor, slip: bool = False) -> FitCheck:
@@ -168,17 +170,25 @@ def _is_elsewhere(pose: Similarity, markers: Tensor, radius: float) -> bool:
     return translation > _MAX_SLIP * radius or angle > _MAX_SLIP_ANGLE or grown > math.log(_UNIT_TOLERANCE)
 
 
-def unit_of_scale(scale: float) -> str:
+def unit_of_scale(scale: float, read_as: str | None = None) -> str:
     """The unit in which coordinates are that must grow by this factor to be millimetres.
 
+    Args:
+        scale: the factor.
+        read_as: the unit that they were read in; of unknown ones those too small were read as millimetres, and those
+            too large are.
+
     Returns:
-        ``m``, ``cm`` or ``in``; ``mm`` where they must shrink by such a factor; empty where it is no unit's.
+        ``m``, ``cm``, ``in``, ``mm`` or ``um``; empty where it is no unit's, or the one they were read in.
     """
-    for factor, unit in ((scale, ""), (1 / scale if scale > 0 else 0.0, "mm")):
-        for name, size in _UNITS.items():
-            if size / _UNIT_TOLERANCE < factor < size * _UNIT_TOLERANCE:
-                return unit or name
-    return ""
+    if read_as is None:
+        read_as = "mm" if scale > 1 else next((name for name in _UNITS if _near(scale * _UNITS[name], 1.0)), "mm")
+    size = scale * _UNITS[read_as]
+    return next((name for name, known in _UNITS.items() if name != read_as and _near(size, known)), "")
+
+
+def _near(size: float, other: float) -> bool:
+    return other / _UNIT_TOLERANCE < size < other * _UNIT_TOLERANCE
 
 
 def _distance(affine: Tensor, markers: Tensor) -> float:

@@ -80,7 +80,7 @@ def load_c3d(path: str | Path, unit: str | None = None) -> Take:
     positions[np.abs(positions) > np.finfo(np.float32).max] = np.nan
     first = _first_frame(sections)
     extras = {} if first == 1 else {"frame_numbers": torch.arange(first, first + len(positions))}
-    return marker_take(path, FrameTimes(fps, None), _labels(sections, int(points)), positions, extras)
+    return marker_take(path, FrameTimes(fps, None), _labels(sections, int(points)), positions, extras, factor)
 
 
 def _number(sections: Sections, name: str, default: float) -> float:

@@ -14,7 +14,7 @@ from torchface.io.tables.csv_table import quoted
 from torchface.io.tables.frame_rates import FrameTimes
 from torchface.take import Take, Track
 
-UNITS = {"mm": 1.0, "cm": 10.0, "m": 1000.0, "in": 25.4}
+UNITS = {"mm": 1.0, "cm": 10.0, "m": 1000.0, "in": 25.4, "um": 0.001}
 """Millimetres in each unit that marker files are written in."""
 
 _SPELLINGS = {
@@ -22,6 +22,7 @@ _SPELLINGS = {
     **dict.fromkeys(("centimeter", "centimeters", "centimetre", "centimetres"), "cm"),
     **dict.fromkeys(("meter", "meters", "metre", "metres"), "m"),
     **dict.fromkeys(("inch", "inches"), "in"),
+    **dict.fromkeys(("micrometer", "micrometers", "micrometre", "micrometres", "\u00b5m", "\u03bcm"), "um"),
 }
 
 
@@ -69,9 +70,10 @@ def unique_labels(labels: Sequence[str]) -> tuple[str, ...]:
 
 
 def marker_take(
-    path: Path, times: FrameTimes, labels: Sequence[str], values: np.ndarray, extras: dict[str, Any]
+    path: Path, times: FrameTimes, labels: Sequence[str], values: np.ndarray, extras: dict[str, Any], factor: float
 ) -> Take:
-    """A take of markers (T,M,3) in millimetres as read from ``path``; a marker with a NaN coordinate was not seen.
+    """A take of markers (T,M,3) in millimetres, read from ``path`` in a unit of ``factor`` millimetres; a marker with a
+    NaN coordinate was not seen.
 
     Raises:
         FileFormatError: there is no frame, no marker, or none was seen in any frame.
@@ -89,4 +91,6 @@ def marker_take(
         )
     values[unseen] = np.nan
     markers = Track(tuple(labels), torch.from_numpy(values))
-    return Take(times.fps, markers=markers, extras={"source": str(path), **extras}, seconds=times.seconds)
+    unit = next(name for name, size in UNITS.items() if size == factor)
+    extras = {"source": str(path), "unit": unit, **extras}
+    return Take(times.fps, markers=markers, extras=extras, seconds=times.seconds)

@@ -58,7 +58,7 @@ def load_markers_csv(path: str | Path, unit: str | None = None) -> Take:
     positions = table.columns(columns).reshape(-1, len(labels), 3)
     positions *= factor
     del table  # a long take fits the memory once, not three times
-    return marker_take(path, times, labels, positions, extras)
+    return marker_take(path, times, labels, positions, extras, factor)
 
 
 def _labels(channels: Sequence[str]) -> dict[str, dict[str, str]] | None:

@@ -77,7 +77,7 @@ def load_trc(path: str | Path, unit: str | None = None) -> Take:
     table = np.frombuffer(numbers).reshape(count, len(columns))
     extras = numbering_extras(table[:, 0], first=1, where=str(path))
     times = frame_times(table[:, 1], TimeSource(file_error(path), table[:, 0], fps))
-    return marker_take(path, times, unique_labels(labels), _scaled(table[:, 2:], factor), extras)
+    return marker_take(path, times, unique_labels(labels), _scaled(table[:, 2:], factor), extras, factor)
 
 
 def _filled_lines(path: Path, data: bytes) -> Iterator[tuple[int, str]]:

@@ -14,12 +14,12 @@ from torchface.io.weights.weight_csv import ROTATIONS
 from torchface.take import Take, Track
 
 LARGEST_WEIGHT = 5.0
-"""Nobody drives a shape so far; where 1 % of the frames do, weights are in percent."""
+"""Nobody drives a shape so far; where a tenth of the frames do, weights are in percent."""
 
 LARGEST_ANGLE = math.pi
-"""No rotation in radians is larger; where it is in 1 % of the frames, it is in degrees."""
+"""No rotation in radians is larger; where it is in a tenth of the frames, it is in degrees."""
 
-_SHARE, _MOST_PERCENT, _MOST_DEGREES = 0.01, 200.0, 360.0
+_SHARE, _MOST_PERCENT, _MOST_DEGREES = 0.1, 200.0, 360.0
 
 
 def in_usual_units(take: Take, path: Path) -> Take:

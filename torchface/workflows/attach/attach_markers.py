@@ -230,7 +230,7 @@ def attach(
     if not free_scale:
         fitted = fit.attachment if settings.standoff else replace(fit.attachment, residual=None)
         free = align_take(loaded, fitted, take, insist=True)
-    notes = [*notes, *scale_warnings(float(free.scale[0]), not free_scale)]
+    notes = [*notes, *scale_warnings(float(free.scale[0]), not free_scale, take.extras.get("unit"))]
     try:
         check_attachment(fit, loaded)
     except (AlignmentError, ValueRangeError) as error:

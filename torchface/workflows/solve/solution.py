@@ -220,7 +220,7 @@ def solve_markers(
     steady, motion = _without_slip(rig, attachment, take, settings)
     if alignment is not None:
         free = alignment if settings.free_scale else align_take(rig, attachment, steady, insist=True)
-        warnings += scale_warnings(float(free.scale[0]), not settings.free_scale)
+        warnings += scale_warnings(float(free.scale[0]), not settings.free_scale, take.extras.get("unit"))
     if settings.subtract_rest and alignment is not None:
         attachment = rest_residual(rig, attachment, steady)
         # Sites that are nearer to the markers show the helmet's motion better.

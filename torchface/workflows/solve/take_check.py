@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 
@@ -98,6 +98,7 @@ def check_explained(solver: MarkerSolver, take: Take, aligned: bool, slip: bool,
     assert take.markers is not None
     markers = solver.arrange(take.markers).double()
     fit = check_fit(torch.cat([solver.rest[..., None], solver.every_basis], dim=2), markers, slip)
+    fit = replace(fit, read_as=take.extras.get("unit"))
     if fit.refused and not insist:
         raise AlignmentError(
             f"{_source(take)}: the rig brings the marker sites no nearer to the markers than {fit.distance:.4g} mm "
@@ -121,7 +122,7 @@ def _cause(fit: FitCheck, aligned: bool) -> str:
         assert fit.similarity is not None
         factor = float(fit.similarity.scale[0])
         sizes = f"{factor:.4g} times larger" if factor > 1 else f"{1 / factor:.4g} times smaller"
-        names = {"m": "metres", "cm": "centimetres", "in": "inches", "mm": "millimetres"}
+        names = {"m": "metres", "cm": "centimetres", "in": "inches", "mm": "millimetres", "um": "micrometres"}
         return (
             f"{sizes} they lie {fit.corrected:.2g} mm from it, so the take seems to be in {names[fit.unit]}: add "
             f"--unit {fit.unit}, and --align if it is not in the rig's space"
