@@ -14,10 +14,7 @@ import torch
 from onnx import TensorProto, helper, numpy_helper
 from torch import Tensor, nn
 
-from torchface.onnx.graph_builder import IR_VERSION
-
-OPSET = 18
-"""The oldest that the exporter of PyTorch writes."""
+from torchface.onnx.graph_builder import IR_VERSION, OPSET
 
 
 def exported_model(

@@ -10,9 +10,10 @@ from typing import Any
 import numpy as np
 import onnx
 from onnx import helper, numpy_helper
-from torch import Tensor, nn
+from torch import Tensor
 
-OPSET = 17
+OPSET = 18
+"""Version of the operators of all graphs: the oldest that the exporter of PyTorch writes."""
 IR_VERSION = 8
 
 
@@ -39,50 +40,28 @@ class GraphBuilder:
         self._root._constants[name] = numpy_helper.from_array(np.ascontiguousarray(array), name)
         return name
 
-    def weight(self, value: Tensor) -> str:
-        """A constant of a network: float16 in the file, float32 in the graph; ONNX Runtime widens it when it loads."""
-        half = np.ascontiguousarray(value.detach().cpu().numpy().astype(np.float16))
-        return self.op("Cast", self._once(half), to=onnx.TensorProto.FLOAT)
-
     def scalar(self, name: str, value: int) -> str:
         """An int64 constant without axes."""
         self._root._constants[name] = numpy_helper.from_array(np.array(value, np.int64), name)
         return name
 
-    def unnamed(self, value: Tensor) -> str:
-        """A float32 constant under a name of its own; the same numbers are kept once."""
-        return self._once(value.detach().cpu().numpy().astype(np.float32, order="C"))
-
     def double(self, value: Tensor) -> str:
         """A float64 constant under a name of its own; the same numbers are kept once."""
-        return self._once(value.detach().cpu().numpy().astype(np.float64, order="C"))
-
-    def _once(self, array: np.ndarray) -> str:
-        name = f"{array.dtype} {'x'.join(map(str, array.shape))} {hashlib.sha256(array.tobytes()).hexdigest()[:16]}"
+        array = value.detach().cpu().numpy().astype(np.float64, order="C")
+        name = f"{'x'.join(map(str, array.shape))} {hashlib.sha256(array.tobytes()).hexdigest()[:16]}"
         self._root._constants[name] = numpy_helper.from_array(array, name)
         return name
 
-    def convolution(self, part: nn.Conv2d, value: str, weight: str) -> str:
-        """The node of a convolution with a bias, whose weight is a value of the graph."""
-        assert part.bias is not None
-        pads = [int(one) for one in (*part.padding, *part.padding)]
-        bias = self.unnamed(part.bias)
-        return self.op("Conv", value, weight, bias, pads=pads, strides=list(part.stride), group=part.groups)
-
     def op(self, kind: str, *inputs: str, output: str | None = None, **attributes: Any) -> str:
-        """Adds a node with one output and returns the output's name."""
+        """Adds a node with one output and returns the output's name; axes to reduce may be an attribute."""
+        if "axes" in attributes:
+            axes = attributes.pop("axes")
+            inputs = (*inputs, self.constant(f"axes {axes}", axes))
         if output is None:
             output = f"v{self._root._count}"
             self._root._count += 1
         self._nodes.append(helper.make_node(kind, list(inputs), [output], **attributes))
         return output
-
-    def two_of(self, kind: str, *inputs: str, **attributes: Any) -> tuple[str, str]:
-        """Adds a node with two outputs and returns their names."""
-        first, second = f"v{self._root._count}", f"v{self._root._count + 1}"
-        self._root._count += 2
-        self._nodes.append(helper.make_node(kind, list(inputs), [first, second], **attributes))
-        return first, second
 
     def branch(self, *outputs: str) -> onnx.GraphProto:
         """The nodes as a branch of an ``If`` with float outputs."""
@@ -95,7 +74,6 @@ class GraphBuilder:
         inputs: Mapping[str, Sequence[int | str]],
         outputs: Mapping[str, Sequence[int | str]],
         metadata: Mapping[str, Any],
-        opset: int = OPSET,
         types: Mapping[str, int] | None = None,
     ) -> onnx.ModelProto:
         """The checked model.
@@ -104,7 +82,6 @@ class GraphBuilder:
             name: of the graph.
             inputs, outputs: their shapes.
             metadata: values that are not text become JSON.
-            opset: version of the operators.
             types: of inputs and outputs that are not float32.
         """
 
@@ -116,7 +93,7 @@ class GraphBuilder:
             ]
 
         graph = helper.make_graph(self._nodes, name, infos(inputs), infos(outputs), list(self._constants.values()))
-        model = helper.make_model(graph, producer_name="torchface", opset_imports=[helper.make_opsetid("", opset)])
+        model = helper.make_model(graph, producer_name="torchface", opset_imports=[helper.make_opsetid("", OPSET)])
         model.ir_version = IR_VERSION
         helper.set_model_props(
             model, {key: value if isinstance(value, str) else json.dumps(value) for key, value in metadata.items()}

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from torchface.onnx.graph_builder import OPSET
 from torchface.optim import exported_operators
 
 _NEWTON_STEPS = 14  # to a residual of 1e-9 for rows' sums of 30 and a share of 0.05
@@ -89,6 +90,6 @@ TRANSLATIONS: Mapping[Callable[..., object], Callable[..., object]] = {
 def _onnx_operators() -> Any:
     # Loaded where a graph is written: solvers that run graphs have no need of it. As annotated, its constants fit none
     # of its operators.
-    from onnxscript import opset18
+    import onnxscript
 
-    return opset18
+    return getattr(onnxscript, f"opset{OPSET}")
