@@ -10,11 +10,11 @@ from typing import Any, get_args, get_origin, get_type_hints
 
 import pytest
 import tyro
-from torchface.cli.export_model import export_model
 from tyro.conf import arg
 
 from torchface.cli import COMMANDS, GROUPS, main
 from torchface.cli.command_options import Output, checked
+from torchface.cli.export import export_model
 
 ALL = {
     **{(name,): command for name, command in COMMANDS.items()},
