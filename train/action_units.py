@@ -93,9 +93,9 @@ def train(settings: Settings, run: Run) -> Trained:
     for path, own in zip(settings.test_video, test_labels, strict=True):
         video = read_regions(open_video(path), own, names, classifier.neutral, settings.size)
         truth = labelled_intensities(video, own, groups, settings.training)
-        found = level_agreement(classify(classifier, video), truth, settings.training.levels)
-        metrics |= {f"{path.stem}, {name}": value for name, value in found.items()}
-        progress(f"{path.name}: {found['within_one']:.1%} within one level")
+        agreement = level_agreement(classify(classifier, video), truth, settings.training.levels)
+        metrics |= {f"{path.stem}, {name}": value for name, value in agreement.items()}
+        progress(f"{path.name}: {agreement['within_one']:.1%} within one level")
     save(classifier, settings, metrics, labels)
     picture = levels_picture(videos[0], labelled_intensities(videos[0], labels[0], groups, settings.training), groups)
     save_rendered_image(picture, settings.out / "levels.png")

@@ -69,7 +69,7 @@ def train(settings: Settings, run: Run) -> Trained:
     progress(f"{len(frames)} annotated frames")
     landmarks = torch.stack([frame.landmarks for frame in frames])
     folds = min(settings.folds, len(frames))
-    before, after, found = torch.zeros(0), torch.zeros(0), landmarks.clone()
+    before, after, refined = torch.zeros(0), torch.zeros(0), landmarks.clone()
     if folds >= 2:
         start = drawn_starts(landmarks, settings.seed)
         for fold in range(folds):
@@ -77,13 +77,13 @@ def train(settings: Settings, run: Run) -> Trained:
             learn = [frame for frame, left_out in zip(frames, rows.tolist(), strict=True) if not left_out]
             trial = AppearanceModel.fit([frame.image for frame in learn], landmarks[~rows], settings.model)
             for row in torch.nonzero(rows)[:, 0].tolist():  # images differ in size
-                found[row] = trial(frames[row].image[None], start[row : row + 1])[0]
+                refined[row] = trial(frames[row].image[None], start[row : row + 1])[0]
             progress("measuring on left-out frames", fold + 1, folds)
-        before, after = relative_errors(start, landmarks), relative_errors(found, landmarks)
+        before, after = relative_errors(start, landmarks), relative_errors(refined, landmarks)
     model = AppearanceModel.fit([frame.image for frame in frames], landmarks, settings.model, progress)
     save(model, settings, frames, before, after)
     if len(after):
-        pictures = [_picture(frame, shape) for frame, shape in zip(frames, found, strict=True)]
+        pictures = [_picture(frame, shape) for frame, shape in zip(frames, refined, strict=True)]
         save_rendered_image(sheet(pictures[:15], 5), settings.out / "held_out.png")
     return Trained(model, before, after)
 

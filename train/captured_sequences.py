@@ -114,8 +114,8 @@ def read_pairs(folder: Path, capture: Capture) -> Capture:
         ValueRangeError: a sequence is missing, or of another number of frames.
         FileFormatError, TopologyError: as :func:`read_capture`.
     """
-    found = read_capture(folder, capture.neutral_file)
-    named = {_bare(sequence.name): sequence for sequence in found.sequences}
+    capture_read = read_capture(folder, capture.neutral_file)
+    named = {_bare(sequence.name): sequence for sequence in capture_read.sequences}
     for sequence in capture.sequences:
         other = named.get(_bare(sequence.name))
         if other is None or other.count != sequence.count:
@@ -124,7 +124,7 @@ def read_pairs(folder: Path, capture: Capture) -> Capture:
                 f"{sequence.name}, expected its {sequence.count} frames under the same name as the coarse animation "
                 "shows them"
             )
-    return replace(found, sequences=tuple(named[_bare(sequence.name)] for sequence in capture.sequences))
+    return replace(capture_read, sequences=tuple(named[_bare(sequence.name)] for sequence in capture.sequences))
 
 
 def performed(vertices: int, seed: int, fps: float) -> Capture:
@@ -192,12 +192,13 @@ def _check(frames: Tensor, name: str, first: int, size: int) -> None:
 
 def _neutral_file(folder: Path, entries: list[Path]) -> Path:
     endings = (*MESH_ENDINGS, ".glb", ".gltf")
-    found = [entry for entry in entries if entry.stem.lower() == _NEUTRAL and entry.suffix.lower() in endings]
-    if len(found) != 1:
+    neutrals = [entry for entry in entries if entry.stem.lower() == _NEUTRAL and entry.suffix.lower() in endings]
+    if len(neutrals) != 1:
         raise FileFormatError(
-            f"{folder}: found {len(found)} files called {_NEUTRAL}, expected one, such as {_NEUTRAL}.obj, or --neutral"
+            f"{folder}: found {len(neutrals)} files called {_NEUTRAL}, expected one, such as {_NEUTRAL}.obj, "
+            "or --neutral"
         )
-    return found[0]
+    return neutrals[0]
 
 
 def _bare(name: str) -> str:

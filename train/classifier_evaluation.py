@@ -51,7 +51,7 @@ def cross_validation(
     names = group_regions(groups)
     patterns, rest = merged_videos(videos, names)
     fold = _folds(labels, folds, split, settings.seed)
-    found = {}
+    scores = {}
     for group in groups:
         own = patterns[:, [names.index(name) for name in group.regions]]
         labelled = label_group(own, labels, group, settings)
@@ -61,8 +61,8 @@ def cross_validation(
         for number in range(folds):
             out = fold == number
             right[out] = _predicted(samples, labelled.classes, out, settings) == labelled.classes[out]
-        found[group.name] = float(right.float().mean())
-    return found
+        scores[group.name] = float(right.float().mean())
+    return scores
 
 
 def _predicted(samples: Tensor, classes: Tensor, out: Tensor, settings: TrainingSettings) -> Tensor:
@@ -105,12 +105,12 @@ def labelled_intensities(
     settings: TrainingSettings = DEFAULT_TRAINING,
 ) -> Tensor:
     """Intensities (T,A) from a video's own labels and the clustering of its frames: the truth of a test."""
-    found = []
+    intensities = []
     for group in groups:
         own = video.patterns[:, [video.names.index(name) for name in group.regions]]
         labelled = label_group(own, [labels], group, settings)
-        found.append(labelled.table[labelled.classes])
-    return torch.cat(found, dim=1)
+        intensities.append(labelled.table[labelled.classes])
+    return torch.cat(intensities, dim=1)
 
 
 def level_agreement(found: Tensor, truth: Tensor, levels: int = 4) -> dict[str, float]:

@@ -67,9 +67,9 @@ def color_casts(colors: Tensor, weights: Tensor | None = None) -> Tensor:
         reference = (robust * (light - gains[:, None])).sum(0) / robust.sum(0).clamp(min=1e-9)
         left = light - reference
         robust = valid * (1 + ((left - gains[:, None]) / _UNALIKE).square()).pow(-2)
-        found = (robust * left).sum(1) / robust.sum(1).clamp(min=1e-9)
-        found -= found.mean(0)
-        moved, gains = float((found - gains).abs().max()), found
+        casts = (robust * left).sum(1) / robust.sum(1).clamp(min=1e-9)
+        casts -= casts.mean(0)
+        moved, gains = float((casts - gains).abs().max()), casts
         if moved < _TOLERANCE:
             break
     return gains.double()

@@ -134,10 +134,12 @@ def entries(folder: Path) -> list[Path]:
     if not folder.is_dir():
         raise TorchfaceError(f"{folder}: found no such folder, expected one with an entry a person")
     shown = (path for path in folder.iterdir() if path.name[0] != ".")
-    found = sorted(path for path in shown if path.is_dir() or path.suffix in (".glb", ".gltf"))
-    if len(found) < 3:
-        raise TorchfaceError(f"{folder}: found {len(found)} people, expected at least three: a .glb or a folder each")
-    return found
+    entries_found = sorted(path for path in shown if path.is_dir() or path.suffix in (".glb", ".gltf"))
+    if len(entries_found) < 3:
+        raise TorchfaceError(
+            f"{folder}: found {len(entries_found)} people, expected at least three: a .glb or a folder each"
+        )
+    return entries_found
 
 
 def read(path: Path, settings: Settings) -> BlendshapeRig:

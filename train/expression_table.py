@@ -53,13 +53,13 @@ class Comparison:
     def metrics(self) -> dict[str, float]:
         """The table as numbers by name."""
         cases = self.squared.shape[0] * self.squared.shape[1]
-        found = {
+        metrics = {
             f"lowest error of {cases} cases, share: {m}": c / cases for m, c in zip(METHODS, self.counts, strict=True)
         }
-        found |= {f"summed squared error, mm²: {m}": float(s) for m, s in zip(METHODS, self.sums, strict=True)}
-        found["squared error of the mean offset's"] = float(self.sums[2] / self.sums[1])
-        found["squared error of transfer's"] = float(self.sums[2] / self.sums[0])
-        return found
+        metrics |= {f"summed squared error, mm²: {m}": float(s) for m, s in zip(METHODS, self.sums, strict=True)}
+        metrics["squared error of the mean offset's"] = float(self.sums[2] / self.sums[1])
+        metrics["squared error of transfer's"] = float(self.sums[2] / self.sums[0])
+        return metrics
 
     def __str__(self) -> str:
         cases = self.squared.shape[0] * self.squared.shape[1]

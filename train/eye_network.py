@@ -79,11 +79,13 @@ def train(settings: Settings, run: Run) -> EyeNetwork:
 
 def evaluate(model: EyeNetwork, pictures: StoredEyePictures) -> dict[str, float]:
     """What the model does on both eyes of pictures of several sizes, blurred, noisy and compressed as in training."""
-    found: dict[str, float] = {}
+    metrics: dict[str, float] = {}
     for name, size in _SIZES.items():
         given = EyeAugmentation(turn=6, scale=0.1, shift=0.06, hidden=0, absent=0, far=1, sizes=(size, size))
-        found |= {f"faces of {name} pixels: {what}": value for what, value in measures(model, pictures, given).items()}
-    return found
+        metrics |= {
+            f"faces of {name} pixels: {what}": value for what, value in measures(model, pictures, given).items()
+        }
+    return metrics
 
 
 @torch.no_grad()

@@ -133,16 +133,16 @@ def _kept(path: Path, key: str, count: int) -> MeshSequence | None:
     if not path.is_file():
         return None
     try:
-        found = MeshSequence(path)
-        if found.key != key or len(found) != count:
+        sequence = MeshSequence(path)
+        if sequence.key != key or len(sequence) != count:
             return None
-        fault = "" if found.is_whole() else f"{path}: found other meshes than were written"
+        fault = "" if sequence.is_whole() else f"{path}: found other meshes than were written"
     except FileFormatError as error:
         fault = str(error)
     if fault:
         warnings.warn(f"{fault}; they are gathered anew", stacklevel=3)
         return None
-    return found
+    return sequence
 
 
 def upright(mesh: Mesh) -> Mesh:
@@ -163,13 +163,13 @@ def laid(gathered: Gathered, scale: bool) -> tuple[Samples, Samples]:
     """The heads to learn from on their common mean, and those to test on aligned with it."""
     total, count = len(gathered.shapes), len(gathered.shapes) - gathered.held_out
     learn = SampleRange(gathered.shapes, 0, count)
-    found = generalised_procrustes(learn, scale, initial_mean=gathered.template.vertices)
+    aligned_heads = generalised_procrustes(learn, scale, initial_mean=gathered.template.vertices)
     rest = SampleRange(gathered.shapes, count, total)
     poses = [
-        similarity_transform(part.double(), found.mean.expand(part.shape), scale=scale)
+        similarity_transform(part.double(), aligned_heads.mean.expand(part.shape), scale=scale)
         for part in (rest.read(*block) for block in blocks(rest))
     ]
-    return aligned(learn, found), MovedSamples(rest, _joined(poses)) if poses else rest
+    return aligned(learn, aligned_heads), MovedSamples(rest, _joined(poses)) if poses else rest
 
 
 def vertex_colored(mesh: Mesh) -> Mesh:

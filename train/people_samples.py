@@ -116,8 +116,8 @@ class _Rows:
         return (len(self.shards), sum(size[0] for _, size in self.shards.forms.values()), 3)
 
     def read(self, begin: int, end: int) -> Tensor:
-        found = self.shards.read(begin, end)
-        return torch.cat([found[name] for name in self.shards.names], dim=1)
+        samples = self.shards.read(begin, end)
+        return torch.cat([samples[name] for name in self.shards.names], dim=1)
 
 
 def gather(

@@ -156,8 +156,8 @@ def synthetic_takes(
 
 
 def _stored(store: TakeStore, first: StoredTake, labels: Sequence[str], people: Sequence[str]) -> PriorTakes:
-    found = store.takes()
-    return PriorTakes(first.names, first.fps, found, labels, found.frames, people, store.solved)
+    takes = store.takes()
+    return PriorTakes(first.names, first.fps, takes, labels, takes.frames, people, store.solved)
 
 
 def _content(rig: BlendshapeRig | None) -> object:

@@ -39,7 +39,7 @@ class OneStep:
     def metrics(self) -> dict[str, float]:
         """Root mean squares in weights, the share of frames within k deviations, the mean negative log likelihood."""
         scaled = self.errors / self.deviations
-        found = {
+        metrics = {
             "one-step error": _rms(self.errors),
             "one-step error of persistence": _rms(self.persistence),
             "one-step error of extrapolation": _rms(self.extrapolation),
@@ -47,8 +47,8 @@ class OneStep:
             "root mean square of error by deviation": _rms(scaled),
         }
         for k in (1, 2, 3):
-            found[f"within {k} deviations"] = float((scaled.abs() < k).double().mean())
-        return found
+            metrics[f"within {k} deviations"] = float((scaled.abs() < k).double().mean())
+        return metrics
 
 
 def one_step(prior: DynamicsPrior, takes: Sequence[Tensor], noise: float = 0.0) -> OneStep:

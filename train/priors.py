@@ -48,9 +48,9 @@ def train(settings: Settings, run: Run) -> dict[str, dict[str, float]]:
         out = settings.out if len(kinds) == 1 else settings.out.with_name(f"{settings.out.name}_{kind}")
         own = replace(settings, kind=kind, out=out)
         learned = learned_dynamics if kind == "dynamics" else learned_shape
-        found = learned(own, material, run.progress)
-        _save(found, own, material)
-        measured[out.name] = found.metrics
+        prior = learned(own, material, run.progress)
+        _save(prior, own, material)
+        measured[out.name] = prior.metrics
     return measured
 
 

@@ -122,10 +122,10 @@ def _mean_log_density(prior: ShapePrior, takes: PriorTakes) -> float:
 
 def _densities(prior: ShapePrior) -> dict[str, float]:
     """How many bells a Parzen window has in each half, and how wide they are."""
-    found = {}
+    densities = {}
     for number, density in enumerate(prior.densities):
         half = ("upper", "lower")[number] if len(prior.groups) == 2 else f"group {number}"
         if isinstance(density, ParzenDensity):
-            found[f"centers, {half}"] = float(len(density.centers))
-            found[f"bandwidth, {half}"] = float(density.bandwidth)
-    return found
+            densities[f"centers, {half}"] = float(len(density.centers))
+            densities[f"bandwidth, {half}"] = float(density.bandwidth)
+    return densities

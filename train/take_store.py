@@ -108,13 +108,13 @@ class TakeStore:
     def stored(self, key: str, make: Callable[[], StoredTake]) -> StoredTake:
         """The next take; it is made where there is none of this key, or a damaged one."""
         path = self._paths[self._done]
-        found = _unpacked(read_checkpoint(path, key))
-        if found is None:
-            found = make()
-            write_checkpoint(path, _packed(found), key)
+        take = _unpacked(read_checkpoint(path, key))
+        if take is None:
+            take = make()
+            write_checkpoint(path, _packed(take), key)
         self._done += 1
-        self.solved += found.solved
-        return found
+        self.solved += take.solved
+        return take
 
     def takes(self) -> TakesOnDisk:
         """All that were written."""

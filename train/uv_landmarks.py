@@ -84,9 +84,9 @@ def train(settings: Settings, run: Run) -> Trained:
     detector = fit(learn, settings.appearance, settings.size, settings.detector, progress)
     errors, pictures = [], []
     for scan in test:
-        found = scan_landmarks(detector, scan.mesh)
-        errors.append(landmark_errors(found, scan.mesh, scan.truth, scan.name))
-        pictures.append(draw_result(found, scan.truth))
+        landmarks = scan_landmarks(detector, scan.mesh)
+        errors.append(landmark_errors(landmarks, scan.mesh, scan.truth, scan.name))
+        pictures.append(draw_result(landmarks, scan.truth))
         progress(f"{scan.name}: {errors[-1].mean_pixels:.1f} px")
     save(detector, settings, errors, len(learn))
     if pictures:

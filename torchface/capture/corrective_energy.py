@@ -137,11 +137,11 @@ def least_in_box(
             if far and len(energy.activation.in_betweens):
                 rounded = replace(part, activation=RoundedActivation(energy.activation))
                 begin = _descended(rounded, begin, lower, upper, max(tolerance, _ROUNDED_TOLERANCE))
-            found = _descended(part, begin, lower, upper, tolerance)
+            weights = _descended(part, begin, lower, upper, tolerance)
         if torch.is_grad_enabled() and (part.extended.H.requires_grad or part.extended.f.requires_grad):
-            free = (found > lower) & (found < upper)
-            found = attach_gradients(part.gradient, found, free)
-        parts.append(found)
+            free = (weights > lower) & (weights < upper)
+            weights = attach_gradients(part.gradient, weights, free)
+        parts.append(weights)
     return torch.cat(parts) if parts else start
 
 

@@ -80,15 +80,15 @@ def load_example_poses(path: str | Path) -> list[ExamplePose]:
     """
     path = Path(path)
     if path.suffix.lower() != ".csv":
-        found = []
+        poses = []
         for name, entry in read_toml(path).table().items():
             entry.table("from", "to", expected="a table with from and to")
             sides = [
                 {shape: weight.number("a weight") for shape, weight in entry[side].table().items()}
                 for side in ("from", "to")
             ]
-            found.append(ExamplePose(name, *sides))
-        return found
+            poses.append(ExamplePose(name, *sides))
+        return poses
     reader = TableReader(path)
     reader.require(["pose"])
     other = [name for name in reader.header if name != "pose" and not name.startswith((_FROM, _TO))]
@@ -158,8 +158,8 @@ def learn_shape_rules(poses: Sequence[ExamplePose], from_names: Sequence[str], t
         )
         for target, row in zip(learned.tolist(), factors, strict=True)
     }
-    found = shape_map(from_names, to_names, rules)(x)
-    return LearnedRules(rules, x, y, found, tuple(_notes(x, shown, from_names)))
+    mapped = shape_map(from_names, to_names, rules)(x)
+    return LearnedRules(rules, x, y, mapped, tuple(_notes(x, shown, from_names)))
 
 
 def _row(pose: str, weights: Mapping[str, float], names: Sequence[str], whose: str) -> Tensor:

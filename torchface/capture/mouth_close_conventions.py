@@ -162,12 +162,12 @@ def _moved(track: Track, sign: float) -> Track:
 
 
 def _expect(rig: BlendshapeRig, opens_jaw: bool) -> None:
-    found = mouth_close_of(rig)
-    if found is None:
+    convention = mouth_close_of(rig)
+    if convention is None:
         raise NameMismatchError(f"rig: found no {JAW} and {CLOSE}, expected both")
-    if found.opens_jaw is not opens_jaw:
-        meant = "opens the jaw itself already" if found.opens_jaw else "leaves the jaw to jawOpen already"
-        raise ValueRangeError(f"rig: its {CLOSE} {meant} (it moves the chin {found.share:.0%} of the way)")
+    if convention.opens_jaw is not opens_jaw:
+        meant = "opens the jaw itself already" if convention.opens_jaw else "leaves the jaw to jawOpen already"
+        raise ValueRangeError(f"rig: its {CLOSE} {meant} (it moves the chin {convention.share:.0%} of the way)")
 
 
 def _converted(rig: BlendshapeRig, sign: float) -> BlendshapeRig:

@@ -151,13 +151,13 @@ def shape_map(
         for source, factor in rule.sum.items():
             matrix[row, column[source]] = factor
         products.append(tuple(column[source] for source in rule.product))
-    found = [rules.get(name, ShapeRule()) for name in to_names]
+    chosen = [rules.get(name, ShapeRule()) for name in to_names]
     made = ShapeMap(
         tuple(from_names),
         tuple(to_names),
         matrix,
         tuple(products),
-        *(torch.tensor([getattr(rule, limit) for rule in found]) for limit in ("gain", "lower", "upper")),
+        *(torch.tensor([getattr(rule, limit) for rule in chosen]) for limit in ("gain", "lower", "upper")),
     )
     if len(made.undriven) == len(made.to_names):
         raise NameMismatchError(
@@ -250,16 +250,16 @@ def _spelled(
     def source(name: str) -> str:
         return spelled_as(name, from_names) or name
 
-    found: dict[str, ShapeRule] = {}
+    spelled: dict[str, ShapeRule] = {}
     for name, rule in rules.items():
         own = spelled_as(name, to_names) or name
-        if own in found:
+        if own in spelled:
             raise NameMismatchError(f"retarget: found two rules for {own}, expected one")
         factors = {source(given): factor for given, factor in rule.sum.items()}
         if len(factors) < len(rule.sum):
             raise NameMismatchError(f"retarget: the rule of {name} names a shape twice, {', '.join(rule.sum)}")
-        found[own] = replace(rule, sum=factors, product=tuple(map(source, rule.product)))
-    return found
+        spelled[own] = replace(rule, sum=factors, product=tuple(map(source, rule.product)))
+    return spelled
 
 
 def _check_rules(rules: Mapping[str, ShapeRule], from_names: Sequence[str], to_names: Sequence[str]) -> None:

@@ -67,8 +67,8 @@ def annotate(
                 if finder is None:
                     given = given_reading(Path(landmarks), video)
                     return given.landmarks, given.confidence
-                found = track_landmarks(video, LandmarkTracker(finder.finder, face=face), progress)
-                return found.values, found.confidence
+                tracked = track_landmarks(video, LandmarkTracker(finder.finder, face=face), progress)
+                return tracked.values, tracked.confidence
 
             progress("reading")
             finder = None if is_table(landmarks) else load_finder(landmarks)

@@ -102,16 +102,16 @@ def evaluate(
         show_batch(batch, _COLUMNS, "mean_mm")
         return
     with job_lock(out), progress_bars(quiet) as progress:
-        found = run(result, truth, out, settings, progress)
+        evaluation = run(result, truth, out, settings, progress)
         progress("drawing")
-        page = write_evaluation_page(found, out, height)
-    table = Table(title=f"{found.result} against {found.truth}, millimetres")
+        page = write_evaluation_page(evaluation, out, height)
+    table = Table(title=f"{evaluation.result} against {evaluation.truth}, millimetres")
     for head in ("region", "mean", "median", "95 %", "largest", "total", "vertices"):
         table.add_column(head, justify="left" if head == "region" else "right")
-    for name, figures in found.regions.items():
+    for name, figures in evaluation.regions.items():
         numbers = (figures.mean, figures.median, figures.percentile_95, figures.largest)
         table.add_row(name, *(f"{x:.3f}" for x in numbers), f"{figures.total:.4e}", str(figures.vertices))
     console.print(table)
-    for line in found.lines():
+    for line in evaluation.lines():
         console.print(line, highlight=False)
     print_path(page)

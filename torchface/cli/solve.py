@@ -129,10 +129,10 @@ def solve(
         for option, path in written.items():
             check_for_each(option, path)
         job = TakeJob(rig, attachment, settings, options, part, camera, animation, report, live_link)
-        found = find_items(take, MARKER_TAKES)
+        items = find_items(take, MARKER_TAKES)
         with progress_bars(quiet) as progress:
             where = BatchOptions(jobs, cluster, time_limit)
-            batch = run_batch(job, MARKER_TAKES, found, out, where, progress, skipped_lines(quiet))
+            batch = run_batch(job, MARKER_TAKES, items, out, where, progress, skipped_lines(quiet))
         show_batch(batch, _COLUMNS, "rmse_mm")
         return
     with file_lock(out, ".csv"), progress_bars(quiet) as progress:

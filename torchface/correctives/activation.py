@@ -102,8 +102,8 @@ class CorrectiveActivation(nn.Module):
     def jacobian(self, weights: Tensor) -> Tensor:
         """All derivatives, (B,C,N) at weights (B,N); differentiable."""
         derivative = self.derivative(weights)
-        found = derivative.new_zeros(*derivative.shape[:2], self.shapes + 1)
-        return found.scatter_add(2, self.drivers.expand_as(derivative), derivative)[..., : self.shapes]
+        padded = derivative.new_zeros(*derivative.shape[:2], self.shapes + 1)
+        return padded.scatter_add(2, self.drivers.expand_as(derivative), derivative)[..., : self.shapes]
 
     def pulled_back(self, derivative: Tensor, matrix: Tensor) -> Tensor:
         r"""The product :math:`(\partial a / \partial w)^\top Z` (B,N,K), by its few numbers that are not zero.
@@ -133,8 +133,8 @@ class CorrectiveActivation(nn.Module):
     def slope(self, derivative: Tensor, by_activation: Tensor) -> Tensor:
         """By the weights, (B,N), what falls by the activations as (B,C); differentiable."""
         by_driver = (derivative * by_activation[..., None]).flatten(1)
-        found = by_driver.new_zeros(len(by_driver), self.shapes + 1)
-        return found.index_add(1, self.drivers.flatten(), by_driver)[:, : self.shapes]
+        padded = by_driver.new_zeros(len(by_driver), self.shapes + 1)
+        return padded.index_add(1, self.drivers.flatten(), by_driver)[:, : self.shapes]
 
     def _factors(self, weights: Tensor) -> Tensor:
         padded = torch.cat([weights, torch.ones_like(weights[:, :1])], 1)
@@ -159,11 +159,11 @@ class CorrectiveActivation(nn.Module):
             >>> CorrectiveActivation([Corrective("ab", ("a", "b")), Corrective("a4", ("a",), 0.4)], "ab").expressions()
             ['w0*w1', 'max(0,min(w0/0.4,(1-w0)/0.6))']
         """
-        found = ["*".join(f"w{place}" for place in range(len(one.drivers))) for one in self.definitions]
+        formulas = ["*".join(f"w{place}" for place in range(len(one.drivers))) for one in self.definitions]
         for row, (left, peak, right) in zip(self.in_betweens.tolist(), self.knots.tolist(), strict=True):
             rise = f"(w0-{left:.9g})" if left else "w0"
-            found[row] = f"max(0,min({rise}/{peak - left:.9g},({right:.9g}-w0)/{right - peak:.9g}))"
-        return found
+            formulas[row] = f"max(0,min({rise}/{peak - left:.9g},({right:.9g}-w0)/{right - peak:.9g}))"
+        return formulas
 
     def extra_repr(self) -> str:
         return f"{len(self.definitions)} correctives, {len(self.in_betweens)} of them in-betweens"

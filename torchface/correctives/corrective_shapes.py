@@ -72,8 +72,8 @@ class Corrective:
 
     def record(self) -> dict[str, Any]:
         """As plain values, for files; see ``definitions_from_records``."""
-        found: dict[str, Any] = {"name": self.name, "drivers": list(self.drivers)}
-        return found if self.peak is None else found | {"peak": self.peak}
+        entry: dict[str, Any] = {"name": self.name, "drivers": list(self.drivers)}
+        return entry if self.peak is None else entry | {"peak": self.peak}
 
 
 @dataclass(frozen=True, eq=False)
@@ -182,7 +182,7 @@ def definitions_from_records(records: object) -> tuple[Corrective, ...]:
     """
     if not isinstance(records, list):
         raise NameMismatchError(f"correctives: found {records!r:.80}, expected a list")
-    found = []
+    definitions = []
     for i, record in enumerate(records):
         given = record if isinstance(record, dict) else {}
         name, drivers, peak = given.get("name"), given.get("drivers"), given.get("peak")
@@ -192,6 +192,6 @@ def definitions_from_records(records: object) -> tuple[Corrective, ...]:
                 f"correctives[{i}]: found {record!r:.80}, expected a name, a list of drivers' names, and of an "
                 "in-between a peak"
             )
-        found.append(Corrective(str(name), tuple(drivers or ()), peak))
-    check_definitions(found)
-    return tuple(found)
+        definitions.append(Corrective(str(name), tuple(drivers or ()), peak))
+    check_definitions(definitions)
+    return tuple(definitions)

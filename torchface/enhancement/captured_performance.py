@@ -74,10 +74,10 @@ def _check_sequences(sequences: Tensor, count: int) -> None:
             "each frame's sequence"
         )
     pieces = 1 + int((sequences[1:] != sequences[:-1]).sum())
-    found = len(sequences.unique())
-    if pieces != found:
-        raise ValueRangeError(f"sequences: found {found} sequences in {pieces} pieces, expected each in one piece")
-    if found < 2:
+    numbers = len(sequences.unique())
+    if pieces != numbers:
+        raise ValueRangeError(f"sequences: found {numbers} sequences in {pieces} pieces, expected each in one piece")
+    if numbers < 2:
         warnings.warn(
             f"sequences: found 1 of {count} frames, expected several, from the neutral to an extreme and back each: "
             "detail and timing of what it does not show are missing",

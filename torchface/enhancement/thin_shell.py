@@ -117,7 +117,7 @@ class ThinShell:
         """
         seen = torch.isfinite(displacements).all(-1)
         self._check(displacements, seen)
-        found = torch.full((len(displacements), *self.neutral.shape), torch.nan)
+        deformed = torch.full((len(displacements), *self.neutral.shape), torch.nan)
         given = torch.where(seen[..., None], displacements, 0.0).double().cpu().numpy()
         mask = (seen.cpu() & self.used).numpy()
         patterns, of_frame = np.unique(mask, axis=0, return_inverse=True)
@@ -128,8 +128,8 @@ class ThinShell:
             columns = given[rows].transpose(1, 0, 2).reshape(self.count, -1)
             level = self._on_level(columns, pattern)
             dense = torch.from_numpy(self._to_dense @ level)
-            found[torch.from_numpy(rows)] = dense.reshape(len(self.neutral), len(rows), 3).transpose(0, 1)
-        return found.to(displacements.device)
+            deformed[torch.from_numpy(rows)] = dense.reshape(len(self.neutral), len(rows), 3).transpose(0, 1)
+        return deformed.to(displacements.device)
 
     def follow(self, points: Tensor, rest: Tensor | None = None) -> Tensor:
         """Every vertex where the points take it, the head's rigid motion included.
@@ -148,13 +148,13 @@ class ThinShell:
         self._check(points, seen)
         still = (self.rest if rest is None else rest.cpu()).double()
         enough = (seen & self.used).sum(-1) >= LEAST_POINTS
-        found = torch.full((len(points), *self.neutral.shape), torch.nan)
+        deformed = torch.full((len(points), *self.neutral.shape), torch.nan)
         if enough.any():
             shown = points.detach().cpu().double()[enough]
             pose = rigid_motion(still, shown)
             moved = self.spread((pose.inverse().apply(shown) - still).float()).double()
-            found[enough] = pose.apply(moved + self.neutral.double()).float()
-        return found.to(points.device)
+            deformed[enough] = pose.apply(moved + self.neutral.double()).float()
+        return deformed.to(points.device)
 
     def _check(self, points: Tensor, seen: Tensor) -> None:
         if points.ndim != 3 or points.shape[1:] != (self.count, 3):

@@ -78,10 +78,10 @@ class Cover:
         """
         if not self.known or (self._colors is None and not (settled and self.ears)):
             return self._none
-        found = self._surface.among_nearest_samples(current[self._exposed])
-        hidden = self._none if self._colors is None else self._by_color(found)
+        nearest = self._surface.among_nearest_samples(current[self._exposed])
+        hidden = self._none if self._colors is None else self._by_color(nearest)
         if settled:
-            hidden = hidden | self._broken_ears(current, found, hidden)
+            hidden = hidden | self._broken_ears(current, nearest, hidden)
         return hidden
 
     def without_islands(self, seen: Tensor) -> Tensor:

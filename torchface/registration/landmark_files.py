@@ -57,8 +57,8 @@ def load_scan_landmarks(path: str | Path, template: Mesh, scan: str | Path, unit
         pairs = load_correspondences(path)
         pairs.check(template)
         return pairs.vertices, pairs.points
-    found = load_landmark_points(path)
-    if found.points.shape[1] != 3:
+    loaded = load_landmark_points(path)
+    if loaded.points.shape[1] != 3:
         raise FileFormatError(f"{path}: found points in an image, two numbers each; expected places on the scan")
     if template.annotations is None or template.annotations.landmarks is None:
         raise ValueRangeError(
@@ -66,7 +66,7 @@ def load_scan_landmarks(path: str | Path, template: Mesh, scan: str | Path, unit
             "correspondences, or an annotated template (torchface pick makes both)"
         )
     ids = template.annotations.landmarks.cpu()
-    points = found.ibug() if found.groups and len(ids) == 68 else found.points
+    points = loaded.ibug() if loaded.groups and len(ids) == 68 else loaded.points
     if len(points) != len(ids):
         raise ShapeError(f"{path}: found {len(points)} points, expected the template's {len(ids)} landmarks")
     suffix = Path(scan).suffix.lower()

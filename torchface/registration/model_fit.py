@@ -136,17 +136,17 @@ def fit_to_scan(
     for reach in _REACHES:
         local = mean + torch.tensordot(coefficients, modes, 1)
         current = pose.apply(local)[0]
-        found = correspondences(current, faces, chosen, scan, reach, largest_angle)
-        left = ((found.points - current[chosen]) * found.normals).sum(-1)
-        used = found.weights > 0
+        pairs = correspondences(current, faces, chosen, scan, reach, largest_angle)
+        left = ((pairs.points - current[chosen]) * pairs.normals).sum(-1)
+        used = pairs.weights > 0
         if bool(used.any()):
             noise = min(max(1.4826 * float(left[used].abs().median()), _LEAST_NOISE), _MAX_NOISE)
         # Hair and collars stand off the head: what misses by more than the rest counts little.
-        weights = found.weights * (1 + (left / max(_OUTLYING * noise, _LEAST_OUTLYING)).square()).pow(-2)
+        weights = pairs.weights * (1 + (left / max(_OUTLYING * noise, _LEAST_OUTLYING)).square()).pow(-2)
         share = area / _CORRELATED**2 / len(chosen) / noise**2
         centre = current.mean(0)
         rows = _jacobian(modes, current, chosen, pose, centre)  # (n,3,7+K)
-        across = (found.normals[:, :, None] * rows).sum(1)
+        across = (pairs.normals[:, :, None] * rows).sum(1)
         weighted = across * (share * weights)[:, None]
         matrix, downhill = weighted.T @ across, weighted.T @ left
         if len(ids):

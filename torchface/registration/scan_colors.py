@@ -129,9 +129,9 @@ def resampled_texture(mesh: Mesh, colors: Tensor, shown: Tensor, source: ScanCol
     values = texels.interpolate(colors.double(), faces).float()
     share = texels.interpolate(shown[:, None].double(), faces).float()
     wanted = (share[:, 0] > 0).nonzero()[:, 0]
-    triangle, barycentric, found = _along_normals(source, points[wanted], normals[wanted])
-    rows = wanted[found]
-    values[rows] = torch.lerp(values[rows], source.at(triangle[found], barycentric[found]), share[rows])
+    triangle, barycentric, hit = _along_normals(source, points[wanted], normals[wanted])
+    rows = wanted[hit]
+    values[rows] = torch.lerp(values[rows], source.at(triangle[hit], barycentric[hit]), share[rows])
     return texels.image(values.clamp(0, 1))
 
 

@@ -65,10 +65,10 @@ def prepare_scan(scan: Mesh, template: Mesh) -> PreparedScan:
         TopologyError: the scan is empty or tiny.
         ValueRangeError: it has no area, or its extent shows another unit than millimetres.
     """
-    found = len(scan.faces)
-    if found < _LEAST_TRIANGLES:
+    triangles = len(scan.faces)
+    if triangles < _LEAST_TRIANGLES:
         raise TopologyError(
-            f"scan: found {len(scan.vertices)} vertices and {found} triangles, expected a surface of at least "
+            f"scan: found {len(scan.vertices)} vertices and {triangles} triangles, expected a surface of at least "
             f"{_LEAST_TRIANGLES} triangles"
         )
     vertices, place = torch.unique(scan.vertices.detach().cpu().double(), dim=0, return_inverse=True)
@@ -110,10 +110,10 @@ def _inside_out(scan: PreparedScan) -> bool:
 
 def check_same_hand(own: Tensor, points: Tensor, name: str = "landmarks") -> None:
     """Raises ``AlignmentError`` where points on a scan (L,3) are a mirror image of a template's own (L,3)."""
-    found = check_mirrored(own, points)
-    if found.mirrored:
+    mirrored = check_mirrored(own, points)
+    if mirrored.mirrored:
         raise AlignmentError(
-            f"{name}: those on the scan are a mirror image of the template's: {found.figures()} are left; the scan "
+            f"{name}: those on the scan are a mirror image of the template's: {mirrored.figures()} are left; the scan "
             "was exported in left-handed axes (export it in right-handed ones, or negate one coordinate of its "
             "vertices and landmarks), or those of left and right are swapped"
         )

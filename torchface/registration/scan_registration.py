@@ -282,9 +282,9 @@ def _model_notes(fit: ModelFit | None) -> list[str]:
 
 def _faces_away(samples: Samples, surface: SurfaceIndex, pose: Similarity) -> bool:
     """Whether most normals of the scan oppose the template's where both are near each other."""
-    found = surface.among_nearest_samples(pose.apply(samples.points)[0])
-    agree = (surface.normals_at(found) * (samples.normals @ pose.rotation[0].double().T)).sum(-1)
-    near = found.distance <= found.distance.median()
+    nearest = surface.among_nearest_samples(pose.apply(samples.points)[0])
+    agree = (surface.normals_at(nearest) * (samples.normals @ pose.rotation[0].double().T)).sum(-1)
+    near = nearest.distance <= nearest.distance.median()
     return float(agree[near].mean()) < 0
 
 
@@ -343,10 +343,10 @@ def _completed(
     deformer.unfold()
     moved = ((deformer.current - before).square().sum(-1) > 0).nonzero()[:, 0]
     newer = _nearest(surface, deformer.current[moved])
-    found = SurfacePoints(*(part.clone() for part in vars(nearest).values()))
-    found.points[moved], found.triangle[moved] = newer.points, newer.triangle
-    found.barycentric[moved], found.distance[moved] = newer.barycentric, newer.distance
-    return found, unseen
+    completed = SurfacePoints(*(part.clone() for part in vars(nearest).values()))
+    completed.points[moved], completed.triangle[moved] = newer.points, newer.triangle
+    completed.barycentric[moved], completed.distance[moved] = newer.barycentric, newer.distance
+    return completed, unseen
 
 
 def _stretch(template: Mesh, current: Tensor, matched: Tensor) -> float:

@@ -81,18 +81,18 @@ def load_animated(path: Path, rig: Path | None = None, part: str | None = None) 
     loaded = None if rig is None else load_rig(rig)
     ending = path.suffix.lower()
     if path.is_dir():
-        found = _of_folder(path, loaded)
+        animated = _of_folder(path, loaded)
     elif ending == ".csv":
-        found = _of_weights(path, loaded)
+        animated = _of_weights(path, loaded)
     elif ending == ".safetensors":
-        found = _of_sequence(path, loaded)
+        animated = _of_sequence(path, loaded)
     elif ending in SCENE_ENDINGS:
-        found = _of_scene(path, loaded)
+        animated = _of_scene(path, loaded)
     elif ending in MESH_ENDINGS:
-        found = _of_meshes(path, [path], loaded)
+        animated = _of_meshes(path, [path], loaded)
     else:
         raise FileFormatError(f"{path}: found the ending {ending!r}, expected {_FORMS}")
-    return found if part is None else _kept(found, region(found.neutral, part))
+    return animated if part is None else _kept(animated, region(animated.neutral, part))
 
 
 def is_animation(path: Path) -> bool:

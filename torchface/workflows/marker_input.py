@@ -90,8 +90,8 @@ def read_markers(path: Path, labels: Sequence[str] | None, options: MarkerOption
         raise ValueRangeError(f"{path}: found {held or 'no markers'}, expected a marker take (.c3d, .trc, .csv){other}")
     renamed = None if options.labels is None else load_label_map(options.labels)
     try:
-        found = take.markers.names
-        match = own_labels(found, renamed) if labels is None else match_labels(found, labels, renamed)
+        names = take.markers.names
+        match = own_labels(names, renamed) if labels is None else match_labels(names, labels, renamed)
     except NameMismatchError as error:
         raise NameMismatchError(f"{path}: {error}") from error
     chosen = take.markers.select(match.channels)

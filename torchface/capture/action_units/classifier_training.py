@@ -107,13 +107,13 @@ def label_group(
             if not units:
                 continue
             frames, at_rest = _frames(own, together, start)
-            found = intensity_levels(patterns[frames], at_rest, settings.levels, settings.seed)
+            levels = intensity_levels(patterns[frames], at_rest, settings.levels, settings.seed)
             for level in range(1, settings.levels):
                 if (units, level) not in class_of:
                     class_of[units, level] = len(rows)
                     strength = level / (settings.levels - 1)
                     rows.append(tuple(strength if unit in units else 0.0 for unit in group.units))
-                classes[frames[found == level]] = class_of[units, level]
+                classes[frames[levels == level]] = class_of[units, level]
         start += own.frames
     return GroupClasses(torch.tensor(rows), classes)
 
@@ -168,13 +168,13 @@ def group_features(
     generator: torch.Generator | None = None,
 ) -> Tensor:
     """Features (T,D) of a group's regions and those at rest, (T,G,h,w) twice, warped alike if a generator is given."""
-    found = []
+    rows = []
     for chunk, still in zip(patterns.split(_CHUNK), rest.split(_CHUNK), strict=True):
         if generator is not None:
             both = local_warps(torch.cat([chunk, still], dim=1), amplitude, generator, alike=2)
             chunk, still = both.chunk(2, dim=1)
-        found.append(part.features(chunk, still))
-    return torch.cat(found)
+        rows.append(part.features(chunk, still))
+    return torch.cat(rows)
 
 
 def principal_components(samples: Tensor, mean: Tensor, variance: float) -> tuple[Tensor, Tensor]:

@@ -54,18 +54,18 @@ class PointTracker:
         """Where helmet and markers are in the next frames (t,H,W) uint8: (t,1+M,2), NaN where one was lost."""
         if frames.ndim != 3 or frames.shape[1:] != self._reference.shape:
             raise ShapeError(f"frames: found {tuple(frames.shape)}, expected (t, {self._reference.shape})")
-        found = torch.full((len(frames), len(self.points), 2), torch.nan)
+        tracked = torch.full((len(frames), len(self.points), 2), torch.nan)
         for i, frame in enumerate(frames):  # where a point was last is where the next search begins
             helmet = self._flow(frame)
             if helmet is not None:
-                found[i, 0] = helmet
+                tracked[i, 0] = helmet
                 self._last[1:] += helmet - self._last[0]
                 self._last[0] = helmet
             blobs, brightness = _blobs(frame, self._last[1:])
             seen = (brightness > self._min_brightness) & ((blobs - self._last[1:]).norm(dim=1) < _REACH)
-            found[i, 1:][seen] = blobs[seen]
+            tracked[i, 1:][seen] = blobs[seen]
             self._last[1:][seen] = blobs[seen]
-        return found
+        return tracked
 
     def _flow(self, frame: Tensor) -> Tensor | None:
         """Where the helmet's point is, (2,), or nothing where it cannot be found."""
@@ -81,10 +81,10 @@ class PointTracker:
             flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
             criteria=(cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 30, 0.01),
         )
-        found = torch.from_numpy(place[0, 0].copy())
-        step = float((found - self._last[0]).norm())
+        moved = torch.from_numpy(place[0, 0].copy())
+        step = float((moved - self._last[0]).norm())
         good = status[0, 0] > 0 and residual[0, 0] < 255 * _MAX_RESIDUAL and step < _MAX_STEP
-        return found if good else None
+        return moved if good else None
 
 
 def _blobs(frame: Tensor, points: Tensor) -> tuple[Tensor, Tensor]:

@@ -174,8 +174,8 @@ def make_room_for_points(
         more: other buffers with a row a point.
     """
     by_point, by_curve = ("rest", "basis", *more), ("rows", "valid")
-    found = {name: state.get(prefix + name) for name in (*by_point, *by_curve)}
-    shapes = {name: tuple(value.shape) for name, value in found.items() if isinstance(value, Tensor)}
+    tensors = {name: state.get(prefix + name) for name in (*by_point, *by_curve)}
+    shapes = {name: tuple(value.shape) for name, value in tensors.items() if isinstance(value, Tensor)}
     count, curve = (shapes.get(name, (0, 0))[axis] for name, axis in (("rest", 0), ("rows", -1)))
     expected = {name: (count, *getattr(solver, name).shape[1:]) for name in by_point}
     expected |= dict.fromkeys(by_curve, (JAW, curve))

@@ -134,7 +134,7 @@ def _split(
     H = mean.H + torch.cat([torch.full_like(mean.weights, 1e-3), precision]).diag()
     upper = torch.cat([torch.ones_like(mean.weights), torch.full_like(precision, _FREE)])
     lower = torch.cat([torch.zeros_like(mean.weights), torch.full_like(precision, -_FREE)])
-    found = here
+    solution = here
     for _ in range(_REWEIGHTINGS):  # each penalty is by the weights that the one before led to
         falls = 1.0 if expression is None else 1 / (1 + expression / _SOFTENING)
         penalty = torch.nn.functional.pad(_PENALTY * falls * torch.ones_like(mean.weights), (0, len(precision)))
@@ -144,10 +144,10 @@ def _split(
             beside = (0, len(precision))
             likely = H + _PRIOR / prior.strength * torch.nn.functional.pad(learned.H[0], 2 * beside)
             penalty = penalty + _PRIOR / prior.strength * torch.nn.functional.pad(learned.f[0], beside)
-        found = box_qp(likely, (f + penalty)[None], lower, upper)[0]
-        expression = found[:count]
+        solution = box_qp(likely, (f + penalty)[None], lower, upper)[0]
+        expression = solution[:count]
     noise = min(mean.noise, before.noise)
-    return replace(before, millimetres=found[count:].view(-1, 3), noise=noise), found[:count]
+    return replace(before, millimetres=solution[count:].view(-1, 3), noise=noise), solution[:count]
 
 
 def _mean_problem(
@@ -158,12 +158,12 @@ def _mean_problem(
     noise = solver.noise(start.rotation, start.translation)
     weight = solver.landmark_weights.double() * trust
     precision = weight.sqrt() / noise[:, None]
-    found = landmarks.nan_to_num(0.0)
-    information = solver.initial_information.double().diag().expand(len(found), -1, -1)
-    terms = FrameTerms(found, precision, start.rotation, start.translation, Expectation(start, information))
+    known_landmarks = landmarks.nan_to_num(0.0)
+    information = solver.initial_information.double().diag().expand(len(known_landmarks), -1, -1)
+    terms = FrameTerms(known_landmarks, precision, start.rotation, start.translation, Expectation(start, information))
     head, rows = solver.solve(terms, start)
     K = solver.intrinsics.double()
-    at = linearise(solver.points, head, rows, K, found, precision, solver.settings.contour_slide)
+    at = linearise(solver.points, head, rows, K, known_landmarks, precision, solver.settings.contour_slide)
     residual, jacobian = at.residual.flatten(1), at.jacobian.flatten(1, 2)
     by_place = at.jacobian[..., -3:] @ head.rotation[:, None]  # in the rig's own axes
     shares = offset_shares(solver.names, head.weights)

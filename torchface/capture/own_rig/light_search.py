@@ -79,8 +79,8 @@ class SourceFit:
 def find_source(seen: SeenSkin) -> SourceFit:
     """The source that explains best what was seen; see ``estimate_light``."""
     starts, width = _starts(seen.thinned(_FEW))
-    found = [_settled(seen, start, width) for start in starts]  # a few; each casts its own shadows
-    return min(found, key=lambda one: (_width(one.residuals, seen), one.cost))
+    fits = [_settled(seen, start, width) for start in starts]  # a few; each casts its own shadows
+    return min(fits, key=lambda one: (_width(one.residuals, seen), one.cost))
 
 
 def information(seen: SeenSkin, fit: SourceFit) -> Tensor:
@@ -234,9 +234,9 @@ def _factors(columns: Tensor, wanted: Tensor, weight: Tensor) -> Tensor:
     free = torch.cartesian_prod(*[torch.tensor([0.0, 1.0], dtype=H.dtype)] * len(columns))
     eye = torch.eye(len(columns), dtype=H.dtype)
     inside = free[:, :, None] * free[:, None]
-    found = torch.linalg.solve(inside * (H[:, None] + 1e-9 * eye) + (1 - free)[:, None] * eye, free * f[:, None])
-    gain = (found * f[:, None]).sum(-1).masked_fill((found < 0).any(-1), -1.0)  # (C,2^K)
-    best = found[torch.arange(len(found)), gain.argmax(1)]
+    solutions = torch.linalg.solve(inside * (H[:, None] + 1e-9 * eye) + (1 - free)[:, None] * eye, free * f[:, None])
+    gain = (solutions * f[:, None]).sum(-1).masked_fill((solutions < 0).any(-1), -1.0)  # (C,2^K)
+    best = solutions[torch.arange(len(solutions)), gain.argmax(1)]
     return (best * scale).T
 
 

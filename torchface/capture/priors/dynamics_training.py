@@ -78,9 +78,9 @@ def fit_dynamics_prior(
     _check(takes, names, window, fps, input_noise)
     everything = TakeWindows(takes, window, input_noise, settings.seed)
     generator = torch.Generator().manual_seed(settings.seed)
-    found = _steps(everything, len(names), generator)
-    drawn = drawn_rows(found.count, max(settings.subset, settings.inducing), generator)
-    scales = _scales(everything, found, drawn)
+    steps = _steps(everything, len(names), generator)
+    drawn = drawn_rows(steps.count, max(settings.subset, settings.inducing), generator)
+    scales = _scales(everything, steps, drawn)
     inducing = scales.inputs[: settings.inducing]
     processes: list[LeftOutProcess] = []
     for number, group in enumerate(regions):
@@ -91,13 +91,13 @@ def fit_dynamics_prior(
         kernel = fitted_kernel(some, targets, inducing, active, settings.iterations)
         processes.append(LeftOutProcess(kernel, inducing, len(group), everything.folds))
     for part in everything.parts():
-        inputs, targets = _examples(part, found, scales)[1:]
+        inputs, targets = _examples(part, steps, scales)[1:]
         for group, process in zip(regions, processes, strict=True):
             process.learn(part.fold, inputs, targets[:, list(group)])
     for process in processes:
         process.settle(max(settings.correlation_time * fps, 1.0))
     progress("fitting the noise")
-    noise = _noise(everything, found, scales, processes, regions, settings)
+    noise = _noise(everything, steps, scales, processes, regions, settings)
     weights = [torch.zeros(len(inducing), len(names), dtype=torch.float64) for _ in regions]
     for group, process, row in zip(regions, processes, weights, strict=True):
         row[:, list(group)] = process.posterior.weights
@@ -112,12 +112,12 @@ def fit_dynamics_prior(
             ),
             noise,
             UsualMotion(
-                center=found.center,
-                coefficients=found.coefficients,
+                center=steps.center,
+                coefficients=steps.coefficients,
                 feature_scale=scales.feature,
                 target_scale=scales.target,
                 gain=torch.tensor([process.gain for process in processes], dtype=torch.float64),
-                limits=found.limits,
+                limits=steps.limits,
             ),
             fps=fps,
             input_noise=input_noise,

@@ -49,10 +49,10 @@ class TakeFrames:
         Raises:
             ValueRangeError: none.
         """
-        found = sum(map(len, self))
-        if not found:
+        total = sum(map(len, self))
+        if not total:
             raise ValueRangeError("prior: found no two frames with all weights, expected takes to learn from")
-        return found
+        return total
 
     def some(self, most: int = MOST_FRAMES, seed: int = 0) -> Tensor:
         """All frames, (F,D), or ``most`` of them, drawn, in order."""

@@ -44,10 +44,10 @@ def named_regions(
     for place, sides in (_PLACES | _BETWEEN).items():
         held = [_holder(at_vertex, neutral, landmarks, ids, place in _BETWEEN, free) for ids in sides]
         if held[0] is not None and held[0] == held[1]:
-            found = {place: held[0]}
+            named = {place: held[0]}
         else:
-            found = {f"{place}_{side}": r for side, r in zip(("right", "left"), held, strict=True) if r is not None}
-        for name, region in found.items():
+            named = {f"{place}_{side}": r for side, r in zip(("right", "left"), held, strict=True) if r is not None}
+        for name, region in named.items():
             names[region] = name
             voluntary[region] = place in _VOLUNTARY
             free.discard(region)

@@ -171,11 +171,11 @@ class RegionProjection:
     def _damped(self, solve: SimplexQP, linear: Tensor, previous: Tensor | None) -> Tensor:
         """Weights (R,T,K), each frame from where the one before ends."""
         before = None if previous is None else previous.double()
-        found = []
+        blocks = []
         for f in linear.unbind(1):
             before = self._alone(f) if before is None else solve(f - self._pull.to(f) * before, start=before)
-            found.append(before)
-        return torch.stack(found, dim=1) if found else linear.new_zeros(linear.shape)
+            blocks.append(before)
+        return torch.stack(blocks, dim=1) if blocks else linear.new_zeros(linear.shape)
 
 
 def _space(features: Tensor, weights: Tensor) -> _Space:

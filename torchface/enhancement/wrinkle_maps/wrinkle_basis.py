@@ -108,7 +108,7 @@ def learn_wrinkle_basis(
 
 def _extremes(components: Tensor, known: Tensor, shares: Tensor, areas: Tensor, count: int) -> Tensor:
     """First weights (K,R,M): of the frames of each region that differ most from combinations of the others chosen."""
-    found = []
+    extremes = []
     for share in shares:
         gram = known.double() @ _gram(components, share * areas) @ known.double().T
         left, chosen = gram.clone(), []
@@ -117,8 +117,8 @@ def _extremes(components: Tensor, known: Tensor, shares: Tensor, areas: Tensor, 
             chosen.append(pick)
             column = left[:, pick].clone()
             left -= column[:, None] * column / column[pick].clamp(min=1e-30)
-        found.append(_solved(gram[chosen][:, chosen], gram[chosen], torch.eye(len(known))))
-    return torch.stack(found, dim=1)
+        extremes.append(_solved(gram[chosen][:, chosen], gram[chosen], torch.eye(len(known))))
+    return torch.stack(extremes, dim=1)
 
 
 def _full_range(weights: Tensor) -> Tensor:
@@ -134,15 +134,15 @@ def _maps(weights: Tensor, components: Tensor, known: Tensor, shares: Tensor) ->
     against = (rows.T @ known.double()).float().view(regions, -1)
     ridge = _RIDGE * float(pairs.view(regions * count, -1).diagonal().mean()) * torch.eye(count)
     fields = components.unflatten(1, (3, -1))
-    found = torch.empty(count, 3, shares.shape[1])
+    maps = torch.empty(count, 3, shares.shape[1])
     for begin in range(0, shares.shape[1], _CHUNK):
         piece = slice(begin, begin + _CHUNK)
         share = shares[:, piece].T
         half = (share @ pairs.float()).view(-1, count, regions, count)
         system = torch.einsum("vmrn,vr->vmn", half, share) + ridge
         wanted = (share @ against).view(len(share), count, -1) @ fields[:, :, piece].float().permute(2, 0, 1)
-        found[:, :, piece] = torch.linalg.solve(system.double(), wanted.double()).float().permute(1, 2, 0)
-    return found
+        maps[:, :, piece] = torch.linalg.solve(system.double(), wanted.double()).float().permute(1, 2, 0)
+    return maps
 
 
 def _system(maps: Tensor, shares: Tensor, areas: Tensor, components: Tensor) -> tuple[Tensor, Tensor]:

@@ -85,10 +85,10 @@ def taught_details(
     """
     progress = silent if progress is None else progress
     detail = DisplacementDetail(model.neutral, model.faces)
-    found = StreamingBasis(3 * len(model.neutral), min(_RANK, count))
+    basis = StreamingBasis(3 * len(model.neutral), min(_RANK, count))
     for begin in range(0, count, _BATCH):  # batches bound the memory
         coarse = read(begin, min(begin + _BATCH, count))
         with torch.no_grad():
-            found.add(detail.encode(coarse, model.enhance(coarse).vertices))
+            basis.add(detail.encode(coarse, model.enhance(coarse).vertices))
         progress("asking the model for wrinkles", min(begin + _BATCH, count), count)
-    return found.finished()
+    return basis.finished()

@@ -233,12 +233,15 @@ class WrinkleWeights(nn.Module):
             turned = vectors.T @ (weights - mean)
             for ridge in _RIDGES:
                 inverse = 1 / (values.clamp(min=0) + ridge)
-                found = vectors @ (inverse[:, None] * turned)
-                left_out = found / (vectors.square() @ inverse)[:, None]
+                coefficients = vectors @ (inverse[:, None] * turned)
+                left_out = coefficients / (vectors.square() @ inverse)[:, None]
                 error = float(left_out.square().sum())
                 if error < best:
                     best = error
-                    self.coefficients[region], self.linear[region] = found.float(), (scores.T @ found).float()
+                    self.coefficients[region], self.linear[region] = (
+                        coefficients.float(),
+                        (scores.T @ coefficients).float(),
+                    )
                     self.sharpness[region] = 0.5 / reach**2
         self.centers[region], self.bias[region] = scores.float(), mean.float()
 

@@ -188,7 +188,7 @@ def refined_poses(x: Tensor, q: Tensor, K: Tensor, w: Tensor, rotation: Tensor, 
     damping = torch.full_like(translation[:, 0], 1e-4)
     error = _error(x, q, K, w, rotation, translation, min_depth)
     total, going = w.sum(1), torch.arange(len(x), device=x.device)
-    found = Pose(rotation.clone(), translation.clone(), error.clone())
+    settled_poses = Pose(rotation.clone(), translation.clone(), error.clone())
     for _ in range(_MAX_ITERATIONS):
         pixels, jacobian = _jacobian(x @ rotation.transpose(-1, -2), translation, K)
         weighted = (jacobian * w.repeat_interleave(2, dim=1)[..., None]).transpose(-1, -2)
@@ -205,15 +205,23 @@ def refined_poses(x: Tensor, q: Tensor, K: Tensor, w: Tensor, rotation: Tensor, 
         error = torch.where(better, reached, error)
         damping = torch.where(better, damping * 0.1, damping * 10).clamp(min=1e-12)
         if bool(settled.any()):  # views that are done wait for no other
-            found.rotation[going], found.translation[going], found.errors[going] = rotation, translation, error
+            settled_poses.rotation[going], settled_poses.translation[going], settled_poses.errors[going] = (
+                rotation,
+                translation,
+                error,
+            )
             left = (~settled).nonzero()[:, 0]
             going, x, q, K, w = going[left], x[left], q[left], K[left], w[left]
             rotation, translation, error, damping = rotation[left], translation[left], error[left], damping[left]
             min_depth = min_depth[left]
             if not len(left):
                 break
-    found.rotation[going], found.translation[going], found.errors[going] = rotation, translation, error
-    return Pose(found.rotation, found.translation, (found.errors / total).sqrt())
+    settled_poses.rotation[going], settled_poses.translation[going], settled_poses.errors[going] = (
+        rotation,
+        translation,
+        error,
+    )
+    return Pose(settled_poses.rotation, settled_poses.translation, (settled_poses.errors / total).sqrt())
 
 
 def _jacobian(rotated: Tensor, translation: Tensor, K: Tensor) -> tuple[Tensor, Tensor]:

@@ -82,11 +82,11 @@ def bending_energy(vertices: Tensor, faces: Tensor) -> sparse.csr_array:
 
 def _cotangents(points: Tensor, faces: Tensor) -> Tensor:
     """Of the angle at each corner, (F,3)."""
-    found = []
+    cotangents = []
     places = corners(points, faces)
     for k in range(3):
         one, other = places[(k + 1) % 3] - places[k], places[(k + 2) % 3] - places[k]
         sine = torch.linalg.cross(one, other).norm(dim=-1)
         longest = (one.norm(dim=-1) * other.norm(dim=-1)).clamp(min=torch.finfo(points.dtype).tiny)
-        found.append((one * other).sum(-1) / torch.maximum(sine, _LEAST_SINE * longest))
-    return torch.stack(found, dim=1)
+        cotangents.append((one * other).sum(-1) / torch.maximum(sine, _LEAST_SINE * longest))
+    return torch.stack(cotangents, dim=1)

@@ -93,9 +93,9 @@ class SurfaceIndex:
 
     def _surface_points(self, queries: Tensor, triangle: Tensor, second: Tensor, third: Tensor) -> SurfacePoints:
         a, ab, ac = self._triangles[triangle].split(3, dim=1)
-        found = a + second[:, None] * ab + third[:, None] * ac
+        points_on_triangles = a + second[:, None] * ab + third[:, None] * ac
         barycentric = torch.stack([1 - second - third, second, third], dim=-1)
-        return SurfacePoints(found, triangle, barycentric, (queries - found).norm(dim=-1))
+        return SurfacePoints(points_on_triangles, triangle, barycentric, (queries - points_on_triangles).norm(dim=-1))
 
     def _among_samples(self, queries: Tensor, count: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """The best of the triangles of each query's ``count`` nearest samples, and whether no other can be nearer."""

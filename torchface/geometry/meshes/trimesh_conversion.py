@@ -78,24 +78,24 @@ def from_trimesh(mesh: trimesh.Trimesh) -> dict[str, Any]:
     ids, row_of = _joined(mesh)
     rows = np.array(mesh.faces, np.int64)
     visual: Any = mesh.visual
-    found = {
+    parts = {
         "vertices": torch.tensor(np.asarray(mesh.vertices)[row_of], dtype=torch.float32),
         "faces": torch.from_numpy(ids[rows]),
     }
     colors = mesh.vertex_attributes.get("color")
     if isinstance(visual, trimesh.visual.TextureVisuals):
         if visual.uv is not None and len(visual.uv) == len(mesh.vertices):
-            found["uvs"] = torch.tensor(np.asarray(visual.uv)[:, :2], dtype=torch.float32)
-            found["uv_faces"] = torch.from_numpy(rows)
+            parts["uvs"] = torch.tensor(np.asarray(visual.uv)[:, :2], dtype=torch.float32)
+            parts["uv_faces"] = torch.from_numpy(rows)
             material = visual.material
             image = getattr(material, "baseColorTexture", None) or getattr(material, "image", None)
             if image is not None:
-                found["texture"] = torch.tensor(np.asarray(image.convert("RGB"))).permute(2, 0, 1) / 255
+                parts["texture"] = torch.tensor(np.asarray(image.convert("RGB"))).permute(2, 0, 1) / 255
     elif visual.kind is not None:
         colors = visual.vertex_colors
     if colors is not None:
-        found["colors"] = torch.tensor(np.asarray(colors)[row_of, :3]) / 255
-    return found
+        parts["colors"] = torch.tensor(np.asarray(colors)[row_of, :3]) / 255
+    return parts
 
 
 def _joined(mesh: trimesh.Trimesh) -> tuple[NDArray[np.int64], NDArray[np.int64]]:

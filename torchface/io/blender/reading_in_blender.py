@@ -78,17 +78,17 @@ def _shown_meshes() -> list[tuple[Any, Any]]:
     """The mesh objects that the scene shows, instances of collections among them, and where each stands, (4,4)."""
     import bpy
 
-    found: list[tuple[Any, Any]] = []
+    meshes: list[tuple[Any, Any]] = []
     for instance in bpy.context.evaluated_depsgraph_get().object_instances:
         one = instance.object.original
         if one.type != "MESH" or not len(one.data.polygons):
             continue
-        if len(found) == _MOST_MESHES:
+        if len(meshes) == _MOST_MESHES:
             raise Refused(f"more than {_MOST_MESHES} meshes in its scene", "a rig")
-        found.append((one, np.array(instance.matrix_world, np.float64)))
-    if not found:
+        meshes.append((one, np.array(instance.matrix_world, np.float64)))
+    if not meshes:
         raise Refused("no mesh that its scene shows", "at least one with faces")
-    return found
+    return meshes
 
 
 class _MeshReader:
@@ -296,8 +296,8 @@ def _path(name: str) -> str:
 
 def _spans(animated: Any) -> list[tuple[float, float]]:
     """First and last frames of an action or of strips."""
-    found = [tuple(animated.action.frame_range)] if animated.action is not None else []
-    return found + [
+    spans = [tuple(animated.action.frame_range)] if animated.action is not None else []
+    return spans + [
         (strip.frame_start, strip.frame_end)
         for track in animated.nla_tracks
         if not track.mute

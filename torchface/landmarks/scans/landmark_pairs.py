@@ -82,13 +82,13 @@ def template_features(template: Mesh, detector: UVLandmarkDetector | None = None
             "template: found no 68 landmarks or no contact pairs among its annotations, expected both or a detector "
             "that sees the template"
         )
-    found = None
+    detected = None
     if detector is not None and sees and (ibug is None or pairs is None):
-        found = scan_landmarks(detector, template)
-    landmarks = _annotated_landmarks(template, ibug) if ibug is not None else _nearest(template, found)
+        detected = scan_landmarks(detector, template)
+    landmarks = _annotated_landmarks(template, ibug) if ibug is not None else _nearest(template, detected)
     lines = _lines_of_contacts(template, pairs, landmarks) if pairs is not None else {}
-    if found is not None:
-        lines = {**_lines_of_traces(template, found, _LINE_POINTS), **lines}
+    if detected is not None:
+        lines = {**_lines_of_traces(template, detected, _LINE_POINTS), **lines}
     return TemplateFeatures(landmarks, lines)
 
 
@@ -228,8 +228,8 @@ class AutomaticLandmarks:
             raise TopologyError(f"template: found {len(laid.vertices)} vertices, expected {self._count}")
         for detector, own in zip(self.detectors, self._poses, strict=True):
             if detector.sees(scan):
-                found = scan_landmarks(detector, scan, _after(own, pose.inverse()))
-                pairs = scan_pairs(self.features, found, scan).above(self.confidence)
+                detected = scan_landmarks(detector, scan, _after(own, pose.inverse()))
+                pairs = scan_pairs(self.features, detected, scan).above(self.confidence)
                 return None if len(pairs.vertices) < 3 else (pairs.vertices, pairs.points)
         return None
 

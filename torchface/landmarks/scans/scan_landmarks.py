@@ -164,23 +164,23 @@ def scan_landmarks(
     head = unwrap(scan, pose, CylinderLayout().resized(detector.size))
     image = appearance_image(head, detector.appearance)
     with torch.no_grad():
-        found = detector(image[None])
-    pixels = found.pixels[0]
+        detected = detector(image[None])
+    pixels = detected.pixels[0]
     points, _ = head.surface_points(scan, pixels)
     contours = trace_lines(
         line_image(head, detector.appearance),
         dict(zip(detector.names, pixels, strict=True)),
         detector.line_shapes(),
     )
-    return ScanLandmarks(detector.names, points, found.confidence[0], pixels, contours, head, image)
+    return ScanLandmarks(detector.names, points, detected.confidence[0], pixels, contours, head, image)
 
 
 def trace_lines(
     image: Tensor, corners: dict[str, Tensor], shapes: dict[str, LineShape] | None = None
 ) -> dict[str, Contour]:
     """Every line of ``LINES`` whose two corners (2,) are there, the one on the left further left."""
-    found, usual = {}, shapes or {}
+    traced, usual = {}, shapes or {}
     for name, (left, right) in LINES.items():
         if left in corners and right in corners and float(corners[right][0] - corners[left][0]) >= 3:
-            found[name] = trace_contour(image, corners[left], corners[right], shape=usual.get(name))
-    return found
+            traced[name] = trace_contour(image, corners[left], corners[right], shape=usual.get(name))
+    return traced

@@ -234,8 +234,8 @@ class UVLandmarkDetector(nn.Module):
         good = (best >= self.settings.similarity_threshold) & self._more_likely_good(landmark, best)
         if without is not None:
             good[without] = False
-        found, votes = place[good].unique(return_counts=True)
-        columns, rows = found % width, torch.div(found, width, rounding_mode="floor")
+        places, votes = place[good].unique(return_counts=True)
+        columns, rows = places % width, torch.div(places, width, rounding_mode="floor")
         return self.settings.hog.positions(torch.stack([columns, rows], dim=-1)), votes
 
     def _locate(self, landmark: int, columns: Tensor, width: int) -> tuple[Tensor, Tensor]:

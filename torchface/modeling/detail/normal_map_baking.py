@@ -254,10 +254,10 @@ class _Surface:
 
     def hits(self, origins: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
         """Distance (R,) and smooth unit normal (R,3), zero for a miss."""
-        found = self.caster.cast(origins, directions)
-        corners = self.faces[found.triangle.clamp(min=0)]
-        normals = interpolate(self.normals, corners, found.barycentric.float())
-        return found.distance, torch.nn.functional.normalize(normals, dim=-1)
+        cast = self.caster.cast(origins, directions)
+        corners = self.faces[cast.triangle.clamp(min=0)]
+        normals = interpolate(self.normals, corners, cast.barycentric.float())
+        return cast.distance, torch.nn.functional.normalize(normals, dim=-1)
 
 
 def _cast_all(

@@ -238,8 +238,8 @@ class _Pairs:
 
 def _pairs(points: Tensor, normals: Tensor, target: _Target, reach: float) -> _Pairs:
     workers = 1 if len(points) <= _COARSE_SAMPLES else -1
-    found = target.tree.query(points.numpy(), distance_upper_bound=reach, workers=workers)
-    distance, nearest = torch.from_numpy(found[0]), torch.from_numpy(found[1])
+    neighbours = target.tree.query(points.numpy(), distance_upper_bound=reach, workers=workers)
+    distance, nearest = torch.from_numpy(neighbours[0]), torch.from_numpy(neighbours[1])
     rows = torch.isfinite(distance).nonzero()[:, 0]
     # A sample whose nearest point is on the scan's border lies beyond it.
     rows = rows[~target.border[nearest[rows]]]

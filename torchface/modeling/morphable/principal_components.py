@@ -207,8 +207,8 @@ class _Rows:
 
     def read(self, number: int, rows: int, columns: int) -> Tensor | None:
         """The rows if they are there and whole."""
-        found = None if self._folder is None else read_checkpoint(self._path(number), self._key)
-        gram = None if found is None else found.get("rows")
+        checkpoint = None if self._folder is None else read_checkpoint(self._path(number), self._key)
+        gram = None if checkpoint is None else checkpoint.get("rows")
         if gram is None or gram.shape != (rows, columns) or gram.dtype != torch.float64:
             return None
         return gram if bool(torch.isfinite(gram).all()) else None

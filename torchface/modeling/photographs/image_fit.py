@@ -124,19 +124,19 @@ def fit_images(
     if images is not None:
         check_images(images, sizes)
     intrinsics, settings = lens(camera, sizes, settings or FitSettings())
-    found = landmarks.detach().cpu().double()
+    pixels = landmarks.detach().cpu().double()
     mean, modes = model.shape.mean.cpu(), model.shape.modes.cpu()
     deltas = _in_place(rig, mean)
     curves = contour_curves(mean, model.faces.cpu(), vertices)
     points = LinearPoints.of(mean, torch.cat([modes, deltas]), vertices, curves)
     progress("placing the cameras")
-    pose = _checked_pose(points.mean[:LANDMARKS], found, intrinsics)
+    pose = _checked_pose(points.mean[:LANDMARKS], pixels, intrinsics)
     twins = len(modes) + _twins(rig.names)
-    problem = Problem(points, len(modes), found, intrinsics[:, 0, 0], settings, twins)
+    problem = Problem(points, len(modes), pixels, intrinsics[:, 0, 0], settings, twins)
     initial = State(
         torch.zeros(len(points.basis), dtype=torch.float64),
         Views(intrinsics, pose.rotation, pose.translation),
-        torch.arange(LANDMARKS).expand(len(found), -1),
+        torch.arange(LANDMARKS).expand(len(pixels), -1),
         float(pose.errors.mean()) if settings.noise is None else settings.noise,
     )
     progress("fitting identity and expression")

@@ -29,18 +29,18 @@ def checked_landmark_vertices(model: HeadModel, rig: BlendshapeRig) -> Tensor:
             f"of {len(rig.vertices)} and {len(faces)}, expected the same triangles"
         )
     annotated = rig.neutral.annotations.landmarks if rig.neutral.annotations is not None else None
-    found = model.landmarks if annotated is None else annotated
-    if found is None:
+    vertices = model.landmarks if annotated is None else annotated
+    if vertices is None:
         raise ValueRangeError("landmarks: found none annotated on rig or model; expected (68,) vertex ids")
-    if found.shape != (LANDMARKS,) or found.dtype != torch.int64:
+    if vertices.shape != (LANDMARKS,) or vertices.dtype != torch.int64:
         raise ShapeError(
-            f"landmarks: found {tuple(found.shape)} of {found.dtype}, expected ({LANDMARKS},) of torch.int64"
+            f"landmarks: found {tuple(vertices.shape)} of {vertices.dtype}, expected ({LANDMARKS},) of torch.int64"
         )
-    if not 0 <= int(found.min()) <= int(found.max()) < len(rig.vertices):
+    if not 0 <= int(vertices.min()) <= int(vertices.max()) < len(rig.vertices):
         raise TopologyError(
-            f"landmarks: found {int(found.min())} to {int(found.max())}, expected 0 to {len(rig.vertices) - 1}"
+            f"landmarks: found {int(vertices.min())} to {int(vertices.max())}, expected 0 to {len(rig.vertices) - 1}"
         )
-    return found.cpu()
+    return vertices.cpu()
 
 
 def checked_sizes(landmarks: Tensor, image_size: tuple[int, int] | Sequence[tuple[int, int]]) -> Tensor:

@@ -324,8 +324,8 @@ def _noise(problem: Problem, state: State, picked: PickedPoints, factors: Tensor
     # A contour landmark that slides constrains hardly more than one number.
     measured = 2 * float(problem.seen.sum()) - (1 - problem.settings.contour_slide) * float(problem.seen[:, :JAW].sum())
     left = max(measured - used, 0.2 * measured)
-    found = state.noise * (float(r.square().sum()) / left) ** 0.5
-    return max(found, _MIN_NOISE * float(problem.focal.mean()))
+    deviation = state.noise * (float(r.square().sum()) / left) ** 0.5
+    return max(deviation, _MIN_NOISE * float(problem.focal.mean()))
 
 
 def covariance(problem: Problem, state: State) -> Tensor:

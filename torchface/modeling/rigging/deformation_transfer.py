@@ -52,13 +52,13 @@ class TransferReport:
 
     def summary(self) -> str:
         """One line on triangles without area; empty where there are none."""
-        found = [
+        lines = [
             f"{len(ids)} in the {what}"
             for what, ids in (("source's neutral", self.flat_source), ("target", self.flat_target))
             if len(ids)
         ]
-        found += [f"{len(ids)} in {name}" for name, ids in self.flat_shapes.items()]
-        return f"triangles without area: {', '.join(found)}" if found else ""
+        lines += [f"{len(ids)} in {name}" for name, ids in self.flat_shapes.items()]
+        return f"triangles without area: {', '.join(lines)}" if lines else ""
 
 
 @dataclass(frozen=True, eq=False)

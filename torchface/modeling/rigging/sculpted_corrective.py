@@ -50,12 +50,12 @@ class SculptedCorrective:
         moved = far > _CHANGED
         when = " x ".join(self.definition.drivers)
         when += "" if self.definition.peak is None else f" at {self.definition.peak:g}"
-        found = [
+        lines = [
             f"{self.definition.name} ({when}): the sculpt changes {int(moved.sum()):,} of {len(far):,} vertices, by up "
             f"to {float(far.max()):.3g} mm, {float(far[moved].mean()):.3g} in the mean{self._where(far)}"
         ]
         if self.activation < 0.999:
-            found.append(
+            lines.append(
                 f"the corrective is {self.activation:.3g} on at this pose; where it is fully on it moves vertices by "
                 f"up to {float(far.max()) / self.activation:.3g} mm"
             )
@@ -65,10 +65,10 @@ class SculptedCorrective:
             other = " ".join(
                 f"{name}{step:+.2f}" for name, step in zip(self.definition.drivers, steps.tolist(), strict=True)
             )
-            found.append(f"warning: {other} is most of the change; was the mesh sculpted at another pose?")
+            lines.append(f"warning: {other} is most of the change; was the mesh sculpted at another pose?")
         if self.within:
-            found.append(f"warning: it acts at the poses of {', '.join(self.within)} too, whose faces it changes")
-        return found
+            lines.append(f"warning: it acts at the poses of {', '.join(self.within)} too, whose faces it changes")
+        return lines
 
     def _where(self, far: Tensor) -> str:
         notes = self.rig.neutral.annotations
@@ -186,12 +186,12 @@ def sculpt_misalignment(shown: Tensor, sculpt: Tensor) -> Similarity | None:
     before = (x - y).norm(dim=-1)
     if float(before.median()) < _SHIFTED:
         return None
-    weights, found = torch.ones_like(before), similarity_transform(y, x)
+    weights, similarity = torch.ones_like(before), similarity_transform(y, x)
     for _ in range(_ITERATIONS):  # each needs the distances of the one before
-        weights = 1 / (found.apply(y) - x).norm(dim=-1).clamp(min=_CHANGED)
-        found = similarity_transform(y, x, weights)
-    left = float((found.apply(y) - x).norm(dim=-1).median())
-    return found if left < _EXPLAINED * float(before.median()) else None
+        weights = 1 / (similarity.apply(y) - x).norm(dim=-1).clamp(min=_CHANGED)
+        similarity = similarity_transform(y, x, weights)
+    left = float((similarity.apply(y) - x).norm(dim=-1).median())
+    return similarity if left < _EXPLAINED * float(before.median()) else None
 
 
 def checked_sculpt(path: object, sculpt: Mesh, rig: BlendshapeRig, shown: Tensor, align: str | None) -> Tensor:

@@ -60,16 +60,16 @@ def correspondences(
 
     Source: Amberg, Romdhani, Vetter 2007, section 4; thesis 3.2.3, figure 15.
     """
-    found = scan.among_nearest_samples(current[vertices])
-    normals = scan.normals_at(found)
+    nearest = scan.among_nearest_samples(current[vertices])
+    normals = scan.normals_at(nearest)
     own = vertex_normals(current, faces)[vertices]
-    far = found.distance > reach
-    border = scan.on_border(found) & ~far
+    far = nearest.distance > reach
+    border = scan.on_border(nearest) & ~far
     turned = ((own * normals).sum(-1) < math.cos(math.radians(largest_angle))) & ~far & ~border
     scale = reach / 2
-    weights = (1 + (found.distance / scale).square()).pow(-2).masked_fill(far | border | turned, 0.0)
+    weights = (1 + (nearest.distance / scale).square()).pow(-2).masked_fill(far | border | turned, 0.0)
     dropped = {"distance": int(far.sum()), "border": int(border.sum()), "normal": int(turned.sum())}
-    return Correspondences(vertices, found.points, normals, weights, found.distance, dropped)
+    return Correspondences(vertices, nearest.points, normals, weights, nearest.distance, dropped)
 
 
 def exposed_vertices(vertices: Tensor, faces: Tensor, opening: float) -> Tensor:

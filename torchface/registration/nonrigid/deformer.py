@@ -124,26 +124,26 @@ class Deformer:
         )
         energies, moved, made = [], float("inf"), 0
         while made < stage.iterations and moved >= stage.tolerance:
-            found = self._correspondences(vertices, stage)
-            data = self._data(found, pull)
+            pairs = self._correspondences(vertices, stage)
+            data = self._data(pairs, pull)
             before, place = step.energy(self.maps, data), self.current
             self.maps = step.minimise(self.maps, data)
             energies.append((before, step.energy(self.maps, data)))
             moved = float((self.current - place).norm(dim=-1).mean())
             made += 1
-        used = (found.weights > 0) & ~(self._folded | self.hidden)[vertices]
+        used = (pairs.weights > 0) & ~(self._folded | self.hidden)[vertices]
         return StageRecord(
             f"{number} {stage.level.value}",
             stage.stiffness,
             made,
             moved,
-            float(found.distance[used].mean()),
+            float(pairs.distance[used].mean()),
             self._landmark_distance(),
             int(used.sum()),
             {
-                **found.dropped,
-                "fold": int((self._folded[vertices] & (found.weights > 0)).sum()),
-                "hidden": int(((self.hidden & ~self._folded)[vertices] & (found.weights > 0)).sum()),
+                **pairs.dropped,
+                "fold": int((self._folded[vertices] & (pairs.weights > 0)).sum()),
+                "hidden": int(((self.hidden & ~self._folded)[vertices] & (pairs.weights > 0)).sum()),
             },
             tuple(energies),
             0.0,
@@ -164,16 +164,16 @@ class Deformer:
         self.maps = maps
 
     def _correspondences(self, vertices: Tensor, stage: Stage) -> Correspondences:
-        found = correspondences(
+        pairs = correspondences(
             self.current, self.faces, vertices, self._scan, stage.reach, self._schedule.largest_angle
         )
-        if not (found.weights > 0).any():
-            reasons = ", ".join(f"{count} for {reason}" for reason, count in found.dropped.items())
+        if not (pairs.weights > 0).any():
+            reasons = ", ".join(f"{count} for {reason}" for reason, count in pairs.dropped.items())
             raise ValueRangeError(
                 f"register: none of {len(vertices)} correspondences stands the tests (dropped: {reasons}); "
                 "expected the scan to show the template's face where the landmarks or its shape lay it"
             )
-        return found
+        return pairs
 
     def _held_together(self, stage: Stage) -> Contacts | None:
         if stage.contact_weight == 0 or not len(self._contacts.pairs):

@@ -33,13 +33,13 @@ def linked_edges(vertices: Tensor, faces: Tensor) -> NDArray[np.int64]:
 def _bridges(points: NDArray[np.float64], label: NDArray[np.int32]) -> NDArray[np.int64]:
     """From each part but the largest, its vertices nearest to the rest, each with its nearest there."""
     sizes = np.bincount(label)
-    found = []
+    edges = []
     for part in np.flatnonzero(np.arange(len(sizes)) != sizes.argmax()):  # a part a turn: they are tens
         own, rest = np.flatnonzero(label == part), np.flatnonzero(label != part)
         distance, nearest = cKDTree(points[rest]).query(points[own])
         chosen = np.argsort(distance, kind="stable")[:_BRIDGES]
-        found.append(np.stack([own[chosen], rest[nearest[chosen]]], axis=1))
-    return np.concatenate(found)
+        edges.append(np.stack([own[chosen], rest[nearest[chosen]]], axis=1))
+    return np.concatenate(edges)
 
 
 def stiffness_rows(vertices: Tensor, faces: Tensor, gradient_length: float) -> sparse.csr_array:

@@ -213,14 +213,14 @@ def _centres(rig: BlendshapeRig) -> dict[str, Tensor]:
     """Where each of ARKit's shapes moves the rig: the mean place, weighted by the squared motion."""
     table = mapping(ARKIT, rig.names).T.double()
     vertices, deltas = rig.vertices.detach().cpu().double(), rig.deltas.detach().cpu()
-    found = {}
+    centres = {}
     for name, row in zip(ARKIT, table, strict=True):
         if name.startswith(_NOT_OF_THE_SKIN) or not bool(row.any()):
             continue
         motion = torch.einsum("n,nvc->vc", row.to(deltas), deltas).double().square().sum(-1)
         if float(motion.sum()) > 0:
-            found[name] = (motion[:, None] * vertices).sum(0) / motion.sum()
-    return found
+            centres[name] = (motion[:, None] * vertices).sum(0) / motion.sum()
+    return centres
 
 
 def _row(weights: _Site) -> Tensor:
@@ -235,8 +235,8 @@ def _on_skin(mesh: Mesh, points: Tensor, names: list[str]) -> Attachment:
     """The nearest points of the skin that some camera sees."""
     vertices, faces = mesh.vertices.detach().cpu().double(), mesh.faces.cpu()
     rows = _outer_skin(mesh)
-    found = SurfaceIndex(vertices, faces[rows]).nearest(points)
-    triangles, corner = rows[found.triangle], found.barycentric.float()
+    nearest = SurfaceIndex(vertices, faces[rows]).nearest(points)
+    triangles, corner = rows[nearest.triangle], nearest.barycentric.float()
     return Attachment(triangles, corner, tuple(names), fingerprint=mesh.fingerprint())
 
 

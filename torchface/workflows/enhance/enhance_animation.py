@@ -147,26 +147,26 @@ def _enhance(
     key = content_key(_METHOD, input=path, **named, given=given, model=model, retime=settings.retime)
     if settings.retime:
         animation = retimed_animation(animation, model, progress)
-    found = enhance_frames(animation, model, out, state, key, progress)
+    frames = enhance_frames(animation, model, out, state, key, progress)
     mesh = framed_model(model)
     products, notes = {"meshes, every frame": out / SEQUENCE}, list(animation.notes)
-    if found.colors is not None:
-        products["vertex colours, every frame"] = found.colors.path
-    share = float(found.outside.any(1).float().mean())
+    if frames.colors is not None:
+        products["vertex colours, every frame"] = frames.colors.path
+    share = float(frames.outside.any(1).float().mean())
     if share > _MANY_OUTSIDE:
         notes.append(
             f"warning: {share:.0%} of the frames are unlike any the model has seen, so their detail is the nearest it "
             "has; a take of more expressions, or another actor's model, would do better"
         )
     if settings.meshes != "none":
-        products["meshes, a file a frame"] = _write_meshes(found, mesh, out / MESHES, settings.meshes, progress)
+        products["meshes, a file a frame"] = _write_meshes(frames, mesh, out / MESHES, settings.meshes, progress)
     if settings.glb:
         products["animation"] = out / GLB
-        notes.append(_write_glb(found, mesh, animation.fps, out / GLB, settings.megabytes, progress))
+        notes.append(_write_glb(frames, mesh, animation.fps, out / GLB, settings.megabytes, progress))
     if settings.video:
         products["video"] = out / VIDEO
-        _write_video(animation, model, found, mesh, out / VIDEO, progress)
-    done = Enhanced(animation, model, model_name, found, mesh, products, tuple(notes))
+        _write_video(animation, model, frames, mesh, out / VIDEO, progress)
+    done = Enhanced(animation, model, model_name, frames, mesh, products, tuple(notes))
     with all_or_none():
         _write_tables(done, out)
     return done

@@ -96,11 +96,11 @@ def enhance_frames(
             if kept is None or min(meshes.done, colors.done) < end:
                 started = time.perf_counter()
                 with torch.no_grad():
-                    found = model.enhance(animation.read(begin, end), previous)
-                    shades = model.colors(found.weights) if colored else None
-                kept = {"distances": found.distances, "outside": found.outside, "previous": found.weights[-1]}
+                    enhanced = model.enhance(animation.read(begin, end), previous)
+                    shades = model.colors(enhanced.weights) if colored else None
+                kept = {"distances": enhanced.distances, "outside": enhanced.outside, "previous": enhanced.weights[-1]}
                 write_checkpoint(_piece(state, begin), kept, key)
-                meshes.append(begin, found.vertices)
+                meshes.append(begin, enhanced.vertices)
                 if shades is not None:
                     colors.append(begin, shades)
                 seconds, fresh = seconds + time.perf_counter() - started, fresh + end - begin
@@ -152,8 +152,8 @@ def _is_finished(path: Path, count: int, key: str) -> bool:
     if not path.is_file():
         return False
     try:
-        found = MeshSequence(path)
-        return found.key == key and len(found) == count and found.is_whole()
+        sequence = MeshSequence(path)
+        return sequence.key == key and len(sequence) == count and sequence.is_whole()
     except FileFormatError:
         return False  # made anew
 

@@ -94,18 +94,18 @@ def _evaluate(
     result: Path, truth: Sequence[Path], out: Path, settings: EvaluationSettings, progress: Progress
 ) -> Evaluation:
     progress("reading result and truth")
-    found = load_animated(result, settings.rig, settings.part)
+    animated = load_animated(result, settings.rig, settings.part)
     scans: ScanTruth | None = None
     if settings.scans:
-        scans = scan_truth(found, truth, out / "registered", settings.landmarks, settings.unit, progress)
+        scans = scan_truth(animated, truth, out / "registered", settings.landmarks, settings.unit, progress)
         true = scans.animated
     else:
         if len(truth) != 1:
             raise ValueRangeError(f"truth: found {len(truth)} files, expected one, or a folder; or scans (--scans)")
         true = load_animated(truth[0], settings.truth_rig or settings.rig, settings.part)
-        true.require_topology_of(found, "; raw scans need --scans, other rigs --truth-rig")
+        true.require_topology_of(animated, "; raw scans need --scans, other rigs --truth-rig")
     progress("comparing")
-    evaluation = compare(found, true, settings, scans)
+    evaluation = compare(animated, true, settings, scans)
     progress("writing")
     with all_or_none():
         write_tables(evaluation, out)

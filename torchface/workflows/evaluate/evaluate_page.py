@@ -77,12 +77,12 @@ def _one_frame(evaluation: Evaluation, shown: Compared, height: int) -> Tensor:
     mean = float(shown.errors.nanmean())
     known = torch.isfinite(shown.true).all(1, keepdim=True) & torch.isfinite(shown.found).all(1, keepdim=True)
     # Where the truth has no vertex the result's stands in, so that the figure has a whole face; it is grey below.
-    found = torch.where(torch.isfinite(shown.found), shown.found, evaluation.mesh.vertices)
-    true = torch.where(known, shown.true, found)
+    vertices = torch.where(torch.isfinite(shown.found), shown.found, evaluation.mesh.vertices)
+    true = torch.where(known, shown.true, vertices)
     title = f"frame {shown.frame}: mean {mean:.2f} mm, total {float(shown.errors.nansum()):.4e} mm"
     own = evaluation.mesh
     return compared_views(
-        own.with_vertices(found), own.with_vertices(true), shown.errors, evaluation.maximum, title, height
+        own.with_vertices(vertices), own.with_vertices(true), shown.errors, evaluation.maximum, title, height
     )
 
 

@@ -89,10 +89,10 @@ class Evaluation:
         lines = [f"{len(self.frames)} frames compared, {how}"]
         for name in (ALL, "face"):
             if name in self.regions:
-                found = self.regions[name]
+                errors = self.regions[name]
                 lines.append(
-                    f"{name}: mean {found.mean:.3f} mm, median {found.median:.3f}, 95th percentile "
-                    f"{found.percentile_95:.3f}, largest {found.largest:.3f}; total {found.total:.4e} mm a frame"
+                    f"{name}: mean {errors.mean:.3f} mm, median {errors.median:.3f}, 95th percentile "
+                    f"{errors.percentile_95:.3f}, largest {errors.largest:.3f}; total {errors.total:.4e} mm a frame"
                 )
         if self.surface is not None:
             lines.append(f"to the scans' surface: mean {self.surface.mean:.3f} mm, median {self.surface.median:.3f}")

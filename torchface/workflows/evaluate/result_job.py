@@ -52,9 +52,9 @@ class ResultJob:
             TorchfaceError: they cannot be compared.
         """
         folder = out / item.name
-        found = evaluate(item.path, [self._truth(item)], folder, item.settings_of(self.settings))
-        page = write_evaluation_page(found, folder, self.height)
-        whole = found.regions[ALL]
+        evaluation = evaluate(item.path, [self._truth(item)], folder, item.settings_of(self.settings))
+        page = write_evaluation_page(evaluation, folder, self.height)
+        whole = evaluation.regions[ALL]
         return Made(
             (folder / "summary.json", page),
             {
@@ -62,10 +62,12 @@ class ResultJob:
                 "median_mm": whole.median,
                 "p95_mm": whole.percentile_95,
                 "largest_mm": whole.largest,
-                "frames": len(found.frames),
+                "frames": len(evaluation.frames),
             },
             f"{whole.mean:.3f} mm",
-            picture=face_picture(found.mesh, error_colors(found.vertex_mean, self.settings.maximum or _SHEET_MAXIMUM)),
+            picture=face_picture(
+                evaluation.mesh, error_colors(evaluation.vertex_mean, self.settings.maximum or _SHEET_MAXIMUM)
+            ),
         )
 
     def _truth(self, item: BatchItem) -> Path:

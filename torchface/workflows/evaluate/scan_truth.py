@@ -41,10 +41,10 @@ class ScanTruth:
     def surface_errors(self, begin: int, vertices: Tensor) -> Tensor:
         """Distances (t,V) from vertices (t,V,3) of the frames from ``begin`` on to the scans' surfaces; NaN where the
         scan does not show the vertex."""
-        found = torch.full(vertices.shape[:2], torch.nan)
+        distances = torch.full(vertices.shape[:2], torch.nan)
         for row, (usable, surface) in enumerate(self._surfaces(begin, vertices)):
-            found[row, usable] = surface.nearest(vertices[row, usable]).distance.to(found)
-        return found
+            distances[row, usable] = surface.nearest(vertices[row, usable]).distance.to(distances)
+        return distances
 
     def settled(self, begin: int, vertices: Tensor) -> Tensor:
         """Vertices (t,V,3) of the frames from ``begin`` on, moved rigidly to where they lie best on the scans'
@@ -123,12 +123,12 @@ def scan_truth(
         )
     frames, notes = [], []
     for outcome in report.outcomes:  # a surface of its own each
-        found = load_mesh(outcome.results[0]).vertices
+        vertices = load_mesh(outcome.results[0]).vertices
         scan = load_mesh(outcome.item.path, unit)
         index = SurfaceIndex(scan.vertices, scan.faces)
-        nearest = index.nearest(found)
+        nearest = index.nearest(vertices)
         shown = (nearest.distance <= NEAR) & ~index.on_border(nearest)
-        frames.append(torch.where(shown[:, None], found, torch.nan))
+        frames.append(torch.where(shown[:, None], vertices, torch.nan))
         known = "" if not outcome.reused else ", known from an earlier run"
         notes.append(
             f"{outcome.name}: registered by {outcome.figures['start']}, median {outcome.figures['median_mm']:.3f} mm "

@@ -84,7 +84,7 @@ def register_scans(
     """
     landmarks, detector, model = settings.landmarks, settings.detector, settings.model
     check_template(template)
-    found = find_items(scans, SCANS)
+    items = find_items(scans, SCANS)
     marks = None if landmarks is None else _folder("landmarks", landmarks)
     if marks == Path(out).resolve():
         raise ValueRangeError(f"out: found {out}, which holds landmarks; expected another folder")
@@ -97,7 +97,7 @@ def register_scans(
         None if detector is None else _folder("detector", zoo.find(detector)),
         None if model is None else LinearShape.of(shape_model(model, template)),
     )
-    return run_batch(job, SCANS, found, out, options, progress, finished)
+    return run_batch(job, SCANS, items, out, options, progress, finished)
 
 
 def load_shape_model(name_or_path: str | Path) -> MorphableModel | HeadModel:

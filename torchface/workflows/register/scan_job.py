@@ -80,27 +80,27 @@ class ScanJob:
         """
         points = None if self.landmarks is None else landmark_file(self.landmarks, item.path)
         registration, count = self._registered(item.path, points)
-        found, result = registration.record, out / f"{item.name}.glb"
+        record, result = registration.record, out / f"{item.name}.glb"
         save_mesh(registration.mesh, result)
-        stages = [asdict(stage) for stage in found.stages]
+        stages = [asdict(stage) for stage in record.stages]
         for stage in stages:
             del stage["energies"]
         return Made(
             (result,),
             {
-                "median_mm": found.median_distance,
-                "matched": found.matched,
-                "start": found.start,
-                "start_mm": found.start_distance,
+                "median_mm": record.median_distance,
+                "matched": record.matched,
+                "start": record.start,
+                "start_mm": record.start_distance,
                 "landmarks": count,
-                "p95_mm": found.far_distance,
-                "shown": found.shown,
-                "covered": found.covered,
-                "stretch": found.stretch,
-                "slid_mm": found.slid,
+                "p95_mm": record.far_distance,
+                "shown": record.shown,
+                "covered": record.covered,
+                "stretch": record.stretch,
+                "slid_mm": record.slid,
             },
-            f"{found.median_distance:.2f} mm on {found.shown:.0%}",
-            found.notes,
+            f"{record.median_distance:.2f} mm on {record.shown:.0%}",
+            record.notes,
             self._picture(registration),
             {"landmark_file": None if points is None else str(points), "stages": stages},
         )
@@ -167,13 +167,13 @@ class ScanJob:
 
 def _by_name(folder: Path) -> dict[str, list[Path]]:
     """The files of a folder by each part of their names that ends before a dot."""
-    found: dict[str, list[Path]] = {}
+    paths: dict[str, list[Path]] = {}
     if folder.is_dir():
         for path in sorted(folder.iterdir()):
             parts = path.name.split(".")
             for end in range(1, len(parts)):
-                found.setdefault(".".join(parts[:end]), []).append(path)
-    return found
+                paths.setdefault(".".join(parts[:end]), []).append(path)
+    return paths
 
 
 def _packed(mesh: Mesh) -> dict[str, Any]:

@@ -54,19 +54,19 @@ class ActorJob:
         """
         own, path = self._own(item), out / f"{item.name}.glb"
         done = rig_actor(item.path, own.template, path, own.landmarks, own.examples, own.detail, own.options)
-        found = done.neutral.record
+        record = done.neutral.record
         return Made(
             (path, done.figure),
             {
-                "median_mm": found.median_distance,
-                "p95_mm": found.far_distance,
-                "shown": found.shown,
+                "median_mm": record.median_distance,
+                "p95_mm": record.far_distance,
+                "shown": record.shown,
                 "vertices": len(done.rig.vertices),
                 "shapes": len(done.rig.names),
                 "examples": len(done.example_names),
             },
-            f"{found.median_distance:.2f} mm on {found.shown:.0%}",
-            (*found.notes, *(f"left out: {line}" for line in done.skipped)),
+            f"{record.median_distance:.2f} mm on {record.shown:.0%}",
+            (*record.notes, *(f"left out: {line}" for line in done.skipped)),
             _picture(done),
         )
 
@@ -79,8 +79,8 @@ class ActorJob:
 
 def _picture(done: ActorReport) -> Tensor:
     """The face, its distances to the scan (blue 0 to red 1 mm), and the shape that moves it furthest, (3,H,W)."""
-    neutral, found = done.rig.neutral, done.neutral
-    distances = found.distance.masked_fill(~found.matched, torch.nan).to(neutral.vertices)
+    neutral, registration = done.rig.neutral, done.neutral
+    distances = registration.distance.masked_fill(~registration.matched, torch.nan).to(neutral.vertices)
     furthest = done.rig.deltas[done.rig.deltas.norm(dim=-1).amax(1).argmax()]
     return sheet(
         [

@@ -267,15 +267,15 @@ class _Actor:
             guess = self.posed(actor, expression.weights)
             try:
                 marks = landmark_file(expression.path.parent, expression.path)
-                found = self.registered(guess, expression.path, marks, texture_size=0)
+                registered = self.registered(guess, expression.path, marks, texture_size=0)
                 moved = (guess.vertices - neutral.vertices).norm(dim=-1)
-                steady = found.matched / (1 + (moved / _FOLLOWS) ** 2)
-                aligned = in_place_of(found.mesh, guess, steady.double())
-                check_side(actor, expression.weights, aligned.vertices, found.matched & matched)
+                steady = registered.matched / (1 + (moved / _FOLLOWS) ** 2)
+                aligned = in_place_of(registered.mesh, guess, steady.double())
+                check_side(actor, expression.weights, aligned.vertices, registered.matched & matched)
             except TorchfaceError as error:
                 self.skipped.append(f"example {expression.path.name}: {error}")
                 continue
-            vertices.append(seen_example(aligned, guess.vertices, found.matched & matched))
+            vertices.append(seen_example(aligned, guess.vertices, registered.matched & matched))
             weights.append(expression.weights)
             used.append(expression.name)
         if not used:

@@ -84,11 +84,11 @@ def expressions_in(folder: Path, names: Sequence[str]) -> list[Expression]:
     if not folder.is_dir():
         raise FileFormatError(f"{folder}: found no such folder, expected one with scans: {LAYOUT}")
     table = folder / WEIGHTS
-    found = _by_table(table, names) if table.is_file() else _by_name(folder, names)
-    for expression in found:
+    expressions = _by_table(table, names) if table.is_file() else _by_name(folder, names)
+    for expression in expressions:
         if not expression.weights.any():
             raise ValueRangeError(f"{expression.path}: found no weight above 0 for it, expected an expression")
-    return found
+    return expressions
 
 
 def neutral_in(folder: Path) -> Path | None:
@@ -109,7 +109,7 @@ def _by_table(table: Path, names: Sequence[str]) -> list[Expression]:
     twice = sorted({file for file in files if files.count(file) > 1})
     if twice:
         raise FileFormatError(f"{table}: found more than one row for {', '.join(twice[:5])}, expected one a scan")
-    found = []
+    expressions = []
     for number, file in enumerate(files):
         path = table.parent / file
         if Path(file).name != file or not path.is_file():
@@ -117,12 +117,12 @@ def _by_table(table: Path, names: Sequence[str]) -> list[Expression]:
         values = torch.from_numpy(rows.numbers[number]).nan_to_num().tolist()
         given = {shape: value for shape, value in zip(shapes, values, strict=True) if value != 0}
         row = weights_row(given, names, f"{table}: {file}") if given else torch.zeros(len(names))
-        found.append(Expression(path, row))
-    return found
+        expressions.append(Expression(path, row))
+    return expressions
 
 
 def _by_name(folder: Path, names: Sequence[str]) -> list[Expression]:
-    found = []
+    expressions = []
     for path in _scans(folder):
         if path.stem.lower() == NEUTRAL:
             continue
@@ -136,10 +136,10 @@ def _by_name(folder: Path, names: Sequence[str]) -> list[Expression]:
             except ValueError:
                 raise ValueRangeError(f"{path}: found {word!r} in its name, expected SHAPE=WEIGHT; {LAYOUT}") from None
         try:
-            found.append(Expression(path, weights_row(given, names, str(path))))
+            expressions.append(Expression(path, weights_row(given, names, str(path))))
         except NameMismatchError as error:
             raise NameMismatchError(f"{error}; either {LAYOUT}") from None
-    return found
+    return expressions
 
 
 def check_side(actor: BlendshapeRig, weights: Tensor, found: Tensor, seen: Tensor) -> None:

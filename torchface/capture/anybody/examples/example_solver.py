@@ -188,10 +188,10 @@ class ExampleSolver(nn.Module):
         """
         self._check(landmarks, initial)
         equations = self.equations(landmarks)
-        found = self.method.solve(equations, self.regions, None if initial is None else initial.double())
-        placement = self.placement.placement(landmarks.double(), self.neutral.double(), found.free)
+        unknowns = self.method.solve(equations, self.regions, None if initial is None else initial.double())
+        placement = self.placement.placement(landmarks.double(), self.neutral.double(), unknowns.free)
         return ExampleFit(
-            found.weights.to(landmarks.dtype),
+            unknowns.weights.to(landmarks.dtype),
             Placement(placement.matrix.to(landmarks.dtype), placement.translation.to(landmarks.dtype)),
         )
 

@@ -121,15 +121,15 @@ class Distances:
     def minimise(self, equations: LandmarkEquations, initial: Tensor | None = None) -> Unknowns:
         """The minimum, differentiable in the equations; see :class:`SquaredDistances`."""
         with torch.no_grad():
-            found = self._iterate(equations, initial)
+            unknowns = self._iterate(equations, initial)
         if torch.is_grad_enabled() and any(
             part.requires_grad for part in (equations.basis, equations.offset, equations.scale, equations.free)
         ):
             # With the second derivative at the minimum the program has the same minimum, and its derivative.
-            at = torch.cat([found.weights, found.free], dim=1)
+            at = torch.cat([unknowns.weights, unknowns.free], dim=1)
             whole = self._step(equations, at, 1.0)
-            return Unknowns(*whole.tensor_split([found.weights.shape[1]], dim=1))
-        return found
+            return Unknowns(*whole.tensor_split([unknowns.weights.shape[1]], dim=1))
+        return unknowns
 
     def value(self, equations: LandmarkEquations, found: Unknowns) -> Tensor:
         """What is minimised, (B,)."""
@@ -144,10 +144,10 @@ class Distances:
             # The penalties are those of distances; of squares a ridge alone is needed, to start from somewhere.
             energy = squares.energy + ridge_term(equations.basis.shape[-1], 1e-6, equations.basis)
             initial = box_qp(energy.H, energy.f)
-        found = squares.unknowns(initial.clamp(0, 1))
-        shapes = found.weights.shape[1]
-        best = torch.cat([found.weights, found.free], dim=1)
-        least = self.value(equations, found)
+        initial_unknowns = squares.unknowns(initial.clamp(0, 1))
+        shapes = initial_unknowns.weights.shape[1]
+        best = torch.cat([initial_unknowns.weights, initial_unknowns.free], dim=1)
+        least = self.value(equations, initial_unknowns)
         rows, part = torch.arange(len(best), device=best.device), equations
         for _ in range(self.iterations):
             before = best[rows]
@@ -174,12 +174,12 @@ class Distances:
             newton: the share of what makes its matrix the second derivative rather than that of the bound.
         """
         shapes = equations.basis.shape[-1]
-        found = Unknowns(at[:, :shapes], at[:, shapes:])
-        residual, columns = equations.residual(found), equations.columns()
+        unknowns = Unknowns(at[:, :shapes], at[:, shapes:])
+        residual, columns = equations.residual(unknowns), equations.columns()
         inverse = equations.share / (residual.square().sum(-1) + self.smoothing**2).sqrt()
         first = ((inverse[..., None] * residual)[..., None] * columns).sum((1, 2))
-        slope = _penalties(self, equations).f + 2 * self.ridge * found.weights
-        first = first + torch.nn.functional.pad(slope, (0, found.free.shape[1]))
+        slope = _penalties(self, equations).f + 2 * self.ridge * unknowns.weights
+        first = first + torch.nn.functional.pad(slope, (0, unknowns.free.shape[1]))
         with torch.no_grad():
             flat = columns.flatten(1, 2)
             counted = (inverse[..., None, None] * columns).flatten(1, 2)
@@ -188,7 +188,7 @@ class Distances:
             H = counted.transpose(1, 2) @ flat - (steep[..., None] * along).transpose(1, 2) @ along
             H = 0.5 * (H + H.transpose(1, 2))
             H.diagonal(dim1=1, dim2=2)[:, :shapes].add_(2 * self.ridge)
-            free = found.free.shape[1]
+            free = unknowns.free.shape[1]
             lower = at.new_tensor([0.0] * shapes + [-torch.inf] * free)
             upper = at.new_tensor([1.0] * shapes + [torch.inf] * free)
         return box_qp(H, first - (H @ at[..., None])[..., 0], lower, upper, at, _TOLERANCE)
