@@ -34,10 +34,6 @@ def color_casts(colors: Tensor, weights: Tensor | None = None) -> Tensor:
     Returns:
         :math:`g`, natural logarithms of the gains in linear light, (M,3) float64; their mean over the scans is 0.
 
-    Raises:
-        ShapeError: no (M,V,3), or weights that do not fit.
-        ValueRangeError: colours that are not finite, or a scan whose colours are all clipped.
-
     Source: thesis 3.2.4 (textures in UV space); Blanz, Vetter 1999 (gain and offset of a channel).
 
     Example:
@@ -97,9 +93,6 @@ def without_cast(colors: Tensor, cast: Tensor) -> Tensor:
 
 def texture_areas(mesh: Mesh) -> Tensor:
     """Each vertex's share of the area of the texture, (V,); how many texels would speak for it.
-
-    Raises:
-        TopologyError: the mesh has no texture coordinates.
 
     Example:
         >>> corners = torch.tensor([[0.0, 0], [1, 0], [1, 1], [0, 1]])

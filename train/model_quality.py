@@ -51,9 +51,6 @@ def model_quality(
         drawn: how many random samples.
         generator: draws them; seeded with 0 if absent.
 
-    Raises:
-        ShapeError: fewer than three samples, or numbers of components that they do not allow.
-
     Source: Styner et al. 2003 (the three measures); thesis 3.2.4.
 
     Example:

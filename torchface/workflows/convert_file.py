@@ -63,10 +63,6 @@ def convert_file(
         names: how shapes are called in ``out``; see ``rig_names``.
         progress: called with each step.
         pose: weights by name, to write the mesh in that pose instead of the rig.
-
-    Raises:
-        MissingExtraError: Blender or usd-core is needed, and is not installed.
-        TorchfaceError: a file is broken, or cannot be written.
     """
     progress = progress or silent
     if out.suffix.lower() in BLENDER_ENDINGS:

@@ -103,9 +103,6 @@ def load_neutral(path: Path, unit: str | None = None, part: str | None = None) -
         path: a mesh file, a rig file or a rig's folder.
         unit: of its numbers, where it is not the format's own.
         part: keep this annotated region only.
-
-    Raises:
-        FileFormatError: neither a rig nor a mesh, or its shapes are broken; of a folder, no rig.
     """
     if path.suffix.lower() not in MESH_ENDINGS:
         try:

@@ -56,9 +56,6 @@ def sculpt_corrective(
 
     Returns:
         What was made, and lines for people to read.
-
-    Raises:
-        TorchfaceError: a file is broken, the pose is none of the rig's, or the sculpt is of another mesh.
     """
     progress, options = progress or silent, options or SculptOptions()
     if out.suffix.lower() not in BLENDER_ENDINGS:
