@@ -15,7 +15,8 @@ import tyro
 
 from torchface import zoo
 from torchface.cli.command_options import inputs_kept, plain_options
-from torchface.cli.terminal import plain_errors, progress_bars
+from torchface.cli.progress_bars import progress_bars
+from torchface.cli.terminal import plain_errors
 from torchface.errors import ValueRangeError
 from torchface.files.job_lock import job_lock
 from torchface.files.whole_files import made_folder, make_folder

@@ -1,19 +1,16 @@
 """Commands do on disk what the library does in memory, and say clearly what is wrong."""
 
 import re
-from functools import partial
-from io import StringIO
 from pathlib import Path
 
 import pytest
 import torch
 from displaced_sites import misplaced, site_distances
-from rich.console import Console
 
 import torchface
 from torchface.attachment import Attachment
 from torchface.capture import MarkerSolver, WholeTakeSolver
-from torchface.cli import COMMANDS, GROUPS, main, terminal
+from torchface.cli import COMMANDS, GROUPS, main
 from torchface.evaluation import weight_jitter
 from torchface.geometry.similarity import Similarity
 from torchface.io import load_rig, load_take, save_animation, save_mesh, save_rig, save_take
@@ -229,57 +226,6 @@ def test_an_attachment_without_a_rig_or_of_another_is_told_by_file(
         said = capsys.readouterr().err
         assert "attachment.json: found marker sites made for topology" in said
         assert "other.glb's own" in said
-
-
-def test_an_error_leaves_no_spinner_behind(monkeypatch: pytest.MonkeyPatch) -> None:
-    screen = StringIO()
-    monkeypatch.setattr(terminal, "console", Console(file=screen, force_terminal=True, width=60))
-
-    def breaks() -> None:
-        with terminal.progress_bars() as step:
-            step("done with")
-            step("at this it breaks")
-            raise ValueError("broken")
-
-    with pytest.raises(ValueError, match="broken"):
-        breaks()
-    last = screen.getvalue().split("\x1b[2K")[-1]
-    assert "done with" in last
-    assert "at this" not in last
-
-
-def test_counted_steps_show_a_bar_and_a_rate(monkeypatch: pytest.MonkeyPatch) -> None:
-    clock, screen = [0.0], StringIO()
-    monkeypatch.setattr(terminal, "console", Console(file=screen, force_terminal=True, width=100))
-    monkeypatch.setattr(terminal, "Bars", partial(terminal.Bars, get_time=lambda: clock[0]))
-    with terminal.progress_bars() as step:
-        step("solving", 100, 300)  # a hundred are from an earlier run
-        clock[0] = 4.0
-        step("solving", 300, 300)
-        step("writing")
-    last = screen.getvalue().split("\x1b[2K")[-1]
-    assert "300/300 50 a second" in last
-    assert "━" in last.splitlines()[0]
-    assert "━" not in last.splitlines()[1]
-
-
-def test_a_log_gets_a_line_a_step_and_none_when_quiet(monkeypatch: pytest.MonkeyPatch) -> None:
-    clock, log = [0.0], StringIO()
-    monkeypatch.setattr(terminal, "console", Console(file=log, width=100))
-    monkeypatch.setattr(terminal.time, "monotonic", lambda: clock[0])
-    for quiet in (True, False):
-        with terminal.progress_bars(quiet) as step:
-            for done in range(0, 100, 5):
-                clock[0] = 2.0 * done
-                step("registering scans", done, 100)
-            step("writing")
-        if quiet:
-            assert log.getvalue() == ""
-    lines = log.getvalue().splitlines()
-    assert lines[0] == "registering scans"
-    assert lines[1] == "registering scans: 15 of 100, 30.0 a minute"
-    assert lines[-1] == "writing"
-    assert len(lines) == 2 + 6
 
 
 def test_solve_cleans_a_slipping_take_and_reports_it(

@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING
 from tyro.conf import Positional
 
 from torchface.cli.command_options import OutputPath
-from torchface.cli.terminal import Quiet, print_path, progress_bars, serve_page
+from torchface.cli.progress_bars import progress_bars
+from torchface.cli.terminal import Quiet, print_path, serve_page
 
 if TYPE_CHECKING:
     from torch import Tensor

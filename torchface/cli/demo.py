@@ -9,7 +9,8 @@ from typing import Annotated
 from rich.table import Table
 
 from torchface.cli.command_options import Output
-from torchface.cli.terminal import Quiet, console, print_path, progress_bars
+from torchface.cli.progress_bars import progress_bars
+from torchface.cli.terminal import Quiet, console, print_path
 
 _FILES = ("template.glb", "neutral.obj", "actor.glb", "attachment.json", "take.c3d", "weights.csv", "animation.glb")
 

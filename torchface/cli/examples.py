@@ -8,7 +8,8 @@ from typing import Annotated
 from tyro.conf import Positional, arg
 
 from torchface.cli.command_options import OutputPath
-from torchface.cli.terminal import Quiet, console, print_lines, print_path, progress_bars
+from torchface.cli.progress_bars import progress_bars
+from torchface.cli.terminal import Quiet, console, print_lines, print_path
 
 
 def examples(

@@ -7,7 +7,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 from torchface.cli.command_options import Output, OutputPath
-from torchface.cli.terminal import Quiet, console, print_lines, print_path, print_table, progress_bars
+from torchface.cli.progress_bars import progress_bars
+from torchface.cli.terminal import Quiet, console, print_lines, print_path, print_table
 
 if TYPE_CHECKING:
     from torchface.onnx import SolverReport

@@ -8,7 +8,8 @@ from typing import Annotated, Literal
 from tyro.conf import Positional
 
 from torchface.cli.command_options import Output
-from torchface.cli.terminal import Quiet, progress_bars, serve_page
+from torchface.cli.progress_bars import progress_bars
+from torchface.cli.terminal import Quiet, serve_page
 
 _FILES = ("landmarks.json", "annotated.glb", "attachment.json", "correspondences.json")
 

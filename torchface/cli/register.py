@@ -8,7 +8,8 @@ from tyro.conf import Positional
 
 from torchface.cli.batch_report import Cluster, Column, Jobs, TimeLimit, show_batch, skipped_lines
 from torchface.cli.command_options import OutputPath
-from torchface.cli.terminal import Quiet, progress_bars
+from torchface.cli.progress_bars import progress_bars
+from torchface.cli.terminal import Quiet
 
 
 def register(

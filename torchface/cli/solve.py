@@ -10,7 +10,8 @@ from tyro.conf import Positional, arg
 
 from torchface.cli.batch_report import Cluster, Column, Jobs, TimeLimit, show_batch, skipped_lines
 from torchface.cli.command_options import OptionalOutputPath, OutputPath
-from torchface.cli.terminal import Quiet, print_lines, print_path, progress_bars
+from torchface.cli.progress_bars import progress_bars
+from torchface.cli.terminal import Quiet, print_lines, print_path
 
 _COLUMNS = (
     Column("marker RMSE", "rmse_mm", "{:.3f} mm"),

@@ -10,7 +10,8 @@ from tyro.conf import Positional, arg
 
 from torchface.cli.batch_report import Cluster, Column, Jobs, TimeLimit, show_batch, skipped_lines
 from torchface.cli.command_options import Output, picture_size
-from torchface.cli.terminal import Quiet, console, print_lines, print_path, progress_bars
+from torchface.cli.progress_bars import progress_bars
+from torchface.cli.terminal import Quiet, console, print_lines, print_path
 
 _COLUMNS = (
     Column("frames", "frames", "{}"),

@@ -7,7 +7,8 @@ from pathlib import Path
 from tyro.conf import Positional
 
 from torchface.cli.command_options import OptionalOutputPath
-from torchface.cli.terminal import Quiet, progress_bars, serve_page
+from torchface.cli.progress_bars import progress_bars
+from torchface.cli.terminal import Quiet, serve_page
 
 
 def view(

@@ -14,6 +14,7 @@ from torchface.io.weights.weight_csv import ROTATIONS
 from torchface.number_checks import check_rate
 from torchface.shape_names import ARKIT, mapping
 
+LIVE_LINK_PORT = 11111
 _VERSION, _VALUES = 6, len(ARKIT) + len(ROTATIONS)
 _TIME = struct.Struct("!ifii")  # frame, subframe, rate as a fraction
 _NUMBERS = struct.Struct(f"!{_VALUES}f")

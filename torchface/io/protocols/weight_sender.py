@@ -11,13 +11,13 @@ from typing import Any
 from torch import Tensor
 
 from torchface.errors import ValueRangeError
-from torchface.io.protocols.live_link_packets import LiveLinkPackets
-from torchface.io.protocols.osc_packets import OscPackets, VmcPackets
+from torchface.io.protocols.live_link_packets import LIVE_LINK_PORT, LiveLinkPackets
+from torchface.io.protocols.vmc_and_osc_packets import VMC_PORT, OscPackets, VmcPackets
 
 Encode = Callable[[Tensor, Tensor | None], list[bytes]]
 """Packets of a frame: weights (N,), and rotations (9,) in radians, none of which turn the head."""
 
-DEFAULT_PORTS = {"livelink": 11111, "vmc": 39539}
+DEFAULT_PORTS = {"livelink": LIVE_LINK_PORT, "vmc": VMC_PORT}
 """Where receivers listen unless they are set up otherwise; the other schemes' addresses name their port."""
 
 _SCHEMES = ("udp", "livelink", "vmc", "osc")

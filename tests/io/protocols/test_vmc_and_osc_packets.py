@@ -14,7 +14,7 @@ from pythonosc.osc_server import BlockingOSCUDPServer
 from scipy.spatial.transform import Rotation
 
 from torchface.errors import NameMismatchError
-from torchface.io.protocols.osc_packets import OscPackets, VmcPackets, unity_quaternion
+from torchface.io.protocols.vmc_and_osc_packets import OscPackets, VmcPackets, unity_quaternion
 from torchface.io.protocols.weight_sender import WeightSender, open_sender
 from torchface.io.weights.weight_csv import ROTATIONS
 from torchface.shape_names import ARKIT

@@ -17,6 +17,7 @@ from torchface.io.protocols.live_link_packets import ArkitWeights, rotations_sen
 from torchface.io.weights.weight_csv import ROTATIONS
 from torchface.shape_names import ARKIT
 
+VMC_PORT = 39539
 _DEFAULT_PREFIX = "/torchface"
 
 _LARGEST_VMC = 1400  # bytes of a packet, which one Ethernet frame must hold
