@@ -114,7 +114,7 @@ def write_rig(
         write_gltf_rig(rig, path, detail, keys)
     elif isinstance(detail, RegionMaps):
         kind = f"a {suffix} file" if suffix else "a folder of OBJ files"
-        raise FileFormatError(f"{path}: found detail maps by region for {kind}, expected .glb for them")
+        raise FileFormatError(f"{path}: found wrinkle maps by region for {kind}, expected .glb for them")
     elif suffix in USD_ENDINGS:
         write_usd_rig(rig, path, keys, detail)
     elif suffix == MAYA_ENDING:

@@ -101,7 +101,7 @@ def maps_for(source: Path, out: Path) -> tuple[DetailMaps | RegionMaps | None, l
     if source.suffix.lower() in GLTF_ENDINGS and (by_region := load_region_maps(source)) is not None:
         if out.suffix.lower() == ".glb":
             return by_region, []
-        notes.append(f"{out.name} has no place for detail maps by region, which are left out; .glb has")
+        notes.append(f"{out.name} has no place for wrinkle maps by region, which are left out; .glb has")
     return (load_detail_maps(source) if source.suffix.lower() in SCENE_ENDINGS else None), notes
 
 
