@@ -103,7 +103,7 @@ def packages() -> dict[str, list[PackagePath]]:
 
 
 def test_what_the_core_needs_is_here(packages: dict[str, list[PackagePath]]) -> None:
-    assert {"torch", "numpy", "scipy", "opencv-contrib-python-headless", "av", "qdldl"} <= set(packages)
+    assert {"torch", "numpy", "scipy", "opencv-contrib-python-headless", "av", "qdldl", "daqp"} <= set(packages)
     assert not {"quadprog", "cholespy"} & set(packages)
 
 

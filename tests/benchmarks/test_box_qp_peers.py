@@ -36,7 +36,6 @@ from torchface import Attachment, BlendshapeRig
 from torchface.capture import MarkerSolver
 from torchface.onnx import export_solver
 from torchface.optim import BoxQP, box_qp
-from torchface.optim.warm_active_set import solve_from_active_set
 
 pytestmark = [pytest.mark.real, pytest.mark.usefixtures("one_thread")]
 Capture = tuple[BlendshapeRig, Attachment, list[Tensor]]
@@ -112,8 +111,7 @@ def frames(real_capture: Capture) -> Frames:
     solver, markers = MarkerSolver(rig, attachment), noisy_markers(real_capture)
     energy = solver.energy(markers)
     assert energy.constant is not None
-    exact = daqp_solver if installed("daqp") else quadprog_solver
-    reference, _ = one_by_one(along(exact(energy.H.numpy()), energy.f), len(energy.f))
+    reference, _ = one_by_one(along(daqp_solver(energy.H.numpy()), energy.f), len(energy.f))
     # The better of two exact solves a frame.
     found = (_objective(energy.H, energy.f, x) for x in (reference, box_qp(energy.H, energy.f)))
     least = torch.stack(list(found)).amin(0) + energy.constant
@@ -172,12 +170,13 @@ def test_all_frames_at_once(
 ) -> None:
     H, f = frames.H, frames.f
     single, singles = H.float(), f.float()
-    ours = {"float32": BoxQP(single), "float64": BoxQP(H)}
+    ours = {"float32": BoxQP(single), "float64": BoxQP(H), "coarse": BoxQP(single, tolerance=6e-5)}
     rows = []
     with torch.inference_mode():
         batched: dict[str, Callable[[], Tensor]] = {
             "torchface, float32": lambda: ours["float32"](singles),
             "torchface, float64": lambda: ours["float64"](f),
+            "torchface, float32, to 6e-5": lambda: ours["coarse"](singles),
             "ADMM on torch, 50 iterations": lambda: batched_admm(single, singles, 50),
             "ADMM on torch, 100 iterations": lambda: batched_admm(single, singles, 100),
             "FISTA on torch, 400 iterations": lambda: fista(single, singles),
@@ -193,13 +192,12 @@ def test_all_frames_at_once(
     show(f"{len(f)} real frames at once (one by one: 2,000), {len(H)} shapes, 100 markers", rows)
 
     found = {row.name: row for row in rows}
-    if "DAQP, one by one" in found:
-        keep_figures(
-            frames=f"{len(f):,}",
-            batch=f"{rows[0].milliseconds:.3f} ms",
-            daqp=f"{found['DAQP, one by one'].milliseconds:.3f} ms",
-            gap=f"{rows[0].gap:.0e}".replace("e-0", "e-"),
-        )
+    keep_figures(
+        frames=f"{len(f):,}",
+        batch=f"{rows[0].milliseconds:.3f} ms",
+        daqp=f"{found['DAQP, one by one'].milliseconds:.3f} ms",
+        gap=f"{rows[0].gap:.0e}".replace("e-0", "e-"),
+    )
     assert rows[0].gap <= 1e-6
     assert rows[0].residual <= 1e-5
     assert rows[1].gap <= 1e-12
@@ -210,8 +208,10 @@ def test_all_frames_at_once(
     for name in ("PIQP", "OSQP 1e-5", "quadprog", "ProxQP 1e-8"):
         if f"{name}, one by one" in found:
             assert found[f"{name}, one by one"].milliseconds >= 5 * rows[0].milliseconds
-    if "DAQP, one by one" in found:
-        assert found["DAQP, one by one"].milliseconds >= 0.6 * rows[0].milliseconds
+    assert found["DAQP, one by one"].milliseconds >= 1.2 * rows[0].milliseconds
+    coarse = found["torchface, float32, to 6e-5"]
+    assert coarse.gap <= 1e-5
+    assert found["DAQP, one by one"].milliseconds >= 1.8 * coarse.milliseconds
 
 
 def session_of(capture: Capture, path: Path) -> onnxruntime.InferenceSession:
@@ -243,12 +243,9 @@ def test_one_frame_at_a_time(
     x, spent = one_by_one(by_graph(session_of(real_capture, tmp_path / "solver.onnx"), markers), len(f), 3)
     rows = [Row.of("torchface, solver.onnx, float32", spent, x, frames)]
 
-    box = torch.zeros(len(H), dtype=torch.float64), torch.ones(len(H), dtype=torch.float64)
     exactly = BoxQP(H)
     steps: dict[str, Callable[[int, Tensor], Tensor]] = {
-        # The compiled solver of the extra ``live``, and what stands in for it.
         "torchface, BoxQP, float64": lambda row, w: exactly(f[row : row + 1], w),
-        "torchface, solve_from_active_set": lambda row, w: solve_from_active_set(H, f[row], *box, w[0], 1e-11)[None],
         "torchface, MarkerSolver, float32": lambda row, w: frames.solver(markers[row : row + 1], w),
     }
     few = frames.part(slice(0, 200))
@@ -271,10 +268,9 @@ def test_one_frame_at_a_time(
     found = {row.name: row for row in rows}
     assert rows[0].gap <= 1e-5
     assert rows[1].gap <= 1e-12
-    assert rows[2].gap <= 1e-12
-    assert rows[3].gap <= 1e-6
-    assert rows[1].milliseconds < found["PIQP"].milliseconds if "PIQP" in found else True
-    # DAQP is the quicker one here.
+    assert rows[2].gap <= 1e-6
+    # DAQP itself, the checks of what it finds, and PyTorch around it.
+    assert rows[1].milliseconds <= found["DAQP"].milliseconds + 0.05
     for name, share in (("OSQP 1e-5", 0.75), ("DAQP", 7.0)):
         if name in found:
             assert rows[0].milliseconds < share * found[name].milliseconds

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from torchface.errors import ValueRangeError
-from torchface.optim.active_set import projected_newton
+from torchface.optim.active_set import primal_dual_active_set, projected_newton
 from torchface.optim.box_problem import BoxProblem, metric
 from torchface.optim.free_variables import solve_free
 from torchface.optim.operator_splitting import (
@@ -16,7 +16,6 @@ from torchface.optim.operator_splitting import (
     start_splitting,
     suited_rho,
 )
-from torchface.optim.primal_dual_active_set import primal_dual_active_set
 
 
 def problem(variables: int = 12, problems: int = 30, seed: int = 0) -> BoxProblem:

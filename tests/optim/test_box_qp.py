@@ -12,8 +12,15 @@ from torch import Tensor
 
 from torchface.errors import ShapeError, ValueRangeError
 from torchface.optim import BoxQP, box_qp
+from torchface.optim.prepared_program import PreparedProgram
 
 INF = math.inf
+
+
+@pytest.fixture(params=["one by one", "as a batch"], autouse=True)
+def way(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each of the two solvers that ``box_qp`` chooses between, whatever the numbers of problems and variables."""
+    monkeypatch.setattr(PreparedProgram, "_are_few", lambda *_: request.param == "one by one")
 
 
 def hessian(variables: int, least: float, largest: float, seed: int = 0, rank: int | None = None) -> Tensor:

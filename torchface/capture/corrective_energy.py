@@ -7,22 +7,19 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from torchface.capture.energy import Quadratic
+from torchface.capture.energy import Quadratic, chunks_of_frames
 from torchface.correctives.activation import CorrectiveActivation, RoundedActivation
-from torchface.optim.active_set import projected_newton
 from torchface.optim.box_problem import BoxProblem
 from torchface.optim.fixed_point_gradient import attach_gradients
+from torchface.optim.prepared_program import PreparedProgram
 
 _MAX_STEPS = 30
-_QUADRATIC_STEPS = 8
 # A step's quadratic program is solved to this share of what is left: more digits are of a model that moves on.
 _INEXACT = 0.03
 _ROUNDED_TOLERANCE = 1e-2
 _HALVINGS, _DECREASE = 20, 1e-4
 # What rounding may add to an energy, times its terms.
 _ROUNDING = 1e-14
-# Numbers in the matrices of frames that are in memory at once: 64 MB of float64.
-_CHUNK_NUMBERS = 2**23
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,8 +126,8 @@ def least_in_box(
 
     Source: Bertsekas 1982 for steps in a box; Nocedal and Wright 2006, 10.3, for Gauss-Newton.
     """
-    parts, numbers = [], energy.extended.f.shape[1] * energy.variables
-    for rows in torch.arange(len(start), device=start.device).split(max(1, _CHUNK_NUMBERS // numbers)):
+    parts = []
+    for rows in chunks_of_frames(torch.arange(len(start), device=start.device), energy.extended.f.shape[1]):
         part = energy.rows(rows)
         with torch.no_grad():
             begin = start[rows].detach().clamp(lower, upper)
@@ -160,7 +157,7 @@ def _descended(energy: CorrectiveEnergy, start: Tensor, lower: Tensor, upper: Te
         if not len(rows):
             break
         exact = max(tolerance, _INEXACT * float(left.min()))
-        step = projected_newton(problem, here, exact, _QUADRATIC_STEPS) - here
+        step = PreparedProgram(problem.H, lower, upper).solve(problem.f, here, exact) - here
         y[rows], moved = _searched(part, here, step, (slope * step).sum(-1))
         rows = rows[moved]
         if not len(rows):

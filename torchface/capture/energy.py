@@ -12,6 +12,8 @@ from torchface.number_checks import LARGEST_WEIGHT, checked_number
 
 # Numbers in the matrices of all markers at once; beyond it frames take their turn.
 _MOST_NUMBERS = 2**24
+# Numbers in the H of frames that have one each, at once: 64 MB of float64.
+_CHUNK_NUMBERS = 2**23
 
 
 @dataclass(frozen=True, eq=False)
@@ -163,3 +165,8 @@ def _check_weight(name: str, weight: float | Tensor) -> None:
     if isinstance(weight, Tensor) and weight.is_meta:  # a solver that waits for its state
         return
     checked_number(name, weight, 0.0, LARGEST_WEIGHT)
+
+
+def chunks_of_frames(rows: Tensor, variables: int) -> tuple[Tensor, ...]:
+    """Frames (K,) in chunks whose matrices, of so many variables, are in memory at once."""
+    return rows.split(max(1, _CHUNK_NUMBERS // variables**2))

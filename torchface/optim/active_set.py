@@ -1,10 +1,15 @@
-r"""Projected Newton steps for box-constrained quadratic programs, batched: the exact end of a solve.
+r"""Active sets of box-constrained quadratic programs, batched: the exact end of a solve.
 
-Variables at a bound whose gradient pushes outward are held; the others take the Newton step
-:math:`-(H_{FF})^{-1} g_F`, clipped to the box at the step length of least objective. Near the solution the held set is
-the active set and one Cholesky factorisation a problem ends at rounding error.
+The primal-dual method holds the variables of a set at their bounds and solves for the others; where
+:math:`x - (Hx + f)/\operatorname{diag} H` lies beyond a bound is the next set, and a set that comes again is the
+solution's. From a set that is nearly right that takes a factorisation or two a problem. Without line search it need not
+settle.
 
-Source: Bertsekas 1982, Projected Newton methods for optimization problems with simple constraints.
+Projected Newton steps always get there: variables at a bound whose gradient pushes outward are held; the others take
+the step :math:`-(H_{FF})^{-1} g_F`, clipped to the box at the step length of least objective.
+
+Source: Hintermüller, Ito and Kunisch 2002, The primal-dual active set strategy as a semismooth Newton method; Bertsekas
+1982, Projected Newton methods for optimization problems with simple constraints.
 """
 
 from __future__ import annotations
@@ -18,56 +23,82 @@ from torchface.number_checks import checked_count, checked_number
 from torchface.optim.box_problem import BoxProblem
 from torchface.optim.free_variables import solve_free
 
-# Numbers in the matrices factored at once: 2 MB of float64 stay in a CPU's cache; an accelerator wants more.
-_CHUNK_NUMBERS = {"cpu": 2**18, "other": 2**25}
 _STEP_LENGTHS, _BLOCKED_TRIES = 10, 8
 # Added to the scaled diagonal (all ones), times the residual: where H is singular the step stays short in directions
 # that only rounding fills, and the term fades as fast as the solution comes near.
 _DAMPING = 1e-5
 
 
-def projected_newton(
-    problem: BoxProblem, start: Tensor, tolerance: float, iterations: int = 100, careful: bool = True
-) -> Tensor:
-    """The minimisers (B,N), from feasible ``start`` (B,N).
+def primal_dual_active_set(problem: BoxProblem, start: Tensor, iterations: int = 10) -> tuple[Tensor, Tensor]:
+    """The minimisers (B,N) of the problems whose active set settles, ``start`` of the others, and the gradient there.
+
+    Args:
+        problem: B problems, float64.
+        start: in the box, (B,N); its variables at a bound are the first active set.
+        iterations: at most so many factorisations.
+
+    Raises:
+        ValueRangeError: ``iterations`` is negative or no whole number.
+    """
+    checked_count("primal_dual_active_set: iterations", iterations)
+    found, slope = start.clone(), problem.gradient(start)
+    gradient = slope.clone()
+    rows = torch.arange(len(start), device=start.device)
+    part, x = problem, start
+    at_lower = x <= problem.lower
+    at_upper = (x >= problem.upper) & ~at_lower
+    before = torch.full_like(rows, start.shape[1] + 1)
+    for _ in range(iterations):
+        free = ~(at_lower | at_upper)
+        x = x + solve_free(part.H, part.diagonal, free, -slope)
+        slope = part.gradient(x)
+        aim = torch.where(free, x, torch.addcdiv(x, slope, part.diagonal, value=-1))
+        below = aim <= part.lower
+        above = (aim >= part.upper) & ~below
+        changes = ((below != at_lower) | (above != at_upper)).sum(-1)
+        settled = changes == 0
+        found[rows[settled]], gradient[rows[settled]] = x[settled], slope[settled]
+        # Sets that change more from one to the next run in circles nearly always.
+        keep = ((changes > 0) & (changes < before)).nonzero()[:, 0]
+        if not len(keep):
+            break
+        rows, part, before = rows[keep], part.rows(keep), changes[keep]
+        at_lower, at_upper = below[keep], above[keep]
+        x = torch.where(at_lower, part.lower, torch.where(at_upper, part.upper, x[keep]))
+        slope = part.gradient(x)
+    return found, gradient
+
+
+def projected_newton(problem: BoxProblem, start: Tensor, tolerance: float, iterations: int = 100) -> Tensor:
+    """The minimisers (B,N), from feasible ``start`` (B,N), by steps that always descend.
 
     Args:
         problem: B problems, float64.
         start: feasible points, (B,N).
         tolerance: on ``problem.residual``; a problem that reaches it is left alone.
         iterations: at most so many steps.
-        careful: search where the full step does not descend, and so descend always; otherwise leave such a problem
-            where it stands, too far from its solution for Newton steps to be worth their cost.
 
     Raises:
         ValueRangeError: ``tolerance`` or ``iterations`` is negative or no number.
     """
     checked_number("projected_newton: tolerance", tolerance)
     checked_count("projected_newton: iterations", iterations)
-    numbers = _CHUNK_NUMBERS.get(start.device.type, _CHUNK_NUMBERS["other"])
-    chunk = max(1, numbers // problem.f.shape[1] ** 2)
     x = start.clone()
-    for first in range(0, len(x), chunk):
-        rows = torch.arange(first, min(first + chunk, len(x)), device=x.device)
-        for _ in range(iterations):
+    rows = torch.arange(len(x), device=x.device)
+    for _ in range(iterations):
+        part, here = problem.rows(rows), x[rows]
+        gradient = part.gradient(here)
+        open_ = part.unsolved(here, tolerance, gradient)
+        if not bool(open_.all()):
+            rows, here, gradient = rows[open_], here[open_], gradient[open_]
             part = problem.rows(rows)
-            here = x[rows]
-            gradient = part.gradient(here)
-            open_ = part.unsolved(here, tolerance, gradient)
-            if not bool(open_.all()):
-                rows, here, gradient = rows[open_], here[open_], gradient[open_]
-                part = problem.rows(rows)
-            if not len(rows):
-                break
-            step = _NewtonStep.at(part, here, gradient)
-            x[rows] = torch.where(step.descends[:, None], step.full, here)
-            stuck = (~step.descends).nonzero()[:, 0]
-            if not len(stuck):
-                continue
-            if careful:
-                x[rows[stuck]] = _careful_step(part.rows(stuck), here[stuck], gradient[stuck], step.rows(stuck))
-            else:
-                rows = rows[step.descends]
+        if not len(rows):
+            break
+        step = _NewtonStep.at(part, here, gradient)
+        x[rows] = torch.where(step.descends[:, None], step.full, here)
+        stuck = (~step.descends).nonzero()[:, 0]
+        if len(stuck):
+            x[rows[stuck]] = _careful_step(part.rows(stuck), here[stuck], gradient[stuck], step.rows(stuck))
     return x
 
 

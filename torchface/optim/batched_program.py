@@ -1,12 +1,18 @@
-"""A batch of box-constrained quadratic programs: splitting finds the active sets, factorisations end it."""
+"""A batch of box-constrained quadratic programs in three phases, each for what the one before has left.
+
+1. Splitting, in float32: matrix products and clamps for all problems at once.
+2. Active sets: from those that splitting found a factorisation or two a problem end at the optimum.
+3. Newton steps with a search, after more of splitting in float64: for an H that is singular or close to it.
+"""
 
 from __future__ import annotations
+
+import math
 
 import torch
 from torch import Tensor
 
-from torchface.optim.active_set import projected_newton
-from torchface.optim.box_checks import check_bounded, check_slope
+from torchface.optim.active_set import primal_dual_active_set, projected_newton
 from torchface.optim.box_problem import BoxProblem
 from torchface.optim.operator_splitting import (
     SplittingFactors,
@@ -16,88 +22,92 @@ from torchface.optim.operator_splitting import (
     start_splitting,
     suited_rho,
 )
-from torchface.optim.prepared_program import PreparedProgram
-from torchface.optim.primal_dual_active_set import primal_dual_active_set
 
-# Cycles of splitting before the active set is tried, times the root of N; then steps of splitting and Newton steps for
-# what it does not settle, an H that is singular or close to it: splitting brings such problems near enough for Newton
-# steps to end them, and the last ones make sure.
-_FIRST_CYCLES = 0.21
-# Few variables and a coarse tolerance: so many steps of splitting alone end nearly always, sooner than a factorisation.
-_COARSE_ROUNDS = ((None, 88), (None, 40))
+# Few variables and a coarse tolerance: splitting alone ends nearly always, sooner than a factorisation. So many steps
+# for a tolerance of 1e-4, for each decade below it, and for what these leave.
 _COARSE, _FEW_VARIABLES = 1e-7, 64
-_SETTLING_ROUNDS = 4
-_LATER_ROUNDS = ((4, 100), (4, 200), (4, 400), (4, 400))
-_CAREFUL_ROUNDS = ((8, 400), (8, 800), (8, 1600), (100, 0))
-# Numbers in one chunk of frames: three buffers of it stay in a CPU's second-level cache; an accelerator wants more.
-_CHUNK_NUMBERS = {"cpu": 2**17, "other": 2**23}
+_STEPS, _STEPS_A_DECADE, _MORE_STEPS = 60, 18, 40
+# Otherwise cycles of splitting before active sets are tried, times the root of N, and how often both.
+_CYCLES, _SETTLING_ROUNDS = 0.21, 4
+# Steps of splitting and of Newton. The last ones make sure.
+_CAREFUL_ROUNDS = ((400, 8), (800, 8), (1600, 8), (0, 100))
 
 
-@torch.no_grad()
-def solve_in_chunks(program: PreparedProgram, f: Tensor, start: Tensor | None, tolerance: float) -> Tensor:
-    """The minimisers (B,N), in as many at once as stay in a cache.
+def solve_batch(
+    problem: BoxProblem, factors: SplittingFactors | None, start: Tensor | None, tolerance: float
+) -> Tensor:
+    """The minimisers (B,N), or where steps do not reach them the last of these.
 
     Args:
-        program: H and bounds.
-        f: (B,N), finite.
-        start: (B,N), finite, or none.
+        problem: B problems.
+        factors: of one H of all of them; those of an H each are made here, as far as needed.
+        start: (B,N), or none.
         tolerance: on the residual of ``box_qp``.
-
-    Raises:
-        ValueRangeError: f is too steep, or a problem has no minimum.
     """
-    lower, upper = program.lower, program.upper
-    count, variables = f.shape
-    shared = program.H.ndim == 2
-    solution = torch.empty_like(f)
-    numbers = _CHUNK_NUMBERS.get(f.device.type, _CHUNK_NUMBERS["other"])
-    most = max(1, numbers // max(variables if shared else variables**2, 1))
-    chunk = -(-count // max(1, -(-count // most)))  # all of about one size: a short last one costs as many calls
-    for first in range(0, count, max(1, chunk)):
-        rows = slice(first, first + chunk)
-        H = program.H if shared else program.H[rows]
-        problem = BoxProblem.of(H, f[rows].double(), lower, upper)
-        check_slope(problem)
-        factors = prepare_splitting(H, suited_rho(H)) if program.factors is None else program.factors
-        x = _solve(problem, factors, None if start is None else start[rows].double(), tolerance)
-        # Rounding to float32 must not step over a bound.
-        solution[rows] = torch.minimum(torch.maximum(x.to(f.dtype), lower.to(f)), upper.to(f))
-    return solution
+    left = _Unsolved(problem, factors, start, tolerance)
+    if start is not None:
+        # With an H each, a try of the active set of the start costs no more than what splitting has to factor.
+        tried = (left.state.z,) if factors is not None else primal_dual_active_set(problem, left.state.z)
+        if left.without(*tried):
+            return left.x
+    for phase in (_split, _settle, _descend):
+        if phase(left):
+            break
+    return left.x
 
 
-def _solve(problem: BoxProblem, factors: SplittingFactors, start: Tensor | None, tolerance: float) -> Tensor:
-    """Splitting finds the active set; it ends most problems, and Newton steps the last of them."""
-    cycles = max(1, round(_FIRST_CYCLES * problem.f.shape[1] ** 0.5))
-    rounds: tuple[tuple[int | None, int], ...] = ((0, cycles),) * _SETTLING_ROUNDS + _LATER_ROUNDS
-    if tolerance >= _COARSE and problem.f.shape[1] <= _FEW_VARIABLES:
-        rounds = _COARSE_ROUNDS + rounds
-    quick = len(rounds)
-    state = start_splitting(problem, start)
-    x = state.z.clone()
-    rows = torch.arange(len(x), device=x.device)
-    part = problem
-    for number, (newton_steps, steps) in enumerate((*rounds, *_CAREFUL_ROUNDS)):
-        gradient = None
-        if number or start is not None:
-            if newton_steps:
-                found = projected_newton(part, state.z, tolerance, newton_steps, number >= quick)
-                gradient = part.gradient(found)
-            elif newton_steps is not None:
-                found, gradient = primal_dual_active_set(part, state.z)
-            else:
-                found, gradient = state.z, part.gradient(state.z)
-            x[rows] = found
-            keep = part.unsolved(found, tolerance, gradient).nonzero()[:, 0]
-            if not len(keep):
-                break
-            gradient = gradient if newton_steps is None else None
-            if len(keep) < len(rows):
-                rows, part, state, factors = rows[keep], part.rows(keep), state.rows(keep), factors.rows(keep)
-                gradient = None if gradient is None else gradient[keep]
-        if newton_steps or newton_steps is None:
-            dtype = torch.float32 if number < quick else torch.float64
-            state = splitting_steps(part, factors, state, steps, gradient, dtype)
-        else:
-            state = extrapolated_splitting(part, factors, state, steps)
-    check_bounded(problem, x)
-    return x
+class _Unsolved:
+    """Problems of a batch that are not solved yet, where splitting stands in them, and the solutions of all."""
+
+    def __init__(
+        self, problem: BoxProblem, factors: SplittingFactors | None, start: Tensor | None, tolerance: float
+    ) -> None:
+        self.problem, self.tolerance = problem, tolerance
+        self._factors = factors
+        self.state = start_splitting(problem, start)
+        self.x = self.state.z.clone()
+        self._rows = torch.arange(len(self.x), device=self.x.device)
+
+    @property
+    def factors(self) -> SplittingFactors:
+        if self._factors is None:
+            self._factors = prepare_splitting(self.problem.H, suited_rho(self.problem.H))
+        return self._factors
+
+    def without(self, found: Tensor, gradient: Tensor | None = None) -> bool:
+        """Takes what was found, and the gradient there, and leaves out what it solves; whether that is all."""
+        self.x[self._rows] = found
+        keep = self.problem.unsolved(found, self.tolerance, gradient).nonzero()[:, 0]
+        if len(keep) < len(self._rows):
+            self._rows, self.problem = self._rows[keep], self.problem.rows(keep)
+            self.state = self.state.rows(keep)
+            self._factors = None if self._factors is None else self._factors.rows(keep)
+        return not len(keep)
+
+
+def _split(left: _Unsolved) -> bool:
+    if left.tolerance < _COARSE or left.x.shape[1] > _FEW_VARIABLES:
+        return False
+    more = max(0.0, _STEPS_A_DECADE * math.log10(1e-4 / left.tolerance))
+    for steps in (_STEPS + round(more), _MORE_STEPS):
+        left.state = splitting_steps(left.problem, left.factors, left.state, steps, torch.float32)
+        if left.without(left.state.z):
+            return True
+    return left.without(*primal_dual_active_set(left.problem, left.state.z))
+
+
+def _settle(left: _Unsolved) -> bool:
+    cycles = max(1, round(_CYCLES * left.x.shape[1] ** 0.5))
+    for _ in range(_SETTLING_ROUNDS):
+        left.state = extrapolated_splitting(left.problem, left.factors, left.state, cycles)
+        if left.without(*primal_dual_active_set(left.problem, left.state.z)):
+            return True
+    return False
+
+
+def _descend(left: _Unsolved) -> bool:
+    for splitting, newton in _CAREFUL_ROUNDS:
+        left.state = splitting_steps(left.problem, left.factors, left.state, splitting)
+        if left.without(projected_newton(left.problem, left.state.z, left.tolerance, newton)):
+            return True
+    return False

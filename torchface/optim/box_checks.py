@@ -9,7 +9,7 @@ from torchface.errors import ShapeError, ValueRangeError
 from torchface.number_checks import checked_number
 from torchface.optim.box_problem import BoxProblem, check_box, metric
 
-TOLERANCE = {torch.float32: 3e-6, torch.float64: 1e-11}
+_TOLERANCE = {torch.float32: 3e-6, torch.float64: 1e-11}
 # A tolerance above it calls nearly every start a solution.
 _COARSEST = 0.5
 # The residual is relative to x and so falls where x runs away. It has, where x is this many times farther than each
@@ -25,7 +25,7 @@ def checked_hessian(H: Tensor, name: str = "box_qp") -> Tensor:
     """The symmetric part of H in float64, after every check that needs no f."""
     if H.ndim not in (2, 3) or H.shape[-1] != H.shape[-2] or H.shape[-1] == 0:
         raise ShapeError(f"{name}: found H {tuple(H.shape)}, expected (N,N) or (B,N,N)")
-    if H.dtype not in TOLERANCE:
+    if H.dtype not in _TOLERANCE:
         raise ValueRangeError(f"{name}: found H of {H.dtype}, expected float32 or float64")
     exact = H.detach().double()
     if not torch.isfinite(exact).all():
@@ -65,8 +65,15 @@ def checked_bounds(
     return low, high
 
 
+def default_tolerance(dtype: torch.dtype) -> float:
+    """What is asked of a solution in this dtype; of a single one where it is neither."""
+    return _TOLERANCE.get(dtype, _TOLERANCE[torch.float32])
+
+
 def checked_tolerance(tolerance: float | None, dtype: torch.dtype) -> float:
-    return TOLERANCE[dtype] if tolerance is None else checked_number("box_qp: tolerance", tolerance, 0.0, _COARSEST)
+    if tolerance is None:
+        return default_tolerance(dtype)
+    return checked_number("box_qp: tolerance", tolerance, 0.0, _COARSEST)
 
 
 def check_vectors(H: Tensor, f: Tensor, start: Tensor | None, name: str = "box_qp") -> None:
@@ -77,6 +84,9 @@ def check_vectors(H: Tensor, f: Tensor, start: Tensor | None, name: str = "box_q
         raise ValueRangeError(f"{name}: found f of {f.dtype} and H of {H.dtype}, expected the same")
     if start is not None and start.shape != f.shape:
         raise ShapeError(f"{name}: found start {tuple(start.shape)}, expected {tuple(f.shape)}")
+
+
+def check_finite(f: Tensor, start: Tensor | None, name: str = "box_qp") -> None:
     for which, vectors in (("f", f), ("start", start)):
         if vectors is not None and not torch.isfinite(vectors).all():
             bad = (~torch.isfinite(vectors)).any(1).nonzero()[:, 0].tolist()

@@ -6,8 +6,7 @@ import torch
 from torch import Tensor, nn
 
 from torchface.errors import TraceError
-from torchface.optim.batched_program import solve_in_chunks
-from torchface.optim.box_checks import TOLERANCE, check_vectors, checked_tolerance
+from torchface.optim.box_checks import check_vectors, checked_tolerance, default_tolerance
 from torchface.optim.data_dependent import data_dependent, is_transformed
 from torchface.optim.implicit import BoxSolution
 from torchface.optim.prepared_program import PreparedProgram
@@ -26,8 +25,8 @@ def box_qp(
 
     .. math:: x = \arg\min_{l \le x \le u} \tfrac12 x^\top H x + f^\top x
 
-    Solved by splitting (one factorisation, then products and clamps), then by projected Newton steps where digits are
-    missing, all in float64 inside. Differentiable in H and f as often as one likes, by implicit
+    Few problems at once are solved one by one by DAQP, a compiled dual active set; many by splitting (products and
+    clamps), and then by active sets, which end it exactly. Differentiable in H and f as often as one likes, by implicit
     differentiation at the solution, and under the transforms of ``torch.func``.
 
     Args:
@@ -65,9 +64,7 @@ def box_qp(
 class BoxQP(nn.Module):
     """``box_qp`` as a module that checks and factors H once for many calls.
 
-    Calls of up to eight problems that ask for no gradients are made for live solving: on the processor they go to
-    NumPy and LAPACK, each from the active set of ``start`` or of the call before; with up to 80 variables to DAQP where
-    it is installed (the extra ``live``).
+    Few problems a call, such as a live frame, start from the active set of the call before.
 
     H is a buffer, or a parameter where an ``nn.Parameter`` is given. What is prepared from it follows it: an
     optimiser's step, ``load_state_dict``, ``.to()`` and ``.double()`` take effect at the next call.
@@ -118,7 +115,8 @@ class BoxQP(nn.Module):
     def _solved(self, f: Tensor, start: Tensor | None) -> Tensor:
         H, lower, upper = self.H, self.lower, self.upper
         prepared = self._prepared.get((H, lower, upper), lambda: PreparedProgram.of(H, lower, upper))
-        return _minimiser(H, prepared, f, start, TOLERANCE[H.dtype] if self.tolerance is None else self.tolerance)
+        tolerance = default_tolerance(H.dtype) if self.tolerance is None else self.tolerance
+        return _minimiser(H, prepared, f, start, tolerance)
 
     def extra_repr(self) -> str:
         return f"{self.H.shape[-1]} variables"
@@ -126,24 +124,18 @@ class BoxQP(nn.Module):
 
 def _minimiser(H: Tensor, prepared: PreparedProgram, f: Tensor, start: Tensor | None, tolerance: float) -> Tensor:
     """The minimisers (B,N), differentiable in H and f where these ask for it."""
-    tracing = torch.jit.is_tracing()
-    differentiable = torch.is_grad_enabled() and (H.requires_grad or f.requires_grad)
-    if not (tracing or differentiable) and f.dtype == H.dtype:
-        quick = prepared.solved_singly(f, start, tolerance)
-        if quick is not None:
-            return quick
-    if tracing:
+    if torch.jit.is_tracing():
         raise TraceError(
             "box_qp: iterates until every problem is solved, and a trace would repeat one frame's path for all; "
             "expected an ONNX graph made by `torchface export solver` (or torchface.onnx), which fixes the iterations"
         )
     check_vectors(H, f, start)
-    if differentiable:
-        solution: Tensor = BoxSolution.apply(
-            H, f, prepared.lower, prepared.upper, lambda _, f, *bounds: solve_in_chunks(prepared, f, start, tolerance)
-        )
-        return solution
-    return solve_in_chunks(prepared, f, start, tolerance)
+    if not (torch.is_grad_enabled() and (H.requires_grad or f.requires_grad)):
+        return prepared.solve(f, start, tolerance)
+    solution: Tensor = BoxSolution.apply(
+        H, f, prepared.lower, prepared.upper, lambda _, f, *bounds: prepared.solve(f, start, tolerance)
+    )
+    return solution
 
 
 def _transformed_minimiser(
@@ -154,7 +146,7 @@ def _transformed_minimiser(
     def solve(H: Tensor, f: Tensor, lower: Tensor, upper: Tensor) -> Tensor:
         prepared = PreparedProgram.of(H, lower, upper)
         check_vectors(H, f, None)
-        return solve_in_chunks(prepared, f, None, checked_tolerance(tolerance, H.dtype))
+        return prepared.solve(f, None, checked_tolerance(tolerance, H.dtype))
 
     bounds = (torch.as_tensor(bound, dtype=torch.float64, device=H.device).detach() for bound in (lower, upper))
     solution: Tensor = BoxSolution.apply(H, f, *bounds, solve)

@@ -118,7 +118,6 @@ def splitting_steps(
     factors: SplittingFactors,
     state: SplittingState,
     steps: int,
-    gradient: Tensor | None = None,
     dtype: torch.dtype = torch.float64,
 ) -> SplittingState:
     """The state after some steps.
@@ -128,14 +127,13 @@ def splitting_steps(
         factors: of its H.
         state: where to start.
         steps: how many.
-        gradient: of the problem at ``state.z``, (B,N), if it is at hand.
         dtype: in which the steps run; what goes in and comes out is float64.
 
     Raises:
         ValueRangeError: ``steps`` is negative or no whole number.
     """
     checked_count("splitting_steps: steps", steps)
-    run = _Run.of(problem, factors, state, gradient, dtype)
+    run = _Run.of(problem, factors, state, dtype)
     v = torch.empty_like(run.z)
     for _ in range(steps):
         run.step(v)
@@ -160,7 +158,7 @@ def extrapolated_splitting(
         ValueRangeError: ``cycles`` is negative or no whole number.
     """
     checked_count("extrapolated_splitting: cycles", cycles)
-    run = _Run.of(problem, factors, state, None, torch.float32)
+    run = _Run.of(problem, factors, state, torch.float32)
     iterates = run.z.new_empty(_ITERATES, *run.z.shape)
     for _ in range(_STEPS_BEFORE):
         run.step(iterates[0])
@@ -207,11 +205,12 @@ class _Run:
         problem: BoxProblem,
         factors: SplittingFactors,
         state: SplittingState,
-        gradient: Tensor | None,
         dtype: torch.dtype,
     ) -> _Run:
-        gradient = problem.gradient(state.z) if gradient is None else gradient
-        constant = factors.constant(state.z, gradient).to(dtype)
+        # From zero, where the gradient is f, there is less to form.
+        cold = not bool(state.z.any())
+        constant = _times(problem.f, factors.offset) if cold else factors.constant(state.z, problem.gradient(state.z))
+        constant = constant.to(dtype)
         lower, upper, step = problem.lower.to(dtype), problem.upper.to(dtype), factors.step.to(dtype)
         z, t = state.z.to(dtype, copy=True), state.t.to(dtype, copy=True)
         if step.ndim == 3:

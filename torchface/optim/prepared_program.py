@@ -1,4 +1,4 @@
-"""Values of box-constrained quadratic programs of one H and bounds, prepared once for many calls."""
+"""Box-constrained quadratic programs prepared once for many calls, and the choice of their solver."""
 
 from __future__ import annotations
 
@@ -9,31 +9,31 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchface.optim.box_checks import checked_bounds, checked_hessian
-from torchface.optim.compiled_program import CompiledProgram, compiled_solver_installed
+from torchface.optim.batched_program import solve_batch
+from torchface.optim.box_checks import check_bounded, check_finite, check_slope, checked_bounds, checked_hessian
+from torchface.optim.box_problem import BoxProblem
+from torchface.optim.one_by_one import Array, OneByOne
 from torchface.optim.operator_splitting import SplittingFactors, prepare_splitting, suited_rho
-from torchface.optim.single_program import SingleProgram
 
-# So many problems are solved one by one.
-_FEW = 8
-# Variables beyond which NumPy and LAPACK are the quicker ones.
-_COMPILED_VARIABLES = 80
+# Measured on 16 to 600 variables: DAQP is the faster one for up to so many problems times variables cubed of one H, and
+# for up to so many variables of an H each, however many problems.
+_FEW, _FEW_VARIABLES = 250**3, 80
+# Numbers in one chunk of frames: its buffers stay in a CPU's second-level cache; an accelerator wants more.
+_CHUNK_NUMBERS = {"cpu": 2**17, "other": 2**23}
 
 
 @dataclass(frozen=True, eq=False)
 class PreparedProgram:
-    """The symmetric part of H in float64, bounds in float64, and the factors of one H for all problems.
+    """The symmetric part of H in float64, and bounds in float64.
 
     Args:
-        H: (N,N) or (B,N,N).
-        lower, upper: (N,).
-        factors: of one H for all problems, none where each has its own.
+        H: (N,N) for all problems or (B,N,N).
+        lower, upper: (N,), infinite where there is no bound.
     """
 
     H: Tensor
     lower: Tensor
     upper: Tensor
-    factors: SplittingFactors | None
 
     @classmethod
     @torch.no_grad()
@@ -44,48 +44,70 @@ class PreparedProgram:
             ShapeError, ValueRangeError: as ``box_qp`` says.
         """
         exact = checked_hessian(H)
-        factors = prepare_splitting(exact, suited_rho(exact)) if exact.ndim == 2 else None
-        return cls(exact, *checked_bounds(lower, upper, exact), factors)
+        return cls(exact, *checked_bounds(lower, upper, exact))
 
-    @cached_property
-    def single(self) -> SingleProgram | CompiledProgram | None:
-        """For calls of few problems; on an accelerator, or with an H for each problem, there is none."""
-        if self.factors is None or self.H.device.type != "cpu":
-            return None
-        single = SingleProgram(self.H, self.factors, self.lower, self.upper)
-        if len(self.H) > _COMPILED_VARIABLES or not compiled_solver_installed():
-            return single
-        return CompiledProgram(self.H.numpy(), self.lower.numpy(), self.upper.numpy(), single)
-
-    @cached_property
-    def _rounded_bounds(self) -> tuple[np.ndarray, np.ndarray]:
-        return self.lower.float().numpy(), self.upper.float().numpy()
-
-    def solved_singly(self, f: Tensor, start: Tensor | None, tolerance: float) -> Tensor | None:
-        """The minimisers (B,N) of few problems, one by one, where each is found.
-
-        What is not as it should be is left to the checks of a batch.
+    def solve(self, f: Tensor, start: Tensor | None, tolerance: float) -> Tensor:
+        """The minimisers (B,N), in the dtype of f: of few problems by DAQP, of many, and what that leaves, as batches.
 
         Args:
-            f: of H's dtype, without gradients.
-            start: as in ``box_qp``.
-            tolerance: as in ``box_qp``.
+            f: (B,N).
+            start: (B,N), or none.
+            tolerance: on the residual of ``box_qp``.
+
+        Raises:
+            ValueRangeError: f is not finite or too steep, or a problem has no minimum.
         """
-        program = self.single
-        if program is None or f.ndim != 2 or not 0 < len(f) <= _FEW or f.shape[1] != len(self.H) or not f.is_cpu:
-            return None
-        if start is not None and (start.shape != f.shape or not start.is_cpu):
-            return None
-        slopes = f.detach().numpy().astype(np.float64, copy=False)
-        starts = None if start is None else start.detach().numpy().astype(np.float64, copy=False)
-        found = np.empty(slopes.shape)
-        for row, slope in enumerate(slopes):  # a batch of few takes as long as a dozen of these
-            x = program.solve(slope, None if starts is None else starts[row], tolerance)
-            if x is None:
-                return None
-            found[row] = x
-        if f.dtype == torch.float32:
-            # Rounding must not step over a bound.
-            lower, upper = self._rounded_bounds
-            found = np.minimum(np.maximum(found.astype(np.float32), lower), upper)
-        return torch.from_numpy(found)
+        if self._are_few(len(f)):
+            x = self._solve_few(f.detach().numpy(), tolerance)
+        else:
+            check_finite(f, start)
+            x = self._in_chunks(f.detach().double(), None if start is None else start.detach().double(), tolerance)
+        if f.dtype == torch.float64:
+            return x
+        # Rounding must not step over a bound.
+        return torch.minimum(torch.maximum(x.to(f.dtype), self.lower.to(f)), self.upper.to(f))
+
+    def _solve_few(self, f: Array, tolerance: float) -> Tensor:
+        f = f.astype(np.float64, copy=False)
+        x, solved = self._one_by_one.solve(f, tolerance)
+        found = torch.from_numpy(x)
+        if not solved.all():
+            rows, slopes = torch.from_numpy((~solved).nonzero()[0]), torch.from_numpy(f[~solved])
+            check_finite(torch.from_numpy(f), None)
+            found[rows] = self._rows(rows)._in_chunks(slopes, found[rows].nan_to_num(0.0), tolerance)
+        return found
+
+    def _are_few(self, problems: int) -> bool:
+        size = len(self.lower)
+        few = problems * size**3 <= _FEW if self.H.ndim == 2 else size <= _FEW_VARIABLES
+        return few and self.H.device.type == "cpu"
+
+    @cached_property
+    def _one_by_one(self) -> OneByOne:
+        return OneByOne(self.H, self.lower, self.upper)
+
+    @cached_property
+    def _factors(self) -> SplittingFactors:
+        return prepare_splitting(self.H, suited_rho(self.H))
+
+    def _rows(self, keep: Tensor | slice) -> PreparedProgram:
+        return self if self.H.ndim == 2 else PreparedProgram(self.H[keep], self.lower, self.upper)
+
+    @torch.no_grad()
+    def _in_chunks(self, f: Tensor, start: Tensor | None, tolerance: float) -> Tensor:
+        """The minimisers (B,N), float64, as many at once as stay in a cache."""
+        count, size = f.shape
+        solution = torch.empty_like(f)
+        numbers = _CHUNK_NUMBERS.get(f.device.type, _CHUNK_NUMBERS["other"])
+        most = max(1, numbers // (size if self.H.ndim == 2 else size**2))
+        chunk = max(1, -(-count // max(1, -(-count // most))))  # all of about one size: a short one costs as many calls
+        for first in range(0, count, chunk):
+            rows = slice(first, first + chunk)
+            part = self._rows(rows)
+            problem = BoxProblem.of(part.H, f[rows], self.lower, self.upper)
+            check_slope(problem)
+            factors = self._factors if self.H.ndim == 2 else None
+            x = solve_batch(problem, factors, None if start is None else start[rows], tolerance)
+            check_bounded(problem, x)
+            solution[rows] = x
+        return solution

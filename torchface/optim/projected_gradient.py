@@ -21,7 +21,7 @@ from torch import Tensor, nn
 
 from torchface.errors import ShapeError, ValueRangeError
 from torchface.number_checks import checked_count, checked_number
-from torchface.optim.box_checks import check_vectors, checked_bounds, checked_hessian
+from torchface.optim.box_checks import check_finite, check_vectors, checked_bounds, checked_hessian
 from torchface.optim.box_problem import metric
 from torchface.optim.data_dependent import is_transformed
 from torchface.optim.implicit import free_step
@@ -126,6 +126,7 @@ class ProjectedGradient(nn.Module):
             raise ShapeError("ProjectedGradient: found no H, expected one here or where the module is made")
         if not (_recorded() or is_transformed()):
             check_vectors(H, f, start, _NAME)
+            check_finite(f, start, _NAME)
             if self.lower.ndim and len(self.lower) != f.shape[1]:
                 raise ShapeError(f"{_NAME}: found f {tuple(f.shape)}, expected {len(self.lower)} columns, as of bounds")
             if not own:

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import pytest
 import torch
+from torch import Tensor
 
 from torchface import Attachment, BlendshapeRig, Take, Track
 from torchface.capture import HybridSolver, MarkerSolver
 from torchface.capture.markers import gamma_curves
 from torchface.errors import NameMismatchError, ShapeError, ValueRangeError
+from torchface.optim import box_qp
+from torchface.optim.box_checks import default_tolerance
 
 
 @pytest.fixture(scope="module")
@@ -56,6 +59,24 @@ def test_gradients_agree_with_finite_differences(hybrid: HybridSolver) -> None:
     gamma = torch.full_like(truth, 2.0)
     predicted = (0.8 * truth + 0.1).requires_grad_()
     assert torch.autograd.gradcheck(lambda p: hybrid(markers, p, gamma), (predicted,), eps=1e-5, atol=1e-6)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_both_solves_stop_at_the_tolerance_of_the_markers(
+    hybrid: HybridSolver, dtype: torch.dtype, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    markers, truth = seen(hybrid, 3)
+    markers[1, :5] = torch.nan
+    asked: list[float] = []
+
+    def watched(H: Tensor, f: Tensor, lower: float, upper: float, start: Tensor, tolerance: float) -> Tensor:
+        asked.append(tolerance)
+        return box_qp(H, f, lower, upper, start, tolerance)
+
+    for solver in ("marker_solver", "hybrid_solver"):
+        monkeypatch.setattr(f"torchface.capture.markers.{solver}.box_qp", watched)
+    hybrid(markers.to(dtype), truth.to(dtype), torch.ones_like(truth).to(dtype))
+    assert asked == 2 * [default_tolerance(dtype)]
 
 
 def test_gamma_fades_in_and_out_within_its_bounds() -> None:

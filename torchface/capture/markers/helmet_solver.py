@@ -9,12 +9,13 @@ from torch import Tensor, nn
 
 from torchface.attachment import Attachment
 from torchface.capture.corrective_energy import CorrectiveEnergy, least_in_box
-from torchface.capture.energy import Quadratic, marker_term
+from torchface.capture.energy import Quadratic, chunks_of_frames, marker_term
 from torchface.capture.markers.marker_solver import RIDGE, SPARSITY, MarkerSolver, frames_seen
 from torchface.errors import NameMismatchError, ShapeError
 from torchface.geometry.rotations import rotation_matrix, rotation_vector
 from torchface.geometry.similarity import Similarity
 from torchface.optim import BoxQP, box_qp
+from torchface.optim.box_checks import default_tolerance
 from torchface.optim.data_dependent import data_dependent
 from torchface.rig import BlendshapeRig
 from torchface.take import Take, Track
@@ -25,8 +26,6 @@ _ARM = 30.0
 # mm² a marker for a squared millimetre of slip: counts only where markers are too few to determine a motion.
 _MOTION_RIDGE = 1e-4
 _MAX_ITERATIONS, _MOTION_TOLERANCE = 6, 1e-4
-_TOLERANCE = {torch.float32: 3e-6, torch.float64: 1e-11}
-_CHUNK_NUMBERS = 2**23
 
 
 @dataclass(frozen=True, eq=False)
@@ -138,16 +137,15 @@ class HelmetSolver(nn.Module):
             raise ShapeError(f"markers: found {tuple(markers.shape)}, expected (B,{len(self.markers.rest)},3)")
         alignment = self.markers.alignment
         seen = markers.double() if alignment is None else alignment.apply(markers.double())
-        tolerance = _TOLERANCE.get(markers.dtype, 3e-6)
+        tolerance = default_tolerance(markers.dtype)
         gaps = torch.isnan(seen).any(-1).any(-1)
         if bool(torch.isnan(seen).any(-1).all(-1).any()):
             self.markers(markers)  # its error names the empty frames
         weights = seen.new_zeros(len(seen), len(self.names))
         rotation = torch.eye(3, dtype=seen.dtype, device=seen.device).repeat(len(seen), 1, 1)
         translation = seen.new_zeros(len(seen), 3)
-        chunk = max(1, _CHUNK_NUMBERS // (len(self.names) + 6) ** 2)
         # Frames without gaps share one H; each of the others has its own, a chunk of them in memory at once.
-        for rows in [(~gaps).nonzero()[:, 0], *gaps.nonzero()[:, 0].split(chunk)]:
+        for rows in [(~gaps).nonzero()[:, 0], *chunks_of_frames(gaps.nonzero()[:, 0], len(self.names) + 6)]:
             if len(rows):
                 weights[rows], rotation[rows], translation[rows] = self._solve(seen[rows], tolerance)
         motion = HelmetMotion(rotation, translation, self.markers.rest.double().mean(0))

@@ -8,21 +8,18 @@ import torch
 from torch import Tensor, nn
 
 from torchface.capture.corrective_energy import CorrectiveEnergy, least_in_box
-from torchface.capture.energy import Quadratic, pull_term
+from torchface.capture.energy import Quadratic, chunks_of_frames, pull_term
 from torchface.capture.markers.marker_solver import MarkerSolver, frames_seen
 from torchface.errors import NameMismatchError, ShapeError, ValueRangeError
 from torchface.number_checks import LARGEST_WEIGHT, checked_number
 from torchface.optim import box_qp
+from torchface.optim.box_checks import default_tolerance
 from torchface.optim.data_dependent import data_dependent
 from torchface.take import Take, Track
 from torchface.temporal import interpolated, savitzky_golay
 
 GAMMA = 4.0
 """Largest weight of a prediction, mm² over all markers for a squared weight of 1."""
-
-# Numbers in the matrices of frames that are in memory at once: 64 MB of float64.
-_CHUNK_NUMBERS = 2**23
-_TOLERANCE = {torch.float32: 3e-6, torch.float64: 1e-11}
 
 
 def gamma_curves(active: Tensor, maximum: float = GAMMA, window: int = 15, order: int = 2) -> Tensor:
@@ -123,17 +120,17 @@ class HybridSolver(nn.Module):
         if not len(pulled):
             return alone
         parts = []
-        for chunk in pulled.split(max(1, _CHUNK_NUMBERS // len(self.names) ** 2)):
+        tolerance = default_tolerance(markers.dtype)
+        for chunk in chunks_of_frames(pulled, len(self.names)):
             active = gamma[chunk] > 0
             energy = self.energy(markers[chunk], torch.where(active, predicted[chunk], 0.0), gamma[chunk])
             start = alone[chunk].detach().double()
             if isinstance(energy, CorrectiveEnergy):
                 lower, upper = torch.zeros_like(start[0]), torch.ones_like(start[0])
-                tolerance = _TOLERANCE.get(markers.dtype, 3e-6)
                 parts.append(least_in_box(energy, start, lower, upper, tolerance).to(alone.dtype))
                 continue
             H = energy.H if energy.H.ndim == 3 else energy.H.expand(len(chunk), -1, -1)
-            parts.append(box_qp(H, energy.f, 0.0, 1.0, start).to(alone.dtype))
+            parts.append(box_qp(H, energy.f, 0.0, 1.0, start, tolerance).to(alone.dtype))
         return alone.index_copy(0, pulled, torch.cat(parts))
 
     def solve_take(self, take: Take, predicted: Track, gamma: Track) -> Take:

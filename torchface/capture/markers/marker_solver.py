@@ -12,12 +12,13 @@ from torch import Tensor, nn
 
 from torchface.attachment import Attachment
 from torchface.capture.corrective_energy import CorrectiveEnergy, least_in_box
-from torchface.capture.energy import Quadratic, marker_term, ridge_term, sparsity_term
+from torchface.capture.energy import Quadratic, chunks_of_frames, marker_term, ridge_term, sparsity_term
 from torchface.correctives.activation import CorrectiveActivation
 from torchface.correctives.corrective_shapes import Corrective, definitions_from_records
 from torchface.errors import NameMismatchError, ShapeError, ValueRangeError
 from torchface.geometry.similarity import Similarity
 from torchface.optim import BoxQP, ProjectedGradient, box_qp
+from torchface.optim.box_checks import default_tolerance
 from torchface.optim.data_dependent import data_dependent
 from torchface.optim.prepared_tensors import Prepared
 from torchface.rig import BlendshapeRig
@@ -30,10 +31,6 @@ from torchface.temporal import interpolated
 SPARSITY = 0.01
 # Small against the smallest curvature that 100 markers give 53 real shapes, yet enough for layouts that see less.
 RIDGE = 1e-3
-
-_TOLERANCE_FLOAT32, _TOLERANCE_FLOAT64 = 3e-6, 1e-11
-# Numbers in the matrices of frames with gaps that are in memory at once: 64 MB of float64.
-_CHUNK_NUMBERS = 2**23
 
 
 class MarkerSolver(nn.Module):
@@ -268,7 +265,7 @@ class MarkerSolver(nn.Module):
             raise ShapeError(f"markers: found {tuple(markers.shape)}, expected (B,{len(self.rest)},3)")
         missing = torch.isnan(markers).any(-1)
         _check_seen(missing)
-        tolerance = _TOLERANCE_FLOAT64 if markers.dtype == torch.float64 else _TOLERANCE_FLOAT32
+        tolerance = default_tolerance(markers.dtype)
         initial = None if initial is None else initial.double()
         gaps = missing.any(-1)
         if self.activation is not None:
@@ -278,7 +275,7 @@ class MarkerSolver(nn.Module):
         whole = (~gaps).nonzero()[:, 0]
         rows, parts = [whole], [self._complete(markers[whole], None if initial is None else initial[whole], tolerance)]
         # A frame with gaps has an H of its own; a chunk of them bounds the memory.
-        for chunk in gaps.nonzero()[:, 0].split(max(1, _CHUNK_NUMBERS // len(self.names) ** 2)):
+        for chunk in chunks_of_frames(gaps.nonzero()[:, 0], len(self.names)):
             energy = self._linear_energy(markers[chunk])
             rows.append(chunk)
             guess = None if initial is None else initial[chunk]
@@ -340,7 +337,7 @@ class MarkerSolver(nn.Module):
         rows, parts = [], []
         whole = (~gaps).nonzero()[:, 0]
         size = self.basis.shape[-1] + (0 if self.corrective_basis is None else self.corrective_basis.shape[-1])
-        for chunk in [whole, *gaps.nonzero()[:, 0].split(max(1, _CHUNK_NUMBERS // size**2))]:
+        for chunk in [whole, *chunks_of_frames(gaps.nonzero()[:, 0], size)]:
             if len(chunk):
                 energy = self.complete_energy(markers[chunk]) if chunk is whole else self.energy(markers[chunk])
                 assert isinstance(energy, CorrectiveEnergy)

@@ -14,9 +14,9 @@ from torchface.geometry.mirrored_points import check_mirrored
 from torchface.geometry.rotations import cross_matrix, rotation_matrix
 from torchface.geometry.similarity import Similarity, similarity_transform
 from torchface.optim import BoxQP
+from torchface.optim.box_checks import default_tolerance
 
 _MIN_EXTENT_RATIO = 1e-2
-_QP_TOLERANCE = 3e-6
 _FILL_ITERATIONS = 12
 _FREE_RIDGE = 1e-4
 _FIRST_RIDGE, _LAST_RIDGE, _ANNEALING_ITERATIONS = 3.0, 0.01, 20
@@ -61,7 +61,7 @@ def solve_weights(
         if passes > 1:
             filled = torch.where(gaps, rest + torch.einsum("mcn,tn->tmc", basis, weights), moved)
         energy = marker_term(basis, rest, filled)
-        solve = solve or BoxQP(energy.H + torch.diag(2 * ridges), lower, upper, _QP_TOLERANCE)
+        solve = solve or BoxQP(energy.H + torch.diag(2 * ridges), lower, upper, default_tolerance(torch.float32))
         weights = solve(energy.f, weights)
     return weights
 

@@ -19,15 +19,12 @@ from torchface.capture.energy import Quadratic
 from torchface.capture.own_rig.face_points import JAW, FacePoints
 from torchface.geometry.cameras.pnp import pixel_jacobian
 from torchface.geometry.rotations import rotation_matrix
-from torchface.optim.active_set import projected_newton
-from torchface.optim.box_problem import BoxProblem
 from torchface.optim.exported_operators import split_box_program, split_box_program_quickly
-from torchface.optim.warm_active_set import solve_from_active_set
+from torchface.optim.prepared_program import PreparedProgram
 
 SLIDING_STEPS = 3
 """Steps of a frame in which landmarks of the contour may slide: later they could go back and forth."""
 
-_NEWTON_STEPS = 50
 _RHO = 0.05  # of the splitting's metric, a share of H's diagonal
 _FREE = 1e9  # a bound that no motion reaches
 _HALVINGS = 3
@@ -165,11 +162,7 @@ def box_step(energy: Quadratic, head: HeadState, lower: Tensor, upper: Tensor, e
     """
     begin = pad(head.weights, (0, 6))
     H, f = energy.H, energy.f - (energy.H @ begin[..., None])[..., 0]
-    if len(begin) == 1:
-        least = solve_from_active_set(H[0], f[0], lower, upper, begin[0], exactness, _NEWTON_STEPS)[None]
-    else:
-        problem = BoxProblem.of(0.5 * (H + H.transpose(1, 2)), f, lower, upper)
-        least = projected_newton(problem, begin, exactness, _NEWTON_STEPS)
+    least = PreparedProgram(0.5 * (H + H.transpose(1, 2)), lower, upper).solve(f, begin, exactness)
     return head.moved(least[:, :-6], least[:, -6:])
 
 

@@ -16,8 +16,6 @@ from torchface.number_checks import LARGEST_WEIGHT, checked_number
 from torchface.optim import BoxQP
 from torchface.optim.prepared_tensors import Prepared
 
-_TOLERANCE = 1e-11
-
 
 class LandmarkModel(nn.Module):
     r"""Principal components of landmark shapes, and the way from their coefficients to the weights of named shapes.
@@ -174,7 +172,7 @@ class LandmarkModel(nn.Module):
             H = (2 / (68 * eyes**2)) * (onto.T @ onto)
             shapes = H.shape[0]
             penalties = sparsity_term(shapes, self.sparsity, H) + ridge_term(shapes, self.ridge, H)
-            return BoxQP(H + penalties.H, 0.0, 1.0, _TOLERANCE)
+            return BoxQP(H + penalties.H)
 
         return self._prepared.get((self.components, basis), prepare)
 

@@ -13,7 +13,6 @@ from torchface.capture.energy import Quadratic, ridge_term, sparsity_term
 from torchface.number_checks import LARGEST_WEIGHT, checked_count, checked_number
 from torchface.optim import box_qp
 
-_TOLERANCE = 1e-11
 # Of the way from the bound's matrix to the second derivative, which may be singular; and the lengths of a step tried.
 _NEWTON = 0.95
 _LENGTHS = (1.0, 0.6, 0.3, 0.1, 0.03)
@@ -64,7 +63,7 @@ class SquaredDistances:
         """
         squares = equations.least_squares(equations.share)
         energy = squares.energy + _penalties(self, equations)
-        return squares.unknowns(box_qp(energy.H, energy.f, start=initial, tolerance=_TOLERANCE))
+        return squares.unknowns(box_qp(energy.H, energy.f, start=initial))
 
     def value(self, equations: LandmarkEquations, found: Unknowns) -> Tensor:
         """What is minimised, (B,)."""
@@ -191,7 +190,7 @@ class Distances:
             free = unknowns.free.shape[1]
             lower = at.new_tensor([0.0] * shapes + [-torch.inf] * free)
             upper = at.new_tensor([1.0] * shapes + [torch.inf] * free)
-        return box_qp(H, first - (H @ at[..., None])[..., 0], lower, upper, at, _TOLERANCE)
+        return box_qp(H, first - (H @ at[..., None])[..., 0], lower, upper, at)
 
 
 def _penalties(objective: SquaredDistances | Distances, equations: LandmarkEquations) -> Quadratic:

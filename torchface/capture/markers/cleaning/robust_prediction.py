@@ -11,13 +11,13 @@ from torchface.capture.markers.helmet_solver import rigid_columns
 from torchface.capture.markers.marker_solver import MarkerSolver, penalty_value
 from torchface.capture.markers.rest_pose import sample_limits
 from torchface.optim import BoxQP
+from torchface.optim.box_checks import default_tolerance
 
 # Samples with a larger residual are left out of the next iteration, mm; then the take's own limit counts.
 _ANNEALED_LIMITS = (20.0, 12.0, 8.0, 6.0, 5.0)
 _LAST_ITERATIONS, _FIRST_FILL_ITERATIONS = 4, 6
 _MAX_BIAS = 2.0
 _RIDGE, _MOTION_RIDGE = 1e-2, 1e-4
-_TOLERANCE = 3e-6
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,7 +66,7 @@ def predict_markers(
         penalty = torch.cat([penalty, rest.new_zeros(6)])
     rows = columns.flatten(0, 1)
     scale = 2.0 / len(rest)
-    qp = BoxQP(scale * (rows.T @ rows) + torch.diag(ridge), lower, upper, _TOLERANCE)
+    qp = BoxQP(scale * (rows.T @ rows) + torch.diag(ridge), lower, upper, default_tolerance(torch.float32))
 
     def solve(inlier: Tensor, weights: Tensor, bias: Tensor, passes: int) -> Tensor:
         for _ in range(passes):  # outliers are filled in by the weights: one H for all frames
