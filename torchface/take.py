@@ -192,6 +192,24 @@ class Take:
         seconds = None if self.seconds is None else self.seconds[rows]
         return Take(self.fps, markers, landmarks, weights, timecode, extras, seconds)
 
+    def rows(self, rows: Tensor) -> Take:
+        """Some frames at their own times, with their extras and frame numbers.
+
+        Args:
+            rows: which, rising, (K,) int64.
+
+        Example:
+            >>> take = Take(2.0, weights=Track(("jawOpen",), torch.tensor([0.0, 0.5, 1.0])[:, None, None]))
+            >>> take.rows(torch.tensor([0, 2])).times.tolist()
+            [0.0, 1.0]
+        """
+        markers, landmarks, weights = (
+            None if track is None else track.frames(rows) for track in (self.markers, self.landmarks, self.weights)
+        )
+        timecode = None if self.timecode is None else tuple(self.timecode[row] for row in rows.tolist())
+        extras = _cut_extras(self.extras, rows, len(self))
+        return Take(self.fps, markers, landmarks, weights, timecode, extras, self.clock[rows])
+
     def resampled(self, fps: float | None = None) -> Take:
         """The take with frames at an even rate over the same time, linear in between: for what needs one.
 
@@ -265,16 +283,22 @@ class Take:
         return Take(fps, moved(self.markers), moved(self.landmarks), moved(self.weights))
 
 
-def _cut_extras(extras: dict[str, Any], rows: slice, count: int) -> dict[str, Any]:
+def _cut_extras(extras: dict[str, Any], rows: slice | Tensor, count: int) -> dict[str, Any]:
     """What readers keep a frame at a time, cut like the tracks."""
+
+    def some(column: Any) -> Any:
+        if isinstance(rows, Tensor) and not isinstance(column, Tensor):
+            return tuple(column[row] for row in rows.tolist())
+        return column[rows]
+
     cut = dict(extras)
     numbers = extras.get("frame_numbers")
-    if numbers is not None or rows.start > 0:
-        cut["frame_numbers"] = (torch.arange(count) if numbers is None else numbers)[rows]
+    if numbers is not None or isinstance(rows, Tensor) or rows.start > 0:
+        cut["frame_numbers"] = some(torch.arange(count) if numbers is None else numbers)
     if "columns" in extras:
-        cut["columns"] = {name: column[rows] for name, column in extras["columns"].items()}
+        cut["columns"] = {name: some(column) for name, column in extras["columns"].items()}
     if "blendshape_count" in extras:
-        cut["blendshape_count"] = extras["blendshape_count"][rows]
+        cut["blendshape_count"] = some(extras["blendshape_count"])
     return cut
 
 

@@ -107,12 +107,13 @@ class MayaScene:
         if kind in ("pointArray", "componentList"):
             each = 4 if kind == "pointArray" else 1
             assert len(values) == 1 + each * int(values[0]), name
-        span = re.fullmatch(r"(.*)\[(\d+):(\d+)\]", name)
+        span = re.fullmatch(r"(.*)\[(\d+)(?::(\d+))?\]", name)
         if span is None:
             assert name not in node.values
             node.values[name] = values
             return
-        base, low, high = span[1], int(span[2]), int(span[3])
+        base, low, high = span[1], int(span[2]), int(span[3] or span[2])
+        assert span[3] is None or high > low
         assert count is not None
         assert high < count
         node.values.setdefault(base, [])

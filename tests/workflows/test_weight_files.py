@@ -5,19 +5,20 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
 from torchface.capture import MarkerSolver
 from torchface.cli import main
-from torchface.io import load_take, save_rig, save_take
+from torchface.io import load_animation, load_take, save_rig, save_take
 from torchface.io.weights.live_link_csv import not_in_live_link
 from torchface.io.weights.weight_csv import ROTATIONS, load_weights_csv, save_weights_csv
 from torchface.rig import BlendshapeRig
-from torchface.shape_names import ARKIT
+from torchface.shape_names import ARKIT, spelled_as
 from torchface.synthetic.stages.marker_stage import StageFlaws, place_markers, record
 from torchface.take import Take, Track
-from torchface.workflows.weight_files import weight_faults
+from torchface.workflows.weight_files import reduced_take, weight_faults
 
 DOME = ("jawOpen", "browInnerUp", "mouthSmileLeft", "mouthSmileRight")
 OWN = ("ctrl_a", "ctrl_b", "ctrl_c", "ctrl_d")
@@ -189,3 +190,60 @@ def test_weights_go_to_a_csv_only(stage: Path, tmp_path: Path, capsys: pytest.Ca
         ])  # fmt: skip
     assert "weights.xlsx: found the ending '.xlsx', expected .csv" in " ".join(capsys.readouterr().err.split())
     assert not list(tmp_path.iterdir())
+
+
+def lines_at(keys: Take, times: torch.Tensor) -> np.ndarray:
+    """What straight lines between a take's keys are at some times, (T,N)."""
+    assert keys.weights is not None
+    rows = keys.weights.values[..., 0].double().T.numpy()
+    return np.stack([np.interp(times.numpy(), keys.times.numpy(), row) for row in rows], 1)
+
+
+@pytest.mark.parametrize(("rig", "ending"), [("own", ".glb"), ("arkit", ".ma"), ("arkit", ".usdc")])
+def test_few_keys_are_written_within_a_bound_of_every_frame(
+    rig: str, ending: str, stage: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    whole = load_take(solve(stage, rig))
+    moved = stage / f"moved{ending}"
+    few = load_take(solve(stage, rig, "--reduce", "0.05", "--animation", moved))
+    told = " ".join(capsys.readouterr().err.split())
+    assert told.count(" keys, largest error 0.0") == 2
+    assert f"{len(few)} of 30 keys" in told
+    assert len(few) < 20
+    names = few.weights.names
+    assert np.abs(lines_at(few, whole.times) - whole.weights.select(names).values[..., 0].numpy()).max() <= 0.05 + 1e-6
+    assert float(few.times[-1]) == pytest.approx(float(whole.times[-1]), abs=1e-4)
+    if ending != ".ma":
+        main(["convert", str(moved), str(stage / "again.glb"), "--reduce", "0.1", "--quiet"])
+        again = load_animation(stage / "again.glb")
+        assert len(again) < len(few)
+        own = whole.weights.select([spelled_as(name, whole.weights.names) for name in again.weights.names])
+        assert np.abs(lines_at(again, whole.times) - own.values[..., 0].numpy()).max() <= 0.15 + 1e-6
+
+
+def test_reduced_takes_keep_rotations_timecodes_and_frame_numbers(tmp_path: Path) -> None:
+    take = phone_take()
+    smooth = torch.linspace(0, 1, 30)
+    columns = {name: 0.3 * smooth.double().square() for name in ROTATIONS}
+    track = Track(OWN, (smooth[:, None] * torch.tensor([0.2, 0.4, 0.0, 1.0]))[..., None])
+    few, reduction = reduced_take(replace(take, weights=track, extras={"columns": columns}), 2e-3)
+    assert (reduction.before, reduction.after) == (30, len(few))
+    assert 2 < len(few) < 12  # the rotations bend
+    rows = few.extras["frame_numbers"]
+    assert few.timecode == tuple(TIMECODE[row] for row in rows.tolist())
+    between = np.interp(np.arange(30), rows.numpy(), few.extras["columns"]["HeadYaw"].numpy())
+    assert np.abs(between - columns["HeadYaw"].numpy()).max() <= 2e-3
+    save_take(few, tmp_path / "few.csv")
+    back = load_take(tmp_path / "few.csv")
+    assert back.fps == 60.0
+    assert torch.equal(back.extras["frame_numbers"], rows)
+    torch.testing.assert_close(back.times, rows.double() / 60)
+
+
+@pytest.mark.parametrize("bound", ["0", "-1", "nan", "2"])
+def test_other_bounds_are_refused(bound: str, stage: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        solve(stage, "own", "--reduce", bound)
+    assert "--reduce: found" in capsys.readouterr().err
+    with pytest.raises(SystemExit):
+        main(["convert", str(stage / "own.glb"), str(stage / "b.glb"), "--reduce", bound])

@@ -32,6 +32,14 @@ OutputPath = Annotated[Path, Output()]
 OptionalOutputPath = Annotated[Path | None, Output()]
 """A file or folder that a command writes; see :class:`Output`."""
 
+Reduce = Annotated[
+    float | None,
+    arg(
+        help="Write as few keys as keep every frame's weights within this of straight lines between keys, such as "
+        "0.001, in place of a key or a row for each frame."
+    ),
+]
+
 Command = TypeVar("Command", bound=Callable[..., Any])
 
 

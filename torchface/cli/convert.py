@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 from tyro.conf import Positional, arg
 
-from torchface.cli.command_options import OutputPath
+from torchface.cli.command_options import OutputPath, Reduce
 from torchface.cli.progress_bars import progress_bars
 from torchface.cli.terminal import Quiet, console, print_lines, print_path
 
@@ -19,6 +19,7 @@ def convert(
     part: str | None = None,
     names: Literal["arkit"] | None = None,
     at: tuple[str, ...] = (),
+    reduce: Reduce = None,
     quiet: Quiet = False,
 ) -> None:
     """Write a rig with its animation, or a mesh, as another kind of file, FBX and Blender's own among them.
@@ -42,7 +43,7 @@ def convert(
 
     with progress_bars(quiet) as progress:
         pose = pose_weights(" ".join(at).split())
-        done = convert_file(source, out, unit, part, names, progress, pose)
+        done = convert_file(source, out, unit, part, names, progress, pose, reduce)
     shapes = 0 if done.rig is None else len(done.rig.names)
     frames = "" if done.take is None else f", {len(done.take)} frames at {done.take.rate}"
     console.print(f"{shapes} shapes, {len(done.mesh.vertices):,} vertices{frames}", highlight=False)

@@ -7,7 +7,7 @@ from typing import Annotated
 
 from tyro.conf import Positional, arg
 
-from torchface.cli.command_options import OptionalOutputPath, OutputPath
+from torchface.cli.command_options import OptionalOutputPath, OutputPath, Reduce
 from torchface.cli.progress_bars import progress_bars
 from torchface.cli.terminal import Quiet, console, print_lines, print_path
 
@@ -23,6 +23,7 @@ def retarget(
     out: OutputPath = Path("out/retargeted.csv"),
     live_link: OptionalOutputPath = None,
     animation: OptionalOutputPath = None,
+    reduce: Reduce = None,
     part: str | None = None,
     quiet: Quiet = False,
 ) -> None:
@@ -54,7 +55,7 @@ def retarget(
     from torchface.workflows.weight_files import WeightFiles
 
     with file_lock(out, ".csv"), progress_bars(quiet) as progress:
-        files = WeightFiles(out, animation, live_link)
+        files = WeightFiles(out, animation, live_link, reduce)
         done = retarget_weights(weights, to, files, from_, table, part, progress, poses)
     driven = len(done.shapes.to_names) - len(done.shapes.undriven)
     console.print(f"{len(done.take)} frames; {driven} of {len(done.shapes.to_names)} shapes driven")

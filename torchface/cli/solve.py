@@ -9,7 +9,7 @@ from typing import Annotated, Literal
 from tyro.conf import Positional, arg
 
 from torchface.cli.batch_report import Cluster, Column, Jobs, TimeLimit, show_batch, skipped_lines
-from torchface.cli.command_options import OptionalOutputPath, OutputPath
+from torchface.cli.command_options import OptionalOutputPath, OutputPath, Reduce
 from torchface.cli.progress_bars import progress_bars
 from torchface.cli.terminal import Quiet, print_lines, print_path
 
@@ -28,6 +28,7 @@ def solve(
     out: OutputPath = Path("out/weights.csv"),
     live_link: OptionalOutputPath = None,
     animation: OptionalOutputPath = None,
+    reduce: Reduce = None,
     neutral: Annotated[int | None, arg(aliases=["--neutral-frame"])] = None,
     align: bool = False,
     keep_rest: bool = False,
@@ -129,7 +130,7 @@ def solve(
         written = {"--animation": animation, "--report": report, "--live-link": live_link}
         for option, path in written.items():
             check_for_each(option, path)
-        job = TakeJob(rig, attachment, settings, options, part, camera, animation, report, live_link)
+        job = TakeJob(rig, attachment, settings, options, part, camera, animation, report, live_link, reduce)
         items = find_items(take, MARKER_TAKES)
         with progress_bars(quiet) as progress:
             where = BatchOptions(jobs, cluster, time_limit)
@@ -138,6 +139,6 @@ def solve(
         return
     with file_lock(out, ".csv"), progress_bars(quiet) as progress:
         inputs = TakeInputs(rig, take[0], attachment, part, camera, options)
-        done = solve_take(inputs, TakeOutputs(out, animation, live_link, report, stream), settings, progress)
+        done = solve_take(inputs, TakeOutputs(out, animation, live_link, reduce, report, stream), settings, progress)
     print_lines(done.lines())
     print_path(out)

@@ -9,7 +9,7 @@ from typing import Annotated, Literal
 from tyro.conf import Positional, arg
 
 from torchface.cli.batch_report import Cluster, Column, Jobs, TimeLimit, show_batch, skipped_lines
-from torchface.cli.command_options import Output, picture_size
+from torchface.cli.command_options import Output, Reduce, picture_size
 from torchface.cli.progress_bars import progress_bars
 from torchface.cli.terminal import Quiet, console, print_lines, print_path
 
@@ -42,6 +42,7 @@ def track(
     overlay: Literal["side", "over", "none"] = "side",
     fps: float | None = None,
     size: str | None = None,
+    reduce: Reduce = None,
     live: str | None = None,
     stream: str = "udp://127.0.0.1:11111",
     seconds: float | None = None,
@@ -95,6 +96,7 @@ def track(
     from torchface.workflows.batch.run_batch import BatchOptions, run_batch
     from torchface.workflows.track.track_inputs import TrackSettings
     from torchface.workflows.track.video_job import VIDEOS, VideoJob
+    from torchface.workflows.weight_files import checked_reduction
 
     given = landmarks.lower().endswith(".csv")
     if (not video) == (live is None) and not (given and live is None):
@@ -115,6 +117,7 @@ def track(
         None if size is None else picture_size(size),
         offsets,
         one_person,
+        checked_reduction(reduce),
     )
     if live is not None:
         _live(live, rig, stream, out, settings, seconds, quiet)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from torchface.errors import FileFormatError
@@ -16,12 +17,13 @@ from torchface.io.gltf.gltf_writing import write_gltf_rig
 from torchface.io.maya.maya_writing import MAYA_ENDING, write_maya_rig
 from torchface.io.rigs.ict_facekit import is_ict_folder, load_ict_facekit, region
 from torchface.io.rigs.rig_folder import load_obj_folder, save_obj_folder
-from torchface.io.scenes.weight_keys import ShapeMatch, WeightKeys, weight_keys
+from torchface.io.scenes.weight_keys import ShapeMatch, WeightKeys, common_keys, keys_of_curves, weight_keys
 from torchface.io.usd.usd_library import require_usd
 from torchface.io.usd.usd_reading import read_usd_detail, read_usd_rig, read_usd_weights
 from torchface.io.usd.usd_writing import USD_ENDINGS, write_usd_rig
 from torchface.rig import BlendshapeRig
 from torchface.take import Take
+from torchface.temporal.key_reduction import KeyReduction
 
 GLTF_ENDINGS = (".glb", ".gltf")
 SCENE_ENDINGS = (*GLTF_ENDINGS, *USD_ENDINGS)
@@ -126,7 +128,11 @@ def write_rig(
 
 
 def save_animation(
-    rig: BlendshapeRig, take: Take, path: str | Path, detail: DetailMaps | RegionMaps | None = None
+    rig: BlendshapeRig,
+    take: Take,
+    path: str | Path,
+    detail: DetailMaps | RegionMaps | None = None,
+    reduce: float | None = None,
 ) -> ShapeMatch:
     """Writes a rig with the take's weights as its animation, a key a frame at its time, linear between.
 
@@ -137,9 +143,10 @@ def save_animation(
         take: with ``weights``; names are matched by ``shape_names.mapping``.
         path: a ``.glb``, ``.usda``, ``.usdc``, ``.usd``, ``.usdz`` or ``.ma``; it appears only when it is complete.
         detail: detail maps of the rig's shapes, or of its regions, for ``.glb`` alone.
+        reduce: keep as few keys as stay within this of every frame's weights; all if absent.
 
     Returns:
-        ``ShapeMatch(driven, missing, unused)``.
+        ``ShapeMatch(driven, missing, unused, reduction)``.
 
     Raises:
         NameMismatchError: no channel drives any shape, or a detail map belongs to none.
@@ -156,8 +163,18 @@ def save_animation(
     """
     check_ending(path, *ANIMATION_ENDINGS)
     keys, match = weight_keys(rig, take)
+    keys, reduction = reduced_keys(rig, keys, path, reduce)
     write_rig(rig, path, detail, keys)
-    return match
+    return replace(match, reduction=reduction)
+
+
+def reduced_keys(
+    rig: BlendshapeRig, keys: WeightKeys, path: str | Path, bound: float | None
+) -> tuple[WeightKeys, KeyReduction | None]:
+    """Few keys within a bound, as the kind of file has them; all without a bound."""
+    if bound is None:
+        return keys, None
+    return keys_of_curves(keys, bound) if Path(path).suffix.lower() == MAYA_ENDING else common_keys(rig, keys, bound)
 
 
 def load_animation(path: str | Path) -> Take | None:

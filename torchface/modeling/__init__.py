@@ -30,11 +30,7 @@ from torchface.modeling.rigging.open_eyed_neutral import open_eyes
 from torchface.modeling.rigging.part_clearance import clear_parts
 from torchface.modeling.rigging.part_placement import place_parts
 from torchface.modeling.rigging.penetration import InnerParts, inner_parts, shape_depths
-from torchface.modeling.rigging.sculpted_corrective import (
-    SculptedCorrective,
-    corrective_from_sculpt,
-    sculpt_misalignment,
-)
+from torchface.modeling.rigging.sculpted_corrective import SculptedCorrective, corrective_from_sculpt
 
 __all__ = [
     "BakeSettings",
@@ -69,7 +65,6 @@ __all__ = [
     "place_parts",
     "rig_from_examples",
     "rig_from_neutral",
-    "sculpt_misalignment",
     "shape_depths",
     "transfer_deformation",
     "transfer_with_report",

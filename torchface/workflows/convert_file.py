@@ -14,7 +14,14 @@ from torchface.io import load_animation, load_detail_maps, load_region_maps, sav
 from torchface.io.blender import BLENDER_ENDINGS, blender_program, read_blender_file, write_blender_file
 from torchface.io.maya.maya_writing import MAYA_ENDING, maya_notes
 from torchface.io.mesh_files import MESH_ENDINGS
-from torchface.io.rig_files import ANIMATION_ENDINGS, GLTF_ENDINGS, SCENE_ENDINGS, check_rig_ending, write_rig
+from torchface.io.rig_files import (
+    ANIMATION_ENDINGS,
+    GLTF_ENDINGS,
+    SCENE_ENDINGS,
+    check_rig_ending,
+    reduced_keys,
+    write_rig,
+)
 from torchface.io.rigs.ict_facekit import region
 from torchface.io.scenes.weight_keys import weight_keys
 from torchface.io.usd.usd_library import require_usd
@@ -24,6 +31,7 @@ from torchface.rig import BlendshapeRig
 from torchface.take import Take
 from torchface.workflows.posed_mesh import load_neutral, posed_mesh
 from torchface.workflows.rig_names import Naming, naming_lines, renamed, renamed_detail
+from torchface.workflows.weight_files import checked_reduction
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,6 +59,7 @@ def convert_file(
     names: Naming | None = None,
     progress: Progress | None = None,
     pose: Mapping[str, float] | None = None,
+    reduce: float | None = None,
 ) -> Converted:
     """Reads whatever holds a rig or a mesh and writes it as ``out``'s ending says.
 
@@ -63,6 +72,7 @@ def convert_file(
         names: how shapes are called in ``out``; see ``rig_names``.
         progress: called with each step.
         pose: weights by name, to write the mesh in that pose instead of the rig.
+        reduce: keep as few keys as stay within this of every frame's weights; all if absent.
     """
     progress = progress or silent
     if out.suffix.lower() in BLENDER_ENDINGS:
@@ -74,6 +84,9 @@ def convert_file(
         check_writable(out)
     else:
         check_writable(folder=out)
+    if reduce is not None:
+        checked_reduction(reduce)
+        check_ending(out, *ANIMATION_ENDINGS)  # Blender bakes a key a frame
     progress("reading")
     source_rig = read_source(source, unit, part)
     if pose:
@@ -91,7 +104,7 @@ def convert_file(
     detail, notes = (None, []) if part is not None else maps_for(source, out)
     if isinstance(detail, DetailMaps):
         detail = renamed_detail(detail, source_rig.rig, names)
-    notes += write_source(rig, source_rig.take, detail, out)
+    notes += write_source(rig, source_rig.take, detail, out, reduce)
     return Converted(rig.neutral, rig, source_rig.take, (*naming_lines(source_rig.rig, names), *notes))
 
 
@@ -120,7 +133,13 @@ def read_source(source: Path, unit: str | None = None, part: str | None = None) 
     return Converted(mesh, rig, take, ())
 
 
-def write_source(rig: BlendshapeRig, take: Take | None, detail: DetailMaps | RegionMaps | None, out: Path) -> list[str]:
+def write_source(
+    rig: BlendshapeRig,
+    take: Take | None,
+    detail: DetailMaps | RegionMaps | None,
+    out: Path,
+    reduce: float | None = None,
+) -> list[str]:
     """Writes the rig with what ``out`` has a place for; says what it has none for."""
     suffix, notes = out.suffix.lower(), []
     if take is not None and not suffix:
@@ -130,6 +149,9 @@ def write_source(rig: BlendshapeRig, take: Take | None, detail: DetailMaps | Reg
         notes.append(f"{suffix} has no place for the detail maps of {len(detail.names)} shapes, which are left out")
         detail = None
     keys = None if take is None else weight_keys(rig, take)[0]
+    if reduce is not None:
+        keys, reduction = (None, None) if keys is None else reduced_keys(rig, keys, out, reduce)
+        notes.append(f"{out.name}: {reduction or 'no animation to reduce'}")
     if suffix == ".fbx" and rig.correctives is not None:
         moved = "which the animation moves and sliders do not" if take is not None else "which no slider moves"
         notes.append(

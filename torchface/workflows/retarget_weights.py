@@ -26,7 +26,7 @@ from torchface.capture.retargeting import (
 )
 from torchface.errors import NameMismatchError, ValueRangeError
 from torchface.files.whole_files import make_folder
-from torchface.io import load_rig, load_take, save_animation
+from torchface.io import load_rig, load_take
 from torchface.progress import Progress, silent
 from torchface.rendering.compositing import save_rendered_image
 from torchface.rig import BlendshapeRig
@@ -99,10 +99,7 @@ def retarget_weights(
         raise NameMismatchError(f"{table or poses or weights}: {error}") from error
     moved, notes = _mouth_closed(retarget_take(played, shapes), rig, target, rules)
     progress("writing")
-    written = [*faults, *notes, *write_weights(moved, files.out, files.live_link)]
-    if files.animation is not None:
-        make_folder(files.animation.parent)
-        save_animation(target, moved, files.animation)
+    written = [*faults, *notes, *write_weights(moved, files, target)]
     return Retargeted(moved, shapes, tuple(written), said)
 
 

@@ -10,11 +10,14 @@ import torch
 
 from torchface.errors import NameMismatchError
 from torchface.files.whole_files import all_or_none, check_ending, check_writable, make_folder
-from torchface.io.rig_files import ANIMATION_ENDINGS
+from torchface.io.rig_files import ANIMATION_ENDINGS, save_animation
 from torchface.io.weights.live_link_csv import not_in_live_link, save_live_link
 from torchface.io.weights.weight_csv import save_weights_csv
+from torchface.number_checks import checked_number
+from torchface.rig import BlendshapeRig
 from torchface.shape_names import ARKIT, mapping
 from torchface.take import Take, Track
+from torchface.temporal.key_reduction import KeyReduction, kept_keys, reduction_error
 
 _SHOWN = 8
 _ROUNDED = 1e-3  # what a file's rounding leaves beyond 0 or 1
@@ -28,20 +31,32 @@ class WeightFiles:
         out: the weights, see :func:`write_weights`.
         animation: the rig with this animation, ``.glb``, USD or ``.ma``, if wanted.
         live_link: Live Link Face's CSV whatever the names are, if wanted.
+        reduce: keep as few keys as stay within this of every frame's weights; a row and a key a frame if absent.
     """
 
     out: Path
     animation: Path | None = None
     live_link: Path | None = None
+    reduce: float | None = None
 
     def check(self, folder: Path | None = None) -> None:
         """Raises where one of them, or a folder beside, cannot be written to or has another ending than it may have."""
         for table in (self.out, self.live_link):
             if table is not None:
                 check_ending(table, ".csv")
+        checked_reduction(self.reduce)
         check_writable(self.out, self.live_link, self.animation, folder=folder)
         if self.animation is not None:
             check_ending(self.animation, *ANIMATION_ENDINGS)
+
+
+def checked_reduction(bound: float | None) -> float | None:
+    """The bound of ``--reduce``, where it is one.
+
+    Raises:
+        ValueRangeError: it is not above 0 and at most 1.
+    """
+    return bound if bound is None else checked_number("--reduce", bound, 0.0, 1.0, above=True)
 
 
 def weight_faults(weights: Track) -> list[str]:
@@ -75,30 +90,47 @@ def check_live_link(names: Sequence[str], target: Path | str | None) -> None:
         )
 
 
-def write_weights(take: Take, out: Path, live_link: Path | None = None) -> list[str]:
+def write_weights(take: Take, files: WeightFiles, rig: BlendshapeRig) -> list[str]:
     """Writes a take's weights, and says what a file leaves out.
 
+    ``files.out`` is Live Link Face's CSV where it gives every shape back, because all are ARKit's; else
+    ``frame,time,<shape>,...`` with every shape by its own name.
+
     Args:
-        take: weights by a rig's names.
-        out: Live Link Face's CSV where it gives every shape back, because all are ARKit's; else
-            ``frame,time,<shape>,...`` with every shape by its own name.
-        live_link: Live Link Face's CSV whatever the names are, by :func:`torchface.shape_names.mapping`.
+        take: weights by the rig's names.
+        files: what is written; ``live_link`` has ARKit's names by :func:`torchface.shape_names.mapping`.
+        rig: that the animation moves.
 
     Returns:
         Lines for people to read.
     """
     assert take.weights is not None
-    lost = not_in_live_link(take.weights.names)
-    make_folder(out.parent)
+    lost, notes, few = not_in_live_link(take.weights.names), [], take
+    if files.reduce is not None:
+        few, reduction = reduced_take(take, files.reduce)
+        notes.append(f"{files.out}: {reduction}")
+    make_folder(files.out.parent)
     with all_or_none():
-        (save_weights_csv if lost else save_live_link)(take, out)
-        if live_link is None:
-            return []
-        make_folder(live_link.parent)
-        save_live_link(take, live_link)
-    more = f" and {len(lost) - _SHOWN} more" if len(lost) > _SHOWN else ""
-    return (
-        [f"{live_link} does not give back (halves are merged, others left out): {', '.join(lost[:_SHOWN])}{more}"]
-        if lost
-        else []
-    )
+        (save_weights_csv if lost else save_live_link)(few, files.out)
+        if files.live_link is not None:
+            make_folder(files.live_link.parent)
+            save_live_link(few, files.live_link)
+    if lost and files.live_link is not None:
+        more = f" and {len(lost) - _SHOWN} more" if len(lost) > _SHOWN else ""
+        listed = ", ".join(lost[:_SHOWN]) + more
+        notes.append(f"{files.live_link} does not give back (halves are merged, others left out): {listed}")
+    if files.animation is not None:
+        make_folder(files.animation.parent)
+        match = save_animation(rig, take, files.animation, reduce=files.reduce)
+        notes += [] if match.reduction is None else [f"{files.animation}: {match.reduction}"]
+    return notes
+
+
+def reduced_take(take: Take, bound: float) -> tuple[Take, KeyReduction]:
+    """The take at as few of its frames as keep weights and rotations between them within a bound; see ``kept_keys``."""
+    assert take.weights is not None
+    columns = [column for column in take.extras.get("columns", {}).values() if isinstance(column, torch.Tensor)]
+    values = torch.cat([take.weights.values[..., 0].double(), *(column[:, None].double() for column in columns)], 1)
+    kept = kept_keys(take.times, values, bound)
+    reduction = KeyReduction(len(kept), int(kept.sum()), reduction_error(take.times, values, kept))
+    return take.rows(kept.nonzero()[:, 0]), reduction

@@ -251,3 +251,8 @@ def test_hidden_eyeballs_and_the_mouth_keep_the_templates_skin_and_nothing_else_
     assert float(values[of_hidden].mean()) > 0.9
     assert float(values[~of_hidden].mean()) < 0.02
     assert with_template_skin(black, white, ~everything) is black
+
+
+def test_details_for_a_file_without_a_place_for_them_are_refused_before_any_work(tmp_path: Path) -> None:
+    with pytest.raises(FileFormatError, match=r"detail maps .* for a \.ma file"):
+        rig_actor(tmp_path / "no.obj", tmp_path / "no.glb", tmp_path / "a.ma", detail=tmp_path)

@@ -9,11 +9,12 @@ import pytest
 import torch
 from torch import Tensor
 
-from torchface import load_rig, save_rig
+from torchface import load_rig, load_take, save_rig
 from torchface.cli import main
 from torchface.errors import NameMismatchError, ValueRangeError
 from torchface.geometry.cameras.calibration import assumed_calibration
 from torchface.geometry.cameras.pinhole import look_at
+from torchface.io import load_animation
 from torchface.io.landmarks.landmark_tables import load_landmark_table
 from torchface.io.landmarks.openface_csv import save_landmarks_csv
 from torchface.io.video import write_video
@@ -58,6 +59,11 @@ def test_a_table_is_solved_without_a_video(take: tuple[Path, Path, Tensor], tmp_
     again = load_landmark_table(tmp_path / "out" / "landmarks.csv")
     torch.testing.assert_close(again.points, load_landmark_table(table).points)
     assert (again.presence == 1).all()
+    few = track_video(None, rig, tmp_path / "few", replace(settings, reduce=0.2))
+    assert next(line for line in few.lines() if "of 6 keys" in line).startswith("weights.csv: ")
+    keys = load_take(tmp_path / "few" / "weights.csv")
+    assert len(keys) == len(load_animation(tmp_path / "few" / "animation.glb")) < COUNT
+    assert len(load_take(tmp_path / "few" / "confidence.csv")) == COUNT
 
 
 @pytest.mark.parametrize(

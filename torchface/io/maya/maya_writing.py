@@ -192,6 +192,7 @@ def _scene(rig: BlendshapeRig, targets: MayaTargets, keys: WeightKeys | None) ->
             curve = np.stack([times, weights[:, place]], 1)
             if not curve[:, 1].any():
                 continue
+            curve = curve if keys.kept is None else curve[keys.kept[:, place].numpy()]
             yield f'createNode animCurveTU -n "shapes_{alias}";\n\tsetAttr ".tan" {_LINEAR};\n\tsetAttr ".wgt" no;\n'
             yield from _array(".ktv", curve)
             links.append((f"shapes_{alias}.o", f"shapes.w[{place}]"))
@@ -219,8 +220,8 @@ def _mesh(mesh: Mesh) -> Iterator[str]:
     yield from _array(".ed", np.concatenate([edges, np.ones_like(edges[:, :1])], 1))
     for begin in range(0, len(sizes), _PER_STATEMENT):
         part = slice(begin, begin + _PER_STATEMENT)
-        last = begin + len(sizes[part]) - 1
-        yield f'\tsetAttr -s {len(sizes)} -ch {len(corners)} ".fc[{begin}:{last}]" -type "polyFaces"'
+        where = _span(begin, len(sizes[part]))
+        yield f'\tsetAttr -s {len(sizes)} -ch {len(corners)} ".fc{where}" -type "polyFaces"'
         for start, size in zip(starts[part].tolist(), sizes[part].tolist(), strict=True):  # a polygon has its own size
             own = slice(start, start + size)
             yield f"\n\t\tf {size} {_joined(which[own])}"
@@ -248,7 +249,7 @@ def _blend_shape(rig: BlendshapeRig, targets: MayaTargets) -> Iterator[str]:
             yield f'\tsetAttr "{where}.ipt" -type "pointArray" {len(moved)}{"".join(_lines(points))};\n'
             breaks = np.flatnonzero(np.diff(moved) > 1)
             spans = list(zip(moved[[0, *(breaks + 1)]].tolist(), moved[[*breaks, -1]].tolist(), strict=True))
-            listed = " ".join(f'"vtx[{low}:{high}]"' if high > low else f'"vtx[{low}]"' for low, high in spans)
+            listed = " ".join(f'"vtx{_span(low, high - low + 1)}"' for low, high in spans)
             yield f'\tsetAttr "{where}.ict" -type "componentList" {len(spans)} {listed};\n'
     named = ",".join(f'"{alias}","weight[{place}]"' for place, alias in enumerate(targets.aliases))
     yield f'\tsetAttr ".aal" -type "attributeAlias" {{{named}}};\n'
@@ -258,7 +259,11 @@ def _array(name: str, rows: NDArray[np.float64] | NDArray[np.int64], kind: str =
     """Statements that set an array, some rows each."""
     for begin in range(0, len(rows), _PER_STATEMENT):
         part = rows[begin : begin + _PER_STATEMENT]
-        yield f'\tsetAttr -s {len(rows)} "{name}[{begin}:{begin + len(part) - 1}]"{kind}{"".join(_lines(part))};\n'
+        yield f'\tsetAttr -s {len(rows)} "{name}{_span(begin, len(part))}"{kind}{"".join(_lines(part))};\n'
+
+
+def _span(begin: int, count: int) -> str:
+    return f"[{begin}]" if count == 1 else f"[{begin}:{begin + count - 1}]"
 
 
 def _lines(rows: NDArray[np.float64] | NDArray[np.int64]) -> Iterator[str]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 
 import torch
 from torch import Tensor
@@ -11,6 +11,7 @@ from torchface.errors import NameMismatchError, ValueRangeError
 from torchface.rig import BlendshapeRig
 from torchface.shape_names import mapping
 from torchface.take import Take
+from torchface.temporal.key_reduction import KeyReduction, kept_keys, reduction_error
 
 
 @dataclass(frozen=True)
@@ -21,11 +22,14 @@ class WeightKeys:
         seconds: of each key, (T,) float64, rising from 0.
         weights: of a rig's shapes, (T,N) float32.
         fps: frames a second of the film that they are for.
+        kept: which of the keys each shape's curve has, (T,N) bool, in a file whose curves have keys of their own; all
+            if absent.
     """
 
     seconds: Tensor
     weights: Tensor
     fps: float
+    kept: Tensor | None = None
 
 
 @dataclass(frozen=True)
@@ -36,6 +40,7 @@ class ShapeMatch:
         driven: shapes of the rig that follow a channel.
         missing: shapes of the rig that no channel drives; they stay at 0.
         unused: channels of the take that the rig has no shape for.
+        reduction: how many keys were left, where few were asked for.
 
     Example:
         >>> match = ShapeMatch(driven=("jawOpen",), missing=("mouthClose",), unused=("tongueOut",))
@@ -46,6 +51,7 @@ class ShapeMatch:
     driven: tuple[str, ...]
     missing: tuple[str, ...]
     unused: tuple[str, ...]
+    reduction: KeyReduction | None = field(default=None, repr=False)
 
 
 def weight_keys(rig: BlendshapeRig, take: Take) -> tuple[WeightKeys, ShapeMatch]:
@@ -78,3 +84,32 @@ def weight_keys(rig: BlendshapeRig, take: Take) -> tuple[WeightKeys, ShapeMatch]
         tuple(name for name, is_driven in zip(rig.names, by_shape, strict=True) if not is_driven),
         tuple(name for name, is_used in zip(track.names, by_channel, strict=True) if not is_used),
     )
+
+
+def common_keys(rig: BlendshapeRig, keys: WeightKeys, bound: float) -> tuple[WeightKeys, KeyReduction]:
+    """Few keys that all shapes share, for files that have one time for all; correctives, which such files hold as
+    weights, stay within the bound too.
+
+    Args:
+        rig: of the N shapes.
+        keys: one a frame.
+        bound: of the distance between a frame's weights and the lines between keys.
+    """
+    values = keys.weights
+    if rig.activation is not None:
+        values = torch.cat([values, rig.activation(values.to(rig.vertices.device)).cpu()], 1)
+    kept = kept_keys(keys.seconds, values, bound)
+    reduction = KeyReduction(len(kept), int(kept.sum()), reduction_error(keys.seconds, values, kept))
+    return replace(keys, seconds=keys.seconds[kept], weights=keys.weights[kept]), reduction
+
+
+def keys_of_curves(keys: WeightKeys, bound: float) -> tuple[WeightKeys, KeyReduction]:
+    """Few keys for each shape that moves, for files whose curves have keys of their own; see :func:`common_keys`."""
+    moving = keys.weights.any(0).nonzero()[:, 0].tolist()
+    kept, largest = torch.ones_like(keys.weights, dtype=torch.bool), 0.0
+    for column in moving:  # each curve has keys of its own
+        values = keys.weights[:, column : column + 1]
+        kept[:, column] = kept_keys(keys.seconds, values, bound)
+        largest = max(largest, reduction_error(keys.seconds, values, kept[:, column]))
+    before, after = len(moving) * len(keys.weights), int(kept[:, moving].sum())
+    return replace(keys, kept=kept), KeyReduction(before, after, largest)

@@ -160,27 +160,13 @@ def _acts_at(definition: Corrective, drivers: tuple[str, ...], peak: float | Non
     return peak is None or abs((definition.peak or 0.0) - peak) < _SAME_PEAK
 
 
-def sculpt_misalignment(shown: Tensor, sculpt: Tensor) -> Similarity | None:
-    r"""The motion of the whole mesh that a sculpt contains beside its change, if most vertices show it.
+def _motion_of_the_whole(shown: Tensor, sculpt: Tensor) -> Similarity | None:
+    r"""The similarity (B = 1) that removes a motion of the whole mesh from a sculpt, if most vertices show one.
 
-    .. math:: \min_{s,R,t} \sum_v \lVert s R x_v + t - y_v \rVert
+    .. math:: \min_{s,R,t} \sum_v \lVert s R y_v + t - x_v \rVert
 
-    by reweighted least squares: the vertices that the artist changed, less than half, do not count.
-
-    Args:
-        shown: vertices x of the rig at the pose, (V,3), millimetres.
-        sculpt: y, (V,3).
-
-    Returns:
-        The similarity (B = 1) that removes it from the sculpt; none if most vertices lie where the rig shows them, or
-        no motion brings them there.
-
-    Source: Weiszfeld 1937, for points under a similarity.
-
-    Example:
-        >>> face = torch.randn(50, 3)
-        >>> sculpt_misalignment(face, face + 5).translation.round().tolist()
-        [[-5.0, -5.0, -5.0]]
+    over the sculpt's vertices y and the rig's x, by reweighted least squares (Weiszfeld 1937): the vertices that the
+    artist changed, less than half, do not count.
     """
     x, y = shown[None].double(), sculpt[None].double()
     before = (x - y).norm(dim=-1)
@@ -223,7 +209,7 @@ def checked_sculpt(path: object, sculpt: Mesh, rig: BlendshapeRig, shown: Tensor
         )
     size = extent(shown)
     check_unit(str(path), sculpt.vertices, size, "the rig", 0.5, 2.0)
-    motion = None if align == "keep" else sculpt_misalignment(shown, sculpt.vertices)
+    motion = None if align == "keep" else _motion_of_the_whole(shown, sculpt.vertices)
     placed = sculpt.vertices if motion is None else motion.apply(sculpt.vertices.double())[0]
     far = float((placed - shown.to(placed)).norm(dim=-1).median())
     if far > _FAR * size:
@@ -231,9 +217,7 @@ def checked_sculpt(path: object, sculpt: Mesh, rig: BlendshapeRig, shown: Tensor
             f"{path}: found half of the vertices {far:.3g} mm and more from where the rig shows them, expected a "
             "sculpt of this rig in its order of vertices"
         )
-    if motion is None:
-        return placed
-    if align == "remove":
+    if motion is None or align == "remove":
         return placed
     undone = motion.inverse()
     trace = float(undone.rotation[0].diagonal().sum())

@@ -14,6 +14,7 @@ from torchface.files.job_lock import file_lock
 from torchface.files.whole_files import all_or_none, check_writable, make_folder
 from torchface.geometry.meshes.normal_maps import DetailMaps
 from torchface.io import load_mesh, load_rig, save_rig
+from torchface.io.maya.maya_writing import MAYA_ENDING
 from torchface.io.rig_files import check_rig_ending
 from torchface.landmarks import UVLandmarkDetector
 from torchface.landmarks.scans.landmark_pairs import AutomaticLandmarks
@@ -169,6 +170,8 @@ def rig_actor(
         progress: called with each step and how far it is.
     """
     check_out(out)
+    if detail is not None and out.suffix.lower() == MAYA_ENDING:
+        raise FileFormatError(f"{out}: found detail maps ({detail}) for a .ma file, expected .glb or USD for them")
     with file_lock(out):
         return _rig_actor(scan, template, out, landmarks, examples, detail, options or RigOptions(), progress or silent)
 

@@ -10,8 +10,7 @@ import torch
 
 from torchface.attachment import Attachment
 from torchface.errors import ValueRangeError
-from torchface.files.whole_files import make_folder
-from torchface.io import load_rig, save_animation
+from torchface.io import load_rig
 from torchface.io.protocols.weight_sender import find_receiver
 from torchface.progress import Progress, silent
 from torchface.workflows.marker_input import DEFAULT_OPTIONS, MarkerOptions, frame_span, read_markers
@@ -47,7 +46,7 @@ class TakeOutputs(WeightFiles):
     """What becomes of a solved take.
 
     Args:
-        out, animation, live_link: see :class:`~torchface.workflows.weight_files.WeightFiles`.
+        out, animation, live_link, reduce: see :class:`~torchface.workflows.weight_files.WeightFiles`.
         report: a folder for a page, if wanted.
         stream: an address that the solved weights are sent to in their own time, if wanted.
     """
@@ -95,10 +94,7 @@ def solve_take(
     seconds = time.perf_counter() - started
 
     progress("writing")
-    written = write_weights(solution.take, outputs.out, outputs.live_link)
-    if outputs.animation is not None:
-        make_folder(outputs.animation.parent)
-        save_animation(rig, solution.take, outputs.animation)
+    written = write_weights(solution.take, outputs, rig)
     samples = len(solution.take) * len(attachment.triangles)
     seen = float(torch.isfinite(solution.markers).all(-1).sum()) / samples
     warnings = (*notes, *solution.warnings, *written)

@@ -27,6 +27,7 @@ class TakeJob:
         rig, attachment: see :func:`solve_take`.
         settings, part, camera, options: see :func:`solve_take`.
         animation, report, live_link: what is to be written of each besides the weights, and where.
+        reduce: see :class:`~torchface.workflows.weight_files.WeightFiles`.
     """
 
     rig: Path
@@ -38,6 +39,7 @@ class TakeJob:
     animation: Path | None = None
     report: Path | None = None
     live_link: Path | None = None
+    reduce: float | None = None
 
     def key(self, item: BatchItem) -> str:
         """A key of all that the take's weights depend on."""
@@ -51,6 +53,7 @@ class TakeJob:
             camera=None if self.camera is None else item.settings_of(self.camera),
             options=item.settings_of(self.options),
             written=[str(path) for path in (self.animation, self.report, self.live_link)],
+            reduce=self.reduce,
         )
 
     def run(self, item: BatchItem, out: Path) -> Made:
@@ -63,7 +66,8 @@ class TakeJob:
         files = item.path_of(self.rig), item.path, item.path_of(self.attachment)
         inputs = TakeInputs(*files, self.part, camera, item.settings_of(self.options))
         weights, report = out / f"{item.name}.csv", item.path_of(self.report)
-        outputs = TakeOutputs(weights, item.path_of(self.animation), item.path_of(self.live_link), report)
+        animation, live_link = item.path_of(self.animation), item.path_of(self.live_link)
+        outputs = TakeOutputs(weights, animation, live_link, self.reduce, report)
         done = solve_take(inputs, outputs, self.settings)
         solution = done.solution
         rig, values, rmse = solution.rig, solution.weights, solution.rmse

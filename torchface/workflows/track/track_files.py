@@ -15,6 +15,7 @@ from torchface.take import Take, Track
 from torchface.workflows.track.head_rotations import rotation_columns
 from torchface.workflows.track.take_solution import OFFSETS
 from torchface.workflows.track.track_result import Tracked
+from torchface.workflows.weight_files import reduced_take
 
 WEIGHTS, CONFIDENCE, LIVE_LINK, LANDMARKS = "weights.csv", "confidence.csv", "live_link.csv", "landmarks.csv"
 ANIMATION, OVERLAY, SUMMARY = "animation.glb", "overlay.mp4", "summary.json"
@@ -47,7 +48,11 @@ def write_curves(tracked: Tracked, out: Path) -> dict[str, Path]:
     angles = rotation_columns(tracked.solution.rotation)
     when = tracked.times
     take = Take(fps, weights=Track(tracked.rig.names, weights[..., None]), extras={"columns": angles}, seconds=when)
-    products = {**save_curves(take, out), "landmarks": out / LANDMARKS, "animation": out / ANIMATION}
+    bound, few = tracked.inputs.settings.reduce, take
+    if bound is not None:
+        few, reduction = reduced_take(take, bound)
+        tracked.reductions.append(f"{WEIGHTS}: {reduction}")
+    products = {**save_curves(few, out), "landmarks": out / LANDMARKS, "animation": out / ANIMATION}
     products["confidence"] = out / CONFIDENCE
     sure = tracked.solution.confidence.detach().float() * tracked.seen[:, None]
     save_weights_csv(Take(fps, weights=Track(tracked.rig.names, sure[..., None]), seconds=when), products["confidence"])
@@ -66,7 +71,9 @@ def write_curves(tracked: Tracked, out: Path) -> dict[str, Path]:
     columns["presence"] = reading.presence
     track = Track(LANDMARK_NAMES, reading.landmarks, reading.confidence)
     save_landmarks_csv(Take(fps, landmarks=track, extras={"columns": columns}, seconds=when), products["landmarks"])
-    save_animation(tracked.rig, take, products["animation"])
+    match = save_animation(tracked.rig, take, products["animation"], reduce=bound)
+    if match.reduction is not None:
+        tracked.reductions.append(f"{ANIMATION}: {match.reduction}")
     return products
 
 

@@ -58,6 +58,7 @@ class TrackSettings:
         fps: frames a second of a table of landmarks without a video; by its times if absent.
         size: width and height of the pictures that such landmarks were found in; the camera's if absent.
         one_person: all frames show the actor, also those in which the face looks like another's.
+        reduce: keep as few rows of weights and keys as stay within this of every frame's; all if absent.
         offsets: a file of fixed offsets between this rig's landmarks and this finder's; those in the folder of results,
             or estimated with the take, if absent.
     """
@@ -76,6 +77,7 @@ class TrackSettings:
     size: tuple[int, int] | None = None
     offsets: Path | None = None
     one_person: bool = False
+    reduce: float | None = None
 
 
 @dataclass(frozen=True, eq=False)

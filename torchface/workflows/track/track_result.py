@@ -46,6 +46,7 @@ class Tracked:
         reused: frames whose readings were known from an earlier run.
         seconds: what each step took, by its name.
         products: the files, by what they are.
+        reductions: what few keys they have, in words, where few were asked for.
         light: of the video, where a texture was put on the face.
         outliers: landmarks that lie where no face has them, and so are not trusted, (T,68) bool; none if absent.
         others: spans of frames that show another face, which are not solved.
@@ -61,6 +62,7 @@ class Tracked:
     reused: int = 0
     seconds: dict[str, float] = field(default_factory=dict)
     products: dict[str, Path] = field(default_factory=dict)
+    reductions: list[str] = field(default_factory=list)
     light: PointLight | None = None
     outliers: Tensor | None = None
     others: Sequence[AnotherFace] = ()
@@ -160,7 +162,7 @@ class Tracked:
             f"landmarks: jitter {self.jitter:.2f} px; to the solved rig's: median {float(errors.nanmedian()):.2f} px, "
             f"95th percentile {float(errors.nanquantile(0.95)):.2f} px",
         ]
-        lines.extend(self.outlier_lines())
+        lines.extend((*self.reductions, *self.outlier_lines()))
         lines.extend(
             f"frames {span.first} to {span.last} show another face than the first frames (its look correlates by "
             f"{span.likeness:.2f}, eyes and nose lie {100 * span.apart:.1f} % of the eyes' distance apart): they are "
