@@ -13,6 +13,8 @@ from torchface.geometry.similarity import Similarity
 from torchface.mesh import Mesh
 from torchface.registration import Registration, register
 from torchface.registration.hair_and_cloth import find_ears
+from torchface.registration.nonrigid.schedule import DEFAULT_SCHEDULE, Schedule
+from torchface.registration.scan_colors import without_colors
 from torchface.registration.scan_completion import completed_colors, completed_form
 from torchface.synthetic.head.performer import performer
 
@@ -63,6 +65,26 @@ def test_hair_is_not_painted_on_the_skull(haired: Registration, region: dict[str
     colors = haired.mesh.colors
     assert colors is not None
     assert float((colors[region["cranium"]] - torch.tensor(SKIN)).norm(dim=1).quantile(0.95)) < 0.1
+    assert not any("colours" in note for note in haired.record.notes)
+
+
+def rainbow(values: Tensor) -> Tensor:
+    """Red to blue over green, as MeshLab paints a quantity, (V,3)."""
+    share = (values - values.min()) / (values.max() - values.min())
+    return torch.stack([1.5 - (4 * share - at).abs() for at in (3, 2, 1)], 1).clamp(0, 1).float()
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_colours_that_no_skin_has_say_nothing_of_hair(head: Mesh, truth: Tensor, axis: int) -> None:
+    scan = Mesh(truth, head.faces, colors=rainbow(truth[:, axis]))
+    marks = (head.landmarks, truth[head.landmarks])
+    schedule = Schedule(DEFAULT_SCHEDULE.stages[:2])
+    painted = register(head, scan, marks, schedule=schedule, texture_size=0)
+    assert painted.record.covered < 0.01
+    assert any("colours are not a face's" in note for note in painted.record.notes)
+    bare = register(head, without_colors(scan), marks, schedule=schedule, texture_size=0)
+    torch.testing.assert_close(painted.mesh.vertices, bare.mesh.vertices)
+    assert bare.mesh.colors is None
 
 
 def test_an_ear_in_pieces_is_the_templates(

@@ -22,6 +22,7 @@ def register(
     detector: str | None = None,
     texture_size: int = 1024,
     model: str | None = None,
+    colors: bool = True,
     jobs: Jobs = 1,
     cluster: Cluster = None,
     time_limit: TimeLimit = None,
@@ -49,9 +50,12 @@ def register(
         texture_size: Texels a side of each result's texture; 0 makes none.
         model: Name or folder of a head model in the template's topology: each registration starts from it, and what it
             knows of heads does not slide along the scan.
+        colors: Find hair by the scans' colours and keep them. --no-colors where they are not the people's: a map of
+            distances or curvature, say.
         quiet: Show no progress.
     """
     from torchface.files.job_lock import job_lock
+    from torchface.registration.nonrigid.schedule import DEFAULT_SCHEDULE
     from torchface.workflows.batch.run_batch import BatchOptions
     from torchface.workflows.register.register_scans import (
         ScanSettings,
@@ -62,7 +66,7 @@ def register(
 
     with job_lock(out), progress_bars(quiet) as progress:
         heads = None if model is None else load_shape_model(model)
-        settings = ScanSettings(landmarks, unit, texture_size=texture_size, detector=detector, model=heads)
+        settings = ScanSettings(landmarks, unit, DEFAULT_SCHEDULE, texture_size, detector, heads, colors)
         done = register_scans(
             load_template(template, part),
             scans,

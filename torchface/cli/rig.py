@@ -35,6 +35,7 @@ def rig(
     texture_size: int = 2048,
     detail_size: int = 2048,
     names: Literal["arkit"] | None = None,
+    colors: bool = True,
     jobs: Jobs = 1,
     cluster: Cluster = None,
     time_limit: TimeLimit = None,
@@ -80,6 +81,8 @@ def rig(
         detail_size: Texels a side of each normal map.
         names: Names of the written shapes. "arkit": ARKit's where the template's mean the same, halves of one of its
             shapes merged (browInnerUp, cheekPuff); shapes that ARKit lacks keep theirs. All keep theirs if absent.
+        colors: Find hair by the scans' colours and keep them. --no-colors where they are not the person's: a map of
+            distances or curvature, say.
         quiet: Show no progress.
     """
     from torchface.workflows.batch.batch_items import check_folder, find_items, is_batch
@@ -89,7 +92,7 @@ def rig(
     from torchface.workflows.rig.actor_rig import RigOptions, rig_actor
     from torchface.workflows.rig_names import naming_lines
 
-    options = RigOptions(part, unit, pose_weights(pose), detector, model, texture_size, detail_size, names)
+    options = RigOptions(part, unit, pose_weights(pose), detector, model, texture_size, detail_size, names, colors)
     if cluster is not None or is_batch(scan, ACTORS):
         check_folder(out)
         job = ActorJob(template, landmarks, examples, detail, options)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from scipy.spatial import cKDTree
@@ -58,6 +58,11 @@ class ScanColors:
 def has_colors(scan: Mesh) -> bool:
     """Whether a scan brings a texture that its coordinates reach, or vertex colours."""
     return scan.colors is not None or (scan.texture is not None and scan.uvs is not None)
+
+
+def without_colors(scan: Mesh) -> Mesh:
+    """The scan without texture and vertex colours."""
+    return replace(scan, colors=None, texture=None)
 
 
 def vertex_colors(source: ScanColors, nearest: SurfacePoints, trusted: Tensor) -> Tensor:

@@ -176,6 +176,11 @@ def register(
     mesh = replace(template, vertices=deformer.current.to(template.vertices), colors=None, texture=None)
     notes = [*start.notes, *_scale_notes(start.pose), *start.pull.disagreement(deformer.current), *_model_notes(fit)]
     notes += _final_notes(template, scan, deformer, texture_size)
+    if cover.false_colors:
+        notes.append(
+            f"the scan's colours are not a face's ({cover.false_colors}, in logarithms): no hair or cloth was looked "
+            "for by them; --no-colors leaves them out of the result too"
+        )
     colors = _scan_colors(scan, start.prepared)
     if colors is not None:
         progress("resampling the scan's colours")

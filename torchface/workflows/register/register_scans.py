@@ -46,6 +46,7 @@ class ScanSettings:
         schedule, texture_size: see ``register``.
         detector: a landmark detector for the scans without landmarks, by name or folder; see ``zoo.get_model``.
         model: of faces in the template's topology, which each registration starts from; see ``register``.
+        colors: whether the scans' colours are used, to find hair and as the results'.
     """
 
     landmarks: str | Path | None = None
@@ -54,6 +55,7 @@ class ScanSettings:
     texture_size: int = 1024
     detector: str | Path | None = None
     model: ShapeModel | HasShape | None = None
+    colors: bool = True
 
     def __post_init__(self) -> None:
         if self.unit is not None:
@@ -96,6 +98,7 @@ def register_scans(
         settings.unit,
         None if detector is None else _folder("detector", zoo.find(detector)),
         None if model is None else LinearShape.of(shape_model(model, template)),
+        settings.colors,
     )
     return run_batch(job, SCANS, items, out, options, progress, finished)
 

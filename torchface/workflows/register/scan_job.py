@@ -22,6 +22,7 @@ from torchface.registration.landmark_files import landmark_file, load_scan_landm
 from torchface.registration.model_fit import LinearShape
 from torchface.registration.nonrigid.schedule import Schedule
 from torchface.registration.registered_mesh import in_place_of
+from torchface.registration.scan_colors import without_colors
 from torchface.registration.scan_registration import Registration, register
 from torchface.rendering.clay_shading import render
 from torchface.rendering.compositing import sheet
@@ -32,7 +33,7 @@ from torchface.workflows.batch.batch_items import BatchItem
 from torchface.workflows.batch.contact_sheet import HEIGHT, WIDTH
 from torchface.workflows.batch.outcomes import Made
 
-_METHOD = "register/3"
+_METHOD = "register/4"
 """What results are made with; another number where the same scan and settings come to give another result."""
 _MAX_DISTANCE = 1.0  # end of the distance maps' scale, millimetres
 
@@ -48,6 +49,7 @@ class ScanJob:
         unit: of the scans' files; each format's own if absent.
         detector: the folder of a landmark detector for the scans without landmarks.
         model: of faces, which each registration starts from.
+        colors: whether the scans' colours are used.
     """
 
     template: Mesh
@@ -57,6 +59,7 @@ class ScanJob:
     unit: str | None = None
     detector: Path | None = None
     model: LinearShape | None = None
+    colors: bool = True
 
     def key(self, item: BatchItem) -> str:
         """A key of everything that a scan's result depends on: its files (those beside it of the same name and those
@@ -108,6 +111,7 @@ class ScanJob:
     def _registered(self, scan: Path, points: Path | None) -> tuple[Registration, int]:
         """The registration, and how many landmarks were given."""
         mesh, landmarks = load_mesh(scan, self.unit), None
+        mesh = mesh if self.colors else without_colors(mesh)
         if points is not None:
             landmarks = load_scan_landmarks(points, self.template, scan, self.unit)
         registration = register(
@@ -140,6 +144,7 @@ class ScanJob:
             unit=self.unit,
             detector=self.detector,
             model=self.model,
+            colors=self.colors,
         )
 
     def _beside(self, scan: Path) -> list[Path]:
@@ -160,7 +165,7 @@ class ScanJob:
 
     def __reduce__(self) -> tuple[Any, ...]:
         # Tensors would travel through shared memory, which containers keep small; arrays are copied.
-        settings = (self.schedule, self.texture_size, self.landmarks, self.unit, self.detector)
+        settings = (self.schedule, self.texture_size, self.landmarks, self.unit, self.detector, None, self.colors)
         model = None if self.model is None else (self.model.mean.numpy(), self.model.modes.numpy())
         return _arrived, (_packed(self.template), model, *settings)
 

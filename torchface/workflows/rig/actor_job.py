@@ -20,7 +20,7 @@ from torchface.workflows.batch.outcomes import Made
 from torchface.workflows.rig.actor_rig import ActorReport, RigOptions, rig_actor
 
 ACTORS = ItemKind("scan", "rigged", SCAN_ENDINGS)
-_METHOD = "rig batch/2"
+_METHOD = "rig batch/3"
 _MAX_DISTANCE = 1.0  # millimetres, red in the picture
 
 

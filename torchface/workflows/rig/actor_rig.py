@@ -38,6 +38,7 @@ from torchface.modeling.rigging.part_clearance import Penetration, penetration
 from torchface.progress import Progress, silent
 from torchface.registration import Registration, hidden_parts, in_place_of, register, with_template_skin
 from torchface.registration.landmark_files import landmark_file, load_scan_landmarks
+from torchface.registration.scan_colors import without_colors
 from torchface.rendering.compositing import save_rendered_image
 from torchface.rig import BlendshapeRig
 from torchface.viz.figures.registration_views import registration_sheet
@@ -74,6 +75,7 @@ class RigOptions:
         texture_size: of the actor's texture, texels a side.
         detail_size: of each normal map, texels a side.
         names: of the written shapes; see ``rig_names.renamed``.
+        colors: whether the scans' colours are used, to find hair and as the actor's.
     """
 
     part: str | None = None
@@ -84,6 +86,7 @@ class RigOptions:
     texture_size: int = 2048
     detail_size: int = 2048
     names: Naming | None = None
+    colors: bool = True
 
 
 @dataclass(frozen=True, eq=False)
@@ -253,6 +256,7 @@ class _Actor:
     ) -> Registration:
         options = self.options
         read = load_mesh(scan, options.unit)
+        read = read if options.colors else without_colors(read)
         marks = None if landmarks is None else load_scan_landmarks(landmarks, mesh, scan, options.unit)
         detector = None
         if marks is None and options.detector is not None:
