@@ -120,7 +120,7 @@ class Deformer:
             stage.landmark_weight,
             self._schedule.sliding,
             self._held_together(stage),
-            pull.weights(self.current).numpy(),
+            pull.weights(self.current, stage.level is Level.TRANSLATIONS).numpy(),
         )
         energies, moved, made = [], float("inf"), 0
         while made < stage.iterations and moved >= stage.tolerance:

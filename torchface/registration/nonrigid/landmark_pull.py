@@ -11,7 +11,8 @@ from torchface.landmarks.images.ibug_68 import INNER
 from torchface.mesh import Mesh
 
 _DISAGREES = 10.0
-_REMARKABLE = 5.0
+_CONTOUR, _NOSE, _NOSE_SHARE = slice(INNER.start), slice(27, 36), 0.01
+_REMARKABLE, _MOST_NAMED = 5.0, 8
 
 
 @dataclass(frozen=True, eq=False)
@@ -23,30 +24,39 @@ class LandmarkPull:
         points: (L,3) float64.
         contour: which of them outline the jaw, (L,) bool: annotators set these along the outline that they see, in
             an image or from a side, and not at a place of the skin.
+        shaped: which of them lie on the nose, (L,) bool, whose shape shows where each belongs: where every vertex moves
+            by itself, a landmark that is a millimetre off would pull the tip out of the surface or along it.
+        numbers: what each is called in messages, (L,): iBUG's number from 0, or the row of the given ones.
     """
 
     vertices: Tensor
     points: Tensor
     contour: Tensor
+    shaped: Tensor
+    numbers: Tensor
 
     @staticmethod
     def of(vertices: Tensor, points: Tensor, template: Mesh) -> LandmarkPull:
         """With the contour given by the template's 68 landmarks, where it has as many."""
-        contour = torch.zeros(len(vertices), dtype=torch.bool)
+        contour = shaped = torch.zeros(len(vertices), dtype=torch.bool)
         known = None if template.annotations is None else template.annotations.landmarks
         if known is not None and len(known) == 68:
-            contour = torch.isin(vertices, known[: INNER.start].cpu())
-        return LandmarkPull(vertices, points, contour)
+            contour, shaped = (torch.isin(vertices, known[rows].cpu()) for rows in (_CONTOUR, _NOSE))
+        numbers = torch.arange(len(vertices))
+        if known is not None:
+            same = vertices[:, None] == known.cpu()
+            numbers = torch.where(same.any(1), same.long().argmax(1), numbers)
+        return LandmarkPull(vertices, points, contour, shaped, numbers)
 
     @staticmethod
     def none() -> LandmarkPull:
         """No landmark at all."""
         empty = torch.zeros(0, dtype=torch.int64)
-        return LandmarkPull(empty, torch.zeros(0, 3, dtype=torch.float64), empty.bool())
+        return LandmarkPull(empty, torch.zeros(0, 3, dtype=torch.float64), empty.bool(), empty.bool(), empty)
 
     def subset(self, rows: Tensor) -> LandmarkPull:
         """Those of a mask (L,) or of rows."""
-        return LandmarkPull(self.vertices[rows], self.points[rows], self.contour[rows])
+        return LandmarkPull(*(part[rows] for part in vars(self).values()))
 
     def distance(self, current: Tensor) -> Tensor:
         """How far each landmark's vertex is from its point, (L,) millimetres, with the vertices (V,3)."""
@@ -57,14 +67,16 @@ class LandmarkPull:
         inside = self.distance(current)[~self.contour]
         return float(inside.median()) if len(inside) else float("nan")
 
-    def weights(self, current: Tensor) -> Tensor:
+    def weights(self, current: Tensor, single: bool = False) -> Tensor:
         r"""How much each counts, (L,) in [0,1], with the vertices (V,3) where they are.
 
-        1 inside the face; along the contour :math:`(1 - r^2/c^2)^2` (Tukey) with r the distance that is left, and
-        nothing from c = 10 mm on: what the surface and the other landmarks contradict lets go.
+        1 inside the face, but 0.01 on the nose where each vertex moves by itself (``single``): there the surface is
+        right. Along the contour :math:`(1 - r^2/c^2)^2` (Tukey) with r the distance that is left, and nothing from
+        c = 10 mm on: what the surface and the other landmarks contradict lets go.
         """
         kept = (1 - (self.distance(current) / _DISAGREES).square()).clamp(min=0).square()
-        return torch.where(self.contour, kept, 1.0)
+        inside = torch.where(self.shaped, _NOSE_SHARE, 1.0) if single else torch.ones_like(kept)
+        return torch.where(self.contour, kept, inside.to(kept))
 
     def disagreement(self, current: Tensor) -> list[str]:
         """A note of what the landmarks contradict, with the vertices (V,3) as the surface has left them; else none."""
@@ -73,9 +85,12 @@ class LandmarkPull:
         for what, rows in (("along the jaw", self.contour), ("inside the face", ~self.contour)):
             wrong = rows & (off > _REMARKABLE)
             if wrong.any():
+                worst = [i for i in off.argsort(descending=True).tolist() if wrong[i]]
+                named = ", ".join(str(int(self.numbers[i])) for i in worst[:_MOST_NAMED])
+                more = " ..." if len(worst) > _MOST_NAMED else ""
                 remarks.append(
-                    f"{int(wrong.sum())} of {int(rows.sum())} {what} by {float(off[wrong].mean()):.1f} mm on average, "
-                    f"at worst {float(off[wrong].max()):.1f} mm"
+                    f"{len(worst)} of {int(rows.sum())} {what} ({named}{more}) by {float(off[wrong].mean()):.1f} mm on "
+                    f"average, at worst {float(off[wrong].max()):.1f} mm"
                 )
         if not remarks:
             return []
