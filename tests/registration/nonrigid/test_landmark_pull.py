@@ -55,15 +55,15 @@ def test_a_jaw_that_is_drawn_right_still_leads(annotated: Mesh, warp, rescanned)
 
 
 def test_the_surface_has_the_last_word_on_the_nose() -> None:
-    """Landmarks a millimetre beside their places, and the nose's tip 7 mm: it lies where the surface has it."""
+    """Landmarks a millimetre beside their places, and the nose's tip 8 mm: it lies where the surface has it."""
     template = performer(texture=False).neutral
     somebody = performer(torch.randn(39, generator=torch.Generator().manual_seed(2)), texture=False).neutral
     truth, marks = somebody.vertices.double(), template.landmarks
     points = truth[marks] + torch.randn(68, 3, generator=torch.Generator().manual_seed(0)).double() / 3**0.5
-    points[30, 0] += 7.0
+    points[30, 0] += 8.0
     found = register(template, Mesh(truth, somebody.faces), (marks, points), texture_size=0)
     off = (found.mesh.vertices.double() - truth).norm(dim=1)
-    assert float(off[marks[30]]) < 1.6
+    assert float(off[marks[30]]) < 2.0
     assert float(off[marks[27:36]].mean()) < 0.8
     (note,) = (note for note in found.record.notes if "disagree" in note)
     assert "1 of 51 inside the face (30) by" in note
