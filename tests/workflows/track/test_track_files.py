@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 from video_samples import encode
 
-from torchface import load_rig, save_rig
+from torchface import load_rig, load_take, save_rig
 from torchface.errors import FileFormatError
 from torchface.geometry.cameras.calibration import assumed_calibration
 from torchface.geometry.cameras.pinhole import look_at
@@ -66,9 +66,9 @@ def test_weights_are_written_at_the_frames_own_times(
     np.testing.assert_allclose(read_back.seconds.numpy(), TIMES, atol=1e-4)
     with (tmp_path / "live_link.csv").open() as file:
         codes = [row["Timecode"] for row in csv.DictReader(file)]
-    base = round(tracked.video.fps)
-    read = [float(code[6:8]) + float(code[9:]) / base for code in codes]
+    read = [float(code[6:8]) + float(code[9:]) / 60 for code in codes]  # frames of uneven takes are sixtieths
     np.testing.assert_allclose(read, TIMES, atol=1e-4)
+    np.testing.assert_allclose(load_take(tmp_path / "live_link.csv").times.numpy(), TIMES, atol=1e-4)
     found = tracked.solution.weights[:, load_rig(rig).names.index("jawOpen")]
     # Offsets and prior keep a part of an opening in so short a take; its course in time is the jaw's.
     assert float(torch.corrcoef(torch.stack([found, jaw]))[0, 1]) > 0.97
