@@ -67,6 +67,16 @@ def checked_count(
     return int(_real(value))
 
 
+def as_real(values: torch.Tensor) -> torch.Tensor:
+    """Whole numbers as floats of torch's default dtype: weights solved in an integer dtype would all be 0 or 1.
+
+    Example:
+        >>> as_real(torch.tensor([3, 4])).dtype
+        torch.float32
+    """
+    return values if values.is_floating_point() or values.is_complex() else values.to(torch.get_default_dtype())
+
+
 def check_rate(fps: object, where: str, error: type[TorchfaceError] = FileFormatError) -> float:
     """The rate itself, where it can be one of a camera's; ``where`` begins the message.
 

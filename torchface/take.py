@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from torchface.errors import NameMismatchError, ShapeError, ValueRangeError
-from torchface.number_checks import check_rate
+from torchface.number_checks import as_real, check_rate
 from torchface.temporal.frame_grid import check_gaps, frame_grid
 from torchface.temporal.interpolation import frames_beside, values_at
 
@@ -24,7 +24,8 @@ class Track:
 
     Args:
         names: one a channel, no name twice (marker labels, shape names, landmark names).
-        values: (T,C,D): markers D=3 in millimetres, landmarks D=2 in pixels, weights D=1. NaN means not seen.
+        values: (T,C,D): markers D=3 in millimetres, landmarks D=2 in pixels, weights D=1. NaN means not seen;
+            whole numbers become floats.
         confidence: (T,C) in [0,1], where the source gives one.
 
     Raises:
@@ -43,6 +44,7 @@ class Track:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "names", tuple(self.names))
+        object.__setattr__(self, "values", as_real(self.values))
         if self.values.ndim != 3 or self.values.shape[1] != len(self.names):
             raise ShapeError(f"track: found values {tuple(self.values.shape)}, expected (T,{len(self.names)},D)")
         if self.confidence is not None and self.confidence.shape != self.values.shape[:2]:

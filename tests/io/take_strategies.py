@@ -32,6 +32,7 @@ def marker_takes(draw: st.DrawFn) -> Take:
     values = draw(arrays.arrays(np.float32, (frames, len(labels), 3), elements=FLOATS))
     seen = draw(arrays.arrays(bool, (frames, len(labels))))
     seen[draw(st.integers(0, frames - 1)), draw(st.integers(0, len(labels) - 1))] = True
+    values[~values.any(2), 2] = 1.0  # the origin stands for not seen
     values[~seen] = np.nan
     return Take(draw(RATES), markers=Track(tuple(labels), torch.from_numpy(values)))
 

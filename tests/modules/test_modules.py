@@ -65,6 +65,22 @@ def assert_same(found: list[Tensor], wanted: list[Tensor], tolerance: float = RO
         )
 
 
+# Pictures are shares of white, of which integers are 0 and 1 alone; a layer's H and f have one dtype.
+NO_INTEGERS = ("ActionUnitClassifier", "LandmarkTrees", "LandmarkNetwork", "EyeNetwork", "ProjectedGradient")
+
+
+@every_class
+def test_whole_numbers_are_taken_for_floats(name: str) -> None:
+    if name in NO_INTEGERS:
+        pytest.skip("takes no whole numbers")
+    example = EXAMPLES[name]
+    module = fresh(example)
+    whole = [part.nan_to_num(0.0).round() if part.is_floating_point() else part for part in example.inputs()]
+    integers = [part.long() if part.is_floating_point() else part for part in whole]
+    floats = [part.float() if part.is_floating_point() else part for part in whole]
+    assert_same(outputs(example, module, *integers), outputs(example, module, *floats), 1e-4)
+
+
 def numbers(example: Example, module: Any, first: Tensor, *rest: Tensor) -> Tensor:
     """A few sums of all that is computed, which the first input bears on."""
     found = [

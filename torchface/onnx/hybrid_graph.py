@@ -59,8 +59,8 @@ class HybridGraph(SolverGraph):
             return alone
         offset = self.rest - markers
         missing = torch.isnan(offset).any(-1, keepdim=True)
-        target = torch.where(led, predicted.clamp(0.0, 1.0), 0.0)
-        given = offset, missing, previous.clamp(0.0, 1.0), gamma * (2 / len(self.labels)), target
+        target = torch.where(led, predicted.to(offset).clamp(0.0, 1.0), 0.0)
+        given = offset, missing, previous.to(offset).clamp(0.0, 1.0), gamma * (2 / len(self.labels)), target
         if compiles:  # a graph has both ways; here a call takes one
             return torch.cond(led.any() | missing.any(), self._with_gaps, self._complete, given)
         return self._with_gaps(*given)

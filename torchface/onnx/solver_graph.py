@@ -136,7 +136,7 @@ class SolverGraph(nn.Module):
             )
         offset = self.rest - markers
         missing = torch.isnan(offset).any(-1, keepdim=True)
-        z = previous.clamp(0.0, 1.0)
+        z = previous.to(offset).clamp(0.0, 1.0)
         if torch.compiler.is_compiling():  # a graph has both ways; here a call takes one
             return torch.cond(missing.any(), self._with_gaps, self._complete, (offset, missing, z))
         return (self._with_gaps if bool(missing.any()) else self._complete)(offset, missing, z)

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable
-from typing import ParamSpec, TypeVar
+from typing import Any, ParamSpec, TypeVar
 
 import torch
 
 from torchface.errors import TraceError
+from torchface.number_checks import as_real
 
 Given = ParamSpec("Given")
 Result = TypeVar("Result")
@@ -19,7 +20,7 @@ def data_dependent(instead: str) -> Callable[[Callable[Given, Result]], Callable
 
     ``torch.compile`` leaves a gap in its graph for it, in which it runs as ever: what it would compile of such a
     method are dozens of pieces, for minutes. What follows one path only is refused at once: ``torch.jit.trace``,
-    ``torch.export`` and the transforms of ``torch.func``.
+    ``torch.export`` and the transforms of ``torch.func``. Tensors of integers become floats.
 
     Args:
         instead: what may be exported, for the error.
@@ -55,11 +56,15 @@ def data_dependent(instead: str) -> Callable[[Callable[Given, Result]], Callable
                     f"{name}: found one of torch.func's transforms, expected a batch in place of vmap, and "
                     "torch.autograd.functional.jacobian in place of jacrev"
                 )
-            return method(*args, **kwargs)
+            return method(*map(_real, args), **{key: _real(value) for key, value in kwargs.items()})
 
         return call
 
     return marked
+
+
+def _real(value: Any) -> Any:
+    return as_real(value) if isinstance(value, torch.Tensor) else value
 
 
 def is_transformed() -> bool:

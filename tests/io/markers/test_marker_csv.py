@@ -12,8 +12,10 @@ from take_strategies import check_refused, marker_takes, round_trip, same
 
 from torchface import load_take
 from torchface.errors import FileFormatError
+from torchface.io.markers.c3d import load_c3d, save_c3d
 from torchface.io.markers.marker_csv import load_markers_csv, save_markers_csv
-from torchface.take import Take
+from torchface.io.markers.trc import load_trc, save_trc
+from torchface.take import Take, Track
 
 _GOOD = """frame,time,nose_x,nose_y,nose_z,chin_x,chin_y,chin_z
 0,0.0,1.5,2,3,4,5,6
@@ -118,3 +120,21 @@ def test_micrometres_are_read_where_they_are_asked_for(tmp_path: Path) -> None:
     assert take.markers is not None
     assert take.markers.values.flatten().tolist() == [1, 2.5, -0.5]
     assert take.extras["unit"] == "um"
+
+
+def test_the_origin_stands_for_not_seen(tmp_path: Path) -> None:
+    table = tmp_path / "take.csv"
+    table.write_text("frame,time,a_x,a_y,a_z,b_x,b_y,b_z\n0,0,0,0,0,0,5,0\n1,0.02,0,-0,0.0,1,2,3\n2,0.04,1,0,0,1,2,3\n")
+    markers = load_markers_csv(table).markers
+    assert markers is not None
+    assert torch.isnan(markers.values).any(2).tolist() == [[True, False], [True, False], [False, False]]
+    # The other formats end in the same function.
+    for name, save, load in (("take.c3d", save_c3d, load_c3d), ("take.trc", save_trc, load_trc)):
+        values = torch.tensor([[[0.0, 0, 0], [0, 5, 0]], [[1, 0, 0], [0, 0, 0]]])
+        save(Take(60.0, markers=Track(("a", "b"), values)), tmp_path / name)
+        found = load(tmp_path / name).markers
+        assert found is not None
+        assert torch.isnan(found.values).any(2).tolist() == [[True, False], [False, True]]
+        save(Take(60.0, markers=Track(("a", "b"), torch.zeros(2, 2, 3))), tmp_path / name)
+        with pytest.raises(FileFormatError, match=r"none of them seen .* other than \(0, 0, 0\)"):
+            load(tmp_path / name)

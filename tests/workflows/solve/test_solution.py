@@ -33,10 +33,12 @@ def performer_rig() -> BlendshapeRig:
     return performer(texture=False)
 
 
-def recorded(capture: Capture, which: int = 0, frames: int = 200, seed: int = 0) -> tuple[Take, Tensor]:
+def recorded(
+    capture: Capture, which: int = 0, frames: int = 200, seed: int = 0, slips: bool = True
+) -> tuple[Take, Tensor]:
     """A take through a helmet that slips, somewhere else on the stage, in millimetres; and its true weights."""
     rig, sites, takes = capture
-    flaws = StageFlaws(noise=0.3, slip_translation=4, slip_rotation=2)
+    flaws = StageFlaws(noise=0.3, slip_translation=4.0 * slips, slip_rotation=2.0 * slips)
     true = takes[which][:frames]
     take = record(rig, sites, true, torch.Generator().manual_seed(seed), flaws).take
     assert take.markers is not None
@@ -95,3 +97,32 @@ def test_labels_exchanged_in_part_of_a_real_take_cost_nothing(
     real_capture: Capture, pair: tuple[int, int], share: float
 ) -> None:
     check_exchanged(real_capture, pair, share, 0, 300)
+
+
+@pytest.mark.parametrize(("pair", "neutral"), [((1, 30), None), ((4, 22), 0)])
+def test_labels_exchanged_in_the_whole_take_are_warned_of_and_put_back(
+    stage: Capture, pair: tuple[int, int], neutral: int | None
+) -> None:
+    rig, sites, _ = stage
+    take, true = recorded(stage, slips=False)
+    dirty = exchanged(take, pair, 0, len(take))
+    settings = SolveSettings(neutral=neutral, align=neutral is None, free_scale=False, frame_by_frame=True)
+    right, warned = (solve_markers(rig, sites, each, settings) for each in (take, dirty))
+    (warning,) = (text for text in warned.warnings if "exchanged in the whole take" in text)
+    assert all((sites.labels or ())[m] in warning for m in pair)
+    assert not any("exchanged" in text for text in right.warnings)
+    repaired = solve_markers(rig, sites, dirty, replace(settings, clean=True))
+    assert not any("exchanged" in text for text in repaired.warnings)
+    assert mesh_error(rig, repaired, true) < 1.1 * mesh_error(rig, right, true)
+
+
+@pytest.mark.parametrize("pair", [(1, 30), (12, 45)])
+def test_labels_exchanged_in_part_of_a_take_that_is_not_cleaned_are_warned_of(
+    stage: Capture, pair: tuple[int, int]
+) -> None:
+    rig, sites, _ = stage
+    take, _ = recorded(stage, slips=False)
+    settings = SolveSettings(align=True, free_scale=False, frame_by_frame=True)
+    found = solve_markers(rig, sites, exchanged(take, pair, 90, 110), settings)
+    first, second = ((sites.labels or ())[m] for m in pair)
+    assert f"the labels {first} and {second} are exchanged in about 10 % of the frames" in found.warnings[0]

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from torchface.errors import ShapeError, ValueRangeError
+from torchface.number_checks import as_real
 
 _REGIONS = (r"eye_?look|pupil", r"eye", r"brow", r"cheek|nose", r"")
 _MAX_ORDERS = 3
@@ -68,7 +69,7 @@ def newest_frames(windows: Tensor, window: int, shapes: int) -> Tensor:
     """
     if windows.ndim != 3 or windows.shape[1] < window or windows.shape[2] != shapes:
         raise ShapeError(f"windows: found {tuple(windows.shape)}, expected (B,{window},{shapes}) or more frames")
-    return windows[:, -window:]
+    return as_real(windows[:, -window:])
 
 
 def windows_of(weights: Tensor, window: int) -> tuple[Tensor, Tensor]:

@@ -17,7 +17,7 @@ from torchface.capture.priors.parzen_window import ParzenDensity
 from torchface.capture.priors.student_t import PARTING_VARIANCE, StudentDensity, StudentGroups
 from torchface.capture.priors.take_frames import TakeFrames
 from torchface.errors import FileFormatError, ShapeError, ValueRangeError
-from torchface.number_checks import LARGEST_WEIGHT, checked_number
+from torchface.number_checks import LARGEST_WEIGHT, as_real, checked_number
 
 _UPPER = re.compile(r"(eye|brow|pupil)", re.IGNORECASE)
 LearnedDensity = ParzenDensity | GaussianMixture | StudentDensity
@@ -130,12 +130,12 @@ class ShapePrior(nn.Module):
 
     def log_density(self, weights: Tensor) -> Tensor:
         """:math:`\\sum_g \\log p_g` of weights (B,N), (B,)."""
-        self._check(weights)
+        weights = self._checked(weights)
         return torch.stack([density.log_density(part) for density, part in self._parts(weights)]).sum(0)
 
     def energy(self, weights: Tensor) -> Quadratic:
         """The quadratic that touches the energy at weights (B,N) from above."""
-        self._check(weights)
+        weights = self._checked(weights)
         return self._assembled(weights, weights.new_full((len(self.groups), len(weights)), self.strength))
 
     def _assembled(self, weights: Tensor, factors: Tensor) -> Quadratic:
@@ -157,9 +157,10 @@ class ShapePrior(nn.Module):
         densities: list[Any] = list(self.densities)
         return [(density, weights[:, list(group)]) for density, group in zip(densities, self.groups, strict=True)]
 
-    def _check(self, weights: Tensor) -> None:
+    def _checked(self, weights: Tensor) -> Tensor:
         if weights.ndim != 2 or weights.shape[1] != len(self.names):
             raise ShapeError(f"weights: found {tuple(weights.shape)}, expected (B,{len(self.names)})")
+        return as_real(weights)
 
     def prepared(self, strength: float | None = None) -> StudentGroups:
         """The same energy for solvers that are exported, or one of another strength.
@@ -314,7 +315,7 @@ class ReciprocalPrior(ShapePrior):
 
     def energy(self, weights: Tensor) -> Quadratic:
         """The quadratic with the energy's value and slope at weights (B,N)."""
-        self._check(weights)
+        weights = self._checked(weights)
         density = torch.stack([density.log_density(part) for density, part in self._parts(weights)]).exp()
         # d/dL of 1/(exp(-L) + p0) for L = -log p.
         return self._assembled(weights, self.strength * density / (density + self.guard).square())

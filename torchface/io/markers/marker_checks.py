@@ -72,8 +72,9 @@ def unique_labels(labels: Sequence[str]) -> tuple[str, ...]:
 def marker_take(
     path: Path, times: FrameTimes, labels: Sequence[str], values: np.ndarray, extras: dict[str, Any], factor: float
 ) -> Take:
-    """A take of markers (T,M,3) in millimetres, read from ``path`` in a unit of ``factor`` millimetres; a marker with a
-    NaN coordinate was not seen.
+    """A take of markers (T,M,3) in millimetres, read from ``path`` in a unit of ``factor`` millimetres.
+
+    A marker with a NaN coordinate was not seen, nor one at (0, 0, 0), which recorders write for it.
 
     Raises:
         FileFormatError: there is no frame, no marker, or none was seen in any frame.
@@ -83,11 +84,11 @@ def marker_take(
             f"{path}: found {values.shape[0]} frames of {values.shape[1]} points, expected at least one of each"
         )
     values = np.ascontiguousarray(values, np.float32)
-    unseen = ~np.isfinite(values).all(2)
+    unseen = ~np.isfinite(values).all(2) | ~values.any(2)
     if unseen.all():
         raise FileFormatError(
             f"{path}: found {values.shape[1]} points, none of them seen in any of {values.shape[0]} frames; "
-            "expected at least one position"
+            "expected at least one position other than (0, 0, 0), which stands for not seen"
         )
     values[unseen] = np.nan
     markers = Track(tuple(labels), torch.from_numpy(values))

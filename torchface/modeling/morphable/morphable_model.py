@@ -14,6 +14,7 @@ from torchface.errors import FileFormatError, ShapeError, ValueRangeError
 from torchface.files.documents import Value
 from torchface.geometry.sample_batches import Samples, SamplesInMemory
 from torchface.modeling.morphable.principal_components import principal_components
+from torchface.number_checks import as_real
 from torchface.progress import Progress
 
 _MAX_BYTES = 2**31
@@ -156,6 +157,7 @@ class MorphableModel(nn.Module):
     def forward(self, coefficients: Tensor) -> Tensor:
         """Coefficients (B,K) to samples (B,V,C)."""
         self._check(coefficients)
+        coefficients = as_real(coefficients)
         scaled = coefficients * self.standard_deviations.to(coefficients)
         offset = scaled @ self.components.flatten(1).to(coefficients)
         return self.mean.to(coefficients) + offset.reshape(-1, *self.mean.shape)

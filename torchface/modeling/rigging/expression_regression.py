@@ -14,7 +14,7 @@ from torchface.geometry.sample_batches import Samples
 from torchface.geometry.similarity import similarity_transform
 from torchface.mesh import Mesh
 from torchface.modeling.rigging.deformation_transfer import transfer_deformation
-from torchface.number_checks import LARGEST_WEIGHT, checked_count, checked_number
+from torchface.number_checks import LARGEST_WEIGHT, as_real, checked_count, checked_number
 from torchface.progress import Progress
 from torchface.rig import BlendshapeRig
 from torchface.shape_names import mapping
@@ -198,12 +198,14 @@ class ExpressionRegression(nn.Module):
         Raises:
             ShapeError: the neutrals are not (B,V,3).
         """
+        neutrals = as_real(neutrals)
         return neutrals[:, None] + self.offsets(neutrals)
 
     def offsets(self, neutrals: Tensor) -> Tensor:
         """How far each vertex goes in each expression, (B,N,V,3); see :meth:`forward`."""
         if neutrals.ndim != 3 or neutrals.shape[1:] != self.neutral_mean.shape:
             raise ShapeError(f"neutrals: found {tuple(neutrals.shape)}, expected (B,{len(self.neutral_mean)},3)")
+        neutrals = as_real(neutrals)
         pose = similarity_transform(neutrals, self.neutral_mean.to(neutrals).expand_as(neutrals), scale=False)
         aligned = pose.apply(neutrals)
         beyond = (aligned - self.neutral_mean.to(aligned))[:, self.region].flatten(1)

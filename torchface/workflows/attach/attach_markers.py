@@ -13,6 +13,8 @@ from torchface.attachment import Attachment
 from torchface.capture import MarkerSolver, align_take, clean_take, fit_attachment
 from torchface.capture.markers import AttachmentFit, Cleanup, check_attachment, sites_by_shape
 from torchface.capture.markers.attachment.attachment_fit import marker_paths
+from torchface.capture.markers.cleaning.label_swaps import find_swaps_by_shape, swapped_back
+from torchface.capture.markers.cleaning.take_cleaning import Defect
 from torchface.capture.markers.rest_pose import check_not_mirrored
 from torchface.errors import AlignmentError, FileFormatError, ValueRangeError
 from torchface.files.content_keys import content_key
@@ -146,12 +148,28 @@ def cleaned_fit(
         TorchfaceError: take and first guess do not fit each other, or the take shows no motion.
     """
     progress = progress or silent
+    take, swaps = _in_order(take)
     fit = fit_attachment(rig, take, start, standoff, progress, insist=True, scale=free_scale)
     progress("looking for what is wrong with the take")
     cleanup = clean_take(MarkerSolver(rig, fit.attachment, fit.alignment), take, slip=fit.motion is not None)
     if any(defect.kind != "gap" for defect in cleanup.defects):
         fit = fit_attachment(rig, _usable(cleanup, take), start, standoff, progress, insist=True, scale=free_scale)
-    return fit, cleanup
+    defects = sorted((*swaps, *cleanup.defects), key=lambda defect: (defect.first, defect.kind, defect.labels))
+    return fit, replace(cleanup, defects=tuple(defects))
+
+
+def _in_order(take: Take) -> tuple[Take, list[Defect]]:
+    """A take with the labels exchanged back that its own shape shows to be exchanged; there are no sites yet."""
+    assert take.markers is not None
+    names, values = take.markers.names, take.markers.values
+    swaps = find_swaps_by_shape(values.double(), take.fps)
+    defects = []
+    for swap in swaps:
+        apart = values[swap.first : swap.last, swap.markers[0]] - values[swap.first : swap.last, swap.markers[1]]
+        size = float(apart.norm(dim=-1).nan_to_num(0.0).max())
+        labels = (names[swap.markers[0]], names[swap.markers[1]])
+        defects.append(Defect("swap", labels, swap.first, swap.last - 1, size, "swapped back"))
+    return replace(take, markers=Track(names, swapped_back(values, swaps), take.markers.confidence)), defects
 
 
 def _standoff_hint(

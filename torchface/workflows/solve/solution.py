@@ -28,7 +28,7 @@ from torchface.rig import BlendshapeRig
 from torchface.take import Take, Track, empty_frames
 from torchface.workflows.marker_input import scale_warnings
 from torchface.workflows.solve.head_camera import Predicted
-from torchface.workflows.solve.take_check import check_coverage, check_explained, fit_warnings
+from torchface.workflows.solve.take_check import check_coverage, check_explained, fit_warnings, label_warnings
 from torchface.workflows.solve.weight_stream import StreamReport
 
 # A take is cleaned again where its alignment moves a site farther after the first cleaning, mm.
@@ -203,7 +203,9 @@ def solve_markers(
     warnings += _empty_frame_warnings(take)
 
     cleanup = None
-    if settings.clean:
+    if not settings.clean:
+        warnings += label_warnings(solver, take, settings.slip)
+    else:
         progress("looking for what is wrong with the take")
         cleanup = clean_take(solver, take, settings.slip)
         if alignment is not None and any(defect.kind != "gap" for defect in cleanup.defects):

@@ -9,11 +9,14 @@ import torch
 
 from torchface.attachment import Attachment
 from torchface.capture.markers import FitCheck, MarkerSolver, check_fit
+from torchface.capture.markers.cleaning.label_swaps import cycled_back, find_swaps, whole_take_exchanges
+from torchface.capture.markers.cleaning.robust_prediction import predict_markers
 from torchface.errors import AlignmentError, NameMismatchError
 from torchface.take import Take
 from torchface.workflows.marker_input import MAX_SCALE_DIFFERENCE
 
 _COORDINATES = 3  # of a marker
+_LABEL_FRAMES = 240
 _MIN_PRESENT, _USUAL_PRESENT = 0.5, 0.9
 _INSIST = "--insist writes the weights all the same"
 
@@ -115,6 +118,40 @@ def fit_warnings(fit: FitCheck, aligned: bool) -> list[str]:
         f"the rig brings the marker sites no nearer to the markers than {fit.distance:.4g} mm (median); "
         f"{_cause(fit, aligned)}"
     ]
+
+
+def label_warnings(solver: MarkerSolver, take: Take, slip: bool) -> list[str]:
+    """Warnings for labels that are exchanged in the whole take or in part of it; for takes that are not cleaned.
+
+    Args:
+        solver: rig and attachment.
+        take: markers in rig space.
+        slip: the helmet moves on the head.
+    """
+    assert take.markers is not None
+    few = solver.arrange(take.markers).double()
+    few = few[:: max(1, len(few) // _LABEL_FRAMES)]
+    prediction = predict_markers(solver, few, slip)
+    lines = []
+    for cycle in (cycles := whole_take_exchanges(few, prediction)):
+        distance = float(prediction.distance[:, list(cycle)].nanmedian())
+        names = " and ".join(solver.labels[m] for m in cycle)
+        lines.append(
+            f"the labels {names} seem to be exchanged in the whole take: the markers lie {distance:.3g} mm from their "
+            "own sites, and on each other's; --clean exchanges them"
+        )
+    if cycles:
+        few = cycled_back(few, cycles)
+        prediction = predict_markers(solver, few, slip)
+    shares: dict[tuple[int, int], int] = {}
+    for swap in find_swaps(few, prediction, 1.0):
+        shares[swap.markers] = shares.get(swap.markers, 0) + swap.last - swap.first
+    for (a, b), count in shares.items():
+        lines.append(
+            f"the labels {solver.labels[a]} and {solver.labels[b]} are exchanged in about "
+            f"{100 * count / len(few):.0f} % of the frames: --clean exchanges them back"
+        )
+    return lines
 
 
 def _cause(fit: FitCheck, aligned: bool) -> str:

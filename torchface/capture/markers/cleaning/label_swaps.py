@@ -1,14 +1,24 @@
-"""Pairs of markers whose labels were exchanged for a stretch of frames."""
+"""Markers whose labels were exchanged, for a stretch of frames or for the whole take."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 from torchface.capture.markers.cleaning.robust_prediction import Prediction
+from torchface.geometry.similarity import similarity_transform
 
+Votes = Mapping[tuple[int, int], Sequence[tuple[int, int]]]
+
+# Fewer markers have no shape. Far ones count less in a frame's pose, mm.
+_MIN_MARKERS, _POSE_ITERATIONS, _POSE_DISTANCE, _MAX_EXCHANGES = 5, 4, 5.0, 8
+# Two markers are exchanged where that leaves less than this part of their distances from their places.
+_NEARER = 0.5
+_WHOLE_RATIO, _CENTRE_ITERATIONS = 0.25, 8
+_CHUNK_FRAMES, _TRIED_FRAMES = 256, 240
 # Seconds: a stretch continues over frames without votes while neither marker is an inlier.
 _MAX_GAP = 0.25
 
@@ -46,18 +56,102 @@ def find_swaps(seen: Tensor, prediction: Prediction, fps: float) -> list[Swap]:
     votes: dict[tuple[int, int], list[tuple[int, int]]] = {}
     for t, a, b in zip(frame[good].tolist(), marker[good].tolist(), other[good].tolist(), strict=True):
         votes.setdefault((min(a, b), max(a, b)), []).append((t, a))
-    gap = max(1, round(_MAX_GAP * fps))
-    swaps = []
-    for (a, b), found in votes.items():  # pairs are few: only those with votes
-        fits = inlier[:, [a, b]].any(1)
-        stretch: list[tuple[int, int]] = []
-        for t, voter in [*sorted(found), (len(outlier) + gap + 1, -1)]:
-            if stretch and (t - stretch[-1][0] > gap or bool(fits[stretch[-1][0] + 1 : t].any())):
-                if len({who for _, who in stretch}) == 2 or len(stretch) >= 3:
-                    swaps.append(Swap((a, b), stretch[0][0], stretch[-1][0] + 1))
-                stretch = []
-            stretch.append((t, voter))
-    return sorted(swaps, key=lambda swap: (swap.first, swap.markers))
+    fits = {pair: inlier[:, list(pair)].any(1) for pair in votes}
+    return _stretches(votes, fits, max(1, round(_MAX_GAP * fps)))
+
+
+def find_swaps_by_shape(markers: Tensor, fps: float) -> list[Swap]:
+    """Stretches in which two markers are each at the other's place in the take's own median shape, without a rig.
+
+    Two labels are in the wrong order in a frame where :math:`(y_a - y_b) \\cdot (e_a - e_b) < 0`, with markers y moved
+    rigidly onto their medians e: an expression bends the face, but does not turn two markers about one another. In such
+    a frame the pair that is most in the wrong order is exchanged, then the next. It holds for any share of frames below
+    half.
+
+    Args:
+        markers: (T,M,3), NaN for not seen.
+        fps: frames a second.
+    """
+    median = _centres(markers)
+    seen = ~torch.isnan(markers).any(-1)
+    able = (seen.sum(1) >= _MIN_MARKERS).nonzero()[:, 0]
+    known = ~torch.isnan(median).any(-1)
+    if int(known.sum()) < _MIN_MARKERS or not len(able):
+        return []
+    moved = torch.full_like(markers, torch.nan)
+    moved[able] = _steadied(markers[able], median)
+    median = _centres(moved)
+    moved[able] = _steadied(markers[able], median)
+    target, place = median.nan_to_num(0.0), moved.nan_to_num(0.0)
+    seen = ~torch.isnan(moved).any(-1) & known
+    votes: dict[tuple[int, int], list[tuple[int, int]]] = {}
+    for rows in able.split(_CHUNK_FRAMES):
+        for _ in range(_MAX_EXCHANGES):
+            product = place[rows] @ target.T
+            own = product.diagonal(dim1=1, dim2=2)
+            order = own[:, :, None] + own[:, None] - product - product.transpose(1, 2)
+            # Both must be at the other's place: else one of them has only gone astray.
+            apart = torch.cdist(place[rows], target.expand(len(rows), -1, -1))
+            before = apart.diagonal(dim1=1, dim2=2)
+            nearer = apart + apart.transpose(1, 2) < _NEARER * (before[:, :, None] + before[:, None])
+            shown = seen[rows][:, :, None] & seen[rows][:, None] & nearer
+            least, pair = torch.where(shown, order, 0.0).flatten(1).min(1)
+            rows, pair = rows[least < 0], pair[least < 0]
+            if not len(rows):
+                break
+            a, b = pair // markers.shape[1], pair % markers.shape[1]
+            place[rows, a], place[rows, b] = place[rows, b], place[rows, a]
+            for t, low, high in zip(
+                rows.tolist(), torch.minimum(a, b).tolist(), torch.maximum(a, b).tolist(), strict=True
+            ):
+                votes.setdefault((low, high), []).extend(((t, low), (t, high)))
+    fits = {}
+    for a, b in votes:
+        shown = seen[:, a] & seen[:, b]
+        right = torch.ones_like(shown)
+        right[[t for t, _ in votes[a, b]]] = False
+        if 2 * int((right & shown).sum()) < int(shown.sum()):  # the centre was the other one's: the fewer are wrong
+            right = ~right
+            votes[a, b] = [(t, m) for t in (shown & ~right).nonzero()[:, 0].tolist() for m in (a, b)]
+        fits[a, b] = right & shown
+    return _stretches(votes, fits, max(1, round(_MAX_GAP * fps)))
+
+
+def whole_take_exchanges(seen: Tensor, prediction: Prediction) -> list[tuple[int, ...]]:
+    """Cycles of markers that stand at one another's expected place in most frames.
+
+    Each marker of a cycle is an outlier in its median frame, and nearest to the expected place of the next one: within
+    that one's limit, or a quarter of its distance from its own place, as weights that the exchange bent predict.
+
+    Args:
+        seen: markers in rig space, (T,M,3), NaN for not seen.
+        prediction: of these markers.
+    """
+    own = prediction.distance.nanmedian(0).values
+    out = (own > prediction.limit).nonzero()[:, 0]
+    if len(out) < 2:
+        return []
+    few = slice(None, None, max(1, len(seen) // _TRIED_FRAMES))
+    apart = (seen[few, out, None] - prediction.expected[few][:, None, out]).norm(dim=-1)
+    nearest, other = apart.nanmedian(0).values.nan_to_num(torch.inf).min(1)
+    enough = torch.maximum(prediction.limit[out[other]], _WHOLE_RATIO * own[out])
+    following = {int(out[i]): int(out[k]) for i, k in enumerate(other.tolist()) if nearest[i] <= enough[i] and i != k}
+    cycles: list[tuple[int, ...]] = []
+    for start in following:
+        cycle = [start]
+        while (after := following.get(cycle[-1], -1)) not in (-1, *cycle):
+            cycle.append(after)
+        if after == start and start == min(cycle):
+            cycles.append(tuple(cycle))
+    return cycles
+
+
+def cycled_back(seen: Tensor, cycles: Sequence[tuple[int, ...]]) -> Tensor:
+    """A copy of markers (T,M,3) in which each marker of a cycle is called like the next one."""
+    repaired = seen.clone()
+    for cycle in cycles:
+        repaired[:, [*cycle[1:], cycle[0]]] = seen[:, list(cycle)]
+    return repaired
 
 
 def swapped_back(seen: Tensor, swaps: list[Swap]) -> Tensor:
@@ -67,3 +161,35 @@ def swapped_back(seen: Tensor, swaps: list[Swap]) -> Tensor:
         stretch, pair = slice(swap.first, swap.last), list(swap.markers)
         repaired[stretch, pair] = repaired[stretch, pair[::-1]]
     return repaired
+
+
+def _stretches(votes: Votes, fits: Mapping[tuple[int, int], Tensor], gap: int) -> list[Swap]:
+    """Votes (frame, marker) of pairs joined over at most ``gap`` frames, unless the pair fits (T,) in one of them."""
+    swaps = []
+    for (a, b), found in votes.items():  # pairs are few: only those with votes
+        stretch: list[tuple[int, int]] = []
+        for t, voter in [*sorted(found), (len(fits[a, b]) + gap + 1, -1)]:
+            if stretch and (t - stretch[-1][0] > gap or bool(fits[a, b][stretch[-1][0] + 1 : t].any())):
+                if len({who for _, who in stretch}) == 2 or len(stretch) >= 3:
+                    swaps.append(Swap((a, b), stretch[0][0], stretch[-1][0] + 1))
+                stretch = []
+            stretch.append((t, voter))
+    return sorted(swaps, key=lambda swap: (swap.first, swap.markers))
+
+
+def _centres(markers: Tensor) -> Tensor:
+    """Where each marker (T,M,3) is most of the time, (M,3): the mean of the nearer half of its samples, iterated."""
+    centre = markers.nanmedian(0).values
+    for _ in range(_CENTRE_ITERATIONS):
+        distance = (markers - centre).norm(dim=-1, keepdim=True)
+        centre = torch.where(distance <= distance.nanmedian(0).values, markers, torch.nan).nanmean(0)
+    return centre
+
+
+def _steadied(markers: Tensor, median: Tensor) -> Tensor:
+    """Markers (T,M,3) moved rigidly onto their medians (M,3), those far from them with less weight."""
+    target, weights = median.expand_as(markers), torch.ones_like(markers[..., 0])
+    for _ in range(_POSE_ITERATIONS):
+        moved = similarity_transform(markers, target, weights, scale=False).apply(markers)
+        weights = 1 / (1 + ((moved - target).norm(dim=-1).nan_to_num(0.0) / _POSE_DISTANCE) ** 2)
+    return moved

@@ -9,7 +9,12 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from torchface.capture.markers.cleaning.label_swaps import find_swaps, swapped_back
+from torchface.capture.markers.cleaning.label_swaps import (
+    cycled_back,
+    find_swaps,
+    swapped_back,
+    whole_take_exchanges,
+)
 from torchface.capture.markers.cleaning.robust_prediction import Prediction, predict_markers
 from torchface.capture.markers.marker_solver import MarkerSolver
 from torchface.capture.markers.take_smoothing import WholeTakeSolver
@@ -19,6 +24,7 @@ from torchface.take import Take, Track
 _SPIKE_SECONDS, _GAP_SECONDS = 0.1, 0.25
 _DISPLACED_FRACTION = 0.7
 _MIN_REPORTED_GAP = 2
+_BACK = "swapped back"
 _BY_SEVERITY = ("swap", "displaced", "spike", "gap")
 
 
@@ -28,7 +34,7 @@ class Defect:
 
     Args:
         kind: ``swap``, ``spike``, ``displaced`` (it drifts, has fallen off, or carries another's label) or ``gap``.
-        labels: the markers; two for a swap.
+        labels: the markers; two for a swap, or more that changed round, each called like the next.
         first, last: frames, ``last`` included.
         size: largest distance from where the rig expects the marker, millimetres; 0 for a gap.
         action: what was done: ``swapped back``, ``masked``, ``filled`` or ``left``.
@@ -125,18 +131,28 @@ def clean_take(solver: MarkerSolver, take: Take, slip: bool = False) -> Cleanup:
     alignment = solver.alignment
     seen = raw if alignment is None else alignment.apply(raw)
     first = predict_markers(solver, seen, slip)
+    labels = solver.labels
+    cycles = whole_take_exchanges(seen, first)
+    defects = [
+        Defect(
+            "swap", tuple(labels[m] for m in cycle), 0, len(raw) - 1, _largest(first.distance[:, list(cycle)]), _BACK
+        )
+        for cycle in cycles
+    ]
+    if cycles:
+        raw, seen = cycled_back(raw, cycles), cycled_back(seen, cycles)
+        first = predict_markers(solver, seen, slip)
     swaps = find_swaps(seen, first, take.fps)
     repaired = swapped_back(seen, swaps)
     prediction = predict_markers(solver, repaired, slip) if swaps else first
-    labels = solver.labels
-    defects = [
+    defects += [
         Defect(
             "swap",
             (labels[swap.markers[0]], labels[swap.markers[1]]),
             swap.first,
             swap.last - 1,
             _largest(first.distance[swap.first : swap.last, list(swap.markers)]),
-            "swapped back",
+            _BACK,
         )
         for swap in swaps
     ]

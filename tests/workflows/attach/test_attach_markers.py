@@ -1,0 +1,39 @@
+"""Sites from a range of motion with faults are those of the same take without them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from torchface import Attachment, BlendshapeRig, Take, Track
+from torchface.synthetic.stages.marker_stage import StageFlaws, place_markers, record
+from torchface.workflows.attach.attach_markers import cleaned_fit
+
+
+@pytest.fixture(scope="module")
+def motion(dome_rig: BlendshapeRig) -> tuple[Attachment, Take]:
+    """Thirty sites on the dome, and what was recorded of them."""
+    sites = place_markers(dome_rig, 30)
+    weights = 0.5 + 0.5 * torch.sin(torch.arange(150)[:, None] / torch.tensor([7.0, 11, 5, 13]))
+    return sites, record(dome_rig, sites, weights, torch.Generator().manual_seed(0), StageFlaws(noise=0.05)).take
+
+
+@pytest.mark.parametrize("pair", [(0, 20), (4, 11), (7, 29)])
+@pytest.mark.parametrize("share", [0.09, 0.46])
+def test_labels_exchanged_in_less_than_half_move_no_site(
+    dome_rig: BlendshapeRig, motion: tuple[Attachment, Take], pair: tuple[int, int], share: float
+) -> None:
+    sites, take = motion
+    assert take.markers is not None
+    values = take.markers.values.clone()
+    rows = slice(30, 30 + round(share * len(take)))
+    values[rows, list(pair)] = values[rows, list(pair[::-1])]
+    dirty = replace(take, markers=Track(take.markers.names, values))
+    fit, cleanup = cleaned_fit(dome_rig, dirty, sites, standoff=False, free_scale=False)
+    faces, rest = dome_rig.neutral.faces, dome_rig.vertices
+    assert (fit.attachment.on(faces, rest) - sites.on(faces, rest)).norm(dim=-1).max() < 1.0
+    labels = take.markers.names
+    (swap,) = (defect for defect in cleanup.defects if defect.kind == "swap")
+    assert (set(swap.labels), swap.first, swap.last) == ({labels[m] for m in pair}, rows.start, rows.stop - 1)
