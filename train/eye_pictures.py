@@ -103,4 +103,4 @@ def eye_picture_files(
 def _render(first: int, count: int, seed: int, ict: Path | None) -> dict[str, Tensor]:
     pictures = draw_eye_pictures(*head_kinds(ict), first, count, seed, EACH)
     names = [field.name for field in fields(EyePictures)]
-    return {name: torch.stack([getattr(one, name) for one in pictures]) for name in names}
+    return {name: torch.stack([getattr(picture, name) for picture in pictures]) for name in names}

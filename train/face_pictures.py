@@ -100,7 +100,7 @@ def picture_files(
 
 def _render(first: int, count: int, seed: int, ict: Path | None) -> dict[str, Tensor]:
     pictures = draw_pictures(*head_kinds(ict), first, count, seed, EACH)
-    return {name: torch.stack([getattr(one, name) for one in pictures]) for name in _TENSORS}
+    return {name: torch.stack([getattr(picture, name) for picture in pictures]) for name in _TENSORS}
 
 
 @lru_cache(maxsize=2)

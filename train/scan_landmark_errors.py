@@ -61,16 +61,16 @@ def error_table(errors: Sequence[ScanErrors]) -> dict[str, float]:
     """Mean, median and worst errors over scans."""
     if not errors:
         return {}
-    pixels = torch.stack([one.pixels for one in errors])
-    millimetres = torch.stack([one.millimetres for one in errors])
+    pixels = torch.stack([error.pixels for error in errors])
+    millimetres = torch.stack([error.millimetres for error in errors])
     table = {
         "mean error, pixels": float(pixels.nanmean()),
         "median error, pixels": float(pixels.nanmedian()),
-        "worst scan, pixels": max(one.mean_pixels for one in errors),
+        "worst scan, pixels": max(error.mean_pixels for error in errors),
         "mean error, mm": float(millimetres.nanmean()),
     }
     for line in LINES:
-        distance = [one.lines[line] for one in errors if line in one.lines]
+        distance = [error.lines[line] for error in errors if line in error.lines]
         if distance:
             table[f"{line}, pixels"] = sum(distance) / len(distance)
     return table

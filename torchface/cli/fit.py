@@ -70,7 +70,7 @@ def fit(
     from torchface.workflows.fit.photograph_rig import PhotographSettings, fit_photographs
     from torchface.workflows.rig_names import naming_lines
 
-    given = tuple(Path(one) for one in landmarks)
+    given = tuple(Path(landmark) for landmark in landmarks)
     if len(landmarks) == 1 and not is_landmark_file(given[0]):
         given, landmark_model = (), landmarks[0]
     fitting = FitSettings(texture_size=texture_size, masked=not everything)

@@ -159,7 +159,9 @@ class CorrectiveActivation(nn.Module):
             >>> CorrectiveActivation([Corrective("ab", ("a", "b")), Corrective("a4", ("a",), 0.4)], "ab").expressions()
             ['w0*w1', 'max(0,min(w0/0.4,(1-w0)/0.6))']
         """
-        formulas = ["*".join(f"w{place}" for place in range(len(one.drivers))) for one in self.definitions]
+        formulas = [
+            "*".join(f"w{place}" for place in range(len(definition.drivers))) for definition in self.definitions
+        ]
         for row, (left, peak, right) in zip(self.in_betweens.tolist(), self.knots.tolist(), strict=True):
             rise = f"(w0-{left:.9g})" if left else "w0"
             formulas[row] = f"max(0,min({rise}/{peak - left:.9g},({right:.9g}-w0)/{right - peak:.9g}))"

@@ -195,7 +195,7 @@ def check_writable(*files: Path | None, folder: Path | None = None) -> None:
     for path in (*files, folder):
         if path is None:
             continue
-        above = next(one for one in path.absolute().parents if os.path.lexists(one))
+        above = next(parent for parent in path.absolute().parents if os.path.lexists(parent))
         if not above.is_dir() or not os.access(above, os.W_OK):
             raise FileFormatError(f"{path}: cannot be written ({above} is no folder that can be written to)")
 

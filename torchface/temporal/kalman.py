@@ -186,7 +186,7 @@ def kalman_smoother(
     if isinstance(settings, KalmanSettings):
         running = KalmanFilter(curves.shape[1], replace(settings, longest_gap=frames))
     else:
-        running = KalmanFilter(curves.shape[1], [replace(one, longest_gap=frames) for one in settings])
+        running = KalmanFilter(curves.shape[1], [replace(setting, longest_gap=frames) for setting in settings])
     running.to(curves.device)
     predicted, filtered = [], []
     for frame, interval in zip(curves, intervals or [1.0] * frames, strict=True):

@@ -47,7 +47,7 @@ def with_lashes(
         curves = _curves(marks.double(), rim, up, short * length, count, generator)
         shown = _in_sight(curves[:, 0], camera, distance)
         pixels = (camera.project(curves) + 0.5) * _FINE - 0.5
-        lines = [(8 * one).round().int().numpy() for one in pixels[shown]]
+        lines = [(8 * pixel).round().int().numpy() for pixel in pixels[shown]]
         cv2.polylines(cover, lines, False, 255 if up > 0 else 130, 1, cv2.LINE_AA, 3)
     size = (camera.width, camera.height)
     share = torch.from_numpy(cv2.resize(cover, size, interpolation=cv2.INTER_AREA)).float() / 255

@@ -57,7 +57,9 @@ def fitted_kernel(inputs: Tensor, targets: Tensor, inducing: Tensor, active: Ten
             loss = (0.5 * (fit + targets.shape[1] * volume) - targets.shape[1] * missed) / targets.numel()
             loss.backward()
             optimizer.step()
-    lengths = [one.lengthscale.item() for one in scaled.base_kernel.modules() if hasattr(one, "raw_lengthscale")]
+    lengths = [
+        module.lengthscale.item() for module in scaled.base_kernel.modules() if hasattr(module, "raw_lengthscale")
+    ]
     inverse = active / torch.tensor(lengths, dtype=active.dtype)[:, None]
     return Kernel(scaled.outputscale.item(), inverse.flatten(), likelihood.noise.item())
 

@@ -108,7 +108,9 @@ class _MeshReader:
         import bpy
 
         keys, name = one.data.shape_keys, one.name
-        changing = [each.name for each in one.modifiers if each.show_viewport and each.type not in _HARMLESS]
+        changing = [
+            modifier.name for modifier in one.modifiers if modifier.show_viewport and modifier.type not in _HARMLESS
+        ]
         if keys is not None and changing:
             shown = ", ".join(changing)[:80]
             self._leave(f"modifiers of {name[:40]!r} ({shown}), which its shape keys are without: apply them before")
@@ -221,7 +223,7 @@ def _animation(found: list[Any], arrays: dict[str, Any], left_out: list[str]) ->
     scene = bpy.context.scene
     keys = list({one.data.name: one.data.shape_keys for one in found if one.data.shape_keys is not None}.values())
     spans = [span for one in keys if one.animation_data is not None for span in _spans(one.animation_data)]
-    driven = any(one.animation_data is not None and len(one.animation_data.drivers) for one in keys)
+    driven = any(key.animation_data is not None and len(key.animation_data.drivers) for key in keys)
     if not spans and driven and len(bpy.data.actions):
         spans = [(scene.frame_start, scene.frame_end)]  # what moves their drivers may be anywhere
     if not spans:
@@ -275,7 +277,7 @@ def _curves(animated: Any, followers: set[str]) -> dict[str, Any] | None:
     """The curves of an action by what they move; none where more than they may move shapes, strips and drivers."""
     if animated is None:
         return {}
-    strange = any(one.data_path not in followers for one in animated.drivers)
+    strange = any(driver.data_path not in followers for driver in animated.drivers)
     if len(animated.nla_tracks) or strange or animated.action_influence != 1:
         return None
     if animated.action is None:

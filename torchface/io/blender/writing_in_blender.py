@@ -28,9 +28,9 @@ def write(source: Path, path: Path, notes: dict[str, Any]) -> None:
     for image in bpy.data.images:
         if Path(image.filepath).stem != source.stem:
             image[_NOTES] = "painted"  # for a part without texture; no part of the mesh's own
-    for one in [one for one in scene.objects if one.type in ("ARMATURE", "EMPTY") and not one.children]:
+    for one in [item for item in scene.objects if item.type in ("ARMATURE", "EMPTY") and not item.children]:
         bpy.data.objects.remove(one)  # USD's skeleton without joints, and the scope of its materials
-    face = next(one for one in scene.objects if one.type == "MESH")
+    face = next(item for item in scene.objects if item.type == "MESH")
     keys = face.data.shape_keys
     blocks = list(keys.key_blocks)[1:]
     for block, name, (least, largest) in zip(blocks, notes["names"], notes["ranges"], strict=True):
@@ -38,11 +38,13 @@ def write(source: Path, path: Path, notes: dict[str, Any]) -> None:
         block.slider_min, block.slider_max = least, largest
     called = {name: block.name for name, block in zip(notes["names"], blocks, strict=True)}  # long names are cut
     correctives = [
-        one | {"name": called[one["name"]], "drivers": [called[name] for name in one["drivers"]]}
-        for one in notes["correctives"]
+        note | {"name": called[note["name"]], "drivers": [called[name] for name in note["drivers"]]}
+        for note in notes["correctives"]
     ]
     if correctives:
-        records = [{key: value for key, value in one.items() if key != "expression"} for one in correctives]
+        records = [
+            {key: value for key, value in corrective.items() if key != "expression"} for corrective in correctives
+        ]
         face[_NOTES] = json.dumps({"correctives": records}, ensure_ascii=False)
     if path.suffix.lower() == ".blend":
         _drive(keys, correctives)

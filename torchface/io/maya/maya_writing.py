@@ -104,7 +104,11 @@ def maya_notes(rig: BlendshapeRig, keys: WeightKeys | None = None) -> list[str]:
     lost = {"the texture": neutral.texture, "vertex colours": neutral.colors, "annotations": neutral.annotations}
     if left := [what for what, value in lost.items() if value is not None]:
         notes.append(f".ma has no place for {' and '.join(left)}, left out")
-    peaks = [] if rig.correctives is None else [one.peak for one in rig.correctives.definitions if one.peak is not None]
+    peaks = (
+        []
+        if rig.correctives is None
+        else [definition.peak for definition in rig.correctives.definitions if definition.peak is not None]
+    )
     if rounded := [peak for peak in peaks if abs(peak - round(peak, 3)) > 1e-6]:
         notes.append(f"Maya has in-betweens at thousandths: {len(rounded)} peaks are rounded")
     if keys is not None and abs(_rate(keys.fps)[0] / keys.fps - 1) > _SAME_RATE:

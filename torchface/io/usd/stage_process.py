@@ -296,7 +296,7 @@ class _MeshReader:
         bound = [self.binding] if skeleton is None else [UsdSkel.BindingAPI(skeleton), self.binding]
         sources = [one.GetInheritedAnimationSource() for one in bound]
         sources += [self._named(one.GetAnimationSourceRel()) for one in bound]
-        return next((one for one in sources if one and one.IsA(UsdSkel.Animation)), None)
+        return next((source for source in sources if source and source.IsA(UsdSkel.Animation)), None)
 
     def _skeleton(self) -> Any:
         """The prim of the skeleton that the mesh is bound to; none where it is not."""

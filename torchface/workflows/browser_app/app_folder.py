@@ -154,8 +154,8 @@ def check_webcam_graph(data: bytes, path: str | Path) -> None:
         session = onnxruntime.InferenceSession(data, options, providers=["CPUExecutionProvider"])
     except Exception as error:  # ONNX Runtime has no common class for what it raises
         raise FileFormatError(f"{path}: not an ONNX file that runs ({str(error)[:160]}), {wanted}") from error
-    inputs = {one.name: one.type for one in session.get_inputs()}
-    missing = sorted(set(_OUTPUTS) - {one.name for one in session.get_outputs()})
+    inputs = {value.name: value.type for value in session.get_inputs()}
+    missing = sorted(set(_OUTPUTS) - {value.name for value in session.get_outputs()})
     if inputs != _INPUTS or missing:
         found = ", ".join(f"{name} {kind}" for name, kind in inputs.items())
         raise FileFormatError(f"{path}: found the inputs {found} and no output {', '.join(missing) or '-'}; {wanted}")

@@ -71,7 +71,7 @@ def _natural(path: Path) -> list[tuple[int, int, str]]:
 
 
 def _names(files: Sequence[Path]) -> list[str]:
-    paper = [one.name for one in paper_expressions()]
+    paper = [expression.name for expression in paper_expressions()]
     spelled = {re.sub("[^a-z]", "", name.lower()): name for name in (*paper, *ARKIT)}
     named = [spelled.get(re.sub("[^a-z]", "", path.stem.lower())) for path in files]
     known = [name for name in named if name is not None]

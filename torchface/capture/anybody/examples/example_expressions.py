@@ -85,7 +85,7 @@ def character_matrix(names: Sequence[str], shapes: Sequence[str]) -> Tensor:
         >>> character_matrix(["jawOpen", "jawLeft"], ["jawLeft", "jawOpen"]).tolist()
         [[0.0, 1.0], [1.0, 0.0]]
     """
-    known = {one.name: one for one in paper_expressions()}
+    known = {expression.name: expression for expression in paper_expressions()}
     matrix = mapping(names, shapes)
     onto = mapping(ARKIT, shapes)
     for column, name in enumerate(names):

@@ -49,7 +49,7 @@ def rig_examples(rig: BlendshapeRig, names: Sequence[str] | None = None) -> Exam
         raise NameMismatchError("rig: found no shape that moves a landmark, expected some")
     rows = rig.index(taken)
     weights = torch.eye(len(rig.names), dtype=rig.deltas.dtype, device=rig.deltas.device)[rows]
-    turns = [one for one in paper_expressions() if one.yaw or one.roll]
+    turns = [expression for expression in paper_expressions() if expression.yaw or expression.roll]
     poses = [*(ExampleExpression(name, "", {}, 0.0, 0.0) for name in taken), *turns]
     return _examples(rig, marks, poses, torch.cat([weights, weights.new_zeros(len(turns), len(rig.names))]))
 
@@ -71,7 +71,7 @@ def paper_examples(rig: BlendshapeRig) -> ExampleShapes:
         (15, 'brow_lower_left')
     """
     marks = _marks(rig)
-    shown = [one for one in paper_expressions() if one.name != NEUTRAL]
+    shown = [expression for expression in paper_expressions() if expression.name != NEUTRAL]
     weights = character_matrix([one.name for one in shown], rig.names).to(rig.deltas).T.clamp(0, 1)
     still = [one.name for one, row in zip(shown, weights, strict=True) if one.shapes and not bool(row.any())]
     if still:

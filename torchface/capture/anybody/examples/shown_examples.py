@@ -46,7 +46,7 @@ def shown_examples(names: Sequence[str], landmarks: Tensor) -> ExampleShapes:
         raise ShapeError(f"examples: found landmarks {tuple(landmarks.shape)}, expected ({len(names)},68,2)")
     if NEUTRAL not in names:
         raise NameMismatchError(f"examples: found {', '.join(list(names)[:5])}, ..., expected {NEUTRAL!r} among them")
-    turning = {one.name for one in paper_expressions() if one.yaw or one.roll}
+    turning = {expression.name for expression in paper_expressions() if expression.yaw or expression.roll}
     first = list(names).index(NEUTRAL)
     neutral = landmarks[first].double()
     others = [row for row in range(len(names)) if row != first]
