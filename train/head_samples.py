@@ -159,7 +159,7 @@ def upright(mesh: Mesh) -> Mesh:
     return mesh.with_vertices(((vertices - vertices.mean(0)) @ head_rotation.T).to(mesh.vertices))
 
 
-def laid(gathered: Gathered, scale: bool) -> tuple[Samples, Samples]:
+def aligned_samples(gathered: Gathered, scale: bool) -> tuple[Samples, Samples]:
     """The heads to learn from on their common mean, and those to test on aligned with it."""
     total, count = len(gathered.shapes), len(gathered.shapes) - gathered.held_out
     learn = SampleRange(gathered.shapes, 0, count)

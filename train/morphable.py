@@ -22,7 +22,7 @@ from torchface.progress import Progress
 from .head_colors import fitted_colors
 from .head_figures import draw
 from .head_measures import card_text, cross_validated, head_quality, measured
-from .head_samples import Source, gather, laid, performers, registered, vertex_colored
+from .head_samples import Source, aligned_samples, gather, performers, registered, vertex_colored
 from .model_cards import model_card
 from .model_quality import ModelQuality
 from .recipe_settings import RecipeSettings
@@ -110,7 +110,7 @@ def train(settings: Settings, run: Run) -> Trained:
     count = len(gathered.shapes) - gathered.held_out
     progress(f"{count} heads to learn from, {gathered.held_out} to test on")
     progress("aligning the heads with each other")
-    learn, test = laid(gathered, settings.scale)
+    learn, test = aligned_samples(gathered, settings.scale)
     progress("fitting the shape")
     shape = MorphableModel.fit(learn, settings.components, work / "shape", progress)
     if settings.variance is not None:

@@ -36,10 +36,10 @@ def completed_form(rest: Tensor, current: Tensor, faces: Tensor, unseen: Tensor,
     """
     if not unseen.any() or int(shown.sum()) < _MIN_COUNT:
         return current
-    laid = similarity_transform(rest[shown][None], current[shown][None]).apply(rest)[0]
-    stiffness, area = _membrane(laid, faces)
+    aligned = similarity_transform(rest[shown][None], current[shown][None]).apply(rest)[0]
+    stiffness, area = _membrane(aligned, faces)
     plate = stiffness @ sparse.diags_array(1 / area) @ stiffness + sparse.diags_array(area / _FORM_FADES**4)
-    return laid + _spread(plate, current - laid, unseen)
+    return aligned + _spread(plate, current - aligned, unseen)
 
 
 def completed_colors(colors: Tensor, base: Tensor, vertices: Tensor, faces: Tensor, unseen: Tensor) -> Tensor:

@@ -61,7 +61,7 @@ class Registration:
 
     Args:
         mesh: the scan's face in the template's topology, in the scan's place, with the scan's colours.
-        pose: the similarity that first laid the template on the scan, a batch of one.
+        pose: the similarity that first aligned the template with the scan, a batch of one.
         distance: of each vertex to the scan, (V,) float64, millimetres; beyond 10 mm it may be a little too long.
         matched: which vertices' positions the scan shows, (V,) bool; the others follow their neighbours.
         record: what was done.
@@ -143,14 +143,14 @@ def register(
     progress("laying the template on the scan")
     schedule = schedule or DEFAULT_SCHEDULE
     start = _start(template, scan, prepared, landmarks, detector, schedule)
-    laid = start.pose.apply(template.vertices.detach().cpu().double())[0]
-    contacts = contact_pull(laid, template)
+    aligned = start.pose.apply(template.vertices.detach().cpu().double())[0]
+    contacts = contact_pull(aligned, template)
     fit, stages_left = None, schedule.stages
     if shape is not None:
         progress("fitting the model")
-        fit = _model_fit(shape, template, laid, start, schedule)
-        laid, stages_left = fit.vertices, schedule.stages[1:] or schedule.stages
-    deformer = Deformer(laid, template.faces.cpu(), start.surface, start.pull, contacts, schedule)
+        fit = _model_fit(shape, template, aligned, start, schedule)
+        aligned, stages_left = fit.vertices, schedule.stages[1:] or schedule.stages
+    deformer = Deformer(aligned, template.faces.cpu(), start.surface, start.pull, contacts, schedule)
     cover = Cover(template, deformer.exposed, start.surface, _scan_colors(scan, start.prepared))
     start_distance = float(start.surface.among_nearest_samples(deformer.current[deformer.exposed]).distance.median())
     stages = []
@@ -231,8 +231,8 @@ def _start(
         by = "shape"
         pose = _pose_by_shape(template, samples, ScanPoints(prepared.vertices, prepared.faces), exposed)
         if detector is not None:
-            laid = template.with_vertices(pose.apply(vertices)[0].to(template.vertices))
-            landmarks = detector(laid, scan, pose)
+            aligned = template.with_vertices(pose.apply(vertices)[0].to(template.vertices))
+            landmarks = detector(aligned, scan, pose)
             by = "detected landmarks" if landmarks is not None else by
     if landmarks is None:
         return _Start(by, pose, LandmarkPull.none(), prepared, surface, prepared.notes)
@@ -261,11 +261,11 @@ def _pose_by_shape(template: Mesh, samples: Samples, scan: ScanPoints, exposed: 
         return find_pose(Samples.of(vertices, faces, evenly_spread(vertices, face, _RIGID_SAMPLES)), scan).pose
 
 
-def _model_fit(model: ShapeModel, template: Mesh, laid: Tensor, start: _Start, schedule: Schedule) -> ModelFit:
+def _model_fit(model: ShapeModel, template: Mesh, aligned: Tensor, start: _Start, schedule: Schedule) -> ModelFit:
     faces = template.faces.cpu()
-    exposed = exposed_vertices(laid, faces, schedule.opening).nonzero()[:, 0]
+    exposed = exposed_vertices(aligned, faces, schedule.opening).nonzero()[:, 0]
     landmarks = (start.pull.vertices, start.pull.points)
-    return fit_to_scan(model, faces, laid, exposed, start.surface, landmarks, schedule.largest_angle)
+    return fit_to_scan(model, faces, aligned, exposed, start.surface, landmarks, schedule.largest_angle)
 
 
 def _scale_notes(pose: Similarity) -> list[str]:

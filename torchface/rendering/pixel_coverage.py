@@ -81,12 +81,12 @@ class Footprint:
         return blurred[:, :-1] / blurred[:, -1:].clamp(min=1e-6)
 
     def blended(self, image: Tensor, over: Tensor, alpha: Tensor) -> Tensor:
-        """An image (3,H,W) with what the samples bring, (S,3) times alpha (S,) already, laid over it."""
+        """An image (3,H,W) with what the samples bring, (S,3) times alpha (S,) already, blended over it."""
         flat = image.reshape(3, -1).T
         weight = self.share.to(flat)[:, None]
-        laid = torch.zeros(len(flat), 4, dtype=flat.dtype)
-        laid.index_add_(0, self.pixel, weight * torch.cat([over, alpha[:, None]], dim=1).to(flat))
-        return (flat * (1 - laid[:, 3:]) + laid[:, :3]).T.reshape(image.shape)
+        drawn = torch.zeros(len(flat), 4, dtype=flat.dtype)
+        drawn.index_add_(0, self.pixel, weight * torch.cat([over, alpha[:, None]], dim=1).to(flat))
+        return (flat * (1 - drawn[:, 3:]) + drawn[:, :3]).T.reshape(image.shape)
 
 
 def footprint(

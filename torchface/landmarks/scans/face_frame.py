@@ -152,7 +152,7 @@ class FaceFrame(nn.Module):
 
 
 def _mean_landmarks(landmarks: Tensor) -> Tensor:
-    """Generalised Procrustes mean (L,3) of landmark sets (M,L,3), symmetric, laid into the frame, at the mean size."""
+    """Generalised Procrustes mean (L,3) of landmark sets (M,L,3), symmetric, in the frame, at the mean size."""
     known = torch.isfinite(landmarks).all(-1)
     if int(known.sum(1).min()) < 3:
         raise ValueRangeError(
@@ -176,9 +176,9 @@ def _into_frame(mean: Tensor) -> Tensor:
     right = torch.nn.functional.normalize(across - up * (across @ up), dim=0)
     forward = torch.linalg.cross(right, up)
     origin = (eyes + mouth) / 2 + forward * ((eyes - mouth) @ forward / 2 - _AXIS_BEHIND_EYES)
-    laid = (mean - origin) @ torch.stack([right, up, forward]).T
-    mirrored = laid[list(MIRRORED)] * torch.tensor([-1.0, 1.0, 1.0], dtype=laid.dtype)
-    return (laid + mirrored) / 2
+    aligned = (mean - origin) @ torch.stack([right, up, forward]).T
+    mirrored = aligned[list(MIRRORED)] * torch.tensor([-1.0, 1.0, 1.0], dtype=aligned.dtype)
+    return (aligned + mirrored) / 2
 
 
 def _row(poses: Similarity, row: int) -> Similarity:

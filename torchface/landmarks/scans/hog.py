@@ -111,7 +111,7 @@ def unit_windows(cells: Tensor, layout: HogLayout) -> Tensor:
 def similarity(columns: Tensor, filters: Tensor) -> Tensor:
     r"""Cosine of the angle between filters and the windows at every place: a convolution, normalised.
 
-    The windows of a map are laid side by side once and serve every landmark's filters.
+    The windows of a map are put side by side once and serve every landmark's filters.
 
     Args:
         columns: of ``unit_windows``, (B,bins·side²,P).

@@ -222,10 +222,10 @@ class AutomaticLandmarks:
         self.features = template_features(template, seeing[0] if seeing else detector)
         self._count = len(template.vertices)
 
-    def __call__(self, laid: Mesh, scan: Mesh, pose: Similarity) -> tuple[Tensor, Tensor] | None:
+    def __call__(self, aligned: Mesh, scan: Mesh, pose: Similarity) -> tuple[Tensor, Tensor] | None:
         """Pairs, or nothing where too few are sure."""
-        if len(laid.vertices) != self._count:
-            raise TopologyError(f"template: found {len(laid.vertices)} vertices, expected {self._count}")
+        if len(aligned.vertices) != self._count:
+            raise TopologyError(f"template: found {len(aligned.vertices)} vertices, expected {self._count}")
         for detector, own in zip(self.detectors, self._poses, strict=True):
             if detector.sees(scan):
                 detected = scan_landmarks(detector, scan, _after(own, pose.inverse()))

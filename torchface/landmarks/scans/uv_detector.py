@@ -76,7 +76,7 @@ class UVLandmarkDetector(nn.Module):
         names: of the landmarks.
         appearance: what the images show, "texture" or "curvature".
         settings: how to match; a dict as in ``config`` will do.
-        frame: config of the ``FaceFrame`` that scans are laid into, where there is one.
+        frame: config of the ``FaceFrame`` that scans are aligned with, where there is one.
 
     Source: thesis 3.2.2.
 

@@ -58,11 +58,11 @@ class ContactPull:
         return kept.masked_fill(open_there, 0.0)
 
 
-def contact_pull(laid: Tensor, template: Mesh) -> ContactPull:
+def contact_pull(aligned: Tensor, template: Mesh) -> ContactPull:
     """The pairs of a template that touch at rest: its annotated contacts, else vertices that face each other.
 
     Args:
-        laid: the template's vertices on the scan, (V,3) float64.
+        aligned: the template's vertices on the scan, (V,3) float64.
         template: its size decides what is close.
     """
     notes = template.annotations
@@ -75,4 +75,4 @@ def contact_pull(laid: Tensor, template: Mesh) -> ContactPull:
         facing = (way * normals[pairs[:, 0]]).sum(-1) > -_BEHIND
         facing &= (way * normals[pairs[:, 1]]).sum(-1) < _BEHIND
         pairs = pairs[facing]
-    return ContactPull(pairs, laid[pairs[:, 1]] - laid[pairs[:, 0]])
+    return ContactPull(pairs, aligned[pairs[:, 1]] - aligned[pairs[:, 0]])

@@ -186,7 +186,7 @@ def _best_view(scan: Mesh, cameras: list[Camera]) -> Tensor:
 
 
 def _truth(head: Mesh, landmarks: Tensor) -> ScanAnnotation:
-    """Twelve landmarks, cheeks laid onto the surface, and the lines where lids and lips meet."""
+    """Twelve landmarks, cheeks moved onto the surface, and the lines where lids and lips meet."""
     twelve = uv_landmarks_from_ibug(landmarks)
     on_surface = SurfaceIndex(head.vertices, head.faces).nearest(twelve).points
     points = dict(zip(UV_LANDMARK_NAMES, on_surface, strict=True))
