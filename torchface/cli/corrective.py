@@ -32,8 +32,8 @@ def corrective(
         rig: .glb, USD, .fbx, .blend, a folder of OBJ files, or ICT-FaceKit's FaceXModel folder.
         at: The pose, such as mouthSmileLeft=1 jawOpen=0.7: up to eight shapes.
         sculpt: The rig in that pose with the artist's changes, in its topology and order of vertices (.obj, .ply, .glb,
-            USD). `torchface convert RIG FOLDER` writes meshes to begin from.
-        out: The rig to write: .glb, USD, .blend, or a name without an ending for a folder of OBJ files.
+            USD). `torchface convert RIG POSED.obj --at ...` writes the mesh to begin from.
+        out: The rig to write: .glb, USD, .ma, .blend, or a name without an ending for a folder of OBJ files.
         name: Name of the corrective; the names of its shapes if absent.
         unit: Unit of the sculpt (mm, cm, m) where it is not the format's own.
         align: A sculpt of which the whole mesh has moved is refused; "remove" takes that motion out, "keep" takes it as

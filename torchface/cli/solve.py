@@ -110,6 +110,7 @@ def solve(
     from torchface.workflows.solve.solution import SolveSettings
     from torchface.workflows.solve.solve_take import TakeInputs, TakeOutputs, solve_take
     from torchface.workflows.solve.take_job import TakeJob
+    from torchface.workflows.weight_files import checked_reduction
 
     if labels is not None and labels.suffix.lower() == ".toml":
         raise FileFormatError(f"{labels}: found TOML, expected a .csv; labels of a video go to --video-labels")
@@ -130,7 +131,9 @@ def solve(
         written = {"--animation": animation, "--report": report, "--live-link": live_link}
         for option, path in written.items():
             check_for_each(option, path)
-        job = TakeJob(rig, attachment, settings, options, part, camera, animation, report, live_link, reduce)
+        job = TakeJob(
+            rig, attachment, settings, options, part, camera, animation, report, live_link, checked_reduction(reduce)
+        )
         items = find_items(take, MARKER_TAKES)
         with progress_bars(quiet) as progress:
             where = BatchOptions(jobs, cluster, time_limit)
