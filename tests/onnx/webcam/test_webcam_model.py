@@ -9,7 +9,7 @@ import onnxruntime
 import pytest
 import torch
 from onnx import ModelProto
-from torch import nn
+from torch import Tensor, nn
 
 from torchface.landmarks import BoxNetwork, LandmarkNetwork
 from torchface.landmarks.images.frame_reader.face_reader import (
@@ -18,7 +18,9 @@ from torchface.landmarks.images.frame_reader.face_reader import (
     ReaderSettings,
     WebcamNetworks,
 )
+from torchface.landmarks.images.frame_reader.picture_pieces import cut_square, whole_picture
 from torchface.landmarks.images.networks.eye_network import EyeNetwork
+from torchface.onnx.exported_model import exported_model
 from torchface.onnx.webcam.webcam_model import OUTPUTS, AnswerSolver, WebcamGraph, webcam_model
 
 USUAL = (0.0, 1.0, 0.5, 0.0, 0.0)
@@ -64,6 +66,27 @@ def test_the_file_says_what_it_takes(webcam_file: bytes) -> None:
     assert int(facts["state"]) == model.graph.input[3].type.tensor_type.shape.dim[0].dim_value
     assert [one.name for one in model.graph.input] == ["image", "interval", "controls", "state"]
     assert [one.name for one in model.graph.output] == list(OUTPUTS)
+
+
+class Pieces(nn.Module):
+    """A square of a picture, and the whole made smaller."""
+
+    def forward(self, image: Tensor, place: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        return cut_square(image, place, 32, 1.25), *whole_picture(image, 100)
+
+
+def test_pieces_of_pictures_of_any_size_are_cut_in_a_graph() -> None:
+    """Their sizes are known when it runs."""
+    given = {"image": torch.zeros(96, 128, 4, dtype=torch.uint8), "place": torch.tensor([40.0, 30.0, 50.0, 1.0, 0.0])}
+    sizes = {"image": ("height", "width", "channels")}
+    model = exported_model(Pieces(), given, ["square", "whole", "ratio"], {}, sizes, optimize=False)
+    session = onnxruntime.InferenceSession(model.SerializeToString(), providers=["CPUExecutionProvider"])
+    for size, side, angle in (((90, 120, 3), 30.0, 0.3), ((300, 40, 4), 190.0, -0.8), ((1, 1, 3), 12.0, 0.0)):
+        image = torch.randint(256, size, generator=torch.Generator().manual_seed(1)).byte()
+        place = torch.tensor([20.0, 30.0, side, np.cos(angle), np.sin(angle)]).float()
+        found = session.run(None, {"image": image.numpy(), "place": place.numpy()})
+        for value, expected in zip(found, Pieces()(image, place), strict=True):
+            np.testing.assert_allclose(value, expected, atol=0.01)
 
 
 @pytest.fixture(scope="module")
