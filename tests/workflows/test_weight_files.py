@@ -209,6 +209,7 @@ def test_few_keys_are_written_within_a_bound_of_every_frame(
     told = " ".join(capsys.readouterr().err.split())
     assert told.count(" keys, largest error 0.0") == 2
     assert f"{len(few)} of 30 keys" in told
+    assert f"warning: {stage / rig}" not in told
     assert len(few) < 20
     names = few.weights.names
     assert np.abs(lines_at(few, whole.times) - whole.weights.select(names).values[..., 0].numpy()).max() <= 0.05 + 1e-6

@@ -44,7 +44,7 @@ class Retargeted:
         take: weights by the target's names.
         shapes: what drove what.
         warnings: what a file leaves out, what examples do not determine.
-        notes: what was learned of examples.
+        notes: what was learned of examples, and how many keys files have.
     """
 
     take: Take
@@ -99,8 +99,8 @@ def retarget_weights(
         raise NameMismatchError(f"{table or poses or weights}: {error}") from error
     moved, notes = _mouth_closed(retarget_take(played, shapes), rig, target, rules)
     progress("writing")
-    written = [*faults, *notes, *write_weights(moved, files, target)]
-    return Retargeted(moved, shapes, tuple(written), said)
+    left_out, written = write_weights(moved, files, target)
+    return Retargeted(moved, shapes, (*faults, *notes, *left_out), (*said, *written))
 
 
 def _learned(

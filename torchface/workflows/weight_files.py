@@ -90,8 +90,8 @@ def check_live_link(names: Sequence[str], target: Path | str | None) -> None:
         )
 
 
-def write_weights(take: Take, files: WeightFiles, rig: BlendshapeRig) -> list[str]:
-    """Writes a take's weights, and says what a file leaves out.
+def write_weights(take: Take, files: WeightFiles, rig: BlendshapeRig) -> tuple[list[str], list[str]]:
+    """Writes a take's weights, and says what a file leaves out and how many keys it has.
 
     ``files.out`` is Live Link Face's CSV where it gives every shape back, because all are ARKit's; else
     ``frame,time,<shape>,...`` with every shape by its own name.
@@ -102,10 +102,12 @@ def write_weights(take: Take, files: WeightFiles, rig: BlendshapeRig) -> list[st
         rig: that the animation moves.
 
     Returns:
-        Lines for people to read.
+        Warnings, and other lines for people to read.
     """
     assert take.weights is not None
-    lost, notes, few = not_in_live_link(take.weights.names), [], take
+    lost, few = not_in_live_link(take.weights.names), take
+    warnings: list[str] = []
+    notes: list[str] = []
     if files.reduce is not None:
         few, reduction = reduced_take(take, files.reduce)
         notes.append(f"{files.out}: {reduction}")
@@ -118,12 +120,12 @@ def write_weights(take: Take, files: WeightFiles, rig: BlendshapeRig) -> list[st
     if lost and files.live_link is not None:
         more = f" and {len(lost) - _SHOWN} more" if len(lost) > _SHOWN else ""
         listed = ", ".join(lost[:_SHOWN]) + more
-        notes.append(f"{files.live_link} does not give back (halves are merged, others left out): {listed}")
+        warnings.append(f"{files.live_link} does not give back (halves are merged, others left out): {listed}")
     if files.animation is not None:
         make_folder(files.animation.parent)
         match = save_animation(rig, take, files.animation, reduce=files.reduce)
         notes += [] if match.reduction is None else [f"{files.animation}: {match.reduction}"]
-    return notes
+    return warnings, notes
 
 
 def reduced_take(take: Take, bound: float) -> tuple[Take, KeyReduction]:

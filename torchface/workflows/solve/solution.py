@@ -122,6 +122,7 @@ class SolveReport:
         predicted: what the head camera saw, where there was a video.
         sent: what was streamed, where that was asked for.
         warnings: what the user should know before they use the weights.
+        notes: what else there is to say of the files.
     """
 
     solution: Solution
@@ -130,12 +131,13 @@ class SolveReport:
     predicted: Predicted | None = None
     sent: StreamReport | None = None
     warnings: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
 
     def lines(self) -> list[str]:
         """For people to read."""
         solution, rmse = self.solution, self.solution.rmse
         frames, worst = len(rmse), float(rmse.nan_to_num().max())
-        lines = [f"warning: {warning}" for warning in self.warnings]
+        lines = [*(f"warning: {warning}" for warning in self.warnings), *self.notes]
         lines.append(
             f"{frames} frames at {solution.take.rate}, {100 * self.seen:.1f} % of the attachment's marker samples seen"
         )

@@ -94,11 +94,11 @@ def solve_take(
     seconds = time.perf_counter() - started
 
     progress("writing")
-    written = write_weights(solution.take, outputs, rig)
+    left_out, written = write_weights(solution.take, outputs, rig)
     samples = len(solution.take) * len(attachment.triangles)
     seen = float(torch.isfinite(solution.markers).all(-1).sum()) / samples
-    warnings = (*notes, *solution.warnings, *written)
-    report = SolveReport(solution, seen, seconds, predicted, warnings=warnings)
+    warnings = (*notes, *solution.warnings, *left_out)
+    report = SolveReport(solution, seen, seconds, predicted, warnings=warnings, notes=tuple(written))
     if outputs.report is not None:
         from torchface.workflows.solve.solve_page import write_solve_page  # matplotlib takes its time
 
