@@ -52,6 +52,7 @@ from torchface.workflows.rig.expression_scans import (
     seen_example,
     weights_row,
 )
+from torchface.workflows.rig.shut_eyes import with_eye_note
 from torchface.workflows.rig_names import Naming, renamed, renamed_detail
 
 FIGURE_ENDING = "_registration.png"
@@ -202,6 +203,14 @@ def _rig_actor(
     if model is not None and bool(shown.any()):
         raise ValueRangeError("model: found a pose beside a model of heads at rest, expected one of the two")
     registration = job.registered(job.posed(rig, shown), scan, landmarks, options.texture_size, model)
+    progress("looking at the eyes")
+    registration = with_eye_note(
+        rig,
+        job.read(scan),
+        registration,
+        shown,
+        lambda weights: job.registered(job.posed(rig, weights), scan, landmarks, 0),
+    )
     neutral = _at_rest(rig, shown, _upright(registration, rig.neutral))
     parts = inner_parts(rig)
     neutral = place_parts(rig, neutral, parts)
@@ -242,6 +251,10 @@ class _Actor:
         self.template, self.options, self.progress = template, options, progress
         self.skipped: list[str] = []
 
+    def read(self, scan: Path) -> Mesh:
+        mesh = load_mesh(scan, self.options.unit)
+        return mesh if self.options.colors else without_colors(mesh)
+
     @staticmethod
     def posed(rig: BlendshapeRig, weights: Tensor) -> Mesh:
         return rig.neutral.with_vertices(rig(weights[None].to(rig.deltas))[0])
@@ -254,9 +267,7 @@ class _Actor:
         texture_size: int,
         model: MorphableModel | HeadModel | None = None,
     ) -> Registration:
-        options = self.options
-        read = load_mesh(scan, options.unit)
-        read = read if options.colors else without_colors(read)
+        options, read = self.options, self.read(scan)
         marks = None if landmarks is None else load_scan_landmarks(landmarks, mesh, scan, options.unit)
         detector = None
         if marks is None and options.detector is not None:
