@@ -20,12 +20,7 @@ from torchface.io.action_labels import ActionLabels, load_action_labels
 from torchface.io.video import open_video
 from torchface.rendering.compositing import headed, save_rendered_image, sheet
 
-from .classifier_evaluation import (
-    Split,
-    cross_validation,
-    labelled_intensities,
-    level_agreement,
-)
+from .classifier_evaluation import Split, cross_validation, labelled_intensities, level_agreement
 from .model_cards import model_card
 from .recipe_settings import RecipeSettings
 from .runner import Recipe, Run, metric_lines, recipe

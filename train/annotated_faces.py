@@ -91,11 +91,7 @@ def load_faces(path: Path, folders_are_people: bool = False) -> Faces:
 
 
 def rendered_faces(
-    count: int,
-    seed: int,
-    settings: FaceImageSettings | None = None,
-    progress: Progress | None = None,
-    workers: int = 1,
+    count: int, seed: int, settings: FaceImageSettings | None = None, progress: Progress | None = None, workers: int = 1
 ) -> Faces:
     """Images of synthetic people; how many processes render them does not change them."""
     parts = [(seed, settings, start, min(_PART, count - start)) for start in range(0, count, _PART)]

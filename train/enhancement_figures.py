@@ -27,12 +27,7 @@ _LINE = 110  # characters of a heading
 
 
 def draw(
-    model: EnhancementModel,
-    neutral: Mesh,
-    learned: Shown,
-    test: Shown | None,
-    folder: Path,
-    progress: Progress,
+    model: EnhancementModel, neutral: Mesh, learned: Shown, test: Shown | None, folder: Path, progress: Progress
 ) -> None:
     """Writes the pictures into a folder: ``regions.png``, ``learned.png`` and ``held_out.png``."""
     make_folder(folder)

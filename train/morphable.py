@@ -162,13 +162,7 @@ def save(
     else:
         tested = f"Tested on {held_out} heads that it has not learned from{_MEASURES}"
     free = "MIT" if settings.performers else "MIT, as ICT-FaceKit" if settings.ict is not None else "that of the scans"
-    card = model_card(
-        settings,
-        licence=free,
-        data=data,
-        metrics=metrics,
-        text=card_text(model, tested),
-    )
+    card = model_card(settings, licence=free, data=data, metrics=metrics, text=card_text(model, tested))
     zoo.save_model(
         model, settings.out, card, half=[name for name in _HALF if settings.half and name in model.state_dict()]
     )

@@ -370,13 +370,7 @@ def _scan_colors(scan: Mesh, prepared: PreparedScan) -> ScanColors | None:
 
 
 def _colored(
-    mesh: Mesh,
-    template: Mesh,
-    source: ScanColors,
-    nearest: SurfacePoints,
-    matched: Tensor,
-    unseen: Tensor,
-    size: int,
+    mesh: Mesh, template: Mesh, source: ScanColors, nearest: SurfacePoints, matched: Tensor, unseen: Tensor, size: int
 ) -> Mesh:
     colors = vertex_colors(source, nearest, matched)
     place, faces = mesh.vertices.detach().cpu().double(), mesh.faces.cpu()

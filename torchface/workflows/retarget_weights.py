@@ -17,13 +17,7 @@ from torchface.capture.mouth_close_conventions import (
     jaw_out_of_mouth_close,
     mouth_close_of,
 )
-from torchface.capture.retargeting import (
-    ShapeMap,
-    load_shape_rules,
-    retarget_take,
-    save_shape_rules,
-    shape_map,
-)
+from torchface.capture.retargeting import ShapeMap, load_shape_rules, retarget_take, save_shape_rules, shape_map
 from torchface.errors import NameMismatchError, ValueRangeError
 from torchface.files.whole_files import make_folder
 from torchface.io import load_rig, load_take

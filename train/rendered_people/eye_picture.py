@@ -25,12 +25,7 @@ from .picture_geometry import CURTAIN, Surface, as_annotated
 from .portrait_geometry import curtain, hair_share_at, lumps
 from .rendered_person import render_person, visible_points
 from .spectacles import with_glasses
-from .turned_eyes import (
-    gaze_toward,
-    gaze_weights,
-    iris_centres,
-    with_turned_eyes,
-)
+from .turned_eyes import gaze_toward, gaze_weights, iris_centres, with_turned_eyes
 
 EYES_WIDTH, EYES_HEIGHT = 160, 64
 """Pixels of a picture of both eyes."""

@@ -13,15 +13,7 @@ from torchface.landmarks.images.ibug_68 import MIRROR_68
 
 from .head_kind import GUMS, SOCKET, TEETH, DrawnHead, HeadKind
 from .looks import Looks
-from .portrait_geometry import (
-    contour_lines,
-    curtain,
-    hair_share_at,
-    lumps,
-    shoulders,
-    teeth,
-    with_visible_jaw,
-)
+from .portrait_geometry import contour_lines, curtain, hair_share_at, lumps, shoulders, teeth, with_visible_jaw
 from .skin_paint import brow_edge_height
 
 CURTAIN, CLOTHES = 10, 11

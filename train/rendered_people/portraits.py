@@ -89,11 +89,7 @@ class _Person:
 
 
 def face_images(
-    count: int,
-    seed: int,
-    settings: FaceImageSettings | None = None,
-    progress: Progress | None = None,
-    first: int = 0,
+    count: int, seed: int, settings: FaceImageSettings | None = None, progress: Progress | None = None, first: int = 0
 ) -> Iterator[FaceImage]:
     """Draws people, poses, expressions, lights and backgrounds, one image at a time.
 

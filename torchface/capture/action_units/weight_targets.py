@@ -121,10 +121,7 @@ def action_unit_curves(
 
 
 def smooth_intensities(
-    intensities: Tensor,
-    units: Sequence[str],
-    windows: Mapping[str, int] = WINDOWS,
-    fps: float = _RATE,
+    intensities: Tensor, units: Sequence[str], windows: Mapping[str, int] = WINDOWS, fps: float = _RATE
 ) -> Tensor:
     """A classifier's levels as continuous curves in [0,1].
 

@@ -212,14 +212,7 @@ class DynamicsPrior(nn.Module):
         from torchface.capture.priors.dynamics_training import fit_dynamics_prior
 
         return fit_dynamics_prior(
-            takes,
-            names,
-            window,
-            fps=fps,
-            groups=groups,
-            input_noise=input_noise,
-            settings=settings,
-            progress=progress,
+            takes, names, window, fps=fps, groups=groups, input_noise=input_noise, settings=settings, progress=progress
         )
 
     def forward(self, windows: Tensor) -> tuple[Tensor, Tensor]:

@@ -103,10 +103,7 @@ class ShapePrior(nn.Module):
 
     @classmethod
     def fit(
-        cls,
-        takes: Sequence[Tensor],
-        names: Sequence[str],
-        groups: Sequence[Sequence[int]] | None = None,
+        cls, takes: Sequence[Tensor], names: Sequence[str], groups: Sequence[Sequence[int]] | None = None
     ) -> ShapePrior:
         """Learns a Student's t-distribution about the face at rest, a :class:`StudentDensity` a group.
 
@@ -295,11 +292,7 @@ class ReciprocalPrior(ShapePrior):
 
     @classmethod
     def fit(
-        cls,
-        takes: Sequence[Tensor],
-        names: Sequence[str],
-        groups: Sequence[Sequence[int]] | None = None,
-        seed: int = 0,
+        cls, takes: Sequence[Tensor], names: Sequence[str], groups: Sequence[Sequence[int]] | None = None, seed: int = 0
     ) -> ReciprocalPrior:
         """Learns a Parzen window a group, over centres binned by mean shift with its automatic bandwidth.
 

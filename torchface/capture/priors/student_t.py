@@ -52,10 +52,7 @@ class StudentDensity(nn.Module):
 
     @classmethod
     def fit(
-        cls,
-        samples: Tensor | Iterable[Tensor],
-        degrees_of_freedom: float = 10.0,
-        floor: float = PARTING_VARIANCE,
+        cls, samples: Tensor | Iterable[Tensor], degrees_of_freedom: float = 10.0, floor: float = PARTING_VARIANCE
     ) -> StudentDensity:
         r"""The likeliest :math:`\Sigma`, by expectation maximisation in float64.
 

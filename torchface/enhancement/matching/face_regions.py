@@ -12,12 +12,7 @@ from scipy.spatial import KDTree
 from torch import Tensor
 
 from torchface.enhancement.matching.motion_clusters import motion_clusters
-from torchface.enhancement.matching.patches import (
-    grow_labels,
-    neighbour_table,
-    neighbouring_triangles,
-    patch_means,
-)
+from torchface.enhancement.matching.patches import grow_labels, neighbour_table, neighbouring_triangles, patch_means
 from torchface.enhancement.matching.region_names import named_regions
 from torchface.errors import ShapeError, ValueRangeError
 from torchface.geometry.meshes.operators import components, corners, edges, triangle_areas

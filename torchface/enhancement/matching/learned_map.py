@@ -33,11 +33,7 @@ class LearnedMap:
     """
 
     def __init__(
-        self,
-        projection: RegionProjection,
-        coefficients: Tensor,
-        components: int = COMPONENTS,
-        ridge: float = RIDGE,
+        self, projection: RegionProjection, coefficients: Tensor, components: int = COMPONENTS, ridge: float = RIDGE
     ) -> None:
         checked_count("components", components, 1)
         checked_number("ridge", ridge, above=True)

@@ -96,11 +96,7 @@ def evenly_spaced(points: Tensor, count: int) -> Tensor:
 
 
 def trace_contour(
-    image: Tensor,
-    left: Tensor,
-    right: Tensor,
-    settings: TraceSettings | None = None,
-    shape: LineShape | None = None,
+    image: Tensor, left: Tensor, right: Tensor, settings: TraceSettings | None = None, shape: LineShape | None = None
 ) -> Contour:
     r"""Traces the line between two corners: a dark one, or one with the profile that was learned.
 

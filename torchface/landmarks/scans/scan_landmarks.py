@@ -141,11 +141,7 @@ def line_image(head: UnwrappedHead, appearance: str) -> Tensor:
     return curvature_image(head) if appearance == "curvature" else appearance_image(head, appearance)
 
 
-def scan_landmarks(
-    detector: UVLandmarkDetector,
-    scan: Mesh,
-    pose: Similarity | None = None,
-) -> ScanLandmarks:
+def scan_landmarks(detector: UVLandmarkDetector, scan: Mesh, pose: Similarity | None = None) -> ScanLandmarks:
     """Finds the twelve landmarks and traces lips and lids on a scan.
 
     Args:
@@ -168,9 +164,7 @@ def scan_landmarks(
     pixels = detected.pixels[0]
     points, _ = head.surface_points(scan, pixels)
     contours = trace_lines(
-        line_image(head, detector.appearance),
-        dict(zip(detector.names, pixels, strict=True)),
-        detector.line_shapes(),
+        line_image(head, detector.appearance), dict(zip(detector.names, pixels, strict=True)), detector.line_shapes()
     )
     return ScanLandmarks(detector.names, points, detected.confidence[0], pixels, contours, head, image)
 

@@ -49,10 +49,7 @@ class PrincipalComponents:
 
 
 def principal_components(
-    samples: Samples,
-    most: int | None = None,
-    checkpoint: str | Path | None = None,
-    progress: Progress | None = None,
+    samples: Samples, most: int | None = None, checkpoint: str | Path | None = None, progress: Progress | None = None
 ) -> PrincipalComponents:
     r"""The directions in which samples vary most; fewer than ``most`` where there are no more.
 

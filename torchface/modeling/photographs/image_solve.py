@@ -286,13 +286,7 @@ def solve(problem: Problem, state: State, free: Tensor | None = None) -> State:
 
 
 def _searched(
-    problem: Problem,
-    state: State,
-    picked: PickedPoints,
-    factors: Tensor,
-    normal: Normal,
-    change: Tensor,
-    before: float,
+    problem: Problem, state: State, picked: PickedPoints, factors: Tensor, normal: Normal, change: Tensor, before: float
 ) -> tuple[State, float]:
     """The step, halved until the energy falls."""
     count, focal = len(problem.found), step_focal(problem)

@@ -78,10 +78,7 @@ class TransferredRig:
 
 
 def transfer_deformation(
-    source: BlendshapeRig,
-    target: Mesh,
-    contact_weight: float = CONTACT_WEIGHT,
-    progress: Progress | None = None,
+    source: BlendshapeRig, target: Mesh, contact_weight: float = CONTACT_WEIGHT, progress: Progress | None = None
 ) -> BlendshapeRig:
     r"""Gives a new face the shapes of a template rig.
 
@@ -124,10 +121,7 @@ def transfer_deformation(
 
 
 def transfer_with_report(
-    source: BlendshapeRig,
-    target: Mesh,
-    contact_weight: float = CONTACT_WEIGHT,
-    progress: Progress | None = None,
+    source: BlendshapeRig, target: Mesh, contact_weight: float = CONTACT_WEIGHT, progress: Progress | None = None
 ) -> TransferredRig:
     """The same as ``transfer_deformation``, with a report in place of a warning.
 

@@ -95,8 +95,7 @@ class ShapeTransfer:
         pose = self.rest + self.deltas[shape] + (0 if below is None else self.deltas[below])
         asked = [*self._link_constraints(shape, self.goal), *self._contact_constraints(shape, pose, below)]
         return Follower(
-            [constraint.matrix for constraint in asked],
-            self.reconstruction.prepare(~self.moving[shape], asked),
+            [constraint.matrix for constraint in asked], self.reconstruction.prepare(~self.moving[shape], asked)
         )
 
     def correctives(self, source: BlendshapeRig, progress: Progress | None = None) -> Correctives | None:

@@ -37,12 +37,7 @@ class Correspondences:
 
 
 def correspondences(
-    current: Tensor,
-    faces: Tensor,
-    vertices: Tensor,
-    scan: SurfaceIndex,
-    reach: float,
-    largest_angle: float,
+    current: Tensor, faces: Tensor, vertices: Tensor, scan: SurfaceIndex, reach: float, largest_angle: float
 ) -> Correspondences:
     r"""The nearest scan point of each template vertex, where it stands the tests.
 

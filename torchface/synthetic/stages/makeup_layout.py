@@ -88,10 +88,7 @@ _SIDE: dict[str, dict[str, _Site]] = {
         "lipUpperOuter": {49: 0.88, 31: 0.12},
         "lipCorner": {48: 1.07, 54: -0.07},
     },
-    "lower lip": {
-        "lipLowerInner": {58: 0.9, 7: 0.1},
-        "lipLowerOuter": {59: 0.9, 6: 0.1},
-    },
+    "lower lip": {"lipLowerInner": {58: 0.9, 7: 0.1}, "lipLowerOuter": {59: 0.9, 6: 0.1}},
     "chin": {
         "mentolabialSide": {58: 0.65, 7: 0.35},
         "marionette": {48: 0.6, 59: 0.1, 6: 0.3},

@@ -197,12 +197,7 @@ def _weight_take(path: Path) -> Take:
     return played
 
 
-def run_demo(
-    scene: Scene,
-    out: Path,
-    seed: int = 0,
-    progress: Progress | None = None,
-) -> DemoResult:
+def run_demo(scene: Scene, out: Path, seed: int = 0, progress: Progress | None = None) -> DemoResult:
     """Plays a scene and writes every file of the main job into a folder.
 
     Args:

@@ -89,10 +89,7 @@ class ExampleSolver(nn.Module):
     basis: Tensor
 
     def __init__(
-        self,
-        examples: ExampleShapes,
-        method: ExampleMethod | None = None,
-        placement: PlacementModel | None = None,
+        self, examples: ExampleShapes, method: ExampleMethod | None = None, placement: PlacementModel | None = None
     ) -> None:
         super().__init__()
         if not bool(examples.basis.any()):
@@ -268,9 +265,5 @@ def landmark_observability(solver: ExampleSolver, noise: float = 0.5) -> Observa
         known = torch.linalg.qr(free)[0]
         basis = basis - known @ (known.T @ basis)
     return weight_observability(
-        basis.unflatten(0, (68, 2)).to(solver.basis.dtype),
-        solver.names,
-        noise,
-        "landmarks",
-        "% of the eyes' distance",
+        basis.unflatten(0, (68, 2)).to(solver.basis.dtype), solver.names, noise, "landmarks", "% of the eyes' distance"
     )

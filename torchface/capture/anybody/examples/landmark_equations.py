@@ -69,11 +69,7 @@ class LandmarkEquations:
     def rows(self, keep: Tensor) -> LandmarkEquations:
         """Those of some frames."""
         return replace(
-            self,
-            offset=self.offset[keep],
-            scale=self.scale[keep],
-            seen=self.seen[keep],
-            free=self.free[keep],
+            self, offset=self.offset[keep], scale=self.scale[keep], seen=self.seen[keep], free=self.free[keep]
         )
 
     def residual(self, found: Unknowns) -> Tensor:

@@ -122,11 +122,7 @@ class WrinkledPerformer:
     """
 
     def __init__(
-        self,
-        identity: Tensor | None = None,
-        vertices: int = 100_000,
-        seed: int = 0,
-        rig: BlendshapeRig | None = None,
+        self, identity: Tensor | None = None, vertices: int = 100_000, seed: int = 0, rig: BlendshapeRig | None = None
     ) -> None:
         if rig is not None and identity is not None:
             raise ValueRangeError("WrinkledPerformer: found identity and rig, expected one of them")
