@@ -10,7 +10,6 @@ from torch import Tensor
 
 from torchface.enhancement.enhancement_model import EnhancementModel
 from torchface.enhancement.timing.motion_keyframes import find_keyframes, travelled, without_holds
-from torchface.errors import ShapeError
 
 _TOLERANCE = 0.08  # of the animation's range: how far its path may leave the straight way between two keyframes
 _FEWEST = 4  # frames of a motion that has a timing
@@ -51,11 +50,6 @@ def at_moments(frames: Tensor, moments: Tensor, vertex_weights: Tensor) -> Tenso
     Returns:
         (T,V,3).
     """
-    if frames.ndim != 3 or len(moments) != len(vertex_weights) or vertex_weights.shape[1] != frames.shape[1]:
-        raise ShapeError(
-            f"at_moments: found frames {tuple(frames.shape)}, moments {tuple(moments.shape)} and weights "
-            f"{tuple(vertex_weights.shape)}, expected (S,V,3), (R,T) and (R,V)"
-        )
     # From the first region's on, so that where all agree no rounding of the shares' sum moves the moment.
     base = moments[0]
     spread = (moments - base).T @ vertex_weights.to(moments)

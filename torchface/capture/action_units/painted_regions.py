@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import grid_sample
 
-from torchface.errors import NameMismatchError, ShapeError, ValueRangeError
+from torchface.errors import NameMismatchError, ValueRangeError
 from torchface.io.action_labels import Box
 
 
@@ -82,11 +82,6 @@ def sample_regions(frames: Tensor, grid: Tensor, transforms: Tensor) -> Tensor:
         grid: pixels of the neutral image, (R,h,w,2).
         transforms: neutral image to frame, (t,2,3).
     """
-    if frames.ndim != 3 or grid.ndim != 4 or transforms.shape != (len(frames), 2, 3):
-        raise ShapeError(
-            f"regions: found frames {tuple(frames.shape)}, grid {tuple(grid.shape)}, transforms "
-            f"{tuple(transforms.shape)}, expected (t,H,W), (R,h,w,2), (t,2,3)"
-        )
     regions, height, width = grid.shape[:3]
     pixels = torch.einsum("nc,tdc->tnd", grid.reshape(-1, 2), transforms[..., :2]) + transforms[:, None, :, 2]
     size = torch.tensor([frames.shape[2], frames.shape[1]], dtype=torch.float32)

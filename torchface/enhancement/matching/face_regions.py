@@ -105,11 +105,6 @@ def regions_of_motion(
     section 4.3.
     """
     checked_count("count", count, 3 if landmarks is not None else 1)
-    if motion.ndim != 3 or motion.shape[1] != int(patches.max()) + 1 or len(patches) != len(faces):
-        raise ShapeError(
-            f"regions: found motion {tuple(motion.shape)} and patches {tuple(patches.shape)} for {len(faces)} "
-            "triangles, expected (K,P,C) and (F,)"
-        )
     if landmarks is not None and len(landmarks) != _LANDMARKS:
         raise ValueRangeError(f"landmarks: found {len(landmarks)} vertices, expected the 68 iBUG landmarks")
     if not bool(torch.isfinite(motion).all()):

@@ -11,7 +11,6 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from torch import Tensor
 
-from torchface.errors import ShapeError
 from torchface.number_checks import LARGEST_SEED, checked_count
 
 _RELAXATIONS = 2  # sizes then deviate by a third of their mean; as sown at random, by more than half
@@ -39,10 +38,6 @@ def grow_patches(faces: Tensor, vertex_count: int, size: int = 100, seed: int = 
     """
     checked_count("size", size, 1)
     checked_count("seed", seed, 0, LARGEST_SEED)
-    if faces.ndim != 2 or faces.shape[1] != 3 or len(faces) == 0 or int(faces.max()) >= vertex_count:
-        raise ShapeError(
-            f"grow_patches: found faces {tuple(faces.shape)}, expected (F,3), at least one, of {vertex_count} vertices"
-        )
     used = len(np.unique(faces.cpu().numpy()))
     pairs = neighbouring_triangles(faces).cpu().numpy()
     return torch.from_numpy(grow_groups(pairs, len(faces), size * len(faces) / used, seed)).to(faces.device)
@@ -66,11 +61,6 @@ def patch_means(values: Tensor, patches: Tensor, areas: Tensor) -> Tensor:
         patches: the patch of each triangle, (F,) int64.
         areas: of the triangles, (F,); a patch without area gets the plain mean.
     """
-    if values.ndim != 3 or values.shape[1] != len(patches) or areas.shape != patches.shape:
-        raise ShapeError(
-            f"patch_means: found values {tuple(values.shape)}, patches {tuple(patches.shape)} and areas "
-            f"{tuple(areas.shape)}, expected (B,F,C), (F,) and (F,)"
-        )
     count = int(patches.max()) + 1
     weights = areas.to(values) + torch.finfo(values.dtype).tiny ** 0.5
     weights = weights / weights.new_zeros(count).index_add(0, patches, weights)[patches]

@@ -19,7 +19,7 @@ from torchface.enhancement.timing.nearest_timing import (
     moving_regions,
     nearest_timing,
 )
-from torchface.errors import ShapeError, ValueRangeError
+from torchface.errors import ValueRangeError
 from torchface.number_checks import checked_count, checked_number
 
 LEAST_MOTIONS = 12
@@ -120,11 +120,6 @@ class LearnedTiming:
         Returns:
             None where the region has fewer than ``LEAST_MOTIONS`` motions.
         """
-        if database.ndim != 3 or sequences.shape != database.shape[:1] or region.shape != database.shape[1:2]:
-            raise ShapeError(
-                f"learned timing: found database {tuple(database.shape)}, sequences {tuple(sequences.shape)} and a "
-                f"region {tuple(region.shape)}, expected (K,P,C), (K,) and (P,)"
-            )
         scale = region.detach().double().clamp(min=0).sqrt()[:, None].clone()
         frames = (database.detach().double() * scale).flatten(1)
         motions = _motions(frames, sequences, fps)
@@ -156,8 +151,6 @@ class LearnedTiming:
         """
         checked_count("frames", frames, 2)
         checked_number("length", length, above=True)
-        if keyframes.ndim != 3 or keyframes.shape[:2] != (2, len(self.scale)):
-            raise ShapeError(f"keyframes: found {tuple(keyframes.shape)}, expected (2,{len(self.scale)},C)")
         pair = (keyframes.detach().double() * self.scale).flatten(1)
         if not float((pair[1] - pair[0]).norm()) > 0:
             raise ValueRangeError("keyframes: found two that are equal, expected a motion between them")

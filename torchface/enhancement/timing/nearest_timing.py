@@ -79,10 +79,6 @@ def captured_sequences(database: Tensor, sequences: Tensor) -> list[Tensor]:
         ShapeError: the shapes do not fit.
         ValueRangeError: none has two frames.
     """
-    if database.ndim != 3 or sequences.shape != database.shape[:1]:
-        raise ShapeError(
-            f"database: found {tuple(database.shape)} and sequences {tuple(sequences.shape)}, expected (K,P,C), (K,)"
-        )
     captured = [database[sequences == number] for number in sequences.unique()]
     captured = [sequence for sequence in captured if len(sequence) > 1]
     if not captured:

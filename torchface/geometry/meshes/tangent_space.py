@@ -13,7 +13,6 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torchface.errors import ShapeError
 from torchface.geometry.meshes.operators import corners
 from torchface.geometry.meshes.rasterization import interpolate
 
@@ -61,11 +60,6 @@ def tangent_space(vertices: Tensor, faces: Tensor, uvs: Tensor, uv_faces: Tensor
 
     Source: Mikkelsen 2008, Simulation of Wrinkled Surfaces Revisited; glTF 2.0 specification, 3.7.2.1 and 3.9.3.
     """
-    if vertices.shape != normals.shape or faces.shape != uv_faces.shape:
-        raise ShapeError(
-            f"tangent_space: found vertices {tuple(vertices.shape)}, normals {tuple(normals.shape)}, faces "
-            f"{tuple(faces.shape)}, uv_faces {tuple(uv_faces.shape)}; expected (V,3) twice and (F,3) twice"
-        )
     direction, sign = _directions(vertices, faces, uvs, uv_faces)
     rows, tangent_faces, signs = _shared_corners(faces, uvs, uv_faces, sign)
     total = torch.zeros(len(signs), 3, dtype=vertices.dtype, device=vertices.device)
