@@ -151,7 +151,7 @@ def test_a_killed_run_goes_on_where_it_was(
         train(settings)
     assert read == [0, 1, 2, 3, 4, 5]
     with monkeypatch.context() as patch:
-        patch.setattr(recipe, "laid", stop)
+        patch.setattr(recipe, "aligned_samples", stop)
         with pytest.raises(KeyboardInterrupt):
             train(settings)
     assert read[6:] == [0, 5, 6, 7, 8]  # the first is the template
