@@ -106,14 +106,14 @@ def find_swaps_by_shape(markers: Tensor, fps: float) -> list[Swap]:
             ):
                 votes.setdefault((low, high), []).extend(((t, low), (t, high)))
     fits = {}
-    for a, b in votes:
-        shown = seen[:, a] & seen[:, b]
+    for low, high in votes:
+        shown = seen[:, low] & seen[:, high]
         right = torch.ones_like(shown)
-        right[[t for t, _ in votes[a, b]]] = False
+        right[[t for t, _ in votes[low, high]]] = False
         if 2 * int((right & shown).sum()) < int(shown.sum()):  # the centre was the other one's: the fewer are wrong
             right = ~right
-            votes[a, b] = [(t, m) for t in (shown & ~right).nonzero()[:, 0].tolist() for m in (a, b)]
-        fits[a, b] = right & shown
+            votes[low, high] = [(t, m) for t in (shown & ~right).nonzero()[:, 0].tolist() for m in (low, high)]
+        fits[low, high] = right & shown
     return _stretches(votes, fits, max(1, round(_MAX_GAP * fps)))
 
 
