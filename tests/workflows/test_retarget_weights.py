@@ -10,6 +10,7 @@ import torch
 from torchface import BlendshapeRig, Take, Track, load_take, save_rig, save_take
 from torchface.capture.mouth_close_conventions import with_jaw_in_mouth_close
 from torchface.cli import main
+from torchface.io import load_animation
 from torchface.io.images.image_files import load_image
 from torchface.synthetic import performer
 from torchface.workflows.retarget_weights import retarget_weights
@@ -64,3 +65,18 @@ def test_a_map_is_learned_from_poses_kept_and_drawn(tmp_path: Path, capsys: pyte
     left, right = picture[:, :, : picture.shape[2] // 2], picture[:, :, picture.shape[2] // 2 :]
     assert picture.shape[2] > 400
     assert (left - right).abs().max() > 0.3  # two poses
+
+
+def test_uneven_times_go_with_the_weights(tmp_path: Path) -> None:
+    rig = performer(texture=False).select(["jawOpen", "mouthPucker"])
+    save_rig(rig, tmp_path / "rig.glb")
+    seconds = torch.rand(20, generator=torch.Generator().manual_seed(0), dtype=torch.float64).add(0.2).cumsum(0) / 30
+    weights = torch.rand(20, 2, 1, generator=torch.Generator().manual_seed(1))
+    save_take(Take(30.0, weights=Track(rig.names, weights), seconds=seconds), tmp_path / "take.csv")
+    words = ["retarget", tmp_path / "take.csv", "--to", tmp_path / "rig.glb", "--out", tmp_path / "out.csv"]
+    words += ["--live-link", tmp_path / "live.csv", "--animation", tmp_path / "out.glb", "--quiet"]
+    main([str(word) for word in words])
+    written = [load_take(tmp_path / "out.csv"), load_take(tmp_path / "live.csv"), load_animation(tmp_path / "out.glb")]
+    for found in written:
+        assert found is not None
+        torch.testing.assert_close(found.times, seconds - seconds[0], atol=2e-5, rtol=0)

@@ -36,6 +36,7 @@ def kept_inputs(inputs: Iterable[Path], outputs: Iterable[tuple[str, Path]]) -> 
     Raises:
         FileFormatError: an output is the same file or folder as an input or as another output.
     """
+    outer = _kept.get() or _Inputs({}, (), ())
     names: dict[Identity, Path] = {}
     for path in inputs:
         if (identity := _identity(path)) is not None:
@@ -48,8 +49,9 @@ def kept_inputs(inputs: Iterable[Path], outputs: Iterable[tuple[str, Path]]) -> 
         place = path.resolve()
         if (other := seen.setdefault(place, option)) != option:
             raise FileFormatError(f"{option}: found {path}, which {other} names too, expected another name for each")
-    own = tuple(path for path in seen if path.is_dir())
-    token = _kept.set(_Inputs(names, tuple(path.resolve() for path in names.values() if path.is_dir()), own))
+    own = (*outer.own, *(path for path in seen if path.is_dir()))
+    folders = (*outer.folders, *(path.resolve() for path in names.values() if path.is_dir()))
+    token = _kept.set(_Inputs(outer.names | names, folders, own))
     try:
         yield
     finally:

@@ -36,3 +36,15 @@ def test_play_at_the_end_begins_anew() -> None:
 @pytest.mark.parametrize("frame", [0, 3])
 def test_a_take_of_one_frame_stays_there(frame: int) -> None:
     assert Playback(frames=1, fps=60).seek(frame, 0.0).play(0.0).frame(10.0) == 0
+
+
+def test_frames_at_uneven_times_are_due_at_these() -> None:
+    times = (0.0, 0.1, 0.5, 0.6)
+    playing = Playback(frames=4, fps=10.0, times=times).play(now=100.0)
+    assert [playing.frame(100 + time) for time in times] == [0, 1, 2, 3]
+    assert [playing.frame(100 + time) for time in (0.09, 0.49, 0.59, 0.69)] == [0, 1, 2, 3]
+    assert playing.frame(100.75) == 0  # the last frame lasts a tenth of a second
+    fast = Playback(4, 10.0, speed=2.0, loop=False, times=times).play(now=0.0)
+    assert [fast.frame(now) for now in (0.26, 0.29, 0.31, 5.0)] == [2, 2, 3, 3]
+    assert playing.seek(2, now=7.0).frame(7.09) == 2
+    assert playing.seek(2, now=7.0).frame(7.11) == 3

@@ -110,6 +110,32 @@ def test_all_files_of_one_animation_give_the_same(actor: Actor, tmp_path: Path) 
     assert "30 a second are assumed" in " ".join(coarse(actor, sequence, tmp_path).notes)
 
 
+def test_uneven_times_are_brought_to_an_even_rate_and_said(actor: Actor, tmp_path: Path) -> None:
+    left = [0, 1, 2, 4, 5, 6, 7, 10, 11]  # the weights are linear in time
+    points = actor.attachment.on(actor.mesh.faces, actor.frames)
+    take = Take(
+        FPS, Track(actor.attachment.labels or (), points), weights=Track(actor.rig.names, actor.weights[..., None])
+    )
+    uneven = Take(
+        FPS,
+        Track(take.markers.names, points[left]),
+        weights=Track(take.weights.names, take.weights.values[left]),
+        seconds=torch.tensor(left, dtype=torch.float64) / FPS,
+    )
+    sites = {"rig": actor.folder / "rig.glb", "attachment": actor.folder / "attachment.json", "neutral": 0}
+    said = "found 9 frames about 30 a second at uneven times, up to 0.1 s apart; brought to 12 at an even 30"
+    for kind, given in (("weights", {"rig": actor.folder / "rig.glb"}), ("markers", sites)):
+        frames = []
+        for name, one in (("even", take), ("uneven", uneven)):
+            path = tmp_path / f"{name}_{kind}.csv"
+            save_take(replace(one, **{"markers" if kind == "weights" else "weights": None}), path)
+            found = coarse(actor, path, tmp_path, **given)
+            assert (found.count, found.fps) == (FRAMES, FPS)
+            assert any(said in note for note in found.notes) == (name == "uneven")
+            frames.append(found.read(0, FRAMES))
+        torch.testing.assert_close(frames[0], frames[1], atol=2e-2, rtol=0)
+
+
 def test_markers_in_any_place_move_the_face_as_the_rig_did(actor: Actor, tmp_path: Path) -> None:
     turn = rotation_matrix(torch.tensor([0.1, 0.6, -0.2]))
     points = actor.attachment.on(actor.mesh.faces, actor.frames)

@@ -12,6 +12,7 @@ from typing import Protocol
 
 from torchface import zoo
 from torchface.errors import MissingExtraError, TorchfaceError
+from torchface.files.input_files import kept_inputs
 from torchface.rendering.compositing import save_rendered_image
 from torchface.workflows.batch.batch_items import BatchItem
 from torchface.workflows.batch.outcomes import Made, Outcome, record_path, write_record
@@ -34,7 +35,7 @@ def attempt(job: BatchJob, item: BatchItem, out: Path) -> Outcome:
     begin, spent, made, key = time.perf_counter(), time.process_time(), None, ""
     try:
         key = job.key(item)  # before the work: what changes meanwhile is seen by the next run
-        with warnings.catch_warnings(record=True) as caught:
+        with kept_inputs([item.path], [("out", out)]), warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
             made = job.run(item, out)
         warned = dict.fromkeys(str(row.message) for row in caught if issubclass(row.category, UserWarning))

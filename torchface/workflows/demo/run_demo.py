@@ -187,7 +187,7 @@ def scene_from(template: Path | None, take: Path | None, target: Path | None, se
 
 
 def _weight_take(path: Path) -> Take:
-    played = load_take(path)
+    played = load_take(path).resampled()
     if played.weights is None:
         raise ValueRangeError(
             f"{path}: found no weights, expected a take of blendshape weights such as Live Link Face's"
