@@ -81,6 +81,11 @@ def learn_wrinkle_basis(
     """
     checked_count("maps", count, 1)
     vertices = region_weights.shape[1]
+    if details.components.shape[1] != 3 * vertices or len(areas) != vertices:
+        raise ShapeError(
+            f"wrinkle basis: found components {tuple(details.components.shape)}, region weights "
+            f"{tuple(region_weights.shape)} and areas {tuple(areas.shape)}, expected (r,3V), (R,V) and (V,)"
+        )
     if len(details.coefficients) < count:
         raise ValueRangeError(
             f"maps: found {count} for {len(details.coefficients)} frames, expected at most as many as frames"
