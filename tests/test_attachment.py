@@ -1,6 +1,7 @@
 """Attachment: linear in the vertices, tied to its topology, safe to load."""
 
 import json
+import math
 from pathlib import Path
 
 import pytest
@@ -11,6 +12,7 @@ from hypothesis import strategies as st
 from torchface.attachment import Attachment
 from torchface.errors import FileFormatError, NameMismatchError, TopologyError, TorchfaceError
 from torchface.mesh import Mesh
+from torchface.synthetic import performer
 
 
 def tetrahedron() -> Mesh:
@@ -97,3 +99,22 @@ def test_mutated_attachments_raise_only_our_errors(
         Attachment.load(path)
     except TorchfaceError:
         return
+
+
+def test_the_head_it_was_made_for_is_recorded_and_old_files_load(tmp_path: Path) -> None:
+    face = performer(texture=False).neutral
+    sites = Attachment.from_vertices(face, face.landmarks)
+    sites.save(tmp_path / "sites.json")
+    loaded = Attachment.load(tmp_path / "sites.json")
+    # A rigid motion is the same head, a smooth bend is not.
+    turned = face.with_vertices(face.vertices[:, [1, 2, 0]] + torch.tensor([5.0, -900, 3]))
+    assert loaded.rest_distance(turned) < 1e-3
+    bent = face.vertices + 3 * torch.sin(face.vertices[:, [1, 2, 0]] / 30)
+    assert loaded.rest_distance(face.with_vertices(bent)) > 0.5
+    assert loaded.select((loaded.labels or ())[5:20]).rest_distance(face.with_vertices(bent)) > 0.5
+    document = json.loads((tmp_path / "sites.json").read_text())
+    del document["rest"]
+    (tmp_path / "old.json").write_text(json.dumps(document))
+    old = Attachment.load(tmp_path / "old.json")
+    assert old.rest is None
+    assert math.isnan(old.rest_distance(face))

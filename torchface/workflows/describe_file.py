@@ -165,6 +165,7 @@ def _attachment_rows(attachment: Attachment) -> Rows:
     return [
         ("markers", _named(attachment.labels or ()) if attachment.labels else str(len(attachment.triangles))),
         ("made for topology", attachment.fingerprint or "not recorded"),
+        ("made for the head", "recorded" if attachment.rest is not None else "not recorded: solve cannot check it"),
     ]
 
 

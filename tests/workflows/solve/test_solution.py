@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from torchface import Attachment, BlendshapeRig, Take, Track
+from torchface.errors import AlignmentError
 from torchface.geometry.similarity import Similarity
 from torchface.synthetic.stages.marker_stage import StageFlaws, place_markers, record
 from torchface.synthetic.stages.weight_curves import perform
@@ -126,3 +127,44 @@ def test_labels_exchanged_in_part_of_a_take_that_is_not_cleaned_are_warned_of(
     found = solve_markers(rig, sites, exchanged(take, pair, 90, 110), settings)
     first, second = ((sites.labels or ())[m] for m in pair)
     assert f"the labels {first} and {second} are exchanged in about 10 % of the frames" in found.warnings[0]
+
+
+def bent(rig: BlendshapeRig, size: float, seed: int) -> BlendshapeRig:
+    """A rig of the same topology and shapes on another head: the rest shape is bent smoothly, by ``size`` mm."""
+    generator = torch.Generator().manual_seed(seed)
+    centres = rig.vertices[torch.randint(len(rig.vertices), (12,), generator=generator)]
+    bumps = torch.exp(-torch.cdist(rig.vertices, centres).square() / (2 * 30.0**2))
+    moved = bumps @ torch.randn(12, 3, generator=generator)
+    moved = moved * (size / moved.norm(dim=1).square().mean().sqrt())
+    return BlendshapeRig(rig.neutral.with_vertices(rig.vertices + moved), rig.deltas, rig.names)
+
+
+@pytest.mark.parametrize(("size", "seed"), [(2.0, 0), (4.0, 1)])
+def test_another_head_of_the_same_topology_is_refused_or_warned_of(stage: Capture, size: float, seed: int) -> None:
+    rig, sites, takes = stage
+    other = bent(rig, size, seed)
+    settings = SolveSettings(align=True, free_scale=False, frame_by_frame=True)
+    take, _ = recorded(stage, slips=False)
+    # The attachment and the take are the actor's, the rig is not.
+    with pytest.raises(AlignmentError, match=r"made for another head: its sites at rest lie \d.* --insist"):
+        solve_markers(other, sites, take, settings)
+    # A rig and its attachment, and the take of another actor.
+    theirs, _ = recorded((other, sites, takes), slips=False)
+    found = solve_markers(rig, replace(sites, rest=None), theirs, settings)
+    assert any("smooth over the face" in warning for warning in found.warnings)
+    own = solve_markers(rig, sites, take, settings)
+    assert own.warnings == ()
+
+
+@pytest.mark.parametrize(("shape", "seed"), [("jawOpen", 0), ("mouthPucker", 1)])
+def test_a_neutral_frame_that_moves_is_warned_of_with_the_calmest_one(stage: Capture, shape: str, seed: int) -> None:
+    rig, sites, takes = stage
+    weights = 0.3 * takes[0][:120]
+    weights[40], weights[60] = 0.0, 0.0
+    weights[60, rig.index([shape])] = 0.8
+    take, _ = recorded((rig, sites, [weights]), frames=120, seed=seed, slips=False)
+    settings = SolveSettings(free_scale=False, frame_by_frame=True)
+    calm, moving = (solve_markers(rig, sites, take, replace(settings, neutral=frame)) for frame in (40, 60))
+    assert not any("not at rest" in warning for warning in calm.warnings)
+    (warning,) = (warning for warning in moving.warnings if "frame 60 is not at rest" in warning)
+    assert shape in warning

@@ -187,7 +187,7 @@ class PickSession:
         triangles = torch.tensor([point.triangle for _, point in self.picks.markers], dtype=torch.int64)
         barycentric = torch.tensor([point.barycentric for _, point in self.picks.markers])
         labels = tuple(label for label, _ in self.picks.markers)
-        return Attachment(triangles, barycentric, labels, fingerprint=self.mesh.fingerprint())
+        return Attachment(triangles, barycentric, labels).made_for(self.mesh)
 
     def correspondences(self) -> Correspondences:
         """The complete pairs.

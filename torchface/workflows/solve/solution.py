@@ -28,7 +28,14 @@ from torchface.rig import BlendshapeRig
 from torchface.take import Take, Track, empty_frames
 from torchface.workflows.marker_input import scale_warnings
 from torchface.workflows.solve.head_camera import Predicted
-from torchface.workflows.solve.take_check import check_coverage, check_explained, fit_warnings, label_warnings
+from torchface.workflows.solve.take_check import (
+    check_coverage,
+    check_explained,
+    check_head,
+    fit_warnings,
+    label_warnings,
+    neutral_warnings,
+)
 from torchface.workflows.solve.weight_stream import StreamReport
 
 # A take is cleaned again where its alignment moves a site farther after the first cleaning, mm.
@@ -203,6 +210,8 @@ def solve_markers(
     fit = check_explained(solver, take, alignment is not None, settings.slip, settings.insist)
     warnings += fit_warnings(fit, alignment is not None)
     warnings += _empty_frame_warnings(take)
+    if settings.neutral is not None:
+        warnings += neutral_warnings(rig, attachment, raw, settings.neutral, settings.free_scale)
 
     cleanup = None
     if not settings.clean:
@@ -225,6 +234,7 @@ def solve_markers(
     if alignment is not None:
         free = alignment if settings.free_scale else align_take(rig, attachment, steady, insist=True)
         warnings += scale_warnings(float(free.scale[0]), not settings.free_scale, take.extras.get("unit"))
+    warnings += check_head(rig, attachment, steady, settings.insist)
     if settings.subtract_rest and alignment is not None:
         attachment = rest_residual(rig, attachment, steady)
         # Sites that are nearer to the markers show the helmet's motion better.

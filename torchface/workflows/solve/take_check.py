@@ -11,12 +11,20 @@ from torchface.attachment import Attachment
 from torchface.capture.markers import FitCheck, MarkerSolver, check_fit
 from torchface.capture.markers.cleaning.label_swaps import cycled_back, find_swaps, whole_take_exchanges
 from torchface.capture.markers.cleaning.robust_prediction import predict_markers
+from torchface.capture.markers.residual_pattern import residual_pattern
+from torchface.capture.markers.take_alignment import align_take, rest_residual
 from torchface.errors import AlignmentError, NameMismatchError
+from torchface.geometry.meshes.operators import vertex_normals
+from torchface.rig import BlendshapeRig
 from torchface.take import Take
 from torchface.workflows.marker_input import MAX_SCALE_DIFFERENCE
 
 _COORDINATES = 3  # of a marker
 _LABEL_FRAMES = 240
+# A frame that moves the markers by so much more than the calmest frame is not neutral, mm.
+MAX_NEUTRAL_MOTION = 1.0
+# Sites of the same head differ by nothing; those of 16 heads drawn from ICT's identities by 0.6 to 5.6 mm.
+MAX_REST_DISTANCE = 0.5
 _MIN_PRESENT, _USUAL_PRESENT = 0.5, 0.9
 _INSIST = "--insist writes the weights all the same"
 
@@ -117,6 +125,83 @@ def fit_warnings(fit: FitCheck, aligned: bool) -> list[str]:
     return [
         f"the rig brings the marker sites no nearer to the markers than {fit.distance:.4g} mm (median); "
         f"{_cause(fit, aligned)}"
+    ]
+
+
+def check_head(rig: BlendshapeRig, attachment: Attachment, take: Take, insist: bool = False) -> list[str]:
+    """Whether rig, attachment and take belong to one head.
+
+    Args:
+        rig: whose mesh has the attachment's triangles.
+        attachment: the sites.
+        take: markers in rig space, without the helmet's motion.
+        insist: warn in place of the error.
+
+    Returns:
+        Warnings where the residual of the take is that of another head.
+
+    Raises:
+        AlignmentError: the attachment was made for a head of another shape, unless ``insist``.
+    """
+    warnings = []
+    distance = attachment.rest_distance(rig.neutral)
+    if distance > MAX_REST_DISTANCE:
+        why = (
+            f"the attachment was made for another head: its sites at rest lie {distance:.2g} mm from this rig's "
+            f"(median), expected at most {MAX_REST_DISTANCE} mm; find this head's own from a range of motion "
+            "(torchface attach --initial)"
+        )
+        if not insist:
+            raise AlignmentError(f"{_source(take)}: {why}; {_INSIST}")
+        warnings.append(why)
+    assert take.markers is not None
+    few = take.markers.frames(slice(None, None, max(1, len(take) // _LABEL_FRAMES)))
+    if bool(torch.isnan(few.values).any(-1).all()):
+        return warnings
+    given = attachment.residual
+    residual = rest_residual(rig, attachment, Take(take.fps, markers=few)).residual
+    assert residual is not None
+    faces, rest = rig.neutral.faces, rig.vertices.detach()
+    normals = attachment.on(faces, vertex_normals(rest, faces))
+    pattern = residual_pattern(residual if given is None else residual - given, attachment.on(faces, rest), normals)
+    if pattern.other_head:
+        warnings.append(
+            f"what is left at rest is smooth over the face ({pattern.smooth:.2g} mm, correlation of neighbours "
+            f"{pattern.correlation:.2f}): the rig is most likely another head's; weights will be wrong"
+        )
+    return warnings
+
+
+def neutral_warnings(rig: BlendshapeRig, attachment: Attachment, take: Take, frame: int, scale: bool) -> list[str]:
+    """Warnings where a frame that is given as neutral moves the face more than the calmest frame of its take.
+
+    Args:
+        rig, attachment: of the take.
+        take: markers, in any space.
+        frame: the one that is to be neutral.
+        scale: an alignment estimates the scale.
+    """
+    assert take.markers is not None
+    rows = torch.arange(0, len(take), max(1, len(take) // _LABEL_FRAMES))
+    rows = torch.cat([rows, torch.tensor([frame])])
+    few = take.markers.frames(rows)
+    seen = (~torch.isnan(few.values).any(-1)).any(1)
+    if not bool(seen[-1]):
+        return []
+    few, rows = few.frames(seen), rows[seen]
+    alignment = align_take(rig, attachment, Take(take.fps, markers=few), insist=True, scale=scale)
+    solver = MarkerSolver(rig, attachment, alignment)
+    weights = solver(solver.arrange(few).double())
+    motion = (solver.points(weights) - solver.points(torch.zeros_like(weights[:1]))).norm(dim=-1)
+    size = motion.square().mean(1).sqrt()
+    calmest = int(size[:-1].argmin()) if len(size) > 1 else 0
+    if float(size[-1]) <= float(size[calmest]) + MAX_NEUTRAL_MOTION:
+        return []
+    strongest = [rig.names[i] for i in weights[-1].argsort(descending=True)[:3].tolist()]
+    return [
+        f"frame {frame} is not at rest: the face moves the markers by {float(size[-1]):.2g} mm there "
+        f"({', '.join(strongest)}), by {float(size[calmest]):.2g} mm in frame {int(rows[calmest])}: take that for "
+        "--neutral, or --align in its place"
     ]
 
 

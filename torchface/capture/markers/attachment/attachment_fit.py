@@ -216,6 +216,7 @@ def _result(
         state.sites.labels,
         (affine[..., 0] - at_rest + offset).float(),
         fingerprint,
+        at_rest.float(),
     )
     helmet = None
     if slips:

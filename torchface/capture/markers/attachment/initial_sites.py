@@ -76,9 +76,7 @@ def sites_by_shape(rig: BlendshapeRig, rom: Take) -> Attachment:
         ) from None
     rows = (motion.skin & moves[motion.faces].all(1)).nonzero()[:, 0]
     on_skin = SurfaceIndex(vertices, motion.faces[rows]).nearest(pose.apply(points)[0])
-    return Attachment(
-        rows[on_skin.triangle], on_skin.barycentric.float(), track.names, fingerprint=rig.neutral.fingerprint()
-    )
+    return Attachment(rows[on_skin.triangle], on_skin.barycentric.float(), track.names).made_for(rig.neutral)
 
 
 def _outward(points: Tensor) -> Tensor:
