@@ -77,7 +77,7 @@ class Reading(nn.Module):
 
     def forward(self, *given: Tensor) -> WebcamAnswer:
         nothing = torch.zeros(len(ARKIT)), torch.eye(3), torch.zeros(3), torch.zeros(2, 2)
-        return WebcamAnswer(*nothing, given[3], given[3], given[3], given[-1])
+        return WebcamAnswer(*nothing, *torch.zeros(3).unbind(), given[-1])
 
 
 def whole(model: bytes, frames: list[np.ndarray], fps: float) -> tuple[float, float]:
@@ -133,7 +133,7 @@ def test_the_whole_way_is_quick_and_small(data: Path, tmp_path: Path) -> None:
 def example(content: bytes, video: Path, folder: Path) -> tuple[float, float]:
     """Frames a second of processor time, and megabytes, of the example in Python, without the start."""
     section = EXAMPLE.read_text().split("\n## From a webcam's picture")[1]
-    (code,) = re.findall(r"```python\n(.*?)```", section, re.DOTALL)
+    code, *_ = re.findall(r"```python\n(.*?)```", section, re.DOTALL)
     code = code.replace('"webcam.avi"', repr(str(video))).replace(
         "while True:", "begun, count = clock(), 0\nwhile True:"
     )
