@@ -28,6 +28,8 @@ _NUMBERS = 2**21  # vertices of all frames that are enhanced at a time
 # Of the distance from which on a frame is outside, until where a linear map is trusted: with what it does to the
 # motion that the smooth part lacks far, for that goes on linearly; with wrinkles alone not so, for they saturate.
 _REACH, _REACH_OF_WRINKLES = 2.0, 0.5
+# Of that distance: a frame that goes so much further than all of the database in its own direction is outside as well.
+_FURTHER = 0.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,8 +41,9 @@ class Enhancement:
         weights: of the database's frames in each region, (T,R,K), of sum 1.
         distances: of the input from the nearest blend of database frames, by region, (T,R), in units of the
             database's own spread.
-        outside: (T,R) bool, whether the input is further from the database than its own sequences are from another,
-            so that its detail is a guess, and far from it but the nearest.
+        outside: (T,R) bool, whether the input is further from the database than its own sequences are from another, or
+            goes further than all of it in the same direction (a brow higher than any), so that its detail is a guess,
+            and far from it but the nearest.
     """
 
     vertices: Tensor
@@ -383,7 +386,10 @@ class EnhancementModel(nn.Module):
             vertices = prepared.lids(encoder.detail.compose(low, details, turned), low, own)
         if self.scale != 1.0:
             vertices = own + self.scale * (vertices - own)
-        outside = matched.distances > self.limits.to(matched.distances)
+        limits = self.limits.to(matched.distances)
+        outside = matched.distances > limits
+        if matched.excess is not None:
+            outside = outside | (matched.excess > _FURTHER * limits)
         return Enhancement(pose.inverse().apply(vertices), matched.weights, matched.distances, outside)
 
     def _smooth(self, coarse: Tensor) -> tuple[Tensor, Tensor, Similarity]:

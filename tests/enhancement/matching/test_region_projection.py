@@ -53,6 +53,20 @@ def test_a_frame_of_the_database_is_itself(features, patch_weights):
     assert float(found.distances.max()) < 1e-3
 
 
+def test_excess_is_how_much_further_a_frame_goes_than_all_of_the_database(patch_weights) -> None:
+    """Along one motion, ten frames go as far as 1; a region that does not move has none."""
+    motion, mean = _random(12, 9, seed=3), torch.linspace(0, 1, 10).mean()
+    motion[8:] = 0.0  # the second region's own patches
+    weights = torch.stack([patch_weights[0], patch_weights[1] * (torch.arange(12) >= 8)])
+    projection = RegionProjection(torch.linspace(0, 1, 10)[:, None, None] * motion, weights)
+    amounts = torch.tensor([0.6, 1.0, 1.2, 2.0, -0.3])
+    found = projection.project(amounts[:, None, None] * motion).excess
+    further = (amounts - mean).abs() - mean  # from the mean, the database reaches as far as the mean on either side
+    spread = (torch.linspace(0, 1, 10) - mean).square().mean().sqrt()
+    torch.testing.assert_close(found[:, 0], further / spread, atol=1e-4, rtol=0)
+    assert (found[:, 1] == 0).all()
+
+
 def test_what_a_region_does_not_see_does_not_matter(features, patch_weights):
     other = features.clone()
     other[:, 8:] = 5.0

@@ -18,6 +18,7 @@ RIDGE = 1e-4
 _HELD_OUT = 200  # frames at most that limits are estimated from
 _QUANTILE, _MARGIN = 0.95, 2.0
 _LEAST_LIMIT, _MOST_LIMIT = 0.1, 0.75  # of the database's spread
+_STILL = 1e-4  # of the spread of the region that moves most: one with less does not move
 _FAINT = 1e-3  # of a region's largest weight of a patch: fainter patches are left out
 _LOST = 1e-8  # of the features' energy, in coordinates of fewer dimensions
 # Two gradients are as far apart as the sum of squares of all nine entries says: a rotation by an angle moves two
@@ -32,10 +33,13 @@ class Matched:
     Args:
         weights: of the database's frames in each region, (T,R,K), non-negative, of sum 1.
         distances: from the combinations, (T,R), in units of the database's spread about its mean.
+        excess: how much further from the mean frames go than all of the database's in the same direction, (T,R), in
+            the same units; negative inside, 0 in a region that does not move. None where nobody asked.
     """
 
     weights: Tensor
     distances: Tensor
+    excess: Tensor | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,7 +119,7 @@ class RegionProjection:
         pairs = zip(centred, inside, strict=True)
         beyond = [whole.double().square().sum(1) - rows.square().sum(1) for whole, rows in pairs]
         distances = self._distances(solved, inside, beyond)
-        return Matched(solved.transpose(0, 1).to(features), distances.to(features))
+        return Matched(solved.transpose(0, 1).to(features), distances.to(features), self._excess(inside).to(features))
 
     def limits(self, sequences: Tensor) -> Tensor:
         """From what distance on a frame is unlike the database, (R,), in units of the database's spread.
@@ -155,6 +159,17 @@ class RegionProjection:
             for space, own, rows, off, spread in parts
         ]
         return torch.stack(left, dim=1)
+
+    def _excess(self, inside: list[Tensor]) -> Tensor:
+        """See :class:`Matched`, of points by their coordinates, (T,q) each."""
+        parts = zip(inside, self._spaces, self.spread, strict=True)
+        further = []
+        for rows, space, spread in parts:
+            size = rows.norm(dim=1)
+            support = (rows / size.clamp(min=1e-12)[:, None] @ space.known.T).amax(1)
+            moves = spread > _STILL * self.spread.max()
+            further.append(torch.where(moves, (size - support) / spread, 0.0))
+        return torch.stack(further, dim=1)
 
     @property
     def known(self) -> list[Tensor]:
