@@ -107,6 +107,12 @@ def test_other_separators_and_capitals_are_markers_too(axes: str, tmp_path: Path
     torch.testing.assert_close(take.markers.values, values)
 
 
+def test_markers_without_one_axis_are_refused_and_no_weights(tmp_path: Path) -> None:
+    (tmp_path / "take.csv").write_text("frame,time,M000:X,M000:Y,M001:X,M001:Y\n0,0,1,2,3,4\n")
+    with pytest.raises(FileFormatError, match=r"found no column 'M000_z', 'M001_z', expected it in the header"):
+        load_take(tmp_path / "take.csv")
+
+
 def test_shapes_that_end_in_an_axis_are_weights(tmp_path: Path) -> None:
     (tmp_path / "take.csv").write_text("frame,time,lookX,lookY,jaw\n0,0,0.5,0.5,0.1\n1,0.1,0.5,0.5,0.1\n")
     take = load_take(tmp_path / "take.csv")

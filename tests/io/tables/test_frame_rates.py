@@ -59,6 +59,12 @@ def test_finer_units_are_recognised_and_said(scale: float, unit: str, fps: float
     assert found.seconds is None
 
 
+def test_a_long_gap_makes_no_milliseconds() -> None:
+    found = read(np.array([0, 0.033, 5000]), np.arange(3))
+    assert found.seconds is not None
+    assert found.seconds.tolist() == pytest.approx([0, 0.033, 5000], abs=1e-4)
+
+
 def test_a_format_in_seconds_may_have_keys_far_apart() -> None:
     found = key_times(np.array([0, 4, 8, 20], np.float32), file_error("take.glb"))
     assert found.seconds is not None

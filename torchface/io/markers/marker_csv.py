@@ -14,16 +14,17 @@ from torchface.io.tables.track_checks import values_to_write
 from torchface.take import Take
 
 _AXES = ("_x", "_y", "_z")
-_CHANNEL = re.compile(r"(.+?)[_.:\- ]?([xyzXYZ])")
+_SEPARATED = re.compile(r".*[_.:\- ][xyzXYZ]", re.DOTALL)
+_CHANNEL = re.compile(r"(.+?)[_.:\- ]?([xyzXYZ])", re.DOTALL)
 
 
 def is_marker_header(header: Sequence[str]) -> bool:
-    """Whether a header looks like markers: most of its channels end in ``_x``, ``_y`` or ``_z``, or all of them are
-    triples that end so with another separator or none."""
+    """Whether a header looks like markers: most of its channels end in ``_x``, ``.y``, ``:Z`` and the like, or all of
+    them are triples that end so without a separator."""
     channels = header[2:]
     if not is_numbered(header) or not channels:
         return False
-    if 2 * sum(name.endswith(_AXES) for name in channels) > len(channels):
+    if 2 * sum(_SEPARATED.fullmatch(name) is not None for name in channels) > len(channels):
         return True
     labels = _labels(channels)
     return labels is not None and len(channels) == 3 * len(labels)

@@ -166,7 +166,7 @@ def _rate(count: float, duration: float, resolution: float, stated: float | None
 def _in_seconds(times: np.ndarray, source: TimeSource) -> np.ndarray:
     """Times in seconds, where their steps say that they are in thousandths, or thousandths of these."""
     steps = np.diff(times)
-    usual, unit = float(np.median(steps[steps > 0])), 0
+    usual, unit = float(np.quantile(steps[steps > 0], 0.25, method="lower")), 0  # whatever gaps there are
     while usual >= _SLOWEST and unit < len(_UNITS):
         usual, unit = usual / 1000, unit + 1
     if unit == 0:
@@ -187,7 +187,7 @@ def _resolution(times: np.ndarray) -> float:
 def _counted(times: np.ndarray) -> np.ndarray:
     """Frame numbers (T,) that steps of the usual length give; they do not rise where times are no frames."""
     steps = np.diff(times)
-    usual = float(np.median(steps[steps > 0]))
+    usual = float(np.quantile(steps[steps > 0], 0.5, method="lower"))
     near = steps[np.abs(steps - usual) < usual / 2]
     return np.concatenate([[0.0], np.cumsum(np.rint(steps / near.mean()))])
 
