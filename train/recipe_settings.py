@@ -10,7 +10,6 @@ from typing import ClassVar
 
 import torch
 
-from torchface.cli.command_options import OutputPath
 from torchface.errors import ValueRangeError
 
 CPU_ALONE = ("cpu",)
@@ -30,7 +29,7 @@ class RecipeSettings:
         licence: Under which the model may be used; what that which it has learned from allows, if absent.
     """
 
-    out: OutputPath = Path("models/mine")
+    out: Path = Path("models/mine")
     seed: int = 0
     device: str | None = None
     resume: bool = True

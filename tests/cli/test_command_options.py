@@ -183,3 +183,13 @@ def test_the_check_leaves_the_command_as_it_is() -> None:
 
     assert signature(checked(command)) == signature(command)
     assert checked(command).__doc__ == "Does nothing."
+
+
+def test_a_recipe_refuses_the_folder_that_it_learns_from(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "data").mkdir()
+    (tmp_path / "linked").symlink_to(tmp_path / "data")
+    with pytest.raises(SystemExit) as ended:
+        main(["train", "appearance", "--data", str(tmp_path / "data"), "--out", str(tmp_path / "linked")])
+    assert ended.value.code == 2
+    assert "linked, which is the input" in " ".join(capsys.readouterr().err.split())
+    assert not list((tmp_path / "data").iterdir())

@@ -64,7 +64,7 @@ def inputs_kept(command: Callable[..., Any], values: Mapping[str, Any]) -> Abstr
     hints = get_type_hints(command, include_extras=True)
     for name, parameter in signature(command).parameters.items():
         value = values.get(name, parameter.default)
-        if (output := _output(hints[name])) is None:
+        if (output := _output(name, hints[name])) is None:
             inputs += _paths(value)
             continue
         option = f"--{name.replace('_', '-')}"
@@ -73,9 +73,10 @@ def inputs_kept(command: Callable[..., Any], values: Mapping[str, Any]) -> Abstr
     return kept_inputs(inputs, outputs)
 
 
-def _output(hint: Any) -> Output | None:
-    """The mark of an option's type, if it has one."""
-    return next((note for note in getattr(hint, "__metadata__", ()) if isinstance(note, Output)), None)
+def _output(name: str, hint: Any) -> Output | None:
+    """The mark of an option's type; ``out`` is an output without one."""
+    marks = (note for note in getattr(hint, "__metadata__", ()) if isinstance(note, Output))
+    return next(marks, Output() if name == "out" else None)
 
 
 def _paths(value: Any) -> Iterator[Path]:
