@@ -18,7 +18,6 @@ import torch
 from torch import Tensor
 
 from torchface.capture.own_rig import VideoSettings, VideoSolver, solve_whole_take
-from torchface.capture.own_rig import video_solver as frame_solve
 from torchface.capture.own_rig.face_points import FacePoints
 from torchface.capture.own_rig.state_estimate import Expectation, StateEstimate
 from torchface.capture.priors import (
@@ -35,6 +34,7 @@ from torchface.geometry.rotations import rotation_matrix
 from torchface.io import load_take
 from torchface.io.rigs.ict_facekit import load_ict_facekit, load_identity_modes
 from torchface.modeling import transfer_deformation
+from torchface.optim.prepared_program import PreparedProgram
 from torchface.rendering.clay_shading import render
 from torchface.rendering.compositing import caption, heat_colors, save_rendered_image, sheet
 from torchface.rig import BlendshapeRig
@@ -430,7 +430,7 @@ def test_speed(faces: Faces, monkeypatch: pytest.MonkeyPatch) -> None:
         ("its covariance, one frame on", StateEstimate, "expectation"),
         ("its covariance, after the frame", Expectation, "updated"),
         ("what it expects", Expectation, "quadratic"),
-        ("quadratic programs in the box", frame_solve, "solve_from_active_set"),
+        ("quadratic programs in the box", PreparedProgram, "solve"),
         ("sums, steps, checks", solver, "step"),
     ):
         timed(part, owner, name)

@@ -10,11 +10,9 @@ from torchface.optim.active_set import primal_dual_active_set, projected_newton
 from torchface.optim.box_problem import BoxProblem, metric
 from torchface.optim.free_variables import solve_free
 from torchface.optim.operator_splitting import (
-    extrapolated_splitting,
     prepare_splitting,
     splitting_steps,
     start_splitting,
-    suited_rho,
 )
 
 
@@ -104,19 +102,6 @@ def test_the_optimum_is_where_splitting_rests() -> None:
     again = splitting_steps(given, factors, state, 1)
     torch.testing.assert_close(again.z, state.z, rtol=0, atol=1e-11)
     torch.testing.assert_close(again.t, state.t, rtol=0, atol=1e-9)
-
-
-def test_extrapolated_splitting_is_nearer_after_as_many_steps() -> None:
-    given = problem(30, 200)
-    optimum = projected_newton(given, torch.zeros(200, 30, dtype=torch.float64), 1e-12)
-    factors, start = prepare_splitting(given.H, suited_rho(given.H)), start_splitting(given, None)
-    ours = (extrapolated_splitting(given, factors, start, 1).z - optimum).abs().amax(1)
-    plain = (splitting_steps(given, factors, start, 27, dtype=torch.float32).z - optimum).abs().amax(1)
-    assert ours.median() < 0.2 * plain.median()
-    H = given.H * torch.linspace(0.5, 2, 200, dtype=torch.float64)[:, None, None]
-    many = BoxProblem.of(H, given.f, given.lower, given.upper)
-    each = extrapolated_splitting(many, prepare_splitting(H, suited_rho(H)), start, 3).z
-    assert many.residual(each).median() < 1e-4
 
 
 def test_splitting_with_an_h_each_is_splitting_of_each() -> None:

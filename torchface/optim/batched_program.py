@@ -16,7 +16,6 @@ from torchface.optim.active_set import primal_dual_active_set, projected_newton
 from torchface.optim.box_problem import BoxProblem
 from torchface.optim.operator_splitting import (
     SplittingFactors,
-    extrapolated_splitting,
     prepare_splitting,
     splitting_steps,
     start_splitting,
@@ -27,8 +26,8 @@ from torchface.optim.operator_splitting import (
 # for a tolerance of 1e-4, for each decade below it, and for what these leave.
 _COARSE, _FEW_VARIABLES = 1e-7, 64
 _STEPS, _STEPS_A_DECADE, _MORE_STEPS = 60, 18, 40
-# Otherwise cycles of splitting before active sets are tried, times the root of N, and how often both.
-_CYCLES, _SETTLING_ROUNDS = 0.21, 4
+# Otherwise so many steps, times the root of N, before active sets are tried, and how often both.
+_STEPS_A_ROOT, _MOST_STEPS, _SETTLING_ROUNDS = 4, 75, 4
 # Steps of splitting and of Newton. The last ones make sure.
 _CAREFUL_ROUNDS = ((400, 8), (800, 8), (1600, 8), (0, 100))
 
@@ -97,9 +96,9 @@ def _split(left: _Unsolved) -> bool:
 
 
 def _settle(left: _Unsolved) -> bool:
-    cycles = max(1, round(_CYCLES * left.x.shape[1] ** 0.5))
+    steps = min(_MOST_STEPS, round(_STEPS_A_ROOT * left.x.shape[1] ** 0.5))
     for _ in range(_SETTLING_ROUNDS):
-        left.state = extrapolated_splitting(left.problem, left.factors, left.state, cycles)
+        left.state = splitting_steps(left.problem, left.factors, left.state, steps, torch.float32)
         if left.without(*primal_dual_active_set(left.problem, left.state.z)):
             return True
     return False

@@ -32,11 +32,7 @@ from torchface.optim.box_problem import BoxProblem, metric
 # Measured on a real rig of 53 shapes, whose eigenvalues span five decades.
 RHO = 0.12
 RELAXATION = 1.9
-# Of a cycle's steps the last so many are extrapolated from; those before wear off what the last extrapolation stirred.
-_CYCLE_STEPS, _ITERATES = 15, 8
-_STEPS_BEFORE, _STEPS_AFTER = 8, 4
 _RHO_SHARE = 1.4
-_DAMPING, _TINY = 1e-6, 1e-30
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,105 +129,22 @@ def splitting_steps(
         ValueRangeError: ``steps`` is negative or no whole number.
     """
     checked_count("splitting_steps: steps", steps)
-    run = _Run.of(problem, factors, state, dtype)
-    v = torch.empty_like(run.z)
-    for _ in range(steps):
-        run.step(v)
-    return run.state(problem)
-
-
-def extrapolated_splitting(
-    problem: BoxProblem, factors: SplittingFactors, state: SplittingState, cycles: int
-) -> SplittingState:
-    """The state after cycles of steps that end in an extrapolation of v, in float32: half the steps for one accuracy.
-
-    An extrapolation combines the last iterates so that the least is left of their differences (Anderson 1965). It may
-    also lead away, which the steps after it make up for.
-
-    Args:
-        problem: B problems.
-        factors: of its H.
-        state: where to start.
-        cycles: how many, of fifteen steps each; a dozen steps come beside them.
-
-    Raises:
-        ValueRangeError: ``cycles`` is negative or no whole number.
-    """
-    checked_count("extrapolated_splitting: cycles", cycles)
-    run = _Run.of(problem, factors, state, torch.float32)
-    iterates = run.z.new_empty(_ITERATES, *run.z.shape)
-    for _ in range(_STEPS_BEFORE):
-        run.step(iterates[0])
-    for _ in range(cycles):
-        for _ in range(_CYCLE_STEPS - _ITERATES):
-            run.step(iterates[0])
-        for v in iterates:
-            run.step(v)
-        run.move_to(_extrapolated(iterates))
-    for _ in range(_STEPS_AFTER):
-        run.step(iterates[0])
-    return run.state(problem)
-
-
-def _extrapolated(iterates: Tensor) -> Tensor:
-    """The last of iterates (K,...,N), moved along their differences to where the least of the last step is left."""
-    steps = iterates.diff(dim=0).flatten(1, -2)
-    bends = steps.diff(dim=0).transpose(0, 1)
-    gram = bends @ bends.mT
-    diagonal = gram.diagonal(dim1=1, dim2=2)
-    diagonal.add_(_DAMPING * diagonal.sum(1, keepdim=True) + _TINY)
-    factor, failed = torch.linalg.cholesky_ex(gram)
-    mix = torch.cholesky_solve(bends @ steps[-1, :, :, None], factor)[..., 0]
-    moved = torch.einsum("bk,kbn->bn", mix, steps[1:]).view_as(iterates[-1])
-    # Also where squares leave the range of float32.
-    bad = ((failed > 0) | ~torch.isfinite(moved.flatten(1)).all(1)).view(-1, *[1] * (moved.ndim - 1))
-    return iterates[-1] - torch.where(bad, 0.0, moved)
-
-
-@dataclass(frozen=True, eq=False)
-class _Run:
-    """Steps under way: what they need, and z and t, which each overwrites; (B,N), or (B,1,N) with an H each."""
-
-    constant: Tensor
-    matrix: Tensor
-    share: float
-    lower: Tensor
-    upper: Tensor
-    z: Tensor
-    t: Tensor
-
-    @staticmethod
-    def of(
-        problem: BoxProblem,
-        factors: SplittingFactors,
-        state: SplittingState,
-        dtype: torch.dtype,
-    ) -> _Run:
-        # From zero, where the gradient is f, there is less to form.
-        cold = not bool(state.z.any())
-        constant = _times(problem.f, factors.offset) if cold else factors.constant(state.z, problem.gradient(state.z))
-        constant = constant.to(dtype)
-        lower, upper, step = problem.lower.to(dtype), problem.upper.to(dtype), factors.step.to(dtype)
-        z, t = state.z.to(dtype, copy=True), state.t.to(dtype, copy=True)
-        if step.ndim == 3:
-            constant, z, t = constant[:, None], z[:, None], t[:, None]
-        return _Run(constant, step, 2 - factors.relaxation, lower, upper, z, t)
-
-    def step(self, v: Tensor) -> None:
-        """The next v, written to the tensor given, and its z and t."""
-        product = torch.addmm if self.matrix.ndim == 2 else torch.baddbmm
-        product(self.constant, self.t, self.matrix, out=v)
-        v.add_(self.z, alpha=self.share)
-        self.move_to(v)
-
-    def move_to(self, v: Tensor) -> None:
-        torch.clamp(v, self.lower, self.upper, out=self.z)
-        torch.lerp(v, self.z, 2.0, out=self.t)  # 2 z - v
-
-    def state(self, problem: BoxProblem) -> SplittingState:
-        shape = problem.f.shape
-        # In float32 a bound may have been rounded to the wrong side of itself.
-        return SplittingState(problem.clip(self.z.view(shape).double()), self.t.view(shape).double())
+    # From zero, where the gradient is f, there is less to form.
+    cold = not bool(state.z.any())
+    constant = _times(problem.f, factors.offset) if cold else factors.constant(state.z, problem.gradient(state.z))
+    lower, upper, matrix = problem.lower.to(dtype), problem.upper.to(dtype), factors.step.to(dtype)
+    constant, z, t = constant.to(dtype), state.z.to(dtype, copy=True), state.t.to(dtype, copy=True)
+    product = torch.addmm
+    if matrix.ndim == 3:
+        product, constant, z, t = torch.baddbmm, constant[:, None], z[:, None], t[:, None]
+    v = torch.empty_like(z)
+    for _ in range(steps):  # each needs the one before
+        product(constant, t, matrix, out=v)
+        v.add_(z, alpha=2 - factors.relaxation)
+        torch.clamp(v, lower, upper, out=z)
+        torch.lerp(v, z, 2.0, out=t)  # 2 z - v
+    z, t = z.view_as(problem.f).double(), t.view_as(problem.f).double()
+    return SplittingState(problem.clip(z), t)  # in float32 a bound may have been rounded to the wrong side of itself
 
 
 def _times(x: Tensor, matrix: Tensor) -> Tensor:
