@@ -30,12 +30,15 @@ from quadratic_programming_peers import (
     quadprog_solver,
     quadprog_with_hessians,
 )
+from test_box_qp_growth import blendshape_problem
 from torch import Tensor
 
 from torchface import Attachment, BlendshapeRig
 from torchface.capture import MarkerSolver
 from torchface.onnx import export_solver
-from torchface.optim import BoxQP, box_qp
+from torchface.optim import BoxQP, ProjectedGradient, box_qp
+from torchface.optim.box_problem import BoxProblem
+from torchface.optim.operator_splitting import prepare_splitting, splitting_steps, start_splitting, suited_rho
 
 pytestmark = [pytest.mark.real, pytest.mark.usefixtures("one_thread")]
 Capture = tuple[BlendshapeRig, Attachment, list[Tensor]]
@@ -318,3 +321,72 @@ def test_an_h_a_frame_when_markers_are_missing(
     assert rows[0].residual <= 1e-5
     assert rows[1].gap <= 1e-12
     assert rows[1].residual <= 1e-10
+
+
+def split_steps(steps: int) -> Callable[[Tensor, Tensor], Tensor]:
+    """Splitting alone, as exported graphs have it, with one H (N,N) or one each."""
+
+    def solve(H: Tensor, f: Tensor) -> Tensor:
+        exact, lower = H.double(), f.new_zeros(f.shape[1]).double()
+        problem = BoxProblem.of(exact, f.double(), lower, lower + 1)
+        factors = prepare_splitting(exact, suited_rho(exact))
+        return splitting_steps(problem, factors, start_splitting(problem, None), steps, f.dtype).z
+
+    return solve
+
+
+def gradient_steps(steps: int) -> Callable[[Tensor, Tensor], Tensor]:
+    layer = ProjectedGradient(steps=steps)
+    return lambda H, f: layer(f, H)
+
+
+def daqp_milliseconds(H: Tensor, f: Tensor, count: int) -> float:
+    vectors = list(f[:count].numpy())
+    if H.ndim == 2:
+        solve = daqp_solver(H.numpy())
+        _, spent = one_by_one(lambda row: solve(vectors[row]), count, 2)
+    else:
+        each, matrices = daqp_with_hessians(H.shape[-1]), list(H[:count].numpy())
+        _, spent = one_by_one(lambda row: each(matrices[row], vectors[row]), count, 2)
+    return 1e3 * spent / count
+
+
+def test_the_gap_over_time(frames: Frames, real_capture: Capture, print_machine: Callable[..., None]) -> None:
+    """Fixed steps of splitting and of ``ProjectedGradient`` beside DAQP: one H, and one each as markers are missing."""
+    part, points = frames.part(slice(0, 2000)), noisy_markers(real_capture)[:500]
+    hidden = torch.rand(points.shape[:2], generator=torch.Generator().manual_seed(1)) < 0.3
+    energy = part.solver.energy(torch.where(hidden[..., None], torch.nan, points))
+    problems = {
+        "53 shapes, one H": (part.H, part.f, part.constant),
+        "53 shapes, 30 % of the markers missing": (energy.H, energy.f, energy.constant),
+        # Made without the markers' part of the energy: a gap there is relative to the mean of the rest.
+        **{f"{count} shapes, one H": (*blendshape_problem(count, 300), None) for count in (140, 280, 600)},
+    }
+    ways = {
+        "box_qp": box_qp,
+        **{f"splitting, {steps} steps": split_steps(steps) for steps in (25, 40, 60)},
+        **{f"projected gradient, {steps} steps": gradient_steps(steps) for steps in (100, 200, 400)},
+    }
+    print_machine("daqp")
+    found: dict[tuple[str, str], tuple[float, float]] = {}
+    for title, (H, f, constant) in problems.items():
+        least = _objective(H, f, box_qp(H, f))
+        scale = least.abs().mean() if constant is None else least + constant
+        daqp = daqp_milliseconds(H, f, 200 if H.shape[-1] < 200 else 20)
+        print(f"{title}, {len(f)} at once; DAQP, one by one: {daqp:.4f} ms; ms a frame and gap in float32, in float64")
+        for name, way in ways.items():
+            line = ""
+            for dtype in (torch.float32, torch.float64):
+                with torch.inference_mode():
+                    x, spent = at_once(lambda: way(H.to(dtype), f.to(dtype)), 2)  # noqa: B023
+                gap = float(((_objective(H, f, x) - least) / scale).max())
+                found[title, name] = spent, gap
+                line += f"{1e3 * spent / len(f):10.4f} {gap:8.1e}"
+            print(f"  {name:32}{line}")
+        few, many = (found[title, f"projected gradient, {steps} steps"][1] for steps in (100, 400))
+        assert many < 0.7 * few
+    quick, layer = (
+        found["53 shapes, one H", name] for name in ("splitting, 60 steps", "projected gradient, 400 steps")
+    )
+    assert layer[1] <= 1e-6
+    assert quick[0] < layer[0]

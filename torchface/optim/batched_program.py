@@ -27,9 +27,9 @@ from torchface.optim.operator_splitting import (
 _COARSE, _FEW_VARIABLES = 1e-7, 64
 _STEPS, _STEPS_A_DECADE, _MORE_STEPS = 60, 18, 40
 # Otherwise so many steps, times the root of N, before active sets are tried, and how often both.
-_STEPS_A_ROOT, _MOST_STEPS, _SETTLING_ROUNDS = 4, 75, 4
+_STEPS_A_ROOT, _MOST_STEPS, _SETTLING_ROUNDS = 4, 75, 6
 # Steps of splitting and of Newton. The last ones make sure.
-_CAREFUL_ROUNDS = ((400, 8), (800, 8), (1600, 8), (0, 100))
+_CAREFUL_ROUNDS = ((60, 8), (400, 8), (800, 8), (1600, 8), (0, 100))
 
 
 def solve_batch(

@@ -15,9 +15,9 @@ from torchface.optim.box_problem import BoxProblem
 from torchface.optim.one_by_one import Array, OneByOne
 from torchface.optim.operator_splitting import SplittingFactors, prepare_splitting, suited_rho
 
-# Measured on 16 to 600 variables: DAQP is the faster one for up to so many problems times variables cubed of one H, and
-# for up to so many variables of an H each, however many problems.
-_FEW, _FEW_VARIABLES = 250**3, 80
+# Measured on 16 to 600 variables: DAQP is the faster one for up to so many problems of one H, each of which takes it a
+# time that grows as variables cubed and a constant; with an H each for up to so many variables, however many problems.
+_FEW, _CONSTANT, _FEW_VARIABLES = 230**3, 40**3, 80
 # Numbers in one chunk of frames: its buffers stay in a CPU's second-level cache; an accelerator wants more.
 _CHUNK_NUMBERS = {"cpu": 2**17, "other": 2**23}
 
@@ -79,7 +79,7 @@ class PreparedProgram:
 
     def _are_few(self, problems: int) -> bool:
         size = len(self.lower)
-        few = problems * size**3 <= _FEW if self.H.ndim == 2 else size <= _FEW_VARIABLES
+        few = problems * (size**3 + _CONSTANT) <= _FEW if self.H.ndim == 2 else size <= _FEW_VARIABLES
         return few and self.H.device.type == "cpu"
 
     @cached_property

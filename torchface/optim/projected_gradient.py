@@ -49,7 +49,7 @@ class ProjectedGradient(nn.Module):
             an ``nn.Parameter`` is given. May be absent where each call has its own.
         lower: a number or (N,); ``-inf`` for none.
         upper: a number or (N,); ``inf`` for none.
-        steps: at most so many. On 53 shapes of a real rig the worst relative gap is 1e-4 after 200 and 1e-8 after 400.
+        steps: at most so many. On 53 shapes of a real rig the worst relative gap is 5e-4 after 200 and 2e-8 after 400.
         tolerance: where given, it stops before, when no problem's residual
             :math:`\max |x - clip(x - (Hx+f)/\mathrm{diag} H)|` exceeds it; not under the transforms of ``torch.func``.
         through_steps: gradients go back through every step; otherwise they are implicit ones at the solution, of any
@@ -81,7 +81,7 @@ class ProjectedGradient(nn.Module):
         H: Tensor | None = None,
         lower: float | Tensor = 0.0,
         upper: float | Tensor = 1.0,
-        steps: int = 300,
+        steps: int = 400,
         tolerance: float | None = None,
         through_steps: bool = False,
     ) -> None:
