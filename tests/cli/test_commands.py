@@ -319,7 +319,17 @@ def test_attach_cleans_takes_slip_out_and_refuses_markers_off_the_skin(
     off = site_distances(dome_rig, Attachment.load(out), true)
     assert off.median() < 0.5
     out.unlink()
-    swapped[:, 5] = torch.tensor([0.0, 40.0, 120.0]) + 0.05 * torch.randn(300, 3)
+    still = torch.tensor([0.0, 40.0, 120.0]) + 0.05 * torch.randn(300, 3)
+    swapped[:, 5] = still
+    save_take(Take(60.0, markers=Track(markers.names, swapped)), shoot / "helmet.c3d")
+    run("attach", shoot / "rig.glb", shoot / "helmet.c3d", *common)
+    assert "warning: left out M006: far from the skin and still" in " ".join(capsys.readouterr().err.split())
+    on_face = [label for label in true.labels or () if label != "M006"]
+    assert Attachment.load(out).labels == tuple(on_face)
+    assert site_distances(dome_rig, Attachment.load(out), true.select(on_face)).median() < 0.5
+    out.unlink()
+    # What moves is no marker of the helmet.
+    swapped[:, 5] = still + 30 * torch.sin(torch.arange(300)[:, None] / 9)
     save_take(Take(60.0, markers=Track(markers.names, swapped)), shoot / "helmet.c3d")
     with pytest.raises(SystemExit):
         run("attach", shoot / "rig.glb", shoot / "helmet.c3d", *common)

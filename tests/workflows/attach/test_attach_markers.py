@@ -9,7 +9,7 @@ import torch
 
 from torchface import Attachment, BlendshapeRig, Take, Track
 from torchface.synthetic.stages.marker_stage import StageFlaws, place_markers, record
-from torchface.workflows.attach.attach_markers import cleaned_fit
+from torchface.workflows.attach.attach_markers import cleaned_fit, helmet_markers
 
 
 @pytest.fixture(scope="module")
@@ -37,3 +37,26 @@ def test_labels_exchanged_in_less_than_half_move_no_site(
     labels = take.markers.names
     (swap,) = (defect for defect in cleanup.defects if defect.kind == "swap")
     assert (set(swap.labels), swap.first, swap.last) == ({labels[m] for m in pair}, rows.start, rows.stop - 1)
+
+
+@pytest.mark.parametrize(("count", "seed"), [(1, 0), (4, 1)])
+def test_markers_of_the_helmet_are_named_and_those_of_the_face_are_not(
+    dome_rig: BlendshapeRig, motion: tuple[Attachment, Take], count: int, seed: int
+) -> None:
+    sites, take = motion
+    assert take.markers is not None
+    generator = torch.Generator().manual_seed(seed)
+    places = torch.tensor([0.0, 60.0, 110.0]) + 30 * torch.randn(count, 3, generator=generator)
+    on_helmet = places + 0.05 * torch.randn(len(take), count, 3, generator=generator)
+    names = [f"H{i}" for i in range(count)]
+    values = torch.cat([take.markers.values, on_helmet], dim=1)
+    whole = replace(take, markers=Track((*take.markers.names, *names), values))
+    start = Attachment(
+        torch.cat([sites.triangles, sites.triangles[:count]]),
+        torch.cat([sites.barycentric, sites.barycentric[:count]]),
+        (*(sites.labels or ()), *names),
+    )
+    fit, _ = cleaned_fit(dome_rig, whole, start, standoff=False, free_scale=False)
+    assert helmet_markers(fit, whole) == names
+    alone, _ = cleaned_fit(dome_rig, take, sites, standoff=False, free_scale=False)
+    assert helmet_markers(alone, take) == []

@@ -156,13 +156,13 @@ def test_another_head_of_the_same_topology_is_refused_or_warned_of(stage: Captur
     assert own.warnings == ()
 
 
-@pytest.mark.parametrize(("shape", "seed"), [("jawOpen", 0), ("mouthPucker", 1)])
-def test_a_neutral_frame_that_moves_is_warned_of_with_the_calmest_one(stage: Capture, shape: str, seed: int) -> None:
+@pytest.mark.parametrize(("shape", "level"), [("jawOpen", 0.3), ("mouthPucker", 0.8)])
+def test_a_neutral_frame_that_moves_is_warned_of_with_the_calmest_one(stage: Capture, shape: str, level: float) -> None:
     rig, sites, takes = stage
     weights = 0.3 * takes[0][:120]
     weights[40], weights[60] = 0.0, 0.0
-    weights[60, rig.index([shape])] = 0.8
-    take, _ = recorded((rig, sites, [weights]), frames=120, seed=seed, slips=False)
+    weights[60, rig.index([shape])] = level
+    take, _ = recorded((rig, sites, [weights]), frames=120, slips=False)
     settings = SolveSettings(free_scale=False, frame_by_frame=True)
     calm, moving = (solve_markers(rig, sites, take, replace(settings, neutral=frame)) for frame in (40, 60))
     assert not any("not at rest" in warning for warning in calm.warnings)

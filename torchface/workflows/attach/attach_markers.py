@@ -15,7 +15,7 @@ from torchface.capture.markers import AttachmentFit, Cleanup, check_attachment, 
 from torchface.capture.markers.attachment.attachment_fit import marker_paths
 from torchface.capture.markers.cleaning.label_swaps import find_swaps_by_shape, swapped_back
 from torchface.capture.markers.cleaning.take_cleaning import Defect
-from torchface.capture.markers.rest_pose import check_not_mirrored
+from torchface.capture.markers.rest_pose import check_not_mirrored, inlier_markers
 from torchface.errors import AlignmentError, FileFormatError, ValueRangeError
 from torchface.files.content_keys import content_key
 from torchface.files.whole_files import all_or_none, check_ending, check_writable, make_folder
@@ -46,6 +46,8 @@ _SHOWN_NAMES = 8
 _MAX_MASKED = 0.5
 # A common distance from the skin is advised where it leaves less than this part of the markers' error.
 _STANDOFF_RATIO = 0.95
+# One marker in so many may sit on the helmet.
+_MAX_HELMET = 3
 _INSIST = "--insist writes the sites all the same"
 
 
@@ -158,6 +160,20 @@ def cleaned_fit(
     return fit, replace(cleanup, defects=tuple(defects))
 
 
+def helmet_markers(fit: AttachmentFit, take: Take) -> list[str]:
+    """The labels of markers that stay far from the skin and move no more than most of the others: the helmet's.
+
+    At most a third of all: else it is the rig or the labels that are wrong.
+    """
+    assert take.markers is not None
+    labels = fit.attachment.labels or ()
+    paths = take.markers.select(labels).values.double()
+    motion = (paths - paths.nanmedian(0).values).square().sum(-1).nanmean(0).sqrt()
+    on_skin = inlier_markers(fit.errors[-1])
+    far = (~on_skin & (motion <= motion[on_skin].median())).nonzero()[:, 0].tolist()
+    return [labels[m] for m in far] if _MAX_HELMET * len(far) <= len(labels) else []
+
+
 def _in_order(take: Take) -> tuple[Take, list[Defect]]:
     """A take with the labels exchanged back that its own shape shows to be exchanged; there are no sites yet."""
     assert take.markers is not None
@@ -244,6 +260,13 @@ def attach(
         check_not_mirrored(marker_paths(take, start), sites, str(rom))
     free_scale = settings.options.frees_scale(rom)
     fit, cleanup = cleaned_fit(loaded, take, start, settings.standoff, progress, free_scale)
+    on_helmet = helmet_markers(fit, take)
+    if on_helmet:
+        names = [name for name in fit.attachment.labels or () if name not in on_helmet]
+        assert take.markers is not None
+        take, start = replace(take, markers=take.markers.select(names)), start.select(names)
+        notes.append(f"left out {_listed(on_helmet)}: far from the skin and still, as markers of the helmet are")
+        fit, cleanup = cleaned_fit(loaded, take, start, settings.standoff, progress, free_scale)
     free = fit.alignment
     if not free_scale:
         fitted = fit.attachment if settings.standoff else replace(fit.attachment, residual=None)
