@@ -38,8 +38,8 @@ from torchface.landmarks.images.trees.landmark_trees import LandmarkTrees
 from torchface.modeling import ExpressionRegression, ExpressionSettings
 from torchface.modeling.morphable.head_model import HeadModel
 from torchface.modeling.morphable.morphable_model import MorphableModel
-from torchface.onnx import HybridGraph, SolverGraph
-from torchface.optim import BoxQP, ProjectedGradient
+from torchface.onnx import SolverGraph
+from torchface.optim import BoxQP, FixedSplitting, ProjectedGradient
 from torchface.synthetic import performer
 
 SOLVER = {"vmap": "batches", "jacrev": "jacobian", "torch.compile": "gap"}
@@ -276,6 +276,11 @@ def graph_inputs() -> tuple[Tensor, ...]:
     return seen_markers(rig()).float(), random(4, len(NAMES), seed=7).float()
 
 
+def solver_graph(number: int) -> SolverGraph:
+    solver = marker_solver(number)
+    return SolverGraph(solver, FixedSplitting(solver.complete_hessian(), steps=3), FixedSplitting(steps=3))
+
+
 def helmet(solver: HelmetSolver, markers: Tensor) -> tuple[Tensor, ...]:
     weights, motion = solver(markers)
     return weights, motion.rotation, motion.translation
@@ -299,11 +304,11 @@ EXAMPLES: dict[str, Example] = {
         {**SOLVER, "torch.export": "no"},
     ),
     "HybridSolver": Example(
-        lambda n: HybridSolver(marker_solver(n)), pulled_markers, cells={**SOLVER, "torch.export": "HybridGraph"}
+        lambda n: HybridSolver(marker_solver(n)), pulled_markers, cells={**SOLVER, "torch.export": "SolverGraph"}
     ),
     "HybridSolver with correctives": Example(
         lambda n: HybridSolver(corrected_solver(n)), pulled_markers,
-        cells={**SOLVER, "torch.export": "HybridCorrectiveGraph"},
+        cells={**SOLVER, "torch.export": "CorrectiveGraph"},
     ),
     "WholeTakeSolver": Example(
         lambda n: WholeTakeSolver(marker_solver(n)), lambda: (seen_markers(rig()),),
@@ -320,10 +325,13 @@ EXAMPLES: dict[str, Example] = {
     "ExampleSolver with LandmarkModel": Example(
         projecting_example_solver, lambda: (seen_landmarks(),), cells={**SOLVER, "torch.export": "ONNX"}
     ),
-    "SolverGraph": Example(lambda n: SolverGraph(marker_solver(n), 3, 3), graph_inputs, cells={"vmap": "no"}),
-    "HybridGraph": Example(
-        lambda n: HybridGraph(marker_solver(n), 3, 3),
-        lambda: (*graph_inputs(), *(x.float() for x in pulled_markers()[1:])), cells={"vmap": "no"},
+    "FixedSplitting": Example(
+        lambda n: FixedSplitting(random(12, 6, seed=n).T @ random(12, 6, seed=n), steps=3),
+        lambda: (random(10, 6, seed=3) - 1,),
+    ),
+    "SolverGraph": Example(solver_graph, graph_inputs, cells={"vmap": "no"}),
+    "SolverGraph with predictions": Example(
+        solver_graph, lambda: (*graph_inputs(), *(x.float() for x in pulled_markers()[1:])), cells={"vmap": "no"}
     ),
     "BlendshapeRig": Example(corrected_rig, lambda: (random(3, len(NAMES)).float(),)),
     "ShapePrior": Example(shape_prior, lambda: (random(3, len(NAMES)),), prior_energy),

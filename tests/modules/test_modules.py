@@ -29,7 +29,7 @@ from torch.utils._pytree import tree_leaves
 from torchface.capture.own_rig import VideoSolver
 from torchface.errors import TraceError
 from torchface.onnx import VideoGraph
-from torchface.onnx.corrective_graph import CorrectiveGraph, HybridCorrectiveGraph
+from torchface.onnx.corrective_graph import CorrectiveGraph
 
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "concepts" / "modules.md"
 COLUMNS = (
@@ -277,14 +277,14 @@ def exported_graphs() -> dict[str, tuple[Callable[[], nn.Module], Callable[[], t
             lambda: CorrectiveGraph(corrected_solver(0), steps=1),
             lambda: (seen_markers(corrected_rig()).float(), none),
         ),
-        "HybridCorrectiveGraph": (
-            lambda: HybridCorrectiveGraph(corrected_solver(0), steps=1),
+        "CorrectiveGraph with predictions": (
+            lambda: CorrectiveGraph(corrected_solver(0), steps=1),
             lambda: (seen_markers(corrected_rig()).float(), none, none + 0.5, none + 1.0),
         ),
     }
 
 
-@pytest.mark.parametrize("kind", ["VideoGraph", "CorrectiveGraph", "HybridCorrectiveGraph"])
+@pytest.mark.parametrize("kind", ["VideoGraph", "CorrectiveGraph", "CorrectiveGraph with predictions"])
 def test_graphs_of_solvers_are_exported(kind: str) -> None:
     make, given = exported_graphs()[kind]
     graph, inputs = make(), given()

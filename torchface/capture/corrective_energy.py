@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
+from torch.nn.functional import pad
 
 from torchface.capture.energy import Quadratic, chunks_of_frames
 from torchface.correctives.activation import CorrectiveActivation, RoundedActivation
@@ -41,8 +42,8 @@ class CorrectiveEnergy:
     def __add__(self, other: Quadratic) -> CorrectiveEnergy:
         """With an energy of the L variables added."""
         count = len(self.activation.definitions)
-        H = torch.nn.functional.pad(other.H, (0, count, 0, count))
-        f = torch.nn.functional.pad(other.f, (0, count))
+        H = pad(other.H, (0, count, 0, count))
+        f = pad(other.f, (0, count))
         return replace(self, extended=self.extended + Quadratic(H, f, other.constant))
 
     @property
@@ -75,10 +76,9 @@ class CorrectiveEnergy:
         A = self.activation.derivative(self._weights(variables))
         Hx = self.extended.H
         crossed = self.activation.pulled_back(A, Hx[..., size:, :].contiguous())  # Aᵀ H of the correctives' rows
-        H = Hx[..., :size, :size].expand(len(variables), -1, -1).clone()
-        H[:, :shapes] += crossed[..., :size]
-        H[:, :, :shapes] += crossed[..., :size].transpose(1, 2)
-        H[:, :shapes, :shapes] += self.activation.pulled_back(A, crossed[..., size:].transpose(1, 2).contiguous())
+        by_weights = pad(crossed[..., :size], (0, 0, 0, size - shapes))
+        bent = self.activation.pulled_back(A, crossed[..., size:].transpose(1, 2).contiguous())
+        H = Hx[..., :size, :size] + by_weights + by_weights.mT + pad(bent, (0, size - shapes, 0, size - shapes))
         H = 0.5 * (H + H.transpose(1, 2))
         slope = self._by_variables(self._extended_slope(self._extended(variables)), A)
         unbounded = slope.new_full((size,), torch.inf)
@@ -102,7 +102,7 @@ class CorrectiveEnergy:
     def _by_variables(self, slope: Tensor, derivative: Tensor) -> Tensor:
         by_weights = self.activation.slope(derivative, slope[:, self.variables :])
         rest = self.variables - self.activation.shapes
-        return slope[:, : self.variables] + torch.nn.functional.pad(by_weights, (0, rest))
+        return slope[:, : self.variables] + pad(by_weights, (0, rest))
 
 
 def least_in_box(

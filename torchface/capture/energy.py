@@ -35,7 +35,9 @@ class Quadratic:
 
     def __post_init__(self) -> None:
         shapes = self.f.ndim == 2 and self.H.ndim in (2, 3) and self.H.shape[-2:] == (self.f.shape[1],) * 2
-        if not shapes or (self.H.ndim == 3 and len(self.f) not in (1, len(self.H))):
+        batches = (1, self.H.shape[0] if self.H.ndim == 3 else self.f.shape[0])
+        # To compare numbers of frames would fix them in a graph.
+        if not shapes or (not torch.compiler.is_compiling() and self.f.shape[0] not in batches):
             raise ShapeError(
                 f"quadratic: found H {tuple(self.H.shape)} and f {tuple(self.f.shape)}, "
                 "expected (N,N) or (B,N,N) and (B,N)"
@@ -84,17 +86,20 @@ def marker_term(basis: Tensor, rest: Tensor, targets: Tensor) -> Quadratic:
             f"marker_term: found basis {tuple(basis.shape)}, rest {tuple(rest.shape)}, targets "
             f"{tuple(targets.shape)}, expected (M,3,N), (M,3), (B,M,3)"
         )
-    if torch.isinf(targets).any():
+    traced = torch.compiler.is_compiling()  # a graph has one path, of frames that each have an H
+    if not traced and torch.isinf(targets).any():
         frames = torch.isinf(targets).flatten(1).any(1).nonzero()[:, 0].tolist()
         raise ValueRangeError(f"markers: infinite in frames {frames[:5]}; expected millimetres, or NaN for not seen")
     seen = ~torch.isnan(targets).any(-1)
-    offset = torch.where(seen[..., None], rest - targets.nan_to_num(0.0), 0.0)
+    offset = torch.where(seen[..., None], rest - targets, 0.0)
     rows = basis.flatten(0, 1)
-    if bool(seen.all()):
+    if not traced and bool(seen.all()):
         H = (2.0 / markers) * (rows.T @ rows)
         return Quadratic(H, (2.0 / markers) * (offset.flatten(1) @ rows), offset.square().sum((-1, -2)) / markers)
     share = seen.to(basis) / seen.sum(-1, keepdim=True).clamp(min=1)
-    if markers * shapes * shapes <= _MOST_NUMBERS:
+    if traced:
+        H = 2.0 * ((rows.T * share.repeat_interleave(3, 1)[:, None]) @ rows)
+    elif markers * shapes * shapes <= _MOST_NUMBERS:
         own = (basis.transpose(1, 2) @ basis).flatten(1)
         H = 2.0 * (share @ own).unflatten(1, (shapes, shapes))
     else:
@@ -162,7 +167,8 @@ def gaussian_term(mean: Tensor, variance: Tensor) -> Quadratic:
 
 
 def _check_weight(name: str, weight: float | Tensor) -> None:
-    if isinstance(weight, Tensor) and weight.is_meta:  # a solver that waits for its state
+    # A compiled call checks nothing; a solver of meta tensors waits for its state.
+    if torch.compiler.is_compiling() or (isinstance(weight, Tensor) and weight.is_meta):
         return
     checked_number(name, weight, 0.0, LARGEST_WEIGHT)
 

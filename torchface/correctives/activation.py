@@ -101,7 +101,9 @@ class CorrectiveActivation(nn.Module):
 
     def jacobian(self, weights: Tensor) -> Tensor:
         """All derivatives, (B,C,N) at weights (B,N); differentiable."""
-        derivative = self.derivative(weights)
+        return self._dense(self.derivative(weights))
+
+    def _dense(self, derivative: Tensor) -> Tensor:
         padded = derivative.new_zeros(*derivative.shape[:2], self.shapes + 1)
         return padded.scatter_add(2, self.drivers.expand_as(derivative), derivative)[..., : self.shapes]
 
@@ -112,6 +114,8 @@ class CorrectiveActivation(nn.Module):
             derivative: (B,C,K), as :meth:`derivative` gives it.
             matrix: :math:`Z`, (C,K) for all frames or (B,C,K).
         """
+        if torch.compiler.is_compiling():  # how many are not zero is for a call to find
+            return self._dense(derivative).mT @ matrix
         count, pairs = len(derivative), len(self.pairs)
         values = derivative.flatten(1)[:, self.pairs]
         frames = torch.arange(count, device=matrix.device)[:, None]
@@ -133,7 +137,7 @@ class CorrectiveActivation(nn.Module):
     def slope(self, derivative: Tensor, by_activation: Tensor) -> Tensor:
         """By the weights, (B,N), what falls by the activations as (B,C); differentiable."""
         by_driver = (derivative * by_activation[..., None]).flatten(1)
-        padded = by_driver.new_zeros(len(by_driver), self.shapes + 1)
+        padded = by_driver.new_zeros(by_driver.shape[0], self.shapes + 1)
         return padded.index_add(1, self.drivers.flatten(), by_driver)[:, : self.shapes]
 
     def _factors(self, weights: Tensor) -> Tensor:

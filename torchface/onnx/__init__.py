@@ -5,7 +5,6 @@ from torchface.onnx.checked_export import ExportReport
 from torchface.onnx.dynamics_prior_graph import export_dynamics_prior
 from torchface.onnx.enhancement_graph import export_wrinkle_weights
 from torchface.onnx.example_graph_export import ExampleReport, export_example_solver
-from torchface.onnx.hybrid_graph import HybridGraph
 from torchface.onnx.model_export import export_model
 from torchface.onnx.solver_graph import SolverGraph
 from torchface.onnx.solver_graph_export import GraphSteps, SolverReport, export_hybrid_solver, export_solver
@@ -17,7 +16,6 @@ __all__ = [
     "ExampleReport",
     "ExportReport",
     "GraphSteps",
-    "HybridGraph",
     "SolverGraph",
     "SolverReport",
     "VideoGraph",

@@ -17,6 +17,7 @@ from torchface.capture.action_units.classifier import ActionUnitClassifier
 from torchface.capture.action_units.classifier_training import local_warps
 from torchface.errors import ValueRangeError
 from torchface.files.whole_files import write_file
+from torchface.onnx.checked_export import one_thread_session
 from torchface.onnx.exported_model import exported_model
 
 _TEST_FRAMES = 64
@@ -72,7 +73,8 @@ def export_action_units(
     """
     classifier = classifier.cpu().float().eval()
     model = action_unit_model(classifier)
-    session = _session(model)
+    content = model.SerializeToString()
+    session = one_thread_session(content)
     frames = _test_frames(classifier) if regions is None else regions.float()
     rest = classifier.neutral
     (found,) = session.run(None, {"regions": frames.numpy(), "rest": rest.numpy()})
@@ -82,7 +84,6 @@ def export_action_units(
     agreement = float(same.float().mean())
     if not bool(same[clear].all()) or agreement < 1 - _ALLOWED:
         raise ValueRangeError(f"{path}: ONNX Runtime agrees with PyTorch in {agreement:.1%} of frames, expected all")
-    content = model.SerializeToString()
     write_file(path, content)
     return ActionUnitReport(Path(path), len(content), agreement, _milliseconds(session, frames, rest))
 
@@ -158,12 +159,6 @@ def _clear(classifier: ActionUnitClassifier, frames: Tensor) -> Tensor:
         best = part.scores(own, rest).topk(2, dim=1).values
         clear &= (distance.abs().amin(1) > _IN_THE_BALANCE) & (best[:, 0] - best[:, 1] > _IN_THE_BALANCE)
     return clear
-
-
-def _session(model: onnx.ModelProto) -> onnxruntime.InferenceSession:
-    options = onnxruntime.SessionOptions()
-    options.intra_op_num_threads = options.inter_op_num_threads = 1
-    return onnxruntime.InferenceSession(model.SerializeToString(), options, providers=["CPUExecutionProvider"])
 
 
 def _milliseconds(session: onnxruntime.InferenceSession, frames: Tensor, rest: Tensor) -> float:

@@ -63,9 +63,7 @@ def write_checked(
         ValueRangeError: they are further apart; nothing is written.
     """
     content = model.SerializeToString()
-    options = onnxruntime.SessionOptions()
-    options.intra_op_num_threads = options.inter_op_num_threads = 1
-    session = onnxruntime.InferenceSession(content, options, providers=["CPUExecutionProvider"])
+    session = one_thread_session(content)
     parity = dict.fromkeys(allowed, 0.0)
     for inputs, expected in cases:
         found = session.run(list(allowed), {name: value.detach().numpy() for name, value in inputs.items()})
@@ -80,3 +78,10 @@ def write_checked(
             )
     write_file(path, content)
     return ExportReport(Path(path), len(content), parity, dict(units))
+
+
+def one_thread_session(model: bytes) -> onnxruntime.InferenceSession:
+    """Runs a model on one thread of the processor."""
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = options.inter_op_num_threads = 1
+    return onnxruntime.InferenceSession(model, options, providers=["CPUExecutionProvider"])

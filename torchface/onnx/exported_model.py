@@ -15,6 +15,9 @@ from onnx import TensorProto, helper, numpy_helper
 from torch import Tensor, nn
 
 from torchface.onnx.graph_builder import IR_VERSION, OPSET
+from torchface.onnx.loop_unrolling import unroll_loops
+
+_FOLDED = 256  # numbers of a constant that is computed beforehand; ONNX Runtime computes larger ones when it loads
 
 
 def exported_model(
@@ -40,7 +43,7 @@ def exported_model(
             Runtime simplifies graphs as it loads them, too.
     """
     # Loaded here: it takes a second, and solvers that run graphs have no need of it.
-    from onnxscript import ir
+    from onnxscript import ir, optimizer
 
     shapes = tuple(
         {axis: size or torch.export.Dim.STATIC for axis, size in enumerate((sizes or {}).get(name, ()))} or None
@@ -55,6 +58,7 @@ def exported_model(
             warnings.filterwarnings(
                 "ignore", r"`isinstance\(treespec", FutureWarning
             )  # PyTorch's copy of its own trees
+            warnings.filterwarnings("ignore", "# The axis name", UserWarning)  # of an axis that several inputs have
             program = torch.onnx.export(
                 module.eval(),
                 tuple(inputs.values()),
@@ -64,22 +68,25 @@ def exported_model(
                 opset_version=OPSET,
                 custom_translation_table=dict(translations or {}),
                 dynamo=True,
-                optimize=optimize,
+                optimize=False,
                 verbose=False,
             )
     finally:
         log.setLevel(level)
     if program is None:
         raise AssertionError("torch.onnx.export returned no program")
+    if optimize:
+        optimizer.optimize_ir(program.model, output_size_limit=_FOLDED)
+    unroll_loops(program.model)
     ir.passes.Sequential(
         ir.passes.common.LiftConstantsToInitializersPass(lift_all_constants=True, size_limit=0),
         ir.passes.common.LiftSubgraphInitializersToMainGraphPass(),
         ir.passes.common.DeduplicateInitializersPass(size_limit=2**30),
+        ir.passes.common.RemoveUnusedNodesPass(),
         ir.passes.common.ClearMetadataAndDocStringPass(),
     )(program.model)
     _with_known_casts(program.model)
-    for node in ir.traversal.RecursiveGraphIterator(program.model.graph):
-        node.name = None
+    _shorten_names(program.model)
     model = program.model_proto
     del model.graph.value_info[:], model.metadata_props[:]
     for value in (*model.graph.input, *model.graph.output):
@@ -128,3 +135,19 @@ def _with_known_casts(model: Any) -> None:
             cast.outputs[0].name, cast.outputs[0].type = node.outputs[0].name, node.outputs[0].type
             cast.outputs[0].shape = node.outputs[0].shape
             ir.convenience.replace_nodes_and_values(graph, node, [node], [cast], node.outputs, cast.outputs)
+
+
+def _shorten_names(model: Any) -> None:
+    """Numbers in place of the names of values inside the graph, of which runtimes find the types by themselves."""
+    from onnxscript import ir
+
+    outside = {*model.graph.inputs, *model.graph.outputs}
+    for number, node in enumerate(ir.traversal.RecursiveGraphIterator(model.graph)):
+        node.name = None
+        for value in node.outputs:
+            if not value.is_graph_output():
+                value.type = value.shape = None
+        graphs = (attribute.as_graph() for attribute in node.attributes.values() if attribute.type.name == "GRAPH")
+        inside = [*node.outputs, *(value for graph in graphs for value in graph.inputs)]
+        for place, value in enumerate(value for value in inside if value not in outside):
+            value.name = f"{number}.{place}"

@@ -1,55 +1,35 @@
-"""The marker solve with a fixed number of steps, as it goes into an ONNX graph."""
+"""The marker solve with a fixed number of steps: the module that goes into an ONNX graph."""
 
 from __future__ import annotations
 
-import math
-from itertools import pairwise
+import copy
 
 import torch
 from torch import Tensor, nn
 
-from torchface.capture.markers.marker_solver import MarkerSolver, penalty_value
+from torchface.capture.energy import Quadratic, pull_term
+from torchface.capture.markers.marker_solver import MarkerSolver
 from torchface.errors import ShapeError, ValueRangeError
-from torchface.optim.box_problem import metric
-from torchface.optim.operator_splitting import RELAXATION, RHO, prepare_splitting
+from torchface.optim.fixed_splitting import FixedSplitting
 
-STEPS = 66
 STEPS_WITH_GAPS = 96
-# Numbers below this share of the largest on the diagonal of H would overflow its scaling.
-_SMALLEST_DIAGONAL = 1e-6
-# Newton's iteration starts from this over a norm of A; below 2 it converges.
-NEWTON_SCALE = 1.5
-# Shares of the steps after which f is formed again from what the markers' distances are by then: early, so that what
-# the first, rough f left behind in slow modes is gone at the end.
-_FORMED_AGAIN = (0.09, 0.27)
 
 
 class SolverGraph(nn.Module):
-    r"""``MarkerSolver`` as matrix products and clamps alone.
+    r"""``MarkerSolver`` and ``HybridSolver`` with a fixed number of steps, for a graph.
 
-    Frames in which every marker is seen share one H, factored here; a step of splitting is then
-
-    .. math:: v' = c + z\,(2G + (2 - \alpha) I) - v\,G, \qquad z' = \mathrm{clip}(v', 0, 1)
-
-    (see ``torchface.optim.operator_splitting``; with ``t = 2z - v`` written out a step is two products and a clamp).
-
-    Missing markers give a frame an H of its own. Its inverse comes from Newton's iteration
-    :math:`X' = X (2I - AX)`, :math:`A = H + \rho D` scaled to a unit diagonal, so that A's condition is at most about
-    :math:`N / \rho` and a dozen products suffice. (To fill missing markers with where the current weights put them
-    would keep the one H, but over-relaxed it can settle on a wrong point.) A frame without a marker gives ``previous``.
-
-    In float32 a shape that moves the markers by hundredths of a millimetre drowns in the rounding of f when the markers
-    are centimetres from rest. So the steps halt twice: from the gradient g at the weights w reached, made of short
-    distances, :math:`f = g - Hw` gives :math:`c = -\alpha g (H + \rho D)^{-1} + w ((\alpha - 1) I - G)`, where nothing
-    large cancels.
+    Batches in which every marker is seen share one H, which is factored beforehand. Where a marker is missing, or a
+    prediction counts, each frame has an H of its own. A frame without a marker gives ``previous``.
 
     Args:
-        solver: the exact solve; its alignment is folded into the constants.
-        steps: for batches in which every marker is seen.
-        steps_with_gaps: for batches with missing markers.
-        rho: the metric's :math:`\rho`; see ``choose_rho``.
+        solver: the exact solve, of a rig without correctives; see ``torchface.onnx.corrective_graph`` for others.
+        complete: solves box QPs of ``solver.complete_hessian()``; ``FixedSplitting`` if absent.
+        with_gaps: solves those that bring their H; ``FixedSplitting`` with 96 steps if absent.
 
-    Source: thesis 4.1.4.
+    Raises:
+        ValueRangeError: the rig has correctives.
+
+    Source: thesis 4.1.4 and 4.1.8.
 
     Example:
         >>> from torchface import zoo
@@ -62,66 +42,38 @@ class SolverGraph(nn.Module):
         True
     """
 
-    inputs: tuple[str, ...] = ("markers", "previous")
-
-    rest: Tensor
-    rows: Tensor
-    l1_penalty: Tensor
-    step: Tensor
-    double_step: Tensor
-    offset: Tensor
-
     def __init__(
-        self,
-        solver: MarkerSolver,
-        steps: int = STEPS,
-        steps_with_gaps: int = STEPS_WITH_GAPS,
-        rho: float = RHO,
+        self, solver: MarkerSolver, complete: nn.Module | None = None, with_gaps: nn.Module | None = None
     ) -> None:
         super().__init__()
         if solver.activation is not None:
             raise ValueRangeError(
                 "solver graph: found a rig with correctives, expected none; see torchface.onnx.corrective_graph"
             )
-        self.names, self.labels = solver.names, solver.labels
-        self.steps, self.steps_with_gaps, self.rho = steps, steps_with_gaps, rho
-        self.sparsity, self.ridge = penalty_value(solver.sparsity), penalty_value(solver.ridge)
-        rest, basis = solver.rest.double(), solver.basis.double()
-        scale = 1.0
-        if solver.alignment is not None:
-            # s R (b' - t) = b - (s R t + shift): the difference is in marker space, its rotation in the rows.
-            rest = solver.alignment.inverse().apply(rest[None])[0]
-            scale = float(solver.alignment.scale[0])
-            basis = scale * (solver.alignment.rotation[0].to(basis).T @ basis)
-        markers = len(rest)
-        rows = (2.0 / markers) * basis.flatten(0, 1)
-        # (2/M) B'B from the rows, whatever the scale between the two spaces.
-        self.gram_scale = 0.5 * markers / scale**2
-        H = self.gram_scale * (rows.T @ rows)
-        H.diagonal().add_(2 * self.ridge)
-        self.double_ridge = 2 * self.ridge
-        factors = prepare_splitting(H, rho)
-        self.smallest_diagonal = _SMALLEST_DIAGONAL * float(H.diagonal().max())
-        # Each iteration doubles the digits once the smallest eigenvalue, rho over a norm of at most N, has come to 1.
-        self.newton_steps = math.ceil(math.log2(16 * min(_norm(H) * 2, len(H)) / (NEWTON_SCALE * rho)))
-        double_step = 2 * factors.step
-        double_step.diagonal().add_(2 - RELAXATION)
-        for name, value in (
-            ("rest", rest),
-            ("rows", rows),
-            ("l1_penalty", torch.full_like(H[0], self.sparsity)),
-            ("step", factors.step),
-            ("double_step", double_step),
-            ("offset", factors.offset),
-        ):
-            self.register_buffer(name, value.to(solver.rest.dtype))
+        self.solver = copy.deepcopy(solver)
+        self.complete = complete or FixedSplitting(self.solver.complete_hessian().detach())
+        self.with_gaps = with_gaps or FixedSplitting(steps=STEPS_WITH_GAPS)
 
-    def forward(self, markers: Tensor, previous: Tensor) -> Tensor:
-        """Weights for markers.
+    @property
+    def steps(self) -> tuple[int, int]:
+        """Of complete batches, and of those with gaps."""
+        return self.complete.steps, self.with_gaps.steps
+
+    @property
+    def rho(self) -> float | None:
+        """Of the splitting's metric."""
+        return getattr(self.complete, "rho", None)
+
+    def forward(
+        self, markers: Tensor, previous: Tensor, predicted: Tensor | None = None, gamma: Tensor | None = None
+    ) -> Tensor:
+        r"""Weights for markers, and for predictions where there are any.
 
         Args:
-            markers: (B,M,3), millimetres, in the order of ``labels``; NaN for not seen.
+            markers: (B,M,3), millimetres, in the order of the solver's labels; NaN for not seen.
             previous: the weights of the frame before, (B,N); zeros where there is none.
+            predicted: :math:`\tilde w`, (B,N); looked at where :math:`\gamma > 0`.
+            gamma: :math:`\gamma`, (B,N), mm² over all markers; zero for the markers alone.
 
         Returns:
             Weights in [0,1], (B,N).
@@ -129,83 +81,45 @@ class SolverGraph(nn.Module):
         Raises:
             ShapeError: the shapes do not fit.
         """
-        if markers.shape[1:] != self.rest.shape or previous.shape != (len(markers), len(self.names)):
-            raise ShapeError(
-                f"solver graph: found markers {tuple(markers.shape)} and previous {tuple(previous.shape)}, "
-                f"expected (B,{len(self.rest)},3) and (B,{len(self.names)})"
-            )
-        offset = self.rest - markers
-        missing = torch.isnan(offset).any(-1, keepdim=True)
-        z = previous.to(offset).clamp(0.0, 1.0)
+        check_inputs(self.solver, markers, previous, predicted, gamma)
+        start = previous.to(torch.promote_types(markers.dtype, self.solver.rest.dtype)).clamp(0.0, 1.0)
+        missing = torch.isnan(markers).any(-1)
+        own, given = missing.any(), (markers, start, missing)
+        if predicted is not None and gamma is not None:
+            own, given = own | (gamma > 0).any(), (*given, predicted, gamma)
         if torch.compiler.is_compiling():  # a graph has both ways; here a call takes one
-            return torch.cond(missing.any(), self._with_gaps, self._complete, (offset, missing, z))
-        return (self._with_gaps if bool(missing.any()) else self._complete)(offset, missing, z)
+            return torch.cond(own, self._with_gaps, self._complete, given)
+        return (self._with_gaps if bool(own) else self._complete)(*given)
 
-    def _complete(
-        self, offset: Tensor, missing: Tensor, z: Tensor, pull: Tensor | None = None, target: Tensor | None = None
-    ) -> Tensor:
-        """Frames that share one H: nothing of markers (B,M,3) is missing, nothing pulls."""
-        offset = offset.flatten(1)
-        v = z
-        for steps in stretches(self.steps):
-            constant = self._constant(offset, z)
-            for _ in range(steps):
-                v = torch.addmm(constant, v, -self.step)
-                v = torch.addmm(v, z, self.double_step)
-                z = v.clamp(0.0, 1.0)
-        return z
+    def _complete(self, markers: Tensor, start: Tensor, *_: Tensor) -> Tensor:
+        return self.complete(self.solver.complete_slope(markers), None, start.double()).to(start)
 
-    def _constant(self, offset: Tensor, w: Tensor) -> Tensor:
-        """:math:`c` from the gradient at w."""
-        # ``.T`` would be taken out of a compiled branch, which then has one tensor twice.
-        distance = torch.addmm(offset, w, self.rows.t(), alpha=self.gram_scale)
-        gradient = torch.addmm(self.l1_penalty, distance, self.rows) + self.double_ridge * w
-        return torch.addmm(torch.addmm((RELAXATION - 1) * w, w, -self.step), gradient, self.offset)
-
-    def _with_gaps(
-        self, offset: Tensor, missing: Tensor, z: Tensor, pull: Tensor | None = None, target: Tensor | None = None
-    ) -> Tensor:
-        """Frames with an H of their own: markers (B,M,1) are missing, or weights are pulled (B,N) to targets (B,N)."""
-        identity = torch.eye(len(self.names), dtype=z.dtype, device=z.device)
-        seen = 1 - missing.to(offset)  # (B,M,1)
-        visible = seen.mean(1, keepdim=True)  # (B,1,1)
-        seen_offset = torch.where(missing, 0.0, offset).flatten(1)[:, None]  # (B,1,3M)
-        seen = seen.expand_as(offset).flatten(1)[:, None]
-        kept = seen.transpose(1, 2) * self.rows  # (B,3M,N)
-        ridge = z.new_full((1, 1, len(self.names)), self.double_ridge)
-        penalty = self.l1_penalty
-        if pull is not None and target is not None:
-            ridge, penalty = ridge + pull[:, None], penalty - (pull * target)[:, None]
-        H = self.gram_scale * (kept.transpose(1, 2) @ self.rows) + (ridge * identity) * visible
-        diagonal = (H * identity).sum(1, keepdim=True)  # (B,1,N)
-        diagonal = diagonal.clamp(min=self.smallest_diagonal)
-        scale = diagonal.rsqrt()
-        A = H * scale * scale.transpose(1, 2) + self.rho * identity
-        X = NEWTON_SCALE * identity / A.square().sum((1, 2), keepdim=True).sqrt()
-        for _ in range(self.newton_steps):
-            X = X @ (2 * identity - A @ X)
-        offset = -RELAXATION * (X * scale * scale.transpose(1, 2))
-        minus_step = self.rho * diagonal.transpose(1, 2) * offset + identity
-        double_step = (2 - RELAXATION) * identity - 2 * (minus_step)
-        z = v = z[:, None]
-        for steps in stretches(self.steps_with_gaps):
-            w = z
-            distance = (seen_offset + self.gram_scale * (w @ self.rows.t())) * seen
-            gradient = distance @ self.rows + visible * (penalty + ridge * w)
-            constant = gradient @ offset + w @ minus_step + (RELAXATION - 1) * w
-            for _ in range(steps):
-                v = constant + v @ minus_step + z @ double_step
-                z = v.clamp(0.0, 1.0)
-        return z[:, 0]
+    def _with_gaps(self, markers: Tensor, start: Tensor, missing: Tensor, *prediction: Tensor) -> Tensor:
+        energy = self.solver.energy(markers)
+        if prediction:
+            energy = energy + prediction_term(*prediction, len(self.solver.labels))
+        H = energy.H.expand(start.shape[0], -1, -1)
+        solved = self.with_gaps(energy.f, H, start.double()).to(start)
+        return torch.where(missing.all(1, keepdim=True), start, solved)
 
 
-def stretches(steps: int) -> list[int]:
-    """The steps between one forming of f and the next."""
-    marks = [0, *(round(fraction * steps) for fraction in _FORMED_AGAIN), steps]
-    return [after - before for before, after in pairwise(marks)]
+def prediction_term(predicted: Tensor, gamma: Tensor, markers: int) -> Quadratic:
+    r"""The pull of predictions (B,N), looked at where :math:`\gamma > 0`, of a solve with some markers."""
+    target = torch.where(gamma > 0, predicted.clamp(0.0, 1.0), 0.0)
+    return pull_term(target.double(), gamma.double() / markers)
 
 
-def _norm(H: Tensor) -> float:
-    """Frobenius norm of H scaled to a unit diagonal."""
-    scale = metric(H).rsqrt()
-    return float((H * scale[:, None] * scale).norm())
+def check_inputs(
+    solver: MarkerSolver, markers: Tensor, previous: Tensor, predicted: Tensor | None, gamma: Tensor | None
+) -> None:
+    """Raises ``ShapeError`` for inputs of a graph that do not fit the solver."""
+    for name, value in (("previous", previous), ("predicted", predicted), ("gamma", gamma)):
+        if value is None:
+            continue
+        # Sizes one by one: to compare all at once, or lengths, would fix the size of the batch in a graph.
+        fits = markers.shape[1:] == solver.rest.shape and value.shape[1:] == (len(solver.names),)
+        if not fits or value.shape[0] != markers.shape[0]:
+            raise ShapeError(
+                f"solver graph: found markers {tuple(markers.shape)} and {name} {tuple(value.shape)}, "
+                f"expected (B,{len(solver.rest)},3) and (B,{len(solver.names)})"
+            )

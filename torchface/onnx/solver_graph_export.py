@@ -1,4 +1,4 @@
-"""Writes ``SolverGraph`` as an ONNX file and says how far it is from the exact solve."""
+"""Files of ``SolverGraph`` and ``CorrectiveGraph``, and how far they are from the exact solve."""
 
 from __future__ import annotations
 
@@ -14,18 +14,19 @@ import onnxruntime
 import torch
 from torch import Tensor
 
+from torchface import __version__
 from torchface.attachment import Attachment
 from torchface.capture.markers.hybrid_solver import GAMMA, HybridSolver
-from torchface.capture.markers.marker_solver import RIDGE, SPARSITY, MarkerSolver
+from torchface.capture.markers.marker_solver import RIDGE, SPARSITY, MarkerSolver, penalty_value
 from torchface.errors import ValueRangeError
 from torchface.files.whole_files import write_file
 from torchface.geometry.similarity import Similarity
 from torchface.number_checks import checked_count
-from torchface.onnx.corrective_graph import CorrectiveGraph, HybridCorrectiveGraph
-from torchface.onnx.corrective_model import corrective_model
-from torchface.onnx.hybrid_graph import HybridGraph
-from torchface.onnx.solver_graph import STEPS, STEPS_WITH_GAPS, SolverGraph
-from torchface.onnx.solver_model import solver_model
+from torchface.onnx.checked_export import one_thread_session
+from torchface.onnx.corrective_graph import CorrectiveGraph
+from torchface.onnx.exported_model import exported_model
+from torchface.onnx.solver_graph import STEPS_WITH_GAPS, SolverGraph
+from torchface.optim.fixed_splitting import STEPS, FixedSplitting
 from torchface.rig import BlendshapeRig
 
 _RHOS = (0.03, 0.045, 0.06, 0.075, 0.09, 0.12, 0.16, 0.22, 0.3, 0.4)
@@ -179,13 +180,8 @@ def export_marker_solver(
         facts: further metadata, such as licence and data.
     """
     solver = copy.deepcopy(solver).cpu().float()
-    if solver.activation is not None:
-        frames = random_frames(solver, _CORRECTIVE_FRAMES) if markers is None else markers.cpu().float()
-        corrected = CorrectiveGraph(solver)
-        return _export(corrective_model(corrected, facts), corrected, solver, frames, (), path)
-    frames = random_frames(solver, _TEST_FRAMES) if markers is None else markers.cpu().float()
-    graph = SolverGraph(solver, steps.seen, steps.with_gaps, choose_rho(solver, steps.seen, frames))
-    return _export(solver_model(graph, facts), graph, solver, frames, (), path)
+    frames = _frames(solver, markers)
+    return _export(solver_graph(solver, frames, steps), solver, frames, (), path, facts)
 
 
 def export_hybrid_solver(
@@ -214,30 +210,72 @@ def export_hybrid_solver(
         'hybrid.onnx'
     """
     solver = MarkerSolver(rig, attachment, alignment, sparsity, ridge).cpu().float()
-    count = _TEST_FRAMES if solver.activation is None else _CORRECTIVE_FRAMES
-    frames = random_frames(solver, count) if markers is None else markers.cpu().float()
+    frames = _frames(solver, markers)
     generator = torch.Generator().manual_seed(1)
     shape = (len(frames), len(solver.names))
     predicted, strength = torch.rand(shape, generator=generator), GAMMA * torch.rand(shape, generator=generator)
     gamma = torch.where(torch.rand(shape, generator=generator) < 1 / 7, strength, 0.0)
-    more = predicted, gamma
+    graph = solver_graph(solver, frames, steps)
+    return _export(graph, HybridSolver(solver), frames, (predicted, gamma), path, None)
+
+
+def solver_graph(
+    solver: MarkerSolver, frames: Tensor, steps: GraphSteps = GraphSteps()
+) -> SolverGraph | CorrectiveGraph:
+    """The graph of a solver, on the CPU, its rho chosen for frames (T,M,3) without gaps."""
     if solver.activation is not None:
-        corrected = HybridCorrectiveGraph(solver)
-        return _export(corrective_model(corrected), corrected, HybridSolver(solver), frames, more, path)
-    graph = HybridGraph(solver, steps.seen, steps.with_gaps, choose_rho(solver, steps.seen, frames))
-    return _export(solver_model(graph), graph, HybridSolver(solver), frames, more, path)
+        return CorrectiveGraph(solver)
+    H, rho = solver.complete_hessian(), choose_rho(solver, steps.seen, frames)
+    return SolverGraph(
+        solver, FixedSplitting(H, steps=steps.seen, rho=rho), FixedSplitting(steps=steps.with_gaps, rho=rho)
+    )
+
+
+def solver_model(
+    graph: SolverGraph | CorrectiveGraph, hybrid: bool = False, facts: Mapping[str, object] | None = None
+) -> onnx.ModelProto:
+    """A graph as ONNX, with the inputs of the hybrid solve or without."""
+    solver = graph.solver
+    names = ("markers", "previous", "predicted", "gamma") if hybrid else ("markers", "previous")
+    markers, weights = solver.rest.expand(2, -1, -1), torch.zeros(3, 2, len(solver.names))
+    correctives = {} if solver.activation is None else {"correctives": len(solver.activation.definitions)}
+    return exported_model(
+        graph,
+        dict(zip(names, (value.clone() for value in (markers, *weights)), strict=False)),  # each in its own memory
+        ["weights"],
+        {
+            "task": "hybrid_solver" if hybrid else "solver",
+            "shape_names": list(solver.names),
+            "marker_labels": list(solver.labels),
+            **correctives,
+            "units": "millimetres",
+            "version": __version__,
+            "sparsity": penalty_value(solver.sparsity),
+            "ridge": penalty_value(solver.ridge),
+            "steps": list(graph.steps),
+            **(facts or {}),
+        },
+        dict.fromkeys(names, ("batch",)),
+    )
+
+
+def _frames(solver: MarkerSolver, markers: Tensor | None) -> Tensor:
+    """What a graph is checked with, (T,M,3)."""
+    count = _TEST_FRAMES if solver.activation is None else _CORRECTIVE_FRAMES
+    return random_frames(solver, count) if markers is None else markers.cpu().float()
 
 
 def _export(
-    model: onnx.ModelProto,
     graph: SolverGraph | CorrectiveGraph,
     solver: MarkerSolver | HybridSolver,
     frames: Tensor,
     more: tuple[Tensor, ...],
     path: str | Path,
+    facts: Mapping[str, object] | None,
 ) -> SolverReport:
     """Checks and writes a graph; ``more`` are its inputs after the markers and the weights before."""
-    session = _session(model)
+    content = solver_model(graph, bool(more), facts).SerializeToString()
+    session = one_thread_session(content)
     gaps = tuple(_gap(session, graph, solver, frames, more, missing) for missing in (0.0, 0.1, 0.3))
     for gap in gaps:
         allowed = max(_PARITY, _ROUNDINGS * gap.rounding)
@@ -245,15 +283,12 @@ def _export(
             raise ValueRangeError(
                 f"{path}: ONNX Runtime differs from PyTorch by {gap.parity:.2g}, expected {allowed:.2g} at most"
             )
-    content = model.SerializeToString()
-    path = Path(path)
     write_file(path, content)
     return SolverReport(
-        path,
+        Path(path),
         len(content),
         graph.rho,
-        graph.steps,
-        graph.steps_with_gaps,
+        *graph.steps,
         gaps,
         _milliseconds(session, frames, more),
         _milliseconds(session, hide_markers(frames, 0.3), more),
@@ -265,14 +300,12 @@ def choose_rho(solver: MarkerSolver, steps: int, markers: Tensor) -> float:
 
     A small rho suits the few frames with a slow mode, a larger one all others: the 98 % quantile weighs the two.
     """
-    exact = copy.deepcopy(solver).double()
-    markers = markers.double()
-    energy = exact.energy(markers)
-    least = energy.value(exact(markers))
-    cold = torch.zeros_like(least[:, None]).expand(-1, len(solver.names))
+    energy, H, f = solver.energy(markers), solver.complete_hessian(), solver.complete_slope(markers)
+    least = energy.value(solver(markers.double()))
 
     def gap(rho: float) -> float:
-        return float((energy.value(SolverGraph(exact, steps, rho=rho)(markers, cold)) / least).quantile(0.98))
+        found = FixedSplitting(H, steps=steps, rho=rho)(f).double()
+        return float((energy.value(found) / least).quantile(0.98))
 
     return min(_RHOS, key=gap)
 
@@ -296,12 +329,6 @@ def hide_markers(markers: Tensor, share: float, seed: int = 0) -> Tensor:
     order = torch.rand(markers.shape[:2], generator=torch.Generator().manual_seed(seed)).argsort(-1)
     hidden = order < min(round(share * markers.shape[1]), markers.shape[1] - 1)
     return torch.where(hidden[..., None], torch.nan, markers)
-
-
-def _session(model: onnx.ModelProto) -> onnxruntime.InferenceSession:
-    options = onnxruntime.SessionOptions()
-    options.intra_op_num_threads = options.inter_op_num_threads = 1
-    return onnxruntime.InferenceSession(model.SerializeToString(), options, providers=["CPUExecutionProvider"])
 
 
 def _run(session: onnxruntime.InferenceSession, markers: Tensor, previous: Tensor, more: tuple[Tensor, ...]) -> Tensor:

@@ -21,6 +21,7 @@ from torchface.files.whole_files import write_file
 from torchface.geometry.cameras.calibration import CameraCalibration
 from torchface.geometry.cameras.distortion import undistort
 from torchface.geometry.rotations import rotation_matrix
+from torchface.onnx.checked_export import one_thread_session
 from torchface.onnx.exported_model import exported_model
 from torchface.onnx.unrolled_operators import TRANSLATIONS
 from torchface.onnx.video_graph import LANDMARKS, VideoGraph
@@ -202,9 +203,7 @@ def write_video_solver(
         translations=TRANSLATIONS,
     )
     content = model.SerializeToString()
-    options = onnxruntime.SessionOptions()
-    options.intra_op_num_threads = options.inter_op_num_threads = 1
-    session = onnxruntime.InferenceSession(content, options, providers=["CPUExecutionProvider"])
+    session = one_thread_session(content)
     run = _run(graph, session, names, frames_to_check)
     if not run.parity <= _PARITY:
         raise ValueRangeError(

@@ -321,11 +321,15 @@ class MarkerSolver(nn.Module):
 
     def _complete(self, markers: Tensor, initial: Tensor | None, tolerance: float) -> Tensor:
         """Weights (B,N), float64, for markers without gaps: one H, factored on first use."""
+        f = self.complete_slope(markers)
+        if self.program is not None:
+            return self.program(f, self.complete_hessian(), initial)
+        return self._shared(tolerance)(f, initial)
+
+    def complete_slope(self, markers: Tensor) -> Tensor:
+        """The energy's slope at rest, (B,N), float64, for markers without gaps."""
         offset = self.rest.double() - self._in_rig_space(markers.double())
-        f = (2.0 / len(self.rest)) * (offset.flatten(1) @ self.basis.double().flatten(0, 1)) + self.sparsity
-        return (
-            self._shared(tolerance)(f, initial) if self.program is None else self.program(f, self._hessian(), initial)
-        )
+        return (2.0 / len(self.rest)) * (offset.flatten(1) @ self.basis.double().flatten(0, 1)) + self.sparsity
 
     def _corrected(self, markers: Tensor, gaps: Tensor, initial: Tensor | None, tolerance: float) -> Tensor:
         """Weights (B,N), float64, with correctives: Gauss-Newton from the answer without, or from a guess (B,N)."""
@@ -378,11 +382,12 @@ class MarkerSolver(nn.Module):
         """The problem of complete frames: prepared once, and anew where what it is made of has changed."""
         parts = (self.basis, self.rest, self.ridge)
         if torch.is_grad_enabled() and any(isinstance(part, Tensor) and part.requires_grad for part in parts):
-            return BoxQP(self._hessian(), 0.0, 1.0, tolerance)  # a graph serves one backward pass
+            return BoxQP(self.complete_hessian(), 0.0, 1.0, tolerance)  # a graph serves one backward pass
         prepare = self._prepared.setdefault(tolerance, Prepared())
-        return prepare.get((self.basis, self.ridge), lambda: BoxQP(self._hessian(), 0.0, 1.0, tolerance))
+        return prepare.get((self.basis, self.ridge), lambda: BoxQP(self.complete_hessian(), 0.0, 1.0, tolerance))
 
-    def _hessian(self) -> Tensor:
+    def complete_hessian(self) -> Tensor:
+        """The energy's H, (N,N), float64, for markers without gaps."""
         rest = self.rest.double()
         H = marker_term(self.basis.double(), rest, rest[None]).H
         return H + self.regularization(H).H

@@ -1,0 +1,127 @@
+"""Files of the marker and the hybrid solve: what ONNX Runtime computes is the module, and near the exact solve."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import onnx
+import onnxruntime
+import pytest
+import torch
+from torch import Tensor
+
+from torchface import Attachment, BlendshapeRig, __version__
+from torchface.capture import HybridSolver, MarkerSolver
+from torchface.errors import ValueRangeError
+from torchface.onnx import SolverReport, export_hybrid_solver, export_solver, solver_graph_export
+from torchface.onnx.solver_graph_export import (
+    GraphSteps,
+    export_marker_solver,
+    hide_markers,
+    random_frames,
+    solver_graph,
+)
+from torchface.synthetic.stages.marker_stage import place_markers
+
+
+def run(path: Path, *inputs: Tensor) -> Tensor:
+    session = onnxruntime.InferenceSession(path, providers=["CPUExecutionProvider"])
+    names = (entry.name for entry in session.get_inputs())
+    (weights,) = session.run(["weights"], {name: value.numpy() for name, value in zip(names, inputs, strict=True)})
+    return torch.from_numpy(weights)
+
+
+@pytest.fixture(scope="module")
+def written(turned_bumps: MarkerSolver, tmp_path_factory: pytest.TempPathFactory) -> SolverReport:
+    return export_marker_solver(turned_bumps, tmp_path_factory.mktemp("graph") / "solver.onnx")
+
+
+def test_the_file_is_the_graph(written: SolverReport, turned_bumps: MarkerSolver) -> None:
+    path = written.path
+    assert [gap.missing for gap in written.gaps] == [0.0, 0.1, 0.3]
+    assert max(gap.parity for gap in written.gaps) <= 1e-5
+    assert max(gap.worst for gap in written.gaps) <= 1e-5
+    assert written.size == path.stat().st_size
+    assert "30% missing" in str(written)
+    assert list(path.parent.iterdir()) == [path]
+
+    graph = solver_graph(turned_bumps, random_frames(turned_bumps, 512))
+    assert graph.rho == written.rho
+    markers = random_frames(turned_bumps, 20, seed=5)
+    markers[3, 7] = torch.nan
+    previous = torch.rand(20, 10, generator=torch.Generator().manual_seed(1))
+    torch.testing.assert_close(run(path, markers, previous), graph(markers, previous), rtol=0, atol=1e-5)
+    # One by one the frames without gaps go through the other branch, to the same weights.
+    alone = torch.cat([run(path, markers[i : i + 1], previous[i : i + 1]) for i in range(20)])
+    energy = turned_bumps.energy(markers.double())
+    least = energy.value(turned_bumps(markers.double()))
+    assert ((energy.value(alone.double()) - least) / least).max() <= 1e-5
+
+
+def test_the_metadata_says_what_goes_in_and_out(written: SolverReport, turned_bumps: MarkerSolver) -> None:
+    loaded = onnxruntime.InferenceSession(written.path, providers=["CPUExecutionProvider"])
+    assert {i.name: i.shape for i in loaded.get_inputs()} == {"markers": ["batch", 36, 3], "previous": ["batch", 10]}
+    assert {o.name: o.shape for o in loaded.get_outputs()} == {"weights": ["batch", 10]}
+    metadata = loaded.get_modelmeta().custom_metadata_map
+    assert tuple(json.loads(metadata["shape_names"])) == turned_bumps.names
+    assert tuple(json.loads(metadata["marker_labels"])) == turned_bumps.labels
+    assert metadata["units"] == "millimetres"
+    assert metadata["version"] == __version__
+    assert json.loads(metadata["steps"]) == [66, 96]
+    assert {opset.domain for opset in onnx.load(written.path).opset_import} == {""}
+
+
+def test_a_graph_that_disagrees_is_not_written(
+    written: SolverReport,
+    bump_rig: BlendshapeRig,
+    bump_sites: Attachment,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The file of another alignment is no solver of this one."""
+    monkeypatch.setattr(solver_graph_export, "exported_model", lambda *_, **__: onnx.load(written.path))
+    with pytest.raises(ValueRangeError, match="ONNX Runtime differs from PyTorch"):
+        export_solver(bump_rig, bump_sites, tmp_path / "solver.onnx")
+    assert not list(tmp_path.iterdir())
+
+
+def test_the_hybrid_file_computes_it_and_says_what_it_takes(dome_rig: BlendshapeRig, tmp_path: Path) -> None:
+    path = tmp_path / "hybrid.onnx"
+    report = export_hybrid_solver(dome_rig, place_markers(dome_rig, 30), path)
+    assert max(gap.parity for gap in report.gaps) <= 1e-5
+    assert max(gap.worst for gap in report.gaps) <= 1e-4
+    solver = MarkerSolver(dome_rig, place_markers(dome_rig, 30))
+    markers, generator = random_frames(solver, 8), torch.Generator().manual_seed(3)
+    predicted = torch.rand(8, len(solver.names), generator=generator)
+    gamma = 4 * torch.rand(predicted.shape, generator=generator) * (predicted > 0.5)
+    predicted = torch.where(gamma > 0, predicted, torch.nan)
+    for shown in (markers, hide_markers(markers, 0.2)):
+        weights = run(path, shown, torch.zeros_like(gamma), predicted, gamma)
+        exact = HybridSolver(solver)(shown.double(), predicted.double(), gamma.double())
+        torch.testing.assert_close(weights.double(), exact, rtol=0, atol=2e-3)
+    metadata = {entry.key: entry.value for entry in onnx.load(path).metadata_props}
+    assert metadata["task"] == "hybrid_solver"
+    assert json.loads(metadata["shape_names"]) == list(dome_rig.names)
+
+
+def test_steps_are_counted() -> None:
+    with pytest.raises(ValueRangeError, match="steps with gaps"):
+        GraphSteps(with_gaps=0)
+
+
+@pytest.mark.real
+@pytest.mark.parametrize(("markers", "worst"), [(100, 1e-5), (50, 5e-5)])
+def test_small_and_close_to_the_exact_solve(
+    real_capture: tuple[BlendshapeRig, Attachment, list[Tensor]], tmp_path: Path, markers: int, worst: float
+) -> None:
+    rig, attachment, takes = real_capture
+    layout = attachment.select((attachment.labels or ())[:markers])
+    points = layout.on(rig.neutral.faces, rig(torch.cat(takes)[::40]))
+    points = points + 0.3 * torch.randn(points.shape, generator=torch.Generator().manual_seed(0))
+    report = export_solver(rig, layout, tmp_path / "solver.onnx", markers=points)
+    assert report.size <= 200_000
+    assert report.gaps[0].worst <= worst
+    # The gaps with missing markers are reported, not promised; that they stay small is what the graph is built for.
+    assert max(gap.worst for gap in report.gaps) <= 1e-4
+    assert max(gap.parity for gap in report.gaps) <= 1e-5
