@@ -14,7 +14,17 @@ if TYPE_CHECKING:
     from torchface.onnx import SolverReport
 
 
-def solver(rig: Path, attachment: Path, out: OutputPath, part: str | None = None, quiet: Quiet = False) -> None:
+Method = Literal["splitting", "projected-gradient"]
+
+
+def solver(
+    rig: Path,
+    attachment: Path,
+    out: OutputPath,
+    method: Method = "splitting",
+    part: str | None = None,
+    quiet: Quiet = False,
+) -> None:
     """Write the marker solve of one rig and one marker layout as an ONNX file, and check it.
 
     Inputs of the graph: `markers` (B,M,3), millimetres, NaN where not seen, and `previous` (B,N), the weights of the
@@ -26,15 +36,24 @@ def solver(rig: Path, attachment: Path, out: OutputPath, part: str | None = None
         rig: A .glb or USD file, a folder of OBJ files, or ICT-FaceKit's FaceXModel folder.
         attachment: Where the markers sit, as JSON.
         out: The .onnx file to write.
+        method: How the graph solves: operator splitting, the quicker one, or projected gradient, a loop without a
+            factorisation.
         part: Keep this region of the rig only, such as face.
         quiet: Show no progress.
     """
     from torchface.onnx import export_solver
 
-    _write_solver(export_solver, rig, attachment, out, part, quiet)
+    _write_solver(export_solver, rig, attachment, out, method, part, quiet)
 
 
-def hybrid_solver(rig: Path, attachment: Path, out: OutputPath, part: str | None = None, quiet: Quiet = False) -> None:
+def hybrid_solver(
+    rig: Path,
+    attachment: Path,
+    out: OutputPath,
+    method: Method = "splitting",
+    part: str | None = None,
+    quiet: Quiet = False,
+) -> None:
     """Write the hybrid solve of one rig and one marker layout as an ONNX file, and check it.
 
     As `torchface export solver`, with two inputs more: `predicted` (B,N), weights in [0,1] that a classifier says, and
@@ -44,27 +63,36 @@ def hybrid_solver(rig: Path, attachment: Path, out: OutputPath, part: str | None
         rig: A .glb or USD file, a folder of OBJ files, or ICT-FaceKit's FaceXModel folder.
         attachment: Where the markers sit, as JSON.
         out: The .onnx file to write.
+        method: How the graph solves: operator splitting, the quicker one, or projected gradient, a loop without a
+            factorisation.
         part: Keep this region of the rig only, such as face.
         quiet: Show no progress.
     """
     from torchface.onnx import export_hybrid_solver
 
-    _write_solver(export_hybrid_solver, rig, attachment, out, part, quiet)
+    _write_solver(export_hybrid_solver, rig, attachment, out, method, part, quiet)
 
 
 def _write_solver(
-    export: Callable[..., SolverReport], rig: Path, attachment: Path, out: Path, part: str | None, quiet: bool
+    export: Callable[..., SolverReport],
+    rig: Path,
+    attachment: Path,
+    out: Path,
+    method: Method,
+    part: str | None,
+    quiet: bool,
 ) -> None:
     from torchface.attachment import Attachment
     from torchface.files.job_lock import file_lock
     from torchface.io import load_rig
+    from torchface.onnx import GraphSteps
 
     with file_lock(out, ".onnx"), progress_bars(quiet) as progress:
         progress("reading the rig")
         loaded, where = load_rig(rig, part=part), Attachment.load(attachment)
         where.check(loaded.neutral, attachment, rig)
         progress("exporting and checking")
-        report = export(loaded, where, out)
+        report = export(loaded, where, out, steps=GraphSteps(method=method))
     print_table(report.rows())
     print_path(out)
 

@@ -62,7 +62,7 @@ class CorrectiveGraph(nn.Module):
         (w,) = fixed_loop(lambda w: (self._stepped(rounded, w),), first, (w,))
         (w,) = fixed_loop(lambda w: (self._stepped(energy, w),), self.steps[0] - first, (w,))
         missing = torch.isnan(markers).any(-1).all(1, keepdim=True)
-        return torch.where(missing, start, w).to(markers)
+        return torch.where(missing, start, w).to(torch.promote_types(markers.dtype, self.solver.rest.dtype))
 
     def _stepped(self, energy: CorrectiveEnergy, w: Tensor) -> Tensor:
         """The weights (B,N) after one step."""

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from onnxscript import ir
 
-_LONGEST = 16  # nodes of a body
+_LONGEST = 8  # nodes of a body; a step of splitting has six
 
 
 def unroll_loops(model: ir.Model) -> None:
@@ -44,7 +44,7 @@ def _unroll(loop: ir.Node, body: ir.Graph, count: int) -> None:
     skipped = {value.producer() for value in body.outputs[:2]}
     carried = list(loop.inputs[3:])
     for _ in range(count):
-        values = dict(zip(body.inputs[3:], carried, strict=True))
+        values: dict[ir.Value | None, ir.Value | None] = dict(zip(body.inputs[3:], carried, strict=True))
         for node in body:
             if node in skipped:
                 continue
@@ -59,7 +59,9 @@ def _unroll(loop: ir.Node, body: ir.Graph, count: int) -> None:
                 copied.type, copied.shape, values[value] = value.type, value.shape, copied
             graph.insert_before(loop, copy)
         carried = [values.get(value, value) for value in body.outputs[2:]]
-    ir.convenience.replace_all_uses_with(loop.outputs[1:], carried, replace_graph_outputs=True)
+    ir.convenience.replace_all_uses_with(
+        loop.outputs[1:], [value for value in carried if value is not None], replace_graph_outputs=True
+    )
     graph.remove(loop, safe=True)
     for node in body:  # uses of values outside that are no more
         for place in range(len(node.inputs)):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 from torch import nn
@@ -25,16 +25,27 @@ from torchface.onnx.solver_graph_export import SolverReport, export_marker_solve
 from torchface.onnx.uv_landmark_graph import export_landmark_bank
 from torchface.onnx.video_graph_export import VideoReport, write_video_solver
 
+_Report = ExportReport | SolverReport | VideoReport | ExampleReport
+_EXPORTS: dict[type[nn.Module], Callable[..., _Report]] = {
+    HeadModel: export_head_decoder,
+    ExpressionRegression: export_expression_regression,
+    UVLandmarkDetector: export_landmark_bank,
+    LandmarkNetwork: export_network,
+    EyeNetwork: export_network,
+    BoxNetwork: export_network,
+    LandmarkTrees: export_landmark_trees,
+    DynamicsPrior: export_dynamics_prior,
+    MarkerSolver: export_marker_solver,
+    VideoSolver: write_video_solver,
+    ExampleSolver: export_example_solver,
+}
 
-def export_model(
-    model: nn.Module, path: str | Path, facts: Mapping[str, object] | None = None
-) -> ExportReport | SolverReport | VideoReport | ExampleReport:
+
+def export_model(model: nn.Module, path: str | Path, facts: Mapping[str, object] | None = None) -> _Report:
     """Writes a model as ONNX, and checks it against PyTorch.
 
     Args:
-        model: a ``HeadModel``, ``ExpressionRegression``, ``UVLandmarkDetector``, ``LandmarkNetwork``,
-            ``EyeNetwork``, ``BoxNetwork``, ``LandmarkTrees``, ``DynamicsPrior``, ``MarkerSolver``, ``VideoSolver``
-            or ``ExampleSolver``.
+        model: of a class that ``torchface export`` names.
         path: the file to write; it appears only when it is complete and checked.
         facts: further metadata, such as licence and data.
 
@@ -47,26 +58,9 @@ def export_model(
         >>> report.path.name, max(report.parity.values()) < 0.1
         ('boxes.onnx', True)
     """
-    if isinstance(model, HeadModel):
-        return export_head_decoder(model, path, facts)
-    if isinstance(model, ExpressionRegression):
-        return export_expression_regression(model, path, facts)
-    if isinstance(model, UVLandmarkDetector):
-        return export_landmark_bank(model, path, facts)
-    if isinstance(model, LandmarkNetwork | EyeNetwork | BoxNetwork):
-        return export_network(model, path, facts)
-    if isinstance(model, LandmarkTrees):
-        return export_landmark_trees(model, path, facts)
-    if isinstance(model, DynamicsPrior):
-        return export_dynamics_prior(model, path, facts)
-    if isinstance(model, MarkerSolver):
-        return export_marker_solver(model, path, facts=facts)
-    if isinstance(model, VideoSolver):
-        return write_video_solver(model, path, facts)
-    if isinstance(model, ExampleSolver):
-        return export_example_solver(model, path, facts=facts)
+    for kind, export in _EXPORTS.items():
+        if isinstance(model, kind):
+            return export(model, path, facts=facts)
     raise ValueRangeError(
-        f"{path}: found a {type(model).__name__}, expected a HeadModel, ExpressionRegression, UVLandmarkDetector, "
-        "LandmarkNetwork, EyeNetwork, BoxNetwork, LandmarkTrees, DynamicsPrior, MarkerSolver, VideoSolver or "
-        "ExampleSolver"
+        f"{path}: found a {type(model).__name__}, expected one of {', '.join(kind.__name__ for kind in _EXPORTS)}"
     )

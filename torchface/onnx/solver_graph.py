@@ -11,6 +11,9 @@ from torchface.capture.energy import Quadratic, pull_term
 from torchface.capture.markers.marker_solver import MarkerSolver
 from torchface.errors import ShapeError, ValueRangeError
 from torchface.optim.fixed_splitting import FixedSplitting
+from torchface.optim.projected_gradient import ProjectedGradient
+
+Program = FixedSplitting | ProjectedGradient
 
 STEPS_WITH_GAPS = 96
 
@@ -42,9 +45,7 @@ class SolverGraph(nn.Module):
         True
     """
 
-    def __init__(
-        self, solver: MarkerSolver, complete: nn.Module | None = None, with_gaps: nn.Module | None = None
-    ) -> None:
+    def __init__(self, solver: MarkerSolver, complete: Program | None = None, with_gaps: Program | None = None) -> None:
         super().__init__()
         if solver.activation is not None:
             raise ValueRangeError(
@@ -62,7 +63,7 @@ class SolverGraph(nn.Module):
     @property
     def rho(self) -> float | None:
         """Of the splitting's metric."""
-        return getattr(self.complete, "rho", None)
+        return self.complete.rho if isinstance(self.complete, FixedSplitting) else None
 
     def forward(
         self, markers: Tensor, previous: Tensor, predicted: Tensor | None = None, gamma: Tensor | None = None
@@ -84,11 +85,13 @@ class SolverGraph(nn.Module):
         check_inputs(self.solver, markers, previous, predicted, gamma)
         start = previous.to(torch.promote_types(markers.dtype, self.solver.rest.dtype)).clamp(0.0, 1.0)
         missing = torch.isnan(markers).any(-1)
-        own, given = missing.any(), (markers, start, missing)
+        own = missing.any()
+        given: tuple[Tensor, ...] = (markers, start, missing)
         if predicted is not None and gamma is not None:
             own, given = own | (gamma > 0).any(), (*given, predicted, gamma)
         if torch.compiler.is_compiling():  # a graph has both ways; here a call takes one
-            return torch.cond(own, self._with_gaps, self._complete, given)
+            weights: Tensor = torch.cond(own, self._with_gaps, self._complete, given)
+            return weights
         return (self._with_gaps if bool(own) else self._complete)(*given)
 
     def _complete(self, markers: Tensor, start: Tensor, *_: Tensor) -> Tensor:
@@ -96,8 +99,10 @@ class SolverGraph(nn.Module):
 
     def _with_gaps(self, markers: Tensor, start: Tensor, missing: Tensor, *prediction: Tensor) -> Tensor:
         energy = self.solver.energy(markers)
+        assert isinstance(energy, Quadratic)
         if prediction:
-            energy = energy + prediction_term(*prediction, len(self.solver.labels))
+            predicted, gamma = prediction
+            energy = energy + prediction_term(predicted, gamma, len(self.solver.labels))
         H = energy.H.expand(start.shape[0], -1, -1)
         solved = self.with_gaps(energy.f, H, start.double()).to(start)
         return torch.where(missing.all(1, keepdim=True), start, solved)

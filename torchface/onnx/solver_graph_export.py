@@ -7,6 +7,7 @@ import time
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import onnx
@@ -27,9 +28,11 @@ from torchface.onnx.corrective_graph import CorrectiveGraph
 from torchface.onnx.exported_model import exported_model
 from torchface.onnx.solver_graph import STEPS_WITH_GAPS, SolverGraph
 from torchface.optim.fixed_splitting import STEPS, FixedSplitting
+from torchface.optim.projected_gradient import ProjectedGradient
 from torchface.rig import BlendshapeRig
 
 _RHOS = (0.03, 0.045, 0.06, 0.075, 0.09, 0.12, 0.16, 0.22, 0.3, 0.4)
+GRADIENT_STEPS = 300
 _PARITY = 1e-5
 # Two runs that round differently may lie a few times as far from each other as one does from the exact sum; a graph
 # that computes something else lies much farther.
@@ -64,8 +67,8 @@ class SolverReport:
     Args:
         path: the file.
         size: in bytes.
-        rho: the metric chosen for this rig and layout.
-        steps, steps_with_gaps: of splitting.
+        rho: of splitting, chosen for this rig and layout.
+        steps, steps_with_gaps: how many.
         gaps: at 0, 10 and 30 % missing markers.
         milliseconds: median of one frame by one thread of ONNX Runtime here, every marker seen.
         milliseconds_with_gaps: the same with missing markers.
@@ -73,7 +76,7 @@ class SolverReport:
 
     path: Path
     size: int
-    rho: float
+    rho: float | None
     steps: int
     steps_with_gaps: int
     gaps: tuple[SolverGap, ...]
@@ -82,9 +85,10 @@ class SolverReport:
 
     def rows(self) -> list[tuple[str, str]]:
         """The report as pairs of what and how much."""
+        rho = "" if self.rho is None else f"; rho {self.rho}"
         rows = [
             ("file", f"{self.path}, {self.size / 1000:.0f} kB"),
-            ("steps", f"{self.steps}, {self.steps_with_gaps} with missing markers; rho {self.rho}"),
+            ("steps", f"{self.steps}, {self.steps_with_gaps} with missing markers{rho}"),
             ("one frame, one thread", f"{self.milliseconds:.3f} ms, {self.milliseconds_with_gaps:.3f} ms with gaps"),
         ]
         for gap in self.gaps:
@@ -103,11 +107,12 @@ class SolverReport:
 
 @dataclass(frozen=True)
 class GraphSteps:
-    """How many steps of operator splitting a solver's graph takes; see ``SolverGraph``.
+    """The steps that a solver's graph takes; see ``SolverGraph``.
 
     Args:
-        seen: for batches in which every marker is seen.
-        with_gaps: for batches with missing markers.
+        seen: for batches in which every marker is seen; 66, or 300 of projected gradient, if absent.
+        with_gaps: for batches with missing markers; 96, or 300 of projected gradient, if absent.
+        method: operator splitting, written out, or ``ProjectedGradient``, a ``Loop``.
 
     Raises:
         ValueRangeError: less than one.
@@ -117,12 +122,14 @@ class GraphSteps:
         20
     """
 
-    seen: int = STEPS
-    with_gaps: int = STEPS_WITH_GAPS
+    seen: int | None = None
+    with_gaps: int | None = None
+    method: Literal["splitting", "projected-gradient"] = "splitting"
 
     def __post_init__(self) -> None:
-        checked_count("steps", self.seen, 1)
-        checked_count("steps with gaps", self.with_gaps, 1)
+        for name, value in (("steps", self.seen), ("steps with gaps", self.with_gaps)):
+            if value is not None:
+                checked_count(name, value, 1)
 
 
 def export_solver(
@@ -224,11 +231,16 @@ def solver_graph(
 ) -> SolverGraph | CorrectiveGraph:
     """The graph of a solver, on the CPU, its rho chosen for frames (T,M,3) without gaps."""
     if solver.activation is not None:
+        if steps.method != "splitting":
+            raise ValueRangeError(f"method: found {steps.method} for a rig with correctives, expected splitting")
         return CorrectiveGraph(solver)
-    H, rho = solver.complete_hessian(), choose_rho(solver, steps.seen, frames)
-    return SolverGraph(
-        solver, FixedSplitting(H, steps=steps.seen, rho=rho), FixedSplitting(steps=steps.with_gaps, rho=rho)
-    )
+    H = solver.complete_hessian()
+    if steps.method == "projected-gradient":
+        seen, gaps = steps.seen or GRADIENT_STEPS, steps.with_gaps or GRADIENT_STEPS
+        return SolverGraph(solver, ProjectedGradient(H, steps=seen), ProjectedGradient(steps=gaps))
+    seen, gaps = steps.seen or STEPS, steps.with_gaps or STEPS_WITH_GAPS
+    rho = choose_rho(solver, seen, frames)
+    return SolverGraph(solver, FixedSplitting(H, steps=seen, rho=rho), FixedSplitting(steps=gaps, rho=rho))
 
 
 def solver_model(
