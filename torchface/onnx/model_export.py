@@ -41,7 +41,9 @@ _EXPORTS: dict[type[nn.Module], Callable[..., _Report]] = {
 }
 
 
-def export_model(model: nn.Module, path: str | Path, facts: Mapping[str, object] | None = None) -> _Report:
+def export_model(
+    model: nn.Module, path: str | Path, facts: Mapping[str, object] | None = None
+) -> ExportReport | SolverReport | VideoReport | ExampleReport:
     """Writes a model as ONNX, and checks it against PyTorch.
 
     Args:

@@ -82,10 +82,11 @@ class FixedSplitting(nn.Module):
             H: of each problem, (B,N,N), float64; the one given before if absent.
             start: (B,N); zero if absent.
         """
-        start = (torch.zeros_like(f) if start is None else start).clamp(self.lower, self.upper)
+        f = f.to(torch.promote_types(f.dtype, self.minus_step.dtype))
+        start = (torch.zeros_like(f) if start is None else start.to(f)).clamp(self.lower, self.upper)
         z = v = start.to(self.minus_step)
         if H is not None:
-            return self._with_own(f, H, z)
+            return self._with_own(f, H.to(f), z)
         constant = (f @ self.offset.to(f)).to(z)
 
         def step(v: Tensor, z: Tensor) -> tuple[Tensor, Tensor]:
