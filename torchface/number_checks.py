@@ -71,8 +71,8 @@ def as_real(values: torch.Tensor) -> torch.Tensor:
     """Whole numbers as floats of torch's default dtype: weights solved in an integer dtype would all be 0 or 1.
 
     Example:
-        >>> as_real(torch.tensor([3, 4])).dtype
-        torch.float32
+        >>> as_real(torch.tensor([3, 4])).is_floating_point()
+        True
     """
     return values if values.is_floating_point() or values.is_complex() else values.to(torch.get_default_dtype())
 
