@@ -21,6 +21,7 @@ Source: Boyd et al. 2011, sections 3.4.3 and 5.2; the diagonal metric takes the 
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -134,7 +135,7 @@ def splitting_steps(
     constant = _times(problem.f, factors.offset) if cold else factors.constant(state.z, problem.gradient(state.z))
     lower, upper, matrix = problem.lower.to(dtype), problem.upper.to(dtype), factors.step.to(dtype)
     constant, z, t = constant.to(dtype), state.z.to(dtype, copy=True), state.t.to(dtype, copy=True)
-    product = torch.addmm
+    product: Callable[..., Tensor] = torch.addmm
     if matrix.ndim == 3:
         product, constant, z, t = torch.baddbmm, constant[:, None], z[:, None], t[:, None]
     v = torch.empty_like(z)
