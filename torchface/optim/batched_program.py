@@ -26,8 +26,8 @@ from torchface.optim.operator_splitting import (
 # for a tolerance of 1e-4, for each decade below it, and for what these leave.
 _COARSE, _FEW_VARIABLES = 1e-7, 64
 _STEPS, _STEPS_A_DECADE, _MORE_STEPS = 60, 18, 40
-# Otherwise so many steps, times the root of N, before active sets are tried, and how often both.
-_STEPS_A_ROOT, _MOST_STEPS, _SETTLING_ROUNDS = 4, 75, 6
+# Otherwise so many steps, times the root of N, before active sets are tried; twice as many each time that both are.
+_STEPS_A_ROOT, _MOST_STEPS, _SETTLING_ROUNDS = 4, 75, 5
 # Steps of splitting and of Newton. The last ones make sure.
 _CAREFUL_ROUNDS = ((60, 8), (400, 8), (800, 8), (1600, 8), (0, 100))
 
@@ -97,8 +97,8 @@ def _split(left: _Unsolved) -> bool:
 
 def _settle(left: _Unsolved) -> bool:
     steps = min(_MOST_STEPS, round(_STEPS_A_ROOT * left.x.shape[1] ** 0.5))
-    for _ in range(_SETTLING_ROUNDS):
-        left.state = splitting_steps(left.problem, left.factors, left.state, steps, torch.float32)
+    for doublings in range(_SETTLING_ROUNDS):  # ever fewer problems are left
+        left.state = splitting_steps(left.problem, left.factors, left.state, steps << doublings, torch.float32)
         if left.without(*primal_dual_active_set(left.problem, left.state.z)):
             return True
     return False
