@@ -90,7 +90,7 @@ def frame_times(times: np.ndarray, source: TimeSource) -> FrameTimes:
         times: of the frames, (T,), seconds.
         source: what is known of them.
     """
-    times = np.asarray(times, np.float64)
+    times = np.array(times, np.float64)  # of its own: a column holds its table in memory
     if not np.isfinite(times).all():
         row = int(np.flatnonzero(~np.isfinite(times))[0])
         raise source.error(f"no time in frame {row + 1}", "one in every row")
