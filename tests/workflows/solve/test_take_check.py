@@ -230,3 +230,26 @@ def test_solvers_put_empty_frames_between_their_neighbours(stage: Path, dome_rig
     assert torch.equal(motion.rotation[0], motion.rotation[1])
     with pytest.raises(ValueRangeError, match="none in any of 120 frames"):
         solver.solve_take(Take(60.0, markers=Track(take.markers.names, torch.full_like(values, torch.nan))))
+
+
+@pytest.mark.parametrize(
+    ("name", "change"),
+    [
+        ("zeros.c3d", lambda markers: 0 * markers),
+        ("one_spot.c3d", lambda markers: 0 * markers + 7),
+        ("line.c3d", lambda markers: 0 * markers + torch.linspace(1, 50, markers.shape[1])[:, None]),
+    ],
+)
+@pytest.mark.parametrize("more", [(), ("--align",), ("--neutral", "0"), ("--slip", "--clean")])
+def test_markers_without_a_shape_are_an_error(
+    stage: Path,
+    name: str,
+    change: Callable[[Tensor], Tensor],
+    more: tuple[str, ...],
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    with pytest.raises(SystemExit) as ended:
+        solve(stage, changed(stage, name, change), *more)
+    assert ended.value.code == 2
+    assert name in capsys.readouterr().err.replace("\n", "")
+    assert not (stage / "weights.csv").exists()

@@ -191,13 +191,13 @@ def check_not_mirrored(paths: Tensor, rest: Tensor, name: str = "markers") -> No
         )
 
 
-def check_not_collinear(points: Tensor) -> None:
+def check_not_collinear(points: Tensor, name: str = "markers") -> None:
     """Raises ``AlignmentError`` where points (M,3) lie on a line or in one spot: no rotation is determined."""
     if len(points) < 3:
-        raise AlignmentError(f"markers: found {len(points)}, expected at least three")
+        raise AlignmentError(f"{name}: found {len(points)} markers, expected at least three")
     extent = torch.linalg.svdvals(points - points.mean(0))
     if not float(extent[1]) > _MIN_EXTENT_RATIO * float(extent[0]):
         raise AlignmentError(
-            f"markers: found {len(points)} on a line (extent {float(extent[1]):.3g} across {float(extent[0]):.3g} "
-            "along it), expected markers spread over the face"
+            f"{name}: found {len(points)} markers on a line (extent {float(extent[1]):.3g} across "
+            f"{float(extent[0]):.3g} along it), expected markers spread over the face"
         )

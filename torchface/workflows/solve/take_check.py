@@ -12,6 +12,7 @@ from torchface.capture.markers import FitCheck, MarkerSolver, check_fit
 from torchface.capture.markers.cleaning.label_swaps import cycled_back, find_swaps, whole_take_exchanges
 from torchface.capture.markers.cleaning.robust_prediction import predict_markers
 from torchface.capture.markers.residual_pattern import residual_pattern
+from torchface.capture.markers.rest_pose import check_not_collinear
 from torchface.capture.markers.take_alignment import align_take, rest_residual
 from torchface.errors import AlignmentError, NameMismatchError
 from torchface.geometry.meshes.operators import vertex_normals
@@ -73,6 +74,7 @@ def check_coverage(attachment: Attachment, take: Take, shapes: int, insist: bool
 
     Raises:
         NameMismatchError: they are too few for the rig's shapes, unless ``insist``.
+        AlignmentError: they lie on a line or in one spot.
     """
     assert take.markers is not None
     labels = attachment.labels or ()
@@ -82,6 +84,10 @@ def check_coverage(attachment: Attachment, take: Take, shapes: int, insist: bool
     enough = math.ceil(shapes / _COORDINATES)
     typical = float(count.double().median()) if len(count) else 0.0
     poor = int(((count > 0) & (count < enough)).sum()) if typical >= enough else 0
+    points = known.values.double().nanmedian(0).values if len(known) else known.values.new_zeros(0, 3)
+    points = points[torch.isfinite(points).all(-1)]
+    if len(points) > 2:
+        check_not_collinear(points, _source(take))
     coverage = Coverage(len(labels), int(seen.any(0).sum()), shapes, poor)
     if coverage.refused and not insist:
         missing = [label for label in labels if label not in known.names]
