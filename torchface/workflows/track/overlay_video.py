@@ -115,7 +115,8 @@ def head_window(tracked: Tracked) -> Camera:
     size[1] = size[1].clamp(min=float(0.6 * size[0]))
     middle = (first + last) / 2
     scale = _HEIGHT / size[1]
-    width = 2 * max(1, round(float(size[0] * scale) / 2))
+    # Both sides together divisible by 32: of other widths x264 reads what lies behind rows, and files differ each time.
+    width = 16 * max(1, round(float(size[0] * scale) / 16))
     intrinsics = tracked.calibration.intrinsics.double().clone()
     intrinsics[:2] *= scale
     intrinsics[:2, 2] += torch.tensor([width, _HEIGHT]).double() / 2 - scale * middle
