@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from concurrent.futures import ProcessPoolExecutor
-from contextlib import ExitStack
+from collections.abc import Sequence
 from dataclasses import dataclass
-from multiprocessing import get_context
 from pathlib import Path
 
 import torch
@@ -22,6 +19,7 @@ from torchface.landmarks.images.ibug_68 import box_around
 from torchface.progress import Progress, silent
 
 from .rendered_people.portraits import FaceImage, FaceImageSettings, face_images
+from .spawned_processes import map_in_processes
 
 _MAX_BOX = 240.0  # pixels a side; larger faces are made smaller, as pairs of pixels say no more than this anyway
 _PART = 60  # images that a process renders at once
@@ -97,15 +95,9 @@ def rendered_faces(
     parts = [(seed, settings, start, min(_PART, count - start)) for start in range(0, count, _PART)]
     progress = progress or silent
     pictures: list[FaceImage] = []
-    with ExitStack() as stack:
-        rendered: Iterable[list[FaceImage]] = map(_rendered_part, parts)
-        if workers > 1:
-            # Spawned: what a process inherits of torch's threads may not survive a fork.
-            pool = ProcessPoolExecutor(workers, get_context("spawn"))
-            rendered = stack.enter_context(pool).map(_rendered_part, parts)
-        for part in rendered:
-            pictures += part
-            progress("rendering portraits", len(pictures), count)
+    for part in map_in_processes(_rendered_part, parts, workers):
+        pictures += part
+        progress("rendering portraits", len(pictures), count)
     if not pictures:
         return NO_FACES
     return Faces(

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import lzma
 import re
 import zipfile
+import zlib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 from itertools import groupby
+from math import prod
 from pathlib import Path
 
 import numpy as np
@@ -30,6 +33,12 @@ _NEUTRAL = "neutral"
 _ANIMATIONS = (".glb", ".gltf", ".safetensors", ".npz")
 _BLOCK = 8  # frames that are read at a time
 _MOST_BYTES = 2**33  # of an .npz file's arrays, which are read whole
+_MOST_COMPRESSED = 100  # times; measured positions become two to four times smaller, zeros a thousand times
+# What zipfile, its decompressors and numpy raise of damaged and built archives.
+_UNREADABLE = (
+    *(zipfile.BadZipFile, zlib.error, lzma.LZMAError, OSError, EOFError),
+    *(ValueError, KeyError, TypeError, ArithmeticError, RuntimeError, MemoryError),
+)
 _NUMBER = re.compile(r"[ _.-]*\d+$")
 _RISE, _HOLD, _FALL = (0.2, 0.5), (0.1, 0.4), (0.3, 0.7)  # seconds of a performer's expressions
 _TWO_SIDED = 3  # takes of each gesture: both sides, left more, right more
@@ -235,7 +244,7 @@ def _npz(path: Path) -> tuple[Tensor, Tensor]:
     try:
         with zipfile.ZipFile(path) as archive:
             arrays = [_array(archive, path, name) for name in ("vertices", "faces")]
-    except (zipfile.BadZipFile, OSError, ValueError, KeyError, EOFError) as error:
+    except _UNREADABLE as error:
         raise FileFormatError(f"{path}: no .npz file of vertices and faces ({error})") from error
     vertices, faces = arrays
     if vertices.ndim != 3 or vertices.shape[2] != 3 or faces.ndim != 2 or faces.shape[1] != 3 or not len(vertices):
@@ -253,11 +262,16 @@ def _array(archive: zipfile.ZipFile, path: Path, name: str) -> np.ndarray:
         version = npy.read_magic(file)
         header = npy.read_array_header_1_0 if version == (1, 0) else npy.read_array_header_2_0
         shape, _, kind = header(file)
-        size = kind.itemsize * int(np.prod(shape, dtype=np.float64)) if kind.kind in "fiu" else -1
-        if size < 0 or size > stored.file_size or size > _MOST_BYTES:
+        size = kind.itemsize * prod(shape) if kind.kind in "fiu" else -1
+        if not 0 <= size <= min(stored.file_size, _MOST_BYTES):
             raise FileFormatError(
-                f"{path}: found {name} {shape} of {kind} in {stored.file_size} bytes, expected numbers of at most "
-                f"{_MOST_BYTES // 2**30} GiB"
+                f"{path}: found {name} {shape!s:.80} of {kind!s:.80} in {stored.file_size} bytes, expected numbers of "
+                f"at most {_MOST_BYTES // 2**30} GiB"
+            )
+        if size > 2**20 + _MOST_COMPRESSED * stored.compress_size:
+            raise FileFormatError(
+                f"{path}: found {name} of {size} bytes compressed into {stored.compress_size}, expected measured "
+                f"positions, which become at most {_MOST_COMPRESSED} times smaller"
             )
     with archive.open(stored) as file:
         return npy.read_array(file, allow_pickle=False)

@@ -4,16 +4,18 @@ from __future__ import annotations
 
 import shutil
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, is_dataclass
 from pathlib import Path
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import torch
 
 from torchface.errors import ValueRangeError
+from torchface.number_checks import LARGEST_SEED, checked_count, checked_number
 
 CPU_ALONE = ("cpu",)
 ANY_DEVICE = ("cpu", "cuda", "mps")
+_MOST = 10_000_000  # of what is counted: more of it no machine holds
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -37,6 +39,9 @@ class RecipeSettings:
 
     devices: ClassVar[tuple[str, ...]] = CPU_ALONE
     """Kinds of devices that the recipe can compute on."""
+
+    def __post_init__(self) -> None:
+        _check_numbers(self)
 
     @property
     def work(self) -> Path:
@@ -69,6 +74,18 @@ class RecipeSettings:
         if device.type == "mps" and not torch.backends.mps.is_available():
             raise ValueRangeError(f"device: found {self.device!r}, but PyTorch sees no such device here; expected cpu")
         return device
+
+
+def _check_numbers(settings: Any, above: str = "") -> None:
+    """No number of a recipe may be negative, infinite or beyond what a machine holds, nested ones included."""
+    for name, value in ((f"{above}{own.name}", getattr(settings, own.name)) for own in fields(settings)):
+        if is_dataclass(value):
+            _check_numbers(value, f"{name}.")
+        for number in value if isinstance(value, tuple) else (value,):
+            if type(number) is int:
+                checked_count(name, number, 0, LARGEST_SEED if name.rpartition(".")[2] == "seed" else _MOST)
+            elif type(number) is float:
+                checked_number(name, number)
 
 
 def recipe_name(kind: type) -> str:

@@ -2,21 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
-from concurrent.futures import ProcessPoolExecutor
-from contextlib import ExitStack
+import warnings
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
-from multiprocessing import get_context
 from pathlib import Path
 
 import torch
+from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import Tensor
 
 from torchface.files.content_keys import content_key
 from torchface.files.whole_files import make_folder, write_file
 from torchface.progress import Progress, silent
+
+from .spawned_processes import map_in_processes
 
 Render = Callable[[int, int, int, Path | None], Mapping[str, Tensor]]
 """From the first picture's number, how many, the seed and ICT-FaceKit's folder to tensors by name, (M,...) each."""
@@ -46,6 +47,8 @@ def rendered_files(
 ) -> list[Path]:
     """Renders what a folder does not hold yet; how many processes render does not change the pictures.
 
+    A file that cannot be read, or has more or fewer pictures, is named in a warning and rendered again.
+
     Args:
         rendering: what is rendered.
         folder: for the files; pictures of another seed or other heads lie beside each other there.
@@ -63,18 +66,27 @@ def rendered_files(
     key = content_key(rendering.method, seed=seed, ict=None if ict is None else ict.name)[:12]
     numbers = range(-(-count // rendering.part))
     paths = [folder / f"{rendering.prefix}_{key}_{number:04d}.safetensors" for number in numbers]
-    missing = [(path, number) for number, path in enumerate(paths) if not path.is_file()]
-    with ExitStack() as stack:
-        work = partial(_render_file, rendering, seed, ict)
-        done: Iterable[None] = map(work, missing)
-        if workers > 1:
-            # Spawned: what a process inherits of torch's threads may not survive a fork.
-            pool = ProcessPoolExecutor(workers, get_context("spawn"))
-            done = stack.enter_context(pool).map(work, missing)
-        for number, _ in enumerate(done):
-            ready = len(paths) - len(missing) + number + 1
-            progress(f"rendering {rendering.what}", rendering.part * ready, rendering.part * len(paths))
+    missing = [(path, number) for number, path in enumerate(paths) if not _is_whole(path, rendering.part)]
+    work = partial(_render_file, rendering, seed, ict)
+    ready = len(paths) - len(missing)
+    for number, _ in enumerate(map_in_processes(work, missing, workers), ready + 1):
+        progress(f"rendering {rendering.what}", rendering.part * number, rendering.part * len(paths))
     return paths
+
+
+def _is_whole(path: Path, pictures: int) -> bool:
+    if not path.is_file():
+        return False
+    try:
+        with safe_open(path, framework="pt") as file:
+            counts = {tuple(file.get_slice(name).get_shape())[:1] for name in file.keys()}  # noqa: SIM118
+        if counts == {(pictures,)}:
+            return True
+        fault = f"found {sorted(counts)} pictures, expected {pictures}"
+    except (SafetensorError, OSError, ValueError, RuntimeError) as error:
+        fault = str(error)
+    warnings.warn(f"{path}: a damaged file of pictures ({fault}); they are rendered again", stacklevel=3)
+    return False
 
 
 def _render_file(rendering: Rendering, seed: int, ict: Path | None, file: tuple[Path, int]) -> None:

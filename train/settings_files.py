@@ -76,7 +76,10 @@ def _value(given: Value, hint: Any) -> Any:
     if hint is float:
         return given.number("a number")
     if hint in (str, Path):
-        return hint(given.text("a path" if hint is Path else "text"))
+        expected = "a path" if hint is Path else "text"
+        if "\0" in given.text(expected):
+            raise given.error(f"{expected} without NUL")
+        return hint(given.found)
     return _table(given, hint)
 
 

@@ -86,11 +86,15 @@ def test_a_model_of_an_earlier_version_is_refused(model):
 
 
 def test_a_state_out_of_range_is_refused(model):
-    for name, value in (("limits", 0.0), ("map_shares", 1.5)):
+    wrong = {"limits": 0.0, "map_shares": 1.5, "region_weights": 0.0, "database_features": 1e30, "coefficients": 1e38}
+    for name, value in wrong.items():
         broken = copy.deepcopy(model)
         getattr(broken, name)[0] = value
         with pytest.raises(ValueRangeError, match=f"{name}: found"):
             broken.check_state()
+    for name, value in (("region_names", [1] * 9), ("voluntary", [[]]), ("keeps_input", "no"), ("scale", 1e300)):
+        with pytest.raises(ValueRangeError, match=name):
+            EnhancementModel.from_config({**model.config, name: value})
 
 
 def test_another_actor_gets_the_detail_in_its_own_place_and_scale(model, database):

@@ -124,6 +124,7 @@ def test_flags_go_before_the_file_and_the_file_before_defaults(tmp_path: Path) -
         ({"network": {"steps": 1.5}}, "found network.steps = 1.5, expected a whole number"),
         ({"parts": [1, "two"]}, "found parts[1] = 'two', expected a whole number"),
         ({"network": 3}, "found network = 3, expected a table"),
+        ({"out": "a\0b"}, r"found out = 'a\x00b', expected a path without NUL"),
     ],
 )
 def test_what_a_file_cannot_say_is_named(
@@ -135,6 +136,27 @@ def test_what_a_file_cannot_say_is_named(
     assert ended.value.code == 2
     told = " ".join(capsys.readouterr().err.split())
     assert f"odd.toml: {message}" in told
+
+
+@pytest.mark.parametrize(
+    ("document", "message"),
+    [
+        ({"slope": -0.5}, "slope: found -0.5, expected a finite number of at least 0"),
+        ({"parts": [1, -1]}, "parts: found -1, expected a whole number from 0"),
+        ({"limit": 2**62}, "limit: found 4.611686e+18, expected a whole number from 0 to 1e+07"),
+        ({"seed": -1}, "seed: found -1, expected a whole number from 0 to 4.294967e+09"),
+        ({"network": {"workers": -1}}, "network.workers: found -1, expected a whole number"),
+    ],
+)
+def test_a_number_that_no_recipe_can_work_with_is_refused_before_any_work(
+    document: dict[str, object], message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_toml(tmp_path / "odd.toml", {"data": str(tmp_path), "out": str(tmp_path / "out"), **document})
+    with pytest.raises(SystemExit) as ended:
+        RECIPE.main(["--config", str(tmp_path / "odd.toml")])
+    assert ended.value.code == 2
+    assert message in " ".join(capsys.readouterr().err.split())
+    assert not (tmp_path / "out").exists()
 
 
 def test_what_has_no_default_and_is_not_in_the_file_is_asked_for(

@@ -30,6 +30,8 @@ _NUMBERS = 2**21  # vertices of all frames that are enhanced at a time
 _REACH, _REACH_OF_WRINKLES = 2.0, 0.5
 # Of that distance: a frame that goes so much further than all of the database in its own direction is outside as well.
 _FURTHER = 0.5
+_MOST_SCALE = 1000.0
+_LARGEST = 1e6  # of any number of a state: millimetres, rotations, stretches, colours
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,7 +121,7 @@ class EnhancementModel(nn.Module):
         self.voluntary = tuple(bool(value) for value in voluntary)
         self.lost_share = checked_number("lost_share", lost_share, 0.0, 1.0)
         self.keeps_input = bool(keeps_input)
-        self.scale = checked_number("scale", scale)
+        self.scale = checked_number("scale", scale, most=_MOST_SCALE)
         vertices, triangles, frames = sizes.vertices, sizes.triangles, sizes.frames
         regions = len(self.region_names)
         self.register_buffer("neutral", torch.zeros(vertices, 3))
@@ -204,6 +206,9 @@ class EnhancementModel(nn.Module):
                 "found a model of an earlier version, which had no limits in its state: learn it again"
             )
         given = dict(config)
+        words, choices = list(given["region_names"]), [*given["voluntary"], given["keeps_input"]]
+        if not all(isinstance(word, str) for word in words) or not all(isinstance(choice, bool) for choice in choices):
+            raise ValueRangeError("found region_names, voluntary or keeps_input, expected texts, and true or false")
         sizes = EnhancementSizes(**{size.name: given.pop(size.name) for size in fields(EnhancementSizes)})
         settings = EnhancementSettings(
             **{setting.name: given.pop(setting.name) for setting in fields(EnhancementSettings)}
@@ -304,7 +309,7 @@ class EnhancementModel(nn.Module):
         Raises:
             TopologyError: another number of vertices.
         """
-        scale = self.scale * checked_number("scale", scale)
+        scale = checked_number("scale", self.scale * checked_number("scale", scale), most=_MOST_SCALE)
         if neutral.shape != self.neutral.shape:
             raise TopologyError(f"neutral: found {tuple(neutral.shape)}, expected {tuple(self.neutral.shape)}")
         if not bool(torch.isfinite(neutral).all()):
@@ -365,6 +370,12 @@ class EnhancementModel(nn.Module):
             raise ValueRangeError(f"limits: found {self.limits.tolist()}, expected positive ones")
         if not bool(((self.map_shares >= 0) & (self.map_shares <= 1)).all()):
             raise ValueRangeError(f"map_shares: found {self.map_shares.tolist()}, expected some of 0 to 1")
+        weights = self.region_weights
+        if not bool(((weights >= 0) & (weights <= 1)).all()) or not bool((weights > 0).any(1).all()):
+            raise ValueRangeError("region_weights: found some beyond 0 to 1, or a region without any, expected neither")
+        for name, values in self.named_buffers():
+            if values.is_floating_point() and values.numel() and not float(values.abs().max()) <= _LARGEST:
+                raise ValueRangeError(f"{name}: found numbers beyond {_LARGEST:g}, expected none")
 
     def _enhanced(self, coarse: Tensor, previous: Tensor | None) -> Enhancement:
         smooth, displacements, pose = self._smooth(coarse)

@@ -6,7 +6,6 @@ import multiprocessing
 import os
 import signal
 import sys
-import threading
 import time
 from collections import deque
 from collections.abc import Iterator, Sequence
@@ -21,6 +20,7 @@ from typing import TYPE_CHECKING, cast
 import torch
 
 from torchface.errors import ValueRangeError
+from torchface.files.parent_process import end_with_parent
 from torchface.workflows.batch.batch_items import BatchItem
 from torchface.workflows.batch.batch_job import BatchJob, attempt
 from torchface.workflows.batch.outcomes import Outcome
@@ -184,7 +184,7 @@ def _one_thread() -> Iterator[None]:
 def _work(job: BatchJob, out: Path, pipe: Connection) -> None:
     """What a process does: says that it is ready, then answers each item, until the pipe is closed."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the process that started this one ends it
-    threading.Thread(target=_end_with_parent, daemon=True).start()
+    end_with_parent()
     torch.set_num_threads(1)
     pipe.send(None)
     while True:
@@ -197,10 +197,3 @@ def _work(job: BatchJob, out: Path, pipe: Connection) -> None:
             pipe.send(outcome)
         except OSError:
             return
-
-
-def _end_with_parent() -> None:
-    parent = multiprocessing.parent_process()
-    if parent is not None:
-        parent.join()
-        os._exit(1)

@@ -264,8 +264,9 @@ def test_bad_input_is_named(learned: LandmarkTrees) -> None:
         LandmarkTrees.fit(images, boxes * torch.tensor([[1.0], [1], [-1]]), points, FEW)
     with pytest.raises(ValueRangeError, match="landmark 0: found in no image"):
         LandmarkTrees.fit(images, boxes, points * torch.nan, FEW)
-    with pytest.raises(ValueRangeError, match="trees: found 0"):
-        LandmarkTrees.fit(images, boxes, points, TreeSettings(trees=0))
+    for name, value in (("trees", 0), ("depth", 40), ("noise", -0.1), ("shrinkage", 2.0)):
+        with pytest.raises(ValueRangeError, match=f"{name}: found {value}|found {name} {value}"):
+            TreeSettings(**{name: value})
     with pytest.raises(ShapeError, match=r"expected \(2,4\)"):
         learned(torch.rand(2, 1, 9, 9), torch.rand(1, 4))
     with pytest.raises(ShapeError, match=r"expected \(B,1,H,W\)"):

@@ -14,11 +14,13 @@ from torchface.files.checkpoints import checkpoint_key, read_checkpoint, write_c
 from torchface.files.content_keys import content_key
 from torchface.landmarks.images.ibug_68 import MIRROR_68
 from torchface.landmarks.images.trees.landmark_trees import FAINTEST, LandmarkTrees, initial_shapes, similarity_to
+from torchface.number_checks import checked_count
 from torchface.progress import Progress, silent
 
 _METHOD = "landmark trees/2"
 _ROWS = 4096  # samples whose pixels are read at once
 _MAX_PIXELS = 2**33
+_MAX_DEPTH = 16  # 65,536 leaves a tree
 
 
 @dataclass(frozen=True)
@@ -67,6 +69,17 @@ class TreeSettings:
     noise: float = 0.01
     seed: int = 0
 
+    def __post_init__(self) -> None:
+        for name, value in asdict(self).items():
+            least = 1 if name in ("cascades", "trees", "depth", "features", "test_splits", "oversampling") else 0
+            if not value >= least:
+                raise ValueRangeError(f"{name}: found {value}, expected at least {least}")
+        checked_count("depth", self.depth, 1, _MAX_DEPTH)
+        if not 0 < self.shrinkage <= 1 or not self.closeness > 0:
+            raise ValueRangeError(
+                f"found shrinkage {self.shrinkage} and closeness {self.closeness}, expected (0,1] and above 0"
+            )
+
 
 @dataclass(frozen=True, eq=False)
 class _Samples:
@@ -104,7 +117,7 @@ def fit_trees(
     """See :meth:`LandmarkTrees.fit`."""
     settings = settings or TreeSettings()
     boxes, landmarks = boxes.float(), landmarks.float()
-    _check(images, boxes, landmarks, settings)
+    _check(images, boxes, landmarks)
     count = landmarks.shape[1]
     if mirror is None and count == len(MIRROR_68):
         mirror = MIRROR_68
@@ -127,7 +140,7 @@ def fit_trees(
     return model.eval()
 
 
-def _check(images: Sequence[Tensor], boxes: Tensor, landmarks: Tensor, settings: TreeSettings) -> None:
+def _check(images: Sequence[Tensor], boxes: Tensor, landmarks: Tensor) -> None:
     if boxes.shape != (len(images), 4) or landmarks.ndim != 3 or landmarks.shape[::2] != (len(images), 2):
         raise ShapeError(
             f"found {len(images)} images, boxes {tuple(boxes.shape)}, landmarks {tuple(landmarks.shape)}; "
@@ -146,14 +159,6 @@ def _check(images: Sequence[Tensor], boxes: Tensor, landmarks: Tensor, settings:
     never = ~torch.isfinite(landmarks).all(-1).any(0)
     if never.any():
         raise ValueRangeError(f"landmark {int(never.nonzero()[0])}: found in no image, expected in one at least")
-    for name, value in asdict(settings).items():
-        least = 1 if name in ("cascades", "trees", "depth", "features", "test_splits", "oversampling") else 0
-        if not value >= least:
-            raise ValueRangeError(f"{name}: found {value}, expected at least {least}")
-    if not 0 < settings.shrinkage <= 1 or not settings.closeness > 0:
-        raise ValueRangeError(
-            f"found shrinkage {settings.shrinkage} and closeness {settings.closeness}, expected (0,1] and above 0"
-        )
 
 
 def _draw_initial_shapes(
