@@ -6,6 +6,7 @@ import hashlib
 import re
 import sys
 import threading
+from collections import defaultdict
 from collections.abc import Callable, Iterator
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
@@ -28,6 +29,7 @@ class Hub(BaseHTTPRequestHandler):
 
     repositories: ClassVar[dict[str, dict[str, bytes]]] = {}
     asked: ClassVar[list[str]] = []
+    tokens: ClassVar[defaultdict[str, set[str]]] = defaultdict(set)
 
     def do_HEAD(self) -> None:
         self._answer(False)
@@ -37,6 +39,7 @@ class Hub(BaseHTTPRequestHandler):
 
     def _answer(self, whole: bool) -> None:
         self.asked.append(f"{self.command} {self.path}")
+        self.tokens[self.headers["Host"].partition(":")[0]].add(self.headers.get("Authorization", ""))
         found = re.fullmatch(r"/([^/]+/[^/]+)/resolve/([^/]+)/(.+)", self.path)
         files = self.repositories.get(found[1]) if found else None
         if found is None or files is None:
@@ -48,7 +51,13 @@ class Hub(BaseHTTPRequestHandler):
         if found[3] not in files:
             return self._refuse("EntryNotFound")
         data = files[found[3]]
-        self.send_response(200)
+        moved = found[1] == "studio/moved" and self.headers["Host"].startswith("127.")
+        self.send_response(302 if moved else 200)
+        if moved:  # as the Hub sends large files from a host of their own
+            self.send_header("Location", f"http://localhost:{self.server.server_address[1]}{self.path}")
+            self.send_header("X-Linked-ETag", f'"{hashlib.sha256(data).hexdigest()}"')
+            self.send_header("X-Linked-Size", str(len(data)))
+            data = b""
         self.send_header("X-Repo-Commit", COMMIT)
         self.send_header("ETag", f'"{hashlib.sha256(data).hexdigest()}"')
         self.send_header("Content-Length", str(len(data)))
@@ -80,10 +89,12 @@ def hub(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[dict[str, d
     monkeypatch.setenv("HF_HUB_DISABLE_PROGRESS_BARS", "1")
     whole = {path.name: path.read_bytes() for path in FILES.iterdir()}
     Hub.asked.clear()
+    Hub.tokens.clear()
     Hub.repositories = {
         "studio/prior": {**whole, "curves.png": b"a picture", "state.bin": b"a pickle"},
         "studio/several": {f"faces/shape/{name}": data for name, data in whole.items()},
         "studio/gated": whole,
+        "studio/moved": whole,
         "studio/words": {"config.json": b"{}", "model.safetensors": b""},
     }
     yield Hub.repositories
@@ -104,6 +115,15 @@ def test_a_repository_gives_the_model_and_nothing_else_is_fetched(hub: dict[str,
     files = [path for path in zoo.find(name).iterdir() if path.name != ".cache"]  # huggingface_hub's record of them
     assert sorted(path.name for path in files) == ["CARD.md", "model.toml", "state.safetensors"]
     assert not any(path.is_symlink() for path in files)
+
+
+def test_a_token_goes_to_the_hub_and_not_where_it_sends_on(
+    hub: dict[str, dict[str, bytes]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("HF_TOKEN", "hf_secret")
+    assert zoo.get_model("hf://studio/moved", ShapePrior).names
+    assert "Bearer hf_secret" in Hub.tokens["127.0.0.1"]
+    assert Hub.tokens["localhost"] == {""}
 
 
 def test_a_description_does_not_fetch_the_state(hub: dict[str, dict[str, bytes]]) -> None:
@@ -140,6 +160,9 @@ def test_what_was_fetched_once_needs_no_network(
         ("hf://studio/prior/faces", FileFormatError, r"prior@main/faces: found no model.toml"),
         ("hf://studio", NameMismatchError, r"found 'hf://studio', expected hf://OWNER/NAME"),
         ("hf://studio/prior/../../x", NameMismatchError, "expected hf://OWNER/NAME"),
+        ("hf://studio/prior@..", NameMismatchError, "expected hf://OWNER/NAME"),
+        ("hf://studio/prior@../../x", NameMismatchError, "expected hf://OWNER/NAME"),
+        ("hf://../prior", NameMismatchError, "expected hf://OWNER/NAME"),
         ("hf://studio/prior@v1@v2", NameMismatchError, "expected hf://OWNER/NAME"),
     ],
 )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
@@ -31,6 +32,7 @@ _REACH, _REACH_OF_WRINKLES = 2.0, 0.5
 # Of that distance: a frame that goes so much further than all of the database in its own direction is outside as well.
 _FURTHER = 0.5
 _MOST_SCALE = 1000.0
+_REGION = re.compile(r"[A-Za-z0-9_-]{1,80}")
 _LARGEST = 1e6  # of any number of a state: millimetres, rotations, stretches, colours
 
 
@@ -207,8 +209,10 @@ class EnhancementModel(nn.Module):
             )
         given = dict(config)
         words, choices = list(given["region_names"]), [*given["voluntary"], given["keeps_input"]]
-        if not all(isinstance(word, str) for word in words) or not all(isinstance(choice, bool) for choice in choices):
-            raise ValueRangeError("found region_names, voluntary or keeps_input, expected texts, and true or false")
+        if not all(isinstance(word, str) and _REGION.fullmatch(word) for word in words):  # they name files
+            raise ValueRangeError("region_names: found other than letters, digits, - and _, expected these alone")
+        if not all(isinstance(choice, bool) for choice in choices):
+            raise ValueRangeError("voluntary or keeps_input: found neither true nor false, expected one")
         sizes = EnhancementSizes(**{size.name: given.pop(size.name) for size in fields(EnhancementSizes)})
         settings = EnhancementSettings(
             **{setting.name: given.pop(setting.name) for setting in fields(EnhancementSettings)}

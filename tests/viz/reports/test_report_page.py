@@ -1,11 +1,13 @@
 """A report page shows what it was given, escaped, with every picture beside it."""
 
 import re
+from html.parser import HTMLParser
 from pathlib import Path
 
 import torch
 from PIL import Image
 
+from torchface.viz.browser import html_lists
 from torchface.viz.reports.report_page import Section, Table, write_page
 
 
@@ -22,3 +24,33 @@ def test_page_holds_tables_and_pictures_and_nothing_half_written(tmp_path: Path)
         assert image.size == (30, 20)
         assert abs(image.getpixel((3, 5))[0] / 255 - float(picture[0, 5, 3])) < 0.003
     assert sorted(path.name for path in page.parent.iterdir()) == ["index.html", "one.png"]
+
+
+HOSTILE = """</title></style><script>alert(1)</script>"><img src=x onerror='alert(1)'>&lt;script&gt;\u202e\u2028"""
+
+
+def elements(markup: str) -> list[tuple[str, set[str]]]:
+    """What a browser makes of it: each element with the names of its attributes."""
+    found: list[tuple[str, set[str]]] = []
+    parser = HTMLParser()
+    parser.handle_starttag = lambda tag, given: found.append((tag, {name for name, _ in given}))  # type: ignore[method-assign]
+    parser.feed(markup)
+    parser.close()
+    return found
+
+
+def test_no_name_of_a_file_becomes_an_element(tmp_path: Path) -> None:
+    """Pages with hostile names have the elements of the same pages with plain names."""
+
+    def pages(name: str) -> list[str]:
+        table = Table((name, "value"), [(name, name)], summary=name)
+        figure = ("one.png", torch.zeros(3, 4, 4))
+        report = write_page(tmp_path, name, [Section(name, name, [table], [figure])]).read_text()
+        lists = (html_lists.shape_list([(name, 0.5)]), html_lists.pick_list([(name, name)], [name]))
+        lines = (html_lists.caption(name), html_lists.big_line(name, "bad"), html_lists.figures_line([(name, name)]))
+        return [report, *lists, *lines]
+
+    long = "x" * len(HOSTILE)
+    for hostile, plain in zip(pages(HOSTILE), pages(long), strict=True):
+        assert elements(hostile) == elements(plain)
+        assert "\u202e" not in hostile

@@ -5,8 +5,14 @@ from __future__ import annotations
 import csv
 import errno
 import json
+import multiprocessing
+import os
+import pickle
+import struct
+import sys
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from slow_items import WORDS, SpellJob
@@ -15,10 +21,11 @@ from torchface.errors import FileFormatError, ValueRangeError
 from torchface.workflows.batch import run_batch as module
 from torchface.workflows.batch.batch_items import BatchItem, ItemKind, check_for_each, find_items, is_batch
 from torchface.workflows.batch.outcomes import Outcome
-from torchface.workflows.batch.processes import in_processes
+from torchface.workflows.batch.processes import _received, _Worker, in_processes
 from torchface.workflows.batch.run_batch import BatchOptions, BatchReport, run_batch
 
 TEXTS = {"anna": "anna", "bob": "robert", "cy": "odd", "nan": "nan"}
+TEXT, NONE = pickle.dumps("done"), pickle.dumps(None)
 
 
 @pytest.fixture
@@ -91,6 +98,29 @@ def test_a_process_that_dies_while_it_reports_holds_no_other_up(words: Path) -> 
     found = {outcome.name: outcome for outcome in in_processes(SpellJob(words.parent / "log"), items, words, 2)}
     assert "signal 9" in found["dies"].error
     assert found["lives"].done
+
+
+@pytest.mark.parametrize(
+    "written",
+    [
+        struct.pack("!i", 4) + b"junk",
+        struct.pack("!i", -7),
+        struct.pack("!i", 2**30) + b"a line of a library\n",
+        struct.pack("!i", len(TEXT)) + TEXT,
+        struct.pack("!i", len(NONE)) + NONE,
+        struct.pack("!i", 9) + b"half",
+    ],
+)
+@pytest.mark.skipif(sys.platform == "win32", reason="pipes of messages")
+def test_a_process_that_writes_something_else_loses_its_item_alone(words: Path, written: bytes) -> None:
+    ours, theirs = multiprocessing.Pipe()
+    killed: list[bool] = []
+    worker = _Worker(SimpleNamespace(kill=lambda: killed.append(True)), BatchItem("bob", words))  # type: ignore[arg-type]
+    os.write(theirs.fileno(), written)
+    theirs.close()
+    with ours, pytest.raises(EOFError):
+        _received(ours, worker)
+    assert (killed, worker.end) == ([True], "wrote what is no outcome, and was ended")
 
 
 def test_a_run_that_is_stopped_goes_on_where_it_was(words: Path) -> None:

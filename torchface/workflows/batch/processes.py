@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import multiprocessing
 import os
+import pickle
 import signal
 import sys
 import time
 from collections import deque
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from math import inf
 from multiprocessing.connection import wait
@@ -33,16 +34,19 @@ if TYPE_CHECKING:
 
 _MAX_STARTS = 3  # of each process, where all end while they load
 _SECONDS_TO_END = 3.0
+_MOST_BYTES = 2**26  # of an answer
+_UNREADABLE = (pickle.UnpicklingError, EOFError, ValueError, TypeError, LookupError, AttributeError, ImportError)
 _THREAD_COUNTS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 
 @dataclass(eq=False)
 class _Worker:
-    """A process, and the item that it has been given and not yet answered for."""
+    """A process, the item that it has been given and not yet answered for, and its end, where the code does not say."""
 
     process: SpawnProcess
     item: BatchItem | None = None
     since: float = 0.0
+    end: str = ""
 
 
 def in_processes(
@@ -79,13 +83,13 @@ def in_processes(
             for pipe in cast("list[Connection]", ready):
                 worker = workers[pipe]
                 try:
-                    outcome: Outcome | None = pipe.recv()
-                except (EOFError, OSError):
+                    outcome = _received(pipe, worker)
+                except EOFError:
                     del workers[pipe]
                     pipe.close()
                     worker.process.join()
                     if worker.item is not None:
-                        yield lost(worker.item, _end_text(worker.process.exitcode or 0))
+                        yield lost(worker.item, worker.end or _end_text(worker.process.exitcode or 0))
                     elif (vain := vain + 1) >= _MAX_STARTS * min(count, len(items)):
                         raise _none_started() from None
                     continue
@@ -118,6 +122,27 @@ def _start(job: BatchJob, out: Path) -> tuple[Connection, SpawnProcess]:
         process.start()
     theirs.close()  # the process alone holds it: the pipe breaks when that dies
     return ours, process
+
+
+def _received(pipe: Connection, worker: _Worker) -> Outcome | None:
+    """What a process says: that it is ready, None, or the outcome of its item; one that says something else is killed.
+
+    Raises:
+        EOFError: it has died, or is killed.
+    """
+    try:
+        data = pipe.recv_bytes(_MOST_BYTES)
+    except ConnectionError as error:
+        raise EOFError from error
+    except OSError:  # a length that no outcome has, or half of one
+        data = b""
+    with suppress(*_UNREADABLE):
+        answer = pickle.loads(data)
+        if isinstance(answer, Outcome) if worker.item is not None else answer is None:
+            return cast("Outcome | None", answer)
+    worker.end = "wrote what is no outcome, and was ended"
+    worker.process.kill()
+    raise EOFError
 
 
 def _given(pipe: Connection, waiting: deque[BatchItem]) -> BatchItem | None:
