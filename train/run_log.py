@@ -17,6 +17,7 @@ from matplotlib.figure import Figure
 from torchface.files.whole_files import make_folder, write_file
 from torchface.files.write_errors import unwritten
 
+_MOST_BYTES = 2**28
 _HEAD = "seconds,step,name,value\n"
 
 
@@ -92,9 +93,13 @@ def read_log(path: Path) -> list[Row]:
     """The rows of a table, up to one that a killed run has left half; none where it is not there."""
     rows: list[Row] = []
     try:
-        for seconds, step, name, value in csv.reader(path.read_text().removeprefix(_HEAD).splitlines()):
+        if path.stat().st_size > _MOST_BYTES:
+            return rows
+        for seconds, step, name, value in csv.reader(
+            path.read_text("utf-8", "replace").removeprefix(_HEAD).splitlines()
+        ):
             rows.append(Row(float(seconds), int(step), name, float(value)))
-    except (OSError, ValueError):
+    except (OSError, ValueError, csv.Error):
         pass
     return rows
 

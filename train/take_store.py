@@ -129,5 +129,9 @@ def _packed(take: StoredTake) -> dict[str, Tensor]:
 def _unpacked(found: dict[str, Tensor] | None) -> StoredTake | None:
     if found is None:
         return None
-    facts = json.loads(bytes(found["facts"].tolist()))
-    return StoredTake(tuple(facts["names"]), float(facts["fps"]), found["weights"].double(), bool(facts["solved"]))
+    try:
+        facts, weights = json.loads(bytes(found["facts"].tolist())), found["weights"].double()
+        names, fps, solved = tuple(facts["names"]), float(facts["fps"]), bool(facts["solved"])
+    except (KeyError, ValueError, TypeError):  # of something else
+        return None
+    return StoredTake(names, fps, weights, solved) if weights.shape[1:] == (len(names),) else None

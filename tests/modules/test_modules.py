@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import copy
+import gc
 import io
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -63,6 +64,21 @@ def assert_same(found: list[Tensor], wanted: list[Tensor], tolerance: float = RO
         torch.testing.assert_close(
             one, other, rtol=tolerance, atol=tolerance, equal_nan=True, check_dtype=False, check_device=False
         )
+
+
+@pytest.mark.parametrize("name", ["VideoSolver", "WebcamSolver", "EnhancementModel"])
+def test_calls_leave_no_tensors_behind(name: str) -> None:
+    example = EXAMPLES[name]
+    module, inputs = fresh(example), example.inputs()
+
+    def tensors() -> int:
+        gc.collect()
+        return sum(isinstance(found, Tensor) for found in gc.get_objects())
+
+    before = tensors()
+    for _ in range(3):
+        outputs(example, module, *inputs)
+    assert tensors() == before
 
 
 # Pictures are shares of white, of which integers are 0 and 1 alone; a layer's H and f have one dtype.

@@ -248,12 +248,13 @@ def test_tensorboard_is_told_where_it_is_installed(tmp_path: Path, monkeypatch: 
     assert told == [("tensorboard", 0.0, 0), ("loss", 0.5, 50)]
 
 
-def test_a_log_goes_on_with_the_step_that_is_done_again(tmp_path: Path) -> None:
+@pytest.mark.parametrize("left", ["9.0,20", "9.0,200,loss," + 200_000 * "1", "\0\ud800"])
+def test_a_log_goes_on_with_the_step_that_is_done_again(tmp_path: Path, left: str) -> None:
     log = RunLog(tmp_path)
     for step in (50, 100, 150):
         log(step, "loss, of all", 1 / step)
-    with (tmp_path / "log.csv").open("a") as file:
-        file.write("9.0,20")  # a line that a killed run has left
+    with (tmp_path / "log.csv").open("ab") as file:
+        file.write(left.encode("utf-8", "surrogatepass"))  # a line that a killed run or a failing disk has left
     again = RunLog(tmp_path, goes_on=True)
     again(100, "loss, of all", 0.5)
     again(150, "loss, of all", 0.25)

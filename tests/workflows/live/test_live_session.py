@@ -7,6 +7,7 @@ import socket
 import tracemalloc
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -22,6 +23,7 @@ from torchface.io.gltf.animation_reading import read_gltf_weights
 from torchface.shape_names import ARKIT
 from torchface.workflows.live import character as characters
 from torchface.workflows.live import live_anybody
+from torchface.workflows.live import recordings as recordings_module
 from torchface.workflows.live.character import load_character
 from torchface.workflows.live.live_anybody import LiveSettings, go_live
 from torchface.workflows.live.live_figures import LiveFigures
@@ -173,6 +175,27 @@ def test_a_full_disk_ends_the_recording_and_not_the_session(
     assert session.figures.frames == 30
     assert told == ["the recording ended: out: cannot be written: No space left on device"]
     assert [take.frames for take in recordings.finish()] == [0]
+
+
+def test_a_disk_that_fills_keeps_what_was_recorded(dome: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The recording ends while its files still fit: they are written, and hold less than was held free for them."""
+    free = [10**12, 10**12, 10**12, 65 * 10**6]
+    monkeypatch.setattr(
+        recordings_module.shutil,
+        "disk_usage",
+        lambda path: SimpleNamespace(free=free.pop(0) if len(free) > 1 else free[0]),
+    )
+    told: list[str] = []
+    session, recordings = a_session(Endless(600), tmp_path / "out", dome, told)
+    session.record(True)
+    session.run()
+    assert session.figures.frames == 600
+    assert "found 65 MB left, which the files of the 384 frames so far may need" in told[0]
+    (saved,) = recordings.finish()
+    assert (saved.frames, saved.error) == (384, "")
+    assert len(load_take(tmp_path / "out" / "weights.csv")) == 384
+    held_free = 384 * 24 * (63 + 2 * (len(load_rig(dome).names) + 11))
+    assert sum(path.stat().st_size for path in (tmp_path / "out").iterdir()) < held_free
 
 
 def test_memory_does_not_grow_with_the_frames(dome: Path, tmp_path: Path) -> None:

@@ -9,6 +9,7 @@ import socket
 import warnings
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -32,6 +33,7 @@ from torchface.rendering.point_light import PointLight
 from torchface.shape_names import ARKIT, mapping
 from torchface.synthetic.head.performer import performer
 from torchface.workflows.live.live_actor import track_live
+from torchface.workflows.live.recordings import FrameLog
 from torchface.workflows.named_finders import load_finder
 from torchface.workflows.track import frame_readings
 from torchface.workflows.track.face_overlay import mesh_drawer, paint_drawer, undistorted
@@ -448,6 +450,23 @@ def test_a_played_video_is_sent_frame_by_frame(filmed: Filmed, tmp_path: Path) -
         track_live(str(filmed.video), filmed.rig, ["tcp://x"])
     with pytest.raises(FileFormatError, match="camera 97: cannot be opened"):
         track_live("97", filmed.rig, [address])
+
+
+def test_a_disk_that_fills_ends_the_curves_and_not_the_stream(
+    filmed: Filmed, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    append = FrameLog.append
+
+    def full(log: FrameLog, *given: Any) -> None:
+        if log.count == 2:
+            raise FileFormatError("the disk is full")
+        append(log, *given)
+
+    monkeypatch.setattr(FrameLog, "append", full)
+    report = track_live(str(filmed.video), filmed.rig, ["udp://127.0.0.1:9"], tmp_path)
+    assert report.figures.frames + report.dropped == FRAMES > 2
+    assert "the curves end at frame 2: the disk is full" in report.notes
+    assert len(load_take(tmp_path / "weights.csv")) == 2
 
 
 def test_the_command_says_what_is_missing(filmed: Filmed, capsys: pytest.CaptureFixture[str]) -> None:

@@ -14,7 +14,7 @@ from torchface.capture.anybody import WebcamControls
 from torchface.capture.own_rig import VideoState
 from torchface.capture.own_rig.landmark_offsets import LandmarkOffsets
 from torchface.capture.own_rig.outlier_landmarks import landmark_reach, outlier_landmarks
-from torchface.errors import ValueRangeError
+from torchface.errors import FileFormatError, ValueRangeError
 from torchface.files.whole_files import all_or_none, make_folder
 from torchface.geometry.cameras.distortion import undistort
 from torchface.io.protocols.weight_sender import find_receiver
@@ -103,7 +103,7 @@ def track_live(
         known = settings.offsets or (None if out is None or not (out / OFFSETS).is_file() else out / OFFSETS)
         offsets = None if known is None else offsets_of(known, inputs)
         solver = ActorSolver(inputs, offsets)
-        log = None if out is None else FrameLog(make_folder(out), actor.names)
+        log = running = None if out is None else FrameLog(make_folder(out), actor.names)
         with (
             log or nullcontext(),
             WeightStreams(addresses, actor.names, source.video.fps, lambda note: None) as streams,
@@ -112,8 +112,12 @@ def track_live(
                 for came, _, solved in solved_frames(source, solver):
                     streams.send(solved.weights, solved.rotations)
                     figures.add(came, time.perf_counter(), solved.seen)
-                    if log is not None:
-                        log.append(came, solved.weights, solved.rotations)
+                    if running is not None:
+                        try:
+                            running.append(came, solved.weights, solved.rotations)
+                        except FileFormatError as error:  # a full disk ends the curves and not the stream
+                            notes.append(f"the curves end at frame {running.count}: {error}")
+                            running = None
                     progress(f"sending to {', '.join(addresses)}", figures.frames)
                     if seconds is not None and figures.seconds >= seconds:
                         break

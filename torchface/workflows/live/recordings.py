@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import signal
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -16,7 +17,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchface.errors import TorchfaceError, ValueRangeError
+from torchface.errors import FileFormatError, TorchfaceError, ValueRangeError
 from torchface.files.temporary_files import new_temporary
 from torchface.files.whole_files import all_or_none, make_folder, write_file
 from torchface.files.write_errors import unwritten
@@ -29,6 +30,15 @@ from torchface.workflows.live.character import Character
 from torchface.workflows.live.live_frames import LiveFrame
 
 _EVEN = 1e-6  # seconds by which times that are even may be off
+_LOOK = 128  # frames between looks at how full the disk is
+_RESERVE, _NUMBER_BYTES = (
+    2**26,
+    24,
+)  # of the character in the animation; of a number as text, with its share of the rest
+
+
+def _columns(names: Sequence[str]) -> int:
+    return len(names) + len(ROTATIONS) + 2  # times and timecodes
 
 
 class FrameLog:
@@ -37,10 +47,12 @@ class FrameLog:
     Args:
         folder: where there is space; it must exist.
         names: of the weights, (N,).
+        columns: numbers a frame in the files that are made of it; those of one table if absent.
     """
 
-    def __init__(self, folder: Path, names: tuple[str, ...]) -> None:
+    def __init__(self, folder: Path, names: tuple[str, ...], columns: int | None = None) -> None:
         self.names, self.count = names, 0
+        self._columns = _columns(names) if columns is None else columns
         numbers = (len(names),), (len(ROTATIONS),)
         self._row = np.dtype([("weights", "<f4", *numbers[:1]), ("rotations", "<f4", *numbers[1:]), ("time", "<f8")])
         self._first = 0.0
@@ -54,8 +66,10 @@ class FrameLog:
         """Adds a frame: when it came in seconds of any clock, weights (N,), rotations (9,).
 
         Raises:
-            FileFormatError: the disk is full.
+            FileFormatError: the disk is full, but for what the files of the frames before need.
         """
+        if self.count % _LOOK == 0:
+            self._check_room()
         if self.count == 0:
             self._first = came
         row = np.zeros(1, self._row)
@@ -67,6 +81,15 @@ class FrameLog:
             raise unwritten(self._path, error) from error
         self.count += 1  # last: of a frame at which an interrupt came in between nothing is read
 
+    def _check_room(self) -> None:
+        needed = _RESERVE + (self.count + 2 * _LOOK) * self._columns * _NUMBER_BYTES
+        with suppress(OSError):  # a file system that does not say
+            if (free := shutil.disk_usage(self._path.parent).free) < needed:
+                raise FileFormatError(
+                    f"{self._path.parent}: found {free / 1e6:,.0f} MB left, which the files of the {self.count} frames "
+                    "so far may need; free some, or name a place on another disk"
+                )
+
     def take(self, fps: float) -> Take:
         """The frames, as they lie on the disk: valid until the log is closed.
 
@@ -75,7 +98,10 @@ class FrameLog:
         """
         if self.count == 0:
             raise ValueRangeError("recording: found no frame, expected at least one")
-        self._file.flush()
+        try:
+            self._file.flush()
+        except OSError as error:
+            raise unwritten(self._path, error) from error
         rows = np.memmap(self._path, self._row, "c", shape=(self.count,))
         seconds = torch.from_numpy(rows["time"].copy())
         angles = torch.from_numpy(rows["rotations"].astype(np.float64))
@@ -150,7 +176,8 @@ class Recordings:
             FileFormatError: nothing can be written there.
         """
         self._place = self._next()
-        self._log, self._found = FrameLog(make_folder(self._place), ARKIT), 0
+        columns = _columns(ARKIT) + 2 * _columns(self._character.rig.names)  # Live Link, weights, animation
+        self._log, self._found = FrameLog(make_folder(self._place), ARKIT, columns), 0
         return self._place
 
     def add(self, came: float, frame: LiveFrame) -> None:
