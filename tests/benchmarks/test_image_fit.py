@@ -37,7 +37,7 @@ from torchface.rendering.compositing import caption, heat_colors, save_rendered_
 from torchface.rig import BlendshapeRig
 from torchface.shape_names import mapping
 from torchface.synthetic import performer
-from torchface.workflows.fit.fit_overlay import overlay
+from torchface.workflows.fit.photograph_rig import overlay
 
 pytestmark = pytest.mark.real
 

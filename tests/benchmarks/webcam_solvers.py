@@ -38,8 +38,7 @@ from torchface.synthetic import performer
 from torchface.temporal.adaptive_kalman import LANDMARK_SETTINGS, AdaptiveFilter
 from torchface.workflows.track.track_inputs import solver_for
 from torchface.workflows.track.track_models import load_track_models
-from torchface.workflows.webcam.default_solver import default_webcam_solver
-from torchface.workflows.webcam.webcam_graph import webcam_networks
+from torchface.workflows.webcam.webcam_graph import default_webcam_solver, webcam_networks
 
 _LEAST = 6  # landmarks that a solve needs
 

@@ -11,7 +11,7 @@ from torch.nn.functional import pad
 from torchface.capture.energy import Quadratic, chunks_of_frames
 from torchface.correctives.activation import CorrectiveActivation, RoundedActivation
 from torchface.optim.box_problem import BoxProblem
-from torchface.optim.fixed_point_gradient import attach_gradients
+from torchface.optim.implicit import attach_gradients
 from torchface.optim.prepared_program import PreparedProgram
 
 _MAX_STEPS = 30

@@ -1,8 +1,14 @@
-"""Takes in and out, by the file's suffix and header."""
+"""Takes in and out, by the file's suffix and header, in the usual units."""
 
 from __future__ import annotations
 
+import math
+import warnings
+from dataclasses import replace
 from pathlib import Path
+
+import torch
+from torch import Tensor
 
 from torchface.errors import FileFormatError, ValueRangeError
 from torchface.files.whole_files import check_ending
@@ -13,12 +19,19 @@ from torchface.io.markers.trc import load_trc, save_trc
 from torchface.io.tables.csv_table import TableReader, quoted
 from torchface.io.tables.numbered_csv import is_numbered
 from torchface.io.weights.live_link_csv import are_live_link_shapes, is_live_link, load_live_link, save_live_link
-from torchface.io.weights.usual_units import in_usual_units
-from torchface.io.weights.weight_csv import load_weights_csv, save_weights_csv
-from torchface.take import Take
+from torchface.io.weights.weight_csv import ROTATIONS, load_weights_csv, save_weights_csv
+from torchface.take import Take, Track
 
 MARKER_ENDINGS = (".c3d", ".trc")
 TAKE_ENDINGS = (*MARKER_ENDINGS, ".csv")
+
+LARGEST_WEIGHT = 5.0
+"""Nobody drives a shape so far; where a tenth of the frames do, weights are in percent."""
+
+LARGEST_ANGLE = math.pi
+"""No rotation in radians is larger; where it is in a tenth of the frames, it is in degrees."""
+
+_SHARE, _MOST_PERCENT, _MOST_DEGREES = 0.1, 200.0, 360.0
 
 
 def load_take(path: str | Path, unit: str | None = None) -> Take:
@@ -114,3 +127,29 @@ def save_take(take: Take, path: str | Path) -> None:
             "save_markers_csv and save_landmarks_csv each write theirs"
         )
     return save_markers_csv(take, path) if take.markers is not None else save_landmarks_csv(take, path)
+
+
+def in_usual_units(take: Take, path: Path) -> Take:
+    """The take with weights from 0 to 1 and rotations in radians; what is converted, a ``UserWarning`` says."""
+    if take.weights is not None and (most := _largest(take.weights.values.flatten(1), LARGEST_WEIGHT, _MOST_PERCENT)):
+        _warn(path, f"weights up to {most:.4g}", "0 to 1", "percent")
+        weights = Track(take.weights.names, take.weights.values / 100, take.weights.confidence)
+        take = replace(take, weights=weights)
+    columns = take.extras.get("columns", {})
+    angles = {name: column for name, column in columns.items() if name in ROTATIONS and isinstance(column, Tensor)}
+    if angles and (most := _largest(torch.stack(list(angles.values()), 1), LARGEST_ANGLE, _MOST_DEGREES)):
+        _warn(path, f"head and eye rotations up to {most:.4g}", "radians", "degrees")
+        columns = columns | {name: column * (math.pi / 180) for name, column in angles.items()}
+        take = replace(take, extras=take.extras | {"columns": columns})
+    return take
+
+
+def _largest(values: Tensor, usual: float, most: float) -> float:
+    """The largest of values (T,C), where many frames are beyond the usual and none beyond the unit's; else 0."""
+    largest = values.abs().nan_to_num(0.0).amax(1) if values.numel() else values.new_zeros(1)
+    beyond = float((largest > usual).double().mean())
+    return float(largest.max()) if beyond >= _SHARE and float(largest.max()) <= most else 0.0
+
+
+def _warn(path: Path, found: str, expected: str, taken: str) -> None:
+    warnings.warn(f"{path}: found {found}, expected {expected}; they are taken for {taken}", stacklevel=4)

@@ -9,7 +9,8 @@ from torch import Tensor, nn
 from torch.func import functional_call
 
 from torchface.capture.own_rig.face_points import LANDMARKS
-from torchface.capture.own_rig.gauss_newton import HeadState
+from torchface.capture.own_rig.frame_states import FrameTerms
+from torchface.capture.own_rig.gauss_newton import SLIDING_STEPS, HeadState, split_step
 from torchface.capture.own_rig.solver_components import (
     DEFAULT_WEIGHT_STEP,
     INITIAL_ROTATION,
@@ -18,15 +19,16 @@ from torchface.capture.own_rig.solver_components import (
     ROTATION_STEP,
     TRANSLATION_STEP,
 )
+from torchface.capture.own_rig.state_estimate import Expectation
 from torchface.capture.own_rig.video_solver import VideoSolver
 from torchface.capture.own_rig.weight_walk import faded, relative_trust, unseen_time, walk_information
 from torchface.capture.priors import AdaptedDynamicsPrior, DynamicsPrior
 from torchface.errors import ShapeError, ValueRangeError
 from torchface.geometry.cameras.affine_pose import affine_pose, orthonormal
-from torchface.onnx.gauss_newton_step import GaussNewtonStep, frame_terms
 from torchface.optim.exported_operators import symmetric_inverse
 
 _MIN_LANDMARKS = 6
+_SPLITTING_STEPS = 40
 
 
 class VideoGraph(nn.Module):
@@ -241,3 +243,62 @@ def _where(condition: Tensor, one: HeadState, other: HeadState) -> HeadState:
         torch.where(condition, one.rotation, other.rotation),
         torch.where(condition, one.translation, other.translation),
     )
+
+
+class GaussNewtonStep(nn.Module):
+    r"""Moves weights and pose toward the least of ``VideoSolver.energy`` linearised where they are, weights in [0,1].
+
+    Args:
+        solver: the exact solve.
+
+    Raises:
+        ValueRangeError: the solver's prior is none of Student's distributions.
+    """
+
+    upper: Tensor
+
+    def __init__(self, solver: VideoSolver) -> None:
+        super().__init__()
+        groups = None if solver.prior is None else solver.prior.prepared()
+        self.solver = copy.deepcopy(solver).double()
+        self.solver.prior, self.solver.dynamics = groups, None  # type: ignore[assignment]
+        self.register_buffer("upper", self.solver.rest.new_ones(len(solver.names)))
+
+    def forward(
+        self,
+        iteration: Tensor,
+        settled: Tensor,
+        weights: Tensor,
+        rotation: Tensor,
+        translation: Tensor,
+        dual: Tensor,
+        rows: Tensor,
+        *given: Tensor,
+    ) -> tuple[Tensor, ...]:
+        """The next values of the first seven arguments.
+
+        Args:
+            iteration: from 0, ().
+            settled: whether the last step moved no weight further than the tolerance, () bool.
+            weights, rotation, translation: (1,N), (1,3,3), (1,3).
+            dual: of the last program, (N+6,).
+            rows: which point each landmark is, (1,68).
+            given: tensors of :func:`frame_terms`.
+        """
+        head = HeadState(weights, rotation, translation)
+        rows = torch.where((iteration > 0) & (iteration < SLIDING_STEPS), self.solver.chosen(head), rows)
+        energy = self.solver.energy(frame_terms(*given), head, rows)
+        after, dual = split_step(energy, head, self.upper, dual, _SPLITTING_STEPS)
+        settled = (after.weights - weights).abs().max() < self.solver.settings.tolerance
+        return iteration + 1, settled, after.weights, after.rotation, after.translation, dual, rows
+
+
+def frame_terms(landmarks: Tensor, precision: Tensor, *expected: Tensor) -> FrameTerms:
+    """The terms of one frame's energy; poses are not tracked.
+
+    Args:
+        landmarks, precision: as of ``FrameTerms``, (1,68,2) and (1,68).
+        expected: mean weights, rotation and translation, (1,N), (1,3,3), (1,3), and the information, (1,N+6,N+6).
+    """
+    mean = HeadState(*expected[:3])
+    return FrameTerms(landmarks, precision, mean.rotation, mean.translation, Expectation(mean, expected[3]))

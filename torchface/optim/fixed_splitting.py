@@ -47,7 +47,7 @@ class FixedSplitting(nn.Module):
 
     Example:
         >>> H = torch.tensor([[2.0, 1.0], [1.0, 2.0]], dtype=torch.float64)
-        >>> FixedSplitting(H)(torch.tensor([[-1.0, 4.0]], dtype=torch.float64)).tolist()
+        >>> FixedSplitting(H)(torch.tensor([[-1.0, 4.0]], dtype=torch.float64)).round(decimals=5).tolist()
         [[0.5, 0.0]]
     """
 

@@ -26,7 +26,7 @@ from torchface.rendering.compositing import save_rendered_image
 from torchface.rig import BlendshapeRig
 from torchface.shape_names import arkit_sources, mapping
 from torchface.take import Take, Track
-from torchface.viz.figures.pose_pairs import pose_pairs
+from torchface.viz.figures.face_views import pose_pairs
 from torchface.workflows.weight_files import WeightFiles, check_live_link, weight_faults, write_weights
 
 

@@ -22,7 +22,7 @@ from torchface.capture.own_rig.weight_walk import faded, frame_intervals, unseen
 from torchface.errors import ShapeError, ValueRangeError
 from torchface.geometry.cameras.pnp import solve_pnp
 from torchface.optim.data_dependent import data_dependent
-from torchface.optim.fixed_point_gradient import attach_gradients
+from torchface.optim.implicit import attach_gradients
 from torchface.progress import Progress, silent
 
 _MIN_LANDMARKS = 6

@@ -13,7 +13,8 @@ from torch import Tensor
 from torchface.geometry.cameras.pinhole import Camera, look_at
 from torchface.mesh import Mesh
 from torchface.rendering.clay_shading import CLAY, DEFAULT_LIGHTING, Lighting, render
-from torchface.rendering.compositing import from_figure, heat_colors, sheet
+from torchface.rendering.compositing import caption, from_figure, heat_colors, sheet
+from torchface.rig import BlendshapeRig
 from torchface.viz.figures.region_colors import as_seen
 
 __all__ = ["face_views", "frame_face", "heat_map"]
@@ -21,6 +22,8 @@ __all__ = ["face_views", "frame_face", "heat_map"]
 FRONT, THREE_QUARTER, PROFILE = 0.0, 35.0, 90.0
 PICTURE_HEIGHTS = (16, 4096)
 """Least and largest height that a command draws a view in, pixels."""
+
+_COLUMNS, _MOST, _WIDTH, _HEIGHT = 6, 24, 200, 250
 
 
 def framing(mesh: Mesh, aspect: float = 0.8) -> tuple[Tensor, float]:
@@ -113,3 +116,26 @@ def clay_colors(mesh: Mesh) -> Tensor:
         torch.Size([1, 3])
     """
     return torch.tensor(CLAY).expand(len(mesh.vertices), 3)
+
+
+def pose_pairs(rig: BlendshapeRig, names: Sequence[str], wanted: Tensor, found: Tensor) -> Tensor:
+    """A column a pose: as an animator set it above, as the rules give it below; (3,H,W), 24 poses at most.
+
+    Args:
+        rig: the character, N shapes.
+        names: of the P poses.
+        wanted, found: weights, (P,N).
+    """
+    colors = clay_colors(rig.neutral)
+
+    def view(weights: Tensor, text: str) -> Tensor:
+        with torch.no_grad():
+            mesh = rig.neutral.with_vertices(rig(weights[None])[0])
+        drawn = face_views(mesh, (FRONT,), colors, _WIDTH, _HEIGHT, samples=1, framed_by=rig.neutral)
+        return caption(drawn, text, 13)
+
+    pairs = []
+    for name, given, learned in zip(names[:_MOST], wanted, found, strict=False):
+        off = float((given - learned).abs().max())
+        pairs.append(sheet([view(given, name[:26]), view(learned, f"learned, off by {off:.2f}")], 1))
+    return sheet(pairs, min(_COLUMNS, len(pairs)))

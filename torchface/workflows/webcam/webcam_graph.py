@@ -1,19 +1,27 @@
-"""The graph from a webcam's picture to weights: made once of the zoo's models, then taken from the cache."""
+"""The webcam's solver, and its graph from a picture to weights: made once of the zoo's models, then cached."""
 
 from __future__ import annotations
 
 import onnx
 
 from torchface import zoo
+from torchface.capture.anybody import WebcamSettings, WebcamSolver
+from torchface.errors import NameMismatchError
 from torchface.landmarks import BoxNetwork, LandmarkNetwork
 from torchface.landmarks.images.frame_reader.face_reader import FaceReader, WebcamNetworks
 from torchface.landmarks.images.networks.eye_network import EyeNetwork
+from torchface.modeling import HeadModel
 from torchface.onnx.webcam.webcam_model import WebcamGraph, webcam_model
 from torchface.onnx.webcam.webcam_solver_graph import WebcamSolverGraph
 from torchface.progress import Progress, silent
+from torchface.synthetic.head.performer import performer
 from torchface.workflows.cached_graph import cached_graph
-from torchface.workflows.track.track_models import DEFAULT_PRIOR
-from torchface.workflows.webcam.default_solver import HEADS, default_webcam_solver
+from torchface.workflows.track.track_models import DEFAULT_PRIOR, load_priors
+
+__all__ = ["default_webcam_solver"]
+
+HEADS = "head"
+"""The model of the zoo that says which heads there are."""
 
 NETWORKS = ("face_boxes", "landmark_network", "eye_network")
 MODELS = (*NETWORKS, HEADS, DEFAULT_PRIOR)
@@ -57,3 +65,21 @@ def webcam_graph(progress: Progress | None = None) -> bytes:
         return webcam_model(webcam_module(), {"licence": "MIT", "licences": licences})
 
     return cached_graph("webcam", make, _CODE, models={name: zoo.find(name) for name in MODELS})
+
+
+def default_webcam_solver(settings: WebcamSettings | None = None) -> WebcamSolver:
+    """The solver of the embedded performer's mean head, with the zoo's model of heads and prior of weights.
+
+    Raises:
+        NameMismatchError: the zoo's model of heads is another kind of model.
+
+    Example:
+        >>> default_webcam_solver().names[:2]
+        ('eyeBlinkLeft', 'eyeLookDownLeft')
+    """
+    rig = performer(texture=False)
+    heads = zoo.get_model(HEADS, HeadModel)
+    if heads.landmarks is None:
+        raise NameMismatchError(f"{HEADS}: found a HeadModel without landmarks, expected one with them")
+    modes = heads.shape.modes[:, heads.landmarks]
+    return WebcamSolver(rig, modes, load_priors(rig, DEFAULT_PRIOR, None).shapes, settings)

@@ -10,8 +10,7 @@ from torch import Tensor
 from torchface.attachment import Attachment
 from torchface.capture.markers.attachment.attachment_check import check_sites, mean_radius
 from torchface.capture.markers.attachment.frame_poses import MIN_MARKERS, frame_poses, solve_frames
-from torchface.capture.markers.attachment.site_iterations import LAST_RIDGE, FitState, SiteSolver
-from torchface.capture.markers.attachment.site_search import SiteSearch
+from torchface.capture.markers.attachment.site_iterations import LAST_RIDGE, FitState, SiteSearch, SiteSolver
 from torchface.capture.markers.attachment.site_uncertainty import SiteUncertainty
 from torchface.capture.markers.helmet_solver import HelmetMotion
 from torchface.capture.markers.marker_solver import check_labels

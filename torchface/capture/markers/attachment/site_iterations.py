@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import torch
+from scipy.spatial import cKDTree
 from torch import Tensor
 
 from torchface.attachment import Attachment
@@ -18,7 +19,6 @@ from torchface.capture.markers.attachment.frame_poses import (
     without_motion,
 )
 from torchface.capture.markers.attachment.site_curvature import ARM, SitesOnTake, TakeCurvature, pose_columns
-from torchface.capture.markers.attachment.site_search import SiteSearch
 from torchface.capture.markers.attachment.site_uncertainty import SITE_PRIOR, SiteUncertainty, site_uncertainty
 from torchface.capture.markers.rest_pose import inlier_markers, transformed_pose
 from torchface.capture.markers.surface_motion import SurfaceMotion, with_one
@@ -37,6 +37,9 @@ _OUTLIER_RATIO = 1.3
 _HELD = 1e15
 # The helmet slips where a rigid motion a frame leaves less than this part of the residual.
 _SLIP_RATIO, _MOTION_ITERATIONS = 0.85, 6
+_CANDIDATES = 24
+# Of so many triangles about a site those whose motion is most like the marker's are candidates, too.
+_NEIGHBOURHOOD, _SIMILAR = 400, 12
 
 
 @dataclass(frozen=True, eq=False)
@@ -229,3 +232,35 @@ class SiteSolver:
 
 def _parts(pose: Similarity) -> tuple[Tensor, Tensor, Tensor]:
     return pose.scale, pose.rotation, pose.translation
+
+
+class SiteSearch:
+    """Candidate triangles for sites; all on the skin, if the initial guess is."""
+
+    def __init__(self, motion: SurfaceMotion, initial: Attachment) -> None:
+        # Sites on another part, such as teeth, keep to the triangles of their own part.
+        skin = motion.skin if bool(motion.skin[initial.triangles].all()) else torch.ones_like(motion.skin)
+        self.rows = skin.nonzero()[:, 0]
+        self._faces = motion.faces
+        self._tree = cKDTree(motion.points[motion.faces[self.rows], :, 0].mean(1).numpy())
+
+    def near(self, points: Tensor, count: int = _CANDIDATES) -> Tensor:
+        """Rows of the faces nearest to points (M,3) at rest, (M,Q)."""
+        count = min(count, len(self.rows))
+        found = torch.from_numpy(self._tree.query(points.numpy(), k=count)[1])
+        return self.rows[found.reshape(len(points), count)]
+
+    def similar_motion(self, lifted: Tensor, points: Tensor, moments: PathMoments) -> Tensor:
+        """Of the faces round points (M,3) those whose middle moves most like the marker, (M,Q): across the lips, say.
+
+        Args:
+            lifted: affine maps of the vertices, (V,3,N+1).
+            points: the sites at rest.
+            moments: of the take.
+        """
+        around = self.near(points, _NEIGHBOURHOOD)
+        used, row = around.unique(return_inverse=True)
+        middle = (lifted[self._faces[used]].mean(1) @ moments.factor).flatten(1)
+        distance = torch.cdist(moments.path.flatten(1), middle).gather(1, row)
+        best = distance.topk(min(_SIMILAR, around.shape[1]), dim=1, largest=False).indices
+        return around.gather(1, best)

@@ -11,8 +11,7 @@ from torch import Tensor
 
 from torchface.geometry.meshes.operators import components
 from torchface.geometry.meshes.rasterization import rasterise_uvs
-from torchface.io.gltf.part_textures.iris_texture import painted_eye, stands_alone
-from torchface.io.gltf.part_textures.texture_painting import Paint, painted
+from torchface.io.gltf.part_textures.iris_texture import Paint, painted, painted_eye, stands_alone
 from torchface.io.gltf.region_materials import EYEBALL, EYELASHES, PARTS, SKIN, PartMaterial, part_material
 from torchface.mesh import Mesh
 

@@ -6,11 +6,14 @@ under a clear cornea, and the inner one, which the hole shows, the iris round th
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import dataclass
+
 import torch
 from torch import Tensor
 
 from torchface.geometry.meshes.operators import components
-from torchface.io.gltf.part_textures.texture_painting import Paint, painted
+from torchface.geometry.meshes.rasterization import rasterise_uvs
 from torchface.io.gltf.region_materials import CORNEA, EYEBALL, IRIS, SCLERA, PartMaterial
 from torchface.mesh import Mesh
 
@@ -22,6 +25,7 @@ _RIM, _DARK, _VEINS = (0.07, 0.05, 0.04), (0.012, 0.010, 0.010), (0.80, 0.60, 0.
 _OUTLIER, _MAX_ITERATIONS = 2.5, 6
 _INNER = (0.50, 0.36, 0.20)  # round the pupil of a brown iris
 _MAX_COLOR_DIFFERENCE = 0.02
+_SIDE = 512
 
 
 def stands_alone(faces: Tensor, inside: Tensor) -> bool:
@@ -168,3 +172,36 @@ def _ramp(value: Tensor, low: float, high: float) -> Tensor:
     """0 below ``low``, 1 above ``high``, smooth between."""
     weight = ((value - low) / (high - low)).clamp(0, 1)
     return weight * weight * (3 - 2 * weight)
+
+
+@dataclass(frozen=True, eq=False)
+class Paint:
+    """Colours of a part, sRGB and opacity.
+
+    Args:
+        image: in the mesh's own layout, (4,S,S); or
+        colors: of its vertices, (V,4), where it has none.
+    """
+
+    image: Tensor | None
+    colors: Tensor | None
+
+
+def painted(mesh: Mesh, rows: Tensor, values: Tensor, color: Callable[[Tensor], Tensor], side: int = _SIDE) -> Paint:
+    """Colours by values at the vertices, as an image where one tile holds the part's texture coordinates.
+
+    Args:
+        mesh: V vertices.
+        rows: the part's triangles, (K,).
+        values: of the vertices, (V,C).
+        color: sRGB and opacity (N,4) of values (N,C).
+        side: texels a side of the image.
+    """
+    if mesh.uvs is None or mesh.uv_faces is None:
+        return Paint(None, color(values).float())
+    corners = mesh.uvs[mesh.uv_faces[rows]].double()
+    tile = corners.reshape(-1, 2).mean(0).floor()
+    if not bool(((corners >= tile) & (corners <= tile + 1)).all()):
+        return Paint(None, color(values).float())
+    texels = rasterise_uvs(mesh.uvs.double() - tile, mesh.uv_faces[rows], side, side)
+    return Paint(texels.image(color(texels.interpolate(values, mesh.faces[rows]))), None)
