@@ -40,11 +40,6 @@ class GraphBuilder:
         self._root._constants[name] = numpy_helper.from_array(np.ascontiguousarray(array), name)
         return name
 
-    def scalar(self, name: str, value: int) -> str:
-        """An int64 constant without axes."""
-        self._root._constants[name] = numpy_helper.from_array(np.array(value, np.int64), name)
-        return name
-
     def double(self, value: Tensor) -> str:
         """A float64 constant under a name of its own; the same numbers are kept once."""
         array = value.detach().cpu().numpy().astype(np.float64, order="C")

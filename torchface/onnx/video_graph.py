@@ -21,7 +21,7 @@ from torchface.capture.own_rig.solver_components import (
 )
 from torchface.capture.own_rig.state_estimate import Expectation
 from torchface.capture.own_rig.video_solver import VideoSolver
-from torchface.capture.own_rig.weight_walk import faded, relative_trust, unseen_time, walk_information
+from torchface.capture.own_rig.weight_walk import relative_trust, unseen_time
 from torchface.capture.priors import AdaptedDynamicsPrior, DynamicsPrior
 from torchface.errors import ShapeError, ValueRangeError
 from torchface.geometry.cameras.affine_pose import affine_pose, orthonormal
@@ -71,8 +71,7 @@ class VideoGraph(nn.Module):
     initial_information: Tensor
     initial_covariance: Tensor
     motion_variance: Tensor
-    tells: Tensor
-    walk_variance: Tensor
+    influence: Tensor
 
     def __init__(self, solver: VideoSolver) -> None:
         super().__init__()
@@ -89,9 +88,8 @@ class VideoGraph(nn.Module):
             "landmark_weights": solver.landmark_weights.double(),
             "to_rays": torch.linalg.inv(solver.intrinsics.double()).T.contiguous(),
             "initial_information": solver.initial_information.double().diag(),
-            # What each landmark alone tells of each shape, (68,N).
-            "tells": solver.shape_confidence(torch.eye(LANDMARKS, dtype=torch.float64, device=solver.rest.device)),
-            "walk_variance": solver.walk_variance.double(),
+            # Share of each landmark in the evidence of each shape, (68,N).
+            "influence": solver.shape_confidence(torch.eye(LANDMARKS, dtype=torch.float64, device=solver.rest.device)),
             "initial_covariance": torch.tensor(deviations, dtype=torch.float64).square().diag(),
             "motion_variance": torch.tensor([ROTATION_STEP**2] * 3 + [TRANSLATION_STEP**2] * 3, dtype=torch.float64),
         }.items():
@@ -100,10 +98,10 @@ class VideoGraph(nn.Module):
     @property
     def outputs(self) -> tuple[str, ...]:
         """Names of what ``forward`` returns."""
-        own = ("weights", "rotation", "translation")
+        names = ("weights", "rotation", "translation")
         if self.dynamics is None:
-            return (*own, "hidden") if self.walks else own
-        return (*own, "window", "mean", "covariance")
+            return (*names, "hidden") if self.walks else names
+        return (*names, "window", "mean", "covariance")
 
     @property
     def state(self) -> tuple[str, ...]:
@@ -135,28 +133,28 @@ class VideoGraph(nn.Module):
             )
         state = {name: value.double() for name, value in zip(self.state, previous, strict=True)}
         unseen = torch.isnan(landmarks).any(1)
-        found = torch.where(unseen[:, None], 0.0, landmarks.double())
+        pixels = torch.where(unseen[:, None], 0.0, landmarks.double())
         trust = torch.where(unseen, 0.0, self.landmark_weights * confidence.double())
         enough = (~unseen).double().sum() > _MIN_LANDMARKS - 0.5
         first = torch.isnan(state["rotation"]).any()
-        rotation, translation = self._affine_pose(found, trust)
+        rotation, translation = self._affine_pose(pixels, trust)
         rotation = torch.where(first, rotation, orthonormal(state["rotation"]))
         translation = torch.where(first, translation, state["translation"])
         window = state["weights"][None] if self.dynamics is None else state["window"]
         weights = torch.where(first, 0.0, window[-1]).clamp(0, 1)
         head = HeadState(weights[None], rotation[None], translation[None])
         counts = torch.where(enough, (~unseen).double() * confidence.double(), 0.0)[None]
-        told = relative_trust(counts) @ self.tells
+        evidence = relative_trust(counts) @ self.influence
         interval = self.settings.interval
-        before = torch.where(first, 0.0, state["hidden"])[None] if self.walks else torch.zeros_like(told)
-        hidden = unseen_time(before, told, interval)
+        before = torch.where(first, 0.0, state["hidden"])[None] if self.walks else torch.zeros_like(evidence)
+        hidden = unseen_time(before, evidence, interval)
         if self.walks:
-            mean, information = self._walked(head, told, hidden, first)
+            mean, information = self._walked(head, evidence, hidden, first)
         else:
             mean, information = self._expected(head, window, first, state)
         noise = self.step.solver.noise(head.rotation, head.translation)
         precision = torch.where(enough, trust.sqrt() / noise, 0.0)[None]
-        given = (found[None], precision, mean.weights, mean.rotation, mean.translation, information[None])
+        given = (pixels[None], precision, mean.weights, mean.rotation, mean.translation, information[None])
         solved, rows = self._solved(head, given, ~enough)
         # A face that is not seen stays as it was, or goes to rest.
         head = _where(enough, solved, HeadState(mean.weights, head.rotation, head.translation) if self.walks else head)
@@ -202,20 +200,18 @@ class VideoGraph(nn.Module):
         )
         return HeadState(weights, rotation, translation), rows
 
-    def _affine_pose(self, found: Tensor, trust: Tensor) -> tuple[Tensor, Tensor]:
+    def _affine_pose(self, pixels: Tensor, trust: Tensor) -> tuple[Tensor, Tensor]:
         """The pose (3,3), (3,) in which an affine camera sees the rig at rest as landmarks (68,2) are."""
-        rays = torch.nn.functional.pad(found, (0, 1), value=1.0) @ self.to_rays
+        rays = torch.nn.functional.pad(pixels, (0, 1), value=1.0) @ self.to_rays
         return affine_pose(self.step.solver.rest[:LANDMARKS], rays[:, :2] / rays[:, 2:], trust)
 
-    def _walked(self, head: HeadState, told: Tensor, hidden: Tensor, first: Tensor) -> tuple[HeadState, Tensor]:
+    def _walked(self, head: HeadState, evidence: Tensor, hidden: Tensor, first: Tensor) -> tuple[HeadState, Tensor]:
         """The prediction for this frame from the last one's weights: the mean and its information (N+6,N+6)."""
-        interval = self.settings.interval
-        walked = walk_information(self.walk_variance, told, interval)[0]
-        information = torch.cat([walked, self.initial_information.diagonal()[-6:]]).diag()
-        weights = torch.where(first, 0.0, head.weights * faded(hidden, interval))
+        walked = self.step.solver.walked(head, evidence, hidden, self.settings.interval)
+        weights = torch.where(first, 0.0, walked.mean.weights)
         return (
             HeadState(weights, head.rotation, head.translation),
-            torch.where(first, self.initial_information, information),
+            torch.where(first, self.initial_information, walked.information[0]),
         )
 
     def _expected(

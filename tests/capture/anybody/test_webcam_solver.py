@@ -47,7 +47,7 @@ def weights_of(**weights: float) -> Tensor:
 
 def seen(solver: WebcamSolver, person: Tensor, weights: Tensor, turn: tuple[float, float, float]) -> FaceReading:
     """Exact landmarks of a person, iris and openness unknown; which points the contour is follows the pose."""
-    points = solver.personal_points(person)
+    points = solver.person.points(person)
     own = (weights @ solver.to_arkit)[None]
     rotation = (UPRIGHT @ rotation_matrix(torch.tensor(turn, dtype=torch.float64)))[None]
     translation = torch.tensor([[10.0, 30.0, 620.0]], dtype=torch.float64)
@@ -78,8 +78,8 @@ def known(solver: WebcamSolver, person: Tensor) -> WebcamState:
 
 def test_a_planted_person_comes_back(solver: WebcamSolver, person: Tensor, known: WebcamState) -> None:
     """In the picture's plane, where a webcam sees; beside what a pose explains."""
-    planted, found = (solver.personal_points(p.double()).rest[17:68, :2] for p in (person, known.person))
-    mean = solver.personal_points(torch.zeros_like(person)).rest[17:68, :2]
+    planted, found = (solver.person.points(p.double()).rest[17:68, :2] for p in (person, known.person))
+    mean = solver.person.points(torch.zeros_like(person)).rest[17:68, :2]
     before, after = ((x - planted - (x - planted).mean(0)).square().sum(1).mean().sqrt() for x in (mean, found))
     assert float(before) > 2.5
     assert float(after) < 0.8

@@ -10,7 +10,7 @@ from torch.nn.functional import conv2d, pad
 
 from torchface.errors import ShapeError
 
-SCALES, ORIENTATIONS = 2, 4
+ORIENTATIONS = 4
 
 
 class GaborBank(nn.Module):
@@ -34,7 +34,7 @@ class GaborBank(nn.Module):
 
     def __init__(self, wavelengths: tuple[float, float] = (6.0, 12.0), stride: int = 4) -> None:
         super().__init__()
-        self.wavelengths, self.stride = wavelengths, stride
+        self.stride = stride
         reach = math.ceil(0.9 * max(wavelengths))
         kernels = torch.stack([
             _kernel(length, math.pi * k / ORIENTATIONS, reach) for length in wavelengths for k in range(ORIENTATIONS)

@@ -152,7 +152,7 @@ def eye_signals(
     """
     openness, closed, visibility = read.openness, read.closed, read.visibility
     known = ~torch.isnan(openness)
-    found = torch.where(known, openness, usual)
+    opening = torch.where(known, openness, usual)
     shut = torch.where(torch.isnan(closed), 0.0, closed)
     visible = torch.where(torch.isnan(visibility), 1.0, visibility).clamp(0, 1)
     resting, shutting = (pose - 1).abs() < 0.5, (pose - 5).abs() < 0.5
@@ -177,8 +177,8 @@ def eye_signals(
     level, floor = usual + before.lids[:, 0], _SHUT + before.lids[:, 1]
     span = (level - floor).clamp(min=0.03)
     by_look = 1 + looking @ look_weights(ahead) * any_gaze
-    part = (found - floor) / span
-    rested = floor + (found - floor) / by_look.clamp(min=0.4)
+    part = (opening - floor) / span
+    rested = floor + (opening - floor) / by_look.clamp(min=0.4)
     # Narrow eyes stay so, blinks do not: what is far below the level counts, and moves it slowly.
     counts = learns * known * visible * (shut < _SURELY_OPEN) * (part > _NARROWEST) * ~shutting
     falls = torch.where(resting, 1.0, torch.where(rested < level, _DOWNWARD, 1.0))
@@ -186,7 +186,7 @@ def eye_signals(
     opened = before.lids[:, 0] + lid_rate * (rested - level)
     is_shut = learns * known * visible * ((shut > _SURELY_SHUT) | (shutting & (part < 0.6)))
     shut_rate = is_shut * interval / (before.lids_seen[:, 1].clamp(max=_SHUT_MEMORY) + _SHUT_PRIOR + interval)
-    closes = before.lids[:, 1] + shut_rate * (found - floor)
+    closes = before.lids[:, 1] + shut_rate * (opening - floor)
     lids = torch.stack([opened, closes], dim=1)
     lids_seen = before.lids_seen + interval * torch.stack([counts, is_shut], dim=1)
 

@@ -55,7 +55,7 @@ def calmed_state(
     outputs: OutputTables,
     after: WebcamState,
     before: WebcamState,
-    found: Tensor,
+    has_face: Tensor,
     present: Tensor,
     interval: Tensor,
     gain: Tensor,
@@ -82,9 +82,9 @@ def calmed_state(
     fit = ((LOST_FIT - after.error) / (LOST_FIT - _MISFIT)).clamp(0, 1)
     return replace(
         after,
-        weights=torch.where(found, calm[:-6].clamp(0, 1), after.weights),
-        rotation=torch.where(found, rotation, before.rotation),
-        translation=torch.where(found, translation, before.translation),
-        speeds=torch.where(found, speeds, after.speeds),
-        tracked=torch.where(found, present * fit, 0.0),
+        weights=torch.where(has_face, calm[:-6].clamp(0, 1), after.weights),
+        rotation=torch.where(has_face, rotation, before.rotation),
+        translation=torch.where(has_face, translation, before.translation),
+        speeds=torch.where(has_face, speeds, after.speeds),
+        tracked=torch.where(has_face, present * fit, 0.0),
     )

@@ -132,7 +132,7 @@ class WebcamSolver(nn.Module):
 
     to_arkit: Tensor
     lid_ridge: Tensor
-    tells: Tensor
+    influence: Tensor
     open_rows: Tensor
     usual_openness: Tensor
     look_shapes: Tensor
@@ -175,8 +175,8 @@ class WebcamSolver(nn.Module):
             "lid_ridge": torch.tensor(
                 [_LID_RIDGE.get(n.removesuffix("Left").removesuffix("Right"), 0.0) for n in called]
             ),
-            # How much of what could tell of each shape each landmark is, (68,N).
-            "tells": moved / moved.sum(0).clamp(min=1e-6),
+            # Share of each landmark in the evidence of each shape, (68,N).
+            "influence": moved / moved.sum(0).clamp(min=1e-6),
             "open_rows": rows,
             "usual_openness": usual,
             "look_shapes": mapping(LOOKS, rig.names).double(),
@@ -277,9 +277,9 @@ class WebcamSolver(nn.Module):
         eyes = points.eyes_distance(rotation[None], translation[None], self.camera)[0]
         signals = self._eye_signals(points, frame, before, rotation, translation)
 
-        told = relative_trust(torch.where(frame.trust > 0, frame.trust, 0.0)[None]) @ self.tells
-        hidden = unseen_time(before.hidden[None], told, frame.interval)
-        known = self._known_energy(signals, before, told, hidden, frame.interval)
+        evidence = relative_trust(torch.where(frame.trust > 0, frame.trust, 0.0)[None]) @ self.influence
+        hidden = unseen_time(before.hidden[None], evidence, frame.interval)
+        known = self._known_energy(signals, before, evidence, hidden, frame.interval)
         upper = highest_weights(gain_factors(before.gains, self.gain_shapes), self.gain_shapes, frame.pose)
         unit = eyes / (points.rest[EYE_CORNERS[0]] - points.rest[EYE_CORNERS[1]]).norm()
         variance = (self.settings.noise * eyes).square() + (0.5 * frame.spread).square()
@@ -349,10 +349,10 @@ class WebcamSolver(nn.Module):
         )
 
     def _known_energy(
-        self, signals: EyeSignals, before: WebcamState, told: Tensor, hidden: Tensor, interval: Tensor
+        self, signals: EyeSignals, before: WebcamState, evidence: Tensor, hidden: Tensor, interval: Tensor
     ) -> Quadratic:
         """Of the weights (1,N), whatever they are: the frame before, openness, gaze, sparsity and ridge."""
-        walked = walk_information((self.settings.motion * self.walk).square(), told, interval + before.lost)[0]
+        walked = walk_information((self.settings.motion * self.walk).square(), evidence, interval + before.lost)[0]
         mean = before.shapes * faded(hidden, interval)[0]
         looking = self.look_shapes @ look_weights(signals.gaze)
         pull = self.look_shapes @ signals.gaze_trust[self.look_eyes] / self.settings.gaze_noise**2
@@ -362,10 +362,6 @@ class WebcamSolver(nn.Module):
         f = self.settings.sparsity * (1 + _UNKNOWN * unknown) - walked * mean - pull * looking
         opened = (self.open_rows.T * sure) @ self.open_rows
         return Quadratic((H + opened)[None], (f + (sure * (1 - signals.open)) @ self.open_rows)[None])
-
-    def personal_points(self, person: Tensor) -> FacePoints:
-        """The rig's points where a person's landmarks lie, of coefficients (D,)."""
-        return self.person.points(person)
 
     def _linearised(self, points: FacePoints, head: HeadState, rays: Tensor, precision: Tensor) -> Linearised:
         rows = points.chosen(head.weights, head.rotation, head.translation, self.camera)

@@ -72,7 +72,7 @@ def other_faces(looks: Tensor, relative: Tensor, trust: Tensor, boxes: Tensor) -
         >>> [(span.first, span.last) for span in spans]
         [(20, 39)]
     """
-    found: list[AnotherFace] = []
+    others: list[AnotherFace] = []
     known: list[_Span] = []
     for span in _spans(looks, relative, trust, _cuts(looks, boxes)):
         if not known:
@@ -83,8 +83,8 @@ def other_faces(looks: Tensor, relative: Tensor, trust: Tensor, boxes: Tensor) -
         if likeness > _ALIKE or (1 - likeness) / _LOOK + apart / _LANDMARKS < _MOST:
             known.append(span)
         else:
-            found.append(AnotherFace(span.first, span.last, likeness, apart))
-    return found
+            others.append(AnotherFace(span.first, span.last, likeness, apart))
+    return others
 
 
 def _cuts(looks: Tensor, boxes: Tensor) -> Tensor:

@@ -66,9 +66,9 @@ class FacePoints:
         stacked = torch.cat([rig.vertices[None], rig.deltas, *correctives]).detach()
         if not slides:
             values = stacked[:, marks].double()
-            own = torch.arange(JAW, device=marks.device)[:, None]
-            every, middle = torch.ones_like(own, dtype=torch.bool), marks.new_zeros(JAW).double()
-            return FacePoints._made(rig, values, own, every, middle)
+            vertex = torch.arange(JAW, device=marks.device)[:, None]
+            every, middle = torch.ones_like(vertex, dtype=torch.bool), marks.new_zeros(JAW).double()
+            return FacePoints._made(rig, values, vertex, every, middle)
         x, y = rig.vertices[:, 0].abs(), rig.vertices[:, 1]
         wing, top, bottom = float(x[marks[[31, 35]]].max()), float(y[marks[27]]), float(y[marks[33]])
         nose = (x < 1.2 * wing) & (y < top) & (y > bottom - 0.1 * (top - bottom))
@@ -181,9 +181,9 @@ def make_room_for_points(
     expected |= dict.fromkeys(by_curve, (JAW, curve))
     if shapes == expected and count >= LANDMARKS:
         for name, shape in shapes.items():
-            own = getattr(solver, name)
-            if own.shape != shape:
-                setattr(solver, name, own.new_zeros(shape))
+            buffer = getattr(solver, name)
+            if buffer.shape != shape:
+                setattr(solver, name, buffer.new_zeros(shape))
 
 
 def _thinned(curves: LevelCurves, vertices: Tensor) -> LevelCurves:

@@ -103,5 +103,5 @@ class FrameTerms:
 
     def tensors(self) -> tuple[Tensor, ...]:
         mean = self.expected.mean
-        own = (self.landmarks, self.precision, self.rotation, self.translation, self.expected.information)
-        return (*own, mean.weights, mean.rotation, mean.translation)
+        terms = (self.landmarks, self.precision, self.rotation, self.translation, self.expected.information)
+        return (*terms, mean.weights, mean.rotation, mean.translation)

@@ -108,8 +108,8 @@ class LandmarkOffsets:
         Raises:
             ValueRangeError: they are; the message says of which, and what to do.
         """
-        for what, own, other in (("rig", self.rig, rig), ("finder of landmarks", self.finder, finder)):
-            if own and other and own != other:
+        for what, stated, other in (("rig", self.rig, rig), ("finder of landmarks", self.finder, finder)):
+            if stated and other and stated != other:
                 raise ValueRangeError(
                     f"{source}: found offsets that were estimated with another {what}, expected those of this one; "
                     "leave --offsets out and they are estimated anew"

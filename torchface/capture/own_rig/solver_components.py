@@ -39,7 +39,7 @@ _DYNAMICS: dict[str, type[DynamicsPrior] | type[AdaptedDynamicsPrior]] = {
     "dynamics_prior": DynamicsPrior,
     "adapted_dynamics_prior": AdaptedDynamicsPrior,
 }
-_LEAST_TOLD = 1e-6  # mm²; less is nothing
+_LEAST_INFLUENCE = 1e-6  # mm²; less is nothing
 _MAX_SHAPES, _MAX_POINTS = 2**12, 2**20
 
 
@@ -134,8 +134,8 @@ class VideoSolverParts(nn.Module):
     def points(self) -> FacePoints:
         """Of the rig, float64."""
         more = None if self.corrective_basis is None else self.corrective_basis.double()
-        found = self.rest.double(), self.basis.double(), self.rows, self.valid, self.side.double()
-        return FacePoints(*found, self.activation, more)
+        parts = self.rest.double(), self.basis.double(), self.rows, self.valid, self.side.double()
+        return FacePoints(*parts, self.activation, more)
 
     @property
     def walks(self) -> bool:
@@ -152,13 +152,13 @@ class VideoSolverParts(nn.Module):
         return made
 
     def shape_confidence(self, trust: Tensor) -> Tensor:
-        """How much of what could tell of each shape is seen, (B,N) in [0,1], where landmarks count as (B,68) beside
-        their frame's surest.
+        """Share of each shape's evidence that is seen, (B,N) in [0,1], where landmarks count as (B,68) beside their
+        frame's surest.
 
-        What a landmark could tell of a shape is how far the shape moves it, squared.
+        A landmark's evidence of a shape is how far the shape moves it, squared.
         """
-        tells = self.basis[:LANDMARKS].square().sum(1).to(trust) * self.landmark_weights.to(trust)[:, None]
-        return (relative_trust(trust) @ tells) / tells.sum(0).clamp(min=_LEAST_TOLD)
+        influence = self.basis[:LANDMARKS].square().sum(1).to(trust) * self.landmark_weights.to(trust)[:, None]
+        return (relative_trust(trust) @ influence) / influence.sum(0).clamp(min=_LEAST_INFLUENCE)
 
     @property
     def config(self) -> dict[str, Any]:

@@ -197,27 +197,27 @@ class VideoSolver(VideoSolverParts):
         """
         given = [None if x is None else x[None] for x in (rotation, translation, confidence)]
         self._check(landmarks[None], *given)
-        found = landmarks[None].double()
+        pixels = landmarks[None].double()
         rotation, translation, confidence = (None if x is None else x.double() for x in given)
-        seen = torch.isfinite(found).all(-1)
+        seen = torch.isfinite(pixels).all(-1)
         # Filtered landmarks go on for some frames after a face was lost, with a confidence of 0.
-        trusted = int((self.landmark_trust(found, confidence) > 0).sum())
+        trusted = int((self.landmark_trust(pixels, confidence) > 0).sum())
         enough = trusted >= _MIN_LANDMARKS
         if state.head is None and not enough:
             raise ValueRangeError(
                 f"landmarks: found {trusted} in the first frame, expected at least {_MIN_LANDMARKS} to start"
             )
         if rotation is None or translation is None or not _finite(rotation, translation):
-            rotation, translation = self._pose_of(state, found, confidence, enough)
-        trust = self.landmark_trust(found, confidence) * enough
+            rotation, translation = self._pose_of(state, pixels, confidence, enough)
+        trust = self.landmark_trust(pixels, confidence) * enough
         interval = self.settings.interval if interval is None else interval
-        told = self.shape_confidence(trust)
-        hidden = unseen_time(state.hidden, told, interval)
-        expected = self._expected(state, rotation, translation, told, hidden, interval)
+        evidence = self.shape_confidence(trust)
+        hidden = unseen_time(state.hidden, evidence, interval)
+        expected = self._expected(state, rotation, translation, evidence, hidden, interval)
         at = HeadState(expected.mean.weights, rotation, translation) if state.head is None else state.head
         noise = self.noise(at.rotation, at.translation)
         precision = self._precision(seen if enough else torch.zeros_like(seen), confidence, noise)
-        terms = FrameTerms(found.nan_to_num(0.0), precision, rotation, translation, expected)
+        terms = FrameTerms(pixels.nan_to_num(0.0), precision, rotation, translation, expected)
         if state.head is not None and not enough:
             weights = expected.mean.weights if self.walks else state.head.weights
             held = HeadState(weights, rotation, translation)
@@ -246,21 +246,30 @@ class VideoSolver(VideoSolverParts):
         state: VideoState,
         rotation: Tensor,
         translation: Tensor,
-        told: Tensor,
+        evidence: Tensor,
         hidden: Tensor,
         interval: float,
     ) -> Expectation:
         """The prediction for the next frame from those before."""
         if state.estimate is not None and self.dynamics is not None:
             return self.predicted(state, state.estimate).expectation()
-        information = self.initial_information.double()
         if state.head is None or not self.walks:
             mean = HeadState(rotation.new_zeros(1, len(self.names)), rotation, translation)
-            return Expectation(mean, information.diag()[None])
-        walked = walk_information(self.walk_variance.double(), told, interval)
-        weights = state.head.weights * faded(hidden, interval)
-        information = torch.cat([walked, information[None, -6:]], dim=1)
-        return Expectation(HeadState(weights, rotation, translation), torch.diag_embed(information))
+            return Expectation(mean, self.initial_information.double().diag()[None])
+        return self.walked(HeadState(state.head.weights, rotation, translation), evidence, hidden, interval)
+
+    def walked(self, head: HeadState, evidence: Tensor, hidden: Tensor, interval: float) -> Expectation:
+        """The prediction of a random walk of the weights (B,N) of the frame before; a pose is expected where it is.
+
+        Args:
+            head: weights of the frame before, and the pose.
+            evidence, hidden: as of ``weight_walk``, (B,N).
+            interval: seconds since the frame before.
+        """
+        weights = walk_information(self.walk_variance.double(), evidence, interval)
+        motion = self.initial_information.double()[-6:].expand(len(weights), 6)
+        mean = HeadState(head.weights * faded(hidden, interval), head.rotation, head.translation)
+        return Expectation(mean, torch.diag_embed(torch.cat([weights, motion], dim=1)))
 
     def predicted(self, state: VideoState, estimate: StateEstimate) -> StateEstimate:
         """The prediction for the next frame from a frame's estimate."""

@@ -10,8 +10,8 @@ from torchface.errors import ShapeError, ValueRangeError
 HOLD, RELAXATION = 0.3, 0.3
 """Seconds that a hidden shape keeps its weight, and those in which it then falls to 1/e: at rest within about one."""
 HIDDEN = 0.25
-"""Share of what could tell of a shape, under which it counts as hidden."""
-# Of the random walk's variance: a shape that nothing tells of is not led off by what others do.
+"""Share of a shape's evidence, under which it counts as hidden."""
+# Of the random walk's variance: a shape without evidence is not led off by what others do.
 _LEAST_SHARE = 0.02
 _LEAST_TRUST = 0.05
 
@@ -22,16 +22,16 @@ def relative_trust(trust: Tensor) -> Tensor:
     return trust / trust.amax(1, keepdim=True).clamp(min=_LEAST_TRUST)
 
 
-def unseen_time(before: Tensor | None, told: Tensor, interval: float | Tensor) -> Tensor:
+def unseen_time(before: Tensor | None, evidence: Tensor, interval: float | Tensor) -> Tensor:
     """For how long shapes have been hidden, (B,N), seconds.
 
     Args:
         before: the same after the frame before, (B,N); None before the first.
-        told: how much of what could tell of each shape is seen, (B,N) in [0,1].
+        evidence: share of each shape's evidence that is seen, (B,N) in [0,1].
         interval: seconds since the frame before.
     """
-    since = torch.zeros_like(told) if before is None else before
-    return torch.where(told < HIDDEN, since + interval, 0.0)
+    since = torch.zeros_like(evidence) if before is None else before
+    return torch.where(evidence < HIDDEN, since + interval, 0.0)
 
 
 def faded(hidden: Tensor, interval: float | Tensor) -> Tensor:
@@ -39,15 +39,15 @@ def faded(hidden: Tensor, interval: float | Tensor) -> Tensor:
     return (-(hidden - HOLD).clamp(min=0).clamp(max=interval) / RELAXATION).exp()
 
 
-def walk_information(variance: Tensor, told: Tensor, interval: float | Tensor) -> Tensor:
-    """How sure the last frame's weights tell of this one's, one over a variance, (B,N).
+def walk_information(variance: Tensor, evidence: Tensor, interval: float | Tensor) -> Tensor:
+    """How certain the last frame's weights make this one's, one over a variance, (B,N).
 
     Args:
         variance: of the random walk after a second, (N,).
-        told: how much of what could tell of each shape is seen, (B,N) in [0,1].
+        evidence: share of each shape's evidence that is seen, (B,N) in [0,1].
         interval: seconds since the frame before.
     """
-    return 1 / (variance * interval * (told / HIDDEN).clamp(_LEAST_SHARE, 1.0))
+    return 1 / (variance * interval * (evidence / HIDDEN).clamp(_LEAST_SHARE, 1.0))
 
 
 def frame_intervals(seconds: Tensor | None, count: int, interval: float) -> list[float]:

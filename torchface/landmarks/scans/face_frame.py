@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from torchface.errors import ShapeError, ValueRangeError
 from torchface.geometry.similarity import Similarity, similarity_transform
 from torchface.landmarks.scans.cylinder import CylinderLayout, unwrap
-from torchface.landmarks.scans.pose_search import PoseSearch, find_pose, misfit, nose_candidates, protrusion, refine
+from torchface.landmarks.scans.pose_search import PoseSearch, find_pose, nose_candidates, protrusion, refine
 from torchface.landmarks.scans.surface_sample import sample_surface
 from torchface.landmarks.scans.uv_landmark_names import MIRRORED, UV_LANDMARK_NAMES
 from torchface.mesh import Mesh
@@ -142,10 +142,6 @@ class FaceFrame(nn.Module):
     def forward(self, scan: Mesh) -> Similarity:
         """See :meth:`locate`."""
         return self.locate(scan)
-
-    def misfit(self, scan: Mesh, pose: Similarity) -> float:
-        """Mean distance of the mean face from a scan in a pose, at most 12 a point, millimetres."""
-        return float(misfit(pose.inverse(), self.surface, self.normals, sample_surface(scan)))
 
     def _refined(self, sample: Any, pose: Similarity) -> Similarity:
         return refine(pose.inverse(), self.surface, self.normals, sample, _LAST_REACHES).inverse()

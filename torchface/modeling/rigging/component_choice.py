@@ -23,14 +23,12 @@ class Choice:
         outputs: components of the output.
         ridge: see ``ExpressionRegression.fit``.
         error: squared, summed over the samples left out, in the unit of the outputs.
-        error_of_mean: the same of the mean of the others.
     """
 
     inputs: int
     outputs: int
     ridge: float
     error: float
-    error_of_mean: float
 
 
 def choose_components(
@@ -59,11 +57,8 @@ def choose_components(
     ridges = RIDGES if ridge is None else (ridge,)
     most = len(inputs) - 2
     errors = torch.zeros(len(ridges), most, most + 1, dtype=torch.float64)
-    of_mean = 0.0
     for left_out in range(len(inputs)):  # a fold each: a spectrum each
-        fold = _fold_errors(gram_in, gram_out, left_out, ridges, most)
-        errors += fold
-        of_mean += float(fold[0, 0, 0])
+        errors += _fold_errors(gram_in, gram_out, left_out, ridges, most)
     allowed = torch.zeros_like(errors, dtype=torch.bool)
     rows = slice(None) if input_components is None else slice(min(input_components, most) - 1, None)
     columns = slice(1, None) if output_components is None else slice(min(output_components, most), None)
@@ -75,7 +70,7 @@ def choose_components(
     # Of equal errors the first: the smallest ridge and the smallest number of components.
     best = int(torch.where(allowed, errors, torch.inf).argmin())
     r, k, j = (int(index) for index in torch.unravel_index(torch.tensor(best), errors.shape))
-    return Choice(k + 1, j, ridges[r], float(errors[r, k, j]), of_mean)
+    return Choice(k + 1, j, ridges[r], float(errors[r, k, j]))
 
 
 def _gram(samples: Tensor) -> Tensor:

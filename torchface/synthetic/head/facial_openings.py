@@ -19,7 +19,7 @@ LIP_SHARES = (0.0, 0.3, 0.55, 0.75, 0.9, 1.0)
 
 UPPER_LID = 16  # edges along each lid; along each half lip there are 13
 HALF_LIP = 13
-MEDIAL_CORNER, LATERAL_CORNER = 29, 13
+MEDIAL_CORNER = 29
 MOUTH_HALF_WIDTH = 25.5
 STOMION_HEIGHT = -66.5
 

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from torchface.synthetic.head.handle_weights import LIP_HANDLES, HandleWeights, handle_weights
 from torchface.synthetic.head.identity import Anatomy, bump, mean_vertices, mirrored, ramp
-from torchface.synthetic.head.topology import MOUTH_BORDER, MOUTH_CONTACT, topology
+from torchface.synthetic.head.topology import MOUTH_CONTACT, topology
 
 JAW_ANGLE = math.radians(19.0)
 _HANDLE = torch.arange(LIP_HANDLES)
@@ -48,9 +48,6 @@ class Mouth:
         self.reach = jaw(head.vertices, head.hinges.mean(0)) / jaw(self.mean, mean_hinge)
         # The dental arch: how far the line of contact falls back toward the corners.
         self.arch = (line[0, 2] - line[13, 2]) / self.half_width**2.2
-        border = head.vertices[rings[MOUTH_BORDER]]
-        self.upper_height = border[0, 1] - line[0, 1]
-        self.lower_height = line[26, 1] - border[26, 1]
         # 0 on the midline to ±1 at the corners.
         across = torch.zeros(LIP_HANDLES, dtype=torch.float64)
         across[:27] = line[:, 0] / self.half_width

@@ -312,8 +312,8 @@ class MotionJob:
         Raises:
             TorchfaceError: they cannot be found.
         """
-        own, sites, picture = item.settings_of(self), out / f"{item.name}.json", out / f"{item.name}.png"
-        done = attach(own.rig, item.path, sites, own.settings, picture)
+        job, sites, picture = item.settings_of(self), out / f"{item.name}.json", out / f"{item.name}.png"
+        done = attach(job.rig, item.path, sites, job.settings, picture)
         last = done.fit.errors[-1]
         error = float(torch.as_tensor(last).mean())
         return Made(

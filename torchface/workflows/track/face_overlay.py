@@ -173,12 +173,12 @@ def _part_of(camera: Camera, x0: int, y0: int, x1: int, y1: int, step: int) -> C
     return Camera(shrunk, camera.rotation, camera.translation, *size)
 
 
-def with_dots(frame: Tensor, found: Tensor, solved: Tensor) -> Tensor:
-    """Landmarks on a frame, uint8 (3,H,W): found ones (L,2) green, the solved rig's (L,2) red."""
+def with_dots(frame: Tensor, landmarks: Tensor, solved: Tensor) -> Tensor:
+    """Landmarks on a frame, uint8 (3,H,W): those given (L,2) green, the solved rig's (L,2) red."""
     canvas = np.ascontiguousarray(frame.permute(1, 2, 0).numpy())
     radius = max(1.0, 0.004 * max(frame.shape[1:]))
     scale = 2**_SUBPIXEL
-    for points, color, size in ((solved, _SOLVED, 0.7 * radius), (found, _FOUND, radius)):
+    for points, color, size in ((solved, _SOLVED, 0.7 * radius), (landmarks, _FOUND, radius)):
         for x, y in (points[torch.isfinite(points).all(1)].double() * scale).round().long().tolist():
             if abs(x) < 2**30 and abs(y) < 2**30:
                 cv2.circle(canvas, (x, y), round(size * scale), color, -1, cv2.LINE_AA, _SUBPIXEL)

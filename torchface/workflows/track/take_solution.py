@@ -118,9 +118,9 @@ def new_offsets(inputs: TrackInputs, solver: VideoSolver, landmarks: Tensor, tru
     return None if offsets is None else replace(offsets, video=inputs.reading_key, source=inputs.clip.path.name)
 
 
-def warn_of_offsets(given: LandmarkOffsets, own: LandmarkOffsets | None, inputs: TrackInputs) -> None:
+def warn_of_offsets(given: LandmarkOffsets, estimated: LandmarkOffsets | None, inputs: TrackInputs) -> None:
     """Warns where the offsets that the user gives are not those that the take itself shows: another person's, say."""
-    if own is not None and (off := given.mismatch(own)) is not None:
+    if estimated is not None and (off := given.mismatch(estimated)) is not None:
         of = f" of {given.source}" if given.source else ""
         warnings.warn(
             f"{inputs.settings.offsets}: the offsets{of} lie {off[0]:.1f} mm from those that {inputs.clip.path.name} "

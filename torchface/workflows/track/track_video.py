@@ -84,10 +84,10 @@ def _track(inputs: TrackInputs, out: Path, filmed: bool, progress: Progress) -> 
     offsets = known_offsets(inputs, out)
     if offsets is None or offsets.video != inputs.reading_key:
         with _timed(seconds, "offsets"):
-            own = new_offsets(inputs, solver, landmarks, trust)
+            estimated = new_offsets(inputs, solver, landmarks, trust)
         if offsets is not None:
-            warn_of_offsets(offsets, own, inputs)
-        offsets = offsets or own
+            warn_of_offsets(offsets, estimated, inputs)
+        offsets = offsets or estimated
     solver = solver if offsets is None else solver.shifted(offsets)
     key = solution_key(inputs, solver, offsets, times)
     solution = kept_solution(state, key)

@@ -34,10 +34,10 @@ class VideoJob:
 
     def key(self, item: BatchItem) -> str:
         """A key of all that a video's results depend on."""
-        own = item.settings_of(self)
+        job = item.settings_of(self)
         names = ("landmarks", "appearance", "prior", "dynamics")
-        contents = {name: model_content(getattr(own.settings, name)) for name in names}
-        return content_key(_METHOD, video=item.path, rig=own.rig, settings=own.settings, **contents)
+        contents = {name: model_content(getattr(job.settings, name)) for name in names}
+        return content_key(_METHOD, video=item.path, rig=job.rig, settings=job.settings, **contents)
 
     def run(self, item: BatchItem, out: Path) -> Made:
         """Tracks a video and writes the folder ``NAME``.
@@ -45,8 +45,8 @@ class VideoJob:
         Raises:
             TorchfaceError: it cannot be tracked.
         """
-        own, folder = item.settings_of(self), out / item.name
-        done = track_video(item.path, own.rig, folder, own.settings)
+        job, folder = item.settings_of(self), out / item.name
+        done = track_video(item.path, job.rig, folder, job.settings)
         page = write_track_page(done, folder)
         errors = torch.where(done.seen, done.solution.errors, torch.nan)
         strongest = done.solution.weights[done.solution.weights.norm(dim=1).argmax()].to(done.rig.deltas)

@@ -61,9 +61,9 @@ class LandmarkEquations:
         """The same where some landmarks only (68,) bool count; where a frame shows none of them, none counts."""
         return replace(self, seen=self.seen & rows)
 
-    def moved(self, columns: Tensor, found: Unknowns) -> LandmarkEquations:
+    def moved(self, columns: Tensor, unknowns: Unknowns) -> LandmarkEquations:
         """What is left when weights of some shapes, columns (68,2,M), and the placement are known."""
-        moved = self.offset + _along(columns, found.weights) + _along(self.free, found.free)
+        moved = self.offset + _along(columns, unknowns.weights) + _along(self.free, unknowns.free)
         return replace(self, offset=moved, free=self.free[..., :0])
 
     def rows(self, keep: Tensor) -> LandmarkEquations:
@@ -72,9 +72,9 @@ class LandmarkEquations:
             self, offset=self.offset[keep], scale=self.scale[keep], seen=self.seen[keep], free=self.free[keep]
         )
 
-    def residual(self, found: Unknowns) -> Tensor:
+    def residual(self, unknowns: Unknowns) -> Tensor:
         """:math:`r` (B,68,2); 0 where a landmark is not seen."""
-        inside = self.offset + _along(self.basis, found.weights) + _along(self.free, found.free)
+        inside = self.offset + _along(self.basis, unknowns.weights) + _along(self.free, unknowns.free)
         return torch.where(self.seen[..., None], self.scale[:, None] * inside, 0.0)
 
     def columns(self) -> Tensor:
@@ -95,12 +95,12 @@ class LandmarkEquations:
             return ReducedSquares(Quadratic(H, f), f[:, :0, None], f[:, :0, None].expand(-1, -1, shapes))
         free = self.free.flatten(1, 2).transpose(1, 2)  # (B,F,136)
         counted = 2 * factor[:, None] * free
-        own = counted @ free.transpose(1, 2)
+        information = counted @ free.transpose(1, 2)
         cross = (counted.flatten(0, 1) @ rows).unflatten(0, counted.shape[:2])  # (B,F,N)
         pull = counted @ offset[..., None]
         # A frame with too few landmarks leaves part of its placement open: that part stays as it was guessed.
-        own = own + torch.diag_embed(own.detach().diagonal(dim1=1, dim2=2) * 1e-12 + 1e-30)
-        solved = torch.linalg.solve(own, torch.cat([pull, cross], dim=-1))
+        information = information + torch.diag_embed(information.detach().diagonal(dim1=1, dim2=2) * 1e-12 + 1e-30)
+        solved = torch.linalg.solve(information, torch.cat([pull, cross], dim=-1))
         start, slope = -solved[..., :1], -solved[..., 1:]
         H = H + cross.transpose(1, 2) @ slope
         return ReducedSquares(

@@ -65,10 +65,10 @@ class SquaredDistances:
         energy = squares.energy + _penalties(self, equations)
         return squares.unknowns(box_qp(energy.H, energy.f, start=initial))
 
-    def value(self, equations: LandmarkEquations, found: Unknowns) -> Tensor:
+    def value(self, equations: LandmarkEquations, unknowns: Unknowns) -> Tensor:
         """What is minimised, (B,)."""
-        squared = equations.residual(found).square().sum(-1)
-        return (equations.share * squared).sum(1) + _penalty(self, found.weights)
+        squared = equations.residual(unknowns).square().sum(-1)
+        return (equations.share * squared).sum(1) + _penalty(self, unknowns.weights)
 
 
 @dataclass(frozen=True)
@@ -130,12 +130,12 @@ class Distances:
             return Unknowns(*whole.tensor_split([unknowns.weights.shape[1]], dim=1))
         return unknowns
 
-    def value(self, equations: LandmarkEquations, found: Unknowns) -> Tensor:
+    def value(self, equations: LandmarkEquations, unknowns: Unknowns) -> Tensor:
         """What is minimised, (B,)."""
-        return (equations.share * self._distances(equations, found)).sum(1) + _penalty(self, found.weights)
+        return (equations.share * self._distances(equations, unknowns)).sum(1) + _penalty(self, unknowns.weights)
 
-    def _distances(self, equations: LandmarkEquations, found: Unknowns) -> Tensor:
-        return (equations.residual(found).square().sum(-1) + self.smoothing**2).sqrt()
+    def _distances(self, equations: LandmarkEquations, unknowns: Unknowns) -> Tensor:
+        return (equations.residual(unknowns).square().sum(-1) + self.smoothing**2).sqrt()
 
     def _iterate(self, equations: LandmarkEquations, initial: Tensor | None) -> Unknowns:
         squares = equations.least_squares(equations.share)
