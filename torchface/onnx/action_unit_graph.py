@@ -17,7 +17,7 @@ from torchface.capture.action_units.classifier import ActionUnitClassifier
 from torchface.capture.action_units.classifier_training import local_warps
 from torchface.errors import ValueRangeError
 from torchface.files.whole_files import write_file
-from torchface.onnx.checked_export import one_thread_session
+from torchface.onnx.checked_export import WrittenGraph, one_thread_session
 from torchface.onnx.exported_model import exported_model
 
 _TEST_FRAMES = 64
@@ -27,31 +27,24 @@ _IN_THE_BALANCE = 1e-3
 
 
 @dataclass(frozen=True)
-class ActionUnitReport:
+class ActionUnitReport(WrittenGraph):
     """What was written, and how good it is.
 
     Args:
-        path: the file.
-        size: in bytes.
         agreement: share of test frames in which ONNX Runtime and PyTorch give the same intensities.
         milliseconds: median of one frame by one thread of ONNX Runtime here.
     """
 
-    path: Path
-    size: int
     agreement: float
     milliseconds: float
 
     def rows(self) -> list[tuple[str, str]]:
         """The report as pairs of what and how much."""
         return [
-            ("file", f"{self.path}, {self.size / 1000:.0f} kB"),
+            *super().rows(),
             ("ONNX Runtime against PyTorch", f"the same in {self.agreement:.1%} of the frames"),
             ("one frame, one thread", f"{self.milliseconds:.3f} ms"),
         ]
-
-    def __str__(self) -> str:
-        return "\n".join(f"{name}: {value}" for name, value in self.rows())
 
 
 def export_action_units(

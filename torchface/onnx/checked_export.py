@@ -17,30 +17,43 @@ from torchface.files.whole_files import write_file
 
 
 @dataclass(frozen=True)
-class ExportReport:
-    """What was written, and how near ONNX Runtime is to PyTorch.
+class WrittenGraph:
+    """A graph's file.
 
     Args:
         path: the file.
         size: in bytes.
-        parity: by output, the largest difference found, in the output's unit.
-        units: of the outputs.
     """
 
     path: Path
     size: int
+
+    def rows(self) -> list[tuple[str, str]]:
+        """The report as pairs of what and how much."""
+        return [("file", f"{self.path}, {self.size / 1000:.0f} kB")]
+
+    def __str__(self) -> str:
+        return "\n".join(f"{name}: {value}" for name, value in self.rows())
+
+
+@dataclass(frozen=True)
+class ExportReport(WrittenGraph):
+    """What was written, and how near ONNX Runtime is to PyTorch.
+
+    Args:
+        parity: by output, the largest difference found, in the output's unit.
+        units: of the outputs.
+    """
+
     parity: dict[str, float]
     units: dict[str, str]
 
     def rows(self) -> list[tuple[str, str]]:
         """The report as pairs of what and how much."""
-        rows = [("file", f"{self.path}, {self.size / 1000:.0f} kB")]
+        rows = super().rows()
         for name, gap in self.parity.items():
             rows.append((name, f"ONNX Runtime against PyTorch: at most {gap:.1e} {self.units[name]} apart"))
         return rows
-
-    def __str__(self) -> str:
-        return "\n".join(f"{name}: {value}" for name, value in self.rows())
 
 
 def write_checked(

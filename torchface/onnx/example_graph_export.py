@@ -16,6 +16,7 @@ from torch import Tensor
 from torchface.capture.anybody import ExampleSolver
 from torchface.errors import ValueRangeError
 from torchface.files.whole_files import write_file
+from torchface.onnx.checked_export import WrittenGraph
 from torchface.onnx.example_graph import STEPS, STEPS_AT_ONCE, example_model
 
 _FRAMES, _FRAMES_A_POSE = 200, 10
@@ -43,19 +44,15 @@ class ExampleGap:
 
 
 @dataclass(frozen=True)
-class ExampleReport:
+class ExampleReport(WrittenGraph):
     """What was written, and how good it is.
 
     Args:
-        path: the file.
-        size: in bytes.
         gaps: one frame after the other, all at once, and with landmarks missing.
         milliseconds, milliseconds_at_once: median of one frame by one thread of ONNX Runtime here, one after the
             other, and the least of a frame among many at once.
     """
 
-    path: Path
-    size: int
     gaps: tuple[ExampleGap, ...]
     milliseconds: float
     milliseconds_at_once: float
@@ -63,7 +60,7 @@ class ExampleReport:
     def rows(self) -> list[tuple[str, str]]:
         """The report as pairs of what and how much."""
         return [
-            ("file", f"{self.path}, {self.size / 1000:.0f} kB"),
+            *super().rows(),
             ("one frame, one thread", f"{self.milliseconds:.3f} ms, {self.milliseconds_at_once:.4f} ms among many"),
             *(
                 (
@@ -74,9 +71,6 @@ class ExampleReport:
                 for gap in self.gaps
             ),
         ]
-
-    def __str__(self) -> str:
-        return "\n".join(f"{name}: {value}" for name, value in self.rows())
 
 
 def export_example_solver(

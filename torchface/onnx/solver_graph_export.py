@@ -23,7 +23,7 @@ from torchface.errors import ValueRangeError
 from torchface.files.whole_files import write_file
 from torchface.geometry.similarity import Similarity
 from torchface.number_checks import checked_count
-from torchface.onnx.checked_export import one_thread_session
+from torchface.onnx.checked_export import WrittenGraph, one_thread_session
 from torchface.onnx.corrective_graph import CorrectiveGraph
 from torchface.onnx.exported_model import exported_model
 from torchface.onnx.solver_graph import STEPS_WITH_GAPS, SolverGraph
@@ -61,12 +61,10 @@ class SolverGap:
 
 
 @dataclass(frozen=True)
-class SolverReport:
+class SolverReport(WrittenGraph):
     """What was written, and how good it is.
 
     Args:
-        path: the file.
-        size: in bytes.
         rho: of splitting, chosen for this rig and layout.
         steps, steps_with_gaps: how many.
         gaps: at 0, 10 and 30 % missing markers.
@@ -74,8 +72,6 @@ class SolverReport:
         milliseconds_with_gaps: the same with missing markers.
     """
 
-    path: Path
-    size: int
     rho: float | None
     steps: int
     steps_with_gaps: int
@@ -87,7 +83,7 @@ class SolverReport:
         """The report as pairs of what and how much."""
         rho = "" if self.rho is None else f"; rho {self.rho}"
         rows = [
-            ("file", f"{self.path}, {self.size / 1000:.0f} kB"),
+            *super().rows(),
             ("steps", f"{self.steps}, {self.steps_with_gaps} with missing markers{rho}"),
             ("one frame, one thread", f"{self.milliseconds:.3f} ms, {self.milliseconds_with_gaps:.3f} ms with gaps"),
         ]
@@ -100,9 +96,6 @@ class SolverReport:
                 )
             )
         return rows
-
-    def __str__(self) -> str:
-        return "\n".join(f"{name}: {value}" for name, value in self.rows())
 
 
 @dataclass(frozen=True)

@@ -21,7 +21,7 @@ from torchface.files.whole_files import write_file
 from torchface.geometry.cameras.calibration import CameraCalibration
 from torchface.geometry.cameras.distortion import undistort
 from torchface.geometry.rotations import rotation_matrix
-from torchface.onnx.checked_export import one_thread_session
+from torchface.onnx.checked_export import WrittenGraph, one_thread_session
 from torchface.onnx.exported_model import exported_model
 from torchface.onnx.unrolled_operators import TRANSLATIONS
 from torchface.onnx.video_graph import LANDMARKS, VideoGraph
@@ -40,12 +40,10 @@ _PERIOD, _ACTIVE = 60.0, 0.3  # frames of a gesture, proportion of shapes that t
 
 
 @dataclass(frozen=True)
-class VideoReport:
+class VideoReport(WrittenGraph):
     """What was written, and how good it is.
 
     Args:
-        path: the file.
-        size: in bytes.
         steps: of Gauss and Newton, a frame.
         frames: that it was checked with, each from the state that the one before handed on.
         parity: largest difference of a weight between ONNX Runtime and the same module in PyTorch, from the same state.
@@ -56,8 +54,6 @@ class VideoReport:
         milliseconds: of processor time a frame, by one thread of ONNX Runtime here.
     """
 
-    path: Path
-    size: int
     steps: int
     frames: int
     parity: float
@@ -71,7 +67,7 @@ class VideoReport:
         """The report as pairs of what and how much."""
         video = "" if self.error is not None else " of the video"
         rows = [
-            ("file", f"{self.path}, {self.size / 1000:.0f} kB"),
+            *super().rows(),
             ("steps", str(self.steps)),
             ("one frame, one thread", f"{self.milliseconds:.2f} ms"),
             ("ONNX Runtime against PyTorch", f"weights at most {self.parity:.1e} apart"),
@@ -84,9 +80,6 @@ class VideoReport:
             found = f"root mean square {self.error:.3f}; the exact solve {self.exact_error:.3f}"
             rows.append(("against true weights", found))
         return rows
-
-    def __str__(self) -> str:
-        return "\n".join(f"{name}: {value}" for name, value in self.rows())
 
 
 def export_video_solver(
