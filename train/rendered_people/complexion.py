@@ -9,7 +9,7 @@ from torch import Tensor
 
 from torchface.color_space import to_linear, to_srgb
 from torchface.errors import ShapeError
-from torchface.synthetic.head.performer import neutral_head
+from torchface.synthetic.head.neutral_head import neutral_head
 
 COMPLEXION = ("melanin", "redness", "lips", "hair", "shadows", "flush")
 """The parameters, in standard deviations: pigment, blood in all the skin, colour of the lips, darkness of brows and

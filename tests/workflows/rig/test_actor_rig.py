@@ -21,7 +21,7 @@ from torchface.mesh import Mesh
 from torchface.modeling import MorphableModel
 from torchface.registration import hidden_parts, with_template_skin
 from torchface.rig import BlendshapeRig
-from torchface.synthetic.head.performer import neutral_head
+from torchface.synthetic.head.neutral_head import neutral_head
 from torchface.workflows.rig.actor_rig import RigOptions, rig_actor
 
 pytestmark = pytest.mark.usefixtures("coarse_figures")
