@@ -139,7 +139,7 @@ def real_capture(ict_folder: Path, performances: list[Path]) -> tuple[Blendshape
 @pytest.fixture(scope="module")
 def coarse_figures() -> Iterator[None]:
     """Figures of reports with one ray a pixel and no shadow in creases, for tests that do not look at them."""
-    figures = ("face_views", "marker_maps", "registration_views", "site_views")
+    figures = ("face_views", "marker_maps", "registration_views")
     pages = (
         "workflows.solve.solve_page",
         "workflows.register.scan_job",

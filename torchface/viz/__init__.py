@@ -4,10 +4,9 @@ from torchface.rendering.compositing import caption, headed, save_rendered_image
 from torchface.viz.figures.curves import error_curve, named_bars, weight_curves
 from torchface.viz.figures.error_maps import compared_views, error_colors, error_views
 from torchface.viz.figures.face_views import clay_colors, face_views, frame_face, heat_map
-from torchface.viz.figures.marker_maps import marker_map
+from torchface.viz.figures.marker_maps import marker_map, site_views
 from torchface.viz.figures.model_figures import modes_figure, random_figure
 from torchface.viz.figures.registration_views import registration_sheet
-from torchface.viz.figures.site_views import site_views
 
 __all__ = [
     "caption",

@@ -26,7 +26,7 @@ from torchface.progress import Progress, silent
 from torchface.rendering.compositing import PICTURE_ENDINGS, save_rendered_image, sheet
 from torchface.rig import BlendshapeRig
 from torchface.take import Take, Track
-from torchface.viz.figures.site_views import errors_by_iteration, site_views
+from torchface.viz.figures.marker_maps import errors_by_iteration, site_views
 from torchface.workflows.batch.batch_items import BatchItem
 from torchface.workflows.batch.contact_sheet import small_picture
 from torchface.workflows.batch.outcomes import Made
