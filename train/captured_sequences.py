@@ -24,8 +24,10 @@ from torchface.files.content_keys import content_key
 from torchface.io import MeshSequence, MeshSequenceWriter
 from torchface.io.mesh_files import MESH_ENDINGS
 from torchface.progress import Progress
+from torchface.rig import BlendshapeRig
 from torchface.synthetic.stages.weight_curves import GESTURES
 from torchface.synthetic.stages.wrinkles import WrinkledPerformer
+from torchface.take import Track
 from torchface.workflows.animated_meshes import load_animated
 
 _METHOD = "captured sequences/1"
@@ -53,12 +55,14 @@ class CapturedSequence:
         count: of frames.
         read: vertices (t,V,3) of the frames from one number up to another, without it, millimetres.
         faces: (F,3) int64, of its own file.
+        moved: what moves it where that is a rig: the rig and its weights.
     """
 
     name: str
     count: int
     read: Callable[[int, int], Tensor]
     faces: Tensor
+    moved: tuple[BlendshapeRig, Track] | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,6 +84,17 @@ class Capture:
     def part(self, begin: int, end: int) -> Capture:
         """Some of the sequences."""
         return Capture(self.sequences[begin:end], self.neutral, self.neutral_file, f"{self.key} {begin} {end}")
+
+    @property
+    def weights(self) -> Track | None:
+        """Of the one rig that moves all sequences, if one does."""
+        moved = [sequence.moved for sequence in self.sequences if sequence.moved is not None]
+        if len(moved) < len(self.sequences):
+            return None
+        rig, first = moved[0]
+        if not all(one.names == rig.names and torch.equal(one.deltas, rig.deltas) for one, _ in moved):
+            return None
+        return Track(first.names, torch.cat([track.select(first.names).values for _, track in moved]))
 
 
 def read_capture(folder: Path, neutral: Path | None) -> Capture:
@@ -220,7 +235,9 @@ def _animated(path: Path) -> CapturedSequence:
         vertices, faces = _npz(path)
         return CapturedSequence(path.name, len(vertices), lambda begin, end: vertices[begin:end], faces)
     animated = load_animated(path)
-    return CapturedSequence(path.name, animated.count, animated.read, animated.neutral.faces)
+    known = animated.rig is not None and animated.weights is not None
+    moved = (animated.rig, animated.weights) if known else None
+    return CapturedSequence(path.name, animated.count, animated.read, animated.neutral.faces, moved)  # type: ignore[arg-type]
 
 
 def _of_meshes(name: str, files: list[Path]) -> CapturedSequence:

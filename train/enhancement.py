@@ -35,6 +35,7 @@ class Settings(RecipeSettings):
         coarse: Folder of what a coarse animation shows of the same frames, in the model's topology and the same places:
             sequences of the same names and lengths (`torchface enhance ... --detail 0` writes such meshes). Then what
             that kind of input lacks or gets wrong is learned, for such inputs; the more it errs the more that gains.
+            If all are .glb animations of one rig, its weights are learned from too, and used where an input has them.
         neutral: The neutral as a mesh; with landmarks (see `torchface annotate`) regions are named and eyes set apart.
             neutral.* in the folder if absent.
         performer: Learn from the embedded performer with so many vertices instead.
@@ -97,6 +98,7 @@ def train(settings: Settings, run: Run) -> EnhancementModel:
             mesh.vertices,
             coarse=known.coarse,
             landmarks=None if mesh.annotations is None else mesh.annotations.landmarks,
+            weights=None if pairs is None else pairs.part(0, learned).weights,
         ),
         EnhancementSettings(fps=settings.fps, wavelength=settings.wavelength, detail=settings.detail),  # type: ignore[arg-type]
         patch_size=settings.patch,

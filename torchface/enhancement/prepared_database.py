@@ -10,17 +10,20 @@ import torch
 from torch import Tensor
 
 from torchface.enhancement.detail.frame_encoder import Encoder, make_encoder
-from torchface.enhancement.detail.low_pass import LowPass
+from torchface.enhancement.detail.low_pass import LowPass, vertex_areas
 from torchface.enhancement.enhancement_settings import EnhancementSettings
 from torchface.enhancement.matching.face_regions import Regions, surface_distances
 from torchface.enhancement.matching.learned_map import LearnedMap
 from torchface.enhancement.matching.region_projection import RegionProjection
+from torchface.enhancement.matching.weight_map import WeightMap
 from torchface.enhancement.timing.actor_timing import ActorTiming
 from torchface.geometry.meshes.operators import triangle_areas
 
 _WAVELENGTH = 8.0  # millimetres: lids are placed by longer waves, shorter ones are their wrinkles
 _SOFT = 6.0  # millimetres inside an eye's region in which its lids become those of the input
 _ALIKE, _UNLIKE = 0.25, 0.4  # of what the lids move: how far the input's are off those found at which they are, are not
+_SMOOTHED, _WHOLE = 0.92, 0.97  # of the detail found: how much of it an input shows that was smoothed, that was not
+_OTHER, _SAME = 0.7, 0.85  # the correlation with it of an input's detail at which that is another, is the same
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,7 +42,9 @@ class InputLids:
     lids closes them nearly, but seldom wholly. With :math:`x` the enhanced lids, :math:`\ell` their smooth part and
     :math:`a` the input's, the input shows lids of its own where :math:`|a - x|` is small beside :math:`|x - \ell|`;
     there the long waves of :math:`a - x` are added, and wrinkles stay. An input that was smoothed itself is always off
-    by a third and more: its lids are those found.
+    by a third and more: its lids are those found. Lids that hardly move are off by as much as they move; they are the
+    input's where its whole face shows the detail found: :math:`\langle a - \ell, x - \ell \rangle / |x - \ell|^2` by
+    area is near 1 and the two correlate. A face that was smoothed shows less.
 
     Args:
         neutral: (V,3), millimetres.
@@ -49,17 +54,31 @@ class InputLids:
 
     def __init__(self, neutral: Tensor, faces: Tensor, eyes: Tensor) -> None:
         self._eyes = [_eye(neutral, faces, inside) for inside in eyes if bool(inside.any())]
+        self._areas = vertex_areas(neutral, faces)[:, None]
 
     def __call__(self, enhanced: Tensor, low: Tensor, own: Tensor) -> Tensor:
         """Enhanced frames (T,V,3) with the lids of ``own``; all of one place, ``low`` the smooth part."""
+        if not self._eyes:
+            return enhanced
+        unsmoothed = self._unsmoothed(enhanced - low, own - low)
         for eye in self._eyes:
             moved, off = ((one - other)[:, eye.ids] for one, other in ((enhanced, low), (own, enhanced)))
             weights = eye.weights.to(enhanced)[:, None]
             size, error = ((weights * some.square()).sum((1, 2)) for some in (moved, off))
             ratio = (error / size.clamp(min=1e-12)).clamp(min=1e-12).sqrt()
-            trusted = ((_UNLIKE - ratio) / (_UNLIKE - _ALIKE)).clamp(0, 1)
+            trusted = torch.maximum(((_UNLIKE - ratio) / (_UNLIKE - _ALIKE)).clamp(0, 1), unsmoothed)
             enhanced = enhanced.index_add(1, eye.ids, trusted[:, None, None] * weights * eye.low_pass(off))
         return enhanced
+
+    def _unsmoothed(self, found: Tensor, shown: Tensor) -> Tensor:
+        """How much the detail that an input shows is that found, and not what smoothing has left of it, (T,)."""
+        areas = self._areas.to(found)
+        product, whole, own = (
+            (areas * one * other).sum((1, 2)).clamp(min=1e-12)
+            for one, other in ((found, shown), (found, found), (shown, shown))
+        )
+        alike = (product / (whole * own).sqrt() - _OTHER) / (_SAME - _OTHER)
+        return ((product / whole - _SMOOTHED) / (_WHOLE - _SMOOTHED)).clamp(0, 1) * alike.clamp(0, 1)
 
 
 def _eye(neutral: Tensor, faces: Tensor, inside: Tensor) -> _Eye:
@@ -86,6 +105,8 @@ class PreparedDatabase:
         coefficients: of the frames' details, (K,r).
         regions: of the face.
         settings: how frames are split and detail is found.
+        weights: of the actor's rig in the frames, (K,N), where they are known.
+        weight_terms: of the map from them, (R,3), see ``WeightMap``.
     """
 
     neutral: Tensor
@@ -96,12 +117,15 @@ class PreparedDatabase:
     coefficients: Tensor
     regions: Regions
     settings: EnhancementSettings
+    weights: Tensor | None = None
+    weight_terms: Tensor | None = None
 
     @property
     def inputs(self) -> tuple[Tensor | float, ...]:
         """All that the parts depend on and that may change."""
         tensors = self.neutral, self.faces, self.patches, self.sequences, self.features, self.coefficients
-        return *tensors, self.regions.weights, self.settings.wavelength, self.settings.temporal
+        known = () if self.weights is None or self.weight_terms is None else (self.weights, self.weight_terms)
+        return *tensors, *known, self.regions.weights, self.settings.wavelength, self.settings.temporal
 
     @cached_property
     @torch.no_grad()
@@ -132,6 +156,14 @@ class PreparedDatabase:
     def learned_map(self) -> LearnedMap:
         """What is added to the blend where frames lie beyond the database."""
         return LearnedMap(self.projection, self.coefficients)
+
+    @cached_property
+    @torch.no_grad()
+    def weight_map(self) -> WeightMap:
+        """What finds detail by the rig's weights."""
+        assert self.weights is not None
+        assert self.weight_terms is not None
+        return WeightMap(self.projection, self.weights, self.coefficients, self.weight_terms)
 
     @cached_property
     @torch.no_grad()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,7 +12,7 @@ from torch import Tensor
 from torchface.errors import AlignmentError, ValueRangeError
 from torchface.geometry.similarity import MAX_HEAD_SCALE, MIN_HEAD_SCALE, similarity_transform
 from torchface.mesh import Mesh
-from torchface.take import Take
+from torchface.take import Take, Track
 from torchface.workflows.animated_meshes import AnimatedMesh
 
 DEFAULT_FPS = 30.0
@@ -37,6 +37,7 @@ class CoarseAnimation:
             where it holds no face at rest.
         notes: lines for people to read; warnings begin with ``warning: ``.
         head: its own head at rest in the model's vertices, (V,3), where that is another person's.
+        weights: of the rig that moves it, where that is of the model's mesh and actor.
     """
 
     path: Path
@@ -49,6 +50,13 @@ class CoarseAnimation:
     residual: float | None = None
     notes: tuple[str, ...] = ()
     head: Tensor | None = None
+    weights: Track | None = None
+
+    def rig_weights(self, names: Sequence[str]) -> Tensor | None:
+        """The weights of these shapes, (T,N); None where one is missing, or none are asked for."""
+        if self.weights is None or not names or not set(names) <= set(self.weights.names):
+            return None
+        return self.weights.select(names).values[..., 0]
 
 
 def same_topology(animated: AnimatedMesh, model: Mesh, fps: float | None) -> CoarseAnimation:
@@ -74,6 +82,7 @@ def same_topology(animated: AnimatedMesh, model: Mesh, fps: float | None) -> Coa
         check_finite(vertices, animated.path, 1, begin)
         return vertices
 
+    another = animated.rig is not None and residual > OTHER_ACTOR_MM
     return CoarseAnimation(
         animated.path,
         "meshes of the model's topology",
@@ -84,7 +93,8 @@ def same_topology(animated: AnimatedMesh, model: Mesh, fps: float | None) -> Coa
         model.faces,
         residual,
         (*rate_notes(animated, fps), *notes),
-        animated.neutral.vertices.float() if animated.rig is not None and residual > OTHER_ACTOR_MM else None,
+        animated.neutral.vertices.float() if another else None,
+        None if another else animated.weights,
     )
 
 

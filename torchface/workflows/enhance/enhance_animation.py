@@ -28,7 +28,7 @@ from torchface.workflows.enhance.enhanced_frames import SEQUENCE, EnhancedFrames
 
 STATE = "state"
 GLB, VIDEO, FRAMES, SUMMARY, MESHES = "enhanced.glb", "comparison.mp4", "frames.csv", "summary.json", "meshes"
-_METHOD = "enhance/1"
+_METHOD = "enhance/2"
 _FORMAT = "torchface.enhance-summary/1"
 _MANY_OUTSIDE = 0.25
 _BADLY_SHOWN_MM = 0.1
@@ -150,6 +150,8 @@ def _enhance(
     frames = enhance_frames(animation, model, out, state, key, progress)
     mesh = framed_model(model)
     products, notes = {"meshes, every frame": out / SEQUENCE}, list(animation.notes)
+    if animation.rig_weights(model.weight_names) is not None:
+        notes.append(f"the weights of the rig's {len(model.weight_names)} shapes helped to find the detail")
     if frames.colors is not None:
         products["vertex colours, every frame"] = frames.colors.path
     share = float(frames.outside.any(1).float().mean())
