@@ -14,7 +14,7 @@ import torch
 from onnx import TensorProto, helper, numpy_helper
 from torch import Tensor, nn
 
-from torchface.onnx.graph_builder import IR_VERSION, OPSET
+from torchface.onnx.operator_set import IR_VERSION, OPSET
 
 if TYPE_CHECKING:
     from onnxscript import ir

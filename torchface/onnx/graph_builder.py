@@ -12,9 +12,7 @@ import onnx
 from onnx import helper, numpy_helper
 from torch import Tensor
 
-OPSET = 18
-"""Version of the operators of all graphs: the oldest that the exporter of PyTorch writes."""
-IR_VERSION = 8
+from torchface.onnx.operator_set import IR_VERSION, OPSET
 
 
 class GraphBuilder:

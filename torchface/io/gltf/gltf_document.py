@@ -195,7 +195,9 @@ def read_document(path: str | Path) -> Document:
         raise document.error("asset.version", shown(version), "'2.0'")
     for name in document.array(root, "extensionsRequired", "document"):
         if not isinstance(name, str) or not name.startswith(_EXTENSIONS):
-            raise document.error("extensionsRequired", shown(name), "none but " + ", ".join(_EXTENSIONS))
+            known = ", ".join(start + "*" * start.endswith("_") for start in _EXTENSIONS)
+            hint = "; decompress it: npx @gltf-transform/cli copy IN.glb OUT.glb" * ("compression" in shown(name))
+            raise document.error("extensionsRequired", shown(name), f"none but {known}{hint}")
     return document
 
 

@@ -126,7 +126,8 @@ def write_demo_page(result: DemoResult, out: Path, progress: Progress | None = N
         Section("The performance", _story(result), markup=markup),
         Section(
             "One frame",
-            "The true and the solved face, and the distance between them. No marker shows where eyes look.",
+            "The true and the solved face, and the distance between them. No marker sits on an eyeball: lids alone "
+            "show where eyes look.",
             figures=[("frame_1.png", frame_figure)],
         ),
         Section(

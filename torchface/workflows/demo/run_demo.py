@@ -231,7 +231,7 @@ def _run_demo(scene: Scene, out: Path, seed: int, flaws: StageFlaws, progress: P
     save_rig(rig, files["transferred rig"])
     progress("capturing the markers")
     layout = _layout(scene.truth)
-    attachment = place_markers(scene.truth) if layout is None else layout.attachment
+    attachment = (place_markers(scene.truth) if layout is None else layout.attachment).made_for(scene.head)
     attachment.save(files["marker sites"])
     generator = torch.Generator().manual_seed(seed)
     recording = record(scene.truth, attachment, scene.weights, generator, flaws, scene.fps)

@@ -16,6 +16,9 @@ from torchface.progress import Progress, ValueLog
 if TYPE_CHECKING:
     from torchface.landmarks.images.boxes.box_training import BoxTrainingSettings, Pictures
 
+INPUT_SIZE = 640
+"""Pixels of the longer side of the copy of an image that the network is given."""
+
 STRIDE = 8
 """Pixels a cell of the maps."""
 

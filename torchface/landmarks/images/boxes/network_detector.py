@@ -11,12 +11,12 @@ from torch import Tensor
 from torchface.errors import ValueRangeError
 from torchface.files.model_roots import shipped_model
 from torchface.files.models import read_model
-from torchface.landmarks.images.boxes.box_network import BoxNetwork
+from torchface.landmarks.images.boxes.box_network import INPUT_SIZE, BoxNetwork
 from torchface.landmarks.images.boxes.face_box import FaceBoxes, check_image, one_each, shrunk, sorted_boxes
 from torchface.landmarks.images.folded_normalisation import without_normalisation
 
 _MULTIPLE = 32  # pixels: the stride of the network's coarsest level
-_LEAST_SCORE, _LONGEST = 0.4, 640  # of a face, and pixels of the copy that is searched
+_LEAST_SCORE = 0.4  # of a face
 _SURE_SCORE = 0.55  # of the shipped network: four turns show four times as much that is no face
 
 
@@ -38,7 +38,7 @@ class NetworkDetector:
         0
     """
 
-    def __init__(self, network: BoxNetwork, least_score: float = _LEAST_SCORE, longest: int = _LONGEST) -> None:
+    def __init__(self, network: BoxNetwork, least_score: float = _LEAST_SCORE, longest: int = INPUT_SIZE) -> None:
         if not (0 < least_score < 1 and longest >= 64):
             raise ValueRangeError(
                 f"NetworkDetector: found score {least_score}, longest {longest}; expected (0,1), from 64"
