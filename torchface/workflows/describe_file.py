@@ -7,6 +7,7 @@ from pathlib import Path
 
 import onnx
 import torch
+from torch import Tensor
 
 from torchface.attachment import Attachment
 from torchface.capture.anybody import ExampleShapes, ExampleSolver, landmark_observability
@@ -93,13 +94,11 @@ def _example_rows(examples: ExampleShapes) -> Rows:
 
 
 def _mesh_rows(mesh: Mesh) -> Rows:
-    low, high = mesh.vertices.amin(0).tolist(), mesh.vertices.amax(0).tolist()
-    extent = " x ".join(f"{b - a:.1f}" for a, b in zip(low, high, strict=True))
     rows = [
         ("vertices", f"{len(mesh.vertices):,}"),
         ("triangles", f"{len(mesh.faces):,}"),
         ("polygons", "triangles only" if mesh.polygons is None else f"{len(mesh.polygons):,}"),
-        ("extent, mm", extent),
+        ("extent, mm", _extent(mesh.vertices)),
         ("texture coordinates", "none" if mesh.uvs is None else f"{len(mesh.uvs):,}"),
         ("texture", "none" if mesh.texture is None else "x".join(str(n) for n in mesh.texture.shape[:0:-1])),
     ]
@@ -112,6 +111,11 @@ def _mesh_rows(mesh: Mesh) -> Rows:
             ("contact pairs", "none" if notes.contacts is None else str(len(notes.contacts))),
         ]
     return rows
+
+
+def _extent(points: Tensor) -> str:
+    """Of finite points (N,3), along x, y and z."""
+    return " x ".join(f"{size:.1f}" for size in (points.amax(0) - points.amin(0)).tolist())
 
 
 def _rig_rows(rig: BlendshapeRig) -> Rows:
@@ -152,11 +156,17 @@ def _take_rows(take: Take) -> Rows:
             (kind, _named(track.names)),
             (f"{kind} seen", f"{100 * float(visible.mean()):.2f} %, {empty} frames without any"),
         ]
+    if take.markers is not None:
+        middles = take.markers.values.nanmedian(0).values
+        seen = middles[torch.isfinite(middles).all(1)]
+        if len(seen):
+            rows.append(("extent, mm", f"{_extent(seen)}, of each marker's median place"))
     if take.weights is not None:
         rows += [("warning", fault) for fault in weight_faults(take.weights)]
     if take.extras:
         columns = take.extras.get("columns")
         named = {"columns": f"columns {', '.join(columns)}"} if isinstance(columns, dict) else {}
+        named["unit"] = f"unit {take.extras.get('unit')}"
         rows.append(("kept besides", "; ".join(named.get(name, name) for name in map(str, take.extras))))
     return rows
 
