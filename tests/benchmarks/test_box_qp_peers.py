@@ -274,6 +274,7 @@ def test_one_frame_at_a_time(
     assert rows[2].gap <= 1e-6
     # DAQP itself, the checks of what it finds, and PyTorch around it.
     assert rows[1].milliseconds <= found["DAQP"].milliseconds + 0.05
+    assert "PIQP" not in found or rows[1].milliseconds < found["PIQP"].milliseconds
     for name, share in (("OSQP 1e-5", 0.75), ("DAQP", 7.0)):
         if name in found:
             assert rows[0].milliseconds < share * found[name].milliseconds
