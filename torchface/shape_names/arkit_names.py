@@ -9,8 +9,6 @@ from difflib import get_close_matches
 import torch
 from torch import Tensor
 
-__all__ = ["ARKIT", "arkit_sources", "mapping", "mirror", "spelled_as"]
-
 ARKIT: tuple[str, ...] = (
     *("eyeBlinkLeft", "eyeLookDownLeft", "eyeLookInLeft", "eyeLookOutLeft", "eyeLookUpLeft", "eyeSquintLeft"),
     *("eyeWideLeft", "eyeBlinkRight", "eyeLookDownRight", "eyeLookInRight", "eyeLookOutRight", "eyeLookUpRight"),
