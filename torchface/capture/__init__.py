@@ -14,6 +14,7 @@ from torchface.capture.markers import (
 )
 from torchface.capture.own_rig import VideoSolver
 from torchface.capture.priors import DynamicsPrior, DynamicsSettings, ShapePrior
+from torchface.capture.weight_readings import WeightReadings
 
 __all__ = [
     "ActionUnitClassifier",
@@ -28,6 +29,7 @@ __all__ = [
     "VideoSolver",
     "WebcamControls",
     "WebcamSolver",
+    "WeightReadings",
     "WholeTakeSolver",
     "action_unit_curves",
     "align_take",

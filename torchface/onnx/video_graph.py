@@ -8,6 +8,7 @@ import torch
 from torch import Tensor, nn
 from torch.func import functional_call
 
+from torchface.capture.antagonist_shapes import one_side, weaker_sides
 from torchface.capture.own_rig.face_points import LANDMARKS
 from torchface.capture.own_rig.frame_states import FrameTerms
 from torchface.capture.own_rig.gauss_newton import SLIDING_STEPS, HeadState, split_step
@@ -141,8 +142,8 @@ class VideoGraph(nn.Module):
         rotation = torch.where(first, rotation, orthonormal(state["rotation"]))
         translation = torch.where(first, translation, state["translation"])
         window = state["weights"][None] if self.dynamics is None else state["window"]
-        weights = torch.where(first, 0.0, window[-1]).clamp(0, 1)
-        head = HeadState(weights[None], rotation[None], translation[None])
+        weights = one_side(torch.where(first, 0.0, window[-1]).clamp(0, 1)[None], self.step.solver.signed)
+        head = HeadState(weights, rotation[None], translation[None])
         counts = torch.where(enough, (~unseen).double() * confidence.double(), 0.0)[None]
         evidence = relative_trust(counts) @ self.influence
         interval = self.settings.interval
@@ -284,7 +285,10 @@ class GaussNewtonStep(nn.Module):
         head = HeadState(weights, rotation, translation)
         rows = torch.where((iteration > 0) & (iteration < SLIDING_STEPS), self.solver.chosen(head), rows)
         energy = self.solver.energy(frame_terms(*given), head, rows)
-        after, dual = split_step(energy, head, self.upper, dual, _SPLITTING_STEPS)
+        signed = self.solver.signed
+        upper = torch.where(weaker_sides(weights, signed)[0], 0.0, self.upper)
+        after, dual = split_step(energy, head, upper, dual, _SPLITTING_STEPS)
+        after = HeadState(one_side(after.weights, signed), after.rotation, after.translation)
         settled = (after.weights - weights).abs().max() < self.solver.settings.tolerance
         return iteration + 1, settled, after.weights, after.rotation, after.translation, dual, rows
 

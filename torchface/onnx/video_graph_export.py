@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from torchface import __version__
+from torchface.capture.antagonist_shapes import one_side
 from torchface.capture.own_rig import VideoSettings, VideoSolver
 from torchface.capture.priors import AdaptedDynamicsPrior, DynamicsPrior, ShapePrior
 from torchface.errors import ShapeError, ValueRangeError
@@ -265,7 +266,7 @@ def synthetic_landmarks(solver: VideoSolver, frames: int, seed: int = 0) -> tupl
     at = torch.arange(frames, dtype=torch.float64)[:, None]
     phase = torch.rand(4, shapes, generator=generator).double()
     wave = torch.sin(2 * torch.pi * (at / (_PERIOD * (0.7 + phase[0])) + phase[1]))
-    weights = wave.clamp(min=0) * phase[2] * (phase[3] < _ACTIVE)
+    weights = one_side(wave.clamp(min=0) * phase[2] * (phase[3] < _ACTIVE), solver.signed)
     angles = torch.tensor([0.1, 0.3, 0.06]).double() * torch.sin(at / _PERIOD * torch.tensor([3.0, 4.0, 2.0]))
     rotation = torch.tensor(_UPRIGHT).double() @ rotation_matrix(angles)
     rest = points.rest[:LANDMARKS]

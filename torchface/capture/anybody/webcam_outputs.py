@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from torchface.capture.antagonist_shapes import signed_difference
 from torchface.capture.anybody.guided_gains import gain_factors
 from torchface.capture.anybody.webcam_state import WebcamState
 from torchface.geometry.rotations import rotation_matrix
@@ -26,11 +27,13 @@ class OutputTables:
         gain_shapes: which shapes each gain is of, as ``gain_factors`` wants them.
         to_arkit: from the rig's weights to ARKit's, (52,N).
         filter_units: what counts as one in the filter, of weights, radians and millimetres, (58,).
+        signed: of ARKit's antagonists, see ``signed_quantities``, (K,52).
     """
 
     gain_shapes: Tensor
     to_arkit: Tensor
     filter_units: Tensor
+    signed: Tensor
 
 
 def lost_state(before: WebcamState, interval: Tensor) -> WebcamState:
@@ -82,7 +85,7 @@ def calmed_state(
     fit = ((LOST_FIT - after.error) / (LOST_FIT - _MISFIT)).clamp(0, 1)
     return replace(
         after,
-        weights=torch.where(has_face, calm[:-6].clamp(0, 1), after.weights),
+        weights=torch.where(has_face, signed_difference(calm[:-6].clamp(0, 1), outputs.signed), after.weights),
         rotation=torch.where(has_face, rotation, before.rotation),
         translation=torch.where(has_face, translation, before.translation),
         speeds=torch.where(has_face, speeds, after.speeds),

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import pad
 
+from torchface.capture.antagonist_shapes import one_side, signed_quantities, weaker_sides
 from torchface.capture.anybody.eye_signals import (
     CORNERS,
     LOOKS,
@@ -56,7 +57,7 @@ _EAGER, _EAGER_FOR = 3.0, 0.7  # how much more the first frames of a person coun
 _LIDS = ("eyeBlink", "eyeWide", "eyeSquint")
 _LID_MOTION = 3.0
 _LID_RIDGE = {"eyeWide": 16.0, "eyeSquint": 8.0}  # lids that stand a little otherwise are noise, more likely than not
-_CONSTANTS = ("landmark_weights", "camera", "look_eyes", "upright", "damping", "filter_units")
+_CONSTANTS = ("signed", "arkit_signed", "landmark_weights", "camera", "look_eyes", "upright", "damping", "filter_units")
 
 
 @dataclass(frozen=True, eq=False)
@@ -138,6 +139,8 @@ class WebcamSolver(nn.Module):
     look_shapes: Tensor
     look_eyes: Tensor
     gain_shapes: Tensor
+    signed: Tensor
+    arkit_signed: Tensor
     walk: Tensor
     landmark_weights: Tensor
     camera: Tensor
@@ -181,6 +184,8 @@ class WebcamSolver(nn.Module):
             "usual_openness": usual,
             "look_shapes": mapping(LOOKS, rig.names).double(),
             "gain_shapes": gain_groups(rig.names),
+            "signed": signed_quantities(rig.names),
+            "arkit_signed": signed_quantities(ARKIT),
             "walk": torch.tensor([(_LID_MOTION if n.startswith(_LIDS) else 1.0) for n in called]),
             "landmark_weights": landmark_weights,
             "camera": torch.eye(3),
@@ -266,7 +271,7 @@ class WebcamSolver(nn.Module):
             (freeze <= 0).double(),
         )
         after = self._solved(frame, before).where(shows_face, lost_state(before, interval))
-        tables = OutputTables(self.gain_shapes, self.to_arkit, self.filter_units)
+        tables = OutputTables(self.gain_shapes, self.to_arkit, self.filter_units, self.arkit_signed)
         return calmed_state(tables, after, before, shows_face, present, interval, gain, smoothing).pack()
 
     def _solved(self, frame: _Frame, before: WebcamState) -> WebcamState:
@@ -284,7 +289,7 @@ class WebcamSolver(nn.Module):
         unit = eyes / (points.rest[EYE_CORNERS[0]] - points.rest[EYE_CORNERS[1]]).norm()
         variance = (self.settings.noise * eyes).square() + (0.5 * frame.spread).square()
         precision = frame.trust.sqrt() / (variance + self.person.person_remainder * unit**2).sqrt()
-        head = HeadState(before.shapes.minimum(upper)[None], rotation[None], translation[None])
+        head = HeadState(one_side(before.shapes.minimum(upper)[None], self.signed), rotation[None], translation[None])
         dual = pad(torch.zeros_like(before.shapes), (0, 6))
         damping = pad(self.damping, (len(self.names), 0))
         damped = Quadratic(damping.diag()[None], torch.zeros_like(damping)[None])
@@ -292,8 +297,9 @@ class WebcamSolver(nn.Module):
             of_weights = known if self.prior is None else known + self.prior.energy(head.weights)
             energy = self._linearised(points, head, frame.rays, precision).energy() + damped
             energy = energy + energy_of_step(of_weights, head.weights)
-            head, dual = split_step(energy, head, upper, dual, _SPLITTING_STEPS, quick=True)
-        weights = head.weights[0].clamp(min=0).minimum(upper)
+            free = torch.where(weaker_sides(head.weights, self.signed)[0], 0.0, upper)
+            head, dual = split_step(energy, head, free, dual, _SPLITTING_STEPS, quick=True)
+        weights = one_side(head.weights.clamp(min=0).minimum(upper), self.signed)[0]
         head = HeadState(weights[None], head.rotation, head.translation)
 
         at = self._linearised(points, head, frame.rays, precision)

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 from torch import Tensor
 
+from torchface.capture.energy import Quadratic
 from torchface.capture.own_rig.gauss_newton import HeadState
 from torchface.capture.own_rig.state_estimate import Expectation, StateEstimate
 from torchface.errors import ValueRangeError
@@ -93,6 +94,8 @@ class FrameTerms:
         precision: of each, one over its standard deviation, 0 where not seen, (B,68).
         rotation, translation: the tracked pose, (B,3,3) and (B,3).
         expected: what is known before the frames are seen.
+        points, point_precision: of the surface, likewise, (B,P,2) and (B,P); none if absent.
+        read: what readings say of the weights (B,N) themselves; nothing if absent.
     """
 
     landmarks: Tensor
@@ -100,8 +103,13 @@ class FrameTerms:
     rotation: Tensor
     translation: Tensor
     expected: Expectation
+    points: Tensor | None = None
+    point_precision: Tensor | None = None
+    read: Quadratic | None = None
 
     def tensors(self) -> tuple[Tensor, ...]:
         mean = self.expected.mean
         terms = (self.landmarks, self.precision, self.rotation, self.translation, self.expected.information)
-        return (*terms, mean.weights, mean.rotation, mean.translation)
+        read = () if self.read is None else (self.read.H, self.read.f)
+        more = (x for x in (self.points, self.point_precision) if x is not None)
+        return (*terms, mean.weights, mean.rotation, mean.translation, *more, *read)

@@ -151,7 +151,9 @@ def energy_of_step(energy: Quadratic, weights: Tensor) -> Quadratic:
     return Quadratic(pad(energy.H, (0, 6, 0, 6)), pad(gradient, (0, 6)))
 
 
-def box_step(energy: Quadratic, head: HeadState, lower: Tensor, upper: Tensor, exactness: float) -> HeadState:
+def box_step(
+    energy: Quadratic, head: HeadState, lower: Tensor, upper: Tensor, exactness: float, rest: Tensor
+) -> HeadState:
     """The least of an energy of a step in a box of weights, exactly: B programs, warm-started.
 
     Args:
@@ -159,9 +161,13 @@ def box_step(energy: Quadratic, head: HeadState, lower: Tensor, upper: Tensor, e
         head: the state, its weights in the box.
         lower, upper: bounds of weights and motion, (N+6,), infinite for the motion.
         exactness: residual of a program at which it counts as solved.
+        rest: which weights are held at 0, (B,N) bool.
     """
     begin = pad(head.weights, (0, 6))
     H, f = energy.H, energy.f - (energy.H @ begin[..., None])[..., 0]
+    free = pad(~rest, (0, 6), value=True).to(H)
+    held = torch.diag_embed((1 - free) * H.diagonal(dim1=-2, dim2=-1))
+    H, f, begin = H * free[:, :, None] * free[:, None] + held, f * free, begin * free
     least = PreparedProgram(0.5 * (H + H.transpose(1, 2)), lower, upper).solve(f, begin, exactness)
     return head.moved(least[:, :-6], least[:, -6:])
 

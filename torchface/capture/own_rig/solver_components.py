@@ -11,8 +11,11 @@ from typing import Any, Self
 import torch
 from torch import Tensor, nn
 
+from torchface.attachment import Attachment
+from torchface.capture.antagonist_shapes import signed_quantities
 from torchface.capture.own_rig.face_points import JAW, LANDMARKS, FacePoints, make_room_for_points
 from torchface.capture.own_rig.landmark_offsets import LandmarkOffsets, shifted_points
+from torchface.capture.own_rig.surface_points import FaceSurfacePoints
 from torchface.capture.own_rig.video_settings import VideoSettings
 from torchface.capture.own_rig.weight_walk import relative_trust
 from torchface.capture.priors import AdaptedDynamicsPrior, DynamicsPrior, ReciprocalPrior, ShapePrior
@@ -34,6 +37,7 @@ INITIAL_WEIGHT, DEFAULT_WEIGHT_STEP = 1.0, 0.1
 _LIDS, _LID_MOTION = re.compile(r"eye_?(blink|wide|squint)", re.IGNORECASE), 2.0
 
 _POINTS = ("rest", "basis", "rows", "valid", "side")
+_SURFACE = ("rest", "basis", "normals", "corrective_basis")
 _PRIORS: dict[str, type[ShapePrior]] = {"shape_prior": ShapePrior, "reciprocal_prior": ReciprocalPrior}
 _DYNAMICS: dict[str, type[DynamicsPrior] | type[AdaptedDynamicsPrior]] = {
     "dynamics_prior": DynamicsPrior,
@@ -52,6 +56,11 @@ class VideoSolverParts(nn.Module):
     valid: Tensor
     side: Tensor
     corrective_basis: Tensor | None
+    surface_rest: Tensor | None
+    surface_basis: Tensor | None
+    surface_normals: Tensor | None
+    surface_corrective_basis: Tensor | None
+    signed: Tensor
     intrinsics: Tensor
     lower: Tensor
     upper: Tensor
@@ -71,6 +80,7 @@ class VideoSolverParts(nn.Module):
         dynamics: DynamicsPrior | AdaptedDynamicsPrior | None = None,
         settings: VideoSettings | None = None,
         landmark_weights: Tensor | None = None,
+        surface: Attachment | None = None,
     ) -> None:
         super().__init__()
         settings = settings or VideoSettings()
@@ -85,12 +95,13 @@ class VideoSolverParts(nn.Module):
             if learned is not None:
                 learned.require(rig.names)
         points = FacePoints.of(rig, marks, slides=settings.contour_slide < 1)
-        self._hold(rig.names, points, intrinsics.detach(), weights, prior, dynamics, settings)
+        found = None if surface is None else FaceSurfacePoints.of(rig, surface)
+        self._hold(rig.names, (points, found), intrinsics.detach(), weights, prior, dynamics, settings)
 
     def _hold(
         self,
         names: Sequence[str],
-        points: FacePoints,
+        seen: tuple[FacePoints, FaceSurfacePoints | None],
         intrinsics: Tensor,
         landmark_weights: Tensor,
         prior: ShapePrior | None,
@@ -100,9 +111,12 @@ class VideoSolverParts(nn.Module):
         self.names: tuple[str, ...] = tuple(names)
         self.prior, self.dynamics = prior, dynamics
         self._settings = settings
+        points, surface = seen
         like = points.rest
         for name in _POINTS:
             self.register_buffer(name, getattr(points, name).detach())
+        for name in _SURFACE:
+            self.register_buffer(f"surface_{name}", None if surface is None else getattr(surface, name))
         self.activation = points.activation
         self.register_buffer("corrective_basis", points.corrective_basis)
         self.register_buffer("intrinsics", intrinsics.to(like, copy=True))
@@ -124,6 +138,9 @@ class VideoSolverParts(nn.Module):
         for name, numbers in constants.items():
             made = torch.tensor(numbers, dtype=torch.float64, device=device)
             self.register_buffer(name, made, persistent=False)
+        with torch.device("cpu"):
+            signed = signed_quantities(names)
+        self.register_buffer("signed", signed.to(device), persistent=False)
 
     @property
     def settings(self) -> VideoSettings:
@@ -136,6 +153,17 @@ class VideoSolverParts(nn.Module):
         more = None if self.corrective_basis is None else self.corrective_basis.double()
         parts = self.rest.double(), self.basis.double(), self.rows, self.valid, self.side.double()
         return FacePoints(*parts, self.activation, more)
+
+    @property
+    def surface(self) -> FaceSurfacePoints | None:
+        """The points beside the 68 landmarks, float64; None where there are none."""
+        rest, basis, normals, more = (None if x is None else x.double() for x in self._surface_buffers())
+        if rest is None or basis is None or normals is None:
+            return None
+        return FaceSurfacePoints(rest, basis, normals, None if more is None else self.activation, more)
+
+    def _surface_buffers(self) -> tuple[Tensor | None, ...]:
+        return tuple(getattr(self, f"surface_{name}") for name in _SURFACE)
 
     @property
     def walks(self) -> bool:
@@ -174,6 +202,7 @@ class VideoSolverParts(nn.Module):
             "settings": asdict(self.settings),
             "prior": _described(self.prior, _PRIORS),
             "dynamics": _described(self.dynamics, _DYNAMICS),
+            **({} if self.surface_rest is None else {"surface": len(self.surface_rest)}),
             **({} if self.activation is None else {"correctives": self.activation.records()}),
         }
 
@@ -207,8 +236,24 @@ class VideoSolverParts(nn.Module):
             CorrectiveActivation(definitions, names) if definitions else None,
             torch.zeros(count, 3, len(definitions), dtype=torch.float64) if definitions else None,
         )
+        surface = None
+        if "surface" in config:
+            sites = values["surface"].whole(1)
+            if sites > _MAX_POINTS:
+                raise FileFormatError(
+                    f"video solver: found {sites} points of the surface, expected {_MAX_POINTS} at most"
+                )
+            rest = torch.zeros(sites, 3, dtype=torch.float64)
+            more = points.corrective_basis
+            surface = FaceSurfacePoints(
+                rest,
+                rest.new_zeros(sites, 3, len(names)),
+                torch.zeros_like(rest),
+                points.activation,
+                None if more is None else rest.new_zeros(sites, 3, more.shape[2]),
+            )
         K, weights = torch.zeros(3, 3), torch.zeros(LANDMARKS)
-        self._hold(names, points, K, weights, prior, dynamics, VideoSettings(**settings))
+        self._hold(names, (points, surface), K, weights, prior, dynamics, VideoSettings(**settings))
         return self
 
     def check_state(self) -> None:

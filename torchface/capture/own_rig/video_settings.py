@@ -33,6 +33,8 @@ class VideoSettings:
         pose_trust: :math:`\kappa`, what the tracked pose is worth beside the frame's own landmarks.
         contour_slide: how much an error along the contour counts beside one across it, 0 to 1. At 1 contour landmarks
             are the vertices themselves.
+        effective_points: points of the surface that err independently: more of them count as so many together, as
+            errors of neighbours are alike.
         motion: how far a weight wanders in a second, standard deviation; lids go further. Without a dynamics prior each
             frame's weights are then a step of that random walk from the last frame's. 0 solves frames apart.
         interval: seconds from frame to frame where none are given.
@@ -54,6 +56,7 @@ class VideoSettings:
     dynamics_strength: float = 1.0
     pose_trust: float = 0.0
     contour_slide: float = 0.3
+    effective_points: float = 100.0
     motion: float = 0.0
     interval: float = 1 / 30
     tolerance: float = 3e-3
@@ -62,7 +65,7 @@ class VideoSettings:
     def __post_init__(self) -> None:
         for name in ("relative_noise", "sparsity", "ridge", "pose_trust", "motion"):
             checked_number(name, getattr(self, name), 0.0, LARGEST_WEIGHT)
-        for name in ("pixel_noise", "dynamics_strength", "tolerance", "interval"):
+        for name in ("pixel_noise", "dynamics_strength", "tolerance", "interval", "effective_points"):
             checked_number(name, getattr(self, name), 0.0, LARGEST_WEIGHT, above=True)
         checked_number("contour_slide", self.contour_slide, 0.0, 1.0)
         checked_count("steps", self.steps, 1)

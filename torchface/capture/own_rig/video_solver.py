@@ -6,7 +6,9 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
+from torchface.capture.antagonist_shapes import one_side, weaker_sides
 from torchface.capture.energy import Quadratic
+from torchface.capture.own_rig.face_measurements import FaceMeasurements
 from torchface.capture.own_rig.face_points import LANDMARKS
 from torchface.capture.own_rig.frame_states import FrameTerms, VideoSolution, VideoState
 from torchface.capture.own_rig.gauss_newton import (
@@ -61,6 +63,7 @@ class VideoSolver(VideoSolverParts):
         dynamics: how weights go on.
         settings: what the terms weigh, and when steps end; :math:`\sigma` grows with the face where they say so.
         landmark_weights: :math:`c`, (68,); 1 for inner landmarks, half for those of the contour if absent.
+        surface: where on the rig's neutral mesh further points lie that are found in the images.
 
     Raises:
         NameMismatchError: a prior was learned for other shapes than the rig has.
@@ -89,6 +92,7 @@ class VideoSolver(VideoSolverParts):
         confidence: Tensor | None = None,
         seconds: Tensor | None = None,
         progress: Progress | None = None,
+        measured: FaceMeasurements | None = None,
     ) -> VideoSolution:
         """Weights and poses of consecutive frames, each from what was seen until then.
 
@@ -98,6 +102,7 @@ class VideoSolver(VideoSolverParts):
             confidence: how far each landmark is trusted, (T,68) in [0,1].
             seconds: when each frame is shown, (T,), rising; ``settings.interval`` apart if absent.
             progress: called with how many frames are solved.
+            measured: what else is known of the T frames.
 
         Returns:
             What the face did, in the dtype of the landmarks; differentiable in all arguments, through all frames. A
@@ -107,7 +112,7 @@ class VideoSolver(VideoSolverParts):
             ShapeError: the shapes do not fit each other.
             ValueRangeError: infinite landmarks, confidences below 0, or no frame with six trusted landmarks.
         """
-        states, _ = self.states(landmarks, rotation, translation, confidence, seconds, progress)
+        states, _ = self.states(landmarks, rotation, translation, confidence, seconds, progress, measured)
         weights, rotations, translations = (
             torch.stack([getattr(state, name) for state in states]).to(landmarks.dtype)
             for name in ("weights", "rotation", "translation")
@@ -139,6 +144,7 @@ class VideoSolver(VideoSolverParts):
         confidence: Tensor | None = None,
         seconds: Tensor | None = None,
         progress: Progress | None = None,
+        measured: FaceMeasurements | None = None,
     ) -> tuple[list[VideoState], Tensor]:
         """The states after each of T frames, and which frames showed a face, (T,) bool; arguments as ``forward``.
 
@@ -159,7 +165,8 @@ class VideoSolver(VideoSolverParts):
         # A frame leans on the one before, so frames come one after the other.
         for t in range(first, count):
             turn, place, sure = (None if x is None else x[t] for x in (rotation, translation, confidence))
-            state = self.step(state, landmarks[t], turn, place, sure, intervals[t])
+            more = None if measured is None else measured.of_frames(torch.tensor([t], device=landmarks.device))
+            state = self.step(state, landmarks[t], turn, place, sure, intervals[t], more)
             states.append(state)
             progress("solving for weights", t + 1, count)
         return [states[0]] * first + states, enough
@@ -177,6 +184,7 @@ class VideoSolver(VideoSolverParts):
         translation: Tensor | None = None,
         confidence: Tensor | None = None,
         interval: float | None = None,
+        measured: FaceMeasurements | None = None,
     ) -> VideoState:
         """The next frame's state; its ``weights``, ``rotation`` and ``translation`` are the frame's.
 
@@ -190,6 +198,7 @@ class VideoSolver(VideoSolverParts):
             rotation, translation: the tracked pose, (3,3) and (3,); the last one's if absent or NaN.
             confidence: (68,) in [0,1].
             interval: seconds since the frame before; ``settings.interval`` if absent.
+            measured: what else is known of the frame, with a row for it.
 
         Raises:
             ShapeError: an argument is not as above.
@@ -197,6 +206,8 @@ class VideoSolver(VideoSolverParts):
         """
         given = [None if x is None else x[None] for x in (rotation, translation, confidence)]
         self._check(landmarks[None], *given)
+        measured = measured or FaceMeasurements()
+        self._check_measured(measured)
         pixels = landmarks[None].double()
         rotation, translation, confidence = (None if x is None else x.double() for x in given)
         seen = torch.isfinite(pixels).all(-1)
@@ -216,8 +227,11 @@ class VideoSolver(VideoSolverParts):
         expected = self._expected(state, rotation, translation, evidence, hidden, interval)
         at = HeadState(expected.mean.weights, rotation, translation) if state.head is None else state.head
         noise = self.noise(at.rotation, at.translation)
-        precision = self._precision(seen if enough else torch.zeros_like(seen), confidence, noise)
-        terms = FrameTerms(pixels.nan_to_num(0.0), precision, rotation, translation, expected)
+        off = noise[:, None] if measured.deviation is None else _both(noise[:, None], measured.deviation)
+        precision = self._precision(seen if enough else torch.zeros_like(seen), confidence, off)
+        points, sure = (None, None) if not enough else self._surface_seen(measured, at, noise)
+        read = None if measured.weights is None or not enough else measured.weights.energy()
+        terms = FrameTerms(pixels.nan_to_num(0.0), precision, rotation, translation, expected, points, sure, read)
         if state.head is not None and not enough:
             weights = expected.mean.weights if self.walks else state.head.weights
             held = HeadState(weights, rotation, translation)
@@ -229,7 +243,9 @@ class VideoSolver(VideoSolverParts):
             else HeadState(expected.mean.weights, rotation, translation)
         )
         begin = expected.mean.weights if state.head is None else state.head.weights
-        start = HeadState(begin.clamp(0, 1), near.rotation, near.translation).mapped(torch.detach)
+        start = HeadState(one_side(begin.clamp(0, 1), self.signed), near.rotation, near.translation).mapped(
+            torch.detach
+        )
         return self._handed_on(state, terms, *self.solve(terms, start), enough, hidden)
 
     def _handed_on(
@@ -297,7 +313,9 @@ class VideoSolver(VideoSolverParts):
             for iteration in range(self.settings.steps):
                 if 0 < iteration < SLIDING_STEPS:
                     rows = self.chosen(head)
-                before, head = head, box_step(self.energy(terms, head, rows), head, *box, exactness)
+                rest = weaker_sides(head.weights, self.signed)
+                before, head = head, box_step(self.energy(terms, head, rows), head, *box, exactness, rest)
+                head = HeadState(one_side(head.weights, self.signed), head.rotation, head.translation)
                 if float((head.weights - before.weights).abs().max()) < self.settings.tolerance:
                     break
         # Copies, as autograd refuses tensors that were made without it.
@@ -322,6 +340,11 @@ class VideoSolver(VideoSolverParts):
         K, slide = self.intrinsics.double(), self.settings.contour_slide
         at = linearise(self.points, head, rows, K, terms.landmarks, terms.precision, slide)
         data = at.energy()
+        if terms.points is not None and terms.point_precision is not None and self.surface is not None:
+            found = terms.points, terms.point_precision
+            data = data + self.surface.energy(head.weights, head.rotation, head.translation, K, found)
+        if terms.read is not None:
+            data = data + energy_of_step(terms.read, head.weights)
         if self.settings.pose_trust == 0:
             return data
         by_motion = at.jacobian[..., -6:].flatten(1, 2)
@@ -361,7 +384,25 @@ class VideoSolver(VideoSolverParts):
         if confidence is not None:
             weights = weights * confidence
         # The root's slope is infinite at 0.
-        return torch.where(weights > 0, weights, 1.0).sqrt() * (weights > 0) / noise[:, None]
+        return torch.where(weights > 0, weights, 1.0).sqrt() * (weights > 0) / noise
+
+    def _surface_seen(
+        self, measured: FaceMeasurements, head: HeadState, noise: Tensor
+    ) -> tuple[Tensor | None, Tensor | None]:
+        """The surface's points (1,P,2) of a frame, finite, and one over their deviations, (1,P), at about a pose."""
+        if measured.points is None or measured.point_deviation is None or self.surface is None:
+            return None, None
+        points, deviation = measured.points.double(), measured.point_deviation.double()
+        known = torch.isfinite(points).all(-1) & torch.isfinite(deviation)
+        with torch.no_grad():
+            counts = self.surface.facing(head.rotation, head.translation) * known
+        precision = self.point_precision(counts, _both(noise[:, None], torch.where(known, deviation, 1.0)))
+        return torch.where(known[..., None], points, 0.0), precision
+
+    def point_precision(self, counts: Tensor, deviation: Tensor) -> Tensor:
+        """One over the deviations of points whose errors are alike: of (B,P) that count in [0,1], (B,P)."""
+        together = self.settings.effective_points / counts.sum(1, keepdim=True).clamp(min=1.0)
+        return (counts * together.clamp(max=1.0)).sqrt() / deviation
 
     def landmark_trust(self, landmarks: Tensor, confidence: Tensor | None) -> Tensor:
         """How much each of landmarks (B,68,2) counts beside one that is surely seen, (B,68) float64."""
@@ -388,6 +429,17 @@ class VideoSolver(VideoSolverParts):
             return state.head.rotation, state.head.translation
         return pose.rotation, pose.translation
 
+    def _check_measured(self, measured: FaceMeasurements) -> None:
+        points = 0 if self.surface_rest is None else len(self.surface_rest)
+        found = {
+            "deviation": (measured.deviation, (1, LANDMARKS)),
+            "points": (measured.points, (1, points, 2)),
+            "weights": (None if measured.weights is None else measured.weights.rows[:1], (1, len(self.names))),
+        }
+        for name, (value, expected) in found.items():
+            if value is not None and value.shape != expected:
+                raise ShapeError(f"measured {name}: found {tuple(value.shape)}, expected {expected}")
+
     def _check(
         self, landmarks: Tensor, rotation: Tensor | None, translation: Tensor | None, confidence: Tensor | None
     ) -> int:
@@ -403,6 +455,11 @@ class VideoSolver(VideoSolverParts):
         if confidence is not None:
             check_not_negative("confidence", confidence)
         return count
+
+
+def _both(noise: Tensor, deviation: Tensor) -> Tensor:
+    """The deviation of a sum of two independent errors."""
+    return (noise.square() + deviation.double().square()).sqrt()
 
 
 def _finite(*tensors: Tensor) -> bool:
