@@ -49,7 +49,7 @@ def test_readings_beside_others_add() -> None:
 
 
 def test_parts_that_do_not_fit_are_refused() -> None:
-    with pytest.raises(ShapeError, match="found 3 values a frame of 2 rows"):
+    with pytest.raises(ShapeError, match="found 3 values a frame, expected 2"):
         WeightReadings(torch.zeros(2, 5), torch.zeros(4, 3), torch.ones(4, 3))
     with pytest.raises(ShapeError, match="expected"):
         WeightReadings(torch.zeros(2, 5), torch.zeros(4, 2), torch.ones(4, 3))

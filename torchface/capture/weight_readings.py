@@ -47,9 +47,7 @@ class WeightReadings:
                 f"deviation {tuple(self.deviation.shape)}, expected (M,N), (T,M) and (T,M)"
             )
         if self.values.shape[1] != len(self.rows):
-            raise ShapeError(
-                f"weight readings: found {self.values.shape[1]} values a frame of {len(self.rows)} rows, expected as many"
-            )
+            raise ShapeError(f"weight readings: found {self.values.shape[1]} values a frame, expected {len(self.rows)}")
 
     @classmethod
     def of_expression(cls, expression: Tensor, deviation: Tensor, names: Sequence[str]) -> WeightReadings:
