@@ -65,7 +65,7 @@ Solver = Callable[[list[FaceReading], float, tuple[int, int]], Solved]
 def read_faces(frames: Tensor, fps: float, kept: Path) -> list[FaceReading]:
     """What the shipped networks read of a face in frames uint8 (T,3,H,W), as in a webcam's model; kept in a folder."""
     reader = FaceReader(webcam_networks()).eval()
-    key = content_key("faces read/3", reader=reader, frames=frames, fps=fps)[:16]
+    key = content_key("faces read/4", reader=reader, frames=frames, fps=fps)[:16]
     path = kept / f"{key}.safetensors"
     if not path.is_file():
         state, rows = torch.zeros(STATE), []

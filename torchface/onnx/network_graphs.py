@@ -23,7 +23,7 @@ ImageNetwork = LandmarkNetwork | EyeNetwork | BoxNetwork
 FACE_VALUES = ("x", "y", "side", "score", "cosine", "sine")
 """What the graph of face boxes gives for a face, in this order."""
 
-_PIXELS = {"landmarks", "iris", "deviation", "faces"}
+_PIXELS = {"landmarks", "iris", "deviation", "faces", "points", "point_deviation"}
 
 
 @dataclass(frozen=True)
@@ -48,7 +48,7 @@ class _Form:
 def _form(network: ImageNetwork) -> _Form:
     if isinstance(network, LandmarkNetwork):
         facts = {"landmarks": "iBUG 68", "image": "red, green, blue, 0 to 1", "crop": str(network.margin)}
-        parity = dict(zip(NetworkLandmarks._fields, (0.1, 0.1, 0.01, 0.01), strict=True))
+        parity = {name: 0.1 if name in _PIXELS else 0.01 for name in _given(network)}
         shape = (network.size, network.size)
         return _Form("image", ("batch",), _cloudy(*shape), parity, facts | {"units": "pixels of the crop"})
     if isinstance(network, EyeNetwork):
@@ -68,7 +68,8 @@ def export_network(network: ImageNetwork, path: str | Path, facts: Mapping[str, 
 
     The graph of a ``LandmarkNetwork`` takes ``image`` (B,3,S,S): faces' boxes enlarged by the metadata's ``crop`` and
     turned upright. It gives ``landmarks`` (B,68,2) and ``deviation`` (B,68), pixels of the crop, ``visibility`` (B,68)
-    and ``presence`` (B,) in [0,1].
+    and ``presence`` (B,) in [0,1]; where the network has further points, also ``points`` (B,P,2) and
+    ``point_deviation`` (B,P), likewise pixels, ``expression`` (B,52) and ``expression_deviation`` (B,52).
 
     That of an ``EyeNetwork`` takes ``eyes`` (B,3,h,w): crops as ``eye_transforms`` cuts them, left eyes mirrored. It
     gives ``landmarks`` (B,6,2), ``iris`` (B,2) and ``deviation`` (B,7), pixels of the crop, ``openness`` (B,), and
@@ -104,14 +105,32 @@ def network_model(network: ImageNetwork, facts: Mapping[str, object] | None = No
     form = _form(network)
     task = {LandmarkNetwork: "landmark_network", EyeNetwork: "eye_network", BoxNetwork: "face_boxes"}[type(network)]
     fused = without_normalisation(network)
+    module = _Given(fused, _given(fused)) if isinstance(fused, LandmarkNetwork) else fused
     model = exported_model(
-        fused,
+        module,
         {form.images: form.example},
         list(form.parity),
         {"task": task, **form.metadata, "version": __version__, **(facts or {})},
         {form.images: form.sizes},
     )
-    return model if isinstance(network, BoxNetwork) else half_stored(model, halves(fused))
+    return model if isinstance(network, BoxNetwork) else half_stored(model, halves(module))
+
+
+def _given(network: LandmarkNetwork) -> tuple[str, ...]:
+    """What a network finds: without further points the 68 alone."""
+    return NetworkLandmarks._fields if network.points else NetworkLandmarks._fields[:4]
+
+
+class _Given(nn.Module):
+    """A landmark network with no more outputs than it has something to say of."""
+
+    def __init__(self, network: LandmarkNetwork, names: tuple[str, ...]) -> None:
+        super().__init__()
+        self.network, self.names = network, names
+
+    def forward(self, crops: Tensor) -> tuple[Tensor, ...]:
+        found = self.network(crops)
+        return tuple(getattr(found, name) for name in self.names)
 
 
 def halves(network: nn.Module, prefix: str = "") -> set[str]:

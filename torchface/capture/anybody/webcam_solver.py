@@ -243,6 +243,10 @@ class WebcamSolver(nn.Module):
         openness: Tensor,
         closed: Tensor,
         eye_visibility: Tensor,
+        points: Tensor,  # nothing is solved of these four yet
+        point_deviation: Tensor,
+        expression: Tensor,
+        expression_deviation: Tensor,
         size: Tensor,
         interval: Tensor,
         controls: Tensor,

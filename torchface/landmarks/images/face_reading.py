@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
 
 import torch
 from torch import Tensor
 
 from torchface.landmarks.images.ibug_68 import COUNT, box_around
+from torchface.shape_names import ARKIT
 
 READ_BY_NETWORKS = (
-    "landmarks", "deviation", "visibility", "presence", "iris", "openness", "closed", "eye_visibility"
+    "landmarks", "deviation", "visibility", "presence", "iris", "openness", "closed", "eye_visibility", "points",
+    "point_deviation", "expression", "expression_deviation",
 )  # fmt: skip
 """The parts of a reading that networks give, in the order in which a webcam's solver takes them."""
 
@@ -22,6 +24,13 @@ _HIDDEN, _VISIBLE = 0.7, 0.95
 _LIPS, _CHIN, _CONTOUR = slice(48, 68), slice(4, 13), 17
 _GROUPS = (slice(17, 22), slice(22, 27), slice(27, 36), slice(36, 42), slice(42, 48), _LIPS)
 """Brows, nose, eyes, lips."""
+
+_UNREAD: dict[str, tuple[tuple[int, ...], float]] = {
+    "iris": ((2, 2), torch.nan), "openness": ((2,), torch.nan), "closed": ((2,), torch.nan),
+    "eye_visibility": ((2,), 0.0), "points": ((0, 2), torch.nan), "point_deviation": ((0,), torch.inf),
+    "expression": ((len(ARKIT),), torch.nan), "expression_deviation": ((len(ARKIT),), torch.inf),
+}  # fmt: skip
+"""Shape and value of what nothing has read."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,6 +49,12 @@ class FaceReading:
         openness: distance of the lids over that of the eye's corners, (...,2); likewise.
         closed: (...,2) in [0,1]: how likely the eye is shut; likewise.
         eye_visibility: (...,2) in [0,1]: how likely nothing hides the eye; 0 where nobody looked.
+        points: other points of the face's surface, those of the network that found them, (...,P,2) pixels of the whole
+            picture; P is 0 if absent, NaN where there is no face.
+        point_deviation: standard deviation of a coordinate of each, (...,P) pixels: large where a point is hidden.
+        expression: weights of blendshapes by ARKit's names, measured from the picture alone: the true ones and noise,
+            so also beyond 0 and 1, (...,52); NaN, if absent too, where nothing measured them.
+        expression_deviation: standard deviation of the noise, (...,52); infinite for what cannot be seen.
         search_box: x, y, width, height of the box that the face was looked for in, (...,4) pixels; the box round the
             landmarks if absent.
 
@@ -60,14 +75,16 @@ class FaceReading:
     openness: Tensor = None  # type: ignore[assignment]
     closed: Tensor = None  # type: ignore[assignment]
     eye_visibility: Tensor = None  # type: ignore[assignment]
+    points: Tensor = None  # type: ignore[assignment]
+    point_deviation: Tensor = None  # type: ignore[assignment]
+    expression: Tensor = None  # type: ignore[assignment]
+    expression_deviation: Tensor = None  # type: ignore[assignment]
     search_box: Tensor = None  # type: ignore[assignment]
 
     def __post_init__(self) -> None:
         lead = self.landmarks.shape[:-2]
-        unread = {"iris": (2, 2), "openness": (2,), "closed": (2,), "eye_visibility": (2,)}
-        for name, shape in unread.items():
+        for name, (shape, value) in _UNREAD.items():
             if getattr(self, name) is None:
-                value = 0.0 if name == "eye_visibility" else torch.nan
                 object.__setattr__(self, name, self.landmarks.new_full((*lead, *shape), value))
         if self.search_box is None and self.landmarks.shape[-2:] == (COUNT, 2):
             object.__setattr__(self, "search_box", box_around(self.landmarks))
@@ -88,8 +105,30 @@ class FaceReading:
 
     @classmethod
     def stacked(cls, readings: Sequence[FaceReading]) -> FaceReading:
-        """A take's reading (T,...) of its frames', one at least."""
-        return cls(*(torch.stack([getattr(one, part.name) for one in readings]) for part in fields(cls)))
+        """A take's reading (T,...) of its frames', one at least; where points were not looked for they are NaN."""
+        return cls._combined(torch.stack, readings)
+
+    @classmethod
+    def joined(cls, readings: Sequence[FaceReading]) -> FaceReading:
+        """A take's reading of its pieces', one at least; likewise."""
+        return cls._combined(torch.cat, readings)
+
+    @classmethod
+    def _combined(cls, combine: Callable[[list[Tensor]], Tensor], readings: Sequence[FaceReading]) -> FaceReading:
+        count = max(one.points.shape[-2] for one in readings)
+        filled = [one._with_points(count) for one in readings]
+        return cls(*(combine([getattr(one, part.name) for one in filled]) for part in fields(cls)))
+
+    def _with_points(self, count: int) -> FaceReading:
+        """The same with so many points, NaN and infinitely uncertain if it has none."""
+        if self.points.shape[-2] == count:
+            return self
+        lead = self.landmarks.shape[:-2]
+        points, deviation = (
+            self.landmarks.new_full((*lead, *size), value)
+            for size, value in (((count, 2), torch.nan), ((count,), torch.inf))
+        )
+        return replace(self, points=points, point_deviation=deviation)
 
     def doubted(self, landmarks: Tensor) -> FaceReading:
         """The same with no confidence in some of the landmarks, (...,68) bool."""

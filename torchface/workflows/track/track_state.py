@@ -20,7 +20,7 @@ FOLDER = "state"
 """Where it lies in the folder of results."""
 
 _RECORD = "track.json"
-_METHOD = "tracked frames/7"
+_METHOD = "tracked frames/8"
 _MAX_PIECE_BYTES = 2**28
 _PARTS = fields(FaceReading)
 
@@ -54,10 +54,8 @@ class TrackState:
     def reading(self) -> FaceReading:
         """All that is kept, (T,...)."""
         nobody = FaceReading.stacked([FaceReading.lost()])
-        return FaceReading(*(
-            torch.cat([getattr(nobody, part.name)[:0], *(getattr(piece, part.name) for piece in self._pieces)])
-            for part in _PARTS
-        ))  # fmt: skip
+        none = FaceReading(*(getattr(nobody, part.name)[:0] for part in _PARTS))
+        return FaceReading.joined([none, *self._pieces])
 
     def looks(self) -> Tensor:
         """How the face looks in all frames that are kept, (T,C) of unit length; NaN where it was not found."""

@@ -42,7 +42,7 @@ def test_a_heat_map_with_one_hot_cell_is_read_at_its_place(network: LandmarkNetw
     heat = torch.full((1, 68, 16, 16), -60.0)
     rows, columns = torch.arange(68) // 16 + 3, torch.arange(68) % 16
     heat[0, torch.arange(68), rows, columns] = 60.0
-    found = network.read(heat, torch.zeros(1, 16, 16, 16), torch.zeros(1)).landmarks[0]
+    found = network.read(heat, torch.zeros(1, 16, 16, 16), torch.zeros(1, 24)).landmarks[0]
     # Four pixels a cell, pixel centres at integers: the first cell's middle is at 1.5.
     torch.testing.assert_close(found, torch.stack([4.0 * columns + 1.5, 4.0 * rows + 1.5], dim=1))
 
@@ -116,7 +116,7 @@ def test_the_graph_gives_what_the_network_gives(network: LandmarkNetwork, tmp_pa
     crops = torch.rand(5, 3, 64, 64, generator=torch.Generator().manual_seed(8))
     outputs = session.run(["landmarks", "deviation", "visibility", "presence"], {"image": crops.numpy()})
     with torch.no_grad():
-        for told, value in zip(network(crops), outputs, strict=True):
+        for told, value in zip(network(crops)[:4], outputs, strict=True):
             # Weights are halves in the file.
             torch.testing.assert_close(torch.from_numpy(value), told, rtol=5e-3, atol=0.05)
     assert report.size < 2_000_000

@@ -25,6 +25,7 @@ from torchface.landmarks.images.networks.eye_crop import eye_transforms, moved, 
 from torchface.landmarks.images.networks.eye_finder import LEAST, merged_lids
 from torchface.landmarks.images.networks.eye_network import EyeNetwork
 from torchface.landmarks.images.networks.landmark_network import LandmarkNetwork
+from torchface.shape_names import ARKIT
 
 STATE = 15
 """Numbers that a reader hands on."""
@@ -139,15 +140,15 @@ class FaceReader(nn.Module):
         # Boxes of the box network fit loosely, but what lies beside them is not their face.
         again = (followed & (shared < _FAR)) | (~followed & (shared >= _LOOSE))
         again = again & ready & plausible(moved, size, settings.smallest)
-        looked = torch.where(again, torch.where(followed, sought(moved, anchor), moved), first)
+        shown = torch.where(again, torch.where(followed, sought(moved, anchor), moved), first)
         seen = _either(
             again,
-            lambda image, looked, seen: self._look(image, looked),
-            lambda image, looked, seen: seen.clone(),
-            (image, looked, seen),
+            lambda image, shown, seen: self._look(image, shown),
+            lambda image, shown, seen: seen.clone(),
+            (image, shown, seen),
         )
-        marks, deviation, visibility, presence = seen.split([2 * COUNT, COUNT, COUNT, 1])
-        marks, presence = marks.view(COUNT, 2), presence[0]
+        looked = self._unpacked(seen)
+        marks, deviation, presence = looked.landmarks, looked.deviation, looked.presence
         own = place_around(marks)
         growth = own[2] / place[2].clamp(min=1)
         vague = confidence_of(deviation / own[2].clamp(min=1)).mean() < settings.vague
@@ -165,21 +166,34 @@ class FaceReader(nn.Module):
             torch.where(searched, 0.0, (since + interval).clamp(max=_LONG)),
             torch.where(refused, attempt + 1, 0.0),
         ]
-        anchor = torch.where(good & ~followed, relation(own, looked), anchor)
+        anchor = torch.where(good & ~followed, relation(own, shown), anchor)
         after = torch.cat([torch.where(good, own, place), anchor, torch.stack(counts), size])
-        face = read_eyes(image, FaceReading(marks, deviation, visibility, presence), self.eyes)
-        nothing = dict.fromkeys(("landmarks", "iris", "openness", "closed"), torch.nan)
+        face = read_eyes(image, looked, self.eyes)
+        nothing = dict.fromkeys(("landmarks", "iris", "openness", "closed", "points", "expression"), torch.nan)
         nothing |= dict.fromkeys(("visibility", "presence", "eye_visibility"), 0.0)
+        nothing |= dict.fromkeys(("point_deviation", "expression_deviation"), torch.inf)
         parts = {name: torch.where(good, getattr(face, name), value) for name, value in nothing.items()}
         return FaceReading(deviation=face.deviation, **parts), after
 
     def _look(self, image: Tensor, place: Tensor) -> Tensor:
-        """What the network finds in the square round a place: landmarks, deviation, visibility, presence in one row."""
+        """What the network finds in the square round a place, one after the other; see :meth:`_unpacked`."""
         network = self.landmarks
         found = network(cut_square(image, place, network.size, network.margin))
-        marks = from_square(found.landmarks[0], place, network.size, network.margin)
-        deviation = found.deviation[0] * place[2] * (network.margin / network.size)
-        return torch.cat([marks.flatten(), deviation, found.visibility[0], found.presence])
+        pixel = place[2] * (network.margin / network.size)
+        marks, points = (from_square(one[0], place, network.size, network.margin) for one in (found[0], found.points))
+        parts = (
+            marks, pixel * found.deviation, found.visibility, found.presence, points, pixel * found.point_deviation,
+            found.expression, found.expression_deviation,
+        )  # fmt: skip
+        return torch.cat([part.flatten() for part in parts])
+
+    def _unpacked(self, seen: Tensor) -> FaceReading:
+        points, shapes = self.landmarks.points, len(ARKIT)
+        parts = seen.split([2 * COUNT, COUNT, COUNT, 1, 2 * points, points, shapes, shapes])
+        return FaceReading(
+            parts[0].view(COUNT, 2), parts[1], parts[2], parts[3][0], points=parts[4].view(points, 2),
+            point_deviation=parts[5], expression=parts[6], expression_deviation=parts[7],
+        )  # fmt: skip
 
 
 def _either(

@@ -12,10 +12,13 @@ from torchface.errors import ShapeError
 from torchface.landmarks.images.face_crop import CROP_MARGIN, crop_transform, cut_crop, from_crop
 from torchface.landmarks.images.face_reading import FaceReading, box_side
 from torchface.landmarks.images.ibug_68 import COUNT, MIRROR_68
+from torchface.landmarks.images.networks.landmark_network import NetworkLandmarks
+from torchface.shape_names import ARKIT, mirror
 
-CropNetwork = Callable[[Tensor], tuple[Tensor, Tensor, Tensor, Tensor]]
-"""Crops (B,3,S,S) float32 in [0,1], red first, to landmarks (B,68,2) and their deviations (B,68), pixels of the crop,
-visibility (B,68) and presence (B,), each in [0,1]."""
+CropNetwork = Callable[[Tensor], NetworkLandmarks]
+"""Crops (B,3,S,S) float32 in [0,1], red first, to what they show."""
+
+_NO_POINTS = torch.zeros(0, dtype=torch.int64)
 
 
 @dataclass(frozen=True, eq=False)
@@ -24,19 +27,38 @@ class BothSides:
 
     Args:
         network: see ``CropNetwork``.
+        mirror: which of the network's points each becomes when the picture is mirrored, (P,) int64.
     """
 
     network: CropNetwork
+    mirror: Tensor = _NO_POINTS
 
-    def __call__(self, crops: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        rows, last = list(MIRROR_68), crops.shape[-1] - 1
+    def __call__(self, crops: Tensor) -> NetworkLandmarks:
+        last = crops.shape[-1] - 1
         upright, mirrored = self.network(crops), self.network(crops.flip(-1).contiguous())
-        across = mirrored[0][:, rows] * mirrored[0].new_tensor([-1.0, 1.0]) + mirrored[0].new_tensor([last, 0.0])
-        landmarks = (upright[0] + across) / 2
-        # Where the two disagree the landmark is less sure than either says.
-        apart = (upright[0] - across).norm(dim=-1) / 2
-        deviation = ((upright[1] + mirrored[1][:, rows]) / 2).square().add(apart.square()).sqrt()
-        return landmarks, deviation, (upright[2] + mirrored[2][:, rows]) / 2, (upright[3] + mirrored[3]) / 2
+        rows, twins = list(MIRROR_68), mirror(ARKIT)
+        landmarks, deviation = _merged(upright[:2], (mirrored.landmarks[:, rows], mirrored.deviation[:, rows]), last)
+        across = mirrored.points[:, self.mirror], mirrored.point_deviation[:, self.mirror]
+        points, point_deviation = _merged(upright[4:6], across, last)
+        return NetworkLandmarks(
+            landmarks,
+            deviation,
+            (upright.visibility + mirrored.visibility[:, rows]) / 2,
+            (upright.presence + mirrored.presence) / 2,
+            points,
+            point_deviation,
+            (upright.expression + mirrored.expression[:, twins]) / 2,
+            (upright.expression_deviation + mirrored.expression_deviation[:, twins]) / 2,
+        )
+
+
+def _merged(upright: tuple[Tensor, ...], mirrored: tuple[Tensor, ...], last: int) -> tuple[Tensor, Tensor]:
+    """Points and deviations of both sides together; the mirror image's points have the other's order already."""
+    across = mirrored[0] * mirrored[0].new_tensor([-1.0, 1.0]) + mirrored[0].new_tensor([last, 0.0])
+    # Where the two disagree a point is less sure than either says.
+    apart = (upright[0] - across).norm(dim=-1) / 2
+    deviation = ((upright[1] + mirrored[1]) / 2).square().add(apart.square()).sqrt()
+    return (upright[0] + across) / 2, deviation
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,15 +82,18 @@ class CropFinder:
         """See :class:`~torchface.landmarks.images.landmark_finder.LandmarkFinder`."""
         transform = crop_transform(box, tilt, self.size, self.margin)
         crop = cut_crop(image, transform, self.size)
-        outputs = self.network(crop[None].float() / 255)
-        shapes = tuple(tuple(one.shape) for one in outputs)
+        found = self.network(crop[None].float() / 255)
+        shapes = tuple(tuple(one.shape) for one in found[:4])
         if shapes != ((1, COUNT, 2), (1, COUNT), (1, COUNT), (1,)):
             raise ShapeError(
                 f"{self.name}: found {shapes}, expected landmarks (1,{COUNT},2), deviation (1,{COUNT}), visibility "
                 f"(1,{COUNT}) and presence (1,)"
             )
-        landmarks, deviation, visibility, presence = (one[0].detach().float().cpu() for one in outputs)
+        one = NetworkLandmarks(*(value[0].detach().float().cpu() for value in found))
         scale = box_side(box) * (self.margin / self.size)  # pixels of the image a pixel of the crop
         return FaceReading(
-            from_crop(landmarks, transform), scale * deviation, visibility, presence, search_box=box.to(landmarks)
-        )
+            from_crop(one.landmarks, transform), scale * one.deviation, one.visibility, one.presence,
+            points=from_crop(one.points, transform), point_deviation=scale * one.point_deviation,
+            expression=one.expression, expression_deviation=one.expression_deviation,
+            search_box=box.to(one.landmarks),
+        )  # fmt: skip

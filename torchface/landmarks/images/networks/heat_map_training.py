@@ -46,7 +46,7 @@ def draw_numbers(pictures: Dataset[Any], settings: DescentSettings, step: int) -
     return torch.randint(count, (settings.batch,), generator=generator), generator
 
 
-def point_loss(points: Tensor, truth: Tensor, deviation: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
+def point_loss(points: Tensor, truth: Tensor, deviation: Tensor | None, weight: Tensor) -> tuple[Tensor, Tensor]:
     r"""The loss of places and of the deviations stated for them, and the distances :math:`r_l` (B,L).
 
     .. math:: \frac{1}{\sum_l v_l} \sum_l v_l \Bigl( r_l + 3 \ln(1 + r_l / 0.7) + \tfrac12 \tfrac{r_l}{\sigma_l}
@@ -57,15 +57,28 @@ def point_loss(points: Tensor, truth: Tensor, deviation: Tensor, weight: Tensor)
 
     Args:
         points, truth: (B,L,2) pixels.
-        deviation: :math:`\sigma`, (B,L) pixels.
+        deviation: :math:`\sigma`, (B,L) pixels; if absent, places alone are learned.
         weight: :math:`v`, (B,L).
 
     Source: Feng et al. 2018 (a loss that is steep near zero); Kumar et al. 2020 (likelihood with visibility).
     """
     distance = ((points - truth).square().sum(-1) + 1e-6).sqrt()
     near = distance + 3 * torch.log1p(distance / 0.7)
-    likelihood = distance.detach() / deviation + 2 * deviation.log()
-    return ((near + 0.5 * likelihood) * weight).sum() / weight.sum().clamp(min=1), distance.detach()
+    if deviation is not None:
+        near = near + 0.5 * (distance.detach() / deviation + 2 * deviation.log())
+    return (near * weight).sum() / weight.sum().clamp(min=1), distance.detach()
+
+
+def deviation_loss(distance: Tensor, deviation: Tensor, weight: Tensor) -> Tensor:
+    r"""The Gaussian negative log likelihood :math:`\tfrac{r^2}{2 \sigma^2} + 2 \ln \sigma` of stated deviations alone.
+
+    Args:
+        distance: r, (B,L) pixels; nothing is learned through it.
+        deviation: :math:`\sigma` of a coordinate, (B,L) pixels.
+        weight: (B,L).
+    """
+    likelihood = 0.5 * (distance.detach() / deviation).square() + 2 * deviation.log()
+    return (likelihood * weight).sum() / weight.sum().clamp(min=1)
 
 
 def gap_loss(points: Tensor, truth: Tensor, weight: Tensor, pairs: Tensor, steepness: float) -> Tensor:

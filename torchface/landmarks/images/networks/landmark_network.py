@@ -1,4 +1,4 @@
-"""68 landmarks of a face in one pass of a small convolutional network: places, their uncertainty, what is hidden."""
+"""Landmarks of a face in one pass of a small convolutional network, and with a head for it points of the whole face."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from torch.utils.data import Dataset
 from torchface.errors import ShapeError, ValueRangeError
 from torchface.files.documents import Value
 from torchface.landmarks.images.ibug_68 import COUNT
+from torchface.landmarks.images.networks.dense_head import WEIGHTS, DenseHead, DenseReading
 from torchface.landmarks.images.networks.heat_maps import ResidualBlock, convolution, doubled, read_heat
 from torchface.progress import Progress, ValueLog
 
@@ -20,7 +21,7 @@ if TYPE_CHECKING:
 
 STRIDE = 4
 """Pixels of the crop a side of a heat map's cell."""
-_MOST_CHANNELS, _MOST_BLOCKS, _MOST_SIZE = 512, 16, 512
+_MOST_CHANNELS, _MOST_BLOCKS, _MOST_SIZE, _MOST_POINTS = 512, 16, 512, 4096
 DEVIATION_RANGE = (0.05, 60.0)
 """Pixels of the crop, of the deviations that the network states."""
 
@@ -33,12 +34,29 @@ class NetworkLandmarks(NamedTuple):
         deviation: mean distance to be expected of each from the truth, (B,68) pixels of the crop.
         visibility: probability that nothing stands before it, (B,68).
         presence: probability that the crop shows a face in the place it expects, (B,).
+        points: the network's other points, (B,P,2) pixels of the crop.
+        point_deviation: standard deviation of a coordinate of each, (B,P) pixels: large where a point is hidden.
+        expression: weights of blendshapes by ARKit's names, the true ones and noise, so also beyond 0 and 1, (B,52);
+            NaN of a network without points.
+        expression_deviation: standard deviation of the noise, (B,52); infinite for what cannot be seen.
     """
 
     landmarks: Tensor
     deviation: Tensor
     visibility: Tensor
     presence: Tensor
+    points: Tensor
+    point_deviation: Tensor
+    expression: Tensor
+    expression_deviation: Tensor
+
+    @classmethod
+    def of_68(cls, landmarks: Tensor, deviation: Tensor, visibility: Tensor, presence: Tensor) -> NetworkLandmarks:
+        """What is found by a network without further points."""
+        count = landmarks.shape[:1]
+        points = landmarks.new_zeros((*count, 0, 2)), landmarks.new_zeros((*count, 0))
+        unseen = (landmarks.new_full((*count, WEIGHTS), value) for value in (torch.nan, torch.inf))
+        return cls(landmarks, deviation, visibility, presence, *points, *unseen)
 
 
 class LandmarkNetwork(nn.Module):
@@ -47,7 +65,7 @@ class LandmarkNetwork(nn.Module):
     .. math:: x_l = \sum_p \mathrm{softmax}(h_l)_p \, p
 
     with :math:`h_l` the heat map of landmark l at a quarter of the crop's resolution. Features under the heat map give
-    the deviation to be expected of the landmark, and whether something hides it.
+    the deviation to be expected of the landmark, and whether something hides it. With points it has a ``DenseHead``.
 
     Args:
         size: of a crop, pixels a side; a multiple of 16.
@@ -55,6 +73,8 @@ class LandmarkNetwork(nn.Module):
         channels: at a half, a quarter, an eighth and a sixteenth of the resolution.
         blocks: residual blocks at a quarter, an eighth and a sixteenth.
         decoder: channels of the decoder at a quarter.
+        points: P, how many points of the face it finds beside the 68: where they are, ``places`` has.
+        hidden: units of the head that finds them and reads the expression.
 
     Source: Newell, Yang, Deng 2016 (encoder and decoder); Sun et al. 2018 (means of heat maps); Kumar et al. 2020
     (uncertainty and visibility beside places).
@@ -75,6 +95,8 @@ class LandmarkNetwork(nn.Module):
         channels: tuple[int, ...] = (16, 24, 48, 96),
         blocks: tuple[int, ...] = (1, 2, 2),
         decoder: int = 32,
+        points: int = 0,
+        hidden: int = 176,
     ) -> None:
         super().__init__()
         if not (32 <= size <= _MOST_SIZE and size % 16 == 0 and 0.5 <= margin <= 4):
@@ -86,6 +108,11 @@ class LandmarkNetwork(nn.Module):
             raise ValueRangeError(f"channels: found {channels} and {decoder}, expected four and one, 1 to 512 each")
         if len(blocks) != 3 or not all(0 <= count <= _MOST_BLOCKS for count in blocks):
             raise ValueRangeError(f"blocks: found {blocks}, expected three numbers, 0 to {_MOST_BLOCKS} each")
+        if not (0 <= points <= _MOST_POINTS and 1 <= hidden <= _MOST_CHANNELS):
+            raise ValueRangeError(
+                f"points: found {points} and {hidden} hidden units, expected 0 to {_MOST_POINTS} and 1 to "
+                f"{_MOST_CHANNELS}"
+            )
         self.size, self.margin = size, margin
         self.channels, self.blocks, self.decoder = tuple(channels), tuple(blocks), decoder
         half, quarter, eighth, sixteenth = channels
@@ -103,6 +130,8 @@ class LandmarkNetwork(nn.Module):
         self.local = nn.Parameter(torch.zeros(COUNT, decoder, 2))
         self.local_bias = nn.Parameter(torch.zeros(COUNT, 2))
         self.presence = nn.Linear(sixteenth, 1)
+        self.points, self.hidden = points, hidden
+        self.dense = DenseHead(points, hidden, decoder, sixteenth) if points else None
 
     @classmethod
     def fit(
@@ -118,7 +147,8 @@ class LandmarkNetwork(nn.Module):
         r"""Trains a landmark network on pictures.
 
         .. math:: \sum_l v_l \Bigl( r_l + 3 \ln(1 + r_l / 0.7) + \tfrac{r_l}{2 \sigma_l} + \ln \sigma_l \Bigr)
-            + \text{distances of pairs} + \text{form of heat maps} + \text{cross entropy of } v \text{ and presence}
+            + \text{distances of pairs} + \text{openings} + \text{form of heat maps}
+            + \text{cross entropy of } v \text{ and presence} + \text{likelihood of points and weights}
 
         with :math:`r_l` the distance from the truth in pixels of the crop.
 
@@ -126,7 +156,8 @@ class LandmarkNetwork(nn.Module):
             pictures: indexed by numbers (B,), such as ``TensorDataset(rgba, landmarks, visible)``; each batch is asked
                 for by a ``DataLoader``'s workers. Gives cut-out faces, uint8 (B,4,H,W), see
                 ``train/rendered_people/face_picture.py``; iBUG's 68, (B,68,2) pixels; and which of them nothing hides,
-                (B,68) bool.
+                (B,68) bool. For a network with points also these, (B,P,2) and (B,P) bool, and the weights of
+                blendshapes by ARKit's names that are posed, (B,52).
             network: goes on from its weights; a new one if absent.
             settings: how.
             progress: called with each step and how far it is.
@@ -151,16 +182,43 @@ class LandmarkNetwork(nn.Module):
     def config(self) -> dict[str, Any]:
         return {
             "size": self.size, "margin": self.margin, "channels": list(self.channels), "blocks": list(self.blocks),
-            "decoder": self.decoder,
+            "decoder": self.decoder, "points": self.points, "hidden": self.hidden,
         }  # fmt: skip
 
     @classmethod
     def from_config(cls, config: dict[str, Any]) -> Self:
-        given = Value("config", "", config).table()
+        given = Value("config", "", {"points": 0, "hidden": 176} | config).table()
         return cls(
             given["size"].whole(), given["margin"].number(), tuple(one.whole() for one in given["channels"].rows()),
             tuple(one.whole() for one in given["blocks"].rows()), given["decoder"].whole(),
+            given["points"].whole(), given["hidden"].whole(),
         )  # fmt: skip
+
+    @property
+    def places(self) -> Tensor:
+        """Where its points are on the embedded performer's mean head, (P,3) millimetres."""
+        return torch.zeros(0, 3) if self.dense is None else self.dense.places
+
+    @property
+    def mirror(self) -> Tensor:
+        """Which of its points each becomes when the picture is mirrored, (P,) int64."""
+        return torch.zeros(0, dtype=torch.int64) if self.dense is None else self.dense.mirror
+
+    def with_points(self, places: Tensor, mirror: Tensor, hidden: int = 176) -> LandmarkNetwork:
+        """A network that finds the 68 as this one does, and has an untrained head for further points.
+
+        Args:
+            places: of the points on the embedded performer's mean head, (P,3) millimetres.
+            mirror: which of them each becomes when the picture is mirrored, (P,) int64.
+            hidden: units of the head.
+        """
+        network = LandmarkNetwork.from_config(self.config | {"points": len(places), "hidden": hidden})
+        own = {name: value for name, value in self.state_dict().items() if not name.startswith("dense.")}
+        network.load_state_dict(network.state_dict() | own)
+        assert network.dense is not None
+        network.dense.places.copy_(places)
+        network.dense.mirror.copy_(mirror)
+        return network
 
     def forward(self, crops: Tensor) -> NetworkLandmarks:
         """Landmarks in crops, (B,3,S,S) in [0,1], red first.
@@ -173,7 +231,7 @@ class LandmarkNetwork(nn.Module):
         return self.read(*self.maps(crops))
 
     def maps(self, crops: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Heat maps (B,68,S/4,S/4), decoder features (B,C,S/4,S/4) and the logit of presence (B,)."""
+        """Heat maps (B,68,S/4,S/4), decoder features (B,C,S/4,S/4) and the deepest features' mean (B,D)."""
         quarter = self.quarter(self.stem(2 * crops - 1))
         eighth = self.eighth(quarter)
         deep = self.sixteenth(eighth)
@@ -181,11 +239,25 @@ class LandmarkNetwork(nn.Module):
         deep = deep + self.context(pooled)[:, :, None, None]
         eighth = self.mix_eighth(doubled(self.up_eighth(deep)) + eighth)
         features = self.mix_quarter(doubled(self.up_quarter(eighth)) + self.skip_quarter(quarter))
-        return self.heat(features), features, self.presence(pooled)[:, 0]
+        return self.heat(features), features, pooled
 
-    def read(self, heat: Tensor, features: Tensor, presence: Tensor) -> NetworkLandmarks:
+    def read(self, heat: Tensor, features: Tensor, pooled: Tensor) -> NetworkLandmarks:
         """Landmarks from what ``maps`` gives."""
+        found, dense = self.readings(heat, features, pooled)
+        if dense is None or self.dense is None:
+            return found
+        weights = self.dense.unshrunk(dense.raw, dense.raw_deviation)
+        return NetworkLandmarks(*found[:4], dense.points, dense.point_deviation, *weights)
+
+    def readings(self, heat: Tensor, features: Tensor, pooled: Tensor) -> tuple[NetworkLandmarks, DenseReading | None]:
+        """The 68 alone, and what the head for points reads as it has learned it; None without one."""
         points, under, widening = read_heat(heat, features, STRIDE)
         local = (under[..., None] * self.local).sum(2) + self.local_bias
-        deviation = (local[..., 0] + widening).exp()
-        return NetworkLandmarks(points, deviation.clamp(*DEVIATION_RANGE), local[..., 1].sigmoid(), presence.sigmoid())
+        deviation = (local[..., 0] + widening).exp().clamp(*DEVIATION_RANGE)
+        presence = self.presence(pooled)[:, 0].sigmoid()
+        found = NetworkLandmarks.of_68(points, deviation, local[..., 1].sigmoid(), presence)
+        if self.dense is None:
+            return found, None
+        # The head describes where the 68 are; it does not move them.
+        dense = self.dense(points.detach(), under, features, pooled, self.size)
+        return found, dense._replace(point_deviation=dense.point_deviation.clamp(*DEVIATION_RANGE))

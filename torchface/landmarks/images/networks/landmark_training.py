@@ -8,12 +8,15 @@ from pathlib import Path
 
 import torch
 from torch import Tensor
-from torch.nn.functional import binary_cross_entropy, binary_cross_entropy_with_logits
+from torch.nn.functional import binary_cross_entropy, smooth_l1_loss
 from torch.utils.data import Dataset
 
 from torchface.files.content_keys import content_key
+from torchface.landmarks.images.ibug_68 import COUNT, MIRROR_68
+from torchface.landmarks.images.networks.dense_head import DenseHead, DenseReading, in_face_frame
 from torchface.landmarks.images.networks.heat_map_training import (
     check_pictures,
+    deviation_loss,
     draw_numbers,
     gap_loss,
     heat_loss,
@@ -24,12 +27,17 @@ from torchface.landmarks.images.networks.landmark_network import STRIDE, Landmar
 from torchface.landmarks.images.networks.picture_augmentation import AugmentationSettings, Crops, augmented
 from torchface.optim import DescentRun, DescentSettings, DescentTask, descend
 from torchface.progress import Progress, ValueLog, silent
+from torchface.shape_names import ARKIT, mirror
 
-_METHOD = "landmark network/2"
+_METHOD = "landmark network/3"
 # Pairs of landmarks whose distance is what is read off a face: how far lids and lips are open, how high brows are.
 _PAIRS = torch.tensor([[37, 41], [38, 40], [43, 47], [44, 46], [61, 67], [62, 66], [63, 65], [51, 57], [48, 54],
                        [19, 37], [24, 44]])  # fmt: skip
+_OPENINGS = ((0, 1), (2, 3), (4, 5, 6), (7,), (8,), (9,), (10,))
+"""Rows of ``_PAIRS`` whose mean length is an opening: lids, lips inside and outside, the mouth's width, brows."""
 _HEAT = 1.0  # standard deviation of the heat map asked for, cells
+_OPENING, _SLOPE, _VARIED = 10.0, 10.0, 0.02  # weights of an opening's error and slope; squares that make a slope
+_STARTED, _RIDGE = 1024, 1e-2  # pictures, and share of their number
 
 
 @dataclass(frozen=True)
@@ -38,7 +46,10 @@ class NetworkSettings(DescentSettings):
 
     Args:
         pair: weight of distances between landmarks, such as between lids.
-        heat: weight of the heat maps' form, which fades over the first half.
+        opening: weight of openings, and of their slope over the true ones in each batch, which is to be 1.
+        heat: weight of the heat maps' form, which fades over the first half; 0 for a network that has learned it.
+        dense: weight of the points beside the 68, where the network has some.
+        expression: weight of the likelihood of blendshape weights, likewise.
         augmentation: how widely crops are drawn.
 
     Example:
@@ -48,7 +59,10 @@ class NetworkSettings(DescentSettings):
 
     workers: int = 1
     pair: float = 1.0
+    opening: float = 1.0
     heat: float = 0.5
+    dense: float = 1.0
+    expression: float = 2.0
     augmentation: AugmentationSettings = field(default_factory=AugmentationSettings)
 
 
@@ -62,12 +76,19 @@ def fit_landmarks(
     log: ValueLog | None,
 ) -> LandmarkNetwork:
     """See :meth:`LandmarkNetwork.fit`."""
-    check_pictures(pictures, "uint8 (4,H,W), landmarks (68,2) and visibility (68,)", (68, 2), (68,))
     settings = settings or NetworkSettings()
     network = network or new_network(LandmarkNetwork, settings.seed)
-    learned = {"pair": settings.pair, "heat": settings.heat, "augmentation": settings.augmentation}
+    expected, shapes = "uint8 (4,H,W), landmarks (68,2) and visibility (68,)", [(68, 2), (68,)]
+    if network.points:
+        expected += f", points ({network.points},2), their visibility, and weights ({len(ARKIT)},)"
+        shapes += [(network.points, 2), (network.points,), (len(ARKIT),)]
+    check_pictures(pictures, expected, *shapes)
+    if network.dense is not None and not bool(network.dense.form.bias.any()):
+        _start_points(network.dense, pictures)
+    names = ("pair", "opening", "heat", "dense", "expression", "augmentation")
+    learned = {name: getattr(settings, name) for name in names}
     task = DescentTask(
-        partial(_crops, pictures, network.size, network.margin, settings),
+        partial(_crops, pictures, network.size, network.margin, network.mirror, settings),
         partial(_loss, network, settings, device),
         content_key(_METHOD, settings=learned, config=network.config),
         "training the network",
@@ -76,31 +97,144 @@ def fit_landmarks(
     return descend(network, task, settings, DescentRun(progress or silent, log, checkpoint, device))
 
 
+@torch.no_grad()
+def _start_points(head: DenseHead, pictures: Dataset[tuple[Tensor, ...]]) -> None:
+    """Has a head begin with the linear map from the 68 to its points that fits pictures best."""
+    count: int = len(pictures)  # type: ignore[arg-type]
+    _, landmarks, _, points, *_ = pictures[torch.linspace(0, count - 1, min(count, _STARTED)).long()]
+    flip = landmarks.new_tensor([-1.0, 1.0])  # both sides of each face
+    landmarks = torch.cat([landmarks, landmarks[:, list(MIRROR_68)] * flip])
+    points = torch.cat([points, points[:, head.mirror] * flip])
+    own, base = (in_face_frame(one, landmarks).flatten(1) for one in (landmarks, points))
+    mean, about = own.mean(0), own - own.mean(0)
+    normal = about.T @ about + _RIDGE * len(own) * torch.eye(own.shape[1])
+    head.form.weight.copy_(torch.linalg.solve(normal, about.T @ (base - base.mean(0))).T)
+    head.form.bias.copy_(base.mean(0) - head.form.weight @ mean)
+
+
 def _crops(
-    pictures: Dataset[tuple[Tensor, ...]], size: int, margin: float, settings: NetworkSettings, step: int
-) -> Crops:
+    pictures: Dataset[tuple[Tensor, ...]],
+    size: int,
+    margin: float,
+    mirrored: Tensor,
+    settings: NetworkSettings,
+    step: int,
+) -> tuple[Crops, Tensor]:
+    """The crops of a step, and the weights (B,52) that they show; none (B,0) for a network of the 68 alone."""
     numbers, generator = draw_numbers(pictures, settings, step)
-    rgba, landmarks, visible = pictures[numbers]
-    return augmented(rgba, landmarks, visible, size, margin, generator, settings.augmentation)
+    return cropped(pictures[numbers], size, margin, mirrored, generator, settings.augmentation)
+
+
+def cropped(
+    pictures: tuple[Tensor, ...],
+    size: int,
+    margin: float,
+    mirrored: Tensor,
+    generator: torch.Generator,
+    settings: AugmentationSettings,
+) -> tuple[Crops, Tensor]:
+    """Crops of pictures as a data set gives them, and the weights (B,52) that they show; (B,0) without points.
+
+    Args:
+        pictures: see :meth:`LandmarkNetwork.fit`.
+        size, margin: of the network.
+        mirrored: a network's ``mirror``, (P,).
+        generator: decides everything.
+        settings: how widely crops are drawn.
+    """
+    rgba, landmarks, visible, *more = pictures
+    if not len(mirrored):
+        return augmented(rgba, landmarks, visible, size, margin, generator, settings), landmarks[:, :0, 0]
+    points, point_visible, weights = more
+    marks, seen = torch.cat([landmarks, points], 1), torch.cat([visible, point_visible], 1)
+    crops = augmented(rgba, marks, seen, size, margin, generator, settings, mirrored)
+    return crops, torch.where(crops.mirrored[:, None], weights[:, mirror(ARKIT)], weights)
 
 
 def _loss(
-    network: LandmarkNetwork, settings: NetworkSettings, device: str | torch.device, crops: Crops, share: float
+    network: LandmarkNetwork,
+    settings: NetworkSettings,
+    device: str | torch.device,
+    batch: tuple[Crops, Tensor],
+    share: float,
 ) -> tuple[Tensor, float]:
-    """The loss of a batch, and the mean distance of what can be seen, pixels."""
-    images, truth = crops.images.to(device, memory_format=torch.channels_last), crops.landmarks.to(device)
-    visible, present = crops.visible.to(device), crops.present.to(device)
-    heat, features, logit = network.maps(images)
-    reading = network.read(heat, features, logit)
-    within = ((truth > 1) & (truth < network.size - 2)).all(-1).float()
-    weight = within * (0.4 + 0.6 * visible) * present[:, None]
+    """The loss of a batch, and the mean distance of what can be seen of the 68, pixels."""
+    crops, weights = batch
+    images, marks = crops.images.to(device, memory_format=torch.channels_last), crops.landmarks.to(device)
+    seen, present, weights = crops.visible.to(device), crops.present.to(device), weights.to(device)
+    within = ((marks > 1) & (marks < network.size - 2)).all(-1).float() * present[:, None]
+    trusted = within * (0.4 + 0.6 * seen)
+    truth, visible, weight = marks[:, :COUNT], seen[:, :COUNT], trusted[:, :COUNT]
+    heat, features, pooled = network.maps(images)
+    reading, dense = network.readings(heat, features, pooled)
     places, distance = point_loss(reading.landmarks, truth, reading.deviation, weight)
     pairs = gap_loss(reading.landmarks, truth, weight, _PAIRS, 2)
-    fading = settings.heat * max(0.0, 1 - 2 * share) + 0.05
-    form = heat_loss(heat, truth, weight, STRIDE, _HEAT)
     hidden = binary_cross_entropy(reading.visibility.clamp(1e-5, 1 - 1e-5), visible, reduction="none")
-    hidden = (hidden * within * present[:, None]).sum() / weight.sum().clamp(min=1)
-    absent = binary_cross_entropy_with_logits(logit, present)
-    loss = places + settings.pair * pairs + fading * form + hidden + absent
-    clear = within * visible * present[:, None]
+    hidden = (hidden * within[:, :COUNT]).sum() / weight.sum().clamp(min=1)
+    absent = binary_cross_entropy(reading.presence.clamp(1e-5, 1 - 1e-5), present)
+    loss = places + settings.pair * pairs + hidden + absent
+    if settings.heat > 0:
+        fading = settings.heat * max(0.0, 1 - 2 * share) + 0.05
+        loss = loss + fading * heat_loss(heat, truth, weight, STRIDE, _HEAT)
+    # Of faces that are not found yet openings say nothing.
+    loss = loss + settings.opening * min(1.0, 4 * share) * opening_loss(reading.landmarks, truth, weight)
+    if dense is not None:
+        near, apart = point_loss(dense.points, marks[:, COUNT:], None, trusted[:, COUNT:])
+        sure = deviation_loss(apart, dense.point_deviation, trusted[:, COUNT:])
+        loss = loss + settings.dense * (near + sure) + settings.expression * weight_loss(dense, weights, present)
+    clear = within[:, :COUNT] * visible
     return loss, float((distance * clear).sum() / clear.sum().clamp(min=1))
+
+
+def openings(points: Tensor, face: Tensor) -> Tensor:
+    """How far a face is open, (B,7) of its size: right and left lids, lips inside and outside, mouth's width, brows.
+
+    Args:
+        points: iBUG's 68, (B,68,2).
+        face: the landmarks whose size counts, (B,68,2).
+    """
+    size = (face - face.mean(1, keepdim=True)).square().sum(-1).mean(1).clamp(min=1e-4).sqrt()
+    first, second = _PAIRS.to(points.device).unbind(1)
+    lengths = ((points[:, first] - points[:, second]).square().sum(-1) + 1e-6).sqrt() / size[:, None]
+    return torch.stack([lengths[:, list(rows)].mean(1) for rows in _OPENINGS], 1)
+
+
+def opening_loss(points: Tensor, truth: Tensor, weight: Tensor) -> Tensor:
+    r"""The loss of openings o, (B,7), :math:`10 \lvert o - \hat o \rvert + 5 (1 - \text{slope})^2`.
+
+    What is uncertain is drawn toward its mean where distances alone are learned: so the slope of what is read over
+    what is true, in each batch, is to be 1.
+
+    Args:
+        points, truth: iBUG's 68, (B,68,2) pixels.
+        weight: of points, (B,68).
+    """
+    read, true = openings(points, truth), openings(truth, truth)
+    both = weight[:, _PAIRS].amin(-1)
+    share = torch.stack([both[:, list(rows)].amin(1) for rows in _OPENINGS], 1)
+    total = share.sum(0).clamp(min=1e-3)
+    off = ((read - true).abs() * share).sum(0) / total
+    about = true - (true * share).sum(0) / total
+    varied = (about.square() * share).sum(0)
+    slope = (about * read * share).sum(0) / varied.clamp(min=1e-3)
+    return (
+        _OPENING * off.mean()
+        + _SLOPE * (smooth_l1_loss(slope, torch.ones_like(slope), reduction="none") * (varied > _VARIED)).mean()
+    )
+
+
+def weight_loss(dense: DenseReading, weights: Tensor, present: Tensor) -> Tensor:
+    r"""The Gaussian negative log likelihood of weights, each times its deviation, so that what is uncertain is learned
+    too.
+
+    Args:
+        dense: what was read.
+        weights: the truth, (B,52).
+        present: whether a face is there, (B,).
+
+    Source: Seitzer et al. 2022 (half of the deviation's square as weight).
+    """
+    deviation = dense.raw_deviation
+    likelihood = 0.5 * ((dense.raw - weights) / deviation).square() + deviation.log()
+    each = (likelihood * deviation.detach()).mean(1)
+    return (each * present).sum() / present.sum().clamp(min=1)

@@ -24,6 +24,7 @@ from torchface.landmarks.images.networks import graph_process
 from torchface.landmarks.images.networks.answering_process import AnsweringProcess
 from torchface.landmarks.images.networks.crop_finder import CropFinder, CropNetwork
 from torchface.landmarks.images.networks.graph_process import signature
+from torchface.landmarks.images.networks.landmark_network import NetworkLandmarks
 
 if TYPE_CHECKING:
     import onnxruntime
@@ -96,7 +97,7 @@ def _finder(declared: dict[str, Any], network: CropNetwork, path: Path) -> CropF
     size = _checked_size(declared, path)
     finder = CropFinder(network, size, _margin(declared["crop"], path), path.name)
     trial = finder.network(torch.full((1, 3, size, size), 0.5))
-    for output, (name, shape) in zip(trial, _OUTPUTS.items(), strict=True):
+    for output, (name, shape) in zip(trial, _OUTPUTS.items(), strict=False):
         if output.shape != (1, *shape):
             raise FileFormatError(f"{path}: found {name} {tuple(output.shape)} for one crop; {_EXPECTED}")
     return finder
@@ -108,10 +109,12 @@ class _OwnGraph:
 
     session: onnxruntime.InferenceSession
 
-    def __call__(self, crops: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        outputs = self.session.run(list(_OUTPUTS), {"image": crops.float().contiguous().numpy()})
-        landmarks, deviation, visibility, presence = (torch.from_numpy(np.asarray(one)) for one in outputs)
-        return landmarks, deviation, visibility, presence
+    def __call__(self, crops: Tensor) -> NetworkLandmarks:
+        names = [one.name for one in self.session.get_outputs()]
+        outputs = self.session.run(names, {"image": crops.float().contiguous().numpy()})
+        given = {name: torch.from_numpy(np.asarray(one)) for name, one in zip(names, outputs, strict=True)}
+        least = NetworkLandmarks.of_68(*(given[name] for name in _OUTPUTS))
+        return least._replace(**{name: given[name] for name in NetworkLandmarks._fields if name in given})
 
 
 class _ForeignGraph:
@@ -133,17 +136,16 @@ class _ForeignGraph:
             )
         self.signature = head
 
-    def __call__(self, crops: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    def __call__(self, crops: Tensor) -> NetworkLandmarks:
         head, content = self._asked(graph_process.packed(crops.float().numpy()))
         if "error" in head:
             raise FileFormatError(f"{self.path}: the graph cannot be run ({head['error']}); {_EXPECTED}")
         self._seconds = self.limits.answer_seconds
         numbers = np.frombuffer(content, "<f4").astype(np.float32)
         parts = np.split(numbers, np.cumsum([math.prod(shape) for shape in head["shapes"]])[:-1])
-        landmarks, deviation, visibility, presence = (
-            torch.from_numpy(part.reshape(shape)) for part, shape in zip(parts, head["shapes"], strict=True)
+        return NetworkLandmarks.of_68(
+            *(torch.from_numpy(part.reshape(shape)) for part, shape in zip(parts, head["shapes"], strict=True))
         )
-        return landmarks, deviation, visibility, presence
 
     def _asked(self, content: bytes) -> tuple[dict[str, Any], bytes]:
         with self._process.within(self._seconds):

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchface.landmarks.images.ibug_68 import MIRROR_68, box_around
+from torchface.landmarks.images.ibug_68 import COUNT, MIRROR_68, box_around
 
 Uniform = Callable[[float, float], float]
 """A number drawn between two others."""
@@ -47,15 +47,17 @@ class Crops:
 
     Args:
         images: (B,3,S,S) in [0,1].
-        landmarks: (B,68,2) pixels.
-        visible: (B,68) in [0,1].
+        landmarks: (B,68+P,2) pixels.
+        visible: (B,68+P) in [0,1].
         present: whether a face is there, (B,) in [0,1].
+        mirrored: whether left and right are exchanged, (B,) bool.
     """
 
     images: Tensor
     landmarks: Tensor
     visible: Tensor
     present: Tensor
+    mirrored: Tensor
 
 
 def augmented(
@@ -66,20 +68,24 @@ def augmented(
     margin: float,
     generator: torch.Generator,
     settings: AugmentationSettings | None = None,
+    mirror: Tensor | None = None,
 ) -> Crops:
     """Draws a crop of each picture.
 
     Args:
         rgba: cut-out faces, uint8 (B,4,H,W).
-        landmarks: iBUG's 68, (B,68,2) pixels.
-        visible: which of them nothing hides, (B,68) bool.
+        landmarks: iBUG's 68 and P other points, (B,68+P,2) pixels.
+        visible: which of them nothing hides, (B,68+P) bool.
         size: of a crop, pixels a side.
         margin: a crop's side, of the side of the face's box.
         generator: decides everything.
         settings: how widely.
+        mirror: which of the other points each becomes in a mirror, (P,) int64; without any if absent.
     """
     settings = settings or AugmentationSettings()
-    count = len(rgba)
+    count, twins = len(rgba), torch.tensor(MIRROR_68)
+    if mirror is not None:
+        twins = torch.cat([twins, COUNT + mirror])
 
     def rand(*shape: int) -> Tensor:
         return torch.rand(*shape, generator=generator)
@@ -89,11 +95,11 @@ def augmented(
 
     present = (rand(count) >= settings.absent).float()
     mirrored = rand(count) < 0.5
-    across = landmarks[:, list(MIRROR_68)].clone()
+    across = landmarks[:, twins].clone()
     across[..., 0] = rgba.shape[-1] - 1 - across[..., 0]
     points = torch.where(mirrored[:, None, None], across, landmarks)
-    seen = torch.where(mirrored[:, None], visible[:, list(MIRROR_68)], visible).float()
-    box = box_around(points)
+    seen = torch.where(mirrored[:, None], visible[:, twins], visible).float()
+    box = box_around(points[:, :COUNT])
     turn = torch.where(rand(count) < 0.25, 45 * (2 * rand(count) - 1), settings.turn * randn(count).clamp(-2.5, 2.5))
     side = box[:, 2] * margin * (settings.scale * (2 * rand(count) - 1)).exp()
     shift = settings.shift * randn(count, 2).clamp(-2.5, 2.5)
@@ -118,7 +124,7 @@ def augmented(
     images, seen = _with_occluders(images, points, seen, settings, generator)
     images = _photographed(images, settings, generator)
     inside = ((points > -0.5) & (points < size - 0.5)).all(-1).float()
-    return Crops(images, points, seen * inside, present)
+    return Crops(images, points, seen * inside, present, mirrored)
 
 
 def _to_crop(middle: Tensor, side: Tensor, turn: Tensor, size: int) -> Tensor:

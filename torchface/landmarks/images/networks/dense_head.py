@@ -1,0 +1,151 @@
+"""Head of the landmark network that reads many points of the face's surface, and the weights of its expression."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+from torch.nn.functional import grid_sample
+
+from torchface.landmarks.images.ibug_68 import COUNT, tilt_around
+from torchface.shape_names import ARKIT
+
+WEIGHTS = len(ARKIT)
+LEAST_SLOPE = 0.15
+"""Slope of a weight as it is read over the true one, under which the weight cannot be seen."""
+
+_OWN, _SHARED, _UNDER = 3, 3, 8  # numbers read off the features of a point: its own, and those that all others see
+_OFFSET = 0.1  # of the face's size, a unit of what features move a point by
+
+
+class DenseReading(NamedTuple):
+    """What the head reads of B faces.
+
+    Args:
+        points: (B,P,2) pixels of the crop.
+        point_deviation: standard deviation of a coordinate, (B,P) pixels.
+        raw: weights by ARKit's names as they were learned, (B,52): drawn toward their means.
+        raw_deviation: of ``raw``, (B,52).
+    """
+
+    points: Tensor
+    point_deviation: Tensor
+    raw: Tensor
+    raw_deviation: Tensor
+
+
+class DenseHead(nn.Module):
+    r"""Points of the face's surface, and weights of blendshapes, from iBUG's 68 landmarks and features at a quarter.
+
+    .. math:: x_p = \bar x_p + F_p g + A_p f(\bar x_p + F_p g) + B_p h
+
+    with g the 68 landmarks in the face's own frame, f the features under a place, and h hidden units that see g, the
+    features under all landmarks and points, and the deepest features' mean. Weights are read off h. They are divided by
+    how far they are drawn toward their mean:
+
+    .. math:: z = (r - b) / a, \qquad r = a w + b + \varepsilon
+
+    Args:
+        points: P.
+        hidden: units of h.
+        channels: of the features.
+        deep: deepest features.
+
+    Source: Wood et al. 2022 (many points with a deviation each, from rendered pictures).
+    """
+
+    places: Tensor
+    mirror: Tensor
+    slope: Tensor
+    offset: Tensor
+    spread: Tensor
+
+    def __init__(self, points: int, hidden: int, channels: int, deep: int) -> None:
+        super().__init__()
+        self.register_buffer("places", torch.zeros(points, 3))
+        self.register_buffer("mirror", torch.arange(points))
+        # Of raw weights over true ones, of held-out pictures: slope and offset, and errors in stated deviations.
+        self.register_buffer("slope", torch.ones(WEIGHTS))
+        self.register_buffer("offset", torch.zeros(WEIGHTS))
+        self.register_buffer("spread", torch.ones(WEIGHTS))
+        self.form = nn.Linear(2 * COUNT, 2 * points)
+        self.local = nn.Parameter(0.05 * torch.randn(points, channels, _OWN + _SHARED))
+        self.under = nn.Parameter(0.1 * torch.randn(COUNT, channels, _UNDER))
+        self.mix = nn.Linear(2 * COUNT + COUNT * _UNDER + points * _SHARED + deep, hidden)
+        self.again = nn.Linear(hidden, hidden)
+        self.move = nn.Linear(hidden, 2 * points, bias=False)
+        self.sure = nn.Linear(hidden, points)
+        self.weights = nn.Linear(hidden, 2 * WEIGHTS)
+        nn.init.zeros_(self.form.bias)
+        nn.init.constant_(self.sure.bias, -2.0)  # a seventh of the face's size
+
+    def forward(self, landmarks: Tensor, under: Tensor, features: Tensor, pooled: Tensor, size: int) -> DenseReading:
+        """What is read.
+
+        Args:
+            landmarks: iBUG's 68, (B,68,2) pixels of the crop.
+            under: features under each, (B,68,C).
+            features: (B,C,h,w).
+            pooled: the deepest features' mean, (B,D).
+            size: pixels a side of the crop.
+        """
+        middle, axes = face_frame(landmarks)
+        own = in_face_frame(landmarks, landmarks).flatten(1)
+        base = self.form(own).unflatten(1, (-1, 2))
+        pixels = base @ axes + middle
+        grid = (pixels[:, None] + 0.5) * (2 / size) - 1
+        sampled = grid_sample(features, grid, padding_mode="border", align_corners=False)[:, :, 0].transpose(1, 2)
+        local = _each(sampled, self.local)
+        read = [own, _each(under, self.under).flatten(1), local[..., _OWN:].flatten(1), pooled]
+        hidden = torch.relu(self.mix(torch.cat(read, 1)))
+        hidden = hidden + torch.relu(self.again(hidden))
+        moved = base + _OFFSET * (local[..., :2] + self.move(hidden).unflatten(1, (-1, 2)))
+        deviation = (local[..., 2] + self.sure(hidden)).clamp(-8, 4).exp() * axes[:, :1].norm(dim=2)
+        raw, logarithm = self.weights(hidden).split(WEIGHTS, 1)
+        return DenseReading(moved @ axes + middle, deviation, raw, (logarithm - 2).clamp(-5, 2).exp())
+
+    def unshrunk(self, raw: Tensor, deviation: Tensor) -> tuple[Tensor, Tensor]:
+        """Weights (B,52) that are the true ones and noise, and the noise's deviation: infinite for those not seen."""
+        seen = self.slope >= LEAST_SLOPE
+        slope = torch.where(seen, self.slope, 1.0)
+        return (raw - self.offset) / slope, torch.where(seen, self.spread * deviation / slope, torch.inf)
+
+    @torch.no_grad()
+    def calibrate(self, raw: Tensor, deviation: Tensor, truth: Tensor) -> None:
+        """Measures how far weights are drawn toward their means, by regression of what is read on the truth.
+
+        Args:
+            raw, deviation: as read of faces of people that were not learned from, (M,52).
+            truth: (M,52); a weight that does not vary counts as one that cannot be seen.
+        """
+        about, mean = truth - truth.mean(0), raw.mean(0)
+        variance = about.square().mean(0)
+        slope = (about * (raw - mean)).mean(0) / variance.clamp(min=1e-6)
+        slope = torch.where(variance > 1e-5, slope, 0.0)
+        self.slope.copy_(slope)
+        self.offset.copy_(mean - slope * truth.mean(0))
+        self.spread.copy_(((raw - slope * truth - self.offset) / deviation).square().mean(0).sqrt())
+
+
+def face_frame(landmarks: Tensor) -> tuple[Tensor, Tensor]:
+    """The middle (B,1,2) of landmarks (B,68,2), and the face's own axes (B,2,2) in pixels: to the left eye, and down.
+
+    An axis is as long as the landmarks are distant from their middle in the root mean square.
+    """
+    middle = landmarks.mean(1, keepdim=True)
+    size = (landmarks - middle).square().sum(-1).mean(1).clamp(min=1e-4).sqrt()
+    tilt = tilt_around(landmarks)
+    across = torch.stack([size * tilt.cos(), size * tilt.sin()], -1)
+    return middle, torch.stack([across, across.flip(-1) * across.new_tensor([-1.0, 1.0])], 1)
+
+
+def in_face_frame(points: Tensor, landmarks: Tensor) -> Tensor:
+    """Points (B,L,2) of faces with landmarks (B,68,2), in the faces' own frames."""
+    middle, axes = face_frame(landmarks)
+    return (points - middle) @ axes.transpose(1, 2) / axes.square().sum(2)[:, None]
+
+
+def _each(features: Tensor, rows: Tensor) -> Tensor:
+    """Products (B,L,K) of features (B,L,C) with rows (L,C,K) of their own."""
+    return torch.bmm(features.transpose(0, 1), rows).transpose(0, 1)
