@@ -11,7 +11,8 @@ import torch
 from received_frames import decode_frame
 
 from torchface.errors import ValueRangeError
-from torchface.io.protocols.weight_sender import StreamAddress, WeightSender, open_sender, parse_address
+from torchface.io.protocols.stream_address import StreamAddress, parse_address
+from torchface.io.protocols.weight_sender import WeightSender, open_sender
 from torchface.shape_names import ARKIT
 
 

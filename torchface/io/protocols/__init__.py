@@ -1,1 +1,1 @@
-"""Frames of weights sent over a network: Live Link Face, VMC, plain OSC."""
+"""Faces sent and received over a network: Live Link Face, VMC, OSC, iFacialMocap, VRChat, VTube Studio."""

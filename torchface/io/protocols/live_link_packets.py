@@ -9,7 +9,8 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from torchface.errors import NameMismatchError, ShapeError, ValueRangeError
+from torchface.errors import FileFormatError, NameMismatchError, ShapeError, ValueRangeError
+from torchface.io.protocols.received_face import ReceivedFace
 from torchface.io.weights.weight_csv import ROTATIONS
 from torchface.number_checks import check_rate
 from torchface.shape_names import ARKIT, mapping
@@ -18,6 +19,7 @@ LIVE_LINK_PORT = 11111
 _VERSION, _VALUES = 6, len(ARKIT) + len(ROTATIONS)
 _TIME = struct.Struct("!ifii")  # frame, subframe, rate as a fraction
 _NUMBERS = struct.Struct(f"!{_VALUES}f")
+_MOST_TEXT = 256  # bytes of a device's or a subject's name
 
 
 class ArkitWeights:
@@ -82,3 +84,53 @@ class LiveLinkPackets:
         time = _TIME.pack(self._sent, 0.0, *self._rate)
         self._sent += 1
         return [self._head + time + bytes([_VALUES]) + _NUMBERS.pack(*numbers)]
+
+
+def read_live_link(packet: bytes) -> list[ReceivedFace]:
+    """The face of a packet of the app; one without values is of a face that the app does not see.
+
+    Raises:
+        FileFormatError: another version, or bytes that are no such packet.
+
+    Example:
+        >>> (face,) = read_live_link(LiveLinkPackets(["jawOpen"], fps=60.0)(torch.tensor([0.5]), None)[0])
+        >>> face.weights[ARKIT.index("jawOpen")].item(), face.number, face.subject
+        (0.5, 0, 'torchface')
+    """
+    if packet[:1] != bytes([_VERSION]):
+        found = f"version {packet[0]}" if packet else "no byte"
+        raise FileFormatError(f"packet: found {found}, expected Live Link Face's version {_VERSION}")
+    texts, at = [], 1
+    try:
+        for _ in range(2):
+            (length,) = struct.unpack_from("!i", packet, at)
+            if not 0 <= length <= _MOST_TEXT or at + 4 + length > len(packet):
+                raise FileFormatError(f"packet: found a name of {length} bytes, expected at most {_MOST_TEXT}")
+            texts.append(packet[at + 4 : at + 4 + length].decode(errors="replace"))
+            at += 4 + length
+        number, _, _, _ = _TIME.unpack_from(packet, at)
+        at += _TIME.size
+        count = packet[at] if at < len(packet) else 0
+        if count == 0:
+            return [ReceivedFace(torch.zeros(len(ARKIT)), subject=texts[1], number=number, found=False)]
+        if count != _VALUES or len(packet) != at + 1 + _NUMBERS.size:
+            raise FileFormatError(f"packet: found {count} values in {len(packet)} bytes, expected {_VALUES}")
+        values = torch.tensor(_NUMBERS.unpack_from(packet, at + 1))
+    except struct.error as error:
+        raise FileFormatError(f"packet: found {len(packet)} bytes, expected a whole packet ({error})") from error
+    return [ReceivedFace(values[: len(ARKIT)], values[len(ARKIT) :], texts[1], number)]
+
+
+def packet_rate(packet: bytes) -> float:
+    """Frames a second that a whole packet states.
+
+    Raises:
+        FileFormatError: it states none that a camera has.
+    """
+    at = 1
+    for _ in range(2):
+        at += 4 + int.from_bytes(packet[at : at + 4], "big")
+    _, _, numerator, denominator = _TIME.unpack_from(packet, at)
+    rate = numerator / denominator if denominator else 0.0
+    check_rate(rate, "packet", FileFormatError)
+    return rate

@@ -1,94 +1,67 @@
-"""Senders of frames of weights over UDP, by the scheme of an address."""
+"""Senders of frames of weights over a network, by the scheme of an address."""
 
 from __future__ import annotations
 
-import re
 import socket
+import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from typing import Any
+from typing import Protocol
 
 from torch import Tensor
 
 from torchface.errors import ValueRangeError
-from torchface.io.protocols.live_link_packets import LIVE_LINK_PORT, LiveLinkPackets
-from torchface.io.protocols.vmc_and_osc_packets import VMC_PORT, OscPackets, VmcPackets
+from torchface.io.protocols.ifacialmocap_packets import IFacialMocapPackets
+from torchface.io.protocols.live_link_packets import LiveLinkPackets
+from torchface.io.protocols.osc_packets import OscPackets
+from torchface.io.protocols.stream_address import StreamAddress, parse_address, resolved
+from torchface.io.protocols.vmc_packets import NAMINGS, VmcPackets
+from torchface.io.protocols.vrchat_packets import VRCHAT_NAMINGS, VrchatPackets
+from torchface.io.protocols.vtube_studio import VTubeStudioSender, checked_token_file
 
 Encode = Callable[[Tensor, Tensor | None], list[bytes]]
 """Packets of a frame: weights (N,), and rotations (9,) in radians, none of which turn the head."""
 
-DEFAULT_PORTS = {"livelink": LIVE_LINK_PORT, "vmc": VMC_PORT}
-"""Where receivers listen unless they are set up otherwise; the other schemes' addresses name their port."""
-
-_SCHEMES = ("udp", "livelink", "vmc", "osc")
-_ADDRESS = re.compile(
-    r"(?P<scheme>[a-z]+)://(?P<host>\[[0-9a-fA-F:.]+\]|[^:/\[\]\s]+)(?::(?P<port>[0-9]{1,5}))?(?P<path>/[!-~]*)?"
-)
-_EXPECTED = (
-    "expected an address such as udp://127.0.0.1:11111 or livelink://127.0.0.1:11111 (Live Link Face), "
-    "vmc://127.0.0.1:39539 or osc://127.0.0.1:9000/torchface, the port 1 to 65535"
-)
+_EARLY = 0.25  # of an interval, by which frames may come before their time
 
 
-@dataclass(frozen=True)
-class StreamAddress:
-    """The parts of ``SCHEME://HOST:PORT/PATH``; the path has no slash at its end and may be empty."""
+class FrameSender(Protocol):
+    """Sends frames to one receiver; ``problem`` says in words why they do not arrive, where that is known."""
 
-    scheme: str
-    host: str
-    port: int
-    path: str = ""
+    address: str
+    problem: str
 
+    def send(self, weights: Tensor, rotations: Tensor | None = None) -> bool:
+        """Sends a frame without waiting: weights (N,), rotations (9,); whether none before was refused."""
 
-def parse_address(address: str) -> StreamAddress:
-    """The parts of an address.
-
-    Example:
-        >>> parse_address("udp://127.0.0.1:11111")
-        StreamAddress(scheme='udp', host='127.0.0.1', port=11111, path='')
-        >>> parse_address("vmc://localhost").port
-        39539
-    """
-    match = _ADDRESS.fullmatch(address)
-    if match is None or match["scheme"] not in _SCHEMES:
-        raise ValueRangeError(f"stream: found {address!r:.200}, {_EXPECTED}")
-    scheme, path = match["scheme"], (match["path"] or "").rstrip("/")
-    port = int(match["port"]) if match["port"] else DEFAULT_PORTS.get(scheme, 0)
-    if not 0 < port < 65536 or (path and scheme != "osc"):
-        raise ValueRangeError(f"stream: found {address!r:.200}, {_EXPECTED}")
-    return StreamAddress(scheme, match["host"].strip("[]"), port, path)
-
-
-def find_receiver(address: str) -> tuple[socket.AddressFamily, Any]:
-    """Family and socket address of an address, its host looked up.
-
-    Raises:
-        ValueRangeError: the text is no such address, or its host is not known.
-    """
-    parts = parse_address(address)
-    try:
-        family, _, _, _, target = socket.getaddrinfo(parts.host, parts.port, type=socket.SOCK_DGRAM)[0]
-    except (OSError, ValueError) as error:  # ValueError: a name that no host can have, such as a..b
-        raise ValueRangeError(f"stream: found {address!r:.200}, whose host is not known ({error})") from error
-    return family, target
+    def close(self) -> None:
+        """Gives back what it holds."""
 
 
 class WeightSender:
-    """Sends one frame after another to one address; that nobody listens there yet is reported and no error.
+    """Sends one frame after another to one address by UDP; that nobody listens there yet is reported and no error.
 
     Args:
         address: see :func:`open_sender`. A broadcast address reaches a whole network.
         encode: makes the packets of a frame.
+        rate: frames a second at most; those between are left out. All if absent.
 
     Raises:
         ValueRangeError: the address is none, its host is not known, or this machine's network does not reach it.
+
+    Example:
+        >>> sender = WeightSender("udp://127.0.0.1:11111", lambda weights, rotations: [bytes(3)])
+        >>> sender.send(torch.zeros(1))
+        True
+        >>> sender.close()
     """
 
-    def __init__(self, address: str, encode: Encode) -> None:
-        family, target = find_receiver(address)
-        self.address, self._encode = address, encode
+    def __init__(self, address: str, encode: Encode, rate: float | None = None) -> None:
+        family, target = resolved(parse_address(address), address)
+        self.address, self.problem, self._encode = address, "nobody listens there yet", encode
+        self._interval, self._due, self._welcome = 0.0 if rate is None else 1 / rate, float("-inf"), True
         self._socket = socket.socket(family, socket.SOCK_DGRAM)
         self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_BROADCAST, 1)
+        self._socket.setblocking(False)
         try:
             self._socket.connect(target)  # of one that is not connected the system reports no refusal
         except OSError as error:
@@ -105,8 +78,13 @@ class WeightSender:
             ShapeError: another number of weights than names.
             ValueRangeError: this machine cannot send there.
         """
+        now = time.monotonic()
+        if now < self._due - _EARLY * self._interval:
+            return self._welcome
+        self._due = max(self._due, now - self._interval) + self._interval
         welcome = [self._send(packet) for packet in self._encode(weights, rotations)]
-        return all(welcome)
+        self._welcome = all(welcome)
+        return self._welcome
 
     def close(self) -> None:
         """Gives the socket back."""
@@ -118,7 +96,7 @@ class WeightSender:
             try:
                 self._socket.send(packet)
                 return welcome
-            except ConnectionError:
+            except (ConnectionError, BlockingIOError):  # a full queue: a later frame is better than a late one
                 welcome = False
             except OSError as error:
                 raise self._unreachable(error) from error
@@ -131,12 +109,23 @@ class WeightSender:
         )
 
 
-def open_sender(address: str, names: Sequence[str], fps: float) -> WeightSender:
+def find_receiver(address: str) -> None:
+    """Looks an address up before any work.
+
+    Raises:
+        ValueRangeError: the text is no address, or its host is not known.
+    """
+    resolved(parse_address(address), address)
+
+
+def open_sender(address: str, names: Sequence[str], fps: float) -> FrameSender:
     """A sender to an address.
 
     Args:
         address: ``udp://HOST:PORT`` or ``livelink://HOST:PORT`` for Live Link Face's packets, ``vmc://HOST:PORT`` for
-            the VMC protocol, ``osc://HOST:PORT/PREFIX`` for plain OSC.
+            the VMC protocol, ``osc://HOST:PORT/PREFIX`` for plain OSC, ``ifacialmocap://HOST:PORT``,
+            ``vrchat://HOST:PORT``, ``vts://HOST:PORT`` for VTube Studio; options behind ``?``, see
+            :func:`torchface.io.protocols.stream_address.parse_address`.
         names: of the weights that come, (N,).
         fps: frames a second.
 
@@ -145,13 +134,25 @@ def open_sender(address: str, names: Sequence[str], fps: float) -> WeightSender:
         NameMismatchError: the protocol cannot carry weights by these names.
 
     Example:
-        >>> sender = open_sender("vmc://127.0.0.1:39539", ["jawOpen", "browInnerUp"], fps=60.0)
+        >>> sender = open_sender("vmc://127.0.0.1:39539?rate=30", ["jawOpen", "browInnerUp"], fps=60.0)
         >>> nobody_refused = sender.send(torch.tensor([0.5, 0.0]))
         >>> sender.close()
     """
     parts = parse_address(address)
+    if parts.scheme == "vts":
+        resolved(parts, address)
+        token = checked_token_file(parts.options["token"], address) if "token" in parts.options else None
+        return VTubeStudioSender(address, parts.host, parts.port, names, token, parts.rate() or 60.0)
+    return WeightSender(address, _encode(parts, names, fps), parts.rate())
+
+
+def _encode(parts: StreamAddress, names: Sequence[str], fps: float) -> Encode:
     if parts.scheme == "vmc":
-        return WeightSender(address, VmcPackets(names))
+        return VmcPackets(names, parts.namings() or NAMINGS[:3])
     if parts.scheme == "osc":
-        return WeightSender(address, OscPackets(names, parts.path))
-    return WeightSender(address, LiveLinkPackets(names, fps))
+        return OscPackets(names, parts.path)
+    if parts.scheme == "vrchat":
+        return VrchatPackets(names, parts.namings() or VRCHAT_NAMINGS[:3])
+    if parts.scheme == "ifacialmocap":
+        return IFacialMocapPackets(names)
+    return LiveLinkPackets(names, fps, parts.options.get("subject", "torchface"))

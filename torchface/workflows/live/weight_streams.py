@@ -2,14 +2,71 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
+from pathlib import Path
 from types import TracebackType
 
 from torch import Tensor
 
-from torchface.errors import ValueRangeError
-from torchface.io.protocols.weight_sender import WeightSender, open_sender
+from torchface.capture.retargeting import ShapeMap, load_shape_rules, shape_map
+from torchface.errors import NameMismatchError, ValueRangeError
+from torchface.io.protocols.stream_address import parse_address
+from torchface.io.protocols.weight_sender import FrameSender, open_sender
+
+_MAP = re.compile(r"(?<=[?&])map=[^&]*&?")
+
+
+class MappedSender:
+    """A sender that gets weights by other names, after a mapping table.
+
+    Args:
+        sender: of the weights by the table's names.
+        shapes: leads to them.
+    """
+
+    def __init__(self, sender: FrameSender, shapes: ShapeMap) -> None:
+        self._sender, self._shapes, self.address = sender, shapes, sender.address
+
+    @property
+    def problem(self) -> str:
+        """Why frames do not arrive."""
+        return self._sender.problem
+
+    def send(self, weights: Tensor, rotations: Tensor | None = None) -> bool:
+        """Sends one frame: weights (N,), rotations (9,)."""
+        return self._sender.send(self._shapes(weights.nan_to_num(0.0)[None])[0], rotations)
+
+    def close(self) -> None:
+        """Closes the sender."""
+        self._sender.close()
+
+
+def mapped_sender(address: str, names: Sequence[str], fps: float) -> FrameSender | MappedSender:
+    """A sender to an address, after the mapping table that its option ``map`` names.
+
+    The table's names are what VMC, VRChat and plain OSC then send; the other protocols have names of their own, which
+    must be among them.
+
+    Args:
+        address: see :func:`torchface.io.open_sender`.
+        names: of the weights that come, (N,).
+        fps: frames a second.
+    """
+    parts = parse_address(address)
+    if "map" not in parts.options:
+        return open_sender(address, names, fps)
+    path = Path(parts.options["map"]).expanduser()
+    rules = load_shape_rules(path)
+    try:
+        shapes = shape_map(names, tuple(rules), rules)
+    except NameMismatchError as error:
+        raise NameMismatchError(f"{path}: {error}") from error
+    plain = _MAP.sub("", address).rstrip("?&")
+    if parts.scheme in ("vmc", "vrchat") and "names" not in parts.options:
+        plain += ("&" if "?" in plain else "?") + "names=own"
+    return MappedSender(open_sender(plain, tuple(rules), fps), shapes)
 
 
 class WeightStreams:
@@ -24,11 +81,12 @@ class WeightStreams:
 
     def __init__(self, addresses: Sequence[str], names: Sequence[str], fps: float, say: Callable[[str], None]) -> None:
         self._say, self._sent = say, 0
-        self._senders: dict[str, WeightSender] = {}
+        self._senders: dict[str, FrameSender | MappedSender] = {}
         self._lost = dict.fromkeys(addresses, 0)
+        self._said: dict[str, str] = {}
         with ExitStack() as opened:
             for address in self._lost:
-                self._senders[address] = open_sender(address, names, fps)
+                self._senders[address] = mapped_sender(address, names, fps)
                 opened.callback(self._senders[address].close)
             self._opened = opened.pop_all()
 
@@ -37,12 +95,13 @@ class WeightStreams:
         self._sent += 1
         for address, sender in self._senders.items():
             try:
-                arrived, why = sender.send(weights, rotations), "nobody listens there yet"
+                arrived, why = sender.send(weights, rotations), sender.problem
             except ValueRangeError as error:  # a network that was reached before
                 arrived, why = False, str(error)
             if not arrived:
                 self._lost[address] += 1
-                if self._lost[address] == 1:
+                if why != self._said.get(address):
+                    self._said[address] = why
                     self._say(f"{address}: {why}; sending goes on")
 
     def notes(self) -> tuple[str, ...]:

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from torchface.errors import ValueRangeError
-from torchface.io.protocols.weight_sender import open_sender
+from torchface.workflows.live.weight_streams import mapped_sender
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,7 +60,7 @@ def stream_weights(
     sent: list[Tensor] = []
     latency: list[float] = []
     coming = iter(frames)
-    with closing(open_sender(address, names, fps)) as sender:
+    with closing(mapped_sender(address, names, fps)) as sender:
         begin = clock()
         while True:
             row = len(sent)

@@ -1,0 +1,94 @@
+"""Order of frames that come by packets: those that were lost, came late or from somebody else are counted."""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass
+
+import numpy as np
+
+_FAR = 300  # frames; a number so much further, or so much earlier, is a clock that was set
+_RECENT = 30
+_FREE = 2.0  # seconds after which another sender may take over
+
+
+@dataclass
+class PacketCounts:
+    """What came.
+
+    Args:
+        taken: frames that were taken.
+        lost: frames whose numbers are missing.
+        late: those that came after a newer one.
+        others: of a second sender while the first was there.
+        jumps: how often the sender's count was set.
+        malformed: packets that are none of the protocol.
+        fault: what is wrong with the last of these.
+    """
+
+    taken: int = 0
+    lost: int = 0
+    late: int = 0
+    others: int = 0
+    jumps: int = 0
+    malformed: int = 0
+    fault: str = ""
+
+    def words(self) -> str:
+        """What went wrong, for people; empty if nothing did.
+
+        Example:
+            >>> PacketCounts(taken=90, lost=2, late=1).words()
+            '2 lost, 1 late'
+        """
+        names = {"lost": "lost", "late": "late", "others": "of another sender", "jumps": "jumps of its clock"}
+        found = [f"{getattr(self, name)} {words}" for name, words in names.items() if getattr(self, name)]
+        return ", ".join([*found, *([f"{self.malformed} not understood ({self.fault})"] if self.malformed else [])])
+
+
+class FrameOrder:
+    """Says of each frame whether it is the next one to show.
+
+    Example:
+        >>> order = FrameOrder()
+        >>> [order.takes("phone", number, now=0.0) for number in (1, 2, 5, 3)], order.counts.lost
+        ([True, True, True, False], 2)
+    """
+
+    def __init__(self) -> None:
+        self.counts = PacketCounts()
+        self.sender = ""
+        self._last: int | None = None
+        self._heard = float("-inf")
+        self._steps: deque[int] = deque(maxlen=_RECENT)
+
+    def takes(self, sender: str, number: int | None, now: float) -> bool:
+        """Whether a frame is taken; counts it.
+
+        Args:
+            sender: whom it is from.
+            number: how the sender counts it; None where it does not.
+            now: seconds.
+        """
+        if sender != self.sender:
+            if now - self._heard < _FREE:
+                self.counts.others += 1
+                return False
+            self.sender, self._last = sender, None
+            self._steps.clear()
+        self._heard = now
+        if number is not None and self._last is not None:
+            step = number - self._last
+            if -_FAR < step <= 0:
+                self.counts.late += 1
+                return False
+            if abs(step) >= _FAR:
+                self.counts.jumps += 1
+                self._steps.clear()
+            else:
+                self._steps.append(step)
+                usual = max(1, int(np.median(self._steps)))  # a phone at half its clock's rate counts every other one
+                self.counts.lost += max(0, round(step / usual) - 1)
+        self._last = number
+        self.counts.taken += 1
+        return True

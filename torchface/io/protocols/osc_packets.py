@@ -1,0 +1,123 @@
+"""Faces as plain OSC: one address a weight, sent under any names and received under those of several programs."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from torchface.errors import NameMismatchError, ShapeError
+from torchface.io.protocols.live_link_packets import rotations_sent
+from torchface.io.protocols.osc_messages import Message, osc_bundles, osc_message, read_osc
+from torchface.io.protocols.received_face import ReceivedFace
+from torchface.io.weights.arkit_values import arkit_row, rotations_of_degrees
+from torchface.io.weights.face_cap_text import FACE_CAP_ORDER
+from torchface.io.weights.weight_csv import ROTATIONS
+from torchface.shape_names import ARKIT, UNIFIED
+
+_DEFAULT_PREFIX = "/torchface"
+_NOT_IN_ADDRESSES = re.compile(r"[^!-~]|[#*,/?\[\]{}]")  # what OSC gives another meaning in an address
+
+
+class OscPackets:
+    """Packets of plain OSC, one bundle a frame: ``PREFIX/weights/NAME`` and, in radians,
+    ``PREFIX/rotations/HeadYaw`` and so on by Live Link Face's nine names, one float each.
+
+    Args:
+        names: of the weights that come, (N,).
+        prefix: of the addresses; ``/torchface`` if empty.
+    """
+
+    def __init__(self, names: Sequence[str], prefix: str = "") -> None:
+        prefix = prefix or _DEFAULT_PREFIX
+        self._count = len(names)
+        self._addresses = [f"{prefix}/weights/{name}" for name in names_for_osc(names)]
+        self._addresses += [f"{prefix}/rotations/{name}" for name in ROTATIONS]
+
+    def __call__(self, weights: Tensor, rotations: Tensor | None) -> list[bytes]:
+        """The packets of a frame: weights (N,), rotations (9,) in radians; NaN is sent as 0.
+
+        Raises:
+            ShapeError: another number of weights than names, or of rotations than nine.
+        """
+        if weights.shape != (self._count,):
+            raise ShapeError(f"stream: found weights {tuple(weights.shape)}, expected ({self._count},)")
+        values = torch.cat([weights.detach().float().cpu().nan_to_num(0.0), rotations_sent(rotations)]).tolist()
+        return osc_bundles([osc_message(address, v) for address, v in zip(self._addresses, values, strict=True)])
+
+
+def names_for_osc(names: Sequence[str]) -> Sequence[str]:
+    """The names, which addresses must be able to hold.
+
+    Raises:
+        NameMismatchError: one has what OSC gives another meaning.
+    """
+    strange = [name for name in names if not name or _NOT_IN_ADDRESSES.search(name)]
+    if strange:
+        raise NameMismatchError(
+            f"stream: found the shape {strange[0]!r:.60}, expected names without blanks and without any of "
+            "# * , / ? [ ] { }, which OSC addresses cannot hold"
+        )
+    return names
+
+
+class OscReader:
+    """A face of addresses that end in a shape's name; each packet with one is a frame, values stay until they change.
+
+    Known are ARKit's names (``/torchface/weights/jawOpen``), Unified Expressions (``/avatar/parameters/v2/JawOpen``),
+    rotations by Live Link Face's names in radians, and what the app Face Cap sends (``/W``, ``/HR``, ``/ELR``,
+    ``/ERR``). Other addresses are passed over.
+
+    Args:
+        prefix: addresses with another one are passed over; any if empty.
+    """
+
+    def __init__(self, prefix: str = "") -> None:
+        self._prefix = prefix
+        self._weights = torch.zeros(len(ARKIT))
+        self._unified = torch.zeros(len(UNIFIED.names))
+        self._rotations = torch.zeros(len(ROTATIONS))
+        self._degrees = {"/HR": [0.0] * 3, "/ELR": [0.0] * 3, "/ERR": [0.0] * 3}
+        self._arkit = False
+
+    def __call__(self, packet: bytes) -> list[ReceivedFace]:
+        """The face after a packet; none if it has nothing of a face.
+
+        Raises:
+            FileFormatError: no OSC.
+        """
+        known = [self._take(message) for message in read_osc(packet) if message[0].startswith(self._prefix)]
+        if not any(known):
+            return []
+        weights = self._weights if self._arkit else UNIFIED.to_arkit(self._unified)
+        return [ReceivedFace(weights.clone(), self._rotations.clone(), "OSC")]
+
+    def _take(self, message: Message) -> bool:
+        address, values = message
+        numbers = [float(value) for value in values if isinstance(value, int | float) and math.isfinite(value)]
+        if len(numbers) != len(values) or not numbers:
+            return False
+        *folders, name = address.split("/")
+        if address == "/W" and len(numbers) == 2 and 0 <= numbers[0] < len(ARKIT):
+            return self._set(ARKIT.index(FACE_CAP_ORDER[int(numbers[0])]), numbers[1])
+        if address in self._degrees and len(numbers) in (2, 3):
+            self._degrees[address] = [*numbers, 0.0][:3]
+            self._rotations = rotations_of_degrees(*self._degrees.values())
+            return True
+        if name in ROTATIONS:
+            self._rotations[ROTATIONS.index(name)] = numbers[0]
+            return True
+        if folders[-1:] == ["v2"]:
+            if name in UNIFIED.names:
+                self._unified[UNIFIED.names.index(name)] = numbers[0]
+            return name in UNIFIED.names
+        row = arkit_row(name)
+        return row is not None and self._set(row, numbers[0])
+
+    def _set(self, row: int, value: float) -> bool:
+        self._arkit = True
+        self._weights[row] = value
+        return True

@@ -1,0 +1,156 @@
+"""VRChat's OSC: avatar parameters by Unified Expressions (v2) and by ARKit's names, and its own eye tracking."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+
+import torch
+from torch import Tensor
+
+from torchface.errors import ShapeError
+from torchface.io.protocols.live_link_packets import ArkitWeights, rotations_sent
+from torchface.io.protocols.osc_messages import LARGEST_IN_ETHERNET, osc_bundles, osc_message
+from torchface.io.protocols.osc_packets import names_for_osc
+from torchface.shape_names import ARKIT, UNIFIED
+
+VRCHAT_PORT = 9000
+
+VRCHAT_NAMINGS = ("unified", "arkit", "eyes", "own")
+"""What is sent: ``v2/`` parameters, ARKit's 52, VRChat's eye tracking, or the weights as they are called."""
+
+_PARAMETERS = "/avatar/parameters/"
+_SIDES = ("Left", "Right")
+_FULL_GAZE = math.radians(45.0)  # what VRCFaceTracking counts as 1
+
+_MEANS = (
+    *("BrowInnerUp", "BrowOuterUp", "CheekSquint", "EyeClosed", "LipFunnel", "LipFunnelLower", "LipFunnelUpper"),
+    *("LipPucker", "LipPuckerLower", "LipPuckerUpper", "LipSuckLower", "LipSuckUpper", "MouthDimple"),
+    *("MouthLowerDown", "MouthPress", "MouthStretch", "MouthUpperUp", "NoseSneer"),
+)
+"""Parameters that are the mean of all expressions whose names begin so and end in parts and sides."""
+
+_PARTS = ("", "Upper", "Lower")
+
+
+def _combined() -> dict[str, dict[str, float]]:
+    """Parameters that are sums of several expressions; ``1`` is a constant."""
+    sums: dict[str, dict[str, float]] = {
+        "JawX": {"JawRight": 1, "JawLeft": -1},
+        "JawZ": {"JawForward": 1},
+        "MouthUpperX": {"MouthUpperRight": 1, "MouthUpperLeft": -1},
+        "MouthLowerX": {"MouthLowerRight": 1, "MouthLowerLeft": -1},
+        "MouthX": {"MouthUpperRight": 0.5, "MouthLowerRight": 0.5, "MouthUpperLeft": -0.5, "MouthLowerLeft": -0.5},
+    }
+    for stem in _MEANS:
+        terms = [f"{stem}{part}{side}" for part in _PARTS for side in _SIDES]
+        terms = [term for term in terms if term in UNIFIED.names]
+        sums[stem] = {term: 1 / len(terms) for term in terms}
+    for side in _SIDES:
+        smile = {f"MouthCornerPull{side}": 0.8, f"MouthCornerSlant{side}": 0.2}
+        lower = {f"BrowLowerer{side}": 0.75, f"BrowPinch{side}": 0.25}
+        sums |= {
+            f"EyeOpen{side}": {"1": 1, f"EyeClosed{side}": -1},
+            f"EyeLid{side}": {"1": 0.75, f"EyeClosed{side}": -0.75, f"EyeWide{side}": 0.25},
+            f"BrowUp{side}": {f"BrowOuterUp{side}": 0.6, f"BrowInnerUp{side}": 0.4},
+            f"BrowDown{side}": lower,
+            f"BrowExpression{side}": {f"BrowInnerUp{side}": 0.5, f"BrowOuterUp{side}": 0.5}
+            | {name: -share for name, share in lower.items()},
+            f"CheekPuffSuck{side}": {f"CheekPuff{side}": 1},
+            f"MouthSmile{side}": smile,
+            f"SmileFrown{side}": smile | {f"MouthFrown{side}": -1},
+            f"SmileSad{side}": smile | {f"MouthFrown{side}": -1},
+        }
+    for stem in (
+        "EyeOpen",
+        "EyeLid",
+        "BrowUp",
+        "BrowDown",
+        "BrowExpression",
+        "CheekPuffSuck",
+        "SmileFrown",
+        "SmileSad",
+    ):
+        both = [sums[stem + side] for side in _SIDES]
+        sums[stem] = {name: sum(terms.get(name, 0.0) for terms in both) / 2 for name in {**both[0], **both[1]}}
+    lips = ("MouthUpperUpLeft", "MouthUpperUpRight", "MouthLowerDownLeft", "MouthLowerDownRight")
+    sums["MouthOpen"] = dict.fromkeys(lips, 0.25)
+    return sums
+
+
+COMBINED: Mapping[str, Mapping[str, float]] = _combined()
+"""Source: docs.vrcft.io, VRCFaceTracking Parameters. ``SmileSad`` counts the frown alone."""
+
+_ACTIVE = ("EyeTrackingActive", "ExpressionTrackingActive", "LipTrackingActive")
+_LARGER = {"EyeWide": ("EyeWideLeft", "EyeWideRight"), "EyeSquint": ("EyeSquintLeft", "EyeSquintRight")}
+
+
+class VrchatPackets:
+    """Packets of avatar parameters and eye tracking; an avatar takes those that it has.
+
+    Args:
+        names: of the weights that come, (N,); any rig's names that ARKit's can be had from.
+        namings: of ``VRCHAT_NAMINGS``.
+
+    Source: docs.vrchat.com, OSC Eye Tracking and OSC Avatar Parameters.
+    """
+
+    def __init__(self, names: Sequence[str], namings: Sequence[str] = VRCHAT_NAMINGS[:3]) -> None:
+        self._own = names_for_osc(names) if "own" in namings else ()
+        self._namings = frozenset(namings)
+        self._arkit = None if self._namings == {"own"} else ArkitWeights(names)
+        sent = [name for twins in UNIFIED.twins.values() for name in twins]
+        row = {name: i for i, name in enumerate(UNIFIED.names)}
+        sums = torch.zeros(len(COMBINED), len(UNIFIED.names))
+        self._constant = torch.zeros(len(COMBINED))
+        for i, terms in enumerate(COMBINED.values()):
+            for name, share in terms.items():
+                if name == "1":
+                    self._constant[i] = share
+                else:
+                    sums[i, row[name]] = share
+        self._sums, self._rows = sums, [row[name] for name in sent]
+        self._sent = sent
+
+    def __call__(self, weights: Tensor, rotations: Tensor | None) -> list[bytes]:
+        """The packets of a frame: weights (N,), rotations (9,) in radians, of which the eyes' count.
+
+        Raises:
+            ShapeError: another number of weights than names, or of rotations than nine.
+        """
+        parameters, eyes = dict[str, float](), list[bytes]()
+        turned = rotations_sent(rotations)
+        if self._own:
+            if weights.shape != (len(self._own),):
+                raise ShapeError(f"stream: found weights {tuple(weights.shape)}, expected ({len(self._own)},)")
+            parameters |= dict(zip(self._own, weights.detach().float().cpu().nan_to_num(0.0).tolist(), strict=True))
+        if self._arkit is not None:
+            arkit = self._arkit(weights).clamp(0, 1)
+            if "arkit" in self._namings:
+                parameters |= dict(zip(ARKIT, arkit.tolist(), strict=True))
+            if "unified" in self._namings:
+                parameters |= {f"v2/{name}": value for name, value in self._unified(arkit, turned).items()}
+            if "eyes" in self._namings:
+                eyes = _eye_tracking(arkit, turned)
+        messages = [osc_message(_PARAMETERS + name, value) for name, value in parameters.items()]
+        messages += [osc_message(_PARAMETERS + name, True) for name in _ACTIVE]
+        return osc_bundles([*messages, *eyes], LARGEST_IN_ETHERNET)
+
+    def _unified(self, arkit: Tensor, rotations: Tensor) -> dict[str, float]:
+        unified = UNIFIED.from_arkit(arkit)
+        values = dict(zip(self._sent, unified[self._rows].tolist(), strict=True))
+        values |= dict(zip(COMBINED, (self._sums @ unified + self._constant).tolist(), strict=True))
+        values |= {name: max(values[left], values[right]) for name, (left, right) in _LARGER.items()}
+        _, _, _, left_yaw, left_pitch, _, right_yaw, right_pitch, _ = (rotations / _FULL_GAZE).clamp(-1, 1).tolist()
+        gaze = {"EyeLeftX": left_yaw, "EyeLeftY": -left_pitch, "EyeRightX": right_yaw, "EyeRightY": -right_pitch}
+        return values | gaze | {"EyeX": (left_yaw + right_yaw) / 2, "EyeY": -(left_pitch + right_pitch) / 2}
+
+
+def _eye_tracking(arkit: Tensor, rotations: Tensor) -> list[bytes]:
+    """VRChat's own: lids, and degrees down and to the right of the left and the right eye."""
+    shut = float(arkit[[ARKIT.index("eyeBlinkLeft"), ARKIT.index("eyeBlinkRight")]].mean())
+    _, _, _, left_yaw, left_pitch, _, right_yaw, right_pitch, _ = (rotations * (180 / math.pi)).tolist()
+    return [
+        osc_message("/tracking/eye/EyesClosedAmount", shut),
+        osc_message("/tracking/eye/LeftRightPitchYaw", left_pitch, left_yaw, right_pitch, right_yaw),
+    ]

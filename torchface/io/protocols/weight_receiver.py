@@ -1,0 +1,145 @@
+"""Receiver of faces by UDP: what an iPhone or another program sends, decoded, checked and put in order."""
+
+from __future__ import annotations
+
+import errno
+import select
+import socket
+import time
+from collections.abc import Callable
+from contextlib import suppress
+
+from torchface.errors import TorchfaceError, ValueRangeError
+from torchface.io.protocols.frame_order import FrameOrder
+from torchface.io.protocols.ifacialmocap_packets import START, read_ifacialmocap
+from torchface.io.protocols.live_link_packets import read_live_link
+from torchface.io.protocols.osc_packets import OscReader
+from torchface.io.protocols.received_face import ReceivedFace
+from torchface.io.protocols.stream_address import StreamAddress, parse_source, resolved
+from torchface.io.protocols.vmc_packets import VmcReader
+
+Read = Callable[[bytes], list[ReceivedFace]]
+"""Faces of a packet; raises ``TorchfaceError`` where it is malformed."""
+
+_LARGEST_PACKET = 65536
+_ASK_AGAIN = 2.0  # seconds without a packet after which the app is asked to send
+_MOST_SENDERS = 16
+_MOST_AT_ONCE = 256  # packets between two looks at the clock
+
+
+class WeightReceiver:
+    """Listens for faces.
+
+    Args:
+        address: ``livelink://:11111``, ``ifacialmocap://PHONE`` (which is asked to send), ``vmc://:39539``,
+            ``osc://:9000/PREFIX``. A host is one of this machine's addresses, for ``ifacialmocap`` the phone's.
+
+    Raises:
+        ValueRangeError: the address is none, its host is not known, or another program has the port.
+
+    Example:
+        >>> with WeightReceiver("livelink://127.0.0.1:0") as receiver:
+        ...     receiver.faces(seconds=0.0)
+        []
+    """
+
+    def __init__(self, address: str) -> None:
+        self.address = address
+        parts = parse_source(address)
+        self.scheme = parts.scheme
+        self._read: dict[str, Read] = {}
+        self._make = _readers(parts)
+        self._order = FrameOrder()
+        self.counts = self._order.counts
+        self._phone, self._asked, self._heard = None, float("-inf"), float("-inf")
+        if parts.scheme == "ifacialmocap" and parts.host:
+            family, self._phone = resolved(parts, address)
+            local = "::" if family == socket.AF_INET6 else ""
+        elif parts.host:
+            family, _ = resolved(parts, address)
+            local = parts.host
+        else:
+            family, local = _any_family(), ""
+        self._socket = socket.socket(family, socket.SOCK_DGRAM)
+        try:
+            if family == socket.AF_INET6 and not parts.host:
+                self._socket.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_V6ONLY, 0)
+            self._socket.bind((local, parts.port))
+        except OSError as error:
+            self._socket.close()
+            why = (
+                f"another program has port {parts.port}; end it, or have the sender use another port"
+                if error.errno == errno.EADDRINUSE
+                else f"{error.strerror or error}; expected one of this machine's addresses"
+            )
+            raise ValueRangeError(f"stream: cannot receive at {address} ({why})") from error
+        self._socket.setblocking(False)
+        self.port: int = self._socket.getsockname()[1]
+
+    def faces(self, seconds: float) -> list[tuple[float, ReceivedFace]]:
+        """The faces that have come, in order, and when; waits so many seconds for the first."""
+        self._ask()
+        select.select([self._socket], [], [], max(0.0, seconds))
+        found = []
+        for _ in range(_MOST_AT_ONCE):
+            try:
+                packet, (host, *_) = self._socket.recvfrom(_LARGEST_PACKET)
+            except BlockingIOError:
+                break
+            except ConnectionError:  # the phone does not listen yet: the system reports what was asked before
+                continue
+            now = time.perf_counter()
+            found += [(now, face) for face in self._faces(packet, host, now)]
+        return found
+
+    def _faces(self, packet: bytes, host: str, now: float) -> list[ReceivedFace]:
+        if host not in self._read and len(self._read) >= _MOST_SENDERS:  # what each sends in parts is kept apart
+            self._read.clear()
+        read = self._read.setdefault(host, self._make())
+        try:
+            faces = read(packet)
+        except TorchfaceError as error:
+            self.counts.malformed += 1
+            self.counts.fault = str(error).removeprefix("packet: ")[:120]
+            return []
+        taken = [face for face in faces if self._order.takes(f"{face.subject} {host}", face.number, now)]
+        if taken:
+            self._heard = now
+        return taken
+
+    @property
+    def sender(self) -> str:
+        """Whom faces are taken from: name and address."""
+        return self._order.sender
+
+    def _ask(self) -> None:
+        now = time.perf_counter()
+        if self._phone is None or now - max(self._asked, self._heard) < _ASK_AGAIN:
+            return
+        self._asked = now
+        with suppress(OSError):  # asked again later: phones come and go
+            self._socket.sendto(START, self._phone)
+
+    def close(self) -> None:
+        """Gives the port back."""
+        self._socket.close()
+
+    def __enter__(self) -> WeightReceiver:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+
+def _readers(parts: StreamAddress) -> Callable[[], Read]:
+    if parts.scheme == "vmc":
+        return VmcReader
+    if parts.scheme == "osc":
+        return lambda: OscReader(parts.path)
+    read = read_live_link if parts.scheme == "livelink" else read_ifacialmocap
+    return lambda: read
+
+
+def _any_family() -> socket.AddressFamily:
+    """One that hears both kinds of addresses, where the system has it."""
+    return socket.AF_INET6 if socket.has_dualstack_ipv6() else socket.AF_INET

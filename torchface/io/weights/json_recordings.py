@@ -1,0 +1,104 @@
+"""JSON recordings of weights: Audio2Face's export, and ARKit's face anchors as apps write them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchface.errors import FileFormatError
+from torchface.files.documents import Value, read_json
+from torchface.io.tables.frame_rates import TimeSource, file_error, frame_times
+from torchface.io.weights.arkit_values import arkit_row
+from torchface.io.weights.weight_csv import ROTATIONS
+from torchface.number_checks import check_rate
+from torchface.take import Take, Track
+
+_MAX_BYTES = 2**27
+_MOST_SHAPES, _MOST_FRAMES = 1000, 2**20
+_LARGEST = 1e4
+
+
+def load_weight_json(path: str | Path) -> Take:
+    """Reads Audio2Face's export (``facsNames``, ``weightMat``, ``exportFps``) or frames of ARKit's face anchors.
+
+    Those are a list, or a table with the list ``frames``; each frame has ``timestamp`` in seconds, ``blendShapes`` with
+    numbers by ARKit's names and, where the app wrote them, ``transform``, ``leftEyeTransform`` and
+    ``rightEyeTransform``: 16 numbers by columns, or four columns of four.
+
+    Args:
+        path: the file.
+
+    Returns:
+        weights (T,N,1), names as the file spells them, such as Audio2Face's 52 and 16 of the tongue; rotations in
+        ``extras["columns"]``, radians, where there are transforms.
+    """
+    document = read_json(path, max_bytes=_MAX_BYTES)
+    if isinstance(document.found, dict) and "weightMat" in document.found:
+        return _audio2face(document)
+    frames = document["frames"] if isinstance(document.found, dict) else document
+    if not isinstance(frames.found, list) or not frames.found:
+        raise document.error("Audio2Face's facsNames and weightMat, or a list of frames with blendShapes")
+    return _face_anchors(frames)
+
+
+def _audio2face(document: Value) -> Take:
+    names = document["facsNames"].texts("the names of the shapes")
+    if not 0 < len(names) <= _MOST_SHAPES or len(set(names)) < len(names) or not all(names):
+        raise document["facsNames"].error(f"1 to {_MOST_SHAPES} names, each once")
+    weights = document["weightMat"].tensor(None, len(names), expected=f"rows of {len(names)} numbers")
+    if not len(weights):
+        raise document["weightMat"].error("a frame at least")
+    rate = document["exportFps"].number("frames a second")
+    check_rate(rate, f"{document.source}: exportFps", FileFormatError)
+    return Take(rate, weights=Track(names, weights.float()[..., None]))
+
+
+def _face_anchors(frames: Value) -> Take:
+    rows = frames.rows(1, _MOST_FRAMES, f"1 to {_MOST_FRAMES} frames")
+    shapes = rows[0]["blendShapes"].table(expected="weights by ARKit's names")
+    names = tuple(shapes)
+    if not 0 < len(names) <= _MOST_SHAPES or not any(arkit_row(name) is not None for name in names):
+        raise rows[0]["blendShapes"].error("some of ARKit's 52 shapes")
+    weights = np.empty((len(rows), len(names)), np.float32)
+    turned: list[Tensor] = []
+    has_head = bool(rows[0]["transform"])
+    for i, row in enumerate(rows):
+        given = row["blendShapes"].table(expected="weights by ARKit's names")
+        if given.keys() != shapes.keys():
+            raise row["blendShapes"].error(f"the {len(names)} shapes of the first frame")
+        weights[i] = [given[name].number("a weight", _LARGEST) for name in names]
+        if has_head:
+            head = _rotation(row["transform"])
+            left, right = (_rotation(row[key]) for key in ("leftEyeTransform", "rightEyeTransform"))
+            turned.append(torch.cat([_angles(head), *(_angles(eye) * _EYES for eye in (left, right))]))
+    times = np.array([(row["timestamp"] or row["time"]).number("seconds") for row in rows])
+    timing = frame_times(times, TimeSource(file_error(frames.source), seconds=True))
+    extras: dict[str, Any] = {}
+    if turned:
+        columns = torch.stack(turned)
+        extras["columns"] = {name: columns[:, i].clone() for i, name in enumerate(ROTATIONS)}
+    return Take(
+        timing.fps, weights=Track(names, torch.from_numpy(weights)[..., None]), extras=extras, seconds=timing.seconds
+    )
+
+
+_EYES = torch.tensor([-1.0, 1.0, 0.0], dtype=torch.float64)  # their yaw is to the person's right, and they do not roll
+
+
+def _rotation(transform: Value) -> Tensor:
+    """The rotation (3,3) of a transform's 16 numbers by columns; none where there is no transform."""
+    if not transform:
+        return torch.eye(3, dtype=torch.float64)
+    nested = isinstance(transform.found, list) and len(transform.found) == 4
+    columns = transform.tensor(4, 4) if nested else transform.tensor(16, expected="16 numbers").reshape(4, 4)
+    return columns[:3, :3].T
+
+
+def _angles(rotation: Tensor) -> Tensor:
+    """Yaw, pitch and roll (3,), radians, of a rotation about ARKit's axes: y up, z out of the face."""
+    yaw = torch.atan2(rotation[0, 2], rotation[2, 2])
+    return torch.stack([yaw, torch.asin((-rotation[1, 2]).clamp(-1, 1)), torch.atan2(rotation[1, 0], rotation[1, 1])])
