@@ -16,8 +16,8 @@ def info(
     """Say what a file holds: a rig, mesh, take, attachment, solver, video or image.
 
     Args:
-        path: A .glb, USD, .obj, .ply, .stl, .off, .c3d, .trc, .csv, .json (attachment) or .onnx file, or a rig's
-            folder.
+        path: A .glb, USD, .obj, .ply, .stl, .off, .c3d, .trc, .csv, .txt (Face Cap, iFacialMocap), .json (attachment,
+            Audio2Face, ARKit), .gesichter or .onnx file, or a rig's folder.
         attachment: Report which shapes of the rig these markers distinguish.
         part: Look at this region of the rig only, such as face.
     """

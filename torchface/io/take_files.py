@@ -11,19 +11,25 @@ import torch
 from torch import Tensor
 
 from torchface.errors import FileFormatError, ValueRangeError
-from torchface.files.whole_files import check_ending
+from torchface.files.whole_files import check_ending, read_file
 from torchface.io.landmarks.openface_csv import is_landmark_header, load_landmarks_csv, save_landmarks_csv
 from torchface.io.markers.c3d import load_c3d, save_c3d
 from torchface.io.markers.marker_csv import is_marker_header, load_markers_csv, save_markers_csv
 from torchface.io.markers.trc import load_trc, save_trc
-from torchface.io.tables.csv_table import TableReader, quoted
+from torchface.io.protocols.live_link_recordings import load_live_link_packets
+from torchface.io.tables.csv_table import MAX_TABLE_BYTES, TableReader, quoted
 from torchface.io.tables.numbered_csv import is_numbered
+from torchface.io.weights.face_cap_text import is_face_cap, load_face_cap
+from torchface.io.weights.ifacialmocap_text import is_ifacialmocap, load_ifacialmocap
+from torchface.io.weights.json_recordings import load_weight_json
 from torchface.io.weights.live_link_csv import are_live_link_shapes, is_live_link, load_live_link, save_live_link
 from torchface.io.weights.weight_csv import ROTATIONS, load_weights_csv, save_weights_csv
 from torchface.take import Take, Track
 
 MARKER_ENDINGS = (".c3d", ".trc")
 TAKE_ENDINGS = (*MARKER_ENDINGS, ".csv")
+RECORDING_ENDINGS = (".txt", ".json", ".gesichter")
+"""Of weights as phones and other programs record them, which are read alone."""
 
 LARGEST_WEIGHT = 5.0
 """Nobody drives a shape so far; where a tenth of the frames do, weights are in percent."""
@@ -44,6 +50,9 @@ def load_take(path: str | Path, unit: str | None = None) -> Take:
     ``frame,time,<label>_x,...``         markers, :func:`torchface.io.markers.marker_csv.load_markers_csv`
     ``frame,time,<shape>,...``           weights, :func:`torchface.io.weights.weight_csv.load_weights_csv`
     ``frame,timestamp,...,x_0,...``      landmarks, :func:`torchface.io.landmarks.openface_csv.load_landmarks_csv`
+    ``.txt``                             weights of Face Cap (``k,...``) or iFacialMocap (``jawOpen-12|...``)
+    ``.json``                            weights of Audio2Face, or frames of ARKit's face anchors
+    ``.gesichter``                       weights of Live Link Face's packets as they were sent
     ==================================== =====================================================
 
     A frame in which no marker was seen loads as NaN; :func:`torchface.take.empty_frames` finds it. Weights in percent
@@ -64,13 +73,19 @@ def load_take(path: str | Path, unit: str | None = None) -> Take:
         >>> take.fps, take.weights.names, take.weights.values[1].flatten().tolist()
         (25.0, ('jawOpen', 'mouthPucker'), [0.5, 0.0])
     """
-    check_ending(path, *TAKE_ENDINGS)
+    check_ending(path, *TAKE_ENDINGS, *RECORDING_ENDINGS)
     path = Path(path)
     suffix = path.suffix.lower()
     if suffix == ".c3d":
         return load_c3d(path, unit)
     if suffix == ".trc":
         return load_trc(path, unit)
+    if suffix == ".json":
+        return in_usual_units(load_weight_json(path), path)
+    if suffix == ".gesichter":
+        return load_live_link_packets(path)
+    if suffix == ".txt":
+        return in_usual_units(_load_text(path), path)
     header = TableReader(path).header
     if is_live_link(header):
         return in_usual_units(load_live_link(path), path)
@@ -83,6 +98,17 @@ def load_take(path: str | Path, unit: str | None = None) -> Take:
     raise FileFormatError(
         f"{path}: found the columns {quoted(header)}; expected Timecode,BlendshapeCount,... or frame,time,... "
         "or OpenFace's frame,timestamp,...,x_0,..."
+    )
+
+
+def _load_text(path: Path) -> Take:
+    first = read_file(path, MAX_TABLE_BYTES).lstrip().split(b"\n", 1)[0].decode(errors="replace")
+    if is_face_cap(first):
+        return load_face_cap(path)
+    if is_ifacialmocap(first):
+        return load_ifacialmocap(path)
+    raise FileFormatError(
+        f"{path}: found the line {first!r:.60}; expected Face Cap's info,... or bs,... or iFacialMocap's jawOpen-12|..."
     )
 
 

@@ -18,6 +18,8 @@ from torchface.io.rig_files import SCENE_ENDINGS
 from torchface.io.rigs.ict_facekit import region
 from torchface.io.tables.csv_table import TableReader
 from torchface.io.tables.numbered_csv import is_numbered
+from torchface.io.take_files import RECORDING_ENDINGS
+from torchface.io.weights.json_recordings import is_weight_json
 from torchface.io.weights.live_link_csv import is_live_link
 from torchface.mesh import Mesh, submesh
 from torchface.rig import BlendshapeRig
@@ -71,8 +73,8 @@ def load_animated(path: Path, rig: Path | None = None, part: str | None = None) 
     """Reads meshes over time.
 
     Args:
-        path: weights as ``.csv`` (of which the rig makes meshes); a glTF or USD file with an animation of its
-            shapes, or without, which is one frame; a mesh sequence as ``.safetensors``
+        path: weights as ``.csv`` or what phones record (of which the rig makes meshes); a glTF or USD file with an
+            animation of its shapes, or without, which is one frame; a mesh sequence as ``.safetensors``
             (:class:`torchface.io.MeshSequence`); a mesh; or a folder of meshes, a frame each, in the order of their
             names.
         rig: what weights move, or the rig whose topology the meshes have.
@@ -82,7 +84,7 @@ def load_animated(path: Path, rig: Path | None = None, part: str | None = None) 
     ending = path.suffix.lower()
     if path.is_dir():
         animated = _of_folder(path, loaded)
-    elif ending == ".csv":
+    elif ending in (".csv", *RECORDING_ENDINGS):
         animated = _of_weights(path, loaded)
     elif ending == ".safetensors":
         animated = _of_sequence(path, loaded)
@@ -111,7 +113,9 @@ def is_animation(path: Path) -> bool:
     if ending == ".csv":
         header = TableReader(path).header
         return is_live_link(header) or (is_numbered(header) and not is_marker_header(header))
-    return ending in (".safetensors", *MESH_ENDINGS, *SCENE_ENDINGS)
+    if ending == ".json":
+        return is_weight_json(path)
+    return ending in (".safetensors", *RECORDING_ENDINGS, *MESH_ENDINGS, *SCENE_ENDINGS)
 
 
 def _is_take(file: Path) -> bool:
@@ -140,7 +144,8 @@ def _of_weights(path: Path, rig: BlendshapeRig | None) -> AnimatedMesh:
     take = load_take(path)
     if take.weights is None:
         raise ValueRangeError(f"{path}: found no weights, expected a take of them")
-    return replace(moved_mesh(path, rig, take), numbered=is_numbered(TableReader(path).header))
+    numbered = path.suffix.lower() == ".csv" and is_numbered(TableReader(path).header)
+    return replace(moved_mesh(path, rig, take), numbered=numbered)
 
 
 def moved_mesh(path: Path, rig: BlendshapeRig, take: Take) -> AnimatedMesh:

@@ -19,9 +19,10 @@ from torchface.io import load_animation, load_mesh, load_rig, load_take
 from torchface.io.images.image_files import IMAGE_ENDINGS, load_image
 from torchface.io.mesh_files import MESH_ENDINGS
 from torchface.io.rig_files import SCENE_ENDINGS
-from torchface.io.take_files import TAKE_ENDINGS
+from torchface.io.take_files import RECORDING_ENDINGS, TAKE_ENDINGS
 from torchface.io.video import open_video
 from torchface.io.video.video_file import VIDEO_ENDINGS
+from torchface.io.weights.json_recordings import is_weight_json
 from torchface.mesh import Mesh
 from torchface.rig import BlendshapeRig
 from torchface.take import Take
@@ -62,7 +63,7 @@ def describe(path: Path, attachment: Path | None = None, part: str | None = None
         raise FileFormatError(f"{path}: found no rig, expected one to test the markers of {attachment} on")
     if suffix in MESH_ENDINGS:
         return _mesh_rows(load_mesh(path))
-    if suffix in TAKE_ENDINGS:
+    if suffix in (*TAKE_ENDINGS, *RECORDING_ENDINGS) and (suffix != ".json" or is_weight_json(path)):
         return _take_rows(load_take(path))
     if suffix == ".json" and is_examples(path):
         return _example_rows(ExampleShapes.load(path))
@@ -79,7 +80,15 @@ def describe(path: Path, attachment: Path | None = None, part: str | None = None
     if suffix in IMAGE_ENDINGS:
         _, height, width = load_image(path).shape
         return [("pixels", f"{width} x {height}")]
-    endings = (*SCENE_ENDINGS, *MESH_ENDINGS, *VIDEO_ENDINGS, *IMAGE_ENDINGS, *TAKE_ENDINGS, ".json", ".onnx")
+    endings = (
+        *SCENE_ENDINGS,
+        *MESH_ENDINGS,
+        *VIDEO_ENDINGS,
+        *IMAGE_ENDINGS,
+        *TAKE_ENDINGS,
+        *RECORDING_ENDINGS,
+        ".onnx",
+    )
     raise FileFormatError(
         f"{path}: found the ending {suffix!r}, expected a folder or one of {' '.join(sorted(endings))}"
     )

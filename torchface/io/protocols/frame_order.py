@@ -5,8 +5,6 @@ from __future__ import annotations
 from collections import deque
 from dataclasses import dataclass
 
-import numpy as np
-
 _FAR = 300  # frames; a number so much further, or so much earlier, is a clock that was set
 _RECENT = 30
 _FREE = 2.0  # seconds after which another sender may take over
@@ -87,7 +85,8 @@ class FrameOrder:
                 self._steps.clear()
             else:
                 self._steps.append(step)
-                usual = max(1, int(np.median(self._steps)))  # a phone at half its clock's rate counts every other one
+                # A phone at half its clock's rate counts every other one.
+                usual = sorted(self._steps)[len(self._steps) // 4]
                 self.counts.lost += max(0, round(step / usual) - 1)
         self._last = number
         self.counts.taken += 1

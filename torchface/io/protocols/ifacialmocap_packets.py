@@ -43,8 +43,8 @@ class IFacialMocapPackets:
 
     Example:
         >>> (packet,) = IFacialMocapPackets(["jawOpen"])(torch.tensor([0.5]), None)
-        >>> b"jawOpen-50|" in packet, packet[-60:]
-        (True, b'|=head#0.0,0.0,0.0,0.0,0.0,0.0|rightEye#0.0,0.0,0.0|leftEye#0.0,0.0,0.0|'[-60:])
+        >>> b"jawOpen-50|" in packet, packet[-42:]
+        (True, b'|rightEye#0.0,0.0,0.0|leftEye#0.0,0.0,0.0|')
     """
 
     def __init__(self, names: Sequence[str]) -> None:

@@ -7,6 +7,7 @@ import zlib
 from collections.abc import Iterator
 from pathlib import Path
 
+import numpy as np
 import torch
 
 from torchface.errors import FileFormatError
@@ -16,7 +17,7 @@ from torchface.io.weights.weight_csv import ROTATIONS
 from torchface.shape_names import ARKIT
 from torchface.take import Take, Track
 
-_MOST_PACKED, _MOST_BYTES = 2**28, 2**29
+_MOST_PACKED, _MOST_BYTES = 2**26, 2**27  # the latter is two hours of 60 frames a second
 _HEAD, _SIZE = struct.Struct("!BI"), struct.Struct("!I")
 _LARGEST_PACKET = 2048
 
@@ -63,22 +64,21 @@ def load_live_link_packets(path: str | Path) -> Take:
     Returns:
         weights (T,52,1) by ARKit's names; head and eye rotations in ``extras["columns"]``, radians.
     """
-    faces, rate = {}, 0.0
+    rows, rate = dict[int, np.ndarray](), 0.0
     for number, packet in enumerate(recorded_packets(path), 1):
         try:
             (face,) = read_live_link(packet)
             rate = rate or packet_rate(packet)
         except FileFormatError as error:
             raise FileFormatError(f"{path}: packet {number}: {error}") from error
-        faces[face.number or 0] = face
-    if not faces:
+        weights = face.weights if face.found else torch.full_like(face.weights, torch.nan)
+        rows[face.number or 0] = torch.cat([weights, face.rotations]).numpy()
+    if not rows:
         raise FileFormatError(f"{path}: found no packet, expected a frame at least")
-    numbers = sorted(faces)
-    weights = torch.stack(
-        [faces[n].weights if faces[n].found else torch.full((len(ARKIT),), torch.nan) for n in numbers]
-    )
-    turned = torch.stack([faces[n].rotations for n in numbers]).double()
-    columns = {name: turned[:, i].clone() for i, name in enumerate(ROTATIONS)}
+    numbers = np.sort(np.fromiter(rows, np.int64))
+    values = np.stack([rows[number] for number in numbers.tolist()])
+    columns = {name: torch.from_numpy(values[:, len(ARKIT) + i].astype(np.float64)) for i, name in enumerate(ROTATIONS)}
+    track = Track(ARKIT, torch.from_numpy(values[:, : len(ARKIT), None].copy()))
     whole = numbers[-1] - numbers[0] == len(numbers) - 1
-    seconds = None if whole else (torch.tensor(numbers).double() - numbers[0]) / rate
-    return Take(rate, weights=Track(ARKIT, weights[..., None]), extras={"columns": columns}, seconds=seconds)
+    seconds = None if whole else torch.from_numpy((numbers - numbers[0]) / rate)
+    return Take(rate, weights=track, extras={"columns": columns}, seconds=seconds)

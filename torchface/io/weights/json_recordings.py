@@ -22,6 +22,15 @@ _MOST_SHAPES, _MOST_FRAMES = 1000, 2**20
 _LARGEST = 1e4
 
 
+def is_weight_json(path: str | Path) -> bool:
+    """Whether a JSON file holds what :func:`load_weight_json` reads, by its keys."""
+    document = read_json(path, max_bytes=_MAX_BYTES).found
+    if isinstance(document, dict) and "weightMat" in document:
+        return True
+    frames = document.get("frames") if isinstance(document, dict) else document
+    return isinstance(frames, list) and bool(frames) and isinstance(frames[0], dict) and "blendShapes" in frames[0]
+
+
 def load_weight_json(path: str | Path) -> Take:
     """Reads Audio2Face's export (``facsNames``, ``weightMat``, ``exportFps``) or frames of ARKit's face anchors.
 
