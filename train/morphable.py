@@ -18,6 +18,7 @@ from torchface.io.rigs.ict_facekit import region
 from torchface.mesh import submesh
 from torchface.modeling import HeadModel, MorphableModel
 from torchface.progress import Progress
+from torchface.zoo.model_folders import own_models
 
 from .head_colors import fitted_colors
 from .head_figures import draw
@@ -28,6 +29,7 @@ from .model_quality import ModelQuality
 from .recipe_settings import RecipeSettings
 from .runner import Recipe, Run, metric_lines, recipe
 
+_OUT = Path("models/head")
 _TESTED_PERFORMERS = 20
 _MANY, _FOLDS, _MIN_FOLDS = 100, 10, 3  # meshes; of fewer than the first, a tenth says too little
 _MEASURES = (
@@ -43,7 +45,8 @@ class Settings(RecipeSettings):
 
     Args:
         scans: Folder of registered meshes, all of one topology, in any place; what `torchface register` writes.
-        ict: Take ICT-FaceKit's `FaceXModel` folder instead: its neutral, identity modes and expressions.
+        ict: Take ICT-FaceKit's `FaceXModel` folder instead: its neutral, identity modes and expressions. Without --out
+            the model is `people` in $TORCHFACE_HOME, else the checkout's models, where `torchface fit` finds it.
         performers: Learn from so many embedded performers instead of a folder's meshes.
         template: The template that the meshes were registered with, a mesh or a rig (.glb, a folder of OBJ files,
             `FaceXModel`): says where and how upright the heads are to stand, and brings annotations. A rig travels with
@@ -65,7 +68,7 @@ class Settings(RecipeSettings):
     scans: Path | None = None
     ict: Path | None = None
     performers: int = 0
-    out: Path = Path("models/head")
+    out: Path = _OUT
     template: Path | None = None
     part: str | None = None
     unit: str | None = None
@@ -78,6 +81,11 @@ class Settings(RecipeSettings):
     half: bool = False
     seed: int = 7
     pictures: Path | None = None
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.ict is not None and self.out == _OUT:
+            object.__setattr__(self, "out", own_models() / "people")
 
 
 @dataclass(frozen=True, eq=False)

@@ -18,7 +18,7 @@ from torchface.io import load_identity_modes
 from torchface.modeling import HeadModel, MorphableModel
 from torchface.synthetic import draw_identities, neutral_head
 from torchface.viz.figures import model_figures as model_pictures
-from torchface.workflows.fit.photograph_rig import load_head_model, matching
+from torchface.workflows.named_heads import load_head_model, matching
 from train import morphable as recipe
 from train.head_samples import Source, registered, upright, vertex_colored
 from train.morphable import Settings, Trained, train

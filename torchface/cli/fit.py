@@ -15,8 +15,8 @@ from torchface.cli.terminal import Quiet, console, print_path
 
 def fit(
     photographs: Annotated[Positional[tuple[Path, ...]], arg(metavar="PHOTO...")],
-    model: str,
     out: OutputPath,
+    model: str | None = None,
     landmarks: tuple[str, ...] = (),
     landmark_model: str = "landmark_network",
     template: Path | None = None,
@@ -26,15 +26,19 @@ def fit(
     face: int | None = None,
     texture_size: int = 1024,
     names: Literal["arkit"] | None = None,
+    prior: str = "shape_prior",
+    one_expression: bool = False,
     everything: bool = False,
     insist: bool = False,
     quiet: Quiet = False,
 ) -> None:
     """Make a person's rig from one or several photographs, and write it as .glb.
 
-    A head model is fitted to 68 landmarks in each photograph: identity, expression, poses and focal length at once.
-    Landmarks that no file gives are found; they are written as .pts beside OUT, to be looked at and corrected.
-    All photographs show one person with one expression; profiles beside a front view show how far things stand out.
+    A head model is fitted to 68 landmarks in each photograph: one identity for all, expression and pose in each, and
+    the focal length at once. Landmarks that no file gives are found; they are written as .pts beside OUT, to be looked
+    at and corrected.
+    All photographs show one person; different expressions help to tell the person from them, and profiles beside a
+    front view show how far things stand out.
     The skin that they show becomes the rig's texture. Beside OUT lies an image for each photograph: it, the fit over
     it, and the landmarks, found green and fitted red; and its camera as .toml, for `torchface track --camera` where the
     video is from the same.
@@ -46,7 +50,8 @@ def fit(
             once upright. Or what finds them: a model of the zoo by name or folder, an .onnx file, or `mediapipe`.
             Found by --landmark-model if absent.
         landmark_model: What finds them, or is compared with those that files give.
-        model: A head model of the zoo by name, or its folder.
+        model: A head model of the zoo by name, or its folder; if absent one of people in $TORCHFACE_HOME or the
+            checkout, else `head`, of performers made by code.
         out: The .glb or USD file to write, or a name without an ending for a folder of OBJ files in the template's
             vertex order.
         template: The rig whose shapes the head is given, with the model's topology; if absent the one that travels with
@@ -59,6 +64,8 @@ def fit(
         texture_size: Texels a side of the rig's texture; 0 makes none.
         names: Names of the written shapes. "arkit": ARKit's where the template's mean the same, halves of one of its
             shapes merged (browInnerUp, cheekPuff); shapes that ARKit lacks keep theirs. All keep theirs if absent.
+        prior: Which weights faces have, by a shape prior's name or folder, or none.
+        one_expression: All photographs show the same expression, as taken at once.
         everything: Paint hair, clothes and what else hangs before the head on it; skin, eyes, brows and mouth alone if
             absent.
         insist: Write a rig also where the photographs do not seem to show one person.
@@ -73,10 +80,10 @@ def fit(
     given = tuple(Path(landmark) for landmark in landmarks)
     if len(landmarks) == 1 and not is_landmark_file(given[0]):
         given, landmark_model = (), landmarks[0]
-    fitting = FitSettings(texture_size=texture_size, masked=not everything)
+    fitting = FitSettings(texture_size=texture_size, masked=not everything, one_expression=one_expression)
     if inner_weight is not None:
         fitting = replace(fitting, inner_weight=inner_weight)
-    settings = PhotographSettings(fitting, template, part, focal, face, landmark_model, names, insist)
+    settings = PhotographSettings(fitting, template, part, focal, face, landmark_model, names, prior, insist)
     with file_lock(out), progress_bars(quiet) as progress:
         made = fit_photographs(photographs, given, model, out, settings, progress)
     for line in [*made.lines(photographs), *naming_lines(made.rig, names)]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -11,6 +12,8 @@ from torchface.errors import ShapeError
 from torchface.geometry.cameras.calibration import CameraCalibration
 from torchface.geometry.cameras.distortion import distort
 from torchface.geometry.cameras.pinhole import Camera
+from torchface.geometry.meshes.operators import vertex_normals
+from torchface.mesh import Mesh
 from torchface.rendering.clay_shading import sample_texture
 from torchface.rendering.raycast import RayCaster
 
@@ -28,6 +31,35 @@ class Shown:
 
     cosine: Tensor
     colors: Tensor
+
+
+@dataclass(frozen=True, eq=False)
+class PosedSurface:
+    """A mesh as a photograph shows it: vertices (V,3) and unit normals (V,3), float64 on the CPU, and what rays hit."""
+
+    vertices: Tensor
+    normals: Tensor
+    caster: RayCaster
+
+    @staticmethod
+    def each(posed: Mesh | Sequence[Mesh], count: int) -> list[PosedSurface]:
+        """One a photograph: of a mesh that all of them show, or of one for each.
+
+        Raises:
+            ShapeError: there are more or fewer meshes than photographs.
+        """
+        meshes = [posed] if isinstance(posed, Mesh) else list(posed)
+        if len(meshes) not in (1, count):
+            raise ShapeError(f"posed: found {len(meshes)} meshes for {count} photographs, expected one, or one each")
+        surfaces = []
+        for mesh in meshes:
+            vertices, faces = mesh.vertices.detach().cpu().double(), mesh.faces.cpu()
+            surfaces.append(PosedSurface(vertices, vertex_normals(vertices, faces), RayCaster(vertices, faces)))
+        return surfaces * (count if len(meshes) == 1 else 1)
+
+    def shown_in(self, image: Tensor, camera: Camera) -> Shown:
+        """What a photograph (3,H,W) shows at the vertices."""
+        return shown_in(image.cpu(), camera, self.caster, self.vertices, self.normals)
 
 
 def shown_in(

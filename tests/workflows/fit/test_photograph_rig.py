@@ -32,9 +32,10 @@ from torchface.rendering.clay_shading import render
 from torchface.rig import BlendshapeRig
 from torchface.synthetic import draw_identities, performer
 from torchface.synthetic.head.identity import anatomy
-from torchface.workflows.fit.fit_checks import one_person_lines
+from torchface.workflows.fit.fit_checks import ALONE, one_person_lines
 from torchface.workflows.fit.fit_landmarks import PhotographLandmarks, check_inside, landmarks_of, warn_if_stored_turned
-from torchface.workflows.fit.photograph_rig import PhotographSettings, fit_photographs, load_head_model, matching
+from torchface.workflows.fit.photograph_rig import PhotographSettings, fit_photographs
+from torchface.workflows.named_heads import load_head_model, matching
 from train.rendered_people.complexion import complexion_colors, draw_complexions
 
 YAWS = (-35.0, 0.0, 35.0)
@@ -279,9 +280,7 @@ class People:
         sizes = [load_image(path).shape[:0:-1] for path in photographs]
 
         def bare(points: Tensor, rows: list[int]) -> ImageFit:
-            return fit_images(
-                self.heads, self.rig, points, [sizes[row] for row in rows], settings=FitSettings(transfers=0)
-            )
+            return fit_images(self.heads, self.rig, points, [sizes[row] for row in rows], settings=ALONE)
 
         return one_person_lines(photographs, marks, bare, insist)
 

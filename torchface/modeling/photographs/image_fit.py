@@ -19,6 +19,7 @@ from torchface.modeling.photographs.image_input import check_images, checked_lan
 from torchface.modeling.photographs.image_solve import FitSettings, Problem, State, covariance, solve, solve_either
 from torchface.modeling.photographs.image_texture import photographed_skin
 from torchface.modeling.photographs.landmark_view import JAW, LANDMARKS, LinearPoints, Views
+from torchface.modeling.photographs.smooth_differences import smooth_differences
 from torchface.modeling.photographs.texture_fit import ColorFit
 from torchface.modeling.rigging.deformation_transfer import transfer_with_report
 from torchface.progress import Progress, silent
@@ -36,19 +37,21 @@ class ImageFit:
 
     Args:
         mesh: the head at rest, in the model's place, with the rig's topology and skin.
-        posed: the same with the expression of the photographs.
-        coefficients: of identity, (K,), standard deviations.
-        weights: of the rig's shapes, (N,).
+        posed: the same with the expression of each photograph.
+        coefficients: of the model's modes of identity, (K,), standard deviations; of what the model does not know the
+            head has more.
+        weights: of the rig's shapes in each photograph, (I,N).
         cameras: one a photograph.
         residuals: where the fit's landmarks are seen minus where they were found, (I,68,2), pixels, NaN for missing.
         landmarks: where the fit's landmarks are seen, (I,68,2), pixels.
-        noise: estimated deviation of an inner landmark, pixels.
-        covariance: of coefficients and weights, (K+N,K+N); rows of those that lie on their bound are zero.
+        noise: estimated deviation of an inner landmark, pixels of a photograph of mean size.
+        covariance: of coefficients and weights of each expression, (K+EN,K+EN); rows of those that lie on their
+            bound are zero.
         color: the colour model's fit to the photographs; None without one, or without photographs.
     """
 
     mesh: Mesh
-    posed: Mesh
+    posed: tuple[Mesh, ...]
     coefficients: Tensor
     weights: Tensor
     cameras: tuple[Camera, ...]
@@ -76,10 +79,12 @@ def fit_images(
 ) -> ImageFit:
     r"""The head whose landmarks are seen where photographs show them.
 
-    .. math:: \min_{a,w,P} \sum_{i,l} c_l \lVert P_i(\bar S + \sum_k a_k s_k + \sum_n w_n B_n)_{v_l} - q_{il} \rVert^2
-              / \sigma^2 + \lVert a \rVert^2 + \rho(w), \quad |a| \le 3, \; 0 \le w \le 1
+    .. math:: \min_{a,u,w,P} \sum_{i,l} c_l
+              \lVert P_i(\bar S + u + \sum_k a_k s_k + \sum_n w_{in} B_n)_{v_l} - q_{il} \rVert^2 / \sigma^2
+              + \lVert a \rVert^2 + \lVert u \rVert^2_{GP} + \sum_i \rho(w_i), \quad |a| \le 3, \; 0 \le w \le 1
 
-    for all photographs of one person with one expression together. PnP gives initial poses; then identity, expression,
+    for all photographs of one person together, each with an expression of its own or all with one; u are smooth
+    differences of heads that the model does not know. PnP gives initial poses; then identity, expression,
     poses and focal length move at once, each step a quadratic program in a box. Landmarks of the face's contour slide
     to where the silhouette is. At the end the shapes that show are transferred to the head found, and it is fitted
     again.
@@ -125,16 +130,17 @@ def fit_images(
         check_images(images, sizes)
     intrinsics, settings = lens(camera, sizes, settings or FitSettings())
     pixels = landmarks.detach().cpu().double()
-    mean, modes = model.shape.mean.cpu(), model.shape.modes.cpu()
+    mean = model.shape.mean.cpu()
+    unknown = smooth_differences(mean, vertices, settings.unknown_deviation)
+    modes = torch.cat([model.shape.modes.cpu(), unknown])
     deltas = _in_place(rig, mean)
     curves = contour_curves(mean, model.faces.cpu(), vertices)
     points = LinearPoints.of(mean, torch.cat([modes, deltas]), vertices, curves)
     progress("placing the cameras")
     pose = _checked_pose(points.mean[:LANDMARKS], pixels, intrinsics)
-    twins = len(modes) + _twins(rig.names)
-    problem = Problem(points, len(modes), pixels, intrinsics[:, 0, 0], settings, twins)
+    problem = Problem(points, len(modes), pixels, intrinsics[:, 0, 0], settings, _twins(rig.names), len(unknown))
     initial = State(
-        torch.zeros(len(points.basis), dtype=torch.float64),
+        torch.zeros(problem.unknowns, dtype=torch.float64),
         Views(intrinsics, pose.rotation, pose.translation),
         torch.arange(LANDMARKS).expand(len(pixels), -1),
         float(pose.errors.mean()) if settings.noise is None else settings.noise,
@@ -143,7 +149,7 @@ def fit_images(
     problem, state = solve_either(problem, initial)
     for number in range(settings.transfers):
         progress("transferring the shapes that show", number, settings.transfers)
-        weights = state.coefficients[len(modes) :].float()
+        weights = problem.weights(state.coefficients).float().amax(0)
         rest = mean + torch.tensordot(state.coefficients[: len(modes)].float(), modes, dims=1)
         deltas = _personal(rig, deltas, weights, vertices, rest)
         points = LinearPoints.of(mean, torch.cat([modes, deltas]), vertices, curves)
@@ -154,15 +160,18 @@ def fit_images(
         return fit
     progress("projecting the photographs onto the head")
     skin = photographed_skin(fit.posed, model.color, images, fit.cameras, settings.texture_size, settings.masked)
-    return replace(fit, mesh=skin.on(fit.mesh), posed=skin.on(fit.posed), color=skin.fit)
+    return replace(fit, mesh=skin.on(fit.mesh), posed=tuple(map(skin.on, fit.posed)), color=skin.fit)
 
 
 def _result(
     problem: Problem, state: State, template: Mesh, mean: Tensor, modes: Tensor, deltas: Tensor, sizes: Tensor
 ) -> ImageFit:
-    coefficients, weights = state.coefficients[: len(modes)].float(), state.coefficients[len(modes) :].float()
-    rest = mean + torch.tensordot(coefficients, modes, dims=1)
+    whole, known = state.coefficients[: len(modes)].float(), len(modes) - problem.smooth
+    weights = problem.weights(state.coefficients).float().expand(len(problem.found), -1)
+    rest = mean + torch.tensordot(whole, modes, dims=1)
     shown = rest + torch.tensordot(weights, deltas, dims=1)
+    kept = torch.ones(problem.unknowns, dtype=torch.bool)
+    kept[known : len(modes)] = False
     views = state.views
     cameras = tuple(
         Camera(K, R, t, int(width), int(height))
@@ -170,18 +179,18 @@ def _result(
             views.intrinsics, views.rotation, views.translation, sizes.tolist(), strict=True
         )
     )
-    seen = views.pixels(problem.points.at(state.coefficients)[state.rows])
+    seen = views.pixels(problem.points.picked(state.rows).at(state.coefficients[problem.rows]))
     mesh = template.to("cpu")
     return ImageFit(
         mesh.with_vertices(rest),
-        mesh.with_vertices(shown),
-        coefficients,
+        tuple(mesh.with_vertices(one) for one in shown),
+        whole[:known],
         weights,
         cameras,
         seen - problem.found,
         seen,
         state.noise,
-        covariance(problem, state),
+        covariance(problem, state)[kept][:, kept],
     )
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Protocol
 
 import torch
 from torch import Tensor
@@ -24,6 +25,24 @@ from torchface.optim import box_qp
 _DONE, _HALVINGS = 1e-5, 6
 _MAX_CONTOUR_ERROR, _SETTLED, _TRIAL_ITERATIONS = 1.5, 0.02, 3
 _MIN_NOISE = 1e-5  # of the focal length: finer than any landmark is found
+_EXPECTED, _LEAST_UNKNOWN = 2.0, 1e-2  # of unknown differences: how many are expected to be as large as expected
+
+
+class WeightQuadratic(Protocol):
+    """An energy ½ wᵀ H w + fᵀ w of weights (E,N): H (E,N,N) or (N,N), f (E,N)."""
+
+    @property
+    def H(self) -> Tensor: ...
+    @property
+    def f(self) -> Tensor: ...
+
+
+class ExpressionPrior(Protocol):
+    """Which weights faces have, as ``ShapePrior`` knows it."""
+
+    def energy(self, weights: Tensor) -> WeightQuadratic:
+        """A quadratic that touches minus the log density at weights (E,N) from above."""
+        ...
 
 
 @dataclass(frozen=True)
@@ -36,11 +55,16 @@ class FitSettings:
             contour landmarks as points.
         sliding: contour landmarks of the far side move to the visible silhouette, as people and detectors mark them;
             False where they are vertices that may be hidden. Absent, what fits better is taken.
+        expression_prior: which weights of the rig's shapes go together, in place of the next three.
+        sparsity: beside that prior, for a weight of 1.
         expression_mean: how strong a shape is on average, in weights; the prior falls exponentially.
         expression_ridge: prior deviation of a weight beside that.
         asymmetry: prior deviation of the difference between a shape's weight and its mirror image's. Faces move almost
             alike on both sides, and 68 landmarks of a rotated head hardly distinguish a lopsided smile from it.
+        one_expression: all photographs show the same one, as taken at once; else each has its own.
         identity_bound: on each coefficient, standard deviations.
+        unknown_deviation: of a coordinate, millimetres: smooth differences of heads that the model does not know, on
+            average; how large this person's are is estimated. 0 holds heads to the model.
         noise: of an inner landmark, pixels; estimated from the residuals if absent.
         focal_deviation: relative deviation of the true focal length from the given one; 0 takes it as exact.
         shared_focal: one focal length for all photographs.
@@ -58,12 +82,16 @@ class FitSettings:
     """
 
     inner_weight: float = 2.0
-    contour_slide: float = 0.3
+    contour_slide: float = 0.5
     sliding: bool | None = None
+    expression_prior: ExpressionPrior | None = None
+    sparsity: float = 1.0
     expression_mean: float = 0.2
     expression_ridge: float = 0.5
     asymmetry: float = 0.1
+    one_expression: bool = False
     identity_bound: float = 3.0
+    unknown_deviation: float = 1.0
     noise: float | None = None
     focal_deviation: float = 0.0
     shared_focal: bool = True
@@ -78,7 +106,8 @@ class FitSettings:
         if self.noise is not None:
             checked_number("noise", self.noise, above=True)
         checked_number("contour_slide", self.contour_slide, 0.0, 1.0)
-        checked_number("focal_deviation", self.focal_deviation)
+        for name in ("focal_deviation", "sparsity", "unknown_deviation"):
+            checked_number(name, getattr(self, name))
         checked_count("max_iterations", self.max_iterations, 1)
         checked_count("transfers", self.transfers)
         checked_count("texture_size", self.texture_size, 0, MAX_SIDE)
@@ -89,12 +118,13 @@ class Problem:
     """What is looked for and where it was seen.
 
     Args:
-        points: landmarks and contour curves as functions of D coefficients, the first ``identities`` of them identity.
-        identities: how many.
+        points: landmarks and contour curves as functions of K coefficients of identity and N weights.
+        identities: K; the last ``smooth`` of them are differences that the head model does not know.
         found: landmarks, (I,68,2), NaN for missing.
         focal: the expected focal lengths, (I,), pixels.
         settings: see there.
-        twins: rows of the coefficients of shapes that mirror each other, (K,2); none if absent.
+        twins: rows of shapes that mirror each other, (P,2); none if absent.
+        smooth: see ``smooth_differences``.
     """
 
     points: LinearPoints
@@ -103,6 +133,7 @@ class Problem:
     focal: Tensor
     settings: FitSettings
     twins: Tensor | None = None
+    smooth: int = 0
 
     @property
     def seen(self) -> Tensor:
@@ -114,36 +145,78 @@ class Problem:
         """The landmarks with zeros for missing ones."""
         return torch.where(self.seen[..., None], self.found, 0.0)
 
+    @property
+    def expressions(self) -> int:
+        """How many there are, E: one a view, or one for all."""
+        return 1 if self.settings.one_expression else len(self.found)
+
+    @property
+    def unknowns(self) -> int:
+        """D, of identity and all expressions: K + E N."""
+        k = self.identities
+        return k + self.expressions * (len(self.points.basis) - k)
+
+    @property
+    def rows(self) -> Tensor:
+        """Which of the D coefficients each view's face follows, (I,K+N)."""
+        k, count = self.identities, len(self.points.basis) - self.identities
+        first = k + count * torch.arange(self.expressions)
+        own = (first[:, None] + torch.arange(count)).expand(len(self.found), count)
+        return torch.cat([torch.arange(k).expand(len(own), k), own], dim=1)
+
+    def weights(self, coefficients: Tensor) -> Tensor:
+        """The expressions (E,N) among coefficients (D,)."""
+        return coefficients[self.identities :].unflatten(0, (self.expressions, -1))
+
     def bounds(self) -> tuple[Tensor, Tensor]:
         """Lower and upper, (D,)."""
-        count, k = len(self.points.basis), self.identities
-        lower, upper = torch.zeros(count, dtype=torch.float64), torch.ones(count, dtype=torch.float64)
+        lower, upper = (make(self.unknowns, dtype=torch.float64) for make in (torch.zeros, torch.ones))
+        k = self.identities
         lower[:k], upper[:k] = -self.settings.identity_bound, self.settings.identity_bound
         return lower, upper
 
-    def prior(self) -> tuple[Tensor, Tensor]:
-        """Of the energy ½ xᵀ P x + βᵀ x: P (D,D) and β (D,)."""
-        count, k = len(self.points.basis), self.identities
-        ridge, linear = torch.ones(count, dtype=torch.float64), torch.zeros(count, dtype=torch.float64)
-        ridge[k:] = 1 / self.settings.expression_ridge**2
-        linear[k:] = 1 / self.settings.expression_mean
-        precision = torch.diag(ridge)
-        if self.twins is not None and len(self.twins):
-            rows = torch.arange(len(self.twins))
-            apart = torch.zeros(len(self.twins), count, dtype=torch.float64)
-            apart[rows, self.twins[:, 0]], apart[rows, self.twins[:, 1]] = 1.0, -1.0
-            precision = precision + apart.T @ apart / self.settings.asymmetry**2
+    def prior(self, state: State) -> tuple[Tensor, Tensor]:
+        """Of the energy ½ xᵀ P x + βᵀ x: P (D,D) and β (D,); it touches that of the expressions at the state."""
+        weights, k = self.weights(state.coefficients), self.identities
+        count, settings = weights.shape[1], self.settings
+        precision, linear = (
+            torch.zeros(*shape, dtype=torch.float64) for shape in ((self.unknowns,) * 2, (self.unknowns,))
+        )
+        precision.diagonal()[:k] = 1.0
+        precision.diagonal()[k - self.smooth : k] = 1 / state.unknown
+        if settings.expression_prior is None:
+            own = torch.eye(count, dtype=torch.float64) / settings.expression_ridge**2
+            if self.twins is not None and len(self.twins):
+                rows = torch.arange(len(self.twins))
+                apart = torch.zeros(len(self.twins), count, dtype=torch.float64)
+                apart[rows, self.twins[:, 0]], apart[rows, self.twins[:, 1]] = 1.0, -1.0
+                own = own + apart.T @ apart / settings.asymmetry**2
+            each, pull = own.expand(len(weights), -1, -1), torch.full_like(weights, 1 / settings.expression_mean)
+        else:
+            energy = settings.expression_prior.energy(weights)
+            each, pull = energy.H.expand(len(weights), -1, -1), energy.f + settings.sparsity
+        linear[k:] = pull.flatten()
+        precision[k:, k:] = torch.block_diag(*each)
         return precision, linear
 
 
 @dataclass(frozen=True, eq=False)
 class State:
-    """Coefficients (D,), cameras, which point each landmark is (I,68), and the noise of an inner landmark, pixels."""
+    """Where the solve stands.
+
+    Args:
+        coefficients: (D,).
+        views: the cameras.
+        rows: which point each landmark is, (I,68).
+        noise: of an inner landmark, pixels.
+        unknown: the variance of differences that the head model does not know, in what is expected of them.
+    """
 
     coefficients: Tensor
     views: Views
     rows: Tensor
     noise: float
+    unknown: float = 1.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -153,26 +226,49 @@ class Normal:
     Args:
         H: of the coefficients, (D,D), without the prior.
         g: (D,).
-        back: the camera's step for one of the coefficients, (C,D), and at none, (C,).
+        rows: of each view's coefficients, (I,K+N).
+        focal_back, focal_alone: the step of the focal lengths for one of the coefficients, (F,D), and at none, (F,).
+        pose_back, pose_alone: that of a view's pose for its coefficients and its focal length, (I,6,K+N+1), and at
+            none, (I,6).
     """
 
     H: Tensor
     g: Tensor
-    back: Tensor
-    alone: Tensor
+    rows: Tensor
+    focal_back: Tensor
+    focal_alone: Tensor
+    pose_back: Tensor
+    pose_alone: Tensor
+
+    @property
+    def cameras(self) -> int:
+        """How many unknowns they have."""
+        return self.pose_alone.numel() + len(self.focal_alone)
+
+    def cameras_step(self, change: Tensor, focal: Tensor) -> tuple[Tensor, Tensor]:
+        """Steps of poses (I,6) and of focal lengths' logarithms (I,) for a change (D,); focal as of ``step_focal``."""
+        longer = focal @ (self.focal_alone + self.focal_back @ change)
+        own = torch.cat([change[self.rows], longer[:, None]], dim=1)
+        return self.pose_alone + (self.pose_back @ own[..., None])[..., 0], longer
 
 
 def whitening(problem: Problem, state: State, picked: PickedPoints) -> Tensor:
     """What makes errors unit and independent, (I,68,2,2): the contour's by whether they lie along or across it."""
     settings = problem.settings
     factors = torch.eye(2, dtype=torch.float64).repeat(*problem.seen.shape, 1, 1)
-    line = state.views.pixels(picked.at(state.coefficients))[:, :JAW]
+    line = state.views.pixels(picked.at(state.coefficients[problem.rows]))[:, :JAW]
     along = torch.cat([line[:, 1:2] - line[:, :1], line[:, 2:] - line[:, :-2], line[:, -1:] - line[:, -2:-1]], dim=1)
     along = torch.nn.functional.normalize(along, dim=-1)
     tangent = along[..., :, None] * along[..., None, :]
     factors[:, :JAW] -= (1 - settings.contour_slide) * tangent
     factors[:, :JAW] /= settings.inner_weight**0.5
-    return factors * (problem.seen[..., None, None] / state.noise)
+    return factors * (problem.seen / (state.noise * _scales(problem, state.views))[:, None])[..., None, None]
+
+
+def _scales(problem: Problem, views: Views) -> Tensor:
+    """How large each view's noise is beside the mean view's, (I,): as the face, where it is not given in pixels."""
+    size = views.intrinsics[:, 0, 0] / views.translation[:, 2]
+    return size / size.log().mean().exp() if problem.settings.noise is None else torch.ones_like(size)
 
 
 def step_focal(problem: Problem) -> Tensor:
@@ -186,35 +282,51 @@ def step_focal(problem: Problem) -> Tensor:
 
 
 def normal_equations(problem: Problem, at: Linearised, views: Views) -> Normal:
-    """Gauss-Newton's, with the cameras eliminated (Schur complement)."""
-    count, D = len(problem.found), at.by_coefficients.shape[-1]
-    focal = step_focal(problem)
-    camera = torch.zeros(count, *at.residual.shape[1:], 6 * count + focal.shape[1], dtype=torch.float64)
-    for i in range(count):  # views: each has its own six columns
-        camera[i, ..., 6 * i : 6 * i + 6] = at.by_camera[i]
-    camera[..., 6 * count :] = at.by_focal[..., None] * focal[:, None, None]
-    A, B, r = at.by_coefficients.reshape(-1, D), camera.reshape(-1, camera.shape[-1]), at.residual.flatten()
-    H_bb, g_b = B.T @ B, B.T @ r
-    if focal.shape[1]:
-        logs = (views.intrinsics[:, 0, 0] / problem.focal).log()
-        precision = 1 / problem.settings.focal_deviation**2
-        each = focal / focal.sum(0)
-        H_bb.diagonal()[6 * count :] += precision
-        g_b[6 * count :] += precision * (each.T @ logs)
-    H_bb.diagonal().add_(1e-9 * H_bb.diagonal().clamp(min=1e-12))
-    H_ba = B.T @ A
+    """Gauss-Newton's, with the cameras eliminated (Schur complement): poses in each view, then focal lengths."""
+    D, focal, rows = problem.unknowns, step_focal(problem), problem.rows
+    F = focal.shape[1]
+    A = torch.cat([at.by_coefficients, at.by_focal[..., None]], dim=-1).flatten(1, 2)
+    B, r = at.by_camera.flatten(1, 2), at.residual.flatten(1)[..., None]
+    H_bb = B.mT @ B
+    H_bb.diagonal(dim1=1, dim2=2).add_(1e-9 * H_bb.diagonal(dim1=1, dim2=2).clamp(min=1e-12))
     factor = torch.linalg.cholesky(H_bb)
-    solved = torch.cholesky_solve(torch.cat([H_ba, g_b[:, None]], dim=1), factor)
-    back, alone = -solved[:, :-1], -solved[:, -1]
-    H = A.T @ A + H_ba.T @ back
-    return Normal(0.5 * (H + H.T), A.T @ r + H_ba.T @ alone, back, alone)
+    H_ba = B.mT @ A
+    solved = -torch.cholesky_solve(torch.cat([H_ba, B.mT @ r], dim=2), factor)
+    pose_back, pose_alone = solved[..., :-1], solved[..., -1]
+    own, pull = A.mT @ A + H_ba.mT @ pose_back, (A.mT @ r)[..., 0] + (H_ba.mT @ pose_alone[..., None])[..., 0]
+    H, g = torch.zeros(D + F, D + F, dtype=torch.float64), torch.zeros(D + F, dtype=torch.float64)
+    for i in range(len(rows)):  # views: each has its own rows
+        wide = torch.cat([rows[i], D + focal[i].nonzero()[:, 0]])
+        kept = torch.arange(len(wide))
+        H[wide[:, None], wide] += own[i][kept[:, None], kept]
+        g[wide] += pull[i][kept]
+    if not F:
+        none = torch.zeros(0, D, dtype=torch.float64)
+        return Normal(0.5 * (H + H.T), g, rows, none, none[:, 0], pose_back, pose_alone)
+    logs = (views.intrinsics[:, 0, 0] / problem.focal).log()
+    precision = 1 / problem.settings.focal_deviation**2
+    H.diagonal()[D:] += precision
+    g[D:] += precision * ((focal / focal.sum(0)).T @ logs)
+    back = -torch.linalg.solve(H[D:, D:], torch.cat([H[D:, :D], g[D:, None]], dim=1))
+    reduced = H[:D, :D] + H[:D, D:] @ back[:, :D]
+    return Normal(
+        0.5 * (reduced + reduced.T),
+        g[:D] + H[:D, D:] @ back[:, D],
+        rows,
+        back[:, :D],
+        back[:, D],
+        pose_back,
+        pose_alone,
+    )
 
 
-def energy(problem: Problem, state: State, picked: PickedPoints, factors: Tensor) -> float:
-    """Minus the log posterior up to a constant, at fixed noise and chosen points."""
-    precision, linear = problem.prior()
+def energy(
+    problem: Problem, state: State, picked: PickedPoints, factors: Tensor, prior: tuple[Tensor, Tensor]
+) -> float:
+    """Minus the log posterior up to a constant, at fixed noise, chosen points and quadratic of the prior."""
+    precision, linear = prior
     x = state.coefficients
-    at = residuals(picked, x, state.views, problem.targets, factors)
+    at = residuals(picked, x[problem.rows], state.views, problem.targets, factors)
     total = 0.5 * at.square().sum() + 0.5 * (x @ precision @ x) + (linear * x).sum()
     focal = step_focal(problem)
     if focal.shape[1]:
@@ -241,7 +353,7 @@ def _contour_error(problem: Problem, state: State) -> float:
     """Root mean square of contour landmarks in what is expected of them beside the inner ones: 1 if all is well."""
     picked = problem.points.picked(state.rows)
     factors = whitening(problem, state, picked)
-    r = residuals(picked, state.coefficients, state.views, problem.targets, factors).square().sum(-1)
+    r = residuals(picked, state.coefficients[problem.rows], state.views, problem.targets, factors).square().sum(-1)
     contour, inner = problem.seen.clone(), problem.seen.clone()
     contour[:, JAW:], inner[:, :JAW] = False, False
     if not contour.any():
@@ -259,26 +371,22 @@ def solve(problem: Problem, state: State, free: Tensor | None = None) -> State:
         free: which coefficients may change, (D,) bool; all if absent.
     """
     lower, upper = problem.bounds()
-    precision, linear = problem.prior()
     for _ in range(problem.settings.max_iterations):
+        x = state.coefficients
         if problem.settings.sliding:
-            rows = chosen_points(problem.points, state.coefficients, state.views)
-            state = replace(state, rows=rows)
+            state = replace(state, rows=chosen_points(problem.points, x[problem.rows], state.views))
         picked = problem.points.picked(state.rows)
         factors = whitening(problem, state, picked)
-        at = linearised(picked, state.coefficients, state.views, problem.targets, factors)
-        normal = normal_equations(problem, at, state.views)
-        x = state.coefficients
-        H = normal.H + precision
-        f = normal.g - normal.H @ x + linear
+        at = linearised(picked, x[problem.rows], state.views, problem.targets, factors)
+        normal, prior = normal_equations(problem, at, state.views), problem.prior(state)
         low, high = (lower, upper) if free is None else (torch.where(free, lower, x), torch.where(free, upper, x))
-        goal = box_qp(H, f[None], low, high, start=x[None])[0]
-        before = energy(problem, state, picked, factors)
-        moved, after = _searched(problem, state, picked, factors, normal, goal - x, before)
-        state = moved
+        f = normal.g - normal.H @ x + prior[1]
+        goal = box_qp(normal.H + prior[0], f[None], low, high, start=x[None])[0]
+        before = energy(problem, state, picked, factors, prior)
+        state, after = _searched(problem, state, picked, factors, (normal, prior), goal - x, before)
         noise = state.noise
         if problem.settings.noise is None:
-            state = replace(state, noise=_noise(problem, state, picked, factors, normal))
+            state = _spreads(problem, state, picked, factors, normal)
         # A falling noise changes what the energy weighs: there is more to come.
         if before - after < _DONE * max(abs(before), 1.0) and abs(state.noise - noise) < _SETTLED * noise:
             break
@@ -286,48 +394,57 @@ def solve(problem: Problem, state: State, free: Tensor | None = None) -> State:
 
 
 def _searched(
-    problem: Problem, state: State, picked: PickedPoints, factors: Tensor, normal: Normal, change: Tensor, before: float
+    problem: Problem,
+    state: State,
+    picked: PickedPoints,
+    factors: Tensor,
+    model: tuple[Normal, tuple[Tensor, Tensor]],
+    change: Tensor,
+    before: float,
 ) -> tuple[State, float]:
     """The step, halved until the energy falls."""
-    count, focal = len(problem.found), step_focal(problem)
-    camera = normal.alone + normal.back @ change
-    motion = camera[: 6 * count].reshape(count, 6)
-    longer = focal @ camera[6 * count :]
+    normal, prior = model
+    motion, longer = normal.cameras_step(change, step_focal(problem))
     for halving in range(_HALVINGS):
         fraction = 0.5**halving
-        tried = State(
-            state.coefficients + fraction * change,
-            state.views.moved(fraction * motion, fraction * longer),
-            state.rows,
-            state.noise,
-        )
-        after = energy(problem, tried, picked, factors)
+        moved = state.views.moved(fraction * motion, fraction * longer)
+        tried = replace(state, coefficients=state.coefficients + fraction * change, views=moved)
+        after = energy(problem, tried, picked, factors, prior)
         if after <= before:
             return tried, after
     return state, before
 
 
-def _noise(problem: Problem, state: State, picked: PickedPoints, factors: Tensor, normal: Normal) -> float:
-    """What is left over, for each number that neither the cameras nor the coefficients can explain."""
-    r = residuals(picked, state.coefficients, state.views, problem.targets, factors)
-    precision, _ = problem.prior()
-    factor = torch.linalg.cholesky(precision)
-    half = torch.linalg.solve_triangular(factor, normal.H, upper=False)
-    values = torch.linalg.eigvalsh(torch.linalg.solve_triangular(factor, half.T, upper=False)).clamp(min=0)
-    used = float((values / (values + 1)).sum()) + len(normal.alone)
+def _spreads(problem: Problem, state: State, picked: PickedPoints, factors: Tensor, normal: Normal) -> State:
+    """With noise and unknown differences as large as what is left over and what is found of them, each by what the
+    other unknowns cannot explain.
+
+    Source: MacKay 1992 (evidence framework).
+    """
+    r = residuals(picked, state.coefficients[problem.rows], state.views, problem.targets, factors)
+    precision, _ = problem.prior(state)
+    posterior = torch.linalg.inv(normal.H + precision)
+    used = float((posterior * normal.H).sum()) + normal.cameras  # the trace of (H + P)⁻¹ H
     # A contour landmark that slides constrains hardly more than one number.
     measured = 2 * float(problem.seen.sum()) - (1 - problem.settings.contour_slide) * float(problem.seen[:, :JAW].sum())
     left = max(measured - used, 0.2 * measured)
     deviation = state.noise * (float(r.square().sum()) / left) ** 0.5
-    return max(deviation, _MIN_NOISE * float(problem.focal.mean()))
+    noise = max(deviation, _MIN_NOISE * float(problem.focal.mean()))
+    if not problem.smooth:
+        return replace(state, noise=noise)
+    some = slice(problem.identities - problem.smooth, problem.identities)
+    found = float(state.coefficients[some].square().sum())
+    known = problem.smooth - float(posterior.diagonal()[some].sum()) / state.unknown
+    unknown = (found + _EXPECTED) / (known + _EXPECTED)
+    return replace(state, noise=noise, unknown=min(max(unknown, _LEAST_UNKNOWN), 1.0 / _LEAST_UNKNOWN))
 
 
 def covariance(problem: Problem, state: State) -> Tensor:
     """Of the coefficients, (D,D), cameras unknown; rows of those that lie on a bound are zero."""
     picked = problem.points.picked(state.rows)
     factors = whitening(problem, state, picked)
-    at = linearised(picked, state.coefficients, state.views, problem.targets, factors)
-    precision, _ = problem.prior()
+    at = linearised(picked, state.coefficients[problem.rows], state.views, problem.targets, factors)
+    precision, _ = problem.prior(state)
     H = normal_equations(problem, at, state.views).H + precision
     lower, upper = problem.bounds()
     x = state.coefficients

@@ -44,7 +44,7 @@ class Skin:
 
 
 def photographed_skin(
-    posed: Mesh,
+    posed: Sequence[Mesh],
     color: MorphableModel | None,
     images: Sequence[Tensor],
     cameras: Sequence[Camera],
@@ -54,7 +54,7 @@ def photographed_skin(
     """A head's skin from photographs and a colour model.
 
     Args:
-        posed: the head as the photographs show it; its own skin is the template's.
+        posed: the head as each photograph shows it; its own skin is the template's.
         color: model of vertex colours, if there is one.
         images: photographs, (3,H,W) each.
         cameras: one each.
@@ -67,19 +67,20 @@ def photographed_skin(
         their colour in the photographs. Without: the colour model's colours.
     """
     fit = None if color is None else fit_colors(color, posed, images, cameras)
-    base = _own_colors(posed) if fit is None else fit.colors
-    if posed.uvs is None or size == 0:
+    mesh = posed[0]
+    base = _own_colors(mesh) if fit is None else fit.colors
+    if mesh.uvs is None or size == 0:
         return Skin(base, None, fit)
-    confidence = skin_shares(posed, images, cameras) if masked and _has_landmarks(posed) else None
+    confidence = skin_shares(posed, images, cameras) if masked and _has_landmarks(mesh) else None
     if base is not None:
         texture = photo_texture(posed, images, cameras, size, base, confidence)
         return Skin(texture.colors, texture.image, fit)
-    parts = part_vertices(posed)
+    parts = part_vertices(mesh)
     if parts.any() and not parts.all():
         confidence = torch.ones(len(images), len(parts)) if confidence is None else confidence
         confidence = torch.where(parts, 0.0, confidence)
     texture = photo_texture(posed, images, cameras, size, base, confidence)
-    colored = with_part_colors(replace(posed, colors=texture.colors), iris_color(posed, images, cameras))
+    colored = with_part_colors(replace(mesh, colors=texture.colors), iris_color(posed, images, cameras))
     return Skin(colored.colors, texture.image, fit)
 
 
@@ -108,31 +109,31 @@ def part_vertices(mesh: Mesh) -> Tensor:
     return result
 
 
-def iris_color(mesh: Mesh, images: Sequence[Tensor], cameras: Sequence[Camera]) -> Tensor | None:
+def iris_color(posed: Mesh | Sequence[Mesh], images: Sequence[Tensor], cameras: Sequence[Camera]) -> Tensor | None:
     """The irises' colour (3,), sRGB, or None where no photograph is large enough to show it.
 
     Where the eyes look is not known: of what is seen of the eyeballs between the lids, the dark share that is neither
     lash and pupil nor white counts.
 
     Args:
-        mesh: the head as the photographs show it, its eyeballs annotated.
+        posed: the head as the photographs show it, or as each of them does, its eyeballs annotated.
         images: photographs, (3,H,W) each.
         cameras: one each.
     """
-    regions = {} if mesh.annotations is None else mesh.annotations.regions
-    balls = [mask.cpu() for name, mask in regions.items() if part_material(name) is EYEBALL]
+    meshes = [posed] * len(images) if isinstance(posed, Mesh) else posed
+    regions = {} if meshes[0].annotations is None else meshes[0].annotations.regions
+    balls = [mask.cpu() for name, mask in regions.items() if part_material(name) is EYEBALL and bool(mask.any())]
     if not balls:
         return None
-    vertices, faces = mesh.vertices.detach().cpu().double(), mesh.faces.cpu()
-    clear = torch.zeros(len(vertices), dtype=torch.bool)
+    clear = torch.zeros(len(meshes[0].vertices), dtype=torch.bool)
     for name, mask in regions.items():
         material = part_material(name)
         clear |= mask.cpu() if material is not None and material.alpha == "BLEND" else torch.zeros_like(clear)
-    normals = vertex_normals(vertices, faces)
-    caster = RayCaster(vertices, faces[~clear[faces].all(1)])
     seen = []
-    for image, camera in zip(images, cameras, strict=True):  # photographs
-        shown = shown_in(image.cpu(), camera, caster, vertices, normals)
+    for mesh, image, camera in zip(meshes, images, cameras, strict=True):  # photographs
+        vertices, faces = mesh.vertices.detach().cpu().double(), mesh.faces.cpu()
+        caster = RayCaster(vertices, faces[~clear[faces].all(1)])
+        shown = shown_in(image.cpu(), camera, caster, vertices, vertex_normals(vertices, faces))
         for ball in balls:
             pixels = camera.project(vertices[ball])
             if float((pixels.amax(0) - pixels.amin(0)).amin()) >= _MIN_DIAMETER:

@@ -47,7 +47,7 @@ class LinearPoints:
         return LinearPoints(points[0], points[1:], rows, curves.valid, curves.side)
 
     def at(self, coefficients: Tensor) -> Tensor:
-        """Positions (P,3) at coefficients (D,)."""
+        """Positions (...,P,3) at coefficients (...,D)."""
         return self.mean + torch.tensordot(coefficients, self.basis, dims=1)
 
     def picked(self, rows: Tensor) -> PickedPoints:
@@ -63,8 +63,8 @@ class PickedPoints:
     basis: Tensor
 
     def at(self, coefficients: Tensor) -> Tensor:
-        """Positions (I,L,3) at coefficients (D,)."""
-        return self.mean + self.basis @ coefficients
+        """Positions (I,L,3) at each view's coefficients (I,D)."""
+        return self.mean + (self.basis @ coefficients[:, None, :, None])[..., 0]
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,7 +89,7 @@ class Views:
 
 
 def chosen_points(points: LinearPoints, coefficients: Tensor, views: Views, slides: bool = True) -> Tensor:
-    """Which point each landmark is in each view, rows (I,68) into the points.
+    """Which point each landmark is in each view, rows (I,68) into the points, of the views' coefficients (I,D).
 
     A contour landmark is the point of its curve that the view shows furthest out from the face's own vertical;
     on the near side of a rotated face that is the landmark's own vertex.
@@ -98,7 +98,7 @@ def chosen_points(points: LinearPoints, coefficients: Tensor, views: Views, slid
     rows = torch.arange(count).expand(len(views.rotation), -1).clone()
     if slides:
         at = points.at(coefficients)
-        seen = views.pixels(at[points.rows].flatten(0, 1)).unflatten(1, points.rows.shape)
+        seen = views.pixels(at[:, points.rows].flatten(1, 2)).unflatten(1, points.rows.shape)
         up = views.rotation[:, :2, 1]
         across = torch.nn.functional.normalize(torch.stack([-up[:, 1], up[:, 0]], dim=-1), dim=-1)
         across = across * torch.where((across * views.rotation[:, :2, 0]).sum(-1) < 0, -1.0, 1.0)[:, None]
@@ -129,7 +129,7 @@ class Linearised:
 def linearised(
     points: PickedPoints, coefficients: Tensor, views: Views, found: Tensor, whitening: Tensor
 ) -> Linearised:
-    """At landmarks found (I,L,2) whose errors ``whitening`` (I,L,2,2) makes unit and independent."""
+    """At coefficients (I,D) and landmarks found (I,L,2) whose errors ``whitening`` (I,L,2,2) makes unit and free."""
     rotated = points.at(coefficients) @ views.rotation.transpose(-1, -2)
     pixels, by_translation = pixel_jacobian(rotated + views.translation[:, None], views.intrinsics)
     by_translation = whitening @ by_translation

@@ -9,12 +9,10 @@ import torch
 from torch import Tensor
 
 from torchface.geometry.cameras.pinhole import Camera
-from torchface.geometry.meshes.operators import vertex_normals
 from torchface.geometry.meshes.vertex_graph import VertexGraph
 from torchface.mesh import Mesh
 from torchface.modeling.photographs.landmark_view import JAW, LANDMARKS
-from torchface.rendering.camera_visibility import Shown, shown_in
-from torchface.rendering.raycast import RayCaster
+from torchface.rendering.camera_visibility import PosedSurface, Shown
 
 _FEATURES = 0.10
 _SURELY_SKIN = 0.75
@@ -76,27 +74,23 @@ class FacePlaces:
         )
 
 
-def skin_shares(mesh: Mesh, images: Sequence[Tensor], cameras: Sequence[Camera]) -> Tensor:
+def skin_shares(posed: Mesh | Sequence[Mesh], images: Sequence[Tensor], cameras: Sequence[Camera]) -> Tensor:
     """How far photographs show skin, or a feature of the face, at each vertex, (I,V) in [0,1].
 
     Inside the face's outline everything is the person's. Around it counts what resembles the cheeks nearby, in
     brightness and in the ratios of the channels; far below the chin and behind the ears nothing does.
 
     Args:
-        mesh: the head as the photographs show it, with 68 landmarks.
+        posed: the head as the photographs show it, or as each of them does, with 68 landmarks.
         images: photographs, (3,H,W) each.
         cameras: one each.
     """
-    places = FacePlaces.of(mesh)
-    vertices, faces = mesh.vertices.detach().cpu().double(), mesh.faces.cpu()
-    normals, caster, graph = (
-        vertex_normals(vertices, faces),
-        RayCaster(vertices, faces),
-        VertexGraph(faces, len(vertices)),
-    )
+    meshes = [posed] * len(images) if isinstance(posed, Mesh) else posed
+    graph = VertexGraph(meshes[0].faces.cpu(), len(meshes[0].vertices))
+    surfaces = PosedSurface.each(posed, len(images))
     shares = [
-        _share(shown_in(image.cpu(), camera, caster, vertices, normals), places, graph)
-        for image, camera in zip(images, cameras, strict=True)
+        _share(surface.shown_in(image, camera), FacePlaces.of(mesh), graph)
+        for mesh, surface, image, camera in zip(meshes, surfaces, images, cameras, strict=True)
     ]
     return torch.stack(shares)
 

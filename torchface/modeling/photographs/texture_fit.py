@@ -10,13 +10,11 @@ from torch import Tensor
 
 from torchface.errors import AlignmentError, ShapeError, TopologyError
 from torchface.geometry.cameras.pinhole import Camera
-from torchface.geometry.meshes.operators import vertex_normals
 from torchface.mesh import Mesh
 from torchface.modeling.morphable.morphable_model import MorphableModel
 from torchface.number_checks import checked_number
 from torchface.optim import box_qp
-from torchface.rendering.camera_visibility import shown_in
-from torchface.rendering.raycast import RayCaster
+from torchface.rendering.camera_visibility import PosedSurface
 
 _STRENGTH = 0.1 / 0.05  # of the model's own distribution beside one vertex at a colour error of 0.05
 _SQUARELY = 0.2  # cosine; what is seen more obliquely is blurred and mixed with what stands behind
@@ -46,7 +44,7 @@ class ColorFit:
 
 def fit_colors(
     model: MorphableModel,
-    mesh: Mesh,
+    mesh: Mesh | Sequence[Mesh],
     images: Sequence[Tensor],
     cameras: Sequence[Camera],
     lighting: bool = True,
@@ -63,7 +61,7 @@ def fit_colors(
 
     Args:
         model: of vertex colours.
-        mesh: the head as the photographs show it.
+        mesh: the head as the photographs show it, or as each of them does.
         images: photographs, (3,H,W) each.
         cameras: one each.
         lighting: estimate each photograph's light.
@@ -90,12 +88,12 @@ def fit_colors(
     """
     if len(images) != len(cameras) or not images:
         raise ShapeError(f"fit_colors: found {len(images)} images and {len(cameras)} cameras, expected one each")
-    if model.mean.shape != mesh.vertices.shape:
-        raise TopologyError(
-            f"fit_colors: found a model of {tuple(model.mean.shape)} for a mesh of {len(mesh.vertices)} vertices"
-        )
+    surfaces = PosedSurface.each(mesh, len(images))
+    count = len(surfaces[0].vertices)
+    if len(model.mean) != count:
+        raise TopologyError(f"fit_colors: found a model of {tuple(model.mean.shape)} for a mesh of {count} vertices")
     checked_number("fit_colors: bound", bound, above=True)
-    views = _shown_vertices(mesh, images, cameras)
+    views = _shown_vertices(surfaces, images, cameras)
     mean, modes = model.mean.cpu().double(), model.modes.cpu().double()
     coefficients = torch.zeros(len(modes), dtype=torch.float64)
     light = torch.zeros(len(views), 3, 4, dtype=torch.float64)
@@ -138,20 +136,19 @@ class _View:
     share: Tensor
 
 
-def _shown_vertices(mesh: Mesh, images: Sequence[Tensor], cameras: Sequence[Camera]) -> list[_View]:
-    vertices, faces = mesh.vertices.detach().cpu().double(), mesh.faces.cpu()
-    normals = vertex_normals(vertices, faces)
-    caster = RayCaster(vertices, faces)
+def _shown_vertices(
+    surfaces: Sequence[PosedSurface], images: Sequence[Tensor], cameras: Sequence[Camera]
+) -> list[_View]:
     views = []
-    for i, (image, camera) in enumerate(zip(images, cameras, strict=True)):
-        shown = shown_in(image.cpu(), camera, caster, vertices, normals)
+    for i, (surface, image, camera) in enumerate(zip(surfaces, images, cameras, strict=True)):
+        shown = surface.shown_in(image, camera)
         ids = (shown.cosine > _SQUARELY).nonzero()[:, 0]
         if len(ids) < _MIN_VERTICES:
             raise AlignmentError(
-                f"images: found {len(ids)} of {len(vertices)} vertices in view {i}, expected at least {_MIN_VERTICES}; "
-                "does the camera see the head?"
+                f"images: found {len(ids)} of {len(surface.vertices)} vertices in view {i}, expected at least "
+                f"{_MIN_VERTICES}; does the camera see the head?"
             )
-        basis = torch.cat([torch.ones(len(ids), 1, dtype=torch.float64), normals[ids]], dim=1)
+        basis = torch.cat([torch.ones(len(ids), 1, dtype=torch.float64), surface.normals[ids]], dim=1)
         views.append(_View(ids, shown.colors[ids].double(), basis, shown.cosine[ids]))
     return views
 

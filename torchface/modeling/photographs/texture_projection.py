@@ -10,12 +10,11 @@ from torch import Tensor
 
 from torchface.errors import AlignmentError, ShapeError, TopologyError
 from torchface.geometry.cameras.pinhole import Camera
-from torchface.geometry.meshes.operators import border_vertices, components, edges, vertex_normals
+from torchface.geometry.meshes.operators import border_vertices, components, edges
 from torchface.geometry.meshes.rasterization import rasterise_uvs
 from torchface.geometry.meshes.vertex_graph import VertexGraph
 from torchface.mesh import Mesh
-from torchface.rendering.camera_visibility import Shown, shown_in
-from torchface.rendering.raycast import RayCaster
+from torchface.rendering.camera_visibility import PosedSurface, Shown, shown_in
 
 _SQUARELY = 0.2
 _MIN_CONFIDENCE = 0.5
@@ -44,7 +43,7 @@ class PhotoTexture:
 
 
 def photo_texture(
-    mesh: Mesh,
+    posed: Mesh | Sequence[Mesh],
     images: Sequence[Tensor],
     cameras: Sequence[Camera],
     size: int = 1024,
@@ -60,7 +59,7 @@ def photo_texture(
     next to them.
 
     Args:
-        mesh: the head as the photographs show it, with texture coordinates.
+        posed: the head as the photographs show it, or as each of them does, with texture coordinates.
         images: photographs, (3,H,W) each.
         cameras: one each.
         size: texels a side.
@@ -88,18 +87,16 @@ def photo_texture(
     """
     if len(images) != len(cameras) or not images:
         raise ShapeError(f"photo_texture: found {len(images)} images and {len(cameras)} cameras, expected one each")
+    surfaces = PosedSurface.each(posed, len(images))
+    mesh = posed if isinstance(posed, Mesh) else posed[0]
     if mesh.uvs is None or mesh.uv_faces is None:
         raise TopologyError("photo_texture: found a mesh without texture coordinates, expected some to lay it out in")
     if base is not None and base.shape != mesh.vertices.shape:
         raise ShapeError(f"base: found {tuple(base.shape)}, expected {tuple(mesh.vertices.shape)}")
-    vertices, faces = mesh.vertices.detach().cpu().double(), mesh.faces.cpu()
-    normals, caster, graph = (
-        vertex_normals(vertices, faces),
-        RayCaster(vertices, faces),
-        VertexGraph(faces, len(vertices)),
-    )
+    vertices, faces = surfaces[0].vertices, mesh.faces.cpu()
+    graph = VertexGraph(faces, len(vertices))
     at_vertices = [
-        shown_in(image.cpu(), camera, caster, vertices, normals) for image, camera in zip(images, cameras, strict=True)
+        surface.shown_in(image, camera) for surface, image, camera in zip(surfaces, images, cameras, strict=True)
     ]
     outside = _outer_border(vertices, faces)
     confidences = (
@@ -123,16 +120,15 @@ def photo_texture(
     filled = _filled(mesh, blended, alpha, base, graph, confidence is not None)
     colors = torch.lerp(filled, blended, alpha[:, None])
     texels = rasterise_uvs(mesh.uvs.cpu(), mesh.uv_faces.cpu(), size, size)
-    points = texels.interpolate(vertices, faces)
-    outward = torch.nn.functional.normalize(texels.interpolate(normals, faces), dim=-1)
-    total = torch.zeros(len(points), 1, dtype=torch.float64)
-    values = torch.zeros(len(points), 3, dtype=torch.float64)
-    for i, (image, camera) in enumerate(zip(images, cameras, strict=True)):  # photographs: a ray a texel each
-        shown = shown_in(image.cpu(), camera, caster, points, outward)
+    total, values = torch.zeros(2, 1, 1, dtype=torch.float64)
+    for i, (at, image, camera) in enumerate(zip(surfaces, images, cameras, strict=True)):  # a ray a texel each
+        points = texels.interpolate(at.vertices, faces)
+        outward = torch.nn.functional.normalize(texels.interpolate(at.normals, faces), dim=-1)
+        shown = shown_in(image.cpu(), camera, at.caster, points, outward)
         weight = texels.interpolate(weights[i, :, None], faces) * (shown.cosine[:, None] > 0)
         tone = texels.interpolate(offsets[i], faces)
-        values += weight * (shown.colors.double() * gains[i] + tone)
-        total += weight
+        values = values + weight * (shown.colors.double() * gains[i] + tone)
+        total = total + weight
     under = texels.interpolate(filled, faces)
     share = texels.interpolate(alpha[:, None], faces) * (total > 0)
     values = torch.lerp(under, values / total.clamp(min=1e-9), share).clamp(0, 1)

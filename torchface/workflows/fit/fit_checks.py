@@ -10,7 +10,7 @@ from torch import Tensor
 
 from torchface.errors import AlignmentError
 from torchface.landmarks import NoFaceError
-from torchface.modeling import ImageFit
+from torchface.modeling import FitSettings, ImageFit
 from torchface.workflows.fit.fit_landmarks import PhotographLandmarks, find_in_photographs
 
 MISFIT = 0.045
@@ -22,6 +22,9 @@ ONE_PERSON, OTHERS = 3.0, -3.0
 Of 39 pairs of photographs of one person each all were above 3.8 (68 landmarks, the modes of ICT-FaceKit), of 1,042
 pairs of two people a quarter below -3 and half below 1.6.
 """
+
+ALONE = FitSettings(transfers=0, unknown_deviation=0.0, contour_slide=0.3)
+"""How heads are fitted for these checks, whose limits are of such fits: nothing but the model explains a head."""
 
 _NEAR = 0.5
 
@@ -74,7 +77,6 @@ def landmark_lines(
     photographs: Sequence[Path],
     images: Sequence[Tensor],
     marks: Tensor,
-    fit: ImageFit,
     finder: str | Path,
     bare: BareFit,
 ) -> list[str]:
@@ -84,12 +86,13 @@ def landmark_lines(
         photographs: the files, I of them.
         images: they, (3,H,W).
         marks: the landmarks given, (I,68,2).
-        fit: to them.
         finder: finds landmarks; by name or folder.
         bare: see there.
     """
     lines = []
-    for i, misfit in enumerate(misfits(fit).tolist()):  # photographs, the few that do not fit
+    for i, misfit in enumerate(
+        misfits(bare(marks, list(range(len(marks))))).tolist()
+    ):  # photographs, the few that do not fit
         if misfit < MISFIT:
             continue
         name = photographs[i].name

@@ -9,17 +9,14 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from torchface import zoo
-from torchface.errors import TopologyError
 from torchface.files.whole_files import all_or_none
 from torchface.geometry.cameras.calibration import CameraCalibration
 from torchface.geometry.cameras.pinhole import Camera
-from torchface.io import load_rig, save_calibration, save_rig
+from torchface.io import save_calibration, save_rig
 from torchface.io.images.image_files import load_image
 from torchface.io.landmarks.landmark_points import save_pts
-from torchface.io.rigs.ict_facekit import region
 from torchface.mesh import Mesh
-from torchface.modeling import FitSettings, HeadModel, ImageFit, fit_images, transfer_with_report
+from torchface.modeling import FitSettings, ImageFit, fit_images, transfer_with_report
 from torchface.modeling.photographs.landmark_view import JAW
 from torchface.number_checks import checked_count
 from torchface.progress import Progress, silent
@@ -28,8 +25,7 @@ from torchface.rendering.clay_shading import Lighting, render, sample_texture
 from torchface.rendering.compositing import save_rendered_image
 from torchface.rendering.raycast import RayCaster
 from torchface.rig import BlendshapeRig
-from torchface.synthetic import performer
-from torchface.workflows.fit.fit_checks import eyes_distances, landmark_lines, one_person_lines
+from torchface.workflows.fit.fit_checks import ALONE, eyes_distances, landmark_lines, one_person_lines
 from torchface.workflows.fit.fit_landmarks import (
     DEFAULT_LANDMARKS,
     PhotographLandmarks,
@@ -38,58 +34,14 @@ from torchface.workflows.fit.fit_landmarks import (
     landmarks_of,
     warn_if_stored_turned,
 )
+from torchface.workflows.named_heads import NamedHeads, load_head_model, matching
 from torchface.workflows.rig.actor_rig import check_out
 from torchface.workflows.rig_names import Naming, renamed
+from torchface.workflows.track.track_models import DEFAULT_PRIOR, load_priors
 
 _OVER, _MARGIN, _SHARE = 480, 0.45, 0.7
 _LIGHT = Lighting(occlusion_rays=0)
 _FOUND, _FIT = (0.1, 1.0, 0.2), (1.0, 0.1, 0.1)
-
-
-def load_head_model(name_or_path: str | Path) -> HeadModel:
-    """A head model by name or folder, see ``zoo.get_model``.
-
-    Raises:
-        NameMismatchError: there is none of this name, or it is of another kind.
-    """
-    return zoo.get_model(name_or_path, HeadModel)
-
-
-def matching(
-    model: HeadModel, template: Path | None = None, part: str | None = None
-) -> tuple[HeadModel, BlendshapeRig]:
-    """A model, and the rig whose shapes its heads are to have, of one topology.
-
-    Args:
-        model: of heads.
-        template: a rig; the one that travels with the model if absent, else the embedded performer.
-        part: an annotated region, such as ``"face"``, that both are cut to; a model of that part alone stays as it is.
-    """
-    source, rig = "the model's own rig", model.rig
-    if template is not None:
-        source, rig = str(template), load_rig(template)
-    elif rig is None:
-        source, rig = "the embedded performer", performer()
-    parts = {} if rig.neutral.annotations is None else rig.neutral.annotations.regions
-    if part is not None:
-        keep = region(rig.neutral, part)
-        if same_topology(model, rig):
-            model = model.part(keep)
-        rig = rig.part(keep)
-    if same_topology(model, rig):
-        return model, rig
-    count = len(model.shape.mean)
-    fitting = [name for name, mask in parts.items() if part is None and int(mask.sum()) == count]
-    hint = "; name a rig with --template whose topology is the model's" if template is None else ""
-    raise TopologyError(
-        f"{source}: found {len(rig.vertices)} vertices and {len(rig.neutral.faces)} triangles, expected the model's "
-        f"{count} and {len(model.faces)}" + (f"; try --part {fitting[0]}" if fitting else hint)
-    )
-
-
-def same_topology(model: HeadModel, rig: BlendshapeRig) -> bool:
-    """Whether a model's heads have the rig's triangles."""
-    return len(rig.vertices) == len(model.shape.mean) and torch.equal(rig.neutral.faces, model.faces.cpu())
 
 
 @dataclass(frozen=True)
@@ -105,6 +57,7 @@ class PhotographSettings:
         face: which of several, from 0: in the order of an XML, or where landmarks are found the largest first.
         landmark_model: finds landmarks where no file gives them; by name or folder.
         names: of the written shapes; see ``rig_names.renamed``.
+        prior: which weights faces have: a shape prior by name or folder, or "none".
         insist: also where photographs do not seem to show one person.
     """
 
@@ -115,6 +68,7 @@ class PhotographSettings:
     face: int | None = None
     landmark_model: str | Path = DEFAULT_LANDMARKS
     names: Naming | None = None
+    prior: str | Path = DEFAULT_PRIOR
     insist: bool = False
 
     def __post_init__(self) -> None:
@@ -133,6 +87,7 @@ class FittedHead:
         transfer_summary: on triangles without area; empty where there are none.
         found: the landmarks that no file gave; empty where files gave them.
         remarks: what speaks against the fit.
+        heads: what there is to say of the head model.
     """
 
     rig: BlendshapeRig
@@ -141,11 +96,13 @@ class FittedHead:
     transfer_summary: str
     found: tuple[PhotographLandmarks, ...] = ()
     remarks: tuple[str, ...] = ()
+    heads: str = ""
 
     def lines(self, photographs: Sequence[Path]) -> list[str]:
         """For people to read."""
         fit = self.fit
-        lines = [line for one in self.found for line in one.lines()]
+        lines = [self.heads] if self.heads else []
+        lines += [line for one in self.found for line in one.lines()]
         for i, (path, camera, error) in enumerate(zip(photographs, fit.cameras, fit.errors.tolist(), strict=True)):
             eyes = float(eyes_distances(fit.landmarks)[i])
             inner = float(fit.residuals[i, JAW:].square().sum(-1).nanmean().sqrt())
@@ -155,9 +112,10 @@ class FittedHead:
             )
         lines += self.remarks
         lines.append(f"identity: largest coefficient {float(fit.coefficients.abs().max()):.2f} standard deviations")
-        strongest = fit.weights.argsort(descending=True)[:5].tolist()
-        listed = [f"{self.rig.names[k]} {float(fit.weights[k]):.2f}" for k in strongest if float(fit.weights[k]) > 0.05]
-        lines.append(f"expression: {', '.join(listed) or 'none'}")
+        for path, weights in zip(photographs, fit.weights, strict=True):
+            strongest = weights.argsort(descending=True)[:5].tolist()
+            listed = [f"{self.rig.names[k]} {float(weights[k]):.2f}" for k in strongest if float(weights[k]) > 0.05]
+            lines.append(f"{path.name}: expression {', '.join(listed) or 'at rest'}")
         if fit.color is not None:
             lines.append(f"colour model: {float(fit.color.error.mean()):.3f} off, of 1 a channel")
         lines.append(f"rig: {len(self.rig.vertices)} vertices, {len(self.rig.names)} shapes transferred")
@@ -167,18 +125,18 @@ class FittedHead:
 def fit_photographs(
     photographs: Sequence[Path],
     landmarks: Sequence[Path],
-    model: str | Path,
+    model: str | Path | None,
     out: Path,
     settings: PhotographSettings = PhotographSettings(),
     progress: Progress | None = None,
 ) -> FittedHead:
-    """Fits a head to photographs of one person with one expression and writes it as a rig.
+    """Fits a head to photographs of one person, each with an expression of its own, and writes it as a rig.
 
     Args:
         photographs: image files.
         landmarks: 68 in iBUG's order for each photograph, in files (.pts, .ljson) or in one of dlib's XML for all;
             where there are none they are found, and written as .pts beside ``out``.
-        model: a head model by name or folder; see ``zoo.get_model``.
+        model: a head model by name or folder; see ``zoo.get_model``. The best at hand if absent.
         out: the ``.glb`` or folder to write, see ``save_rig``; overlays are written beside it.
         settings: whose shapes, which lens, which face of several.
         progress: called with each step and how far it is.
@@ -186,7 +144,9 @@ def fit_photographs(
     progress = progress or silent
     check_out(out)
     progress("reading the model")
-    heads, rig = matching(load_head_model(model), settings.template, settings.part)
+    named = NamedHeads.of(model)
+    heads, rig = matching(load_head_model(named.name), settings.template, settings.part)
+    fitting = replace(settings.fit, expression_prior=load_priors(rig, settings.prior, None).shapes)
     progress(f"reading {len(photographs)} photographs")
     images = [load_image(path) for path in photographs]
     found: list[PhotographLandmarks] = []
@@ -203,13 +163,12 @@ def fit_photographs(
 
     def bare(points: Tensor, rows: list[int]) -> ImageFit:
         some = [sizes[row] for row in rows]
-        unmoved = replace(settings.fit, transfers=0)
-        return fit_images(heads, rig, points, some, camera=settings.focal, settings=unmoved)
+        return fit_images(heads, rig, points, some, camera=settings.focal, settings=ALONE)
 
     remarks = one_person_lines(photographs, marks, bare, settings.insist)
-    fit = fit_images(heads, rig, marks, sizes, images, settings.focal, settings.fit, progress)
+    fit = fit_images(heads, rig, marks, sizes, images, settings.focal, fitting, progress)
     if not found:
-        remarks += landmark_lines(photographs, images, marks, fit, settings.landmark_model, bare)
+        remarks += landmark_lines(photographs, images, marks, settings.landmark_model, bare)
     # Photographs show little of eyeballs and teeth: parts of their own keep the template's skin.
     unseen = hidden_parts(rig.neutral, torch.zeros(len(rig.vertices), dtype=torch.bool))
     dressed = with_template_skin(fit.mesh, rig.neutral, unseen)
@@ -225,7 +184,8 @@ def fit_photographs(
             save_calibration(calibration, path.with_suffix(".toml"))
         for path, one in zip(overlays, found, strict=False):  # to be corrected and given as --landmarks
             save_pts(one.face.landmarks, path.with_suffix(".pts"))
-    return FittedHead(transferred.rig, fit, overlays, transferred.report.summary(), tuple(found), tuple(remarks))
+    summary = transferred.report.summary()
+    return FittedHead(transferred.rig, fit, overlays, summary, tuple(found), tuple(remarks), named.line)
 
 
 def overlay(fit: ImageFit, view: int, image: Tensor, marks: Tensor) -> Tensor:
@@ -239,7 +199,7 @@ def overlay(fit: ImageFit, view: int, image: Tensor, marks: Tensor) -> Tensor:
     """
     camera, corner = _cut(fit.cameras[view], marks)
     piece = _sampled(image, corner)
-    mesh = fit.posed
+    mesh = fit.posed[view]
     drawn = render(_clay(mesh), camera, lighting=_LIGHT, samples=1)
     origins, directions = camera.rays()
     caster = RayCaster(mesh.vertices, mesh.faces)

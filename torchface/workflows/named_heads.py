@@ -1,0 +1,98 @@
+"""Choice of a head model and of the rig whose shapes its heads are given."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+
+from torchface import zoo
+from torchface.errors import TopologyError
+from torchface.io import load_rig
+from torchface.io.rigs.ict_facekit import region
+from torchface.modeling import HeadModel
+from torchface.rig import BlendshapeRig
+from torchface.synthetic import performer
+from torchface.zoo.kinds import KINDS
+
+SHIPPED = "head"
+_KIND = next(name for name, kind in KINDS.items() if kind is HeadModel)
+_BETTER = (
+    "for a likeness of real people: torchface train morphable --ict FaceXModel, once, "
+    "with the folder of github.com/ICT-VGL/ICT-FaceKit (MIT)"
+)
+
+
+@dataclass(frozen=True)
+class NamedHeads:
+    """A head model by name or folder, and what there is to say of it where nobody has named it."""
+
+    name: str | Path
+    line: str = ""
+
+    @staticmethod
+    def of(name: str | Path | None) -> NamedHeads:
+        """What the user names; else the best at hand.
+
+        Models of people go before those of performers made by code, models that carry a rig before others, then those
+        of more modes. The user's own lie in ``$TORCHFACE_HOME`` or the checkout, see ``zoo.find``.
+        """
+        if name is not None:
+            return NamedHeads(name)
+        known = [zoo.describe(one) for one in zoo.list_models()]
+        people = [one for one in known if one.kind == _KIND and not one.settings.get("performers")]
+        if not people:
+            return NamedHeads(SHIPPED, f"head model: {SHIPPED}, of performers made by code; {_BETTER}")
+
+        def worth(one: zoo.ModelDescription) -> tuple[bool, float]:
+            return "rig" in one.config, one.metrics.get("shape components", 0.0)
+
+        best = max(people, key=worth)
+        return NamedHeads(best.name, f"head model: {best.name}, {best.data.rstrip('.')}; another with --model")
+
+
+def load_head_model(name_or_path: str | Path) -> HeadModel:
+    """A head model by name or folder, see ``zoo.get_model``.
+
+    Raises:
+        NameMismatchError: there is none of this name, or it is of another kind.
+    """
+    return zoo.get_model(name_or_path, HeadModel)
+
+
+def matching(
+    model: HeadModel, template: Path | None = None, part: str | None = None
+) -> tuple[HeadModel, BlendshapeRig]:
+    """A model, and the rig whose shapes its heads are to have, of one topology.
+
+    Args:
+        model: of heads.
+        template: a rig; the one that travels with the model if absent, else the embedded performer.
+        part: an annotated region, such as ``"face"``, that both are cut to; a model of that part alone stays as it is.
+    """
+    source, rig = "the model's own rig", model.rig
+    if template is not None:
+        source, rig = str(template), load_rig(template)
+    elif rig is None:
+        source, rig = "the embedded performer", performer()
+    parts = {} if rig.neutral.annotations is None else rig.neutral.annotations.regions
+    if part is not None:
+        keep = region(rig.neutral, part)
+        if _same_topology(model, rig):
+            model = model.part(keep)
+        rig = rig.part(keep)
+    if _same_topology(model, rig):
+        return model, rig
+    count = len(model.shape.mean)
+    fitting = [name for name, mask in parts.items() if part is None and int(mask.sum()) == count]
+    hint = "; name a rig with --template whose topology is the model's" if template is None else ""
+    raise TopologyError(
+        f"{source}: found {len(rig.vertices)} vertices and {len(rig.neutral.faces)} triangles, expected the model's "
+        f"{count} and {len(model.faces)}" + (f"; try --part {fitting[0]}" if fitting else hint)
+    )
+
+
+def _same_topology(model: HeadModel, rig: BlendshapeRig) -> bool:
+    """Whether a model's heads have the rig's triangles."""
+    return len(rig.vertices) == len(model.shape.mean) and torch.equal(rig.neutral.faces, model.faces.cpu())
