@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import lru_cache
 from pathlib import Path
 
@@ -14,8 +14,10 @@ from torch.utils.data import Dataset
 from torchface.errors import FileFormatError
 from torchface.io import load_ict_facekit, load_identity_modes
 from torchface.progress import Progress
+from torchface.shape_names import ARKIT
 
 from .rendered_files import Rendering, rendered_files
+from .rendered_people.dense_points import COUNT as POINTS
 from .rendered_people.face_picture import draw_pictures
 from .rendered_people.face_scenes import cut_out, upright_faces
 from .rendered_people.head_kind import HeadKind, people_kind, performer_kind
@@ -26,6 +28,7 @@ PART = 240
 EACH = 4
 """Pictures of one person, in a row."""
 _TENSORS = ("rgba", "landmarks", "visible")
+_POINTS = ("points", "point_visible", "weights")
 _PEOPLE = 0.8  # of the pictures show ICT-FaceKit's heads, where there are some
 
 
@@ -38,13 +41,8 @@ class StoredPictures(Dataset[tuple[Tensor, ...]]):
     """
 
     def __init__(self, paths: Sequence[Path], count: int | None = None) -> None:
-        self._shards = Shards(paths, _TENSORS)
-        forms = [self._shards.forms[name] for name in _TENSORS]
-        right = [(torch.uint8, (4, *forms[0][1][1:])), (torch.float32, (68, 2)), (torch.bool, (68,))]
-        if forms != right or len(forms[0][1]) != 3:
-            raise FileFormatError(
-                f"{paths[0]}: found {self._shards.forms}, expected {dict(zip(_TENSORS, right, strict=True))}"
-            )
+        right = [(torch.uint8, (4,)), (torch.float32, (68, 2)), (torch.bool, (68,))]
+        self._shards = _shards(paths, dict(zip(_TENSORS, right, strict=True)))
         self._count = len(self._shards) if count is None else count
 
     def __len__(self) -> int:
@@ -53,7 +51,30 @@ class StoredPictures(Dataset[tuple[Tensor, ...]]):
     def __getitem__(self, numbers: Tensor) -> tuple[Tensor, ...]:
         """Pictures uint8 (B,4,H,W), landmarks (B,68,2) and which are visible (B,68), of numbers (B,)."""
         rows = self._shards.rows(numbers)
-        return rows["rgba"], rows["landmarks"], rows["visible"]
+        return tuple(rows[name] for name in self._shards.names)
+
+
+class StoredExpressions(StoredPictures):
+    """The same pictures with points of the surface, which are visible, and weights beside.
+
+    Args:
+        paths, count: as of :class:`StoredPictures`.
+    """
+
+    def __init__(self, paths: Sequence[Path], count: int | None = None) -> None:
+        super().__init__(paths, count)
+        more = [(torch.float32, (POINTS, 2)), (torch.bool, (POINTS,)), (torch.float32, (len(ARKIT),))]
+        self._shards = _shards(paths, {**self._shards.forms, **dict(zip(_POINTS, more, strict=True))})
+
+
+def _shards(paths: Sequence[Path], right: Mapping[str, tuple[torch.dtype, tuple[int, ...]]]) -> Shards:
+    """Rows of files that have these tensors; of pictures the channels alone are checked."""
+    shards = Shards(paths, list(right))
+    forms = {name: (dtype, size[:1] if name == "rgba" else size) for name, (dtype, size) in shards.forms.items()}
+    expected = {name: (dtype, size[:1] if name == "rgba" else size) for name, (dtype, size) in right.items()}
+    if forms != expected or len(shards.forms["rgba"][1]) != 3:
+        raise FileFormatError(f"{paths[0]}: found {shards.forms}, expected {expected}")
+    return shards
 
 
 class StoredCutOuts:
@@ -94,13 +115,13 @@ def picture_files(
     Returns:
         The files, in order, of :data:`PART` pictures each.
     """
-    rendering = Rendering(_render, "face pictures/3", "pictures", "faces", PART)
+    rendering = Rendering(_render, "face pictures/4", "pictures", "faces", PART)
     return rendered_files(rendering, folder, count, seed, ict, workers, progress)
 
 
 def _render(first: int, count: int, seed: int, ict: Path | None) -> dict[str, Tensor]:
     pictures = draw_pictures(*head_kinds(ict), first, count, seed, EACH)
-    return {name: torch.stack([getattr(picture, name) for picture in pictures]) for name in _TENSORS}
+    return {name: torch.stack([getattr(picture, name) for picture in pictures]) for name in _TENSORS + _POINTS}
 
 
 @lru_cache(maxsize=2)

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from torchface.shape_names import ARKIT
 from torchface.synthetic.stages.weight_curves import GESTURES
+from train.people_performances import converse
 
 from .backdrops import uniform
 
@@ -28,6 +29,7 @@ class Both(Protocol):
 
 
 _SIDES = ("Left", "Right")
+_FRAMES, _FRAME_RATE = 24, 8.0
 
 
 def draw_expression(generator: torch.Generator) -> Tensor:
@@ -72,6 +74,15 @@ def draw_expression(generator: torch.Generator) -> Tensor:
     add("eyeLookOutRight" if across < 0 else "eyeLookInRight", abs(across))
     both("eyeLookUp" if up > 0 else "eyeLookDown", abs(up) * (0.0 if max(table["eyeBlinkLeft"], 0) > 0.8 else 1.0), 0.0)
     return torch.tensor([table[name] for name in ARKIT])
+
+
+def people_expression(generator: torch.Generator) -> Tensor:
+    """Weights (52,) in ARKit's order of a moment of a performance; half of the times the liveliest of three."""
+    take = converse(_FRAMES, generator, _FRAME_RATE).weights
+    assert take is not None
+    moments = take.values[torch.randint(_FRAMES, (3,), generator=generator), :, 0]
+    liveliest = int(moments.square().sum(1).argmax())
+    return moments[liveliest if uniform(0, 1, generator) < 0.5 else 0].float()
 
 
 def _mouth(between: Between, chance: Chance, add: Add, both: Both) -> None:

@@ -13,18 +13,20 @@ from torchface.geometry.cameras.pinhole import Camera, look_at
 from torchface.landmarks.images.ibug_68 import box_around
 
 from .backdrops import uniform
-from .expressions import draw_expression
+from .expressions import draw_expression, people_expression
 from .head_kind import HeadKind
 from .people import Person, closed_lids, draw_person
 from .picture_geometry import annotated, surface
 from .rendered_person import render_person, visible_points
 from .spectacles import with_glasses
 
-SIZE = 192
+SIZE = 256
 """Pixels a side of a picture."""
-_BOX = 104.0  # pixels a side of the face's box in it
+_BOX = 139.0  # pixels a side of the face's box in it
 # Millimetres that a landmark may lie behind what is seen, on a curved edge or the contour, and still be visible.
 _BEHIND = torch.where(torch.arange(68) < 17, 45.0, 7.0)
+_POINT_BEHIND = 6.0
+_PEOPLES = 0.6  # of the expressions are those of people who talk and feel; the others reach what people seldom do
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,12 +37,18 @@ class FacePicture:
         rgba: uint8 (4,S,S); the fourth channel is 255 on the person, 0 on what is behind.
         landmarks: iBUG's 68 as an annotator sees them, (68,2) pixels.
         visible: which of them nothing hides, (68,) bool.
+        points: of the face's surface, (P,2) pixels; see ``dense_points``.
+        point_visible: which of them nothing hides, (P,) bool.
+        weights: the expression, (52,) by ARKit's names; a blink of 1 closes this person's lids.
         person: its number.
     """
 
     rgba: Tensor
     landmarks: Tensor
     visible: Tensor
+    points: Tensor
+    point_visible: Tensor
+    weights: Tensor
     person: int
 
 
@@ -69,19 +77,22 @@ def draw_pictures(
 
 def _photograph(person: Person, generator: torch.Generator) -> FacePicture:
     kind, looks = person.kind, person.looks
-    posed = closed_lids(kind, person.head, draw_expression(generator))
+    weights = (people_expression if uniform(0, 1, generator) < _PEOPLES else draw_expression)(generator)
+    posed = closed_lids(kind, person.head, weights)
     scene = surface(kind, person.head, posed, looks, generator)
     camera = _camera(kind, posed, generator)
     pixels = camera.project(posed.double())
     landmarks = annotated(kind, pixels, looks).float()
     shown = render_person(person, scene, camera, generator)
-    image = shown.image
+    image, points = shown.image, pixels[kind.dense].float()
     visible = visible_points(shown.distance, camera, posed[kind.landmarks].double(), landmarks, _BEHIND)
+    behind = torch.full((len(points),), _POINT_BEHIND)
+    point_visible = visible_points(shown.distance, camera, posed[kind.dense].double(), points, behind)
     if looks.glasses is not None:
         image, hidden = with_glasses(image, camera, posed[kind.landmarks].double(), looks.glasses, generator)
         visible &= ~hidden
     stored = (255 * image.clamp(0, 1)).round().to(torch.uint8).permute(2, 0, 1).contiguous()
-    return FacePicture(stored, landmarks, visible, 0)
+    return FacePicture(stored, landmarks, visible, points, point_visible, weights, 0)
 
 
 def _camera(kind: HeadKind, posed: Tensor, generator: torch.Generator) -> Camera:

@@ -7,7 +7,7 @@ of its own mean head onto it, by their common landmarks.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -26,7 +26,10 @@ from torchface.synthetic.head.identity import IDENTITY, draw_identities, mean_ve
 from torchface.synthetic.head.performer import SHAPES, performer
 from torchface.synthetic.head.skin_texture import vertex_marks
 
+from .dense_points import dense_vertices, jaw_and_lids, same_points
+
 _WAVES = 10
+_BLINKS = ("eyeBlinkLeft", "eyeBlinkRight")
 SKIN, TEETH, GUMS, EYEBALL, SOCKET = range(5)
 """What a triangle is made of."""
 _SHARED = [*range(4, 13), *range(27, 68)]  # landmarks that both kinds of heads mean alike
@@ -60,6 +63,7 @@ class HeadKind:
         marks: what skin is painted by, (V,8); see ``skin_texture``.
         outer: vertices of the skin that can be a contour, (V,) bool.
         shapes: from ARKit's 52 weights to the rig's, (N,52).
+        dense: vertices of the points of ``dense_points``, (P,).
         brow_lift: how much higher brows lie than on the performer, millimetres.
         draw: someone new.
     """
@@ -71,6 +75,7 @@ class HeadKind:
     marks: Tensor
     outer: Tensor
     shapes: Tensor
+    dense: Tensor
     brow_lift: float
     draw: Callable[[torch.Generator], DrawnHead]
 
@@ -93,8 +98,18 @@ def performer_kind() -> HeadKind:
         return DrawnHead(_lumpy(someone.vertices, mean_vertices(), generator), someone.deltas)
 
     outer = ~torch.stack([regions[name] for name in hidden]).any(0)
+    dense, _ = dense_vertices()
     return HeadKind(
-        faces, material, notes.landmarks, mean_vertices(), vertex_marks(), outer, mapping(ARKIT, SHAPES), 0.0, draw
+        faces,
+        material,
+        notes.landmarks,
+        mean_vertices(),
+        vertex_marks(),
+        outer,
+        mapping(ARKIT, SHAPES),
+        dense,
+        0.0,
+        draw,
     )
 
 
@@ -147,7 +162,23 @@ def people_kind(rig: BlendshapeRig, modes: IdentityModes) -> HeadKind:
         return DrawnHead(_lumpy((head - middle) * stretch + middle, canonical, generator), rig.deltas * stretch)
 
     outer = (regions["face"] | regions["head_and_neck"]) & ~(own[:, 7] > 0.5)
-    return HeadKind(faces, material, notes.landmarks, canonical, own, outer, mapping(ARKIT, rig.names), 1.0, draw)
+    actor, actor_marks = performer(texture=False), head_annotations().landmarks
+    assert actor_marks is not None
+    dense = same_points(
+        canonical,
+        jaw_and_lids(rig.deltas.double(), _moving(rig.names), notes.landmarks),
+        outer,
+        jaw_and_lids(actor.deltas.double(), _moving(actor.names), actor_marks),
+    )
+    shapes = mapping(ARKIT, rig.names)
+    return HeadKind(faces, material, notes.landmarks, canonical, own, outer, shapes, dense, 1.0, draw)
+
+
+def _moving(names: Sequence[str]) -> tuple[int, int, int]:
+    """Rows of the open jaw and the two blinks."""
+    shapes = mapping(ARKIT, names)
+    jaw, left, right = (int(shapes[:, ARKIT.index(name)].argmax()) for name in ("jawOpen", *_BLINKS))
+    return jaw, left, right
 
 
 def _marks_of(canonical: Tensor, regions: dict[str, Tensor], placed: Tensor, inner: Tensor) -> Tensor:

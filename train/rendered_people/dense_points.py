@@ -1,0 +1,119 @@
+"""Points of a face's surface that a landmark network finds beside iBUG's 68: close at lids and lips, wide on cheeks."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+
+import torch
+from scipy.spatial import KDTree
+from torch import Tensor
+
+from torchface.geometry.meshes.operators import vertex_normals
+from torchface.synthetic.head.head_annotations import head_annotations
+from torchface.synthetic.head.identity import mean_vertices
+from torchface.synthetic.head.performer import performer
+
+COUNT = 452
+"""With iBUG's 68 together 520."""
+_FARTHEST = 11.0  # millimetres between points of a cheek
+# Landmarks, and how close points lie there, millimetres; a third of a millimetre more for each one away from them.
+_CLOSE = ((slice(36, 48), 3.0), (slice(48, 68), 3.2), (slice(17, 27), 5.0), (slice(30, 36), 5.0))
+_WIDENING, _FOLD = 0.35, 6.0
+_PARTS = ("ear_left", "ear_right", "neck", "mouth_interior", "nostrils", "eye_sockets", "eyeball_left", "eyeball_right")
+_LOWEST, _HIGHEST, _WIDEST, _FRONTAL = -121.0, 62.0, 72.0, 0.17
+_MIDDLE = 0.2  # millimetres
+_JAW, _LIDS = 8.0, 6.0  # millimetres that a whole motion of the jaw and of the lids counts when points are compared
+
+
+@lru_cache(maxsize=1)
+def dense_vertices() -> tuple[Tensor, Tensor]:
+    """Vertices of the embedded performer that are the points, (P,), and of each its mirrored twin, (P,) into them.
+
+    Points are taken one after the other, each the farthest from all before in distances that they may have there.
+    """
+    mean, notes = mean_vertices(), head_annotations()
+    assert notes.landmarks is not None
+    regions, marks = notes.regions, mean[notes.landmarks]
+    normals = vertex_normals(mean, performer(texture=False).neutral.faces)
+    skin = ~torch.stack([regions[name] for name in _PARTS]).any(0) & (normals[:, 2] > _FRONTAL)
+    skin &= (mean[:, 1] > _LOWEST) & (mean[:, 1] < _HIGHEST) & (mean[:, 0].abs() < _WIDEST)
+    rows = skin.nonzero()[:, 0]
+    points = mean[rows]
+    spacing = torch.full((len(points),), _FARTHEST).double()
+    places = [(marks[group], least) for group, least in _CLOSE] + [(_nasolabial_folds(), _FOLD)]
+    for place, least in places:
+        spacing = torch.minimum(spacing, least + _WIDENING * torch.cdist(points, place).amin(1))
+    half = points[:, 0] > -_MIDDLE
+    points, spacing, own = points[half], spacing[half], rows[half]
+    middle = points[:, 0].abs() < _MIDDLE
+    nearest = torch.full((len(points),), 1e9).double()
+    chosen: list[int] = []
+    count, current = 0, int((points - marks[62]).norm(dim=1).argmin())
+    while count < COUNT:
+        if count + 2 - int(middle[current]) > COUNT:  # one is left
+            nearest[~middle] = 0
+        else:
+            chosen.append(current)
+            count += 2 - int(middle[current])
+            nearest = torch.minimum(nearest, (points - points[current]).norm(dim=1))
+        current = int((nearest / spacing).argmax())
+    right = own[torch.tensor(chosen)]
+    tree = KDTree(mean[rows].numpy())
+    left = rows[torch.from_numpy(tree.query((mean[right] * torch.tensor([-1.0, 1, 1])).numpy())[1])]
+    vertices: list[int] = []
+    mirror: list[int] = []
+    for one, other in zip(right.tolist(), left.tolist(), strict=True):
+        at = len(vertices)
+        vertices += [one] if one == other else [one, other]
+        mirror += [at] if one == other else [at + 1, at]
+    return torch.tensor(vertices), torch.tensor(mirror)
+
+
+def dense_places() -> tuple[Tensor, Tensor]:
+    """Where the points lie on the performer's mean head, (P,3) millimetres, and of each its mirrored twin, (P,)."""
+    vertices, mirror = dense_vertices()
+    return mean_vertices()[vertices].float(), mirror
+
+
+def same_points(
+    canonical: Tensor, motion: tuple[Tensor, Tensor], skin: Tensor, performer_motion: tuple[Tensor, Tensor]
+) -> Tensor:
+    """Vertices of another topology that are the points, (P,).
+
+    Lids and lips of two topologies lie a few millimetres apart on the mean head, and their upper and lower ones close
+    together: so motions are compared beside places.
+
+    Args:
+        canonical: each vertex on the performer's mean head, (V,3).
+        motion: how far the jaw and both lids move each vertex down, (V,), of how far they move the chin and the lids.
+        skin: which vertices may be points, (V,) bool.
+        performer_motion: of the performer's vertices.
+    """
+    vertices, _ = dense_vertices()
+
+    def features(places: Tensor, moved: tuple[Tensor, Tensor], rows: Tensor) -> Tensor:
+        scaled = [scale * part[rows, None] for scale, part in zip((_JAW, _LIDS), moved, strict=True)]
+        return torch.cat([places[rows], *scaled], 1).double()
+
+    rows = skin.nonzero()[:, 0]
+    tree = KDTree(features(canonical, motion, rows).numpy())
+    return rows[torch.from_numpy(tree.query(features(mean_vertices(), performer_motion, vertices).numpy())[1])]
+
+
+def jaw_and_lids(deltas: Tensor, rows: tuple[int, int, int], landmarks: Tensor) -> tuple[Tensor, Tensor]:
+    """How far the jaw and the lids move each vertex down, (V,), of the chin's and the lids' motion.
+
+    Args:
+        deltas: of all shapes, (N,V,3).
+        rows: of the open jaw and the two blinks.
+        landmarks: vertices of iBUG's 68.
+    """
+    jaw, lids = deltas[rows[0], :, 1], deltas[rows[1], :, 1] + deltas[rows[2], :, 1]
+    return jaw / jaw[landmarks[8]].abs(), lids / lids[landmarks[[37, 38, 43, 44]]].abs().mean()
+
+
+def _nasolabial_folds() -> Tensor:
+    """Places along both folds between nose and cheek, (12,3)."""
+    along = torch.linspace(0, 1, 6)[:, None].double()
+    one = torch.tensor([18.0, -33, 88]) + along * torch.tensor([14.0, -40, -8])
+    return torch.cat([one * torch.tensor([-1.0, 1, 1]), one])
