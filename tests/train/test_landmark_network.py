@@ -28,7 +28,7 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
     paths = [folder / f"{number}.safetensors" for number in range(2)]
     for number, path in enumerate(paths):
         drawn = draw_pictures((performer_kind(),), (1.0,), 3 * number, 3, seed=2)
-        names = ("rgba", "landmarks", "visible")
+        names = ("rgba", "landmarks", "visible", "points", "point_visible", "weights")
         save_file({name: torch.stack([getattr(one, name) for one in drawn]) for name in names}, path)
     return paths
 
@@ -53,8 +53,13 @@ def test_the_recipe(files: list[Path], tmp_path: Path, monkeypatch: pytest.Monke
     monkeypatch.setattr(recipe, "PART", 3)
     monkeypatch.setattr(recipe, "EACH", 2)
     monkeypatch.setattr(recipe, "picture_files", lambda *_: files)
-    settings = recipe.Settings(out=tmp_path / "own", pictures=6, held_out=2, network=QUICK)
+    zoo.save_model(small(), tmp_path / "start", zoo.ModelCard("MIT", "none", {}, ""))
+    settings = recipe.Settings(
+        out=tmp_path / "own", pictures=6, held_out=3, start=str(tmp_path / "start"), size=64, network=QUICK
+    )
     model = recipe.train(settings)
+    assert model.config == {**SMALL, "channels": [8, 12, 16, 24], "blocks": [1, 1, 1], "points": 452, "hidden": 176}
+    assert model.places.shape == (452, 3)
     again = zoo.get_model(tmp_path / "own")
     assert isinstance(again, LandmarkNetwork)
     assert again.config == model.config

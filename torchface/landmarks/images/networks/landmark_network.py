@@ -204,15 +204,19 @@ class LandmarkNetwork(nn.Module):
         """Which of its points each becomes when the picture is mirrored, (P,) int64."""
         return torch.zeros(0, dtype=torch.int64) if self.dense is None else self.dense.mirror
 
-    def with_points(self, places: Tensor, mirror: Tensor, hidden: int = 176) -> LandmarkNetwork:
+    def with_points(
+        self, places: Tensor, mirror: Tensor, hidden: int = 176, size: int | None = None
+    ) -> LandmarkNetwork:
         """A network that finds the 68 as this one does, and has an untrained head for further points.
 
         Args:
             places: of the points on the embedded performer's mean head, (P,3) millimetres.
             mirror: which of them each becomes when the picture is mirrored, (P,) int64.
             hidden: units of the head.
+            size: of its crops, pixels a side; as this one's if absent. Of crops of another size it is to learn first.
         """
-        network = LandmarkNetwork.from_config(self.config | {"points": len(places), "hidden": hidden})
+        config = {"points": len(places), "hidden": hidden, "size": size or self.size}
+        network = LandmarkNetwork.from_config(self.config | config)
         own = {name: value for name, value in self.state_dict().items() if not name.startswith("dense.")}
         network.load_state_dict(network.state_dict() | own)
         assert network.dense is not None
