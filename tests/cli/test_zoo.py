@@ -82,3 +82,11 @@ def test_a_mistyped_name_is_a_mistake(home: Path, capsys: pytest.CaptureFixture[
         printed(capsys, "verify", "hole")
     assert ended.value.code == 2
     assert "found no 'hole', expected one of" in capsys.readouterr().err
+
+
+def test_a_narrow_terminal_keeps_words_whole(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COLUMNS", "60")
+    words = printed(capsys, "describe", "landmark_network").split()
+    assert {"iBUG's", "landmarks", "landmark_network", "MIT"} <= set(words)

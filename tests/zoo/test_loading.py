@@ -59,3 +59,27 @@ def test_a_model_lies_wholly_where_it_was_asked_for() -> None:
     for name in zoo.list_models():
         model = zoo.get_model(name, device=torch.device("meta"))
         assert {tensor.device.type for tensor in model.state_dict().values()} == {"meta"}, name
+
+
+class Own(torch.nn.Module):
+    config = None
+
+    @classmethod
+    def from_config(cls, config: dict[str, int]) -> Own:
+        return cls()
+
+
+@pytest.mark.parametrize(
+    ("kind", "model_class", "message"),
+    [
+        ("My Kind", Own, "found 'My Kind', expected up to 64 lower-case letters"),
+        ("head", Own, "found 'head', which is HeadModel's, expected another name"),
+        ("my_head", zoo.KINDS["head"], "found 'my_head' for HeadModel, which is 'head' already"),
+        ("linear", torch.nn.Linear, "Linear: found no config, expected `config` and `from_config`"),
+    ],
+)
+def test_kinds_that_cannot_be_registered(kind: str, model_class: type[torch.nn.Module], message: str) -> None:
+    before = dict(zoo.KINDS)
+    with pytest.raises(NameMismatchError, match=message):
+        zoo.register(kind, model_class)
+    assert before == zoo.KINDS

@@ -65,7 +65,8 @@ def describe(name: Annotated[Positional[str], arg(metavar="NAME")]) -> None:
 
     model = zoo.describe(name)
     table = Table(box=None, show_header=False, padding=(0, 2, 0, 0))
-    table.add_column(no_wrap=True)
+    page = PlainConsole(stderr=False)
+    table.add_column(max_width=max(page.width // 3, 12))
     table.add_column(overflow="fold")
     learned = zoo.KINDS.get(model.kind)
     rows = {
@@ -85,7 +86,7 @@ def describe(name: Annotated[Positional[str], arg(metavar="NAME")]) -> None:
     for key, value in rows.items():
         if value:
             table.add_row(key, value)
-    PlainConsole(stderr=False).print(table, highlight=False)
+    page.print(table, highlight=False)
 
 
 def verify(names: Annotated[Positional[tuple[str, ...]], arg(metavar="[NAME ...]")] = ()) -> None:

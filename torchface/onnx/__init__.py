@@ -6,6 +6,7 @@ from torchface.onnx.dynamics_prior_graph import export_dynamics_prior
 from torchface.onnx.enhancement_graph import export_wrinkle_weights
 from torchface.onnx.example_graph_export import ExampleReport, export_example_solver
 from torchface.onnx.model_export import export_model
+from torchface.onnx.module_graph import export_module
 from torchface.onnx.solver_graph import SolverGraph
 from torchface.onnx.solver_graph_export import GraphSteps, SolverReport, export_hybrid_solver, export_solver
 from torchface.onnx.video_graph import VideoGraph
@@ -25,6 +26,7 @@ __all__ = [
     "export_example_solver",
     "export_hybrid_solver",
     "export_model",
+    "export_module",
     "export_solver",
     "export_video_solver",
     "export_wrinkle_weights",

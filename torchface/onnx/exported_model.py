@@ -45,6 +45,7 @@ def exported_model(
         optimize: with the exporter's own search for simpler operators, which takes minutes for thousands of them; ONNX
             Runtime simplifies graphs as it loads them, too.
     """
+    held = _held_apart(module.eval())
     # Loaded here: it takes a second, and solvers that run graphs have no need of it.
     from onnxscript import ir, optimizer
 
@@ -63,11 +64,11 @@ def exported_model(
             )  # PyTorch's copy of its own trees
             warnings.filterwarnings("ignore", "# The axis name", UserWarning)  # of an axis that several inputs have
             program = torch.onnx.export(
-                module.eval(),
+                held,
                 tuple(inputs.values()),
                 input_names=list(inputs),
                 output_names=list(outputs),
-                dynamic_shapes=shapes if any(shapes) else None,
+                dynamic_shapes=None if not any(shapes) else shapes if held is module else (shapes,),
                 opset_version=OPSET,
                 custom_translation_table=dict(translations or {}),
                 dynamo=True,
@@ -100,6 +101,21 @@ def exported_model(
     )
     _check(model)
     return model
+
+
+class _Held(nn.Module):
+    def __init__(self, module: nn.Module) -> None:
+        super().__init__()
+        self.module = module
+
+    def forward(self, *inputs: Tensor) -> object:
+        return self.module(*inputs)
+
+
+def _held_apart(module: nn.Module) -> nn.Module:
+    """The module itself; or one around it, where it has attributes, such as ``graph``, that ``torch.export`` needs."""
+    own = {name.partition(".")[0] for name in module.state_dict()} | {name for name, _ in module.named_children()}
+    return _Held(module).eval() if own & (set(dir(torch.fx.GraphModule)) - set(dir(nn.Module))) else module
 
 
 def half_stored(model: onnx.ModelProto, names: Collection[str]) -> onnx.ModelProto:

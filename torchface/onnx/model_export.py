@@ -9,7 +9,7 @@ from torch import nn
 
 from torchface.capture import ExampleSolver, MarkerSolver
 from torchface.capture.own_rig import VideoSolver
-from torchface.capture.priors import DynamicsPrior
+from torchface.capture.priors import DynamicsPrior, ShapePrior
 from torchface.errors import ValueRangeError
 from torchface.landmarks import BoxNetwork, LandmarkNetwork, LandmarkTrees, UVLandmarkDetector
 from torchface.landmarks.images.networks.eye_network import EyeNetwork
@@ -20,6 +20,7 @@ from torchface.onnx.example_graph_export import ExampleReport, export_example_so
 from torchface.onnx.expression_graph import export_expression_regression
 from torchface.onnx.head_decoder_graph import export_head_decoder
 from torchface.onnx.landmark_trees_graph import export_landmark_trees
+from torchface.onnx.module_graph import export_module, export_shape_prior
 from torchface.onnx.network_graphs import export_network
 from torchface.onnx.solver_graph_export import SolverReport, export_marker_solver
 from torchface.onnx.uv_landmark_graph import export_landmark_bank
@@ -35,6 +36,7 @@ _EXPORTS: dict[type[nn.Module], Callable[..., _Report]] = {
     BoxNetwork: export_network,
     LandmarkTrees: export_landmark_trees,
     DynamicsPrior: export_dynamics_prior,
+    ShapePrior: export_shape_prior,
     MarkerSolver: export_marker_solver,
     VideoSolver: write_video_solver,
     ExampleSolver: export_example_solver,
@@ -47,7 +49,8 @@ def export_model(
     """Writes a model as ONNX, and checks it against PyTorch.
 
     Args:
-        model: of a class that ``torchface export`` names.
+        model: of a class that ``torchface export`` names, or one with a method ``example_inputs``; see
+            ``torchface.zoo.register``.
         path: the file to write; it appears only when it is complete and checked.
         facts: further metadata, such as licence and data.
 
@@ -63,6 +66,8 @@ def export_model(
     for kind, export in _EXPORTS.items():
         if isinstance(model, kind):
             return export(model, path, facts=facts)
+    if example := getattr(model, "example_inputs", None):
+        return export_module(model, example(), path, facts)
     raise ValueRangeError(
         f"{path}: found a {type(model).__name__}, expected one of {', '.join(kind.__name__ for kind in _EXPORTS)}"
     )

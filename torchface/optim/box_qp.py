@@ -5,12 +5,13 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from torchface.errors import TraceError
 from torchface.optim.box_checks import check_vectors, checked_tolerance, default_tolerance
 from torchface.optim.data_dependent import data_dependent, is_transformed
 from torchface.optim.implicit import BoxSolution
 from torchface.optim.prepared_program import PreparedProgram
 from torchface.optim.prepared_tensors import Prepared
+
+_EXPORTED = "torchface.optim.ProjectedGradient, whose steps a graph can hold"
 
 
 def box_qp(
@@ -57,6 +58,18 @@ def box_qp(
     """
     if is_transformed():
         return _transformed_minimiser(H, f, lower, upper, tolerance)
+    return _box_qp(H, f, lower, upper, start, tolerance)
+
+
+@data_dependent(_EXPORTED)
+def _box_qp(
+    H: Tensor,
+    f: Tensor,
+    lower: float | Tensor,
+    upper: float | Tensor,
+    start: Tensor | None,
+    tolerance: float | None,
+) -> Tensor:
     prepared = PreparedProgram.of(H, lower, upper)
     return _minimiser(H, prepared, f, start, checked_tolerance(tolerance, H.dtype))
 
@@ -111,7 +124,7 @@ class BoxQP(nn.Module):
             return _transformed_minimiser(self.H, f, self.lower, self.upper, self.tolerance)
         return self._solved(f, start)
 
-    @data_dependent("torchface.onnx.SolverGraph, or steps of torchface.optim.exported_operators, which are fixed")
+    @data_dependent(_EXPORTED)
     def _solved(self, f: Tensor, start: Tensor | None) -> Tensor:
         H, lower, upper = self.H, self.lower, self.upper
         prepared = self._prepared.get((H, lower, upper), lambda: PreparedProgram.of(H, lower, upper))
@@ -124,11 +137,6 @@ class BoxQP(nn.Module):
 
 def _minimiser(H: Tensor, prepared: PreparedProgram, f: Tensor, start: Tensor | None, tolerance: float) -> Tensor:
     """The minimisers (B,N), differentiable in H and f where these ask for it."""
-    if torch.jit.is_tracing():
-        raise TraceError(
-            "box_qp: iterates until every problem is solved, and a trace would repeat one frame's path for all; "
-            "expected an ONNX graph made by `torchface export solver` (or torchface.onnx), which fixes the iterations"
-        )
     check_vectors(H, f, start)
     if not (torch.is_grad_enabled() and (H.requires_grad or f.requires_grad)):
         return prepared.solve(f, start, tolerance)

@@ -40,7 +40,7 @@ def data_dependent(instead: str) -> Callable[[Callable[Given, Result]], Callable
     """
 
     def marked(method: Callable[Given, Result]) -> Callable[Given, Result]:
-        name = method.__qualname__.partition(".")[0]
+        name = method.__qualname__.partition(".")[0].lstrip("_")
 
         @functools.wraps(method)
         def call(*args: Given.args, **kwargs: Given.kwargs) -> Result:

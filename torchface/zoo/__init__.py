@@ -2,7 +2,7 @@
 
 from torchface.files.models import STATE
 from torchface.zoo.description import ModelDescription, describe
-from torchface.zoo.kinds import KINDS
+from torchface.zoo.kinds import KINDS, register
 from torchface.zoo.loading import get_model, verify
 from torchface.zoo.model_folders import HOME, damaged_models, find, list_models
 from torchface.zoo.saving import ModelCard, save_model
@@ -18,6 +18,7 @@ __all__ = [
     "find",
     "get_model",
     "list_models",
+    "register",
     "save_model",
     "verify",
 ]

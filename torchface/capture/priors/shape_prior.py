@@ -128,7 +128,7 @@ class ShapePrior(nn.Module):
     def log_density(self, weights: Tensor) -> Tensor:
         """:math:`\\sum_g \\log p_g` of weights (B,N), (B,)."""
         weights = self._checked(weights)
-        return torch.stack([density.log_density(part) for density, part in self._parts(weights)]).sum(0)
+        return torch.stack([density.log_density(part) for density, part in self.parts(weights)]).sum(0)
 
     def energy(self, weights: Tensor) -> Quadratic:
         """The quadratic that touches the energy at weights (B,N) from above."""
@@ -143,14 +143,15 @@ class ShapePrior(nn.Module):
             return Quadratic(factors[0, :, None, None] * own, factors[0, :, None] * pull)
         H = weights.new_zeros(len(weights), len(self.names), len(self.names))
         f = weights.new_zeros(len(weights), len(self.names))
-        for (density, part), group, factor in zip(self._parts(weights), self.groups, factors, strict=True):
+        for (density, part), group, factor in zip(self.parts(weights), self.groups, factors, strict=True):
             own, pull = density.bound(part)
             rows = torch.tensor(group, device=weights.device)
             H[:, rows[:, None], rows] = factor[:, None, None] * own
             f[:, rows] = factor[:, None] * pull
         return Quadratic(H, f)
 
-    def _parts(self, weights: Tensor) -> list[tuple[Density, Tensor]]:
+    def parts(self, weights: Tensor) -> list[tuple[Density, Tensor]]:
+        """Each group's density, with its columns of weights (B,N)."""
         densities: list[Any] = list(self.densities)
         return [(density, weights[:, list(group)]) for density, group in zip(densities, self.groups, strict=True)]
 
@@ -309,7 +310,7 @@ class ReciprocalPrior(ShapePrior):
     def energy(self, weights: Tensor) -> Quadratic:
         """The quadratic with the energy's value and slope at weights (B,N)."""
         weights = self._checked(weights)
-        density = torch.stack([density.log_density(part) for density, part in self._parts(weights)]).exp()
+        density = torch.stack([density.log_density(part) for density, part in self.parts(weights)]).exp()
         # d/dL of 1/(exp(-L) + p0) for L = -log p.
         return self._assembled(weights, self.strength * density / (density + self.guard).square())
 

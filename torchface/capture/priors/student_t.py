@@ -97,10 +97,15 @@ class StudentDensity(nn.Module):
         """:math:`\\log p` of samples (B,D), (B,)."""
         factor, nu = self.factor.to(samples), self.degrees_of_freedom.to(samples)
         dimensions = samples.shape[1]
-        half = 0.5 * (nu + dimensions)
-        constant = torch.lgamma(half) - torch.lgamma(0.5 * nu) - 0.5 * dimensions * (nu * math.pi).log()
-        distance = (samples @ factor).square().sum(1)
-        return constant + factor.diagonal().log().sum() - half * torch.log1p(distance / nu)
+        constant = torch.lgamma(0.5 * (nu + dimensions)) - torch.lgamma(0.5 * nu)
+        constant = constant - 0.5 * dimensions * (nu * math.pi).log()
+        return constant + factor.diagonal().log().sum() + self.below_peak(samples)
+
+    def below_peak(self, samples: Tensor) -> Tensor:
+        """:math:`\\log p` of samples (B,D) less that of their likeliest, rest, (B,)."""
+        nu = self.degrees_of_freedom.to(samples)
+        distance = (samples @ self.factor.to(samples)).square().sum(1)
+        return -0.5 * (nu + samples.shape[1]) * torch.log1p(distance / nu)
 
     def bound(self, samples: Tensor) -> tuple[Tensor, Tensor]:
         r"""A quadratic that touches :math:`-\log p` at samples (B,D) and lies above it everywhere else.
