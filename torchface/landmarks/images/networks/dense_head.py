@@ -136,8 +136,9 @@ def face_frame(landmarks: Tensor) -> tuple[Tensor, Tensor]:
     middle = landmarks.mean(1, keepdim=True)
     size = (landmarks - middle).square().sum(-1).mean(1).clamp(min=1e-4).sqrt()
     tilt = tilt_around(landmarks)
-    across = torch.stack([size * tilt.cos(), size * tilt.sin()], -1)
-    return middle, torch.stack([across, across.flip(-1) * across.new_tensor([-1.0, 1.0])], 1)
+    cosine, sine = size * tilt.cos(), size * tilt.sin()
+    # Without a constant tensor, which a branch of an exported graph cannot hold.
+    return middle, torch.stack([cosine, sine, -sine, cosine], -1).unflatten(-1, (2, 2))
 
 
 def in_face_frame(points: Tensor, landmarks: Tensor) -> Tensor:
