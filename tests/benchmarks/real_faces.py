@@ -263,8 +263,7 @@ class Outcome:
         hand, dlib: offsets, see :func:`errors`.
         follows: of the clips.
         verdicts: how many pictures are right, said so and wrong, a way of spoiling them.
-        milliseconds: wall clock a face in a frame, its box and tilt given, the quickest of 30; MediaPipe runs in
-            another process.
+        milliseconds: wall clock a face in a frame, its box and tilt given, the quickest of 30.
     """
 
     hand: Tensor

@@ -1,7 +1,7 @@
 """Somebody unknown before a webcam: weights against the truth, of every solver from the same readings of the face.
 
 Heads of ICT-FaceKit and embedded performers that nothing learned from, rendered as a webcam shows them and driven by
-the two test takes; see ``webcam_clips``. Two clips of four seconds by default; with ``TORCHFACE_WEBCAM_CLIPS=all`` the
+the two test takes; see ``webcam_film``. Two clips of four seconds by default; with ``TORCHFACE_WEBCAM_CLIPS=all`` the
 four of nine seconds, which take ten minutes to render and are kept in ``out/webcam_clips``.
 """
 
@@ -14,28 +14,35 @@ from pathlib import Path
 
 import pytest
 import torch
-from webcam_clips import CAMERA, FPS, KEPT, SCENES, SHORT, Clip, webcam_clip
-from webcam_measures import (
-    LIDS,
-    REGIONS,
-    SIGNALS,
-    BlinkCount,
-    blinks,
-    follows,
-    gaze_error,
-    lag,
-    recovery,
-    tremor,
-    vertex_error,
-    weight_error,
-)
+from webcam_measures import SIGNALS, follows, gaze_error, recovery, vertex_error, weight_error
 from webcam_solvers import PAPER, SOLVERS, Solved, read_faces
 
-from planted.webcam_performance import gaze_of
+from torchface.evaluation.expression_scores import LIDS, REGIONS, BlinkCount, blinks, tremor, weight_lag
 from torchface.landmarks.images.face_reading import FaceReading
+from train.rendered_people.webcam_film import FPS, Film, FilmSources, Scene, webcam_film
+from train.rendered_people.webcam_performance import SittingSettings, gaze_of
+from train.rendered_people.webcam_video import WebcamSettings
 
 pytestmark = pytest.mark.real
-SIZE = (CAMERA.width, CAMERA.height)
+SIZE = (WebcamSettings().width, WebcamSettings().height)
+KEPT = Path("out/webcam_clips")
+
+SHORT = {
+    "ict, 4 s": Scene("ict", 92001, 5, 5.0, 4.0, SittingSettings(520, (10, 15), 5.0), (0.2, 3.9), hand=2.2),
+    "performer, 4 s": Scene(
+        "performer", 91005, 4, 17.5, 4.0, SittingSettings(560, (-30, 25), -4.0), (0.2, 3.9), away=1.2, blinks=(0.3, 3.3)
+    ),
+}
+"""Of people and takes as in ``SCENES``, which are the last two takes: quick to render."""
+
+SCENES = {
+    "ict a": Scene("ict", 92001, 5, 5.0, 9.0, SittingSettings(520, (10, 15), 5.0), (1.0, 8.5), away=3.2, hand=6.3),
+    "ict b": Scene("ict", 92005, 4, 7.0, 9.0, SittingSettings(430, (-15, 10), -11.0), (2.5, 8.0), hand=5.2),
+    "performer a": Scene("performer", 91006, 5, 13.0, 9.0, SittingSettings(690, (40, -20), 3.0), (2.0, 7.5), hand=2.8),
+    "performer b": Scene(
+        "performer", 91005, 4, 17.5, 9.0, SittingSettings(560, (-30, 25), -4.0), (0.5, 6.0), away=6.2, blinks=(4.4,)
+    ),
+}
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,7 +50,7 @@ class Filmed:
     """A clip and what the networks read of it."""
 
     name: str
-    clip: Clip
+    clip: Film
     readings: list[FaceReading]
 
 
@@ -66,9 +73,10 @@ class Row:
 def filmed(data: Path) -> list[Filmed]:
     torch.set_num_threads(1)
     scenes = SCENES if os.environ.get("TORCHFACE_WEBCAM_CLIPS") == "all" else SHORT
+    sources = FilmSources(data / "performances", data / "ict_facekit" / "FaceXModel")
     shots = []
     for name, scene in scenes.items():
-        clip = webcam_clip(scene, data)
+        clip = webcam_film(scene, sources, KEPT)
         shots.append(Filmed(name, clip, read_faces(clip.frames(), FPS, KEPT)))
     return shots
 
@@ -92,8 +100,9 @@ def measured(filmed: list[Filmed], solved: list[Solved]) -> Row:
         for name in SIGNALS:
             signals[name].append(follows(found.weights, true, name, seen))
         vertices.append(vertex_error(shot.clip.person, found.weights, true, seen))
-        lags.append(lag(found.weights, true, seen))
-        tremors.append(tremor(found.weights, true, seen))
+        lags.append(weight_lag(found.weights, true, seen))
+        skin = REGIONS["all"]
+        tremors.append(tremor(found.weights[:, skin], true[:, skin], seen))
         opened = seen[:, None] & (true[:, LIDS] < 0.5)
         gazes.append(gaze_error(found.gaze, gaze_of(true), opened))
         count = count + blinks(found.weights, true, seen)

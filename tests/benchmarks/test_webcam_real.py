@@ -14,7 +14,6 @@ import pytest
 import torch
 from real_faces import clips, pooled
 from torch import Tensor
-from webcam_clips import KEPT
 from webcam_solvers import SOLVERS, Solver, read_faces
 
 from planted.landmark_measures import Agreement, lid_openings, mouth_gap
@@ -26,6 +25,7 @@ from torchface.synthetic import performer
 pytestmark = pytest.mark.real
 
 FPS = {"head_pose_male": 12.0}  # the others have 30
+KEPT = Path("out/webcam_clips")
 SETTLED = 5  # frames that tell how a solver starts
 
 

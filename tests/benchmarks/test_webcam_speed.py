@@ -1,7 +1,7 @@
 """From a webcam's picture to weights: time of each part and of the whole at 640 x 480 on one thread.
 
-And the memory of an application that has onnxruntime, numpy and OpenCV alone. MediaPipe's face mesh beside it, where
-``TORCHFACE_MEDIAPIPE_PYTHON`` or the running Python has it.
+And the memory of an application that has onnxruntime, numpy and OpenCV alone. MediaPipe's Face Landmarker
+beside it, in this process, from a picture to blendshapes.
 """
 
 from __future__ import annotations
@@ -21,7 +21,8 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from torchface.landmarks.images.networks.mediapipe_finder import PYTHON
+from torchface.io.video import open_video
+from torchface.landmarks.images.face_landmarker.mediapipe_finder import MediaPipeTracker
 from torchface.onnx.network_graphs import network_model
 from torchface.onnx.webcam.webcam_model import WebcamGraph, webcam_model
 from torchface.onnx.webcam.webcam_session import WebcamSession
@@ -32,23 +33,6 @@ from torchface.workflows.webcam.webcam_graph import webcam_graph, webcam_module
 EXAMPLE = Path(__file__).resolve().parents[2] / "export" / "README.md"
 WEBCAM, NEAR = "webcam/again.mkv", "single_face.mp4"
 FRAMES = 70
-# Runs in any Python: the clip's path, then milliseconds of processor and of the clock a frame, faces, megabytes.
-PEER = """
-import sys, time, cv2
-from mediapipe import solutions
-mesh = solutions.face_mesh.FaceMesh(static_image_mode=False, max_num_faces=1, refine_landmarks=True)
-camera, times, found = cv2.VideoCapture(sys.argv[1]), [], 0
-while True:
-    good, picture = camera.read()
-    if not good or len(times) == 70:
-        break
-    begun = time.process_time(), time.perf_counter()
-    found += bool(mesh.process(cv2.cvtColor(picture, cv2.COLOR_BGR2RGB)).multi_face_landmarks)
-    times.append((time.process_time() - begun[0], time.perf_counter() - begun[1]))
-middle = [1000 * sorted(column)[len(times) // 10] for column in zip(*times)]
-high = [line for line in open("/proc/self/status") if line.startswith("VmHWM")]
-print("figures", *middle, found / len(times), int(high[0].split()[1]) / 1024)
-"""
 
 
 def quiet(times: list[float]) -> float:
@@ -118,11 +102,8 @@ def test_the_whole_way_is_quick_and_small(data: Path, tmp_path: Path) -> None:
     rows["solve (the difference)"] = rows[f"whole, {WEBCAM}"] - rows["picture to reading, face followed"]
     for name, took in rows.items():
         print(f"{name:<36} {took:7.2f}")
-    peer = mediapipe(data / "video" / WEBCAM)
-    if peer is not None:
-        used, clock, share, memory = peer
-        print(f"MediaPipe's face mesh, {WEBCAM}: {used:.2f} ms of processor time, {clock:.2f} ms by the clock")
-        print(f"  a face in {share:.0%} of the frames, {memory:.0f} MB resident")
+    took, share = mediapipe(data / "peers" / "face_landmarker.task", data / "video" / WEBCAM)
+    print(f"MediaPipe's Face Landmarker, {WEBCAM}: {took:.2f}, a face in {share:.0%} of the frames")
     fps, memory = example(content, data / "video" / WEBCAM, tmp_path)
     print(f"the example of export/README.md: {fps:.0f} frames a second with decoding, {memory:.0f} MB resident")
     assert rows[f"whole, {WEBCAM}"] < 1000 / 60
@@ -151,9 +132,18 @@ def example(content: bytes, video: Path, folder: Path) -> tuple[float, float]:
     return values[0], values[1]
 
 
-def mediapipe(video: Path) -> list[float] | None:
-    """Of MediaPipe, where it is installed."""
-    return figures([os.environ.get(PYTHON, sys.executable), "-c", PEER, str(video)], Path.cwd())
+def mediapipe(task: Path, video: Path) -> tuple[float, float]:
+    """Milliseconds a frame from its picture to blendshapes, and the share of frames with a face."""
+    pytest.importorskip("ai_edge_litert")
+    tracker, times, found = MediaPipeTracker(task), [], 0
+    for picture, _ in zip(open_video(video).color_frames(), range(FRAMES), strict=False):
+        begun = time.process_time()
+        face = tracker.mesh(picture)
+        if face is not None:
+            tracker.landmarker.blendshapes(face.points)
+            found += 1
+        times.append(time.process_time() - begun)
+    return quiet(times), found / len(times)
 
 
 def figures(command: list[str], folder: Path) -> list[float] | None:

@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 from planted.landmark_measures import Agreement, agreement
+from torchface.evaluation.expression_scores import REGIONS, moving, runs
 from torchface.shape_names import ARKIT
 from train.rendered_people.people import Person, closed_lids
 
-LIDS = [ARKIT.index("eyeBlinkRight"), ARKIT.index("eyeBlinkLeft")]
 SIGNALS = {
     "mouth open": {"jawOpen": 1.0},
     "smile": {"mouthSmileLeft": 0.5, "mouthSmileRight": 0.5},
@@ -21,36 +20,12 @@ SIGNALS = {
     "lids": {"eyeBlinkLeft": 0.5, "eyeBlinkRight": 0.5},
 }
 """What a region does as one number: sums of weights."""
-_MOVES = 0.05  # a shape whose weight stays in a narrower range does not move
-_RESTS = 0.004  # of a weight's second difference in the truth
-_BLINK, _SHUT = 0.6, 0.5  # a blink's highest weight; a weight from which lids count as shut
-_LATE = 3  # frames that a blink may be found too early or too late
-_LAGS = 8  # frames
 _EACH = 3  # frames of which one is measured in millimetres
-
-
-def region(*starts: str) -> Tensor:
-    """Which of ARKit's shapes begin with one of some words, (52,) bool."""
-    return torch.tensor([name.startswith(starts) for name in ARKIT])
-
-
-REGIONS = {
-    "all": ~region("eyeLook"),
-    "eyes": region("eyeBlink", "eyeSquint", "eyeWide"),
-    "brows": region("brow"),
-    "mouth": region("mouth", "jaw"),
-}
-
-
-def moving(truth: Tensor) -> Tensor:
-    """Which shapes the truth (T,52) moves, (52,) bool."""
-    return truth.amax(0) - truth.amin(0) > _MOVES
 
 
 def weight_error(solved: Tensor, truth: Tensor, shapes: Tensor, seen: Tensor) -> float:
     """Root mean square over the shapes (52,) that the truth (T,52) moves and frames (T,) that show a face."""
-    shapes = shapes & moving(truth)
-    difference = (solved - truth)[seen][:, shapes]
+    difference = (solved - truth)[seen][:, shapes & moving(truth)]
     return float(difference.square().mean().sqrt())
 
 
@@ -78,86 +53,6 @@ def follows(solved: Tensor, truth: Tensor, name: str, seen: Tensor) -> Agreement
     return agreement(signal(solved, name)[seen], signal(truth, name)[seen])
 
 
-def lag(solved: Tensor, truth: Tensor, seen: Tensor) -> float:
-    """Frames by which weights (T,52) come late: where their cross-correlation with the truth is highest.
-
-    Of changes from frame to frame of the shapes that the truth moves, over frames that show a face; interpolated
-    between whole frames.
-    """
-    shapes = moving(truth) & ~region("eyeLook")
-    change, true = solved[:, shapes].diff(dim=0), truth[:, shapes].diff(dim=0)
-    steady = seen[1:] & seen[:-1]
-    values = torch.tensor([_correlation(change, true, steady, shift) for shift in range(-_LAGS, _LAGS + 1)])
-    best = int(values[1:-1].argmax()) + 1
-    before, at, after = values[best - 1 : best + 2].tolist()
-    bend = before - 2 * at + after
-    return best - _LAGS + (0.5 * (before - after) / bend if bend < 0 else 0.0)
-
-
-def _correlation(change: Tensor, true: Tensor, steady: Tensor, shift: int) -> float:
-    """Correlation of changes (T,N) that come ``shift`` frames later with true ones."""
-    count = len(true)
-    rows = torch.arange(max(0, -shift), count - max(0, shift))
-    rows = rows[steady[rows] & steady[rows + shift]]
-    a, b = change[rows + shift], true[rows]
-    return float((a * b).sum() / (a.square().sum() * b.square().sum()).sqrt().clamp(min=1e-12))
-
-
-def tremor(solved: Tensor, truth: Tensor, seen: Tensor) -> float:
-    """Root mean square of weights' second differences where the truth's (T,52) rest."""
-    own, true = solved.diff(n=2, dim=0), truth.diff(n=2, dim=0)
-    wide = torch.nn.functional.max_pool1d(true.abs().T[None], 5, 1, 2)[0].T  # the frames beside too
-    still = (wide < _RESTS) & (seen[2:] & seen[1:-1] & seen[:-2])[:, None] & ~region("eyeLook")
-    return float(own[still].square().mean().sqrt())
-
-
-@dataclass(frozen=True)
-class BlinkCount:
-    """True blinks, how many of them were found, blinks that were reported, and how many of these are none."""
-
-    true: int
-    found: int
-    reported: int
-    false: int
-
-    @property
-    def recall(self) -> float:
-        """Share of the true blinks that were found."""
-        return self.found / self.true if self.true else math.nan
-
-    @property
-    def precision(self) -> float:
-        """Share of the reported blinks that are true."""
-        return 1 - self.false / self.reported if self.reported else math.nan
-
-    def __add__(self, other: BlinkCount) -> BlinkCount:
-        return BlinkCount(
-            self.true + other.true, self.found + other.found, self.reported + other.reported, self.false + other.false
-        )
-
-
-def blinks(solved: Tensor, truth: Tensor, seen: Tensor) -> BlinkCount:
-    """Counts blinks of weights (T,52): lids whose weight rises over 0.6 in the truth, over 0.5 in what was solved."""
-    true, own = (weights[:, LIDS].mean(1).masked_fill(~seen, 0.0).nan_to_num(0.0) for weights in (truth, solved))
-    real = [(a, b) for a, b in _runs(true > _SHUT) if float(true[a : b + 1].max()) > _BLINK]
-    told = _runs(own > _SHUT)
-    found = sum(any(_meets(one, other) for other in told) for one in real)
-    half = _runs(true > 0.8 * _SHUT)
-    false = sum(not any(_meets(one, other) for other in half) for one in told)
-    return BlinkCount(len(real), found, len(told), false)
-
-
-def _runs(mask: Tensor) -> list[tuple[int, int]]:
-    """First and last frame of each run of a mask (T,)."""
-    change = torch.nn.functional.pad(mask.to(torch.int8), (1, 1)).diff()
-    starts, ends = (change == 1).nonzero()[:, 0].tolist(), (change == -1).nonzero()[:, 0].tolist()
-    return [(start, end - 1) for start, end in zip(starts, ends, strict=True)]
-
-
-def _meets(one: tuple[int, int], other: tuple[int, int]) -> bool:
-    return one[0] - _LATE <= other[1] and other[0] <= one[1] + _LATE
-
-
 def gaze_error(solved: Tensor, truth: Tensor, opened: Tensor) -> float:
     """Mean angle, degrees, between gazes (T,2,2) in radians, over eyes (T,2) that are open."""
 
@@ -174,10 +69,10 @@ def recovery(solved: Tensor, truth: Tensor, present: Tensor) -> list[float]:
 
     As near: the mean distance over shapes that move is under one and a half times its median for three frames on end.
     """
-    distance = (solved - truth)[:, moving(truth) & ~region("eyeLook")].abs().mean(1)
+    distance = (solved - truth)[:, moving(truth) & ~REGIONS["gaze"]].abs().mean(1)
     good = distance < 1.5 * distance[present].nanmedian()
     took = []
-    for start, end in _runs(~present):
+    for start, end in runs(~present):
         if start == 0 or end + 4 >= len(present):
             continue
         settled = [t for t in range(end + 1, len(good) - 2) if bool(good[t : t + 3].all())]

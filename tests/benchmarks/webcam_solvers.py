@@ -14,7 +14,6 @@ import torch
 from safetensors.torch import load_file, save
 from torch import Tensor
 
-from planted.webcam_performance import gaze_of
 from torchface.capture.anybody import (
     AllAtOnce,
     ExampleShapes,
@@ -39,6 +38,7 @@ from torchface.temporal.adaptive_kalman import LANDMARK_SETTINGS, AdaptiveFilter
 from torchface.workflows.track.track_inputs import solver_for
 from torchface.workflows.track.track_models import load_track_models
 from torchface.workflows.webcam.webcam_graph import default_webcam_solver, webcam_networks
+from train.rendered_people.webcam_performance import gaze_of
 
 _LEAST = 6  # landmarks that a solve needs
 

@@ -14,7 +14,6 @@ import pytest
 import torch
 from torch import Tensor
 
-from planted.webcam_video import talking_subject
 from torchface import Attachment, BlendshapeRig
 from torchface.capture import MarkerSolver
 from torchface.capture.own_rig import VideoSolver
@@ -27,6 +26,7 @@ from torchface.onnx import export_model, export_video_solver, export_wrinkle_wei
 from torchface.onnx.video_graph_export import synthetic_landmarks
 from torchface.synthetic import performer
 from torchface.workflows.webcam.webcam_graph import webcam_graph
+from train.rendered_people.webcam_video import talking_subject
 
 EXPORT = Path(__file__).resolve().parents[2] / "export"
 WEB = EXPORT / "web"

@@ -39,7 +39,7 @@ def annotate(
         video: A video of the actor, extreme faces among what it shows.
         out: The folder for images and .pts files.
         landmarks: What finds landmarks to start from: a model of the zoo by name or folder, an .onnx file, or
-            `mediapipe`; or a .csv that holds those of the whole video.
+            MediaPipe's Face Landmarker (.task); or a .csv that holds those of the whole video.
         count: How many frames.
         face: Which face, from 0, the largest first, where there are several.
         browser: Open the page; --no-browser writes the proposed landmarks at once, to be corrected elsewhere.

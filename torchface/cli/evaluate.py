@@ -21,7 +21,7 @@ _COLUMNS = (
 )
 
 
-_FILES = ("regions.csv", "frames.csv", "shapes.csv")
+_FILES = ("regions.csv", "frames.csv", "shapes.csv", "methods.csv")
 
 
 def evaluate(
@@ -34,6 +34,7 @@ def evaluate(
     frames: tuple[int, ...] | None = None,
     by_number: bool = False,
     scans: bool = False,
+    benchmark: bool = False,
     landmarks: Path | None = None,
     unit: str | None = None,
     align: bool = False,
@@ -50,6 +51,11 @@ def evaluate(
     RESULT and TRUTH are each weights (.csv, with the rig that they move), an animated .glb, a mesh sequence
     (.safetensors), a mesh, or a folder of meshes, a frame each; both of one topology. Or the truth is raw scans
     (--scans), which are registered first; killed and started again, what is registered is kept.
+
+    With --benchmark TRUTH is a folder of films with true weights, NAME.csv, as `python -m train.expression_films`
+    renders them, and RESULT a folder of what was found in them, NAME.csv or NAME/live_link.csv, or a folder of such
+    folders, one a method: errors, correlation, lag, jitter, blinks and more, a row a method, also in OUT/methods.csv
+    and, by shape, in OUT/shapes.csv. A column that is empty says that the method does not give the shape.
 
     Writes OUT/index.html with its images, OUT/regions.csv, frames.csv, shapes.csv where both have weights, and
     summary.json.
@@ -69,6 +75,7 @@ def evaluate(
         frames: Which of the result's frames, from 0, the truth's are, in order; all if absent.
         by_number: Compare the first frame with the first, and so on, whatever their times say.
         scans: TRUTH is raw scans, in files or folders.
+        benchmark: RESULT and TRUTH are folders of films' weights.
         landmarks: A folder of landmark files named as the scans; see `torchface register`.
         unit: Unit of the scans (mm, cm, m) where it is not the format's own.
         align: Turn and move each frame of the result to where it is nearest to the truth; scans are always so.
@@ -88,6 +95,9 @@ def evaluate(
     from torchface.workflows.evaluate.evaluate_page import write_evaluation_page
     from torchface.workflows.evaluate.result_job import RESULTS, ResultJob
 
+    if benchmark:
+        _benchmark(result, truth, out, quiet)
+        return
     if align and as_is:
         raise ValueRangeError("evaluate: found --align and --as-is, expected one of the two")
     checked_count("--height", height, *PICTURE_HEIGHTS)
@@ -116,3 +126,25 @@ def evaluate(
     for line in evaluation.lines():
         console.print(line, highlight=False)
     print_path(page)
+
+
+def _benchmark(result: Path, truth: tuple[Path, ...], out: Path, quiet: bool) -> None:
+    """Compares films' weights, and prints a row a method."""
+    from torchface.errors import ValueRangeError
+    from torchface.files.job_lock import job_lock
+    from torchface.workflows.evaluate.expression_benchmark import expression_benchmark
+
+    if len(truth) != 1 or not (result.is_dir() and truth[0].is_dir()):
+        raise ValueRangeError("evaluate --benchmark: expected a folder of results and one folder of films with truth")
+    with job_lock(out), progress_bars(quiet) as progress:
+        found = expression_benchmark(result, truth[0], out, progress)
+    rows = found.table()
+    table = Table(title=f"{len(found.films)} films, {found.frames} frames")
+    for number, head in enumerate(rows.heading):
+        table.add_column(head, justify="right" if number else "left")
+    for row in rows.rows:
+        table.add_row(*row)
+    console.print(table)
+    for line in found.lines()[1:]:
+        console.print(line, highlight=False)
+    print_path(out / "index.html")

@@ -38,7 +38,8 @@ def examples(
         rig: A .glb or USD file, a folder of OBJ files, or ICT-FaceKit's FaceXModel folder; with landmarks annotated.
         paper: Of the rig only the 16 above, made of ARKit's shapes.
         seconds: For each expression before the camera.
-        landmarks: What finds landmarks: a model of the zoo by name or folder, an .onnx file, or `mediapipe`.
+        landmarks: What finds landmarks: a model of the zoo by name or folder, an .onnx file, or MediaPipe's Face
+            Landmarker bundle (.task).
         quiet: Show no progress.
     """
     from torchface.capture.anybody import (

@@ -47,7 +47,8 @@ def fit(
         photographs: Image files.
         landmarks: 68 landmarks in iBUG's order for each photograph: a .pts or .ljson file each, in the same order, or
             one .xml of dlib's (imglab) that names the photographs, or one .csv of a row a photograph, in their pixels
-            once upright. Or what finds them: a model of the zoo by name or folder, an .onnx file, or `mediapipe`.
+            once upright. Or what finds them: a model of the zoo by name or folder, an .onnx file, or MediaPipe's Face
+            Landmarker bundle (.task).
             Found by --landmark-model if absent.
         landmark_model: What finds them, or is compared with those that files give.
         model: A head model of the zoo by name, or its folder; if absent one of people in $TORCHFACE_HOME or the

@@ -68,8 +68,9 @@ def track(
             folders of them.
         rig: The actor's own rig, with 68 annotated landmarks: .glb, USD, or ICT-FaceKit's FaceXModel folder.
         out: Folder for everything; needed but with --live, where curves are kept only if it is given.
-        landmarks: What finds the 68 landmarks: a model of the zoo by name or folder, an .onnx file, or `mediapipe`; or
-            a .csv that holds them, ours, OpenFace's, py-feat's or MediaPipe's mesh, then VIDEO may be left out.
+        landmarks: What finds the 68 landmarks: a model of the zoo by name or folder, an .onnx file, or MediaPipe's Face
+            Landmarker bundle (.task); or a .csv that holds them, ours, OpenFace's, py-feat's or MediaPipe's mesh, then
+            VIDEO may be left out.
         appearance: Model of the actor's own looks that refines them.
         prior: What weights faces have, for names of shapes that the rig has too, or none; see `torchface train priors`.
         dynamics: A dynamics prior, the motion of weights from frame to frame, at any frame rate.

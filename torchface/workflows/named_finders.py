@@ -13,11 +13,11 @@ from torch import Tensor
 from torchface import zoo
 from torchface.errors import NameMismatchError, ValueRangeError
 from torchface.landmarks import LandmarkNetwork, LandmarkTrees
+from torchface.landmarks.images.face_landmarker.mediapipe_finder import MediaPipeFinder
 from torchface.landmarks.images.landmark_finder import LandmarkFinder
 from torchface.landmarks.images.networks.crop_finder import BothSides
 from torchface.landmarks.images.networks.eye_finder import EyedFinder, EyeFinder, graph_eye_finder
 from torchface.landmarks.images.networks.eye_network import EyeNetwork
-from torchface.landmarks.images.networks.mediapipe_finder import MediaPipeFinder
 from torchface.landmarks.images.networks.onnx_finder import graph_finder, onnx_finder
 from torchface.landmarks.images.trees.landmark_consensus import ConsensusSettings
 from torchface.landmarks.images.trees.tree_finder import PHOTOGRAPH, TreeFinder
@@ -31,8 +31,8 @@ DEFAULT_LANDMARKS = "landmark_network"
 EYES = "eye_network"
 """The model of the zoo that reads eyes."""
 
-MEDIAPIPE = "mediapipe"
-"""The name that asks for MediaPipe's face mesh."""
+BUNDLE = ".task"
+"""The ending of MediaPipe's Face Landmarker bundles."""
 
 
 @dataclass(frozen=True)
@@ -57,7 +57,8 @@ def load_finder(
 
     Args:
         name_or_path: a model of the zoo by name or folder, see ``zoo.get_model``; an ``.onnx`` file, see
-            :func:`~torchface.landmarks.images.networks.onnx_finder.onnx_finder`; or ``mediapipe``.
+            :func:`~torchface.landmarks.images.networks.onnx_finder.onnx_finder`; or MediaPipe's Face Landmarker
+            bundle, ``.task``.
         photographs: take the time that a single picture is worth.
         option: of the command that gives the name, for messages.
 
@@ -65,7 +66,7 @@ def load_finder(
         NameMismatchError: there is none of this name, or it is of another kind.
         ValueRangeError: it finds other landmarks than iBUG's 68.
         FileFormatError: it is damaged, or a graph of other inputs and outputs.
-        MissingExtraError: MediaPipe is asked for and not installed.
+        MissingExtraError: a bundle is asked for, and LiteRT, which runs it, is not installed.
 
     Example:
         >>> load_finder("face_landmarks").finder.name
@@ -73,8 +74,8 @@ def load_finder(
     """
     if Path(name_or_path).suffix.lower() == ".csv":
         raise NameMismatchError(f"{option}: found {name_or_path}, a table of landmarks, expected what finds them")
-    if str(name_or_path) == MEDIAPIPE:
-        return NamedFinder(MediaPipeFinder(), MEDIAPIPE)
+    if Path(name_or_path).suffix.lower() == BUNDLE:
+        return NamedFinder(MediaPipeFinder(name_or_path, Path(name_or_path).name), Path(name_or_path))
     if Path(name_or_path).suffix.lower() == ".onnx":
         return NamedFinder(onnx_finder(name_or_path), Path(name_or_path))
     model = zoo.get_model(name_or_path)

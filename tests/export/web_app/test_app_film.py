@@ -15,9 +15,9 @@ from headless_chromium import headless_chromium, until
 from PIL import Image
 from recorded_take import allow_camera, assert_same_weights, record, watch
 
-from planted.webcam_video import talking_subject
 from torchface.errors import MissingExtraError
 from torchface.workflows.browser_app import export_app
+from train.rendered_people.webcam_video import talking_subject
 
 pytestmark = [pytest.mark.browser, pytest.mark.bench]
 TOLERANCE = 0.02

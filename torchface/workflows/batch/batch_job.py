@@ -80,5 +80,5 @@ def model_content(name: str | Path | None) -> str | Path | None:
         return None if name is None else Path(name)
     try:
         return zoo.find(name)
-    except TorchfaceError:  # not a model of the zoo, such as "mediapipe" or "none"
+    except TorchfaceError:  # not a model of the zoo, such as "none"
         return name

@@ -11,7 +11,8 @@ from torch import Tensor
 from torchface.geometry.rotations import rotation_matrix
 from torchface.shape_names import ARKIT
 from torchface.synthetic.stages.weight_curves import GESTURES, perform, raised_cosine
-from train.rendered_people.turned_eyes import FULL_GAZE
+
+from .turned_eyes import FULL_GAZE
 
 _MOUTH = ("jaw", "mouth")
 _AWAY = 105.0  # degrees that a head turns away: no face is left to be seen

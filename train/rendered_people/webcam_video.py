@@ -10,19 +10,20 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from planted.webcam_performance import SittingSettings, WebcamPerformance, gaze_of, sitting
 from torchface.geometry.cameras.pinhole import Camera
 from torchface.progress import Progress, silent
 from torchface.shape_names import ARKIT
-from train.rendered_people.head_kind import performer_kind
-from train.rendered_people.lashes import with_lashes
-from train.rendered_people.looks import draw_looks
-from train.rendered_people.people import Person, closed_lids
-from train.rendered_people.picture_geometry import annotated, surface
-from train.rendered_people.rendered_person import render_person, visible_points
-from train.rendered_people.scene_clutter import clutter, draw_hand
-from train.rendered_people.spectacles import with_glasses
-from train.rendered_people.turned_eyes import iris_centres, with_turned_eyes
+
+from .head_kind import performer_kind
+from .lashes import with_lashes
+from .looks import draw_looks
+from .people import Person, closed_lids
+from .picture_geometry import annotated, surface
+from .rendered_person import render_person, visible_points
+from .scene_clutter import clutter, draw_hand
+from .spectacles import with_glasses
+from .turned_eyes import iris_centres, with_turned_eyes
+from .webcam_performance import SittingSettings, WebcamPerformance, gaze_of, sitting
 
 # Millimetres that a landmark may lie behind what is seen, on a curved edge, and still be visible; contour landmarks
 # count where they are drawn.

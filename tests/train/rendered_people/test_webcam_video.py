@@ -9,7 +9,12 @@ import torch
 from torch import Tensor
 
 from planted.landmark_measures import lid_openings, mouth_gap
-from planted.webcam_performance import (
+from torchface.shape_names import ARKIT
+from train.rendered_people.head_kind import performer_kind
+from train.rendered_people.looks import draw_looks
+from train.rendered_people.people import Person
+from train.rendered_people.turned_eyes import iris_centres
+from train.rendered_people.webcam_performance import (
     SittingSettings,
     WebcamPerformance,
     gaze_of,
@@ -17,12 +22,7 @@ from planted.webcam_performance import (
     with_blinks,
     with_speech,
 )
-from planted.webcam_video import WebcamFrame, WebcamSettings, posed_head, webcam_frames
-from torchface.shape_names import ARKIT
-from train.rendered_people.head_kind import performer_kind
-from train.rendered_people.looks import draw_looks
-from train.rendered_people.people import Person
-from train.rendered_people.turned_eyes import iris_centres
+from train.rendered_people.webcam_video import WebcamFrame, WebcamSettings, posed_head, webcam_frames
 
 FPS = 10.0
 STILL = SittingSettings(distance=500, yaw=0, pitch=0, tilt=0, drift=0)

@@ -1,0 +1,149 @@
+"""What turns a film into weights of ARKit's shapes, each by its own means, and writes them as Live Link Face does."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from functools import lru_cache
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchface.capture.anybody import (
+    AllAtOnce,
+    ExampleSolver,
+    WebcamControls,
+    character_matrix,
+    paper_examples,
+)
+from torchface.io import load_take, save_rig
+from torchface.io.rigs.ict_facekit import load_ict_facekit
+from torchface.io.video import open_video
+from torchface.io.weights.live_link_csv import save_live_link
+from torchface.landmarks.images.face_landmarker.mediapipe_finder import MediaPipeTracker
+from torchface.landmarks.images.face_mesh_478 import landmarks_of_mesh
+from torchface.progress import silent
+from torchface.rig import BlendshapeRig
+from torchface.shape_names import ARKIT, mapping
+from torchface.synthetic import performer
+from torchface.take import Take, Track
+from torchface.workflows.live.live_anybody import person_solver
+from torchface.workflows.track.track_inputs import TrackSettings
+from torchface.workflows.track.track_video import track_video
+from train.rendered_people.people import Person
+from train.rendered_people.webcam_film import Film
+
+Method = Callable[[Film], tuple[Tensor, Tensor]]
+"""Gives weights (T,52) of a film, NaN where a face is lost or a shape not known, and iBUG's landmarks (T,68,2)."""
+
+
+def frames(film: Film) -> Iterator[Tensor]:
+    """Pictures, uint8 (3,H,W)."""
+    return open_video(film.path).color_frames()
+
+
+def mediapipe(bundle: Path) -> Method:
+    """MediaPipe's blendshapes, as they are."""
+
+    def run(film: Film) -> tuple[Tensor, Tensor]:
+        tracker = MediaPipeTracker(bundle)
+        faces = [tracker.mesh(frame) for frame in frames(film)]
+        lost = torch.full((len(ARKIT),), torch.nan), torch.full((68, 2), torch.nan)
+        found = [
+            lost if face is None else (tracker.landmarker.blendshapes(face.points), landmarks_of_mesh(face.points))
+            for face in faces
+        ]
+        return torch.stack([weights for weights, _ in found]), torch.stack([marks for _, marks in found])
+
+    return run
+
+
+def live(film: Film) -> tuple[Tensor, Tensor]:
+    """``torchface live`` with nobody to calibrate it."""
+    solver = _live()
+    weights, marks = [], []
+    for number, frame in enumerate(frames(film)):
+        picture = np.ascontiguousarray(frame.permute(1, 2, 0).numpy())
+        solved = solver.step(picture, None if number == 0 else 1 / 30, WebcamControls(reset=number == 0))
+        weights.append(torch.as_tensor(solved.weights).clone())
+        marks.append(torch.as_tensor(solved.landmarks).clone())
+    return torch.stack(weights) @ mapping(solver.names, ARKIT).T, torch.stack(marks)
+
+
+@lru_cache(maxsize=1)
+def _live():
+    return person_solver(silent)
+
+
+def track(rig: Callable[[Film], BlendshapeRig], **options: object) -> Method:
+    """``torchface track`` on a rig."""
+
+    def run(film: Film) -> tuple[Tensor, Tensor]:
+        with TemporaryDirectory() as folder:
+            path = Path(folder) / "rig.glb"
+            save_rig(rig(film), path)
+            settings = TrackSettings(overlay="none", **options)  # type: ignore[arg-type]
+            tracked = track_video(film.path, path, Path(folder) / "out", settings)
+            weights = load_take(Path(folder) / "out" / "live_link.csv").weights
+            assert weights is not None
+            return weights.values[..., 0].float() @ mapping(weights.names, ARKIT).T, tracked.reading.landmarks
+
+    return run
+
+
+def mean_head(film: Film) -> BlendshapeRig:
+    """The embedded performer's mean head, whoever is filmed."""
+    return performer(texture=False)
+
+
+def own_head(ict: Path) -> Callable[[Film], BlendshapeRig]:
+    """The rig of whom a film shows."""
+
+    def rig(film: Film) -> BlendshapeRig:
+        return person_rig(film.person, ict)
+
+    return rig
+
+
+def person_rig(person: Person, ict: Path) -> BlendshapeRig:
+    """Someone's true rig: the face alone of ICT-FaceKit's heads."""
+    own = performer(texture=False)
+    if len(person.head.rest) != len(own.vertices):
+        own = load_ict_facekit(ict)
+    notes = own.neutral.annotations
+    assert notes is not None
+    rig = BlendshapeRig(own.neutral.with_vertices(person.head.rest), person.head.deltas, own.names)
+    return rig.part(notes.regions["face"]) if "face" in notes.regions and len(rig.vertices) > 20_000 else rig
+
+
+def examples(reference: Callable[[Film], Tensor]) -> Method:
+    """The dissertation's solver on 16 examples of the embedded performer, for landmarks that another method found."""
+
+    def run(film: Film) -> tuple[Tensor, Tensor]:
+        shown = paper_examples(performer(texture=False))
+        solver, onto = ExampleSolver(shown, AllAtOnce()), character_matrix(shown.names, ARKIT)
+        landmarks, before, rows = reference(film), None, []
+        for marks in landmarks:  # a frame starts where the one before ended
+            if bool(torch.isfinite(marks).all()):
+                before = solver(marks[None], before)
+            rows.append(torch.zeros(len(shown.names)) if before is None else before[0])
+        return (torch.stack(rows) @ onto.T).clamp(0, 1), landmarks
+
+    return run
+
+
+def run_methods(
+    methods: dict[str, Method], films: dict[str, Film], results: Path, say: Callable[[str], None] = print
+) -> None:
+    """Writes RESULTS/METHOD/FILM.csv of each method and film."""
+    for name, method in methods.items():
+        started = time.process_time()
+        for film, shown in films.items():
+            weights, _ = method(shown)
+            folder = results / name
+            folder.mkdir(parents=True, exist_ok=True)
+            save_live_link(Take(30.0, weights=Track(ARKIT, weights[..., None].float())), folder / f"{film}.csv")
+        say(f"{name}: {time.process_time() - started:.0f} s of processor time")

@@ -1,0 +1,1 @@
+"""MediaPipe's Face Landmarker: its bundle of three networks, read and run in this process."""

@@ -1,0 +1,217 @@
+"""Landmarks, irises and blendshapes by a Face Landmarker bundle, face by face or followed through a video."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchface.landmarks.images.boxes.face_box import FaceBoxes, check_image, sorted_boxes
+from torchface.landmarks.images.face_crop import crop_transform, cut_crop, from_crop
+from torchface.landmarks.images.face_landmarker.landmarker_bundle import LandmarkerBundle, load_bundle
+from torchface.landmarks.images.face_landmarker.short_range_boxes import SIDE, decoded, merged
+from torchface.landmarks.images.face_mesh_478 import BLENDSHAPE_POINTS, IRISES, landmarks_of_mesh
+from torchface.landmarks.images.face_reading import FaceReading, box_side
+from torchface.landmarks.images.ibug_68 import COUNT
+from torchface.shape_names import ARKIT
+
+BLENDSHAPES = ("_neutral", *sorted((name for name in ARKIT if name != "tongueOut"), key=str.lower))
+"""What the bundle's last network gives, in its order: ARKit's shapes by the alphabet, but ``tongueOut``."""
+
+_CROP = 256
+_CORNER = 0.3  # of its pixels: where the crop's first one has its middle; a mirrored crop gives mirrored points by it
+_ROUND = 1.5  # the crop's side, of the points' extent or of the detector's box
+_PRESENT, _LIKELY = 0.5, 0.5  # least presence of a face that is followed, and score of one that is found
+_EYES = (33, 263)
+# The crop's middle and side beside the box round iBUG's 68, of that box's side: medians over six clips.
+_BELOW, _WIDER = 0.05, 1.46
+_MISPLACED, _OTHER_SIZE, _OTHER_TURN = 0.08, 1.12, 0.15  # of the crop's side, its ratio, radians: then one more look
+_DEVIATION = 0.01  # of the box's side; the networks give none of their own
+_SHUT, _SHUT_WIDTH = 0.45, 0.08  # of the blink's weight
+
+
+@dataclass(frozen=True, eq=False)
+class FaceSquare:
+    """A turned square of a picture: its middle (2,) and side, pixels, and tilt, radians clockwise as it is seen."""
+
+    middle: Tensor
+    side: float
+    tilt: float
+
+    @property
+    def box(self) -> Tensor:
+        """x, y, width, height of the square before it was turned, (4,)."""
+        return torch.cat([self.middle - self.side / 2, self.middle.new_full((2,), self.side)])
+
+    def fits(self, other: FaceSquare) -> bool:
+        """Whether a face looks much the same in the other square."""
+        turn = math.remainder(self.tilt - other.tilt, 2 * math.pi)
+        apart = float((self.middle - other.middle).norm()) / self.side
+        ratio = max(self.side / other.side, other.side / self.side)
+        return apart < _MISPLACED and ratio < _OTHER_SIZE and abs(turn) < _OTHER_TURN
+
+
+@dataclass(frozen=True, eq=False)
+class MeshFace:
+    """A face's mesh.
+
+    Args:
+        points: (478,2) pixels of the picture.
+        presence: how likely there is a face, in [0,1].
+    """
+
+    points: Tensor
+    presence: float
+
+    @property
+    def square(self) -> FaceSquare:
+        """Where the networks look for the face next."""
+        first, last = self.points[_EYES[0]], self.points[_EYES[1]]
+        tilt = math.atan2(*(last - first).flip(0).tolist())
+        upright = torch.tensor([[math.cos(tilt), -math.sin(tilt)], [math.sin(tilt), math.cos(tilt)]])
+        own = self.points @ upright
+        low, high = own.amin(0), own.amax(0)
+        return FaceSquare(upright @ ((low + high) / 2), _ROUND * float((high - low).amax()), tilt)
+
+
+class FaceLandmarker:
+    """The networks of a bundle on squares and pictures.
+
+    Args:
+        bundle: the networks, or the file that holds them.
+    """
+
+    def __init__(self, bundle: LandmarkerBundle | str | Path) -> None:
+        self.bundle = bundle if isinstance(bundle, LandmarkerBundle) else load_bundle(bundle)
+
+    def look(self, image: Tensor, square: FaceSquare) -> MeshFace:
+        """The mesh of the face in a square of a picture, uint8 (H,W) or (3,H,W), red first."""
+        transform = crop_transform(square.box, square.tilt, _CROP, 1.0)
+        crop = cut_crop(image, transform, _CROP).permute(1, 2, 0).numpy()
+        found, logit = self.bundle.landmarks(crop[None].astype(np.float32) / 255)
+        points = torch.from_numpy(found.reshape(-1, 3)[:, :2].copy())
+        return MeshFace(from_crop(points - _CORNER, transform), 1 / (1 + math.exp(-float(logit.flat[0]))))
+
+    def blendshapes(self, points: Tensor) -> Tensor:
+        """Weights of ARKit's shapes (52,) for a mesh (478,2); NaN for ``tongueOut``, which the network lacks."""
+        (found,) = self.bundle.blendshapes(points[torch.tensor(BLENDSHAPE_POINTS)].numpy()[None])
+        weights = torch.full((len(ARKIT),), torch.nan)
+        weights[torch.tensor([ARKIT.index(name) for name in BLENDSHAPES[1:]])] = torch.from_numpy(found[1:].copy())
+        return weights
+
+    def faces(self, image: Tensor) -> tuple[list[FaceSquare], Tensor]:
+        """Squares of the faces in a picture, the best first, and their scores (F,)."""
+        check_image(image)
+        pixels = (image if image.ndim == 3 else image.expand(3, *image.shape)).permute(1, 2, 0).cpu().numpy()
+        height, width = pixels.shape[:2]
+        scale = SIDE / max(height, width)
+        size = (max(1, round(width * scale)), max(1, round(height * scale)))
+        small = cv2.resize(np.ascontiguousarray(pixels), size, interpolation=cv2.INTER_AREA if scale < 1 else 1)
+        shown = np.zeros((SIDE, SIDE, 3), np.float32)  # black beside the picture, which stays in the middle
+        left, top = (SIDE - size[0]) // 2, (SIDE - size[1]) // 2
+        shown[top : top + size[1], left : left + size[0]] = small
+        regressors, logits = self.bundle.boxes(shown[None] / 127.5 - 1)
+        boxes, points, scores = merged(*decoded(regressors[0], logits[0, :, 0], _LIKELY))
+        ratio, corner = torch.tensor([width / size[0], height / size[1]]), torch.tensor([left, top])
+        squares = []
+        for box, marks in zip(boxes * SIDE, points * SIDE, strict=True):  # a few faces
+            middle = (box[:2] + box[2:] / 2 - corner) * ratio - 0.5
+            across = ((marks[1] - marks[0]) * ratio).tolist()
+            side = _ROUND * float(box[2:].amax() * ratio.mean())
+            squares.append(FaceSquare(middle, side, math.atan2(across[1], across[0])))
+        return squares, scores
+
+
+class MediaPipeFinder:
+    """Finds landmarks, irises and blendshapes in a box, by a Face Landmarker bundle.
+
+    It gives no deviation and no visibility of its own: every landmark has the confidence 0.8 and is visible.
+
+    Args:
+        bundle: the networks, or the file that holds them.
+        name: what messages call it.
+    """
+
+    def __init__(self, bundle: LandmarkerBundle | str | Path, name: str = "mediapipe") -> None:
+        self.landmarker, self.name = FaceLandmarker(bundle), name
+
+    def __call__(self, image: Tensor, box: Tensor, tilt: float = 0.0) -> FaceReading:
+        """See :class:`~torchface.landmarks.images.landmark_finder.LandmarkFinder`."""
+        side = float(box_side(box))
+        down = box.new_tensor([-math.sin(tilt), math.cos(tilt)])
+        square = FaceSquare(box[:2] + box[2:] / 2 + _BELOW * side * down, _WIDER * side, tilt)
+        face = self.landmarker.look(image, square)
+        if face.presence >= _PRESENT and not square.fits(face.square):
+            face = self.landmarker.look(image, face.square)
+        return replace(reading_of(face, self.landmarker.blendshapes(face.points)), search_box=box)
+
+
+class MediaPipeTracker:
+    """Follows one face as Face Landmarker does: in the square round its last points, by the box network where lost.
+
+    Args:
+        bundle: the networks, or the file that holds them.
+    """
+
+    def __init__(self, bundle: LandmarkerBundle | str | Path) -> None:
+        self.landmarker = FaceLandmarker(bundle)
+        self._square: FaceSquare | None = None
+
+    def mesh(self, image: Tensor) -> MeshFace | None:
+        """The face in the next picture, uint8 (H,W) or (3,H,W), red first; None where there is none."""
+        square = self._square
+        if square is None:
+            squares, _ = self.landmarker.faces(image)
+            square = squares[0] if squares else None
+        face = None if square is None else self.landmarker.look(image, square)
+        present = face is not None and face.presence >= _PRESENT
+        self._square = face.square if face is not None and present else None
+        return face if present else None
+
+
+class MediaPipeDetector:
+    """Finds faces by a Face Landmarker bundle's box network, which is made for faces near the camera.
+
+    Args:
+        bundle: the networks, or the file that holds them.
+    """
+
+    def __init__(self, bundle: LandmarkerBundle | str | Path) -> None:
+        self.landmarker = FaceLandmarker(bundle)
+
+    def __call__(self, image: Tensor) -> FaceBoxes:
+        """See :class:`~torchface.landmarks.images.boxes.face_box.FaceDetector`."""
+        squares, scores = self.landmarker.faces(image)
+        boxes = (
+            torch.stack([replace(one, side=one.side / _WIDER).box for one in squares]) if squares else torch.zeros(0, 4)
+        )
+        return sorted_boxes(boxes, scores, torch.tensor([one.tilt for one in squares]))
+
+
+def reading_of(face: MeshFace, weights: Tensor) -> FaceReading:
+    """What iBUG's landmarks, irises and lids are of a mesh with blendshapes (52,)."""
+    landmarks = landmarks_of_mesh(face.points)
+    nothing = torch.zeros(COUNT)
+    blink = weights[torch.tensor([ARKIT.index("eyeBlinkRight"), ARKIT.index("eyeBlinkLeft")])]
+    presence = torch.tensor(face.presence)
+    reading = FaceReading(
+        landmarks, nothing, nothing + 1, presence, iris=face.points[torch.tensor(IRISES)],
+        openness=lid_openness(landmarks), closed=torch.sigmoid((blink - _SHUT) / _SHUT_WIDTH),
+        eye_visibility=presence.expand(2),
+    )  # fmt: skip
+    return replace(reading, deviation=nothing + _DEVIATION * box_side(reading.search_box))
+
+
+def lid_openness(landmarks: Tensor) -> Tensor:
+    """The lids' distance over that of the eye's corners, right eye first, (...,2), of iBUG's landmarks (...,68,2)."""
+    rows = []
+    for first in (36, 42):
+        eye = landmarks[..., first : first + 6, :]
+        gaps = (eye[..., 1:3, :] - eye[..., [5, 4], :]).norm(dim=-1).mean(-1)
+        rows.append(gaps / (eye[..., 3, :] - eye[..., 0, :]).norm(dim=-1).clamp(min=1e-6))
+    return torch.stack(rows, -1)
