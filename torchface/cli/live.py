@@ -1,4 +1,4 @@
-"""``torchface live``: anybody before a webcam moves a character."""
+"""``torchface live``: anybody before a webcam, or with a phone, moves a character."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _FILES = ("weights.csv", "live_link.csv", "animation.glb")
 
 
 def live(
-    camera: Annotated[Positional[str], arg(metavar="CAMERA|VIDEO")] = "0",
+    camera: Annotated[Positional[str], arg(metavar="CAMERA|VIDEO|ADDRESS")] = "0",
     *,
     character: Path | None = None,
     mapping: Path | None = None,
@@ -29,7 +29,7 @@ def live(
     cameras: Annotated[bool, arg(name="list")] = False,
     quiet: Quiet = False,
 ) -> None:
-    """Move a character with your face, before a webcam; no scan, no markers, no training.
+    """Move a character with your face, before a webcam or by a phone; no scan, no markers, no training.
 
     A page in the browser shows the character and the camera's picture with what was found in it, and has sliders for
     gain and smoothing, a guided calibration of ten seconds, and a button to record. It is at 127.0.0.1, no other
@@ -37,14 +37,17 @@ def live(
     (torchface's extra `viewer`); --no-page does without.
 
     Args:
-        camera: A camera's number, from 0, or a video file that is played in its own time, of which --record
-            misses no frame.
+        camera: A camera's number, from 0; a video file that is played in its own time, of which --record misses no
+            frame; or an address at which a phone or a program sends a face: livelink://:11111 (Live Link Face),
+            ifacialmocap://PHONE (its address; it is asked to send), vmc://:39539, osc://:9000/PREFIX.
         character: A .glb or USD file with shapes by ARKit's names, or a folder of OBJ files; the embedded performer if
             absent.
         mapping: For shapes by other names: a mapping table, TOML, as `torchface retarget` takes it.
         calibrate: Begin with the guided calibration; without the page it is asked for in the terminal.
         to: Where weights are sent to, again for each: livelink://HOST:11111 (Live Link Face, for Unreal),
-            vmc://HOST:39539 (VMC protocol), osc://HOST:PORT/PREFIX (PREFIX/weights/jawOpen and so on).
+            vmc://HOST:39539 (VMC protocol), osc://HOST:PORT/PREFIX (PREFIX/weights/jawOpen and so on),
+            vrchat://HOST:9000, vts://HOST:8001 (VTube Studio), ifacialmocap://HOST:49983. Options of an address:
+            ?rate=30 (frames a second at most), map=FILE (a mapping table), names=arkit+vrm0+vrm1 (vmc).
         record: Record from the first frame on into this folder: weights.csv by the character's names, live_link.csv,
             animation.glb, summary.json. The page's button records into `recordings` without.
         page: Open the page in the browser.

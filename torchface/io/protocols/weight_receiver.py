@@ -8,6 +8,7 @@ import socket
 import time
 from collections.abc import Callable
 from contextlib import suppress
+from typing import Any
 
 from torchface.errors import TorchfaceError, ValueRangeError
 from torchface.io.protocols.frame_order import FrameOrder
@@ -54,7 +55,7 @@ class WeightReceiver:
         self._phone, self._asked, self._heard = None, float("-inf"), float("-inf")
         if parts.scheme == "ifacialmocap" and parts.host:
             family, self._phone = resolved(parts, address)
-            local = "::" if family == socket.AF_INET6 else ""
+            local = _facing(family, self._phone)
         elif parts.host:
             family, _ = resolved(parts, address)
             local = parts.host
@@ -108,6 +109,11 @@ class WeightReceiver:
         return taken
 
     @property
+    def asks(self) -> bool:
+        """Whether somebody is asked to send."""
+        return self._phone is not None
+
+    @property
     def sender(self) -> str:
         """Whom faces are taken from: name and address."""
         return self._order.sender
@@ -138,6 +144,14 @@ def _readers(parts: StreamAddress) -> Callable[[], Read]:
         return lambda: OscReader(parts.path)
     read = read_live_link if parts.scheme == "livelink" else read_ifacialmocap
     return lambda: read
+
+
+def _facing(family: socket.AddressFamily, target: Any) -> str:
+    """This machine's address that another one sees; all of them where no way leads there."""
+    with socket.socket(family, socket.SOCK_DGRAM) as probe, suppress(OSError):
+        probe.connect(target)
+        return str(probe.getsockname()[0])
+    return ""
 
 
 def _any_family() -> socket.AddressFamily:

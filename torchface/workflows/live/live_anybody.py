@@ -13,6 +13,7 @@ import torch
 from torchface.capture.anybody import WebcamControls
 from torchface.errors import ValueRangeError
 from torchface.files.job_lock import job_lock
+from torchface.io.protocols.stream_address import is_source, parse_source
 from torchface.io.protocols.weight_sender import find_receiver
 from torchface.landmarks.images.boxes.network_detector import shipped_detector
 from torchface.number_checks import checked_number
@@ -22,10 +23,11 @@ from torchface.shape_names import ARKIT
 from torchface.workflows.live.camera import DEFAULT_SIZE
 from torchface.workflows.live.character import load_character
 from torchface.workflows.live.live_figures import LiveReport
-from torchface.workflows.live.live_frames import FaceSolver, LiveFrame, Say, open_source
+from torchface.workflows.live.live_frames import FaceSolver, FrameSource, LiveFrame, Say, open_source
 from torchface.workflows.live.live_session import LiveSession, Notes
+from torchface.workflows.live.received_source import ReceivedSolver, ReceivedSource, ReceivedWatch
 from torchface.workflows.live.recordings import Recordings, SavedTake
-from torchface.workflows.live.session_prompts import FaceWatch
+from torchface.workflows.live.session_prompts import FaceWatch, Watch
 from torchface.workflows.live.weight_streams import WeightStreams
 from torchface.workflows.webcam.webcam_graph import webcam_graph
 
@@ -78,8 +80,8 @@ class LiveSettings:
     """What a live session is made of.
 
     Args:
-        camera: a device's number, or a video file, which is played at its own rate; every frame of it is solved where
-            ``record`` names a folder.
+        camera: a device's number; a video file, which is played at its own rate, every frame of it where ``record``
+            names a folder; or an address at which faces are received, such as ``livelink://:11111``.
         character: a rig by ARKit's names; the embedded performer if absent.
         mapping: a table for shapes of other names.
         addresses: see :func:`torchface.io.open_sender`.
@@ -125,6 +127,8 @@ def go_live(
     progress = progress or silent
     for address in settings.addresses:
         find_receiver(address)
+    if is_source(settings.camera):
+        parse_source(settings.camera)
     if settings.seconds is not None:
         checked_number("seconds", settings.seconds, above=True)
     if settings.page:  # what is missing should be said before a large character is read
@@ -139,15 +143,24 @@ def go_live(
     with ExitStack() as stack:
         if settings.record is not None:
             stack.enter_context(job_lock(settings.record))
-        progress("loading the solver")
-        solver = make_solver(progress)
-        progress("opening the camera")
         every = settings.record is not None  # a film that is recorded loses no frame
-        source = stack.enter_context(closing(open_source(settings.camera, notes, settings.size, every)))
+        source: FrameSource
+        solver: FaceSolver
+        watch: Watch
+        received = None
+        if is_source(settings.camera):
+            received = ReceivedSource(settings.camera, every)
+            source, solver = stack.enter_context(closing(received)), ReceivedSolver(received, notes)
+            watch = ReceivedWatch(received, notes)
+        else:
+            progress("loading the solver")
+            solver = make_solver(progress)
+            progress("opening the camera")
+            source = stack.enter_context(closing(open_source(settings.camera, notes, settings.size, every)))
+            watch = FaceWatch(lambda picture: len(shipped_detector()(picture)))
         streams = stack.enter_context(WeightStreams(settings.addresses, ARKIT, source.video.fps, notes))
         folder = settings.record or RECORDINGS
         recordings = Recordings(folder, character, source.video.path.name, source.video.fps)
-        watch = FaceWatch(lambda picture: len(shipped_detector()(picture)))
         prompt: Say = (lambda words: None) if settings.page else say
         session = LiveSession(source, solver, streams, recordings, notes, prompt, watch)
         if settings.record is not None:
@@ -168,4 +181,5 @@ def go_live(
             saved = recordings.finish()
         if session.figures.frames == 0:
             raise ValueRangeError(f"{settings.camera}: found no frame, expected at least one")
-        return LiveReport(session.figures, source.dropped, streams.notes()), saved
+        wrong = received.receiver.counts.words() if received is not None else ""
+        return LiveReport(session.figures, source.dropped, (*((wrong,) if wrong else ()), *streams.notes())), saved

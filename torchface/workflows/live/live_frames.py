@@ -116,6 +116,7 @@ class LiveFrame:
         iris: centres of the irises, right eye first, (2,2) pixels; NaN where nothing finds them.
         gaze: right eye first, to the person's left and up, (2,2) radians.
         calibrated: how far the person is learned, in [0,1].
+        found: whether a face is there, where no landmarks say so.
     """
 
     weights: Tensor
@@ -124,11 +125,12 @@ class LiveFrame:
     iris: Tensor = field(default_factory=lambda: torch.full((2, 2), torch.nan))
     gaze: Tensor = field(default_factory=lambda: torch.zeros(2, 2))
     calibrated: float = 1.0
+    found: bool = False
 
     @cached_property
     def seen(self) -> bool:
         """Whether a face is there."""
-        return bool(torch.isfinite(self.landmarks).all(1).any())
+        return self.found or bool(torch.isfinite(self.landmarks).all(1).any())
 
     @cached_property
     def rotations(self) -> Tensor:

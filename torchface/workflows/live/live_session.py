@@ -15,7 +15,7 @@ from torchface.viz.browser.live_view import LiveView
 from torchface.workflows.live.live_figures import LiveFigures
 from torchface.workflows.live.live_frames import FaceSolver, FrameSource, LiveFrame, Say, solved_frames
 from torchface.workflows.live.recordings import Recordings
-from torchface.workflows.live.session_prompts import FaceWatch, GuidedCalibration
+from torchface.workflows.live.session_prompts import GuidedCalibration, Watch
 from torchface.workflows.live.weight_streams import WeightStreams
 
 _MAX_NOTES = 20
@@ -49,7 +49,7 @@ class LiveSession:
         recordings: what keeps them when asked to.
         notes: called with what the user should know.
         prompt: called with what a guided calibration asks for, each time that changes.
-        watch: counts faces now and then.
+        watch: says what the user should know of the source.
     """
 
     def __init__(
@@ -60,7 +60,7 @@ class LiveSession:
         recordings: Recordings,
         notes: Notes,
         prompt: Say,
-        watch: FaceWatch | None = None,
+        watch: Watch | None = None,
     ) -> None:
         self.gain, self.smoothing = 1.0, 0.5
         self.figures = LiveFigures()

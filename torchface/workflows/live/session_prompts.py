@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Protocol
 
 import numpy as np
 
@@ -66,6 +67,15 @@ class GuidedCalibration:
 _INTERVAL = 3.0  # seconds between two counts of faces
 _DARK = 35.0  # mean of the brightest of the colours, of 255
 _SPARSE = 8  # pixels
+
+
+class Watch(Protocol):
+    """Looks at frames as they pass; ``words`` are what the user should know."""
+
+    words: str
+
+    def look(self, picture: np.ndarray, seen: bool, now: float) -> None:
+        """Updates ``words`` by a frame, uint8 (H,W,3), that shows the face that is followed or none."""
 
 
 class FaceWatch:

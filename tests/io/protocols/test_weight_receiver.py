@@ -1,0 +1,139 @@
+"""Faces received by UDP: an iPhone's packets as they are, other programs', and what is wrong on the way."""
+
+from __future__ import annotations
+
+import gzip
+import socket
+import struct
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+import torch
+
+from torchface.errors import ValueRangeError
+from torchface.io.protocols.ifacialmocap_packets import START, IFacialMocapPackets
+from torchface.io.protocols.live_link_packets import LiveLinkPackets
+from torchface.io.protocols.live_link_recordings import recorded_packets
+from torchface.io.protocols.osc_packets import OscPackets
+from torchface.io.protocols.received_face import ReceivedFace
+from torchface.io.protocols.vmc_packets import VmcPackets
+from torchface.io.protocols.weight_receiver import WeightReceiver
+from torchface.shape_names import ARKIT
+
+WEIGHTS, ROTATIONS = torch.arange(52) / 64, torch.arange(9) / 16
+
+
+def played(receiver: WeightReceiver, packets: list[bytes], host: str = "127.0.0.1") -> list[ReceivedFace]:
+    """What comes out of packets that are sent one by one."""
+    faces = []
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
+        for packet in packets:
+            sender.sendto(packet, (host, receiver.port))
+            faces += [face for _, face in receiver.faces(0.05 if packet is packets[-1] else 0.0)]
+    return faces + [face for _, face in receiver.faces(0.05)]
+
+
+@pytest.mark.real
+@pytest.mark.parametrize("file", ["dao", "debug-jawopen", "debug-headyaw"])
+def test_an_iphones_packets_are_received_as_they_are(file: str, data: Path) -> None:
+    path = data / "protocols" / f"live_link_{file}.gesichter"
+    packets = list(recorded_packets(path))
+    raw = gzip.decompress(path.read_bytes())  # the numbers by their place in the bytes, without a reader of ours
+    size = int.from_bytes(raw[5:9], "big")
+    expected = [struct.unpack("!61f", raw[at + size - 240 : at + size + 4]) for at in range(5, len(raw), size + 4)]
+    with WeightReceiver("livelink://127.0.0.1:0") as receiver:
+        faces = played(receiver, packets)
+        assert "LLV Default Device" in receiver.sender
+        assert receiver.counts.malformed == 0
+        gaps = 7 if file == "dao" else 0  # the recording lacks frames: eight numbers further after the sixth
+        assert receiver.counts.lost >= gaps
+    assert len(faces) == len(expected) == receiver.counts.taken
+    found = torch.stack([torch.cat([face.weights, face.rotations]) for face in faces])
+    torch.testing.assert_close(found, torch.tensor(expected), rtol=0, atol=0)
+
+
+@pytest.mark.parametrize(
+    ("scheme", "packets"),
+    [
+        ("livelink", LiveLinkPackets(ARKIT, 60.0)(WEIGHTS, ROTATIONS)),
+        ("ifacialmocap", IFacialMocapPackets(ARKIT)(WEIGHTS, ROTATIONS)),
+        ("vmc", VmcPackets(ARKIT)(WEIGHTS, ROTATIONS)),
+        ("osc", OscPackets(ARKIT)(WEIGHTS, ROTATIONS)),
+    ],
+)
+def test_each_protocol_is_received_at_ipv4_and_ipv6(scheme: str, packets: list[bytes]) -> None:
+    with WeightReceiver(f"{scheme}://:0") as receiver:
+        assert len(played(receiver, packets)) == 1
+        if socket.has_dualstack_ipv6():
+            with socket.socket(socket.AF_INET6, socket.SOCK_DGRAM) as sender:
+                for packet in packets:
+                    sender.sendto(packet, ("::1", receiver.port))
+            receiver._order.takes("nobody", None, float("inf"))  # whoever was first is gone
+            receiver._order.sender = ""
+            receiver._order._heard = float("-inf")
+            (face,) = [face for _, face in receiver.faces(0.5)]
+            torch.testing.assert_close(face.weights, WEIGHTS, atol=0.006, rtol=0)
+
+
+def test_the_phone_is_asked_to_send_until_it_does(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("torchface.io.protocols.weight_receiver._ASK_AGAIN", 0.02)
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as phone:
+        phone.bind(("127.0.0.2", 0))
+        phone.settimeout(5)
+        port = phone.getsockname()[1]
+        with WeightReceiver(f"ifacialmocap://127.0.0.2:{port}") as receiver:
+            assert receiver.port == port  # where the app answers to
+            assert receiver.asks
+            receiver.faces(0.0)
+            text, asker = phone.recvfrom(1024)
+            assert text == START
+            time.sleep(0.03)
+            receiver.faces(0.0)
+            assert phone.recv(1024) == START
+            (packet,) = IFacialMocapPackets(ARKIT)(WEIGHTS, None)
+            phone.sendto(packet, ("127.0.0.1", asker[1]))
+            assert len(receiver.faces(1.0)) == 1
+
+
+def test_a_second_sender_and_another_version_are_counted() -> None:
+    packets = LiveLinkPackets(ARKIT, 60.0, "iPhone")
+    frames = [packets(torch.full((52,), i / 10), None)[0] for i in range(6)]
+    (other,) = LiveLinkPackets(ARKIT, 60.0, "iPad")(WEIGHTS, None)
+    changed = b"\x07" + frames[4][1:]
+    with WeightReceiver("livelink://127.0.0.1:0") as receiver:
+        faces = played(receiver, [frames[0], frames[1], other, frames[3], frames[2], changed, frames[5]])
+        counts = receiver.counts
+    assert [round(face.weights[0].item() * 10) for face in faces] == [0, 1, 3, 5]
+    assert (counts.others, counts.late, counts.malformed, counts.lost) == (1, 1, 1, 2)
+    assert counts.fault == "found version 7, expected Live Link Face's version 6"
+    assert "1 not understood (found version 7" in counts.words()
+
+
+def test_a_face_that_the_app_does_not_see_is_said() -> None:
+    (packet,) = LiveLinkPackets(ARKIT, 60.0)(WEIGHTS, None)
+    for cut in (packet[: -61 * 4 - 1], packet[: -61 * 4 - 1] + b"\0"):
+        with WeightReceiver("livelink://127.0.0.1:0") as receiver:
+            (face,) = played(receiver, [cut])
+            assert not face.found
+
+
+def test_a_port_that_is_taken_is_said() -> None:
+    with (
+        WeightReceiver("vmc://127.0.0.1:0") as first,
+        pytest.raises(ValueRangeError, match=rf"cannot receive at .* \(another program has port {first.port}; end"),
+    ):
+        WeightReceiver(f"vmc://127.0.0.1:{first.port}")
+    with pytest.raises(
+        ValueRangeError, match=r"cannot receive at vmc://192\.0\.2\.1 .*one of this machine's addresses"
+    ):
+        WeightReceiver("vmc://192.0.2.1")
+
+
+@pytest.mark.parametrize("make", [lambda: b"", lambda: b"\0" * 60_000, lambda: b"#bundle\0" + b"\0" * 8])
+def test_packets_of_nobody_leave_the_receiver_alive(make: Callable[[], bytes]) -> None:
+    (good,) = LiveLinkPackets(ARKIT, 60.0)(WEIGHTS, None)
+    with WeightReceiver("livelink://127.0.0.1:0") as receiver:
+        assert len(played(receiver, [make(), good])) == 1
+        assert receiver.counts.malformed == 1

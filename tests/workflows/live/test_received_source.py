@@ -1,0 +1,229 @@
+"""A phone as the camera: its packets move a character, are recorded and sent on; what is lost is held, then relaxes."""
+
+from __future__ import annotations
+
+import json
+import math
+import socket
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from itertools import pairwise
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+from received_frames import decode_frame
+
+from torchface import BlendshapeRig, load_take, save_rig
+from torchface.capture.anybody import WebcamControls
+from torchface.cli import main
+from torchface.io.protocols.live_link_packets import LiveLinkPackets
+from torchface.io.protocols.live_link_recordings import recorded_packets
+from torchface.io.protocols.received_face import ReceivedFace
+from torchface.shape_names import ARKIT
+from torchface.workflows.live.live_anybody import LiveSettings, go_live
+from torchface.workflows.live.received_source import ReceivedSolver, ReceivedSource, ReceivedWatch
+from torchface.workflows.live.session_prompts import STEPS
+
+JAW = ARKIT.index("jawOpen")
+PICTURE = np.zeros((4, 4, 3), np.uint8)
+
+
+@pytest.fixture(scope="module")
+def dome(dome_rig: BlendshapeRig, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A small character by ARKit's names."""
+    path = tmp_path_factory.mktemp("character") / "dome.glb"
+    save_rig(dome_rig, path)
+    return path
+
+
+def free_port() -> int:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
+@contextmanager
+def phone(packets: list[bytes], port: int, said: list[str], fps: float = 120.0) -> Iterator[None]:
+    """Sends packets at a rate, beside what goes on, once the session has said that it listens."""
+
+    def send() -> None:
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
+            while not said:
+                time.sleep(0.01)
+            for packet in packets:
+                sender.sendto(packet, ("127.0.0.1", port))
+                time.sleep(1 / fps)
+
+    thread = threading.Thread(target=send)
+    thread.start()
+    yield
+    thread.join()
+
+
+@pytest.mark.real
+def test_an_iphones_packets_move_a_character_and_are_recorded_and_sent_on(
+    dome: Path, tmp_path: Path, data: Path
+) -> None:
+    packets = list(recorded_packets(data / "protocols" / "live_link_debug-jawopen.gesichter"))
+    port, said = free_port(), list[str]()
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as engine, phone(packets, port, said):
+        engine.bind(("127.0.0.1", 0))
+        engine.settimeout(5)
+        to = (f"livelink://127.0.0.1:{engine.getsockname()[1]}",)
+        settings = LiveSettings(
+            f"livelink://127.0.0.1:{port}", dome, None, to, tmp_path / "out", page=False, seconds=2.5
+        )
+        report, (saved,) = go_live(settings, said.append, print, lambda progress: pytest.fail("no solver is needed"))
+        sent = torch.stack([decode_frame(engine.recv(2048)).weights for _ in range(report.figures.frames)])
+    assert saved.error == ""
+    assert report.figures.found >= len(packets)
+    # From -1 to 1 in the file: below 0 the mouth is shut.
+    assert float(sent[:, JAW].max()) > 0.9
+    assert float(sent[:, [i for i in range(52) if i != JAW]].max()) == 0
+    kept = load_take(tmp_path / "out" / "weights.csv").weights
+    assert kept is not None
+    torch.testing.assert_close(kept.select(["jawOpen"]).values[:, 0, 0], sent[:, JAW])
+    assert json.loads((tmp_path / "out" / "summary.json").read_text())["source"] == f"livelink {port}"
+    assert said[0].startswith(f"Waiting for a face at port {port}: have the app send to ")
+    assert any(words.startswith("Receiving from LLV Default Device 127.0.0.1") for words in said)
+    assert "ms from frame to packet" in report.lines()[1]
+
+
+def a_source() -> ReceivedSource:
+    """A source that a test sets."""
+    return SimpleNamespace(face=None, fresh=False)  # type: ignore[return-value]
+
+
+def test_what_is_lost_is_held_then_relaxes_to_rest() -> None:
+    source = a_source()
+    solver = ReceivedSolver(source, print)
+    weights = torch.zeros(52)
+    weights[JAW] = 0.9
+    angles = torch.tensor([0.3, 0.1, -0.2, 0.1, 0.05, 0.0, 0.15, 0.05, 0.0])
+    first = solver.step(PICTURE, None, WebcamControls())
+    assert not first.seen
+    assert bool(torch.isnan(first.rotation).all())
+    source.face, source.fresh = ReceivedFace(weights, angles), True
+    for _ in range(3):
+        frame = solver.step(PICTURE, 1 / 60, WebcamControls(smoothing=0.0))
+    assert frame.seen
+    assert frame.weights[JAW].item() == pytest.approx(0.9)
+    torch.testing.assert_close(frame.rotations.float(), angles, atol=1e-6, rtol=0)
+    source.fresh = False
+    held = [solver.step(PICTURE, 1 / 30, WebcamControls()) for _ in range(15)]
+    assert {round(frame.weights[JAW].item(), 6) for frame in held} == {0.9}
+    relaxed = [solver.step(PICTURE, 1 / 30, WebcamControls()) for _ in range(60)]
+    jaw = [frame.weights[JAW].item() for frame in relaxed]
+    assert all(later < sooner for sooner, later in pairwise(jaw))
+    assert jaw[12] == pytest.approx(0.9 * math.exp(-13 / 30 / 0.4), rel=0.02)
+    assert jaw[-1] < 0.01
+    assert float(relaxed[-1].rotations.abs().max()) < 0.01
+    assert not relaxed[-1].seen
+    source.fresh = True  # it comes back
+    assert solver.step(PICTURE, 1 / 60, WebcamControls()).weights[JAW] > 0.5
+    source.face = ReceivedFace(torch.zeros(52), found=False)  # the app sees no face: held as if nothing came
+    assert solver.step(PICTURE, 1 / 60, WebcamControls()).weights[JAW] > 0.5
+
+
+def test_smoothing_calms_what_trembles_and_follows_what_moves() -> None:
+    generator = torch.Generator().manual_seed(1)
+    rough: dict[float, float] = {}
+    for smoothing in (0.0, 0.5, 1.0):
+        source, values = a_source(), []
+        source.fresh = True
+        solver = ReceivedSolver(source, print)
+        for i in range(240):
+            weights = torch.full((52,), 0.0 if i < 180 else 0.8) + 0.02 * torch.randn(52, generator=generator)
+            source.face = ReceivedFace(weights)
+            values.append(solver.step(PICTURE, 1 / 60, WebcamControls(smoothing=smoothing, freeze=True)).weights[JAW])
+        rough[smoothing] = float(torch.stack(values[60:180]).std())
+        assert values[183] > 0.6  # within 50 ms of a jump
+    assert rough[1.0] < rough[0.5] < rough[0.0]
+    assert rough[0.5] < 0.6 * rough[0.0]
+
+
+def test_a_guided_calibration_says_which_poses_were_not_held() -> None:
+    source, said = a_source(), list[str]()
+    source.face, source.fresh = ReceivedFace(torch.zeros(52)), True
+    solver = ReceivedSolver(source, said.append)
+    for pose in (1, 2, 3, 4, 5, 0):
+        for _ in range(60):
+            solver.step(PICTURE, 1 / 60, WebcamControls(pose))
+    assert said == [f"calibration: not held: {words}; its shapes keep their gain" for words in STEPS[1:]]
+    assert solver.step(PICTURE, 1 / 60, WebcamControls(reset=True)).calibrated < 0.1
+
+
+def test_the_status_line_says_who_sends_what_is_lost_and_that_it_ended() -> None:
+    packets, said = LiveLinkPackets(ARKIT, 60.0, "iPhone"), list[str]()
+    source = ReceivedSource("livelink://127.0.0.1:0")
+    try:
+        watch, frames = ReceivedWatch(source, said.append), source.frames()
+
+        def shown(packet: bytes | None) -> str:
+            if packet is not None:
+                with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
+                    sender.sendto(packet, ("127.0.0.1", source.receiver.port))
+            came, picture = next(frames)
+            watch.look(picture, True, came)
+            return watch.words
+
+        assert shown(None).startswith("Waiting for a face at port")
+        whole = [packets(torch.zeros(52), None)[0] for _ in range(6)]
+        assert "1 not understood (found version 9" in shown(b"\x09" + whole[0][1:])
+        assert shown(whole[0]).startswith("Receiving from iPhone 127.0.0.1")
+        shown(whole[1])
+        assert "2 lost" in shown(whole[4])
+        source.heard -= 3.0
+        assert "the last expression is held, then relaxes (3 s)" in shown(None)
+        assert "sees no face" in shown(whole[5][: -61 * 4 - 1])
+    finally:
+        source.close()
+    assert len(said) == len(set(said)) == 5
+
+
+def test_only_the_newest_of_several_faces_is_given_unless_every_one_is_recorded() -> None:
+    packets = LiveLinkPackets(ARKIT, 60.0)
+    for every, expected in ((False, [0.5]), (True, [0.1, 0.2, 0.3, 0.4, 0.5])):
+        source = ReceivedSource("livelink://127.0.0.1:0", every)
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
+            for i in range(1, 6):
+                sender.sendto(packets(torch.full((52,), i / 10), None)[0], ("127.0.0.1", source.receiver.port))
+        frames, found = source.frames(), []
+        for _ in expected:
+            next(frames)
+            assert source.face is not None
+            found.append(round(source.face.weights[0].item(), 3))
+        source.close()
+        assert found == expected
+        assert source.dropped == 5 - len(expected)
+
+
+@pytest.mark.parametrize(
+    ("camera", "told"),
+    [
+        ("midi://:5", "expected what receives a face: livelink://:11111"),
+        ("livelink://no-such-host.invalid:1", "whose host is not known"),
+        ("vmc://192.0.2.1", "expected one of this machine's addresses"),
+    ],
+)
+def test_the_command_says_what_is_wrong_with_an_address(
+    camera: str, told: str, dome: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit) as ended:
+        main(["live", camera, "--no-page", "--character", str(dome), "--seconds", "1"])
+    assert ended.value.code == 2
+    assert told in " ".join(capsys.readouterr().err.split())
+
+
+def test_a_port_that_another_program_has_is_said(dome: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
+        other.bind(("127.0.0.1", 0))
+        port = other.getsockname()[1]
+        with pytest.raises(SystemExit):
+            main(["live", f"vmc://127.0.0.1:{port}", "--no-page", "--character", str(dome), "--seconds", "1"])
+    assert f"another program has port {port}" in " ".join(capsys.readouterr().err.split())

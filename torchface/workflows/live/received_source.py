@@ -1,0 +1,188 @@
+"""A phone or another program as a camera: the faces that it sends, and what is made of each."""
+
+from __future__ import annotations
+
+import math
+import socket
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchface.capture.anybody import WebcamControls
+from torchface.capture.curve_calibration import CurveCalibration
+from torchface.io.protocols.received_face import ReceivedFace
+from torchface.io.protocols.weight_receiver import WeightReceiver
+from torchface.io.video import VideoFile
+from torchface.shape_names import ARKIT
+from torchface.temporal.one_euro import OneEuroSettings, one_euro_step
+from torchface.workflows.live.live_frames import LiveFrame, Say
+from torchface.workflows.live.session_prompts import STEPS
+
+_FPS = 60.0  # of phones, where times do not say
+_SIZE = (480, 360)
+_SILENT, _TICK, _WAIT = 0.1, 1 / 30, 0.2  # seconds without a packet: until the first tick, between ticks, at rest
+_HOLD, _RELAX, _RESTS = 0.5, 0.4, 4.0  # seconds: the last face is held, falls to 1/e, is at rest
+_NO_ROUTE = "192.0.2.1"  # an address for documentation: nothing is sent to it
+_CUTOFF, _SPREAD, _SPEED = 9.0, 9.0, 10.0  # Hz without smoothing, by how much less with all, and for each unit a second
+
+
+class ReceivedSource:
+    """Faces as a source of frames; while none come, ticks go on so that the last one can relax.
+
+    Args:
+        address: see :class:`torchface.io.protocols.weight_receiver.WeightReceiver`.
+        every: give each face, as for a recording; else of those that wait the newest.
+    """
+
+    def __init__(self, address: str, every: bool = False) -> None:
+        self.receiver = WeightReceiver(address)
+        self.video = VideoFile(Path(f"{self.receiver.scheme} {self.receiver.port}"), _FPS, *_SIZE, 1)
+        self.dropped, self._every = 0, every
+        self.face: ReceivedFace | None = None
+        self.fresh, self.heard = False, float("-inf")
+        self._picture = np.full((_SIZE[1], _SIZE[0], 3), 60, np.uint8)
+
+    def frames(self) -> Iterator[tuple[float, np.ndarray]]:
+        """When each face came, and a picture without anything; ``face`` is the face."""
+        wait = _WAIT
+        while True:
+            faces = self.receiver.faces(wait)
+            if not self._every and len(faces) > 1:
+                self.dropped += len(faces) - 1
+                faces = faces[-1:]
+            for came, face in faces:
+                self.face, self.fresh, self.heard = face, True, came
+                yield came, self._picture
+                wait = _SILENT
+            if not faces:
+                now = time.perf_counter()
+                self.fresh = False
+                wait = _TICK if now - self.heard < _RESTS else _WAIT
+                yield now, self._picture
+
+    def close(self) -> None:
+        """Gives the port back."""
+        self.receiver.close()
+
+
+class ReceivedSolver:
+    """What a received face is for the session: corrected for the person, smoothed, held and relaxed while it is lost.
+
+    Args:
+        source: of the faces.
+        say: called with guided poses that were not held.
+    """
+
+    names = ARKIT
+
+    def __init__(self, source: ReceivedSource, say: Say) -> None:
+        self._source, self._say = source, say
+        self._calibration = CurveCalibration()
+        self._state: tuple[Tensor, Tensor] | None = None
+        self._pose = 0
+        self._lost = 0.0
+
+    def step(self, picture: np.ndarray, interval: float | None, controls: WebcamControls) -> LiveFrame:
+        """The next frame; see :class:`torchface.workflows.live.live_frames.FaceSolver`."""
+        face, between = self._source.face, interval or 1 / _FPS
+        if controls.reset:
+            self._calibration, self._pose = CurveCalibration(), 0
+        if self._source.fresh and face is not None and face.found:
+            self._lost = 0.0
+            if not controls.freeze:
+                self._calibration.add(face.weights, controls.pose, between)
+            corrected = self._calibration.correction(face.weights)
+            values = self._smoothed(torch.cat([corrected, face.rotations]), between, controls.smoothing)
+        else:
+            self._lost += between
+            values = torch.zeros(len(ARKIT) + 9) if self._state is None else self._state[0]
+            if self._lost > _HOLD:
+                values = values * math.exp(-between / _RELAX)
+                self._state = values, torch.zeros_like(values)
+        if self._pose == len(STEPS) and controls.pose == 0:
+            for missed in self._calibration.missed:
+                self._say(f"calibration: not held: {STEPS[missed - 1]}; its shapes keep their gain")
+        self._pose = controls.pose
+        weights, rotations = (controls.gain * values[: len(ARKIT)]).clamp(0, 1), values[len(ARKIT) :]
+        ever = self._state is not None
+        return LiveFrame(
+            weights,
+            rotation_of_angles(rotations[:3]) if ever else torch.full((3, 3), torch.nan),
+            torch.full((68, 2), torch.nan),
+            # To the person's left and up, the right eye first; yaw is to the right, pitch down.
+            gaze=-torch.stack([rotations[6:8], rotations[3:5]]),
+            calibrated=self._calibration.learned,
+            found=ever and self._lost <= _HOLD,
+        )
+
+    def _smoothed(self, values: Tensor, interval: float, smoothing: float) -> Tensor:
+        if self._state is None or smoothing == 0:
+            self._state = values, torch.zeros_like(values)
+            return values
+        settings = OneEuroSettings(_CUTOFF * _SPREAD**-smoothing, _SPEED, _CUTOFF)
+        self._state = one_euro_step(values, *self._state, interval, settings)
+        return self._state[0]
+
+
+def rotation_of_angles(angles: Tensor) -> Tensor:
+    """The rotation (3,3) from the rig to a camera that looks at it, of Live Link Face's yaw, pitch and roll (3,)."""
+    (sy, sx, sz), (cy, cx, cz) = angles.sin().tolist(), angles.cos().tolist()
+    rows = [
+        [cy * cz + sy * sx * sz, sy * sx * cz - cy * sz, sy * cx],
+        [cx * sz, cx * cz, -sx],
+        [cy * sx * sz - sy * cz, cy * sx * cz + sy * sz, cy * cx],
+    ]
+    return torch.tensor([1.0, -1.0, -1.0])[:, None] * torch.tensor(rows)
+
+
+class ReceivedWatch:
+    """Words about the sender, for the status line; each change is said.
+
+    Args:
+        source: of the faces.
+        say: called with a change.
+    """
+
+    def __init__(self, source: ReceivedSource, say: Say) -> None:
+        self._source, self._say = source, say
+        self._state = ""
+        self.words = self._waiting()
+        say(self.words)
+
+    def look(self, picture: np.ndarray, seen: bool, now: float) -> None:
+        """Updates ``words`` after a frame."""
+        source, counts = self._source, self._source.receiver.counts
+        if source.face is None:
+            state, words = counts.fault, self._waiting()
+        elif source.fresh and not source.face.found:
+            state = words = f"{source.receiver.sender}: connected, but sees no face: the last expression is held"
+        elif source.fresh or now - source.heard < _HOLD:
+            state = words = f"Receiving from {source.receiver.sender}"
+        else:
+            state = f"Nothing from {source.receiver.sender}: the last expression is held, then relaxes"
+            words = f"{state} ({now - source.heard:.0f} s)"
+        wrong = counts.words()
+        self.words = f"{words} · {wrong}" if wrong else words
+        if state != self._state:
+            self._state = state
+            self._say(self.words)
+
+    def _waiting(self) -> str:
+        receiver = self._source.receiver
+        if receiver.address.startswith("ifacialmocap://") and receiver.asks:
+            return f"Waiting for a face: {receiver.address} is asked to send; open iFacialMocap there"
+        return f"Waiting for a face at port {receiver.port}: have the app send to {own_address()}"
+
+
+def own_address() -> str:
+    """This machine's address in its network; its name where it has none."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        try:
+            probe.connect((_NO_ROUTE, 9))
+            return str(probe.getsockname()[0])
+        except OSError:
+            return socket.gethostname()
