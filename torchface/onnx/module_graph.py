@@ -89,6 +89,8 @@ def export_shape_prior(prior: ShapePrior, path: str | Path, facts: Mapping[str, 
 class _LogDensity(nn.Module):
     """The log density of a shape prior; what does not depend on the weights is computed here, for ONNX has no gamma."""
 
+    peak: Tensor
+
     def __init__(self, prior: ShapePrior) -> None:
         super().__init__()
         self.prior = prior
