@@ -87,7 +87,8 @@ def solve(
         table: What action units mean in the rig's shapes, TOML; built in for ARKit's and ICT-FaceKit's names.
         report: A folder for a page: the face playing, the error of each marker, what was wrong, every curve.
         stream: Then send the solved frames in their own time: as Live Link Face does to udp://127.0.0.1:11111 for
-            Unreal on this machine, by the VMC protocol to vmc://HOST:PORT, or plain to osc://HOST:PORT/PREFIX.
+            Unreal on this machine, by the VMC protocol to vmc://HOST:PORT, or to any other address that
+            `torchface live --to` takes.
         sparsity: Pull of each weight toward zero, square millimetres; the default suits 0.3 mm noise.
         ridge: Quadratic pull of each weight toward zero, square millimetres.
         part: Keep this region of the rig only, such as face.

@@ -89,7 +89,7 @@ class WeightReceiver:
                 break
             except ConnectionError:  # the phone does not listen yet: the system reports what was asked before
                 continue
-            now = time.perf_counter()
+            now, host = time.perf_counter(), host.removeprefix("::ffff:")  # what IPv6 makes of IPv4
             found += [(now, face) for face in self._faces(packet, host, now)]
         return found
 
