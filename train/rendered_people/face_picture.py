@@ -15,6 +15,7 @@ from torchface.landmarks.images.ibug_68 import box_around
 from .backdrops import uniform
 from .expressions import draw_expression, people_expression
 from .head_kind import HeadKind
+from .lashes import with_lashes
 from .people import Person, closed_lids, draw_person
 from .picture_geometry import annotated, surface
 from .rendered_person import render_person, visible_points
@@ -84,12 +85,14 @@ def _photograph(person: Person, generator: torch.Generator) -> FacePicture:
     pixels = camera.project(posed.double())
     landmarks = annotated(kind, pixels, looks).float()
     shown = render_person(person, scene, camera, generator)
-    image, points = shown.image, pixels[kind.dense].float()
-    visible = visible_points(shown.distance, camera, posed[kind.landmarks].double(), landmarks, _BEHIND)
+    marks, points = posed[kind.landmarks].double(), pixels[kind.dense].float()
+    dark = looks.lashes or looks.liner > 0.3
+    image = with_lashes(shown.image, shown.distance, camera, marks, (0.3 * looks.hair).clamp(max=0.14), dark, generator)
+    visible = visible_points(shown.distance, camera, marks, landmarks, _BEHIND)
     behind = torch.full((len(points),), _POINT_BEHIND)
     point_visible = visible_points(shown.distance, camera, posed[kind.dense].double(), points, behind)
     if looks.glasses is not None:
-        image, hidden = with_glasses(image, camera, posed[kind.landmarks].double(), looks.glasses, generator)
+        image, hidden = with_glasses(image, camera, marks, looks.glasses, generator)
         visible &= ~hidden
     stored = (255 * image.clamp(0, 1)).round().to(torch.uint8).permute(2, 0, 1).contiguous()
     return FacePicture(stored, landmarks, visible, points, point_visible, weights, 0)

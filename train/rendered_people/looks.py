@@ -27,7 +27,8 @@ class Looks:
         skin, lips, hair, iris, clothes: colours.
         redness, freckles, shadows, wrinkles: of the skin.
         gloss: how much light the skin mirrors.
-        brow: share of hair in the brows, their thickness beside the usual, and millimetres that they lie higher.
+        brow: share of hair in the brows, their thickness and their arch beside the usual, and millimetres that they
+            lie higher.
         beard, moustache, stubble: shares of hair.
         liner, shadow: of make-up round the eyes; ``shadow_color`` its colour.
         lashes: dark lashes, or none that show.
@@ -48,7 +49,7 @@ class Looks:
     shadows: float
     wrinkles: float
     gloss: float
-    brow: tuple[float, float, float]
+    brow: tuple[float, float, float, float]
     beard: float
     moustache: float
     stubble: float
@@ -83,7 +84,8 @@ def draw_looks(generator: torch.Generator) -> Looks:
     hair = _HAIR[choices[int(between(0, len(choices) - 1e-3))]] * between(0.75, 1.25)
     iris = _IRIS[int(between(0, 2))] if dark_skin else _IRIS[int(between(0, len(_IRIS) - 1e-3))]
     made_up = chance(0.3)
-    lips = skin * torch.tensor([0.86, 0.66, 0.68]) * between(0.85, 1.1)
+    # Many lips hardly differ from the skin about them.
+    lips = skin * torch.lerp(torch.ones(3), torch.tensor([0.86, 0.66, 0.68]), between(0.15, 1)) * between(0.85, 1.08)
     if made_up and chance(0.7):
         red = torch.tensor([between(0.35, 0.85), between(0.05, 0.3), between(0.1, 0.4)])
         lips = torch.lerp(lips, red, between(0.3, 0.95))
@@ -104,7 +106,7 @@ def draw_looks(generator: torch.Generator) -> Looks:
         skin.clamp(0.03, 0.97), lips.clamp(0.02, 0.95), hair.clamp(0.01, 0.95), iris, color(),
         between(0, 1), between(0.3, 1) if chance(0.2) else 0.0, between(0, 1), between(0, 1) ** 2,
         between(0.01, 0.16) if chance(0.8) else between(0.16, 0.4),
-        (between(0.25, 1.0) if chance(0.9) else 0.08, between(0.5, 1.5), between(-3.5, 2.5)),
+        (between(0.2, 1.0) if chance(0.88) else 0.08, between(0.45, 1.7), between(0.2, 1.4), between(-3.5, 2.5)),
         between(0.3, 1.0) if bearded and chance(0.5) else 0.0,
         between(0.3, 1.0) if bearded and chance(0.6) else 0.0,
         between(0.1, 0.6) if bearded else 0.0,

@@ -12,9 +12,10 @@ from torchface.geometry.cameras.pinhole import Camera
 from torchface.geometry.meshes.operators import vertex_normals
 from torchface.rendering.gaussian_blur import gaussian_blur
 from torchface.rendering.raycast import RayCaster
+from torchface.synthetic.head.identity import ramp
 
 from .backdrops import uniform
-from .head_kind import EYEBALL, GUMS, SKIN, TEETH
+from .head_kind import EYEBALL, GUMS, SKIN, SOCKET, TEETH
 from .people import Person
 from .picture_geometry import CURTAIN, Surface
 from .skin_paint import hair_color, surface_color
@@ -111,7 +112,7 @@ def _surface_color(
     values = (table[rows] * weights[..., None]).sum(1)
     canonical, marks, hair = values[:, :3], values[:, 3:11], values[:, 11]
     skin = surface_color(canonical, marks, material[made], looks, kind.brow_lift)
-    hair = torch.where(material[made] == SKIN, hair, 0.0)
+    hair = torch.where(material[made] == SKIN, ramp(hair, 0.05, 0.5), 0.0)  # skin under it does not show
     skin = torch.lerp(skin, hair_color(canonical, looks), (0.98 * hair)[:, None])
     color[made] = skin
     shine = torch.full((len(skin),), looks.gloss) * (1 - hair) + 0.06 * hair
@@ -155,15 +156,12 @@ class _SeenSurface:
 
 
 def _lit(caster: RayCaster, camera: Camera, seen: _SeenSurface, generator: torch.Generator) -> Tensor:
-    """Linear light (R,3) under coloured lamps from anywhere in front, above or beside, and a sky."""
+    """Linear light (R,3) under coloured lamps from anywhere in front, above or beside, and in a room."""
     points, normals, ways, gloss = seen.points, seen.normals, seen.ways, seen.gloss
     right, down, _ = camera.rotation.double()
     toward_camera = -camera.rotation[2].double()
     starts = points + 0.3 * normals
-    sky = torch.nn.functional.normalize(torch.randn(3, generator=generator).double() - 0.8 * down, dim=0)
-    even = uniform(0.15, 1.0, generator) * (1 + uniform(0, 0.9, generator) * (normals @ sky))
-    even = even * seen.free
-    light = even[:, None].float() * _tint(generator, 0.12)
+    light = _room_light(normals, down, generator) * seen.free[:, None].float()
     mirrored = torch.zeros(len(points), 3)
     sharp = torch.where((seen.material == EYEBALL), 220.0, uniform(8, 45, generator)).double()
     for number in range(int(uniform(0.5, 3.6, generator))):
@@ -181,8 +179,21 @@ def _lit(caster: RayCaster, camera: Camera, seen: _SeenSurface, generator: torch
         half = torch.nn.functional.normalize(toward - ways, dim=-1)
         shine = (normals * half).sum(-1).clamp(min=0) ** sharp * (falls > 0)
         mirrored = mirrored + strength * shine[:, None].float() * tint
-    # Blood under the skin softens and reddens where light ends.
-    return seen.albedo.float() * light + gloss[:, None] * mirrored * 0.6
+    # Lips keep most light from what is behind them, a lamp's too.
+    behind = (seen.material == TEETH) | (seen.material == GUMS) | (seen.material == SOCKET)
+    reached = torch.where(behind, seen.free.clamp(0, 1), 1.0).float()[:, None]
+    return (seen.albedo.float() * light + gloss[:, None] * mirrored * 0.6) * reached
+
+
+def _room_light(normals: Tensor, down: Tensor, generator: torch.Generator) -> Tensor:
+    """Light (R,3) of broad coloured areas: a sky or a ceiling, and walls or windows or screens beside."""
+    light = torch.full((len(normals), 3), uniform(0.08, 0.6, generator))
+    for number in range(int(uniform(1, 4, generator))):
+        way = torch.randn(3, generator=generator).double() - (1.2 if number == 0 else 0.2) * down
+        facing = 0.5 + 0.5 * (normals @ torch.nn.functional.normalize(way, dim=0))
+        falls = facing ** uniform(1, 3, generator)
+        light = light + uniform(0.05, 0.8, generator) * falls[:, None].float() * _tint(generator, 0.15)
+    return light * _tint(generator, 0.08)
 
 
 def _tint(generator: torch.Generator, spread: float) -> Tensor:

@@ -13,7 +13,7 @@ from .head_kind import EYEBALL, GUMS, TEETH
 from .looks import Looks
 
 _GUMS = (0.62, 0.33, 0.32)
-_LOWER_ENDS = 3.5  # millimetres
+_LOWER_ENDS, _BROW_HEIGHT = 3.5, 20.0  # millimetres
 _DEEP = (0.10, 0.035, 0.035)
 
 
@@ -49,14 +49,16 @@ def hair_color(points: Tensor, looks: Looks) -> Tensor:
 
 def brow_edge_height(x: Tensor, looks: Looks, brow_lift: float) -> Tensor:
     """How high the brows' upper edge lies on the mean head at distances from its middle (N,), millimetres."""
-    middle, half = _brow_line(x)
-    return middle + 0.5 * half * looks.brow[1] + looks.brow[2] + brow_lift
+    middle, half = _brow_line(x, looks)
+    return middle + 0.5 * half * looks.brow[1] + brow_lift
 
 
-def _brow_line(x: Tensor) -> tuple[Tensor, Tensor]:
-    """The performer's brows with lower ends, as photographed people have them."""
+def _brow_line(x: Tensor, looks: Looks) -> tuple[Tensor, Tensor]:
+    """Someone's brows: the performer's with lower ends, as photographed people have them, more or less arched."""
     middle, half = brow_line(x)
-    return middle - _LOWER_ENDS * ((x - 29.5) / 20.5).square().clamp(max=1.3), half
+    _, _, arch, shift = looks.brow
+    middle = _BROW_HEIGHT + arch * (middle - _BROW_HEIGHT) - _LOWER_ENDS * ((x - 29.5) / 20.5).square().clamp(max=1.3)
+    return middle + shift, half
 
 
 def _skin(p: Tensor, marks: Tensor, looks: Looks, brow_lift: float) -> Tensor:
@@ -107,10 +109,10 @@ def _lines(p: Tensor, color: Tensor, looks: Looks) -> Tensor:
 
 
 def _brows(p: Tensor, color: Tensor, looks: Looks, brow_lift: float) -> Tensor:
-    density, thickness, shift = looks.brow
-    x, y = p[:, 0].abs(), p[:, 1] - shift - brow_lift
+    density, thickness, *_ = looks.brow
+    x, y = p[:, 0].abs(), p[:, 1] - brow_lift
     along = (x - 9.0) / 41.0
-    middle, half = _brow_line(x)
+    middle, half = _brow_line(x, looks)
     inside = 1 - ramp((y - middle).abs() / (half * thickness), 0.55, 1.15)
     ends = ramp(along, -0.05, 0.08) * (1 - ramp(along, 0.9, 1.04))
     lean = 0.9 - 0.6 * along.clamp(0, 1)
