@@ -294,17 +294,37 @@ def _photographed(images: Tensor, settings: AugmentationSettings, generator: tor
     images = (images + noise).clamp(0, 1)
     small = (rand(count) < 0.3).nonzero()[:, 0].tolist()
     coded = (rand(count) < 0.45).nonzero()[:, 0].tolist()
-    share, quality = 0.3 + 0.55 * rand(count), (25 + 65 * rand(count)).long()
+    share, quality = 0.3 + 0.55 * rand(count), (20 + 70 * rand(count)).long()
+    dim, smooth, sharp = (torch.nonzero(rand(count) < part)[:, 0].tolist() for part in (0.2, 0.15, 0.2))
+    strength = rand(count, 3).tolist()
     stored = (255 * images).round().byte().permute(0, 2, 3, 1).contiguous().numpy()
-    for number in {*small, *coded}:  # codecs take an image at a time
+    for number in {*small, *coded, *dim, *smooth, *sharp}:  # cameras and codecs take an image at a time
         picture = stored[number]
         if number in small:
             side = max(16, int(size * float(share[number])))
             picture = cv2.resize(picture, (side, side), interpolation=cv2.INTER_AREA)
+        if number in dim:
+            picture = _grained(picture, 6 + 24 * strength[number][0] ** 2, generator)
+        if number in smooth:  # a camera that takes the grain away, and the skin's with it
+            picture = cv2.bilateralFilter(picture, 5, 15 + 45 * strength[number][1], 2.0)
+        if number in sharp:  # and one that draws bright seams along edges
+            soft = cv2.GaussianBlur(picture, (0, 0), 0.8 + 0.8 * strength[number][2])
+            picture = cv2.addWeighted(picture, 1.4 + strength[number][2], soft, -0.4 - strength[number][2], 0)
         if number in coded:
             code = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, int(quality[number])])[1]
             picture = cv2.imdecode(code, cv2.IMREAD_COLOR)
         if number in small:
-            picture = cv2.resize(picture, (size, size), interpolation=cv2.INTER_LINEAR)
+            way = cv2.INTER_CUBIC if strength[number][0] < 0.3 else cv2.INTER_LINEAR
+            picture = cv2.resize(picture, (size, size), interpolation=way)
         stored[number] = picture
     return torch.from_numpy(stored).permute(0, 3, 1, 2).float() / 255
+
+
+def _grained(picture: np.ndarray, deviation: float, generator: torch.Generator) -> np.ndarray:
+    """A picture uint8 (S,S,3) of a dim room: grain in spots of more than a pixel, of colours more than of lightness."""
+    side = len(picture)
+    grain = torch.randn(side, side, 3, generator=generator).numpy()
+    grain = 1.2 * grain + 0.8 * grain.mean(2, keepdims=True)
+    spots = cv2.GaussianBlur(grain, (0, 0), 0.7)
+    light = np.sqrt(0.15 + picture.astype(np.float32) / 255)
+    return np.clip(picture + deviation * light * spots, 0, 255).astype(np.uint8)
