@@ -33,6 +33,7 @@ def dense_vertices() -> tuple[Tensor, Tensor]:
     """
     mean, notes = mean_vertices(), head_annotations()
     assert notes.landmarks is not None
+    assert notes.mirror is not None
     regions, marks = notes.regions, mean[notes.landmarks]
     normals = vertex_normals(mean, performer(texture=False).neutral.faces)
     skin = ~torch.stack([regions[name] for name in _PARTS]).any(0) & (normals[:, 2] > _FRONTAL)
@@ -58,8 +59,7 @@ def dense_vertices() -> tuple[Tensor, Tensor]:
             nearest = torch.minimum(nearest, (points - points[current]).norm(dim=1))
         current = int((nearest / spacing).argmax())
     right = own[torch.tensor(chosen)]
-    tree = KDTree(mean[rows].numpy())
-    left = rows[torch.from_numpy(tree.query((mean[right] * torch.tensor([-1.0, 1, 1])).numpy())[1])]
+    left = notes.mirror[right]
     vertices: list[int] = []
     mirror: list[int] = []
     for one, other in zip(right.tolist(), left.tolist(), strict=True):
