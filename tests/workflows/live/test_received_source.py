@@ -23,6 +23,7 @@ from torchface.capture.anybody import WebcamControls
 from torchface.cli import main
 from torchface.io.protocols.live_link_packets import LiveLinkPackets
 from torchface.io.protocols.live_link_recordings import recorded_packets
+from torchface.io.protocols.osc_messages import osc_message
 from torchface.io.protocols.received_face import ReceivedFace
 from torchface.shape_names import ARKIT
 from torchface.workflows.live.live_anybody import LiveSettings, go_live
@@ -201,6 +202,18 @@ def test_only_the_newest_of_several_faces_is_given_unless_every_one_is_recorded(
         source.close()
         assert found == expected
         assert source.dropped == 5 - len(expected)
+
+
+def test_weights_that_come_one_by_one_are_one_frame_of_a_recording() -> None:
+    source = ReceivedSource("osc://127.0.0.1:0", every=True)
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
+        for i, name in enumerate(ARKIT):
+            sender.sendto(osc_message(f"/face/{name}", i / 64), ("127.0.0.1", source.receiver.port))
+    next(source.frames())
+    source.close()
+    assert source.face is not None
+    torch.testing.assert_close(source.face.weights, torch.arange(52) / 64)
+    assert source.dropped == 0
 
 
 @pytest.mark.parametrize(

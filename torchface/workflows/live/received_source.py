@@ -42,6 +42,7 @@ class ReceivedSource:
         self.receiver = WeightReceiver(address)
         self.video = VideoFile(Path(f"{self.receiver.scheme} {self.receiver.port}"), _FPS, *_SIZE, 1)
         self.dropped, self._every = 0, every
+        self._in_parts = self.receiver.scheme == "osc"  # where each weight may come in a packet of its own
         self.face: ReceivedFace | None = None
         self.fresh, self.heard = False, float("-inf")
         self._picture = np.full((_SIZE[1], _SIZE[0], 3), 60, np.uint8)
@@ -51,8 +52,8 @@ class ReceivedSource:
         wait = _WAIT
         while True:
             faces = self.receiver.faces(wait)
-            if not self._every and len(faces) > 1:
-                self.dropped += len(faces) - 1
+            if len(faces) > 1 and (not self._every or self._in_parts):
+                self.dropped += 0 if self._in_parts else len(faces) - 1
                 faces = faces[-1:]
             for came, face in faces:
                 self.face, self.fresh, self.heard = face, True, came
