@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -36,19 +37,27 @@ from torchface.workflows.track.track_video import track_video
 from train.rendered_people.people import Person
 from train.rendered_people.webcam_film import Film
 
-Method = Callable[[Film], tuple[Tensor, Tensor]]
+
+@dataclass(frozen=True)
+class Clip:
+    """A video without truth."""
+
+    path: Path
+
+
+Method = Callable[[Film | Clip], tuple[Tensor, Tensor]]
 """Gives weights (T,52) of a film, NaN where a face is lost or a shape not known, and iBUG's landmarks (T,68,2)."""
 
 
-def frames(film: Film) -> Iterator[Tensor]:
+def frames(film: Film | Clip) -> Iterator[Tensor]:
     """Pictures, uint8 (3,H,W)."""
-    return open_video(film.path).color_frames()
+    return replace(open_video(film.path), even=False).color_frames()
 
 
 def mediapipe(bundle: Path) -> Method:
     """MediaPipe's blendshapes, as they are."""
 
-    def run(film: Film) -> tuple[Tensor, Tensor]:
+    def run(film: Film | Clip) -> tuple[Tensor, Tensor]:
         tracker = MediaPipeTracker(bundle)
         faces = [tracker.mesh(frame) for frame in frames(film)]
         lost = torch.full((len(ARKIT),), torch.nan), torch.full((68, 2), torch.nan)
@@ -61,7 +70,7 @@ def mediapipe(bundle: Path) -> Method:
     return run
 
 
-def live(film: Film) -> tuple[Tensor, Tensor]:
+def live(film: Film | Clip) -> tuple[Tensor, Tensor]:
     """``torchface live`` with nobody to calibrate it."""
     solver = _live()
     weights, marks = [], []
@@ -78,10 +87,10 @@ def _live():
     return person_solver(silent)
 
 
-def track(rig: Callable[[Film], BlendshapeRig], **options: object) -> Method:
+def track(rig: Callable[[Film | Clip], BlendshapeRig], **options: object) -> Method:
     """``torchface track`` on a rig."""
 
-    def run(film: Film) -> tuple[Tensor, Tensor]:
+    def run(film: Film | Clip) -> tuple[Tensor, Tensor]:
         with TemporaryDirectory() as folder:
             path = Path(folder) / "rig.glb"
             save_rig(rig(film), path)
@@ -94,15 +103,16 @@ def track(rig: Callable[[Film], BlendshapeRig], **options: object) -> Method:
     return run
 
 
-def mean_head(film: Film) -> BlendshapeRig:
+def mean_head(film: Film | Clip) -> BlendshapeRig:
     """The embedded performer's mean head, whoever is filmed."""
     return performer(texture=False)
 
 
-def own_head(ict: Path) -> Callable[[Film], BlendshapeRig]:
+def own_head(ict: Path) -> Callable[[Film | Clip], BlendshapeRig]:
     """The rig of whom a film shows."""
 
-    def rig(film: Film) -> BlendshapeRig:
+    def rig(film: Film | Clip) -> BlendshapeRig:
+        assert isinstance(film, Film)
         return person_rig(film.person, ict)
 
     return rig
@@ -119,10 +129,10 @@ def person_rig(person: Person, ict: Path) -> BlendshapeRig:
     return rig.part(notes.regions["face"]) if "face" in notes.regions and len(rig.vertices) > 20_000 else rig
 
 
-def examples(reference: Callable[[Film], Tensor]) -> Method:
+def examples(reference: Callable[[Film | Clip], Tensor]) -> Method:
     """The dissertation's solver on 16 examples of the embedded performer, for landmarks that another method found."""
 
-    def run(film: Film) -> tuple[Tensor, Tensor]:
+    def run(film: Film | Clip) -> tuple[Tensor, Tensor]:
         shown = paper_examples(performer(texture=False))
         solver, onto = ExampleSolver(shown, AllAtOnce()), character_matrix(shown.names, ARKIT)
         landmarks, before, rows = reference(film), None, []

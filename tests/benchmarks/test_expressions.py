@@ -11,8 +11,10 @@ from pathlib import Path
 
 import pytest
 import torch
-from expression_methods import examples, live, mean_head, mediapipe, own_head, run_methods, track
+from coded_frames import ATTRIBUTES, agreement, coded
+from expression_methods import Clip, examples, live, mean_head, mediapipe, own_head, run_methods, track
 
+from torchface.shape_names import ARKIT
 from torchface.workflows.evaluate.expression_benchmark import NOTHING, ExpressionBenchmark, expression_benchmark
 from train.expression_films import Settings, render
 
@@ -53,3 +55,36 @@ def test_expressions(benchmark: ExpressionBenchmark) -> None:
     for name in ("live", "track", "track, own rig"):
         if name in benchmark.methods:
             assert benchmark.methods[name].error() < nothing
+
+
+def test_real_frames(data: Path) -> None:
+    """Frames that were coded by eye: eyes shut, lips apart, smile, brows up, by all methods through the same limits."""
+    pytest.importorskip("ai_edge_litert")
+    methods = {"mediapipe": mediapipe(data / "peers" / "face_landmarker.task"), "live": live, "track": track(mean_head)}
+    films = {
+        name: Clip(next(path for path in sorted((data / "video").rglob("*")) if path.stem == name)) for name in coded()
+    }
+    print("\nyes found of all, no found of all")
+    print(f"{'':16s}" + "".join(f"{words:>18s}" for words, _, _ in ATTRIBUTES.values()))
+    for name, method in methods.items():
+        counts = agreement({film: method(clip)[0] for film, clip in films.items()})
+        print(f"{name:16s}" + "".join(f"{f'{a}/{b}, {c}/{d}':>18s}" for a, b, c, d in counts.values()))
+        assert set(counts) == set(ATTRIBUTES)
+
+
+def test_coding_is_counted() -> None:
+    """Weights that are made of the coding agree with it everywhere; those at rest agree where the answer is no."""
+    made = {}
+    for film, parts in coded().items():
+        weights = made[film] = torch.zeros(120, len(ARKIT))
+        for name, rows in (("shut", ("eyeBlink",)), ("apart", ("mouthLowerDown", "mouthUpperUp", "jawOpen")),
+                           ("smile", ("mouthSmile",)), ("brows_up", ("browInnerUp", "browOuterUp"))):  # fmt: skip
+            columns = [row for row, shape in enumerate(ARKIT) if shape.startswith(rows)]
+            for frame, yes in parts.get(name, {}).items():
+                weights[frame, columns] = float(yes)
+    for a, b, c, d in agreement(made).values():
+        assert (a, c) == (b, d)
+        assert b > 2
+        assert d > 5
+    still = agreement({film: torch.zeros(120, len(ARKIT)) for film in made})
+    assert all((a, c) == (0, d) for a, _, c, d in still.values())
