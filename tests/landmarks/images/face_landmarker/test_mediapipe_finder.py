@@ -20,6 +20,7 @@ from torchface.landmarks.images.face_landmarker.mediapipe_finder import (
     MediaPipeTracker,
     MeshFace,
     lid_openness,
+    measured_expression,
 )
 from torchface.landmarks.images.face_mesh_478 import BLENDSHAPE_POINTS, MESH_POINTS, landmarks_of_mesh
 from torchface.landmarks.images.ibug_68 import turned_box
@@ -73,6 +74,19 @@ def test_weights_go_by_name() -> None:
     weights = FaceLandmarker(stand_in()).blendshapes(torch.zeros(MESH_POINTS, 2))
     assert weights[ARKIT.index("jawOpen")] == 0.25
     assert weights.isnan().nonzero().flatten().tolist() == [ARKIT.index("tongueOut")]
+
+
+def test_what_the_network_takes_off_is_given_back() -> None:
+    weights = torch.full((2, len(ARKIT)), 0.04)
+    weights[1, ARKIT.index("mouthSmileRight")] += 0.718  # the slope of a full smile
+    found, spread = measured_expression(weights)
+    torch.testing.assert_close(found[:, ARKIT.index("mouthSmileRight")], torch.tensor([0.0, 1.0]))
+    assert spread[ARKIT.index("mouthSmileLeft")] == spread[ARKIT.index("mouthSmileRight")] == 0.23
+    for name in ("mouthLeft", "jawOpen", "browInnerUp"):  # names without sides, or that are a side
+        assert spread[ARKIT.index(name)] < 1
+    for name in ("noseSneerLeft", "cheekPuff", "tongueOut"):
+        assert spread[ARKIT.index(name)] == torch.inf
+        assert found[:, ARKIT.index(name)].isnan().all()
 
 
 def test_no_face_is_an_answer() -> None:
