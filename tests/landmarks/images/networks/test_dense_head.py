@@ -174,7 +174,7 @@ def test_training_finds_points_and_weights_beside_the_68(faces: torch.Tensor) ->
     weights = torch.rand(4, 52, generator=torch.Generator().manual_seed(3))
     given = rgba, faces, torch.ones(4, 68, dtype=torch.bool), points, torch.ones(4, 4, dtype=torch.bool), weights
     settings = NetworkSettings(steps=20, batch=6, rate=2e-3, average=0.7, workers=0, heat=0.0, augmentation=PLAIN)
-    crops, shown = cropped(given, 112, 1.25, TWINS, torch.Generator().manual_seed(1), PLAIN)
+    crops, shown = cropped(given, network.size, network.margin, TWINS, torch.Generator().manual_seed(1), PLAIN)
 
     @torch.no_grad()
     def errors(network: LandmarkNetwork) -> list[float]:
