@@ -96,7 +96,7 @@ def eye_picture_files(
     Returns:
         The files, in order, of :data:`PART` pictures each.
     """
-    rendering = Rendering(_render, "eye pictures/2", "eyes", "eyes", PART)
+    rendering = Rendering(_render, "eye pictures/3", "eyes", "eyes", PART)
     return rendered_files(rendering, folder, count, seed, ict, workers, progress)
 
 

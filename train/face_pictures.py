@@ -115,7 +115,7 @@ def picture_files(
     Returns:
         The files, in order, of :data:`PART` pictures each.
     """
-    rendering = Rendering(_render, "face pictures/5", "pictures", "faces", PART)
+    rendering = Rendering(_render, "face pictures/6", "pictures", "faces", PART)
     return rendered_files(rendering, folder, count, seed, ict, workers, progress)
 
 

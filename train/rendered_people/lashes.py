@@ -39,7 +39,7 @@ def with_lashes(
     Returns:
         (H,W,4).
     """
-    strength = uniform(0.55, 1.0, generator) if dense else uniform(0.05, 0.6, generator)
+    strength = uniform(0.35, 0.9, generator) if dense else uniform(0.05, 0.5, generator)
     length = uniform(6.0, 10.0, generator) if dense else uniform(4.0, 7.5, generator)
     cover = np.zeros((_FINE * camera.height, _FINE * camera.width), np.uint8)
     for rim, up in _RIMS:

@@ -141,7 +141,7 @@ def _eye(p: Tensor, looks: Looks) -> Tensor:
     offset = torch.cat([p[:, :1].abs(), p[:, 1:]], dim=1) - torch.tensor(EYE_CENTRE)
     polar = torch.acos(torch.nn.functional.normalize(offset, dim=1)[:, 2].clamp(-1, 1))
     angle = torch.atan2(offset[:, 1], offset[:, 0])
-    white = 0.78 + 0.12 * ((looks.seed % 31) / 31)
+    white = 0.6 + 0.26 * ((looks.seed % 31) / 31)
     color = torch.tensor((white, 0.965 * white, 0.935 * white)).expand(len(p), 3).clone()
     color = mix(color, (0.74, 0.5, 0.46), 0.6 * ramp(polar, 0.7, 1.5))
     spokes = torch.stack([angle.cos() * 9, angle.sin() * 9, polar * 2.5], dim=1)
