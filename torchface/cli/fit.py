@@ -32,7 +32,7 @@ def fit(
     insist: bool = False,
     quiet: Quiet = False,
 ) -> None:
-    """Make a person's rig from one or several photographs, and write it as .glb.
+    """Make a person's rig from one or several photographs, or of a video, and write it as .glb.
 
     A head model is fitted to 68 landmarks in each photograph: one identity for all, expression and pose in each, and
     the focal length at once. Landmarks that no file gives are found; they are written as .pts beside OUT, to be looked
@@ -44,7 +44,7 @@ def fit(
     video is from the same.
 
     Args:
-        photographs: Image files.
+        photographs: Image files, or videos, of which sharp frames of several angles and expressions are chosen.
         landmarks: 68 landmarks in iBUG's order for each photograph: a .pts or .ljson file each, in the same order, or
             one .xml of dlib's (imglab) that names the photographs, or one .csv of a row a photograph, in their pixels
             once upright. Or what finds them: a model of the zoo by name or folder, an .onnx file, or MediaPipe's Face
@@ -87,7 +87,7 @@ def fit(
     settings = PhotographSettings(fitting, template, part, focal, face, landmark_model, names, prior, insist)
     with file_lock(out), progress_bars(quiet) as progress:
         made = fit_photographs(photographs, given, model, out, settings, progress)
-    for line in [*made.lines(photographs), *naming_lines(made.rig, names)]:
+    for line in [*made.lines(), *naming_lines(made.rig, names)]:
         console.print(line, highlight=False)
     marks = (overlay.with_suffix(".pts") for overlay in made.overlays[: len(made.found)])
     cameras = (overlay.with_suffix(".toml") for overlay in made.overlays)

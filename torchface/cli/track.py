@@ -26,7 +26,7 @@ _FILES = (*_TABLES, "animation.glb", "overlay.mp4")
 def track(
     video: Annotated[Positional[tuple[Path, ...]], arg(metavar="VIDEO...")] = (),
     *,
-    rig: Path,
+    rig: Path | None = None,
     out: Annotated[Path | None, Output(_FILES)] = None,
     landmarks: str = "landmark_network",
     appearance: str | None = None,
@@ -37,6 +37,8 @@ def track(
     texture: Path | None = None,
     face: int = 0,
     one_person: bool = False,
+    anybody: bool = False,
+    head_model: str | None = None,
     whole_take: bool = False,
     part: str | None = None,
     overlay: Literal["side", "over", "none"] = "side",
@@ -51,7 +53,10 @@ def track(
     time_limit: TimeLimit = None,
     quiet: Quiet = False,
 ) -> None:
-    """Track a face in a video and solve it for the weights of the actor's rig; no markers are needed.
+    """Track a face in a video and solve it for the weights of a rig; no markers are needed.
+
+    The rig is the actor's own (--rig). Without one the head of whoever is seen is solved with the take, and lies in OUT
+    as head.glb.
 
     Landmarks, the camera, then weights and where the head is. Writes into OUT: weights.csv by the rig's names,
     confidence.csv (how much of each shape was seen), live_link.csv for Unreal (head rotation included), landmarks.csv,
@@ -67,6 +72,7 @@ def track(
         video: A file: .avi, .mkv, .webm, .mp4, .mov or .gif, of one size; its frame rate may vary. Or several, or
             folders of them.
         rig: The actor's own rig, with 68 annotated landmarks: .glb, USD, or ICT-FaceKit's FaceXModel folder.
+            A head is solved if absent.
         out: Folder for everything; needed but with --live, where curves are kept only if it is given.
         landmarks: What finds the 68 landmarks: a model of the zoo by name or folder, an .onnx file, or MediaPipe's Face
             Landmarker bundle (.task); or a .csv that holds them, ours, OpenFace's, py-feat's or MediaPipe's mesh, then
@@ -80,6 +86,9 @@ def track(
         texture: An image to put on the face in the overlay, in the rig's texture coordinates, under the video's light.
         face: Which of several faces to follow, from 0, the largest first.
         one_person: All frames show the actor: solve those after a cut too in which the face looks like another's.
+        anybody: The rig is not the actor's: a head is solved with its shapes, and the head model's topology.
+        head_model: Which head model a head is solved with, by name or folder; if absent one of people in
+            $TORCHFACE_HOME or the checkout, else `head`, of performers made by code.
         whole_take: Smooth landmarks over all frames, those after each too; with --dynamics the weights as well.
         part: Keep this region of the rig only, such as face.
         overlay: overlay.mp4: the rig as opaque clay beside the picture, parts of low confidence tinted; half through
@@ -119,8 +128,12 @@ def track(
         offsets,
         one_person,
         checked_reduction(reduce),
+        anybody,
+        head_model,
     )
     if live is not None:
+        if rig is None:
+            raise ValueRangeError("track: found --live without a rig, expected --rig; for anybody: torchface live")
         _live(live, rig, stream, out, settings, seconds, quiet)
         return
     if out is None:
@@ -135,7 +148,7 @@ def track(
     _file(video[0] if video else None, rig, out, settings, quiet)
 
 
-def _file(video: Path | None, rig: Path, out: Path, settings: object, quiet: bool) -> None:
+def _file(video: Path | None, rig: Path | None, out: Path, settings: object, quiet: bool) -> None:
     from torchface.files.job_lock import job_lock
     from torchface.workflows.track.track_inputs import TrackSettings
     from torchface.workflows.track.track_page import write_track_page

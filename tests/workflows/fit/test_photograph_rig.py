@@ -26,9 +26,11 @@ from torchface.io import load_identity_modes
 from torchface.io.camera_files import load_calibration
 from torchface.io.images.image_files import load_image, save_image
 from torchface.io.landmarks.landmark_points import load_landmark_points
+from torchface.io.video import write_video
 from torchface.landmarks import FaceReading, NoFaceError, find_faces
 from torchface.modeling import FitSettings, HeadModel, ImageFit, MorphableModel, fit_images
 from torchface.rendering.clay_shading import render
+from torchface.rendering.gaussian_blur import gaussian_blur
 from torchface.rig import BlendshapeRig
 from torchface.synthetic import draw_identities, performer
 from torchface.synthetic.head.identity import anatomy
@@ -321,7 +323,7 @@ def test_given_landmarks_that_do_not_fit_are_said(people: People, tmp_path: Path
     assert len(made.remarks) == 1
     assert "takeo.ppm: the given landmarks do not fit well" in made.remarks[0]
     assert "those that landmark_network finds have" in made.remarks[0]
-    assert made.remarks[0] in made.lines([photograph])
+    assert made.remarks[0] in made.lines()
 
 
 def test_photographs_of_one_performer_are_one_person(studio: Path, tmp_path: Path) -> None:
@@ -334,6 +336,19 @@ def test_photographs_of_one_performer_are_one_person(studio: Path, tmp_path: Pat
         PhotographSettings(fit=FitSettings(texture_size=0)),
     )
     assert made.remarks == ()
+
+
+def test_frames_of_a_video_are_fitted(studio: Path, tmp_path: Path) -> None:
+    frames = [(load_image(studio / f"p{i}.png") * 255).round().to(torch.uint8) for i in (0, 0, 1, 1, 2, 2)]
+    frames[1] = (255 * gaussian_blur(frames[0].float()[None] / 255, 3.0)[0]).to(torch.uint8)
+    write_video(iter(frame[None] for frame in frames), tmp_path / "film.avi", 25.0)
+    settings = PhotographSettings(fit=FitSettings(texture_size=0))
+    made = fit_photographs([tmp_path / "film.avi"], [], studio / "heads_with_rig", tmp_path / "rig.glb", settings)
+    numbers = [int(path.name.removeprefix("film_")) for path in made.shown]
+    assert len(numbers) >= 2
+    assert 1 not in numbers  # it is blurred
+    assert all(f"film_{number:06d}: expression" in " ".join(made.lines()) for number in numbers)
+    assert load_rig(tmp_path / "rig.glb").names == tuple(SHAPES)
 
 
 def test_landmarks_counted_before_the_photograph_was_turned_are_refused() -> None:

@@ -55,7 +55,7 @@ class FitSettings:
             contour landmarks as points.
         sliding: contour landmarks of the far side move to the visible silhouette, as people and detectors mark them;
             False where they are vertices that may be hidden. Absent, what fits better is taken.
-        expression_prior: which weights of the rig's shapes go together, in place of the next three.
+        expression_prior: which weights of the rig's shapes go together, in place of the mean and the ridge below.
         sparsity: beside that prior, for a weight of 1.
         expression_mean: how strong a shape is on average, in weights; the prior falls exponentially.
         expression_ridge: prior deviation of a weight beside that.
@@ -186,15 +186,15 @@ class Problem:
         precision.diagonal()[k - self.smooth : k] = 1 / state.unknown
         if settings.expression_prior is None:
             own = torch.eye(count, dtype=torch.float64) / settings.expression_ridge**2
-            if self.twins is not None and len(self.twins):
-                rows = torch.arange(len(self.twins))
-                apart = torch.zeros(len(self.twins), count, dtype=torch.float64)
-                apart[rows, self.twins[:, 0]], apart[rows, self.twins[:, 1]] = 1.0, -1.0
-                own = own + apart.T @ apart / settings.asymmetry**2
             each, pull = own.expand(len(weights), -1, -1), torch.full_like(weights, 1 / settings.expression_mean)
         else:
             energy = settings.expression_prior.energy(weights)
             each, pull = energy.H.expand(len(weights), -1, -1), energy.f + settings.sparsity
+        if self.twins is not None and len(self.twins):
+            rows = torch.arange(len(self.twins))
+            apart = torch.zeros(len(self.twins), count, dtype=torch.float64)
+            apart[rows, self.twins[:, 0]], apart[rows, self.twins[:, 1]] = 1.0, -1.0
+            each = each + apart.T @ apart / settings.asymmetry**2
         linear[k:] = pull.flatten()
         precision[k:, k:] = torch.block_diag(*each)
         return precision, linear

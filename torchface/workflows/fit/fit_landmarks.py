@@ -138,7 +138,8 @@ def _as_detected(faces: list[LabelledFace], photograph: Path) -> list[LabelledFa
 UNSURE = 0.2
 """Landmarks of lower confidence are left out of a fit."""
 
-_MIN_CONFIDENT = 40
+_HIDDEN, _EYES_HIDDEN = 0.3, 0.3  # visibilities
+_MIN_CONFIDENT = 25
 _PARTS = {"jaw": slice(0, 17), "brows": slice(17, 27), "nose": slice(27, 36), "eyes": slice(36, 48)} | {
     "mouth": slice(48, 68)
 }
@@ -155,6 +156,7 @@ class PhotographLandmarks:
         number: which of the faces it is, from 0, the largest first.
         boxes: of all faces, x, y, width, height, (F,4) pixels.
         size: of the photograph, width and height.
+        asked: whether the user said which face.
     """
 
     photograph: Path
@@ -163,15 +165,17 @@ class PhotographLandmarks:
     number: int
     boxes: Tensor
     size: tuple[int, int]
+    asked: bool = False
 
     @property
     def confident(self) -> Tensor:
-        """The landmarks (68,2) float64, NaN where they are unsure or outside the image.
+        """The landmarks (68,2) float64, NaN where they are unsure, hidden or outside the image.
 
         All are kept where most are unsure: then there is nothing better.
         """
         points = self.face.landmarks.double()
-        unsure = self.face.confidence < UNSURE
+        unsure = (self.face.confidence < UNSURE) | (self.face.visibility < _HIDDEN)
+        unsure[36:48] |= bool(self.face.iris.isfinite().any() and self.face.eye_visibility.mean() < _EYES_HIDDEN)
         if int((~unsure).sum()) < _MIN_CONFIDENT:
             unsure = torch.zeros_like(unsure)
         outside = ((points < -0.5) | (points > points.new_tensor(self.size) - 0.5)).any(1)
@@ -224,5 +228,5 @@ def find_in_photographs(
                 f"{path}: {str(error).partition(': ')[2]}; give another photograph, or landmarks with --landmarks"
             ) from error
         size = (pixels.shape[2], pixels.shape[1])
-        readings.append(PhotographLandmarks(path, str(model), reading, face or 0, faces.boxes, size))
+        readings.append(PhotographLandmarks(path, str(model), reading, face or 0, faces.boxes, size, face is not None))
     return readings

@@ -15,6 +15,7 @@ from torchface.geometry.cameras.pinhole import Camera
 from torchface.io import save_calibration, save_rig
 from torchface.io.images.image_files import load_image
 from torchface.io.landmarks.landmark_points import save_pts
+from torchface.io.video.video_file import VIDEO_ENDINGS
 from torchface.mesh import Mesh
 from torchface.modeling import FitSettings, ImageFit, fit_images, transfer_with_report
 from torchface.modeling.photographs.landmark_view import JAW
@@ -34,6 +35,8 @@ from torchface.workflows.fit.fit_landmarks import (
     landmarks_of,
     warn_if_stored_turned,
 )
+from torchface.workflows.fit.picture_checks import picture_lines, profile_lines
+from torchface.workflows.fit.video_pictures import video_pictures
 from torchface.workflows.named_heads import NamedHeads, load_head_model, matching
 from torchface.workflows.rig.actor_rig import check_out
 from torchface.workflows.rig_names import Naming, renamed
@@ -88,6 +91,7 @@ class FittedHead:
         found: the landmarks that no file gave; empty where files gave them.
         remarks: what speaks against the fit.
         heads: what there is to say of the head model.
+        shown: the photographs, and the frames of videos, by their names.
     """
 
     rig: BlendshapeRig
@@ -97,10 +101,11 @@ class FittedHead:
     found: tuple[PhotographLandmarks, ...] = ()
     remarks: tuple[str, ...] = ()
     heads: str = ""
+    shown: tuple[Path, ...] = ()
 
-    def lines(self, photographs: Sequence[Path]) -> list[str]:
+    def lines(self) -> list[str]:
         """For people to read."""
-        fit = self.fit
+        fit, photographs = self.fit, self.shown
         lines = [self.heads] if self.heads else []
         lines += [line for one in self.found for line in one.lines()]
         for i, (path, camera, error) in enumerate(zip(photographs, fit.cameras, fit.errors.tolist(), strict=True)):
@@ -133,7 +138,7 @@ def fit_photographs(
     """Fits a head to photographs of one person, each with an expression of its own, and writes it as a rig.
 
     Args:
-        photographs: image files.
+        photographs: image files, or videos, of which frames are chosen.
         landmarks: 68 in iBUG's order for each photograph, in files (.pts, .ljson) or in one of dlib's XML for all;
             where there are none they are found, and written as .pts beside ``out``.
         model: a head model by name or folder; see ``zoo.get_model``. The best at hand if absent.
@@ -141,22 +146,21 @@ def fit_photographs(
         settings: whose shapes, which lens, which face of several.
         progress: called with each step and how far it is.
     """
-    progress = progress or silent
+    progress, insist = progress or silent, settings.insist
     check_out(out)
     progress("reading the model")
     named = NamedHeads.of(model)
     heads, rig = matching(load_head_model(named.name), settings.template, settings.part)
     fitting = replace(settings.fit, expression_prior=load_priors(rig, settings.prior, None).shapes)
     progress(f"reading {len(photographs)} photographs")
-    images = [load_image(path) for path in photographs]
     found: list[PhotographLandmarks] = []
     if landmarks or not photographs:
+        images = [load_image(path) for path in photographs]
         marks = torch.stack(landmarks_of(photographs, landmarks, settings.face))
         for photograph in photographs:
             warn_if_stored_turned(photograph)
     else:
-        progress(f"finding the landmarks of {len(photographs)} photographs")
-        found = find_in_photographs(photographs, images, settings.landmark_model, settings.face)
+        photographs, images, found = _pictures(photographs, rig, settings, progress)
         marks = torch.stack([one.confident for one in found])
     sizes = [(image.shape[2], image.shape[1]) for image in images]
     check_inside(photographs, marks, sizes)
@@ -165,8 +169,10 @@ def fit_photographs(
         some = [sizes[row] for row in rows]
         return fit_images(heads, rig, points, some, camera=settings.focal, settings=ALONE)
 
-    remarks = one_person_lines(photographs, marks, bare, settings.insist)
+    remarks = [line for one, image in zip(found, images, strict=False) for line in picture_lines(one, image, insist)]
+    remarks += one_person_lines(photographs, marks, bare, insist)
     fit = fit_images(heads, rig, marks, sizes, images, settings.focal, fitting, progress)
+    remarks += profile_lines(fit)
     if not found:
         remarks += landmark_lines(photographs, images, marks, settings.landmark_model, bare)
     # Photographs show little of eyeballs and teeth: parts of their own keep the template's skin.
@@ -185,7 +191,26 @@ def fit_photographs(
         for path, one in zip(overlays, found, strict=False):  # to be corrected and given as --landmarks
             save_pts(one.face.landmarks, path.with_suffix(".pts"))
     summary = transferred.report.summary()
-    return FittedHead(transferred.rig, fit, overlays, summary, tuple(found), tuple(remarks), named.line)
+    return FittedHead(
+        transferred.rig, fit, overlays, summary, tuple(found), tuple(remarks), named.line, tuple(photographs)
+    )
+
+
+def _pictures(
+    paths: Sequence[Path], rig: BlendshapeRig, settings: PhotographSettings, progress: Progress
+) -> tuple[list[Path], list[Tensor], list[PhotographLandmarks]]:
+    """Photographs and frames of videos, by name, with their landmarks found."""
+    names, images, found = list[Path](), list[Tensor](), list[PhotographLandmarks]()
+    progress(f"finding the landmarks of {len(paths)} photographs")
+    for path in paths:
+        if path.suffix.lower() in VIDEO_ENDINGS:
+            rest = rig.vertices[rig.neutral.landmarks].detach()
+            some = video_pictures(path, rest, progress, settings.landmark_model, settings.face or 0)
+            names, images, found = names + some.names, images + some.images, found + some.found
+            continue
+        names, images = [*names, path], [*images, load_image(path)]
+        found += find_in_photographs([path], images[-1:], settings.landmark_model, settings.face)
+    return names, images, found
 
 
 def overlay(fit: ImageFit, view: int, image: Tensor, marks: Tensor) -> Tensor:

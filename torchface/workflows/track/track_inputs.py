@@ -19,8 +19,10 @@ from torchface.io.images.image_files import load_paint
 from torchface.io.landmarks.landmark_tables import load_landmark_table
 from torchface.io.video import VideoFile, open_video
 from torchface.io.video.blank_video import BlankVideo
+from torchface.modeling import HeadModel
 from torchface.number_checks import check_rate
 from torchface.rig import BlendshapeRig
+from torchface.workflows.named_heads import NamedHeads, load_head_model, matching
 from torchface.workflows.track.track_models import (
     DEFAULT_LANDMARKS,
     DEFAULT_PRIOR,
@@ -59,6 +61,8 @@ class TrackSettings:
         size: width and height of the pictures that such landmarks were found in; the camera's if absent.
         one_person: all frames show the actor, also those in which the face looks like another's.
         reduce: keep as few rows of weights and keys as stay within this of every frame's; all if absent.
+        anybody: the rig is not the person's: the head is solved with the take.
+        heads: the head model for that, by name or folder; the best at hand if absent.
         offsets: a file of fixed offsets between this rig's landmarks and this finder's; those in the folder of results,
             or estimated with the take, if absent.
     """
@@ -78,6 +82,8 @@ class TrackSettings:
     offsets: Path | None = None
     one_person: bool = False
     reduce: float | None = None
+    anybody: bool = False
+    heads: str | Path | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,6 +98,8 @@ class TrackInputs:
         models: what tracks and solves.
         times: when each frame is shown, (T,) seconds, where the frame rate varies.
         rate_varies: how, in words.
+        heads: of the rig's topology, from which the person's is solved; None where the rig is the person's.
+        about: what there is to say of them.
     """
 
     settings: TrackSettings
@@ -101,6 +109,8 @@ class TrackInputs:
     models: TrackModels
     times: Tensor | None = None
     rate_varies: str = ""
+    heads: HeadModel | None = None
+    about: str = ""
 
     @property
     def reading_key(self) -> str:
@@ -121,8 +131,8 @@ class TrackInputs:
             )
 
 
-def load_inputs(video: Path | None, rig: Path, settings: TrackSettings) -> TrackInputs:
-    """Reads and checks everything; warns of a video of variable frame rate.
+def load_inputs(video: Path | None, rig: Path | None, settings: TrackSettings) -> TrackInputs:
+    """Reads and checks everything; warns of a video of variable frame rate. Without a rig anybody is tracked.
 
     Raises:
         FileFormatError: the video or another file cannot be read.
@@ -136,7 +146,12 @@ def load_inputs(video: Path | None, rig: Path, settings: TrackSettings) -> Track
     if times is not None:
         clip = replace(clip, fps=check_rate(float((len(times) - 1) / times[-1]), str(clip.path)))
         warnings.warn(f"{clip.path}: found a variable frame rate: {rate_varies}; {_AT_ITS_TIMES}", stacklevel=4)
-    inputs = inputs_of(clip, load_actor(rig, settings.part), settings)
+    if rig is None or settings.anybody:
+        named = NamedHeads.of(settings.heads)
+        heads, actor = matching(load_head_model(named.name), rig, settings.part)
+        inputs = replace(inputs_of(clip, actor, settings), heads=heads, about=named.line)
+    else:
+        inputs = inputs_of(clip, load_actor(rig, settings.part), settings)
     inputs.check_length(clip.count)
     if settings.texture is not None:
         load_paint(settings.texture)

@@ -21,6 +21,7 @@ from torchface.landmarks.images.face_reading import FaceReading
 from torchface.landmarks.images.tracking.video_landmarks import landmark_jitter
 from torchface.rendering.point_light import PointLight
 from torchface.rig import BlendshapeRig
+from torchface.workflows.track.person_head import PersonHead
 from torchface.workflows.track.track_inputs import TrackInputs
 
 MIN_STABLE = 6
@@ -50,6 +51,7 @@ class Tracked:
         light: of the video, where a texture was put on the face.
         outliers: landmarks that lie where no face has them, and so are not trusted, (T,68) bool; none if absent.
         others: spans of frames that show another face, which are not solved.
+        head: the person's, where it was solved with the take.
     """
 
     inputs: TrackInputs
@@ -66,6 +68,7 @@ class Tracked:
     light: PointLight | None = None
     outliers: Tensor | None = None
     others: Sequence[AnotherFace] = ()
+    head: PersonHead | None = None
 
     def __len__(self) -> int:
         return len(self.landmarks)
@@ -162,6 +165,8 @@ class Tracked:
             f"landmarks: jitter {self.jitter:.2f} px; to the solved rig's: median {float(errors.nanmedian()):.2f} px, "
             f"95th percentile {float(errors.nanquantile(0.95)):.2f} px",
         ]
+        if self.head is not None:
+            lines += [line for line in (self.inputs.about, *self.head.lines()) if line]
         lines.extend((*self.reductions, *self.outlier_lines()))
         lines.extend(
             f"frames {span.first} to {span.last} show another face than the first frames (its look correlates by "

@@ -13,11 +13,13 @@ from torchface.files.content_keys import content_key
 from torchface.files.documents import write_json
 from torchface.files.job_lock import within_job
 from torchface.files.whole_files import all_or_none
+from torchface.io import save_rig
 from torchface.progress import Progress, silent
 from torchface.rendering.point_light import PointLight
 from torchface.workflows.track.face_overlay import video_light
 from torchface.workflows.track.frame_readings import read_frames
 from torchface.workflows.track.overlay_video import write_overlay
+from torchface.workflows.track.person_head import person_head
 from torchface.workflows.track.take_solution import (
     frame_times,
     judged_reading,
@@ -35,19 +37,21 @@ from torchface.workflows.track.track_inputs import METHOD, TrackInputs, TrackSet
 from torchface.workflows.track.track_result import Tracked
 from torchface.workflows.track.track_state import TrackState
 
+HEAD = "head.glb"
 _LIGHT = "light.safetensors"
 
 
 def track_video(
     video: Path | None,
-    rig: Path,
+    rig: Path | None,
     out: Path,
     settings: TrackSettings | None = None,
     progress: Progress | None = None,
 ) -> Tracked:
     """Tracks, solves and writes; see ``torchface track --help`` for the arguments.
 
-    Without a video the landmarks are those of a table, and no overlay is drawn.
+    Without a video the landmarks are those of a table, and no overlay is drawn. Without a rig the person's head is
+    solved with the take, and written beside the weights.
 
     A video of variable frame rate is solved at its frames' own times, with a warning; with a dynamics prior at its mean
     rate, brought back to those times.
@@ -80,6 +84,11 @@ def _track(inputs: TrackInputs, out: Path, filmed: bool, progress: Progress) -> 
         judged = judged_reading(inputs, reading, None if inputs.models.finder is None else state.looks())
         reading = judged.reading
         landmarks = smoothed_landmarks(inputs, reading, times)
+    head = None
+    if inputs.heads is not None:
+        with _timed(seconds, "head"):
+            head = person_head(inputs, inputs.heads, landmarks, reading.trust, progress)
+        inputs = replace(inputs, actor=head.rig)
     trust, solver = reading.trust, inputs.solver(inputs.clip.fps)
     offsets = known_offsets(inputs, out)
     if offsets is None or offsets.video != inputs.reading_key:
@@ -107,9 +116,13 @@ def _track(inputs: TrackInputs, out: Path, filmed: bool, progress: Progress) -> 
         seconds,
         outliers=judged.outliers,
         others=judged.others,
+        head=head,
     )
     with all_or_none():
         tracked.products.update(write_curves(tracked, out))
+        if head is not None:
+            tracked.products["head"] = out / HEAD
+            save_rig(head.rig, out / HEAD)
     if filmed and inputs.settings.overlay != "none":
         tracked = _with_overlay(tracked, out, state, key, progress)
     write_json(out / SUMMARY, summary(tracked))

@@ -29,13 +29,13 @@ class VideoJob:
         rig, settings: see :func:`track_video`.
     """
 
-    rig: Path
+    rig: Path | None
     settings: TrackSettings = field(default_factory=TrackSettings)
 
     def key(self, item: BatchItem) -> str:
         """A key of all that a video's results depend on."""
         job = item.settings_of(self)
-        names = ("landmarks", "appearance", "prior", "dynamics")
+        names = ("landmarks", "appearance", "prior", "dynamics", "heads")
         contents = {name: model_content(getattr(job.settings, name)) for name in names}
         return content_key(_METHOD, video=item.path, rig=job.rig, settings=job.settings, **contents)
 

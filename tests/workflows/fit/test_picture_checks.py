@@ -1,0 +1,121 @@
+"""What makes a photograph unfit for a likeness is said with its figure; what is hardly a face is refused."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image, ImageDraw, ImageFilter, ImageOps
+from torch import Tensor
+
+from torchface.landmarks import FaceReading, NoFaceError
+from torchface.workflows.fit.fit_landmarks import PhotographLandmarks, find_in_photographs
+from torchface.workflows.fit.picture_checks import picture_lines
+
+
+def skin() -> Tensor:
+    """A picture of skin with grain, 200 x 200."""
+    grain = 0.03 * torch.randn(1, 200, 200, generator=torch.Generator().manual_seed(0))
+    return (torch.tensor([0.78, 0.58, 0.48])[:, None, None] + grain).clamp(0, 1)
+
+
+def reading(eyes: float = 90.0) -> FaceReading:
+    """A face in its middle, so many pixels between the outer corners of its eyes."""
+    points = torch.full((68, 2), 100.0)
+    points[[0, 16, 8, 24]] = 100 + eyes * torch.tensor([[-0.8, 0.0], [0.8, 0.0], [0.0, 1.0], [0.0, -0.6]])
+    points[[36, 45]] = 100 + eyes * torch.tensor([[-0.5, 0.0], [0.5, 0.0]])
+    sure, both = torch.ones(68), torch.ones(2)
+    return FaceReading(points, sure, sure, sure[0], points[[36, 45]], 0.3 * both, 0 * both, both)
+
+
+def found(face: FaceReading) -> PhotographLandmarks:
+    return PhotographLandmarks(Path("a.png"), "network", face, 0, face.box[None], (200, 200))
+
+
+def test_a_face_that_is_shown_well_is_not_remarked_on() -> None:
+    assert picture_lines(found(reading()), skin()) == []
+
+
+@pytest.mark.parametrize(
+    ("change", "line"),
+    [
+        (lambda image: image.mean(0).expand(3, -1, -1), "no colours"),
+        (lambda image: (image * 4).round() / 4, "without grain"),
+        (lambda image: image.flip(0), "colours that skin has not (red -0.19"),
+        (lambda image: torch.full_like(image, 0.7), "a drawing, a statue"),
+    ],
+)
+def test_pictures_that_are_not_plain_photographs(change: Callable[[Tensor], Tensor], line: str) -> None:
+    lines = picture_lines(found(reading()), change(skin()))
+    assert any(line in one and one.startswith("WARNING: a.png: ") for one in lines), lines
+
+
+def test_hidden_and_small_faces() -> None:
+    face = reading()
+    behind = replace(face, eye_visibility=torch.tensor([0.1, 0.05]))
+    assert "the eyes hidden (visible to 8%" in picture_lines(found(behind), skin())[0]
+    masked = replace(face, visibility=torch.where(torch.arange(68) < 48, 1.0, 0.02))
+    assert "the mouth hidden (visible to 2%" in picture_lines(found(masked), skin())[0]
+    both = replace(behind, visibility=masked.visibility)
+    with pytest.raises(NoFaceError, match=r"a\.png: found eyes and mouth hidden .* --insist"):
+        picture_lines(found(both), skin())
+    assert "eyes and mouth hidden" in picture_lines(found(both), skin(), insist=True)[0]
+    assert "20 pixels between the eyes' outer corners" in picture_lines(found(reading(20.0)), skin())[0]
+    with pytest.raises(NoFaceError, match="found 8 pixels between the outer corners of the eyes, expected at least 10"):
+        picture_lines(found(reading(8.0)), skin())
+    with pytest.raises(NoFaceError, match=r"hardly a face \(likelihood 0\.20\)"):
+        picture_lines(found(replace(face, presence=torch.tensor(0.2))), skin())
+
+
+def test_two_faces_of_one_size() -> None:
+    face = reading()
+    pair = replace(found(face), boxes=torch.stack([face.box, face.box]))
+    assert "2 faces of similar size; say which is meant with --face" in picture_lines(pair, skin())[0]
+    assert picture_lines(replace(pair, asked=True), skin()) == []
+
+
+def test_hidden_landmarks_do_not_count() -> None:
+    face = reading()
+    behind = replace(face, eye_visibility=torch.tensor([0.1, 0.05]))
+    assert found(behind).confident.isnan().any(1).nonzero()[:, 0].tolist() == list(range(36, 48))
+    masked = replace(face, visibility=torch.where(torch.arange(68) < 48, 1.0, 0.02))
+    assert found(masked).confident.isnan().any(1).nonzero()[:, 0].tolist() == list(range(48, 68))
+
+
+@pytest.mark.real
+def test_a_photograph_that_is_spoilt(data: Path) -> None:
+    """By code: glasses, a mask, no colours, few colours, few pixels."""
+    plain = Image.open(data / "images" / "people" / "lfpw_1.png").convert("RGB")
+
+    def seen(image: Image.Image) -> tuple[PhotographLandmarks, list[str]]:
+        pixels = torch.from_numpy(np.asarray(image.convert("RGB")).copy()).permute(2, 0, 1).float() / 255
+        one = find_in_photographs([Path("a.png")], [pixels])[0]
+        return one, picture_lines(one, pixels)
+
+    whole, lines = seen(plain)
+    assert lines == []
+    marks = whole.face.landmarks
+    eyes = float((marks[36] - marks[45]).norm())
+    dark, masked = plain.copy(), plain.copy()
+    for first in (36, 42):
+        x, y = marks[first : first + 6].mean(0).tolist()
+        box = (x - 0.3 * eyes, y - 0.22 * eyes, x + 0.3 * eyes, y + 0.25 * eyes)
+        ImageDraw.Draw(dark).ellipse(box, fill=(15, 15, 18))
+    cloth = [tuple(point) for point in [*marks[2:15].tolist(), marks[28].tolist()]]
+    ImageDraw.Draw(masked).polygon(cloth, fill=(150, 190, 210))
+    scale = 40 / float(whole.face.box[2])
+    small = plain.resize((int(plain.width * scale), int(plain.height * scale)), Image.Resampling.LANCZOS)
+    stone = ImageOps.autocontrast(plain.convert("L").filter(ImageFilter.GaussianBlur(eyes / 40)))
+    for image, line in (
+        (dark, "the eyes hidden"),
+        (masked, "the mouth hidden"),
+        (ImageOps.grayscale(plain), "no colours"),
+        (Image.eval(stone, lambda value: int(90 + 0.45 * value)), "a statue"),
+        (ImageOps.posterize(plain, 2), "a strong filter"),
+        (small, "pixels between the eyes' outer corners"),
+    ):
+        assert any(line in one for one in seen(image)[1]), line

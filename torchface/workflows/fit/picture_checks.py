@@ -1,0 +1,118 @@
+"""Checks of what photographs show: a face that is large, uncovered, alone, in colour, not drawn and not filtered."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from torchface.landmarks import NoFaceError
+from torchface.modeling import ImageFit
+from torchface.workflows.fit.fit_landmarks import PhotographLandmarks
+
+# Pixels between the outer corners of the eyes: a face 40 pixels wide has 20.
+_LEAST_EYES, _FEW_EYES = 10.0, 30.0
+_PRESENT = 0.5
+_HIDDEN, _EYE_HIDDEN = 0.4, 0.3  # visibilities; those of 9 faces that nothing hides were above 0.87 and 0.91
+_RIVAL = 0.5  # of the chosen face's area: another that large may be the one that is meant
+_GREY = 0.015  # mean difference of the channels, of 1
+_RED, _BLUE = (
+    (0.03, 1.0),
+    (-1.1, 0.1),
+)  # logarithms of red and blue over green of skin; 8 faces 0.20 to 0.51, -0.53 to -0.08
+_FLAT, _FLAT_GREY = 0.65, 0.18  # share of pixels like their neighbours; 9 photographs at most 0.12
+_PROFILE = 50.0  # degrees
+_PARTS = {"nose": slice(27, 36), "mouth": slice(48, 68)}
+
+
+def picture_lines(found: PhotographLandmarks, image: Tensor, insist: bool = False) -> list[str]:
+    """What speaks against a photograph, for people to read; nothing where it shows one face well.
+
+    Args:
+        found: the face.
+        image: the photograph, (3,H,W) in [0,1].
+        insist: report also what is refused otherwise.
+
+    Raises:
+        NoFaceError: it shows hardly a face: too few pixels, eyes and mouth hidden, or nothing like one.
+    """
+    face, name = found.face, found.photograph.name
+    eyes = float((face.landmarks[36] - face.landmarks[45]).norm())
+    hidden = _hidden_parts(found)
+    refusals = []
+    if eyes < _LEAST_EYES:
+        refusals.append(f"{eyes:.0f} pixels between the outer corners of the eyes, expected at least {_LEAST_EYES:.0f}")
+    if float(face.presence) < _PRESENT:
+        refusals.append(f"hardly a face (likelihood {float(face.presence):.2f}), expected one of a person")
+    if {"eyes", "mouth"} <= set(hidden):
+        refusals.append(f"eyes and mouth hidden (visible to {hidden['eyes']:.0%} and {hidden['mouth']:.0%})")
+    if refusals and not insist:
+        raise NoFaceError(f"{name}: found {'; '.join(refusals)}; give another photograph, or say --insist")
+    lines = [f"found {refusal}" for refusal in refusals]
+    if _LEAST_EYES <= eyes < _FEW_EYES:
+        lines.append(
+            f"{eyes:.0f} pixels between the eyes' outer corners, below {_FEW_EYES:.0f}: the head is a rough guess"
+        )
+    lines += [
+        f"the {part} hidden (visible to {share:.0%}; sunglasses, a mask, a hand?): there the head is the model's guess"
+        for part, share in hidden.items()
+    ]
+    areas = found.boxes[:, 2] * found.boxes[:, 3]
+    rivals = [
+        k for k, area in enumerate(areas.tolist()) if k != found.number and area > _RIVAL * float(areas[found.number])
+    ]
+    if rivals and not found.asked:
+        lines.append(f"{len(rivals) + 1} faces of similar size; say which is meant with --face")
+    return [f"WARNING: {name}: {line}" for line in [*lines, *_color_lines(image, face.box)]]
+
+
+def profile_lines(fit: ImageFit) -> list[str]:
+    """Whether all photographs show a face from the side, for people to read."""
+    turns = [
+        float(torch.rad2deg(torch.atan2(-camera.rotation[2, 0], -camera.rotation[2, 2]))) for camera in fit.cameras
+    ]
+    if all(abs(turn) > _PROFILE for turn in turns):
+        listed = ", ".join(f"{turn:.0f}°" for turn in turns)
+        return [f"WARNING: only profiles ({listed}): how wide the face is they do not show; add a view from the front"]
+    return []
+
+
+def _hidden_parts(found: PhotographLandmarks) -> dict[str, float]:
+    """Parts of the face that something hides, and to what share they are visible."""
+    face = found.face
+    shares = {part: float(face.visibility[rows].mean()) for part, rows in _PARTS.items()}
+    hidden = {part: share for part, share in shares.items() if share < _HIDDEN}
+    eyes = (
+        float(face.eye_visibility.mean()) if bool(face.iris.isfinite().any()) else float(face.visibility[36:48].mean())
+    )
+    return ({"eyes": eyes} if eyes < _EYE_HIDDEN else {}) | hidden
+
+
+def _color_lines(image: Tensor, box: Tensor) -> list[str]:
+    """What colours and grain of the face's middle say against a photograph of skin."""
+    middle = _middle(image, box)
+    if min(middle.shape[1:]) < 4:
+        return []
+    grey = float((middle.amax(0) - middle.amin(0)).mean()) < _GREY
+    light = middle.mean(0)
+    alike = [(light.diff(dim=axis).abs() < 1 / 255) for axis in (0, 1)]
+    flat = float((alike[0][:, 1:] & alike[1][1:]).float().mean())
+    lines = []
+    if flat > (_FLAT_GREY if grey else _FLAT):
+        what = "a drawing, a statue" if grey else "a drawing, a strong filter"
+        lines.append(f"{flat:.0%} of the face without grain, which photographs have: {what}? It may be nobody's head")
+    if grey:
+        return [*lines, "no colours: the skin is grey, and what it hides of the eyes' colour too"]
+    red, green, blue = middle.flatten(1).median(dim=1).values.clamp(min=0.02).log().tolist()
+    if not (_RED[0] < red - green < _RED[1] and _BLUE[0] < blue - green < _BLUE[1]):
+        lines.append(
+            f"colours that skin has not (red {red - green:+.2f}, blue {blue - green:+.2f} beside green, natural "
+            f"logarithms): a filter, coloured light, paint?"
+        )
+    return lines
+
+
+def _middle(image: Tensor, box: Tensor) -> Tensor:
+    """The middle quarter of a face's box (4,) in an image (3,H,W)."""
+    x, y, width, height = box.tolist()
+    low = (max(int(y + height / 4), 0), max(int(x + width / 4), 0))
+    return image[:3, low[0] : int(y + 3 * height / 4), low[1] : int(x + 3 * width / 4)]

@@ -1,0 +1,95 @@
+"""Frames of a video as photographs: sharp ones of several angles and expressions."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from torchface.errors import ValueRangeError
+from torchface.io.video import open_video
+from torchface.landmarks.images.face_reading import FaceReading
+from torchface.landmarks.images.tracking.landmark_tracker import LandmarkTracker
+from torchface.landmarks.images.tracking.video_landmarks import naming_the_frame
+from torchface.modeling.photographs.frame_choice import choose_frames
+from torchface.progress import Progress
+from torchface.workflows.fit.fit_landmarks import PhotographLandmarks
+from torchface.workflows.named_finders import DEFAULT_LANDMARKS, load_finder
+
+FRAMES = 6
+"""How many frames of a video are fitted at most."""
+
+_READ = 200  # frames in which the face is followed, at even distances
+
+
+@dataclass(frozen=True, eq=False)
+class VideoPictures:
+    """Frames of a video: names ``NAME_000123`` for people to read, images (3,H,W) in [0,1], their landmarks."""
+
+    names: list[Path]
+    images: list[Tensor]
+    found: list[PhotographLandmarks]
+
+
+def video_pictures(
+    video: Path, rest: Tensor, progress: Progress, model: str | Path = DEFAULT_LANDMARKS, face: int = 0
+) -> VideoPictures:
+    """Chooses frames of a video to fit a head to.
+
+    Args:
+        video: the file.
+        rest: landmarks of a head at rest, (68,3) millimetres.
+        progress: called with how many frames are read.
+        model: finds landmarks; by name or folder.
+        face: which of several, from 0, the largest first.
+
+    Raises:
+        FileFormatError: the video cannot be decoded.
+        ValueRangeError: no frame shows a face.
+    """
+    clip = open_video(video)
+    clip.check()
+    tracker = LandmarkTracker(load_finder(model, option="landmark model").finder, face=face)
+    step = max(-(-clip.count // _READ), 1)
+    readings, sharpness, numbers = [], [], []
+    for number, frame in enumerate(clip.color_frames()):  # a frame's box is the one before's
+        if number % step:
+            continue
+        with naming_the_frame(number):
+            readings.append(tracker.step(frame))
+        numbers.append(number)
+        sharpness.append(_sharpness(frame, readings[-1]))
+        progress("finding the face in the video", number + 1, max(clip.count, number + 1))
+    taken = FaceReading.stacked(readings)
+    try:
+        chosen = choose_frames(rest, taken.landmarks, taken.trust, FRAMES, torch.stack(sharpness)).tolist()
+    except ValueRangeError as error:
+        raise ValueRangeError(f"{video}: {error}") from error
+    wanted = {numbers[row]: readings[row] for row in chosen}
+    pictures = VideoPictures([], [], [])
+    for number, frame in enumerate(clip.color_frames()):
+        if (reading := wanted.get(number)) is None:
+            continue
+        name = Path(f"{video.stem}_{number:06d}")
+        pictures.names.append(name)
+        pictures.images.append(frame.float() / 255)
+        size = (frame.shape[2], frame.shape[1])
+        pictures.found.append(PhotographLandmarks(name, str(model), reading, 0, reading.box[None], size))
+    return pictures
+
+
+def _sharpness(frame: Tensor, reading: FaceReading) -> Tensor:
+    """How much of the face's detail a frame (3,H,W) keeps, (): the second differences beside the first."""
+    if not bool(reading.found):
+        return torch.zeros(())
+    height, width = frame.shape[1:]
+    low = reading.box[:2].long().clamp(min=0)
+    high = (reading.box[:2] + reading.box[2:]).long().minimum(torch.tensor([width, height]))
+    face = frame[:, low[1] : high[1], low[0] : high[0]].float().mean(0)
+    if min(face.shape) < 4:
+        return torch.zeros(())
+    first = face.diff(dim=0).abs().mean() + face.diff(dim=1).abs().mean()
+    second = face.diff(n=2, dim=0).abs().mean() + face.diff(n=2, dim=1).abs().mean()
+    return second / first.clamp(min=1e-3)

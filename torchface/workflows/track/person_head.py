@@ -1,0 +1,83 @@
+"""The head of whoever a video shows: solved with a head model from frames of several angles and expressions."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torchface.errors import ValueRangeError
+from torchface.modeling import FitSettings, HeadModel, ImageFit, fit_images, transfer_with_report
+from torchface.modeling.photographs.frame_choice import choose_frames
+from torchface.modeling.photographs.landmark_view import JAW
+from torchface.progress import Progress
+from torchface.rig import BlendshapeRig
+from torchface.workflows.track.track_inputs import TrackInputs
+
+FRAMES = 10
+"""How many frames the head is solved from at most."""
+
+_DOUBTED = 0.2  # trust below which a landmark does not count
+
+
+@dataclass(frozen=True, eq=False)
+class PersonHead:
+    """The person's rig, and the frames that it comes from.
+
+    Args:
+        rig: the head found, with the shapes of the model's rig transferred to it.
+        fit: to the frames.
+        frames: their numbers, (F,).
+    """
+
+    rig: BlendshapeRig
+    fit: ImageFit
+    frames: Tensor
+
+    def lines(self) -> list[str]:
+        """For people to read."""
+        eyes = (self.fit.landmarks[:, 36] - self.fit.landmarks[:, 45]).norm(dim=-1)
+        inner = (self.fit.residuals[:, JAW:].square().sum(-1).nanmean(-1).sqrt() / eyes).mean()
+        listed = ", ".join(str(frame) for frame in self.frames.tolist())
+        return [
+            f"head: solved from {len(self.frames)} frames ({listed}); inner landmarks {float(inner):.1%} of the eyes' "
+            f"distance off; largest coefficient {float(self.fit.coefficients.abs().max()):.2f} standard deviations"
+        ]
+
+
+def person_head(
+    inputs: TrackInputs, heads: HeadModel, landmarks: Tensor, trust: Tensor, progress: Progress
+) -> PersonHead:
+    """Solves the head of a take, its expressions and poses together; see ``fit_images``.
+
+    Args:
+        inputs: whose actor is the rig of the model's mean head.
+        heads: of the rig's topology.
+        landmarks: smoothed, (T,68,2) pixels of a camera without distortion.
+        trust: in each, (T,68).
+        progress: called with each step.
+
+    Raises:
+        ValueRangeError: no frame shows a face.
+    """
+    progress("solving the head")
+    rig, clip = inputs.actor, inputs.clip
+    rest = rig.vertices[rig.neutral.landmarks].detach()
+    try:
+        frames = choose_frames(rest, landmarks, trust, FRAMES)
+    except ValueRangeError as error:
+        raise ValueRangeError(f"{clip.path}: {error}") from error
+    marks = torch.where((trust > _DOUBTED)[..., None], landmarks, torch.nan)[frames]
+    few = (torch.isfinite(marks[:, JAW:]).all(-1).sum(1) < FRAMES)[:, None, None]
+    settings = FitSettings(expression_prior=inputs.models.prior)
+    fit = fit_images(
+        heads,
+        rig,
+        torch.where(few, landmarks[frames], marks),
+        (clip.width, clip.height),
+        camera=inputs.calibration.intrinsics,
+        settings=settings,
+        progress=progress,
+    )
+    return PersonHead(transfer_with_report(rig, fit.mesh, progress=progress).rig, fit, frames)
