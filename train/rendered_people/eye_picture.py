@@ -12,6 +12,7 @@ from torch import Tensor
 
 from torchface.geometry.cameras.pinhole import Camera, look_at
 from torchface.geometry.meshes.operators import vertex_normals
+from torchface.landmarks.images.ibug_68 import as_annotated
 from torchface.shape_names import ARKIT
 from torchface.synthetic.head.signed_distance import EYE_CENTRE
 
@@ -21,7 +22,7 @@ from .head_kind import EYEBALL, SKIN, DrawnHead, HeadKind
 from .lashes import with_lashes
 from .looks import Looks
 from .people import Person, closed_lids, draw_person
-from .picture_geometry import CURTAIN, Surface, as_annotated
+from .picture_geometry import CURTAIN, Surface
 from .portrait_geometry import curtain, hair_share_at, lumps
 from .rendered_person import render_person, visible_points
 from .spectacles import with_glasses

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from torchface.geometry.meshes.operators import vertex_normals
-from torchface.landmarks.images.ibug_68 import MIRROR_68
+from torchface.landmarks.images.ibug_68 import as_annotated
 
 from .head_kind import GUMS, SOCKET, TEETH, DrawnHead, HeadKind
 from .looks import Looks
@@ -18,11 +18,6 @@ from .skin_paint import brow_edge_height
 
 CURTAIN, CLOTHES = 10, 11
 """Materials beside those of the head."""
-# Landmarks, and by which share of the way to another annotators put them further (away from it, if negative).
-_RIGHT = ((36, 39, 0.11), (37, 38, 0.41), (38, 39, 0.22), (40, 39, 0.10), (41, 40, 0.31), (31, 32, -0.2),
-          (49, 50, 0.15), (58, 57, 0.3), (60, 64, 0.09), (61, 62, 0.35), (67, 66, 0.35))  # fmt: skip
-_MIDDLE = ((28, 29, 0.2), (29, 30, 0.2), (33, 51, 0.13))
-_ALONG = _MIDDLE + _RIGHT + tuple((MIRROR_68[row], MIRROR_68[toward], share) for row, toward, share in _RIGHT)
 _SHUT = 1.0  # millimetres between lips
 _BROW_X = (10.5, 21.0, 32.5, 43.0, 51.5)  # of a brow's five landmarks on the mean head, from its inner end
 
@@ -86,19 +81,6 @@ def annotated(kind: HeadKind, pixels: Tensor, looks: Looks) -> Tensor:
     rows, weights = _brow_spots(kind, looks)
     seen[17:27] = (pixels[rows] * weights[..., None].to(pixels)).sum(1)
     return with_visible_jaw(seen, pixels, _contours(id(kind), kind))
-
-
-def as_annotated(landmarks: Tensor) -> Tensor:
-    """Landmarks (...,68,2) of heads moved along lids and nostrils to where annotators put them.
-
-    Of 23 faces with iBUG's landmarks: eyes end at their outer side a tenth of their width before the corner that heads
-    are annotated with, the lids' points lie at 0.30 and 0.68 of that (heads have theirs at 0.21 and 0.63 above, 0.24
-    below), the nostrils' outer ones further out, the inner lips' nearer to the middle.
-    """
-    moved = landmarks.clone()
-    for row, toward, share in _ALONG:
-        moved[..., row, :] = landmarks[..., row, :] + share * (landmarks[..., toward, :] - landmarks[..., row, :])
-    return moved
 
 
 @lru_cache(maxsize=4)

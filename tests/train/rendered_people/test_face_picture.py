@@ -2,11 +2,11 @@
 
 import torch
 
+from torchface.landmarks.images.ibug_68 import as_annotated
 from torchface.shape_names import ARKIT
 from train.rendered_people.face_picture import SIZE, draw_pictures
 from train.rendered_people.head_kind import performer_kind
 from train.rendered_people.people import closed_lids
-from train.rendered_people.picture_geometry import as_annotated
 
 
 def test_a_picture_depends_on_its_number_and_the_seed_alone() -> None:

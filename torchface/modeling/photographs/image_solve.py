@@ -55,6 +55,8 @@ class FitSettings:
             contour landmarks as points.
         sliding: contour landmarks of the far side move to the visible silhouette, as people and detectors mark them;
             False where they are vertices that may be hidden. Absent, what fits better is taken.
+        annotated: landmarks lie where annotators put them on lids, nose and lips, and what learns from them, rather
+            than on the heads' vertices; see ``as_annotated``.
         expression_prior: which weights of the rig's shapes go together, in place of the mean and the ridge below.
         sparsity: beside that prior, for a weight of 1.
         expression_mean: how strong a shape is on average, in weights; the prior falls exponentially.
@@ -84,6 +86,7 @@ class FitSettings:
     inner_weight: float = 2.0
     contour_slide: float = 0.5
     sliding: bool | None = None
+    annotated: bool = False
     expression_prior: ExpressionPrior | None = None
     sparsity: float = 1.0
     expression_mean: float = 0.2

@@ -10,6 +10,7 @@ from torch import Tensor
 from torchface.geometry.cameras.pnp import pixel_jacobian
 from torchface.geometry.cameras.sliding_contour import LevelCurves, outermost
 from torchface.geometry.rotations import cross_matrix, rotation_matrix
+from torchface.landmarks.images.ibug_68 import as_annotated
 
 LANDMARKS = 68
 JAW = 17
@@ -35,14 +36,17 @@ class LinearPoints:
     side: Tensor
 
     @staticmethod
-    def of(mean: Tensor, modes: Tensor, landmarks: Tensor, curves: LevelCurves) -> LinearPoints:
-        """Those of a whole mesh: mean (V,3), modes (D,V,3), landmark vertices (68,)."""
+    def of(
+        mean: Tensor, modes: Tensor, landmarks: Tensor, curves: LevelCurves, annotated: bool = False
+    ) -> LinearPoints:
+        """Those of a whole mesh: mean (V,3), modes (D,V,3), landmark vertices (68,); or where annotators put them."""
         stacked = torch.cat([mean[None], modes])
         used, place = torch.cat([landmarks, curves.vertices.flatten()]).unique(return_inverse=True)
         values = stacked[:, used].transpose(0, 1).double()
         local = replace(curves, vertices=place[len(landmarks) :].reshape(curves.vertices.shape))
         on_curves = local.interpolate(values).flatten(0, 1)
-        points = torch.cat([values[place[: len(landmarks)]], on_curves]).transpose(0, 1)
+        marks = values[place[: len(landmarks)]].transpose(0, 1)
+        points = torch.cat([as_annotated(marks) if annotated else marks, on_curves.transpose(0, 1)], dim=1)
         rows = len(landmarks) + torch.arange(curves.valid.numel()).reshape(curves.valid.shape)
         return LinearPoints(points[0], points[1:], rows, curves.valid, curves.side)
 

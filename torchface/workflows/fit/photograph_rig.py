@@ -151,7 +151,8 @@ def fit_photographs(
     progress("reading the model")
     named = NamedHeads.of(model)
     heads, rig = matching(load_head_model(named.name), settings.template, settings.part)
-    fitting = replace(settings.fit, expression_prior=load_priors(rig, settings.prior, None).shapes)
+    prior = load_priors(rig, settings.prior, None).shapes
+    fitting = replace(settings.fit, expression_prior=prior, annotated=True)
     progress(f"reading {len(photographs)} photographs")
     found: list[PhotographLandmarks] = []
     if landmarks or not photographs:

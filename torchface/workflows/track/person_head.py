@@ -70,7 +70,7 @@ def person_head(
         raise ValueRangeError(f"{clip.path}: {error}") from error
     marks = torch.where((trust > _DOUBTED)[..., None], landmarks, torch.nan)[frames]
     few = (torch.isfinite(marks[:, JAW:]).all(-1).sum(1) < FRAMES)[:, None, None]
-    settings = FitSettings(expression_prior=inputs.models.prior)
+    settings = FitSettings(expression_prior=inputs.models.prior, annotated=True)
     fit = fit_images(
         heads,
         rig,
