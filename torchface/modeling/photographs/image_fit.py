@@ -15,7 +15,13 @@ from torchface.geometry.cameras.sliding_contour import LevelCurves, level_curves
 from torchface.geometry.similarity import similarity_transform
 from torchface.mesh import Mesh
 from torchface.modeling.morphable.head_model import HeadModel
-from torchface.modeling.photographs.image_input import check_images, checked_landmark_vertices, checked_sizes, lens
+from torchface.modeling.photographs.image_input import (
+    annotated_vertices,
+    check_images,
+    checked_landmark_vertices,
+    checked_sizes,
+    lens,
+)
 from torchface.modeling.photographs.image_solve import FitSettings, Problem, State, covariance, solve, solve_either
 from torchface.modeling.photographs.image_texture import photographed_skin
 from torchface.modeling.photographs.landmark_view import JAW, LANDMARKS, LinearPoints, Views
@@ -131,6 +137,7 @@ def fit_images(
     intrinsics, settings = lens(camera, sizes, settings or FitSettings())
     pixels = landmarks.detach().cpu().double()
     mean = model.shape.mean.cpu()
+    vertices = annotated_vertices(mean, vertices) if settings.annotated else vertices
     unknown = smooth_differences(mean, vertices, settings.unknown_deviation)
     modes = torch.cat([model.shape.modes.cpu(), unknown])
     deltas = _in_place(rig, mean)

@@ -55,8 +55,8 @@ class FitSettings:
             contour landmarks as points.
         sliding: contour landmarks of the far side move to the visible silhouette, as people and detectors mark them;
             False where they are vertices that may be hidden. Absent, what fits better is taken.
-        annotated: landmarks lie where annotators put them on lids, nose and lips, and what learns from them, rather
-            than on the heads' vertices; see ``as_annotated``.
+        annotated: landmarks lie where annotators put them, and what learns from them, rather than on the heads'
+            vertices; see ``as_annotated`` and ``annotated_vertices``.
         expression_prior: which weights of the rig's shapes go together, in place of the mean and the ridge below.
         sparsity: beside that prior, for a weight of 1.
         expression_mean: how strong a shape is on average, in weights; the prior falls exponentially.

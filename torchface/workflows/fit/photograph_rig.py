@@ -152,7 +152,6 @@ def fit_photographs(
     named = NamedHeads.of(model)
     heads, rig = matching(load_head_model(named.name), settings.template, settings.part)
     prior = load_priors(rig, settings.prior, None).shapes
-    fitting = replace(settings.fit, expression_prior=prior, annotated=True)
     progress(f"reading {len(photographs)} photographs")
     found: list[PhotographLandmarks] = []
     if landmarks or not photographs:
@@ -170,6 +169,7 @@ def fit_photographs(
         some = [sizes[row] for row in rows]
         return fit_images(heads, rig, points, some, camera=settings.focal, settings=ALONE)
 
+    fitting = replace(settings.fit, expression_prior=prior, annotated=bool(found))
     remarks = [line for one, image in zip(found, images, strict=False) for line in picture_lines(one, image, insist)]
     remarks += one_person_lines(photographs, marks, bare, insist)
     fit = fit_images(heads, rig, marks, sizes, images, settings.focal, fitting, progress)
