@@ -25,6 +25,7 @@ from torchface.optim import box_qp
 _DONE, _HALVINGS = 1e-5, 6
 _MAX_CONTOUR_ERROR, _SETTLED, _TRIAL_ITERATIONS = 1.5, 0.02, 3
 _MIN_NOISE = 1e-5  # of the focal length: finer than any landmark is found
+_FOUND_NOISE = 0.02  # of the distance of the eyes' outer corners
 _EXPECTED, _LEAST_UNKNOWN = 2.0, 1e-2  # of unknown differences: how many are expected to be as large as expected
 
 
@@ -147,6 +148,15 @@ class Problem:
     def targets(self) -> Tensor:
         """The landmarks with zeros for missing ones."""
         return torch.where(self.seen[..., None], self.found, 0.0)
+
+    @property
+    def least_noise(self) -> float:
+        """Of an inner landmark, pixels: finders err alike in neighbours, which their residuals do not show."""
+        least = _MIN_NOISE * float(self.focal.mean())
+        if not self.settings.annotated:
+            return least
+        eyes = (self.found[:, 36] - self.found[:, 45]).norm(dim=-1)
+        return max(least, _FOUND_NOISE * float(eyes.nan_to_num(0.0).mean()))
 
     @property
     def expressions(self) -> int:
@@ -432,7 +442,7 @@ def _spreads(problem: Problem, state: State, picked: PickedPoints, factors: Tens
     measured = 2 * float(problem.seen.sum()) - (1 - problem.settings.contour_slide) * float(problem.seen[:, :JAW].sum())
     left = max(measured - used, 0.2 * measured)
     deviation = state.noise * (float(r.square().sum()) / left) ** 0.5
-    noise = max(deviation, _MIN_NOISE * float(problem.focal.mean()))
+    noise = max(deviation, problem.least_noise)
     if not problem.smooth:
         return replace(state, noise=noise)
     some = slice(problem.identities - problem.smooth, problem.identities)
