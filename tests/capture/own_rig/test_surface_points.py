@@ -10,11 +10,10 @@ import torch
 from torch import Tensor
 
 from torchface import Attachment
-from torchface.capture.energy import Quadratic
 from torchface.capture.own_rig import VideoSettings, VideoSolver
 from torchface.capture.own_rig.face_measurements import FaceMeasurements
-from torchface.capture.own_rig.gauss_newton import HeadState
-from torchface.capture.own_rig.surface_points import FaceSurfacePoints
+from torchface.capture.own_rig.gauss_newton import HeadState, Linearised
+from torchface.capture.own_rig.surface_points import FaceSurfacePoints, alike_errors, smooth_modes
 from torchface.capture.weight_readings import WeightReadings
 from torchface.errors import ShapeError
 from torchface.geometry.rotations import rotation_matrix
@@ -48,7 +47,7 @@ def pose(frames: int = FRAMES) -> tuple[Tensor, Tensor]:
 
 def planted(surface: FaceSurfacePoints, weights: Tensor) -> Tensor:
     rotation, translation = pose(len(weights))
-    placed = surface.rest + torch.einsum("tn,pcn->tpc", weights, surface.basis)
+    placed = surface.rest + torch.einsum("tn,pcn->tpc", weights, surface.basis.double())
     image = (placed @ rotation.mT + translation[:, None]) @ K.T
     return image[..., :2] / image[..., 2:]
 
@@ -79,14 +78,14 @@ def test_the_energys_slope_is_that_of_the_squared_errors() -> None:
         image = (placed @ at.rotation.mT + at.translation[:, None]) @ K.T
         return 0.5 * ((image[..., :2] / image[..., 2:] - found) * precision[..., None]).square().sum()
 
-    energy: Quadratic = surface.energy(head.weights, head.rotation, head.translation, K, (found, precision))
+    energy = surface.linearised(head, K, found, precision).energy()
     for row in range(13):
         step = torch.zeros(1, 13, dtype=torch.float64)
         step[0, row] = 1e-5
         slope = (squared(step) - squared(-step)) / 2e-5
         assert float(energy.f[0, row]) == pytest.approx(float(slope), rel=1e-5, abs=1e-5)
     # H is that of Gauss and Newton: exact where nothing is left over.
-    exact = surface.energy(weights, rotation, translation, K, (planted(surface, weights), precision))
+    exact = surface.linearised(head, K, planted(surface, weights), precision).energy()
     found = planted(surface, weights)
     step = 1e-4 * torch.randn(1, 13, generator=generator, dtype=torch.float64)
     assert float(squared(step)) == pytest.approx(float(0.5 * step @ exact.H[0] @ step.T), rel=1e-2)
@@ -107,7 +106,7 @@ def test_points_recover_what_68_landmarks_leave_open() -> None:
 def test_two_copies_of_a_point_at_half_its_information_are_one() -> None:
     solver, _, landmarks, points = film()
     solver = VideoSolver(
-        actor(), None, K, settings=replace(solver.settings, effective_points=1e6, pixel_noise=1e-6), surface=sites()
+        actor(), None, K, settings=replace(solver.settings, alike=0.0, pixel_noise=1e-6), surface=sites()
     )
     once = sites()
     twice = Attachment(once.triangles.repeat(2), once.barycentric.repeat(2, 1))
@@ -119,13 +118,35 @@ def test_two_copies_of_a_point_at_half_its_information_are_one() -> None:
     assert torch.allclose(one.weights, both.weights, atol=1e-6)
 
 
-def test_more_points_of_the_same_surface_count_no_more_than_their_errors_are_independent() -> None:
-    solver, _, _, _ = film()
-    one = solver.point_precision(torch.ones(1, 200), torch.ones(1, 200))
-    more = solver.point_precision(torch.ones(1, 800), torch.ones(1, 800))
-    limit = solver.settings.effective_points
-    assert float(one.square().sum()) == pytest.approx(min(limit, 200))
-    assert float(more.square().sum()) == pytest.approx(min(limit, 800))
+def test_errors_that_are_alike_count_by_the_inverse_of_their_covariance() -> None:
+    solver, weights, landmarks, points = film()
+    surface, head = solver.surface, HeadState(weights[:1], *(x[:1] for x in pose()))
+    assert surface is not None
+    own, alike = alike_errors(solver.error_modes, torch.ones(1, 268).double())
+    ones = torch.ones(1, 268).double()
+    found = points[:1] + torch.randn(1, 200, 2, generator=torch.Generator().manual_seed(0)).double()
+    marks = replace(surface, rest=solver.points.rest[:68], basis=solver.points.basis[:68])
+    first = marks.linearised(head, K, landmarks[:1] + 1.0, ones[:, :68] / own[:, :68])
+    then = replace(surface, basis=surface.basis.double()).linearised(head, K, found, ones[:, 68:] / own[:, 68:])
+    energy = first.energy_beside(then, alike)
+    both = Linearised(
+        torch.cat([first.residual, then.residual], dim=1), torch.cat([first.jacobian, then.jacobian], dim=1)
+    )
+    modes = solver.error_modes
+    covariance = (own[0].square().diag() + modes @ modes.T).inverse()
+    J, r = both.jacobian[0] * own[0, :, None, None], both.residual[0] * own[0, :, None]  # in pixels
+    H = torch.einsum("lci,lm,mcj->ij", J, covariance, J)
+    f = torch.einsum("lci,lm,mc->i", J, covariance, r)
+    assert torch.allclose(energy.H[0], H, rtol=1e-8, atol=1e-8 * float(H.max()))
+    assert torch.allclose(energy.f[0], f, rtol=1e-8, atol=1e-8 * float(f.abs().max()))
+
+
+def test_modes_are_those_of_a_kernel() -> None:
+    places = sites().on(actor().neutral.faces, actor().vertices)
+    modes = smooth_modes(places, 60.0)
+    kernel = torch.exp(-0.5 * (torch.cdist(places, places).double() / 60.0).square())
+    assert float((modes @ modes.T - kernel).abs().max()) < 0.15
+    assert float((modes @ modes.T - kernel).abs().mean()) < 0.02
 
 
 def test_the_order_of_points_does_not_matter() -> None:
@@ -180,7 +201,6 @@ def test_gradients_of_points_are_those_of_differences() -> None:
     )
     points = points[:1] + 0.3 * torch.randn(1, 200, 2, generator=torch.Generator().manual_seed(1)).double()
     direction = torch.randn(1, 200, 2, generator=torch.Generator().manual_seed(2)).double()
-    direction[:, 3:] = 0  # few points, so that no weight leaves its bound
 
     def jaw(given: Tensor) -> Tensor:
         measured = FaceMeasurements(None, given, torch.ones(1, 200))
@@ -189,7 +209,7 @@ def test_gradients_of_points_are_those_of_differences() -> None:
     leaf = points.clone().requires_grad_()
     (slope,) = torch.autograd.grad(jaw(leaf), leaf)
     with torch.no_grad():
-        difference = (jaw(points + 1e-3 * direction) - jaw(points - 1e-3 * direction)) / 2e-3
+        difference = (jaw(points + 0.02 * direction) - jaw(points - 0.02 * direction)) / 0.04
     assert float((slope * direction).sum()) == pytest.approx(float(difference), rel=2e-2, abs=1e-7)
 
 

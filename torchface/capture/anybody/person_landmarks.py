@@ -20,7 +20,8 @@ from torchface.rig import BlendshapeRig
 # hair is; eyes, nose and lips are drawn sharply.
 _CONTOUR, _BROWS, _INNER = 4.0, 2.5, 1.5
 _BROW_END = 27
-_DEPTH = 0.4  # what a webcam sees of a displacement along its line of sight, beside one across
+VISIBLE = (1.0, 1.0, 0.4)
+"""What a webcam sees of a displacement beside one across: of one along its line of sight less."""
 _GRADE = 1e-3  # how much more the first coordinate varies than the last, so that no two eigenvalues are the same
 _LEFT_EYE = 42  # the first of its landmarks
 _POSE_INFORMATION = 1e-6
@@ -154,7 +155,7 @@ def likeliest_differences(identity_modes: Tensor | None, count: int) -> tuple[Te
     deviation[:JAW], deviation[JAW:_BROW_END] = _CONTOUR, _BROWS
     variance = deviation.square().repeat_interleave(3)
     covariance = rows.T @ rows + (variance * torch.linspace(1 + _GRADE, 1, len(variance)).double()).diag()
-    visible = torch.tensor([1.0, 1.0, _DEPTH], dtype=torch.float64).repeat(LANDMARKS)
+    visible = torch.tensor(VISIBLE, dtype=torch.float64).repeat(LANDMARKS)
     values, vectors = torch.linalg.eigh(visible[:, None] * covariance * visible)
     values, vectors = values.flip(0)[:count], vectors.flip(1)[:, :count]
     # LAPACK's builds differ in a vector's sign and in vectors of one eigenvalue; a kept state means the same person

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import pad
 
+from torchface.attachment import Attachment
 from torchface.capture.antagonist_shapes import one_side, signed_quantities, weaker_sides
 from torchface.capture.anybody.eye_signals import (
     CORNERS,
@@ -23,12 +24,21 @@ from torchface.capture.anybody.eye_signals import (
 )
 from torchface.capture.anybody.guided_gains import gain_factors, gain_groups, highest_weights, learned_gains
 from torchface.capture.anybody.person_landmarks import PersonLandmarks
+from torchface.capture.anybody.person_surface import PersonSurface
 from torchface.capture.anybody.webcam_outputs import LOST_FIT, OutputTables, calmed_state, lost_state
 from torchface.capture.anybody.webcam_settings import WebcamSettings
 from torchface.capture.anybody.webcam_state import StateLayout, WebcamControls, WebcamState
 from torchface.capture.energy import Quadratic
 from torchface.capture.own_rig.face_points import EYE_CORNERS, JAW, LANDMARKS, FacePoints
-from torchface.capture.own_rig.gauss_newton import HeadState, Linearised, energy_of_step, linearise, split_step
+from torchface.capture.own_rig.gauss_newton import (
+    ErrorModes,
+    HeadState,
+    Linearised,
+    energy_of_step,
+    linearise,
+    split_step,
+)
+from torchface.capture.own_rig.surface_points import FaceSurfacePoints, alike_errors
 from torchface.capture.own_rig.weight_walk import faded, relative_trust, unseen_time, walk_information
 from torchface.capture.priors import ShapePrior
 from torchface.errors import NameMismatchError
@@ -52,6 +62,7 @@ _PRESENT = 0.5
 _NEAR = 0.5  # of the eyes' distance
 _SHORTEST, _LONGEST = 1e-3, 0.5  # seconds
 _SETTLED = 0.15  # seconds after which the pose of a face that has just appeared has come to rest
+_FARTHEST_OFF = 1.0  # of a point: at a depth of 1; further off it is not seen
 _UNKNOWN, _FADE = 5.0, 0.4  # how much more sparse a face is that nothing is known of, and for how long, seconds
 _EAGER, _EAGER_FOR = 3.0, 0.7  # how much more the first frames of a person count, and for how long, seconds
 _LIDS = ("eyeBlink", "eyeWide", "eyeSquint")
@@ -68,6 +79,8 @@ class _Frame:
         rays: to the landmarks, (68,2), at a depth of 1.
         trust: in each, (68,).
         spread: of each, standard deviation of a coordinate, (68,), at a depth of 1.
+        points: rays to P points of the surface, (P,2), and their spread, (P,), likewise; NaN for what is not seen.
+        read: weights by ARKit's names as a network reads them, and their deviations, (52,) both; likewise.
         iris: rays to the irises, (2,2).
         eyes: how open they are.
         interval: seconds since the frame before, ().
@@ -78,11 +91,24 @@ class _Frame:
     rays: Tensor
     trust: Tensor
     spread: Tensor
+    points: tuple[Tensor, Tensor]
+    read: tuple[Tensor, Tensor]
     iris: Tensor
     eyes: EyesRead
     interval: Tensor
     pose: Tensor
     learns: Tensor
+
+
+@dataclass(frozen=True, eq=False)
+class _SurfaceSeen:
+    """Points of a surface (P) as a frame shows them, one over their deviations, those of the landmarks, (68,)."""
+
+    points: FaceSurfacePoints
+    rays: Tensor
+    precision: Tensor
+    landmarks: Tensor
+    alike: ErrorModes
 
 
 class WebcamSolver(nn.Module):
@@ -109,6 +135,8 @@ class WebcamSolver(nn.Module):
             (K,68,3), millimetres; see ``HeadModel``.
         prior: which weights faces have, one of Student's distributions.
         settings: what terms weigh.
+        surface: where on the rig's neutral mesh P further points lie that networks find; the modes are then of the
+            landmarks and of these, (K,68+P,3).
 
     Raises:
         ShapeError: the rig has no landmarks, or the modes are others.
@@ -154,11 +182,20 @@ class WebcamSolver(nn.Module):
         identity_modes: Tensor | None = None,
         prior: ShapePrior | None = None,
         settings: WebcamSettings | None = None,
+        surface: Attachment | None = None,
     ) -> None:
         super().__init__()
         self.settings = settings or WebcamSettings()
         self.names: tuple[str, ...] = tuple(rig.names)
-        self.person = PersonLandmarks(rig, identity_modes, self.settings.coefficients)
+        of_landmarks = identity_modes
+        if identity_modes is not None and surface is not None:
+            of_landmarks = identity_modes[:, :LANDMARKS]
+        self.person = PersonLandmarks(rig, of_landmarks, self.settings.coefficients)
+        self.surface = (
+            None
+            if surface is None
+            else PersonSurface(rig, surface, identity_modes, self.person, self.settings.errors_alike)
+        )
         if prior is not None:
             prior.require(rig.names)
         to_arkit = mapping(rig.names, ARKIT).double()
@@ -243,7 +280,7 @@ class WebcamSolver(nn.Module):
         openness: Tensor,
         closed: Tensor,
         eye_visibility: Tensor,
-        points: Tensor,  # nothing is solved of these four yet
+        points: Tensor,
         point_deviation: Tensor,
         expression: Tensor,
         expression_deviation: Tensor,
@@ -268,6 +305,8 @@ class WebcamSolver(nn.Module):
             torch.where(visible[:, None] & shows_face, rays, self.person.rest[:LANDMARKS, :2] * self.upright),
             torch.where(shows_face, trust, 1.0),
             _known(deviation.double(), 0.0).clamp(0, 1e3) / focal,
+            ((points.double() - centre) / focal, point_deviation.double() / focal),
+            (expression.double(), expression_deviation.double()),
             iris_rays,
             EyesRead(openness.double(), closed.double(), eye_visibility.double()),
             interval,
@@ -288,18 +327,24 @@ class WebcamSolver(nn.Module):
 
         evidence = relative_trust(torch.where(frame.trust > 0, frame.trust, 0.0)[None]) @ self.influence
         hidden = unseen_time(before.hidden[None], evidence, frame.interval)
-        known = self._known_energy(signals, before, evidence, hidden, frame.interval)
+        known = self._known_energy(signals, before, evidence, hidden, frame.interval) + self._read_energy(frame)
         upper = highest_weights(gain_factors(before.gains, self.gain_shapes), self.gain_shapes, frame.pose)
         unit = eyes / (points.rest[EYE_CORNERS[0]] - points.rest[EYE_CORNERS[1]]).norm()
         variance = (self.settings.noise * eyes).square() + (0.5 * frame.spread).square()
         precision = frame.trust.sqrt() / (variance + self.person.person_remainder * unit**2).sqrt()
+        surface = self._surface_seen(frame, before, (rotation, translation), eyes, precision)
         head = HeadState(one_side(before.shapes.minimum(upper)[None], self.signed), rotation[None], translation[None])
         dual = pad(torch.zeros_like(before.shapes), (0, 6))
         damping = pad(self.damping, (len(self.names), 0))
         damped = Quadratic(damping.diag()[None], torch.zeros_like(damping)[None])
         for _ in range(self.settings.steps):  # each begins where the one before ends
             of_weights = known if self.prior is None else known + self.prior.energy(head.weights)
-            energy = self._linearised(points, head, frame.rays, precision).energy() + damped
+            if surface is None:
+                energy = self._linearised(points, head, frame.rays, precision).energy() + damped
+            else:
+                at = self._linearised(points, head, frame.rays, surface.landmarks)
+                there = surface.points.linearised(head, self.camera, surface.rays[None], surface.precision[None])
+                energy = at.energy_beside(there, surface.alike) + damped
             energy = energy + energy_of_step(of_weights, head.weights)
             free = torch.where(weaker_sides(head.weights, self.signed)[0], 0.0, upper)
             head, dual = split_step(energy, head, free, dual, _SPLITTING_STEPS, quick=True)
@@ -372,6 +417,29 @@ class WebcamSolver(nn.Module):
         f = self.settings.sparsity * (1 + _UNKNOWN * unknown) - walked * mean - pull * looking
         opened = (self.open_rows.T * sure) @ self.open_rows
         return Quadratic((H + opened)[None], (f + (sure * (1 - signals.open)) @ self.open_rows)[None])
+
+    def _read_energy(self, frame: _Frame) -> Quadratic:
+        """Of the weights (1,N), by what a network read of them."""
+        values, deviation = frame.read
+        precision = torch.where(torch.isnan(values), 0.0, deviation.square().reciprocal())
+        pulled = precision * _known(values, 0.0)
+        return Quadratic(((self.to_arkit.T * precision) @ self.to_arkit)[None], -(pulled @ self.to_arkit)[None])
+
+    def _surface_seen(
+        self, frame: _Frame, before: WebcamState, pose: tuple[Tensor, Tensor], eyes: Tensor, landmarks: Tensor
+    ) -> _SurfaceSeen | None:
+        """The surface's points of a frame, and how surely they and the landmarks are known, (68,), with them."""
+        if self.surface is None:
+            return None
+        points, (rays, spread) = self.surface.points(before.person), frame.points
+        known = ~torch.isnan(rays).any(1) & (spread < _FARTHEST_OFF)
+        counts = torch.where(known, points.facing(pose[0][None], pose[1][None])[0], 0.0).sqrt()
+        off = torch.where(known, spread, 1.0).square() + (self.settings.noise * eyes).square()
+        apart = (self.person.rest[EYE_CORNERS[0]] - self.person.rest[EYE_CORNERS[1]]).norm()
+        off = (off + self.surface.remainder * (eyes / apart).square()).sqrt()
+        own, alike = alike_errors(self.surface.modes, torch.cat([frame.trust.sqrt(), counts])[None])
+        seen = torch.where(known[:, None], rays, 0.0), counts / (own[0, LANDMARKS:] * off)
+        return _SurfaceSeen(points, *seen, landmarks / own[0, :LANDMARKS], alike)
 
     def _linearised(self, points: FacePoints, head: HeadState, rays: Tensor, precision: Tensor) -> Linearised:
         rows = points.chosen(head.weights, head.rotation, head.translation, self.camera)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from torch import Tensor
 
 from torchface.capture.energy import Quadratic
-from torchface.capture.own_rig.gauss_newton import HeadState
+from torchface.capture.own_rig.gauss_newton import ErrorModes, HeadState
 from torchface.capture.own_rig.state_estimate import Expectation, StateEstimate
 from torchface.errors import ValueRangeError
 
@@ -95,6 +95,7 @@ class FrameTerms:
         rotation, translation: the tracked pose, (B,3,3) and (B,3).
         expected: what is known before the frames are seen.
         points, point_precision: of the surface, likewise, (B,P,2) and (B,P); none if absent.
+        alike: what errors of landmarks and points have in common.
         read: what readings say of the weights (B,N) themselves; nothing if absent.
     """
 
@@ -105,6 +106,7 @@ class FrameTerms:
     expected: Expectation
     points: Tensor | None = None
     point_precision: Tensor | None = None
+    alike: ErrorModes | None = None
     read: Quadratic | None = None
 
     def tensors(self) -> tuple[Tensor, ...]:

@@ -101,6 +101,44 @@ class Linearised:
         J, r = self.jacobian.flatten(1, 2), self.residual.flatten(1)
         return Quadratic(J.transpose(1, 2) @ J, (r[:, None] @ J)[:, 0])
 
+    def energy_beside(self, points: Linearised, alike: ErrorModes) -> Quadratic:
+        """The energy of these landmarks and of points, which may be in single precision, less what errors share."""
+        other, count = points.energy(), self.residual.shape[1]
+        shared = alike.shared([(self, alike.modes[:, :count]), (points, alike.modes[:, count:])])
+        return self.energy() + Quadratic(other.H.to(shared.H), other.f.to(shared.f)) + shared
+
+
+@dataclass(frozen=True, eq=False)
+class ErrorModes:
+    r"""What the errors of L landmarks have in common, in units of what each errs by itself.
+
+    The errors' covariance, whitened by the independent part, is :math:`I + U U^\top`, the same for x and y. Its inverse
+    is :math:`I - U (I + U^\top U)^{-1} U^\top`, so that modes that many landmarks share count once.
+
+    Args:
+        modes: U, (B,L,M).
+        inner: :math:`(I + U^\top U)^{-1}`, (B,M,M).
+
+    Source: Woodbury 1950.
+    """
+
+    modes: Tensor
+    inner: Tensor
+
+    def shared(self, parts: list[tuple[Linearised, Tensor]]) -> Quadratic:
+        """What to add to the energy of independent errors, of a step (B,N+6); it is negative.
+
+        Args:
+            parts: landmarks with their rows of the modes, (B,L,M) in sum.
+        """
+        through = torch.zeros(1, dtype=self.modes.dtype, device=self.modes.device)
+        for at, modes in parts:
+            lines = torch.cat([at.residual[..., None], at.jacobian], dim=-1).flatten(2)
+            through = through + (modes.to(lines).transpose(1, 2) @ lines).to(through)  # (B,M,2(N+7))
+        scaled = (self.inner @ through).unflatten(2, (2, -1)).flatten(1, 2)
+        gram = through.unflatten(2, (2, -1)).flatten(1, 2).transpose(1, 2) @ scaled
+        return Quadratic(-gram[:, 1:, 1:], -gram[:, 0, 1:])
+
 
 def linearise(
     points: FacePoints,

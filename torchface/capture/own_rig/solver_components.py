@@ -15,7 +15,7 @@ from torchface.attachment import Attachment
 from torchface.capture.antagonist_shapes import signed_quantities
 from torchface.capture.own_rig.face_points import JAW, LANDMARKS, FacePoints, make_room_for_points
 from torchface.capture.own_rig.landmark_offsets import LandmarkOffsets, shifted_points
-from torchface.capture.own_rig.surface_points import FaceSurfacePoints
+from torchface.capture.own_rig.surface_points import FaceSurfacePoints, alike_over, smooth_modes
 from torchface.capture.own_rig.video_settings import VideoSettings
 from torchface.capture.own_rig.weight_walk import relative_trust
 from torchface.capture.priors import AdaptedDynamicsPrior, DynamicsPrior, ReciprocalPrior, ShapePrior
@@ -23,6 +23,7 @@ from torchface.correctives.activation import CorrectiveActivation
 from torchface.correctives.corrective_shapes import definitions_from_records
 from torchface.errors import FileFormatError, NameMismatchError, ShapeError, ValueRangeError
 from torchface.files.documents import Value
+from torchface.optim.prepared_tensors import Prepared
 from torchface.rig import BlendshapeRig
 
 CONTOUR_WEIGHT = 0.5
@@ -116,7 +117,10 @@ class VideoSolverParts(nn.Module):
         for name in _POINTS:
             self.register_buffer(name, getattr(points, name).detach())
         for name in _SURFACE:
-            self.register_buffer(f"surface_{name}", None if surface is None else getattr(surface, name))
+            value = None if surface is None else getattr(surface, name)
+            # Products of thousands of rows take half the time in single precision, and pixels need no more.
+            self.register_buffer(f"surface_{name}", value.float() if name == "basis" and value is not None else value)
+        self._modes: Prepared[Tensor] = Prepared()
         self.activation = points.activation
         self.register_buffer("corrective_basis", points.corrective_basis)
         self.register_buffer("intrinsics", intrinsics.to(like, copy=True))
@@ -157,13 +161,22 @@ class VideoSolverParts(nn.Module):
     @property
     def surface(self) -> FaceSurfacePoints | None:
         """The points beside the 68 landmarks, float64; None where there are none."""
-        rest, basis, normals, more = (None if x is None else x.double() for x in self._surface_buffers())
+        rest, normals, more = (
+            None if x is None else x.double()
+            for x in (self.surface_rest, self.surface_normals, self.surface_corrective_basis)
+        )
+        basis = self.surface_basis
         if rest is None or basis is None or normals is None:
             return None
         return FaceSurfacePoints(rest, basis, normals, None if more is None else self.activation, more)
 
-    def _surface_buffers(self) -> tuple[Tensor | None, ...]:
-        return tuple(getattr(self, f"surface_{name}") for name in _SURFACE)
+    @property
+    def error_modes(self) -> Tensor:
+        """What errors of the landmarks and the surface's points have in common, (68+P,M); see ``smooth_modes``."""
+        marks, surface = self.rest[:LANDMARKS].detach().double(), self.surface
+        places = marks if surface is None else torch.cat([marks, surface.rest.detach()])
+
+        return self._modes.get((places,), lambda: self.settings.alike**0.5 * smooth_modes(places, alike_over(places)))
 
     @property
     def walks(self) -> bool:
@@ -175,8 +188,23 @@ class VideoSolverParts(nn.Module):
         made = copy.copy(self)
         made._buffers = dict(self._buffers)
         points = shifted_points(self.points, self.names, offsets.millimetres)
-        made.rest, made.basis = points.rest, points.basis
+        made.rest, made.basis, made._modes = points.rest, points.basis, Prepared()
         made._settings = replace(self.settings, relative_noise=offsets.noise)
+        return made
+
+    def with_settings(self, settings: VideoSettings) -> Self:
+        """The same solver with other weights of terms; those of sparsity, ridge and motion stay."""
+        made = copy.copy(self)
+        made._settings, made._modes = settings, Prepared()
+        return made
+
+    def with_surface_moved(self, offsets: Tensor) -> Self:
+        """The same solver with the surface's points (P,3) millimetres further."""
+        if self.surface_rest is None:
+            raise ShapeError("surface: found a solver without points of a surface, expected some")
+        made = copy.copy(self)
+        made._buffers, made._modes = dict(self._buffers), Prepared()
+        made.surface_rest = self.surface_rest + offsets.to(self.surface_rest)
         return made
 
     def shape_confidence(self, trust: Tensor) -> Tensor:

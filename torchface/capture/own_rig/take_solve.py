@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from torchface.capture.own_rig.face_measurements import FaceMeasurements
 from torchface.capture.own_rig.face_points import LANDMARKS
 from torchface.capture.own_rig.frame_states import FrameTerms, VideoSolution, VideoState
 from torchface.capture.own_rig.gauss_newton import HeadState
@@ -29,6 +30,7 @@ def solve_take(
     seconds: Tensor | None = None,
     whole_take: bool = False,
     progress: Progress | None = None,
+    measured: FaceMeasurements | None = None,
 ) -> VideoSolution:
     """Weights and poses of a take, as ``torchface track`` solves it.
 
@@ -43,20 +45,23 @@ def solve_take(
         whole_take: each frame is solved from all frames, with a dynamics prior; without one, frames that show no face
             lie between those before and after.
         progress: called with how many frames are solved.
+        measured: what else is known of the frames.
     """
     if seconds is not None and solver.dynamics is not None:
         frame_intervals(seconds, len(landmarks), solver.settings.interval)  # checks them
         even = even_times(seconds)
         points, trust = (values_at(x, seconds, even) for x in (landmarks, confidence))
         if bool(solver.shows_face(points, trust).any()):
-            solution = solve_take(solver, points, trust, None, whole_take, progress)
+            nearest = frames_beside(seconds, even)[0]
+            there = None if measured is None else measured.of_frames(nearest)
+            solution = solve_take(solver, points, trust, None, whole_take, progress, there)
             weights, translation = (values_at(x, even, seconds) for x in (solution.weights, solution.translation))
             rotation = rotations_at(solution.rotation, even, seconds)
             return solver.solution(landmarks, confidence, weights, rotation, translation)
     if whole_take and solver.dynamics is not None:
-        return solve_whole_take(solver, landmarks, confidence=confidence, progress=progress)
+        return solve_whole_take(solver, landmarks, confidence=confidence, progress=progress, measured=measured)
     with torch.no_grad():
-        solution = solver(landmarks, confidence=confidence, seconds=seconds, progress=progress)
+        solution = solver(landmarks, confidence=confidence, seconds=seconds, progress=progress, measured=measured)
     if not whole_take or bool(solution.solved.all()):
         return solution
     when = torch.arange(len(landmarks), device=landmarks.device) if seconds is None else seconds
@@ -71,6 +76,7 @@ def solve_whole_take(
     translation: Tensor | None = None,
     confidence: Tensor | None = None,
     progress: Progress | None = None,
+    measured: FaceMeasurements | None = None,
 ) -> VideoSolution:
     r"""Weights and poses of consecutive frames, each from all of them.
 
@@ -83,7 +89,7 @@ def solve_whole_take(
 
     Args:
         solver: with a dynamics prior; without one no frame says anything of another.
-        landmarks, rotation, translation, confidence, progress: as of ``VideoSolver.forward``.
+        landmarks, rotation, translation, confidence, progress, measured: as of ``VideoSolver.forward``.
 
     Raises:
         ShapeError: the shapes do not fit each other.
@@ -108,7 +114,8 @@ def solve_whole_take(
     if solver.dynamics is None:
         raise ValueRangeError("whole take: found a solver without a dynamics prior, expected one that has it")
     with torch.no_grad():
-        states, enough = solver.states(landmarks, rotation, translation, confidence, progress=progress)
+        given = landmarks, rotation, translation, confidence
+        states, enough = solver.states(*given, progress=progress, measured=measured)
         first = int(enough.nonzero()[0, 0])
         smoothed = _smoothed(solver, states[first:])
         head = _solved(solver, states[first:], smoothed)

@@ -20,6 +20,7 @@ from torchface.capture.own_rig.gauss_newton import (
 )
 from torchface.capture.own_rig.solver_components import DEFAULT_WEIGHT_STEP, VideoSolverParts, check_not_negative
 from torchface.capture.own_rig.state_estimate import Expectation, StateEstimate
+from torchface.capture.own_rig.surface_points import alike_errors
 from torchface.capture.own_rig.weight_walk import faded, frame_intervals, unseen_time, walk_information
 from torchface.errors import ShapeError, ValueRangeError
 from torchface.geometry.cameras.pnp import solve_pnp
@@ -229,9 +230,14 @@ class VideoSolver(VideoSolverParts):
         noise = self.noise(at.rotation, at.translation)
         off = noise[:, None] if measured.deviation is None else _both(noise[:, None], measured.deviation)
         precision = self._precision(seen if enough else torch.zeros_like(seen), confidence, off)
-        points, sure = (None, None) if not enough else self._surface_seen(measured, at, noise)
+        points, sure, alike = None, None, None
+        if enough and measured.points is not None and measured.point_deviation is not None and self.surface is not None:
+            points, counts, spread = self._surface_seen(measured.points, measured.point_deviation, at, noise[:, None])
+            own, alike = alike_errors(self.error_modes, torch.cat([(precision * off).detach(), counts], dim=1))
+            precision, sure = precision / own[:, :LANDMARKS], counts / (own[:, LANDMARKS:] * spread)
         read = None if measured.weights is None or not enough else measured.weights.energy()
-        terms = FrameTerms(pixels.nan_to_num(0.0), precision, rotation, translation, expected, points, sure, read)
+        pixels = pixels.nan_to_num(0.0)
+        terms = FrameTerms(pixels, precision, rotation, translation, expected, points, sure, alike, read)
         if state.head is not None and not enough:
             weights = expected.mean.weights if self.walks else state.head.weights
             held = HeadState(weights, rotation, translation)
@@ -339,10 +345,12 @@ class VideoSolver(VideoSolverParts):
         """Landmarks and tracked poses linearised at a state, of a step from there, (B,N+6)."""
         K, slide = self.intrinsics.double(), self.settings.contour_slide
         at = linearise(self.points, head, rows, K, terms.landmarks, terms.precision, slide)
-        data = at.energy()
-        if terms.points is not None and terms.point_precision is not None and self.surface is not None:
-            found = terms.points, terms.point_precision
-            data = data + self.surface.energy(head.weights, head.rotation, head.translation, K, found)
+        surface = self.surface
+        if terms.points is None or terms.point_precision is None or terms.alike is None or surface is None:
+            data = at.energy()
+        else:
+            points = surface.linearised(head, K, terms.points, terms.point_precision)
+            data = at.energy_beside(points, terms.alike)
         if terms.read is not None:
             data = data + energy_of_step(terms.read, head.weights)
         if self.settings.pose_trust == 0:
@@ -387,22 +395,16 @@ class VideoSolver(VideoSolverParts):
         return torch.where(weights > 0, weights, 1.0).sqrt() * (weights > 0) / noise
 
     def _surface_seen(
-        self, measured: FaceMeasurements, head: HeadState, noise: Tensor
-    ) -> tuple[Tensor | None, Tensor | None]:
-        """The surface's points (1,P,2) of a frame, finite, and one over their deviations, (1,P), at about a pose."""
-        if measured.points is None or measured.point_deviation is None or self.surface is None:
-            return None, None
-        points, deviation = measured.points.double(), measured.point_deviation.double()
+        self, points: Tensor, deviation: Tensor, head: HeadState, noise: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """A frame's points of the surface (1,P,2), finite, the roots of what they count at about a pose, (1,P), and
+        their deviations, (1,P), pixels."""
+        points, deviation = points.double(), deviation.double()
         known = torch.isfinite(points).all(-1) & torch.isfinite(deviation)
         with torch.no_grad():
-            counts = self.surface.facing(head.rotation, head.translation) * known
-        precision = self.point_precision(counts, _both(noise[:, None], torch.where(known, deviation, 1.0)))
-        return torch.where(known[..., None], points, 0.0), precision
-
-    def point_precision(self, counts: Tensor, deviation: Tensor) -> Tensor:
-        """One over the deviations of points whose errors are alike: of (B,P) that count in [0,1], (B,P)."""
-        together = self.settings.effective_points / counts.sum(1, keepdim=True).clamp(min=1.0)
-        return (counts * together.clamp(max=1.0)).sqrt() / deviation
+            facing = self.surface.facing(head.rotation, head.translation)  # type: ignore[union-attr]
+        counts = torch.where(known, facing, 0.0).sqrt()
+        return torch.where(known[..., None], points, 0.0), counts, _both(noise, torch.where(known, deviation, 1.0))
 
     def landmark_trust(self, landmarks: Tensor, confidence: Tensor | None) -> Tensor:
         """How much each of landmarks (B,68,2) counts beside one that is surely seen, (B,68) float64."""

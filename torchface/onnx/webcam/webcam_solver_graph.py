@@ -66,6 +66,9 @@ def webcam_solver_model(solver: WebcamSolver) -> onnx.ModelProto:
     The metadata holds ``names`` (JSON list, of the weights), ``state`` (S), ``controls``, ``poses`` and ``version``.
     """
     reading = empty_reading()
+    if solver.surface is not None:
+        unseen = torch.full((len(solver.surface.rest), 2), torch.nan)
+        reading = replace(reading, points=unseen, point_deviation=unseen[:, 0] + torch.inf)
     examples = [getattr(reading, name) for name in READ_BY_NETWORKS]
     examples += [torch.tensor([640.0, 480.0]), torch.tensor(1 / 30), torch.zeros(len(CONTROLS))]
     examples.append(torch.zeros(solver.layout.length))

@@ -9,7 +9,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from torchface.capture.own_rig import VideoSolution, VideoSolver
+from torchface.capture.own_rig import FaceMeasurements, VideoSolution, VideoSolver
 from torchface.capture.own_rig.another_face import AnotherFace, other_faces
 from torchface.capture.own_rig.landmark_offset_estimate import estimate_offsets
 from torchface.capture.own_rig.landmark_offsets import LandmarkOffsets
@@ -162,6 +162,7 @@ def new_solution(
     trust: Tensor,
     times: Tensor | None,
     progress: Progress,
+    measured: FaceMeasurements | None = None,
 ) -> VideoSolution:
     """Weights and poses of smoothed landmarks (T,68,2), trusted (T,68).
 
@@ -169,7 +170,7 @@ def new_solution(
         ValueRangeError: no frame shows enough of them; the message names the video or table.
     """
     try:
-        return solve_take(solver, landmarks, trust, times, inputs.settings.whole_take, progress)
+        return solve_take(solver, landmarks, trust, times, inputs.settings.whole_take, progress, measured)
     except ValueRangeError as error:
         raise ValueRangeError(f"{inputs.clip.path}: {error}") from error
 

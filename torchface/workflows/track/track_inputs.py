@@ -23,6 +23,7 @@ from torchface.modeling import HeadModel
 from torchface.number_checks import check_rate
 from torchface.rig import BlendshapeRig
 from torchface.workflows.named_heads import NamedHeads, load_head_model, matching
+from torchface.workflows.surface_sites import sites_on_rig
 from torchface.workflows.track.track_models import (
     DEFAULT_LANDMARKS,
     DEFAULT_PRIOR,
@@ -31,7 +32,7 @@ from torchface.workflows.track.track_models import (
     load_track_models,
 )
 
-METHOD = "track/6"
+METHOD = "track/7"
 """Of the keys; another number where the same inputs, or pieces of another length, come to give other results."""
 
 Overlay = Literal["side", "over", "none"]
@@ -198,7 +199,8 @@ def solver_for(
 ) -> VideoSolver:
     """The solver of a rig, for landmarks that the models find, at a frame rate."""
     settings = VideoSettings.of_found_landmarks(models.dynamics is not None, models.appearance is not None, fps)
-    return VideoSolver(rig, None, calibration.intrinsics, models.prior, models.dynamics, settings)
+    surface = sites_on_rig(rig, models.places) if len(models.places) else None
+    return VideoSolver(rig, None, calibration.intrinsics, models.prior, models.dynamics, settings, surface=surface)
 
 
 def _clip(video: Path | None, settings: TrackSettings) -> VideoFile:

@@ -20,6 +20,7 @@ from torchface.workflows.track.face_overlay import video_light
 from torchface.workflows.track.frame_readings import read_frames
 from torchface.workflows.track.overlay_video import write_overlay
 from torchface.workflows.track.person_head import person_head
+from torchface.workflows.track.take_measurements import measuring_solver, take_measurements
 from torchface.workflows.track.take_solution import (
     frame_times,
     judged_reading,
@@ -102,7 +103,10 @@ def _track(inputs: TrackInputs, out: Path, filmed: bool, progress: Progress) -> 
     solution = kept_solution(state, key)
     if solution is None:
         with _timed(seconds, "weights"):
-            solution = new_solution(inputs, solver, landmarks, trust, times, progress)
+            measured, sure = take_measurements(inputs, solver, reading), trust
+            if measured is not None:
+                solver, sure = measuring_solver(solver, landmarks, reading, measured)
+            solution = new_solution(inputs, solver, landmarks, sure, times, progress, measured)
         keep_solution(state, key, solution)
     tracked = Tracked(
         inputs,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import onnx
+import torch
 
 from torchface import zoo
 from torchface.capture.anybody import WebcamSettings, WebcamSolver
@@ -16,6 +17,7 @@ from torchface.onnx.webcam.webcam_solver_graph import WebcamSolverGraph
 from torchface.progress import Progress, silent
 from torchface.synthetic.head.performer import performer
 from torchface.workflows.cached_graph import cached_graph
+from torchface.workflows.surface_sites import sites_on_rig
 from torchface.workflows.track.track_models import DEFAULT_PRIOR, load_priors
 
 __all__ = ["default_webcam_solver"]
@@ -81,5 +83,8 @@ def default_webcam_solver(settings: WebcamSettings | None = None) -> WebcamSolve
     heads = zoo.get_model(HEADS, HeadModel)
     if heads.landmarks is None:
         raise NameMismatchError(f"{HEADS}: found a HeadModel without landmarks, expected one with them")
-    modes = heads.shape.modes[:, heads.landmarks]
-    return WebcamSolver(rig, modes, load_priors(rig, DEFAULT_PRIOR, None).shapes, settings)
+    modes, places = heads.shape.modes[:, heads.landmarks], zoo.get_model(NETWORKS[1], LandmarkNetwork).places
+    surface = sites_on_rig(rig, places) if len(places) else None
+    if surface is not None:
+        modes = torch.cat([modes, surface.on(rig.neutral.faces, heads.shape.modes)], dim=1)
+    return WebcamSolver(rig, modes, load_priors(rig, DEFAULT_PRIOR, None).shapes, settings, surface)
