@@ -22,12 +22,12 @@ from torchface.io.video import open_video
 from torchface.landmarks import (
     FaceBoxes,
     FaceReading,
-    HaarDetector,
     LandmarkTracker,
     NoFaceError,
     find_landmarks,
     landmark_jitter,
 )
+from torchface.landmarks.images.boxes.network_detector import shipped_detector
 from torchface.landmarks.images.ibug_68 import INNER, box_around, relative_errors, tilt_around
 from torchface.landmarks.images.landmark_finder import LandmarkFinder
 
@@ -133,7 +133,7 @@ class GivenBox:
 
     def __init__(self) -> None:
         self.landmarks, self.shape = torch.full((68, 2), torch.nan), torch.Size()
-        self.piece = HaarDetector(smallest=0.33, step=1.1)
+        self.piece = shipped_detector()
 
     def __call__(self, image: Tensor) -> FaceBoxes:
         if image.shape[-2:] != self.shape:  # the tracker's look at the face's surroundings

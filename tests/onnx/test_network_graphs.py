@@ -23,7 +23,7 @@ def network() -> BoxNetwork:
         torch.manual_seed(3)
         drawn = BoxNetwork((8, 8, 12, 12), (1, 1, 1, 1), faces=8)
         with torch.no_grad():
-            drawn.said.weight.normal_()
+            drawn.said.weight.normal_(0, 0.2)
             for _ in range(30):  # batch normalisation learns what comes
                 drawn.train()(torch.rand(2, 3, 96, 96))
     return drawn.eval()
@@ -38,8 +38,8 @@ def test_other_sizes_than_it_was_exported_with(network: BoxNetwork, tmp_path: Pa
         (found,) = session.run(["faces"], {"images": images.numpy()})
         with torch.no_grad():
             expected = network(images).numpy()
-        assert expected[:, 0, 3].min() > 1.5 * expected[:, -1, 3].max()  # there is something to tell apart
-        np.testing.assert_allclose(found, expected, atol=2e-3)
+        assert (expected[:, 0, 3] > 1.5 * expected[:, -1, 3]).all()  # there is something to tell apart
+        np.testing.assert_allclose(found, expected, atol=2e-3, rtol=1e-5)  # sides of thousands of pixels
     facts = {one.key: one.value for one in onnx.load(path).metadata_props}
     assert facts["task"] == "face_boxes"
     assert facts["values"] == str(list(FACE_VALUES)).replace("'", '"')

@@ -6,7 +6,6 @@ from torchface.landmarks.images.boxes.box_network import BoxNetwork
 from torchface.landmarks.images.boxes.box_training import BoxTrainingSettings, LabelledPicture
 from torchface.landmarks.images.boxes.face_box import FaceBoxes, NoFaceError
 from torchface.landmarks.images.boxes.find_faces import find_face, find_faces
-from torchface.landmarks.images.boxes.haar_detector import HaarDetector
 from torchface.landmarks.images.boxes.network_detector import NetworkDetector
 from torchface.landmarks.images.face_reading import FaceReading
 from torchface.landmarks.images.landmark_finder import LandmarkFinder
@@ -50,7 +49,6 @@ __all__ = [
     "FaceBoxes",
     "FaceFrame",
     "FaceReading",
-    "HaarDetector",
     "LabelledPicture",
     "LandmarkFinder",
     "LandmarkNetwork",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import cache, cached_property, lru_cache
 from typing import Protocol
@@ -111,14 +112,17 @@ class SceneSettings:
         smallest, largest: side of a face's box, pixels; the larger the rarer.
         turned: share of people at any roll angle; the others are near upright.
         broken: share of people whose face is shuffled, covered with skin or with hair: they are none.
+        huge: share of people who are up to seven times as large as the largest: they are none, though their eyes and
+            mouths are seen. A detector finds them in a smaller copy of the picture.
     """
 
-    size: int = 256
+    size: int = 96
     people: int = 4
-    smallest: float = 15.0
-    largest: float = 260.0
-    turned: float = 0.35
-    broken: float = 0.12
+    smallest: float = 12.0
+    largest: float = 44.0
+    turned: float = 0.75
+    broken: float = 0.15
+    huge: float = 0.15
 
     def __post_init__(self) -> None:
         if not (self.size >= 64 and self.people >= 0 and 4 <= self.smallest < self.largest):
@@ -152,6 +156,15 @@ def face_scene(
     return LabelledPicture(torch.from_numpy(stored).permute(2, 0, 1).contiguous(), faces, uncertain)
 
 
+def empty_scene(piece: np.ndarray, rng: np.random.Generator) -> LabelledPicture:
+    """A square (S,S,3) without a face as a picture: turned by quarters, mirrored or not, in another light."""
+    image = np.rot90(piece[:, :: int(rng.choice([-1, 1]))], int(rng.integers(4)))
+    stored = _photographed(np.ascontiguousarray(image), rng)
+    return LabelledPicture(
+        torch.from_numpy(stored).permute(2, 0, 1).contiguous(), torch.zeros(0, 4), torch.zeros(0, dtype=torch.bool)
+    )
+
+
 @lru_cache(maxsize=2 * _SCENES)  # each is shown again soon
 def _staged(people: ScenePeople, number: int, settings: SceneSettings, seed: int) -> tuple[np.ndarray, Tensor, Tensor]:
     """A scene before it is taken (S,S,3), its faces (F,4), and which are uncertain (F,)."""
@@ -163,9 +176,10 @@ def _staged(people: ScenePeople, number: int, settings: SceneSettings, seed: int
     sides = np.exp(rng.uniform(np.log(settings.smallest), np.log(settings.largest), count))
     faces: list[np.ndarray] = []
     hulls: list[np.ndarray] = []
+    sides = np.where(rng.random(count) < settings.huge, settings.largest * rng.uniform(1.6, 7, count), sides)
     for side in np.sort(sides):  # in front of those before
         face, hull = _stand(image, owner, people, float(side), len(faces), settings, rng)
-        if face is not None:
+        if face is not None and side <= settings.largest:
             faces.append(face)
             hulls.append(hull)
     for hull in hulls:
@@ -354,6 +368,7 @@ def _share_inside(face: np.ndarray, size: int) -> float:
 def _photographed(image: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """What light and a camera make of it."""
     size = image.shape[0]
+    fine = math.sqrt(size / 256)  # small pictures are parts of sharper ones
     curve = np.linspace(0, 1, 256)[:, None] ** np.exp(rng.normal(0, 0.3))
     curve = curve * np.exp(rng.normal(0, 0.1, 3)) * rng.uniform(0.65, 1.2)
     if rng.random() < 0.12:  # dark
@@ -366,9 +381,9 @@ def _photographed(image: np.ndarray, rng: np.random.Generator) -> np.ndarray:
         share = 1.0 if rng.random() < 0.7 else float(rng.uniform(-0.6, 0.9))  # none, less or more colour
         taken = cv2.addWeighted(grey, share, taken, 1 - share, 0)
     if rng.random() < 0.35:
-        taken = cv2.GaussianBlur(taken, (0, 0), float(rng.uniform(0.4, 1.6)))
+        taken = cv2.GaussianBlur(taken, (0, 0), fine * float(rng.uniform(0.4, 1.6)))
     if rng.random() < 0.08:  # the camera moved
-        length = int(rng.integers(3, 9))
+        length = max(2, round(fine * rng.integers(3, 9)))
         line: np.ndarray = np.zeros((length, length), dtype=np.float32)
         line[length // 2] = 1
         middle = (length / 2 - 0.5, length / 2 - 0.5)

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from torchface.landmarks.images.appearance.appearance_model import AppearanceModel
 from torchface.landmarks.images.boxes.face_box import FaceDetector, NoFaceError, grey_pixels, overlaps
-from torchface.landmarks.images.boxes.find_faces import find_faces_of_any_turn, find_some_faces
+from torchface.landmarks.images.boxes.find_faces import find_some_faces
 from torchface.landmarks.images.face_reading import FaceReading
 from torchface.landmarks.images.ibug_68 import box_around, turned_box
 from torchface.landmarks.images.landmark_finder import LandmarkFinder, find_in_box
@@ -77,7 +77,7 @@ def find_landmarks(
         image: uint8 (H,W), or (3,H,W) red first.
         finder: finds 68 landmarks in a box; landmark trees do so from 48 starts.
         face: which one, from 0, the largest first.
-        detector: finds boxes; the shipped cascades if absent.
+        detector: finds boxes; the zoo's ``face_boxes`` if absent.
         appearance: of this person; refines what the finder finds.
 
     Raises:
@@ -94,7 +94,7 @@ def find_landmarks(
         torchface.landmarks.images.boxes.face_box.NoFaceError: image of 160 x 120: found no face, expected one at least
     """
     finder = TreeFinder(finder, PHOTOGRAPH) if isinstance(finder, LandmarkTrees) else finder
-    faces = find_some_faces(image, face, detector or find_faces_of_any_turn)
+    faces = find_some_faces(image, face, detector)
     reading = settled_face(finder, image, faces.boxes[face], float(faces.tilts[face]))
     presence = float(reading.presence)
     if presence < _PHOTOGRAPHED:

@@ -78,7 +78,7 @@ def box_around(landmarks: Tensor, tilt: float = 0.0) -> Tensor:
     r"""The box that a face detector of OpenCV's kind would draw round landmarks.
 
     A square of :math:`1.6\sqrt{(w^2 + h^2)/2}`, w and h the extent of brows, nose, eyes and mouth; their mean lies in
-    its middle, a little below. The two factors are medians of the shipped Haar cascade's boxes over frontal faces.
+    its middle, a little below. The two factors are medians of the boxes of OpenCV's Haar cascade over frontal faces.
 
     Args:
         landmarks: iBUG's 68, (...,68,2), pixels; NaN rows are left out.

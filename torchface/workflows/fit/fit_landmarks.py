@@ -18,7 +18,6 @@ from torchface.io.landmarks.dlib_xml import LabelledFace, load_dlib_faces
 from torchface.io.landmarks.landmark_points import load_landmark_points
 from torchface.io.landmarks.landmark_tables import load_landmark_table
 from torchface.landmarks import FaceReading, NoFaceError, find_faces, find_landmarks
-from torchface.landmarks.images.boxes.find_faces import find_faces_of_any_turn
 from torchface.landmarks.images.face_mesh_478 import landmarks_of_mesh
 from torchface.landmarks.images.ibug_68 import COUNT
 from torchface.modeling.photographs.landmark_view import LANDMARKS
@@ -220,7 +219,7 @@ def find_in_photographs(
     readings = []
     for path, image in zip(photographs, images, strict=True):  # one photograph at a time: they differ in size
         pixels = (image[:3].clamp(0, 1) * 255).round().to(torch.uint8)
-        faces = find_faces_of_any_turn(pixels)
+        faces = find_faces(pixels)
         try:
             reading = find_landmarks(pixels, finder, face or 0, lambda _, faces=faces: faces)  # type: ignore[misc]
         except NoFaceError as error:

@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from torchface.errors import ShapeError, ValueRangeError
+from torchface.errors import ShapeError
 from torchface.geometry.cameras.pinhole import look_at
 from torchface.io.images.image_files import load_image
 from torchface.io.landmarks.dlib_xml import load_dlib_faces
@@ -19,7 +19,6 @@ from torchface.landmarks.images.boxes.face_box import (
     overlaps,
 )
 from torchface.landmarks.images.boxes.find_faces import find_face, find_faces
-from torchface.landmarks.images.boxes.haar_detector import HaarDetector
 from torchface.landmarks.images.ibug_68 import box_around
 from torchface.rendering.clay_shading import render
 from torchface.synthetic import performer
@@ -95,8 +94,6 @@ def test_no_face_is_said() -> None:
         find_face(noise)
     with pytest.raises(ShapeError, match="expected uint8"):
         find_faces(noise / 255)
-    with pytest.raises(ValueRangeError, match="smallest"):
-        HaarDetector(smallest=0)
 
 
 def test_overlaps_are_shared_area_over_the_whole() -> None:

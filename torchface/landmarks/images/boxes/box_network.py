@@ -8,21 +8,24 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
-from torch.nn.functional import interpolate, max_pool2d
+from torch.nn.functional import avg_pool2d, interpolate, max_pool2d
 
 from torchface.errors import ShapeError, ValueRangeError
-from torchface.progress import Progress, ValueLog
+from torchface.progress import Progress, ValueLog, silent
 
 if TYPE_CHECKING:
     from torchface.landmarks.images.boxes.box_training import BoxTrainingSettings, Pictures
 
-INPUT_SIZE = 640
-"""Pixels of the longer side of the copy of an image that the network is given."""
+INPUT_SIZE = 896
+"""Pixels of the longer side of the copy of an image that the network is given; a face of 32 pixels in 1280 has 22."""
+
+COPIES = 5
+"""Copies of an image that the network sees: each half as large as the one before, for faces twice as large."""
 
 STRIDE = 8
 """Pixels a cell of the maps."""
 
-TYPICAL_SIDE = 48.0
+TYPICAL_SIDE = 24.0
 """Pixels: what a network that has learned nothing takes a face for."""
 
 _SMALLEST = 64  # pixels a side of an image
@@ -31,7 +34,9 @@ LOG_SIDES = 5.0
 """How far the logarithm of a side may lie from the typical one's."""
 
 BESIDE_A_PEAK = 1e-3
-"""What a cell's score counts beside a likelier one."""
+"""What a score counts beside a likelier one of the same face."""
+
+_SAME_FACE = 0.45  # of the larger side: two faces whose centres are nearer are one
 
 
 class FaceMaps(NamedTuple):
@@ -40,7 +45,7 @@ class FaceMaps(NamedTuple):
     Args:
         centre: logit that a face has its centre in the cell, (B,1,h,w).
         geometry: of that face (B,5,h,w): its centre against the cell's, x and y in cells; the logarithm of its side
-            over 48 pixels; cosine and sine of its roll angle, of any length.
+            over 24 pixels; cosine and sine of its roll angle, of any length.
     """
 
     centre: Tensor
@@ -51,8 +56,9 @@ class BoxNetwork(nn.Module):
     """Face boxes of every size and roll angle in colour images, in one pass.
 
     Depthwise separable convolutions at strides 4, 8, 16 and 32; what the coarse levels see is added to the level of
-    stride 8, whose cells say whether a face has its centre there, how large it is and how far it is turned. Of
-    neighbouring cells the likeliest alone counts.
+    stride 8, whose cells say whether a face has its centre there, how large it is and how far it is turned. The same
+    is asked of copies of half the size, a quarter, and so on: the network needs to know faces of a range of three in
+    size alone. Of all that is said of one face the likeliest counts.
 
     Args:
         channels: of the four levels.
@@ -75,8 +81,8 @@ class BoxNetwork(nn.Module):
 
     def __init__(
         self,
-        channels: Sequence[int] = (24, 32, 64, 96),
-        blocks: Sequence[int] = (1, 3, 4, 4),
+        channels: Sequence[int] = (24, 48, 64, 64),
+        blocks: Sequence[int] = (1, 4, 3, 1),
         faces: int = 32,
     ) -> None:
         super().__init__()
@@ -116,6 +122,7 @@ class BoxNetwork(nn.Module):
         source: Mapping[str, object] | None = None,
         device: str | torch.device = "cpu",
         log: ValueLog | None = None,
+        start: BoxNetwork | None = None,
     ) -> BoxNetwork:
         """Learns from pictures.
 
@@ -128,13 +135,15 @@ class BoxNetwork(nn.Module):
             source: what the pictures are made of, for the checkpoint.
             device: where the network computes.
             log: called with what was measured, every fifty steps.
+            start: a network of the settings' channels and blocks that goes on learning; an untaught one if absent.
 
         Raises:
             FileFormatError: the checkpoint is of other settings or another source.
         """
         from torchface.landmarks.images.boxes.box_training import fit_boxes
+        from torchface.optim import DescentRun
 
-        return fit_boxes(pictures, settings, progress, checkpoint, source, device, log)
+        return fit_boxes(pictures, settings, DescentRun(progress or silent, log, checkpoint, device), source, start)
 
     @property
     def config(self) -> dict[str, Any]:
@@ -148,7 +157,6 @@ class BoxNetwork(nn.Module):
 
     def maps(self, images: Tensor) -> FaceMaps:
         """What is said of every cell of images (B,3,H,W) in [0,1]; h and w are an eighth of H and W."""
-        _check_images(images)
         fine = self.level_8(self.level_4(self.stem(images - 0.5)))
         middle = self.level_16(fine)
         coarse = self.from_32(self.level_32(middle))
@@ -169,19 +177,38 @@ class BoxNetwork(nn.Module):
         Raises:
             ShapeError: no such images.
         """
-        centre, geometry = self.maps(images)
-        likely = centre.sigmoid()
-        # Cells beside a peak keep a thousandth: among equal ones the order would be anybody's.
-        peaks = likely * torch.where(max_pool2d(likely, 3, 1, 1) == likely, 1.0, BESIDE_A_PEAK)
-        column = geometry[:, :1] + torch.arange(peaks.shape[3]).to(peaks)
-        row = geometry[:, 1:2] + torch.arange(peaks.shape[2]).to(peaks)[:, None]
-        cell = torch.cat([column, row, geometry[:, 2:]], 1).flatten(2)
-        scores, cells = peaks.flatten(1).topk(self.faces, dim=1)
-        face = cell.gather(2, cells[:, None].expand(-1, 5, -1)).transpose(1, 2)
-        middle = STRIDE * (face[..., :2] + 0.5) - 0.5
-        side = TYPICAL_SIDE * face[..., 2:3].clamp(-LOG_SIDES, LOG_SIDES).exp()
-        angle = face[..., 3:] / face[..., 3:].square().sum(-1, keepdim=True).clamp(min=1e-12).sqrt()
-        return torch.cat([middle, side, scores[..., None], angle], -1)
+        _check_images(images)
+        copies = [images]
+        for _ in range(COPIES - 1):
+            copies.append(avg_pool2d(copies[-1], 2))
+        cells = torch.cat([_said_faces(self.maps(copy), 2**half) for half, copy in enumerate(copies)], 1)
+        rows = cells[..., 3].topk(self.faces, dim=1).indices
+        faces = cells.gather(1, rows[..., None].expand(-1, -1, 6))
+        apart = (faces[:, :, None, :2] - faces[:, None, :, :2]).square().sum(-1).sqrt()
+        near = apart < _SAME_FACE * torch.maximum(faces[:, :, None, 2], faces[:, None, :, 2])
+        known = near.logical_and(torch.ones(self.faces, self.faces).tril(-1) > 0).any(2)  # by a likelier row
+        scores = faces[..., 3] * torch.where(known, BESIDE_A_PEAK, 1.0)
+        scores, rows = scores.topk(self.faces, dim=1)
+        faces = faces.gather(1, rows[..., None].expand(-1, -1, 6))
+        return torch.cat([faces[..., :3], scores[..., None], faces[..., 4:]], -1)
+
+
+def _said_faces(maps: FaceMaps, scale: int) -> Tensor:
+    """The face of every cell (B,h*w,6), as :meth:`BoxNetwork.forward` gives faces.
+
+    Args:
+        maps: of images.
+        scale: pixels a pixel of the images.
+    """
+    likely, geometry = maps.centre.sigmoid(), maps.geometry
+    # Cells beside a peak keep a thousandth: among equal ones the order would be anybody's.
+    peaks = likely * torch.where(max_pool2d(likely, 3, 1, 1) == likely, 1.0, BESIDE_A_PEAK)
+    column = geometry[:, :1] + torch.arange(peaks.shape[3]).to(peaks)
+    row = geometry[:, 1:2] + torch.arange(peaks.shape[2]).to(peaks)[:, None]
+    middle = scale * STRIDE * (torch.cat([column, row], 1) + 0.5) - 0.5
+    side = scale * TYPICAL_SIDE * geometry[:, 2:3].clamp(-LOG_SIDES, LOG_SIDES).exp()
+    angle = geometry[:, 3:] / geometry[:, 3:].square().sum(1, keepdim=True).clamp(min=1e-12).sqrt()
+    return torch.cat([middle, side, peaks, angle], 1).flatten(2).transpose(1, 2)
 
 
 def face_geometry(faces: Tensor, cells: Tensor) -> Tensor:

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
-from pathlib import Path
 from typing import NamedTuple, Protocol
 
 import torch
@@ -16,9 +15,8 @@ from torchface.errors import ValueRangeError
 from torchface.files.content_keys import content_key
 from torchface.landmarks.images.boxes.box_network import STRIDE, BoxNetwork, FaceMaps, face_geometry
 from torchface.optim import DescentRun, DescentSettings, DescentTask, descend
-from torchface.progress import Progress, ValueLog, silent
 
-_SPREAD, _LEAST_SPREAD = 0.09, 0.6  # of the heat round a centre: of the face's side, and in cells
+_SPREAD, _LEAST_SPREAD = 0.09, 0.8  # of the heat round a centre: of the face's side, and in cells
 _DESCRIBED = 0.3  # cells of so much heat describe the face
 _GEOMETRY = torch.tensor([1.0, 1.0, 1.5, 0.7, 0.7])  # what an error of centre (in sides), size and angle costs
 
@@ -70,13 +68,13 @@ class BoxTrainingSettings:
         100
     """
 
-    pictures: int = 80_000
-    batch: int = 16
+    pictures: int = 400_000
+    batch: int = 32
     rate: float = 3e-3
     decay: float = 1e-4
     averaged: int = 200
-    channels: tuple[int, ...] = (24, 32, 64, 96)
-    blocks: tuple[int, ...] = (1, 3, 4, 4)
+    channels: tuple[int, ...] = (24, 48, 64, 64)
+    blocks: tuple[int, ...] = (1, 4, 3, 1)
     seed: int = 0
     workers: int = 0
     checkpoint_every: float = 120.0
@@ -119,26 +117,26 @@ class _Batch(NamedTuple):
 def fit_boxes(
     pictures: Pictures,
     settings: BoxTrainingSettings | None,
-    progress: Progress | None,
-    checkpoint: Path | None,
+    run: DescentRun,
     source: Mapping[str, object] | None,
-    device: str | torch.device,
-    log: ValueLog | None,
+    start: BoxNetwork | None,
 ) -> BoxNetwork:
     """See :meth:`BoxNetwork.fit`."""
-    settings, progress = settings or BoxTrainingSettings(), progress or silent
+    settings, device = settings or BoxTrainingSettings(), run.device
     with torch.random.fork_rng([]):  # the first weights alone
         torch.manual_seed(settings.seed)
         model = BoxNetwork(settings.channels, settings.blocks)
+    if start is not None:
+        model.load_state_dict(start.state_dict())
 
     def loss(batch: _Batch, _: float) -> tuple[Tensor, float]:
         images = (batch.images.to(device).float() / 255).to(memory_format=torch.channels_last)
         value = box_loss(model.maps(images), batch.faces.to(device), batch.uncertain.to(device))
         return value, float(value.detach())
 
-    key = content_key("box_training/2", config=model.config, source=source or {})
+    key = content_key("box_training/3", config=model.config, source=source or {})
     task = DescentTask(partial(_drawn, pictures, settings.batch), loss, key)
-    return descend(model, task, settings.descent, DescentRun(progress, log, checkpoint, device))
+    return descend(model, task, settings.descent, run)
 
 
 def _drawn(pictures: Pictures, size: int, step: int) -> _Batch:

@@ -14,9 +14,6 @@ from torchface.errors import ShapeError, TorchfaceError
 
 cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)  # what matters comes as an error
 
-SAME_FACE = 0.3
-"""Overlap from which two boxes are of one face."""
-
 
 class NoFaceError(TorchfaceError):
     """An image shows no face, or fewer than asked for.
@@ -81,31 +78,7 @@ def grey_pixels(image: Tensor) -> np.ndarray:
     return cv2.cvtColor(np.ascontiguousarray(image.permute(1, 2, 0).cpu().numpy()), cv2.COLOR_RGB2GRAY)
 
 
-def sorted_boxes(boxes: Tensor, scores: Tensor, tilts: Tensor | None = None) -> FaceBoxes:
-    """Boxes (F,4), scores (F,) and tilts (F,), the largest face first."""
-    order = (boxes[:, 2] * boxes[:, 3]).argsort(descending=True, stable=True)
-    return FaceBoxes(boxes[order], scores[order], None if tilts is None else tilts[order])  # type: ignore[arg-type]
-
-
 def check_image(image: Tensor) -> None:
     """Raises a ``ShapeError`` where an image is not uint8 (H,W) or (3,H,W)."""
     if image.dtype != torch.uint8 or not (image.ndim == 2 or (image.ndim == 3 and len(image) == 3)) or 0 in image.shape:
         raise ShapeError(f"image: found {image.dtype} {tuple(image.shape)}, expected uint8 (H,W) or (3,H,W)")
-
-
-def one_each(boxes: Tensor, scores: Tensor) -> Tensor:
-    """Rows of boxes (F,4) that no box of a higher score (F,) overlaps, the highest first."""
-    same = overlaps(boxes, boxes) >= SAME_FACE
-    rows: list[int] = []
-    for row in scores.argsort(descending=True, stable=True).tolist():  # a few faces
-        if not same[row, rows].any():
-            rows.append(row)
-    return torch.tensor(rows, dtype=torch.long)
-
-
-def shrunk(pixels: np.ndarray, scale: float) -> np.ndarray:
-    """Pixels (H,W) or (H,W,3) at a scale of at most 1, averaged."""
-    if scale >= 1:
-        return pixels
-    size = (max(1, round(pixels.shape[1] * scale)), max(1, round(pixels.shape[0] * scale)))
-    return cv2.resize(pixels, size, interpolation=cv2.INTER_AREA)

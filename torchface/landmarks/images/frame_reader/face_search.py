@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torchface.landmarks.images.boxes.box_network import BoxNetwork
+from torchface.landmarks.images.boxes.box_network import INPUT_SIZE, BoxNetwork
 from torchface.landmarks.images.frame_reader.face_place import overlap
 from torchface.landmarks.images.frame_reader.picture_pieces import whole_picture
 
@@ -31,7 +31,7 @@ class SearchSettings:
         candidates: faces that are tried in turn, a frame each, where the landmark network refuses one.
     """
 
-    longest: int = 640
+    longest: int = INPUT_SIZE
     score: float = 0.4
     again: float = 0.3
     overlap: float = 0.25

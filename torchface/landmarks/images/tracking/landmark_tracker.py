@@ -11,8 +11,8 @@ from torchface.errors import ValueRangeError
 from torchface.landmarks.images.appearance.appearance_model import AppearanceModel
 from torchface.landmarks.images.box_landmarks import refined_face, settled_face
 from torchface.landmarks.images.boxes.face_box import FaceBoxes, FaceDetector, check_image, overlaps
-from torchface.landmarks.images.boxes.find_faces import find_faces, find_turned_faces
-from torchface.landmarks.images.boxes.haar_detector import STREAM, SURROUNDINGS, HaarDetector
+from torchface.landmarks.images.boxes.find_faces import find_faces
+from torchface.landmarks.images.boxes.network_detector import shipped_detector
 from torchface.landmarks.images.face_reading import FaceReading
 from torchface.landmarks.images.ibug_68 import turned_box
 from torchface.landmarks.images.landmark_finder import LandmarkFinder, find_in_box
@@ -36,8 +36,6 @@ class TrackingSettings:
         checks: how often in a row it must see none.
         frames_waited: for which a lost face is waited for at its place before another is taken.
         least_side: of a box, pixels, under which a face is lost.
-        turned_every: frames in a row without a face after which turned faces are looked for again; the first is such a
-            frame.
         least_likeness: correlation of a face's look with how it looked before, under which it is another's where there
             are several.
         likeness_gain: how much more another face must look as this one did to be taken for it.
@@ -50,7 +48,6 @@ class TrackingSettings:
     checks: int = 3
     frames_waited: int = 10
     least_side: float = 12.0
-    turned_every: int = 4
     least_likeness: float = 0.6
     likeness_gain: float = 0.15
 
@@ -65,7 +62,7 @@ class LandmarkTracker:
     Args:
         finder: finds 68 landmarks in a box; landmark trees do so from several starts.
         appearance: of the actor; refines what the finder finds.
-        detector: finds boxes; the shipped cascades if absent.
+        detector: finds boxes; the zoo's ``face_boxes`` if absent.
         face: which one, from 0, the largest first, where the first frame that shows one shows several. It stays with
             that face while others come and go.
         settings: when a face counts as lost.
@@ -92,9 +89,7 @@ class LandmarkTracker:
             raise ValueRangeError(f"face: found {face}, expected a number from 0")
         self.finder: LandmarkFinder = TreeFinder(finder) if isinstance(finder, LandmarkTrees) else finder
         self.appearance, self.face = appearance, face
-        self.detector = detector or HaarDetector(**STREAM)
-        haar = isinstance(self.detector, HaarDetector)
-        self._near_detector: FaceDetector = HaarDetector(**SURROUNDINGS) if haar else self.detector
+        self.detector = detector or shipped_detector()
         self.settings = settings or TrackingSettings()
         self.reset()
 
@@ -215,7 +210,7 @@ class LandmarkTracker:
         x, y, side = (float(value) for value in (box[0], box[1], box[2]))
         left, top = max(0, int(x - side / 2)), max(0, int(y - side / 2))
         piece = frame[..., top : int(y + 1.5 * side) + 1, left : int(x + 1.5 * side) + 1]
-        faces = find_faces(piece, self._near_detector)
+        faces = find_faces(piece, self.detector)
         corner = box.new_tensor([left, top, 0, 0])
         faces = FaceBoxes(faces.boxes + corner, faces.scores, faces.tilts)
         self._note_others(frame, faces, box)
@@ -227,11 +222,6 @@ class LandmarkTracker:
         face = self._chosen(frame, find_faces(frame, self.detector))
         if face is None and followed.place is not None and 0 < followed.missed < settings.frames_waited:
             face = self._still_there(frame, followed.place)
-        clear = face is not None and self._is_sure(face) and float(face.confidence.mean()) >= settings.least_confidence
-        if followed.missed % settings.turned_every == 0 and not clear:
-            turned = self._chosen(frame, find_turned_faces(frame, self.detector))
-            if turned is not None and self._is_sure(turned) and _is_clearer(turned, face):
-                face = turned
         if face is not None:
             followed.unconfirmed = 0
         return face
@@ -272,8 +262,3 @@ class LandmarkTracker:
         height, width = frame.shape[-2:]
         inside = 0 <= x < width and 0 <= y < height
         return inside and self.settings.least_side <= float(box[2]) <= 1.5 * max(height, width)
-
-
-def _is_clearer(face: FaceReading, other: FaceReading | None) -> bool:
-    """Whether a face that was found turned is one, rather than what was found upright."""
-    return other is None or float(face.confidence.mean()) > float(other.confidence.mean())
