@@ -26,6 +26,7 @@ from .face_pictures import EACH, StoredCutOuts, StoredPictures, picture_files
 from .model_cards import model_card
 from .recipe_settings import ANY_DEVICE, RecipeSettings
 from .rendered_people.face_scenes import ScenePeople, SceneSettings, empty_scene, face_scene
+from .rendered_people.scene_clutter import clutter
 from .runner import Recipe, Run, metric_lines, recipe
 
 _SAME, _NOTHING = 0.4, 0.3  # overlaps from which a box is the face's, and under which it is none's
@@ -44,7 +45,8 @@ class Settings(RecipeSettings):
         ict: ICT-FaceKit's FaceXModel, whose heads are four people in five; embedded performers alone without.
         held_out: Of them, the last, of people whom no scene that it learns from shows, kept for the test.
         tested: Scenes of those that are held out.
-        mined: Scenes in which mistakes are looked for when it has learned; it learns again as long, with those.
+        mined: Pictures without people in which mistakes are looked for when it has learned; it learns again as long,
+            with those.
         workers: Processes that render.
         scenes: What is in them.
         training: How it learns.
@@ -85,7 +87,7 @@ def train(settings: Settings, run: Run) -> tuple[BoxNetwork, dict[str, float]]:
     source = {"scenes": settings.scenes, "people": len(people), "ict": settings.ict is not None, "seed": settings.seed}
     draw = partial(_scene, people, settings.scenes, settings.seed)
     model = BoxNetwork.fit(draw, settings.training, progress, run.checkpoint, source, run.device, run.log)
-    mistaken = mined_pieces(model, people, settings.mined, settings.scenes.size, settings.seed, progress)
+    mistaken = mined_pieces(model, settings.mined, settings.scenes.size, settings.seed, progress)
     draw = partial(_scene_or_piece, draw, mistaken, settings.seed + 1)
     again = replace(settings.training, rate=settings.training.rate / 2)
     checkpoint = run.checkpoint.with_name(f"again_{run.checkpoint.name}")
@@ -129,35 +131,31 @@ def evaluate(
 
 
 def mined_pieces(
-    model: BoxNetwork, people: ScenePeople, count: int, size: int, seed: int, progress: Progress | None = None
+    model: BoxNetwork, count: int, size: int, seed: int, progress: Progress | None = None
 ) -> list[np.ndarray]:
-    """Squares (S,S,3) round what a network takes for faces where there is none, in half as many scenes without people
-    as with people.
+    """Squares (S,S,3) round what a network takes for faces in pictures without people.
 
     Args:
         model: that errs.
-        people: of the scenes.
-        count: of the scenes.
+        count: of the pictures.
         size: pixels a side of the squares, S.
-        seed: of the scenes.
+        seed: of the pictures.
         progress: called with each step and how far it is.
     """
     progress, detector = progress or silent, NetworkDetector(model, _MISTAKEN)
-    settings = SceneSettings(size=_TEST_SIZE, smallest=16.0, largest=0.7 * _TEST_SIZE, huge=0.0)
     pieces: list[np.ndarray] = []
     for number in range(count):  # pictures have different numbers of mistakes
-        scene = face_scene(people, number, settings if number % 3 else replace(settings, people=0), seed + 2_000_000)
-        seen = detector(scene.image)
-        truth = torch.cat([scene.faces[:, :2] - scene.faces[:, 2:3] / 2, scene.faces[:, 2:3].expand(-1, 2)], 1)
-        image = scene.image.permute(1, 2, 0).numpy()
-        for box in seen.boxes[(overlaps(truth, seen.boxes) < 0.1).all(0)]:
-            side = float(box[2])
-            copies = max(0, math.ceil(math.log2(side / _LARGEST_SHOWN)))  # of the copy in which it was seen
-            scale = 0.5**copies
-            way = np.array([[scale, 0, size / 2], [0, scale, size / 2]])
-            way[:, 2] -= scale * (box[:2] + box[2:] / 2).numpy()
-            small = cv2.GaussianBlur(image, (0, 0), 0.5 / scale) if copies else image
-            pieces.append(cv2.warpAffine(small, way, (size, size), borderMode=cv2.BORDER_REFLECT))
+        rng = np.random.default_rng((seed, number, 3))
+        picture = empty_scene(clutter(_TEST_SIZE, _TEST_SIZE, rng), rng).image
+        image = picture.permute(1, 2, 0).numpy()
+        for x, y, side, _ in detector(picture).boxes.tolist():
+            halvings = max(0, math.ceil(math.log2(side / _LARGEST_SHOWN)))  # to the copy in which it was seen
+            scale = 0.5**halvings
+            way = np.array(
+                [[scale, 0, size / 2 - scale * (x + side / 2)], [0, scale, size / 2 - scale * (y + side / 2)]]
+            )
+            smooth = cv2.GaussianBlur(image, (0, 0), 0.5 / scale) if halvings else image
+            pieces.append(cv2.warpAffine(smooth, way, (size, size), borderMode=cv2.BORDER_REPLICATE))
         progress("looking for mistakes", number + 1, count)
     return pieces
 

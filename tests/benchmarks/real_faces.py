@@ -27,7 +27,7 @@ from torchface.landmarks import (
     find_landmarks,
     landmark_jitter,
 )
-from torchface.landmarks.images.boxes.network_detector import shipped_detector
+from torchface.landmarks.images.checked_detector import shipped_detector
 from torchface.landmarks.images.ibug_68 import INNER, box_around, relative_errors, tilt_around
 from torchface.landmarks.images.landmark_finder import LandmarkFinder
 

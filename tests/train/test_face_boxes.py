@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from safetensors.torch import save_file
@@ -11,8 +12,8 @@ from safetensors.torch import save_file
 from torchface import TorchfaceError, zoo
 from torchface.landmarks import BoxNetwork, BoxTrainingSettings
 from train import face_boxes as recipe
-from train.face_boxes import Settings, train
-from train.rendered_people.face_scenes import SceneSettings
+from train.face_boxes import Settings, mined_pieces, train
+from train.rendered_people.face_scenes import SceneSettings, empty_scene
 
 
 def planted(folder: Path, *_: object) -> list[Path]:
@@ -36,6 +37,7 @@ def test_what_is_saved_is_what_was_learned(tmp_path: Path, monkeypatch: pytest.M
             people=10,
             held_out=2,
             tested=2,
+            mined=2,
             scenes=SceneSettings(size=64, largest=50),
             training=learning,
         )
@@ -47,6 +49,19 @@ def test_what_is_saved_is_what_was_learned(tmp_path: Path, monkeypatch: pytest.M
     record = zoo.describe(out)
     assert record.metrics == pytest.approx(measured)
     assert record.settings["training"]["pictures"] == 16
+
+
+def test_mistakes_are_cut_out_of_pictures_without_people() -> None:
+    """A network that takes every cell for a face errs in each picture; what is cut out shows no face to learn."""
+    network = BoxNetwork((4, 4, 4, 4), (1, 1, 1, 1), faces=4)
+    with torch.no_grad():
+        network.said.bias[0] = 3.0  # type: ignore[index]
+    pieces = mined_pieces(network.eval(), 3, 64, 1)
+    assert len(pieces) >= 3
+    assert all(piece.shape == (64, 64, 3) for piece in pieces)
+    shown = [empty_scene(pieces[0], np.random.default_rng(seed)) for seed in range(2)]
+    assert all(one.image.shape == (3, 64, 64) and len(one.faces) == 0 for one in shown)
+    assert not torch.equal(shown[0].image, shown[1].image)
 
 
 def test_settings_that_cannot_be_are_refused(tmp_path: Path) -> None:

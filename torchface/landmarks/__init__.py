@@ -5,9 +5,9 @@ from torchface.landmarks.images.box_landmarks import find_landmarks
 from torchface.landmarks.images.boxes.box_network import BoxNetwork
 from torchface.landmarks.images.boxes.box_training import BoxTrainingSettings, LabelledPicture
 from torchface.landmarks.images.boxes.face_box import FaceBoxes, NoFaceError
-from torchface.landmarks.images.boxes.find_faces import find_face, find_faces
 from torchface.landmarks.images.boxes.network_detector import NetworkDetector
 from torchface.landmarks.images.face_reading import FaceReading
+from torchface.landmarks.images.find_faces import find_face, find_faces
 from torchface.landmarks.images.landmark_finder import LandmarkFinder
 from torchface.landmarks.images.networks.eye_network import EyeFindings, EyeNetwork
 from torchface.landmarks.images.networks.landmark_network import LandmarkNetwork, NetworkLandmarks

@@ -9,8 +9,8 @@ from torch import Tensor
 
 from torchface.landmarks.images.appearance.appearance_model import AppearanceModel
 from torchface.landmarks.images.boxes.face_box import FaceDetector, NoFaceError, grey_pixels, overlaps
-from torchface.landmarks.images.boxes.find_faces import find_some_faces
 from torchface.landmarks.images.face_reading import FaceReading
+from torchface.landmarks.images.find_faces import find_some_faces
 from torchface.landmarks.images.ibug_68 import box_around, turned_box
 from torchface.landmarks.images.landmark_finder import LandmarkFinder, find_in_box
 from torchface.landmarks.images.trees.landmark_trees import LandmarkTrees
@@ -62,6 +62,7 @@ def appearance_landmarks(appearance: AppearanceModel, grey: Tensor, start: Tenso
 
 # Presence under which a photograph shows no face: boxes in pictures without one had 0.27 to 0.57.
 _PHOTOGRAPHED = 0.6
+_TRIED = 5  # boxes, where no face was asked for by number
 
 
 def find_landmarks(
@@ -77,7 +78,7 @@ def find_landmarks(
         image: uint8 (H,W), or (3,H,W) red first.
         finder: finds 68 landmarks in a box; landmark trees do so from 48 starts.
         face: which one, from 0, the largest first.
-        detector: finds boxes; the zoo's ``face_boxes`` if absent.
+        detector: finds boxes; see :func:`find_faces`.
         appearance: of this person; refines what the finder finds.
 
     Raises:
@@ -95,12 +96,14 @@ def find_landmarks(
     """
     finder = TreeFinder(finder, PHOTOGRAPH) if isinstance(finder, LandmarkTrees) else finder
     faces = find_some_faces(image, face, detector)
-    reading = settled_face(finder, image, faces.boxes[face], float(faces.tilts[face]))
-    presence = float(reading.presence)
-    if presence < _PHOTOGRAPHED:
-        x, y, wide = (round(float(value)) for value in reading.search_box[:3])
-        raise NoFaceError(
-            f"image of {image.shape[-1]} x {image.shape[-2]}: found something at ({x}, {y}), {wide} pixels wide, that "
-            f"is a face with a probability of {presence:.2f}, expected a face"
-        )
-    return refined_face(reading, image, appearance)
+    refused: list[FaceReading] = []
+    for number in range(len(faces))[:_TRIED] if face == 0 else [face]:  # the largest box may show none
+        reading = settled_face(finder, image, faces.boxes[number], float(faces.tilts[number]))
+        if float(reading.presence) >= _PHOTOGRAPHED:
+            return refined_face(reading, image, appearance)
+        refused.append(reading)
+    x, y, wide = (round(float(value)) for value in refused[0].search_box[:3])
+    raise NoFaceError(
+        f"image of {image.shape[-1]} x {image.shape[-2]}: found something at ({x}, {y}), {wide} pixels wide, that "
+        f"is a face with a probability of {float(refused[0].presence):.2f}, expected a face"
+    )

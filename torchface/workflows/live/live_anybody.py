@@ -15,7 +15,7 @@ from torchface.errors import ValueRangeError
 from torchface.files.job_lock import job_lock
 from torchface.io.protocols.stream_address import is_source, parse_source
 from torchface.io.protocols.weight_sender import find_receiver
-from torchface.landmarks.images.boxes.network_detector import shipped_detector
+from torchface.landmarks.images.checked_detector import shipped_detector
 from torchface.number_checks import checked_number
 from torchface.onnx.webcam.webcam_session import WebcamSession
 from torchface.progress import Progress, silent

@@ -14,9 +14,9 @@ from torchface.io.landmarks.landmark_tables import load_landmark_table
 from torchface.io.video import VideoFile
 from torchface.io.video.blank_video import BlankVideo
 from torchface.landmarks.images.boxes.face_box import overlaps
-from torchface.landmarks.images.boxes.find_faces import find_faces
 from torchface.landmarks.images.face_mesh_478 import landmarks_of_mesh
 from torchface.landmarks.images.face_reading import FaceReading
+from torchface.landmarks.images.find_faces import find_faces
 from torchface.landmarks.images.ibug_68 import COUNT, box_around
 from torchface.landmarks.images.landmark_finder import LandmarkFinder
 from torchface.landmarks.images.tracking.landmark_tracker import LandmarkTracker

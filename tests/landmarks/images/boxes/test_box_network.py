@@ -15,7 +15,7 @@ from torchface.errors import FileFormatError, ShapeError, ValueRangeError
 from torchface.landmarks import BoxNetwork, BoxTrainingSettings, LabelledPicture, NetworkDetector
 from torchface.landmarks.images.boxes.box_network import FaceMaps, face_geometry
 from torchface.landmarks.images.boxes.box_training import box_loss
-from torchface.landmarks.images.boxes.network_detector import shipped_detector
+from torchface.landmarks.images.checked_detector import shipped_detector
 
 FEW = BoxTrainingSettings(pictures=1440, batch=8, rate=2e-2, averaged=10, channels=(8, 12, 16, 16), blocks=(1, 1, 1, 1))
 

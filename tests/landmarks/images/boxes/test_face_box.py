@@ -18,7 +18,7 @@ from torchface.landmarks.images.boxes.face_box import (
     NoFaceError,
     overlaps,
 )
-from torchface.landmarks.images.boxes.find_faces import find_face, find_faces
+from torchface.landmarks.images.find_faces import find_face, find_faces
 from torchface.landmarks.images.ibug_68 import box_around
 from torchface.rendering.clay_shading import render
 from torchface.synthetic import performer

@@ -9,7 +9,7 @@ from torch import Tensor
 from torchface import zoo
 from torchface.geometry.cameras.pinhole import look_at
 from torchface.landmarks import FaceReading, LandmarkTracker
-from torchface.landmarks.images.boxes.network_detector import shipped_detector
+from torchface.landmarks.images.checked_detector import shipped_detector
 from torchface.landmarks.images.frame_reader.face_reader import STATE, FaceReader, WebcamNetworks, read_eyes
 from torchface.landmarks.images.ibug_68 import relative_errors
 from torchface.landmarks.images.networks.crop_finder import CropFinder

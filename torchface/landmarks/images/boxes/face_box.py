@@ -78,6 +78,12 @@ def grey_pixels(image: Tensor) -> np.ndarray:
     return cv2.cvtColor(np.ascontiguousarray(image.permute(1, 2, 0).cpu().numpy()), cv2.COLOR_RGB2GRAY)
 
 
+def sorted_boxes(boxes: Tensor, scores: Tensor, tilts: Tensor | None = None) -> FaceBoxes:
+    """Boxes (F,4), scores (F,) and tilts (F,), the largest face first."""
+    order = (boxes[:, 2] * boxes[:, 3]).argsort(descending=True, stable=True)
+    return FaceBoxes(boxes[order], scores[order], None if tilts is None else tilts[order])  # type: ignore[arg-type]
+
+
 def check_image(image: Tensor) -> None:
     """Raises a ``ShapeError`` where an image is not uint8 (H,W) or (3,H,W)."""
     if image.dtype != torch.uint8 or not (image.ndim == 2 or (image.ndim == 3 and len(image) == 3)) or 0 in image.shape:

@@ -2,18 +2,14 @@
 
 from __future__ import annotations
 
-from functools import cache
-
 import cv2
 import numpy as np
 import torch
 from torch import Tensor
 
 from torchface.errors import ValueRangeError
-from torchface.files.model_roots import shipped_model
-from torchface.files.models import read_model
 from torchface.landmarks.images.boxes.box_network import INPUT_SIZE, BoxNetwork
-from torchface.landmarks.images.boxes.face_box import FaceBoxes, check_image
+from torchface.landmarks.images.boxes.face_box import FaceBoxes, check_image, sorted_boxes
 from torchface.landmarks.images.folded_normalisation import without_normalisation
 
 _MULTIPLE = 32  # pixels: the stride of the network's coarsest level
@@ -54,22 +50,10 @@ class NetworkDetector:
         picture, ratio = _network_picture(image, self.longest)
         faces = self._fused(picture)[0].clone()
         faces = faces[faces[:, 3] >= self.least_score]
-        faces = faces[faces[:, 2].argsort(descending=True, stable=True)]
         middle = (faces[:, :2] + 0.5) * ratio - 0.5
         side = faces[:, 2:3] * ratio.mean()
         boxes = torch.cat([middle - side / 2, side, side], 1)
-        return FaceBoxes(boxes, faces[:, 3], torch.atan2(faces[:, 5], faces[:, 4]))
-
-
-@cache
-def shipped_detector() -> NetworkDetector:
-    """The detector of the zoo's ``face_boxes``, read once.
-
-    Raises:
-        FileFormatError: it is missing or damaged.
-    """
-    network = read_model(shipped_model("face_boxes"), {"face_boxes": BoxNetwork})
-    return NetworkDetector(network)
+        return sorted_boxes(boxes, faces[:, 3], torch.atan2(faces[:, 5], faces[:, 4]))
 
 
 def _network_picture(image: Tensor, longest: int) -> tuple[Tensor, Tensor]:

@@ -32,8 +32,8 @@ class SearchSettings:
     """
 
     longest: int = INPUT_SIZE
-    score: float = 0.4
-    again: float = 0.3
+    score: float = 0.3
+    again: float = 0.25
     overlap: float = 0.25
     candidates: int = 4
 

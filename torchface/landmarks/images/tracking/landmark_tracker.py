@@ -11,9 +11,9 @@ from torchface.errors import ValueRangeError
 from torchface.landmarks.images.appearance.appearance_model import AppearanceModel
 from torchface.landmarks.images.box_landmarks import refined_face, settled_face
 from torchface.landmarks.images.boxes.face_box import FaceBoxes, FaceDetector, check_image, overlaps
-from torchface.landmarks.images.boxes.find_faces import find_faces
-from torchface.landmarks.images.boxes.network_detector import shipped_detector
+from torchface.landmarks.images.checked_detector import shipped_detector
 from torchface.landmarks.images.face_reading import FaceReading
+from torchface.landmarks.images.find_faces import find_faces
 from torchface.landmarks.images.ibug_68 import turned_box
 from torchface.landmarks.images.landmark_finder import LandmarkFinder, find_in_box
 from torchface.landmarks.images.tracking.followed_face import LOOK, FollowedFace, face_place
@@ -22,6 +22,7 @@ from torchface.landmarks.images.trees.tree_finder import TreeFinder
 
 _SAME_PLACE, _UNMOVED, _CONFIRMED, _APART = 0.5, 0.75, 0.4, 0.3  # overlaps of boxes
 _MOST_OTHERS = 4
+_MOST_TRIED = 4  # boxes of a search beside those of the larger faces
 
 
 @dataclass(frozen=True)
@@ -29,6 +30,7 @@ class TrackingSettings:
     """When a face counts as lost, and where it is looked for.
 
     Args:
+        new_presence: from which a box of the detector elsewhere than where a face was shows one.
         sure_presence: from which a face is one without asking the detector.
         least_presence: from which it is one where the detector sees a face too.
         least_confidence: the mean under which a face that the detector misses ``checks`` times in a row is lost.
@@ -41,6 +43,7 @@ class TrackingSettings:
         likeness_gain: how much more another face must look as this one did to be taken for it.
     """
 
+    new_presence: float = 0.5
     sure_presence: float = 0.9
     least_presence: float = 0.1
     least_confidence: float = 0.44
@@ -62,7 +65,7 @@ class LandmarkTracker:
     Args:
         finder: finds 68 landmarks in a box; landmark trees do so from several starts.
         appearance: of the actor; refines what the finder finds.
-        detector: finds boxes; the zoo's ``face_boxes`` if absent.
+        detector: finds boxes; see ``find_faces``.
         face: which one, from 0, the largest first, where the first frame that shows one shows several. It stays with
             that face while others come and go.
         settings: when a face counts as lost.
@@ -238,12 +241,17 @@ class LandmarkTracker:
         waits = followed.place is not None and followed.missed < self.settings.frames_waited
         if not near and (waits or self.face >= len(faces)):
             return None
-        number = near[0] if near else self.face
-        face = self._face_in(frame, faces, number)
-        if face is not None:
-            followed.look = followed.look if near else None  # a face elsewhere may be anybody's
-            self._note_others(frame, faces, faces.boxes[number])
-        return face
+        skipped = 0 if near else self.face
+        for number in near[:1] or range(min(len(faces), self.face + _MOST_TRIED)):  # a box may show no face
+            face = self._face_in(frame, faces, number)
+            if face is None or not (near or float(face.presence) >= self.settings.new_presence):
+                continue
+            if skipped == 0:
+                followed.look = followed.look if near else None  # a face elsewhere may be anybody's
+                self._note_others(frame, faces, faces.boxes[number])
+                return face
+            skipped -= 1
+        return None
 
     def _still_there(self, frame: Tensor, place: Tensor) -> FaceReading | None:
         """The face where it was lost (5,), though the detector sees none: turned or half hidden."""

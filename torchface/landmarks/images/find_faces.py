@@ -5,7 +5,7 @@ from __future__ import annotations
 from torch import Tensor
 
 from torchface.landmarks.images.boxes.face_box import FaceBoxes, FaceDetector, NoFaceError, check_image
-from torchface.landmarks.images.boxes.network_detector import shipped_detector
+from torchface.landmarks.images.checked_detector import shipped_detector
 
 
 def find_faces(image: Tensor, detector: FaceDetector | None = None) -> FaceBoxes:
@@ -13,7 +13,7 @@ def find_faces(image: Tensor, detector: FaceDetector | None = None) -> FaceBoxes
 
     Args:
         image: uint8 (H,W), or (3,H,W) red first.
-        detector: the zoo's ``face_boxes`` if absent, which finds faces at every roll angle.
+        detector: the zoo's ``face_boxes``, checked by its ``landmark_network``, if absent: faces at every roll angle.
 
     Raises:
         ShapeError: no such image.
@@ -46,7 +46,7 @@ def find_some_faces(image: Tensor, number: int = 0, detector: FaceDetector | Non
     Args:
         image: uint8 (H,W), or (3,H,W) red first.
         number: of the face that must be there, from 0.
-        detector: the zoo's ``face_boxes`` if absent.
+        detector: see :func:`find_faces`.
     """
     faces = find_faces(image, detector)
     if not 0 <= number < len(faces):
