@@ -19,6 +19,7 @@ def find_faces(image: Tensor, detector: FaceDetector | None = None) -> FaceBoxes
         ShapeError: no such image.
 
     Example:
+        >>> import torch
         >>> len(find_faces(torch.full((120, 160), 128, dtype=torch.uint8)).boxes)
         0
     """
@@ -30,6 +31,7 @@ def find_face(image: Tensor, number: int = 0, detector: FaceDetector | None = No
     """The box of one face: x, y, width, height, (4,) pixels; see :func:`find_some_faces`.
 
     Example:
+        >>> import torch
         >>> from torchface.landmarks import NoFaceError
         >>> try:
         ...     box = find_face(torch.full((120, 160), 128, dtype=torch.uint8))
