@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -12,16 +11,7 @@ from torch.nn.functional import pad
 
 from torchface.attachment import Attachment
 from torchface.capture.antagonist_shapes import one_side, signed_quantities, weaker_sides
-from torchface.capture.anybody.eye_signals import (
-    CORNERS,
-    LOOKS,
-    EyeSignals,
-    EyesRead,
-    eye_signals,
-    look_weights,
-    openness_rows,
-    seen_gaze,
-)
+from torchface.capture.anybody.eye_signals import EyeSignals, EyesRead, eye_signals
 from torchface.capture.anybody.guided_gains import gain_factors, gain_groups, highest_weights, learned_gains
 from torchface.capture.anybody.person_landmarks import PersonLandmarks
 from torchface.capture.anybody.person_surface import PersonSurface
@@ -29,6 +19,14 @@ from torchface.capture.anybody.webcam_outputs import LOST_FIT, OutputTables, cal
 from torchface.capture.anybody.webcam_settings import WebcamSettings
 from torchface.capture.anybody.webcam_state import StateLayout, WebcamControls, WebcamState
 from torchface.capture.energy import Quadratic
+from torchface.capture.own_rig.eye_geometry import (
+    CORNERS,
+    LOOKS,
+    arkit_names,
+    look_weights,
+    openness_rows,
+    seen_gaze,
+)
 from torchface.capture.own_rig.face_points import EYE_CORNERS, JAW, LANDMARKS, FacePoints
 from torchface.capture.own_rig.gauss_newton import (
     ErrorModes,
@@ -205,7 +203,7 @@ class WebcamSolver(nn.Module):
             )
         self.prior = None if prior is None else prior.prepared(self.settings.prior_strength)
         self.layout = StateLayout(len(rig.names), self.settings.coefficients)
-        called = _arkit_names(rig.names)
+        called = arkit_names(rig.names)
         rest, basis = self.person.rest[:LANDMARKS], self.person.basis[:LANDMARKS]
         rows, usual = openness_rows(rest, basis, called)
         landmark_weights = torch.tensor([_CONTOUR_TRUST] * JAW + [1.0] * (LANDMARKS - JAW))
@@ -492,15 +490,6 @@ class WebcamSolver(nn.Module):
     def _same_person(self, *given: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         person, information, evidence, _ = given[-4:]
         return person.clone(), information.clone(), evidence.clone()
-
-
-def _arkit_names(names: Sequence[str]) -> list[str]:
-    """What ARKit calls each shape; its own name where ARKit knows none."""
-    called = mapping(names, ARKIT)
-    return [
-        ARKIT[int(column.argmax())] if bool(column.any()) else name
-        for name, column in zip(names, called.T, strict=True)
-    ]
 
 
 def _known(values: Tensor, otherwise: float) -> Tensor:

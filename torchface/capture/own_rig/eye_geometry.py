@@ -1,0 +1,193 @@
+"""Geometry of eyes before a camera: how far lids are open, where eyeballs look, and which shapes say so."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torchface.rig import BlendshapeRig
+from torchface.shape_names import ARKIT, mapping
+
+CORNERS = ((36, 39), (42, 45))
+"""Corners of the right eye and the left one among the 68 landmarks."""
+_LIDS = (((37, 41), (38, 40)), ((43, 47), (44, 46)))  # the lids' landmarks across from each other
+LOOKS = (
+    *("eyeLookInRight", "eyeLookOutRight", "eyeLookInLeft", "eyeLookOutLeft"),
+    *("eyeLookUpRight", "eyeLookDownRight", "eyeLookUpLeft", "eyeLookDownLeft"),
+)
+"""The shapes that turn the eyes, in the order of :func:`look_weights`."""
+SIDEWAYS, UPWARD = 0.52, 0.45
+"""Rotation of an eye at weight 1 where no eyeball shows it, radians: 30 degrees to the side, 26 up and down."""
+
+# Millimetres: an eyeball's middle lies behind the middle of its corners, above it and further out; its iris before it.
+_BEHIND, _ABOVE, _OUTWARD, _IRIS = 9.5, 1.8, 1.8, 11.5
+_WIDEST = 0.9  # of an eyeball's radius
+_LEAST_TURN = 0.1  # radians; eyeballs that turn less are turned by something else than shapes
+SURELY_OPEN, SURELY_SHUT = 0.3, 0.9
+_LEAST_OPEN = 0.35  # of an eye that is surely not shut
+_UNSEEN = 0.3  # of an eye that is hidden, its twin's openness counts for less
+
+
+@dataclass(frozen=True, eq=False)
+class Eyeballs:
+    """Eyeballs of a rig, the right one first.
+
+    Args:
+        centre: beside the middle of the eye's corners, in the head's axes, (2,3) millimetres.
+        radius: from there to the iris, (2,) millimetres.
+        turns: by what each shape of ``LOOKS`` turns its eye at weight 1, (8,) radians.
+
+    Example:
+        >>> from torchface.synthetic import performer
+        >>> Eyeballs.of(performer(texture=False)).turns.rad2deg().round().tolist()
+        [30.0, 30.0, 30.0, 30.0, 26.0, 26.0, 26.0, 26.0]
+    """
+
+    centre: Tensor
+    radius: Tensor
+    turns: Tensor
+
+    @staticmethod
+    def usual() -> Eyeballs:
+        """As people have them, float64."""
+        out = torch.tensor([[-_OUTWARD, _ABOVE, -_BEHIND], [_OUTWARD, _ABOVE, -_BEHIND]]).double()
+        return Eyeballs(out, torch.full((2,), _IRIS).double(), torch.tensor([SIDEWAYS] * 4 + [UPWARD] * 4).double())
+
+    @staticmethod
+    def of(rig: BlendshapeRig) -> Eyeballs:
+        """By a rig's regions ``eyeball_right`` and ``eyeball_left``; what those do not show is as people have it.
+
+        Of shapes that are halves or have no twin among ARKit's, and of eyeballs that a joint turns, the turn is the
+        usual one.
+        """
+        made, notes = Eyeballs.usual(), rig.neutral.annotations
+        regions = {} if notes is None else notes.regions
+        marks = rig.vertices[rig.neutral.landmarks].detach().double()
+        names = arkit_names(rig.names)
+        for eye, (side, corners) in enumerate(zip(("right", "left"), CORNERS, strict=True)):
+            mask = regions.get(f"eyeball_{side}")
+            if mask is None or int(mask.sum()) < 4:
+                continue
+            ball = rig.vertices[mask].detach().double()
+            middle = _sphere(ball)
+            made.centre[eye] = middle - 0.5 * (marks[corners[0]] + marks[corners[1]])
+            made.radius[eye] = (ball - middle).norm(dim=1).mean()
+            for row, look in enumerate(LOOKS):
+                if look.lower().endswith(side) and look in names:
+                    moved = rig.deltas[names.index(look)][mask].detach().double()
+                    angle = _turn(ball - middle, ball + moved - middle)
+                    made.turns[row] = angle if angle > _LEAST_TURN else made.turns[row]
+        return made
+
+
+def _sphere(points: Tensor) -> Tensor:
+    """The centre (3,) of the sphere through points (K,3), by least squares."""
+    lines = torch.cat([2 * points, torch.ones_like(points[:, :1])], 1)
+    return torch.linalg.lstsq(lines, points.square().sum(1, keepdim=True)).solution[:3, 0]
+
+
+def _turn(before: Tensor, after: Tensor) -> float:
+    """The angle between the sight of an eyeball's points (K,3) before and after they moved, radians."""
+    left, _, right = torch.linalg.svd((before - before.mean(0)).T @ (after - after.mean(0)))
+    turned = (left @ right)[2]  # where what looked along z looks now
+    return float(torch.atan2(turned[:2].norm(), turned[2]))
+
+
+def arkit_names(names: Sequence[str]) -> list[str]:
+    """What ARKit calls each shape; its own name where ARKit knows none."""
+    called = mapping(names, ARKIT)
+    return [
+        ARKIT[int(column.argmax())] if bool(column.any()) else name
+        for name, column in zip(names, called.T, strict=True)
+    ]
+
+
+def openness_of(landmarks: Tensor) -> Tensor:
+    """The distance of the lids over that of the eye's corners, (B,2), of landmarks (B,68,C)."""
+    eyes = []
+    for (right, left), pairs in zip(CORNERS, _LIDS, strict=True):
+        apart = sum((landmarks[:, a] - landmarks[:, b]).norm(dim=-1) for a, b in pairs) / len(pairs)
+        eyes.append(apart / (landmarks[:, right] - landmarks[:, left]).norm(dim=-1))
+    return torch.stack(eyes, dim=1)
+
+
+def openness_rows(rest: Tensor, basis: Tensor, names: Sequence[str]) -> tuple[Tensor, Tensor]:
+    """What a unit of each shape adds to each eye's openness, 0 shut and 1 at rest, (2,N); and the rig's at rest, (2,).
+
+    Args:
+        rest, basis: of the 68 landmarks, (68,3) and (68,3,N).
+        names: of the shapes, by ARKit.
+    """
+    at_rest = openness_of(rest[None])[0]
+    moved = openness_of((rest[..., None] + basis).permute(2, 0, 1)).T - at_rest[:, None]
+    blinks = [names.index(f"eyeBlink{side}") if f"eyeBlink{side}" in names else -1 for side in ("Right", "Left")]
+    way = torch.stack([-moved[eye, row] if row >= 0 else at_rest[eye] for eye, row in enumerate(blinks)])
+    return moved / way[:, None], at_rest
+
+
+def seen_gaze(rays: Tensor, iris: Tensor, rotation: Tensor, depth: Tensor, eyes: Eyeballs | None = None) -> Tensor:
+    """Where the eyes look beside the head, (...,2,2) radians: to the person's left, up.
+
+    The line of sight goes from the middle of an eyeball, which lies behind the middle of the eye's corners, through
+    the iris.
+
+    Args:
+        rays: of the 68 landmarks, (...,68,2), at depth 1.
+        iris: of the irises, (...,2,2).
+        rotation: head to camera, (...,3,3).
+        depth: of the eyes, (...,2), millimetres.
+        eyes: where eyeballs lie; as people have them if absent.
+    """
+    eyes = eyes or Eyeballs.usual()
+    radius = eyes.radius.to(rays)[:, None]
+    middle = torch.stack([0.5 * (rays[..., a, :] + rays[..., b, :]) for a, b in CORNERS], dim=-2)
+    centre = (eyes.centre.to(rays) @ rotation.transpose(-1, -2))[..., :2]
+    across = (iris - middle) * depth[..., None] - centre
+    length = across.square().sum(-1, keepdim=True).sqrt()
+    across = across * (_WIDEST * radius / length.maximum(_WIDEST * radius))
+    toward = -(radius.square() - across.square().sum(-1, keepdim=True)).sqrt()
+    sight = torch.cat([across, toward], dim=-1) @ rotation / radius
+    up = sight[..., 1].clamp(-0.95, 0.95)
+    side = (sight[..., 0] / (1 - up.square()).sqrt()).clamp(-0.95, 0.95)
+    # ONNX Runtime has the arc sine of float32 alone.
+    return torch.asin(torch.stack([side, up], dim=-1).float()).to(rays)
+
+
+def look_weights(gaze: Tensor, turns: Tensor | None = None) -> Tensor:
+    """Weights of ``LOOKS``, (...,8) in [0,1], of gaze (...,2,2); ``turns`` (8,) are a rig's, as is usual if absent."""
+    side, up = gaze[..., 0], gaze[..., 1]
+    # To the person's left is toward the nose for the right eye.
+    made = torch.stack([side[..., 0], -side[..., 0], -side[..., 1], side[..., 1],
+                        up[..., 0], -up[..., 0], up[..., 1], -up[..., 1]], dim=-1)  # fmt: skip
+    turns = Eyeballs.usual().turns if turns is None else turns
+    return (made / turns.to(gaze)).clamp(0, 1)
+
+
+def gaze_of_looks(weights: Tensor, turns: Tensor) -> Tensor:
+    """Where eyes look, (...,2,2) radians to the person's left and up, that have weights (...,8) of ``LOOKS``."""
+    turned = weights * turns.to(weights)
+    side = torch.stack([turned[..., 0] - turned[..., 1], turned[..., 3] - turned[..., 2]], dim=-1)
+    up = torch.stack([turned[..., 4] - turned[..., 5], turned[..., 6] - turned[..., 7]], dim=-1)
+    return torch.stack([side, up], dim=-1)
+
+
+def judged_openness(part: Tensor, closed: Tensor, trust: Tensor) -> tuple[Tensor, Tensor]:
+    """How open eyes are with what is known of whether they are shut and of each other, and how much that counts.
+
+    An eye that is surely shut is at 0, one that surely is not is never near it, and a hidden one is about as its twin.
+
+    Args:
+        part: openness beside the person's own, 0 shut and 1 at rest, (...,2).
+        closed: how likely each is shut, (...,2); NaN where nobody said.
+        trust: how much each openness counts, (...,2) in [0,1].
+    """
+    shut = torch.where(torch.isnan(closed), 0.0, closed)
+    sure = ((shut - 0.5) / (SURELY_SHUT - 0.5)).clamp(0, 1)
+    least = _LEAST_OPEN * (1 - shut / SURELY_OPEN).clamp(0, 1) * ~torch.isnan(closed)
+    part = torch.maximum(part, least) * (1 - sure)
+    twin, twin_trust = part.flip(-1), _UNSEEN * trust.flip(-1)
+    total = trust + twin_trust * (1 - trust)
+    return (trust * part + twin_trust * (1 - trust) * twin) / total.clamp(min=1e-6), total
