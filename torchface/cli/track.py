@@ -33,6 +33,7 @@ def track(
     prior: str = "shape_prior",
     dynamics: str | None = None,
     offsets: Path | None = None,
+    neutral_frame: int | None = None,
     camera: Path | None = None,
     texture: Path | None = None,
     face: int = 0,
@@ -82,6 +83,8 @@ def track(
         dynamics: A dynamics prior, the motion of weights from frame to frame, at any frame rate.
         offsets: Fixed offsets between the rig's landmarks and those found, as an earlier take wrote them; those in OUT,
             or estimated with the take, if absent.
+        neutral_frame: A frame of VIDEO, from 0, in which the face has no expression: what the rig differs by there is
+            taken out. Without it the frames in which the face rests are found.
         camera: The camera's calibration, as `torchface calibrate` writes it; a focal length is assumed without.
         texture: An image to put on the face in the overlay, in the rig's texture coordinates, under the video's light.
         face: Which of several faces to follow, from 0, the largest first.
@@ -130,6 +133,7 @@ def track(
         checked_reduction(reduce),
         anybody,
         head_model,
+        neutral_frame,
     )
     if live is not None:
         if rig is None:

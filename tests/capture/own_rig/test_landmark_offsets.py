@@ -135,6 +135,40 @@ def test_too_few_frames_tell_no_offsets() -> None:
     assert estimate_offsets(solver_of(person()), landmarks) is None
 
 
+def modes() -> Tensor:
+    return zoo.get_model("head").shape.modes[:, zoo.get_model("head").landmarks].detach()
+
+
+@pytest.mark.parametrize("neutral", [None, 3])
+def test_a_laugh_of_most_of_the_take_is_no_offset(neutral: int | None) -> None:
+    """Of a stranger who rests for a sixth of a take and laughs, rest is at rest and the laugh as large as it was."""
+    laugh = dict.fromkeys(SMILE, 0.8) | {"jawOpen": 0.5}
+    laughing = torch.zeros(5 * FRAMES, len(person().names), dtype=torch.float64)
+    for name, size in laugh.items():
+        laughing[:, person().names.index(name)] = size * torch.linspace(0.7, 1.0, len(laughing)).double()
+    rest = torch.zeros(FRAMES, len(person().names), dtype=torch.float64)
+    weights = torch.cat([rest, laughing])
+    landmarks = seen(person(5), weights, 0.5 * planted_offsets())
+    solver = solver_of(person())
+    offsets = estimate_offsets(solver, landmarks, identity_modes=modes(), neutral=neutral)
+    assert offsets is not None
+    found = solver.shifted(offsets)(landmarks[::4]).weights
+    for names in (SMILE, ("jawOpen",)):
+        rows = [person().names.index(name) for name in names]
+        true, solved = weights[::4, rows].mean(1), found[:, rows].mean(1)
+        assert 0.8 < float(solved[10:].mean() / true[10:].mean()) < 1.25
+        assert float(solved[1:5].max()) < 0.15
+
+
+def test_a_neutral_frame_must_show_the_face() -> None:
+    landmarks = seen(person(), talking({}))
+    with pytest.raises(ValueRangeError, match="neutral frame 20: found 20 frames"):
+        estimate_offsets(solver_of(person()), landmarks, neutral=20)
+    landmarks[4] = torch.nan
+    with pytest.raises(ValueRangeError, match="neutral frame 4: found no face in it"):
+        estimate_offsets(solver_of(person()), landmarks, neutral=4)
+
+
 def test_crying_is_crying_on_another_head() -> None:
     """Furrowed brows, shut eyes and mouth corners drawn down, seen with offsets on one head and solved on another."""
     constant = {name + side: size for name, size in CRYING.items() for side in ("Left", "Right")}

@@ -6,23 +6,26 @@ from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
+from torch.nn.functional import pad
 
 from torchface.capture.own_rig.face_points import JAW, LANDMARKS
 from torchface.capture.own_rig.frame_states import FrameTerms
 from torchface.capture.own_rig.gauss_newton import HeadState, linearise
 from torchface.capture.own_rig.head_pose import measure_poses
 from torchface.capture.own_rig.landmark_offsets import LandmarkOffsets, offset_shares
+from torchface.capture.own_rig.resting_frames import activity_of_weights, resting_share
 from torchface.capture.own_rig.state_estimate import Expectation
 from torchface.capture.own_rig.video_solver import VideoSolver
-from torchface.capture.priors import ShapePrior
-from torchface.errors import AlignmentError
+from torchface.errors import AlignmentError, ValueRangeError
 from torchface.optim.box_qp import box_qp
 
-_FRAMES, _ROUNDS, _REWEIGHTINGS = 40, 3, 3
+_SEARCHED, _FRAMES, _ROUNDS, _REWEIGHTINGS = 120, 40, 3, 3
+_NEUTRAL = 5  # frames on each side of one that is neutral
 _STABLE = 10
 # Standard deviations of offsets to each other, millimetres: finders put the contour where the head's edge is, and brows
 # where hair is; eyes, nose and lips are drawn sharply. How large they are altogether is estimated from the take.
 _CONTOUR, _BROWS, _INNER = 5.0, 3.0, 2.0
+_CONTOUR_HABIT, _BROWS_HABIT, _INNER_HABIT = 4.0, 2.0, 1.0  # the same of finders alone
 _LEAST_SCALE, _MOST_SCALE = 0.02, 2.0
 _RESEMBLANCE = 1.5  # people differ from rigs more along what expressions move, which is left out of the measure
 _MODEL_ERROR = 0.5  # millimetres; what no constant expression and no offset explains of the mean residual
@@ -54,8 +57,9 @@ def estimate_offsets(
     solver: VideoSolver,
     landmarks: Tensor,
     confidence: Tensor | None = None,
-    rig: str = "",
-    finder: str = "",
+    resting: Tensor | None = None,
+    identity_modes: Tensor | None = None,
+    neutral: int | None = None,
 ) -> LandmarkOffsets | None:
     r"""The offsets of a rig's landmarks that a take shows, jointly with its poses and weights.
 
@@ -72,98 +76,151 @@ def estimate_offsets(
     hardly move a landmark go to the offsets. How large offsets are, s, comes from the part of the mean residual that no
     expression explains: where rig and finder agree, there are next to none. Then the frames are solved anew.
 
+    An expression of most of a take is none that never ends, so the sums are over frames in which the face rests: a
+    twelfth of the frames, or more where more are alike. With modes of other people's heads, offsets are likely as far
+    as those and the finder's habits explain them: no head has its lips apart at rest.
+
     Args:
         solver: of the rig, without offsets; its prior holds for the frames.
         landmarks: (T,68,2), pixels of images without distortion; NaN for not seen.
         confidence: how far each is trusted, (T,68) in [0,1].
-        rig, finder: digests to be kept with the offsets.
+        resting: how far the face rests in each frame, (T,) in [0,1]; found by solved weights if absent.
+        identity_modes: what a standard deviation of each of K ways of being another person adds to the landmarks,
+            (K,68,3), millimetres.
+        neutral: a frame in which the face has no expression; those beside it are taken as like it.
 
     Returns:
-        The offsets and the noise that is left; None where fewer than ten frames show a face, which are too few
+        The offsets and the noise that is left; None where fewer than ten frames show a face, which are too few to know
         an expression from an offset.
+
+    Raises:
+        ValueRangeError: the neutral frame is none of the take, or shows no face.
 
     Source: Candès, Wakin and Boyd 2008 for the penalty.
     """
     trust = solver.landmark_trust(landmarks, confidence)
-    shown = ((trust > 0).sum(1) >= LANDMARKS // 2).nonzero()[:, 0]
-    if len(shown) < _STABLE:
+    seen = (trust > 0).sum(1) >= LANDMARKS // 2
+    frames = torch.arange(len(landmarks), device=landmarks.device)
+    if neutral is not None:
+        if not 0 <= neutral < len(landmarks) or not bool(seen[neutral]):
+            what = "no face in it" if 0 <= neutral < len(landmarks) else f"{len(landmarks)} frames"
+            raise ValueRangeError(f"neutral frame {neutral}: found {what}, expected one that shows the face at rest")
+        seen &= (frames - neutral).abs() <= _NEUTRAL
+        resting = seen.double()
+    shown = frames[seen]
+    if len(shown) < (_STABLE if neutral is None else 1):
         return None
-    chosen = shown[torch.linspace(0, len(shown) - 1, min(_FRAMES, len(shown))).round().long()]
+    chosen = shown[torch.linspace(0, len(shown) - 1, min(_SEARCHED, len(shown))).round().long()]
+    likely = None if identity_modes is None else _likely_offsets(identity_modes.to(landmarks).double())
     with torch.no_grad():
-        return _estimated(solver, landmarks[chosen].double(), trust[chosen], rig, finder)
+        take = _Take(landmarks[chosen].double(), trust[chosen], None if resting is None else resting[chosen].double())
+        return _estimated(solver, take, likely, neutral is not None)
 
 
-def _estimated(solver: VideoSolver, landmarks: Tensor, trust: Tensor, rig: str, finder: str) -> LandmarkOffsets | None:
-    count = len(solver.names)
+@dataclass(frozen=True, eq=False)
+class _Take:
+    """Landmarks (B,68,2), how far they are trusted, (B,68), and how far the face rests, (B,), where that is known."""
+
+    landmarks: Tensor
+    trust: Tensor
+    resting: Tensor | None
+
+    def of_frames(self, frames: Tensor) -> _Take:
+        return _Take(self.landmarks[frames], self.trust[frames], None if self.resting is None else self.resting[frames])
+
+
+def _likely_offsets(modes: Tensor) -> Tensor:
+    """The covariance (204,204) of offsets by ways of being another person, (K,68,3), and by a finder's habits."""
+    habits = modes.new_full((LANDMARKS,), _INNER_HABIT)
+    habits[:JAW], habits[JAW : JAW + 10] = _CONTOUR_HABIT, _BROWS_HABIT
+    moved = modes.flatten(1)
+    return moved.T @ moved + habits.square().repeat_interleave(3).diag()
+
+
+def _estimated(solver: VideoSolver, take: _Take, likely: Tensor | None, neutral: bool) -> LandmarkOffsets | None:
     noise = max(solver.settings.relative_noise, _LEAST_NOISE)
-    offsets = LandmarkOffsets(landmarks.new_zeros(LANDMARKS, 3), noise, rig, finder)
+    offsets = LandmarkOffsets(take.landmarks.new_zeros(LANDMARKS, 3), noise)
+    least = 1 if neutral else _STABLE
     try:
-        poses = measure_poses(solver.points.rest[:LANDMARKS], landmarks, solver.intrinsics.double(), trust)
+        poses = measure_poses(solver.points.rest[:LANDMARKS], take.landmarks, solver.intrinsics.double(), take.trust)
     except AlignmentError:
         return None
-    landmarks, trust = landmarks[poses.found], trust[poses.found]
-    if len(landmarks) < _STABLE:
+    if int(poses.found.sum()) < least:
         return None
-    head = HeadState(
-        landmarks.new_zeros(len(landmarks), count), poses.rotation[poses.found], poses.translation[poses.found]
-    )
-    deviations = landmarks.new_full((LANDMARKS,), _INNER)
-    deviations[:JAW], deviations[JAW : JAW + 10] = _CONTOUR, _BROWS
+    take = take.of_frames(poses.found)
+    nothing = take.landmarks.new_zeros(len(take.landmarks), len(solver.names))
+    head = HeadState(nothing, poses.rotation[poses.found], poses.translation[poses.found])
+    if take.resting is None:
+        head, _, _ = _solved(solver, take, head)
+        take = _Take(take.landmarks, take.trust, resting_share(activity_of_weights(head.weights, solver.names)))
+    assert take.resting is not None
+    calm = take.resting.argsort(descending=True)[: max(_FRAMES, least)].sort().values
+    take, head = take.of_frames(calm), HeadState(head.weights[calm], head.rotation[calm], head.translation[calm])
+    if likely is None:
+        deviations = take.landmarks.new_full((LANDMARKS,), _INNER)
+        deviations[:JAW], deviations[JAW : JAW + 10] = _CONTOUR, _BROWS
+        likely = deviations.square().repeat_interleave(3).diag()
     scale, expression = 1.0, None
     for begun in range(_ROUNDS):
-        shifted = solver.shifted(offsets)
-        head, mean = _mean_problem(shifted, landmarks, trust, head, deviations)
+        head, mean = _mean_problem(solver.shifted(offsets), take, head, likely)
         if begun == 0:
             scale = mean.scale
-        offsets, expression = _split(mean, offsets, expression, scale * deviations, solver.prior)
+        offsets, expression = _split(mean, offsets, expression, scale**2 * likely, None if neutral else solver)
     return offsets.rounded()
 
 
 def _split(
-    mean: _Mean,
-    before: LandmarkOffsets,
-    expression: Tensor | None,
-    deviations: Tensor,
-    prior: ShapePrior | None,
+    mean: _Mean, before: LandmarkOffsets, expression: Tensor | None, likely: Tensor, solver: VideoSolver | None
 ) -> tuple[LandmarkOffsets, Tensor]:
-    """The mean residual as offsets and a constant expression, (N,)."""
+    """The mean residual as offsets and a constant expression, (N,), which is none where no solver is given.
+
+    Args:
+        mean: of the frames.
+        before, expression: of the round before.
+        likely: covariance of the offsets, (204,204).
+        solver: with the prior of the expression.
+    """
     count = len(mean.weights)
     here = torch.cat([mean.weights, before.millimetres.flatten()])
     f = mean.gradient - mean.H @ here
-    precision = deviations.square().reciprocal().repeat_interleave(3)
-    H = mean.H + torch.cat([torch.full_like(mean.weights, 1e-3), precision]).diag()
-    upper = torch.cat([torch.ones_like(mean.weights), torch.full_like(precision, _FREE)])
-    lower = torch.cat([torch.zeros_like(mean.weights), torch.full_like(precision, -_FREE)])
+    beside = (count, 0)
+    H = mean.H + pad(torch.cholesky_inverse(torch.linalg.cholesky(likely)), 2 * beside)
+    H = H + pad(torch.full_like(mean.weights, 1e-3), (0, len(likely))).diag()
+    upper = pad(torch.full_like(mean.weights, float(solver is not None)), (0, len(likely)), value=_FREE)
+    lower = pad(torch.zeros_like(mean.weights), (0, len(likely)), value=-_FREE)
     solution = here
     for _ in range(_REWEIGHTINGS):  # each penalty is by the weights that the one before led to
         falls = 1.0 if expression is None else 1 / (1 + expression / _SOFTENING)
-        penalty = torch.nn.functional.pad(_PENALTY * falls * torch.ones_like(mean.weights), (0, len(precision)))
-        likely = H
-        if prior is not None:
-            learned = prior.energy((mean.weights if expression is None else expression)[None])
-            beside = (0, len(precision))
-            likely = H + _PRIOR / prior.strength * torch.nn.functional.pad(learned.H[0], 2 * beside)
-            penalty = penalty + _PRIOR / prior.strength * torch.nn.functional.pad(learned.f[0], beside)
-        solution = box_qp(likely, (f + penalty)[None], lower, upper)[0]
+        penalty = pad(_PENALTY * falls * torch.ones_like(mean.weights), (0, len(likely)))
+        program = H
+        if solver is not None and solver.prior is not None:
+            learned = solver.prior.energy((mean.weights if expression is None else expression)[None])
+            strength = _PRIOR / solver.prior.strength
+            program = H + strength * pad(learned.H[0], 2 * (0, len(likely)))
+            penalty = penalty + strength * pad(learned.f[0], (0, len(likely)))
+        solution = box_qp(program, (f + penalty)[None], lower, upper)[0]
         expression = solution[:count]
     noise = min(mean.noise, before.noise)
     return replace(before, millimetres=solution[count:].view(-1, 3), noise=noise), solution[:count]
 
 
-def _mean_problem(
-    solver: VideoSolver, landmarks: Tensor, trust: Tensor, start: HeadState, deviations: Tensor
-) -> tuple[HeadState, _Mean]:
-    """The frames (B,68,2) solved from a start, and what their residuals have in common."""
-    count = len(solver.names)
+def _solved(solver: VideoSolver, take: _Take, start: HeadState) -> tuple[HeadState, FrameTerms, Tensor]:
+    """The frames solved from a start, with their terms and which of the rig's points their landmarks are."""
     noise = solver.noise(start.rotation, start.translation)
-    weight = solver.landmark_weights.double() * trust
-    precision = weight.sqrt() / noise[:, None]
-    known_landmarks = landmarks.nan_to_num(0.0)
-    information = solver.initial_information.double().diag().expand(len(known_landmarks), -1, -1)
-    terms = FrameTerms(known_landmarks, precision, start.rotation, start.translation, Expectation(start, information))
-    head, rows = solver.solve(terms, start)
-    K = solver.intrinsics.double()
-    at = linearise(solver.points, head, rows, K, known_landmarks, precision, solver.settings.contour_slide)
+    precision = (solver.landmark_weights.double() * take.trust).sqrt() / noise[:, None]
+    known = take.landmarks.nan_to_num(0.0)
+    information = solver.initial_information.double().diag().expand(len(known), -1, -1)
+    terms = FrameTerms(known, precision, start.rotation, start.translation, Expectation(start, information))
+    return solver.solve(terms, start)[0], terms, noise
+
+
+def _mean_problem(solver: VideoSolver, take: _Take, start: HeadState, likely: Tensor) -> tuple[HeadState, _Mean]:
+    """The frames solved from a start, and what their residuals have in common where the face rests."""
+    count = len(solver.names)
+    head, terms, noise = _solved(solver, take, start)
+    weight = solver.landmark_weights.double() * take.trust
+    rows, K = solver.chosen(head), solver.intrinsics.double()
+    at = linearise(solver.points, head, rows, K, terms.landmarks, terms.precision, solver.settings.contour_slide)
     residual, jacobian = at.residual.flatten(1), at.jacobian.flatten(1, 2)
     by_place = at.jacobian[..., -3:] @ head.rotation[:, None]  # in the rig's own axes
     shares = offset_shares(solver.names, head.weights)
@@ -174,7 +231,7 @@ def _mean_problem(
     rest = residual - (by_motion @ torch.linalg.lstsq(by_motion, residual[..., None]).solution)[..., 0]
     # Frames that the solve explains badly count less.
     size = rest.square().mean(1)
-    share = 1 / (1 + size / size.median().clamp(min=1e-12))
+    share = 1 / (1 + size / size.median().clamp(min=1e-12)) * (1.0 if take.resting is None else take.resting)
     share = share / share.sum()
     # A residual of 1 is the frames' noise, in millimetres on the head:
     unit = float((noise * head.translation[:, 2]).median() / K[0, 0])
@@ -185,7 +242,7 @@ def _mean_problem(
         0.5 * (H + H.T),
         gradient,
         share @ head.weights,
-        _scale(share, residual, jacobian, weight, deviations / unit),
+        _scale(share, residual, jacobian, weight, likely.diagonal().view(-1, 3).mean(1).sqrt() / unit),
         _varying_noise(solver, residual, weight, share, head),
     )
     return head, mean

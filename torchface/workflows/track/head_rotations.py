@@ -24,19 +24,18 @@ def head_angles(rotation: Tensor) -> Tensor:
 
 
 def eye_angles(gaze: Tensor) -> Tensor:
-    """Yaw, pitch and roll of the left eye, then of the right, (6,), as Live Link Face has them.
+    """Yaw, pitch and roll of the left eye, then of the right, (...,6), as Live Link Face has them.
 
     Positive yaw looks to the person's right, positive pitch down; eyes do not roll.
 
     Args:
-        gaze: right eye first, to the person's left and up, (2,2) radians.
+        gaze: right eye first, to the person's left and up, (...,2,2) radians.
     """
-    still = gaze.new_zeros(2, 1)
-    return torch.cat([-gaze.flip(0), still], 1).flatten()
+    still = gaze.new_zeros(*gaze.shape[:-1], 1)
+    return torch.cat([-gaze.flip(-2), still], -1).flatten(-2)
 
 
-def rotation_columns(rotation: Tensor) -> dict[str, Tensor]:
-    """Live Link Face's nine columns by name, each (T,) float64: the head's of rotations (T,3,3), the eyes' 0."""
-    angles = head_angles(rotation.detach().cpu().double())
-    still = angles.new_zeros(len(angles))
-    return {name: angles[:, i] if i < 3 else still for i, name in enumerate(ROTATIONS)}
+def rotation_columns(rotation: Tensor, gaze: Tensor) -> dict[str, Tensor]:
+    """Live Link Face's nine columns by name, each (T,) float64: the head's of rotations (T,3,3), the eyes' of gaze."""
+    head, eyes = head_angles(rotation.detach().cpu().double()), eye_angles(gaze.detach().cpu().double())
+    return dict(zip(ROTATIONS, torch.cat([head, eyes], 1).unbind(1), strict=True))

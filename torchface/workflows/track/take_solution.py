@@ -11,12 +11,18 @@ from torch import Tensor
 
 from torchface.capture.own_rig import FaceMeasurements, VideoSolution, VideoSolver
 from torchface.capture.own_rig.another_face import AnotherFace, other_faces
+from torchface.capture.own_rig.eye_geometry import CORNERS, LOOKS, Eyeballs, arkit_names, openness_rows
+from torchface.capture.own_rig.face_measurements import FaceMeasurements
+from torchface.capture.own_rig.face_points import LANDMARKS
+from torchface.capture.own_rig.head_pose import measure_poses
 from torchface.capture.own_rig.landmark_offset_estimate import estimate_offsets
 from torchface.capture.own_rig.landmark_offsets import LandmarkOffsets
 from torchface.capture.own_rig.outlier_landmarks import landmark_reach, landmark_residuals, outlier_landmarks
+from torchface.capture.own_rig.resting_frames import activity_of_readings, resting_share
+from torchface.capture.own_rig.take_eyes import TakeEyes, take_eyes
 from torchface.capture.own_rig.take_solve import solve_take
 from torchface.capture.own_rig.weight_walk import frame_intervals
-from torchface.errors import FileFormatError, ValueRangeError
+from torchface.errors import AlignmentError, FileFormatError, ValueRangeError
 from torchface.files.checkpoints import read_checkpoint, write_checkpoint
 from torchface.files.content_keys import content_key
 from torchface.files.whole_files import make_folder
@@ -24,8 +30,10 @@ from torchface.geometry.cameras.distortion import undistort
 from torchface.landmarks.images.face_reading import FaceReading
 from torchface.progress import Progress
 from torchface.rig import BlendshapeRig
+from torchface.shape_names import ARKIT
 from torchface.temporal.adaptive_kalman import LANDMARK_SETTINGS, adaptive_filter, adaptive_smoother
 from torchface.workflows.track.track_inputs import METHOD, TrackInputs
+from torchface.workflows.track.track_models import identity_modes
 from torchface.workflows.track.track_state import TrackState
 
 OFFSETS = "landmark_offsets.json"
@@ -97,7 +105,7 @@ def known_offsets(inputs: TrackInputs, out: Path) -> LandmarkOffsets | None:
         offsets = offsets_of(out / OFFSETS, inputs)
     except (FileFormatError, ValueRangeError):
         return None  # another rig's, or damaged: made anew
-    return offsets if offsets.video == inputs.reading_key else None
+    return offsets if offsets.video == inputs.offsets_key else None
 
 
 def offsets_of(path: Path, inputs: TrackInputs) -> LandmarkOffsets:
@@ -112,10 +120,60 @@ def offsets_of(path: Path, inputs: TrackInputs) -> LandmarkOffsets:
     return offsets
 
 
-def new_offsets(inputs: TrackInputs, solver: VideoSolver, landmarks: Tensor, trust: Tensor) -> LandmarkOffsets | None:
-    """The offsets of a take's smoothed landmarks (T,68,2), trusted (T,68); None where it is too short."""
-    offsets = estimate_offsets(solver, landmarks, trust, _rig_digest(inputs.actor), _finder_digest(inputs))
-    return None if offsets is None else replace(offsets, video=inputs.reading_key, source=inputs.clip.path.name)
+def new_offsets(
+    inputs: TrackInputs, solver: VideoSolver, landmarks: Tensor, reading: FaceReading
+) -> LandmarkOffsets | None:
+    """The offsets of a take's smoothed landmarks (T,68,2) and their reading (T,...); None where it is too short.
+
+    Raises:
+        ValueRangeError: the neutral frame is none of the take, or shows no face.
+    """
+    offsets = estimate_offsets(
+        solver, landmarks, reading.trust, known_rest(reading), identity_modes(), inputs.settings.neutral_frame
+    )
+    if offsets is None:
+        return None
+    digests = {"rig": _rig_digest(inputs.actor), "finder": _finder_digest(inputs)}
+    return replace(offsets, **digests, video=inputs.offsets_key, source=inputs.clip.path.name)
+
+
+def known_rest(reading: FaceReading) -> Tensor | None:
+    """How far the face rests in each frame (T,) by the expression that was read; None where none was."""
+    activity = activity_of_readings(reading.expression, reading.expression_deviation, ARKIT)
+    return resting_share(activity) if bool(torch.isfinite(activity).any()) else None
+
+
+def seen_eyes(inputs: TrackInputs, solver: VideoSolver, landmarks: Tensor, reading: FaceReading) -> TakeEyes | None:
+    """What a take shows of the eyes, with landmarks (T,68,2) smoothed; None where nobody looked at them."""
+    if not bool(torch.isfinite(reading.openness).any()):
+        return None
+    K, rest = inputs.calibration.intrinsics.double(), solver.rest[:LANDMARKS].double()
+    try:
+        poses = measure_poses(rest, landmarks, K, reading.trust)
+    except AlignmentError:
+        return None
+    middles = torch.stack([0.5 * (rest[a] + rest[b]) for a, b in CORNERS])
+    depth = torch.einsum("ti,ei->te", poses.rotation[:, 2], middles) + poses.translation[:, 2:]
+    seen, iris = (
+        (undistort(one.double(), inputs.calibration) - K[:2, 2]) / K.diagonal()[:2]
+        for one in (reading.trusted_landmarks, reading.iris)
+    )
+    resting = known_rest(reading)
+    called = arkit_names(solver.names)
+    onto = torch.tensor([[float(name == look) for look in LOOKS] for name in called]).double()
+    rows, _ = openness_rows(rest, solver.basis[:LANDMARKS].double(), called)
+    even = torch.ones(len(landmarks)) if resting is None else resting
+    return take_eyes(reading, seen, iris, poses.rotation, depth, even, Eyeballs.of(inputs.actor), rows @ onto)
+
+
+def with_eyes(
+    inputs: TrackInputs, solver: VideoSolver, measured: FaceMeasurements | None, eyes: TakeEyes
+) -> FaceMeasurements:
+    """What else is known of a take's frames, with its eyes."""
+    points, measured = solver.points, measured or FaceMeasurements()
+    rest, basis = points.rest[:LANDMARKS], points.basis[:LANDMARKS]
+    read = eyes.readings(rest, basis, solver.names, Eyeballs.of(inputs.actor))
+    return replace(measured, weights=read if measured.weights is None else measured.weights.beside(read))
 
 
 def warn_of_offsets(given: LandmarkOffsets, estimated: LandmarkOffsets | None, inputs: TrackInputs) -> None:
@@ -143,6 +201,7 @@ def solution_key(
         calibration=inputs.calibration,
         whole_take=inputs.settings.whole_take,
         one_person=inputs.settings.one_person,
+        neutral_frame=inputs.settings.neutral_frame,
         solver=solver.settings,
         offsets=torch.zeros(0) if offsets is None else offsets.millimetres,
         seconds=torch.zeros(0) if times is None else times,

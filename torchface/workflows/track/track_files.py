@@ -45,7 +45,7 @@ def write_curves(tracked: Tracked, out: Path) -> dict[str, Path]:
     shape to whatever else reads them, and could not say which part of the face is hidden.
     """
     fps, weights = tracked.video.fps, tracked.solution.weights.detach().float()
-    angles = rotation_columns(tracked.solution.rotation)
+    angles = rotation_columns(tracked.solution.rotation, tracked.gaze)
     when = tracked.times
     take = Take(fps, weights=Track(tracked.rig.names, weights[..., None]), extras={"columns": angles}, seconds=when)
     bound, few = tracked.inputs.settings.reduce, take

@@ -66,6 +66,7 @@ class TrackSettings:
         heads: the head model for that, by name or folder; the best at hand if absent.
         offsets: a file of fixed offsets between this rig's landmarks and this finder's; those in the folder of results,
             or estimated with the take, if absent.
+        neutral_frame: of the video, in which the face has no expression: offsets are estimated there.
     """
 
     landmarks: str | Path = DEFAULT_LANDMARKS
@@ -85,6 +86,7 @@ class TrackSettings:
     reduce: float | None = None
     anybody: bool = False
     heads: str | Path | None = None
+    neutral_frame: int | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,6 +119,12 @@ class TrackInputs:
     def reading_key(self) -> str:
         """Changes when what is read of the frames does."""
         return content_key(METHOD, video=self.clip.path, models=self.models.seeing, face=self.settings.face)
+
+    @property
+    def offsets_key(self) -> str:
+        """Changes when the offsets that the video shows do."""
+        neutral = self.settings.neutral_frame
+        return self.reading_key if neutral is None else content_key(self.reading_key, neutral_frame=neutral)
 
     def solver(self, fps: float | None = None) -> VideoSolver:
         """The solver of the rig, for landmarks that the models find, at a frame rate."""
@@ -154,6 +162,8 @@ def load_inputs(video: Path | None, rig: Path | None, settings: TrackSettings) -
     else:
         inputs = inputs_of(clip, load_actor(rig, settings.part), settings)
     inputs.check_length(clip.count)
+    if settings.neutral_frame is not None and settings.offsets is not None:
+        raise ValueRangeError("--neutral-frame: found --offsets beside it, expected one of the two")
     if settings.texture is not None:
         load_paint(settings.texture)
         if inputs.actor.neutral.uvs is None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import re
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -17,9 +18,12 @@ from torchface.errors import NameMismatchError, ValueRangeError
 from torchface.files.content_keys import content_key
 from torchface.landmarks import AppearanceModel
 from torchface.landmarks.images.landmark_finder import LandmarkFinder
+from torchface.modeling import HeadModel
 from torchface.rig import BlendshapeRig
 from torchface.workflows.named_finders import DEFAULT_LANDMARKS, load_finder
 
+HEADS = "head"
+"""Of the zoo; ways of being another person."""
 DEFAULT_PRIOR = "shape_prior"
 """Of the zoo; what weights faces have, where no other prior is named."""
 NO_PRIOR = "none"
@@ -112,6 +116,20 @@ class FittedPriors:
     shapes: ShapePrior | None
     dynamics: DynamicsPrior | AdaptedDynamicsPrior | None
     unlearned: tuple[str, ...]
+
+
+@functools.cache
+def identity_modes() -> torch.Tensor:
+    """What a standard deviation of each of K ways of being another person adds to the 68 landmarks, (K,68,3), of the
+    zoo's model of heads.
+
+    Raises:
+        NameMismatchError: that is another kind of model.
+    """
+    heads = zoo.get_model(HEADS, HeadModel)
+    if heads.landmarks is None:
+        raise NameMismatchError(f"{HEADS}: found a HeadModel without landmarks, expected one with them")
+    return heads.shape.modes[:, heads.landmarks].detach()
 
 
 def load_priors(

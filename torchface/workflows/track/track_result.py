@@ -12,8 +12,10 @@ from torch import Tensor
 
 from torchface.capture.own_rig import VideoSolution
 from torchface.capture.own_rig.another_face import AnotherFace
+from torchface.capture.own_rig.eye_geometry import Eyeballs
 from torchface.capture.own_rig.head_pose import STABLE_LANDMARKS
 from torchface.capture.own_rig.landmark_offsets import LandmarkOffsets
+from torchface.capture.own_rig.take_eyes import TakeEyes
 from torchface.capture.own_rig.weight_walk import HIDDEN
 from torchface.geometry.cameras.calibration import CameraCalibration
 from torchface.io.video import VideoFile
@@ -52,6 +54,7 @@ class Tracked:
         outliers: landmarks that lie where no face has them, and so are not trusted, (T,68) bool; none if absent.
         others: spans of frames that show another face, which are not solved.
         head: the person's, where it was solved with the take.
+        eyes: what the frames show of the eyes; None where nobody looked at them.
     """
 
     inputs: TrackInputs
@@ -69,6 +72,7 @@ class Tracked:
     outliers: Tensor | None = None
     others: Sequence[AnotherFace] = ()
     head: PersonHead | None = None
+    eyes: TakeEyes | None = None
 
     def __len__(self) -> int:
         return len(self.landmarks)
@@ -92,6 +96,15 @@ class Tracked:
     def finder(self) -> str:
         """What found the landmarks, by its name."""
         return Path(self.inputs.settings.landmarks).name
+
+    @property
+    def gaze(self) -> Tensor:
+        """Where the eyes look beside the head, (T,2,2) radians to the person's left and up, right eye first; 0 where
+        nobody knows."""
+        weights = self.solution.weights.detach()
+        if self.eyes is None:
+            return weights.new_zeros(len(self), 2, 2)
+        return self.eyes.turned(weights, self.rig.names, Eyeballs.of(self.rig)).nan_to_num(0.0)
 
     def seconds_at(self, frame: int) -> float:
         """When a frame is shown."""

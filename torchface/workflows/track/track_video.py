@@ -29,9 +29,11 @@ from torchface.workflows.track.take_solution import (
     known_offsets,
     new_offsets,
     new_solution,
+    seen_eyes,
     smoothed_landmarks,
     solution_key,
     warn_of_offsets,
+    with_eyes,
 )
 from torchface.workflows.track.track_files import OVERLAY, SUMMARY, summary, write_curves
 from torchface.workflows.track.track_inputs import METHOD, TrackInputs, TrackSettings, load_inputs
@@ -92,20 +94,24 @@ def _track(inputs: TrackInputs, out: Path, filmed: bool, progress: Progress) -> 
         inputs = replace(inputs, actor=head.rig)
     trust, solver = reading.trust, inputs.solver(inputs.clip.fps)
     offsets = known_offsets(inputs, out)
-    if offsets is None or offsets.video != inputs.reading_key:
+    if offsets is None or offsets.video != inputs.offsets_key:
         with _timed(seconds, "offsets"):
-            estimated = new_offsets(inputs, solver, landmarks, trust)
+            estimated = new_offsets(inputs, solver, landmarks, reading)
         if offsets is not None:
             warn_of_offsets(offsets, estimated, inputs)
         offsets = offsets or estimated
     solver = solver if offsets is None else solver.shifted(offsets)
     key = solution_key(inputs, solver, offsets, times)
+    with _timed(seconds, "eyes"):
+        eyes = seen_eyes(inputs, solver, landmarks, reading)
     solution = kept_solution(state, key)
     if solution is None:
         with _timed(seconds, "weights"):
             measured, sure = take_measurements(inputs, solver, reading), trust
             if measured is not None:
                 solver, sure = measuring_solver(solver, landmarks, reading, measured)
+            if eyes is not None:
+                measured, sure = with_eyes(inputs, solver, measured, eyes), eyes.agreed(sure)
             solution = new_solution(inputs, solver, landmarks, sure, times, progress, measured)
         keep_solution(state, key, solution)
     tracked = Tracked(
@@ -121,6 +127,7 @@ def _track(inputs: TrackInputs, out: Path, filmed: bool, progress: Progress) -> 
         outliers=judged.outliers,
         others=judged.others,
         head=head,
+        eyes=eyes,
     )
     with all_or_none():
         tracked.products.update(write_curves(tracked, out))

@@ -1,0 +1,53 @@
+"""Eyeballs of rigs, and gaze that is seen as it was planted."""
+
+from __future__ import annotations
+
+import torch
+
+from planted.seen_irises import irises
+from torchface.capture.own_rig.eye_geometry import (
+    CORNERS,
+    LOOKS,
+    Eyeballs,
+    gaze_of_looks,
+    judged_openness,
+    look_weights,
+    seen_gaze,
+)
+from torchface.geometry.rotations import rotation_matrix
+from torchface.synthetic import performer
+
+
+def test_gaze_is_seen_as_planted() -> None:
+    """Of heads that turn by up to 20 degrees, within two degrees: a camera sees eyes in perspective."""
+    rig, generator = performer(texture=False), torch.Generator().manual_seed(3)
+    gaze = 0.5 * (torch.rand(40, 1, 2, generator=generator).double() - 0.5).expand(-1, 2, -1)
+    turn = 0.35 * (torch.rand(40, 3, generator=generator).double() - 0.5)
+    rotation = torch.diag(torch.tensor([1.0, -1, -1]).double()) @ rotation_matrix(turn)
+    translation = torch.tensor([0.0, 0, 600]).double().expand(40, 3)
+    marks = rig.vertices[rig.neutral.landmarks].double() @ rotation.mT + translation[:, None]
+    middle = torch.stack([0.5 * (marks[:, a] + marks[:, b]) for a, b in CORNERS], 1)
+    seen = seen_gaze(
+        marks[..., :2] / marks[..., 2:], irises(rig, gaze, rotation, translation), rotation, middle[..., 2],
+        Eyeballs.of(rig),
+    )  # fmt: skip
+    assert float((seen - gaze).abs().max().rad2deg()) < 4
+    assert float((seen - gaze).square().mean().sqrt().rad2deg()) < 2
+
+
+def test_looks_and_gaze_are_inverse() -> None:
+    turns = torch.linspace(0.4, 0.6, len(LOOKS)).double()
+    gaze = 0.6 * (torch.rand(30, 2, 2, generator=torch.Generator().manual_seed(0)).double() - 0.5)
+    weights = look_weights(gaze, turns)
+    torch.testing.assert_close(gaze_of_looks(weights, turns), gaze)
+    assert bool(((weights > 0).sum(1) == 4).all())  # never both of two antagonists
+
+
+def test_hidden_and_shut_eyes() -> None:
+    part, closed = torch.tensor([[0.4, 1.0]]).double(), torch.tensor([[0.95, 0.0]]).double()
+    opened, trust = judged_openness(part, closed, torch.tensor([[1.0, 1.0]]).double())
+    assert opened.tolist() == [[0.0, 1.0]]
+    assert trust.tolist() == [[1.0, 1.0]]
+    opened, trust = judged_openness(part, torch.full_like(closed, torch.nan), torch.tensor([[0.0, 1.0]]).double())
+    assert opened.tolist() == [[1.0, 1.0]]  # as its twin
+    assert 0 < float(trust[0, 0]) < 0.5

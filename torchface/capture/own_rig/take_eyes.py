@@ -1,0 +1,219 @@
+"""Eyes of a whole take: openness and gaze beside the person's own, as readings of the weights of a rig."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torchface.capture.own_rig.eye_geometry import (
+    CORNERS,
+    LOOKS,
+    SURELY_OPEN,
+    SURELY_SHUT,
+    Eyeballs,
+    arkit_names,
+    gaze_of_looks,
+    judged_openness,
+    look_weights,
+    openness_of,
+    openness_rows,
+    seen_gaze,
+)
+from torchface.capture.weight_readings import WeightReadings
+from torchface.landmarks.images.face_reading import FaceReading
+
+_USUAL_OPEN, _USUAL_SHUT = 0.3, 0.05  # openness where a take shows none
+_SHUT_FRAMES = 5.0  # that the usual shut level counts as
+_LOWEST, _HIGHEST = (
+    0.7,
+    0.9,
+)  # the open level is at least the first of this quantile: a squint of the whole take is none
+_LEAST_SPAN = 0.05
+_NOISE, _PIXELS = 0.08, 0.5  # of openness beside the open eye's; and what lids are off by, of their stated deviation
+_BLINK_NOISE = 0.1  # of eyeBlink where the eye is surely shut
+_LIDS = {"eyeWide": 0.35, "eyeSquint": 0.5}  # lids that stand a little otherwise are noise, more likely than not
+_GAZE_NOISE = 0.05  # of eyeLook's weights
+_STRAYS = 0.35  # radians: what is further to the side or up is no looking straight ahead
+_LASTING = (1.0, 0.3)  # people look up or down for long, to one side for long only as their eyes lie otherwise
+_STRAIGHT_FRAMES = 15.0  # that looking straight as people usually do counts as
+_VERGENCE = 0.12  # radians from straight, of each eye at most
+_LEAST_GAZE = 0.3  # trust, under which a gaze is that of before
+_DISAGREE = 0.08  # of openness by landmarks and by the eye network, at which lids' landmarks count half
+_EYES = tuple(range(36, 42)), tuple(range(42, 48))
+
+
+@dataclass(frozen=True, eq=False)
+class TakeEyes:
+    """Eyes in T frames, the right one first.
+
+    Args:
+        open: openness beside the person's own, 0 shut and 1 as at rest, (T,2); NaN where nothing is known.
+        open_deviation: of it, (T,2).
+        closed: how likely each is shut, (T,2); NaN where nobody said.
+        gaze: to the person's left and up, beside the head and straight ahead, (T,2,2) radians; held where eyes are
+            shut, NaN where they were never seen.
+        gaze_trust: (T,2) in [0,1].
+        lid_trust: how far the landmarks of each eye agree with that, (T,2) in [0,1].
+    """
+
+    open: Tensor
+    open_deviation: Tensor
+    closed: Tensor
+    gaze: Tensor
+    gaze_trust: Tensor
+    lid_trust: Tensor
+
+    def readings(self, rest: Tensor, basis: Tensor, names: Sequence[str], eyeballs: Eyeballs) -> WeightReadings:
+        """As readings of the weights of a rig.
+
+        Args:
+            rest, basis: of the 68 landmarks, (68,3) and (68,3,N).
+            names: of the rig's N shapes.
+            eyeballs: of the rig.
+        """
+        called = arkit_names(names)
+        opened, _ = openness_rows(rest.double(), basis.double(), called)
+        one = torch.eye(len(called)).double()
+        shut = ((self.closed.nan_to_num(0.0) - 0.5) / (SURELY_SHUT - 0.5)).clamp(0, 1).double()
+        rows, values, deviation = [opened], [self.open.double() - 1], [self.open_deviation.double()]
+        known = torch.isfinite(self.open)
+        looks = look_weights(self.gaze.double(), eyeballs.turns)
+        sides = torch.tensor([0, 0, 1, 1, 0, 0, 1, 1])
+        for number, name in enumerate(called):
+            eye = int(name.endswith("Left"))
+            kind = name.removesuffix("Left").removesuffix("Right")
+            if name in LOOKS:
+                place = LOOKS.index(name)
+                rows.append(one[number : number + 1])
+                values.append(looks[:, place : place + 1])
+                trust = self.gaze_trust[:, sides[place : place + 1]].double()
+                deviation.append(_GAZE_NOISE / trust.sqrt())
+            elif kind in _LIDS or kind == "eyeBlink":
+                rows.append(one[number : number + 1])
+                values.append(torch.full_like(shut[:, :1], float(kind == "eyeBlink")))
+                sure = _BLINK_NOISE / shut[:, eye : eye + 1].sqrt()
+                quiet = torch.where(known[:, eye : eye + 1], _LIDS.get(kind, torch.inf), torch.inf)
+                deviation.append(sure if kind == "eyeBlink" else quiet.double())
+        return WeightReadings(torch.cat(rows), torch.cat(values, 1), torch.cat(deviation, 1))
+
+    def agreed(self, trust: Tensor) -> Tensor:
+        """Trust in landmarks (T,68) with less of it in lids' that disagree with how far the eye is open."""
+        lids = self.lid_trust.to(trust).repeat_interleave(len(_EYES[0]), dim=1)
+        return torch.cat([trust[:, : _EYES[0][0]], trust[:, _EYES[0][0] : _EYES[1][-1] + 1] * lids, trust[:, 48:]], 1)
+
+    def turned(self, weights: Tensor, names: Sequence[str], eyeballs: Eyeballs) -> Tensor:
+        """Where eyes look, (T,2,2) radians, that have weights (T,N) of a rig; as was seen of a rig that turns none."""
+        called = arkit_names(names)
+        if not all(name in called for name in LOOKS):
+            return self.gaze
+        return gaze_of_looks(weights[:, [called.index(name) for name in LOOKS]].double(), eyeballs.turns)
+
+
+def take_eyes(
+    reading: FaceReading,
+    rays: Tensor,
+    iris: Tensor,
+    rotation: Tensor,
+    depth: Tensor,
+    resting: Tensor,
+    eyeballs: Eyeballs | None = None,
+    looking: Tensor | None = None,
+) -> TakeEyes:
+    """What a take shows of the eyes beside the person's own open and shut eyes, and beside looking straight ahead.
+
+    Args:
+        reading: of T frames.
+        rays: of the 68 landmarks at depth 1, (T,68,2); NaN where none was found.
+        iris: of the irises at depth 1, (T,2,2).
+        rotation: head to camera, (T,3,3); NaN for lost.
+        depth: of the eyes, (T,2), millimetres.
+        resting: how far the face rests in each frame, (T,) in [0,1].
+        eyeballs: of the rig; as people have them if absent.
+        looking: what looking up or down adds to openness at weights (8,) of ``LOOKS``, (2,8); nothing if absent.
+    """
+    closed, seen = reading.closed.double(), reading.eye_visibility.double().clamp(0, 1)
+    shut = closed.nan_to_num(0.0)
+    raw = seen_gaze(rays.double(), iris.double(), rotation.double(), depth.double(), eyeballs)
+    looks = torch.isfinite(raw).all(-1)
+    trust = torch.where(looks, seen * (1 - shut), 0.0)
+    gaze, trust = _one_gaze(torch.where(looks[..., None], raw, 0.0), trust)
+
+    openness = reading.openness.double()
+    known = torch.isfinite(openness)
+    by_look = torch.ones_like(openness)
+    if looking is not None:
+        turns = None if eyeballs is None else eyeballs.turns
+        by_look = (1 + look_weights(gaze, turns) @ looking.double().T * trust).clamp(min=0.4)
+    floor, level = _levels(openness, by_look, shut, known * seen, resting.double())
+    span = (level - floor).clamp(min=_LEAST_SPAN)
+    part, counts = judged_openness(((openness - floor) / span).nan_to_num(1.0), closed, known * seen)
+    width = torch.stack([(reading.landmarks[:, a] - reading.landmarks[:, b]).norm(dim=1) for a, b in CORNERS], 1)
+    off = torch.stack([reading.deviation[:, list(eye)].mean(1) for eye in _EYES], 1)
+    blurred = (_PIXELS * off / width.clamp(min=1.0)).double().nan_to_num(0.0) / span
+    deviation = (_NOISE**2 + blurred.square()).sqrt() / counts.sqrt()
+    apart = (openness_of(reading.landmarks.double()) - openness).abs() - blurred
+    agree = 1 / (1 + (apart.clamp(min=0) / _DISAGREE).square())
+    return TakeEyes(
+        torch.where(counts > 0, part.clamp(-0.1, 1.8), torch.nan),
+        deviation,
+        closed,
+        _held(gaze, trust.amax(1) > _LEAST_GAZE),
+        trust.amax(1, keepdim=True).expand(-1, 2),
+        torch.where(known, agree.nan_to_num(1.0), 1.0),
+    )
+
+
+def _levels(openness: Tensor, by_look: Tensor, shut: Tensor, counts: Tensor, resting: Tensor) -> tuple[Tensor, Tensor]:
+    """The person's shut and open eyes, (2,) each."""
+    floor, level = [], []
+    for eye in range(2):
+        seen = counts[:, eye] > 0.5
+        is_shut = openness[seen & (shut[:, eye] > SURELY_SHUT), eye]
+        share = len(is_shut) / (len(is_shut) + _SHUT_FRAMES)
+        low = is_shut.median() if len(is_shut) else openness.new_tensor(_USUAL_SHUT)
+        floor.append(share * low + (1 - share) * _USUAL_SHUT)
+        is_open = seen & (shut[:, eye] < SURELY_OPEN)
+        if not bool(is_open.any()):
+            level.append(openness.new_tensor(_USUAL_OPEN))
+            continue
+        values = openness[is_open, eye] / by_look[is_open, eye]
+        high = values.quantile(_HIGHEST)
+        level.append(_weighted_median(values, resting[is_open] + 1e-3).clamp(_LOWEST * high, high))
+    return torch.stack(floor), torch.stack(level)
+
+
+def _weighted_median(values: Tensor, weight: Tensor) -> Tensor:
+    order = values.argsort()
+    total = weight[order].cumsum(0)
+    return values[order[int((total < 0.5 * total[-1]).sum())]]
+
+
+def _one_gaze(raw: Tensor, trust: Tensor) -> tuple[Tensor, Tensor]:
+    """Both eyes' gaze at one thing beside straight ahead, (T,2,2), and how much it counts, (T,2)."""
+    straight = torch.zeros_like(raw[0])
+    for eye in range(2):
+        frames = trust[:, eye] > _LEAST_GAZE
+        if bool(frames.any()):
+            lasting = raw[frames, eye].clamp(-_STRAYS, _STRAYS).median(0).values
+            straight[eye] = lasting * lasting.new_tensor(_LASTING) * frames.sum() / (frames.sum() + _STRAIGHT_FRAMES)
+    ahead = raw - straight
+    share = (trust + 1e-3)[..., None]
+    both = (share * ahead).sum(1) / share.sum(1)
+    cross = 0.5 * (ahead[:, 0, 0] - ahead[:, 1, 0]) * (trust.amin(1) > _LEAST_GAZE)
+    cross = cross.clamp(-_VERGENCE / 4, _VERGENCE)
+    made = both[:, None].expand(-1, 2, 2).clone()
+    made[:, 0, 0] += cross
+    made[:, 1, 0] -= cross
+    return made, trust
+
+
+def _held(gaze: Tensor, seen: Tensor) -> Tensor:
+    """Gaze of frames (T,...) as of the last one that was seen, the first one's before it."""
+    if not bool(seen.any()):
+        return torch.full_like(gaze, torch.nan)
+    frames = torch.arange(len(gaze))
+    last = torch.where(seen, frames, -1).cummax(0).values
+    return gaze[torch.where(last < 0, int(seen.nonzero()[0, 0]), last)]
