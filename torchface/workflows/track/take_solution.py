@@ -12,7 +12,6 @@ from torch import Tensor
 from torchface.capture.own_rig import FaceMeasurements, VideoSolution, VideoSolver
 from torchface.capture.own_rig.another_face import AnotherFace, other_faces
 from torchface.capture.own_rig.eye_geometry import CORNERS, LOOKS, Eyeballs, arkit_names, openness_rows
-from torchface.capture.own_rig.face_measurements import FaceMeasurements
 from torchface.capture.own_rig.face_points import LANDMARKS
 from torchface.capture.own_rig.head_pose import measure_poses
 from torchface.capture.own_rig.landmark_offset_estimate import estimate_offsets

@@ -102,8 +102,7 @@ def _track(inputs: TrackInputs, out: Path, filmed: bool, progress: Progress) -> 
         offsets = offsets or estimated
     solver = solver if offsets is None else solver.shifted(offsets)
     key = solution_key(inputs, solver, offsets, times)
-    with _timed(seconds, "eyes"):
-        eyes = seen_eyes(inputs, solver, landmarks, reading)
+    eyes = seen_eyes(inputs, solver, landmarks, reading)
     solution = kept_solution(state, key)
     if solution is None:
         with _timed(seconds, "weights"):
