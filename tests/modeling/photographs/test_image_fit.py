@@ -287,6 +287,25 @@ def test_landmarks_as_annotators_put_them_are_no_other_face(rig: BlendshapeRig, 
     assert errors[True] < errors[False]
 
 
+def test_landmarks_count_by_their_deviations(rig: BlendshapeRig, model: HeadModel) -> None:
+    """A mouth that is found 30 pixels aside, and said to be uncertain, bends the head less."""
+    skin, errors = model.annotations.regions["face"], torch.zeros(2)
+    deviations = torch.ones(1, 68)
+    deviations[:, 48:] = 4.0
+    for seed in range(3):
+        rest = model.shape(torch.randn(1, 15, generator=torch.Generator().manual_seed(60 + seed)))[0]
+        marks = snapshots(rig, rest, [(20.0, {})], seed)
+        marks[:, 48:, 0] += 30.0
+        for row, some in enumerate((None, deviations)):
+            fit = fit_images(model, rig, marks, SIZE, settings=replace(POINTS, deviations=some))
+            errors[row] += aligned_error(fit.mesh.vertices[skin], rest[skin])
+    assert float(errors[1]) < 0.9 * float(errors[0])
+    with pytest.raises(ShapeError, match="found 2 views, expected 1"):
+        fit_images(model, rig, marks, SIZE, settings=FitSettings(deviations=torch.ones(2, 68)))
+    with pytest.raises(ShapeError, match=r"deviations: found \(1, 5\)"):
+        FitSettings(deviations=torch.ones(1, 5))
+
+
 def test_a_laugh_goes_to_a_smile_by_the_prior(rig: BlendshapeRig, model: HeadModel) -> None:
     """Of a face that is nobody's in the model and laughs at the camera, what a laugh has beside stays small."""
     prior = zoo.get_model("shape_prior").renamed(rig.names)

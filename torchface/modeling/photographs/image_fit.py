@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from torchface.errors import AlignmentError
+from torchface.errors import AlignmentError, ShapeError
 from torchface.geometry.cameras.pinhole import Camera
 from torchface.geometry.cameras.pnp import Pose, solve_pnp
 from torchface.geometry.cameras.sliding_contour import LevelCurves, level_curves
@@ -134,6 +134,8 @@ def fit_images(
     sizes = checked_sizes(landmarks, image_size)
     if images is not None:
         check_images(images, sizes)
+    if settings is not None and settings.deviations is not None and len(settings.deviations) != len(landmarks):
+        raise ShapeError(f"deviations: found {len(settings.deviations)} views, expected {len(landmarks)}")
     intrinsics, settings = lens(camera, sizes, settings or FitSettings())
     pixels = landmarks.detach().cpu().double()
     mean = model.shape.mean.cpu()

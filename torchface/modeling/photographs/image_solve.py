@@ -8,9 +8,11 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
+from torchface.errors import ShapeError
 from torchface.geometry.cameras.pinhole import MAX_SIDE
 from torchface.modeling.photographs.landmark_view import (
     JAW,
+    LANDMARKS,
     Linearised,
     LinearPoints,
     PickedPoints,
@@ -25,6 +27,7 @@ from torchface.optim import box_qp
 _DONE, _HALVINGS = 1e-5, 6
 _MAX_CONTOUR_ERROR, _SETTLED, _TRIAL_ITERATIONS = 1.5, 0.02, 3
 _MIN_NOISE = 1e-5  # of the focal length: finer than any landmark is found
+_LEAST, _MOST = 0.5, 4.0  # deviations beside the median
 _FOUND_NOISE = 0.02  # of the distance of the eyes' outer corners
 _EXPECTED, _LEAST_UNKNOWN = 2.0, 1e-2  # of unknown differences: how many are expected to be as large as expected
 
@@ -56,6 +59,8 @@ class FitSettings:
             contour landmarks as points.
         sliding: contour landmarks of the far side move to the visible silhouette, as people and detectors mark them;
             False where they are vertices that may be hidden. Absent, what fits better is taken.
+        deviations: what each landmark is expected to be off by, (I,68), in any unit: they count beside their view's
+            median, from half to four times it. All alike if absent.
         annotated: landmarks lie where annotators put them, and what learns from them, rather than on the heads'
             vertices; see ``as_annotated`` and ``annotated_vertices``.
         expression_prior: which weights of the rig's shapes go together, in place of the mean and the ridge below.
@@ -78,6 +83,7 @@ class FitSettings:
 
     Raises:
         ValueRangeError: a setting is NaN, infinite or out of its range.
+        ShapeError: deviations of another shape.
 
     Example:
         >>> FitSettings(focal_deviation=0.05, shared_focal=True).identity_bound
@@ -87,6 +93,7 @@ class FitSettings:
     inner_weight: float = 2.0
     contour_slide: float = 0.5
     sliding: bool | None = None
+    deviations: Tensor | None = None
     annotated: bool = False
     expression_prior: ExpressionPrior | None = None
     sparsity: float = 1.0
@@ -107,6 +114,8 @@ class FitSettings:
     def __post_init__(self) -> None:
         for name in ("inner_weight", "expression_mean", "expression_ridge", "asymmetry", "identity_bound"):
             checked_number(name, getattr(self, name), 0.0, LARGEST_WEIGHT, above=True)
+        if self.deviations is not None and self.deviations.shape[1:] != (LANDMARKS,):
+            raise ShapeError(f"deviations: found {tuple(self.deviations.shape)}, expected (I,{LANDMARKS})")
         if self.noise is not None:
             checked_number("noise", self.noise, above=True)
         checked_number("contour_slide", self.contour_slide, 0.0, 1.0)
@@ -275,7 +284,15 @@ def whitening(problem: Problem, state: State, picked: PickedPoints) -> Tensor:
     tangent = along[..., :, None] * along[..., None, :]
     factors[:, :JAW] -= (1 - settings.contour_slide) * tangent
     factors[:, :JAW] /= settings.inner_weight**0.5
+    if settings.deviations is not None:
+        factors /= _relative(settings.deviations)[..., None, None]
     return factors * (problem.seen / (state.noise * _scales(problem, state.views))[:, None])[..., None, None]
+
+
+def _relative(deviations: Tensor) -> Tensor:
+    """Deviations (I,68) beside the median of their view."""
+    known = torch.where(deviations.isfinite(), deviations.double(), torch.nan)
+    return (known / known.nanmedian(1, keepdim=True).values).nan_to_num(_MOST).clamp(_LEAST, _MOST)
 
 
 def _scales(problem: Problem, views: Views) -> Tensor:

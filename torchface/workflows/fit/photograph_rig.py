@@ -170,6 +170,8 @@ def fit_photographs(
         return fit_images(heads, rig, points, some, camera=settings.focal, settings=ALONE)
 
     fitting = replace(settings.fit, expression_prior=prior, annotated=bool(found))
+    if found:
+        fitting = replace(fitting, deviations=torch.stack([one.face.deviation for one in found]))
     remarks = [line for one, image in zip(found, images, strict=False) for line in picture_lines(one, image, insist)]
     remarks += one_person_lines(photographs, marks, bare, insist)
     fit = fit_images(heads, rig, marks, sizes, images, settings.focal, fitting, progress)

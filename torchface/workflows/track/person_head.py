@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from torchface.errors import ValueRangeError
+from torchface.landmarks.images.face_reading import FaceReading
 from torchface.modeling import FitSettings, HeadModel, ImageFit, fit_images, transfer_with_report
 from torchface.modeling.photographs.frame_choice import choose_frames
 from torchface.modeling.photographs.landmark_view import JAW
@@ -47,7 +48,7 @@ class PersonHead:
 
 
 def person_head(
-    inputs: TrackInputs, heads: HeadModel, landmarks: Tensor, trust: Tensor, progress: Progress
+    inputs: TrackInputs, heads: HeadModel, landmarks: Tensor, reading: FaceReading, progress: Progress
 ) -> PersonHead:
     """Solves the head of a take, its expressions and poses together; see ``fit_images``.
 
@@ -55,14 +56,14 @@ def person_head(
         inputs: whose actor is the rig of the model's mean head.
         heads: of the rig's topology.
         landmarks: smoothed, (T,68,2) pixels of a camera without distortion.
-        trust: in each, (T,68).
+        reading: of the frames, (T,...): how far each landmark is trusted.
         progress: called with each step.
 
     Raises:
         ValueRangeError: no frame shows a face.
     """
     progress("solving the head")
-    rig, clip = inputs.actor, inputs.clip
+    rig, clip, trust = inputs.actor, inputs.clip, reading.trust
     rest = rig.vertices[rig.neutral.landmarks].detach()
     try:
         frames = choose_frames(rest, landmarks, trust, FRAMES)
@@ -70,7 +71,12 @@ def person_head(
         raise ValueRangeError(f"{clip.path}: {error}") from error
     marks = torch.where((trust > _DOUBTED)[..., None], landmarks, torch.nan)[frames]
     few = (torch.isfinite(marks[:, JAW:]).all(-1).sum(1) < FRAMES)[:, None, None]
-    settings = FitSettings(expression_prior=inputs.models.prior, annotated=True)
+    found = inputs.models.finder is not None
+    settings = FitSettings(
+        expression_prior=inputs.models.prior,
+        annotated=found,
+        deviations=reading.deviation[frames] if found else None,
+    )
     fit = fit_images(
         heads,
         rig,

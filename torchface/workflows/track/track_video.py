@@ -90,7 +90,7 @@ def _track(inputs: TrackInputs, out: Path, filmed: bool, progress: Progress) -> 
     head = None
     if inputs.heads is not None:
         with _timed(seconds, "head"):
-            head = person_head(inputs, inputs.heads, landmarks, reading.trust, progress)
+            head = person_head(inputs, inputs.heads, landmarks, reading, progress)
         inputs = replace(inputs, actor=head.rig)
     trust, solver = reading.trust, inputs.solver(inputs.clip.fps)
     offsets = known_offsets(inputs, out)
