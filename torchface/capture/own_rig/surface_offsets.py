@@ -44,9 +44,9 @@ def surface_offsets(
     chosen = shown[torch.linspace(0, len(shown) - 1, min(_FRAMES, len(shown))).round().long()]
     K = solver.intrinsics.double()
     with torch.no_grad():
-        seen, trust = landmarks[chosen].double(), trust[chosen]
+        seen, trust = landmarks[chosen].double(), trust[chosen].double()
         try:
-            poses = measure_poses(solver.points.rest[:LANDMARKS], seen, K, trust)
+            poses = measure_poses(solver.points.rest[:LANDMARKS].double(), seen, K, trust)
         except AlignmentError:
             return None
         chosen, seen, trust = chosen[poses.found], seen[poses.found], trust[poses.found]
@@ -62,11 +62,11 @@ def surface_offsets(
         found, off = points[chosen].double(), deviation[chosen].double()
         known = torch.isfinite(found).all(-1) & torch.isfinite(off)
         calm = 1 / (1 + (head.weights.sum(1) / _CALM).square())
-        share = surface.facing(head.rotation, head.translation) * known * calm[:, None]
+        share = surface.facing(head.rotation, head.translation).double() * known * calm[:, None]
         at = surface.linearised(head, K, torch.where(known[..., None], found, 0.0), torch.ones_like(share))
         unit = head.translation[:, 2:, None, None] / K[0, 0]  # from pixels to millimetres
-        by_offset = unit * (at.jacobian[..., -3:] @ head.rotation[:, None])
-        residual = unit[..., 0] * at.residual
+        by_offset = unit * (at.jacobian[..., -3:].double() @ head.rotation[:, None].double())
+        residual = unit[..., 0] * at.residual.double()
         share = share / share.sum(0).clamp(min=1e-6) / _ERROR**2
         H = torch.einsum("tp,tpci,tpcj->pij", share, by_offset, by_offset)
         f = torch.einsum("tp,tpci,tpc->pi", share, by_offset, residual)
