@@ -9,6 +9,8 @@ from torch import Tensor
 
 from torchface.shape_names import antagonists
 
+_NOTHING = 1e-6  # a side that a solve leaves so far up has come to rest
+
 
 def signed_quantities(names: Sequence[str]) -> Tensor:
     """The matrix (K,N) of +1 and -1 that makes of weights (N,) the K quantities whose sides are two shapes each.
@@ -33,7 +35,8 @@ def weaker_sides(weights: Tensor, signed: Tensor) -> Tensor:
         signed: as of :func:`signed_quantities`, (K,N).
     """
     signed = signed.to(weights)
-    return (weights @ signed.T).sign() @ signed < 0
+    difference = weights @ signed.T
+    return torch.where(difference.abs() > _NOTHING, difference.sign(), 0.0) @ signed < 0
 
 
 def one_side(weights: Tensor, signed: Tensor) -> Tensor:

@@ -131,13 +131,14 @@ class ErrorModes:
         Args:
             parts: landmarks with their rows of the modes, (B,L,M) in sum.
         """
-        through = torch.zeros(1, dtype=self.modes.dtype, device=self.modes.device)
+        residual = jacobian = torch.zeros(1, dtype=self.modes.dtype, device=self.modes.device)
         for at, modes in parts:
-            lines = torch.cat([at.residual[..., None], at.jacobian], dim=-1).flatten(2)
-            through = through + (modes.to(lines).transpose(1, 2) @ lines).to(through)  # (B,M,2(N+7))
-        scaled = (self.inner @ through).unflatten(2, (2, -1)).flatten(1, 2)
-        gram = through.unflatten(2, (2, -1)).flatten(1, 2).transpose(1, 2) @ scaled
-        return Quadratic(-gram[:, 1:, 1:], -gram[:, 0, 1:])
+            across = modes.to(at.jacobian).transpose(1, 2)
+            residual = residual + (across @ at.residual).to(residual)  # (B,M,2)
+            jacobian = jacobian + (across @ at.jacobian.flatten(2)).to(jacobian)  # (B,M,2(N+6))
+        scaled = (self.inner @ jacobian).unflatten(2, (2, -1)).flatten(1, 2)
+        jacobian = jacobian.unflatten(2, (2, -1)).flatten(1, 2)
+        return Quadratic(-(jacobian.transpose(1, 2) @ scaled), -(residual.flatten(1)[:, None] @ scaled)[:, 0])
 
 
 def linearise(

@@ -77,7 +77,10 @@ class FaceSurfacePoints:
         by_place = by_place * precision[..., None, None]
         by_world = (by_place.flatten(1, 2) @ head.rotation).view(by_place.shape)
         by_turn = torch.linalg.cross(turned[:, :, None].expand_as(by_place), by_place)
-        jacobian = torch.cat([by_world.to(basis) @ basis, by_turn.to(basis), by_place.to(basis)], dim=-1)
+        lines = by_world.to(basis)[..., None]
+        # Thousands of products of a 2x3 and a 3xN matrix: three sums over all of them are quicker.
+        by_weights = sum(lines[..., axis, :] * basis[..., axis, :].unsqueeze(-2) for axis in range(3))
+        jacobian = torch.cat([by_weights, by_turn.to(basis), by_place.to(basis)], dim=-1)
         return Linearised(((at - found) * precision[..., None]).to(basis), jacobian)
 
 
