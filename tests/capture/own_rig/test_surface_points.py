@@ -13,6 +13,7 @@ from torchface import Attachment
 from torchface.capture.own_rig import VideoSettings, VideoSolver
 from torchface.capture.own_rig.face_measurements import FaceMeasurements
 from torchface.capture.own_rig.gauss_newton import HeadState, Linearised
+from torchface.capture.own_rig.surface_offsets import surface_offsets
 from torchface.capture.own_rig.surface_points import FaceSurfacePoints, alike_errors, smooth_modes
 from torchface.capture.weight_readings import WeightReadings
 from torchface.errors import ShapeError
@@ -221,3 +222,24 @@ def test_points_are_kept_with_the_solver() -> None:
     assert torch.allclose(made(landmarks, measured=measured).weights, solver(landmarks, measured=measured).weights)  # type: ignore[operator]
     with pytest.raises(ShapeError, match=r"measured points: found \(1, 5, 2\), expected \(1, 200, 2\)"):
         solver(landmarks, measured=FaceMeasurements(None, points[:, :5], torch.ones(FRAMES, 5)))
+
+
+def test_planted_offsets_come_back_though_half_of_the_take_smiles() -> None:
+    settings = VideoSettings(pixel_noise=0.3, contour_slide=1.0, sparsity=0.1)
+    solver = VideoSolver(actor(), None, K, settings=settings, surface=sites())
+    surface, points = solver.surface, solver.points
+    assert surface is not None
+    weights = torch.zeros(24, 7, dtype=torch.float64)
+    weights[12:, 1:3] = 0.8
+    offsets = 3 * torch.randn(200, 3, generator=torch.Generator().manual_seed(0)).double()
+    offsets[:, 2] = 0  # along the line of sight little is seen
+    person = VideoSolver(actor(), None, K, settings=settings, surface=sites()).with_surface_moved(offsets).surface
+    assert person is not None
+    landmarks = planted(FaceSurfacePoints(points.rest[:68], points.basis[:68], torch.zeros(68, 3).double()), weights)
+    measured = FaceMeasurements(None, planted(person, weights), torch.ones(24, 200))
+    found = surface_offsets(solver, landmarks, torch.ones(24, 68), measured)
+    assert found is not None
+    seen = surface.facing(*pose(24)).amin(0) > 0.9
+    assert float((found - offsets)[seen][:, :2].square().mean().sqrt()) < 0.6
+    few = FaceMeasurements(None, measured.points[:5], measured.point_deviation[:5])  # type: ignore[index]
+    assert surface_offsets(solver, landmarks[:5], torch.ones(5, 68), few) is None
