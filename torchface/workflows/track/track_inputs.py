@@ -23,7 +23,7 @@ from torchface.modeling import HeadModel
 from torchface.number_checks import check_rate
 from torchface.rig import BlendshapeRig
 from torchface.workflows.named_heads import NamedHeads, load_head_model, matching
-from torchface.workflows.surface_sites import sites_on_rig
+from torchface.workflows.surface_sites import counted_sites
 from torchface.workflows.track.track_models import (
     DEFAULT_LANDMARKS,
     DEFAULT_PRIOR,
@@ -209,7 +209,7 @@ def solver_for(
 ) -> VideoSolver:
     """The solver of a rig, for landmarks that the models find, at a frame rate."""
     settings = VideoSettings.of_found_landmarks(models.dynamics is not None, models.appearance is not None, fps)
-    surface = sites_on_rig(rig, models.places) if len(models.places) else None
+    surface = counted_sites(rig, models.places)
     return VideoSolver(rig, None, calibration.intrinsics, models.prior, models.dynamics, settings, surface=surface)
 
 

@@ -17,7 +17,7 @@ from torchface.onnx.webcam.webcam_solver_graph import WebcamSolverGraph
 from torchface.progress import Progress, silent
 from torchface.synthetic.head.performer import performer
 from torchface.workflows.cached_graph import cached_graph
-from torchface.workflows.surface_sites import sites_on_rig
+from torchface.workflows.surface_sites import counted_sites
 from torchface.workflows.track.track_models import DEFAULT_PRIOR, load_priors
 
 __all__ = ["default_webcam_solver"]
@@ -84,7 +84,7 @@ def default_webcam_solver(settings: WebcamSettings | None = None) -> WebcamSolve
     if heads.landmarks is None:
         raise NameMismatchError(f"{HEADS}: found a HeadModel without landmarks, expected one with them")
     modes, places = heads.shape.modes[:, heads.landmarks], zoo.get_model(NETWORKS[1], LandmarkNetwork).places
-    surface = sites_on_rig(rig, places) if len(places) else None
+    surface = counted_sites(rig, places)
     if surface is not None:
         modes = torch.cat([modes, surface.on(rig.neutral.faces, heads.shape.modes)], dim=1)
     return WebcamSolver(rig, modes, load_priors(rig, DEFAULT_PRIOR, None).shapes, settings, surface)
