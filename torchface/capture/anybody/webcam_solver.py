@@ -39,6 +39,7 @@ from torchface.capture.own_rig.gauss_newton import (
 from torchface.capture.own_rig.surface_points import FaceSurfacePoints, alike_errors
 from torchface.capture.own_rig.weight_walk import faded, relative_trust, unseen_time, walk_information
 from torchface.capture.priors import ShapePrior
+from torchface.capture.weight_readings import EXPRESSION_SHARE
 from torchface.errors import NameMismatchError
 from torchface.geometry.cameras.affine_pose import affine_pose, orthonormal
 from torchface.geometry.cameras.calibration import ASSUMED_FIELD_OF_VIEW
@@ -304,7 +305,7 @@ class WebcamSolver(nn.Module):
             torch.where(shows_face, trust, 1.0),
             _known(deviation.double(), 0.0).clamp(0, 1e3) / focal,
             ((points.double() - centre) / focal, point_deviation.double() / focal),
-            (expression.double(), expression_deviation.double()),
+            (expression.double(), EXPRESSION_SHARE * expression_deviation.double()),
             iris_rays,
             EyesRead(openness.double(), closed.double(), eye_visibility.double()),
             interval,
