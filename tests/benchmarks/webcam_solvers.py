@@ -110,12 +110,14 @@ def webcam_solver(readings: list[FaceReading], fps: float, size: tuple[int, int]
     """``WebcamSolver``'s graph as ``torchface live`` and the app run it; nobody calibrates anything."""
     session = _webcam_session()
     controls = WebcamControls().tensor().numpy()
+    points = next(one.shape[0] for one in session.get_inputs() if one.name == "points")  # none if it counts none
     state = np.zeros(session.get_inputs()[-1].shape, np.float32)
     fixed = {"size": np.array(size, np.float32), "interval": np.array(1 / fps, np.float32), "controls": controls}
     weights, gazes = [], []
     started = time.process_time()
     for reading in readings:  # a frame's state is the next one's
         given = {name: getattr(reading, name).numpy() for name in READ_BY_NETWORKS}
+        given |= {name: given[name][:points] for name in ("points", "point_deviation")}
         solved, gaze, state = session.run(["weights", "gaze", "next_state"], given | fixed | {"state": state})
         weights.append(torch.from_numpy(solved))
         gazes.append(torch.from_numpy(gaze))
