@@ -153,13 +153,14 @@ def fit_photographs(
     heads, rig = matching(load_head_model(named.name), settings.template, settings.part)
     prior = load_priors(rig, settings.prior, None).shapes
     progress(f"reading {len(photographs)} photographs")
-    found: list[PhotographLandmarks] = []
+    found, one_film = list[PhotographLandmarks](), False
     if landmarks or not photographs:
         images = [load_image(path) for path in photographs]
         marks = torch.stack(landmarks_of(photographs, landmarks, settings.face))
         for photograph in photographs:
             warn_if_stored_turned(photograph)
     else:
+        one_film = len(photographs) == 1
         photographs, images, found = _pictures(photographs, rig, settings, progress)
         marks = torch.stack([one.confident for one in found])
     sizes = [(image.shape[2], image.shape[1]) for image in images]
@@ -167,13 +168,16 @@ def fit_photographs(
 
     def bare(points: Tensor, rows: list[int]) -> ImageFit:
         some = [sizes[row] for row in rows]
-        return fit_images(heads, rig, points, some, camera=settings.focal, settings=ALONE)
+        # What all found landmarks have in common must not look like one head.
+        alone = replace(ALONE, annotated=bool(found))
+        return fit_images(heads, rig, points, some, camera=settings.focal, settings=alone)
 
     fitting = replace(settings.fit, expression_prior=prior, annotated=bool(found))
     if found:
         fitting = replace(fitting, deviations=torch.stack([one.face.deviation for one in found]))
     remarks = [line for one, image in zip(found, images, strict=False) for line in picture_lines(one, image, insist)]
-    remarks += one_person_lines(photographs, marks, bare, insist)
+    # The tracker has followed one face through a film.
+    remarks += one_person_lines(photographs, marks, bare, insist or one_film)
     fit = fit_images(heads, rig, marks, sizes, images, settings.focal, fitting, progress)
     remarks += profile_lines(fit)
     if not found:
