@@ -1,7 +1,7 @@
 """``torchface train landmark_network --out models/NAME``: a network that finds landmarks and expressions of faces.
 
 Learns from rendered people alone: ``--ict FaceXModel`` takes ICT-FaceKit's heads of real people beside the embedded
-performers. Pictures stay in files, of which a batch is read at a time. 10,000 pictures take about 17 minutes of one
+performers. Pictures stay in files, of which a batch is read at a time. 10,000 pictures take about 21 minutes of one
 core, 8,000 steps 80 minutes of two; a GPU is used if there is one. ``--start zoo --network.heat 0`` goes on from the
 network that ships. Killed and started again it goes on.
 """
