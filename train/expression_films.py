@@ -18,7 +18,7 @@ from torchface.cli.progress_bars import progress_bars
 from torchface.cli.terminal import plain_errors
 from torchface.errors import NameMismatchError
 from torchface.files.job_lock import job_lock
-from torchface.files.whole_files import make_folder
+from torchface.files.whole_files import make_folder, write_file
 from torchface.io.weights.live_link_csv import save_live_link
 from torchface.io.weights.weight_csv import ROTATIONS
 from torchface.progress import Progress, silent
@@ -112,7 +112,7 @@ def render(settings: Settings, progress: Progress | None = None) -> dict[str, Fi
         try:
             os.link(film.path, video)
         except OSError:  # a file system without links
-            video.write_bytes(film.path.read_bytes())
+            write_file(video, film.path.read_bytes())
         save_live_link(truth(film), settings.out / f"{name}.csv")
         made[name] = film
     return made

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from torchface.shape_names import ARKIT
 from torchface.synthetic.stages.weight_curves import GESTURES
-from train.people_performances import converse
+from ..people_performances import converse
 
 from .backdrops import uniform
 

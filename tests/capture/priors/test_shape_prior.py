@@ -126,7 +126,7 @@ def test_a_solve_with_the_prior_never_gets_worse(kind: type[StudentDensity] | ty
 def test_the_papers_form_is_flat_near_the_data_and_guarded_far_from_it() -> None:
     prior = ReciprocalPrior.fit([clusters()], NAMES).double()
     at = clusters(3, seed=5).requires_grad_()
-    density = torch.stack([d.log_density(part) for d, part in prior._parts(at)]).exp()
+    density = torch.stack([d.log_density(part) for d, part in prior.parts(at)]).exp()
     (slope,) = torch.autograd.grad((1 / (density + prior.guard)).sum(), at)
     energy = prior.energy(at.detach())
     torch.testing.assert_close((energy.H @ at.detach()[..., None])[..., 0] + energy.f, slope, rtol=1e-6, atol=1e-6)

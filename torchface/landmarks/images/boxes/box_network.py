@@ -11,6 +11,7 @@ from torch import Tensor, nn
 from torch.nn.functional import avg_pool2d, interpolate, max_pool2d
 
 from torchface.errors import ShapeError, ValueRangeError
+from torchface.number_checks import as_real
 from torchface.progress import Progress, ValueLog, silent
 
 if TYPE_CHECKING:
@@ -178,7 +179,7 @@ class BoxNetwork(nn.Module):
             ShapeError: no such images.
         """
         _check_images(images)
-        copies = [images]
+        copies = [as_real(images)]
         for _ in range(COPIES - 1):
             copies.append(avg_pool2d(copies[-1], 2))
         cells = torch.cat([_said_faces(self.maps(copy), 2**half) for half, copy in enumerate(copies)], 1)
@@ -186,7 +187,7 @@ class BoxNetwork(nn.Module):
         faces = cells.gather(1, rows[..., None].expand(-1, -1, 6))
         apart = (faces[:, :, None, :2] - faces[:, None, :, :2]).square().sum(-1).sqrt()
         near = apart < _SAME_FACE * torch.maximum(faces[:, :, None, 2], faces[:, None, :, 2])
-        known = near.logical_and(torch.ones(self.faces, self.faces).tril(-1) > 0).any(2)  # by a likelier row
+        known = near.logical_and(faces.new_ones(self.faces, self.faces).tril(-1) > 0).any(2)  # by a likelier row
         scores = faces[..., 3] * torch.where(known, BESIDE_A_PEAK, 1.0)
         scores, rows = scores.topk(self.faces, dim=1)
         faces = faces.gather(1, rows[..., None].expand(-1, -1, 6))
