@@ -216,6 +216,26 @@ def test_what_is_up_to_date_is_kept(done: Done, filmed: Filmed, tmp_path: Path) 
     assert not torch.equal(smooth.solution.weights, again.solution.weights)
 
 
+def assert_same_file(path: Path, other: Path) -> None:
+    """Bit for bit, but that numbers of tables may differ by rounding: products of matrices depend on where they lie."""
+    if path.read_bytes() == other.read_bytes():
+        return
+    if path.suffix == ".glb":
+        played, wanted_take = read_gltf_weights(path), read_gltf_weights(other)
+        assert played is not None
+        assert wanted_take is not None
+        assert played.weights is not None
+        assert wanted_take.weights is not None
+        torch.testing.assert_close(played.weights.values, wanted_take.weights.values, atol=1e-5, rtol=0)
+        return
+    assert path.suffix == ".csv", path
+    ours, theirs = (table.read_text().splitlines() for table in (path, other))
+    assert len(ours) == len(theirs)
+    for row, wanted in zip(ours, theirs, strict=True):
+        for one, two in zip(row.split(","), wanted.split(","), strict=True):
+            assert one == two or float(one) == pytest.approx(float(two), abs=1e-5), (path.name, row[:20])
+
+
 def test_damaged_files_are_told_and_made_anew(
     done: Done, filmed: Filmed, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -242,7 +262,7 @@ def test_damaged_files_are_told_and_made_anew(
             ours, theirs = load_file(out / name), load_file(done.out / name)
             torch.testing.assert_close(ours, theirs, rtol=0, atol=0, equal_nan=True)
         else:
-            assert (out / name).read_bytes() == (done.out / name).read_bytes(), name
+            assert_same_file(out / name, done.out / name)
 
 
 def test_another_run_into_the_folder_is_refused(done: Done, filmed: Filmed, tmp_path: Path) -> None:
