@@ -10,8 +10,8 @@ from torch import Tensor
 
 from torchface.shape_names import ARKIT
 from torchface.synthetic.stages.weight_curves import GESTURES
-from ..people_performances import converse
 
+from ..people_performances import converse
 from .backdrops import uniform
 
 Between = Callable[[float, float], float]

@@ -79,7 +79,8 @@ class FaceSurfacePoints:
         by_turn = torch.linalg.cross(turned[:, :, None].expand_as(by_place), by_place)
         lines = by_world.to(basis)[..., None]
         # Thousands of products of a 2x3 and a 3xN matrix: three sums over all of them are quicker.
-        by_weights = sum(lines[..., axis, :] * basis[..., axis, :].unsqueeze(-2) for axis in range(3))
+        x, y, z = (lines[..., axis, :] * basis[..., axis, :].unsqueeze(-2) for axis in range(3))
+        by_weights = x + y + z
         jacobian = torch.cat([by_weights, by_turn.to(basis), by_place.to(basis)], dim=-1)
         return Linearised(((at - found) * precision[..., None]).to(basis), jacobian)
 

@@ -132,8 +132,13 @@ def new_offsets(
     )
     if offsets is None:
         return None
-    digests = {"rig": _rig_digest(inputs.actor), "finder": _finder_digest(inputs)}
-    return replace(offsets, **digests, video=inputs.offsets_key, source=inputs.clip.path.name)
+    return replace(
+        offsets,
+        rig=_rig_digest(inputs.actor),
+        finder=_finder_digest(inputs),
+        video=inputs.offsets_key,
+        source=inputs.clip.path.name,
+    )
 
 
 def known_rest(reading: FaceReading) -> Tensor | None:
