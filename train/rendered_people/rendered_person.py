@@ -181,7 +181,7 @@ class _SeenSurface:
 
 
 def _lit(caster: RayCaster, camera: Camera, seen: _SeenSurface, generator: torch.Generator) -> Tensor:
-    """Linear light (R,3) under coloured lamps from anywhere in front, above or beside, and in a room."""
+    """Linear light (R,3) under coloured lights in front, above or beside, and indoors."""
     points, normals, ways, gloss = seen.points, seen.normals, seen.ways, seen.gloss
     right, down, _ = camera.rotation.double()
     toward_camera = -camera.rotation[2].double()

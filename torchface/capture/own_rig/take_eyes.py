@@ -147,9 +147,9 @@ def take_eyes(
     if looking is not None:
         turns = None if eyeballs is None else eyeballs.turns
         by_look = (1 + look_weights(gaze, turns) @ looking.double().T * trust).clamp(min=0.4)
-    floor, level = _levels(openness, by_look, shut, known * seen, resting.double())
-    span = (level - floor).clamp(min=_LEAST_SPAN)
-    part, counts = judged_openness(((openness - floor) / span).nan_to_num(1.0), closed, known * seen)
+    lowest, level = _levels(openness, by_look, shut, known * seen, resting.double())
+    span = (level - lowest).clamp(min=_LEAST_SPAN)
+    part, counts = judged_openness(((openness - lowest) / span).nan_to_num(1.0), closed, known * seen)
     width = torch.stack([(reading.landmarks[:, a] - reading.landmarks[:, b]).norm(dim=1) for a, b in CORNERS], 1)
     off = torch.stack([reading.deviation[:, list(eye)].mean(1) for eye in _EYES], 1)
     blurred = (_PIXELS * off / width.clamp(min=1.0)).double().nan_to_num(0.0) / span
@@ -168,13 +168,13 @@ def take_eyes(
 
 def _levels(openness: Tensor, by_look: Tensor, shut: Tensor, counts: Tensor, resting: Tensor) -> tuple[Tensor, Tensor]:
     """The person's shut and open eyes, (2,) each."""
-    floor, level = [], []
+    lowest, level = [], []
     for eye in range(2):
         seen = counts[:, eye] > 0.5
         is_shut = openness[seen & (shut[:, eye] > SURELY_SHUT), eye]
         share = len(is_shut) / (len(is_shut) + _SHUT_FRAMES)
         low = is_shut.median() if len(is_shut) else openness.new_tensor(_USUAL_SHUT)
-        floor.append(share * low + (1 - share) * _USUAL_SHUT)
+        lowest.append(share * low + (1 - share) * _USUAL_SHUT)
         is_open = seen & (shut[:, eye] < SURELY_OPEN)
         if not bool(is_open.any()):
             level.append(openness.new_tensor(_USUAL_OPEN))
@@ -182,7 +182,7 @@ def _levels(openness: Tensor, by_look: Tensor, shut: Tensor, counts: Tensor, res
         values = openness[is_open, eye] / by_look[is_open, eye]
         high = values.quantile(_HIGHEST)
         level.append(_weighted_median(values, resting[is_open] + 1e-3).clamp(_LOWEST * high, high))
-    return torch.stack(floor), torch.stack(level)
+    return torch.stack(lowest), torch.stack(level)
 
 
 def _weighted_median(values: Tensor, weight: Tensor) -> Tensor:

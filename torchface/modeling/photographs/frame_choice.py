@@ -66,7 +66,7 @@ def choose_frames(
 
 
 def _features(rest: Tensor, landmarks: Tensor, trust: Tensor) -> tuple[Tensor, Tensor]:
-    """Of each frame what tells it from others, (T,F), and how far the head is rotated from the camera, degrees (T,)."""
+    """Of each frame what is its own, (T,F), and how far the head is rotated from the camera, degrees (T,)."""
     x, q = rest[JAW:] - rest[JAW:].mean(0), landmarks[:, JAW:]
     weight = torch.where(q.isfinite().all(-1), trust[:, JAW:], 0.0)[..., None]
     q = q.nan_to_num(0.0)

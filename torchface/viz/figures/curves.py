@@ -47,8 +47,8 @@ def weight_curves(solved: Tensor, true: Tensor | None, names: Sequence[str], fps
     # A constrained layout of so many axes takes two thirds of the time, and finds these margins.
     height = 1.5 * (len(order) + 1)
     figure = Figure(figsize=(10, height), dpi=100)
-    room = {"left": 0.065, "right": 0.993, "bottom": 0.45 / height, "top": 1 - 0.08 / height, "hspace": 0.09}
-    rows = figure.subplots(len(order) + 1, 1, sharex=True, gridspec_kw=room)
+    margins = {"left": 0.065, "right": 0.993, "bottom": 0.45 / height, "top": 1 - 0.08 / height, "hspace": 0.09}
+    rows = figure.subplots(len(order) + 1, 1, sharex=True, gridspec_kw=margins)
     seconds = torch.arange(len(solved)) / fps
     curves = [("sum of weights", solved.sum(1), None if true is None else true.sum(1))]
     curves += [(names[i], solved[:, i], None if true is None else true[:, i]) for i in order]

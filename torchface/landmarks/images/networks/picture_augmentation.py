@@ -321,7 +321,7 @@ def _photographed(images: Tensor, settings: AugmentationSettings, generator: tor
 
 
 def _grained(picture: np.ndarray, deviation: float, generator: torch.Generator) -> np.ndarray:
-    """A picture uint8 (S,S,3) of a dim room: grain in spots of more than a pixel, of colours more than of lightness."""
+    """A picture uint8 (S,S,3) in dim light: grain in spots of more than a pixel, of colours more than of lightness."""
     side = len(picture)
     grain = torch.randn(side, side, 3, generator=generator).numpy()
     grain = 1.2 * grain + 0.8 * grain.mean(2, keepdims=True)
