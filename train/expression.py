@@ -86,6 +86,9 @@ def train(settings: Settings, run: Run) -> Trained:
         template = None if settings.template is None else load_rig(settings.template)
         comparison = compare(people, lambda rest: fit(rest, settings, progress), template, settings.pictured, progress)
     model = fit(people, settings, progress)
+    if comparison is not None:
+        assert model.errors is not None
+        model.errors.copy_(comparison.expected())
     save(model, people, comparison, settings)
     return Trained(model, comparison)
 

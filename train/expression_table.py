@@ -32,12 +32,19 @@ class Comparison:
         names: of the expressions.
         predicted: offsets (3,N,V,3) of those people who are kept for pictures, by their number.
         learned: how many people each was predicted from.
+        distances: of each from those, (M,); see ``ExpressionRegression.distance``.
     """
 
     squared: Tensor
     names: tuple[str, ...]
     predicted: dict[int, Tensor]
     learned: int
+    distances: Tensor
+
+    def expected(self) -> Tensor:
+        """Mean squared errors of regression, at distance 0, and of transfer, (2,N)."""
+        regression = self.squared[..., 2] / (1 + self.distances[:, None] ** 2)
+        return torch.stack([regression.mean(0), self.squared[..., 0].mean(0)])
 
     @property
     def counts(self) -> list[int]:
@@ -95,6 +102,7 @@ def compare(
     count = len(people.who)
     tested = range(count) if count <= _MANY else range(count - _TESTED, count)
     squared = torch.zeros(len(tested), len(people.names), len(METHODS), dtype=torch.float64)
+    distances = torch.zeros(len(tested), dtype=torch.float64)
     predicted = {}
     learned: _Learned | None = None
     for row, i in enumerate(tested):
@@ -109,11 +117,13 @@ def compare(
                 learned.model.offsets(neutral[None])[0],
             ]
         )
+        distances[row] = learned.model.distance(neutral[None])[0]
         squared[row] = (predictions - offsets).double().square().sum((-1, -2)).T
         if row < keep:
             predicted[i] = predictions
         progress("predicting people from the others", row + 1, len(tested))
-    return Comparison(squared, people.names, predicted, count - (1 if count <= _MANY else _TESTED))
+    others = count - (1 if count <= _MANY else _TESTED)
+    return Comparison(squared, people.names, predicted, others, distances)
 
 
 @dataclass(frozen=True, eq=False)

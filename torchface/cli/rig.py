@@ -21,9 +21,12 @@ _COLUMNS = (
 
 
 def rig(
-    scan: Annotated[Positional[tuple[Path, ...]], arg(metavar="SCAN...")],
-    template: Path,
+    scan: Annotated[Positional[tuple[Path, ...]], arg(metavar="[SCAN...]")] = (),
+    *,
     out: OutputPath,
+    template: Path | None = None,
+    neutral: Path | None = None,
+    expressions: str | None = None,
     landmarks: Path | None = None,
     examples: Path | None = None,
     detail: Path | None = None,
@@ -54,6 +57,10 @@ def rig(
     scan,<shape>,... and a row for each file. Landmark files of the same names (.ljson, .pts, .json) may lie beside the
     scans. DETAIL holds one scan a shape at full strength, named for it, and neutral.obj (or another format).
 
+    A head that has the template's topology already: --neutral HEAD in place of SCAN. A model of expressions, learned
+    from other people, predicts its shapes; deformation transfer makes those that the model does not know and those in
+    which it is unsure. NAME_shapes/index.html shows both ways side by side.
+
     Neutral scans of several actors, or a folder of them: OUT is a folder, for NAME.glb of each; --landmarks may be a
     folder of files named as the scans. {name} in an option's path is the
     scan's name. One that cannot be worked on is reported and skipped, and the exit status is 1; started again, the
@@ -62,9 +69,13 @@ def rig(
     Args:
         scan: The actor at rest: any topology and pose, with holes, hair and collar; or several actors' scans, or
             folders of them.
-        template: A .glb or USD file with shapes, a folder of OBJ files, or ICT-FaceKit's FaceXModel folder.
         out: The .glb or USD file to write, or a name without an ending for a folder of OBJ files in the template's
             vertex order.
+        template: A .glb or USD file with shapes, a folder of OBJ files, or ICT-FaceKit's FaceXModel folder. With
+            --neutral the embedded performer if absent.
+        neutral: A head at rest in the template's topology, in place of a scan.
+        expressions: Model of expressions in the template's topology, by name or folder, see `torchface train
+            expression`; it predicts shapes of a scan too. With --neutral the zoo's `expressions` if absent.
         landmarks: The scan's landmarks: .ljson, .pts or .json in the order of the template's annotated landmarks, or
             correspondences saved by `torchface pick`. Without them the face is found by its shape.
         examples: Folder of scans of expressions.
@@ -85,14 +96,42 @@ def rig(
             distances or curvature, say.
         quiet: Show no progress.
     """
+    from torchface.errors import ValueRangeError
     from torchface.workflows.batch.batch_items import check_folder, find_items, is_batch
     from torchface.workflows.batch.run_batch import BatchOptions, run_batch
     from torchface.workflows.posed_mesh import pose_weights
     from torchface.workflows.rig.actor_job import ACTORS, ActorJob
     from torchface.workflows.rig.actor_rig import RigOptions, rig_actor
+    from torchface.workflows.rig.predicted_rig import EXPRESSIONS, predict_rig
     from torchface.workflows.rig_names import naming_lines
 
-    options = RigOptions(part, unit, pose_weights(pose), detector, model, texture_size, detail_size, names, colors)
+    options = RigOptions(
+        part, unit, pose_weights(pose), detector, model, texture_size, detail_size, names, colors, expressions
+    )
+    if neutral is not None:
+        unused = [
+            flag
+            for flag, value in (
+                ("SCAN", scan),
+                ("--landmarks", landmarks),
+                ("--examples", examples),
+                ("--detail", detail),
+                ("--pose", pose),
+                ("--detector", detector),
+                ("--model", model),
+            )
+            if value
+        ]
+        if unused:
+            raise ValueRangeError(f"--neutral: found {', '.join(unused)} beside it, which are for a scan")
+        with progress_bars(quiet) as progress:
+            made = predict_rig(neutral, out, expressions or EXPRESSIONS, template, options, progress)
+        for line in [*made.lines(), *naming_lines(made.made.rig, names)]:
+            console.print(line, highlight=False)
+        print_path(out)
+        return
+    if not scan or template is None:
+        raise ValueRangeError("rig: expected a SCAN and --template RIG, or --neutral HEAD in the template's topology")
     if cluster is not None or is_batch(scan, ACTORS):
         check_folder(out)
         job = ActorJob(template, landmarks, examples, detail, options)

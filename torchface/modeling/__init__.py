@@ -24,6 +24,8 @@ from torchface.modeling.rigging.example_rigging import ExampleRig, RiggingSchedu
 from torchface.modeling.rigging.expression_regression import (
     ExpressionRegression,
     ExpressionSettings,
+    NeutralRig,
+    neutral_rig,
     rig_from_neutral,
 )
 from torchface.modeling.rigging.open_eyed_neutral import open_eyes
@@ -45,6 +47,7 @@ __all__ = [
     "ImageFit",
     "InnerParts",
     "MorphableModel",
+    "NeutralRig",
     "NormalMap",
     "PhotoTexture",
     "RiggingSchedule",
@@ -60,6 +63,7 @@ __all__ = [
     "fit_colors",
     "fit_images",
     "inner_parts",
+    "neutral_rig",
     "open_eyes",
     "photo_texture",
     "place_parts",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,7 +14,13 @@ from torch import Tensor
 
 from torchface import BlendshapeRig, load_rig, zoo
 from torchface.errors import NameMismatchError, ShapeError, TopologyError, ValueRangeError
-from torchface.modeling import ExpressionRegression, ExpressionSettings, rig_from_neutral, transfer_deformation
+from torchface.modeling import (
+    ExpressionRegression,
+    ExpressionSettings,
+    neutral_rig,
+    rig_from_neutral,
+    transfer_deformation,
+)
 from torchface.modeling.rigging.component_choice import choose_components
 from torchface.synthetic import draw_identities, performer
 
@@ -281,3 +288,37 @@ def test_real_heads_get_the_shapes_that_they_have(ict_folder: Path) -> None:
     made = rig_from_neutral(model, rig, rig.neutral.with_vertices(heads[11]))
     moved = rig.deltas.norm(dim=-1).max()
     assert (made.deltas - rig.deltas).norm(dim=-1).max() < 0.05 * moved
+
+
+def test_shapes_that_the_model_predicts_worse_are_transferred() -> None:
+    """Of a person whom the zoo's model has not seen: the choice is better than either way alone."""
+    model = zoo.get_model("expressions", ExpressionRegression)
+    person = performer(draw_identities(3, torch.Generator().manual_seed(77))[1], texture=False).select(model.names)
+    made = neutral_rig(model, performer(texture=False).select(model.names), person.neutral)
+    errors = {
+        "rig": made.rig.deltas,
+        "transfer": made.transferred.deltas,
+        "regression": model.offsets(person.vertices[None])[0],
+    }
+    squared = {name: (deltas - person.deltas).square().sum((1, 2)) for name, deltas in errors.items()}
+    assert [name for name, row in zip(made.rig.names, made.learned, strict=True) if not row] == [
+        "eyeBlinkLeft",
+        "eyeBlinkRight",
+    ]
+    assert squared["rig"].sum() < min(squared["regression"].sum(), squared["transfer"].sum())
+    found = (squared["regression"] / len(person.vertices)).sqrt()
+    assert (found / made.expected[0]).log().abs().max() < math.log(4)
+
+
+def test_distance_is_that_of_the_people_learned_from(people: tuple[Tensor, Tensor]) -> None:
+    """Mean square 1 along components among those learned from, whatever their pose; it grows with how far one goes."""
+    neutrals, expressions = people
+    model = ExpressionRegression.fit(neutrals, expressions, ExpressionSettings(neutral_components=3))
+    squared = model.distance(neutrals).square()
+    assert abs(float(squared.mean()) - 2 * 23 / 24) < 0.15
+    moved = turned(neutrals[0])[0]
+    torch.testing.assert_close(model.distance(moved[None]), model.distance(neutrals[:1]), rtol=1e-3, atol=1e-3)
+    aligned = neutrals.mean(0) + 10 * (neutrals[:1] - neutrals.mean(0))
+    assert model.distance(aligned)[0] > 5 * model.distance(neutrals[:1])[0]
+    unjudged = ExpressionRegression.from_config(model.config | {"judged": False})
+    assert bool(unjudged.distance(neutrals).isnan().all())

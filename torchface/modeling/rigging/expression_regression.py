@@ -11,7 +11,7 @@ from torch import Tensor, nn
 
 from torchface.errors import NameMismatchError, ShapeError, TopologyError, ValueRangeError
 from torchface.geometry.sample_batches import Samples
-from torchface.geometry.similarity import similarity_transform
+from torchface.geometry.similarity import Similarity, similarity_transform
 from torchface.mesh import Mesh
 from torchface.modeling.rigging.deformation_transfer import transfer_deformation
 from torchface.number_checks import LARGEST_WEIGHT, as_real, checked_count, checked_number
@@ -99,6 +99,8 @@ class ExpressionRegression(nn.Module):
     offset_components: Tensor
     coefficients: Tensor
     places: Tensor
+    deviations: Tensor | None
+    errors: Tensor | None
 
     def __init__(
         self,
@@ -126,6 +128,18 @@ class ExpressionRegression(nn.Module):
         self.register_buffer("offset_components", torch.zeros(offset_components, moving, 3))
         self.register_buffer("coefficients", torch.zeros(neutral_components, offset_components))
         self.register_buffer("places", torch.zeros(moving, dtype=torch.int64))
+        self.register_buffer("deviations", None)
+        self.register_buffer("errors", None)
+
+    def add_errors(self) -> None:
+        """Gives it the buffers of what it knows of itself, which models saved before there were any lack.
+
+        ``deviations`` (K+1,): of people along each component and, last, of what no component holds, millimetres.
+        ``errors`` (2,N): of regression, over 1 + d², and of transfer for people left out, mm², summed over the
+        vertices; 0 where nobody has compared.
+        """
+        self.deviations = self.neutral_mean.new_ones(len(self.neutral_components) + 1)
+        self.errors = self.neutral_mean.new_zeros(2, len(self.names))
 
     @classmethod
     def fit(
@@ -185,12 +199,16 @@ class ExpressionRegression(nn.Module):
             "offset_components": len(self.offset_components),
             "topology": self.topology,
             "form": self.form,
+            "judged": self.deviations is not None,
         }
 
     @classmethod
     def from_config(cls, config: Mapping[str, Any]) -> ExpressionRegression:
         """A regression of zeros for the state to be loaded into."""
-        return cls(**config)
+        model = cls(**{name: value for name, value in config.items() if name != "judged"})
+        if config.get("judged"):
+            model.add_errors()
+        return model
 
     def forward(self, neutrals: Tensor) -> Tensor:
         """Expressions (B,N,V,3) of neutral faces (B,V,3), millimetres, in their own poses.
@@ -206,10 +224,9 @@ class ExpressionRegression(nn.Module):
         if neutrals.ndim != 3 or neutrals.shape[1:] != self.neutral_mean.shape:
             raise ShapeError(f"neutrals: found {tuple(neutrals.shape)}, expected (B,{len(self.neutral_mean)},3)")
         neutrals = as_real(neutrals)
-        pose = similarity_transform(neutrals, self.neutral_mean.to(neutrals).expand_as(neutrals), scale=False)
+        pose = self._pose(neutrals)
         aligned = pose.apply(neutrals)
-        beyond = (aligned - self.neutral_mean.to(aligned))[:, self.region].flatten(1)
-        X = beyond @ self.neutral_components.flatten(1).T.to(aligned)
+        X = self._beyond(aligned) @ self.neutral_components.flatten(1).T.to(aligned)
         Y = X @ self.coefficients.to(X)
         moving = self.offset_mean.to(Y) + torch.einsum("bk,kpc->bpc", Y, self.offset_components.to(Y))
         whole = moving.new_zeros(len(neutrals), len(self.names) * len(self.neutral_mean), 3)
@@ -217,6 +234,29 @@ class ExpressionRegression(nn.Module):
         if self.form == "expressions":
             whole = whole - aligned[:, None]
         return whole @ pose.rotation.to(whole)[:, None]
+
+    def distance(self, neutrals: Tensor) -> Tensor:
+        r"""How far from the people learned from neutral faces (B,V,3) are, (B,); NaN where the model is not judged.
+
+        .. math:: d^2 = \frac1K \sum_k \frac{X_k^2}{\sigma_k^2}
+            + \frac{\lVert (N - \bar N) - X N_{PCA}^\top \rVert^2}{\sigma_{rest}^2}
+
+        Among those learned from the first part is 1 on average, and so is the second.
+        """
+        neutrals = as_real(neutrals)
+        if self.deviations is None:
+            return neutrals.new_full((len(neutrals),), torch.nan)
+        beyond = self._beyond(self._pose(neutrals).apply(neutrals))
+        basis, deviations = self.neutral_components.flatten(1).to(beyond), self.deviations.to(beyond)
+        X = beyond @ basis.T
+        left = (beyond - X @ basis).square().sum(1)
+        return ((X / deviations[:-1]).square().mean(1) + left / deviations[-1] ** 2).sqrt()
+
+    def _pose(self, neutrals: Tensor) -> Similarity:
+        return similarity_transform(neutrals, self.neutral_mean.to(neutrals).expand_as(neutrals), scale=False)
+
+    def _beyond(self, aligned: Tensor) -> Tensor:
+        return (aligned - self.neutral_mean.to(aligned))[:, self.region].flatten(1)
 
     def check_state(self) -> None:
         """Raises ``TopologyError`` where a loaded state points to vertices that there are not."""
@@ -232,11 +272,34 @@ class ExpressionRegression(nn.Module):
         return f"{len(self.neutral_mean)} vertices, {len(self.names)} expressions, {bases}, form={self.form}"
 
 
+@dataclass(frozen=True, eq=False)
+class NeutralRig:
+    """A rig made from a neutral face alone, and why each shape is what it is.
+
+    Args:
+        rig: of N shapes.
+        transferred: the same by deformation transfer alone.
+        known: shapes that the regression has, (N,) bool.
+        learned: those that are its prediction, (N,) bool.
+        expected: error of prediction and of transfer to be expected, root mean square over the vertices, millimetres,
+            (2,N); NaN where nobody has measured it.
+        distance: of the neutral from the people learned from, see :meth:`ExpressionRegression.distance`.
+    """
+
+    rig: BlendshapeRig
+    transferred: BlendshapeRig
+    known: Tensor
+    learned: Tensor
+    expected: Tensor
+    distance: float
+
+
 def rig_from_neutral(regression: ExpressionRegression, template: BlendshapeRig, neutral: Mesh) -> BlendshapeRig:
-    """A whole personal rig from one neutral face.
+    """A whole personal rig from one neutral face; :func:`neutral_rig` says why each shape is what it is.
 
     Shapes of the template that the regression has, in any spelling that ``shape_names`` reads, are predicted; the
-    others come by deformation transfer. A predicted whole is divided between a template's halves as transfer does.
+    others come by deformation transfer, and so do those for which the regression expects the larger error for this
+    face. A predicted whole is divided between a template's halves as transfer does.
 
     Args:
         regression: in the template's topology.
@@ -260,6 +323,29 @@ def rig_from_neutral(regression: ExpressionRegression, template: BlendshapeRig, 
         >>> rig.names
         ('jawOpen', 'mouthSmileLeft')
     """
+    return neutral_rig(regression, template, neutral).rig
+
+
+def neutral_rig(regression: ExpressionRegression, template: BlendshapeRig, neutral: Mesh) -> NeutralRig:
+    r"""The rig of :func:`rig_from_neutral` beside that of deformation transfer, with the errors to be expected.
+
+    A shape is predicted where
+
+    .. math:: e_{regression} \, (1 + d^2) \le e_{transfer}
+
+    with the squared errors for people left out in training, and the neutral's distance d from those learned from; a
+    regression without such a comparison predicts all shapes that it has.
+
+    Args:
+        regression, template, neutral: as for :func:`rig_from_neutral`, which raises the same errors.
+
+    Example:
+        >>> from torchface import zoo
+        >>> from torchface.synthetic import performer
+        >>> template = performer(texture=False).select(["jawOpen", "mouthClose"])
+        >>> neutral_rig(zoo.get_model("expressions"), template, template.neutral).learned.tolist()
+        [True, False]
+    """
     expected = neutral.fingerprint()
     for what, found in (("template", template.neutral.fingerprint()), ("regression", regression.topology)):
         if found is not None and found != expected:
@@ -273,24 +359,36 @@ def rig_from_neutral(regression: ExpressionRegression, template: BlendshapeRig, 
             f"neutral's {len(neutral.vertices)}"
         )
     translation = mapping(regression.names, template.names)
-    predictable = translation.any(1)
-    if not predictable.any():
+    known = translation.any(1)
+    if not known.any():
         raise NameMismatchError(
             f"rig_from_neutral: found a regression of {', '.join(regression.names[:5])}, expected some of the "
             f"template's shapes, {', '.join(template.names[:5])}, ..."
         )
     with torch.no_grad():
         predicted = regression.offsets(neutral.vertices[None].float())[0]
-    split = (translation > 0) & ((translation > 0).sum(0) > 1)
+        distance = float(regression.distance(neutral.vertices[None].float()))
+    parts = (translation > 0).to(predicted)
     # All of them: a shape that undoes another is transferred on top of it.
-    needless = bool(predictable.all()) and not bool(split.any())
-    moved = template if needless and template.correctives is None else transfer_deformation(template, neutral)
-    transferred = torch.zeros_like(template.deltas) if needless else moved.deltas
+    transferred = transfer_deformation(template, neutral)
     # Deltas of halves add up to those of their whole.
-    named = torch.einsum("nm,mvc->nvc", (translation > 0).to(predicted), predicted)
-    named = (named * _shares_of_the_whole(transferred, split)).to(transferred)
-    deltas = torch.where(predictable[:, None, None], named, transferred)
-    return BlendshapeRig(neutral, deltas, template.names, moved.correctives)
+    named = torch.einsum("nm,mvc->nvc", parts, predicted)
+    split = (translation > 0) & ((translation > 0).sum(0) > 1)
+    named = (named * _shares_of_the_whole(transferred.deltas, split)).to(transferred.deltas)
+    squared = _expected_errors(regression, parts, distance)
+    learned = known & ~(squared[0] > squared[1])
+    deltas = torch.where(learned[:, None, None], named, transferred.deltas)
+    rig = BlendshapeRig(neutral, deltas, template.names, transferred.correctives)
+    return NeutralRig(rig, transferred, known, learned, (squared / len(neutral.vertices)).sqrt(), distance)
+
+
+def _expected_errors(regression: ExpressionRegression, parts: Tensor, distance: float) -> Tensor:
+    """Squared errors of prediction and transfer for a face so far away, mm², (2,N); NaN where they are not known."""
+    if regression.errors is None:
+        return parts.new_full((2, len(parts)), torch.nan)
+    squared = regression.errors.to(parts) @ parts.T
+    squared[0] *= 1 + distance**2
+    return squared.masked_fill(squared[1] <= 0, torch.nan)
 
 
 def _shares_of_the_whole(transferred: Tensor, split: Tensor) -> Tensor:

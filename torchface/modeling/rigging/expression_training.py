@@ -20,6 +20,7 @@ _CHOSEN_FROM = 300
 """People from whom components and ridge are chosen at most; their Gram matrices are decomposed once a person."""
 # Of the vertex that moves most. The form of ears and neck predicts little of a smile, and would fill the components.
 _MOVES = 0.05
+_LEAST_LEFT = 0.01  # of the variance, beyond the components: few people fit in them whole, another one does not
 
 
 def fit_expressions(
@@ -52,6 +53,7 @@ def fit_expressions(
     offset = _components_or_mean(moving, motion, offset_components, progress)
     counts = len(neutral.components), len(offset.components)
     model = ExpressionRegression(len(mean), names, len(considered), len(motion.places), *counts, topology, form)
+    model.add_errors()
     model.neutral_mean.copy_(mean)
     model.region.copy_(considered)
     model.neutral_components.copy_(neutral.components.unflatten(1, (-1, 3)))
@@ -68,6 +70,10 @@ def fit_expressions(
     gram.diagonal().add_(ridge * gram.diagonal().mean())
     model.coefficients.copy_(torch.linalg.solve(gram, product))
     model.places.copy_(motion.places)
+    kept = neutral.standard_deviations.square()
+    left = max(neutral.total_variance - float(kept.sum()), _LEAST_LEFT * neutral.total_variance)
+    assert model.deviations is not None
+    model.deviations.copy_(torch.cat([kept, kept.new_tensor([left])]).sqrt())
     return model
 
 

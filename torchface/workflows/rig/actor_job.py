@@ -42,7 +42,12 @@ class ActorJob:
     def key(self, item: BatchItem) -> str:
         """A key of all that a rig depends on."""
         own, options = self._own(item), self.options
-        contents = replace(options, detector=model_content(options.detector), model=model_content(options.model))
+        contents = replace(
+            options,
+            detector=model_content(options.detector),
+            model=model_content(options.model),
+            expressions=model_content(options.expressions),
+        )
         files = {str(path): path for path in (item.path, *named_files(item.path))}
         return content_key(_METHOD, files=files, own=replace(own, options=contents))
 

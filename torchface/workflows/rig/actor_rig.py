@@ -9,7 +9,14 @@ import torch
 from torch import Tensor
 
 from torchface import zoo
-from torchface.errors import AlignmentError, FileFormatError, TorchfaceError, ValueRangeError
+from torchface.errors import (
+    AlignmentError,
+    FileFormatError,
+    NameMismatchError,
+    TopologyError,
+    TorchfaceError,
+    ValueRangeError,
+)
 from torchface.files.job_lock import file_lock
 from torchface.files.whole_files import all_or_none, check_writable, make_folder
 from torchface.geometry.meshes.normal_maps import DetailMaps
@@ -21,6 +28,7 @@ from torchface.landmarks.scans.landmark_pairs import AutomaticLandmarks
 from torchface.mesh import Mesh
 from torchface.modeling import (
     ExampleRig,
+    ExpressionRegression,
     HeadModel,
     MorphableModel,
     NormalMap,
@@ -28,6 +36,7 @@ from torchface.modeling import (
     clear_parts,
     detail_maps,
     inner_parts,
+    neutral_rig,
     open_eyes,
     place_parts,
     rig_from_examples,
@@ -41,6 +50,7 @@ from torchface.registration.landmark_files import landmark_file, load_scan_landm
 from torchface.registration.scan_colors import without_colors
 from torchface.rendering.compositing import save_rendered_image
 from torchface.rig import BlendshapeRig
+from torchface.shape_names import mapping
 from torchface.viz.figures.registration_views import registration_sheet
 from torchface.workflows.register.register_scans import load_shape_model
 from torchface.workflows.rig.expression_scans import (
@@ -77,6 +87,7 @@ class RigOptions:
         detail_size: of each normal map, texels a side.
         names: of the written shapes; see ``rig_names.renamed``.
         colors: whether the scans' colours are used, to find hair and as the actor's.
+        expressions: a regression of expressions, by name or folder, which predicts those of the shapes that it knows.
     """
 
     part: str | None = None
@@ -88,6 +99,7 @@ class RigOptions:
     detail_size: int = 2048
     names: Naming | None = None
     colors: bool = True
+    expressions: str | Path | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,6 +116,7 @@ class ActorReport:
         skipped: lines on scans that could not be used.
         figure: of the registration: scan, face, distances and lines.
         penetration: how far teeth, gums and eyes stand out of the skin.
+        predicted: how many of the shapes a model of expressions has predicted.
     """
 
     rig: BlendshapeRig
@@ -115,6 +128,7 @@ class ActorReport:
     skipped: tuple[str, ...]
     figure: Path
     penetration: Penetration | None = None
+    predicted: int = 0
 
     def lines(self) -> list[str]:
         """For people to read."""
@@ -123,6 +137,8 @@ class ActorReport:
         lines += [f"  note: {note}" for note in record.notes]
         lines.append(f"  figure: {self.figure}")
         lines.append(f"rig: {len(self.rig.vertices)} vertices, {len(self.rig.names)} shapes transferred")
+        if self.predicted:
+            lines[-1] += f", {self.predicted} of them predicted by the model of expressions"
         lines += [f"  note: {self.transfer_summary}"] if self.transfer_summary else []
         lines += [] if self.penetration is None else [self.penetration.line()]
         if self.examples is not None:
@@ -197,6 +213,9 @@ def _rig_actor(
     if examples is not None and not expressions:
         raise FileFormatError(f"{examples}: found no scan of an expression, expected {LAYOUT}")
     fine = [] if detail is None else _detail_scans(detail, rig)
+    if options.expressions is not None and expressions:
+        raise ValueRangeError("examples: found them beside a model of expressions, expected one of the two")
+    regression = None if options.expressions is None else load_expressions(options.expressions, rig, template)
     job = _Actor(rig, options, progress)
     progress("registering the neutral scan")
     model = None if options.model is None else load_shape_model(options.model)
@@ -217,6 +236,9 @@ def _rig_actor(
     neutral = with_template_skin(neutral, rig.neutral, hidden_parts(rig.neutral, registration.matched))
     transferred = transfer_with_report(rig, neutral, progress=progress)
     actor: BlendshapeRig = transferred.rig
+    predicted = None if regression is None else neutral_rig(regression, rig, neutral)
+    if predicted is not None:
+        actor = clear_parts(predicted.rig, parts)
     learned: ExampleRig | None = None
     used: tuple[str, ...] = ()
     if expressions:
@@ -241,7 +263,34 @@ def _rig_actor(
         tuple(job.skipped),
         figure,
         penetration(actor, parts),
+        0 if predicted is None else int(predicted.learned.sum()),
     )
+
+
+def load_expressions(name_or_path: str | Path, template: BlendshapeRig, path: Path | None) -> ExpressionRegression:
+    """A regression of expressions for the template's topology.
+
+    Args:
+        name_or_path: see ``zoo.get_model``.
+        template: the rig.
+        path: where the rig was read; None for the embedded performer.
+
+    Raises:
+        TopologyError: it has learned from meshes of another topology.
+        NameMismatchError: it is no such model, or has none of the template's shapes.
+    """
+    model = zoo.get_model(name_or_path, ExpressionRegression)
+    wanted, named = template.neutral.fingerprint(), "the embedded performer" if path is None else str(path)
+    if (model.topology or wanted) != wanted or len(model.neutral_mean) != len(template.vertices):
+        raise TopologyError(
+            f"expressions: found {name_or_path} of topology {model.topology or len(model.neutral_mean)}, expected that "
+            f"of {named}, {wanted} (vertices, hash of the triangles); learn one by `torchface train expression`"
+        )
+    if not mapping(model.names, template.names).any():
+        raise NameMismatchError(
+            f"expressions: found {name_or_path} of {', '.join(model.names[:5])}, expected some of the shapes of {named}"
+        )
+    return model
 
 
 class _Actor:
