@@ -1,0 +1,285 @@
+"""A template's blendshapes on a head of another topology, whose vertices keep their number and order."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from scipy import sparse
+from scipy.spatial import cKDTree
+from scipy.sparse.csgraph import connected_components
+from torch import Tensor
+
+from torchface.errors import ValueRangeError
+from torchface.geometry.meshes.operators import border_vertices, corners, triangle_normals, vertex_normals
+from torchface.geometry.meshes.shell_energies import stretching_energy
+from torchface.geometry.meshes.surface_index import triangle_coordinates
+from torchface.geometry.similarity import Similarity
+from torchface.mesh import Mesh
+from torchface.modeling.rigging.deformation_transfer import transfer_with_report
+from torchface.modeling.rigging.loose_parts import moved_parts
+from torchface.modeling.rigging.part_clearance import clear_parts
+from torchface.modeling.rigging.part_placement import place_parts
+from torchface.modeling.rigging.penetration import inner_parts
+from torchface.optim.sparse import SparseCholesky
+from torchface.progress import Progress, silent
+from torchface.registration import Registration, hidden_parts, register, with_template_skin
+from torchface.registration.scan_preparation import Landmarks
+from torchface.rig import BlendshapeRig
+
+_NORMAL_REACH = 6.0
+"""A normal that points the other way counts as far as twice these millimetres: lips that touch stay apart."""
+_CANDIDATES = 12
+_NEAR, _FAR = 2.0, 20.0
+_BLIND = 1e-3
+"""How much the guess counts for a vertex that has no place on the template, beside one that has."""
+_SMOOTH = 0.7
+_SKIN_SHARE = 0.3
+_SAME_PLACE = 1e-4
+_ALIKE = 0.2
+
+
+@dataclass(frozen=True, eq=False)
+class CarriedShapes:
+    """A head of its own topology with a template's shapes.
+
+    Args:
+        rig: the head, every vertex where it was, with the template's names.
+        registration: of the template with the head, in the head's space.
+        template: the template's rig on the head's face, in the template's topology, place and size.
+        distance: of each of the head's vertices to that face, (V,), millimetres of the template's size.
+        places: which vertices have a place on it, (V,) bool; the others follow by smoothness or as loose parts.
+        tongue: vertices of the head's own tongue, (V,) bool; none where it has none.
+    """
+
+    rig: BlendshapeRig
+    registration: Registration
+    template: BlendshapeRig
+    distance: Tensor
+    places: Tensor
+    tongue: Tensor
+
+
+def shapes_on(
+    template: BlendshapeRig,
+    target: Mesh,
+    landmarks: Landmarks | None = None,
+    *,
+    registration: Registration | None = None,
+    movable: Tensor | None = None,
+    progress: Progress | None = None,
+) -> CarriedShapes:
+    r"""Gives a head of any topology a template's shapes on its own vertices.
+
+    The template is registered to the head and its shapes are transferred to what it became. The head's vertices take
+    the motion :math:`\hat u` of the nearest place there whose normal agrees, as smoothly as they have no such place:
+
+    .. math:: \min_u \sum_v c_v a_v \lVert u_v - \hat u_v \rVert^2 + \ell^2 \int \lVert \nabla u \rVert^2
+
+    with areas a and confidences c that fall with the distance and the normals' angle. Eyeballs turn about their own
+    middle, teeth and tongue go with the jaw, other loose parts with the skin nearest to them; far from the template
+    nothing moves.
+
+    Args:
+        template: a rig, millimetres.
+        target: the head: any vertices, order, size and pose, parts apart or not, split at seams or not.
+        landmarks: template vertex ids (L,) and points in the target's space (L,3), as ``register`` takes them.
+        registration: of the template's neutral with the target, where it is there already.
+        movable: which of the target's vertices may move, (V,) bool; all if absent.
+        progress: called with each step and how far it is.
+
+    Raises:
+        AlignmentError, ValueRangeError, TopologyError: as of ``register`` and ``transfer_deformation``.
+
+    Source: Sumner and Popovic 2004 between topologies, with displacements in place of gradients.
+
+    Example:
+        >>> from torchface.mesh import submesh
+        >>> from torchface.synthetic import performer
+        >>> actor = performer(texture=False).select(["jawOpen"])
+        >>> face = submesh(actor.neutral, actor.neutral.annotations.regions["face"]).mesh  # other vertices
+        >>> carried = shapes_on(actor, face, (actor.neutral.landmarks, face.vertices[face.landmarks].double()))
+        >>> carried.rig.names, len(carried.rig.vertices) == len(face.vertices)
+        (('jawOpen',), True)
+    """
+    progress = progress or silent
+    if movable is not None and movable.shape != target.vertices.shape[:1]:
+        raise ValueRangeError(f"movable: found {tuple(movable.shape)}, expected ({len(target.vertices)},)")
+    template = template.linear("shapes_on")
+    if registration is None:
+        registration = register(template.neutral, target, landmarks, texture_size=0, progress=progress)
+    to_template = registration.pose.inverse()
+    goal = to_template.apply(target.vertices.detach().cpu().double())[0]
+    fitted = _fitted(template, registration, to_template)
+    moved = transfer_with_report(template, fitted, progress=progress).rig
+    progress("carrying the shapes over")
+    joined = joined_vertices(goal, target.faces.cpu())
+    skin = _Skin.of(moved, registration, joined)
+    deltas = skin.carried(moved.deltas.double())
+    deltas, tongue = moved_parts(moved, joined.vertices, joined.faces, joined.part, skin.loose, deltas)
+    still = torch.zeros(len(joined.vertices), dtype=torch.bool)
+    if movable is not None:
+        still[joined.of] = ~movable.cpu()
+        deltas[:, still] = 0.0
+    own = BlendshapeRig(Mesh(joined.vertices, joined.faces), deltas, moved.names)
+    own = clear_parts(own, inner_parts(own))
+    deltas = own.deltas.double().masked_fill(still[:, None], 0.0)[:, joined.of]
+    placed = registration.pose.apply_vectors(deltas).to(target.vertices)
+    rig = BlendshapeRig(target, placed, moved.names)
+    return CarriedShapes(
+        rig, registration, moved, skin.distance[joined.of], skin.known[joined.of], tongue[joined.of]
+    )
+
+
+def _fitted(template: BlendshapeRig, registration: Registration, to_template: Similarity) -> Mesh:
+    """The registered template in its own place and size, its inner parts where they belong in this head."""
+    vertices = to_template.apply(registration.mesh.vertices.detach().cpu().double())[0]
+    fitted = template.neutral.with_vertices(vertices.to(template.vertices))
+    fitted = place_parts(template, fitted, inner_parts(template))
+    return with_template_skin(fitted, template.neutral, hidden_parts(template.neutral, registration.matched))
+
+
+@dataclass(frozen=True, eq=False)
+class JoinedMesh:
+    """A mesh whose vertices in one place are one, unless they face apart.
+
+    Args:
+        vertices: (J,3) float64.
+        faces: (F,3) of them.
+        of: the joined vertex of each of the mesh's, (V,).
+        part: connected part of each, (J,).
+    """
+
+    vertices: Tensor
+    faces: Tensor
+    of: Tensor
+    part: Tensor
+
+
+def joined_vertices(vertices: Tensor, faces: Tensor) -> JoinedMesh:
+    """Joins the vertices that a file has split at seams; lips that touch stay two.
+
+    Args:
+        vertices: (V,3), millimetres.
+        faces: (F,3).
+
+    Example:
+        >>> square = torch.tensor([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
+        >>> joined = joined_vertices(square.double(), torch.tensor([[0, 1, 2], [3, 4, 5]]))
+        >>> len(joined.vertices), joined.part.unique().tolist()
+        (4, [0])
+    """
+    normals = vertex_normals(vertices, faces)
+    first, second = torch.from_numpy(cKDTree(vertices.numpy()).query_pairs(_SAME_PLACE, output_type="ndarray")).T
+    alike = (normals[first] * normals[second]).sum(-1) > _ALIKE
+    pairs = torch.stack([first[alike], second[alike]])
+    of = torch.from_numpy(_labels(pairs, len(vertices)))
+    count = int(of.max()) + 1
+    kept = torch.zeros(count, dtype=torch.int64)
+    kept[of.flip(0)] = torch.arange(len(of)).flip(0)
+    own = of[faces]
+    along = torch.cat([own[:, [0, 1]], own[:, [1, 2]]]).T
+    return JoinedMesh(vertices[kept], own, of, torch.from_numpy(_labels(along, count)))
+
+
+def _labels(pairs: Tensor, count: int) -> np.ndarray:
+    graph = sparse.coo_array((np.ones(pairs.shape[1]), (pairs[0].numpy(), pairs[1].numpy())), (count, count))
+    return connected_components(graph, directed=False)[1].astype(np.int64)
+
+
+@dataclass(frozen=True, eq=False)
+class _Skin:
+    """Where a head's vertices lie on the fitted template.
+
+    Args:
+        joined: the head.
+        corner: template vertices around each place, (J,3).
+        share: of each corner, (J,3).
+        confidence: (J,).
+        distance: (J,), millimetres.
+        known: (J,) bool.
+        loose: vertices of parts that are no skin, (J,) bool.
+    """
+
+    joined: JoinedMesh
+    corner: Tensor
+    share: Tensor
+    confidence: Tensor
+    distance: Tensor
+    known: Tensor
+    loose: Tensor
+
+    @staticmethod
+    def of(rig: BlendshapeRig, registration: Registration, joined: JoinedMesh) -> _Skin:
+        faces = rig.neutral.faces.cpu()
+        label = torch.from_numpy(_labels(torch.cat([faces[:, [0, 1]], faces[:, [1, 2]]]).T, len(rig.vertices)))
+        faces = faces[(label == label.bincount().argmax())[faces[:, 0]]]
+        surface = rig.vertices.detach().cpu().double()
+        normals = vertex_normals(joined.vertices, joined.faces)
+        corner, share, distance, cosine = nearest_alike(surface, faces, joined.vertices, normals)
+        beyond = (border_vertices(faces, len(surface))[corner] | (share < 1e-6)).all(1) & (distance > _NEAR / 4)
+        seen = registration.matched.cpu().double().clamp(min=0.15)[corner]
+        confidence = torch.exp(-((distance / _NEAR) ** 2)) * cosine.clamp(min=0) ** 2 * (seen * share).sum(1)
+        confidence[beyond] *= _BLIND
+        known = (confidence > 0.1) & ~beyond
+        part = joined.part
+        size = part.bincount().double()
+        near = torch.zeros_like(size).index_add_(0, part, known.double()) / size
+        body = near > _SKIN_SHARE
+        body[torch.zeros_like(size).index_add_(0, part, known.double()).argmax()] = True
+        return _Skin(joined, corner, share, confidence, distance, known, ~body[part])
+
+    def carried(self, deltas: Tensor) -> Tensor:
+        """The template's deltas (N,T,3) at the head's vertices, (N,J,3); zero for loose parts."""
+        vertices, faces = self.joined.vertices, self.joined.faces
+        area = torch.zeros(len(vertices), dtype=torch.float64)
+        a, b, c = corners(vertices, faces)
+        third = torch.linalg.cross(b - a, c - a).norm(dim=-1) / 6
+        for k in range(3):
+            area.index_add_(0, faces[:, k], third)
+        weight = area.clamp(min=1e-9) * self.confidence.clamp(min=_BLIND)
+        guess = torch.einsum("njkc,jk->njc", deltas[:, self.corner], self.share)
+        guess[:, self.distance > _FAR] = 0.0
+        matrix = sparse.diags_array(weight.numpy()) + _SMOOTH**2 * stretching_energy(vertices, faces)
+        rows = (guess * weight[:, None]).permute(1, 0, 2).flatten(1)
+        moving = rows.abs().amax(0) > 0
+        solved = torch.zeros_like(rows)
+        if moving.any():
+            solved[:, moving] = SparseCholesky(matrix).solve(rows[:, moving])
+        solved[self.loose] = 0.0
+        return solved.unflatten(1, (-1, 3)).permute(1, 0, 2).contiguous()
+
+
+def nearest_alike(surface: Tensor, faces: Tensor, points: Tensor, normals: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """The place on a surface nearest to each point in position and normal together.
+
+    Args:
+        surface: vertices (V,3), millimetres.
+        faces: (F,3).
+        points: (Q,3).
+        normals: unit, (Q,3).
+
+    Returns:
+        The vertices around each place (Q,3) and their shares (Q,3), its distance (Q,) and the cosine of the normals.
+    """
+    a, b, c = corners(surface, faces)
+    across = triangle_normals(surface, faces)
+    samples = torch.cat([(a + b + c) / 3, _NORMAL_REACH * across], 1)
+    tree = cKDTree(samples.numpy())
+    count = min(_CANDIDATES, len(faces))
+    found = torch.from_numpy(tree.query(torch.cat([points, _NORMAL_REACH * normals], 1).numpy(), count)[1])
+    found = found.reshape(len(points), count)
+    ab, ac, ap = (b - a)[found], (c - a)[found], points[:, None] - a[found]
+    v, w = triangle_coordinates(
+        ab.square().sum(-1), ac.square().sum(-1), (ab * ac).sum(-1), (ab * ap).sum(-1), (ac * ap).sum(-1)
+    )
+    offset = ap - v[..., None] * ab - w[..., None] * ac
+    turned = (across[found] - normals[:, None]).square().sum(-1)
+    best = (offset.square().sum(-1) + _NORMAL_REACH**2 * turned).argmin(1)
+    row = torch.arange(len(points))
+    v, w, triangle = v[row, best], w[row, best], found[row, best]
+    smooth = vertex_normals(surface, faces)[faces[triangle]]
+    share = torch.stack([1 - v - w, v, w], 1)
+    cosine = (torch.nn.functional.normalize((smooth * share[..., None]).sum(1), dim=-1) * normals).sum(-1)
+    return faces[triangle], share, offset[row, best].norm(dim=-1), cosine
