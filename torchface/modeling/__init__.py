@@ -29,6 +29,7 @@ from torchface.modeling.rigging.expression_regression import (
     rig_from_neutral,
 )
 from torchface.modeling.rigging.open_eyed_neutral import open_eyes
+from torchface.modeling.rigging.other_topology import CarriedShapes, shapes_on
 from torchface.modeling.rigging.part_clearance import clear_parts
 from torchface.modeling.rigging.part_placement import place_parts
 from torchface.modeling.rigging.penetration import InnerParts, inner_parts, shape_depths
@@ -37,6 +38,7 @@ from torchface.modeling.rigging.sculpted_corrective import SculptedCorrective, c
 __all__ = [
     "BakeSettings",
     "BakeStatistics",
+    "CarriedShapes",
     "ColorFit",
     "ExampleRig",
     "ExpressionRegression",
@@ -70,6 +72,7 @@ __all__ = [
     "rig_from_examples",
     "rig_from_neutral",
     "shape_depths",
+    "shapes_on",
     "transfer_deformation",
     "transfer_with_report",
 ]

@@ -5,17 +5,24 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import torch
+from scipy import sparse
 from scipy.spatial import cKDTree
 from torch import Tensor
 
+from torchface.geometry.meshes.shell_energies import stretching_energy
 from torchface.geometry.similarity import Similarity, similarity_transform
+from torchface.optim.sparse import SparseCholesky
 from torchface.rig import BlendshapeRig
 
-_EYEBALL_REACH = 1.35
-_IN_THE_MOUTH = 45.0  # millimetres
-_MOUTH_HEIGHT = 25.0
+_EYEBALL_REACH, _CORNEA = 1.35, 0.8  # radii; the cosine of how far it reaches from its middle
+_IN_THE_MOUTH, _MOUTH_HEIGHT = 60.0, 25.0  # millimetres
+_BITE, _BITE_BLEND = 0.2, 3.0
+"""How much the line between upper and lower teeth rises toward the back, and the millimetres over which a part that
+both jaws share, such as gums in one piece, passes from the one to the other."""
+_BOTH_JAWS, _ARCH = 0.15, 30.0
 _JAW = "jaw"
-_TONGUE_WIDTH, _TONGUE_DEPTH = 15.0, 15.0  # millimetres at least: teeth are smaller
+_TONGUE, _FILLED = 15.0, 0.2  # millimetres at least: teeth are smaller; and the share near the middle
+_ROOT, _STIFF = 0.3, 0.01
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,9 +35,24 @@ class _Head:
     deltas: Tensor
 
 
+@dataclass(frozen=True, eq=False)
+class LooseParts:
+    """How a head moves with its loose parts.
+
+    Args:
+        deltas: (N,J,3), millimetres.
+        bones: vertices of eyeballs and of what lies in the mouth, (J,) bool.
+        tongue: vertices of the tongue, (J,) bool.
+    """
+
+    deltas: Tensor
+    bones: Tensor
+    tongue: Tensor
+
+
 def moved_parts(
     template: BlendshapeRig, vertices: Tensor, faces: Tensor, part: Tensor, loose: Tensor, deltas: Tensor
-) -> tuple[Tensor, Tensor]:
+) -> LooseParts:
     """Deltas of a head's loose parts beside those of its skin.
 
     What lies within a template's eyeball turns as it does, about its own middle. What lies in the mouth is bone: above
@@ -45,12 +67,11 @@ def moved_parts(
         loose: vertices of parts that are no skin, (J,) bool.
         deltas: of the skin, (N,J,3).
 
-    Returns:
-        Deltas (N,J,3), and the vertices of the head's tongue (J,).
     """
     deltas, tongue = deltas.clone(), torch.zeros(len(vertices), dtype=torch.bool)
+    loose = loose & (torch.bincount(faces.flatten(), minlength=len(vertices)) > 0)
     if not loose.any():
-        return deltas, tongue
+        return LooseParts(deltas, tongue, tongue)
     head = _Head(vertices, part, loose, deltas)
     left = loose.clone()
     for eyeball in _eyeballs(template):
@@ -58,17 +79,35 @@ def moved_parts(
     notes = template.neutral.annotations
     if notes is not None and notes.landmarks is not None and len(notes.landmarks) == 68:
         mouth = template.vertices.double().cpu()[notes.landmarks.cpu()[48:68]]
-        lower, upper, tongue = _in_the_mouth(head, left, mouth)
+        inside, share, tongue = _in_the_mouth(head, left, mouth)
         jaw = _jaw_motions(template)
-        ids = lower.nonzero()[:, 0]
+        ids = inside.nonzero()[:, 0]
         if len(ids):
-            deltas[:, ids] = jaw.apply(vertices[ids]) - vertices[ids]
-        left &= ~(lower | upper)
-    ids, skin = left.nonzero()[:, 0], (~loose).nonzero()[:, 0]
-    if len(ids):
-        beside = skin[torch.from_numpy(cKDTree(vertices[skin].numpy()).query(vertices[ids].numpy())[1])]
-        deltas[:, ids] = deltas[:, beside]
-    return deltas, tongue
+            deltas[:, ids] = share[ids, None] * (jaw.apply(vertices[ids]) - vertices[ids])
+        left &= ~inside
+    if left.any():
+        _attached(head, faces, left)
+    return LooseParts(deltas, loose & ~left, tongue)
+
+
+def _attached(head: _Head, faces: Tensor, left: Tensor) -> None:
+    """Lets parts go with the skin where they touch it, and the rest of each with that: lashes stay straight."""
+    ids, skin = left.nonzero()[:, 0], (~head.loose).nonzero()[:, 0]
+    row = torch.full((len(left),), -1)
+    row[ids] = torch.arange(len(ids))
+    own = row[faces[left[faces].all(1)]]
+    points = head.vertices[ids]
+    found = cKDTree(head.vertices[skin].numpy()).query(points.numpy())
+    distance, beside = (torch.from_numpy(one) for one in found)
+    part = head.part[ids].unique(return_inverse=True)[1]
+    nearest = torch.full((int(part.max()) + 1,), torch.inf, dtype=torch.float64)
+    nearest = nearest.scatter_reduce(0, part, distance, "amin")
+    root = distance <= nearest[part] + _ROOT
+    weight = torch.where(root, 1.0, 1e-9).numpy()
+    guess = (head.deltas[:, skin[beside]] * root[:, None]).permute(1, 0, 2).flatten(1)
+    matrix = sparse.diags_array(weight) + _STIFF * stretching_energy(points, own)
+    solved = SparseCholesky(matrix).solve(guess)
+    head.deltas[:, ids] = solved.unflatten(1, (-1, 3)).permute(1, 0, 2)
 
 
 def _eyeballs(template: BlendshapeRig) -> list[Tensor]:
@@ -86,8 +125,7 @@ def _turned(head: _Head, template: BlendshapeRig, eyeball: Tensor, left: Tensor)
     own = torch.zeros_like(left)
     for one in head.part[inside & left].unique().tolist():  # a head has a handful of such parts
         rows = head.part == one
-        span = head.vertices[rows].amax(0) - head.vertices[rows].amin(0)
-        if bool(inside[rows].double().mean() > 0.9) and float(span.max()) > 0.4 * radius:
+        if bool(inside[rows].all()) and _is_of_the_eye(head.vertices[rows] - centre, radius):
             own |= rows
     ids = own.nonzero()[:, 0]
     if not len(ids):
@@ -103,27 +141,39 @@ def _turned(head: _Head, template: BlendshapeRig, eyeball: Tensor, left: Tensor)
     return own
 
 
+def _is_of_the_eye(points: Tensor, radius: float) -> bool:
+    """Whether a part is a ball, or lies on it as a cornea or an iris does, and not as lashes or the shell under lids."""
+    middle = points.mean(0)
+    if float(middle.norm()) < 0.5 * radius:
+        return float((points.amax(0) - points.amin(0)).max()) > radius
+    away = torch.nn.functional.normalize(points, dim=-1) @ torch.nn.functional.normalize(middle, dim=0)
+    return float(away.min()) > _CORNEA
+
+
 def _in_the_mouth(head: _Head, left: Tensor, lips: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Vertices (J,) of parts behind the lips, below and above their line, and of the tongue."""
+    """Vertices (J,) of parts behind the lips, how much each goes with the jaw (J,), and those of the tongue (J,)."""
     middle = lips.mean(0)
-    lower, upper, tongue = (torch.zeros_like(left) for _ in range(3))
-    widest = 0.0
+    inside, tongue = torch.zeros_like(left), torch.zeros_like(left)
+    share = torch.zeros(len(left), dtype=torch.float64)
+    widest = _FILLED
     for one in head.part[left].unique().tolist():  # every tooth is a part
         rows = (head.part == one) & left
-        points = head.vertices[rows]
-        away = points.mean(0) - middle
-        behind = float(away[2]) < 2.0 and float(away.norm()) < _IN_THE_MOUTH and abs(float(away[1])) < _MOUTH_HEIGHT
-        if not behind or float((points - middle).norm(dim=-1).max()) > 2 * _IN_THE_MOUTH:
+        away = head.vertices[rows] - middle
+        at = away.mean(0)
+        behind = float(at[2]) < 2.0 and abs(float(at[1])) < _MOUTH_HEIGHT
+        if not behind or float(at.norm()) > _IN_THE_MOUTH or float(away.norm(dim=-1).max()) > 2 * _IN_THE_MOUTH:
             continue
-        if float(away[1]) > 0:
-            upper |= rows
-            continue
-        lower |= rows
-        width, _, depth = (points.amax(0) - points.amin(0)).tolist()
-        filled = float((points[:, 0].abs() < 5.0).double().mean())  # gums are an arch, hollow in the middle
-        if width > _TONGUE_WIDTH and depth > _TONGUE_DEPTH and filled > max(widest, 0.2):
+        inside |= rows
+        below = -(away[:, 1] + _BITE * away[:, 2])
+        low = (0.5 + below / (2 * _BITE_BLEND)).clamp(0, 1)
+        width, _, depth = (away.amax(0) - away.amin(0)).tolist()
+        above = float((low < 0.5).double().mean())
+        both = width > _ARCH and _BOTH_JAWS < above < 1 - _BOTH_JAWS
+        share[rows] = low * low * (3 - 2 * low) if both else float(below.mean() > 0)
+        filled = float((away[:, 0].abs() < 5.0).double().mean())  # gums are an arch, hollow in the middle
+        if float(below.mean()) > 0 and not both and width > _TONGUE and depth > _TONGUE and filled > widest:
             widest, tongue = filled, rows
-    return lower, upper, tongue
+    return inside, share, tongue
 
 
 def _jaw_motions(template: BlendshapeRig) -> Similarity:

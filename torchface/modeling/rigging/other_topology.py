@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 from scipy import sparse
-from scipy.spatial import cKDTree
 from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
 from torch import Tensor
 
 from torchface.errors import ValueRangeError
@@ -21,7 +21,7 @@ from torchface.modeling.rigging.deformation_transfer import transfer_with_report
 from torchface.modeling.rigging.loose_parts import moved_parts
 from torchface.modeling.rigging.part_clearance import clear_parts
 from torchface.modeling.rigging.part_placement import place_parts
-from torchface.modeling.rigging.penetration import inner_parts
+from torchface.modeling.rigging.penetration import InnerParts, inner_parts
 from torchface.optim.sparse import SparseCholesky
 from torchface.progress import Progress, silent
 from torchface.registration import Registration, hidden_parts, register, with_template_skin
@@ -35,7 +35,7 @@ _NEAR, _FAR = 2.0, 20.0
 _BLIND = 1e-3
 """How much the guess counts for a vertex that has no place on the template, beside one that has."""
 _SMOOTH = 0.7
-_SKIN_SHARE = 0.3
+_SKIN_SHARE, _BODY_SHARE = 0.3, 0.15
 _SAME_PLACE = 1e-4
 _ALIKE = 0.2
 
@@ -117,19 +117,27 @@ def shapes_on(
     joined = joined_vertices(goal, target.faces.cpu())
     skin = _Skin.of(moved, registration, joined)
     deltas = skin.carried(moved.deltas.double())
-    deltas, tongue = moved_parts(moved, joined.vertices, joined.faces, joined.part, skin.loose, deltas)
+    parts = moved_parts(moved, joined.vertices, joined.faces, joined.part, skin.loose, deltas)
+    deltas = parts.deltas
     still = torch.zeros(len(joined.vertices), dtype=torch.bool)
     if movable is not None:
         still[joined.of] = ~movable.cpu()
         deltas[:, still] = 0.0
     own = BlendshapeRig(Mesh(joined.vertices, joined.faces), deltas, moved.names)
-    own = clear_parts(own, inner_parts(own))
+    own = clear_parts(own, _among(inner_parts(own), parts.bones))
     deltas = own.deltas.double().masked_fill(still[:, None], 0.0)[:, joined.of]
     placed = registration.pose.apply_vectors(deltas).to(target.vertices)
     rig = BlendshapeRig(target, placed, moved.names)
     return CarriedShapes(
-        rig, registration, moved, skin.distance[joined.of], skin.known[joined.of], tongue[joined.of]
+        rig, registration, moved, skin.distance[joined.of], skin.known[joined.of], parts.tongue[joined.of]
     )
+
+
+def _among(parts: InnerParts, bones: Tensor) -> InnerParts:
+    """Those parts that are bone: lashes and shells of the eye stand before the skin by nature."""
+    kept = bones[parts.vertices]
+    group = parts.group[kept].unique(return_inverse=True)[1]
+    return replace(parts, vertices=parts.vertices[kept], group=group, hard=parts.hard[kept])
 
 
 def _fitted(template: BlendshapeRig, registration: Registration, to_template: Similarity) -> Mesh:
@@ -158,7 +166,7 @@ class JoinedMesh:
 
 
 def joined_vertices(vertices: Tensor, faces: Tensor) -> JoinedMesh:
-    """Joins the vertices that a file has split at seams; lips that touch stay two.
+    """Joins the vertices that a file has split at seams; lips that touch, and lashes on a lid, stay apart.
 
     Args:
         vertices: (V,3), millimetres.
@@ -170,8 +178,9 @@ def joined_vertices(vertices: Tensor, faces: Tensor) -> JoinedMesh:
         >>> len(joined.vertices), joined.part.unique().tolist()
         (4, [0])
     """
-    normals = vertex_normals(vertices, faces)
-    first, second = torch.from_numpy(cKDTree(vertices.numpy()).query_pairs(_SAME_PLACE, output_type="ndarray")).T
+    normals, seam = vertex_normals(vertices, faces), border_vertices(faces, len(vertices)).nonzero()[:, 0]
+    near = cKDTree(vertices[seam].numpy()).query_pairs(_SAME_PLACE, output_type="ndarray")
+    first, second = seam[torch.from_numpy(near)].T
     alike = (normals[first] * normals[second]).sum(-1) > _ALIKE
     pairs = torch.stack([first[alike], second[alike]])
     of = torch.from_numpy(_labels(pairs, len(vertices)))
@@ -225,9 +234,9 @@ class _Skin:
         known = (confidence > 0.1) & ~beyond
         part = joined.part
         size = part.bincount().double()
-        near = torch.zeros_like(size).index_add_(0, part, known.double()) / size
-        body = near > _SKIN_SHARE
-        body[torch.zeros_like(size).index_add_(0, part, known.double()).argmax()] = True
+        near = torch.zeros_like(size).index_add_(0, part, known.double())
+        body = (near > _SKIN_SHARE * size) & (near > _BODY_SHARE * near.max())
+        body[near.argmax()] = True
         return _Skin(joined, corner, share, confidence, distance, known, ~body[part])
 
     def carried(self, deltas: Tensor) -> Tensor:
@@ -251,7 +260,9 @@ class _Skin:
         return solved.unflatten(1, (-1, 3)).permute(1, 0, 2).contiguous()
 
 
-def nearest_alike(surface: Tensor, faces: Tensor, points: Tensor, normals: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+def nearest_alike(
+    surface: Tensor, faces: Tensor, points: Tensor, normals: Tensor
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """The place on a surface nearest to each point in position and normal together.
 
     Args:

@@ -1,0 +1,100 @@
+"""Tests of shapes on another topology: the embedded performer's head with other vertices has the performer's shapes."""
+
+import pytest
+import torch
+
+from torchface import Mesh
+from torchface.errors import ValueRangeError
+from torchface.geometry.rotations import rotation_matrix
+from torchface.mesh import Annotations
+from torchface.modeling.rigging.other_topology import CarriedShapes, joined_vertices, shapes_on
+from torchface.rig import BlendshapeRig
+from torchface.synthetic import performer
+
+SHAPES = ["eyeBlinkLeft", "eyeLookOutLeft", "jawOpen", "mouthSmileLeft", "mouthPucker", "browInnerUp"]
+SCALE = 0.6  # the head is smaller, and turned
+TURN = rotation_matrix(torch.tensor([[0.2, 0.5, -0.1]], dtype=torch.float64))[0]
+
+
+@pytest.fixture(scope="module")
+def template() -> BlendshapeRig:
+    return performer(texture=False).select(SHAPES)
+
+
+@pytest.fixture(scope="module")
+def head(template: BlendshapeRig) -> tuple[Mesh, torch.Tensor]:
+    """The same head with a vertex in the middle of each quad, in another order, and the deltas of its shapes."""
+    quads = template.neutral.polygons
+    quads = quads[(quads >= 0).all(1)]
+    order = torch.randperm(len(template.vertices) + len(quads), generator=torch.Generator().manual_seed(0))
+    count = len(template.vertices)
+    middles = count + torch.arange(len(quads))
+    faces = torch.cat([torch.stack([quads[:, k], quads[:, (k + 1) % 4], middles], 1) for k in range(4)])
+
+    def reordered(values: torch.Tensor) -> torch.Tensor:
+        return torch.cat([values, values[..., quads, :].mean(-2)], -2)[..., order, :]
+
+    place = torch.empty_like(order)
+    place[order] = torch.arange(len(order))
+    vertices = SCALE * reordered(template.vertices.double()) @ TURN.T
+    deltas = SCALE * reordered(template.deltas.double()) @ TURN.T
+    mesh = Mesh(vertices.float(), place[faces], annotations=Annotations(place[template.neutral.landmarks]))
+    return mesh, deltas
+
+
+@pytest.fixture(scope="module")
+def carried(template: BlendshapeRig, head: tuple[Mesh, torch.Tensor]) -> CarriedShapes:
+    mesh, _ = head
+    return shapes_on(template, mesh, (template.neutral.landmarks, mesh.vertices[mesh.landmarks].double()))
+
+
+def test_the_heads_vertices_stay_as_they_are(carried: CarriedShapes, head: tuple[Mesh, torch.Tensor]) -> None:
+    assert carried.rig.neutral is head[0]
+    assert carried.rig.names == tuple(SHAPES)
+
+
+def test_every_shape_is_the_true_one(carried: CarriedShapes, head: tuple[Mesh, torch.Tensor]) -> None:
+    truth, found = head[1].flatten(1), carried.rig.deltas.double().flatten(1)
+    relative = (found - truth).norm(dim=1) / truth.norm(dim=1)
+    cosine = (found * truth).sum(1) / (found.norm(dim=1) * truth.norm(dim=1))
+    assert float(cosine.min()) > 0.985, dict(zip(SHAPES, cosine.tolist(), strict=True))
+    assert float(relative.max()) < 0.18, dict(zip(SHAPES, relative.tolist(), strict=True))
+
+
+def test_an_eyeball_turns_rigidly(
+    carried: CarriedShapes, head: tuple[Mesh, torch.Tensor], template: BlendshapeRig
+) -> None:
+    mesh, truth = head
+    look = SHAPES.index("eyeLookOutLeft")
+    part = joined_vertices(mesh.vertices.double(), mesh.faces).part
+    moving = truth[look].norm(dim=1) > 0.02
+    ball = max((part == one for one in part[moving].unique()), key=lambda m: float(moving[m].double().mean()))
+    rest = mesh.vertices[ball].double()
+    posed = rest + carried.rig.deltas[look, ball].double()
+    assert torch.allclose(torch.pdist(posed[::7]), torch.pdist(rest[::7]), atol=SCALE * 0.05)
+    assert float((carried.rig.deltas[look, ball].double() - truth[look, ball]).norm(dim=1).max()) < SCALE * 0.5
+
+
+def test_what_may_not_move_does_not(
+    template: BlendshapeRig, head: tuple[Mesh, torch.Tensor], carried: CarriedShapes
+) -> None:
+    mesh, _ = head
+    movable = torch.ones(len(mesh.vertices), dtype=torch.bool)
+    movable[mesh.landmarks[48:]] = False
+    fixed = shapes_on(template, mesh, registration=carried.registration, movable=movable)
+    assert float(fixed.rig.deltas[:, ~movable].abs().max()) == 0.0
+    assert torch.allclose(fixed.rig.deltas[:, movable], carried.rig.deltas[:, movable], atol=SCALE * 0.5)
+    with pytest.raises(ValueRangeError, match="movable: found"):
+        shapes_on(template, mesh, registration=carried.registration, movable=movable[:5])
+
+
+def test_vertices_split_at_a_seam_are_one_and_lips_that_touch_are_two() -> None:
+    """Two squares share an edge that is split; a third lies on one of them, facing the other way."""
+    square = torch.tensor([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], dtype=torch.float64)
+    vertices = torch.cat([square, square + torch.tensor([1.0, 0, 0]), square])
+    faces = torch.tensor([[0, 1, 2], [0, 2, 3], [4, 5, 6], [4, 6, 7], [8, 10, 9], [8, 11, 10]])
+    joined = joined_vertices(vertices, faces)
+    assert len(joined.vertices) == 10
+    assert joined.of[1] == joined.of[4]
+    assert joined.of[2] == joined.of[7]
+    assert joined.part[joined.of[0]] == joined.part[joined.of[5]] != joined.part[joined.of[8]]
