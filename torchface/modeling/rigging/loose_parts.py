@@ -142,7 +142,7 @@ def _turned(head: _Head, template: BlendshapeRig, eyeball: Tensor, left: Tensor)
 
 
 def _is_of_the_eye(points: Tensor, radius: float) -> bool:
-    """Whether a part is a ball, or lies on it as a cornea or an iris does, and not as lashes or the shell under lids."""
+    """Whether a part is a ball, or lies on it as a cornea or an iris does; lashes and shells under lids do not."""
     middle = points.mean(0)
     if float(middle.norm()) < 0.5 * radius:
         return float((points.amax(0) - points.amin(0)).max()) > radius
