@@ -11,6 +11,7 @@ from torchface.shape_names.arkit_names import (
 )
 from torchface.shape_names.arkit_names import near_names as near_names
 from torchface.shape_names.name_tables import METAHUMAN, UNIFIED, VISEMES, VRM0, VRM1, ClipTable, TwinTable
+from torchface.shape_names.recognised_names import RecognisedShape, arkit_name, recognised_shapes
 
 __all__ = [
     "ANTAGONISTS",
@@ -21,10 +22,13 @@ __all__ = [
     "VRM0",
     "VRM1",
     "ClipTable",
+    "RecognisedShape",
     "TwinTable",
     "antagonists",
+    "arkit_name",
     "arkit_sources",
     "mapping",
     "mirror",
+    "recognised_shapes",
     "spelled_as",
 ]

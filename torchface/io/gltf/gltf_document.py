@@ -15,6 +15,7 @@ from urllib.parse import unquote
 
 from torchface.errors import FileFormatError
 from torchface.files.documents import parse_json
+from torchface.files.extra_packages import import_extra
 from torchface.files.whole_files import LARGEST_FILE, read_file
 from torchface.io.gltf.buffers import BufferWriter
 
@@ -25,8 +26,12 @@ _UNPACKED_ALWAYS = 2**28
 _UNPACKED_PER_BYTE = 32
 _SHORT = reprlib.Repr()
 _SHORT.maxstring = 60
-_EXTENSIONS = ("KHR_mesh_quantization", "KHR_texture_transform", "KHR_materials_", "KHR_lights_punctual")
-"""Extensions a file may require: the first is read, the others change no vertex."""
+MESHOPT = "EXT_meshopt_compression"
+_EXTENSIONS = (
+    *("KHR_mesh_quantization", MESHOPT, "KHR_texture_transform", "KHR_texture_basisu", "KHR_materials_"),
+    "KHR_lights_punctual",
+)
+"""Extensions a file may require: the first two are read, the others change no vertex."""
 
 
 def shown(value: object) -> str:
@@ -48,6 +53,7 @@ class Document:
     root: dict[str, Any]
     binary: memoryview | None = None
     _sources: dict[str, memoryview] = field(default_factory=dict)
+    _unpacked_views: dict[str, memoryview] = field(default_factory=dict)
     _unpacked: int = 0
 
     def error(self, where: str, found: object, expected: str) -> FileFormatError:
@@ -103,14 +109,36 @@ class Document:
         """The bytes of a bufferView, and its stride."""
         view = self.item("bufferViews", index, where)
         location = f"bufferViews[{index}]"
-        if "EXT_meshopt_compression" in self.record(view.get("extensions"), f"{location}.extensions"):
-            raise self.error(location, "meshopt compression", "plain data; decompress the file first")
+        packed = self.record(view.get("extensions"), f"{location}.extensions").get(MESHOPT)
+        if packed is not None:
+            return self._decompressed(self.record(packed, location), f"{location}.extensions.{MESHOPT}")
         start, length = self.integer(view, "byteOffset", location, 0), self.integer(view, "byteLength", location)
         buffer = self._buffer(self.integer(view, "buffer", location))
         if start + length > len(buffer):
             raise self.error(location, f"bytes {start} to {start + length}", f"at most the buffer's {len(buffer)}")
         stride = self.integer(view, "byteStride", location) if "byteStride" in view else None
         return buffer[start : start + length], stride
+
+    def _decompressed(self, packed: dict[str, Any], location: str) -> tuple[memoryview, int]:
+        """The bytes of a bufferView that meshoptimizer has packed, and their stride; unpacked once."""
+        if location not in self._unpacked_views:
+            count, stride = self.integer(packed, "count", location), self.integer(packed, "byteStride", location)
+            start, length = (
+                self.integer(packed, "byteOffset", location, 0),
+                self.integer(packed, "byteLength", location),
+            )
+            buffer = self._buffer(self.integer(packed, "buffer", location))
+            if start + length > len(buffer):
+                raise self.error(location, f"bytes {start} to {start + length}", f"at most the buffer's {len(buffer)}")
+            meshopt = import_extra("meshopt", "meshopt", "compressed", f"{self.path}: meshopt compression")
+            self.reserve(count * stride, location)
+            mode, kept = packed.get("mode"), packed.get("filter", "NONE")
+            try:
+                rows = meshopt.decode_gltf_buffer(bytes(buffer[start : start + length]), count, stride, mode, kept)
+            except (ValueError, TypeError, RuntimeError, OverflowError, MemoryError) as error:
+                raise self.error(location, f"broken data ({str(error)[:80]})", "what meshoptimizer packs") from error
+            self._unpacked_views[location] = memoryview(rows).cast("B")
+        return self._unpacked_views[location], self.integer(packed, "byteStride", location)
 
     def bytes_at(self, uri: object, where: str) -> memoryview:
         """The bytes that a URI names: data in it, or a file in the document's folder or below; read once."""

@@ -68,7 +68,7 @@ def read_part(document: Document, index: int) -> Part | None:
         if key not in blocks:
             blocks[key] = _read_block(document, primitive, f"{location}.primitives[{i}]", first)
             first += len(blocks[key].positions)
-        corners = _read_triangles(document, primitive, f"{location}.primitives[{i}]", len(blocks[key].positions))
+        corners = read_triangles(document, primitive, f"{location}.primitives[{i}]", len(blocks[key].positions))
         triangles.append(corners + blocks[key].first)
         painted = _painted(primitive)  # that texture is not of the mesh
         texture = None if painted else _texture(document, primitive, f"{location}.primitives[{i}]")[0]
@@ -137,7 +137,8 @@ def _read_block(document: Document, primitive: dict[str, Any], location: str, fi
     return _Block(first, positions, deltas, uvs, colors, ids)
 
 
-def _read_triangles(document: Document, primitive: dict[str, Any], location: str, count: int) -> NDArray[np.int64]:
+def read_triangles(document: Document, primitive: dict[str, Any], location: str, count: int) -> NDArray[np.int64]:
+    """The triangles (F,3) of a primitive of ``count`` vertices; strips and fans taken apart."""
     if primitive.get("indices") is None:
         corners = np.arange(count)
     else:

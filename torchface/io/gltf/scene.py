@@ -51,6 +51,11 @@ def instances(document: Document) -> list[Instance]:
     return visible
 
 
+def node_transforms(document: Document) -> dict[int, NDArray[np.float64]]:
+    """From each node of the default scene to the scene, (4,4)."""
+    return dict(_walk(document, document.objects("nodes")))
+
+
 def _name(first: dict[str, Any], second: dict[str, Any], index: int) -> str:
     names = [name for thing in (first, second) if isinstance(name := thing.get("name"), str) and name]
     return names[0] if names else f"mesh_{index}"

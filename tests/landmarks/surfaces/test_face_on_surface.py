@@ -1,0 +1,56 @@
+"""Faces are found on surfaces in any pose and unit, where they are; what is no face is refused with pictures."""
+
+import pytest
+import torch
+from torch import Tensor
+
+from planted.characters import box_mesh
+from torchface.geometry.rotations import rotation_matrix
+from torchface.landmarks.images.checked_detector import shipped_detector
+from torchface.landmarks.surfaces.face_on_surface import FaceSearch, NoFaceOnSurfaceError, ReferencePoints
+from torchface.rendering.textured_surface import Material, TexturedSurface
+from torchface.synthetic import draw_identities, neutral_head
+from torchface.workflows.named_finders import load_finder
+
+RINGS = ((0.0, 6), (55.0, 4), (-55.0, 4))
+
+
+def surface(vertices: Tensor, faces: Tensor) -> TexturedSurface:
+    skin = Material(torch.tensor([0.8, 0.65, 0.56, 1.0]))
+    material = torch.zeros(len(faces), dtype=torch.int64)
+    return TexturedSurface(vertices.double(), faces, torch.zeros(len(vertices), 2), material, (skin,))
+
+
+@pytest.fixture(scope="module")
+def search() -> FaceSearch:
+    mean, finder = neutral_head(texture=False), load_finder()
+    points = ReferencePoints(mean.vertices[mean.landmarks], finder.places)
+    return FaceSearch(shipped_detector(), finder.finder, points, RINGS)
+
+
+@pytest.mark.parametrize("turn", [(0.0, 0.0, 0.0), (-1.4, 0.4, 0.2), (0.3, 2.5, 1.0)])  # upright, on its back, anyhow
+def test_points_lie_where_the_head_has_them(search: FaceSearch, turn: tuple[float, ...]) -> None:
+    head = neutral_head(draw_identities(1, torch.Generator().manual_seed(7))[0], texture=False)
+    mean = neutral_head(texture=False).vertices.double()
+    rotation = rotation_matrix(torch.tensor(turn, dtype=torch.float64))
+    placed = 0.01 * head.vertices.double() @ rotation.T + 5.0  # in another unit, elsewhere
+    found = search.find(surface(placed, head.faces))
+    ids = torch.cdist(search.reference.points.double(), mean).argmin(1)
+    error = (found.points[68:] - placed[ids]).norm(dim=-1) / found.eye_distance
+    assert float(error.nanmedian()) < 0.035
+    assert float(torch.isfinite(error).double().mean()) > 0.9
+    forward = found.pose.rotation[0] @ torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
+    assert float(forward @ (rotation @ torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64))) > 0.99
+    assert found.presence > 0.9
+
+
+def test_a_ball_a_box_and_the_back_of_a_head_are_no_faces(search: FaceSearch) -> None:
+    head = neutral_head(texture=False)
+    behind = head.faces[(head.vertices[head.faces][..., 2] < -10).all(1)]
+    box, triangles = box_mesh(torch.zeros(3), torch.tensor([200.0, 240.0, 180.0]))
+    round_box, fine = box_mesh(torch.zeros(3), torch.tensor([2.0, 2.0, 2.0]), divisions=4)
+    ball = 100 * torch.nn.functional.normalize(round_box, dim=-1)
+    for vertices, faces in ((box, triangles), (ball, fine), (head.vertices, behind)):
+        with pytest.raises(NoFaceOnSurfaceError, match=r"found no face|not from near") as refused:
+            search.find(surface(vertices, faces))
+        assert len(refused.value.views) > 0

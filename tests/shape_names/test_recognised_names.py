@@ -1,0 +1,137 @@
+"""Names of other programs are ARKit's shapes, and no others are."""
+
+import pytest
+
+from torchface.shape_names import ARKIT, METAHUMAN, UNIFIED, VISEMES, VRM0, VRM1, arkit_name, recognised_shapes
+
+CC4 = [
+    "A01_Brow_Inner_Up",
+    "A02_Brow_Down_Left",
+    "A03_Brow_Down_Right",
+    "A04_Brow_Outer_Up_Left",
+    "A05_Brow_Outer_Up_Right",
+    "A06_Eye_Look_Up_Left",
+    "A07_Eye_Look_Up_Right",
+    "A08_Eye_Look_Down_Left",
+    "A09_Eye_Look_Down_Right",
+    "A10_Eye_Look_Out_Left",
+    "A11_Eye_Look_In_Left",
+    "A12_Eye_Look_In_Right",
+    "A13_Eye_Look_Out_Right",
+    "A14_Eye_Blink_Left",
+    "A15_Eye_Blink_Right",
+    "A16_Eye_Squint_Left",
+    "A17_Eye_Squint_Right",
+    "A18_Eye_Wide_Left",
+    "A19_Eye_Wide_Right",
+    "A20_Cheek_Puff",
+    "A21_Cheek_Squint_Left",
+    "A22_Cheek_Squint_Right",
+    "A23_Nose_Sneer_Left",
+    "A24_Nose_Sneer_Right",
+    "A25_Jaw_Open",
+    "A26_Jaw_Forward",
+    "A27_Jaw_Left",
+    "A28_Jaw_Right",
+    "A29_Mouth_Funnel",
+    "A30_Mouth_Pucker",
+    "A31_Mouth_Left",
+    "A32_Mouth_Right",
+    "A33_Mouth_Roll_Upper",
+    "A34_Mouth_Roll_Lower",
+    "A35_Mouth_Shrug_Upper",
+    "A36_Mouth_Shrug_Lower",
+    "A37_Mouth_Close",
+    "A38_Mouth_Smile_Left",
+    "A39_Mouth_Smile_Right",
+    "A40_Mouth_Frown_Left",
+    "A41_Mouth_Frown_Right",
+    "A42_Mouth_Dimple_Left",
+    "A43_Mouth_Dimple_Right",
+    "A44_Mouth_Upper_Up_Left",
+    "A45_Mouth_Upper_Up_Right",
+    "A46_Mouth_Lower_Down_Left",
+    "A47_Mouth_Lower_Down_Right",
+    "A48_Mouth_Press_Left",
+    "A49_Mouth_Press_Right",
+    "A50_Mouth_Stretch_Left",
+    "A51_Mouth_Stretch_Right",
+    "T01_Tongue_Out",
+]
+
+
+@pytest.mark.parametrize(
+    ("dialect", "spelled"),
+    [
+        ("ARKit", list(ARKIT)),
+        ("Live Link, Perfect Sync", [name[0].upper() + name[1:] for name in ARKIT]),
+        ("Faceit", [name.replace("Left", "_L").replace("Right", "_R") for name in ARKIT]),
+        ("Audio2Face, Maya", [f"blendShape1.{name}" for name in ARKIT]),
+        ("Daz", [f"Genesis9__facs_bs_{name[0].upper()}{name[1:]}_div2" for name in ARKIT]),
+        ("lower case", [name.lower() for name in ARKIT]),
+        ("MetaHuman", list(METAHUMAN.names)),
+        ("CC4 Extended Plus", CC4),
+    ],
+)
+def test_a_dialect_has_all_52(dialect: str, spelled: list[str]) -> None:
+    assert tuple(recognised_shapes(spelled)) == ARKIT, dialect
+
+
+def test_every_cc4_name_is_the_one_it_says() -> None:
+    assert sorted(map(str, map(arkit_name, CC4))) == sorted(ARKIT)
+    assert arkit_name("A10_Eye_Look_Out_Left") == "eyeLookOutLeft"
+
+
+@pytest.mark.parametrize(
+    ("name", "arkit"),
+    [
+        ("Fcl_EYE_Close_L", "eyeBlinkLeft"),
+        ("Face.M_F00_000_00_Fcl_EYE_Close_R", "eyeBlinkRight"),
+        ("blinkLeft", "eyeBlinkLeft"),
+        ("Blink_R", "eyeBlinkRight"),
+        ("Eye_L_Look_L", "eyeLookOutLeft"),  # CC4: the left eye looks to the left
+        ("Eye_R_Look_L", "eyeLookInRight"),
+        ("Mouth_Down_Lower_R", "mouthLowerDownRight"),
+        ("Jaw_L", "jawLeft"),
+        ("Brow_Drop_L", "browDownLeft"),
+        ("eye-blink.L", "eyeBlinkLeft"),
+        ("facs_jnt_JawOpen", "jawOpen"),
+    ],
+)
+def test_names_of_other_programs(name: str, arkit: str) -> None:
+    assert arkit_name(name) == arkit
+
+
+def test_poses_of_several_shapes_and_both_sides_at_once_are_none_of_them() -> None:
+    none = [
+        "aa",
+        "happy",
+        "Fcl_MTH_A",
+        "Fcl_ALL_Joy",
+        "viseme_aa",
+        "blink",
+        "mouthOpen",
+        "mouthSmile",
+        "eyesClosed",
+        "",
+    ]
+    none += [name for name in (*VRM0.names, *VRM1.names, *VISEMES.names) if "link" not in name]
+    assert {name: arkit_name(name) for name in none} == dict.fromkeys(none)
+
+
+def test_halves_are_one_shape_and_one_half_is_none() -> None:
+    found = recognised_shapes(["jawOpen", "Brow_Raise_Inner_L", "Brow_Raise_Inner_R", "cheekPuff_L"])
+    assert found["browInnerUp"].rows == (1, 2)
+    assert set(found) == {"jawOpen", "browInnerUp"}
+    assert (found["jawOpen"].as_arkit, found["browInnerUp"].as_arkit) == (True, False)
+
+
+def test_arkits_own_spelling_counts_before_another() -> None:
+    assert recognised_shapes(["Jaw_Open", "jawOpen"])["jawOpen"].rows == (1,)
+
+
+def test_unified_expressions_that_mean_the_same_are_read_the_same() -> None:
+    for arkit, twins in UNIFIED.twins.items():
+        for twin in twins:
+            found = arkit_name(twin)
+            assert found is None or found.startswith(arkit), (twin, found, arkit)

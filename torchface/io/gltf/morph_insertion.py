@@ -1,0 +1,201 @@
+"""Morph targets added to a binary glTF file; all else of it, and its numbering, stays as it was."""
+
+from __future__ import annotations
+
+import copy
+import json
+import struct
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from torchface.errors import FileFormatError
+from torchface.files.whole_files import read_file, replaced_file
+from torchface.io.gltf.accessors import read_floats
+from torchface.io.gltf.buffers import BufferWriter
+from torchface.io.gltf.gltf_document import Document
+from torchface.io.gltf.primitive_reading import read_target_names
+
+_HEADER, _CHUNK = struct.Struct("<4sII"), struct.Struct("<II")
+_JSON, _BINARY = 0x4E4F534A, 0x004E4942
+
+
+@dataclass(frozen=True, eq=False)
+class AddedTargets:
+    """What new morph targets move of vertices that some primitives of a mesh share.
+
+    Args:
+        mesh: its index in the file.
+        primitives: those that share the vertices.
+        positions: (N,C,3) in the mesh's own axes and unit, one for each new name.
+        normals: the same of the normals, or none.
+    """
+
+    mesh: int
+    primitives: tuple[int, ...]
+    positions: NDArray[np.float32]
+    normals: NDArray[np.float32] | None = None
+
+
+def document_with_targets(
+    document: Document, added: Sequence[AddedTargets], names: Sequence[str]
+) -> tuple[dict[str, Any], bytes]:
+    """The file's JSON with morph targets behind those that it has, and the bytes that come behind its binary chunk.
+
+    Every mesh that ``added`` names gets all names, on each of its primitives; those that nothing moves get targets
+    without data. Weights of meshes, nodes and animations get zeros for them.
+
+    Args:
+        document: a ``.glb`` whose first buffer is its binary chunk.
+        added: at least one.
+        names: of the new morph targets, none of which such a mesh has.
+
+    Raises:
+        FileFormatError: the file keeps its data elsewhere, or a mesh has such a name already.
+    """
+    root, first = copy.deepcopy(document.root), document.root.get("buffers") or [{}]
+    if document.binary is None or first[0].get("uri") is not None:
+        raise document.error("buffers[0]", "its data in another file", "a .glb that holds it (gltf-transform copy)")
+    writer = _Appended(document, root)
+    for mesh in sorted({one.mesh for one in added}):
+        moved: Mapping[int, AddedTargets] = {
+            primitive: one for one in added if one.mesh == mesh for primitive in one.primitives
+        }
+        _extend_mesh(document, root, mesh, moved, tuple(names), writer)
+    return writer.finished()
+
+
+def write_edited(document: Document, root: Mapping[str, Any], appended: bytes, path: str | Path) -> None:
+    """Writes a binary glTF with another JSON: its binary chunk, ``appended``, then its other chunks.
+
+    The file appears only when it is complete.
+    """
+    start = document.root["buffers"][0]["byteLength"] if document.root.get("buffers") else 0
+    binary = bytes(document.binary or b"")[:start] if appended else bytes(document.binary or b"")
+    text = json.dumps(root, separators=(",", ":"), ensure_ascii=False, allow_nan=False).encode()
+    text += b" " * (-len(text) % 4)
+    binary += b"\0" * (-len(binary) % 4) + appended
+    binary += b"\0" * (-len(binary) % 4)
+    chunks = [(_JSON, text), *([(_BINARY, binary)] if binary else []), *_other_chunks(document.path)]
+    size = _HEADER.size + sum(_CHUNK.size + len(data) for _, data in chunks)
+    if size >= 2**32:
+        raise FileFormatError(f"{path}: would take {size} bytes, expected less than 4 GB for a .glb")
+    with replaced_file(path) as temporary, temporary.open("wb") as file:
+        file.write(_HEADER.pack(b"glTF", 2, size))
+        for kind, data in chunks:
+            file.write(_CHUNK.pack(len(data), kind))
+            file.write(data)
+
+
+def _other_chunks(path: Path) -> list[tuple[int, bytes]]:
+    """Chunks that are neither JSON nor the binary one, which readers of glTF 2 skip."""
+    data, at, found = read_file(path), _HEADER.size, []
+    taken: set[int] = set()
+    while at + _CHUNK.size <= len(data):
+        size, kind = _CHUNK.unpack_from(data, at)
+        if kind in (_JSON, _BINARY) and kind not in taken:
+            taken.add(kind)
+        else:
+            found.append((kind, data[at + _CHUNK.size : at + _CHUNK.size + size]))
+        at += _CHUNK.size + size
+    return found
+
+
+class _Appended:
+    """Accessors and bufferViews behind those of a document."""
+
+    def __init__(self, document: Document, root: dict[str, Any]) -> None:
+        self.document, self.root, self.buffers = document, root, BufferWriter()
+        self.first_accessor = len(root.get("accessors", []))
+        self.first_view = len(root.get("bufferViews", []))
+
+    def deltas(self, rows: NDArray[np.float32]) -> int:
+        return self.first_accessor + self.buffers.deltas(np.ascontiguousarray(rows, np.float32))
+
+    def numbers(self, rows: NDArray[np.float32]) -> int:
+        return self.first_accessor + self.buffers.keys(np.ascontiguousarray(rows, np.float32))
+
+    def finished(self) -> tuple[dict[str, Any], bytes]:
+        length = self.document.root["buffers"][0]["byteLength"]
+        start = length + -length % 4
+        for view in self.buffers.views:
+            view["byteOffset"] += start
+        for accessor in self.buffers.accessors:
+            sparse = accessor.get("sparse", {})
+            for owner in (accessor, sparse.get("indices", {}), sparse.get("values", {})):
+                if "bufferView" in owner:
+                    owner["bufferView"] += self.first_view
+        self.root.setdefault("bufferViews", []).extend(self.buffers.views)
+        self.root.setdefault("accessors", []).extend(self.buffers.accessors)
+        data = b"".join(self.buffers.pieces)
+        self.root["buffers"][0]["byteLength"] = start + len(data)
+        return self.root, data
+
+
+def _extend_mesh(
+    document: Document,
+    root: dict[str, Any],
+    index: int,
+    moved: Mapping[int, AddedTargets],
+    names: tuple[str, ...],
+    writer: _Appended,
+) -> None:
+    mesh, location = root["meshes"][index], f"meshes[{index}]"
+    old = read_target_names(document, index)
+    if twice := [name for name in names if name in old]:
+        raise document.error(f"{location}.extras.targetNames", f"{twice[0]!r} already", "names that it lacks")
+    written: dict[tuple[int, bool], list[dict[str, int]]] = {}
+    for number, primitive in enumerate(mesh["primitives"]):
+        one = moved.get(number)
+        normals = "NORMAL" in primitive["attributes"]
+        count = document.item("accessors", primitive["attributes"]["POSITION"], location)["count"]
+        key = (-count if one is None else id(one), normals)
+        if key not in written:
+            still = np.zeros((count, 3), np.float32)
+            written[key] = []
+            for row in range(len(names)):
+                target = {"POSITION": writer.deltas(still if one is None else one.positions[row])}
+                if normals:
+                    turned = still if one is None or one.normals is None else one.normals[row]
+                    target["NORMAL"] = writer.deltas(turned)
+                written[key].append(target)
+        primitive["targets"] = [*primitive.get("targets", []), *written[key]]
+    _extend_names(document, mesh, location, (*old, *names))
+    zeros = [0.0] * len(names)
+    if "weights" in mesh or not old:
+        mesh["weights"] = [*mesh.get("weights", []), *zeros]
+    nodes = {number for number, node in enumerate(root.get("nodes", [])) if node.get("mesh") == index}
+    for number in nodes:
+        if "weights" in root["nodes"][number]:
+            root["nodes"][number]["weights"] += zeros
+    _extend_animations(document, root, nodes, len(old), len(names), writer)
+
+
+def _extend_names(document: Document, mesh: dict[str, Any], location: str, names: tuple[str, ...]) -> None:
+    """The names where the file has them, at the mesh or at each of its primitives; else at the mesh."""
+    owners = [one for one in (mesh, *mesh["primitives"]) if "targetNames" in (one.get("extras") or {})] or [mesh]
+    for owner in owners:
+        extras = owner.setdefault("extras", {})
+        if not isinstance(extras, dict):
+            raise document.error(f"{location}.extras", type(extras).__name__, "an object, to name morph targets in")
+        extras["targetNames"] = list(names)
+
+
+def _extend_animations(
+    document: Document, root: dict[str, Any], nodes: set[int], old: int, new: int, writer: _Appended
+) -> None:
+    """Zeros for the new targets in animations of the weights of these nodes."""
+    for animation in root.get("animations", []):
+        for channel in animation.get("channels", []):
+            target = channel.get("target", {})
+            if target.get("path") != "weights" or target.get("node") not in nodes or not old:
+                continue
+            sampler = animation["samplers"][channel["sampler"]]
+            values = read_floats(document, sampler["output"], "animations", ("SCALAR",)).reshape(-1, old)
+            padded = np.pad(values, ((0, 0), (0, new))).reshape(-1, 1)
+            animation["samplers"].append({**sampler, "output": writer.numbers(padded)})
+            channel["sampler"] = len(animation["samplers"]) - 1

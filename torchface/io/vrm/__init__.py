@@ -1,0 +1,1 @@
+"""VRM avatars: what their extensions of glTF say of expressions."""

@@ -1,0 +1,1 @@
+"""Faces found on surfaces of any kind, by looking at them from around."""

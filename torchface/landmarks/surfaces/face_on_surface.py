@@ -1,0 +1,331 @@
+"""A face found on a surface in any pose and unit: seen in pictures from around, its points placed by rays."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torchface.errors import AlignmentError
+from torchface.geometry.cameras.pinhole import Camera, look_at
+from torchface.geometry.similarity import Similarity, similarity_transform
+from torchface.landmarks.images.boxes.face_box import FaceDetector
+from torchface.landmarks.images.face_reading import FaceReading
+from torchface.landmarks.images.ibug_68 import INNER, box_around
+from torchface.landmarks.images.landmark_finder import LandmarkFinder
+from torchface.progress import Progress, silent
+from torchface.rendering.textured_surface import TexturedSurface
+
+_SIDE, _CLOSE_SIDE = 320, 384  # pixels of the pictures from around, and of those from near
+_RINGS = ((0.0, 10), (28.0, 9), (-28.0, 9), (58.0, 5), (-58.0, 5), (90.0, 1), (-90.0, 1))  # pitch, directions in it
+_SURE = 0.7  # score of a face from which no further ring is looked at
+_CLOSE = ((0.0, 0.0), (-16.0, 0.0), (16.0, 0.0), (-32.0, 0.0), (32.0, 0.0), (0.0, 14.0), (0.0, -14.0))
+_CLOSE_SPAN = 2.6  # of the picture, in extents of the reference's landmarks
+_ROUNDS = 2
+_EYES = (36, 45)
+_LEAST_POINTS = 12
+_SLANTED = 0.25  # cosine between ray and normal below which a hit says nothing
+_ASTRAY = 0.5  # of the eyes' distance: a view's hit that is further from the median of all is left out
+_PRESENCE, _MISFIT = 0.6, 0.35
+
+
+@dataclass(frozen=True, eq=False)
+class ReferencePoints:
+    """Where a reference head has what finders find, millimetres, upright and looking along z.
+
+    Args:
+        landmarks: iBUG's 68, (68,3).
+        points: the other points of the finder, (P,3).
+    """
+
+    landmarks: Tensor
+    points: Tensor
+
+    @property
+    def all(self) -> Tensor:
+        """The 68, then the others, (68+P,3) float64."""
+        return torch.cat([self.landmarks, self.points]).double()
+
+
+@dataclass(frozen=True, eq=False)
+class FaceOnSurface:
+    """A face on a surface.
+
+    Args:
+        points: of the reference on the surface, (68+P,3) in its unit, NaN where none was seen.
+        pose: the similarity that takes the reference to the surface; its scale holds the unit.
+        presence: how likely the pictures from near show a face, their mean, in [0,1].
+        misfit: root mean square distance of the points from the reference in ``pose``, in distances of the eyes.
+        views: pictures from near with what was found, (3,H,W) each.
+        others: middles of other faces on the surface, (K,3).
+    """
+
+    points: Tensor
+    pose: Similarity
+    presence: float
+    misfit: float
+    views: tuple[Tensor, ...]
+    others: Tensor
+
+    @property
+    def eye_distance(self) -> float:
+        """From one eye's outer corner to the other's, in the surface's unit."""
+        return float((self.points[_EYES[0]] - self.points[_EYES[1]]).norm())
+
+
+class NoFaceOnSurfaceError(AlignmentError):
+    """A surface shows no face; ``views`` are pictures of what was seen.
+
+    Example:
+        >>> NoFaceOnSurfaceError("ball.glb: found no face", ()).views
+        ()
+    """
+
+    def __init__(self, message: str, views: Sequence[Tensor]) -> None:
+        super().__init__(message)
+        self.views = tuple(views)
+
+
+@dataclass(frozen=True, eq=False)
+class FaceSearch:
+    """What finds a face on surfaces.
+
+    Args:
+        detector: of faces in pictures, at any roll.
+        finder: of landmarks in boxes.
+        reference: where a head has those points.
+        rings: of directions from which the surface is seen, the likeliest first: pitch in degrees and their number.
+    """
+
+    detector: FaceDetector
+    finder: LandmarkFinder
+    reference: ReferencePoints
+    rings: tuple[tuple[float, int], ...] = _RINGS
+
+    def find(
+        self, surface: TexturedSurface, framed: Tensor | None = None, progress: Progress | None = None
+    ) -> FaceOnSurface:
+        """The face on a surface: the one that most pictures show, of several.
+
+        Args:
+            surface: any unit, turned by any angle.
+            framed: vertices (V,) bool that the pictures from around frame, such as those of a head's bone.
+            progress: called with each picture.
+
+        Raises:
+            NoFaceOnSurfaceError: no picture shows one, or what they show is none from near.
+        """
+        progress = progress or silent
+        seen: list[_Sighting] = []
+        pictures: list[Tensor] = []
+        frames = [framed] if framed is not None and bool(framed.any()) else []
+        for frame in [*frames, None]:
+            for plain in (False, True) if any(one.texture is not None for one in surface.materials) else (False,):
+                seen = self._around(surface, frame, plain, pictures, progress)
+                if seen:
+                    break
+            if seen:
+                break
+        if not seen:
+            raise NoFaceOnSurfaceError(
+                f"found no face in {len(pictures)} pictures from around, expected a head", pictures
+            )
+        first, others = _main(seen)
+        return self._from_near(surface, first, others, progress)
+
+    def _around(
+        self,
+        surface: TexturedSurface,
+        framed: Tensor | None,
+        plain: bool,
+        pictures: list[Tensor],
+        progress: Progress,
+    ) -> list[_Sighting]:
+        """The faces in pictures from around; from above and below only where those on the level show none for sure."""
+        rows = surface.faces.unique() if framed is None else framed.nonzero()[:, 0]
+        corners = surface.vertices[rows]
+        low, high = corners.amin(0), corners.amax(0)
+        middle, span = (low + high) / 2, 1.05 * float((corners - (low + high) / 2).norm(dim=-1).max()) * 2
+        found: list[_Sighting] = []
+        for number, (pitch, count) in enumerate(self.rings):
+            if found and max(one.score for one in found) >= _SURE:
+                break
+            for step in range(count):
+                progress("looking for the face", len(pictures), 0)
+                camera = look_at(middle, 360 * (step + 0.5 * (number % 2)) / count, pitch, span, _SIDE, _SIDE)
+                picture = surface.draw(camera, plain).picture
+                pictures.append(picture)
+                image = _bytes(picture)
+                faces = self.detector(image)
+                for box, score, tilt in zip(faces.boxes, faces.scores.tolist(), faces.tilts.tolist(), strict=True):
+                    reading = self.finder(image, box, tilt)
+                    sighting = self._sighting(surface, camera, reading, score, plain)
+                    if sighting is not None:
+                        found.append(sighting)
+        return found
+
+    def _sighting(
+        self, surface: TexturedSurface, camera: Camera, reading: FaceReading, score: float, plain: bool
+    ) -> _Sighting | None:
+        hits = _hits(surface, camera, reading.landmarks[INNER], plain)
+        if int(torch.isfinite(hits).all(-1).sum()) < _LEAST_POINTS:
+            return None
+        pose, misfit = _robust_pose(self.reference.landmarks[INNER].double(), hits)
+        eyes = float((self.reference.landmarks[_EYES[0]] - self.reference.landmarks[_EYES[1]]).norm())
+        middle = pose.apply(self.reference.landmarks[INNER].double().mean(0)[None])[0, 0]
+        size = float(pose.scale[0]) * eyes
+        return _Sighting(
+            pose, middle, size, score * float(reading.presence) / (1 + (misfit / eyes / _MISFIT) ** 2), plain
+        )
+
+    def _from_near(
+        self, surface: TexturedSurface, first: _Sighting, others: Tensor, progress: Progress
+    ) -> FaceOnSurface:
+        reference = self.reference.all
+        eyes = float((reference[_EYES[0]] - reference[_EYES[1]]).norm())
+        pose, views = first.pose, []
+        points, presence = torch.full_like(reference, torch.nan), 0.0
+        for attempt in range(_ROUNDS):
+            # In the reference's place the face looks along z, whatever way the surface is turned.
+            near = surface.moved(pose.inverse())
+            seen, views, read = [], [], []
+            cameras = _close_cameras(self.reference.landmarks)
+            for number, camera in enumerate(cameras if attempt else cameras[:5]):
+                progress("looking at the face", number, len(cameras))
+                picture = near.draw(camera, first.plain, (-1.0) ** number).picture
+                box = box_around(camera.project(self.reference.landmarks.double())).float()
+                reading = self.finder(_bytes(picture), box, 0.0)
+                seen.append(_placed(near, camera, reading, first.plain, eyes))
+                views.append(_marked(picture, reading))
+                read.append(float(reading.presence))
+            found = _together([one[0] for one in seen], [one[1] for one in seen], _ASTRAY * eyes)
+            if int(torch.isfinite(found).all(-1).sum()) < _LEAST_POINTS:
+                break
+            better, _ = _robust_pose(reference[INNER.start :], found[INNER.start :])
+            points = pose.apply(found)[0]
+            pose = _after(pose, better)
+            presence = sum(sorted(read)[-3:]) / 3
+        fit = pose.inverse().apply(points)[0] - reference
+        fit = fit[INNER.start :]
+        misfit = float(fit[torch.isfinite(fit).all(-1)].square().sum(-1).mean().sqrt()) / eyes
+        result = FaceOnSurface(points, pose, presence, misfit, tuple(views), others)
+        if not (presence >= _PRESENCE and misfit <= _MISFIT):
+            raise NoFaceOnSurfaceError(
+                f"found what looks like a face from afar but not from near: presence {presence:.2f} (expected at least "
+                f"{_PRESENCE:g}), its points {misfit:.2f} distances of the eyes from a head's (expected at most "
+                f"{_MISFIT:g})",
+                views,
+            )
+        return result
+
+
+@dataclass(frozen=True, eq=False)
+class _Sighting:
+    """A face in one picture: its pose, middle and size on the surface, and how sure it is."""
+
+    pose: Similarity
+    middle: Tensor
+    size: float
+    score: float
+    plain: bool
+
+
+def _main(seen: list[_Sighting]) -> tuple[_Sighting, Tensor]:
+    """Of the faces that sightings agree on the surest, and where the others are that two sightings show."""
+    groups: list[list[_Sighting]] = []
+    for one in sorted(seen, key=lambda sighting: -sighting.score):
+        for group in groups:
+            if float((one.middle - group[0].middle).norm()) < max(one.size, group[0].size):
+                group.append(one)
+                break
+        else:
+            groups.append([one])
+    groups.sort(key=lambda group: -sum(one.score for one in group))
+    others = [group[0].middle for group in groups[1:] if len(group) > 1 and group[0].score > 0.5]
+    return groups[0][0], torch.stack(others) if others else torch.zeros(0, 3, dtype=torch.float64)
+
+
+def _close_cameras(landmarks: Tensor) -> list[Camera]:
+    inner = landmarks[INNER]
+    middle = inner.double().mean(0)
+    span = _CLOSE_SPAN * float((inner.amax(0) - inner.amin(0)).max())
+    return [look_at(middle, yaw, pitch, span, _CLOSE_SIDE, _CLOSE_SIDE) for yaw, pitch in _CLOSE]
+
+
+def _placed(
+    surface: TexturedSurface, camera: Camera, reading: FaceReading, plain: bool, eyes: float
+) -> tuple[Tensor, Tensor]:
+    """Where a reading's points lie on the surface, (68+P,3), and their weights (68+P,)."""
+    pixels = torch.cat([reading.landmarks, reading.points])
+    deviation = torch.cat([reading.deviation, reading.point_deviation]).double()
+    hits = _hits(surface, camera, pixels, plain)
+    visible = torch.cat([reading.visibility.double(), torch.ones(len(reading.points), dtype=torch.float64)])
+    weight = visible * float(reading.presence) / (deviation.square() + 1)
+    away = (hits - camera.centre).norm(dim=-1)
+    weight[away < 0.2 * eyes] = 0
+    return hits, torch.where(torch.isfinite(hits).all(-1), weight, 0.0)
+
+
+def _hits(surface: TexturedSurface, camera: Camera, pixels: Tensor, plain: bool) -> Tensor:
+    """Where rays through pixels (N,2) meet a surface, (N,3) float64; NaN for those that miss or graze it."""
+    ones = torch.ones(len(pixels), 1, dtype=torch.float64)
+    ways = torch.cat([pixels.double(), ones], 1) @ torch.linalg.inv(camera.intrinsics).T @ camera.rotation
+    ways = torch.nn.functional.normalize(ways, dim=-1)
+    origins = camera.centre.expand_as(ways)
+    hits, _ = surface.first_opaque(origins, ways, plain)
+    points = origins + hits.distance[:, None] * ways
+    missed = (hits.triangle < 0) | (surface.facing(hits, ways) < _SLANTED)
+    return points.masked_fill(missed[:, None], torch.nan)
+
+
+def _together(points: Sequence[Tensor], weights: Sequence[Tensor], astray: float) -> Tensor:
+    """The views' points (N,3) as one: the weighted mean of those near the median; NaN where no view has one."""
+    stacked, weight = torch.stack(list(points)), torch.stack(list(weights))
+    known = torch.isfinite(stacked).all(-1)
+    filled = torch.where(known[..., None], stacked, 0.0)
+    order = filled.argsort(0)
+    sorted_weight = torch.gather(weight[..., None].expand_as(filled), 0, order)
+    half = sorted_weight.cumsum(0) >= sorted_weight.sum(0, keepdim=True) / 2
+    median = torch.gather(torch.gather(filled, 0, order), 0, half.double().argmax(0, keepdim=True))[0]
+    kept = weight * ((filled - median).norm(dim=-1) < astray)
+    total = kept.sum(0)
+    mean = (filled * kept[..., None]).sum(0) / total[:, None].clamp(min=1e-12)
+    return mean.masked_fill((total <= 0)[:, None], torch.nan)
+
+
+def _robust_pose(reference: Tensor, points: Tensor) -> tuple[Similarity, float]:
+    """The similarity of reference points (N,3) to points (N,3) with NaN, few astray; and its residual in the
+    reference's unit."""
+    known = torch.isfinite(points).all(-1)
+    x, y = reference[known], points[known]
+    weights = torch.ones(len(x), dtype=torch.float64)
+    pose, distance = similarity_transform(x[None], y[None]), weights
+    for _ in range(8):
+        pose = similarity_transform(x[None], y[None], weights[None])
+        distance = (pose.inverse().apply(y)[0] - x).norm(dim=-1)
+        scale = 1.5 * float(distance.median()) + 1e-9
+        weights = 1 / (1 + (distance / scale).square())
+    return pose, float(distance.square().mean().sqrt())
+
+
+def _after(second: Similarity, first: Similarity) -> Similarity:
+    """First one, then the other."""
+    rotation = second.rotation @ first.rotation
+    moved = second.apply(first.translation[:, None])[:, 0]
+    return Similarity(second.scale * first.scale, rotation, moved)
+
+
+def _bytes(picture: Tensor) -> Tensor:
+    return (picture * 255).round().to(torch.uint8)
+
+
+def _marked(picture: Tensor, reading: FaceReading) -> Tensor:
+    """The picture with a dot at every landmark that was found."""
+    marked = picture.clone()
+    height, width = picture.shape[1:]
+    for x, y in torch.cat([reading.points, reading.landmarks]).round().long().tolist():
+        if 1 <= x < width - 1 and 1 <= y < height - 1:
+            marked[:, y : y + 2, x : x + 2] = torch.tensor([0.1, 0.9, 0.3])[:, None, None]
+    return marked

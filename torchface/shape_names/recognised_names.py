@@ -1,0 +1,172 @@
+"""ARKit's shapes under the names that other programs give them: one table of aliases, and a reading by words."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cache
+
+from torchface.shape_names.arkit_names import ARKIT
+from torchface.shape_names.name_tables import METAHUMAN
+
+_PREFIX = re.compile(
+    r"^(.*__(?=facs_)|.*(?=Fcl_)(?<!^)|.*[.:|](?=[^.:|]{3,}$)|(?:facs_)?(?:bs|jnt|ctrl|cbs)_|facs_|[at]\d\d_|arkit[_ ]|"
+    r"(?:head|face|blendshapes?|bs)\d*_(?=[a-z]))",
+    re.IGNORECASE,
+)
+_SUFFIX = re.compile(r"(_div\d+|_hd\d*|\.\d{3})$", re.IGNORECASE)
+_WORD = re.compile(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+|\d+")
+_SIDE = {"l": "left", "r": "right", "lt": "left", "rt": "right"}
+_SPELLING = {"eyes": "eye", "brows": "brow", "eyebrow": "brow", "eyebrows": "brow", "lips": "lip"}
+
+_SIDED = {
+    "eyeBlink": (
+        "Fcl_EYE_Close_*",
+        "blink*",
+        "Blink_*",
+        "Eye_Blink_*",
+        "eCTRLEyesClosed*",
+        "EyeClosed*",
+        "EyesClosed*",
+    ),
+    "eyeLookUp": ("Eye_*_Look_Up", "EyeLookUp*"),
+    "eyeLookDown": ("Eye_*_Look_Down",),
+    "eyeSquint": ("Eye_Squint_*",),
+    "eyeWide": ("Eye_Wide_*", "EyeWiden*", "EyesWide*"),
+    "browDown": ("Brow_Drop_*", "Brow_Lower_*", "BrowLowerer*"),
+    "browOuterUp": ("Brow_Raise_Outer_*", "OuterBrowRaiser*", "BrowRaiseOuter*"),
+    "browInnerUp": ("Brow_Raise_Inner_*", "InnerBrowRaiser*", "BrowRaiseInner*"),
+    "cheekSquint": ("Cheek_Raise_*", "CheekRaiser*"),
+    "cheekPuff": ("Cheek_Blow_*", "CheekBlow*"),
+    "noseSneer": ("Nose_Crease_*", "NoseWrinkler*"),
+    "mouthSmile": ("LipCornerPuller*", "MouthCornerPull*"),
+    "mouthFrown": ("LipCornerDepressor*", "MouthCornerDepress*"),
+    "mouthDimple": ("Dimpler*", "Mouth_Dimple_*"),
+    "mouthStretch": ("LipStretcher*",),
+    "mouthPress": ("LipPressor*",),
+    "mouthUpperUp": ("Mouth_Up_Upper_*", "UpperLipRaiser*"),
+    "mouthLowerDown": ("Mouth_Down_Lower_*", "LowerLipDepressor*"),
+}
+"""Other programs' names of shapes that have sides; ``*`` stands for the side in any spelling."""
+
+_GAZE = {
+    "eyeLookOutLeft": ("Eye_L_Look_L", "eyeLookLeftL"),
+    "eyeLookInLeft": ("Eye_L_Look_R", "eyeLookRightL"),
+    "eyeLookInRight": ("Eye_R_Look_L", "eyeLookLeftR"),
+    "eyeLookOutRight": ("Eye_R_Look_R", "eyeLookRightR"),
+}
+"""Names in which an eye's side and the way it looks are told apart by their order."""
+
+_PLAIN = {
+    "jawForward": ("Jaw_Fwd", "JawThrust", "Jaw_Front"),
+    "mouthPucker": ("LipPucker", "Mouth_Pucker_All"),
+    "mouthFunnel": ("LipFunneler",),
+    "mouthRollUpper": ("Mouth_Roll_In_Upper", "LipRollUpper"),
+    "mouthRollLower": ("Mouth_Roll_In_Lower", "LipRollLower"),
+    "tongueOut": ("Tongue_Out", "TongueStickOut", "V_Tongue_Out"),
+    "cheekPuff": ("Cheek_Puff", "CheekPuffBoth"),
+}
+"""Other programs' names of the other shapes."""
+
+
+@dataclass(frozen=True)
+class RecognisedShape:
+    """One of ARKit's shapes among a rig's.
+
+    Args:
+        rows: of the rig's names, whose sum it is: one, or two halves.
+        names: those names.
+        as_arkit: it is spelled as ARKit spells it.
+    """
+
+    rows: tuple[int, ...]
+    names: tuple[str, ...]
+    as_arkit: bool
+
+
+def recognised_shapes(names: Sequence[str]) -> dict[str, RecognisedShape]:
+    """Which of ARKit's 52 a rig has, however it calls them, in ARKit's order.
+
+    ARKit's own spelling counts before others; of MetaHuman's curves those that :data:`METAHUMAN` joins. Poses of
+    several shapes (VRM's ``happy``, visemes) are none of the 52.
+
+    Args:
+        names: a rig's.
+
+    Example:
+        >>> found = recognised_shapes(["A25_Jaw_Open", "Fcl_EYE_Close_L", "browInnerUp_L", "browInnerUp_R", "Fcl_Joy"])
+        >>> for name, shape in found.items():
+        ...     print(name, *shape.names)
+        eyeBlinkLeft Fcl_EYE_Close_L
+        jawOpen A25_Jaw_Open
+        browInnerUp browInnerUp_L browInnerUp_R
+    """
+    row: dict[str, int] = {}
+    for number, name in enumerate(names):
+        row.setdefault(name, number)
+    by_words: dict[str, int] = {}
+    for number, name in enumerate(names):
+        arkit = arkit_name(name)
+        if arkit is not None:
+            by_words.setdefault(arkit, number)
+    found: dict[str, RecognisedShape] = {}
+    for arkit in ARKIT:
+        rows: tuple[int, ...] = ()
+        if arkit in row:
+            rows = (row[arkit],)
+        elif arkit in by_words:
+            rows = (by_words[arkit],)
+        elif f"{arkit}Left" in by_words and f"{arkit}Right" in by_words:
+            rows = (by_words[f"{arkit}Left"], by_words[f"{arkit}Right"])
+        elif all(curve in row for curve in METAHUMAN.twins.get(arkit, ("",))):
+            rows = tuple(row[curve] for curve in METAHUMAN.twins[arkit])
+        if rows:
+            found[arkit] = RecognisedShape(rows, tuple(names[i] for i in rows), arkit in row)
+    return found
+
+
+def arkit_name(name: str) -> str | None:
+    """ARKit's name of a shape that another program has named; with a side behind it for half of a shape without one.
+
+    Example:
+        >>> arkit_name("facs_bs_MouthSmileLeft_div2"), arkit_name("Mouth_Up_Upper_R"), arkit_name("viseme_aa")
+        ('mouthSmileLeft', 'mouthUpperUpRight', None)
+    """
+    words = _words(name)
+    return _table().get(words) or _table().get(tuple(sorted(words)))
+
+
+def _words(name: str) -> tuple[str, ...]:
+    """The words of a name in lower case, sides written out; without what programs put around it."""
+    previous = ""
+    while previous != name:
+        previous, name = name, _SUFFIX.sub("", _PREFIX.sub("", name))
+    words = [word.lower() for word in _WORD.findall(name)]
+    return tuple(_SPELLING.get(word, _SIDE.get(word, word)) for word in words)
+
+
+@cache
+def _table() -> dict[tuple[str, ...], str]:
+    table: dict[tuple[str, ...], str] = {}
+
+    def add(name: str, arkit: str) -> None:
+        table.setdefault(tuple(sorted(_words(name))), arkit)
+
+    for arkit, aliases in _GAZE.items():
+        table |= {_words(alias): arkit for alias in aliases}
+    for arkit in ARKIT:
+        table[(arkit.lower(),)] = arkit
+        add(arkit, arkit)
+    for arkit in ARKIT:
+        if not arkit.endswith(("Left", "Right")):
+            for side in ("Left", "Right"):
+                add(f"{arkit}_{side}", f"{arkit}{side}")
+    for whole, aliases in _SIDED.items():
+        for side in ("Left", "Right"):
+            for alias in aliases:
+                add(alias.replace("*", f"_{side}_").strip("_"), f"{whole}{side}")
+    for whole, aliases in _PLAIN.items():
+        for alias in aliases:
+            add(alias, whole)
+    return table

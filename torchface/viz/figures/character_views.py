@@ -1,0 +1,47 @@
+"""A character's face at rest and with shapes on, from the front and from three quarters, in its own materials."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from torchface.geometry.cameras.pinhole import look_at
+from torchface.rendering.compositing import headed, sheet
+from torchface.rendering.textured_surface import TexturedSurface
+from torchface.viz.figures.face_views import FRONT, THREE_QUARTER
+
+SHOWN = {
+    "neutral": (),
+    "blink": ("eyeBlinkLeft", "eyeBlinkRight"),
+    "smile": ("mouthSmileLeft", "mouthSmileRight"),
+    "jaw": ("jawOpen",),
+    "pucker": ("mouthPucker",),
+}
+"""The poses of the sheet, and the shapes that are fully on in each."""
+
+
+def character_sheet(
+    surface: TexturedSurface, shapes: Mapping[str, Tensor], middle: Tensor, span: float, side: int = 300
+) -> Tensor:
+    """A column a pose of :data:`SHOWN`, a row a view; (3,H,W).
+
+    Args:
+        surface: upright, looking along z.
+        shapes: by ARKit's names how far each vertex goes, (V,3) of the surface's unit; one that is absent is left out.
+        middle: what is looked at, (3,).
+        span: of each picture.
+        side: of each picture, pixels.
+    """
+    columns = []
+    for pose, names in SHOWN.items():
+        moved = surface.vertices + sum((shapes[name] for name in names if name in shapes), torch.zeros(1, 3))
+        posed = replace(surface, vertices=moved)
+        views = [
+            posed.draw(look_at(middle, yaw, 0.0, span, 2 * side, 2 * side)).picture for yaw in (FRONT, THREE_QUARTER)
+        ]
+        small = [torch.nn.functional.avg_pool2d(view[None], 2)[0] for view in views]
+        columns.append(headed(sheet(small, 1), pose))
+    return sheet(columns, len(columns))

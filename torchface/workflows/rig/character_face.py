@@ -1,0 +1,161 @@
+"""The face of a character: found on its surface, and which of the character's pieces move with it."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+
+import torch
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+from torchface.geometry.meshes.surface_index import SurfaceIndex
+from torchface.io.gltf.character_scene import Character
+from torchface.landmarks.images.checked_detector import shipped_detector
+from torchface.landmarks.images.ibug_68 import COUNT
+from torchface.landmarks.surfaces.face_on_surface import FaceOnSurface, FaceSearch, ReferencePoints
+from torchface.mesh import Mesh
+from torchface.modeling.rigging.other_topology import joined_vertices
+from torchface.progress import Progress
+from torchface.registration.scan_preparation import Landmarks
+from torchface.rendering.textured_surface import Material, TexturedSurface
+from torchface.synthetic import neutral_head
+from torchface.workflows.named_finders import load_finder
+
+_HEAD_SHARE = 0.5  # of a vertex's weights on the head's bone, from which pictures frame it
+_REACH, _BELOW, _NECK = 280.0, -210.0, 60.0  # millimetres of the reference: from its middle, below its eyes
+_EYE_REACH, _MOUTH_REACH, _SKIN_REACH = 48.0, 80.0, 8.0
+_BEFORE_LIPS, _MOUTH_HEIGHT = 4.0, 38.0
+_FACE_REACH = 95.0
+_STILL = re.compile(r"hair|hat\b|cap\b|helmet|glass|cloth|outfit|shirt|collar|scarf|hood|mask|earring|horn", re.I)
+_EYES, _LIPS = (slice(36, 42), slice(42, 48)), slice(48, 68)
+
+
+@dataclass(frozen=True, eq=False)
+class CharacterFace:
+    """A character's head in the reference's place and size.
+
+    Args:
+        found: the face on the character's surface.
+        vertices: all of the character's, (V,3) float64, millimetres of the reference.
+        rows: the character's vertices in ``head``, (K,).
+        head: the pieces that move with the face.
+        skin: what the template is registered to.
+        movable: which of the head's vertices may move, (K,) bool: not those at the cut through the neck.
+        landmarks: template vertices and where they lie, as ``register`` takes them.
+    """
+
+    found: FaceOnSurface
+    vertices: Tensor
+    rows: Tensor
+    head: Mesh
+    skin: Mesh
+    movable: Tensor
+    landmarks: Landmarks
+
+
+def textured(character: Character) -> TexturedSurface:
+    """A character's surface, to draw it."""
+    materials = tuple(
+        Material(color, texture) for color, texture in zip(character.colors, character.textures, strict=True)
+    )
+    return TexturedSurface(character.vertices, character.faces, character.uvs, character.material, materials)
+
+
+def find_character_face(
+    character: Character, surface: TexturedSurface, progress: Progress | None = None
+) -> CharacterFace:
+    """The face of a character.
+
+    Args:
+        character: in any unit and pose.
+        surface: the same, to be looked at.
+        progress: called with each picture.
+
+    Raises:
+        NoFaceOnSurfaceError: it shows none.
+    """
+    reference = neutral_head(texture=False)
+    finder = load_finder()
+    points = ReferencePoints(reference.vertices[reference.landmarks], finder.places)
+    search = FaceSearch(shipped_detector(), finder.finder, points)
+    framed = None if character.head is None else character.head > _HEAD_SHARE
+    found = search.find(surface, framed, progress)
+    return _pieces(character, found, reference, points)
+
+
+def _pieces(character: Character, found: FaceOnSurface, reference: Mesh, points: ReferencePoints) -> CharacterFace:
+    """The head's pieces, by where they lie: what the points lie on is skin, the rest eyes, teeth, lashes or still."""
+    vertices = found.pose.inverse().apply(character.vertices)[0]
+    eyes = points.landmarks[36:48].double().mean(0)
+    middle = eyes + torch.tensor([0.0, 0.0, -_NECK], dtype=torch.float64)
+    near = ((vertices - middle).norm(dim=-1) < _REACH) & (vertices[:, 1] > eyes[1] + _BELOW)
+    faces = character.faces[near[character.faces].all(1)]
+    joined = joined_vertices(vertices, faces)
+    part = joined.part[joined.of]
+    placed = found.pose.inverse().apply(found.points)[0]
+    skin_part, on_skin = _skin_part(vertices, faces, part, placed)
+    allowed = torch.zeros(int(part.max()) + 1, dtype=torch.bool)
+    skin_faces = faces[part[faces[:, 0]] == skin_part]
+    skin_tree = cKDTree(vertices[skin_faces.unique()].numpy())
+    still = torch.tensor([bool(_STILL.search(block.name)) for block in character.blocks])
+    for one in part[faces[:, 0]].unique().tolist():  # a head has tens of parts
+        rows = (part == one).nonzero()[:, 0]
+        own = vertices[rows]
+        name_moves = not bool(still[character.block[rows[0]]])
+        allowed[one] = one == skin_part or (name_moves and _moves(own, placed, skin_tree))
+    kept = faces[allowed[part[faces[:, 0]]]]
+    rows, local = kept.unique(return_inverse=True)
+    cut = torch.zeros(len(vertices), dtype=torch.bool)
+    cut[character.faces[~near[character.faces].all(1)].flatten()] = True
+    cut_joined = torch.zeros(len(joined.vertices), dtype=torch.bool)
+    cut_joined[joined.of[cut]] = True
+    skin_rows, skin_local = skin_faces.unique(return_inverse=True)
+    landmarks = _landmarks(reference, points, placed, on_skin)
+    return CharacterFace(
+        found,
+        vertices,
+        rows,
+        Mesh(vertices[rows].float(), local.reshape(-1, 3)),
+        Mesh(vertices[skin_rows].float(), skin_local.reshape(-1, 3)),
+        ~cut_joined[joined.of[rows]],
+        landmarks,
+    )
+
+
+def _skin_part(vertices: Tensor, faces: Tensor, part: Tensor, placed: Tensor) -> tuple[int, Tensor]:
+    """The part that most of the found points lie on, and which points do, (68+P,) bool."""
+    known = torch.isfinite(placed).all(-1)
+    nearest = SurfaceIndex(vertices, faces).nearest(placed[known])
+    owner = part[faces[nearest.triangle, 0]]
+    skin = int(owner.bincount().argmax())
+    on_skin = torch.zeros(len(placed), dtype=torch.bool)
+    on_skin[known] = owner == skin
+    return skin, on_skin
+
+
+def _moves(own: Tensor, placed: Tensor, skin: cKDTree) -> bool:
+    """Whether a loose part (n,3) belongs to eyes or mouth, or lies on the face as brows and lashes do."""
+    for eye in _EYES:
+        lids = placed[eye]
+        centre = lids[torch.isfinite(lids).all(-1)].mean(0)
+        if bool(((own - centre).norm(dim=-1) < _EYE_REACH).all()):
+            return True
+    lips = placed[_LIPS]
+    lips = lips[torch.isfinite(lips).all(-1)].mean(0)
+    at = own.mean(0) - lips
+    inside = bool(((own - lips).norm(dim=-1) < _MOUTH_REACH).all())
+    if inside and float(at[2]) < _BEFORE_LIPS and abs(float(at[1])) < _MOUTH_HEIGHT:
+        return True
+    face = placed[torch.isfinite(placed).all(-1)].mean(0)
+    if not bool(((own - face).norm(dim=-1) < _FACE_REACH).all()):
+        return False
+    return bool((skin.query(own.numpy())[0] < _SKIN_REACH).all())
+
+
+def _landmarks(reference: Mesh, points: ReferencePoints, placed: Tensor, on_skin: Tensor) -> Landmarks:
+    """The finder's points on the face as pairs; of iBUG's only where the finder has no points beside them."""
+    usable = on_skin.clone()
+    usable[:COUNT] &= len(points.points) == 0
+    ids = torch.cdist(points.all, reference.vertices.double()).argmin(1)
+    return ids[usable], placed[usable]

@@ -1,0 +1,296 @@
+"""From a character's file to the same file with ARKit's shapes on its face."""
+
+from __future__ import annotations
+
+import copy
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchface.errors import AlignmentError, FileFormatError
+from torchface.files.job_lock import file_lock
+from torchface.files.whole_files import all_or_none, check_ending
+from torchface.geometry.meshes.operators import vertex_normals
+from torchface.io.gltf.character_scene import Block, Character, read_character
+from torchface.io.gltf.gltf_document import read_document
+from torchface.io.gltf.morph_insertion import AddedTargets, document_with_targets, write_edited
+from torchface.io.vrm.vrm_expressions import VRM_ENDING, MorphBind, add_expressions, vrm_expressions
+from torchface.landmarks.surfaces.face_on_surface import NoFaceOnSurfaceError
+from torchface.modeling.rigging.other_topology import CarriedShapes, joined_vertices, shapes_on
+from torchface.progress import Progress, silent
+from torchface.registration import register
+from torchface.rendering.compositing import save_rendered_image, sheet
+from torchface.rendering.textured_surface import TexturedSurface
+from torchface.rig import BlendshapeRig
+from torchface.shape_names import ARKIT
+from torchface.shape_names.recognised_names import arkit_name, recognised_shapes
+from torchface.synthetic import performer
+from torchface.viz.figures.character_views import SHOWN, character_sheet
+from torchface.workflows.rig.character_face import CharacterFace, find_character_face, textured
+
+CHARACTER_ENDINGS = (".glb", VRM_ENDING)
+"""Files of characters that are read and written."""
+PICTURE_ENDING = "_face.png"
+"""Ends the name of the picture that lies beside a character's rig."""
+
+_STILL_MM = 2e-3  # at a head's size; what moves less does not move
+_SPAN = 260.0  # of the pictures, millimetres at a head's size
+_FAR, _LEAST_MET = 4.0, 0.4  # millimetres of a head's size between face and template, and the face's share that is met
+_CONVERT = {
+    ".fbx": "export it from Blender as .glb (File, Export, glTF 2.0, with Shape Keys and Skinning)",
+    ".usd": "export it from Blender or usdview's host as .glb",
+    ".gltf": "pack it: npx @gltf-transform/cli copy IN.gltf OUT.glb",
+}
+
+
+@dataclass(frozen=True, eq=False)
+class CharacterReport:
+    """What was found on a character and made for it.
+
+    Args:
+        made: names of the shapes that were made.
+        present: of ARKit's names those that the character has, and how it calls them.
+        expressions: of a VRM, those that were added.
+        median_mm: between face and template, at a head's size.
+        seconds: that finding the face took, and all.
+        figure: pictures of the face before and after.
+    """
+
+    made: tuple[str, ...]
+    present: dict[str, tuple[str, ...]]
+    expressions: tuple[str, ...]
+    median_mm: float
+    seconds: tuple[float, float]
+    figure: Path | None
+    notes: tuple[str, ...] = field(default=())
+
+    def lines(self) -> list[str]:
+        """For people to read."""
+        return list(self.notes)
+
+
+def is_character(path: Path) -> bool:
+    """Whether a file's ending is a character's."""
+    return path.suffix.lower() in (*CHARACTER_ENDINGS, *_CONVERT)
+
+
+def rig_character(path: Path, out: Path, progress: Progress | None = None) -> CharacterReport:
+    """Puts ARKit's shapes on the face of a character; everything else of its file stays as it is.
+
+    The face is found by its bone's name and by looking at the character from around. The embedded performer is
+    registered to it, his shapes are transferred to it and carried over to the character's own vertices. Shapes that the
+    character has, under whatever program's names, are kept and not made again. A VRM gets an expression for each.
+
+    A picture of the face beside ``out``, ``NAME_face.png``, shows it before and after; where there is no face, what was
+    seen.
+
+    Args:
+        path: a ``.glb`` or ``.vrm``.
+        out: the file to write, of the same ending.
+        progress: called with each step.
+
+    Raises:
+        FileFormatError: another kind of file, or a broken one.
+        AlignmentError: no face, or one that the template does not come to lie on.
+    """
+    check_character(path)
+    check_ending(out, path.suffix.lower())
+    progress, begin = progress or silent, time.perf_counter()
+    with file_lock(out):
+        progress("reading the character")
+        document = read_document(path)
+        character = read_character(document)
+        surface = textured(character)
+        figure = out.with_name(f"{out.stem}{PICTURE_ENDING}")
+        try:
+            face = find_character_face(character, surface, progress)
+        except NoFaceOnSurfaceError as error:
+            save_rendered_image(sheet(list(error.views)[:24], min(8, len(error.views))), figure)
+            raise AlignmentError(f"{path}: {error}; what was seen is in {figure}") from error
+        found_after = time.perf_counter() - begin
+        present = _present(character)
+        missing = [name for name in ARKIT if name not in present]
+        template = performer(texture=False)
+        made = tuple(name for name in missing if name in template.names)
+        carried = _carried(template, face, path, progress)
+        job = _Job(character, face, carried, made)
+        progress("writing the character")
+        added = job.targets()
+        root, data = document_with_targets(document, added, made) if added else (copy.deepcopy(document.root), b"")
+        expressions = add_expressions(document, root, job.binds(present, added))
+        with all_or_none():
+            write_edited(document, root, data, out)
+            save_rendered_image(job.views(surface, present), figure)
+    seconds = (found_after, time.perf_counter() - begin)
+    names = {name: shape.names for name, shape in present.items()}
+    notes = tuple(job.notes(names, expressions, seconds))
+    median = float(carried.registration.record.median_distance)
+    return CharacterReport(made, names, expressions, median, seconds, figure, notes)
+
+
+def check_character(path: Path) -> None:
+    """Raises ``FileFormatError`` for files that are no ``.glb`` or ``.vrm``, with the way to make one."""
+    ending = path.suffix.lower()
+    if ending not in CHARACTER_ENDINGS:
+        how = _CONVERT.get(ending[:4] if ending.startswith(".usd") else ending, "export it as .glb")
+        raise FileFormatError(f"{path}: found the ending {ending!r}, expected a character's .glb or .vrm; {how}")
+
+
+@dataclass(frozen=True)
+class _Present:
+    """One of ARKit's shapes that a character has.
+
+    Args:
+        names: how it calls it.
+        binds: morph targets, and how much of each.
+    """
+
+    names: tuple[str, ...]
+    binds: tuple[MorphBind, ...]
+
+
+def _present(character: Character) -> dict[str, _Present]:
+    """The shapes that a character has, by ARKit's names: as morph targets, else as a VRM's expressions."""
+    blocks: dict[tuple[int, int], Block] = {}
+    for block in character.blocks:
+        blocks.setdefault((block.node, block.mesh), block)
+    names = list(dict.fromkeys(name for block in blocks.values() for name in block.names))
+    found = {}
+    for arkit, shape in recognised_shapes(names).items():
+        binds = [
+            MorphBind(block.node, block.mesh, block.names.index(name))
+            for name in shape.names
+            for block in blocks.values()
+            if name in block.names
+        ]
+        found[arkit] = _Present(shape.names, tuple(binds))
+    for expression, bound in vrm_expressions(character.document).items():
+        arkit = arkit_name(expression)
+        if arkit in ARKIT and bound and arkit not in found:
+            found[arkit] = _Present((expression,), bound)
+    return {name: found[name] for name in ARKIT if name in found}
+
+
+def _carried(template: BlendshapeRig, face: CharacterFace, path: Path, progress: Progress) -> CarriedShapes:
+    """The template's shapes on the head; refused where its face does not come to lie on the head."""
+    registration = register(template.neutral, face.skin, face.landmarks, texture_size=0, progress=progress)
+    region = template.neutral.annotations.regions["face"]  # type: ignore[union-attr]
+    met = float(registration.matched[region].double().mean())
+    far = float(registration.distance[region].median())
+    if not (met >= _LEAST_MET and far <= _FAR):
+        raise AlignmentError(
+            f"{path}: the template lies {far:.1f} mm from the face (median, at a head's size; expected at most "
+            f"{_FAR:g}) and meets {met:.0%} of it (expected at least {_LEAST_MET:.0%}): is it a face?"
+        )
+    return shapes_on(
+        template, face.head, face.landmarks, registration=registration, movable=face.movable, progress=progress
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _Job:
+    """A character, its face, and the shapes that were made for it."""
+
+    character: Character
+    face: CharacterFace
+    carried: CarriedShapes
+    made: tuple[str, ...]
+
+    def targets(self) -> list[AddedTargets]:
+        """The new morph targets of the meshes that move, in their own axes and unit."""
+        if not self.made:
+            return []
+        deltas = self.carried.rig.select(self.made).deltas.double()
+        rest = self.face.head.vertices.double()
+        turned = _normal_changes(rest, self.face.head.faces, deltas)
+        added = []
+        for number, block in enumerate(self.character.blocks):
+            here = (self.character.block[self.face.rows] == number).nonzero()[:, 0]
+            if not len(here) or not bool((deltas[:, here].norm(dim=-1) > _STILL_MM).any()):
+                continue
+            rows = self.face.rows[here]
+            back = torch.linalg.inv(self.character.linear[rows])
+            moved = self.face.found.pose.apply_vectors(deltas[:, here])
+            own = torch.einsum("vij,nvj->nvi", back, moved)
+            own[deltas[:, here].norm(dim=-1) <= _STILL_MM] = 0.0
+            rotated = turned[:, here] @ self.face.found.pose.rotation[0].T.double()
+            scale = torch.linalg.det(self.character.linear[rows]).abs().clamp(min=1e-30).pow(1 / 3)
+            normals = torch.einsum("vji,nvj->nvi", self.character.linear[rows] / scale[:, None, None], rotated)
+            shape = (len(self.made), block.rows.stop - block.rows.start, 3)
+            positions, normal_rows = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
+            at = (rows - block.rows.start).numpy()
+            positions[:, at], normal_rows[:, at] = own.numpy(), normals.numpy()
+            added.append(AddedTargets(block.mesh, block.primitives, positions, normal_rows))
+        return added
+
+    def binds(self, present: dict[str, _Present], added: list[AddedTargets]) -> dict[str, tuple[MorphBind, ...]]:
+        """What each of ARKit's expressions of a VRM drives: shapes that were there, and new ones."""
+        bound = {name: shape.binds for name, shape in present.items()}
+        meshes = {one.mesh for one in added}
+        blocks = {(block.node, block.mesh): block for block in self.character.blocks if block.mesh in meshes}
+        for row, name in enumerate(self.made):
+            bound[name] = tuple(MorphBind(node, mesh, len(block.names) + row) for (node, mesh), block in blocks.items())
+        return {name: bound[name] for name in ARKIT if name in bound}
+
+    def views(self, surface: TexturedSurface, present: dict[str, _Present]) -> Tensor:
+        """The face at rest and with shapes on, those that were there among them."""
+        upright = surface.moved(self.face.found.pose.inverse())
+        shapes = {}
+        for name in {name for names in SHOWN.values() for name in names}:
+            moved = torch.zeros_like(upright.vertices)
+            if name in self.made:
+                moved[self.face.rows] = self.carried.rig.select([name]).deltas[0].double()
+            elif name in present:
+                moved = self._present_motion(present[name])
+            shapes[name] = moved
+        landmarks = self.face.found.pose.inverse().apply(self.face.found.points[17:68])[0]
+        middle = landmarks[torch.isfinite(landmarks).all(-1)].mean(0)
+        return character_sheet(upright, shapes, middle, _SPAN)
+
+    def _present_motion(self, shape: _Present) -> Tensor:
+        moved = torch.zeros_like(self.character.vertices)
+        for bind in shape.binds:
+            for block in self.character.blocks:
+                if (block.node, block.mesh) == (bind.node, bind.mesh):
+                    own = self.character.targets(block)[bind.target].double() * bind.weight
+                    moved[block.rows] += torch.einsum("vij,vj->vi", self.character.linear[block.rows], own)
+        return self.face.found.pose.inverse().apply_vectors(moved[None])[0]
+
+    def notes(
+        self, present: dict[str, tuple[str, ...]], expressions: tuple[str, ...], seconds: tuple[float, float]
+    ) -> list[str]:
+        """For people to read."""
+        found, record, character = self.face.found, self.carried.registration.record, self.character
+        where = f"bone {character.head_bone!r} and " if character.head is not None else ""
+        lines = [
+            f"face: found by {where}{len(found.views)} views in {seconds[0]:.1f} s; presence {found.presence:.2f}, "
+            f"its points {found.misfit:.2f} distances of the eyes from a head's"
+        ]
+        if len(found.others):
+            lines.append(f"  note: {1 + len(found.others)} faces were seen; the surest was taken")
+        lines.append(f"template: {record.figures()}")
+        lines += [f"  note: {note}" for note in record.notes]
+        own = {name: names for name, names in present.items() if names != (name,)}
+        if present:
+            lines.append(f"already there: {len(present)} of ARKit's 52, kept as they are")
+        if own:
+            lines.append("  by other names: " + ", ".join(f"{k} ({' + '.join(v)})" for k, v in own.items()))
+        missing = [name for name in ARKIT if name not in self.made and name not in present]
+        lines.append(f"made: {len(self.made)} shapes" + (f"; not made: {', '.join(missing)}" if missing else ""))
+        if expressions:
+            lines.append(f"expressions added to the VRM: {len(expressions)}")
+        return [*lines, f"in all {seconds[1]:.1f} s"]
+
+
+def _normal_changes(rest: Tensor, faces: Tensor, deltas: Tensor) -> Tensor:
+    """How each vertex's normal changes in shapes (N,V,3), those in one place as one."""
+    joined = joined_vertices(rest, faces)
+    before = vertex_normals(joined.vertices, joined.faces)
+    kept = torch.zeros(len(joined.vertices), dtype=torch.int64)
+    kept[joined.of] = torch.arange(len(joined.of))
+    changes = torch.stack([vertex_normals(joined.vertices + one[kept], joined.faces) - before for one in deltas])
+    return changes[:, joined.of]
