@@ -28,7 +28,7 @@ from torchface.rig import BlendshapeRig
 from torchface.synthetic.stages.weight_curves import GESTURES
 from torchface.synthetic.stages.wrinkles import WrinkledPerformer
 from torchface.take import Track
-from torchface.workflows.animated_meshes import load_animated
+from torchface.workflows.animated_meshes import load_animated, meshes_over_time
 
 _METHOD = "captured sequences/1"
 _NEUTRAL = "neutral"
@@ -56,6 +56,7 @@ class CapturedSequence:
         read: vertices (t,V,3) of the frames from one number up to another, without it, millimetres.
         faces: (F,3) int64, of its own file.
         moved: what moves it where that is a rig: the rig and its weights.
+        colors: of the vertices, (t,V,3) in [0,1], read as ``read`` does, where there are some.
     """
 
     name: str
@@ -63,6 +64,7 @@ class CapturedSequence:
     read: Callable[[int, int], Tensor]
     faces: Tensor
     moved: tuple[BlendshapeRig, Track] | None = None
+    colors: Callable[[int, int], Tensor] | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,6 +86,11 @@ class Capture:
     def part(self, begin: int, end: int) -> Capture:
         """Some of the sequences."""
         return Capture(self.sequences[begin:end], self.neutral, self.neutral_file, f"{self.key} {begin} {end}")
+
+    @property
+    def colored(self) -> bool:
+        """Whether all sequences have vertex colours."""
+        return all(sequence.colors is not None for sequence in self.sequences)
 
     @property
     def weights(self) -> Track | None:
@@ -176,32 +183,36 @@ def performed(vertices: int, seed: int, fps: float) -> Capture:
     return Capture(tuple(sequences), person.neutral, None, key)
 
 
-def gather(capture: Capture, path: Path, progress: Progress) -> tuple[MeshSequence, Tensor]:
-    """Writes all frames into one file; where an earlier run has stopped, it goes on.
+def gather(capture: Capture, path: Path, progress: Progress, colors: bool = False) -> tuple[MeshSequence, Tensor]:
+    """Writes all frames, or their colours, into one file; where an earlier run has stopped, it goes on.
 
     Args:
         capture: what is gathered.
         path: of the file.
         progress: called with each step and how far it is.
+        colors: of the vertices, in place of their positions; all sequences have some.
 
     Returns:
         The frames, and the number of each frame's sequence, (K,) int64.
     """
     counts = torch.tensor([sequence.count for sequence in capture.sequences])
     numbers = torch.arange(len(counts)).repeat_interleave(counts)
+    key = f"{capture.key} colors" if colors else capture.key
     if path.is_file():
         kept = MeshSequence(path)
-        if kept.key == capture.key:
+        if kept.key == key:
             return kept, numbers
     total, size = int(counts.sum()), len(capture.neutral.vertices)
     begin = 0
-    with MeshSequenceWriter(path, total, size, capture.neutral.faces, key=capture.key) as writer:
+    with MeshSequenceWriter(path, total, size, capture.neutral.faces, key=key) as writer:
         for sequence in capture.sequences:
             for first in range(max(0, writer.done - begin), sequence.count, _BLOCK):
-                frames = sequence.read(first, min(first + _BLOCK, sequence.count))
+                read = sequence.colors if colors else sequence.read
+                assert read is not None
+                frames = read(first, min(first + _BLOCK, sequence.count))
                 _check(frames, sequence.name, first, size)
                 writer.append(frames)
-                progress("gathering frames", writer.done, total)
+                progress("gathering colours" if colors else "gathering frames", writer.done, total)
             begin += sequence.count
     return MeshSequence(path), numbers
 
@@ -237,23 +248,12 @@ def _animated(path: Path) -> CapturedSequence:
     animated = load_animated(path)
     known = animated.rig is not None and animated.weights is not None
     moved = (animated.rig, animated.weights) if known else None
-    return CapturedSequence(path.name, animated.count, animated.read, animated.neutral.faces, moved)  # type: ignore[arg-type]
+    return CapturedSequence(path.name, animated.count, animated.read, animated.neutral.faces, moved, animated.colors)  # type: ignore[arg-type]
 
 
 def _of_meshes(name: str, files: list[Path]) -> CapturedSequence:
-    faces = load_mesh(files[0]).faces
-
-    def read(begin: int, end: int) -> Tensor:
-        meshes = [load_mesh(file) for file in files[begin:end]]  # a file a frame
-        for mesh, file in zip(meshes, files[begin:end], strict=True):
-            if not torch.equal(mesh.faces, faces):
-                raise TopologyError(
-                    f"{file}: found {len(mesh.vertices)} vertices and {len(mesh.faces)} triangles, expected the "
-                    f"triangles of {files[0].name}"
-                )
-        return torch.stack([mesh.vertices for mesh in meshes])
-
-    return CapturedSequence(name, len(files), read, faces)
+    animated = meshes_over_time(Path(name), files, None)
+    return CapturedSequence(name, animated.count, animated.read, animated.neutral.faces, colors=animated.colors)
 
 
 def _npz(path: Path) -> tuple[Tensor, Tensor]:

@@ -1,14 +1,16 @@
 """``torchface train enhancement --frames DIR --out models/NAME``: an actor's fine detail and timing, as captured.
 
 ``DIR`` holds sequences from the neutral to an expression and back, all of one topology: folders of OBJ or PLY meshes,
-``.glb`` animations, ``.npz`` files, and ``neutral.obj``. ``--performer 20000`` learns from the embedded performer with
-so many vertices and planted wrinkles, and needs no file. Killed and started again, a run goes on where it was.
+``.glb`` animations, ``.npz`` files, and ``neutral.obj``; vertex colours of meshes are learned
+too. ``--performer 20000`` learns from the embedded performer with so many vertices and planted wrinkles, and needs no
+file. Killed and started again, a run goes on where it was.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 from torch import Tensor
 
@@ -46,6 +48,7 @@ class Settings(RecipeSettings):
         regions: How many regions are looked for.
         rank: Components of the detail that are kept.
         detail: As displacements of vertices, or as gradients of triangles (the paper's).
+        matching: How detail is found: by the projection onto the database alone (the paper's), or with a learned map.
     """
 
     frames: Path | None = None
@@ -59,7 +62,8 @@ class Settings(RecipeSettings):
     patch: int = 100
     regions: int = 13
     rank: int = 64
-    detail: str = "displacements"
+    detail: Literal["displacements", "gradients"] = "displacements"
+    matching: Literal["learned", "projection"] = "learned"
 
 
 @recipe
@@ -86,6 +90,8 @@ def train(settings: Settings, run: Run) -> EnhancementModel:
         shown = None if pairs is None else gather(pairs.part(begin, end), work / f"{name}_coarse.safetensors", progress)
         return Shown(known, None if shown is None else shown[0]), numbers
 
+    part = capture.part(0, learned)
+    colors = gather(part, work / "learned_colors.safetensors", progress, colors=True)[0] if part.colored else None
     known, numbers = gathered("learned", 0, learned)
     test = gathered("tested", learned, len(capture.sequences))[0] if settings.held_out else None
     progress(f"{len(known)} frames of {learned} sequences to learn from, {0 if test is None else len(test)} to test on")
@@ -97,10 +103,11 @@ def train(settings: Settings, run: Run) -> EnhancementModel:
             numbers,
             mesh.vertices,
             coarse=known.coarse,
+            colors=colors,
             landmarks=None if mesh.annotations is None else mesh.annotations.landmarks,
             weights=None if pairs is None else pairs.part(0, learned).weights,
         ),
-        EnhancementSettings(fps=settings.fps, wavelength=settings.wavelength, detail=settings.detail),  # type: ignore[arg-type]
+        EnhancementSettings(settings.fps, settings.wavelength, settings.detail, settings.matching),
         patch_size=settings.patch,
         region_count=settings.regions,
         rank=settings.rank,

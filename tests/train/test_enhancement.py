@@ -202,3 +202,27 @@ def test_the_performers_takes_begin_and_end_at_rest():
     assert torch.allclose(moved[0], capture.neutral.vertices, atol=1e-4)
     assert float((moved - capture.neutral.vertices).norm(dim=-1).max()) > 3
     assert torch.equal(one.read(3, 5), moved[3:5])
+
+
+def test_colours_of_meshes_are_learned_and_given_back(tmp_path, monkeypatch):
+    """Skin that reddens where a bump rises: an enhanced bump is as red, and the rest of the face is not."""
+    monkeypatch.setattr(recipe, "draw", lambda *a: None)
+    mesh, path = sheet(), tmp_path / "capture"
+
+    def skin(vertices: torch.Tensor) -> torch.Tensor:
+        red = ((vertices[:, 2] - mesh.vertices[:, 2]) / 16).clamp(0, 0.5)
+        return torch.stack([0.5 + red, 0.5 - red / 2, 0.5 - red / 2], -1)
+
+    for kind in range(3):
+        (path / f"s{kind}").mkdir(parents=True)
+        for number, vertices in enumerate(frames(kind)):
+            colored = replace(mesh, vertices=vertices, colors=skin(vertices))
+            save_mesh(colored, path / f"s{kind}" / f"{number:03d}.ply")
+    save_mesh(mesh, path / "neutral.obj")
+    model = train(replace(settings(path, matching="projection"), held_out=0))
+    assert model.settings.matching == "projection"
+    shown = frames(1)[4:5]
+    found = model.colors(model.enhance(shown).weights)[0]
+    away = (found - skin(shown[0])).abs()
+    assert away.mean() < 0.02
+    assert float((model.mean_color - skin(shown[0])).abs().mean()) > 2 * float(away.mean())

@@ -28,8 +28,10 @@ from torchface.cli.info import info
 from torchface.cli.live import live
 from torchface.cli.pick import pick
 from torchface.cli.register import register
+from torchface.cli.relight import relight
 from torchface.cli.render import render
 from torchface.cli.retarget import retarget
+from torchface.cli.retime import retime
 from torchface.cli.rig import rig
 from torchface.cli.solve import solve
 from torchface.cli.terminal import PlainConsole, plain_errors
@@ -50,9 +52,11 @@ COMMANDS: dict[str, Callable[..., None]] = {
     "attach": attach,
     "solve": solve,
     "track": track,
+    "relight": relight,
     "examples": examples,
     "live": live,
     "retarget": retarget,
+    "retime": retime,
     "enhance": enhance,
     "evaluate": evaluate,
     "calibrate": calibrate,

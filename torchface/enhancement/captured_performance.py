@@ -26,7 +26,7 @@ class CapturedPerformance:
             the actor's rig fitted to them, or the thin shell through their markers. Then the detail is what such an
             animation lacks, and what it has itself beyond the smooth part stays. Absent, the smooth part's detail
             takes the place of the input's own.
-        colors: of the frames' vertices, in [0,1], (K,V,3).
+        colors: of the frames' vertices, in [0,1], (K,V,3); or on disk.
         weights: of the actor's rig in the same frames, (K,N,1), where they are known: a model then uses those of its
             input, see :meth:`EnhancementModel.enhance`.
         landmarks: vertex ids of the 68 iBUG landmarks, which name the regions and set the eyes apart.
@@ -50,7 +50,7 @@ class CapturedPerformance:
     sequences: Tensor
     neutral: Tensor
     coarse: Tensor | MeshSequence | None = None
-    colors: Tensor | None = None
+    colors: Tensor | MeshSequence | None = None
     landmarks: Tensor | None = None
     weights: Track | None = None
 
@@ -62,7 +62,7 @@ class CapturedPerformance:
             if len(self.coarse) != count:
                 raise ShapeError(f"coarse: found {len(self.coarse)} frames, expected {count}, one for each")
         _check_sequences(self.sequences, count)
-        if self.colors is not None and self.colors.shape != (count, len(self.neutral), 3):
+        if self.colors is not None and tuple(self.colors.shape) != (count, len(self.neutral), 3):
             raise ShapeError(f"colors: found {tuple(self.colors.shape)}, expected {(count, len(self.neutral), 3)}")
         if self.weights is not None:
             _check_weights(self.weights, count)

@@ -297,13 +297,14 @@ class EnhancementModel(nn.Module):
         offsets = blended(self.color_components, weights @ self.color_coefficients.to(weights), self.vertex_weights)
         return (self.mean_color.to(weights) + offsets.unflatten(1, (3, -1)).transpose(1, 2)).clamp(0, 1)
 
-    def retime(self, keyframes: Tensor, frames: int, fps: float | None = None) -> Tensor:
+    def retime(self, keyframes: Tensor, frames: int, fps: float | None = None, extend: bool = True) -> Tensor:
         """The actor's timing of a motion between two poses, by region.
 
         Args:
             keyframes: (2,V,3), millimetres, in this mesh and any rigid place.
             frames: how many the motion lasts, both keyframes counted.
             fps: of these frames; the database's unless given.
+            extend: time them as the whole captured motion of which they meet a part, not as that part.
 
         Returns:
             How far each region has come in each frame, (R,frames), 0 first and 1 last, never falling;
@@ -318,7 +319,7 @@ class EnhancementModel(nn.Module):
         """
         checked_count("frames", frames, 2)
         fps = self.fps if fps is None else checked_number("fps", fps, MIN_FPS, MAX_FPS)
-        return self.prepared.timing.times(self.features(keyframes), frames, (frames - 1) * self.fps / fps)
+        return self.prepared.timing.times(self.features(keyframes), frames, (frames - 1) * self.fps / fps, extend)
 
     def on_actor(self, neutral: Tensor, scale: float = 1.0) -> EnhancementModel:
         """This actor's detail for another head of the same mesh, as much larger as that head is.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 import warnings
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -98,12 +99,18 @@ def fit_enhancement(
     return model.eval()
 
 
-def _learn_colors(model: EnhancementModel, colors: Tensor) -> None:
+def _learn_colors(model: EnhancementModel, colors: Tensor | MeshSequence) -> None:
     """Sets a model's colour buffers from the colours (K,V,3) of the database's frames."""
+
+    def blocks() -> Iterator[Tensor]:
+        for begin in range(0, len(colors), _LARGEST_BLOCK):
+            end = min(begin + _LARGEST_BLOCK, len(colors))
+            yield (colors[begin:end] if isinstance(colors, Tensor) else colors.read(begin, end)).float()
+
     basis = StreamingBasis(3 * colors.shape[1], model.sizes.color_rank)
-    model.mean_color = colors.float().mean(0)
-    for block in colors.split(_LARGEST_BLOCK):
-        basis.add((block.float() - model.mean_color).transpose(1, 2).flatten(1).contiguous())
+    model.mean_color = sum((block.sum(0) for block in blocks()), torch.zeros(colors.shape[1], 3)) / len(colors)
+    for block in blocks():
+        basis.add((block - model.mean_color).transpose(1, 2).flatten(1).contiguous())
     learned = basis.finished()
     model.color_components[: len(learned.components)] = learned.components
     model.color_coefficients[:, : learned.coefficients.shape[1]] = learned.coefficients

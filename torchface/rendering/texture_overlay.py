@@ -13,6 +13,7 @@ from torchface.errors import ShapeError, TopologyError, ValueRangeError
 from torchface.geometry.cameras.calibration import CameraCalibration
 from torchface.geometry.cameras.pinhole import Camera
 from torchface.mesh import Mesh
+from torchface.rendering.environment_light import EnvironmentLight
 from torchface.rendering.pixel_coverage import Footprint, footprint
 from torchface.rendering.point_light import PointLight, irradiance, lit_by
 
@@ -96,7 +97,7 @@ def overlay(
     frame: Tensor,
     vertices: Tensor,
     paint: FacePaint,
-    light: PointLight,
+    light: PointLight | EnvironmentLight,
     camera: Camera,
     calibration: CameraCalibration | None = None,
 ) -> Tensor:
@@ -129,7 +130,7 @@ def overlay(
     if len(painted) == 0:
         return frame
     covered, colors = covered.select(painted), colors[painted]
-    shade = _light_on(covered, light, _soft_shadow(covered, light))
+    shade = _light_on(covered, light)
     mixed = covered.blended(to_linear(image), colors[:, :3] * shade, colors[:, 3])
     return _as(frame, image, mixed, covered.pixel)
 
@@ -139,7 +140,7 @@ def relight(
     vertices: Tensor,
     mesh: Mesh,
     light: PointLight,
-    new_light: PointLight,
+    new_light: PointLight | EnvironmentLight,
     camera: Camera,
     calibration: CameraCalibration | None = None,
     share: Tensor | None = None,
@@ -181,7 +182,7 @@ def relight(
     # hold some of what is behind: the skin beside it goes there.
     clear = (1 - 4 * lit * (1 - lit)).clamp(min=0) ** 2 * (covered.share == 1)
     reflected = torch.lerp(covered.softened(reflected, clear + 1e-3, _BESIDE), reflected, clear[:, None])
-    new = reflected * (_light_on(covered, new_light, _soft_shadow(covered, new_light)) + _FLOOR) - _FLOOR
+    new = reflected * (_light_on(covered, new_light) + _FLOOR) - _FLOOR
     new = torch.minimum(new.clamp(min=0), _MAX_GAIN * old)
     alpha = torch.ones(len(old)) if share is None else covered.of_vertices(share.double()[:, None], faces)[:, 0].float()
     return _as(frame, image, covered.blended(linear, new * alpha[:, None], alpha), covered.pixel)
@@ -193,8 +194,11 @@ def _soft_shadow(covered: Footprint, light: PointLight) -> Tensor:
     return covered.softened(lit[:, None])[:, 0]
 
 
-def _light_on(covered: Footprint, light: PointLight, lit: Tensor) -> Tensor:
-    """Red, green and blue light at the samples, (S,3)."""
+def _light_on(covered: Footprint, light: PointLight | EnvironmentLight, lit: Tensor | None = None) -> Tensor:
+    """Red, green and blue light at the samples, (S,3); ``lit`` is the share of the source that each sees, if known."""
+    if isinstance(light, EnvironmentLight):
+        return light.irradiance(covered.normals).float()
+    lit = _soft_shadow(covered, light) if lit is None else lit
     return irradiance(covered.points, covered.normals, light, lit.double()).float()
 
 

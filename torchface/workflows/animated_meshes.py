@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from pathlib import Path
 
 import torch
@@ -27,6 +28,8 @@ from torchface.take import Take, Track
 
 _FORMS = "weights as .csv, an animated .glb or .usdc, a mesh sequence as .safetensors, a mesh, or a folder of meshes"
 
+_KEPT = 8  # meshes
+
 
 @dataclass(frozen=True, eq=False)
 class AnimatedMesh:
@@ -42,6 +45,7 @@ class AnimatedMesh:
         rig: of its topology, where one came with it.
         take: of the weights, where there is one, with the times of its frames.
         numbered: whether its frames are numbered from a beginning that others may share.
+        colors: of the vertices, (t,V,3) in [0,1], read as ``read`` does, where meshes have them.
     """
 
     path: Path
@@ -53,6 +57,7 @@ class AnimatedMesh:
     rig: BlendshapeRig | None = None
     take: Take | None = None
     numbered: bool = False
+    colors: Callable[[int, int], Tensor] | None = None
 
     def require_topology_of(self, other: AnimatedMesh, hint: str = "") -> None:
         """Checks that both have the same vertices and triangles.
@@ -91,7 +96,7 @@ def load_animated(path: Path, rig: Path | None = None, part: str | None = None) 
     elif ending in SCENE_ENDINGS:
         animated = _of_scene(path, loaded)
     elif ending in MESH_ENDINGS:
-        animated = _of_meshes(path, [path], loaded)
+        animated = meshes_over_time(path, [path], loaded)
     else:
         raise FileFormatError(f"{path}: found the ending {ending!r}, expected {_FORMS}")
     return animated if part is None else _kept(animated, region(animated.neutral, part))
@@ -171,7 +176,7 @@ def moved_mesh(path: Path, rig: BlendshapeRig, take: Take) -> AnimatedMesh:
 def _of_scene(path: Path, rig: BlendshapeRig | None) -> AnimatedMesh:
     take = load_animation(path)
     if take is None or take.weights is None:
-        return _of_meshes(path, [path], rig)
+        return meshes_over_time(path, [path], rig)
     return moved_mesh(path, load_rig(path), take)
 
 
@@ -188,25 +193,38 @@ def _of_folder(folder: Path, rig: BlendshapeRig | None) -> AnimatedMesh:
     files = sorted(file for file in folder.iterdir() if file.suffix.lower() in (*MESH_ENDINGS, *SCENE_ENDINGS))
     if not files:
         raise FileFormatError(f"{folder}: found no mesh, expected files ending in {', '.join(MESH_ENDINGS)} or .glb")
-    return _of_meshes(folder, files, rig)
+    return meshes_over_time(folder, files, rig)
 
 
-def _of_meshes(path: Path, files: list[Path], rig: BlendshapeRig | None) -> AnimatedMesh:
+def meshes_over_time(path: Path, files: list[Path], rig: BlendshapeRig | None) -> AnimatedMesh:
+    """Meshes of one topology, a file a frame.
+
+    Raises:
+        TopologyError: one has another, or the rig has.
+    """
     first = load_mesh(files[0])
 
-    def one(file: Path) -> Tensor:
+    @lru_cache(maxsize=_KEPT)  # vertices and colours of a frame are asked for after one another
+    def one(file: Path) -> Mesh:
         mesh = load_mesh(file)
         if len(mesh.vertices) != len(first.vertices) or not torch.equal(mesh.faces, first.faces):
             raise TopologyError(
                 f"{file}: found {len(mesh.vertices)} vertices and {len(mesh.faces)} triangles, expected those of "
                 f"{files[0].name}, {len(first.vertices)} and {len(first.faces)}"
             )
-        return mesh.vertices
+        return mesh
 
     def read(begin: int, end: int) -> Tensor:
-        return torch.stack([one(file) for file in files[begin:end]])  # a file a frame
+        return torch.stack([one(file).vertices for file in files[begin:end]])  # a file a frame
 
-    return AnimatedMesh(path, _at_rest(path, first, rig), len(files), read, rig=rig)
+    def colors(begin: int, end: int) -> Tensor:
+        found = [one(file).colors for file in files[begin:end]]
+        if any(row is None for row in found):
+            raise FileFormatError(f"{path}: found meshes without vertex colours beside {files[0].name}, which has some")
+        return torch.stack([row for row in found if row is not None])
+
+    shades = None if first.colors is None else colors
+    return AnimatedMesh(path, _at_rest(path, first, rig), len(files), read, rig=rig, colors=shades)
 
 
 def _at_rest(path: Path, mesh: Mesh, rig: BlendshapeRig | None) -> Mesh:
@@ -228,4 +246,4 @@ def _kept(whole: AnimatedMesh, keep: Tensor) -> AnimatedMesh:
     def read(begin: int, end: int) -> Tensor:
         return whole.read(begin, end)[:, piece.vertex_ids]
 
-    return replace(whole, neutral=piece.mesh, read=read, rig=rig)
+    return replace(whole, neutral=piece.mesh, read=read, rig=rig, colors=None)

@@ -42,6 +42,18 @@ def test_the_neutral_at_both_ends_is_told_apart_by_direction(falls: bool) -> Non
     assert times[:, -1].tolist() == [1, 1]
 
 
+@pytest.mark.parametrize("extend", [False, True])
+def test_a_part_of_a_motion_is_timed_as_that_part_or_extended_to_the_whole(extend: bool) -> None:
+    """A captured smile eases in and out; half a smile meets its first half, which eases in alone."""
+    even = torch.linspace(0, 1, 41, dtype=torch.float64)
+    smile = 3 * even**2 - 2 * even**3
+    timing = ActorTiming(motion(smile), torch.zeros(41), torch.ones(1, 4), 30.0)
+    times = timing.times(motion(smile[[0, 20]]), 41, 40.0, extend)[0]
+    half = (3 * (even / 2) ** 2 - 2 * (even / 2) ** 3) / 0.5
+    assert float((times - (smile if extend else half)).abs().max()) < 0.05  # the slow ends count as held
+    assert float((smile - half).abs().max()) > 0.15
+
+
 def test_a_hold_inside_a_motion_keeps_its_share_of_time() -> None:
     progress = torch.cat([torch.linspace(0, 0.5, 11), torch.full((20,), 0.5), torch.linspace(0.5, 1, 11)]).double()
     found = motion_progress(motion(progress).flatten(1), 42)

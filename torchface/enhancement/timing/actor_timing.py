@@ -55,30 +55,34 @@ class ActorTiming:
         self._whole = weights.mean(0)
         self._learned = [LearnedTiming.fit(database, sequences, region, fps) for region in (*weights, self._whole)]
 
-    def times(self, keyframes: Tensor, frames: int, length: float) -> Tensor:
+    def times(self, keyframes: Tensor, frames: int, length: float, extend: bool = True) -> Tensor:
         """How far the motion between two keyframes has come in each frame, (R,frames), 0 first, 1 last, never falling.
 
         Args:
             keyframes: features of both, (2,P,C).
             frames: at even distance, both keyframes counted.
             length: of the motion, in frames of the database.
+            extend: to the whole motion of which the keyframes meet a part; regressions know whole motions alone, so
+                the nearest motions are taken otherwise.
         """
         checked_count("frames", frames, 2)
         checked_number("length", length, above=True)
         check_keyframes(keyframes, self._captured[0].shape[1:])
         moves = moving_regions(keyframes, self._weights)
-        whole = self._region(-1, self._whole, keyframes, frames, length)
+        regressions = self._learned if extend else [None] * len(self._learned)
+
+        def region_times(row: int, region: Tensor) -> Tensor:
+            regression = regressions[row]
+            if regression is not None:
+                return regression.times(keyframes, frames, length)
+            return nearest_timing(keyframes, self._captured, region, frames, length, extend=extend)
+
+        whole = region_times(-1, self._whole)
         rows = [
-            self._region(row, region, keyframes, frames, length) if moves[row] else whole
+            region_times(row, region) if moves[row] else whole
             for row, region in enumerate(self._weights)  # each has a regression of its own
         ]
         return torch.stack(rows)
-
-    def _region(self, row: int, region: Tensor, keyframes: Tensor, frames: int, length: float) -> Tensor:
-        learned = self._learned[row]
-        if learned is not None:
-            return learned.times(keyframes, frames, length)
-        return nearest_timing(keyframes, self._captured, region, frames, length)
 
 
 @dataclass(frozen=True, eq=False)

@@ -22,13 +22,19 @@ _HOLD = 0.01  # share of the range within which the face counts as held
 
 
 def nearest_timing(
-    keyframes: Tensor, captured: Sequence[Tensor], region: Tensor, frames: int, length: float, nearest: int = NEAREST
+    keyframes: Tensor,
+    captured: Sequence[Tensor],
+    region: Tensor,
+    frames: int,
+    length: float,
+    nearest: int = NEAREST,
+    extend: bool = True,
 ) -> Tensor:
     """How far a region's motion between two keyframes has come in each frame, by its nearest captured motions.
 
     The pair is projected in order onto each sequence; what it meets is extended to the whole of that motion, from where
-    it sets in to where it ends. The timings of the nearest motions, in pose and in length, are averaged, nearer ones
-    weighing more.
+    it sets in to where it ends, if asked for. The timings of the nearest motions, in pose and in length,
+    are averaged, nearer ones weighing more.
 
     Args:
         keyframes: features of both, (2,P,C).
@@ -37,6 +43,7 @@ def nearest_timing(
         frames: at even distance, both keyframes counted.
         length: of the motion, in frames of the database.
         nearest: how many captured motions are averaged; the paper takes one.
+        extend: to the whole motion of which the keyframes meet a part.
 
     Returns:
         (frames,), 0 first and 1 last, never falling.
@@ -53,7 +60,7 @@ def nearest_timing(
     for sequence in captured:
         path = (sequence.double() * scale).flatten(1)
         times, error = _on_one_motion(pair, path)
-        motion = _extended(path, times, pair[1] - pair[0])
+        motion = _extended(path, times, pair[1] - pair[0]) if extend else _between(path, times)
         if len(motion) < 2:
             continue
         # Both poses may lie at one of the sequence's: then it says nothing of the way between them.
@@ -146,6 +153,18 @@ def _on_one_motion(pair: Tensor, captured: Tensor) -> tuple[Tensor, float]:
     first, last = divmod(best, len(steps))
     times = torch.stack([first + shares[0, first], last + shares[1, last]])
     return times, float(cost[first, last])
+
+
+def _between(captured: Tensor, times: Tensor) -> Tensor:
+    """The frames of a sequence (n,D) from one moment to a later one, as many as the sequence has there, at even steps.
+
+    A sequence's own frames between these would lie at uneven steps from both ends.
+    """
+    first, last = times.tolist()
+    moments = torch.linspace(first, last, max(math.ceil(last - first) + 1, 2), dtype=captured.dtype)
+    before = moments.long().clamp(max=len(captured) - 2)
+    motion = torch.lerp(captured[before], captured[before + 1], (moments - before)[:, None])
+    return motion if last > first else motion[:1]
 
 
 def _extended(captured: Tensor, times: Tensor, direction: Tensor) -> Tensor:

@@ -34,6 +34,25 @@ def error_curve(error: Tensor, fps: float, label: str = "marker RMSE (mm)") -> T
     return from_figure(figure)
 
 
+def timing_curves(values: Tensor, names: Sequence[str], fps: float, label: str) -> Tensor:
+    """What each region shows (R,T) over time, beside an even course from the first frame to the last; (3,H,W).
+
+    Example:
+        >>> picture = timing_curves(torch.linspace(0, 1, 20)[None] ** 2, ["brow"], fps=30.0, label="share of the way")
+        >>> bool(picture.min() < 0.5 and picture.max() == 1)  # drawn on white
+        True
+    """
+    figure = Figure(figsize=(10, 4), dpi=100, layout="constrained")
+    axes = figure.subplots()
+    seconds = torch.arange(values.shape[1]) / fps
+    for row, name in zip(values, names, strict=True):
+        axes.plot(seconds, row, linewidth=0.9, label=name)
+    axes.plot(seconds[[0, -1]], values[0][[0, -1]], color="grey", linewidth=0.8, linestyle="--", label="even")
+    axes.set(xlabel="seconds", ylabel=label)
+    axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False, fontsize=7)
+    return from_figure(figure)
+
+
 def weight_curves(solved: Tensor, true: Tensor | None, names: Sequence[str], fps: float, max_shapes: int = 6) -> Tensor:
     """The sum of weights over time and the curves of the shapes that move most, solved (T,N) over true; (3,H,W).
 

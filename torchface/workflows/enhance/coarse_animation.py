@@ -38,6 +38,7 @@ class CoarseAnimation:
         notes: lines for people to read; warnings begin with ``warning: ``.
         head: its own head at rest in the model's vertices, (V,3), where that is another person's.
         weights: of the rig that moves it, where that is of the model's mesh and actor.
+        moments: which of its frames each region shows in each frame, (R,T), where it was retimed.
     """
 
     path: Path
@@ -51,6 +52,7 @@ class CoarseAnimation:
     notes: tuple[str, ...] = ()
     head: Tensor | None = None
     weights: Track | None = None
+    moments: Tensor | None = None
 
     def rig_weights(self, names: Sequence[str]) -> Tensor | None:
         """The weights of these shapes, (T,N); None where one is missing, or none are asked for."""

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from torchface.escaped_text import as_markup
 from torchface.rendering.compositing import from_figure
+from torchface.viz.figures.curves import timing_curves
 from torchface.viz.reports.report_page import Section, Table, write_page
 from torchface.workflows.enhance.enhance_animation import Enhanced, spread_frames
 from torchface.workflows.enhance.enhance_views import added_views, compared_frames, curvature_views, shown_frame
@@ -59,6 +60,11 @@ def write_enhance_page(done: Enhanced, out: Path, height: int = _HEIGHT) -> Path
             [("distances.png", distance_curves(done))],
         ),
     ]
+    moments, fps = done.animation.moments, done.animation.fps
+    if moments is not None:
+        text = "Which moment of the input each region shows; between the keyframes the course is the actor's."
+        figure = timing_curves(moments / fps, done.model.regions.names, fps, "moment of the input (s)")
+        sections.insert(2, Section("Timing", text, figures=[("timing.png", figure)]))
     return write_page(out, f"{done.animation.path.name} enhanced", sections)
 
 

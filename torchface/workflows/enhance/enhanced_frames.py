@@ -186,7 +186,7 @@ def retimed_animation(animation: CoarseAnimation, model: EnhancementModel, progr
         return at_moments(animation.read(first, last), asked - first, shares)
 
     note = shift_note((moments - torch.arange(animation.count)).abs() / animation.fps, model.region_names)
-    return replace(animation, read=read, notes=(*animation.notes, note), weights=None)
+    return replace(animation, read=read, notes=(*animation.notes, note), weights=None, moments=moments)
 
 
 def shift_note(shifts: Tensor, names: Sequence[str]) -> str:

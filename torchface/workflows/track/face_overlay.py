@@ -17,6 +17,7 @@ from torchface.geometry.cameras.calibration import CameraCalibration
 from torchface.geometry.cameras.pinhole import Camera
 from torchface.geometry.meshes.operators import vertex_normals
 from torchface.io.images.image_files import load_paint
+from torchface.mesh import Mesh
 from torchface.rendering.point_light import vertex_albedo
 from torchface.rendering.raycast import RayCaster
 from torchface.rendering.texture_overlay import FacePaint, overlay, skin_faces
@@ -91,17 +92,26 @@ def video_light(tracked: Tracked) -> PointLight:
         at += len(chunk)
         if len(frames) == len(wanted):
             break
-    try:
-        albedo = vertex_albedo(rig.neutral)
-    except ValueRangeError:
-        albedo = torch.tensor(_EVEN_SKIN).expand(len(rig.vertices), 3)
-    skin = torch.zeros(len(rig.vertices))
-    skin[rig.neutral.faces[skin_faces(rig.neutral)].flatten()] = 1.0
     vertices = rig(tracked.solution.weights.detach()[wanted].to(rig.deltas))
     cameras = [camera_at(tracked, t) for t in wanted]
-    image = torch.stack(frames)
-    fit = estimate_light(image, vertices, rig.neutral.faces, albedo, cameras, skin, tracked.calibration)
-    return fit.light
+    return light_of(rig.neutral, torch.stack(frames), vertices, cameras, tracked.calibration)
+
+
+def light_of(
+    neutral: Mesh, frames: Tensor, vertices: Tensor, cameras: list[Camera], calibration: CameraCalibration
+) -> PointLight:
+    """The light of frames (T,3,H,W) that show a mesh as vertices (T,V,3), beside its colours or skin of one colour.
+
+    Raises:
+        AlignmentError: the frames show too little of the face.
+    """
+    try:
+        albedo = vertex_albedo(neutral)
+    except ValueRangeError:
+        albedo = torch.tensor(_EVEN_SKIN).expand(len(neutral.vertices), 3)
+    skin = torch.zeros(len(neutral.vertices))
+    skin[neutral.faces[skin_faces(neutral)].flatten()] = 1.0
+    return estimate_light(frames, vertices, neutral.faces, albedo, cameras, skin, calibration).light
 
 
 def camera_at(tracked: Tracked, t: int) -> Camera:

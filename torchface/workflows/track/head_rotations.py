@@ -23,6 +23,20 @@ def head_angles(rotation: Tensor) -> Tensor:
     return torch.stack([yaw, pitch, roll], dim=-1)
 
 
+def head_rotations(angles: Tensor) -> Tensor:
+    """The rotations (...,3,3) whose :func:`head_angles` are yaw, pitch and roll (...,3)."""
+    (yaw, pitch, roll), one = angles.unbind(-1), torch.ones_like(angles[..., 0])
+    zero, signs = torch.zeros_like(one), angles.new_tensor([1.0, -1.0, -1.0])[:, None]
+
+    def matrix(*rows: Tensor) -> Tensor:
+        return torch.stack(rows, -1).unflatten(-1, (3, 3))
+
+    about_y = matrix(yaw.cos(), zero, yaw.sin(), zero, one, zero, -yaw.sin(), zero, yaw.cos())
+    about_x = matrix(one, zero, zero, zero, pitch.cos(), -pitch.sin(), zero, pitch.sin(), pitch.cos())
+    about_z = matrix(roll.cos(), -roll.sin(), zero, roll.sin(), roll.cos(), zero, zero, zero, one)
+    return signs * (about_y @ about_x @ about_z)
+
+
 def eye_angles(gaze: Tensor) -> Tensor:
     """Yaw, pitch and roll of the left eye, then of the right, (...,6), as Live Link Face has them.
 

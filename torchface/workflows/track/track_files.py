@@ -20,7 +20,7 @@ from torchface.workflows.weight_files import reduced_take
 WEIGHTS, CONFIDENCE, LIVE_LINK, LANDMARKS = "weights.csv", "confidence.csv", "live_link.csv", "landmarks.csv"
 ANIMATION, OVERLAY, SUMMARY = "animation.glb", "overlay.mp4", "summary.json"
 
-_FORMAT = "torchface.track-summary/1"
+SUMMARY_FORMAT = "torchface.track-summary/1"
 
 
 def save_curves(take: Take, out: Path) -> dict[str, Path]:
@@ -81,7 +81,7 @@ def summary(tracked: Tracked) -> dict[str, object]:
     """The figures as JSON has them."""
     errors = tracked.solution.errors
     return {
-        "format": _FORMAT,
+        "format": SUMMARY_FORMAT,
         "video": tracked.video.path.name,
         "frames": len(tracked),
         "fps": tracked.video.fps,

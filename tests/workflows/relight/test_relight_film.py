@@ -1,0 +1,127 @@
+"""A film of a lit performer behind a hand: relit as under the other light, the hand as it was; input that is wrong."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+import torch
+from torch import Tensor
+
+from planted.light_stage import LightStageSettings, lit_image, render_lit_video
+from torchface.cli import main
+from torchface.color_space import to_srgb
+from torchface.errors import FileFormatError, ValueRangeError
+from torchface.files.documents import write_json
+from torchface.geometry.cameras.pinhole import Camera
+from torchface.io import save_animation, save_image
+from torchface.io.landmarks.openface_csv import save_landmarks_csv
+from torchface.io.video import open_video, write_video
+from torchface.rendering.point_light import PointLight
+from torchface.rig import BlendshapeRig
+from torchface.synthetic import performer
+from torchface.take import Take, Track
+from torchface.workflows.relight.relight_film import RelightSettings, WantedLight, relight_film
+from torchface.workflows.relight.tracked_film import read_tracked_film
+from torchface.workflows.track.head_rotations import rotation_columns
+from torchface.workflows.track.track_files import ANIMATION, LANDMARKS, SUMMARY, SUMMARY_FORMAT
+
+LAMP = PointLight.directional(torch.full((3,), 0.3), torch.full((3,), 0.8), torch.tensor([-0.8, -0.3, -0.6]))
+STAGE = LightStageSettings(width=160, height=160, samples=1, noise=0.004, span=260.0, gloss=0.0)
+FRAMES, HIDDEN = 7, (3, 4)
+HAND = (slice(70, 110), slice(62, 92))
+HAND_COLOR = (60, 90, 140)
+
+
+@dataclass(frozen=True, eq=False)
+class Filmed:
+    """A film, its track, and the truth behind it."""
+
+    film: Path
+    track: Path
+    rig: BlendshapeRig
+    weights: Tensor
+    cameras: tuple[Camera, ...]
+
+
+@pytest.fixture(scope="module")
+def filmed(tmp_path_factory: pytest.TempPathFactory) -> Filmed:
+    folder = tmp_path_factory.mktemp("relight")
+    rig = performer().select(["jawOpen", "mouthSmileLeft"])
+    weights = torch.linspace(0, 0.3, FRAMES)[:, None].expand(-1, 2).contiguous()
+    plain = render_lit_video(folder / "plain.avi", rig, weights, LAMP, 25.0, torch.Generator().manual_seed(0), STAGE)
+
+    def with_hand():
+        for t, frame in enumerate(open_video(plain.video.path).color_frames()):
+            if t in HIDDEN:
+                frame = frame.clone()
+                frame[:, HAND[0], HAND[1]] = torch.tensor(HAND_COLOR, dtype=torch.uint8)[:, None, None]
+            yield frame[None]
+
+    write_video(with_hand(), folder / "film.avi", 25.0)
+    track = folder / "track"
+    track.mkdir()
+    save_animation(rig, Take(25.0, weights=Track(rig.names, weights[..., None])), track / ANIMATION)
+    rotation = torch.stack([camera.rotation.double() for camera in plain.cameras])
+    angles = rotation_columns(rotation, torch.zeros(FRAMES, 2, 2))
+    columns = {f"pose_{name.removeprefix('Head').lower()}": angles[name] for name in list(angles)[:3]}
+    moved = torch.stack([camera.translation.double() for camera in plain.cameras])
+    columns |= {f"pose_T{axis}": moved[:, i] for i, axis in enumerate("xyz")}
+    marks = torch.stack([c.project(rig(w[None])[0].double())[rig.neutral.landmarks]
+                         for c, w in zip(plain.cameras, weights, strict=True)])  # fmt: skip
+    landmarks = Track(tuple(str(i) for i in range(marks.shape[1])), marks.float(), torch.ones(marks.shape[:2]))
+    save_landmarks_csv(Take(25.0, landmarks=landmarks, extras={"columns": columns}), track / LANDMARKS)
+    focal = float(plain.cameras[0].intrinsics[0, 0])
+    write_json(track / SUMMARY, {"format": SUMMARY_FORMAT, "camera_assumed": True, "focal_px": focal})
+    return Filmed(folder / "film.avi", track, rig, weights, plain.cameras)
+
+
+def test_the_face_is_relit_and_the_hand_before_it_is_not(filmed: Filmed, tmp_path: Path) -> None:
+    read = read_tracked_film(filmed.film, filmed.track)
+    assert (read.camera(2).project(read.vertices(2).double())
+            - filmed.cameras[2].project(filmed.rig(filmed.weights[2:3])[0].double())).abs().max() < 0.05  # fmt: skip
+    out, wanted = tmp_path / "relit.avi", ("azimuth=55", "elevation=15", "ambient=0.25")
+    words = ["--track", filmed.track, "--out", out, "--light", *wanted]
+    main(["relight", str(filmed.film), *map(str, words), "--quiet"])
+    old, new = (torch.cat(list(open_video(path).color_chunks(16))) for path in (filmed.film, out))
+    light = WantedLight.parse(wanted).beside(LAMP)
+    t = 1
+    mesh = filmed.rig.neutral.with_vertices(filmed.rig(filmed.weights[t : t + 1])[0])
+    truth = to_srgb(lit_image(mesh, filmed.cameras[t], light, STAGE).clamp(0, 1)) * 255
+    changed = (old[t].float() - truth).abs().mean(0) > 12
+    before, after = ((film[t].float() - truth).abs().mean(0)[changed].mean() for film in (old, new))
+    assert float(after) < 0.5 * float(before)
+    for t in HIDDEN:
+        hand = (new[t].float() - old[t].float()).abs().amax(0)[HAND]
+        assert float((hand <= 3).float().mean()) > 0.9
+        beside = (new[t].float() - old[t].float()).abs().amax(0)[60:110, 95:110]
+        assert float(beside.mean()) > 4  # the cheek behind it is relit
+
+
+def test_paint_lies_behind_the_hand_too(filmed: Filmed, tmp_path: Path) -> None:
+    save_image(torch.tensor([0.1, 0.9, 0.1])[:, None, None].expand(3, 8, 8), tmp_path / "green.png")
+    out = tmp_path / "painted.avi"
+    relight_film(filmed.film, filmed.track, out, RelightSettings(texture=tmp_path / "green.png"))
+    old, new = (torch.cat(list(open_video(path).color_chunks(16)))[HIDDEN[0]].float() for path in (filmed.film, out))
+    assert float(((new - old).abs().amax(0)[HAND] <= 3).float().mean()) > 0.9
+    cheek = new[:, 75:100, 95:108].mean((1, 2))
+    assert cheek[1] > 2 * cheek[0]
+
+
+def test_what_does_not_fit_is_named(filmed: Filmed, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out, light = tmp_path / "out.avi", RelightSettings(light=("azimuth=10",))
+    short = tmp_path / "short.avi"
+    write_video((frame[None] for frame in list(open_video(filmed.film).color_frames())[:-1]), short, 25.0)
+    with pytest.raises(ValueRangeError, match=r"short\.avi: found 6 frames, expected the 7 of .*track"):
+        relight_film(short, filmed.track, out, light)
+    save_image(torch.ones(3, 8, 16), tmp_path / "sky.png")
+    with pytest.raises(FileFormatError, match=r"sky\.png: found no Radiance picture"):
+        relight_film(filmed.film, filmed.track, out, RelightSettings(environment=tmp_path / "sky.png"))
+    with pytest.raises(FileFormatError, match=r"found no summary\.json, expected the folder"):
+        relight_film(filmed.film, tmp_path, out, light)
+    with pytest.raises(ValueRangeError, match="found nothing to do, expected one of --light and --environment"):
+        relight_film(filmed.film, filmed.track, out, RelightSettings())
+    with pytest.raises(ValueRangeError, match="found 'azimut=3', expected NAME=NUMBER with azimuth"):
+        WantedLight.parse(("azimut=3",))
+    assert not out.exists()

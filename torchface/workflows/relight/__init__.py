@@ -1,0 +1,1 @@
+"""A filmed face under another light, with another skin or another head."""

@@ -1,0 +1,299 @@
+"""A filmed face under another light, with another skin or another head, written as a film; what covers it stays."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+from torchface.errors import AlignmentError, ValueRangeError
+from torchface.files.whole_files import check_writable
+from torchface.geometry.similarity import similarity_transform
+from torchface.io import load_rig
+from torchface.io.images.image_files import load_paint
+from torchface.io.images.radiance_hdr import load_panorama
+from torchface.io.video import write_video
+from torchface.progress import Progress, silent
+from torchface.rendering.environment_light import EnvironmentLight
+from torchface.rendering.point_light import PointLight
+from torchface.rendering.texture_overlay import FacePaint, overlay, relight
+from torchface.rendering.uncovered_skin import UncoveredSkin
+from torchface.rig import BlendshapeRig
+from torchface.take import Track
+from torchface.workflows.relight.tracked_film import TrackedFilm, read_tracked_film
+from torchface.workflows.track.face_overlay import light_of
+
+FilmLight = Literal["once", "each"]
+Draw = Callable[[int, Tensor, PointLight | EnvironmentLight], Tensor]
+_CHUNK = 8
+_LEARNED, _LIT = 24, 2  # frames from which the skin's look and the film's light are learned
+_AMBIENT = 0.3  # of the wanted light, unless said
+_SPHERE = 0.25  # the mean of the clamped cosine over all directions
+_MOST = 100.0
+
+
+@dataclass(frozen=True)
+class WantedLight:
+    """A light from one direction and from everywhere, relative to the film's.
+
+    Args:
+        azimuth: degrees from the camera to the viewer's right.
+        elevation: degrees upwards.
+        strength: of both together, 1 as bright as the film's.
+        ambient: the share from everywhere.
+        red, green, blue: its colour beside the film's.
+    """
+
+    azimuth: float = 0.0
+    elevation: float = 0.0
+    strength: float = 1.0
+    ambient: float = _AMBIENT
+    red: float = 1.0
+    green: float = 1.0
+    blue: float = 1.0
+
+    @staticmethod
+    def parse(words: Sequence[str]) -> WantedLight:
+        """Of words such as ``azimuth=60``.
+
+        Raises:
+            ValueRangeError: another name, no number, or one out of range.
+        """
+        bounds = {"azimuth": (-360, 360), "elevation": (-90, 90), "ambient": (0, 1)}
+        names = tuple(WantedLight.__dataclass_fields__)
+        found: dict[str, float] = {}
+        for word in words:
+            name, _, number = word.partition("=")
+            try:
+                value = float(number)
+            except ValueError:
+                value = math.nan
+            low, high = bounds.get(name, (0, _MOST))
+            if name not in names or not low <= value <= high:
+                raise ValueRangeError(
+                    f"--light: found {word!r:.60}, expected NAME=NUMBER with {', '.join(names)}; azimuth and elevation "
+                    f"in degrees, ambient of 0 to 1, the others of 0 to {_MOST:g}"
+                )
+            found[name] = value
+        return WantedLight(**found)
+
+    def beside(self, film: PointLight) -> PointLight:
+        """The light, in the film's brightness and colour."""
+        whole = (film.ambient + film.intensity) * self.strength * torch.tensor([self.red, self.green, self.blue])
+        around, up = math.radians(self.azimuth), math.radians(self.elevation)
+        toward = torch.tensor([math.sin(around) * math.cos(up), -math.sin(up), -math.cos(around) * math.cos(up)])
+        return PointLight.directional(self.ambient * whole, (1 - self.ambient) * whole, toward)
+
+
+@dataclass(frozen=True)
+class RelightSettings:
+    """What the film is to show.
+
+    Args:
+        light: another light, as words; see :class:`WantedLight`.
+        environment: a panorama of light (``.hdr``), of the film's mean brightness.
+        turn: of the panorama, degrees; its middle to the viewer's right.
+        exposure: how many times as bright as the film's light the panorama is.
+        texture: paint in the rig's texture coordinates.
+        rig: another head, which moves as the actor does.
+        film_light: whether the film's light is estimated once, or in each frame.
+        occluders: leave what is before the face as it is.
+        camera: the calibration with which the film was tracked.
+    """
+
+    light: tuple[str, ...] = ()
+    environment: Path | None = None
+    turn: float = 0.0
+    exposure: float = 1.0
+    texture: Path | None = None
+    rig: Path | None = None
+    film_light: FilmLight = "once"
+    occluders: bool = True
+    camera: Path | None = None
+
+
+def relight_film(
+    film: Path, track: Path, out: Path, settings: RelightSettings, progress: Progress | None = None
+) -> list[str]:
+    """Reads a film and its track, and writes the film anew.
+
+    Args:
+        film: a video.
+        track: the folder that ``torchface track`` wrote of it.
+        out: the video to write.
+        settings: what it is to show.
+        progress: called with each step and how far it is.
+
+    Returns:
+        Lines for people to read.
+
+    Raises:
+        FileFormatError: a file is missing, damaged or of another kind.
+        ValueRangeError: film and track differ in length, or nothing is asked for.
+        AlignmentError: the film shows too little of the face for an estimate of its light.
+
+    Source: thesis 4.2.11 and figure 80.
+    """
+    progress = progress or silent
+    wanted = {"--light": settings.light, "--environment": settings.environment, "--texture": settings.texture}
+    wanted["--rig"] = settings.rig
+    if not any(wanted.values()) or all((settings.light, settings.environment)) or all((settings.texture, settings.rig)):
+        raise ValueRangeError(
+            f"relight: found {', '.join(name for name, value in wanted.items() if value) or 'nothing to do'}, expected "
+            "one of --light and --environment, one of --texture and --rig, or one of both"
+        )
+    check_writable(out)
+    light = WantedLight.parse(settings.light) if settings.light else None
+    panorama = None if settings.environment is None else load_panorama(settings.environment)
+    progress("reading the track")
+    tracked = read_tracked_film(film, track, settings.camera)
+    draw = _painter(tracked, settings)
+    learned = _spread(tracked.seen, _LEARNED)
+    frames = dict(zip(learned, _frames(tracked, learned, progress), strict=True))
+    whole = _light(tracked, {t: frames[t] for t in _of(learned, _LIT)})
+    lights = {t: _light(tracked, {t: frames[t]}, whole) for t in learned} if settings.film_light == "each" else {}
+    look = _look(tracked, frames, lights, whole) if settings.occluders else None
+    lines = [f"{tracked.video.count} frames, the face in {int(tracked.seen.sum())}; {_words(whole, 'the film')}"]
+    hidden: list[float] = []
+
+    def new_light(old: PointLight) -> PointLight | EnvironmentLight:
+        if light is not None:
+            return light.beside(old)
+        if panorama is None:
+            return old
+        found = EnvironmentLight.of(panorama, settings.turn)
+        mean = float((old.ambient + _SPHERE * old.intensity).mean())
+        return found.scaled(settings.exposure * mean / max(float(found.mean.mean()), 1e-9))
+
+    def drawn() -> Iterator[Tensor]:
+        old, at = whole, 0
+        changed = light is not None or panorama is not None
+        for chunk in tracked.video.color_chunks(_CHUNK):
+            for frame in chunk:
+                if bool(tracked.seen[at]):
+                    if settings.film_light == "each":
+                        old = _light(tracked, {at: frame}, old)
+                    new = new_light(old)
+                    vertices, camera = tracked.vertices(at), tracked.camera(at)
+                    result = frame
+                    mesh, lens = tracked.rig.neutral, tracked.calibration
+                    if changed:
+                        result = relight(frame, vertices, mesh, old, new, camera, lens)
+                    if draw is not None:
+                        result = draw(at, result, new)
+                    if look is not None:
+                        mask = look.mask(frame, vertices, mesh.faces, camera, old, lens)
+                        hidden.append(float((mask < 0.5).float().mean()))
+                        result = torch.lerp(frame.float(), result.float(), mask).round().to(torch.uint8)
+                    yield result[None]
+                else:
+                    yield frame[None]
+                at += 1
+                progress("relighting", at, tracked.video.count)
+
+    write_video(drawn(), out, tracked.video.fps)
+    if hidden:
+        lines.append(f"left as they are: {max(hidden):.1%} of the pixels of a frame at most, which lie before the face")
+    return lines
+
+
+def _painter(tracked: TrackedFilm, settings: RelightSettings) -> Draw | None:
+    """Draws paint or another head on a frame; None where neither is asked for."""
+    if settings.texture is not None:
+        paint, moved = FacePaint.of(tracked.rig.neutral, load_paint(settings.texture)), tracked.vertices
+    elif settings.rig is not None:
+        other = load_rig(settings.rig)
+        paint, moved = _head(other, settings.rig), _placed(other, tracked, settings.rig)
+    else:
+        return None
+
+    def draw(frame: int, image: Tensor, light: PointLight | EnvironmentLight) -> Tensor:
+        return overlay(image, moved(frame), paint, light, tracked.camera(frame), tracked.calibration)
+
+    return draw
+
+
+def _head(other: BlendshapeRig, path: Path) -> FacePaint:
+    """All of another head as paint, eyes and teeth too."""
+    mesh = other.neutral
+    if mesh.texture is None or mesh.uvs is None:
+        raise ValueRangeError(f"{path}: found a rig without a texture, expected one, which the film is to show")
+    texture = torch.cat([mesh.texture.float(), torch.ones_like(mesh.texture[:1]).float()])
+    paint = FacePaint.of(mesh, texture)
+    return replace(paint, skin=torch.ones_like(paint.skin))
+
+
+def _placed(other: BlendshapeRig, tracked: TrackedFilm, path: Path) -> Callable[[int], Tensor]:
+    """Another head that stands where the actor's does, by their landmarks, and moves as it."""
+    marks = other.neutral.landmarks, tracked.rig.neutral.landmarks
+    if len(marks[0]) != len(marks[1]):
+        raise ValueRangeError(f"{path}: found {len(marks[0])} landmarks, expected the actor's {len(marks[1])}")
+    target = tracked.rig.vertices[marks[1]].double()[None]
+    pose = similarity_transform(other.vertices[marks[0]].double()[None], target)
+    weights = other.weights_from(Track(tracked.rig.names, tracked.weights[..., None]))
+
+    def vertices(frame: int) -> Tensor:
+        posed = other(weights[frame : frame + 1].to(other.deltas))
+        return pose.apply(posed.double())[0]
+
+    return vertices
+
+
+def _look(
+    tracked: TrackedFilm, frames: dict[int, Tensor], lights: dict[int, PointLight], whole: PointLight
+) -> UncoveredSkin:
+    rows = list(frames)
+    return UncoveredSkin.of(
+        list(frames.values()),
+        [tracked.vertices(t) for t in rows],
+        tracked.rig.neutral.faces,
+        [tracked.camera(t) for t in rows],
+        [lights.get(t, whole) for t in rows],
+        tracked.calibration,
+    )
+
+
+def _light(tracked: TrackedFilm, frames: dict[int, Tensor], fallback: PointLight | None = None) -> PointLight:
+    """The light of some frames; the fallback where they show too little of the face."""
+    vertices = torch.stack([tracked.vertices(t) for t in frames])
+    cameras = [tracked.camera(t) for t in frames]
+    try:
+        return light_of(tracked.rig.neutral, torch.stack(list(frames.values())), vertices, cameras, tracked.calibration)
+    except AlignmentError:
+        if fallback is None:
+            raise
+        return fallback
+
+
+def _frames(tracked: TrackedFilm, wanted: Sequence[int], progress: Progress) -> list[Tensor]:
+    frames, at = [], 0
+    for chunk in tracked.video.color_chunks(_CHUNK):
+        frames += [chunk[t - at].clone() for t in wanted if at <= t < at + len(chunk)]
+        at += len(chunk)
+        progress("learning how the face looks", at, tracked.video.count)
+        if len(frames) == len(wanted):
+            break
+    return frames
+
+
+def _spread(seen: Tensor, count: int) -> list[int]:
+    rows = seen.nonzero()[:, 0]
+    return rows[torch.linspace(0, len(rows) - 1, min(count, len(rows))).round().long().unique()].tolist()
+
+
+def _of(rows: Sequence[int], count: int) -> list[int]:
+    return [
+        rows[i] for i in sorted({round(x) for x in torch.linspace(0, len(rows) - 1, min(count, len(rows))).tolist()})
+    ]
+
+
+def _words(light: PointLight, what: str) -> str:
+    x, y, z = torch.nn.functional.normalize(light.position, dim=0).tolist()
+    around, up = math.degrees(math.atan2(x, -z)), math.degrees(math.asin(max(-1.0, min(1.0, -y))))
+    share = float(light.ambient.mean() / (light.ambient + light.intensity).mean().clamp(min=1e-9))
+    return f"the light of {what}: azimuth={around:.0f} elevation={up:.0f} ambient={share:.2f}"

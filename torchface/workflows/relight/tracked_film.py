@@ -1,0 +1,106 @@
+"""A film with what ``torchface track`` found in it: the rig, its weights and the head's pose in every frame."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from torchface.errors import FileFormatError, NameMismatchError, ValueRangeError
+from torchface.files.documents import read_json
+from torchface.geometry.cameras.calibration import CameraCalibration
+from torchface.geometry.cameras.pinhole import Camera
+from torchface.io import load_animation, load_calibration, load_rig
+from torchface.io.landmarks.openface_csv import load_landmarks_csv
+from torchface.io.video import VideoFile, open_video
+from torchface.io.weights.weight_csv import ROTATIONS
+from torchface.rig import BlendshapeRig
+from torchface.workflows.track.head_rotations import head_rotations
+from torchface.workflows.track.track_files import ANIMATION, LANDMARKS, SUMMARY, SUMMARY_FORMAT
+
+_POSE = (*(f"pose_T{axis}" for axis in "xyz"), *(f"pose_{name.removeprefix('Head').lower()}" for name in ROTATIONS[:3]))
+
+
+@dataclass(frozen=True, eq=False)
+class TrackedFilm:
+    """A film and the face in it.
+
+    Args:
+        video: the film.
+        rig: the actor's.
+        weights: of its shapes, (T,N).
+        rotation, translation: from the rig to the camera, (T,3,3) and (T,3) millimetres.
+        seen: frames that show the face, (T,) bool.
+        calibration: of the camera.
+    """
+
+    video: VideoFile
+    rig: BlendshapeRig
+    weights: Tensor
+    rotation: Tensor
+    translation: Tensor
+    seen: Tensor
+    calibration: CameraCalibration
+
+    def camera(self, frame: int) -> Camera:
+        """The camera of a frame, from the rig's space, without distortion."""
+        pose = self.rotation[frame], self.translation[frame]
+        return Camera(self.calibration.intrinsics.double(), *pose, self.video.width, self.video.height)
+
+    def vertices(self, frame: int) -> Tensor:
+        """The face of a frame in the rig's space, (V,3)."""
+        return self.rig(self.weights[frame : frame + 1].to(self.rig.deltas))[0]
+
+
+def read_tracked_film(film: Path, track: Path, camera: Path | None = None) -> TrackedFilm:
+    """Reads a film and the folder that ``torchface track`` wrote of it.
+
+    Args:
+        film: a video.
+        track: the folder.
+        camera: the calibration with which it was tracked; needed where there was one.
+
+    Raises:
+        FileFormatError: the folder is not of ``torchface track``, or was tracked from a head that moves alone.
+        ValueRangeError: the film has another number of frames than the track, or the calibration is missing.
+    """
+    for name in (SUMMARY, LANDMARKS, ANIMATION):
+        if not (track / name).is_file():
+            raise FileFormatError(f"{track}: found no {name}, expected the folder that `torchface track` wrote")
+    video, record = open_video(film), read_json(track / SUMMARY, SUMMARY_FORMAT)
+    marks, animation = load_landmarks_csv(track / LANDMARKS), load_animation(track / ANIMATION)
+    if animation is None or animation.weights is None or marks.landmarks is None:
+        raise FileFormatError(f"{track / ANIMATION}: found no weights over time, expected those of `torchface track`")
+    count = len(marks.landmarks)
+    if video.count != count:
+        raise ValueRangeError(
+            f"{film}: found {video.count} frames, expected the {count} of {track}: it is another film, or was cut"
+        )
+    if len(animation.weights) != count:
+        raise ValueRangeError(
+            f"{track / ANIMATION}: found {len(animation.weights)} keys for {count} frames, expected one each; track "
+            "without --reduce"
+        )
+    columns = marks.extras.get("columns", {})
+    missing = [name for name in _POSE if name not in columns]
+    if missing:
+        raise NameMismatchError(f"{track / LANDMARKS}: found no {', '.join(missing)}, expected the head's pose")
+    pose = torch.stack([columns[name] for name in _POSE], 1).double()
+    seen = torch.isfinite(pose).all(1) & torch.isfinite(marks.landmarks.values).all(2).any(1)
+    if not bool(seen.any()):
+        raise ValueRangeError(f"{track}: found no frame with a face, expected some")
+    pose = pose.nan_to_num(0.0)
+    rig = load_rig(track / ANIMATION)
+    if camera is not None:
+        calibration = load_calibration(camera).resized(video.width, video.height)
+    elif not record["camera_assumed"].found:
+        raise ValueRangeError(f"{track}: found a track with a calibrated camera, expected its calibration (--camera)")
+    else:
+        focal = record["focal_px"].number()
+        middle = (video.width - 1) / 2, (video.height - 1) / 2
+        intrinsics = torch.tensor([[focal, 0, middle[0]], [0, focal, middle[1]], [0, 0, 1]], dtype=torch.float64)
+        calibration = CameraCalibration(intrinsics, torch.zeros(5, dtype=torch.float64), video.width, video.height)
+    weights = rig.weights_from(animation.weights)
+    return TrackedFilm(video, rig, weights, head_rotations(pose[:, 3:]), pose[:, :3], seen, calibration)
