@@ -4,6 +4,8 @@ import { existsSync, readFileSync } from "node:fs";
 import { createRequire } from "node:module";
 import { join } from "node:path";
 
+import { KTX2Loader } from "three/addons/loaders/KTX2Loader.js";
+
 const read = (path) => readFileSync(new URL(path, import.meta.url), "utf8");
 
 /** A file of an installed package, beside this folder or above it. */
@@ -19,9 +21,24 @@ const licences = {
     const parts = [
       read("./licences/torchface.txt"),
       `three.js ${version("three")}, https://threejs.org\n\n${packaged("three", "LICENSE")}`,
+      read("./licences/decoders.txt"),
       `ONNX Runtime Web ${version("onnxruntime-web")}, https://onnxruntime.ai\n\n${read("./licences/onnxruntime.txt")}`,
     ];
     this.emitFile({ type: "asset", fileName: "LICENCES.txt", source: parts.join(`\n${"-".repeat(80)}\n\n`) });
+  },
+};
+
+/**
+ * The worker of KTX2 pictures as a file of its own. three.js makes it of strings in a blob, which is under the page's policy,
+ * and the transcoder makes functions of strings when it starts.
+ */
+const basisWorker = {
+  name: "basis-worker",
+  generateBundle() {
+    const constants = ["EngineFormat", "EngineType", "TranscoderFormat", "BasisFormat"].map((name) => `let _${name} = ${JSON.stringify(KTX2Loader[name])};`);
+    const code = String(KTX2Loader.BasisWorker), body = code.slice(code.indexOf("{") + 1, code.lastIndexOf("}"));
+    const source = [...constants, packaged("three", "examples/jsm/libs/basis/basis_transcoder.js"), body].join("\n");
+    this.emitFile({ type: "asset", fileName: "assets/basis_worker.js", source });
   },
 };
 
@@ -40,5 +57,5 @@ export default {
     rollupOptions: { output: { assetFileNames: assetName } },
   },
   worker: { format: "es", rollupOptions: { output: { assetFileNames: assetName } } },
-  plugins: [licences],
+  plugins: [licences, basisWorker],
 };

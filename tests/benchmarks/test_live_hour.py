@@ -12,7 +12,7 @@ from planted_faces import Endless, ShadeSolver
 
 from torchface.io import load_take
 from torchface.shape_names import ARKIT
-from torchface.workflows.live.character import load_character
+from torchface.workflows.browser_app.character import load_character
 from torchface.workflows.live.live_session import LiveSession, Notes
 from torchface.workflows.live.recordings import Recordings
 from torchface.workflows.live.weight_streams import WeightStreams

@@ -25,34 +25,39 @@ def live(
     page: bool = True,
     port: int = 8080,
     size: str = "640x480",
+    loop: bool = False,
     seconds: float | None = None,
     cameras: Annotated[bool, arg(name="list")] = False,
     quiet: Quiet = False,
 ) -> None:
     """Move a character with your face, before a webcam or by a phone; no scan, no markers, no training.
 
-    A page in the browser shows the character and the camera's picture with what was found in it, and has sliders for
-    gain and smoothing, a guided calibration of ten seconds, and a button to record. It is at 127.0.0.1, no other
-    machine can open it, and no picture leaves this one. Ends with Ctrl+C. The page needs viser
-    (torchface's extra `viewer`); --no-page does without.
+    A page in the browser, the one of `torchface export app`, shows the character and the camera's picture with what
+    was found in it. It has a guided calibration, settings by groups of shapes, and takes that are recorded, played and
+    renamed; the stream view at /stream shows the character alone, for OBS. It is at 127.0.0.1, no other machine can
+    open it, and no picture leaves this one. Ends with Ctrl+C. In a checkout Node builds the page once; --no-page does
+    without.
 
     Args:
         camera: A camera's number, from 0; a video file that is played in its own time, of which --record misses no
             frame; or an address at which a phone or a program sends a face: livelink://:11111 (Live Link Face),
             ifacialmocap://PHONE (its address; it is asked to send), vmc://:39539, osc://:9000/PREFIX.
-        character: A .glb or USD file with shapes by ARKit's names, or a folder of OBJ files; the embedded performer if
-            absent.
+        character: A .glb or .vrm, whose data may be compressed, or a USD file or folder of OBJ files, with shapes by
+            ARKit's names; the embedded performer if absent.
         mapping: For shapes by other names: a mapping table, TOML, as `torchface retarget` takes it.
-        calibrate: Begin with the guided calibration; without the page it is asked for in the terminal.
+        calibrate: Begin with the guided calibration: rest, then five poses, each of which is checked; without the page
+            the terminal asks for rest and four poses, two seconds each.
         to: Where weights are sent to, again for each: livelink://HOST:11111 (Live Link Face, for Unreal),
             vmc://HOST:39539 (VMC protocol), osc://HOST:PORT/PREFIX (PREFIX/weights/jawOpen and so on),
             vrchat://HOST:9000, vts://HOST:8001 (VTube Studio), ifacialmocap://HOST:49983. Options of an address:
             ?rate=30 (frames a second at most), map=FILE (a mapping table), names=arkit+vrm0+vrm1 (vmc).
         record: Record from the first frame on into this folder: weights.csv by the character's names, live_link.csv,
-            animation.glb, summary.json. The page's button records into `recordings` without.
+            animation.glb (the character's own file with weights, head, neck and eyes), summary.json. The page's button
+            records into `recordings` without.
         page: Open the page in the browser.
         port: The first port to try for the page.
         size: WIDTHxHEIGHT to ask the camera for.
+        loop: Play a video file again and again.
         seconds: After which it ends; until Ctrl+C if absent.
         cameras: Only list the cameras.
         quiet: Show no progress.
@@ -69,7 +74,7 @@ def live(
             console.print("no camera found; a video file does as well: torchface live film.mp4")
         return
     sides = picture_size(size)
-    settings = LiveSettings(camera, character, mapping, to, record, calibrate, page, port, seconds, sides)
+    settings = LiveSettings(camera, character, mapping, to, record, calibrate, page, port, loop, seconds, sides)
 
     def opened(url: str) -> None:
         console.print("Open this page; Ctrl+C ends.")

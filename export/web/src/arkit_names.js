@@ -35,5 +35,10 @@ export function sourcesOf(name) {
   return whole !== wanted && ROW.has(whole) ? [[ROW.get(whole), 1]] : [];
 }
 
-/** The weight of a shape with these sources, of ARKit's weights. */
-export const weightOf = (sources, weights) => sources.reduce((sum, [row, factor]) => sum + factor * weights[row], 0);
+/** The weight of a shape of ARKit's weights: by its sources, or by a rule of torchface's mapping tables. */
+export function weightOf({ sources, rule }, weights) {
+  const sum = (rule?.sum ?? sources).reduce((all, [row, factor]) => all + factor * weights[row], 0);
+  if (!rule) return sum;
+  const product = rule.product.reduce((all, row) => all * weights[row], 1);
+  return Math.min(rule.upper, Math.max(rule.lower, rule.gain * (rule.sum.length > 0 || rule.product.length === 0 ? sum : 1) * product));
+}

@@ -1,74 +1,80 @@
 // A character of a .glb: its shapes by name, its head and its eyes.
 
 import * as THREE from "three";
-import { GLTFLoader } from "three/addons/loaders/GLTFLoader.js";
 
 import { ARKIT, weightOf } from "./arkit_names.js";
-import { CharacterError } from "./glb_container.js";
+import { characterBones, looksBack } from "./character_bones.js";
 import { checkCharacter } from "./character_check.js";
+import { characterLoader } from "./character_loader.js";
+import { CharacterError } from "./glb_container.js";
 import { upright } from "./head_angles.js";
 
-const HEAD = /^(mixamorig:?|cc_base_)?head$/i;
-const EYES = [/^(mixamorig:?|cc_base_)?(right_?eye(ball)?|eye(ball)?_?(right|r)|r_eye)$/i,
-  /^(mixamorig:?|cc_base_)?(left_?eye(ball)?|eye(ball)?_?(left|l)|l_eye)$/i]; // the right one first, as the graph has them
+const NECKS = 0.3; // of the head's rotation, where there is a neck
 const STILL = 1e-6; // of the character's size: what moves less does not move
+const RAISED = -0.5; // of an arm's way downwards; arms that hang lower stay
+const HANGING = [0.22, -0.97, 0.08]; // an arm at rest: outwards, up, forwards
 const LOOKS = ARKIT.flatMap((name, row) => (name.startsWith("eyeLook") ? [row] : []));
 
-/** Reads a character; throws a `CharacterError` in plain words for one that a face cannot move. */
-export async function readCharacter(bytes, name) {
-  const check = checkCharacter(bytes);
-  const loader = new GLTFLoader();
-  // Its own choice fetches pictures from blobs, which the page's policy forbids; an image element may show them.
-  loader.register((parser) => ((parser.textureLoader = new THREE.TextureLoader(parser.options.manager)), { name: "torchface_pictures_by_elements" }));
+/**
+ * Reads a character; throws a `CharacterError` in plain words for one that a face cannot move.
+ *
+ * @param {ArrayBuffer} bytes of a .glb or .vrm.
+ * @param {string} name of the file.
+ * @param {object | null} sources of each shape by its name, where ARKit's names do not say them; see `sourcesOf`.
+ */
+export async function readCharacter(bytes, name, sources = null) {
+  const check = checkCharacter(bytes, sources);
   let gltf;
+  const nodes = new Map();
   try {
-    gltf = await loader.parseAsync(bytes, "");
+    gltf = await (await characterLoader(check.document)).parseAsync(bytes, "");
+    for (const [part, node] of Object.entries(characterBones(check.document)))
+      nodes.set(part, { node, object: await gltf.parser.getDependency("node", node) });
   } catch (error) {
     throw new CharacterError(`The character cannot be read (${error.message ?? error}). Export it once more.`);
   }
-  return new Character(gltf, check, name);
+  return new Character(gltf, check, name, nodes);
 }
 
 class Character {
   #moved = [];
   #turned = [];
 
-  constructor(gltf, check, name) {
+  constructor(gltf, check, name, nodes) {
     this.name = name;
     this.check = check;
     this.root = new THREE.Group(); // turns with the head where the character has no bone for it
     this.root.add(gltf.scene);
+    if (looksBack(check.document)) gltf.scene.rotation.y = Math.PI;
     this.root.updateWorldMatrix(true, true);
+    for (const side of ["left", "right"]) hang(nodes.get(`${side}UpperArm`)?.object, nodes.get(`${side}LowerArm`)?.object);
     gltf.scene.traverse((object) => this.#addShapes(object, check, gltf.parser.associations));
     this.box = this.#box();
-    const node = (object) => gltf.parser.associations.get(object)?.nodes;
-    let head = null;
-    gltf.scene.traverse((object) => {
-      const eye = EYES.findIndex((pattern) => pattern.test(object.name));
-      if (object.isBone && head === null && HEAD.test(object.name)) head = object;
-      else if (eye >= 0 && !this.#looksByShapes(object)) this.#turned.push(new Turned(object, node(object), eye));
-    });
-    if (head !== null) this.#turned.unshift(new Turned(head, node(head), null));
+    const head = nodes.get("head"), neck = head && nodes.get("neck");
+    if (neck) this.#turned.push(new Turned(neck, ({ rotation }) => turn(rotation, NECKS)));
+    if (head) this.#turned.push(new Turned(head, ({ rotation }) => turn(rotation, neck ? 1 - NECKS : 1)));
     else this.#hangUp(gltf.scene);
+    ["rightEye", "leftEye"].forEach((part, eye) => {
+      const found = nodes.get(part);
+      if (found && !this.#looksByShapes(found.object)) this.#turned.push(new Turned(found, ({ gaze }) => gazeTurn(gaze, eye)));
+    });
+    this.hasHead = head !== undefined;
   }
 
   /** Takes what the graph says. */
-  pose({ weights, rotation, gaze }) {
+  pose(solved) {
     for (const { influences, shapes } of this.#moved)
-      for (const [row, sources] of shapes) influences[row] = weightOf(sources, weights);
-    const head = turn(upright(rotation));
-    if (this.#turned[0]?.eye !== null) this.root.quaternion.copy(head);
-    for (const one of this.#turned) one.set(one.eye === null ? head : gazeTurn(gaze, one.eye));
+      for (const [row, shape] of shapes) influences[row] = weightOf(shape, solved.weights);
+    if (!this.hasHead) this.root.quaternion.copy(turn(solved.rotation));
+    for (const one of this.#turned) one.pose(solved);
   }
 
   /** The nodes of the file that a recording turns, each with its rotation in each frame; see `animatedGlb`. */
   turnedNodes(take) {
-    return this.#turned.map((one) => ({
-      node: one.node,
-      quaternions: take.frames.map(({ rotation, gaze }) =>
-        one.local(one.eye === null ? turn(upright(rotation)) : gazeTurn(gaze, one.eye)).toArray(),
-      ),
-    }));
+    const found = this.#turned.map((one) => ({ node: one.node, quaternions: take.frames.map((frame) => one.local(frame).toArray()) }));
+    if (this.hasHead) return found;
+    const quaternions = take.frames.map(({ rotation }) => turn(rotation).toArray());
+    return [...found, { node: null, pivot: this.root.position.toArray(), quaternions }];
   }
 
   dispose() {
@@ -87,7 +93,7 @@ class Character {
     object.frustumCulled = false; // shapes and bones reach beyond the box that it is culled by
     const shapes = check.meshes.get(associations.get(object)?.meshes);
     if (!object.morphTargetInfluences || shapes === undefined) return;
-    const driven = shapes.flatMap(({ sources }, row) => (sources.length > 0 ? [[row, sources]] : []));
+    const driven = shapes.flatMap((shape, row) => (shape.sources.length > 0 ? [[row, shape]] : []));
     this.#moved.push({ object, influences: object.morphTargetInfluences, shapes: driven });
   }
 
@@ -97,7 +103,7 @@ class Character {
     return this.#moved.some(
       ({ object, shapes }) =>
         (object === eye || object.parent === eye) &&
-        shapes.some(([row, [[source]]]) => LOOKS.includes(source) && reach(object, row) > STILL * size),
+        shapes.some(([row, { sources: [[source]] }]) => LOOKS.includes(source) && reach(object, row) > STILL * size),
     );
   }
 
@@ -132,30 +138,46 @@ class Character {
 
 /** A node that is turned about its own origin, in the world's directions, from where it rests. */
 class Turned {
+  #object;
+  #way;
   #above;
   #rest;
 
-  constructor(object, node, eye) {
-    this.object = object;
-    this.node = node;
-    this.eye = eye;
+  constructor({ object, node }, way) {
+    [this.#object, this.node, this.#way] = [object, node, way];
     this.#above = object.parent.getWorldQuaternion(new THREE.Quaternion());
     this.#rest = object.quaternion.clone();
   }
 
-  local(turned) {
-    return this.#above.clone().invert().multiply(turned).multiply(this.#above).multiply(this.#rest);
+  local(frame) {
+    return this.#above.clone().invert().multiply(this.#way(frame)).multiply(this.#above).multiply(this.#rest);
   }
 
-  set(turned) {
-    this.object.quaternion.copy(this.local(turned));
+  pose(frame) {
+    this.#object.quaternion.copy(this.local(frame));
   }
 }
 
-function turn(rows) {
-  if (!rows.every(Number.isFinite)) return new THREE.Quaternion();
+/** A share of the head's rotation, in the world's directions. */
+function turn(rotation, share = 1) {
+  const rows = upright(rotation), turned = new THREE.Quaternion();
+  if (!rows.every(Number.isFinite)) return turned;
   const [a, b, c, d, e, f, g, h, i] = rows;
-  return new THREE.Quaternion().setFromRotationMatrix(new THREE.Matrix4().set(a, b, c, 0, d, e, f, 0, g, h, i, 0, 0, 0, 0, 1));
+  const whole = turned.clone().setFromRotationMatrix(new THREE.Matrix4().set(a, b, c, 0, d, e, f, 0, g, h, i, 0, 0, 0, 0, 1));
+  return turned.slerp(whole, share);
+}
+
+/** Lets an arm hang that stands off, as in the pose in which skeletons are bound. */
+function hang(upper, lower) {
+  if (!upper || !lower) return;
+  const from = upper.getWorldPosition(new THREE.Vector3());
+  const way = lower.getWorldPosition(new THREE.Vector3()).sub(from).normalize();
+  if (!(way.y > RAISED)) return;
+  const [out, up, front] = HANGING;
+  const turned = new THREE.Quaternion().setFromUnitVectors(way, new THREE.Vector3(out * Math.sign(way.x), up, front).normalize());
+  const above = upper.parent.getWorldQuaternion(new THREE.Quaternion());
+  upper.quaternion.premultiply(above.clone().invert().multiply(turned).multiply(above));
+  upper.updateWorldMatrix(false, true);
 }
 
 /** Of the gaze's angles to the person's left, which is x, and up. */

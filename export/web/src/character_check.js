@@ -5,11 +5,6 @@ import { CharacterError, readGlb } from "./glb_container.js";
 
 export const LARGEST_FILE = 100 * 2 ** 20; // bytes
 const MOST_NUMBERS = 2 ** 27; // of all morph targets together, half a gigabyte once they are unpacked
-const UNREADABLE = {
-  KHR_draco_mesh_compression: "Draco",
-  EXT_meshopt_compression: "meshopt",
-  KHR_texture_basisu: "Basis Universal",
-};
 const SHOWN = 8;
 
 /** Refuses what is too large to be read, by its size alone. */
@@ -25,25 +20,27 @@ export function checkSize(size) {
  * The meshes of a .glb that have shapes, and which of these the face drives.
  *
  * @param {ArrayBuffer} bytes the whole file.
+ * @param {Record<string, [number, number][] | object> | null} sources or rules of shapes by name; by ARKit's names if absent.
  * @returns {{document: object, binary: Uint8Array, meshes: Map<number, Shape[]>, driven: string[], unknown: string[]}}
- *   of each mesh its shapes in the file's order, each `{name, sources}`; names each once.
+ *   of each mesh its shapes in the file's order, each `{name, sources, rule}`; names each once.
  */
-export function checkCharacter(bytes) {
+export function checkCharacter(bytes, sources = null) {
+  const shape = (name) => {
+    const given = sources === null ? sourcesOf(name) : (sources[name] ?? []);
+    return Array.isArray(given) ? { name, sources: given } : { name, sources: [...given.sum, ...given.product.map((row) => [row, 1])], rule: given };
+  };
   checkSize(bytes.byteLength);
   const { document, binary } = readGlb(bytes);
-  const packed = (document.extensionsRequired ?? []).filter((name) => name in UNREADABLE);
-  if (packed.length > 0)
-    throw new CharacterError(`The file is compressed with ${UNREADABLE[packed[0]]}. Export it without compression.`);
   const outside = (document.images ?? []).some(({ uri }) => uri !== undefined && !uri.startsWith("data:"));
-  if (outside || (document.buffers ?? []).some(({ uri }) => uri !== undefined))
+  if (outside || (document.buffers ?? []).some(({ uri }) => uri !== undefined && !uri.startsWith("data:")))
     throw new CharacterError("The character's data lie in other files. Export it as one .glb with everything inside.");
   const meshes = new Map();
   let numbers = 0;
   for (const [index, mesh] of (document.meshes ?? []).entries()) {
     const counts = (mesh.primitives ?? []).map((one) => one.targets?.length ?? 0);
     if (!counts[0]) continue;
-    const names = mesh.extras?.targetNames ?? [];
-    meshes.set(index, Array.from({ length: counts[0] }, (_, i) => shape(String(names[i] ?? `shape ${i}`))));
+    const names = mesh.extras?.targetNames ?? mesh.primitives[0].extras?.targetNames ?? [];
+    meshes.set(index, Array.from({ length: counts[0] }, (_, i) => shape(String(names[i] ?? `target_${i}`))));
     for (const primitive of mesh.primitives)
       for (const target of primitive.targets ?? [])
         for (const accessor of Object.values(target)) numbers += 3 * (document.accessors?.[accessor]?.count ?? 0);
@@ -64,8 +61,6 @@ export function checkCharacter(bytes) {
     );
   return { document, binary, meshes, driven, unknown };
 }
-
-const shape = (name) => ({ name, sources: sourcesOf(name) });
 
 /** The first few names, and how many more there are. */
 export function listed(names) {

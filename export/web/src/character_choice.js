@@ -2,8 +2,10 @@
 
 import { readCharacter } from "./character.js";
 import { checkSize, listed } from "./character_check.js";
+import { forgetFile, keepFile, keptFile } from "./kept_files.js";
 import { hideProblem, showCharacterLine, showProblem } from "./words.js";
 
+const KEY = "character";
 const element = (id) => document.getElementById(id);
 
 /**
@@ -12,10 +14,15 @@ const element = (id) => document.getElementById(id);
  * @param {(character: object) => void} use is given each one that can be used.
  */
 export function offerCharacters(use) {
+  const take = (file) => taken(file, use, null, true);
   element("choose").addEventListener("click", () => element("file").click());
   element("file").addEventListener("change", ({ target }) => {
-    if (target.files.length > 0) take(target.files[0], use);
+    if (target.files.length > 0) take(target.files[0]);
     target.value = ""; // the same file may be chosen again
+  });
+  element("own").addEventListener("click", async () => {
+    await forgetFile(KEY).catch(() => {});
+    await shippedCharacter(use, false);
   });
   const dropping = (event, on) => {
     event.preventDefault();
@@ -25,27 +32,39 @@ export function offerCharacters(use) {
   document.addEventListener("dragleave", (event) => event.relatedTarget === null && dropping(event, false));
   document.addEventListener("drop", (event) => {
     dropping(event, false);
-    if (event.dataTransfer.files.length > 0) take(event.dataTransfer.files[0], use);
+    if (event.dataTransfer.files.length > 0) take(event.dataTransfer.files[0]);
   });
 }
 
-/** The character beside the page. */
-export async function shippedCharacter(use) {
-  const answer = await fetch("./character.glb");
+/**
+ * The character that was chosen last, else the one beside the page.
+ *
+ * @param {(character: object) => void} use is given it.
+ * @param {boolean} remembered whether one that was chosen before comes first.
+ */
+export async function shippedCharacter(use, remembered = true) {
+  const kept = remembered ? await keptFile(KEY).catch(() => null) : null;
+  if (kept && (await taken(kept, use, null, false))) return;
+  const [answer, shapes] = await Promise.all([fetch("./character.glb"), fetch("./character.json")]);
   if (!answer.ok) return showProblem("character", "character.glb is not beside this page; choose one of your own.");
-  await take(new File([await answer.blob()], "character.glb"), use);
+  const { name, sources } = shapes.ok ? await shapes.json() : { name: "character.glb", sources: null };
+  await taken(new File([await answer.blob()], name), use, sources, false);
 }
 
-async function take(file, use) {
+async function taken(file, use, sources, keep) {
   try {
     checkSize(file.size);
-    const character = await readCharacter(await file.arrayBuffer(), file.name);
+    const character = await readCharacter(await file.arrayBuffer(), file.name, sources);
     use(character);
+    element("own").hidden = sources !== null;
+    if (keep) await keepFile(KEY, file).catch(() => {}); // a browser that keeps nothing
     const { driven, unknown } = character.check;
     const others = unknown.length > 0 ? `; these stay still: ${listed(unknown)}` : "";
     showCharacterLine(`${file.name}: your face moves ${driven.length} of its ${driven.length + unknown.length} shapes${others}`);
     hideProblem("character");
+    return true;
   } catch (error) {
     showProblem("character", `${file.name}: ${error.message}`);
+    return false;
   }
 }

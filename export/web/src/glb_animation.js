@@ -10,7 +10,8 @@ const FLOAT = 5126;
  *
  * @param {object} character what `checkCharacter` returned.
  * @param {Take} take the recording, at least one frame.
- * @param {{node: number, quaternions: number[][]}[]} turned nodes that were rotated, and how in each frame (x, y, z, w).
+ * @param {{node: number | null, pivot?: number[], quaternions: number[][]}[]} turned nodes that were rotated, and how in each frame (x, y, z, w);
+ *   without a node the whole scene about `pivot`.
  * @returns {Uint8Array} a .glb.
  */
 export function animatedGlb(character, take, turned = []) {
@@ -31,14 +32,23 @@ export function animatedGlb(character, take, turned = []) {
     if (!outputs.has(key)) outputs.set(key, writer.add(keys(shapes, rest, take), "SCALAR"));
     drive(index, "weights", outputs.get(key));
   }
-  for (const { node, quaternions } of turned) drive(node, "rotation", writer.add(quaternions.flat(), "VEC4"));
+  for (const { node, pivot, quaternions } of turned)
+    drive(node ?? hungUp(document, pivot), "rotation", writer.add(quaternions.flat(), "VEC4"));
   document.animations = [...(document.animations ?? []), { name: "performance", samplers, channels }];
   return writeGlb(document, writer.binary());
 }
 
+/** The node that turns all that the first scene shows about a point. */
+function hungUp(document, pivot) {
+  const scene = document.scenes[document.scene ?? 0], at = document.nodes.length;
+  document.nodes.push({ name: "head", translation: pivot, children: [at + 1] }, { translation: pivot.map((value) => -value), children: scene.nodes });
+  scene.nodes = [at];
+  return at;
+}
+
 function keys(shapes, rest, take) {
   return take.frames.flatMap(({ weights }) =>
-    shapes.map(({ sources }, i) => (sources.length > 0 ? weightOf(sources, weights) : (rest[i] ?? 0))),
+    shapes.map((shape, i) => (shape.sources.length > 0 ? weightOf(shape, weights) : (rest[i] ?? 0))),
   );
 }
 

@@ -43,7 +43,7 @@ function parsed(chunk) {
 /** Puts a .glb together; `document.buffers[0]` gets the buffer's size. */
 export function writeGlb(document, binary) {
   const padded = (size) => Math.ceil(size / 4) * 4;
-  document = { ...document, buffers: [{ ...document.buffers?.[0], byteLength: binary.length }] };
+  document = { ...document, buffers: [{ ...document.buffers?.[0], byteLength: binary.length }, ...(document.buffers?.slice(1) ?? [])] };
   const json = new TextEncoder().encode(JSON.stringify(document));
   const total = 12 + 8 + padded(json.length) + 8 + padded(binary.length);
   const bytes = new Uint8Array(total), view = new DataView(bytes.buffer);

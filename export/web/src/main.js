@@ -1,129 +1,108 @@
-// The page: camera, solver, character and controls put together.
+// The page: engine, character and controls put together. The engine runs in this browser, or in Python behind a socket.
 
 import "./style.css";
 
 import { Calibration, tone } from "./calibration.js";
-import { closeCamera, openCamera } from "./camera.js";
+import { CameraEngine } from "./camera_engine.js";
 import { offerCharacters, shippedCharacter } from "./character_choice.js";
 import { drawFace } from "./face_overlay.js";
-import { pumpFrames } from "./frame_pump.js";
 import { FrameRate } from "./frame_rate.js";
-import { Recording } from "./recording.js";
-import { Solver } from "./solver.js";
+import { offerGroups } from "./group_settings.js";
+import { ServerEngine } from "./server_engine.js";
+import { keepSettings, settings } from "./settings.js";
 import { Stage } from "./stage.js";
-import { hideProblem, showProblem, showStatus, speak } from "./words.js";
+import { StateWords, isSeen } from "./state_words.js";
+import { isStream, layOutStream } from "./stream_view.js";
+import { TakeList } from "./take_list.js";
+import { shapeSettings, WeightControls } from "./weight_controls.js";
+import { hideProblem, showNotes, showProblem, showStatus, speak } from "./words.js";
 
-const SEEN = 0.5; // of presence; below it there is no face
-const GONE = 1000; // milliseconds without a face until that is said
-
+const NEUTRAL = { ...shapeSettings({}), centre: null, frozen: false };
 const element = (id) => document.getElementById(id);
-const rate = new FrameRate();
-const recording = new Recording(() => character);
+const server = document.documentElement.dataset.engine === "server", stream = isStream();
+const rate = new FrameRate(), words = new StateWords();
 let character = null, stage = null, calibration = null;
-let solver = null, loading = null, stream = null, pump = null;
-let resetAsked = false, lastSeen = 0;
+let newest = null; // as it was solved, before what the user set
+let frozen = false, said = "";
+let weights = null; // what the user set of weights
 
-const controls = () => {
-  const reset = resetAsked;
-  resetAsked = false;
-  const value = (id) => Number(element(id).value);
-  return { pose: calibration?.pose ?? 0, gain: value("gain"), smoothing: value("smoothing"), reset };
+const mirrored = (stream ? layOutStream() : null) ?? settings.mirror;
+
+function collect() {
+  weights = calibration ? NEUTRAL : { ...shapeSettings(settings.groups, settings.gains), centre: settings.centre, frozen };
+}
+
+const page = {
+  controls: () => ({
+    solver: { pose: calibration?.pose ?? 0, gain: settings.gain, smoothing: settings.smoothing },
+    weights,
+    mirror: settings.mirror,
+  }),
+  show(wanted, solved) {
+    newest = solved;
+    rate.add(solved.milliseconds);
+    if (!takes.playing) stage?.pose(wanted);
+    if (stream) return;
+    const seen = isSeen(solved);
+    if (!document.hidden) showStatus(said || words.of(solved)); // else the pause has been said
+    drawFace(element("overlay"), seen ? solved : null);
+    takes.tell();
+    if (calibration !== null) goOnCalibrating(solved, seen);
+  },
+  running(on) {
+    document.documentElement.dataset.running = on ? "on" : "off";
+    element("start").textContent = on ? "Stop camera" : "Start camera";
+    element("start").classList.toggle("first", !on);
+    element("invitation").hidden = on;
+    for (const id of ["calibrate", "reset", "record", "recenter", "freeze"]) element(id).disabled = !on;
+    words.forget();
+    if (on) return;
+    endCalibration();
+    takes.stop();
+    rate.forget();
+    drawFace(element("overlay"), null);
+    showStatus(said);
+  },
+  status: showStatus,
+  problem: (what) => showProblem("camera", what),
+  takesChanged: () => takes.refresh(),
+  /** What torchface says of itself, beside the frames. */
+  state({ words: told = "", notes = [], ended = "", calibrate = false }) {
+    said = ended || told;
+    if (ended) showStatus(ended);
+    showNotes(notes);
+    if (calibrate && calibration === null && !stream) startCalibration();
+  },
 };
 
-async function start() {
-  element("start").disabled = true;
-  hideProblem("camera");
-  try {
-    showStatus("Asking for the camera…");
-    const loaded = loadedSolver(); // while the user is asked
-    loaded.catch(() => {}); // said once the camera is there
-    stream = await openCamera(element("video"), () => stop("The camera was unplugged or taken away."));
-    element("invitation").hidden = true;
-    showStatus("Loading the solver…");
-    await loaded;
-    if (stream !== null) run(); // else it was taken away meanwhile
-  } catch (error) {
-    stop(error.message);
-  }
-  element("start").disabled = false;
-}
+const engine = server ? new ServerEngine(page, element("picture")) : new CameraEngine(page, element("video"));
+const playing = new WeightControls();
+const takes = new TakeList(engine.takes, () => character, (frame) => stage?.pose(playing.apply(frame, NEUTRAL)));
 
-function run() {
-  pump = pumpFrames(element("video"), solver, controls, show, (error) => {
-    forgetSolver();
-    stop(`The solver stopped: ${error.message}`);
-  });
-  setRunning(true);
-}
-
-/** The solver, which is loaded once; after a failure once more. */
-async function loadedSolver() {
-  loading ??= (solver = new Solver()).load("./webcam.onnx");
-  try {
-    await loading;
-  } catch (error) {
-    forgetSolver();
-    throw new Error(`The solver could not be loaded: ${error.message}.`);
-  }
-}
-
-function forgetSolver() {
-  solver?.close();
-  solver = loading = null;
-}
-
-function stop(problem = null) {
-  pump?.stop();
-  if (stream !== null) closeCamera(element("video"), stream);
-  pump = stream = null;
-  endCalibration();
-  recording.stop();
-  rate.forget();
-  drawFace(element("overlay"), null);
-  setRunning(false);
-  showStatus("");
-  if (problem) showProblem("camera", problem);
-}
-
-function setRunning(running) {
-  element("start").textContent = running ? "Stop camera" : "Start camera";
-  element("start").classList.toggle("first", !running);
-  element("invitation").hidden = running;
-  for (const id of ["calibrate", "reset", "record"]) element(id).disabled = !running;
-  lastSeen = performance.now();
-}
-
-function show(solved) {
-  const seen = solved.presence > SEEN;
-  if (seen) lastSeen = performance.now();
-  const gone = performance.now() - lastSeen > GONE;
-  if (!document.hidden) // else this is the picture that was under way, and the pause has been said
-    showStatus(gone ? "No face is seen. Move into the picture, with light on your face." : "Your face is followed.");
-  rate.add(solved.milliseconds);
-  drawFace(element("overlay"), seen ? solved : null);
-  stage?.pose(solved);
-  recording.add(solved);
-  if (calibration !== null) goOnCalibrating(solved.time, seen);
-}
-
-function goOnCalibrating(time, seen) {
-  const step = calibration.advance(time, seen);
+function goOnCalibrating({ time, weights: seenWeights }, seen) {
+  const step = calibration.advance(time, seen, seenWeights);
   element("prompt-progress").value = calibration.progress;
+  element("prompt-remark").textContent = calibration.remark;
   if (step === "same") return;
   tone();
   if (step === "done") {
+    const { missed, gains } = calibration;
+    keepSettings({ gains });
     endCalibration();
-    speak("Calibrated");
-  } else showPrompt();
+    const result = missed.length > 0 ? `Calibrated; not seen: ${missed.join(", ")}.` : "Calibrated.";
+    showNotes([result]);
+    speak(result);
+  } else showPrompt(step === "again" ? "Once more, it was not seen: " : "");
 }
 
-function showPrompt() {
+function showPrompt(before = "") {
   element("prompt-words").textContent = `${calibration.number} of ${Calibration.count}: ${calibration.prompt}`;
-  speak(calibration.prompt);
+  speak(before + calibration.prompt);
 }
 
 function startCalibration() {
   calibration = new Calibration();
+  collect();
   element("prompt").hidden = false;
   element("prompt-progress").value = 0;
   showPrompt();
@@ -134,35 +113,79 @@ function endCalibration() {
   if (calibration === null) return;
   const focused = element("prompt").contains(document.activeElement);
   calibration = null;
+  collect();
   element("prompt").hidden = true;
   if (focused) element("calibrate").focus();
 }
 
+function recenter() {
+  if (newest === null || !newest.rotation.every(Number.isFinite)) return;
+  keepSettings({ centre: { rotation: [...newest.rotation], gaze: [...newest.gaze] } });
+  collect();
+  speak("Head and gaze are centred");
+}
+
+function freeze() {
+  frozen = !frozen;
+  element("freeze").setAttribute("aria-pressed", String(frozen));
+  collect();
+}
+
+function setMirror(on) {
+  for (const view of document.querySelectorAll(".view")) view.classList.toggle("mirrored", on);
+}
+
 function showRate() {
-  const now = rate.get();
-  const threads = solver?.facts?.threads > 1 ? `, ${solver.facts.threads} threads` : "";
+  const now = rate.get(), threads = engine.threads > 1 ? `, ${engine.threads} threads` : "";
   element("rate").value = now ? `${now.perSecond.toFixed(0)} frames a second, ${now.milliseconds.toFixed(0)} ms each${threads}` : "";
 }
 
-element("start").addEventListener("click", () => (stream === null ? start() : stop()));
+element("start").addEventListener("click", async () => {
+  if (engine.running) return engine.stop();
+  element("start").disabled = true;
+  hideProblem("camera");
+  await engine.start();
+  element("start").disabled = false;
+});
 element("calibrate").addEventListener("click", startCalibration);
 element("prompt-stop").addEventListener("click", endCalibration);
+element("recenter").addEventListener("click", recenter);
+element("freeze").addEventListener("click", freeze);
 element("reset").addEventListener("click", () => {
-  resetAsked = true;
+  engine.reset();
+  keepSettings({ gains: {}, centre: null });
+  collect();
   speak("Begun anew");
 });
+element("mirror").checked = settings.mirror;
 element("mirror").addEventListener("change", ({ target }) => {
-  for (const view of document.querySelectorAll(".view")) view.classList.toggle("mirrored", target.checked);
+  keepSettings({ mirror: target.checked });
+  setMirror(target.checked);
 });
-for (const id of ["gain", "smoothing"])
-  element(id).addEventListener("input", ({ target }) => (element(`${id}-value`).value = Number(target.value).toFixed(1)));
-document.addEventListener("keydown", ({ key }) => key === "Escape" && endCalibration());
+for (const id of ["gain", "smoothing"]) {
+  const tell = () => (element(`${id}-value`).value = settings[id].toFixed(1));
+  element(id).value = settings[id];
+  tell();
+  element(id).addEventListener("input", ({ target }) => {
+    keepSettings({ [id]: Number(target.value) });
+    tell();
+  });
+}
+document.addEventListener("keydown", ({ key, target, ctrlKey, metaKey, altKey }) => {
+  if (key === "Escape") return endCalibration();
+  if (ctrlKey || metaKey || altKey || target.matches?.("input:not([type=range], [type=checkbox])")) return;
+  if (key === "c") recenter();
+  if (key === "f" && engine.running) freeze();
+});
 document.addEventListener("visibilitychange", () => {
-  if (pump !== null) showStatus(document.hidden ? "Paused while this tab is hidden." : "");
-  lastSeen = performance.now();
+  if (engine.running && !server) showStatus(document.hidden ? "Paused while this tab is hidden." : "");
+  words.forget();
 });
 setInterval(showRate, 500);
 
+collect();
+setMirror(mirrored);
+offerGroups(element("groups"), collect);
 try {
   stage = new Stage(element("character"));
 } catch {
@@ -171,6 +194,9 @@ try {
 const use = (chosen) => {
   character = chosen;
   stage?.show(chosen);
+  if (newest !== null) stage?.pose(newest);
 };
-offerCharacters(use);
+if (!stream) offerCharacters(use);
 shippedCharacter(use).catch((error) => showProblem("character", `The character could not be loaded: ${error.message}.`));
+takes.refresh();
+if (server || stream) engine.start();

@@ -85,7 +85,7 @@ export class Stage {
       const size = this.#character.box.getSize(new THREE.Vector3());
       const middle = this.#character.box.getCenter(new THREE.Vector3());
       const half = Math.tan((FIELD * Math.PI) / 360);
-      const distance = (1.15 * Math.max(size.y, size.x / this.#camera.aspect)) / (2 * half) + size.z / 2;
+      const distance = (1.04 * Math.max(size.y, size.x / this.#camera.aspect)) / (2 * half) + size.z / 2;
       this.#camera.position.copy(middle).add(new THREE.Vector3(0, 0, distance));
       this.#camera.lookAt(middle);
       [this.#camera.near, this.#camera.far] = [distance / 50, distance * 20];

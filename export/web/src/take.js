@@ -1,6 +1,7 @@
 // A recording: weights and rotations of each frame, at the camera's own times.
 
 export const LONGEST = 3600; // seconds; about 40 MB
+const ROW = 66;
 
 export class Take {
   frames = [];
@@ -17,6 +18,22 @@ export class Take {
     const seconds = Math.fround((time - this.#start) / 1000); // as it stands in a .glb, where times must rise
     if (this.frames.length > 0 && seconds <= this.frames.at(-1).seconds) return;
     this.frames.push({ seconds, weights: weights.slice(), rotation: rotation.slice(), gaze: gaze.slice() });
+  }
+
+  /** Rows of `ROW` numbers: seconds, weights, rotation, gaze. */
+  static ofRows(rows) {
+    const take = new Take();
+    for (let at = 0; at + ROW <= rows.length; at += ROW) {
+      const part = (first, count) => rows.slice(at + first, at + first + count);
+      take.frames.push({ seconds: rows[at], weights: part(1, 52), rotation: part(53, 9), gaze: part(62, 4) });
+    }
+    return take;
+  }
+
+  get rows() {
+    const rows = new Float32Array(ROW * this.frames.length);
+    this.frames.forEach(({ seconds, weights, rotation, gaze }, i) => rows.set([seconds, ...weights, ...rotation, ...gaze], ROW * i));
+    return rows;
   }
 
   get seconds() {

@@ -22,6 +22,12 @@ export function showCharacterLine(words) {
   element("character-line").textContent = words;
 }
 
+/** The last notes of what happened. */
+export function showNotes(notes) {
+  const text = notes.slice(-3).join("\n");
+  if (text && element("notes").textContent !== text) element("notes").textContent = text;
+}
+
 /** For screen readers: what those who see have before their eyes. */
 export function speak(words) {
   element("spoken").textContent = words;

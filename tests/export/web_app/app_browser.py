@@ -118,7 +118,7 @@ class Page:
         """Starts the camera, if it does not run, and waits for the first answer."""
         if self.text("start") == "Start camera":
             self.click("start")
-        until(lambda: self.text("status").startswith(("Your face", "No face")) or self.problem)
+        until(lambda: self.text("status").startswith(("Your face", "No face", "Learning")) or self.problem)
         assert not self.problem, self.problem
 
     @property

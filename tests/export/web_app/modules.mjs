@@ -14,16 +14,48 @@ const jobs = {
     return { arkit: ARKIT, sources: JSON.parse(input).map(sourcesOf) };
   },
 
-  /** The poses that frames of a list of [milliseconds, whether a face is seen] are told, and when it was over. */
+  /** What a calibration asks and says of frames of [milliseconds, whether a face is seen, weights by name]. */
   async calibration() {
     const { Calibration } = await load("calibration");
-    const calibration = new Calibration(), poses = [], prompts = new Set();
-    for (const [time, seen] of JSON.parse(input)) {
-      prompts.add(calibration.prompt);
-      poses.push(calibration.pose);
-      if (calibration.advance(time, seen) === "done") return { poses, done: time, prompts: [...prompts] };
+    const { ARKIT } = await load("arkit_names");
+    const calibration = new Calibration(), told = [];
+    for (const [time, seen, shown] of JSON.parse(input)) {
+      const number = calibration.number;
+      const step = calibration.advance(time, seen, ARKIT.map((name) => shown[name] ?? 0));
+      told.push({ number, step, pose: step === "done" ? 0 : calibration.pose, remark: calibration.remark });
+      if (step === "done") break;
     }
-    return { poses, done: null };
+    return { told, missed: calibration.missed, gains: calibration.gains };
+  },
+
+  /** Frames of {weights, rotation, gaze, interval} as settings want them. */
+  async controls() {
+    const { WeightControls } = await load("weight_controls");
+    const controls = new WeightControls();
+    return JSON.parse(input).map(({ solved, settings }) => {
+      const { weights, rotation, gaze } = controls.apply(solved, settings);
+      return [...weights, ...rotation, ...gaze];
+    });
+  },
+
+  /** Settings of each shape, of groups and factors by shape. */
+  async settings() {
+    const { shapeSettings } = await load("weight_controls");
+    const { groups, gains } = JSON.parse(input);
+    return shapeSettings(groups, gains);
+  },
+
+  /** A .glb as base64 with a take of one frame or more, given as rows. */
+  async animation() {
+    globalThis.self = globalThis;
+    const { readCharacter } = await load("character");
+    const { animatedGlb } = await load("glb_animation");
+    const { Take } = await load("take");
+    const { glb, rows, sources } = JSON.parse(input);
+    const data = readFileSync(glb);
+    const character = await readCharacter(data.buffer.slice(data.byteOffset, data.byteOffset + data.length), "file", sources);
+    const take = Take.ofRows(Float32Array.from(rows.flat()));
+    return Buffer.from(animatedGlb(character.check, take, character.turnedNodes(take))).toString("base64");
   },
 
   /** Times and rate of a recording of frames at these milliseconds. */

@@ -31,8 +31,10 @@ def watched(page: Page, what: str) -> Any:
 
 
 def blob(page: Page, button: str) -> bytes:
-    """What a button downloads."""
-    page.click(button)
+    """What a button of the newest take downloads."""
+    count = page.driver.execute_script("return watched.blobs.length")
+    page.driver.execute_script("document.querySelector(`#takes .${arguments[0]}`).click()", button)
+    until(lambda: page.driver.execute_script("return watched.blobs.length") > count)
     script = "const done = arguments[0]; watched.text(watched.blobs.at(-1)).then(done)"
     return base64.b64decode(page.driver.execute_async_script(script))
 
@@ -60,10 +62,13 @@ def record(page: Page, folder: Path, frames: int) -> Recorded:
     """Starts the camera, records so many frames or a few more, stops both, and downloads what the page made of it."""
     page.driver.execute_script("watched.keep = true")
     page.start()
+    kept = "return document.querySelectorAll('#takes li').length"
+    takes = page.driver.execute_script(kept)
     page.click("record")
     until(lambda: page.recorded_frames >= frames)
     page.driver.execute_script("document.getElementById('record').click(); document.getElementById('start').click()")
     page.driver.execute_script("watched.keep = false")
+    until(lambda: page.driver.execute_script(kept) > takes)
     script = """
     const done = arguments[0];
     const withText = async (one) => ({...one, pixels: one.pixels && await watched.text(one.pixels)});

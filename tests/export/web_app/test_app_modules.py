@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import json
 import shutil
 import struct
@@ -14,13 +15,20 @@ import numpy as np
 import pytest
 import torch
 from rig_samples import quad_sheet
+from scipy.spatial.transform import Rotation
 
 from torchface import BlendshapeRig
-from torchface.errors import MissingExtraError
+from torchface.errors import MissingExtraError, ValueRangeError
 from torchface.io import save_rig
+from torchface.io.gltf.accessors import read_floats
+from torchface.io.gltf.gltf_document import read_document
+from torchface.io.gltf.performance_animation import Performance, performed_glb
 from torchface.progress import silent
 from torchface.shape_names import ARKIT, mapping
 from torchface.workflows.browser_app.built_page import installed_packages, page_sources
+from torchface.workflows.browser_app.character import load_character
+from torchface.workflows.live.live_frames import LiveFrame
+from torchface.workflows.live.weight_controls import WeightControls, read_weight_settings
 
 pytestmark = pytest.mark.browser
 Run = Callable[[str, object], Any]
@@ -65,16 +73,94 @@ def test_names_are_taken_as_torchface_takes_them(run: Run) -> None:
     torch.testing.assert_close(found, mapping(ARKIT, names))
 
 
-def test_calibration_takes_ten_seconds_of_a_face_that_is_seen(run: Run) -> None:
-    frames = [(1000 * i / 30, not 60 <= i < 105) for i in range(500)]  # 1.5 s without a face
-    told = run("calibration", frames)
-    assert abs(told["done"] / 1000 - 11.5) < 0.3
-    assert len(told["prompts"]) == 5
-    poses = np.array(told["poses"])
-    order = poses[np.flatnonzero(np.diff(poses, prepend=-1))]
-    assert order.tolist() == [0, 1, 0, 2, 0, 3, 0, 4, 0, 5]
+POSES = (
+    {"jawOpen": 0.7},
+    {"mouthSmileLeft": 0.6, "mouthSmileRight": 0.5},
+    {"browInnerUp": 0.6},
+    {"eyeBlinkLeft": 0.8, "eyeBlinkRight": 0.8},
+    {"mouthPucker": 0.5},
+)
+
+
+def performed(*parts: tuple[float, dict[str, float]]) -> list[tuple[float, bool, dict[str, float]]]:
+    """Frames of parts of so many seconds each."""
+    frames: list[tuple[float, bool, dict[str, float]]] = []
+    for seconds, shown in parts:
+        frames += [(1000 * (len(frames) + i) / 30, True, shown) for i in range(round(30 * seconds))]
+    return frames
+
+
+def test_a_calibration_takes_the_poses_that_are_shown(run: Run) -> None:
+    told = run("calibration", performed((3.1, {}), *((1.6, shown) for shown in POSES)))
+    assert [one["number"] for one in told["told"] if one["step"] in ("next", "done")] == [1, 2, 3, 4, 5, 6]
+    assert told["told"][-1]["step"] == "done"
+    assert told["missed"] == []
+    poses = np.array([one["pose"] for one in told["told"]])
+    assert poses[np.flatnonzero(np.diff(poses, prepend=0))].tolist() == [1, 0, 2, 0, 3, 0, 4, 0, 5, 0]
     held = np.bincount(poses, minlength=6)[1:] / 30
-    assert held.min() > 1.2
+    assert held[0] == pytest.approx(3, abs=0.15)
+    assert held[1:] == pytest.approx([1] * 4, abs=0.15)
+    assert told["gains"] == pytest.approx({"mouthPucker": 1.6, "mouthFunnel": 1.6})  # 0.8 / 0.5
+
+
+def test_somebody_who_does_nothing_is_asked_twice_and_learns_what_was_not_seen(run: Run) -> None:
+    told = run("calibration", performed((3.1, {}), (12.5, {"jawOpen": 0.1}), (70, {})))
+    steps = [(one["number"], one["step"]) for one in told["told"] if one["step"] != "same"]
+    assert steps == [
+        (1, "next"),
+        *((n, step) for n in range(2, 6) for step in ("again", "next")),
+        (6, "again"),
+        (6, "done"),
+    ]
+    assert told["missed"] == ["open mouth", "smile", "raised eyebrows", "shut eyes", "puckered lips"]
+    assert not any(one["pose"] for one in told["told"] if one["number"] > 1)
+    assert "A little more." in {one["remark"] for one in told["told"] if one["number"] == 2}
+
+
+def test_a_calibration_waits_until_the_face_rests_and_stands_while_none_is_seen(run: Run) -> None:
+    talking = [(0.2, {"jawOpen": 0.4 * (i % 2)}) for i in range(20)]
+    frames = performed(*talking, (1.5, {}))
+    unseen = [(frames[-1][0] + 1000 * i / 30, False, {}) for i in range(1, 90)]
+    rest = [(unseen[-1][0] + 1000 * i / 30, True, {}) for i in range(1, 90)]
+    told = run("calibration", [*frames, *unseen, *rest])["told"]
+    (at,) = [i for i, one in enumerate(told) if one["step"] == "next"]
+    assert len(frames) + len(unseen) + 30 < at  # three still seconds, none of them while it talked or was away
+    assert {one["remark"] for one in told[len(frames) : len(frames) + 80]} == {
+        "Your face is not seen: the clock stands."
+    }
+    assert "Your face moves: let it rest." in {one["remark"] for one in told[: len(frames)]}
+
+
+def test_settings_do_to_weights_what_they_do_where_python_solves(run: Run) -> None:
+    generator = torch.Generator().manual_seed(0)
+    controls = WeightControls()
+    groups = {"jaw": {"gain": 1.5, "dead": 0.1, "smoothing": 0.5}, "mouth": {"smoothing": 1.0}, "gaze": {"muted": True}}
+    shapes = run("settings", {"groups": groups, "gains": {"mouthPucker": 2}})
+    assert shapes["gain"][ARKIT.index("jawOpen")] == 1.5
+    assert shapes["gain"][ARKIT.index("mouthPucker")] == 2
+    assert shapes["gain"][ARKIT.index("eyeLookUpLeft")] == 0
+    turns = Rotation.from_rotvec(0.3 * np.random.default_rng(0).normal(size=(9, 3))).as_matrix()
+    solved = np.diag([1.0, -1.0, -1.0]) @ turns
+    centre = {"rotation": solved[0].ravel().tolist(), "gaze": [0.1, 0.2, 0.1, -0.1]}
+    frames, expected = [], []
+    for i in range(1, 9):
+        weights = torch.rand(52, generator=generator)
+        settings = {**shapes, "centre": centre if i > 2 else None, "frozen": i == 6}
+        gaze = torch.rand(2, 2, generator=generator)
+        rotation = torch.tensor(solved[i], dtype=torch.float32)
+        given = {"weights": weights, "rotation": rotation, "gaze": gaze}
+        told = {name: values.flatten().tolist() for name, values in given.items()}
+        frames.append({"solved": {**told, "interval": i / 40}, "settings": settings})
+        controls.settings = read_weight_settings(settings)
+        made = controls.apply(LiveFrame(weights, rotation, torch.zeros(68, 2), gaze=gaze), i / 40)
+        expected.append(torch.cat([made.weights, made.rotation.flatten(), made.gaze.flatten()]).numpy())
+    found = np.array(run("controls", frames))
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-5)
+    assert (found[5] == found[4]).all()  # frozen
+    own = Rotation.from_matrix(np.diag([1.0, -1.0, -1.0]) @ found[-1][52:61].reshape(3, 3))
+    assert (own.inv() * Rotation.from_matrix(turns[8] @ turns[0].T)).magnitude() < 1e-5
+    with pytest.raises(ValueRangeError, match="expected 52 numbers from 0"):
+        read_weight_settings({"gain": [1.0] * 51})
 
 
 def test_times_rise_and_the_rate_is_a_usual_one(run: Run) -> None:
@@ -132,6 +218,81 @@ def test_morph_targets_summed_for_software_drawing_are_those_of_three(run: Run, 
     assert not told["left"]
 
 
+TILT = [0.0, 0.0, 0.3826834, 0.9238795]  # 45 degrees about z: bones rarely lie along the axes
+
+
+def with_bones(root: dict[str, Any]) -> None:
+    """Neck, head and eyes beside the mesh, as bones of a skin that nothing is bound to."""
+    first = len(root["nodes"])
+    root["nodes"] += [
+        {"name": "mixamorig:Neck", "rotation": TILT, "translation": [0.0, 0.1, 0.0], "children": [first + 1]},
+        {"name": "mixamorig:Head", "rotation": TILT, "children": [first + 2, first + 3]},
+        {"name": "LeftEye", "rotation": TILT, "translation": [0.03, 0.05, 0.1]},
+        {"name": "RightEye", "translation": [-0.03, 0.05, 0.1]},
+    ]
+    root["skins"] = [{"joints": [first, first + 1]}]
+    root["scenes"][0]["nodes"].append(first)
+
+
+def plain(root: dict[str, Any]) -> None:
+    """Nothing changed: the head has no bone."""
+
+
+@pytest.mark.parametrize("edit", [with_bones, plain])
+def test_a_take_in_the_characters_file_is_the_same_from_page_and_python(
+    run: Run, tmp_path: Path, edit: Callable[[dict[str, Any]], None]
+) -> None:
+    names = ("jawOpen", "mouthSmile_L", "antenna")
+    path = edited(sheet(tmp_path / "sheet.glb", names).read_bytes(), tmp_path / "bones.glb", edit)
+    rng = np.random.default_rng(3)
+    angles = 0.4 * rng.normal(size=(5, 9))
+    angles[:, [5, 8]] = 0  # eyes do not roll
+    arkit = rng.random((5, 52)).astype(np.float32)
+    head = np.diag([1.0, -1.0, -1.0]) @ Rotation.from_euler("YXZ", angles[:, :3]).as_matrix()
+    seconds = np.arange(5) / 30
+    rows = np.column_stack([seconds, arkit, head.reshape(5, 9), -angles[:, [6, 7, 3, 4]]])
+    character = load_character(path)
+    job = {"glb": str(path), "rows": rows.tolist(), "sources": json.loads(character.page_table())["sources"]}
+    (tmp_path / "page.glb").write_bytes(base64.b64decode(run("animation", job)))
+    weights = character.weights(torch.from_numpy(arkit)).numpy()
+    ours = performed_glb(character.document, Performance(seconds, character.names, weights, angles))
+    (tmp_path / "python.glb").write_bytes(ours)
+    found, expected = (animated(tmp_path / name) for name in ("python.glb", "page.glb"))
+    assert found.keys() == expected.keys()
+    for name, keys in expected.items():
+        if name[1] == "rotation":  # a quaternion and its negative are one rotation
+            keys, found[name] = (rows.reshape(-1, 4) for rows in (keys, found[name]))
+            keys = keys * np.sign((keys * found[name]).sum(1, keepdims=True))
+        np.testing.assert_allclose(found[name], keys, rtol=0, atol=2e-5, err_msg=str(name))
+    np.testing.assert_allclose(found["face", "weights"], weights.reshape(-1), atol=1e-6)
+    whole = Rotation.from_euler("YXZ", angles[:, :3])
+    if edit is plain:
+        turned = Rotation.from_quat(found["head", "rotation"].reshape(-1, 4))
+        assert (turned * whole.inv()).magnitude().max() < 1e-5
+        return
+    neck, own, left = (
+        Rotation.from_quat(found[name, "rotation"].reshape(-1, 4))
+        for name in ("mixamorig:Neck", "mixamorig:Head", "LeftEye")
+    )
+    tilt = Rotation.from_quat(TILT)
+    assert (neck * own * (tilt * tilt).inv() * whole.inv()).magnitude().max() < 1e-5  # the head in the world
+    assert (neck * tilt.inv()).magnitude() == pytest.approx(0.3 * whole.magnitude(), abs=1e-5)
+    way = (tilt * tilt * left * (tilt * tilt * tilt).inv()).apply([0.0, 0.0, 1.0])  # beside a head at rest
+    np.testing.assert_allclose(np.arctan2(way[:, 0], way[:, 2]), -angles[:, 3], atol=1e-5)
+    np.testing.assert_allclose(np.arcsin(way[:, 1]), -angles[:, 4], atol=1e-5)
+
+
+def animated(path: Path) -> dict[tuple[str, str], np.ndarray]:
+    """The keys of a file's last animation by the name of the node and what of it moves."""
+    document = read_document(path)
+    nodes, animation = document.objects("nodes"), document.objects("animations")[-1]
+    outputs = [
+        read_floats(document, sampler["output"], "output", ("SCALAR", "VEC4")) for sampler in animation["samplers"]
+    ]
+    targets = [(channel["target"], outputs[channel["sampler"]]) for channel in animation["channels"]]
+    return {(nodes[target["node"]].get("name", ""), target["path"]): keys.reshape(-1) for target, keys in targets}
+
+
 def test_eyes_that_no_shape_moves_turn_in_the_head(run: Run, tmp_path: Path) -> None:
     data = sheet(tmp_path / "sheet.glb", ("jawOpen",)).read_bytes()
 
@@ -169,7 +330,6 @@ def document(path: Path, **fields: object) -> Path:
 @pytest.mark.parametrize(
     ("fields", "words"),
     [
-        ({"extensionsRequired": ["KHR_draco_mesh_compression"]}, "compressed with Draco"),
         ({"buffers": [{"uri": "face.bin", "byteLength": 4}]}, "lie in other files"),
         ({"images": [{"uri": "https://elsewhere.test/skin.png"}]}, "lie in other files"),
         ({"meshes": [{"primitives": [{}]}]}, "no morph targets"),

@@ -18,7 +18,7 @@ from torchface.io.video import write_video
 from torchface.workflows.live import camera as module
 from torchface.workflows.live import live_frames
 from torchface.workflows.live.camera import Camera, list_cameras
-from torchface.workflows.live.live_frames import PlayedVideo, open_source, planes
+from torchface.workflows.live.live_frames import PlayedVideo, SourceSettings, open_source, planes
 
 
 class Planted:
@@ -185,7 +185,7 @@ def test_frames_that_come_while_another_is_solved_are_dropped(tmp_path: Path, cl
 
 def test_a_video_that_is_recorded_loses_no_frame(tmp_path: Path, clock: Clock) -> None:
     write_video([torch.zeros(10, 3, 32, 48, dtype=torch.uint8)], tmp_path / "film.avi", 50.0)
-    played = open_source(str(tmp_path / "film.avi"), print, every=True)
+    played = open_source(str(tmp_path / "film.avi"), print, SourceSettings(every=True))
     times = []
     for came, _ in played.frames():
         times.append(came)

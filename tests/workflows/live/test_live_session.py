@@ -20,13 +20,15 @@ from torchface.capture.anybody import WebcamControls
 from torchface.cli import main
 from torchface.errors import FileFormatError, ValueRangeError
 from torchface.io.gltf.animation_reading import read_gltf_weights
+from torchface.landmarks.images.boxes.face_box import FaceBoxes
 from torchface.shape_names import ARKIT
-from torchface.workflows.live import character as characters
+from torchface.workflows.browser_app import character as characters
+from torchface.workflows.browser_app.character import load_character
 from torchface.workflows.live import live_anybody
 from torchface.workflows.live import recordings as recordings_module
-from torchface.workflows.live.character import load_character
 from torchface.workflows.live.live_anybody import LiveSettings, go_live
 from torchface.workflows.live.live_figures import LiveFigures
+from torchface.workflows.live.live_frames import LiveFrame
 from torchface.workflows.live.live_session import LiveSession, Notes
 from torchface.workflows.live.recordings import FrameLog, Recordings
 from torchface.workflows.live.session_prompts import STEPS, FaceWatch, GuidedCalibration
@@ -44,7 +46,8 @@ def dome(dome_rig: BlendshapeRig, tmp_path_factory: pytest.TempPathFactory) -> P
 @pytest.fixture(autouse=True)
 def one_face(monkeypatch: pytest.MonkeyPatch) -> None:
     """Nothing looks for faces in pictures of one shade."""
-    monkeypatch.setattr(live_anybody, "shipped_detector", lambda: lambda picture: ())
+    nobody = FaceBoxes(torch.zeros(0, 4), torch.zeros(0))
+    monkeypatch.setattr(live_anybody, "shipped_detector", lambda: lambda picture: nobody)
 
 
 def a_session(source: Endless, folder: Path, dome: Path, told: list[str]) -> tuple[LiveSession, Recordings]:
@@ -173,7 +176,7 @@ def test_a_full_disk_ends_the_recording_and_not_the_session(
     monkeypatch.setattr(FrameLog, "append", full)
     session.run()
     assert session.figures.frames == 30
-    assert told == ["the recording ended: out: cannot be written: No space left on device"]
+    assert told[0] == "the recording ended: out: cannot be written: No space left on device"
     assert [take.frames for take in recordings.finish()] == [0]
 
 
@@ -233,8 +236,8 @@ def test_controls_reach_the_solver_and_reset_does_once(dome: Path, tmp_path: Pat
     assert solver.intervals[1:] == pytest.approx([1 / 30, 1 / 30], abs=1e-6)
     view = session.view()
     assert view is not None
-    assert float(view.weights[SMILE]) == 0.25
-    assert view.seen
+    assert float(view.solved.weights[SMILE]) == 0.25
+    assert view.solved.seen
 
 
 def test_a_guided_calibration_asks_for_five_faces_in_ten_seconds(dome: Path, tmp_path: Path) -> None:
@@ -242,7 +245,8 @@ def test_a_guided_calibration_asks_for_five_faces_in_ten_seconds(dome: Path, tmp
     session, _ = a_session(Endless(320), tmp_path, dome, told)
     session.calibrate()
     session.run()
-    assert told == [f"{i + 1} of 5: {words}" for i, words in enumerate(STEPS)] + ["Calibrated: thank you"]
+    asked = [f"{i + 1} of 5: {words}" for i, words in enumerate(STEPS)]
+    assert told == [*asked, "The calibration has ended", "planted has ended after 320 frames"]
     solver = session._solver
     assert isinstance(solver, ShadeSolver)
     poses = torch.tensor([controls.pose for controls in solver.controls])
@@ -263,27 +267,36 @@ def test_the_calibrations_clock_stands_while_no_face_is_seen() -> None:
     assert GuidedCalibration(9.95).after(0.1, seen=True) is None
 
 
-def test_no_face_darkness_and_several_faces_are_told() -> None:
+def seen_at(x: float) -> LiveFrame:
+    """A face whose landmarks lie at one place; none at NaN."""
+    return LiveFrame(torch.zeros(52), torch.eye(3), torch.tensor([[x, 20.0]]).expand(68, 2))
+
+
+def test_no_face_darkness_and_which_of_several_faces_are_said() -> None:
     counted: list[tuple[int, ...]] = []
 
-    def count(picture: torch.Tensor) -> int:
+    def find(picture: torch.Tensor) -> list[list[float]]:
         counted.append(tuple(picture.shape))
-        return 2
+        return [[40.0, 10.0, 20.0, 20.0], [0.0, 10.0, 20.0, 20.0]]
 
-    watch = FaceWatch(count)
+    watch = FaceWatch(find)
     bright, dark = np.full((48, 64, 3), 120, np.uint8), np.full((48, 64, 3), 9, np.uint8)
-    watch.look(bright, False, 0.0)
+    nobody, left = seen_at(float("nan")), seen_at(11.0)
+    watch.look(bright, nobody, 0.0)
     assert watch.words == "No face yet: sit before the camera and look into it"
-    watch.look(dark, False, 0.1)
+    watch.look(dark, nobody, 0.1)
     assert watch.words.startswith("Too dark")
-    watch.look(bright, True, 0.2)
-    assert watch._counting is not None
-    watch._counting.join(5)
-    watch.look(bright, True, 0.3)
-    assert watch.words.startswith("2 faces")
+    watch.look(bright, left, 0.2)
+    assert watch._looking is not None
+    watch._looking.join(5)
+    watch.look(bright, left, 0.3)
+    assert watch.words == "Two people: following the right one"  # as in a mirror
+    watch.mirrored = False
+    watch.look(bright, left, 0.3)
+    assert watch.words == "Two people: following the left one"
     assert counted == [(3, 48, 64)]  # not at every frame
-    watch.look(bright, False, 0.4)
-    assert watch.words == "No face: the last expression is held, then relaxes"
+    watch.look(bright, nobody, 0.4)
+    assert watch.words == "Your face is hidden: the last expression is held, then relaxes"
 
 
 def test_latency_is_told_within_a_hundredth() -> None:
@@ -328,7 +341,7 @@ def test_characters_that_cannot_move(dome_rig: BlendshapeRig, tmp_path: Path, mo
     (tmp_path / "broken.glb").write_bytes(whole[: len(whole) // 2])
     with pytest.raises(FileFormatError, match=r"broken.glb"):
         load_character(tmp_path / "broken.glb")
-    monkeypatch.setattr(characters, "_MAX_BYTES", 1000)
+    monkeypatch.setattr(characters, "LARGEST_CHARACTER", 1000)
     with pytest.raises(FileFormatError, match=r"dome.glb: found 0 MB, expected at most 0 MB for a character"):
         load_character(tmp_path / "dome.glb")
 

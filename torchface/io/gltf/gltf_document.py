@@ -201,7 +201,21 @@ def read_document(path: str | Path) -> Document:
         FileFormatError: missing, empty, truncated, not glTF 2, or an extension it requires is not known.
     """
     path = Path(path)
-    data = read_file(path)
+    document = document_of(path, read_file(path))
+    for name in document.array(document.root, "extensionsRequired", "document"):
+        if not isinstance(name, str) or not name.startswith(_EXTENSIONS):
+            known = ", ".join(start + "*" * start.endswith("_") for start in _EXTENSIONS)
+            hint = "; decompress it: npx @gltf-transform/cli copy IN.glb OUT.glb" * ("compression" in shown(name))
+            raise document.error("extensionsRequired", shown(name), f"none but {known}{hint}")
+    return document
+
+
+def document_of(path: Path, data: bytes) -> Document:
+    """A document of a file's bytes, whatever extensions it requires: its vertices may be compressed.
+
+    Raises:
+        FileFormatError: truncated, or not glTF 2.
+    """
     if data[:4] == _MAGIC:
         text, binary = _chunks(path, data)
     else:
@@ -221,11 +235,6 @@ def read_document(path: str | Path) -> Document:
     version = root["asset"].get("version")
     if not isinstance(version, str) or not version.startswith("2."):
         raise document.error("asset.version", shown(version), "'2.0'")
-    for name in document.array(root, "extensionsRequired", "document"):
-        if not isinstance(name, str) or not name.startswith(_EXTENSIONS):
-            known = ", ".join(start + "*" * start.endswith("_") for start in _EXTENSIONS)
-            hint = "; decompress it: npx @gltf-transform/cli copy IN.glb OUT.glb" * ("compression" in shown(name))
-            raise document.error("extensionsRequired", shown(name), f"none but {known}{hint}")
     return document
 
 
@@ -268,7 +277,7 @@ def glb_pieces(root: dict[str, Any], buffers: BufferWriter, source: str | Path =
         **root,
         "accessors": buffers.accessors,
         "bufferViews": buffers.views,
-        "buffers": [{"byteLength": buffers.size}],
+        "buffers": [{"byteLength": buffers.size}, *root.get("buffers", [])[1:]],
     }
     text = json.dumps(root, separators=(",", ":"), allow_nan=False).encode()
     text += b" " * (-len(text) % 4)

@@ -56,6 +56,11 @@ def node_transforms(document: Document) -> dict[int, NDArray[np.float64]]:
     return dict(_walk(document, document.objects("nodes")))
 
 
+def local_transform(document: Document, node: int) -> NDArray[np.float64]:
+    """From a node to its parent, (4,4)."""
+    return _local(document, document.item("nodes", node, "nodes"), f"nodes[{node}]")
+
+
 def _name(first: dict[str, Any], second: dict[str, Any], index: int) -> str:
     names = [name for thing in (first, second) if isinstance(name := thing.get("name"), str) and name]
     return names[0] if names else f"mesh_{index}"

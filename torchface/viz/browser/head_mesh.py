@@ -46,7 +46,6 @@ class HeadOnPage:
         name: of its nodes.
         offset: where to, millimetres.
         normal_map: gives the normal map (3,H,W) of the pose, or nothing; called when the head has come to rest.
-        most_colors: of the pieces in motion.
     """
 
     def __init__(
@@ -56,10 +55,9 @@ class HeadOnPage:
         name: str,
         offset: tuple[float, float, float] = (0.0, 0.0, 0.0),
         normal_map: Callable[[], Tensor | None] | None = None,
-        most_colors: int = 6,
     ) -> None:
         self._server = server
-        self._parts = split_parts(mesh, most_colors)
+        self._parts = split_parts(mesh)
         self._vertices = mesh.vertices.detach().cpu().float()
         self._normal_map = normal_map if mesh.uvs is not None else None
         has_colors = (mesh.texture is not None and mesh.uvs is not None) or mesh.colors is not None

@@ -43,29 +43,5 @@ def caption(text: str) -> str:
     return f'<div style="padding:0 0.75em 0.3em;font-size:0.8em">{_grey(text)}</div>'
 
 
-_KINDS = {"good": "#2f8f4e", "bad": "#c0392b", "ask": "#2e5c8a", "": "#888888"}
-
-
-def big_line(text: str, kind: str) -> str:
-    """A sentence to be read from a distance: ``kind`` is good, bad, ask (what to do now) or empty."""
-    color = _KINDS[kind]
-    size = "1.35em" if kind == "ask" else "1em"
-    return (
-        '<div role="status" aria-live="polite" style="margin:0.2em 0.6em;padding:0.45em 0.7em;min-height:2.6em;'
-        f"display:flex;align-items:center;border-left:0.35em solid {color};background:rgba(128,128,128,0.1);"
-        f'font-weight:600;font-size:{size};line-height:1.25">{as_markup(text)}</div>'
-    )
-
-
-def figures_line(figures: Sequence[tuple[str, str]]) -> str:
-    """Figures in a row, each over what it means."""
-    cells = "".join(
-        '<div style="flex:1;text-align:center"><div style="font-size:1.15em;font-weight:600">'
-        f'{as_markup(figure)}</div><div style="font-size:0.7em;opacity:0.65">{as_markup(what)}</div></div>'
-        for what, figure in figures
-    )
-    return f'<div style="display:flex;padding:0.1em 0.4em;min-height:2.8em">{cells}</div>'
-
-
 def _grey(text: str) -> str:
     return f'<span style="opacity:0.65">{as_markup(text)}</span>'

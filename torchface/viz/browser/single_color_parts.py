@@ -36,7 +36,7 @@ class Part:
     color: tuple[float, float, float]
 
 
-def split_parts(mesh: Mesh, most_colors: int = _MAX_COLORS) -> list[Part]:
+def split_parts(mesh: Mesh) -> list[Part]:
     """The mesh cut by connected component and by colour, largest piece first.
 
     Colours are those of the texture, else of the vertices, else of what regions are named; few classes, for shapes in
@@ -44,12 +44,11 @@ def split_parts(mesh: Mesh, most_colors: int = _MAX_COLORS) -> list[Part]:
 
     Args:
         mesh: what to cut.
-        most_colors: at most; more look smoother and make more pieces.
     """
     mesh = mesh.to("cpu")
     colors, drawn = _triangle_colors(mesh)
     component = _components(mesh)
-    classes, palette = _color_classes(colors, most_colors)
+    classes, palette = _color_classes(colors, _MAX_COLORS)
     piece = torch.where(drawn, component * len(palette) + classes, -1)
     # A few triangles of a stray colour do not deserve a part of their own: they take their component's main one.
     for number in component.unique().tolist():

@@ -6,25 +6,20 @@ import gzip
 import json
 from dataclasses import dataclass
 from pathlib import Path
-from tempfile import TemporaryDirectory
 
 import onnxruntime
 
-from torchface.errors import FileFormatError, NameMismatchError
+from torchface.errors import FileFormatError
 from torchface.files.job_lock import job_lock
 from torchface.files.whole_files import all_or_none, check_writable, delete_file, make_folder, read_file, write_file
-from torchface.io import load_rig, save_rig
 from torchface.progress import Progress, silent
-from torchface.rig import BlendshapeRig
-from torchface.shape_names import ARKIT, mapping
-from torchface.synthetic import performer
+from torchface.shape_names import ARKIT
 from torchface.workflows.browser_app.built_page import built_page
+from torchface.workflows.browser_app.character import load_character
 from torchface.workflows.webcam.webcam_graph import webcam_graph
 
-CHARACTER, GRAPH, PAGE = "character.glb", "webcam.onnx", "index.html"
+CHARACTER, TABLE, GRAPH, PAGE = "character.glb", "character.json", "webcam.onnx", "index.html"
 _ASSETS = (".js", ".css", ".wasm")
-LARGEST_CHARACTER = 100 * 2**20
-"""Bytes; what the page itself takes (``export/web/src/character_check.js``)."""
 
 
 @dataclass(frozen=True)
@@ -46,7 +41,7 @@ class AppReport:
     def rows(self) -> list[tuple[str, str]]:
         """Sizes by kind of file, and which shapes move."""
         kinds = {
-            "page (HTML, JavaScript, CSS)": (".html", ".js", ".css", ".txt", ""),
+            "page (HTML, JavaScript, CSS)": (".html", ".js", ".css", ".txt", ".json", ""),
             "ONNX Runtime (WebAssembly)": (".wasm",),
             "solver": (".onnx",),
             "character": (".glb",),
@@ -73,8 +68,8 @@ def export_app(
 
     Args:
         out: the folder; files of an earlier app in it are replaced.
-        character: a ``.glb``, which is taken as it is, or another rig, with shapes that ARKit knows; the embedded
-            performer if absent.
+        character: a ``.glb`` or ``.vrm``, which is taken as it is, or another rig, with shapes that ARKit knows; the
+            embedded performer if absent.
         webcam: the graph from picture to weights, as ``torchface export webcam`` writes it; made, or taken from the
             cache, if absent.
         progress: called with each step.
@@ -89,11 +84,10 @@ def export_app(
     check_writable(folder=out)
     _check_folder(out)
     progress("reading the character")
-    rig = performer() if character is None else load_rig(character).linear("app")
-    driven, still = _shapes(rig, character)
+    shown = load_character(character)
     graph = webcam_graph(progress) if webcam is None else read_file(webcam)
     check_webcam_graph(graph, webcam or "the webcam's graph")
-    files = {GRAPH: graph, CHARACTER: _glb(rig, character)}
+    files = {GRAPH: graph, CHARACTER: shown.data, TABLE: shown.page_table()}
     page = built_page(progress)
     files |= {path.relative_to(page).as_posix(): read_file(path) for path in sorted(page.rglob("*")) if path.is_file()}
     progress("writing the app")
@@ -105,32 +99,14 @@ def export_app(
             if old.suffix in _ASSETS and f"assets/{old.name}" not in files:
                 delete_file(old)
     packed = {name: len(gzip.compress(data, 6)) for name, data in files.items()}
+    still = shown.shapes.undriven
+    driven = tuple(name for name in shown.names if name not in still)
     return AppReport({name: len(data) for name, data in files.items()}, packed, driven, still)
 
 
 def _check_folder(out: Path) -> None:
     if out.is_dir() and any(out.iterdir()) and not ((out / PAGE).is_file() and (out / GRAPH).is_file()):
         raise FileFormatError(f"{out}: found a folder with other files, expected none, an empty one or an earlier app")
-
-
-def _shapes(rig: BlendshapeRig, character: str | Path | None) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    drives = (mapping(ARKIT, rig.names) != 0).any(1).tolist()
-    driven = tuple(name for name, moves in zip(rig.names, drives, strict=True) if moves)
-    still = tuple(name for name, moves in zip(rig.names, drives, strict=True) if not moves)
-    if not driven:
-        raise NameMismatchError(
-            f"{character}: found the shapes {', '.join(still[:8]) or 'none'}, expected names that ARKit knows, such as "
-            "jawOpen; rename them, or bring them over with torchface transfer --names arkit"
-        )
-    return driven, still
-
-
-def _glb(rig: BlendshapeRig, character: str | Path | None) -> bytes:
-    if character is not None and Path(character).suffix.lower() == ".glb":
-        return read_file(character, LARGEST_CHARACTER)
-    with TemporaryDirectory() as folder:
-        save_rig(rig, Path(folder) / CHARACTER)
-        return read_file(Path(folder) / CHARACTER, LARGEST_CHARACTER)
 
 
 _INPUTS = {"image": "tensor(uint8)", "interval": "tensor(float)", "controls": "tensor(float)", "state": "tensor(float)"}

@@ -19,6 +19,7 @@ DEFAULT_SIZE = (640, 480)
 
 _DEFAULT_FPS, _WANTED_FPS = 30.0, 60.0
 _MAX_WAIT = 5.0  # seconds without a frame
+_FIRST_WAIT = 2.5  # and until the first
 _TICK = 0.2  # seconds until an interrupt is looked for
 _RETRY = 0.05
 _MEASURED = 2.0  # seconds over which the rate is measured
@@ -39,7 +40,7 @@ class Camera:
         size: width and height to ask for.
 
     Raises:
-        FileFormatError: there is none, or it gives no frame within five seconds.
+        FileFormatError: there is none, or it gives no frame within 2.5 seconds.
     """
 
     def __init__(self, number: int, say: Callable[[str], None], size: tuple[int, int] = DEFAULT_SIZE) -> None:
@@ -57,7 +58,7 @@ class Camera:
             (cv2.CAP_PROP_BUFFERSIZE, 1),
         ):
             self._capture.set(setting, value)
-        self.dropped = 0
+        self.dropped, self._begun = 0, False
         self._newest: tuple[float, np.ndarray] | None = None
         self._change = threading.Condition()
         self._open = True
@@ -65,11 +66,11 @@ class Camera:
         self._thread = threading.Thread(target=self._take, name="torchface-camera", daemon=True)
         self._thread.start()
         with self._change:
-            first = self._wait()
+            first = self._wait(_FIRST_WAIT)
         if first is None:
             self.close()
             raise FileFormatError(
-                f"{self._name}: gives no frame within {_MAX_WAIT:.0f} seconds; expected one that no other program "
+                f"{self._name}: gives no frame within {_FIRST_WAIT:g} seconds; expected one that no other program "
                 f"holds and that is switched on. {_BY_FILE.capitalize()}"
             )
         rate = self._capture.get(cv2.CAP_PROP_FPS)
@@ -78,6 +79,7 @@ class Camera:
 
     def frames(self) -> Iterator[tuple[float, np.ndarray]]:
         """When each frame came, and the frame, uint8 (H,W,3), red first; until the camera gives no more."""
+        self._begun = True
         while True:
             with self._change:
                 newest = self._wait()
@@ -95,8 +97,8 @@ class Camera:
         if not self._thread.is_alive():  # one that hangs in its driver cannot be released
             self._capture.release()
 
-    def _wait(self) -> tuple[float, np.ndarray] | None:
-        end = time.monotonic() + _MAX_WAIT
+    def _wait(self, seconds: float = _MAX_WAIT) -> tuple[float, np.ndarray] | None:
+        end = time.monotonic() + seconds
         while self._newest is None and self._open and time.monotonic() < end:
             self._change.wait(_TICK)
         return self._newest
@@ -118,7 +120,7 @@ class Camera:
             if change is not None:
                 self._say(f"{self._name} now gives {change[1]:.0f} frames a second ({change[0]:.0f} before)")
             with self._change:
-                self.dropped += self._newest is not None
+                self.dropped += self._begun and self._newest is not None
                 self._newest = (now, frame)
                 self._change.notify()
         with self._change:

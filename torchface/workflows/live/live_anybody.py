@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from contextlib import ExitStack, closing
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -20,11 +21,15 @@ from torchface.number_checks import checked_number
 from torchface.onnx.webcam.webcam_session import WebcamSession
 from torchface.progress import Progress, silent
 from torchface.shape_names import ARKIT
+from torchface.workflows.browser_app.app_folder import CHARACTER, TABLE
+from torchface.workflows.browser_app.built_page import built_page
+from torchface.workflows.browser_app.character import load_character
 from torchface.workflows.live.camera import DEFAULT_SIZE
-from torchface.workflows.live.character import load_character
+from torchface.workflows.live.kept_takes import take_rows
 from torchface.workflows.live.live_figures import LiveReport
-from torchface.workflows.live.live_frames import FaceSolver, FrameSource, LiveFrame, Say, open_source
+from torchface.workflows.live.live_frames import FaceSolver, FrameSource, LiveFrame, Say, SourceSettings, open_source
 from torchface.workflows.live.live_session import LiveSession, Notes
+from torchface.workflows.live.page_server import PageServer
 from torchface.workflows.live.received_source import ReceivedSolver, ReceivedSource, ReceivedWatch
 from torchface.workflows.live.recordings import Recordings, SavedTake
 from torchface.workflows.live.session_prompts import FaceWatch, Watch
@@ -89,6 +94,7 @@ class LiveSettings:
         calibrate: begin with the guided calibration.
         page: open the page in the browser.
         port: the first that the page tries.
+        loop: play a video file again and again.
         seconds: after which it ends.
         size: width and height to ask a camera for.
     """
@@ -101,6 +107,7 @@ class LiveSettings:
     calibrate: bool = False
     page: bool = True
     port: int = 8080
+    loop: bool = False
     seconds: float | None = None
     size: tuple[int, int] = DEFAULT_SIZE
 
@@ -131,49 +138,49 @@ def go_live(
         parse_source(settings.camera)
     if settings.seconds is not None:
         checked_number("seconds", settings.seconds, above=True)
-    if settings.page:  # what is missing should be said before a large character is read
-        from torchface.viz.browser.browser_page import import_viser
-
-        import_viser()
-    progress("reading the character")
-    character = load_character(settings.character, settings.mapping)
     notes = Notes(say)
-    for note in character.notes():
-        notes(note)
     with ExitStack() as stack:
         if settings.record is not None:
             stack.enter_context(job_lock(settings.record))
         every = settings.record is not None  # a film that is recorded loses no frame
         source: FrameSource
-        solver: FaceSolver
-        watch: Watch
         received = None
         if is_source(settings.camera):
-            received = ReceivedSource(settings.camera, every)
-            source, solver = stack.enter_context(closing(received)), ReceivedSolver(received, notes)
-            watch = ReceivedWatch(received, notes)
+            source = received = ReceivedSource(settings.camera, every)
+        else:  # what is missing should be said before models are read
+            progress("opening the camera")
+            source = open_source(settings.camera, notes, SourceSettings(settings.size, every, settings.loop))
+        stack.enter_context(closing(source))
+        progress("reading the character")
+        character = load_character(settings.character, settings.mapping)
+        for note in character.notes():
+            notes(note)
+        page = built_page(progress) if settings.page else None
+        solver: FaceSolver
+        watch: Watch
+        if received is not None:
+            solver, watch = ReceivedSolver(received, notes), ReceivedWatch(received, notes)
         else:
             progress("loading the solver")
             solver = make_solver(progress)
-            progress("opening the camera")
-            source = stack.enter_context(closing(open_source(settings.camera, notes, settings.size, every)))
-            watch = FaceWatch(lambda picture: len(shipped_detector()(picture)))
+            watch = FaceWatch(lambda picture: shipped_detector()(picture).boxes.tolist())
         streams = stack.enter_context(WeightStreams(settings.addresses, ARKIT, source.video.fps, notes))
-        folder = settings.record or RECORDINGS
-        recordings = Recordings(folder, character, source.video.path.name, source.video.fps)
-        prompt: Say = (lambda words: None) if settings.page else say
-        session = LiveSession(source, solver, streams, recordings, notes, prompt, watch)
+        recordings = Recordings(settings.record or RECORDINGS, character, source.video.path.name, source.video.fps)
+        session = LiveSession(source, solver, streams, recordings, notes, say, watch)
         if settings.record is not None:
-            recordings.start()
-        if settings.calibrate:
+            recordings.start(settings.record)
+        session.guided = settings.calibrate
+        if settings.calibrate and page is None:
             session.calibrate()
+        server = None
         try:
-            if settings.page:
-                from torchface.viz.browser.live_page import LivePage
-
-                page = LivePage(character.rig, character.weights, session, "live", settings.port)
-                stack.callback(page.stop)
-                opened(page.url)
+            if page is not None:
+                files = {CHARACTER: character.data, TABLE: character.page_table()}
+                takes = partial(take_rows, recordings.folder)
+                server = PageServer(page, files, takes, session, settings.port)
+                stack.callback(server.stop)
+                opened(server.url)
+                say(f"For OBS, the character alone: {server.stream_url}")
             session.run(settings.seconds, progress)
         finally:
             if recordings.running:

@@ -43,22 +43,48 @@ class FrameSource(Protocol):
         """Gives the camera back."""
 
 
+@dataclass(frozen=True)
+class SourceSettings:
+    """How frames are given.
+
+    Args:
+        size: width and height to ask a camera for.
+        every: give every frame of a video, however late, as for a recording; else those that come too late are dropped.
+        loop: play a video again and again.
+    """
+
+    size: tuple[int, int] = DEFAULT_SIZE
+    every: bool = False
+    loop: bool = False
+
+
+_DEFAULT = SourceSettings()
+
+
 class PlayedVideo:
     """A video file whose frames come at its own rate, as a camera's would.
 
     Args:
         path: of the file; its frame rate may vary.
-        every: give each frame, however late, as for a recording; else those that come too late are dropped.
+        settings: whether each frame is given, and whether it begins anew at its end.
     """
 
-    def __init__(self, path: Path, every: bool = False) -> None:
+    def __init__(self, path: Path, settings: SourceSettings = _DEFAULT) -> None:
         self.video = replace(open_video(path), even=False)
         self.dropped = 0
-        self._every = every
+        self._settings = settings
         self._times, _ = self.video.uneven_seconds()
 
     def frames(self) -> Iterator[tuple[float, np.ndarray]]:
         """When each frame was due, and the frame, uint8 (H,W,3), red first."""
+        again = True
+        while again:
+            again = False
+            for frame in self._once():
+                again = self._settings.loop
+                yield frame
+
+    def _once(self) -> Iterator[tuple[float, np.ndarray]]:
         started: float | None = None
         for number, frame in enumerate(self.video.color_frames()):
             started = time.perf_counter() if started is None else started  # with the first frame: opening takes a while
@@ -66,7 +92,9 @@ class PlayedVideo:
             early = due - time.perf_counter()
             if early > 0:
                 time.sleep(early)
-            elif -early > 1 / self.video.fps and not self._every:  # a camera would have shown the next one by now
+            elif (
+                -early > 1 / self.video.fps and not self._settings.every
+            ):  # a camera would have shown the next one by now
                 self.dropped += 1
                 continue
             yield due, cv2.merge(list(frame.numpy()))
@@ -80,18 +108,17 @@ class PlayedVideo:
         """A file needs no closing."""
 
 
-def open_source(camera: str, say: Say, size: tuple[int, int] = DEFAULT_SIZE, every: bool = False) -> FrameSource:
+def open_source(camera: str, say: Say, settings: SourceSettings = _DEFAULT) -> FrameSource:
     """A camera by its number, or a video file by its path.
 
     Args:
         camera: ``"0"``, ``"1"``, ... or a path.
         say: called with what happens to the camera on the way.
-        size: width and height to ask a camera for.
-        every: give every frame of a video, however late.
+        settings: of either.
     """
     if re.fullmatch("[0-9]{1,3}", camera):
-        return Camera(int(camera), say, size)
-    return PlayedVideo(Path(camera), every)
+        return Camera(int(camera), say, settings.size)
+    return PlayedVideo(Path(camera), settings)
 
 
 def planes(picture: np.ndarray) -> torch.Tensor:

@@ -5,21 +5,24 @@ from __future__ import annotations
 import threading
 import time
 from collections import deque
-
-import numpy as np
+from collections.abc import Mapping
+from typing import Any
 
 from torchface.capture.anybody import WebcamControls
-from torchface.errors import FileFormatError
+from torchface.errors import FileFormatError, TorchfaceError, ValueRangeError
 from torchface.progress import Progress, silent
-from torchface.viz.browser.live_view import LiveView
+from torchface.workflows.live.kept_takes import kept_takes, remove_take, rename_take
 from torchface.workflows.live.live_figures import LiveFigures
 from torchface.workflows.live.live_frames import FaceSolver, FrameSource, LiveFrame, Say, solved_frames
+from torchface.workflows.live.live_view import LiveView
 from torchface.workflows.live.recordings import Recordings
-from torchface.workflows.live.session_prompts import GuidedCalibration, Watch
+from torchface.workflows.live.session_prompts import FOLLOWED, GuidedCalibration, Watch
+from torchface.workflows.live.weight_controls import WeightControls, read_weight_settings
 from torchface.workflows.live.weight_streams import WeightStreams
 
 _MAX_NOTES = 20
-_FIGURES_INTERVAL = 0.25  # seconds
+_SHOWN_NOTES = 3
+_TAKES_INTERVAL = 1.0  # seconds
 
 
 class Notes:
@@ -64,18 +67,93 @@ class LiveSession:
     ) -> None:
         self.gain, self.smoothing = 1.0, 0.5
         self.figures = LiveFigures()
+        self.ended = ""
+        self.guided = False
         self._source, self._solver, self._streams = source, solver, streams
         self._recordings, self._notes, self._prompt, self._watch = recordings, notes, prompt, watch
+        self._weights = WeightControls()
         self._calibration: GuidedCalibration | None = None
+        self._pose = 0
         self._forget = False
         self._prompted = ""
-        self._recent, self._recent_at = (0.0, 0.0), float("-inf")
         self._view: LiveView | None = None
+        self._changed = threading.Condition()
+        self._takes: tuple[float, list[dict[str, Any]]] = (float("-inf"), [])
         self._lock = threading.RLock()
 
     def view(self) -> LiveView | None:
         """The newest moment; None before the first frame."""
         return self._view
+
+    def next_view(self, before: LiveView | None, seconds: float) -> LiveView | None:
+        """The newest moment once there is another than ``before``; None where none came in time."""
+        with self._changed:
+            self._changed.wait_for(lambda: self._view is not before, seconds)
+            return self._view if self._view is not before else None
+
+    def state(self) -> dict[str, Any]:
+        """What the page shows beside the frames."""
+        view, recordings = self._view, self._recordings
+        seen, learned = view is not None and view.solved.seen, view.solved.calibrated if view is not None else 0.0
+        words = self._watch.words if self._watch is not None else ""
+        running = recordings.running
+        recording = (
+            {"seconds": recordings.seconds(time.perf_counter()), "frames": recordings.frames} if running else None
+        )
+        return {
+            "words": "" if seen and learned < 1 and words == FOLLOWED else words,
+            "notes": self._notes.kept()[-_SHOWN_NOTES:],
+            "recording": recording,
+            "takes": self._listed(),
+            "ended": self.ended,
+            "calibrate": self._guided(),
+        }
+
+    def _guided(self) -> bool:
+        asked, self.guided = self.guided, False
+        return asked
+
+    def _listed(self) -> list[dict[str, Any]]:
+        at, takes = self._takes
+        if time.monotonic() - at > _TAKES_INTERVAL:
+            takes = [take.fields() for take in kept_takes(self._recordings.folder)]
+            self._takes = time.monotonic(), takes
+        return takes
+
+    def asked(self, message: Mapping[str, Any]) -> None:
+        """Does what a page asks for: ``controls``, ``reset``, ``record``, ``rename`` or ``remove``.
+
+        Raises:
+            TorchfaceError: it cannot be done; the notes say why.
+        """
+        try:
+            if "controls" in message:
+                self._set(message["controls"])
+            if message.get("reset") is True:
+                self.reset()
+            if isinstance(on := message.get("record"), bool):
+                self._notes(self.record(on))
+            folder, forgotten = self._recordings.folder, float("-inf")
+            if isinstance(names := message.get("rename"), list) and len(names) == 2:
+                rename_take(folder, str(names[0]), str(names[1]))
+                self._takes = forgotten, []
+            if isinstance(place := message.get("remove"), str):
+                remove_take(folder, place)
+                self._takes = forgotten, []
+        except TorchfaceError as error:
+            self._notes(str(error))
+            raise
+
+    def _set(self, controls: object) -> None:
+        solver = controls.get("solver") if isinstance(controls, dict) else None
+        weights = controls.get("weights") if isinstance(controls, dict) else None
+        if not isinstance(solver, dict) or not isinstance(weights, dict) or not isinstance(controls, dict):
+            raise ValueRangeError("page: found controls without solver and weights, expected both")
+        checked = WebcamControls(solver.get("pose"), solver.get("gain"), solver.get("smoothing"))  # type: ignore[arg-type]
+        self._weights.settings = read_weight_settings(weights)
+        self._pose, self.gain, self.smoothing = checked.pose, checked.gain, checked.smoothing
+        if self._watch is not None:
+            self._watch.mirrored = controls.get("mirror") is not False
 
     def calibrate(self) -> None:
         """Begins a guided calibration."""
@@ -109,25 +187,32 @@ class LiveSession:
         progress, before = progress or silent, None
         try:
             for came, picture, solved in solved_frames(self._source, self._solver, self._controls):
-                rotations = solved.rotations
-                self._streams.send(solved.weights, rotations)
+                wanted = self._weights.apply(solved, None if before is None else came - before)
+                self._streams.send(wanted.weights, wanted.rotations)
                 now = time.perf_counter()
                 self.figures.add(came, now, solved.seen)
-                self._keep(came, solved)
-                self._advance(0.0 if before is None else came - before, solved.seen)
+                interval = 0.0 if before is None else came - before
+                with self._changed:
+                    self._view = LiveView(came, interval, 1000 * (now - came), picture, wanted, self.figures.frames)
+                    self._changed.notify_all()
+                self._keep(came, wanted)
+                self._advance(interval, solved.seen)
                 before = came
                 if self._watch is not None:
-                    self._watch.look(picture, solved.seen, now)
-                self._view = self._moment(picture, solved, now)
+                    self._watch.look(picture, solved, now)
                 progress("live", self.figures.frames)
                 if seconds is not None and self.figures.seconds >= seconds:
+                    self._notes(f"The {seconds:g} seconds are over")
                     break
+            else:
+                self._notes(f"{self._source.video.path.name} has ended after {self.figures.frames} frames")
+            self.ended = self._notes.kept()[-1]
         except KeyboardInterrupt:  # how people end what has no end of its own
             pass
 
     def _controls(self) -> WebcamControls:
         forget, self._forget = self._forget, False
-        pose = 0 if self._calibration is None else self._calibration.pose
+        pose = self._pose if self._calibration is None else self._calibration.pose
         return WebcamControls(pose, self.gain, self.smoothing, reset=forget)
 
     def _keep(self, came: float, solved: LiveFrame) -> None:
@@ -151,25 +236,4 @@ class LiveSession:
             self._calibration = after
         if after is None:
             self._prompted = ""
-            self._prompt("Calibrated: thank you")
-
-    def _moment(self, picture: np.ndarray, solved: LiveFrame, now: float) -> LiveView:
-        if now - self._recent_at > _FIGURES_INTERVAL:
-            self._recent, self._recent_at = self.figures.recent(), now
-        calibration, (fps, latency) = self._calibration, self._recent
-        return LiveView(
-            picture,
-            solved.landmarks,
-            solved.iris,
-            solved.weights,
-            solved.rotation,
-            solved.seen,
-            self._watch.words if self._watch is not None else "",
-            fps,
-            latency,
-            solved.calibrated,
-            "" if calibration is None else calibration.words,
-            0.0 if calibration is None else calibration.left,
-            self._recordings.seconds(now) if self._recordings.running else None,
-            self._notes.kept(),
-        )
+            self._prompt("The calibration has ended")

@@ -150,11 +150,11 @@ class ReceivedWatch:
 
     def __init__(self, source: ReceivedSource, say: Say) -> None:
         self._source, self._say = source, say
-        self._state = ""
+        self._state, self.mirrored = "", True
         self.words = self._waiting()
         say(self.words)
 
-    def look(self, picture: np.ndarray, seen: bool, now: float) -> None:
+    def look(self, picture: np.ndarray, solved: LiveFrame, now: float) -> None:
         """Updates ``words`` after a frame."""
         source, counts = self._source, self._source.receiver.counts
         if source.face is None:

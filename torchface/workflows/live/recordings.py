@@ -21,12 +21,13 @@ from torchface.errors import FileFormatError, TorchfaceError, ValueRangeError
 from torchface.files.temporary_files import new_temporary
 from torchface.files.whole_files import all_or_none, make_folder, write_file
 from torchface.files.write_errors import unwritten
-from torchface.io import save_animation
+from torchface.io.gltf.performance_animation import Performance, performed_glb
 from torchface.io.weights.live_link_csv import save_live_link
 from torchface.io.weights.weight_csv import ROTATIONS, save_weights_csv
 from torchface.shape_names import ARKIT
 from torchface.take import Take, Track
-from torchface.workflows.live.character import Character
+from torchface.workflows.browser_app.character import Character
+from torchface.workflows.live.kept_takes import ANIMATION, LIVE_LINK, SUMMARY, WEIGHTS
 from torchface.workflows.live.live_frames import LiveFrame
 
 _EVEN = 1e-6  # seconds by which times that are even may be off
@@ -128,7 +129,6 @@ class FrameLog:
         self.close()
 
 
-WEIGHTS, LIVE_LINK, ANIMATION, SUMMARY = "weights.csv", "live_link.csv", "animation.glb", "summary.json"
 _FORMAT = "torchface.live-summary/1"
 _MAX_TAKES = 10_000
 
@@ -156,6 +156,7 @@ class Recordings:
         self._folder, self._character, self._source, self._fps = folder, character, source, fps
         self._log: FrameLog | None = None
         self._place = folder
+        self._begun: set[Path] = set()  # whose files may still be in the making
         self._began, self._found = 0.0, 0
         self._saving: list[threading.Thread] = []
         self.saved: list[SavedTake] = []
@@ -169,14 +170,28 @@ class Recordings:
         """How long the take that runs is."""
         return now - self._began if self._log is not None and self._log.count else 0.0
 
-    def start(self) -> Path:
+    @property
+    def frames(self) -> int:
+        """How many frames the take that runs has."""
+        return self._log.count if self._log is not None else 0
+
+    @property
+    def folder(self) -> Path:
+        """Where the takes lie."""
+        return self._folder
+
+    def start(self, place: Path | None = None) -> Path:
         """Begins a take and returns its folder.
+
+        Args:
+            place: whose files it replaces; a new one if absent.
 
         Raises:
             FileFormatError: nothing can be written there.
         """
-        self._place = self._next()
-        columns = _columns(ARKIT) + 2 * _columns(self._character.rig.names)  # Live Link, weights, animation
+        self._place = place or self._next()
+        self._begun.add(self._place)
+        columns = _columns(ARKIT) + 2 * _columns(self._character.names)  # Live Link, weights, animation
         self._log, self._found = FrameLog(make_folder(self._place), ARKIT, columns), 0
         return self._place
 
@@ -211,11 +226,10 @@ class Recordings:
         return self.saved
 
     def _next(self) -> Path:
-        if not self.saved and not self._saving:
+        if self._folder not in self._begun and not (self._folder / SUMMARY).exists():
             return self._folder
-        taken = {take.folder for take in self.saved} | {self._place}
         numbered = (self._folder / f"take_{number}" for number in range(2, _MAX_TAKES))
-        return next(folder for folder in numbered if folder not in taken and not folder.exists())
+        return next(folder for folder in numbered if folder not in self._begun and not folder.exists())
 
     def _save(self, log: FrameLog, folder: Path, found: int) -> None:
         with log:
@@ -229,8 +243,8 @@ class Recordings:
     def _write(self, log: FrameLog, folder: Path, found: int) -> None:
         take = log.take(self._fps)
         assert take.weights is not None
-        rig = self._character.rig
-        moved = replace(take, weights=Track(rig.names, self._character.weights(take.weights.values[..., 0])[..., None]))
+        names = self._character.names
+        moved = replace(take, weights=Track(names, self._character.weights(take.weights.values[..., 0])[..., None]))
         summary = {
             "format": _FORMAT,
             "source": self._source,
@@ -242,10 +256,13 @@ class Recordings:
             "found": found,
             "files": [WEIGHTS, LIVE_LINK, ANIMATION],
         }
+        assert moved.weights is not None
+        turns = np.stack([take.extras["columns"][name].numpy() for name in ROTATIONS], 1)
+        performance = Performance(take.times.numpy(), names, moved.weights.values[..., 0].numpy(), turns)
         with all_or_none():
             save_weights_csv(moved, folder / WEIGHTS)
             save_live_link(take, folder / LIVE_LINK)
-            save_animation(rig, moved, folder / ANIMATION)
+            write_file(folder / ANIMATION, performed_glb(self._character.document, performance))
             write_file(folder / SUMMARY, json.dumps(summary, indent=1).encode())
 
 

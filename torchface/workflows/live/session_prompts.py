@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
 
-from torchface.workflows.live.live_frames import planes
+from torchface.workflows.live.live_frames import LiveFrame, planes
 
 _STEP, _READY = 2.0, 0.7  # seconds a face, and those in which the person gets into it
 
@@ -67,49 +67,65 @@ class GuidedCalibration:
 _INTERVAL = 3.0  # seconds between two counts of faces
 _DARK = 35.0  # mean of the brightest of the colours, of 255
 _SPARSE = 8  # pixels
+_NUMBERS = ("No", "One", "Two", "Three", "Four")
+
+FOLLOWED = "Your face is followed"
+"""What is said of a face that is seen, and of no other."""
 
 
 class Watch(Protocol):
-    """Looks at frames as they pass; ``words`` are what the user should know."""
+    """Looks at frames as they pass.
+
+    ``words`` are what the user should know, ``mirrored`` whether the user sees the picture as in a mirror.
+    """
 
     words: str
+    mirrored: bool
 
-    def look(self, picture: np.ndarray, seen: bool, now: float) -> None:
-        """Updates ``words`` by a frame, uint8 (H,W,3), that shows the face that is followed or none."""
+    def look(self, picture: np.ndarray, solved: LiveFrame, now: float) -> None:
+        """Updates ``words`` by a frame, uint8 (H,W,3), and what was solved of it."""
 
 
 class FaceWatch:
-    """Looks at frames as they pass; faces are counted now and then beside them, in a thread.
+    """Looks at frames as they pass; faces are looked for now and then beside them, in a thread.
 
     Args:
-        count: how many faces a picture (3,H,W) shows.
+        find: the boxes of faces in a picture (3,H,W): rows of x, y, width and height, pixels.
     """
 
-    def __init__(self, count: Callable[..., int]) -> None:
-        self._count = count
-        self._faces = 1
+    def __init__(self, find: Callable[..., Sequence[Sequence[float]]]) -> None:
+        self._find = find
+        self._middles: list[float] = []
         self._due = float("-inf")
         self._ever = False
-        self._counting: threading.Thread | None = None
-        self.words = ""
+        self._looking: threading.Thread | None = None
+        self.words, self.mirrored = "", True
 
-    def look(self, picture: np.ndarray, seen: bool, now: float) -> None:
-        """Updates ``words`` by a frame, uint8 (H,W,3), that shows the face that is followed or none."""
+    def look(self, picture: np.ndarray, solved: LiveFrame, now: float) -> None:
+        """Updates ``words`` by a frame, uint8 (H,W,3), and what was solved of it."""
+        seen = solved.seen
         self._ever |= seen
-        if seen and now >= self._due and (self._counting is None or not self._counting.is_alive()):
+        if seen and now >= self._due and (self._looking is None or not self._looking.is_alive()):
             self._due = now + _INTERVAL
-            self._counting = threading.Thread(target=self._look_for_others, args=(picture,), daemon=True)
-            self._counting.start()
-        if seen and self._faces > 1:
-            self.words = f"{self._faces} faces: one of them is followed, best the only one in the picture"
+            self._looking = threading.Thread(target=self._look_for_others, args=(picture,), daemon=True)
+            self._looking.start()
+        if seen and len(self._middles) > 1:
+            self.words = self._which(float(solved.landmarks[:, 0].nanmean()))
         elif seen:
-            self.words = "Your face is followed"
+            self.words = FOLLOWED
         elif picture[::_SPARSE, ::_SPARSE].max(2).mean() < _DARK:
             self.words = "Too dark to see a face: put a light before you"
         elif self._ever:
-            self.words = "No face: the last expression is held, then relaxes"
+            self.words = "Your face is hidden: the last expression is held, then relaxes"
         else:
             self.words = "No face yet: sit before the camera and look into it"
 
+    def _which(self, at: float) -> str:
+        middles = sorted(self._middles, reverse=self.mirrored)
+        place = min(range(len(middles)), key=lambda i: abs(middles[i] - at))
+        name = "left" if place == 0 else "right" if place == len(middles) - 1 else "middle"
+        count = _NUMBERS[len(middles)] if len(middles) < len(_NUMBERS) else str(len(middles))
+        return f"{count} people: following the {name} one"
+
     def _look_for_others(self, picture: np.ndarray) -> None:
-        self._faces = self._count(planes(picture))
+        self._middles = [float(box[0]) + float(box[2]) / 2 for box in self._find(planes(picture))]

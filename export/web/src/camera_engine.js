@@ -1,0 +1,96 @@
+// The engine in the browser: its camera, and the graph in a worker.
+
+import { BrowserTakes } from "./browser_takes.js";
+import { closeCamera, openCamera } from "./camera.js";
+import { pumpFrames } from "./frame_pump.js";
+import { Solver } from "./solver.js";
+import { WeightControls } from "./weight_controls.js";
+
+export class CameraEngine {
+  #page;
+  #video;
+  #controls = new WeightControls();
+  #solver = null;
+  #loading = null;
+  #stream = null;
+  #pump = null;
+  #reset = false;
+
+  /**
+   * @param {object} page `{controls(), show(solved), running(on), status(words), problem(words), takesChanged()}`.
+   * @param {HTMLVideoElement} video where the camera is shown.
+   */
+  constructor(page, video) {
+    [this.#page, this.#video] = [page, video];
+    this.takes = new BrowserTakes(page.takesChanged);
+  }
+
+  get running() {
+    return this.#stream !== null;
+  }
+
+  get threads() {
+    return this.#solver?.facts?.threads ?? 1;
+  }
+
+  reset() {
+    this.#reset = true;
+  }
+
+  async start() {
+    const { status } = this.#page;
+    try {
+      status("Asking for the camera…");
+      const loaded = this.#loaded(); // while the user is asked
+      loaded.catch(() => {}); // said once the camera is there
+      this.#stream = await openCamera(this.#video, () => this.stop("The camera was unplugged or taken away."));
+      this.#page.running(true);
+      status("Loading the solver…");
+      await loaded;
+      if (this.#stream !== null) this.#run(); // else it was taken away meanwhile
+    } catch (error) {
+      this.stop(error.message);
+    }
+  }
+
+  stop(problem = "") {
+    this.#pump?.stop();
+    if (this.#stream !== null) closeCamera(this.#video, this.#stream);
+    this.#pump = this.#stream = null;
+    this.#page.running(false);
+    if (problem) this.#page.problem(problem);
+  }
+
+  #run() {
+    const controls = () => {
+      const reset = this.#reset;
+      this.#reset = false;
+      return { ...this.#page.controls().solver, reset };
+    };
+    const show = (solved) => {
+      const wanted = this.#controls.apply(solved, this.#page.controls().weights);
+      this.takes.add(wanted);
+      this.#page.show(wanted, solved);
+    };
+    this.#pump = pumpFrames(this.#video, this.#solver, controls, show, (error) => {
+      this.#forget();
+      this.stop(`The solver stopped: ${error.message}`);
+    });
+  }
+
+  /** The solver, which is loaded once; after a failure once more. */
+  async #loaded() {
+    this.#loading ??= (this.#solver = new Solver()).load("./webcam.onnx");
+    try {
+      await this.#loading;
+    } catch (error) {
+      this.#forget();
+      throw new Error(`The solver could not be loaded: ${error.message}.`);
+    }
+  }
+
+  #forget() {
+    this.#solver?.close();
+    this.#solver = this.#loading = null;
+  }
+}

@@ -1,0 +1,30 @@
+// The state of the face that is followed, in words.
+
+const SEEN = 0.5; // of presence; below it there is no face
+const GONE = 1000; // milliseconds without a face until that is said
+const LEARNED = 0.99;
+
+export const isSeen = (solved) => solved.presence > SEEN;
+
+export class StateWords {
+  #lastSeen = -Infinity;
+  #ever = false;
+
+  /** Begins anew, as after a pause. */
+  forget() {
+    this.#lastSeen = performance.now();
+  }
+
+  /** What a frame shows. */
+  of(solved) {
+    const now = performance.now();
+    if (isSeen(solved)) {
+      this.#lastSeen = now;
+      this.#ever = true;
+    } else if (now - this.#lastSeen > GONE) {
+      return this.#ever ? "Your face is hidden: the last expression is held, then relaxes." : "No face is seen. Move into the picture, with light on your face.";
+    }
+    if (solved.calibrated < LEARNED) return `Learning your face: ${Math.floor(100 * solved.calibrated)} %.`;
+    return "Your face is followed.";
+  }
+}

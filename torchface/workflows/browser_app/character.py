@@ -1,0 +1,143 @@
+"""The character of the page: a ``.glb``, and what drives each of its shapes."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torchface.capture.retargeting import ShapeMap, load_shape_rules, shape_map
+from torchface.errors import FileFormatError, NameMismatchError, NoShapesError
+from torchface.files.whole_files import read_file
+from torchface.io import load_rig, save_rig
+from torchface.io.gltf.gltf_document import Document, document_of
+from torchface.io.gltf.primitive_reading import read_target_names
+from torchface.io.tables.csv_table import quoted
+from torchface.shape_names import ARKIT
+from torchface.synthetic import performer
+
+LARGEST_CHARACTER = 100 * 2**20
+"""Bytes; what the page itself takes (``export/web/src/character_check.js``)."""
+
+_FEW = 10
+_BLOCK = 4096  # frames mapped at a time
+_GLB = (".glb", ".vrm")
+
+
+@dataclass(frozen=True, eq=False)
+class Character:
+    """A ``.glb`` and what drives it.
+
+    Args:
+        name: for people.
+        data: the file; its meshes and pictures may be compressed.
+        shapes: from ARKit's names to the file's.
+    """
+
+    name: str
+    data: bytes
+    shapes: ShapeMap
+
+    @cached_property
+    def document(self) -> Document:
+        """The file as glTF."""
+        return document_of(Path(self.name), self.data)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Of its shapes."""
+        return self.shapes.to_names
+
+    def weights(self, arkit: Tensor) -> Tensor:
+        """ARKit's weights (T,52) as the character's (T,N)."""
+        moved = torch.empty(len(arkit), len(self.names))
+        for first in range(0, len(arkit), _BLOCK):  # an hour at once would fill the memory
+            rows = slice(first, first + _BLOCK)
+            moved[rows] = self.shapes(arkit[rows])
+        return moved
+
+    def notes(self) -> tuple[str, ...]:
+        """What the user should know of it."""
+        driven = len(self.names) - len(self.shapes.undriven)
+        if driven >= _FEW or not self.shapes.undriven:
+            return ()
+        return (
+            f"{self.name}: {driven} of its {len(self.names)} shapes move; {quoted(self.shapes.undriven)} are "
+            "neither ARKit's nor in a mapping table (--mapping)",
+        )
+
+    def page_table(self) -> bytes:
+        """What drives each shape, as JSON for the page: rows of ``ARKIT`` and their factors, or a rule, by its name."""
+        shapes = self.shapes
+        return json.dumps(
+            {"name": self.name, "sources": {name: self._drive(i) for i, name in enumerate(shapes.to_names)}}
+        ).encode()
+
+    def _drive(self, row: int) -> Any:
+        shapes = self.shapes
+        used = [[column, float(shapes.matrix[row, column])] for column in shapes.matrix[row].nonzero()[:, 0].tolist()]
+        limits = [float(values[row]) for values in (shapes.gain, shapes.lower, shapes.upper)]
+        if not shapes.products[row] and limits == [1.0, 0.0, 1.0]:
+            return used
+        gain, lower, upper = limits
+        return {"sum": used, "product": list(shapes.products[row]), "gain": gain, "lower": lower, "upper": upper}
+
+
+def load_character(path: str | Path | None = None, table: Path | None = None) -> Character:
+    """Reads a character.
+
+    Args:
+        path: a ``.glb`` or ``.vrm``, which is taken as it is, or what else holds a rig; the embedded performer if
+            absent.
+        table: for shapes of other names than ARKit's; see :func:`torchface.capture.retargeting.load_shape_rules`.
+
+    Raises:
+        FileFormatError: it cannot be read, or is too large for the page.
+        NameMismatchError: nothing drives any of its shapes.
+    """
+    if path is None:
+        name, (data, names) = "the embedded performer", _written(None)
+    else:
+        name = Path(path).name if Path(path).suffix.lower() in _GLB else f"{Path(path).stem}.glb"
+        data, names = _taken(Path(path)) if Path(path).suffix.lower() in _GLB else _written(Path(path))
+    rules = None if table is None else load_shape_rules(table)
+    try:
+        return Character(name, data, shape_map(ARKIT, names, rules))
+    except NameMismatchError as error:
+        if table is not None:
+            raise NameMismatchError(f"{table}: {error}") from error
+        raise NameMismatchError(
+            f"{path}: found the shapes {quoted(names)}, none by a name of ARKit's; expected names that ARKit knows, "
+            "such as jawOpen, or --mapping FILE, a TOML table that says what drives each of them, such as\n"
+            f'["{names[0]}"]\nsum = {{jawOpen = 1.0}}'
+        ) from error
+
+
+def _taken(path: Path) -> tuple[bytes, tuple[str, ...]]:
+    if path.is_file() and path.stat().st_size > LARGEST_CHARACTER:
+        raise FileFormatError(
+            f"{path}: found {path.stat().st_size / 2**20:.0f} MB, expected at most {LARGEST_CHARACTER / 2**20:.0f} MB "
+            "for a character that moves live: export it with smaller textures, or the head alone"
+        )
+    data = read_file(path)
+    document = document_of(path, data)
+    meshes = [read_target_names(document, i) for i in range(len(document.objects("meshes")))]
+    names = tuple(dict.fromkeys(name for mesh in meshes for name in mesh))
+    if not names:
+        raise NoShapesError(
+            f"{path}: found no morph target in its {len(meshes)} meshes, expected at least one for a rig"
+        )
+    return data, names
+
+
+def _written(path: Path | None) -> tuple[bytes, tuple[str, ...]]:
+    rig = performer() if path is None else load_rig(path).linear("the page's character")
+    with TemporaryDirectory() as folder:
+        save_rig(rig, Path(folder) / "character.glb")
+        return read_file(Path(folder) / "character.glb", LARGEST_CHARACTER), rig.names

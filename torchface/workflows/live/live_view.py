@@ -1,0 +1,55 @@
+"""View of a live session: one moment as the page shows it, and its bytes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import torch
+
+from torchface.workflows.live.live_frames import LiveFrame
+
+FRAME, PICTURE = 1, 2
+"""First number of a message."""
+
+_WIDTH, _QUALITY = 320, 70  # of the camera's small picture
+
+
+@dataclass(frozen=True, eq=False)
+class LiveView:
+    """One moment of a live session.
+
+    Args:
+        came: when the frame came, seconds.
+        interval: since the frame before, seconds.
+        latency: from its arrival to its packets on the way, milliseconds.
+        picture: of the camera, uint8 (H,W,3), red first.
+        solved: what was sent.
+        frames: how many there were before it.
+    """
+
+    came: float
+    interval: float
+    latency: float
+    picture: np.ndarray
+    solved: LiveFrame
+    frames: int
+
+    def message(self) -> bytes:
+        """For ``export/web/src/server_engine.js``: kind and 0, milliseconds as a double, then floats."""
+        solved = self.solved
+        height, width = self.picture.shape[:2]
+        facts = [float(solved.seen), solved.calibrated, self.interval, self.latency, float(width), float(height)]
+        parts = [solved.weights, solved.rotation, solved.gaze, solved.landmarks, solved.iris, torch.tensor(facts)]
+        numbers = torch.cat([part.detach().cpu().float().reshape(-1) for part in parts])
+        head = np.array([FRAME, 0], "<u4").tobytes() + np.array([1000 * self.came], "<f8").tobytes()
+        return head + numbers.numpy().astype("<f4").tobytes()
+
+    def picture_message(self) -> bytes:
+        """Kind and 0, then a JPEG of the camera's picture, made small."""
+        height, width = self.picture.shape[:2]
+        size = (_WIDTH, max(1, round(height * _WIDTH / width)))
+        small = self.picture if width <= _WIDTH else cv2.resize(self.picture, size, interpolation=cv2.INTER_AREA)
+        coded = cv2.imencode(".jpg", small[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])[1]
+        return np.array([PICTURE, 0], "<u4").tobytes() + coded.tobytes()

@@ -1,0 +1,198 @@
+"""Server of the live page on this machine: its files, its socket, and the stream view at an address of its own.
+
+The page, the camera's pictures and the controls lie under a token that each start draws anew. The character, the stream
+view and its socket, which shows frames and takes nothing, lie beside it at addresses that stay.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import mimetypes
+import secrets
+import threading
+import time
+from collections.abc import Callable, Mapping
+from http import HTTPStatus
+from pathlib import Path
+from typing import Any, Protocol
+from urllib.parse import unquote
+
+from websockets.datastructures import Headers
+from websockets.exceptions import ConnectionClosed
+from websockets.http11 import Request, Response
+from websockets.sync.server import ServerConnection, serve
+
+from torchface.errors import TorchfaceError
+from torchface.files.whole_files import read_file
+from torchface.viz.browser.browser_page import HOST, free_port
+from torchface.viz.browser.origin_check import is_allowed, without_token
+from torchface.workflows.live.live_view import LiveView
+
+_LARGEST_MESSAGE = 2**16
+_STATE_INTERVAL, _PICTURE_INTERVAL = 0.25, 1 / 15  # seconds
+_WAIT = 0.25
+_HEADERS = {
+    "X-Frame-Options": "DENY",
+    "Referrer-Policy": "no-referrer",  # the address holds the token
+    "Cache-Control": "no-store",
+    "Connection": "close",
+}
+_ENGINE = b'data-engine="browser"', b'data-engine="server"'
+
+Reply = Callable[[str], bytes]
+"""The bytes of a file by its path behind a folder's address."""
+
+
+class LiveDesk(Protocol):
+    """What a page sees of a live session, and may ask of it; called from other threads than the session's."""
+
+    def next_view(self, before: LiveView | None, seconds: float) -> LiveView | None:
+        """The newest moment once there is another than ``before``; None where none came in time."""
+
+    def state(self) -> dict[str, Any]:
+        """What the page shows beside the frames."""
+
+    def asked(self, message: Mapping[str, Any]) -> None:
+        """Does what a page asks for.
+
+        Raises:
+            TorchfaceError: it cannot be done.
+        """
+
+
+class PageServer:
+    """Serves the page until it is stopped.
+
+    Args:
+        folder: of the page's files.
+        character: ``character.glb`` and ``character.json``, by name.
+        takes: gives the rows of a take by its name.
+        desk: the session.
+        port: the first to try, 0 for any.
+    """
+
+    def __init__(self, folder: Path, character: Mapping[str, bytes], takes: Reply, desk: LiveDesk, port: int) -> None:
+        self._folder, self._character, self._takes, self._desk = folder, character, takes, desk
+        self._files = {path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file()}
+        self._token = secrets.token_urlsafe(12)
+        self._stopped = threading.Event()
+        logger = logging.getLogger(__name__)
+        logger.setLevel(logging.CRITICAL + 1)  # browsers that hang up are no news
+        self._server = serve(
+            self._talk,
+            HOST,
+            free_port(HOST, port),
+            process_request=self._answer,
+            max_size=_LARGEST_MESSAGE,
+            logger=logger,
+            compression=None,
+        )
+        self.port = int(self._server.socket.getsockname()[1])
+        self._thread = threading.Thread(target=self._server.serve_forever, name="torchface-page", daemon=True)
+        self._thread.start()
+
+    @property
+    def url(self) -> str:
+        """The address of the page."""
+        return f"http://{HOST}:{self.port}/{self._token}/"
+
+    @property
+    def stream_url(self) -> str:
+        """The address of the stream view."""
+        return f"http://{HOST}:{self.port}/stream"
+
+    def stop(self) -> None:
+        """Says to open pages that it has ended, and ends."""
+        self._stopped.set()
+        self._server.shutdown()
+        self._thread.join(2)
+
+    def _answer(self, connection: ServerConnection, request: Request) -> Response | None:
+        hosts, origins = request.headers.get_all("Host"), request.headers.get_all("Origin")
+        if len(hosts) != 1 or len(origins) > 1 or not is_allowed(hosts[0], origins[0] if origins else None, self.port):
+            return _response(HTTPStatus.FORBIDDEN, b"This page is for this machine's own browser alone.\n")
+        path = request.path
+        inside = without_token(path, self._token)
+        private = inside is not None
+        name = unquote((inside if inside is not None else path).partition("?")[0]).removeprefix("/")
+        if name == "socket":
+            return None
+        if name in ("", "index.html") and not private:
+            return _response(HTTPStatus.FORBIDDEN, b"Open the whole address that torchface has printed.\n")
+        try:
+            return self._file(name, private)
+        except TorchfaceError as error:
+            return _response(HTTPStatus.NOT_FOUND, str(error).encode())
+
+    def _file(self, name: str, private: bool) -> Response:
+        if name in ("", "index.html", "stream"):
+            return _response(HTTPStatus.OK, read_file(self._folder / "index.html").replace(*_ENGINE), ".html")
+        if name in self._character:
+            return _response(HTTPStatus.OK, self._character[name], Path(name).suffix)
+        if private and name.startswith("takes/"):
+            return _response(HTTPStatus.OK, self._takes(name.removeprefix("takes/")), ".bin")
+        if name in self._files:
+            return _response(HTTPStatus.OK, read_file(self._folder / name), Path(name).suffix)
+        return _response(HTTPStatus.NOT_FOUND, b"There is no such file.\n")
+
+    def _talk(self, connection: ServerConnection) -> None:
+        private = connection.request is not None and without_token(connection.request.path, self._token) is not None
+        sender = threading.Thread(target=self._send, args=(connection, private), daemon=True)
+        sender.start()
+        try:
+            for message in connection:
+                if private:
+                    self._take(message)
+        except ConnectionClosed:
+            pass
+        sender.join(2 * _WAIT)
+
+    def _take(self, message: str | bytes) -> None:
+        try:
+            asked = json.loads(message)
+            if isinstance(asked, dict):
+                self._desk.asked(asked)
+        except (TorchfaceError, ValueError, OSError, RecursionError):
+            pass  # a message that is none; what went wrong with one that is stands in the notes
+
+    def _send(self, connection: ServerConnection, private: bool) -> None:
+        shown: LiveView | None = None
+        state_at = picture_at = float("-inf")
+        said = ""
+        try:
+            while not self._stopped.is_set():
+                view = self._desk.next_view(shown, _WAIT)
+                if view is not None:
+                    shown = view
+                    connection.send(view.message())
+                now = time.monotonic()
+                if private and view is not None and now - picture_at >= _PICTURE_INTERVAL:
+                    picture_at = now
+                    connection.send(view.picture_message())
+                if private and now - state_at >= _STATE_INTERVAL:
+                    state_at = now
+                    state = json.dumps(self._desk.state())
+                    if state != said:
+                        connection.send(state)
+                        said = state
+            state = self._desk.state() if private else {}
+            connection.send(json.dumps({**state, "ended": state.get("ended") or "torchface has ended."}))
+            connection.close()
+        except ConnectionClosed:
+            pass
+
+
+def _response(status: HTTPStatus, body: bytes, suffix: str = ".txt") -> Response:
+    kinds = {
+        ".js": "text/javascript",
+        ".glb": "model/gltf-binary",
+        ".bin": "application/octet-stream",
+        ".wasm": "application/wasm",
+    }
+    kind = kinds.get(suffix) or mimetypes.types_map.get(suffix, "application/octet-stream")
+    text = kind.startswith("text/") or kind.endswith("json")
+    headers = Headers(
+        {**_HEADERS, "Content-Type": f"{kind}; charset=utf-8" if text else kind, "Content-Length": str(len(body))}
+    )
+    return Response(status.value, status.phrase, headers, body)
