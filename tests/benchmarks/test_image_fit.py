@@ -30,7 +30,15 @@ from torchface.io.rigs.ict_facekit import load_ict_facekit, load_identity_modes
 from torchface.modeling import FitSettings, HeadModel, ImageFit, MorphableModel, fit_images, transfer_deformation
 from torchface.modeling.photographs.image_fit import contour_curves
 from torchface.modeling.photographs.image_solve import Problem, State, solve, whitening
-from torchface.modeling.photographs.landmark_view import JAW, LANDMARKS, LinearPoints, Views, chosen_points, linearised
+from torchface.modeling.photographs.landmark_view import (
+    JAW,
+    LANDMARKS,
+    LandmarkSites,
+    LinearPoints,
+    Views,
+    chosen_points,
+    linearised,
+)
 from torchface.optim import box_qp
 from torchface.rendering.clay_shading import render
 from torchface.rendering.compositing import caption, heat_colors, save_rendered_image, sheet
@@ -146,7 +154,7 @@ def planted(
     views = Views(intrinsics.expand(len(yaws), 3, 3), rotation, away - rotation @ centre)
     marks = rig.neutral.landmarks
     curves = contour_curves(rig.vertices, rig.neutral.faces, marks)
-    points = LinearPoints.of(face, faces.modes[:0], marks, curves)
+    points = LinearPoints.of(face, faces.modes[:0], LandmarkSites(marks, curves))
     none = torch.zeros(len(yaws), 0, dtype=torch.float64)
     pixels = views.pixels(points.at(none[0])[chosen_points(points, none, views, slides)])
     line = pixels[:, :JAW]
@@ -249,7 +257,7 @@ def test_joint_steps_against_turns(faces: Faces, focal: float | None) -> None:
     model, marks = faces.model(20), faces.rig.neutral.landmarks
     curves = contour_curves(faces.rig.vertices, faces.rig.neutral.faces, marks)
     basis = torch.cat([model.shape.modes, faces.rig.deltas])
-    points = LinearPoints.of(faces.rig.vertices, basis, marks, curves)
+    points = LinearPoints.of(faces.rig.vertices, basis, LandmarkSites(marks, curves))
     settings = FitSettings(sliding=False, contour_slide=1.0, noise=1.0, one_expression=True)
     ways = {"joint": Row(), "10 turns": Row(), "40 turns": Row()}
     for seed in range(10):

@@ -1,38 +1,35 @@
-"""Sites on a rig of the points that a landmark network finds: the embedded performer is registered to it, once."""
+"""Sites on a rig of the points that a landmark network finds: a head's places are carried over to another's."""
 
 from __future__ import annotations
 
-from contextlib import suppress
-
 import torch
+from scipy.interpolate import RBFInterpolator
+from scipy.spatial import KDTree
 from torch import Tensor
 
-from torchface import zoo
 from torchface.attachment import Attachment
-from torchface.capture.own_rig.face_points import JAW
-from torchface.errors import FileFormatError, ShapeError
-from torchface.files.cache_folder import cache_folder
-from torchface.files.content_keys import content_key
-from torchface.geometry.meshes.operators import components
+from torchface.errors import ShapeError
+from torchface.geometry.meshes.operators import components, vertex_normals
 from torchface.geometry.meshes.surface_index import SurfaceIndex
+from torchface.geometry.similarity import similarity_transform
 from torchface.mesh import Mesh
-from torchface.modeling import HeadModel
-from torchface.progress import Progress, silent
-from torchface.registration.scan_registration import register
 from torchface.rig import BlendshapeRig
+from torchface.shape_names import ARKIT, mapping
 from torchface.synthetic.head.head_annotations import head_annotations
 from torchface.synthetic.head.identity import mean_vertices
 from torchface.synthetic.head.performer import performer
-
-HEADS = "head"
-"""The model of the zoo by which the performer takes on another head's form."""
 
 COUNTED = False
 """Whether ``track`` and ``live`` count a network's points. On four films of other people, with the expression read too,
 they take errors of weights from 0.125 to 0.126 and from 0.142 to 0.148, correlations from 0.74 to 0.55 and from 0.48 to
 0.45: their errors are those of the landmarks and of the head."""
 
-_METHOD = "surface sites/1"
+SHARED = [*range(4, 13), *range(27, 68)]
+"""Landmarks that all heads mean alike."""
+
+_SMOOTHING, _OTHER_SIZE, _TURNED = 1.0, 0.2, 20.0  # the second a logarithm, the third in degrees
+_JAW, _LIDS = 8.0, 6.0  # millimetres that a whole motion of the jaw and of the lids counts when points are compared
+_AHEAD = 0.0  # z of a normal: what faces back lies inside a mouth
 
 
 def counted_sites(rig: BlendshapeRig, places: Tensor) -> Attachment | None:
@@ -40,46 +37,95 @@ def counted_sites(rig: BlendshapeRig, places: Tensor) -> Attachment | None:
     return sites_on_rig(rig, places) if COUNTED and len(places) else None
 
 
-def sites_on_rig(rig: BlendshapeRig, places: Tensor, progress: Progress | None = None) -> Attachment:
+def sites_on_rig(rig: BlendshapeRig, places: Tensor) -> Attachment:
     """Where points of the embedded performer's mean head lie on a rig, as sites on its neutral mesh.
 
-    The performer is registered to the rig by its landmarks, and each point goes to the nearest place of the skin that
-    the landmarks lie on, past eyeballs and teeth. That takes a minute, and is kept in the cache; on a rig of the
-    performer's own topology the points are known.
+    The rig's head is bent onto the performer's by their landmarks, and each point goes to the vertex of the skin that
+    lies nearest and moves alike with the jaw and the lids: so networks were taught where their points are on other
+    heads. On a rig of the performer's own topology the points are known.
 
     Args:
         rig: with the 68 landmarks annotated.
         places: of the points on the mean head, (P,3), millimetres; see ``LandmarkNetwork.places``.
-        progress: called with each step.
 
     Raises:
         ShapeError: the rig has no landmarks.
-        AlignmentError: the performer cannot be registered to it.
     """
-    template = performer(texture=False).neutral.with_vertices(mean_vertices().float())
+    actor = performer(texture=False)
+    template = actor.neutral.with_vertices(mean_vertices().float())
     own = _attached(template, places)
     neutral = rig.neutral
     if neutral.faces.shape == template.faces.shape and torch.equal(neutral.faces.cpu(), template.faces):
         return Attachment(own.triangles, own.barycentric).made_for(neutral)
-    if neutral.landmarks is None:
+    marks = neutral.landmarks
+    if marks is None:
         raise ShapeError("rig: found no landmarks, expected the 68 of iBUG's order; see torchface annotate")
-    key = content_key(_METHOD, neutral=neutral, places=places, heads=zoo.find(HEADS))[:32]
-    with suppress(FileFormatError):  # not there, or damaged
-        return Attachment.load(cache_folder("surface_sites") / f"{key}.json")
-    (progress or silent)("finding the points' places on the rig, once")
-    marks, inner = head_annotations().landmarks, slice(JAW, None)  # a contour is where a head is seen to end
-    assert marks is not None
-    landmarks = marks[inner], neutral.vertices[neutral.landmarks[inner]]
-    fitted = register(
-        template, neutral, landmarks, model=zoo.get_model(HEADS, HeadModel), texture_size=0, progress=progress
-    )
-    skin = components(neutral.faces, len(neutral.vertices))
-    on_skin = torch.isin(skin[neutral.faces[:, 0]], skin[neutral.landmarks]).nonzero()[:, 0]
-    found = SurfaceIndex(neutral.vertices, neutral.faces[on_skin]).nearest(own.on(template.faces, fitted.mesh.vertices))
-    sites = Attachment(on_skin[found.triangle], found.barycentric.float()).made_for(neutral)
-    with suppress(FileFormatError):
-        sites.save(cache_folder("surface_sites") / f"{key}.json")
-    return sites
+    theirs = head_annotations().landmarks
+    assert theirs is not None
+    vertices, faces = neutral.vertices.detach().cpu().double(), neutral.faces.cpu()
+    canonical = bent_onto(vertices, marks, mean_vertices().double()[theirs])
+    part = components(faces, len(vertices))
+    skin = torch.isin(part, part[marks]) & (vertex_normals(canonical, faces)[:, 2] > _AHEAD)
+    motions = jaw_and_lids(rig, marks), jaw_and_lids(actor, theirs)
+    moved = None
+    if motions[0] is not None and motions[1] is not None:
+        wanted = own.on(template.faces, torch.stack([*motions[1], motions[1][0]], dim=1))[:, :2]
+        moved = torch.stack(motions[0], dim=1), wanted
+    return Attachment.from_vertices(neutral, alike_vertices(canonical, skin, places, moved)).made_for(neutral)
+
+
+def bent_onto(vertices: Tensor, landmarks: Tensor, target: Tensor) -> Tensor:
+    """Vertices (V,3) of a head moved smoothly so that its landmarks (68,) lie at others, (68,3)."""
+    marks, goal = vertices[landmarks[SHARED]], target[SHARED]
+    place = similarity_transform(marks[None], goal[None])
+    turn = torch.rad2deg(torch.arccos(((place.rotation[0].trace() - 1) / 2).clamp(-1, 1)))
+    # The heads that networks learned from were moved alone; one of another size or bearing is brought there first.
+    if abs(float(place.scale[0].log())) > _OTHER_SIZE or float(turn) > _TURNED:
+        placed = place.apply(vertices[None])[0]
+    else:
+        placed = vertices + (goal - marks).mean(0)
+    at = placed[landmarks[SHARED]].numpy()
+    # The motion is interpolated, not the place: far from all landmarks it fades to their mean.
+    warp = RBFInterpolator(at, goal.numpy() - at, kernel="linear", smoothing=_SMOOTHING)
+    return placed + torch.from_numpy(warp(placed.numpy()))
+
+
+def alike_vertices(
+    canonical: Tensor, skin: Tensor, places: Tensor, motions: tuple[Tensor, Tensor] | None = None
+) -> Tensor:
+    """Vertices of another topology that are points of the mean head, (P,).
+
+    Lids and lips of two topologies lie a few millimetres apart there, and their upper and lower ones close together:
+    so motions are compared beside places.
+
+    Args:
+        canonical: each vertex on the performer's mean head, (V,3).
+        skin: which vertices may be points, (V,) bool.
+        places: of the points, (P,3).
+        motions: how far the jaw and both lids move each vertex, (V,2), and each point, (P,2); see ``jaw_and_lids``.
+    """
+    rows, unit = skin.nonzero()[:, 0], torch.tensor([_JAW, _LIDS], dtype=torch.float64)
+    own, wanted = canonical[rows].double(), places.double()
+    if motions is not None:
+        own = torch.cat([own, unit * motions[0][rows].double()], dim=1)
+        wanted = torch.cat([wanted, unit * motions[1].double()], dim=1)
+    return rows[torch.from_numpy(KDTree(own.numpy()).query(wanted.numpy())[1])]
+
+
+def jaw_and_lids(rig: BlendshapeRig, landmarks: Tensor) -> tuple[Tensor, Tensor] | None:
+    """How far the jaw and the lids move each vertex down, (V,), of the chin's and the lids' motion; None without them.
+
+    Args:
+        rig: with shapes of ARKit's meanings.
+        landmarks: vertices of iBUG's 68.
+    """
+    shapes = mapping(ARKIT, rig.names)
+    rows = [shapes[:, ARKIT.index(name)] for name in ("jawOpen", "eyeBlinkLeft", "eyeBlinkRight")]
+    if any(float(row.amax()) <= 0 for row in rows):
+        return None
+    open_jaw, left, right = (rig.deltas[int(row.argmax()), :, 1].detach().cpu().double() for row in rows)
+    lids = left + right
+    return open_jaw / open_jaw[landmarks[8]].abs(), lids / lids[landmarks[[37, 38, 43, 44]]].abs().mean()
 
 
 def _attached(mesh: Mesh, points: Tensor) -> Attachment:

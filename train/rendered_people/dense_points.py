@@ -5,7 +5,6 @@ from __future__ import annotations
 from functools import lru_cache
 
 import torch
-from scipy.spatial import KDTree
 from torch import Tensor
 
 from torchface.geometry.meshes.operators import vertex_normals
@@ -22,7 +21,6 @@ _WIDENING, _FOLD = 0.35, 6.0
 _PARTS = ("ear_left", "ear_right", "neck", "mouth_interior", "nostrils", "eye_sockets", "eyeball_left", "eyeball_right")
 _LOWEST, _HIGHEST, _WIDEST, _FRONTAL = -121.0, 62.0, 72.0, 0.17
 _MIDDLE = 0.2  # millimetres
-_JAW, _LIDS = 8.0, 6.0  # millimetres that a whole motion of the jaw and of the lids counts when points are compared
 
 
 @lru_cache(maxsize=1)
@@ -73,43 +71,6 @@ def dense_places() -> tuple[Tensor, Tensor]:
     """Where the points lie on the performer's mean head, (P,3) millimetres, and of each its mirrored twin, (P,)."""
     vertices, mirror = dense_vertices()
     return mean_vertices()[vertices].float(), mirror
-
-
-def same_points(
-    canonical: Tensor, motion: tuple[Tensor, Tensor], skin: Tensor, performer_motion: tuple[Tensor, Tensor]
-) -> Tensor:
-    """Vertices of another topology that are the points, (P,).
-
-    Lids and lips of two topologies lie a few millimetres apart on the mean head, and their upper and lower ones close
-    together: so motions are compared beside places.
-
-    Args:
-        canonical: each vertex on the performer's mean head, (V,3).
-        motion: how far the jaw and both lids move each vertex down, (V,), of how far they move the chin and the lids.
-        skin: which vertices may be points, (V,) bool.
-        performer_motion: of the performer's vertices.
-    """
-    vertices, _ = dense_vertices()
-
-    def features(places: Tensor, moved: tuple[Tensor, Tensor], rows: Tensor) -> Tensor:
-        scaled = [scale * part[rows, None] for scale, part in zip((_JAW, _LIDS), moved, strict=True)]
-        return torch.cat([places[rows], *scaled], 1).double()
-
-    rows = skin.nonzero()[:, 0]
-    tree = KDTree(features(canonical, motion, rows).numpy())
-    return rows[torch.from_numpy(tree.query(features(mean_vertices(), performer_motion, vertices).numpy())[1])]
-
-
-def jaw_and_lids(deltas: Tensor, rows: tuple[int, int, int], landmarks: Tensor) -> tuple[Tensor, Tensor]:
-    """How far the jaw and the lids move each vertex down, (V,), of the chin's and the lids' motion.
-
-    Args:
-        deltas: of all shapes, (N,V,3).
-        rows: of the open jaw and the two blinks.
-        landmarks: vertices of iBUG's 68.
-    """
-    jaw, lids = deltas[rows[0], :, 1], deltas[rows[1], :, 1] + deltas[rows[2], :, 1]
-    return jaw / jaw[landmarks[8]].abs(), lids / lids[landmarks[[37, 38, 43, 44]]].abs().mean()
 
 
 def _nasolabial_folds() -> Tensor:

@@ -7,13 +7,12 @@ of its own mean head onto it, by their common landmarks.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
 import torch
-from scipy.interpolate import RBFInterpolator
 from scipy.spatial import KDTree
 from torch import Tensor
 
@@ -25,17 +24,15 @@ from torchface.synthetic.head.head_annotations import head_annotations
 from torchface.synthetic.head.identity import IDENTITY, draw_identities, mean_vertices
 from torchface.synthetic.head.performer import SHAPES, performer
 from torchface.synthetic.head.skin_texture import vertex_marks
+from torchface.workflows.surface_sites import SHARED, alike_vertices, bent_onto, jaw_and_lids
 
-from .dense_points import dense_vertices, jaw_and_lids, same_points
+from .dense_points import dense_vertices
 
 _WAVES = 10
-_BLINKS = ("eyeBlinkLeft", "eyeBlinkRight")
 SKIN, TEETH, GUMS, EYEBALL, SOCKET = range(5)
 """What a triangle is made of."""
-_SHARED = [*range(4, 13), *range(27, 68)]  # landmarks that both kinds of heads mean alike
 # Clear shells over the eyes, and lashes on cards that an image would have to cut out.
 _HIDDEN = ("lacrimal_fluid", "eye_blend", "eye_occlusion", "eyelashes")
-_WARP_SMOOTHING = 1.0
 _LUMP = 1.5  # millimetres; standard deviation of what no mode of identity knows
 
 
@@ -127,12 +124,9 @@ def people_kind(rig: BlendshapeRig, modes: IdentityModes) -> HeadKind:
     marks68 = head_annotations().landmarks
     assert marks68 is not None
     target = mean_vertices()[marks68]
-    shift = (target[_SHARED] - mean[notes.landmarks[_SHARED]]).mean(0)
+    shift = (target[SHARED] - mean[notes.landmarks[SHARED]]).mean(0)
     placed = mean + shift
-    sources = placed[notes.landmarks[_SHARED]].numpy()
-    # The motion is interpolated, not the place: far from all landmarks it fades to their mean.
-    warp = RBFInterpolator(sources, target[_SHARED].numpy() - sources, kernel="linear", smoothing=_WARP_SMOOTHING)
-    canonical = placed + torch.from_numpy(warp(placed.numpy()))
+    canonical = bent_onto(mean, notes.landmarks, target)
     inner = torch.zeros(len(mean), dtype=torch.bool)
     for name in ("mouth_socket", "gums_and_tongue", "teeth", "eye_socket_left", "eye_socket_right"):
         inner |= regions[name]
@@ -162,23 +156,14 @@ def people_kind(rig: BlendshapeRig, modes: IdentityModes) -> HeadKind:
         return DrawnHead(_lumpy((head - middle) * stretch + middle, canonical, generator), rig.deltas * stretch)
 
     outer = (regions["face"] | regions["head_and_neck"]) & ~(own[:, 7] > 0.5)
-    actor, actor_marks = performer(texture=False), head_annotations().landmarks
-    assert actor_marks is not None
-    dense = same_points(
-        canonical,
-        jaw_and_lids(rig.deltas.double(), _moving(rig.names), notes.landmarks),
-        outer,
-        jaw_and_lids(actor.deltas.double(), _moving(actor.names), actor_marks),
-    )
+    points = dense_vertices()[0]
+    motions, theirs = jaw_and_lids(rig, notes.landmarks), jaw_and_lids(performer(texture=False), marks68)
+    assert motions is not None
+    assert theirs is not None
+    moved = torch.stack(motions, dim=1), torch.stack(theirs, dim=1)[points]
+    dense = alike_vertices(canonical, outer, mean_vertices()[points], moved)
     shapes = mapping(ARKIT, rig.names)
     return HeadKind(faces, material, notes.landmarks, canonical, own, outer, shapes, dense, 1.0, draw)
-
-
-def _moving(names: Sequence[str]) -> tuple[int, int, int]:
-    """Rows of the open jaw and the two blinks."""
-    shapes = mapping(ARKIT, names)
-    jaw, left, right = (int(shapes[:, ARKIT.index(name)].argmax()) for name in ("jawOpen", *_BLINKS))
-    return jaw, left, right
 
 
 def _marks_of(canonical: Tensor, regions: dict[str, Tensor], placed: Tensor, inner: Tensor) -> Tensor:

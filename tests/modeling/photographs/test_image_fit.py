@@ -23,9 +23,10 @@ from torchface.landmarks.images.ibug_68 import as_annotated
 from torchface.mesh import Mesh
 from torchface.modeling.morphable.head_model import HeadModel
 from torchface.modeling.morphable.morphable_model import MorphableModel
-from torchface.modeling.photographs.image_fit import ImageFit, fit_images
+from torchface.modeling.photographs.image_fit import ImageFit, contour_curves, fit_images
 from torchface.modeling.photographs.image_input import annotated_vertices
-from torchface.modeling.photographs.image_solve import FitSettings
+from torchface.modeling.photographs.image_solve import FitSettings, Problem, SurfacePoints
+from torchface.modeling.photographs.landmark_view import LandmarkSites, LinearPoints
 from torchface.modeling.rigging.deformation_transfer import transfer_deformation
 from torchface.rig import BlendshapeRig
 from torchface.synthetic import draw_identities, performer
@@ -421,3 +422,47 @@ def test_smiles_of_turned_heads_are_as_strong_on_both_sides(
         apart.append(float((fit.weights[0, left] - fit.weights[0, right]).abs()))
     assert max(apart) < 0.1
     assert sum(apart) / len(apart) < 0.06
+
+
+def test_points_of_the_surface_tell_a_head_better(rig: BlendshapeRig, model: HeadModel) -> None:
+    """With landmarks 3 pixels off, 150 points whose errors go together with their neighbours' still help."""
+    generator = torch.Generator().manual_seed(5)
+    skin = rig.neutral.annotations.regions["face"] & (rig.vertices[:, 2] > 40)
+    chosen = skin.nonzero()[:, 0][torch.randperm(int(skin.sum()), generator=generator)[:150]]
+    sites = Attachment.from_vertices(rig.neutral, chosen)
+    places = torch.cat([rig.vertices[rig.neutral.landmarks], rig.vertices[chosen]]).double()
+    alike = 0.5 * (-torch.cdist(places, places) / 25).exp()
+    alike.diagonal().fill_(1.0)
+    root = torch.linalg.cholesky(alike)
+    errors = {"landmarks": 0.0, "surface": 0.0}
+    for seed in range(3):
+        who = person(rig, model, seed, noise=0.0)
+        seen = torch.stack([camera.project(who.face[chosen].double()) for camera in who.cameras])
+        noise = 3 * root @ torch.randn(3, len(places), 2, generator=generator).double()
+        marks, points = who.landmarks + noise[:, :68], seen + noise[:, 68:]
+        deviations = torch.full((3, 68), 2.5), torch.full((3, 150), 4.0)
+        settings = replace(FIXED, transfers=0, deviations=deviations[0])
+        both = replace(settings, surface=SurfacePoints(points, deviations[1], sites))
+        for name, one in (("landmarks", settings), ("surface", both)):
+            fit = fit_images(model, rig, marks, SIZE, camera=who.focal, settings=one)
+            assert fit.residuals.shape == (3, 68, 2)
+            errors[name] += aligned_error(fit.mesh.vertices[skin], who.rest[skin])
+    assert errors["surface"] < 0.8 * errors["landmarks"]
+
+
+def test_errors_that_go_together_are_whitened(rig: BlendshapeRig, model: HeadModel) -> None:
+    curves = contour_curves(rig.vertices, rig.neutral.faces, rig.neutral.landmarks)
+    sites = Attachment.from_vertices(rig.neutral, rig.neutral.landmarks[17:30])
+    placed = LandmarkSites(rig.neutral.landmarks, curves, False, rig.neutral.faces, sites)
+    points = LinearPoints.of(rig.vertices, model.shape.modes, placed)
+    assert points.count == 81
+    found = torch.rand(1, 81, 2, dtype=torch.float64)
+    found[0, 3] = torch.nan
+    surface = SurfacePoints(found[:, 68:], torch.ones(1, 13), sites)
+    problem = Problem(points, 15, found, torch.ones(1), FitSettings(surface=surface, deviations=torch.ones(1, 68)))
+    assert problem.mixing is not None
+    inverse = torch.linalg.inv(problem.mixing[0])
+    alike = inverse @ inverse.T  # the 17th landmark twice, and once a landmark that is missing
+    assert torch.isclose(alike[17, 68], torch.tensor(0.5).double())
+    assert torch.equal(alike[3, :3].round(decimals=9), torch.zeros(3).double())
+    assert torch.allclose(alike.diagonal(), torch.ones(81).double())

@@ -24,7 +24,7 @@ from torchface.modeling.photographs.image_input import (
 )
 from torchface.modeling.photographs.image_solve import FitSettings, Problem, State, covariance, solve, solve_either
 from torchface.modeling.photographs.image_texture import photographed_skin
-from torchface.modeling.photographs.landmark_view import JAW, LANDMARKS, LinearPoints, Views
+from torchface.modeling.photographs.landmark_view import JAW, LANDMARKS, LandmarkSites, LinearPoints, Views
 from torchface.modeling.photographs.smooth_differences import smooth_differences
 from torchface.modeling.photographs.texture_fit import ColorFit
 from torchface.modeling.rigging.deformation_transfer import transfer_with_report
@@ -143,15 +143,18 @@ def fit_images(
     unknown = smooth_differences(mean, vertices, settings.unknown_deviation)
     modes = torch.cat([model.shape.modes.cpu(), unknown])
     deltas = _in_place(rig, mean)
-    curves = contour_curves(mean, model.faces.cpu(), vertices)
-    points = LinearPoints.of(mean, torch.cat([modes, deltas]), vertices, curves, settings.annotated)
+    faces, surface = model.faces.cpu(), settings.surface
+    curves = contour_curves(mean, faces, vertices)
+    sites = LandmarkSites(vertices, curves, settings.annotated, faces, None if surface is None else surface.sites)
+    points = LinearPoints.of(mean, torch.cat([modes, deltas]), sites)
     progress("placing the cameras")
     pose = _checked_pose(points.mean[:LANDMARKS], pixels, intrinsics)
-    problem = Problem(points, len(modes), pixels, intrinsics[:, 0, 0], settings, _twins(rig.names), len(unknown))
+    found = pixels if surface is None else torch.cat([pixels, surface.points.double()], dim=1)
+    problem = Problem(points, len(modes), found, intrinsics[:, 0, 0], settings, _twins(rig.names), len(unknown))
     initial = State(
         torch.zeros(problem.unknowns, dtype=torch.float64),
         Views(intrinsics, pose.rotation, pose.translation),
-        torch.arange(LANDMARKS).expand(len(pixels), -1),
+        torch.arange(points.count).expand(len(pixels), -1),
         float(pose.errors.mean()) if settings.noise is None else settings.noise,
     )
     progress("fitting identity and expression")
@@ -161,7 +164,7 @@ def fit_images(
         weights = problem.weights(state.coefficients).float().amax(0)
         rest = mean + torch.tensordot(state.coefficients[: len(modes)].float(), modes, dims=1)
         deltas = _personal(rig, deltas, weights, vertices, rest)
-        points = LinearPoints.of(mean, torch.cat([modes, deltas]), vertices, curves, settings.annotated)
+        points = LinearPoints.of(mean, torch.cat([modes, deltas]), sites)
         problem = replace(problem, points=points)
         state = solve(problem, state)
     fit = _result(problem, state, rig.neutral, mean, modes, deltas, sizes)
@@ -188,7 +191,8 @@ def _result(
             views.intrinsics, views.rotation, views.translation, sizes.tolist(), strict=True
         )
     )
-    seen = views.pixels(problem.points.picked(state.rows).at(state.coefficients[problem.rows]))
+    rows = state.rows[:, :LANDMARKS]
+    seen = views.pixels(problem.points.picked(rows).at(state.coefficients[problem.rows]))
     mesh = template.to("cpu")
     return ImageFit(
         mesh.with_vertices(rest),
@@ -196,7 +200,7 @@ def _result(
         whole[:known],
         weights,
         cameras,
-        seen - problem.found,
+        seen - problem.found[:, :LANDMARKS],
         seen,
         state.noise,
         covariance(problem, state)[kept][:, kept],

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Protocol
 
 import torch
 from torch import Tensor
 
+from torchface.attachment import Attachment
 from torchface.errors import ShapeError
 from torchface.geometry.cameras.pinhole import MAX_SIDE
 from torchface.modeling.photographs.landmark_view import (
@@ -17,6 +19,7 @@ from torchface.modeling.photographs.landmark_view import (
     LinearPoints,
     PickedPoints,
     Views,
+    Whitening,
     chosen_points,
     linearised,
     residuals,
@@ -27,9 +30,15 @@ from torchface.optim import box_qp
 _DONE, _HALVINGS = 1e-5, 6
 _MAX_CONTOUR_ERROR, _SETTLED, _TRIAL_ITERATIONS = 1.5, 0.02, 3
 _MIN_NOISE = 1e-5  # of the focal length: finer than any landmark is found
-_LEAST, _MOST = 0.5, 4.0  # deviations beside the median
+_LEAST, _MOST, _FAR = 0.5, 4.0, 100.0  # deviations beside the median; of points of the surface
 _FOUND_NOISE = 0.02  # of the distance of the eyes' outer corners
 _EXPECTED, _LEAST_UNKNOWN = 2.0, 1e-2  # of unknown differences: how many are expected to be as large as expected
+
+
+# Errors of found points, by 100 rendered pictures: of neighbours they go together as 0.5 exp(-d / 25 mm), and they are
+# so much larger than stated at landmarks, smaller at points of the surface.
+_TOGETHER, _ALIKE_OVER = 0.5, 25.0
+_STATED_68, _STATED_POINTS = 1.2, 0.75
 
 
 class WeightQuadratic(Protocol):
@@ -49,6 +58,21 @@ class ExpressionPrior(Protocol):
         ...
 
 
+@dataclass(frozen=True, eq=False)
+class SurfacePoints:
+    """Points of the face's surface as a dense network finds them beside the 68 landmarks.
+
+    Args:
+        points: (I,P,2) pixels; NaN for missing.
+        deviations: standard deviations of a coordinate as they are stated, (I,P) pixels.
+        sites: where they lie on the rig's mesh, P of them.
+    """
+
+    points: Tensor
+    deviations: Tensor
+    sites: Attachment
+
+
 @dataclass(frozen=True)
 class FitSettings:
     """The noise of landmarks, the priors on faces, and what is made of them.
@@ -59,8 +83,9 @@ class FitSettings:
             contour landmarks as points.
         sliding: contour landmarks of the far side move to the visible silhouette, as people and detectors mark them;
             False where they are vertices that may be hidden. Absent, what fits better is taken.
-        deviations: what each landmark is expected to be off by, (I,68), in any unit: they count beside their view's
+        deviations: what each landmark is expected to be off by, (I,68) pixels: they count beside their view's
             median, from half to four times it. All alike if absent.
+        surface: further points of the face; with them errors of neighbours are taken to go together.
         annotated: landmarks lie where annotators put them, and what learns from them, rather than on the heads'
             vertices; see ``as_annotated`` and ``annotated_vertices``.
         expression_prior: which weights of the rig's shapes go together, in place of the mean and the ridge below.
@@ -94,6 +119,7 @@ class FitSettings:
     contour_slide: float = 0.5
     sliding: bool | None = None
     deviations: Tensor | None = None
+    surface: SurfacePoints | None = None
     annotated: bool = False
     expression_prior: ExpressionPrior | None = None
     sparsity: float = 1.0
@@ -133,7 +159,7 @@ class Problem:
     Args:
         points: landmarks and contour curves as functions of K coefficients of identity and N weights.
         identities: K; the last ``smooth`` of them are differences that the head model does not know.
-        found: landmarks, (I,68,2), NaN for missing.
+        found: landmarks and points of the surface, (I,68+P,2), NaN for missing.
         focal: the expected focal lengths, (I,), pixels.
         settings: see there.
         twins: rows of shapes that mirror each other, (P,2); none if absent.
@@ -150,7 +176,7 @@ class Problem:
 
     @property
     def seen(self) -> Tensor:
-        """Which landmarks are there, (I,68) bool."""
+        """Which landmarks and points are there, (I,68+P) bool."""
         return torch.isfinite(self.found).all(-1)
 
     @property
@@ -164,8 +190,23 @@ class Problem:
         least = _MIN_NOISE * float(self.focal.mean())
         if not self.settings.annotated:
             return least
+        if self.settings.surface is not None and self.settings.deviations is not None:
+            return max(least, _STATED_68 * float(_typical(self.settings.deviations).mean()))
         eyes = (self.found[:, 36] - self.found[:, 45]).norm(dim=-1)
         return max(least, _FOUND_NOISE * float(eyes.nan_to_num(0.0).mean()))
+
+    @cached_property
+    def mixing(self) -> Tensor | None:
+        """See ``Whitening``; of the points that are there."""
+        if self.settings.surface is None:
+            return None
+        places = self.points.mean[: self.points.count]
+        alike = _TOGETHER * (-torch.cdist(places, places) / _ALIKE_OVER).exp()
+        alike.diagonal().fill_(1.0)
+        both = self.seen[:, :, None] & self.seen[:, None]
+        alike = torch.where(both, alike, torch.eye(len(places), dtype=alike.dtype))
+        one = torch.eye(len(places), dtype=alike.dtype).expand_as(alike)
+        return torch.linalg.solve_triangular(torch.linalg.cholesky(alike), one, upper=False)
 
     @property
     def expressions(self) -> int:
@@ -274,8 +315,8 @@ class Normal:
         return self.pose_alone + (self.pose_back @ own[..., None])[..., 0], longer
 
 
-def whitening(problem: Problem, state: State, picked: PickedPoints) -> Tensor:
-    """What makes errors unit and independent, (I,68,2,2): the contour's by whether they lie along or across it."""
+def whitening(problem: Problem, state: State, picked: PickedPoints) -> Whitening:
+    """What makes errors unit and independent: the contour's by whether they lie along or across it."""
     settings = problem.settings
     factors = torch.eye(2, dtype=torch.float64).repeat(*problem.seen.shape, 1, 1)
     line = state.views.pixels(picked.at(state.coefficients[problem.rows]))[:, :JAW]
@@ -285,14 +326,25 @@ def whitening(problem: Problem, state: State, picked: PickedPoints) -> Tensor:
     factors[:, :JAW] -= (1 - settings.contour_slide) * tangent
     factors[:, :JAW] /= settings.inner_weight**0.5
     if settings.deviations is not None:
-        factors /= _relative(settings.deviations)[..., None, None]
-    return factors * (problem.seen / (state.noise * _scales(problem, state.views))[:, None])[..., None, None]
+        factors /= _relative(settings.deviations, settings.surface)[..., None, None]
+    scale = problem.seen / (state.noise * _scales(problem, state.views))[:, None]
+    return Whitening(factors * scale[..., None, None], problem.mixing)
 
 
-def _relative(deviations: Tensor) -> Tensor:
-    """Deviations (I,68) beside the median of their view."""
+def _typical(deviations: Tensor) -> Tensor:
+    """The median of each view's deviations (I,68), (I,1)."""
     known = torch.where(deviations.isfinite(), deviations.double(), torch.nan)
-    return (known / known.nanmedian(1, keepdim=True).values).nan_to_num(_MOST).clamp(_LEAST, _MOST)
+    return known.nanmedian(1, keepdim=True).values
+
+
+def _relative(deviations: Tensor, surface: SurfacePoints | None) -> Tensor:
+    """Deviations (I,68) of landmarks beside the median of their view, and those of a surface, (I,68+P)."""
+    typical = _typical(deviations)
+    landmarks = (deviations.double() / typical).nan_to_num(_MOST, _MOST).clamp(_LEAST, _MOST)
+    if surface is None:
+        return landmarks
+    points = (_STATED_POINTS / _STATED_68) * surface.deviations.double() / typical
+    return torch.cat([landmarks, points.nan_to_num(_FAR, _FAR).clamp(_LEAST, _FAR)], dim=1)
 
 
 def _scales(problem: Problem, views: Views) -> Tensor:
@@ -351,7 +403,7 @@ def normal_equations(problem: Problem, at: Linearised, views: Views) -> Normal:
 
 
 def energy(
-    problem: Problem, state: State, picked: PickedPoints, factors: Tensor, prior: tuple[Tensor, Tensor]
+    problem: Problem, state: State, picked: PickedPoints, factors: Whitening, prior: tuple[Tensor, Tensor]
 ) -> float:
     """Minus the log posterior up to a constant, at fixed noise, chosen points and quadratic of the prior."""
     precision, linear = prior
@@ -382,7 +434,7 @@ def solve_either(problem: Problem, initial: State) -> tuple[Problem, State]:
 def _contour_error(problem: Problem, state: State) -> float:
     """Root mean square of contour landmarks in what is expected of them beside the inner ones: 1 if all is well."""
     picked = problem.points.picked(state.rows)
-    factors = whitening(problem, state, picked)
+    factors = replace(whitening(problem, state, picked), mixing=None)
     r = residuals(picked, state.coefficients[problem.rows], state.views, problem.targets, factors).square().sum(-1)
     contour, inner = problem.seen.clone(), problem.seen.clone()
     contour[:, JAW:], inner[:, :JAW] = False, False
@@ -427,7 +479,7 @@ def _searched(
     problem: Problem,
     state: State,
     picked: PickedPoints,
-    factors: Tensor,
+    factors: Whitening,
     model: tuple[Normal, tuple[Tensor, Tensor]],
     change: Tensor,
     before: float,
@@ -445,7 +497,7 @@ def _searched(
     return state, before
 
 
-def _spreads(problem: Problem, state: State, picked: PickedPoints, factors: Tensor, normal: Normal) -> State:
+def _spreads(problem: Problem, state: State, picked: PickedPoints, factors: Whitening, normal: Normal) -> State:
     """With noise and unknown differences as large as what is left over and what is found of them, each by what the
     other unknowns cannot explain.
 

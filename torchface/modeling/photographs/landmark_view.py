@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from torchface.attachment import Attachment
 from torchface.geometry.cameras.pnp import pixel_jacobian
 from torchface.geometry.cameras.sliding_contour import LevelCurves, outermost
 from torchface.geometry.rotations import cross_matrix, rotation_matrix
@@ -18,11 +19,30 @@ JAW = 17
 
 
 @dataclass(frozen=True, eq=False)
-class LinearPoints:
-    """Points that follow D coefficients: the landmarks, and the curves that the contour's ones slide along.
+class LandmarkSites:
+    """Where on a mesh points are that pictures show.
 
     Args:
-        mean: (P,3); the first 68 rows are the landmarks.
+        landmarks: vertices of the 68, (68,).
+        curves: that the contour's ones slide along.
+        annotated: the 68 lie where annotators put them.
+        faces: of the mesh, (F,3); not needed without other points.
+        surface: other points of the surface; none if absent.
+    """
+
+    landmarks: Tensor
+    curves: LevelCurves
+    annotated: bool = False
+    faces: Tensor | None = None
+    surface: Attachment | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class LinearPoints:
+    """Points that follow D coefficients: landmarks, others of the surface, curves that the contour's ones slide along.
+
+    Args:
+        mean: (P,3); the first 68 rows are the landmarks, those of the surface follow, then the curves.
         basis: what a unit of each coefficient adds, (D,P,3).
         rows: which points each contour landmark may be, (J,C) into P; the first is the landmark itself.
         valid: which of them count, (J,C) bool.
@@ -36,19 +56,26 @@ class LinearPoints:
     side: Tensor
 
     @staticmethod
-    def of(
-        mean: Tensor, modes: Tensor, landmarks: Tensor, curves: LevelCurves, annotated: bool = False
-    ) -> LinearPoints:
-        """Those of a whole mesh: mean (V,3), modes (D,V,3), landmark vertices (68,); or where annotators put them."""
-        stacked = torch.cat([mean[None], modes])
+    def of(mean: Tensor, modes: Tensor, sites: LandmarkSites) -> LinearPoints:
+        """Those of a whole mesh: mean (V,3), modes (D,V,3)."""
+        stacked, curves, landmarks = torch.cat([mean[None], modes]), sites.curves, sites.landmarks
         used, place = torch.cat([landmarks, curves.vertices.flatten()]).unique(return_inverse=True)
         values = stacked[:, used].transpose(0, 1).double()
         local = replace(curves, vertices=place[len(landmarks) :].reshape(curves.vertices.shape))
-        on_curves = local.interpolate(values).flatten(0, 1)
+        on_curves = local.interpolate(values).flatten(0, 1).transpose(0, 1)
         marks = values[place[: len(landmarks)]].transpose(0, 1)
-        points = torch.cat([as_annotated(marks) if annotated else marks, on_curves.transpose(0, 1)], dim=1)
-        rows = len(landmarks) + torch.arange(curves.valid.numel()).reshape(curves.valid.shape)
-        return LinearPoints(points[0], points[1:], rows, curves.valid, curves.side)
+        points = [as_annotated(marks) if sites.annotated else marks]
+        if sites.surface is not None:
+            points.append(sites.surface.on(sites.faces, stacked).double())
+        count = sum(part.shape[1] for part in points)
+        rows = count + torch.arange(curves.valid.numel()).reshape(curves.valid.shape)
+        whole = torch.cat([*points, on_curves], dim=1)
+        return LinearPoints(whole[0], whole[1:], rows, curves.valid, curves.side)
+
+    @property
+    def count(self) -> int:
+        """How many points are looked for in a picture: the landmarks and those of the surface."""
+        return len(self.mean) - self.rows.numel()
 
     def at(self, coefficients: Tensor) -> Tensor:
         """Positions (...,P,3) at coefficients (...,D)."""
@@ -98,8 +125,7 @@ def chosen_points(points: LinearPoints, coefficients: Tensor, views: Views, slid
     A contour landmark is the point of its curve that the view shows furthest out from the face's own vertical;
     on the near side of a rotated face that is the landmark's own vertex.
     """
-    count = len(points.mean) - points.rows.numel()
-    rows = torch.arange(count).expand(len(views.rotation), -1).clone()
+    rows = torch.arange(points.count).expand(len(views.rotation), -1).clone()
     if slides:
         at = points.at(coefficients)
         seen = views.pixels(at[:, points.rows].flatten(1, 2)).unflatten(1, points.rows.shape)
@@ -130,23 +156,46 @@ class Linearised:
     by_focal: Tensor
 
 
+@dataclass(frozen=True, eq=False)
+class Whitening:
+    """What makes errors of L points in I views unit and independent.
+
+    Args:
+        factors: of each point, (I,L,2,2).
+        mixing: across points whose errors go together, (I,L,L); nothing if absent.
+    """
+
+    factors: Tensor
+    mixing: Tensor | None = None
+
+    def scaled(self, values: Tensor) -> Tensor:
+        """Values (I,L,2,...) in each point's own deviations."""
+        whole = values.flatten(3) if values.ndim > 3 else values[..., None]
+        return (self.factors @ whole).reshape(values.shape)
+
+    def mixed(self, values: Tensor) -> Tensor:
+        """What ``scaled`` gives, free of what points' errors have in common."""
+        if self.mixing is None:
+            return values
+        return (self.mixing @ values.flatten(2)).reshape(values.shape)
+
+
 def linearised(
-    points: PickedPoints, coefficients: Tensor, views: Views, found: Tensor, whitening: Tensor
+    points: PickedPoints, coefficients: Tensor, views: Views, found: Tensor, whitening: Whitening
 ) -> Linearised:
-    """At coefficients (I,D) and landmarks found (I,L,2) whose errors ``whitening`` (I,L,2,2) makes unit and free."""
+    """At coefficients (I,D) and landmarks found (I,L,2)."""
     rotated = points.at(coefficients) @ views.rotation.transpose(-1, -2)
     pixels, by_translation = pixel_jacobian(rotated + views.translation[:, None], views.intrinsics)
-    by_translation = whitening @ by_translation
+    by_translation = whitening.scaled(by_translation)
     by_world = by_translation @ views.rotation[:, None]
     return Linearised(
-        (whitening @ (pixels - found)[..., None])[..., 0],
-        by_world @ points.basis,
-        torch.cat([by_translation @ -cross_matrix(rotated), by_translation], dim=-1),
-        (whitening @ (pixels - views.intrinsics[:, None, :2, 2])[..., None])[..., 0],
+        whitening.mixed(whitening.scaled(pixels - found)),
+        whitening.mixed(by_world @ points.basis),
+        whitening.mixed(torch.cat([by_translation @ -cross_matrix(rotated), by_translation], dim=-1)),
+        whitening.mixed(whitening.scaled(pixels - views.intrinsics[:, None, :2, 2])),
     )
 
 
-def residuals(points: PickedPoints, coefficients: Tensor, views: Views, found: Tensor, whitening: Tensor) -> Tensor:
+def residuals(points: PickedPoints, coefficients: Tensor, views: Views, found: Tensor, whitening: Whitening) -> Tensor:
     """The residuals of ``linearised`` alone, (I,L,2)."""
-    pixels = views.pixels(points.at(coefficients))
-    return (whitening @ (pixels - found)[..., None])[..., 0]
+    return whitening.mixed(whitening.scaled(views.pixels(points.at(coefficients)) - found))

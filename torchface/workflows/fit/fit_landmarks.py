@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import torch
@@ -156,6 +156,7 @@ class PhotographLandmarks:
         boxes: of all faces, x, y, width, height, (F,4) pixels.
         size: of the photograph, width and height.
         asked: whether the user said which face.
+        places: of the points that the model finds beside the 68, on the embedded performer's mean head, (P,3) mm.
     """
 
     photograph: Path
@@ -165,6 +166,7 @@ class PhotographLandmarks:
     boxes: Tensor
     size: tuple[int, int]
     asked: bool = False
+    places: Tensor = field(default_factory=lambda: torch.zeros(0, 3))
 
     @property
     def confident(self) -> Tensor:
@@ -215,7 +217,8 @@ def find_in_photographs(
         model: of landmarks, by name or folder.
         face: which one of each, from 0, the largest first; the largest if absent.
     """
-    finder = load_finder(model, photographs=True, option="landmark model").finder
+    named = load_finder(model, photographs=True, option="landmark model")
+    finder = named.finder
     readings = []
     for path, image in zip(photographs, images, strict=True):  # one photograph at a time: they differ in size
         pixels = (image[:3].clamp(0, 1) * 255).round().to(torch.uint8)
@@ -227,5 +230,6 @@ def find_in_photographs(
                 f"{path}: {str(error).partition(': ')[2]}; give another photograph, or landmarks with --landmarks"
             ) from error
         size = (pixels.shape[2], pixels.shape[1])
-        readings.append(PhotographLandmarks(path, str(model), reading, face or 0, faces.boxes, size, face is not None))
+        asked, number = face is not None, face or 0
+        readings.append(PhotographLandmarks(path, str(model), reading, number, faces.boxes, size, asked, named.places))
     return readings

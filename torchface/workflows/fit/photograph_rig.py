@@ -35,6 +35,7 @@ from torchface.workflows.fit.fit_landmarks import (
     landmarks_of,
     warn_if_stored_turned,
 )
+from torchface.workflows.fit.fit_readings import with_readings
 from torchface.workflows.fit.picture_checks import picture_lines, profile_lines
 from torchface.workflows.fit.video_pictures import video_pictures
 from torchface.workflows.named_heads import NamedHeads, load_head_model, matching
@@ -174,7 +175,7 @@ def fit_photographs(
 
     fitting = replace(settings.fit, expression_prior=prior, annotated=bool(found))
     if found:
-        fitting = replace(fitting, deviations=torch.stack([one.face.deviation for one in found]))
+        fitting = with_readings(fitting, found, rig)
     remarks = [line for one, image in zip(found, images, strict=False) for line in picture_lines(one, image, insist)]
     # The tracker has followed one face through a film.
     remarks += one_person_lines(photographs, marks, bare, insist or one_film)

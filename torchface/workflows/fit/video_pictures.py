@@ -51,7 +51,8 @@ def video_pictures(
     """
     clip = open_video(video)
     clip.check()
-    tracker = LandmarkTracker(load_finder(model, option="landmark model").finder, face=face)
+    named = load_finder(model, option="landmark model")
+    tracker = LandmarkTracker(named.finder, face=face)
     step = max(-(-clip.count // _READ), 1)
     readings, sharpness, numbers = [], [], []
     for number, frame in enumerate(clip.color_frames()):  # a frame's box is the one before's
@@ -76,7 +77,8 @@ def video_pictures(
         pictures.names.append(name)
         pictures.images.append(frame.float() / 255)
         size = (frame.shape[2], frame.shape[1])
-        pictures.found.append(PhotographLandmarks(name, str(model), reading, 0, reading.box[None], size))
+        boxes = reading.box[None]
+        pictures.found.append(PhotographLandmarks(name, str(model), reading, 0, boxes, size, places=named.places))
     return pictures
 
 

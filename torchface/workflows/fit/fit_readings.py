@@ -1,0 +1,62 @@
+"""What a landmark network reads of photographs beside the 68 landmarks, as a fit of a head counts it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from torchface.capture.energy import Quadratic
+from torchface.capture.weight_readings import EXPRESSION_SHARE, WeightReadings
+from torchface.landmarks import FaceReading
+from torchface.modeling import FitSettings
+from torchface.modeling.photographs.image_solve import ExpressionPrior, SurfacePoints, WeightQuadratic
+from torchface.rig import BlendshapeRig
+from torchface.workflows.fit.fit_landmarks import PhotographLandmarks
+from torchface.workflows.surface_sites import sites_on_rig
+
+
+@dataclass(frozen=True, eq=False)
+class ReadExpressions:
+    """A prior on the weights of I photographs, and what was read of each.
+
+    Args:
+        prior: of any face; none if absent.
+        readings: of the photographs' expressions.
+    """
+
+    prior: ExpressionPrior | None
+    readings: WeightReadings
+
+    def energy(self, weights: Tensor) -> WeightQuadratic:
+        """Of weights (I,N), or (1,N) that all photographs show."""
+        read = self.readings.energy()
+        if len(weights) != len(read.f):
+            read = Quadratic(read.H.sum(0), read.f.sum(0, keepdim=True))
+        if self.prior is None:
+            return read
+        own = self.prior.energy(weights)
+        return Quadratic(own.H + read.H, own.f + read.f)
+
+
+def with_readings(settings: FitSettings, found: Sequence[PhotographLandmarks], rig: BlendshapeRig) -> FitSettings:
+    """Settings with each landmark's deviation, and the points of the surface and the expressions that were read.
+
+    Args:
+        settings: with the prior on expressions.
+        found: one a photograph, all by one model.
+        rig: whose weights are solved for, with the 68 landmarks annotated.
+    """
+    readings = FaceReading.stacked([one.face for one in found])
+    settings, places = replace(settings, deviations=readings.deviation), found[0].places
+    if len(places) and len(places) == readings.points.shape[1]:
+        surface = SurfacePoints(readings.points, readings.point_deviation, sites_on_rig(rig, places))
+        settings = replace(settings, surface=surface)
+    if bool(torch.isfinite(readings.expression).any()):
+        read = WeightReadings.of_expression(
+            readings.expression.double(), EXPRESSION_SHARE * readings.expression_deviation.double(), rig.names
+        )
+        settings = replace(settings, expression_prior=ReadExpressions(settings.expression_prior, read))
+    return settings
