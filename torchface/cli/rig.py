@@ -44,7 +44,11 @@ def rig(
     time_limit: TimeLimit = None,
     quiet: Quiet = False,
 ) -> None:
-    """Make an actor's own rig from raw scans and a template rig, and write it as .glb.
+    """Make an actor's own rig from raw scans and a template rig, or put ARKit's shapes on a character's face.
+
+    Without --template SCAN is a character, a .glb or .vrm with or without a body. Its face is found, in any pose and
+    unit; OUT is the same file with ARKit's shapes on the face and nothing else changed. Shapes that it has, by ARKit's
+    or another program's names, are kept; a VRM gets an expression for each. NAME_face.png beside OUT shows the face.
 
     An image beside it, NAME_registration.png, shows how the neutral scan was met: distances (blue 0 to red 1 mm,
     grey where the scan shows no skin) and the mesh's lines. Hair, cloth and ears in pieces are taken from the template.
@@ -68,7 +72,7 @@ def rig(
 
     Args:
         scan: The actor at rest: any topology and pose, with holes, hair and collar; or several actors' scans, or
-            folders of them.
+            folders of them. Without a template a character's file.
         out: The .glb or USD file to write, or a name without an ending for a folder of OBJ files in the template's
             vertex order.
         template: A .glb or USD file with shapes, a folder of OBJ files, or ICT-FaceKit's FaceXModel folder. With
@@ -105,6 +109,14 @@ def rig(
     from torchface.workflows.rig.predicted_rig import EXPRESSIONS, predict_rig
     from torchface.workflows.rig_names import naming_lines
 
+    if template is None:
+        given = [
+            name
+            for name, value in (("--landmarks", landmarks), ("--examples", examples), ("--detail", detail))
+            if value
+        ]
+        _rig_character(scan, out, given, quiet)
+        return
     options = RigOptions(
         part, unit, pose_weights(pose), detector, model, texture_size, detail_size, names, colors, expressions
     )
@@ -143,5 +155,22 @@ def rig(
     with progress_bars(quiet) as progress:
         report = rig_actor(scan[0], template, out, landmarks, examples, detail, options, progress)
     for line in [*report.lines(), *naming_lines(report.rig, names)]:
+        console.print(line, highlight=False)
+    print_path(out)
+
+
+def _rig_character(scan: tuple[Path, ...], out: Path, given: list[str], quiet: bool) -> None:
+    from torchface.errors import ValueRangeError
+    from torchface.workflows.rig.character_rig import check_character, rig_character
+
+    if given or len(scan) > 1:
+        found = " and ".join(given) or f"{len(scan)} files"
+        raise ValueRangeError(
+            f"found {found} without --template, expected one for scans, or one character's file alone"
+        )
+    check_character(scan[0])
+    with progress_bars(quiet) as progress:
+        report = rig_character(scan[0], out, progress)
+    for line in report.lines():
         console.print(line, highlight=False)
     print_path(out)

@@ -11,9 +11,12 @@ from torch import Tensor
 
 from torchface.geometry.meshes.shell_energies import stretching_energy
 from torchface.geometry.similarity import Similarity, similarity_transform
+from torchface.geometry.spheres import nearest_sphere
 from torchface.optim.sparse import SparseCholesky
 from torchface.rig import BlendshapeRig
 
+_ROUND, _LEAST_BALL, _SMALLEST_BALL, _LARGEST_BALL = 0.12, 12, 0.4, 2.4
+"""How far from a sphere an eyeball may be, in radii, its fewest vertices, and its size in the template's."""
 _EYEBALL_REACH, _CORNEA = 1.35, 0.8  # radii; the cosine of how far it reaches from its middle
 _IN_THE_MOUTH, _MOUTH_HEIGHT = 60.0, 25.0  # millimetres
 _BITE, _BITE_BLEND = 0.2, 3.0
@@ -121,11 +124,12 @@ def _turned(head: _Head, template: BlendshapeRig, eyeball: Tensor, left: Tensor)
     rest = template.vertices.double().cpu()[eyeball]
     centre = (rest.amax(0) + rest.amin(0)) / 2
     radius = float((rest - centre).norm(dim=-1).median())
-    inside = (head.vertices - centre).norm(dim=-1) < _EYEBALL_REACH * radius
+    middle, size = _own_ball(head, left, centre, radius)
+    inside = (head.vertices - middle).norm(dim=-1) < _EYEBALL_REACH * size
     own = torch.zeros_like(left)
     for one in head.part[inside & left].unique().tolist():  # a head has a handful of such parts
         rows = head.part == one
-        if bool(inside[rows].all()) and _is_of_the_eye(head.vertices[rows] - centre, radius):
+        if bool(inside[rows].all()) and _is_of_the_eye(head.vertices[rows] - middle, size):
             own |= rows
     ids = own.nonzero()[:, 0]
     if not len(ids):
@@ -139,6 +143,23 @@ def _turned(head: _Head, template: BlendshapeRig, eyeball: Tensor, left: Tensor)
     shift = motion.apply(centre[None])[:, 0] - centre
     head.deltas[:, ids] = (points - middle) @ motion.rotation.transpose(1, 2) + middle + shift[:, None] - points
     return own
+
+
+def _own_ball(head: _Head, left: Tensor, centre: Tensor, radius: float) -> tuple[Tensor, float]:
+    """Middle and radius of the head's own eyeball, which may be larger or smaller than the template's; else its."""
+    near = (head.vertices - centre).norm(dim=-1) < _LARGEST_BALL * radius
+    best, found = _ROUND, (centre, radius)
+    for one in head.part[near & left].unique().tolist():
+        rows = head.part == one
+        if not bool(near[rows].all()) or int(rows.sum()) < _LEAST_BALL:
+            continue
+        points = head.vertices[rows]
+        middle, size = nearest_sphere(points)
+        off = float(((points - middle).norm(dim=-1) - size).abs().mean()) / size
+        around = float((points.mean(0) - middle).norm()) < 0.5 * size  # a shell before the eye lies on one side
+        if around and off < best and float((middle - centre).norm()) < radius and size > _SMALLEST_BALL * radius:
+            best, found = off, (middle, size)
+    return found
 
 
 def _is_of_the_eye(points: Tensor, radius: float) -> bool:

@@ -10,9 +10,11 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from torchface.geometry.meshes.surface_index import SurfaceIndex
+from torchface.geometry.spheres import nearest_sphere
 from torchface.io.gltf.character_scene import Character
 from torchface.landmarks.images.checked_detector import shipped_detector
 from torchface.landmarks.images.ibug_68 import COUNT
+from torchface.landmarks.surfaces.eye_openings import eye_opening
 from torchface.landmarks.surfaces.face_on_surface import FaceOnSurface, FaceSearch, ReferencePoints
 from torchface.mesh import Mesh
 from torchface.modeling.rigging.other_topology import joined_vertices
@@ -28,6 +30,9 @@ _EYE_REACH, _MOUTH_REACH, _SKIN_REACH = 48.0, 80.0, 8.0
 _BEFORE_LIPS, _MOUTH_HEIGHT = 4.0, 38.0
 _FACE_REACH = 95.0
 _STILL = re.compile(r"hair|hat\b|cap\b|helmet|glass|cloth|outfit|shirt|collar|scarf|hood|mask|earring|horn", re.I)
+_LEAST_ASTRAY, _ASTRAY = 15.0, 4.0  # millimetres, and times the median, that a point may lie from a head's
+_EYE_SPAN, _SHARES = 76.0, torch.linspace(0.04, 0.96, 17, dtype=torch.float64)
+_ROUND, _LEAST_BALL, _RADIUS, _INSIDE = 0.12, 12, (5.0, 32.0), 1.15
 _EYES, _LIPS = (slice(36, 42), slice(42, 48)), slice(48, 68)
 
 
@@ -81,10 +86,16 @@ def find_character_face(
     search = FaceSearch(shipped_detector(), finder.finder, points)
     framed = None if character.head is None else character.head > _HEAD_SHARE
     found = search.find(surface, framed, progress)
-    return _pieces(character, found, reference, points)
+    return _pieces(character, surface, found, reference, points)
 
 
-def _pieces(character: Character, found: FaceOnSurface, reference: Mesh, points: ReferencePoints) -> CharacterFace:
+def _pieces(
+    character: Character,
+    surface: TexturedSurface,
+    found: FaceOnSurface,
+    reference: Mesh,
+    points: ReferencePoints,
+) -> CharacterFace:
     """The head's pieces, by where they lie: what the points lie on is skin, the rest eyes, teeth, lashes or still."""
     vertices = found.pose.inverse().apply(character.vertices)[0]
     eyes = points.landmarks[36:48].double().mean(0)
@@ -111,7 +122,8 @@ def _pieces(character: Character, found: FaceOnSurface, reference: Mesh, points:
     cut_joined = torch.zeros(len(joined.vertices), dtype=torch.bool)
     cut_joined[joined.of[cut]] = True
     skin_rows, skin_local = skin_faces.unique(return_inverse=True)
-    landmarks = _landmarks(reference, points, placed, on_skin)
+    upright = surface.moved(found.pose.inverse())
+    landmarks = _with_lids(_landmarks(reference, points, placed, on_skin), reference, upright, part, skin_part, placed)
     return CharacterFace(
         found,
         vertices,
@@ -154,8 +166,74 @@ def _moves(own: Tensor, placed: Tensor, skin: cKDTree) -> bool:
 
 
 def _landmarks(reference: Mesh, points: ReferencePoints, placed: Tensor, on_skin: Tensor) -> Landmarks:
-    """The finder's points on the face as pairs; of iBUG's only where the finder has no points beside them."""
-    usable = on_skin.clone()
-    usable[:COUNT] &= len(points.points) == 0
+    """The finder's points on the face as pairs, without those that are far from where the others say they are."""
+    astray = (placed - points.all).norm(dim=-1)
+    usable = on_skin & (astray < max(_LEAST_ASTRAY, _ASTRAY * float(astray[on_skin].median())))
+    if len(points.points):  # iBUG's 68 follow annotators' habits, the finder's other points the head
+        usable[:COUNT] = False
     ids = torch.cdist(points.all, reference.vertices.double()).argmin(1)
     return ids[usable], placed[usable]
+
+
+def _with_lids(
+    landmarks: Landmarks, reference: Mesh, upright: TexturedSurface, part: Tensor, skin: int, placed: Tensor
+) -> Landmarks:
+    """The pairs with the lids' edges in place of the finder's points there, of each eye whose edges can be seen."""
+    assert reference.annotations is not None
+    regions = reference.annotations.regions
+    eyeballs = regions["eyeball_left"] | regions["eyeball_right"]
+    template = _plain_surface(reference.vertices.double(), reference.faces)
+    template_skin = ~eyeballs[reference.faces].any(1)
+    own_skin = part[upright.faces[:, 0]] == skin
+    ids, targets = landmarks
+    for eye, lids in ((_EYES[0], "lids_right"), (_EYES[1], "lids_left")):
+        rest = reference.vertices[reference.landmarks[eye]].double().mean(0)
+        marks = placed[eye]
+        marks = marks[torch.isfinite(marks).all(-1)]
+        if not len(marks):
+            continue
+        near = eye_parts(upright.vertices, upright.faces, part, marks.mean(0), skin)
+        if near is None:
+            continue
+        middle = marks.mean(0)
+        shown = _plain_surface(upright.vertices, upright.faces[own_skin | near])
+        found = eye_opening(shown, own_skin[own_skin | near], middle, _EYE_SPAN)
+        known = eye_opening(template, template_skin, rest, _EYE_SPAN)
+        if found is None or known is None:
+            continue
+        pairs, points = [], []
+        rim = (regions[lids] & ~eyeballs).nonzero()[:, 0]
+        for edge, own in zip(known.at(_SHARES), found.at(_SHARES), strict=True):
+            nearest = torch.cdist(edge, reference.vertices[rim].double()).argmin(1)
+            pairs.append(rim[nearest])
+            points.append(own + (reference.vertices[rim[nearest]].double() - edge))
+        outside = ~regions[lids][ids]
+        ids = torch.cat([ids[outside], *pairs])
+        targets = torch.cat([targets[outside], *points])
+    return ids, targets
+
+
+def eye_parts(vertices: Tensor, faces: Tensor, part: Tensor, middle: Tensor, skin: int) -> Tensor | None:
+    """Triangles (F,) of the eyeball around a middle: of the roundest loose part there and what lies in it; or none."""
+    near = (vertices - middle).norm(dim=-1) < _EYE_REACH
+    best, ball = _ROUND, None
+    for one in part[faces[:, 0]].unique().tolist():  # a head has tens of parts
+        rows = (part == one).nonzero()[:, 0]
+        if one == skin or not bool(near[rows].all()) or len(rows) < _LEAST_BALL:
+            continue
+        centre, radius = nearest_sphere(vertices[rows])
+        off = float(((vertices[rows] - centre).norm(dim=-1) - radius).abs().mean()) / radius
+        if off < best and _RADIUS[0] < radius < _RADIUS[1]:
+            best, ball = off, (centre, radius)
+    if ball is None:
+        return None
+    inside = (vertices - ball[0]).norm(dim=-1) < _INSIDE * ball[1]
+    own = part[faces[:, 0]]
+    return (own != skin) & inside[faces].all(1)
+
+
+def _plain_surface(vertices: Tensor, faces: Tensor) -> TexturedSurface:
+    clay = (Material(torch.ones(4)),)
+    return TexturedSurface(
+        vertices, faces, torch.zeros(len(vertices), 2), torch.zeros(len(faces), dtype=torch.int64), clay
+    )

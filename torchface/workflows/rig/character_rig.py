@@ -73,11 +73,6 @@ class CharacterReport:
         return list(self.notes)
 
 
-def is_character(path: Path) -> bool:
-    """Whether a file's ending is a character's."""
-    return path.suffix.lower() in (*CHARACTER_ENDINGS, *_CONVERT)
-
-
 def rig_character(path: Path, out: Path, progress: Progress | None = None) -> CharacterReport:
     """Puts ARKit's shapes on the face of a character; everything else of its file stays as it is.
 
@@ -137,7 +132,9 @@ def check_character(path: Path) -> None:
     ending = path.suffix.lower()
     if ending not in CHARACTER_ENDINGS:
         how = _CONVERT.get(ending[:4] if ending.startswith(".usd") else ending, "export it as .glb")
-        raise FileFormatError(f"{path}: found the ending {ending!r}, expected a character's .glb or .vrm; {how}")
+        raise FileFormatError(
+            f"{path}: found {ending!r}, expected a character's .glb or .vrm ({how}), or --template for a scan"
+        )
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,84 @@
+"""The edges of lids on a surface whose eyeballs are parts of their own: where skin ends in a picture from the front."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchface.geometry.cameras.pinhole import look_at
+from torchface.rendering.textured_surface import TexturedSurface
+
+_SIDE = 320  # pixels of the picture
+_LEAST_WIDTH, _LEAST_HEIGHT = 0.12, 0.03  # of the opening, in sides of the picture
+_EDGE = 2  # pixels from the opening to the skin that is taken for the lid's edge
+_SMOOTH = 5  # columns
+
+
+@dataclass(frozen=True, eq=False)
+class EyeOpening:
+    """The edges of an eye's lids, from the viewer's left to the right.
+
+    Args:
+        upper, lower: (n,3), each column of pixels one point.
+        share: how far each lies along the line between the corners, (n,) in [0,1].
+    """
+
+    upper: Tensor
+    lower: Tensor
+    share: Tensor
+
+    def at(self, shares: Tensor) -> tuple[Tensor, Tensor]:
+        """Points of the upper and lower edge (k,3) at shares (k,) of the way between the corners."""
+        edges = []
+        for edge in (self.upper, self.lower):
+            columns = [np.interp(shares.numpy(), self.share.numpy(), column.numpy()) for column in edge.T]
+            edges.append(torch.from_numpy(np.stack(columns, 1)))
+        return edges[0], edges[1]
+
+
+def eye_opening(surface: TexturedSurface, skin: Tensor, middle: Tensor, span: float) -> EyeOpening | None:
+    """The opening of an eye, seen from the front; none where skin does not end around it, as of closed or painted eyes.
+
+    Args:
+        surface: upright, looking along z.
+        skin: which of its triangles are skin, (F,) bool; the others are the eyeball.
+        middle: of the eye, (3,).
+        span: of the picture, in the surface's unit: about twice an eye's width.
+    """
+    camera = look_at(middle, 0.0, 0.0, span, _SIDE, _SIDE)
+    origins, directions = (rays.reshape(-1, 3) for rays in camera.rays())
+    hits, _ = surface.first_opaque(origins, directions, plain=True)
+    is_skin = (hits.triangle >= 0) & skin[hits.triangle.clamp(min=0)]
+    points = (origins + hits.distance[:, None] * directions).reshape(_SIDE, _SIDE, 3)
+    open_pixels = (~is_skin).reshape(_SIDE, _SIDE).numpy().astype(np.uint8)
+    _, labels = cv2.connectedComponents(open_pixels, connectivity=4)
+    centre = slice(_SIDE // 2 - _SIDE // 8, _SIDE // 2 + _SIDE // 8)
+    counts = np.bincount(labels[centre, centre].ravel())
+    counts[0] = 0
+    if not counts.any():
+        return None
+    mask = labels == counts.argmax()
+    columns = np.flatnonzero(mask.any(0))
+    top, bottom = mask.argmax(0)[columns], _SIDE - 1 - mask[::-1].argmax(0)[columns]
+    borders = mask[0].any() or mask[-1].any() or mask[:, 0].any() or mask[:, -1].any()
+    small = len(columns) < _LEAST_WIDTH * _SIDE or (bottom - top).max() < _LEAST_HEIGHT * _SIDE
+    if borders or small:
+        return None
+    above, below = (np.clip(rows, 0, _SIDE - 1) for rows in (top - _EDGE, bottom + _EDGE))
+    x = torch.from_numpy(columns)
+    upper, lower = points[torch.from_numpy(above), x], points[torch.from_numpy(below), x]
+    usable = torch.isfinite(upper).all(-1) & torch.isfinite(lower).all(-1)
+    if int(usable.sum()) < _LEAST_WIDTH * _SIDE / 2:
+        return None
+    share = ((x - x[0]).double() / float(x[-1] - x[0]))[usable]
+    return EyeOpening(_smoothed(upper[usable]), _smoothed(lower[usable]), share)
+
+
+def _smoothed(points: Tensor) -> Tensor:
+    """The median over neighbouring columns, which spikes of lashes do not shift."""
+    padded = torch.cat([points[:1].expand(_SMOOTH // 2, 3), points, points[-1:].expand(_SMOOTH // 2, 3)])
+    return padded.unfold(0, _SMOOTH, 1).median(-1).values
