@@ -16,7 +16,7 @@ _LAYERS = 4  # of cut-out surfaces (lashes, brows) that a ray passes
 _OPAQUE = 0.5
 _STEP = 1e-5  # of the surface's size, behind a surface that a ray passes
 _BACKGROUND = 0.62
-_AMBIENT, _FALL = 0.35, 0.65
+_AMBIENT, _FALL = 0.45, 0.55
 
 
 @dataclass(frozen=True, eq=False)

@@ -57,7 +57,7 @@ class Character:
         document: the file.
         vertices: (V,3) float64.
         linear: what moves directions from each vertex's array to the scene, (V,3,3) float64.
-        faces: (F,3) int64.
+        faces: (F,3) int64, the way round that they have in the scene: turned where a node mirrors them.
         uvs: (V,2), origin at the lower left.
         material: which colour and texture each triangle has, (F,).
         colors: (M,4) red, green, blue, opacity, encoded as images are.
@@ -205,7 +205,8 @@ class _Shelf:
             if name in attributes:
                 read = read_floats(document, attributes[name], f"{location}.{name}", ("VEC2",), count)
                 uvs = np.stack([read[:, 0], 1 - read[:, 1]], axis=1)
-            self.faces.append(faces + self._count)
+            mirrored = np.linalg.det(matrices[faces[:, 0], :3, :3]) < 0
+            self.faces.append(np.where(mirrored[:, None], faces[:, ::-1], faces) + self._count)
             self.material.append(np.full(len(faces), material))
         names = read_target_names(document, mesh)
         materials = [document.item("materials", p["material"], location) for _, p in group if "material" in p]

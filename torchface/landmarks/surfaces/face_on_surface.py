@@ -70,6 +70,12 @@ class FaceOnSurface:
     others: Tensor
 
     @property
+    def middle(self) -> Tensor:
+        """Of brows, eyes, nose and mouth, (3,)."""
+        inner = self.points[INNER]
+        return inner[torch.isfinite(inner).all(-1)].mean(0)
+
+    @property
     def eye_distance(self) -> float:
         """From one eye's outer corner to the other's, in the surface's unit."""
         return float((self.points[_EYES[0]] - self.points[_EYES[1]]).norm())

@@ -9,6 +9,7 @@ import torch
 from scipy.spatial import cKDTree
 from torch import Tensor
 
+from torchface.geometry.meshes.operators import triangle_normals
 from torchface.geometry.meshes.surface_index import SurfaceIndex
 from torchface.geometry.spheres import nearest_sphere
 from torchface.io.gltf.character_scene import Character
@@ -105,7 +106,9 @@ def _pieces(
     joined = joined_vertices(vertices, faces)
     part = joined.part[joined.of]
     placed = found.pose.inverse().apply(found.points)[0]
-    skin_part, on_skin = _skin_part(vertices, faces, part, placed)
+    skin_part, on_skin, toward = _skin_part(vertices, faces, part, placed)
+    if toward < 0:  # the file's normals look inward
+        faces = faces.flip(1)
     allowed = torch.zeros(int(part.max()) + 1, dtype=torch.bool)
     skin_faces = faces[part[faces[:, 0]] == skin_part]
     skin_tree = cKDTree(vertices[skin_faces.unique()].numpy())
@@ -135,15 +138,16 @@ def _pieces(
     )
 
 
-def _skin_part(vertices: Tensor, faces: Tensor, part: Tensor, placed: Tensor) -> tuple[int, Tensor]:
-    """The part that most of the found points lie on, and which points do, (68+P,) bool."""
+def _skin_part(vertices: Tensor, faces: Tensor, part: Tensor, placed: Tensor) -> tuple[int, Tensor, float]:
+    """The part that most of the found points lie on, which points do, (68+P,) bool, and how far it faces the viewer."""
     known = torch.isfinite(placed).all(-1)
     nearest = SurfaceIndex(vertices, faces).nearest(placed[known])
     owner = part[faces[nearest.triangle, 0]]
     skin = int(owner.bincount().argmax())
     on_skin = torch.zeros(len(placed), dtype=torch.bool)
     on_skin[known] = owner == skin
-    return skin, on_skin
+    normals = triangle_normals(vertices, faces[nearest.triangle[owner == skin]])
+    return skin, on_skin, float(normals[:, 2].mean())
 
 
 def _moves(own: Tensor, placed: Tensor, skin: cKDTree) -> bool:

@@ -40,6 +40,8 @@ PICTURE_ENDING = "_face.png"
 _STILL_MM = 2e-3  # at a head's size; what moves less does not move
 _SPAN = 260.0  # of the pictures, millimetres at a head's size
 _FAR, _LEAST_MET = 4.0, 0.4  # millimetres of a head's size between face and template, and the face's share that is met
+_OF_SCANS = ("the scan has neither", "the scan's triangles")
+"""Notes of a registration that say nothing of a character."""
 _CONVERT = {
     ".fbx": "export it from Blender as .glb (File, Export, glTF 2.0, with Shape Keys and Skinning)",
     ".usd": "export it from Blender or usdview's host as .glb",
@@ -268,9 +270,12 @@ class _Job:
             f"its points {found.misfit:.2f} distances of the eyes from a head's"
         ]
         if len(found.others):
-            lines.append(f"  note: {1 + len(found.others)} faces were seen; the surest was taken")
+            lines.append(
+                f"  note: {1 + len(found.others)} faces were seen; the one at {_place(found.middle)} was taken"
+            )
+            lines.append(f"    the others are at {', '.join(map(_place, found.others))}, in the file's unit")
         lines.append(f"template: {record.figures()}")
-        lines += [f"  note: {note}" for note in record.notes]
+        lines += [f"  note: {note}" for note in record.notes if not note.startswith(_OF_SCANS)]
         own = {name: names for name, names in present.items() if names != (name,)}
         if present:
             lines.append(f"already there: {len(present)} of ARKit's 52, kept as they are")
@@ -291,3 +296,7 @@ def _normal_changes(rest: Tensor, faces: Tensor, deltas: Tensor) -> Tensor:
     kept[joined.of] = torch.arange(len(joined.of))
     changes = torch.stack([vertex_normals(joined.vertices + one[kept], joined.faces) - before for one in deltas])
     return changes[:, joined.of]
+
+
+def _place(point: Tensor) -> str:
+    return "(" + ", ".join(f"{value:.4g}" for value in point.tolist()) + ")"

@@ -1,0 +1,132 @@
+"""A character gets ARKit's shapes on its face and comes back with all else as it was; what is none is refused."""
+
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from planted.characters import Planted, box_mesh, caricature, packed, unpacked, write_character
+from torchface.errors import AlignmentError, FileFormatError
+from torchface.io.gltf.character_scene import Character, read_character
+from torchface.io.gltf.gltf_document import read_document
+from torchface.io.vrm.vrm_expressions import vrm_expressions
+from torchface.landmarks.surfaces.face_on_surface import FaceSearch
+from torchface.mesh import Mesh
+from torchface.rig import BlendshapeRig
+from torchface.shape_names import ARKIT
+from torchface.synthetic import draw_identities, performer
+from torchface.workflows.rig import character_face
+from torchface.workflows.rig.character_rig import CharacterReport, check_character, rig_character
+
+FEW = ((0.0, 4),)
+TURN = torch.tensor([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]], dtype=torch.float64)  # lies on its back
+
+
+@dataclass(frozen=True, eq=False)
+class Rigged:
+    before: Path
+    after: Path
+    report: CharacterReport
+    own: BlendshapeRig
+    character: Character
+
+
+@pytest.fixture(scope="module")
+def rigged(tmp_path_factory: pytest.TempPathFactory) -> Rigged:
+    """A caricature with a body, in centimetres, on its back; a VRM that has a jaw and a blink under other names."""
+    folder = tmp_path_factory.mktemp("character")
+    person = performer(draw_identities(1, torch.Generator().manual_seed(3))[0], texture=False)
+    own = caricature(person, person.vertices[person.neutral.landmarks])
+    jaw, blink = (own.deltas[own.names.index(name)] for name in ("jawOpen", "eyeBlinkLeft"))
+    how = Planted(turn=TURN, units=100.0, vrm="VRMC_vrm", expressions={"blinkLeft": "m_17"})
+    write_character(folder / "a.vrm", own.neutral, {"A25_Jaw_Open": jaw, "m_17": blink, "fat": 0.1 * jaw}, how)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(character_face, "FaceSearch", partial(FaceSearch, rings=((0.0, 2), (90.0, 1), (-90.0, 1))))
+        report = rig_character(folder / "a.vrm", folder / "b.vrm")
+    return Rigged(folder / "a.vrm", folder / "b.vrm", report, own, read_character(read_document(folder / "b.vrm")))
+
+
+def test_all_else_of_the_file_is_as_it_was(rigged: Rigged) -> None:
+    (before, old), (after, new) = unpacked(rigged.before), unpacked(rigged.after)
+    assert new[: len(old)] == old
+    for key in before:
+        if key not in ("accessors", "bufferViews", "buffers", "meshes", "extensions", "animations"):
+            assert after[key] == before[key], key
+    for key in ("accessors", "bufferViews"):
+        assert after[key][: len(before[key])] == before[key]
+    assert after["meshes"][1:] == before["meshes"][1:]
+    (mesh, was) = after["meshes"][0], before["meshes"][0]
+    assert mesh["extras"]["targetNames"][:3] == was["extras"]["targetNames"]
+    primitive, old_primitive = mesh["primitives"][0], was["primitives"][0]
+    assert primitive["targets"][:3] == old_primitive["targets"]
+    assert {**primitive, "targets": []} == {**old_primitive, "targets": []}
+    vrm, old_vrm = after["extensions"]["VRMC_vrm"], before["extensions"]["VRMC_vrm"]
+    assert {**vrm, "expressions": 0} == {**old_vrm, "expressions": 0}
+    assert vrm["expressions"]["preset"] == old_vrm["expressions"]["preset"]
+
+
+def test_only_missing_shapes_are_made_and_the_vrm_has_expressions_for_all(rigged: Rigged) -> None:
+    report = rigged.report
+    assert report.present == {
+        "eyeBlinkLeft": ("blinkLeft",),
+        "jawOpen": ("A25_Jaw_Open",),
+    }
+    assert set(report.made) == set(ARKIT) - {"jawOpen", "eyeBlinkLeft", "tongueOut"}
+    expressions = vrm_expressions(read_document(rigged.after))
+    assert set(ARKIT) - {"tongueOut"} <= set(expressions)
+    assert [bind.target for bind in expressions["jawOpen"]] == [0]
+    assert [bind.target for bind in expressions["eyeBlinkLeft"]] == [1]
+    assert expressions["eyeBlinkRight"][0].target == 3 + report.made.index("eyeBlinkRight")
+    assert report.figure is not None
+    assert report.figure.is_file()
+
+
+def test_made_shapes_go_the_way_of_the_characters_own(rigged: Rigged) -> None:
+    block = rigged.character.blocks[0]
+    targets = rigged.character.targets(block).double() * 1000
+    cosine = []
+    for name in rigged.report.made:
+        own = rigged.own.deltas[rigged.own.names.index(name)].double()
+        found = targets[block.names.index(name), : len(own)]
+        cosine.append(float((own * found).sum() / (own.norm() * found.norm())))
+    assert float(np.median(cosine)) > 0.97
+    assert min(cosine) > 0.75
+    moved = targets[3:].norm(dim=-1).amax(0)
+    assert float(moved[: len(rigged.own.vertices)].max()) > 5  # millimetres
+    assert float(moved[len(rigged.own.vertices) :].max()) == 0  # the body
+
+
+def test_a_chair_is_refused_with_a_picture_of_what_was_seen(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(character_face, "FaceSearch", partial(FaceSearch, rings=FEW))
+    seat, faces = box_mesh(torch.zeros(3), torch.tensor([400.0, 60.0, 400.0]))
+    back, behind = box_mesh(torch.tensor([0.0, 250.0, -180.0]), torch.tensor([400.0, 440.0, 40.0]))
+    chair = Mesh(torch.cat([seat, back]).float(), torch.cat([faces, behind + 8]))
+    write_character(tmp_path / "chair.glb", chair, how=Planted(body=False))
+    with pytest.raises(AlignmentError, match=r"found no face in 4 pictures.*out_face\.png"):
+        rig_character(tmp_path / "chair.glb", tmp_path / "out.glb")
+    assert (tmp_path / "out_face.png").is_file()
+    assert not (tmp_path / "out.glb").exists()
+
+
+def test_files_that_are_no_characters_are_refused(tmp_path: Path) -> None:
+    empty = tmp_path / "empty.glb"
+    empty.write_bytes(packed({"asset": {"version": "2.0"}, "nodes": [{}], "scenes": [{"nodes": [0]}], "scene": 0}, b""))
+    with pytest.raises(FileFormatError, match="no triangle"):
+        rig_character(empty, tmp_path / "out.glb")
+    with pytest.raises(FileFormatError, match="Blender"):
+        check_character(tmp_path / "hero.fbx")
+    with pytest.raises(FileFormatError, match=r"expected.*\.glb"):
+        rig_character(empty, tmp_path / "out.obj")
+
+
+def test_draco_is_refused_with_the_command_that_decompresses(tmp_path: Path) -> None:
+    path = tmp_path / "packed.glb"
+    write_character(path, Mesh(torch.eye(3), torch.tensor([[0, 1, 2]])))
+    root, binary = unpacked(path)
+    root["meshes"][0]["primitives"][0]["extensions"] = {"KHR_draco_mesh_compression": {"bufferView": 0}}
+    path.write_bytes(packed(root, binary))
+    with pytest.raises(FileFormatError, match="gltf-transform"):
+        rig_character(path, tmp_path / "out.glb")
