@@ -46,9 +46,10 @@ def rig(
 ) -> None:
     """Make an actor's own rig from raw scans and a template rig, or put ARKit's shapes on a character's face.
 
-    Without --template SCAN is a character, a .glb or .vrm with or without a body. Its face is found, in any pose and
-    unit; OUT is the same file with ARKit's shapes on the face and nothing else changed. Shapes that it has, by ARKit's
-    or another program's names, are kept; a VRM gets an expression for each. NAME_face.png beside OUT shows the face.
+    Without --template and --neutral SCAN is a character, a .glb or .vrm with or without a body. Its face is found, in
+    any pose and unit; OUT is the same file with ARKit's shapes on the face and nothing else changed. Shapes that it
+    has, by ARKit's or another program's names, are kept; a VRM gets an expression for each. NAME_face.png beside OUT
+    shows the face.
 
     An image beside it, NAME_registration.png, shows how the neutral scan was met: distances (blue 0 to red 1 mm,
     grey where the scan shows no skin) and the mesh's lines. Hair, cloth and ears in pieces are taken from the template.
@@ -109,13 +110,9 @@ def rig(
     from torchface.workflows.rig.predicted_rig import EXPRESSIONS, predict_rig
     from torchface.workflows.rig_names import naming_lines
 
-    if template is None:
-        given = [
-            name
-            for name, value in (("--landmarks", landmarks), ("--examples", examples), ("--detail", detail))
-            if value
-        ]
-        _rig_character(scan, out, given, quiet)
+    if template is None and neutral is None and scan:
+        of_scans = {"--landmarks": landmarks, "--examples": examples, "--detail": detail, "--expressions": expressions}
+        _rig_character(scan, out, [flag for flag, value in of_scans.items() if value is not None], quiet)
         return
     options = RigOptions(
         part, unit, pose_weights(pose), detector, model, texture_size, detail_size, names, colors, expressions
