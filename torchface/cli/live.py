@@ -63,8 +63,7 @@ def live(
         quiet: Show no progress.
     """
     from torchface.errors import FileFormatError
-    from torchface.workflows.live.camera import list_cameras
-    from torchface.workflows.live.live_anybody import LiveSettings, go_live, person_solver
+    from torchface.workflows.live.camera_devices import check_source, list_cameras
 
     if cameras:
         found = list_cameras()
@@ -74,6 +73,9 @@ def live(
             console.print("no camera found; a video file does as well: torchface live film.mp4")
         return
     sides = picture_size(size)
+    check_source(camera)
+    from torchface.workflows.live.live_anybody import LiveSettings, go_live, person_solver
+
     settings = LiveSettings(camera, character, mapping, to, record, calibrate, page, port, loop, seconds, sides)
 
     def opened(url: str) -> None:

@@ -17,7 +17,8 @@ from torchface.errors import FileFormatError
 from torchface.io.video import write_video
 from torchface.workflows.live import camera as module
 from torchface.workflows.live import live_frames
-from torchface.workflows.live.camera import Camera, list_cameras
+from torchface.workflows.live.camera import Camera
+from torchface.workflows.live.camera_devices import list_cameras
 from torchface.workflows.live.live_frames import PlayedVideo, SourceSettings, open_source, planes
 
 
@@ -59,7 +60,7 @@ class Planted:
 @pytest.fixture
 def quick(monkeypatch: pytest.MonkeyPatch) -> pytest.MonkeyPatch:
     """Patience of a quarter of a second, and a rate measured over a tenth."""
-    for name, value in (("_MAX_WAIT", 0.25), ("_RETRY", 0.01), ("_TICK", 0.02), ("_MEASURED", 0.1)):
+    for name, value in (("_MAX_WAIT", 0.25), ("_FIRST_WAIT", 0.25), ("_RETRY", 0.01), ("_TICK", 0.02), ("_MEASURED", 0.1)):
         monkeypatch.setattr(module, name, value)
     return monkeypatch
 

@@ -64,5 +64,5 @@ def _vrm_bones(document: Document) -> dict[str, Any]:
             if isinstance(bones, Mapping):
                 return {part: bone.get("node") for part, bone in bones.items() if isinstance(bone, Mapping)}
             if isinstance(bones, list):
-                return {bone.get("bone"): bone.get("node") for bone in bones if isinstance(bone, Mapping)}
+                return {str(bone.get("bone")): bone.get("node") for bone in bones if isinstance(bone, Mapping)}
     return {}

@@ -1,8 +1,7 @@
-"""A camera at this machine: opened with little delay, watched while it runs, and named where there are several."""
+"""A camera at this machine: opened with little delay, watched while it runs."""
 
 from __future__ import annotations
 
-import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -13,6 +12,7 @@ import numpy as np
 
 from torchface.errors import FileFormatError
 from torchface.io.video import VideoFile
+from torchface.workflows.live.camera_devices import BY_FILE, list_cameras, no_camera
 
 DEFAULT_SIZE = (640, 480)
 """Width and height that suit faces before a webcam."""
@@ -24,8 +24,6 @@ _TICK = 0.2  # seconds until an interrupt is looked for
 _RETRY = 0.05
 _MEASURED = 2.0  # seconds over which the rate is measured
 _RATE_CHANGE = 1.4
-_MAX_PROBED = 6
-_BY_FILE = "a video file does as well: torchface live film.mp4"
 
 
 class Camera:
@@ -49,7 +47,7 @@ class Camera:
         self._capture = cv2.VideoCapture(number)
         if not self._capture.isOpened():
             self._capture.release()
-            raise FileFormatError(f"{self._name}: cannot be opened; {_others(number)}. {_BY_FILE.capitalize()}")
+            raise no_camera(number, list_cameras())
         for setting, value in (
             (cv2.CAP_PROP_FOURCC, cv2.VideoWriter.fourcc(*"MJPG")),
             (cv2.CAP_PROP_FRAME_WIDTH, size[0]),
@@ -71,7 +69,7 @@ class Camera:
             self.close()
             raise FileFormatError(
                 f"{self._name}: gives no frame within {_FIRST_WAIT:g} seconds; expected one that no other program "
-                f"holds and that is switched on. {_BY_FILE.capitalize()}"
+                f"holds and that is switched on. {BY_FILE}"
             )
         rate = self._capture.get(cv2.CAP_PROP_FPS)
         height, width = first[1].shape[:2]
@@ -168,35 +166,3 @@ class _Pace:
             return None
         self._told = rate
         return None if before is None else (before, rate)
-
-
-def list_cameras() -> dict[int, str]:
-    """Cameras by number, with their names where the system gives them."""
-    if sys.platform == "linux":
-        cameras = {}
-        for folder in Path("/sys/class/video4linux").glob("video*"):
-            try:
-                number, first = int(folder.name.removeprefix("video")), (folder / "index").read_text().strip() == "0"
-                if first:  # the others are a camera's metadata
-                    cameras[number] = (folder / "name").read_text(errors="replace").strip()[:80]
-            except (OSError, ValueError):
-                continue
-        return dict(sorted(cameras.items()))
-    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
-    return {number: "" for number in range(_MAX_PROBED) if _opens(number)}
-
-
-def _opens(number: int) -> bool:
-    capture = cv2.VideoCapture(number)
-    try:
-        return bool(capture.isOpened())
-    finally:
-        capture.release()
-
-
-def _others(number: int) -> str:
-    cameras = {other: name for other, name in list_cameras().items() if other != number}
-    if not cameras:
-        return "found no camera at this machine, expected one that is plugged in and that this user may open"
-    named = ", ".join(f"{other} ({name})" if name else str(other) for other, name in cameras.items())
-    return f"expected a camera that no other program holds, or another one's number: {named}"

@@ -176,8 +176,8 @@ class PageServer:
                     if state != said:
                         connection.send(state)
                         said = state
-            state = self._desk.state() if private else {}
-            connection.send(json.dumps({**state, "ended": state.get("ended") or "torchface has ended."}))
+            last = self._desk.state() if private else {}
+            connection.send(json.dumps({**last, "ended": last.get("ended") or "torchface has ended."}))
             connection.close()
         except ConnectionClosed:
             pass

@@ -100,7 +100,7 @@ def read_weight_settings(found: Mapping[str, object]) -> WeightSettings:
 
 
 def _numbers(values: object, count: int, least: float, most: float) -> Tensor:
-    good = isinstance(values, list) and len(values) == count
-    if not good or not all(isinstance(value, int | float) and least <= value <= most for value in values):  # type: ignore[union-attr]
+    numbers = values if isinstance(values, list) else []
+    if len(numbers) != count or not all(isinstance(one, int | float) and least <= one <= most for one in numbers):
         raise ValueRangeError(f"page: found {str(values)[:60]}, expected {count} numbers from {least} to {most}")
-    return torch.tensor(values, dtype=torch.float32)
+    return torch.tensor(numbers, dtype=torch.float32)
