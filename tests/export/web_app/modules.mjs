@@ -119,12 +119,13 @@ const jobs = {
     const [c, s] = [Math.cos(0.3), Math.sin(0.3)]; // a yaw of 0.3 before an OpenCV camera
     character.pose({ weights, rotation: Float32Array.of(c, 0, s, 0, -1, 0, s, 0, -c), gaze: Float32Array.of(0.2, 0.1, 0.2, 0.1) });
     character.root.updateWorldMatrix(true, true);
-    const influences = {}, ways = {};
+    const influences = {}, ways = {}, places = {};
     character.root.traverse((object) => {
       for (const [name, row] of Object.entries(object.morphTargetDictionary ?? {})) influences[name] = object.morphTargetInfluences[row];
+      places[object.name] = object.getWorldPosition(new Vector3()).toArray();
       ways[object.name || "root"] = new Vector3(0, 0, 1).transformDirection(object.matrixWorld).toArray();
     });
-    return { influences, ways, box: [character.box.min.toArray(), character.box.max.toArray()] };
+    return { influences, ways, places, box: [character.box.min.toArray(), character.box.max.toArray()] };
   },
 };
 console.log(JSON.stringify(await jobs[job]()));

@@ -17,7 +17,7 @@ from headless_chromium import headless_chromium, until
 from planted_graph import write_planted_graph
 from recorded_take import Recorded, allow_camera, assert_same_weights, record, watch, watched
 from rig_samples import quad_sheet
-from test_gltf_viewers import assert_valid, node  # noqa: F401  (its packages)
+from test_gltf_viewers import WEB, assert_valid, node  # noqa: F401  (its packages)
 
 from torchface import BlendshapeRig
 from torchface.errors import MissingExtraError
@@ -379,6 +379,33 @@ def test_every_control_has_a_name_for_screen_readers(opened: Open) -> None:
     assert all(name for _, name in controls), controls
 
 
+AXE = """
+const done = arguments[0], told = ({ id, impact, nodes }) => [id, impact, nodes[0].html];
+axe.run(document).then(({ violations }) => done(violations.map(told)));
+"""
+
+
+@pytest.mark.parametrize("width", [480, 390])
+def test_axe_core_finds_nothing_and_nothing_is_wider_than_the_page(
+    opened: Open,
+    recorded: Recorded,
+    node: str,  # noqa: F811
+    width: int,
+) -> None:
+    page, driver = opened.page, opened.page.driver
+    screen = {"width": width, "height": 844, "deviceScaleFactor": 1, "mobile": width < 480}
+    driver.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", screen)
+    driver.execute_script((WEB / "node_modules" / "axe-core" / "axe.min.js").read_text())
+    page.start()
+    driver.execute_script("document.querySelector('details').open = true")
+    page.click("calibrate")
+    assert driver.execute_async_script(AXE) == []
+    assert driver.execute_script("return document.documentElement.scrollWidth") <= width
+    page.click("prompt-stop")
+    driver.execute_script("document.querySelector('details').open = false")
+    driver.execute_cdp_cmd("Emulation.clearDeviceMetricsOverride", {})
+
+
 def broken(folder: Path) -> dict[str, tuple[Path, str]]:
     """Files that no face can move, and what the page says."""
     good = folder / "good.glb"
@@ -410,4 +437,13 @@ def test_a_character_that_cannot_be_used_is_explained_and_the_one_before_stays(o
         assert page.text("character-line") == before
     chooser.send_keys(str(tmp_path / "good.glb"))
     until(lambda: page.text("character-line") == "good.glb: your face moves 2 of its 2 shapes")
+    assert page.problem == ""
+
+
+@pytest.mark.real
+def test_a_character_of_meshopt_and_ktx2_is_taken(opened: Open, data: Path) -> None:
+    """Face Cap's head as three.js ships it, by the decoders that the page brings."""
+    page = opened.page
+    page.driver.find_element("id", "file").send_keys(str(data / "characters" / "facecap.glb"))
+    until(lambda: page.text("character-line") == "facecap.glb: your face moves 52 of its 52 shapes" or page.problem)
     assert page.problem == ""

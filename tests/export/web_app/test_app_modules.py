@@ -282,6 +282,29 @@ def test_a_take_in_the_characters_file_is_the_same_from_page_and_python(
     np.testing.assert_allclose(np.arcsin(way[:, 1]), -angles[:, 4], atol=1e-5)
 
 
+def test_arms_that_stand_off_hang_and_arms_that_hang_stay(run: Run, tmp_path: Path) -> None:
+    def with_arms(root: dict[str, Any]) -> None:
+        first = len(root["nodes"])
+        root["nodes"] += [
+            {"name": "LeftArm", "translation": [0.1, 0.0, 0.0], "children": [first + 1]},
+            {"name": "LeftForeArm", "translation": [0.3, 0.0, 0.0]},
+            {"name": "RightArm", "translation": [-0.1, 0.0, 0.0], "children": [first + 3]},
+            {"name": "RightForeArm", "translation": [-0.05, -0.3, 0.0]},
+        ]
+        root["skins"] = [{"joints": [*range(first, first + 4)]}]
+        root["scenes"][0]["nodes"] += [first, first + 2]
+
+    told = run("pose", edited(sheet(tmp_path / "a.glb", ("jawOpen",)).read_bytes(), tmp_path / "arms.glb", with_arms))
+    left, right = (
+        np.subtract(told["places"][f"{side}ForeArm"], told["places"][f"{side}Arm"]) for side in ("Left", "Right")
+    )
+    neck = Rotation.from_euler("Y", 0.3)  # the whole character turns, as it has no head
+    left, right = (neck.inv().apply(way) for way in (left, right))
+    assert left[1] / 0.3 < -0.95
+    assert left[0] > 0
+    np.testing.assert_allclose(right, [-0.05, -0.3, 0], atol=1e-6)
+
+
 def animated(path: Path) -> dict[tuple[str, str], np.ndarray]:
     """The keys of a file's last animation by the name of the node and what of it moves."""
     document = read_document(path)

@@ -60,7 +60,8 @@ class Planted:
 @pytest.fixture
 def quick(monkeypatch: pytest.MonkeyPatch) -> pytest.MonkeyPatch:
     """Patience of a quarter of a second, and a rate measured over a tenth."""
-    for name, value in (("_MAX_WAIT", 0.25), ("_FIRST_WAIT", 0.25), ("_RETRY", 0.01), ("_TICK", 0.02), ("_MEASURED", 0.1)):
+    times = {"_MAX_WAIT": 0.25, "_FIRST_WAIT": 0.25, "_RETRY": 0.01, "_TICK": 0.02, "_MEASURED": 0.1}
+    for name, value in times.items():
         monkeypatch.setattr(module, name, value)
     return monkeypatch
 
