@@ -13,6 +13,7 @@ from rich.text import Text
 
 from torchface import __version__
 from torchface.cli.annotate import annotate
+from torchface.cli.arkit import arkit
 from torchface.cli.attach import attach
 from torchface.cli.calibrate import calibrate
 from torchface.cli.command_options import checked
@@ -46,6 +47,7 @@ COMMANDS: dict[str, Callable[..., None]] = {
     "demo": demo,
     "register": register,
     "rig": rig,
+    "arkit": arkit,
     "fit": fit,
     "transfer": transfer,
     "corrective": corrective,

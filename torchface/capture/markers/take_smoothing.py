@@ -226,6 +226,26 @@ class WholeTakeSolver(nn.Module):
         return f"smoothness={self.smoothness:g}, huber_threshold={self.huber_threshold:g}, sparsity={self.sparsity:g}"
 
 
+def smooth_in_box(H: Tensor, slopes: Tensor, fps: float, smoothness: float) -> Tensor:
+    r"""Weights (T,N) in [0,1] of consecutive frames that share H, calm in time as those of :class:`WholeTakeSolver`.
+
+    Args:
+        H: of the frames' energies, (N,N) float64.
+        slopes: f of each, (T,N) float64.
+        fps: frames a second.
+        smoothness: :math:`\lambda` at 60 frames a second, in the unit of the energies.
+
+    Example:
+        >>> steps = torch.tensor([0.0, 0.0, 1.0, 1.0], dtype=torch.float64)[:, None]
+        >>> smooth_in_box(2 * torch.eye(1, dtype=torch.float64), -2 * steps, 60.0, 0.0)[:, 0].round(decimals=2).tolist()
+        [0.0, 0.0, 1.0, 1.0]
+    """
+    check_rate(fps, "fps", ValueRangeError)
+    own, threshold = smoothness * (fps / _REFERENCE_FPS) ** 4, HUBER_THRESHOLD * (_REFERENCE_FPS / fps) ** 2
+    start = torch.zeros_like(slopes)
+    return _SmoothProblem.of(H, len(slopes), own, threshold).least(lambda _: slopes, start, start)[0]
+
+
 @dataclass(frozen=True, eq=False)
 class _SmoothProblem:
     r"""The smooth part of the problem in the basis that makes it diagonal: eigenvectors of H, cosines over time."""

@@ -25,6 +25,7 @@ both jaws share, such as gums in one piece, passes from the one to the other."""
 _BOTH_JAWS, _ARCH = 0.15, 30.0
 _JAW = "jaw"
 _TONGUE, _FILLED = 15.0, 0.2  # millimetres at least: teeth are smaller; and the share near the middle
+_TONGUE_OUT, _TONGUE_DOWN = 12.0, 8.0
 _ROOT, _STIFF = 0.3, 0.01
 
 
@@ -213,3 +214,25 @@ def _jaw_motions(template: BlendshapeRig) -> Similarity:
     rotation = torch.where(jaw[:, None, None], motion.rotation, torch.eye(3, dtype=torch.float64))
     translation = torch.where(jaw[:, None], motion.translation, 0.0)
     return Similarity(torch.ones_like(motion.scale), rotation, translation)
+
+
+def tongue_out(vertices: Tensor, tongue: Tensor, lips: Tensor) -> Tensor:
+    """What ``tongueOut`` adds to a head whose tongue is a part of its own, (V,3), millimetres.
+
+    The tongue's tip comes out before the lips and a little down, its root stays.
+
+    Args:
+        vertices: (V,3), millimetres, z toward the viewer.
+        tongue: mask (V,), not empty.
+        lips: points of the lips, (L,3).
+
+    Source: ARKit's description of the shape.
+    """
+    own = vertices[tongue].double()
+    depth = own[:, 2]
+    share = (depth - depth.min()) / (depth.max() - depth.min()).clamp(min=1e-6)
+    share = share * share * (3 - 2 * share)
+    out = (lips[:, 2].double().max() + _TONGUE_OUT - depth.max()).clamp(min=0.0)
+    delta = torch.zeros_like(vertices, dtype=torch.float64)
+    delta[tongue] = torch.stack([torch.zeros_like(share), -_TONGUE_DOWN * share.square(), out * share], 1)
+    return delta.to(vertices)

@@ -1,0 +1,69 @@
+"""Linear blend skinning: vertices that follow joints, and the way back."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from torchface.geometry.rotations import rotation_matrix
+
+
+def joint_transforms(positions: Tensor, parents: Sequence[int], rotations: Tensor) -> tuple[Tensor, Tensor]:
+    r"""Where joints take the space around them: :math:`x \mapsto A_j x + t_j`.
+
+    Args:
+        positions: of the joints at rest, (J,3), millimetres.
+        parents: of each joint, -1 for a root; before its children.
+        rotations: of each joint beside its parent, axis times angle, (B,J,3).
+
+    Returns:
+        A (B,J,3,3) and t (B,J,3).
+    """
+    own = rotation_matrix(rotations.reshape(-1, 3)).reshape(*rotations.shape, 3)
+    turns: list[Tensor] = []
+    shifts: list[Tensor] = []
+    for joint, parent in enumerate(parents):  # a head has a handful of joints
+        at = positions[joint].to(own)
+        turn = own[:, joint]
+        shift = at - turn @ at
+        if parent >= 0:
+            turn, shift = turns[parent] @ turn, (turns[parent] @ shift[..., None])[..., 0] + shifts[parent]
+        turns.append(turn)
+        shifts.append(shift)
+    return torch.stack(turns, 1), torch.stack(shifts, 1)
+
+
+def skinned(vertices: Tensor, weights: Tensor, turns: Tensor, shifts: Tensor) -> Tensor:
+    r"""Vertices that follow joints, :math:`\sum_j w_{vj} (A_j x_v + t_j)`.
+
+    Args:
+        vertices: (B,V,3) or (V,3), millimetres.
+        weights: (V,J).
+        turns, shifts: of :func:`joint_transforms`.
+
+    Returns:
+        (B,V,3).
+
+    Example:
+        >>> turned = torch.tensor([[[0.0, 0.0, torch.pi / 2]]])
+        >>> turns, shifts = joint_transforms(torch.zeros(1, 3), [-1], turned)
+        >>> skinned(torch.tensor([[1.0, 0.0, 0.0]]), torch.ones(1, 1), turns, shifts).round(decimals=3).tolist()
+        [[[0.0, 1.0, 0.0]]]
+    """
+    turn, shift = blended(weights, turns, shifts)
+    return (turn @ vertices[..., None])[..., 0] + shift
+
+
+def unskinned(vertices: Tensor, weights: Tensor, turns: Tensor, shifts: Tensor) -> Tensor:
+    """The vertices (B,V,3) that :func:`skinned` takes to ``vertices`` (B,V,3)."""
+    turn, shift = blended(weights, turns, shifts)
+    return torch.linalg.solve(turn, (vertices - shift)[..., None])[..., 0]
+
+
+def blended(weights: Tensor, turns: Tensor, shifts: Tensor) -> tuple[Tensor, Tensor]:
+    """The transforms of each vertex, (B,V,3,3) and (B,V,3)."""
+    weights = weights.to(turns)
+    turn = (weights @ turns.flatten(2)).unflatten(-1, (3, 3))
+    return turn, weights @ shifts

@@ -1,0 +1,1 @@
+"""Head models of others as their authors publish them: read without pickles, sizes checked before memory is taken."""

@@ -1,0 +1,358 @@
+"""Heads, animations and weights on disk to ARKit's and back."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from torchface.capture.markers.mesh_solver import MeshSolution, MeshSolver
+from torchface.errors import FileFormatError, NameMismatchError, ValueRangeError
+from torchface.files.documents import Value, read_json
+from torchface.files.whole_files import check_ending, check_writable, make_folder, write_file
+from torchface.io import load_take, save_rig
+from torchface.io.head_models.array_files import ONLY, ArrayFile
+from torchface.io.take_files import RECORDING_ENDINGS
+from torchface.modeling import transfer_deformation
+from torchface.number_checks import check_rate
+from torchface.optim import BoxQP
+from torchface.progress import Progress
+from torchface.rig import BlendshapeRig
+from torchface.shape_names import ARKIT, mapping
+from torchface.take import Take, Track
+from torchface.workflows.animated_meshes import load_animated
+from torchface.workflows.arkit.arkit_rig import Source, load_source, make_arkit
+from torchface.workflows.arkit.head_parameters import (
+    HeadParameters,
+    has_parameters,
+    parameters_of,
+    read_parameters,
+    save_parameters,
+)
+from torchface.workflows.rig.actor_rig import check_out
+from torchface.workflows.weight_files import WeightFiles, write_weights
+
+_ENOUGH = 45  # of ARKit's shapes: such a rig is taken as it is
+_FPS = 30.0
+_VERTICES = ("vertices", "verts", "vertex_positions", ONLY)
+_MAX_JSON, _MOST_FRAMES = 2**30, 2**18
+_UNITS = (1.0, 10.0, 1000.0)
+_UNIT_NAMES = {1.0: "millimetres", 10.0: "centimetres", 1000.0: "metres"}
+_SHOWN_FRAMES = 200
+_LEFT_MM, _LEFT_SHARE, _SHOWN = 0.2, 0.1, 6
+
+
+@dataclass(frozen=True)
+class AnimationSettings:
+    """How an animation becomes weights; see ``torchface arkit --help``."""
+
+    template: Path | None = None
+    landmarks: Path | None = None
+    everything: bool = False
+    temporal: bool = True
+    fps: float | None = None
+    unit: str | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class MovingHead:
+    """An animation as meshes of one topology.
+
+    Args:
+        count: of frames.
+        read: vertices (t,V,3), millimetres, of the frames from one number up to another, without it.
+        fps: frames a second, where that is known.
+        person: the head at rest that moves (V,3); None for the source's own.
+        parameters: that move it, where it came as such.
+        notes: lines for people to read.
+    """
+
+    count: int
+    read: Callable[[int, int], Tensor]
+    fps: float | None = None
+    person: Tensor | None = None
+    parameters: HeadParameters | None = None
+    notes: tuple[str, ...] = ()
+
+
+def arkit_head(
+    source: Path,
+    out: Path,
+    template: Path | None,
+    landmarks: Path | None,
+    everything: bool,
+    unit: str | None,
+    progress: Progress,
+) -> list[str]:
+    """Reads, makes, writes a rig; lines for people to read."""
+    check_out(out)
+    progress("reading the head")
+    made = make_arkit(load_source(source, unit), template, landmarks, everything, progress)
+    progress("writing the rig")
+    save_rig(made.rig, out)
+    return made.lines()
+
+
+def animation_to_weights(
+    source: Path, animation: Path, out: Path, settings: AnimationSettings, progress: Progress
+) -> list[str]:
+    """Reads, solves, writes weights, and the error of each frame beside; lines for people to read."""
+    files = WeightFiles(out)
+    files.check()
+    if settings.fps is not None:
+        check_rate(settings.fps, "--fps", ValueRangeError)
+    progress("reading the animation")
+    if (named := _named_weights(animation)) is not None:
+        return _renamed(named, animation, files)
+    head = load_source(source, settings.unit)
+    moving = load_moving_head(animation, head)
+    rig, notes = arkit_shapes(head, settings, progress)
+    if moving.person is not None:
+        rig = transfer_deformation(rig, rig.neutral.with_vertices(moving.person), progress=progress)
+    solver = MeshSolver(rig)
+    scale, note = _unit_factor(solver, moving.read(0, 1)[0], animation)
+    read = (lambda begin, end: moving.read(begin, end) * scale) if scale != 1 else moving.read
+    fps = settings.fps or moving.fps or _FPS
+    solution = solver.solve(read, moving.count, fps, settings.temporal, progress)
+    take = Take(fps, weights=Track(rig.names, solution.weights.float()[..., None]))
+    warnings, _ = write_weights(_all_of_arkit(take), files, rig)
+    error_file = out.with_name(f"{out.stem}_error.csv")
+    _write_errors(solution, fps, error_file)
+    lines = [*notes, *moving.notes, *note, *solution_lines(solution), *unsaid_lines(solver, solution, read, rig)]
+    if moving.parameters is not None and head.model is not None:
+        lines += parameter_lines(solver, head, moving.parameters)
+    return [*lines, *warnings, f"error of each frame: {error_file}"]
+
+
+def weights_back(
+    source: Path, weights: Path, out: Path, template: Path | None, landmarks: Path | None, progress: Progress
+) -> list[str]:
+    """Reads ARKit weights, writes the head model's parameters; lines for people to read."""
+    check_ending(out, ".npz")
+    check_writable(out)
+    head = load_source(source)
+    if head.model is None or not len(head.model.expressions):
+        raise FileFormatError(
+            f"{source}: found no expression parameters, expected a head model that has some; weights go onto a rig by "
+            "torchface retarget"
+        )
+    take = load_take(weights)
+    if take.weights is None:
+        raise ValueRangeError(f"{weights}: found no weights, expected a take of them")
+    made = make_arkit(head, template, landmarks, progress=progress)
+    progress("solving")
+    values = made.rig.weights_from(take.weights)
+    parameters, left = parameters_of(head.model, made.rig, values)
+    make_folder(out.parent)
+    save_parameters(parameters, head.model.joints, take.fps, out)
+    moved = torch.tensordot(values.double(), made.rig.deltas.double(), 1).square().sum(-1).mean(1).sqrt()
+    return [
+        *made.notes,
+        f"{len(values)} frames; {head.model.name}'s parameters come to {float(left.mean()):.3f} mm of ARKit's faces "
+        f"(root mean square; they move {float(moved.mean()):.2f} mm)",
+    ]
+
+
+def arkit_shapes(head: Source, settings: AnimationSettings, progress: Progress) -> tuple[BlendshapeRig, list[str]]:
+    """The rig whose weights an animation becomes, and notes: the source itself where it has ARKit's shapes."""
+    if head.rig is not None and not settings.everything:
+        own = head.rig.with_arkit_names()
+        names = [name for name in ARKIT if name in own.names]
+        if len(names) >= _ENOUGH:
+            return own.linear("torchface arkit").select(names), []
+    made = make_arkit(head, settings.template, settings.landmarks, settings.everything, progress)
+    return made.rig.select([name for name in made.rig.names if name in ARKIT]), list(made.notes)
+
+
+def load_moving_head(path: Path, head: Source) -> MovingHead:
+    """An animation of a head as meshes.
+
+    Args:
+        path: parameters or vertices of frames (``.npz``, ``.npy``, ``.safetensors``), face anchors (``.json``), or what
+            ``load_animated`` reads.
+        head: whose topology the meshes have.
+    """
+    if path.suffix.lower() == ".json":
+        return _face_anchors(path, len(head.neutral.vertices))
+    if path.is_file() and path.suffix.lower() in (".npz", ".npy", ".safetensors", ".pkl", ".pickle"):
+        arrays = ArrayFile(path)
+        if has_parameters(arrays):
+            return _by_parameters(path, arrays, head)
+        key = arrays.first(_VERTICES)
+        if key is not None and "faces" not in arrays:
+            return _of_array(arrays, key, len(head.neutral.vertices))
+    animated = load_animated(path)
+    own = head.neutral
+    if len(animated.neutral.vertices) != len(own.vertices) or not torch.equal(animated.neutral.faces, own.faces):
+        raise FileFormatError(
+            f"{path}: found meshes of {len(animated.neutral.vertices)} vertices and {len(animated.neutral.faces)} "
+            f"triangles, expected those of {head.path}, {len(own.vertices)} and {len(own.faces)}"
+        )
+    return MovingHead(animated.count, animated.read, animated.fps)
+
+
+def _by_parameters(path: Path, arrays: ArrayFile, head: Source) -> MovingHead:
+    model = head.model
+    if model is None:
+        raise FileFormatError(
+            f"{path}: found expression parameters for {head.path}, a rig, expected their head model as SOURCE"
+        )
+    parameters = read_parameters(arrays, model)
+    person = model.neutral.vertices if parameters.person is None else model.person(parameters.person)
+
+    def read(begin: int, end: int) -> Tensor:
+        turned = None if parameters.rotations is None else parameters.rotations[begin:end]
+        return model.posed(person, parameters.expressions[begin:end], turned)
+
+    unread = f"left out of {path.name}: {', '.join(parameters.unread[:8])}"
+    notes = (unread,) if parameters.unread else ()
+    moved = None if parameters.person is None else person
+    return MovingHead(len(parameters), read, parameters.fps, moved, parameters, notes)
+
+
+def _of_array(arrays: ArrayFile, key: str, vertices: int) -> MovingHead:
+    shape = arrays.shape(key)
+    flat = len(shape) == 2 and shape[1] == 3 * vertices
+    if (not flat and (len(shape) != 3 or shape[1:] != (vertices, 3))) or not shape[0]:
+        raise arrays.error(key, f"(T,{vertices},3) vertices of the head")
+    meshes = arrays.numbers(key, *shape).reshape(-1, vertices, 3)
+    return MovingHead(len(meshes), lambda begin, end: meshes[begin:end])
+
+
+def _face_anchors(path: Path, vertices: int) -> MovingHead:
+    """Frames of ARKit's face anchors whose apps wrote ``vertices``, in metres: 1,220 of them."""
+    document = read_json(path, max_bytes=_MAX_JSON)
+    frames = document["frames"] if isinstance(document.found, dict) else document
+    rows = frames.rows(1, _MOST_FRAMES, "frames of face anchors with vertices, or Audio2Face's weights")
+    meshes = torch.stack([_anchor_vertices(row, vertices) for row in rows])
+    times = [float(row["timestamp"].found or row["time"].found or 0.0) for row in rows]
+    span = times[-1] - times[0]
+    fps = (len(rows) - 1) / span if len(rows) > 1 and span > 0 else None
+    return MovingHead(len(meshes), lambda begin, end: meshes[begin:end], fps)
+
+
+def _anchor_vertices(row: Value, count: int) -> Tensor:
+    found = row["geometry"]["vertices"] if row["geometry"] else row["vertices"]
+    nested = isinstance(found.found, list) and bool(found.found) and isinstance(found.found[0], list)
+    values = found.tensor(count, 3) if nested else found.tensor(3 * count, expected=f"{count} vertices of 3 numbers")
+    return values.reshape(count, 3).float()
+
+
+def _named_weights(path: Path) -> Take | None:
+    """The weights of a recording that has weights by name and no vertices, as of Audio2Face; None of another file."""
+    if path.suffix.lower() not in (".csv", *RECORDING_ENDINGS):
+        return None
+    if path.suffix.lower() == ".json":
+        found = read_json(path, max_bytes=_MAX_JSON).found
+        frames = found.get("frames") if isinstance(found, dict) else found
+        first = frames[0] if isinstance(frames, list) and frames else {}
+        if isinstance(first, dict) and ("vertices" in first or "geometry" in first):
+            return None
+    return load_take(path)
+
+
+def _renamed(take: Take, path: Path, files: WeightFiles) -> list[str]:
+    """Writes weights that go by names to ARKit's."""
+    if take.weights is None:
+        raise ValueRangeError(f"{path}: found no weights, expected weights, parameters or meshes over time")
+    matrix = mapping(take.weights.names, ARKIT).to(take.weights.values)
+    if not matrix.any():
+        raise NameMismatchError(
+            f"{path}: found {', '.join(take.weights.names[:5])}, ..., expected some of ARKit's names; torchface "
+            "retarget --table maps others"
+        )
+    lost = [name for name, used in zip(take.weights.names, matrix.any(0).tolist(), strict=True) if not used]
+    values = take.weights.values[..., 0] @ matrix.T
+    write_weights(replace(take, weights=Track(ARKIT, values[..., None])), files, _no_rig())
+    left = f"; ARKit has no {', '.join(lost[:8])}" + (f" and {len(lost) - 8} more" if len(lost) > 8 else "")
+    return [f"{len(take)} frames of weights by name{left if lost else ''}"]
+
+
+def _no_rig() -> BlendshapeRig:
+    from torchface.mesh import Mesh
+
+    return BlendshapeRig(Mesh(torch.eye(3), torch.tensor([[0, 1, 2]])), torch.zeros(len(ARKIT), 3, 3), ARKIT)
+
+
+def _all_of_arkit(take: Take) -> Take:
+    """All 52 columns, those that the rig lacks at zero, so that every program takes the file."""
+    assert take.weights is not None
+    matrix = mapping(take.weights.names, ARKIT).to(take.weights.values)
+    return replace(take, weights=Track(ARKIT, (take.weights.values[..., 0] @ matrix.T)[..., None]))
+
+
+def _unit_factor(solver: MeshSolver, first: Tensor, path: Path) -> tuple[float, list[str]]:
+    """Millimetres per unit of the meshes, by their size beside the rig; a note where it is not 1."""
+    scale = solver.scale_of(first)
+    for factor in _UNITS:
+        if 0.7 <= scale * factor <= 1.4:
+            note = f"{path.name}: taken to be in {_UNIT_NAMES[factor]}, by the head's size"
+            return factor, [] if factor == 1 else [note]
+    solver.check_unit(first)
+    return 1.0, []
+
+
+def _write_errors(solution: MeshSolution, fps: float, path: Path) -> None:
+    rows = ["frame,time,error_mm,least_squares_mm,motion_mm"]
+    table = torch.stack([solution.error, solution.unbounded, solution.motion], 1).tolist()
+    rows += [f"{row},{row / fps:.4f},{a:.4f},{b:.4f},{c:.4f}" for row, (a, b, c) in enumerate(table)]
+    write_file(path, ("\n".join(rows) + "\n").encode())
+
+
+def solution_lines(solution: MeshSolution) -> list[str]:
+    """What the weights leave, for people to read."""
+    error, motion = solution.error, solution.motion
+    share = float(error.square().sum() / motion.square().sum().clamp(min=1e-12))
+    return [
+        f"{len(error)} frames; error {float(error.mean()):.3f} mm (root mean square over the vertices, mean of frames; "
+        f"95 % of the frames below {float(error.quantile(0.95)):.3f}) of {float(motion.mean()):.2f} mm of motion, "
+        f"{share:.1%} of its energy; least squares without bounds {float(solution.unbounded.mean()):.3f} mm"
+    ]
+
+
+def unsaid_lines(
+    solver: MeshSolver, solution: MeshSolution, read: Callable[[int, int], Tensor], rig: BlendshapeRig
+) -> list[str]:
+    """The regions whose motion ARKit's shapes cannot show, the worst first; of at most 200 frames."""
+    notes = rig.neutral.annotations
+    if notes is None or not notes.regions:
+        return []
+    frames = torch.linspace(0, len(solution.weights) - 1, min(_SHOWN_FRAMES, len(solution.weights))).round().long()
+    left = torch.zeros(len(rig.vertices), dtype=torch.float64)
+    moved = torch.zeros_like(left)
+    for frame in frames.tolist():  # frames of a file are read one at a time
+        residual, motion = solver.residual(read(frame, frame + 1), solution.weights[frame : frame + 1])
+        left += residual[0].square().sum(-1)
+        moved += motion[0].square().sum(-1)
+    found = []
+    for name, mask in notes.regions.items():
+        if mask.any():
+            error = float((left[mask].mean() / len(frames)).sqrt())
+            share = float(left[mask].sum() / moved[mask].sum().clamp(min=1e-12))
+            if error > _LEFT_MM and share > _LEFT_SHARE:
+                found.append((error, share, name))
+    listed = [f"{name} {error:.2f} mm ({share:.0%})" for error, share, name in sorted(found, reverse=True)[:_SHOWN]]
+    return [f"ARKit's shapes cannot show: {', '.join(listed)} of the motion there"] if listed else []
+
+
+def parameter_lines(solver: MeshSolver, head: Source, parameters: HeadParameters) -> list[str]:
+    """The parameters whose motion, as far as the take uses them, ARKit's shapes show worst."""
+    assert head.model is not None
+    used = parameters.expressions.double().square().mean(0).sqrt()
+    rows = head.model.expressions[: len(used)].double() * used[:, None, None]
+    meshes = torch.cat([head.neutral.vertices.double() + rows, head.neutral.vertices.double() - rows])
+    slopes, constant = solver.equations(meshes)
+    left = solver.error(slopes, constant, BoxQP(solver.H, 0.0, 1.0)(slopes)).view(2, -1).amax(0)
+    size = solver.error(slopes, constant, torch.zeros_like(slopes)).view(2, -1).amax(0)
+    worst = left.argsort(descending=True)[:_SHOWN].tolist()
+    listed = [
+        f"{head.model.expression_names[row]} {float(left[row]):.2f} of {float(size[row]):.2f} mm"
+        for row in worst
+        if float(left[row]) > _LEFT_SHARE * float(size[row]) and float(left[row]) > 0.02
+    ]
+    return (
+        [f"parameters that ARKit's shapes show worst, as far as they are used: {', '.join(listed)}"] if listed else []
+    )
