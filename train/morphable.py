@@ -1,8 +1,9 @@
 """``torchface train morphable --scans DIR --out models/NAME``: a head model, shape and colour, of registered meshes.
 
 ``--ict FaceXModel`` makes one of ICT-FaceKit's identity modes, which come from light-stage scans of people, with its 53
-expressions as the rig; ``--performers 200`` learns from so many embedded performers, and needs no file. Killed and
-started again, a run goes on where it was.
+expressions as the rig; ``--published FILE`` one of GNM Head, FLAME or Basel, with ARKit's shapes made on it;
+``--performers 200`` learns from so many embedded performers, and needs no file. Killed and started again, a run goes on
+where it was.
 """
 
 from __future__ import annotations
@@ -13,11 +14,13 @@ from pathlib import Path
 from torchface import BlendshapeRig, Mesh, TorchfaceError, load_mesh, load_rig, zoo
 from torchface.errors import FileFormatError
 from torchface.io import load_ict_facekit, load_identity_modes
+from torchface.io.head_models.head_model_files import load_head_model_file
 from torchface.io.rig_files import SCENE_ENDINGS
 from torchface.io.rigs.ict_facekit import region
 from torchface.mesh import submesh
 from torchface.modeling import HeadModel, MorphableModel
 from torchface.progress import Progress
+from torchface.workflows.arkit.arkit_rig import published_head
 from torchface.zoo.model_folders import own_models
 
 from .head_colors import fitted_colors
@@ -47,6 +50,9 @@ class Settings(RecipeSettings):
         scans: Folder of registered meshes, all of one topology, in any place; what `torchface register` writes.
         ict: Take ICT-FaceKit's `FaceXModel` folder instead: its neutral, identity modes and expressions. Without --out
             the model is `people` in $TORCHFACE_HOME, else the checkout's models, where `torchface fit` finds it.
+        published: Take a head model as others publish it instead: GNM Head's gnm_head.npz, FLAME's arrays as .npz or
+            .safetensors, Basel's .h5. It gets ARKit's shapes on its own vertices, as by `torchface arkit`, and lies
+            where --ict's model does.
         performers: Learn from so many embedded performers instead of a folder's meshes.
         template: The template that the meshes were registered with, a mesh or a rig (.glb, a folder of OBJ files,
             `FaceXModel`): says where and how upright the heads are to stand, and brings annotations. A rig travels with
@@ -67,6 +73,7 @@ class Settings(RecipeSettings):
 
     scans: Path | None = None
     ict: Path | None = None
+    published: Path | None = None
     performers: int = 0
     out: Path = _OUT
     template: Path | None = None
@@ -84,7 +91,7 @@ class Settings(RecipeSettings):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.ict is not None and self.out == _OUT:
+        if (self.ict is not None or self.published is not None) and self.out == _OUT:
             object.__setattr__(self, "out", own_models() / "people")
 
 
@@ -108,7 +115,13 @@ def train(settings: Settings, run: Run) -> Trained:
     progress = run.progress
     _check_one_source(settings)
     if settings.ict is not None:
-        return _ict(settings, settings.ict, progress)
+        progress("reading the modes and the expressions")
+        return _as_given(ict_head_model(settings.ict, settings.part, settings.components), settings, progress)
+    if settings.published is not None:
+        model = published_head(settings.published, settings.components, progress)
+        if settings.part is not None:
+            model = model.part(region(model.template(), settings.part))
+        return _as_given(model, settings, progress)
     source, held_out = _source(settings)
     template, rig = (
         (None, None) if settings.template is None else load_template(settings.template, settings.part, settings.unit)
@@ -139,10 +152,8 @@ def train(settings: Settings, run: Run) -> Trained:
     return Trained(model, metrics, quality)
 
 
-def _ict(settings: Settings, folder: Path, progress: Progress) -> Trained:
-    """The model of ICT-FaceKit's own modes: nothing is learned, so nothing is held out."""
-    progress("reading the modes and the expressions")
-    model = ict_head_model(folder, settings.part, settings.components)
+def _as_given(model: HeadModel, settings: Settings, progress: Progress) -> Trained:
+    """A model of its authors' own modes: nothing is learned, so nothing is held out."""
     deviations = model.shape.modes.square().sum((0, 2)).sqrt()
     metrics = {
         "shape components": float(model.shape.count),
@@ -161,15 +172,18 @@ def save(
         data = f"{count} embedded performers, heads and complexions drawn by seed {settings.seed}; no person's face."
     elif settings.ict is not None:
         data = f"{model.shape.count} identity modes of ICT-FaceKit's FaceXModel, made of light-stage scans of people."
+    elif settings.published is not None:
+        data = f"{model.shape.count} identity modes of {settings.published.name}, as its authors publish it."
     else:
         data = f"{count} registered meshes of {settings.scans and settings.scans.name}."
     if folds:
         tested = f"Tested on all {count} heads, each left out of the model once, in {folds} turns{_MEASURES}"
-    elif settings.ict is not None:
+    elif settings.ict is not None or settings.published is not None:
         tested = "Nothing was held out: the modes are as their authors give them."
     else:
         tested = f"Tested on {held_out} heads that it has not learned from{_MEASURES}"
     free = "MIT" if settings.performers else "MIT, as ICT-FaceKit" if settings.ict is not None else "that of the scans"
+    free = free if settings.published is None else load_head_model_file(settings.published).licence
     card = model_card(settings, licence=free, data=data, metrics=metrics, text=card_text(model, tested))
     zoo.save_model(
         model, settings.out, card, half=[name for name in _HALF if settings.half and name in model.state_dict()]
@@ -177,10 +191,12 @@ def save(
 
 
 def _check_one_source(settings: Settings) -> None:
-    if (settings.scans is not None) + (settings.ict is not None) + (settings.performers > 0) != 1:
+    given = (settings.scans, settings.ict, settings.published)
+    if sum(one is not None for one in given) + (settings.performers > 0) != 1:
         raise TorchfaceError(
-            f"found --scans {settings.scans}, --ict {settings.ict}, --performers {settings.performers}; expected one "
-            "of a folder of registered meshes, ICT-FaceKit's FaceXModel, and a number of performers"
+            f"found --scans {settings.scans}, --ict {settings.ict}, --published {settings.published}, --performers "
+            f"{settings.performers}; expected one of a folder of registered meshes, ICT-FaceKit's FaceXModel, a head "
+            "model's file, and a number of performers"
         )
 
 

@@ -2,6 +2,8 @@
 
 from torchface.io.camera_files import load_calibration, save_calibration
 from torchface.io.gltf.wrinkle_textures import load_region_maps
+from torchface.io.head_models.head_model_file import HeadJoints, HeadModelFile, SurfacePlaces
+from torchface.io.head_models.head_model_files import load_head_model_file
 from torchface.io.images.image_files import load_image, save_image, save_image16, save_normal_map
 from torchface.io.landmarks.landmark_points import load_landmark_points, save_pts
 from torchface.io.landmarks.picks import (
@@ -25,16 +27,20 @@ from torchface.io.weights.live_link_csv import save_live_link
 __all__ = [
     "Correspondences",
     "FrameSender",
+    "HeadJoints",
+    "HeadModelFile",
     "IdentityModes",
     "LandmarkVertices",
     "MeshSequence",
     "MeshSequenceWriter",
     "ShapeMatch",
+    "SurfacePlaces",
     "WeightSender",
     "load_animation",
     "load_calibration",
     "load_correspondences",
     "load_detail_maps",
+    "load_head_model_file",
     "load_ict_facekit",
     "load_identity_modes",
     "load_image",

@@ -10,6 +10,7 @@ from torchface.modeling.detail.normal_map_baking import (
 from torchface.modeling.detail.scan_alignment import ScanAlignment, align_scan
 from torchface.modeling.morphable.head_model import HeadModel, Heads
 from torchface.modeling.morphable.morphable_model import MorphableModel
+from torchface.modeling.morphable.published_models import head_model_of
 from torchface.modeling.photographs.image_fit import ImageFit, fit_images
 from torchface.modeling.photographs.image_solve import FitSettings
 from torchface.modeling.photographs.texture_fit import ColorFit, fit_colors
@@ -64,6 +65,7 @@ __all__ = [
     "detail_maps",
     "fit_colors",
     "fit_images",
+    "head_model_of",
     "inner_parts",
     "neutral_rig",
     "open_eyes",

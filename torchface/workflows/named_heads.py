@@ -10,17 +10,19 @@ import torch
 from torchface import zoo
 from torchface.errors import TopologyError
 from torchface.io import load_rig
+from torchface.io.head_models.head_model_files import is_head_model_file
 from torchface.io.rigs.ict_facekit import region
 from torchface.modeling import HeadModel
 from torchface.rig import BlendshapeRig
 from torchface.synthetic import performer
+from torchface.workflows.arkit.arkit_rig import published_head
 from torchface.zoo.kinds import KINDS
 
 SHIPPED = "head"
 _KIND = next(name for name, kind in KINDS.items() if kind is HeadModel)
 _BETTER = (
     "for a likeness of real people: torchface train morphable --ict FaceXModel, once, "
-    "with the folder of github.com/ICT-VGL/ICT-FaceKit (MIT)"
+    "with the folder of github.com/ICT-VGL/ICT-FaceKit (MIT); or --published FILE of GNM Head, FLAME or Basel"
 )
 
 
@@ -53,11 +55,13 @@ class NamedHeads:
 
 
 def load_head_model(name_or_path: str | Path) -> HeadModel:
-    """A head model by name or folder, see ``zoo.get_model``.
+    """A head model by name or folder, see ``zoo.get_model``; or a file of others, see ``published_head``.
 
     Raises:
         NameMismatchError: there is none of this name, or it is of another kind.
     """
+    if is_head_model_file(name_or_path):
+        return published_head(Path(name_or_path))
     return zoo.get_model(name_or_path, HeadModel)
 
 

@@ -8,6 +8,7 @@ from torchface.capture.markers.helmet_solver import HelmetMotion, HelmetSolver
 from torchface.capture.markers.hybrid_solver import HybridSolver, gamma_curves
 from torchface.capture.markers.marker_labels import LabelMatch, match_labels, own_labels
 from torchface.capture.markers.marker_solver import MarkerSolver
+from torchface.capture.markers.mesh_solver import MeshSolution, MeshSolver
 from torchface.capture.markers.observability import observability
 from torchface.capture.markers.rig_fit_check import FitCheck, check_fit
 from torchface.capture.markers.sparsity import sparsity_by_rule
@@ -25,6 +26,8 @@ __all__ = [
     "HybridSolver",
     "LabelMatch",
     "MarkerSolver",
+    "MeshSolution",
+    "MeshSolver",
     "Observability",
     "SiteUncertainty",
     "WholeTakeSolver",

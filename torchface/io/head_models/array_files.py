@@ -117,7 +117,7 @@ class ArrayFile:
         """
         values = self._read(name, "fiub", shape)
         with np.errstate(over="ignore"):
-            read = np.ascontiguousarray(values, dtype=np.float32)
+            read = np.require(values, np.float32, ["C", "W"])
         if finite and not bool(np.isfinite(read).all() and (not read.size or np.abs(read).max() < _LARGEST_NUMBER)):
             raise FileFormatError(f"{self.path}: found NaN, infinity or a giant in {name}, expected finite numbers")
         return torch.from_numpy(read)

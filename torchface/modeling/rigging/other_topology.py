@@ -34,7 +34,7 @@ _CANDIDATES = 12
 _NEAR, _FAR = 2.0, 20.0
 _BLIND = 1e-3
 """How much the guess counts for a vertex that has no place on the template, beside one that has."""
-_SMOOTH = 0.7
+_SMOOTH = 0.4
 _SKIN_SHARE, _BODY_SHARE = 0.3, 0.15
 _SAME_PLACE = 1e-4
 _ALIKE = 0.2

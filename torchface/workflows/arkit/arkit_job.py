@@ -21,7 +21,7 @@ from torchface.number_checks import check_rate
 from torchface.optim import BoxQP
 from torchface.progress import Progress
 from torchface.rig import BlendshapeRig
-from torchface.shape_names import ARKIT, mapping
+from torchface.shape_names import ARKIT, mapping, recognised_shapes
 from torchface.take import Take, Track
 from torchface.workflows.animated_meshes import load_animated
 from torchface.workflows.arkit.arkit_rig import Source, load_source, make_arkit
@@ -159,10 +159,10 @@ def weights_back(
 def arkit_shapes(head: Source, settings: AnimationSettings, progress: Progress) -> tuple[BlendshapeRig, list[str]]:
     """The rig whose weights an animation becomes, and notes: the source itself where it has ARKit's shapes."""
     if head.rig is not None and not settings.everything:
-        own = head.rig.with_arkit_names()
-        names = [name for name in ARKIT if name in own.names]
-        if len(names) >= _ENOUGH:
-            return own.linear("torchface arkit").select(names), []
+        rig, own = head.rig.linear("torchface arkit"), recognised_shapes(head.rig.names)
+        if len(own) >= _ENOUGH:
+            deltas = torch.stack([rig.deltas[list(shape.rows)].sum(0) for shape in own.values()])
+            return BlendshapeRig(rig.neutral, deltas, tuple(own)), []
     made = make_arkit(head, settings.template, settings.landmarks, settings.everything, progress)
     return made.rig.select([name for name in made.rig.names if name in ARKIT]), list(made.notes)
 

@@ -15,13 +15,15 @@ from torchface.io.head_models.head_model_file import HeadModelFile
 from torchface.io.head_models.head_model_files import is_head_model_file, load_head_model_file
 from torchface.io.mesh_files import MESH_ENDINGS
 from torchface.mesh import Annotations, Mesh, submesh
+from torchface.modeling import HeadModel
+from torchface.modeling.morphable.published_models import head_model_of
 from torchface.modeling.rigging.loose_parts import tongue_out
 from torchface.modeling.rigging.other_topology import CarriedShapes, shapes_on
 from torchface.progress import Progress, silent
 from torchface.registration import register
 from torchface.registration.landmark_files import load_scan_landmarks
 from torchface.rig import BlendshapeRig
-from torchface.shape_names import ARKIT, arkit_sources
+from torchface.shape_names import ARKIT, recognised_shapes
 from torchface.synthetic import performer
 
 TONGUE = "tongueOut"
@@ -120,14 +122,18 @@ def make_arkit(
         ValueRangeError: the template has none of ARKit's shapes.
     """
     progress = progress or silent
-    own = {} if source.rig is None else dict(arkit_sources(source.rig.names))
-    kept = () if everything else tuple(name for name in ARKIT if name in own)
-    others = tuple(name for name in own if name not in ARKIT)
+    rig = None if source.rig is None else source.rig.linear("torchface arkit")
+    own = {} if rig is None else recognised_shapes(rig.names)
+    kept = () if everything else tuple(own)
+    used = {row for shape in own.values() for row in shape.rows}
     wanted = [name for name in ARKIT if name not in kept]
     shapes: dict[str, Tensor] = {}
-    if source.rig is not None:
-        named = source.rig.linear("torchface arkit").with_arkit_names()
-        shapes = {name: named.deltas[row] for row, name in enumerate(named.names) if name in (*kept, *others)}
+    others: tuple[str, ...] = ()
+    if rig is not None:
+        shapes = {name: rig.deltas[list(own[name].rows)].sum(0) for name in kept}
+        left = {name: rig.deltas[row] for row, name in enumerate(rig.names) if row not in used}
+        others = tuple(left)
+        shapes |= left
     carried, notes, neutral = None, [], source.neutral
     if wanted:
         given = _template(template)
@@ -205,10 +211,9 @@ def annotated(neutral: Mesh, carried: CarriedShapes) -> Mesh:
         return neutral
     on_head = carried.registration.mesh.vertices.double()
     landmarks, regions = own.landmarks, dict(own.regions)
-    known = carried.places.nonzero()[:, 0]
     vertices = neutral.vertices.double().cpu()
     if (landmarks is None or len(landmarks) != 68) and template.landmarks is not None:
-        landmarks = known[torch.from_numpy(cKDTree(vertices[known]).query(on_head[template.landmarks])[1])]
+        landmarks = torch.from_numpy(cKDTree(vertices).query(on_head[template.landmarks])[1])
     distance, nearest = cKDTree(on_head).query(vertices)
     scale = float(carried.registration.pose.scale[0])
     near = torch.from_numpy(distance) < _BESIDE * scale
@@ -229,3 +234,20 @@ def _tongue(neutral: Mesh, carried: CarriedShapes) -> dict[str, Tensor]:
     upright = pose.inverse().apply(neutral.vertices.double())[0]
     delta = tongue_out(upright, mask, upright[notes.landmarks[48:]])
     return {TONGUE: pose.apply_vectors(delta[None])[0]}
+
+
+def published_head(path: Path, components: int | None = None, progress: Progress | None = None) -> HeadModel:
+    """A head model of others with ARKit's shapes as its rig, ready for `fit`, `track`, `register` and `rig`.
+
+    Args:
+        path: see ``load_head_model_file``.
+        components: of its shape, of the largest deviations; all if absent.
+        progress: called with each step and how far it is.
+
+    Raises:
+        FileFormatError: no head model.
+        AlignmentError: the template does not come to lie on it.
+    """
+    model = load_head_model_file(path)
+    made = make_arkit(Source(path, model.neutral, None, model), progress=progress)
+    return head_model_of(model, made.rig, components)

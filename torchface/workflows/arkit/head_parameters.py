@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -143,9 +143,22 @@ def parameters_of(model: HeadModelFile, rig: BlendshapeRig, weights: Tensor) -> 
         rig: its mean head with ARKit's shapes.
         weights: by the rig's names, (T,N).
 
+    A model whose expressions move the jaw themselves is nearer without the joints: then their rotations are 0.
+
     Returns:
         The parameters, and the root mean square distance that is left, (T,), millimetres.
     """
+    plain = _parameters(replace(model, joints=None), rig, weights)
+    if model.joints is None:
+        return plain
+    turned = _parameters(model, rig, weights)
+    if float(turned[1].mean()) < float(plain[1].mean()):
+        return turned
+    still = torch.zeros(len(weights), len(model.joints.names), 3)
+    return replace(plain[0], rotations=still), plain[1]
+
+
+def _parameters(model: HeadModelFile, rig: BlendshapeRig, weights: Tensor) -> tuple[HeadParameters, Tensor]:
     count, rest = len(rig.vertices), model.neutral.vertices.double()
     basis = model.expressions.double().flatten(1)
     joints, turns = model.joints, None

@@ -9,10 +9,12 @@ from pathlib import Path
 from torchface import zoo
 from torchface.errors import FileFormatError, NameMismatchError, ValueRangeError
 from torchface.io import load_mesh, load_rig
+from torchface.io.head_models.head_model_files import is_head_model_file, load_head_model_file
 from torchface.io.length_units import millimetres_per
 from torchface.io.rigs.ict_facekit import region
 from torchface.mesh import Mesh, submesh
 from torchface.modeling import HeadModel, MorphableModel
+from torchface.modeling.morphable.published_models import head_model_of
 from torchface.progress import Progress
 from torchface.registration.model_fit import HasShape, LinearShape, ShapeModel, shape_model
 from torchface.registration.nonrigid.schedule import DEFAULT_SCHEDULE, Schedule
@@ -104,11 +106,13 @@ def register_scans(
 
 
 def load_shape_model(name_or_path: str | Path) -> MorphableModel | HeadModel:
-    """A model of heads by name or folder, see ``zoo.get_model``.
+    """A model of heads by name or folder, see ``zoo.get_model``; or a file of others, of its own topology.
 
     Raises:
         NameMismatchError: there is none of this name, or it is of another kind.
     """
+    if is_head_model_file(name_or_path):
+        return head_model_of(load_head_model_file(name_or_path))
     model = zoo.get_model(name_or_path)
     if not isinstance(model, MorphableModel | HeadModel):
         raise NameMismatchError(

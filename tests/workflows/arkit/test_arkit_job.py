@@ -1,0 +1,178 @@
+"""Tests of ``torchface arkit`` from files to files, on planted models of the embedded performer's head."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from planted.published_heads import codes, expression_basis, flame_arrays, gnm_arrays, head
+from torchface import Mesh, load_mesh, load_rig, load_take, save_mesh, save_rig
+from torchface.errors import FileFormatError, NameMismatchError
+from torchface.modeling import HeadModel
+from torchface.progress import silent
+from torchface.rig import BlendshapeRig
+from torchface.shape_names import ARKIT
+from torchface.synthetic import performer
+from torchface.workflows.arkit import arkit_rig
+from torchface.workflows.arkit.arkit_job import AnimationSettings, animation_to_weights, arkit_head, weights_back
+from torchface.workflows.named_heads import load_head_model, matching
+
+FRAMES = 30
+SHAPES = ["eyeBlinkLeft", "eyeLookInRight", "jawOpen", "mouthPucker", "mouthSmileLeft", "browInnerUp"]
+ALONE = AnimationSettings(temporal=False)
+
+
+@pytest.fixture(scope="module")
+def rig() -> BlendshapeRig:
+    return head()
+
+
+@pytest.fixture(scope="module")
+def weights(rig: BlendshapeRig) -> torch.Tensor:
+    generator = torch.Generator().manual_seed(5)
+    weights = torch.zeros(FRAMES, len(rig.names))
+    weights[:, rig.index(SHAPES)] = torch.rand(FRAMES, len(SHAPES), generator=generator)
+    return weights
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory, rig: BlendshapeRig, weights: torch.Tensor) -> Path:
+    """A planted FLAME and its codes, a rig, and meshes."""
+    folder = tmp_path_factory.mktemp("arkit")
+    np.savez(folder / "flame.npz", **flame_arrays(rig))
+    exp = codes(rig, expression_basis(rig), weights).numpy()
+    np.savez(folder / "take.npz", exp=exp, pose=np.zeros((FRAMES, 6)), cam=np.zeros((FRAMES, 3)), fps=60.0)
+    save_rig(rig, folder / "rig.glb")
+    save_rig(rig.select(SHAPES), folder / "template.glb")
+    return folder
+
+
+def solved(path: Path, rig: BlendshapeRig) -> torch.Tensor:
+    take = load_take(path)
+    assert take.weights is not None
+    assert [name.lower() for name in take.weights.names] == [name.lower() for name in ARKIT]
+    return rig.weights_from(take.weights)
+
+
+def test_a_head_model_gets_the_shapes_on_its_own_vertices(folder: Path, rig: BlendshapeRig) -> None:
+    """The model's mean is the template's head, so that the shapes are the template's own."""
+    lines = arkit_head(folder / "flame.npz", folder / "flame.glb", folder / "template.glb", None, False, None, silent)
+    made = load_rig(folder / "flame.glb")
+    assert "6 of ARKit's 52" in lines[0]
+    assert "no tongue" in lines[-1]
+    assert made.names == tuple(SHAPES)
+    assert torch.equal(made.neutral.faces, rig.neutral.faces)
+    for name in SHAPES:
+        a, b = (one.deltas[one.index([name])[0]] for one in (made, rig))
+        assert float((a - b).norm() / b.norm()) < 0.06, name
+    landmarks = made.vertices[made.neutral.landmarks]
+    assert float((landmarks - rig.vertices[rig.neutral.landmarks]).norm(dim=1).max()) < 1.0
+
+
+def test_codes_become_the_planted_weights_and_go_back(
+    folder: Path, rig: BlendshapeRig, weights: torch.Tensor, tmp_path: Path
+) -> None:
+    settings = AnimationSettings(folder / "template.glb", temporal=False)
+    lines = animation_to_weights(folder / "flame.npz", folder / "take.npz", tmp_path / "w.csv", settings, silent)
+    assert float((solved(tmp_path / "w.csv", rig) - weights).abs().max()) < 0.04
+    assert load_take(tmp_path / "w.csv").fps == pytest.approx(60.0)
+    assert any("left out of take.npz: cam" in line for line in lines)
+    table = np.loadtxt(tmp_path / "w_error.csv", delimiter=",", skiprows=1)
+    assert table.shape == (FRAMES, 5)
+    assert table[:, 2].max() < 0.1
+    lines = weights_back(
+        folder / "flame.npz", tmp_path / "w.csv", tmp_path / "back.npz", settings.template, None, silent
+    )
+    back, truth = np.load(tmp_path / "back.npz"), np.load(folder / "take.npz")
+    basis = expression_basis(rig).flatten(1).numpy()
+    apart = (back["exp"] - truth["exp"]) @ basis
+    assert np.sqrt((apart**2).mean()) < 0.1 * np.sqrt(((truth["exp"] @ basis) ** 2).mean())
+
+
+@pytest.mark.parametrize("kind", ["obj", "npy", "anchors"])
+def test_meshes_of_a_rigs_topology_become_the_planted_weights(
+    kind: str, folder: Path, rig: BlendshapeRig, weights: torch.Tensor, tmp_path: Path
+) -> None:
+    """In millimetres, metres, and metres with times; the head turned."""
+    few = 3
+    meshes = rig(weights[:few]) @ torch.tensor([[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]]) + 20.0
+    path = tmp_path / {"obj": "meshes", "npy": "meshes.npy", "anchors": "meshes.json"}[kind]
+    if kind == "obj":
+        path.mkdir()
+        for number, vertices in enumerate(meshes):
+            save_mesh(Mesh(vertices, rig.neutral.faces), path / f"{number:03}.obj")
+    elif kind == "npy":
+        np.save(path, (meshes / 1000).flatten(1).numpy())
+    else:
+        frames = [{"timestamp": 0.05 * i, "vertices": (one / 1000).tolist()} for i, one in enumerate(meshes)]
+        path.write_text(json.dumps({"frames": frames}))
+    save_mesh(Mesh(rig.vertices, rig.neutral.faces), tmp_path / "neutral.obj")
+    mesh = load_mesh(tmp_path / "neutral.obj")
+    save_rig(BlendshapeRig(mesh, rig.deltas, rig.names), tmp_path / "plain.glb")
+    lines = animation_to_weights(tmp_path / "plain.glb", path, tmp_path / "w.csv", ALONE, silent)
+    assert float((solved(tmp_path / "w.csv", rig) - weights[:few]).abs().mean()) < 0.01
+    assert any("taken to be in metres" in line for line in lines) is (kind != "obj")
+    assert load_take(tmp_path / "w.csv").fps == pytest.approx(20.0 if kind == "anchors" else 30.0, rel=1e-2)
+
+
+def test_shapes_that_a_rig_has_are_kept_and_only_the_others_made(rig: BlendshapeRig, tmp_path: Path) -> None:
+    few = rig.select(["eyeBlinkLeft", "jawOpen", "mouthPucker"])
+    save_rig(rig.select(SHAPES), tmp_path / "template.glb")
+    doubled = BlendshapeRig(few.neutral, 2 * few.deltas, ["Fcl_EYE_Close_L", "A25_Jaw_Open", "Ears_Wiggle"])
+    save_rig(doubled, tmp_path / "few.glb")
+    lines = arkit_head(tmp_path / "few.glb", tmp_path / "all.glb", tmp_path / "template.glb", None, False, None, silent)
+    made = load_rig(tmp_path / "all.glb")
+    assert "4 made, 2 of its own kept" in lines[0]
+    assert made.names[-1] == "Ears_Wiggle"
+    kept = made.deltas[made.index(["jawOpen"])[0]]
+    assert torch.allclose(kept, 2 * few.deltas[1], atol=1e-3)
+
+
+def test_audio2faces_weights_go_by_name(tmp_path: Path) -> None:
+    document = {
+        "exportFps": 25.0,
+        "facsNames": ["jawOpen", "eyeBlinkLeft", "tongueTipUp"],
+        "weightMat": [[0.5, 0, 0.2]],
+    }
+    (tmp_path / "a2f.json").write_text(json.dumps(document))
+    lines = animation_to_weights(tmp_path / "none.glb", tmp_path / "a2f.json", tmp_path / "w.csv", ALONE, silent)
+    take = load_take(tmp_path / "w.csv")
+    assert take.weights is not None
+    assert float(take.weights.select(["JawOpen"]).values[0]) == pytest.approx(0.5)
+    assert "ARKit has no tongueTipUp" in lines[0]
+
+
+def test_a_published_model_is_a_head_model_with_its_rig(
+    tmp_path: Path, rig: BlendshapeRig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    np.savez(tmp_path / "gnm_head.npz", **gnm_arrays(rig))
+    few = performer(texture=False).select(SHAPES)
+    monkeypatch.setattr(arkit_rig, "performer", lambda texture: few)
+    model = load_head_model(tmp_path / "gnm_head.npz")
+    assert isinstance(model, HeadModel)
+    same, shapes = matching(model)
+    assert same is model
+    assert shapes.names == tuple(SHAPES)
+    assert len(model.landmarks) == 68  # type: ignore[arg-type]
+
+
+def test_what_is_of_another_model_is_named(folder: Path, rig: BlendshapeRig, tmp_path: Path) -> None:
+    with pytest.raises(FileFormatError, match="expected their head model as SOURCE"):
+        animation_to_weights(folder / "rig.glb", folder / "take.npz", tmp_path / "w.csv", ALONE, silent)
+    np.savez(tmp_path / "wide.npz", exp=np.zeros((3, 300)))
+    with pytest.raises(FileFormatError, match="at most 51 parameters"):
+        animation_to_weights(folder / "flame.npz", tmp_path / "wide.npz", tmp_path / "w.csv", ALONE, silent)
+    np.savez(tmp_path / "jaw.npz", exp=np.zeros((3, 20)), jaw=np.zeros((2, 3)))
+    with pytest.raises(FileFormatError, match="jaw of f"):
+        animation_to_weights(folder / "flame.npz", tmp_path / "jaw.npz", tmp_path / "w.csv", ALONE, silent)
+    np.savez(tmp_path / "other.npz", vertices=np.zeros((3, 100, 3)))
+    with pytest.raises(FileFormatError, match="vertices of f"):
+        animation_to_weights(folder / "rig.glb", tmp_path / "other.npz", tmp_path / "w.csv", ALONE, silent)
+    (tmp_path / "strange.csv").write_text("frame,time,wiggle\n0,0,1\n")
+    with pytest.raises(NameMismatchError, match="expected some of ARKit's names"):
+        animation_to_weights(folder / "rig.glb", tmp_path / "strange.csv", tmp_path / "w.csv", ALONE, silent)
+    with pytest.raises(FileFormatError, match="no expression parameters"):
+        weights_back(folder / "rig.glb", folder / "take.npz", tmp_path / "back.npz", None, None, silent)
+    assert not (tmp_path / "w.csv").exists()
