@@ -19,7 +19,7 @@ def rig() -> BlendshapeRig:
 
 @pytest.fixture(scope="module")
 def solver(rig: BlendshapeRig) -> MeshSolver:
-    return MeshSolver(rig, ridge=1e-7)
+    return MeshSolver(rig)
 
 
 @pytest.fixture(scope="module")

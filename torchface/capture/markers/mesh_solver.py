@@ -8,7 +8,6 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torchface.capture.markers.marker_solver import RIDGE
 from torchface.capture.markers.take_smoothing import smooth_in_box
 from torchface.errors import ShapeError, ValueRangeError
 from torchface.geometry.rotations import cross_matrix
@@ -20,7 +19,8 @@ from torchface.rig import BlendshapeRig
 CALM = 0.02
 """Smoothness at 60 frames a second as a share of the mean curvature of a weight: meshes have hardly any noise, so what
 it settles is which of several like explanations of a frame goes on."""
-_STEADY = 1.0  # millimetres; a vertex that shapes move by this counts half for the head's place
+_RIDGE = 1e-6
+_STEADY = 1.0  # millimetres; a vertex that shapes move by this counts a quarter for the head's place
 _CHUNK = 2**22  # numbers of vertices at once
 _NUMBERS = "meshes: found NaN or infinity, expected millimetres in every frame"
 
@@ -53,7 +53,8 @@ class MeshSolver:
 
     Args:
         rig: N shapes; its correctives are left out with a warning.
-        ridge: :math:`\varepsilon`, mm² a vertex for a squared weight of 1.
+        ridge: :math:`\varepsilon`, as a share of the mean curvature of a weight: only what no vertex tells apart is
+            decided by it.
 
     Source: thesis 4.1.4, with every vertex as a marker.
 
@@ -68,7 +69,7 @@ class MeshSolver:
         True
     """
 
-    def __init__(self, rig: BlendshapeRig, ridge: float = RIDGE) -> None:
+    def __init__(self, rig: BlendshapeRig, ridge: float = _RIDGE) -> None:
         rig = rig.linear("MeshSolver")
         self.names = rig.names
         self.rest = rig.vertices.detach().cpu().double()
@@ -81,9 +82,9 @@ class MeshSolver:
         self._rows = rows - self._rigid @ (self._rigid.T @ rows)
         self._data = (2.0 / len(arms)) * (self._rows.T @ self._rows)
         self.H = self._data.clone()
-        self.H.diagonal().add_(2 * ridge)
+        self.H.diagonal().add_(ridge * float(self.H.diagonal().mean()))
         moved = deltas.norm(dim=-1).amax(0)
-        self._steady = 1 / (1 + (moved / _STEADY) ** 2)
+        self._steady = 1 / (1 + (moved / _STEADY) ** 2) ** 2
         self._share = self._steady / self._steady.sum()
         self._at_rest = self._share @ self.rest
         self._arms = (self.rest - self._at_rest) * self._share[:, None]

@@ -23,6 +23,11 @@ class HeadJoints:
         weights: how much each vertex follows each, (V,J).
         regressor: the positions as means of vertices, (J,V), where the model says how.
         correctives: what each entry of the rotations minus one adds, without the root's, (9(J-1),V,3), millimetres.
+
+    Example:
+        >>> joints = HeadJoints(("neck", "left_eye"), (-1, 0), torch.zeros(2, 3), torch.ones(5, 2) / 2)
+        >>> joints.index("leftEye"), joints.index("jaw")
+        (1, None)
     """
 
     names: tuple[str, ...]
@@ -54,6 +59,11 @@ class SurfacePlaces:
         rows: of iBUG's 68, (L,) int64.
         vertices: around each, (L,3) int64.
         shares: of these, (L,3).
+
+    Example:
+        >>> nose = SurfacePlaces(torch.tensor([30]), torch.tensor([[0, 1, 2]]), torch.tensor([[0.5, 0.5, 0.0]]))
+        >>> nose.on(torch.eye(3)).tolist()
+        [[0.5, 0.5, 0.0]]
     """
 
     rows: Tensor
