@@ -27,6 +27,7 @@ def live(
     size: str = "640x480",
     loop: bool = False,
     seconds: float | None = None,
+    enhance: str | None = None,
     cameras: Annotated[bool, arg(name="list")] = False,
     quiet: Quiet = False,
 ) -> None:
@@ -59,6 +60,8 @@ def live(
         size: WIDTHxHEIGHT to ask the camera for.
         loop: Play a video file again and again.
         seconds: After which it ends; until Ctrl+C if absent.
+        enhance: An actor's model, by name or folder, as `torchface enhance` takes it: when the session ends, each take
+            gets a folder `enhanced` with the actor's wrinkles on its character; the page and --to stay as they are.
         cameras: Only list the cameras.
         quiet: Show no progress.
     """
@@ -76,7 +79,9 @@ def live(
     check_source(camera)
     from torchface.workflows.live.live_anybody import LiveSettings, go_live, person_solver
 
-    settings = LiveSettings(camera, character, mapping, to, record, calibrate, page, port, loop, seconds, sides)
+    settings = LiveSettings(
+        camera, character, mapping, to, record, calibrate, page, port, loop, seconds, enhance, sides
+    )
 
     def opened(url: str) -> None:
         console.print("Open this page; Ctrl+C ends.")

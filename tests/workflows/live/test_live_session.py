@@ -330,6 +330,15 @@ def test_a_mapping_drives_a_character_of_other_names(dome_rig: BlendshapeRig, tm
         load_character(tmp_path / "strange.glb", table)
 
 
+def test_shapes_by_other_programs_names_move(dome_rig: BlendshapeRig, tmp_path: Path) -> None:
+    names = ["A25_Jaw_Open", "Fcl_EYE_Close_L", "mouthSmile_L", "Nase"]
+    save_rig(BlendshapeRig(dome_rig.neutral, dome_rig.deltas, names), tmp_path / "other.glb")
+    moved = load_character(tmp_path / "other.glb")
+    weights = torch.rand(3, 52)
+    expected = weights[:, [JAW, ARKIT.index("eyeBlinkLeft"), SMILE]]
+    torch.testing.assert_close(moved.weights(weights), torch.cat([expected, torch.zeros(3, 1)], 1))
+
+
 def test_characters_that_cannot_move(dome_rig: BlendshapeRig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     from torchface import save_mesh
 

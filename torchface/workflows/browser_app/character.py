@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -12,14 +13,14 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchface.capture.retargeting import ShapeMap, load_shape_rules, shape_map
+from torchface.capture.retargeting import ShapeMap, ShapeRule, load_shape_rules, shape_map
 from torchface.errors import FileFormatError, NameMismatchError, NoShapesError
 from torchface.files.whole_files import read_file
 from torchface.io import load_rig, save_rig
 from torchface.io.gltf.gltf_document import Document, document_of
 from torchface.io.gltf.primitive_reading import read_target_names
 from torchface.io.tables.csv_table import quoted
-from torchface.shape_names import ARKIT
+from torchface.shape_names import ARKIT, mapping, recognised_shapes
 from torchface.synthetic import performer
 
 LARGEST_CHARACTER = 100 * 2**20
@@ -106,7 +107,7 @@ def load_character(path: str | Path | None = None, table: Path | None = None) ->
     else:
         name = Path(path).name if Path(path).suffix.lower() in _GLB else f"{Path(path).stem}.glb"
         data, names = _taken(Path(path)) if Path(path).suffix.lower() in _GLB else _written(Path(path))
-    rules = None if table is None else load_shape_rules(table)
+    rules = _recognised(names) if table is None else load_shape_rules(table)
     try:
         return Character(name, data, shape_map(ARKIT, names, rules))
     except NameMismatchError as error:
@@ -117,6 +118,14 @@ def load_character(path: str | Path | None = None, table: Path | None = None) ->
             "such as jawOpen, or --mapping FILE, a TOML table that says what drives each of them, such as\n"
             f'["{names[0]}"]\nsum = {{jawOpen = 1.0}}'
         ) from error
+
+
+def _recognised(names: Sequence[str]) -> dict[str, ShapeRule]:
+    """Rules for shapes that other programs call otherwise, such as ``A25_Jaw_Open`` or ``Fcl_EYE_Close_L``."""
+    known = mapping(ARKIT, names).any(1).tolist()
+    plain = {name for name, known_one in zip(names, known, strict=True) if known_one}
+    found = recognised_shapes(names).items()
+    return {name: ShapeRule({arkit: 1.0}) for arkit, shape in found for name in shape.names if name not in plain}
 
 
 def _taken(path: Path) -> tuple[bytes, tuple[str, ...]]:

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 
 from torchface.capture.anybody import WebcamControls
-from torchface.errors import ValueRangeError
+from torchface.errors import TorchfaceError, ValueRangeError
 from torchface.files.job_lock import job_lock
 from torchface.io.protocols.stream_address import is_source, parse_source
 from torchface.io.protocols.weight_sender import find_receiver
@@ -24,8 +24,9 @@ from torchface.shape_names import ARKIT
 from torchface.workflows.browser_app.app_folder import CHARACTER, TABLE
 from torchface.workflows.browser_app.built_page import built_page
 from torchface.workflows.browser_app.character import load_character
+from torchface.workflows.enhance.enhance_animation import EnhanceSettings, enhance_animation, load_model
 from torchface.workflows.live.camera import DEFAULT_SIZE
-from torchface.workflows.live.kept_takes import take_rows
+from torchface.workflows.live.kept_takes import ANIMATION, take_rows
 from torchface.workflows.live.live_figures import LiveReport
 from torchface.workflows.live.live_frames import FaceSolver, FrameSource, LiveFrame, Say, SourceSettings, open_source
 from torchface.workflows.live.live_session import LiveSession, Notes
@@ -96,6 +97,7 @@ class LiveSettings:
         port: the first that the page tries.
         loop: play a video file again and again.
         seconds: after which it ends.
+        enhance: an actor's model by name or folder, with which takes are enhanced when the session ends.
         size: width and height to ask a camera for.
     """
 
@@ -109,6 +111,7 @@ class LiveSettings:
     port: int = 8080
     loop: bool = False
     seconds: float | None = None
+    enhance: str | None = None
     size: tuple[int, int] = DEFAULT_SIZE
 
 
@@ -138,6 +141,8 @@ def go_live(
         parse_source(settings.camera)
     if settings.seconds is not None:
         checked_number("seconds", settings.seconds, above=True)
+    if settings.enhance is not None:
+        load_model(settings.enhance)  # which is wrong should not be said after the take
     notes = Notes(say)
     with ExitStack() as stack:
         if settings.record is not None:
@@ -186,7 +191,28 @@ def go_live(
             if recordings.running:
                 progress("writing the recording")
             saved = recordings.finish()
+        if settings.enhance is not None:
+            _enhance(saved, settings.enhance, notes, progress)
         if session.figures.frames == 0:
             raise ValueRangeError(f"{settings.camera}: found no frame, expected at least one")
         wrong = received.receiver.counts.words() if received is not None else ""
         return LiveReport(session.figures, source.dropped, (*((wrong,) if wrong else ()), *streams.notes())), saved
+
+
+ENHANCED = "enhanced"
+"""The folder in a take's with what enhancement writes."""
+
+
+def _enhance(takes: list[SavedTake], model: str, say: Say, progress: Progress) -> None:
+    """Writes each take with an actor's wrinkles beside its files."""
+    for take in takes:
+        if take.error or not take.frames:
+            continue
+        out = take.folder / ENHANCED
+        try:
+            with job_lock(out):
+                done = enhance_animation(take.folder / ANIMATION, model, out, EnhanceSettings(video=False), progress)
+            for line in (*done.lines(), str(done.products["animation"])):
+                say(line)
+        except TorchfaceError as error:
+            say(f"{take.folder}: not enhanced: {error}")
