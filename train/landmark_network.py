@@ -30,6 +30,7 @@ from .model_cards import model_card
 from .recipe_settings import ANY_DEVICE, RecipeSettings
 from .rendered_people.dense_points import dense_places
 from .runner import Recipe, Run, metric_lines, recipe
+from .tensor_shards import Shards
 
 _TEST_BATCH = 64
 _ZOO = "landmark_network"
@@ -88,7 +89,7 @@ def train(settings: Settings, run: Run) -> LandmarkNetwork:
         learned, first_network(settings), settings.network, progress, run.checkpoint, run.device, run.log
     )
     middle = EACH * ((count + len(pictures)) // (2 * EACH))
-    calibrate(model, held_out(model, pictures, count, middle))
+    calibrate(model, held_out(model, pictures, count, middle), Shards(files, ["weights"]).read(0, count)["weights"])
     save(model, settings, measures(held_out(model, pictures, middle, len(pictures))))
     return model
 
@@ -149,10 +150,11 @@ def held_out(model: LandmarkNetwork, pictures: StoredExpressions, first: int, la
     )
 
 
-def calibrate(model: LandmarkNetwork, seen: HeldOut) -> None:
-    """Measures how far the network draws weights toward their means, and how wrong its deviations are."""
+def calibrate(model: LandmarkNetwork, seen: HeldOut, learned: Tensor) -> None:
+    """Measures how far the network draws weights toward their means, and how wrong its deviations are; keeps mean and
+    covariance of the weights that it learned from, (K,52)."""
     if model.dense is not None and seen.dense is not None:
-        model.dense.calibrate(seen.dense.raw, seen.dense.raw_deviation, seen.weights)
+        model.dense.calibrate(seen.dense.raw, seen.dense.raw_deviation, seen.weights, learned)
 
 
 def measures(seen: HeldOut) -> dict[str, float]:

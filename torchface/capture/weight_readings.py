@@ -12,10 +12,6 @@ from torchface.capture.energy import Quadratic
 from torchface.errors import ShapeError
 from torchface.shape_names import ARKIT, mapping
 
-EXPRESSION_SHARE = 0.7
-"""Of the deviation that a network states of an expression, reckoned with beside prior and penalty. Of 1, 0.7 and
-0.5 by the error of four films: 0.125, 0.120 and 0.125, live 0.142, 0.137 and 0.135."""
-
 
 @dataclass(frozen=True, eq=False)
 class WeightReadings:

@@ -11,10 +11,12 @@ from torch import Tensor
 
 from torchface import zoo
 from torchface.capture.own_rig import VideoSettings, VideoSolver
+from torchface.capture.own_rig.face_measurements import FaceMeasurements
 from torchface.capture.own_rig.face_points import FacePoints
 from torchface.capture.own_rig.landmark_offset_estimate import estimate_offsets
 from torchface.capture.own_rig.landmark_offsets import LandmarkOffsets, shifted_points
 from torchface.capture.priors import ShapePrior
+from torchface.capture.weight_readings import WeightReadings
 from torchface.errors import FileFormatError, ValueRangeError
 from torchface.geometry.rotations import rotation_matrix
 from torchface.rig import BlendshapeRig
@@ -220,3 +222,20 @@ def test_frames_left_out_change_little() -> None:
         assert float((some - whole[kept])[3:].abs().mean()) < 0.01
     with pytest.raises(ValueRangeError, match="times that rise"):
         solver(landmarks[:3], seconds=torch.tensor([0.0, 0.1, 0.1]))
+
+
+def test_what_was_read_of_an_expression_that_never_ends_is_no_offset() -> None:
+    """Half a smile and half a frown of the brows for the whole take, which no frame at rest tells from a wide mouth."""
+    constant = {**dict.fromkeys(SMILE, 0.5), "browDownLeft": 0.5, "browDownRight": 0.5}
+    weights, truth = talking(constant), planted_offsets()
+    landmarks, solver = seen(person(), weights, truth), solver_of(person())
+    read = WeightReadings(torch.eye(weights.shape[1]).double(), weights + 0.05, torch.full_like(weights, 0.15))
+    found = {way: estimate_offsets(solver, landmarks, read=given) for way, given in (("read", read), ("guessed", None))}
+    off = {}
+    for way, offsets in found.items():
+        assert offsets is not None
+        solved = solver.shifted(offsets)(landmarks, measured=FaceMeasurements(weights=read)).weights
+        rows = [person().names.index(name) for name in constant]
+        off[way] = float((solved - weights)[:, rows].mean(0).abs().mean())
+    assert off["read"] < 0.12
+    assert off["read"] < 0.7 * off["guessed"]

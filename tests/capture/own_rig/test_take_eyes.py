@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import fields
+
 import pytest
 import torch
 from torch import Tensor
@@ -16,6 +18,7 @@ from torchface.rig import BlendshapeRig
 from torchface.synthetic import performer
 
 FRAMES, SHUT = 60, slice(20, 24)
+TIMES = 200  # that the person does so
 NARROW = 0.21  # openness of this person's open eyes
 K = torch.tensor([[700.0, 0, 319.5], [0, 700.0, 239.5], [0, 0, 1]]).double()
 ROTATION = torch.diag(torch.tensor([1.0, -1, -1]).double()).expand(FRAMES, 3, 3)
@@ -35,7 +38,7 @@ def true_gaze() -> Tensor:
 
 @pytest.fixture(scope="module")
 def eyes(rig: BlendshapeRig) -> TakeEyes:
-    """A narrow-eyed person who blinks once; while the eyes are shut irises are anywhere."""
+    """A narrow-eyed person who blinks once; while the eyes are shut irises are anywhere. Two seconds of a minute."""
     marks = rig.vertices[rig.neutral.landmarks].double()
     placed = marks @ ROTATION[0].T + TRANSLATION[0]
     rays = (placed[:, :2] / placed[:, 2:]).expand(FRAMES, -1, -1)
@@ -44,12 +47,17 @@ def eyes(rig: BlendshapeRig) -> TakeEyes:
     closed, openness = torch.zeros(FRAMES, 2), torch.full((FRAMES, 2), NARROW)
     closed[SHUT], openness[SHUT] = 0.97, 0.06
     openness[40:44] = 1.4 * NARROW
-    reading = FaceReading(
-        (700 * rays + K[:2, 2]).float(), torch.ones(FRAMES, 68), torch.ones(FRAMES, 68), torch.ones(FRAMES),
-        iris.float(), openness, closed, torch.ones(FRAMES, 2),
-    )  # fmt: skip
     middles = torch.stack([0.5 * (placed[a] + placed[b]) for a, b in CORNERS])[:, 2].expand(FRAMES, 2)
-    return take_eyes(reading, rays, iris, ROTATION, middles, torch.ones(FRAMES), Eyeballs.of(rig))
+    rays, iris, closed, openness, turned, middles = (
+        torch.cat([part] * TIMES) for part in (rays, iris, closed, openness, ROTATION, middles)
+    )
+    count = TIMES * FRAMES
+    reading = FaceReading(
+        (700 * rays + K[:2, 2]).float(), torch.ones(count, 68), torch.ones(count, 68), torch.ones(count),
+        iris.float(), openness, closed, torch.ones(count, 2),
+    )  # fmt: skip
+    found = take_eyes(reading, rays, iris, turned, middles, torch.ones(count), Eyeballs.of(rig))
+    return TakeEyes(*(getattr(found, part.name)[:FRAMES] for part in fields(found)))
 
 
 def test_openness_is_beside_the_persons_own(eyes: TakeEyes) -> None:

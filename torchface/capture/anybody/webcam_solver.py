@@ -39,7 +39,6 @@ from torchface.capture.own_rig.gauss_newton import (
 from torchface.capture.own_rig.surface_points import FaceSurfacePoints, alike_errors
 from torchface.capture.own_rig.weight_walk import faded, relative_trust, unseen_time, walk_information
 from torchface.capture.priors import ShapePrior
-from torchface.capture.weight_readings import EXPRESSION_SHARE
 from torchface.errors import NameMismatchError
 from torchface.geometry.cameras.affine_pose import affine_pose, orthonormal
 from torchface.geometry.cameras.calibration import ASSUMED_FIELD_OF_VIEW
@@ -66,7 +65,6 @@ _UNKNOWN, _FADE = 5.0, 0.4  # how much more sparse a face is that nothing is kno
 _EAGER, _EAGER_FOR = 3.0, 0.7  # how much more the first frames of a person count, and for how long, seconds
 _LIDS = ("eyeBlink", "eyeWide", "eyeSquint")
 _LID_MOTION = 3.0
-_LID_RIDGE = {"eyeWide": 16.0, "eyeSquint": 8.0}  # lids that stand a little otherwise are noise, more likely than not
 _CONSTANTS = ("signed", "arkit_signed", "landmark_weights", "camera", "look_eyes", "upright", "damping", "filter_units")
 
 
@@ -159,7 +157,6 @@ class WebcamSolver(nn.Module):
     """
 
     to_arkit: Tensor
-    lid_ridge: Tensor
     influence: Tensor
     open_rows: Tensor
     usual_openness: Tensor
@@ -211,9 +208,6 @@ class WebcamSolver(nn.Module):
         moved = basis.square().sum(1) * landmark_weights[:, None]
         for name, value in {
             "to_arkit": to_arkit,
-            "lid_ridge": torch.tensor(
-                [_LID_RIDGE.get(n.removesuffix("Left").removesuffix("Right"), 0.0) for n in called]
-            ),
             # Share of each landmark in the evidence of each shape, (68,N).
             "influence": moved / moved.sum(0).clamp(min=1e-6),
             "open_rows": rows,
@@ -305,7 +299,7 @@ class WebcamSolver(nn.Module):
             torch.where(shows_face, trust, 1.0),
             _known(deviation.double(), 0.0).clamp(0, 1e3) / focal,
             ((points.double() - centre) / focal, point_deviation.double() / focal),
-            (expression.double(), EXPRESSION_SHARE * expression_deviation.double()),
+            (expression.double(), expression_deviation.double()),
             iris_rays,
             EyesRead(openness.double(), closed.double(), eye_visibility.double()),
             interval,
@@ -345,7 +339,9 @@ class WebcamSolver(nn.Module):
                 there = surface.points.linearised(head, self.camera, surface.rays[None], surface.precision[None])
                 energy = at.energy_beside(there, surface.alike) + damped
             energy = energy + energy_of_step(of_weights, head.weights)
-            free = torch.where(weaker_sides(head.weights, self.signed)[0], 0.0, upper)
+            # A step with both sides free says which of two antagonists it is.
+            tried, _ = split_step(energy, head, upper, dual, _SPLITTING_STEPS, quick=True)
+            free = torch.where(weaker_sides(tried.weights, self.signed)[0], 0.0, upper)
             head, dual = split_step(energy, head, free, dual, _SPLITTING_STEPS, quick=True)
         weights = one_side(head.weights.clamp(min=0).minimum(upper), self.signed)[0]
         head = HeadState(weights[None], head.rotation, head.translation)
@@ -412,7 +408,7 @@ class WebcamSolver(nn.Module):
         pull = self.look_shapes @ signals.gaze_trust[self.look_eyes] / self.settings.gaze_noise**2
         sure = signals.open_trust / self.settings.openness_noise**2
         unknown = torch.exp(-before.learned / _FADE)
-        H = (walked + pull + 2 * self.settings.ridge + self.lid_ridge).diag()
+        H = (walked + pull + 2 * self.settings.ridge).diag()
         f = self.settings.sparsity * (1 + _UNKNOWN * unknown) - walked * mean - pull * looking
         opened = (self.open_rows.T * sure) @ self.open_rows
         return Quadratic((H + opened)[None], (f + (sure * (1 - signals.open)) @ self.open_rows)[None])

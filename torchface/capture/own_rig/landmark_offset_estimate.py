@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
+from torchface.capture.energy import Quadratic
 from torchface.capture.own_rig.face_points import JAW, LANDMARKS
 from torchface.capture.own_rig.frame_states import FrameTerms
 from torchface.capture.own_rig.gauss_newton import HeadState, linearise
@@ -16,6 +17,7 @@ from torchface.capture.own_rig.landmark_offsets import LandmarkOffsets, offset_s
 from torchface.capture.own_rig.resting_frames import activity_of_weights, resting_share
 from torchface.capture.own_rig.state_estimate import Expectation
 from torchface.capture.own_rig.video_solver import VideoSolver
+from torchface.capture.weight_readings import WeightReadings
 from torchface.errors import AlignmentError, ValueRangeError
 from torchface.optim.box_qp import box_qp
 
@@ -40,12 +42,14 @@ class _Mean:
     """What all frames together say of a constant expression (N) and of offsets (204), the heads' poses left to each.
 
     Args:
+        read: what the frames' readings say of the expression on average.
         H, gradient: of half the squared residual, in units of ``_MODEL_ERROR``, (N+204,N+204) and (N+204,).
         weights: the frames' mean, (N,).
         scale: how large offsets are beside what is expected of them.
         noise: what varies of residuals, standard deviation as a share of the eyes' distance.
     """
 
+    read: Quadratic | None
     H: Tensor
     gradient: Tensor
     weights: Tensor
@@ -60,6 +64,7 @@ def estimate_offsets(
     resting: Tensor | None = None,
     identity_modes: Tensor | None = None,
     neutral: int | None = None,
+    read: WeightReadings | None = None,
 ) -> LandmarkOffsets | None:
     r"""The offsets of a rig's landmarks that a take shows, jointly with its poses and weights.
 
@@ -77,8 +82,10 @@ def estimate_offsets(
     expression explains: where rig and finder agree, there are next to none. Then the frames are solved anew.
 
     An expression of most of a take is none that never ends, so the sums are over frames in which the face rests: a
-    twelfth of the frames, or more where more are alike. With modes of other people's heads, offsets are likely as far
-    as those and the finder's habits explain them: no head has its lips apart at rest.
+    twelfth of the frames, or more where more are alike. Where weights were read, the readings' mean, whose error is
+    alike in all frames, says of the constant expression what penalty and rest only guess, and all frames count. With
+    modes of other people's heads, offsets are likely as far as those and the finder's habits explain them: no head has
+    its lips apart at rest.
 
     Args:
         solver: of the rig, without offsets; its prior holds for the frames.
@@ -88,6 +95,7 @@ def estimate_offsets(
         identity_modes: what a standard deviation of each of K ways of being another person adds to the landmarks,
             (K,68,3), millimetres.
         neutral: a frame in which the face has no expression; those beside it are taken as like it.
+        read: what networks read of the frames' weights.
 
     Returns:
         The offsets and the noise that is left; None where fewer than ten frames show a face, which are too few to know
@@ -113,20 +121,28 @@ def estimate_offsets(
     chosen = shown[torch.linspace(0, len(shown) - 1, min(_SEARCHED, len(shown))).round().long()]
     likely = None if identity_modes is None else _likely_offsets(identity_modes.to(landmarks).double())
     with torch.no_grad():
-        take = _Take(landmarks[chosen].double(), trust[chosen], None if resting is None else resting[chosen].double())
+        if read is not None and neutral is None:
+            resting = torch.ones(len(landmarks), device=landmarks.device)
+        rest = None if resting is None else resting[chosen].double()
+        take = _Take(landmarks[chosen].double(), trust[chosen], rest, None if read is None else read.of_frames(chosen))
         return _estimated(solver, take, likely, neutral is not None)
 
 
 @dataclass(frozen=True, eq=False)
 class _Take:
-    """Landmarks (B,68,2), how far they are trusted, (B,68), and how far the face rests, (B,), where that is known."""
+    """Landmarks (B,68,2), how far they are trusted, (B,68), how far the face rests, (B,), and readings, where known."""
 
     landmarks: Tensor
     trust: Tensor
     resting: Tensor | None
+    read: WeightReadings | None = None
 
     def of_frames(self, frames: Tensor) -> _Take:
-        return _Take(self.landmarks[frames], self.trust[frames], None if self.resting is None else self.resting[frames])
+        if frames.dtype == torch.bool:
+            frames = frames.nonzero()[:, 0]
+        rest = None if self.resting is None else self.resting[frames]
+        read = None if self.read is None else self.read.of_frames(frames)
+        return _Take(self.landmarks[frames], self.trust[frames], rest, read)
 
 
 def _likely_offsets(modes: Tensor) -> Tensor:
@@ -152,7 +168,7 @@ def _estimated(solver: VideoSolver, take: _Take, likely: Tensor | None, neutral:
     head = HeadState(nothing, poses.rotation[poses.found], poses.translation[poses.found])
     if take.resting is None:
         head, _, _ = _solved(solver, take, head)
-        take = _Take(take.landmarks, take.trust, resting_share(activity_of_weights(head.weights, solver.names)))
+        take = replace(take, resting=resting_share(activity_of_weights(head.weights, solver.names)))
     assert take.resting is not None
     calm = take.resting.argsort(descending=True)[: max(_FRAMES, least)].sort().values
     take, head = take.of_frames(calm), HeadState(head.weights[calm], head.rotation[calm], head.translation[calm])
@@ -190,14 +206,17 @@ def _split(
     lower = pad(torch.zeros_like(mean.weights), (0, len(likely)), value=-_FREE)
     solution = here
     for _ in range(_REWEIGHTINGS):  # each penalty is by the weights that the one before led to
-        falls = 1.0 if expression is None else 1 / (1 + expression / _SOFTENING)
+        read, falls = mean.read, 1.0 if expression is None else 1 / (1 + expression / _SOFTENING)
         penalty = pad(_PENALTY * falls * torch.ones_like(mean.weights), (0, len(likely)))
         program = H
         if solver is not None and solver.prior is not None:
             learned = solver.prior.energy((mean.weights if expression is None else expression)[None])
-            strength = _PRIOR / solver.prior.strength
+            strength = (_PRIOR if read is None else 1.0) / solver.prior.strength
             program = H + strength * pad(learned.H[0], 2 * (0, len(likely)))
-            penalty = penalty + strength * pad(learned.f[0], (0, len(likely)))
+            penalty = (read is None) * penalty + strength * pad(learned.f[0], (0, len(likely)))
+        if solver is not None and read is not None:
+            program = program + pad(read.H[0], 2 * (0, len(likely)))
+            penalty = penalty + pad(read.f[0], (0, len(likely)))
         solution = box_qp(program, (f + penalty)[None], lower, upper)[0]
         expression = solution[:count]
     noise = min(mean.noise, before.noise)
@@ -210,7 +229,8 @@ def _solved(solver: VideoSolver, take: _Take, start: HeadState) -> tuple[HeadSta
     precision = (solver.landmark_weights.double() * take.trust).sqrt() / noise[:, None]
     known = take.landmarks.nan_to_num(0.0)
     information = solver.initial_information.double().diag().expand(len(known), -1, -1)
-    terms = FrameTerms(known, precision, start.rotation, start.translation, Expectation(start, information))
+    read = None if take.read is None else take.read.energy()
+    terms = FrameTerms(known, precision, start.rotation, start.translation, Expectation(start, information), read=read)
     return solver.solve(terms, start)[0], terms, noise
 
 
@@ -238,7 +258,12 @@ def _mean_problem(solver: VideoSolver, take: _Take, start: HeadState, likely: Te
     factor = (unit / _MODEL_ERROR) ** 2
     H = factor * torch.einsum("t,tij,tik->jk", share, left, by_both)
     gradient = factor * torch.einsum("t,tij,ti->j", share, left, rest)
+    read = None
+    if terms.read is not None:
+        H_read = torch.einsum("t,tij->ij", share, terms.read.H)
+        read = Quadratic(H_read[None], (share @ terms.read.f)[None])
     mean = _Mean(
+        read,
         0.5 * (H + H.T),
         gradient,
         share @ head.weights,

@@ -34,11 +34,11 @@ _LOWEST, _HIGHEST = (
 _LEAST_SPAN = 0.05
 _NOISE, _PIXELS = 0.08, 0.5  # of openness beside the open eye's; and what lids are off by, of their stated deviation
 _BLINK_NOISE = 0.1  # of eyeBlink where the eye is surely shut
-_LIDS = {"eyeWide": 0.35, "eyeSquint": 0.5}  # lids that stand a little otherwise are noise, more likely than not
 _GAZE_NOISE = 0.03  # of eyeLook's weights
 _STRAYS = 0.35  # radians: what is further to the side or up is no looking straight ahead
-_LASTING = (1.0, 0.3)  # people look up or down for long, to one side for long only as their eyes lie otherwise
-_STRAIGHT_FRAMES = 15.0  # that looking straight as people usually do counts as
+# Frames that eyes open, and looking straight, as people usually have them count as: people squint and look aside for
+# seconds.
+_OPEN_FRAMES, _STRAIGHT_FRAMES = 90.0, 240.0
 _VERGENCE = 0.12  # radians from straight, of each eye at most
 _LEAST_GAZE = 0.3  # trust, under which a gaze is that of before
 _DISAGREE = 0.08  # of openness by landmarks and by the eye network, at which lids' landmarks count half
@@ -79,7 +79,6 @@ class TakeEyes:
         one = torch.eye(len(called)).double()
         shut = ((self.closed.nan_to_num(0.0) - 0.5) / (SURELY_SHUT - 0.5)).clamp(0, 1).double()
         rows, values, deviation = [opened], [self.open.double() - 1], [self.open_deviation.double()]
-        known = torch.isfinite(self.open)
         looks = look_weights(self.gaze.double(), eyeballs.turns)
         sides = torch.tensor([0, 0, 1, 1, 0, 0, 1, 1])
         for number, name in enumerate(called):
@@ -91,12 +90,10 @@ class TakeEyes:
                 values.append(looks[:, place : place + 1])
                 trust = self.gaze_trust[:, sides[place : place + 1]].double()
                 deviation.append(_GAZE_NOISE / trust.sqrt())
-            elif kind in _LIDS or kind == "eyeBlink":
+            elif kind == "eyeBlink":
                 rows.append(one[number : number + 1])
-                values.append(torch.full_like(shut[:, :1], float(kind == "eyeBlink")))
-                sure = _BLINK_NOISE / shut[:, eye : eye + 1].sqrt()
-                quiet = torch.where(known[:, eye : eye + 1], _LIDS.get(kind, torch.inf), torch.inf)
-                deviation.append(sure if kind == "eyeBlink" else quiet.double())
+                values.append(torch.ones_like(shut[:, :1]))
+                deviation.append(_BLINK_NOISE / shut[:, eye : eye + 1].sqrt())
         return WeightReadings(torch.cat(rows), torch.cat(values, 1), torch.cat(deviation, 1))
 
     def agreed(self, trust: Tensor) -> Tensor:
@@ -181,7 +178,8 @@ def _levels(openness: Tensor, by_look: Tensor, shut: Tensor, counts: Tensor, res
             continue
         values = openness[is_open, eye] / by_look[is_open, eye]
         high = values.quantile(_HIGHEST)
-        level.append(_weighted_median(values, resting[is_open] + 1e-3).clamp(_LOWEST * high, high))
+        own = _weighted_median(values, resting[is_open] + 1e-3).clamp(_LOWEST * high, high)
+        level.append(own + (_USUAL_OPEN - own) * _OPEN_FRAMES / (len(values) + _OPEN_FRAMES))
     return torch.stack(lowest), torch.stack(level)
 
 
@@ -198,7 +196,7 @@ def _one_gaze(raw: Tensor, trust: Tensor) -> tuple[Tensor, Tensor]:
         frames = trust[:, eye] > _LEAST_GAZE
         if bool(frames.any()):
             lasting = raw[frames, eye].clamp(-_STRAYS, _STRAYS).median(0).values
-            straight[eye] = lasting * lasting.new_tensor(_LASTING) * frames.sum() / (frames.sum() + _STRAIGHT_FRAMES)
+            straight[eye] = lasting * frames.sum() / (frames.sum() + _STRAIGHT_FRAMES)
     ahead = raw - straight
     share = (trust + 1e-3)[..., None]
     both = (share * ahead).sum(1) / share.sum(1)

@@ -319,10 +319,12 @@ class VideoSolver(VideoSolverParts):
             for iteration in range(self.settings.steps):
                 if 0 < iteration < SLIDING_STEPS:
                     rows = self.chosen(head)
-                rest = weaker_sides(head.weights, self.signed)
+                # The first step says which of two antagonists it is: in the next the other is at rest.
+                rest = weaker_sides(head.weights, self.signed) & (iteration > 0)
                 before, head = head, box_step(self.energy(terms, head, rows), head, *box, exactness, rest)
-                head = HeadState(one_side(head.weights, self.signed), head.rotation, head.translation)
-                if float((head.weights - before.weights).abs().max()) < self.settings.tolerance:
+                if iteration > 0:
+                    head = HeadState(one_side(head.weights, self.signed), head.rotation, head.translation)
+                if iteration > 0 and float((head.weights - before.weights).abs().max()) < self.settings.tolerance:
                     break
         # Copies, as autograd refuses tensors that were made without it.
         head, rows = head.mapped(torch.clone), rows.clone()

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from torchface.capture.own_rig import FaceMeasurements, VideoSolver
 from torchface.capture.own_rig.surface_offsets import surface_offsets
-from torchface.capture.weight_readings import EXPRESSION_SHARE, WeightReadings
+from torchface.capture.weight_readings import WeightReadings
 from torchface.geometry.cameras.distortion import undistort
 from torchface.landmarks.images.face_reading import FaceReading, trust_of
 from torchface.temporal.adaptive_kalman import LANDMARK_SETTINGS, adaptive_filter
@@ -32,8 +32,7 @@ def take_measurements(inputs: TrackInputs, solver: VideoSolver, reading: FaceRea
         spread = reading.point_deviation
     read = None
     if bool(torch.isfinite(reading.expression_deviation).any()):
-        deviations = EXPRESSION_SHARE * reading.expression_deviation
-        read = WeightReadings.of_expression(reading.expression, deviations, solver.names)
+        read = WeightReadings.of_expression(reading.expression, reading.expression_deviation, solver.names)
     return FaceMeasurements(deviation, points, spread, read)
 
 

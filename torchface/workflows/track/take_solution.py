@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
 from torch import Tensor
 
+from torchface.capture.antagonist_shapes import signed_difference, signed_quantities
 from torchface.capture.own_rig import FaceMeasurements, VideoSolution, VideoSolver
 from torchface.capture.own_rig.another_face import AnotherFace, other_faces
 from torchface.capture.own_rig.eye_geometry import CORNERS, LOOKS, Eyeballs, arkit_names, openness_rows
@@ -21,6 +23,7 @@ from torchface.capture.own_rig.resting_frames import activity_of_readings, resti
 from torchface.capture.own_rig.take_eyes import TakeEyes, take_eyes
 from torchface.capture.own_rig.take_solve import solve_take
 from torchface.capture.own_rig.weight_walk import frame_intervals
+from torchface.capture.weight_readings import WeightReadings
 from torchface.errors import AlignmentError, FileFormatError, ValueRangeError
 from torchface.files.checkpoints import read_checkpoint, write_checkpoint
 from torchface.files.content_keys import content_key
@@ -30,6 +33,7 @@ from torchface.landmarks.images.face_reading import FaceReading
 from torchface.progress import Progress
 from torchface.rig import BlendshapeRig
 from torchface.shape_names import ARKIT
+from torchface.temporal import savitzky_golay
 from torchface.temporal.adaptive_kalman import LANDMARK_SETTINGS, adaptive_filter, adaptive_smoother
 from torchface.workflows.track.track_inputs import METHOD, TrackInputs
 from torchface.workflows.track.track_models import identity_modes
@@ -37,6 +41,10 @@ from torchface.workflows.track.track_state import TrackState
 
 OFFSETS = "landmark_offsets.json"
 _SOLUTION = "solution.safetensors"
+_LEAST_WINDOW = 5  # frames
+MOTION = 2.4
+"""How far a weight wanders in a second in a take's solve, standard deviation: the frames after calm what jitters."""
+_CALM = 0.23  # seconds over which weights are calmed; those of blinks are not
 
 
 def frame_times(inputs: TrackInputs, count: int) -> Tensor | None:
@@ -127,8 +135,11 @@ def new_offsets(
     Raises:
         ValueRangeError: the neutral frame is none of the take, or shows no face.
     """
+    read = None
+    if solver.prior is not None and solver.prior.centered and bool(torch.isfinite(reading.expression_deviation).any()):
+        read = WeightReadings.of_expression(reading.expression, reading.expression_deviation, solver.names)
     offsets = estimate_offsets(
-        solver, landmarks, reading.trust, known_rest(reading), identity_modes(), inputs.settings.neutral_frame
+        solver, landmarks, reading.trust, known_rest(reading), identity_modes(), inputs.settings.neutral_frame, read
     )
     if offsets is None:
         return None
@@ -233,9 +244,27 @@ def new_solution(
         ValueRangeError: no frame shows enough of them; the message names the video or table.
     """
     try:
-        return solve_take(solver, landmarks, trust, times, inputs.settings.whole_take, progress, measured)
+        solution = solve_take(solver, landmarks, trust, times, inputs.settings.whole_take, progress, measured)
     except ValueRangeError as error:
         raise ValueRangeError(f"{inputs.clip.path}: {error}") from error
+    weights = calmed(solution.weights, solver.names, inputs.clip.fps)
+    return solver.solution(landmarks, trust, weights, solution.rotation, solution.translation)
+
+
+def calmed(weights: Tensor, names: Sequence[str], fps: float) -> Tensor:
+    """Weights (T,N) as parabolas through the frames on both sides of each have them, without lag; blinks as they are.
+
+    Example:
+        >>> noisy = torch.rand(60, 1, generator=torch.Generator().manual_seed(0))
+        >>> bool(calmed(noisy, ["jawOpen"], 30.0).diff(dim=0).std() < 0.5 * noisy.diff(dim=0).std())
+        True
+    """
+    window = 2 * round(0.5 * _CALM * fps) + 1
+    if not _LEAST_WINDOW <= window <= len(weights):
+        return weights
+    blinks = torch.tensor([name.startswith("eyeBlink") for name in arkit_names(names)], device=weights.device)
+    calm = signed_difference(savitzky_golay(weights, window).clamp(0, 1), signed_quantities(names).to(weights.device))
+    return torch.where(blinks, weights, calm)
 
 
 def keep_solution(state: TrackState, key: str, solution: VideoSolution) -> None:

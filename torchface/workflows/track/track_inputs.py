@@ -32,7 +32,7 @@ from torchface.workflows.track.track_models import (
     load_track_models,
 )
 
-METHOD = "track/7"
+METHOD = "track/8"
 """Of the keys; another number where the same inputs, or pieces of another length, come to give other results."""
 
 Overlay = Literal["side", "over", "none"]
@@ -126,9 +126,9 @@ class TrackInputs:
         neutral = self.settings.neutral_frame
         return self.reading_key if neutral is None else content_key(self.reading_key, neutral_frame=neutral)
 
-    def solver(self, fps: float | None = None) -> VideoSolver:
-        """The solver of the rig, for landmarks that the models find, at a frame rate."""
-        return solver_for(self.actor, self.models, self.calibration, fps)
+    def solver(self, fps: float | None = None, motion: float | None = None) -> VideoSolver:
+        """The solver of the rig, for landmarks that the models find, at a frame rate; ``motion`` as of its settings."""
+        return solver_for(self.actor, self.models, self.calibration, fps, motion)
 
     def check_length(self, frames: int) -> None:
         """Raises a ``ValueRangeError`` where a take is too short for the dynamics prior's window."""
@@ -205,12 +205,20 @@ def load_actor(rig: Path, part: str | None) -> BlendshapeRig:
 
 
 def solver_for(
-    rig: BlendshapeRig, models: TrackModels, calibration: CameraCalibration, fps: float | None = None
+    rig: BlendshapeRig,
+    models: TrackModels,
+    calibration: CameraCalibration,
+    fps: float | None = None,
+    motion: float | None = None,
 ) -> VideoSolver:
-    """The solver of a rig, for landmarks that the models find, at a frame rate."""
+    """The solver of a rig, for landmarks that the models find, at a frame rate; see :meth:`TrackInputs.solver`."""
     settings = VideoSettings.of_found_landmarks(models.dynamics is not None, models.appearance is not None, fps)
-    surface = counted_sites(rig, models.places)
-    return VideoSolver(rig, None, calibration.intrinsics, models.prior, models.dynamics, settings, surface=surface)
+    surface, prior = counted_sites(rig, models.places), models.prior
+    if motion is not None and models.dynamics is None:
+        settings = replace(settings, motion=motion)
+    if models.expected is not None:
+        prior, settings = models.expected, replace(settings, sparsity=0.0)
+    return VideoSolver(rig, None, calibration.intrinsics, prior, models.dynamics, settings, surface=surface)
 
 
 def _clip(video: Path | None, settings: TrackSettings) -> VideoFile:

@@ -47,6 +47,8 @@ class TrackModels:
         finder: finds landmarks in any face; absent where they are given.
         appearance: refines them on the actor's own.
         prior: which weights faces have.
+        expected: which weights the finder's network learned from, for the rig's shapes: what its readings of
+            expressions are solved with instead, where no prior was named; None where it reads none.
         dynamics: how weights go on.
         unlearned: shapes of the rig that a prior says nothing of: they stay near rest.
         seeing: changes when what finds landmarks does.
@@ -62,6 +64,7 @@ class TrackModels:
     seeing: str = ""
     solving: str = ""
     places: Tensor = field(default_factory=lambda: torch.zeros(0, 3))
+    expected: ShapePrior | None = None
 
 
 def is_table(landmarks: str | Path | None) -> bool:
@@ -106,7 +109,13 @@ def load_track_models(
         ),
         content_key("solving", prior=learned, dynamics=_folder(dynamics), fps=fps),
         torch.zeros(0, 3) if named is None else named.places,
+        None if named is None or prior != DEFAULT_PRIOR else for_rig(named.expected, rig),
     )
+
+
+def for_rig(expected: ShapePrior | None, rig: BlendshapeRig) -> ShapePrior | None:
+    """What a network expects, for a rig's shapes; None where it knows less than half of them."""
+    return expected.renamed(rig.names) if expected is not None and _knows(expected, rig) else None
 
 
 @dataclass(frozen=True)

@@ -22,6 +22,7 @@ from torchface.workflows.track.overlay_video import write_overlay
 from torchface.workflows.track.person_head import person_head
 from torchface.workflows.track.take_measurements import measuring_solver, take_measurements
 from torchface.workflows.track.take_solution import (
+    MOTION,
     frame_times,
     judged_reading,
     keep_solution,
@@ -92,7 +93,7 @@ def _track(inputs: TrackInputs, out: Path, filmed: bool, progress: Progress) -> 
         with _timed(seconds, "head"):
             head = person_head(inputs, inputs.heads, landmarks, reading, progress)
         inputs = replace(inputs, actor=head.rig)
-    trust, solver = reading.trust, inputs.solver(inputs.clip.fps)
+    trust, solver = reading.trust, inputs.solver(inputs.clip.fps, MOTION)
     offsets = known_offsets(inputs, out)
     if offsets is None or offsets.video != inputs.offsets_key:
         with _timed(seconds, "offsets"):

@@ -16,6 +16,7 @@ LEAST_SLOPE = 0.15
 """Slope of a weight as it is read over the true one, under which the weight cannot be seen."""
 
 _OWN, _SHARED, _UNDER = 3, 3, 8  # numbers read off the features of a point: its own, and those that all others see
+_LEAST_VARIANCE = 1e-3  # added to those of weights: shapes that hardly moved may move
 _OFFSET = 0.1  # of the face's size, a unit of what features move a point by
 
 
@@ -51,6 +52,7 @@ class DenseHead(nn.Module):
         hidden: units of h.
         channels: of the features.
         deep: deepest features.
+        expects: whether it says which weights it learned from; :meth:`calibrate` makes it so.
 
     Source: Wood et al. 2022 (many points with a deviation each, from rendered pictures).
     """
@@ -60,8 +62,10 @@ class DenseHead(nn.Module):
     slope: Tensor
     offset: Tensor
     spread: Tensor
+    mean: Tensor | None
+    factor: Tensor | None
 
-    def __init__(self, points: int, hidden: int, channels: int, deep: int) -> None:
+    def __init__(self, points: int, hidden: int, channels: int, deep: int, expects: bool = False) -> None:
         super().__init__()
         self.register_buffer("places", torch.zeros(points, 3))
         self.register_buffer("mirror", torch.arange(points))
@@ -69,6 +73,9 @@ class DenseHead(nn.Module):
         self.register_buffer("slope", torch.ones(WEIGHTS))
         self.register_buffer("offset", torch.zeros(WEIGHTS))
         self.register_buffer("spread", torch.ones(WEIGHTS))
+        # Of the weights of faces that it learned from: mean, and L of the precision L L^T.
+        self.register_buffer("mean", torch.zeros(WEIGHTS) if expects else None)
+        self.register_buffer("factor", torch.zeros(WEIGHTS, WEIGHTS) if expects else None)
         self.form = nn.Linear(2 * COUNT, 2 * points)
         self.local = nn.Parameter(0.05 * torch.randn(points, channels, _OWN + _SHARED))
         self.under = nn.Parameter(0.1 * torch.randn(COUNT, channels, _UNDER))
@@ -112,13 +119,20 @@ class DenseHead(nn.Module):
         return (raw - self.offset) / slope, torch.where(seen, self.spread * deviation / slope, torch.inf)
 
     @torch.no_grad()
-    def calibrate(self, raw: Tensor, deviation: Tensor, truth: Tensor) -> None:
+    def calibrate(self, raw: Tensor, deviation: Tensor, truth: Tensor, learned: Tensor | None = None) -> None:
         """Measures how far weights are drawn toward their means, by regression of what is read on the truth.
 
         Args:
             raw, deviation: as read of faces of people that were not learned from, (M,52).
             truth: (M,52); a weight that does not vary counts as one that cannot be seen.
+            learned: weights of faces that were learned from, (K,52), whose mean and covariance solvers expect where
+                nothing is seen; the truth if absent.
         """
+        population = (truth if learned is None else learned).double()
+        covariance = torch.cov(population.T) + _LEAST_VARIANCE * torch.eye(WEIGHTS).double()
+        precision = torch.cholesky_inverse(torch.linalg.cholesky(covariance))
+        self.mean = population.mean(0).to(self.slope)
+        self.factor = torch.linalg.cholesky(precision).to(self.slope).contiguous()
         about, mean = truth - truth.mean(0), raw.mean(0)
         variance = about.square().mean(0)
         slope = (about * (raw - mean)).mean(0) / variance.clamp(min=1e-6)

@@ -75,6 +75,7 @@ class LandmarkNetwork(nn.Module):
         decoder: channels of the decoder at a quarter.
         points: P, how many points of the face it finds beside the 68: where they are, ``places`` has.
         hidden: units of the head that finds them and reads the expression.
+        expects: whether that head says which weights it learned from.
 
     Source: Newell, Yang, Deng 2016 (encoder and decoder); Sun et al. 2018 (means of heat maps); Kumar et al. 2020
     (uncertainty and visibility beside places).
@@ -97,6 +98,7 @@ class LandmarkNetwork(nn.Module):
         decoder: int = 32,
         points: int = 0,
         hidden: int = 176,
+        expects: bool = False,
     ) -> None:
         super().__init__()
         if not (32 <= size <= _MOST_SIZE and size % 16 == 0 and 0.5 <= margin <= 4):
@@ -131,7 +133,7 @@ class LandmarkNetwork(nn.Module):
         self.local_bias = nn.Parameter(torch.zeros(COUNT, 2))
         self.presence = nn.Linear(sixteenth, 1)
         self.points, self.hidden = points, hidden
-        self.dense = DenseHead(points, hidden, decoder, sixteenth) if points else None
+        self.dense = DenseHead(points, hidden, decoder, sixteenth, expects) if points else None
 
     @classmethod
     def fit(
@@ -183,21 +185,29 @@ class LandmarkNetwork(nn.Module):
         return {
             "size": self.size, "margin": self.margin, "channels": list(self.channels), "blocks": list(self.blocks),
             "decoder": self.decoder, "points": self.points, "hidden": self.hidden,
+            "expects": int(self.learned_weights is not None),
         }  # fmt: skip
 
     @classmethod
     def from_config(cls, config: dict[str, Any]) -> Self:
-        given = Value("config", "", {"points": 0, "hidden": 176} | config).table()
+        given = Value("config", "", {"points": 0, "hidden": 176, "expects": 0} | config).table()
         return cls(
             given["size"].whole(), given["margin"].number(), tuple(one.whole() for one in given["channels"].rows()),
             tuple(one.whole() for one in given["blocks"].rows()), given["decoder"].whole(),
-            given["points"].whole(), given["hidden"].whole(),
+            given["points"].whole(), given["hidden"].whole(), bool(given["expects"].whole()),
         )  # fmt: skip
 
     @property
     def places(self) -> Tensor:
         """Where its points are on the embedded performer's mean head, (P,3) millimetres."""
         return torch.zeros(0, 3) if self.dense is None else self.dense.places
+
+    @property
+    def learned_weights(self) -> tuple[Tensor, Tensor] | None:
+        """Mean (52,) and L (52,52) of the precision L L^T of the weights of faces that it learned from, if known."""
+        if self.dense is None or self.dense.mean is None or self.dense.factor is None:
+            return None
+        return self.dense.mean, self.dense.factor
 
     @property
     def mirror(self) -> Tensor:
@@ -215,7 +225,7 @@ class LandmarkNetwork(nn.Module):
             hidden: units of the head.
             size: of its crops, pixels a side; as this one's if absent. Of crops of another size it is to learn first.
         """
-        config = {"points": len(places), "hidden": hidden, "size": size or self.size}
+        config = {"points": len(places), "hidden": hidden, "size": size or self.size, "expects": 0}
         network = LandmarkNetwork.from_config(self.config | config)
         own = {name: value for name, value in self.state_dict().items() if not name.startswith("dense.")}
         network.load_state_dict(network.state_dict() | own)
