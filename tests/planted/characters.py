@@ -272,6 +272,14 @@ def _cap() -> tuple[Tensor, Tensor]:
 def _vrm(root: dict[str, Any], how: Planted, shapes: list[str]) -> None:
     node = {bone["name"].removeprefix(how.prefix).lower(): i for i, bone in enumerate(root["nodes"])}
     bones = {name: node[name] for name in ("hips", "spine", "neck", "head")}
+    for parent, limb in (("hips", ("UpperLeg", "LowerLeg", "Foot")), ("spine", ("UpperArm", "LowerArm", "Hand"))):
+        for side, across in (("left", 1.0), ("right", -1.0)):
+            above = bones[parent]
+            for bone in limb:  # bones that VRM asks for and nothing is bound to
+                bones[side + bone] = len(root["nodes"])
+                root["nodes"].append({"name": side + bone, "translation": [0.1 * across, -0.1, 0.0]})
+                root["nodes"][above].setdefault("children", []).append(bones[side + bone])
+                above = bones[side + bone]
     root["extensionsUsed"] = [how.vrm]
     index = {name: row for row, name in enumerate(shapes)}
     if how.vrm == "VRMC_vrm":
