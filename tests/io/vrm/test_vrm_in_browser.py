@@ -109,7 +109,7 @@ def test_an_animation_still_plays(browser: str, tmp_path: Path, data: Path) -> N
     write_character(avatar, HEAD, how=Planted(vrm="VRMC_vrm"))
     document = read_document(avatar)
     moved = np.zeros((1, 44, 3), np.float32)
-    root, data = document_with_targets(document, [AddedTargets(0, (0,), moved)], ["jawOpen"])
-    write_edited(document, root, data, avatar)
+    root, added = document_with_targets(document, [AddedTargets(0, (0,), moved)], ["jawOpen"])
+    write_edited(document, root, added, avatar)
     found = seen(browser, avatar, tmp_path, data / "characters" / "test.vrma")
     assert max(found["turned"].values()) > 0.01  # radians
