@@ -9,13 +9,15 @@ import torch
 from torch import Tensor
 
 from torchface.capture.energy import Quadratic
-from torchface.capture.weight_readings import EXPRESSION_SHARE, WeightReadings
+from torchface.capture.weight_readings import WeightReadings
 from torchface.landmarks import FaceReading
 from torchface.modeling import FitSettings
 from torchface.modeling.photographs.image_solve import ExpressionPrior, SurfacePoints, WeightQuadratic
 from torchface.rig import BlendshapeRig
 from torchface.workflows.fit.fit_landmarks import PhotographLandmarks
 from torchface.workflows.surface_sites import sites_on_rig
+
+_SHARE = 0.7  # of the deviations that a network states of an expression, reckoned with beside a prior about rest
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,7 +58,7 @@ def with_readings(settings: FitSettings, found: Sequence[PhotographLandmarks], r
         settings = replace(settings, surface=surface)
     if bool(torch.isfinite(readings.expression).any()):
         read = WeightReadings.of_expression(
-            readings.expression.double(), EXPRESSION_SHARE * readings.expression_deviation.double(), rig.names
+            readings.expression.double(), _SHARE * readings.expression_deviation.double(), rig.names
         )
         settings = replace(settings, expression_prior=ReadExpressions(settings.expression_prior, read))
     return settings
