@@ -18,6 +18,7 @@ from torchface.workflows.live import live_anybody
 from torchface.workflows.live.live_anybody import LiveSettings, go_live
 
 
+@pytest.mark.bench
 def test_a_take_gets_the_models_wrinkles(actor: Actor, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     nobody = FaceBoxes(torch.zeros(0, 4), torch.zeros(0))
     monkeypatch.setattr(live_anybody, "shipped_detector", lambda: lambda picture: nobody)

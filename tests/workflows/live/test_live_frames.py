@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from contextlib import closing
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -194,6 +195,15 @@ def test_a_video_that_is_recorded_loses_no_frame(tmp_path: Path, clock: Clock) -
         clock.sleep(0.07)
     assert played.dropped == 0
     assert times == pytest.approx([100 + number / 50 for number in range(10)])  # the film's own
+
+
+def test_a_video_that_loops_begins_anew_without_a_pause(tmp_path: Path, clock: Clock) -> None:
+    write_video([torch.zeros(5, 3, 32, 48, dtype=torch.uint8)], tmp_path / "film.avi", 50.0)
+    played = PlayedVideo(tmp_path / "film.avi", SourceSettings(loop=True))
+    times = [came for came, _ in islice(played.frames(), 12)]
+    assert times[:5] == pytest.approx([100 + number / 50 for number in range(5)])
+    assert np.diff(times).max() <= 0.02 + 1e-6
+    assert len(times) == 12
 
 
 def test_planes_are_the_picture() -> None:

@@ -144,6 +144,10 @@ class LiveSession:
             self._notes(str(error))
             raise
 
+    def left(self) -> None:
+        """A page was closed, which may have asked for a pose."""
+        self._pose = 0
+
     def _set(self, controls: object) -> None:
         solver = controls.get("solver") if isinstance(controls, dict) else None
         weights = controls.get("weights") if isinstance(controls, dict) else None
@@ -196,7 +200,7 @@ class LiveSession:
                     self._view = LiveView(came, interval, 1000 * (now - came), picture, wanted, self.figures.frames)
                     self._changed.notify_all()
                 self._keep(came, wanted)
-                self._advance(interval, solved.seen)
+                self._advance(interval, solved)
                 before = came
                 if self._watch is not None:
                     self._watch.look(picture, solved, now)
@@ -223,7 +227,7 @@ class LiveSession:
                 self._recordings.stop()
                 self._notes(f"the recording ended: {error}")
 
-    def _advance(self, interval: float, seen: bool) -> None:
+    def _advance(self, interval: float, solved: LiveFrame) -> None:
         calibration = self._calibration
         if calibration is None:
             return
@@ -231,9 +235,10 @@ class LiveSession:
         if words != self._prompted:
             self._prompted = words
             self._prompt(words)
-        after = calibration.after(interval, seen)
+        after = calibration.after(interval, solved)
         if self._calibration is calibration:  # else the page has begun another meanwhile
             self._calibration = after
         if after is None:
             self._prompted = ""
-            self._prompt("The calibration has ended")
+            missed = calibration.missed
+            self._prompt("Calibrated" if not missed else f"Calibrated; not seen: {'; '.join(missed)}")

@@ -60,6 +60,9 @@ class LiveDesk(Protocol):
             TorchfaceError: it cannot be done.
         """
 
+    def left(self) -> None:
+        """A page was closed, which may have asked for a pose."""
+
 
 class PageServer:
     """Serves the page until it is stopped.
@@ -146,6 +149,8 @@ class PageServer:
                     self._take(message)
         except ConnectionClosed:
             pass
+        if private:
+            self._desk.left()
         sender.join(2 * _WAIT)
 
     def _take(self, message: str | bytes) -> None:

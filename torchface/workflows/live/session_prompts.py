@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
 
+from torchface.shape_names import ARKIT
 from torchface.workflows.live.live_frames import LiveFrame, planes
 
 _STEP, _READY = 2.0, 0.7  # seconds a face, and those in which the person gets into it
@@ -23,20 +24,48 @@ STEPS = (
 """What is asked for, in words; poses 1 to 5 of the solver."""
 
 
+_SHAPES = (
+    (),
+    ("jawOpen",),
+    ("mouthSmileLeft", "mouthSmileRight"),
+    ("browInnerUp",),
+    ("eyeBlinkLeft", "eyeBlinkRight"),
+)
+_SEEN_IN = tuple(tuple(ARKIT.index(name) for name in names) for names in _SHAPES)
+_LEAST = 0.2  # of a weight over rest: a pose that is shown
+
+
 @dataclass(frozen=True)
 class GuidedCalibration:
-    """How far it is; the clock stands while no face is seen.
+    """How far it is, where no page guides; the clock stands while no face is seen.
 
     Args:
         elapsed: seconds, 0 to 10.
+        rest: weights of each pose's shapes at rest, (5,).
+        most: and the largest while it was asked for, (5,).
     """
 
     elapsed: float = 0.0
+    rest: tuple[float, ...] = (0.0,) * len(STEPS)
+    most: tuple[float, ...] = (0.0,) * len(STEPS)
 
-    def after(self, seconds: float, seen: bool) -> GuidedCalibration | None:
+    def after(self, seconds: float, solved: LiveFrame) -> GuidedCalibration | None:
         """The state after a frame; None when it is over."""
-        moved = replace(self, elapsed=self.elapsed + seconds if seen else self.elapsed)
+        if not solved.seen:
+            return self
+        shown = [float(solved.weights[list(rows)].mean()) if rows else 0.0 for rows in _SEEN_IN]
+        rest = tuple(shown) if self.step == 0 else self.rest
+        most = tuple(
+            max(was, now) if i == self.step else was for i, (was, now) in enumerate(zip(self.most, shown, strict=True))
+        )
+        moved = GuidedCalibration(self.elapsed + seconds, rest, most)
         return moved if moved.elapsed < _STEP * len(STEPS) else None
+
+    @property
+    def missed(self) -> tuple[str, ...]:
+        """What was asked for so far and not seen."""
+        asked = range(1, self.step + 1)
+        return tuple(STEPS[i] for i in asked if self.most[i] - self.rest[i] < _LEAST)
 
     @property
     def step(self) -> int:
@@ -47,11 +76,6 @@ class GuidedCalibration:
     def pose(self) -> int:
         """The pose that the solver may learn from now; 0 while the person gets into it."""
         return self.step + 1 if self.elapsed - _STEP * self.step >= _READY else 0
-
-    @property
-    def left(self) -> float:
-        """Seconds until the next face."""
-        return _STEP * (self.step + 1) - self.elapsed
 
     @property
     def words(self) -> str:
