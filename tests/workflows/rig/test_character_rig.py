@@ -49,6 +49,7 @@ def rigged(tmp_path_factory: pytest.TempPathFactory) -> Rigged:
     return Rigged(folder / "a.vrm", folder / "b.vrm", report, own, read_character(read_document(folder / "b.vrm")))
 
 
+@pytest.mark.bench
 def test_all_else_of_the_file_is_as_it_was(rigged: Rigged) -> None:
     (before, old), (after, new) = unpacked(rigged.before), unpacked(rigged.after)
     assert new[: len(old)] == old
@@ -68,6 +69,7 @@ def test_all_else_of_the_file_is_as_it_was(rigged: Rigged) -> None:
     assert vrm["expressions"]["preset"] == old_vrm["expressions"]["preset"]
 
 
+@pytest.mark.bench
 def test_only_missing_shapes_are_made_and_the_vrm_has_expressions_for_all(rigged: Rigged) -> None:
     report = rigged.report
     assert report.present == {
@@ -84,6 +86,7 @@ def test_only_missing_shapes_are_made_and_the_vrm_has_expressions_for_all(rigged
     assert report.figure.is_file()
 
 
+@pytest.mark.bench
 def test_made_shapes_go_the_way_of_the_characters_own(rigged: Rigged) -> None:
     block = rigged.character.blocks[0]
     targets = rigged.character.targets(block).double() * 1000

@@ -11,7 +11,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchface.errors import AlignmentError, FileFormatError
+from torchface.capture.mouth_close_conventions import mouth_close_of
+from torchface.errors import AlignmentError, FileFormatError, ValueRangeError
 from torchface.files.job_lock import file_lock
 from torchface.files.whole_files import all_or_none, check_ending
 from torchface.geometry.meshes.operators import vertex_normals
@@ -20,6 +21,7 @@ from torchface.io.gltf.gltf_document import read_document
 from torchface.io.gltf.morph_insertion import AddedTargets, document_with_targets, write_edited
 from torchface.io.vrm.vrm_expressions import VRM_ENDING, MorphBind, add_expressions, vrm_expressions
 from torchface.landmarks.surfaces.face_on_surface import NoFaceOnSurfaceError
+from torchface.modeling.rigging.loose_parts import tongue_out
 from torchface.modeling.rigging.other_topology import CarriedShapes, joined_vertices, shapes_on
 from torchface.progress import Progress, silent
 from torchface.registration import register
@@ -42,6 +44,7 @@ _SPAN = 260.0  # of the pictures, millimetres at a head's size
 _FAR, _LEAST_MET = 4.0, 0.4  # millimetres of a head's size between face and template, and the face's share that is met
 _OF_SCANS = ("the scan has neither", "the scan's triangles")
 """Notes of a registration that say nothing of a character."""
+_TONGUE, _JAW, _CLOSE = "tongueOut", "jawOpen", "mouthClose"
 _CONVERT = {
     ".fbx": "export it from Blender as .glb (File, Export, glTF 2.0, with Shape Keys and Skinning)",
     ".usd": "export it from Blender or usdview's host as .glb",
@@ -112,9 +115,10 @@ def rig_character(path: Path, out: Path, progress: Progress | None = None) -> Ch
         present = _present(character)
         missing = [name for name in ARKIT if name not in present]
         template = performer(texture=False)
-        made = tuple(name for name in missing if name in template.names)
         carried = _carried(template, face, path, progress)
-        job = _Job(character, face, carried, made)
+        rig = _with_tongue(carried)
+        made = tuple(name for name in missing if name in rig.names)
+        job = _Job(character, face, carried, rig, made)
         progress("writing the character")
         added = job.targets()
         root, data = document_with_targets(document, added, made) if added else (copy.deepcopy(document.root), b"")
@@ -124,7 +128,7 @@ def rig_character(path: Path, out: Path, progress: Progress | None = None) -> Ch
             save_rendered_image(job.views(surface, present), figure)
     seconds = (found_after, time.perf_counter() - begin)
     names = {name: shape.names for name, shape in present.items()}
-    notes = tuple(job.notes(names, expressions, seconds))
+    notes = tuple(job.notes(present, expressions, seconds))
     median = float(carried.registration.record.median_distance)
     return CharacterReport(made, names, expressions, median, seconds, figure, notes)
 
@@ -190,6 +194,16 @@ def _carried(template: BlendshapeRig, face: CharacterFace, path: Path, progress:
     )
 
 
+def _with_tongue(carried: CarriedShapes) -> BlendshapeRig:
+    """The head's shapes, with ``tongueOut`` where the head has a tongue of its own."""
+    rig = carried.rig
+    if not bool(carried.tongue.any()):
+        return rig
+    lips = carried.registration.mesh.vertices[carried.registration.mesh.landmarks[48:68]]
+    out = tongue_out(rig.vertices, carried.tongue, lips)
+    return BlendshapeRig(rig.neutral, torch.cat([rig.deltas, out[None].to(rig.deltas)]), (*rig.names, _TONGUE))
+
+
 @dataclass(frozen=True, eq=False)
 class _Job:
     """A character, its face, and the shapes that were made for it."""
@@ -197,13 +211,14 @@ class _Job:
     character: Character
     face: CharacterFace
     carried: CarriedShapes
+    rig: BlendshapeRig
     made: tuple[str, ...]
 
     def targets(self) -> list[AddedTargets]:
         """The new morph targets of the meshes that move, in their own axes and unit."""
         if not self.made:
             return []
-        deltas = self.carried.rig.select(self.made).deltas.double()
+        deltas = self.rig.select(self.made).deltas.double()
         rest = self.face.head.vertices.double()
         turned = _normal_changes(rest, self.face.head.faces, deltas)
         added = []
@@ -242,7 +257,7 @@ class _Job:
         for name in {name for names in SHOWN.values() for name in names}:
             moved = torch.zeros_like(upright.vertices)
             if name in self.made:
-                moved[self.face.rows] = self.carried.rig.select([name]).deltas[0].double()
+                moved[self.face.rows] = self.rig.select([name]).deltas[0].double()
             elif name in present:
                 moved = self._present_motion(present[name])
             shapes[name] = moved
@@ -260,9 +275,10 @@ class _Job:
         return self.face.found.pose.inverse().apply_vectors(moved[None])[0]
 
     def notes(
-        self, present: dict[str, tuple[str, ...]], expressions: tuple[str, ...], seconds: tuple[float, float]
+        self, there: dict[str, _Present], expressions: tuple[str, ...], seconds: tuple[float, float]
     ) -> list[str]:
         """For people to read."""
+        present = {name: shape.names for name, shape in there.items()}
         found, record, character = self.face.found, self.carried.registration.record, self.character
         where = f"bone {character.head_bone!r} and " if character.head is not None else ""
         lines = [
@@ -281,11 +297,30 @@ class _Job:
             lines.append(f"already there: {len(present)} of ARKit's 52, kept as they are")
         if own:
             lines.append("  by other names: " + ", ".join(f"{k} ({' + '.join(v)})" for k, v in own.items()))
+        lines += self._doubts(there)
         missing = [name for name in ARKIT if name not in self.made and name not in present]
         lines.append(f"made: {len(self.made)} shapes" + (f"; not made: {', '.join(missing)}" if missing else ""))
         if expressions:
             lines.append(f"expressions added to the VRM: {len(expressions)}")
         return [*lines, f"in all {seconds[1]:.1f} s"]
+
+    def _doubts(self, there: dict[str, _Present]) -> list[str]:
+        """Which of the character's own shapes move nothing, and whether its ``mouthClose`` opens the jaw itself."""
+        motion = {name: self._present_motion(shape) for name, shape in there.items()}
+        still = [name for name, moved in motion.items() if not bool((moved.norm(dim=-1) > _STILL_MM).any())]
+        lines = [f"  note: {', '.join(still)}: there, but nothing moves by it"] if still else []
+        if _JAW in motion and _CLOSE in motion and not {_JAW, _CLOSE} & set(still):
+            deltas = torch.stack([motion[_JAW], motion[_CLOSE]]).float()
+            own = BlendshapeRig.from_tensors(self.face.vertices.float(), self.character.faces, deltas, (_JAW, _CLOSE))
+            try:
+                convention = mouth_close_of(own)
+            except ValueRangeError as error:
+                return [*lines, f"  note: {error}"]
+            if convention is not None and convention.opens_jaw:
+                lines.append(
+                    f"  note: its {_CLOSE} opens the jaw itself, as Audio2Face's does; ARKit's leaves that to {_JAW}"
+                )
+        return lines
 
 
 def _normal_changes(rest: Tensor, faces: Tensor, deltas: Tensor) -> Tensor:
