@@ -14,6 +14,7 @@ from planted.characters import UPRIGHT, Planted, packed, unpacked, write_charact
 from torchface.geometry.similarity import similarity_transform
 from torchface.io.gltf.character_scene import Character, read_character
 from torchface.io.gltf.gltf_document import read_document
+from torchface.modeling.rigging.other_topology import joined_vertices
 from torchface.rig import BlendshapeRig
 from torchface.shape_names.recognised_names import recognised_shapes
 from torchface.synthetic import performer
@@ -49,9 +50,10 @@ class Scores:
     error: Tensor
 
     @staticmethod
-    def of(own: dict[str, Tensor], made: dict[str, Tensor]) -> Scores:
+    def of(own: dict[str, Tensor], made: dict[str, Tensor], counted: Tensor) -> Scores:
+        """Of the vertices (V,) bool that count."""
         names = tuple(name for name in own if name in made and float(own[name].norm()) > 0)
-        pairs = [(own[name].double(), made[name].double()) for name in names]
+        pairs = [(own[name].double()[counted], made[name].double()[counted]) for name in names]
         cosine = [float((a * b).sum() / (a.norm() * b.norm()).clamp(min=1e-12)) for a, b in pairs]
         error = [float((a - b).norm() / a.norm()) for a, b in pairs]
         return Scores(names, torch.tensor(cosine), torch.tensor(error))
@@ -93,9 +95,20 @@ def rigged(one: Trial, folder: Path) -> tuple[CharacterReport, Scores, Scores]:
     """What was made of a character without its shapes, how near it is, and how near nearest vertices come."""
     bare = without_shapes(one.whole, folder / f"{one.name}.glb")
     report = rig_character(bare, folder / f"{one.name}_rigged.glb")
-    _, own = own_shapes(one.whole)
+    character, own = own_shapes(one.whole)
     _, made = own_shapes(folder / f"{one.name}_rigged.glb")
-    return report, Scores.of(own, made), Scores.of(own, nearest_vertices(bare))
+    counted = gaze_or_all(character, own)
+    return report, Scores.of(own, made, counted), Scores.of(own, nearest_vertices(bare), counted)
+
+
+def gaze_or_all(character: Character, own: dict[str, Tensor]) -> Tensor:
+    """All vertices but those of parts that no shape of the character's own moves, such as eyeballs that bones turn."""
+    millimetres = character.vertices / float((character.vertices.amax(0) - character.vertices.amin(0)).norm()) * 300
+    joined = joined_vertices(millimetres, character.faces)
+    moved = torch.stack(list(own.values())).norm(dim=-1).amax(0)
+    part = joined.part[joined.of]
+    most = torch.zeros(int(part.max()) + 1, dtype=moved.dtype).scatter_reduce(0, part, moved, "amax")
+    return most[part] > 0.01 * moved.max()
 
 
 def nearest_vertices(bare: Path) -> dict[str, Tensor]:

@@ -20,7 +20,7 @@ _WRITERS = {
     **{".obj": write_obj, ".ply": write_ply, ".stl": write_stl, ".off": write_off, ".glb": save_gltf_mesh},
     **dict.fromkeys(USD_ENDINGS, write_usd_mesh),
 }
-_GLTF = (".glb", ".gltf")
+_GLTF = (".glb", ".gltf", ".vrm")
 MESH_ENDINGS = tuple(_READERS)
 """What :func:`load_mesh` reads beside glTF and USD, which may hold a rig."""
 
@@ -30,7 +30,7 @@ def load_mesh(path: str | Path, unit: str | None = None) -> Mesh:
 
     Args:
         path: ``.obj`` (polygons, seams, vertex colours, the material's image), ``.ply`` (polygons, vertex colours),
-            ``.stl`` (triangles, equal corners merged), ``.off`` (triangles), ``.glb`` or ``.gltf`` (the whole
+            ``.stl`` (triangles, equal corners merged), ``.off`` (triangles), ``.glb``, ``.gltf`` or ``.vrm`` (the whole
             scene, morph targets at rest), ``.usd``, ``.usda``, ``.usdc`` or ``.usdz`` (the same). Vertices keep the
             file's order.
         unit: the file's, ``"mm"``, ``"cm"`` or ``"m"``; if absent metres for glTF, what the file says for USD,

@@ -25,7 +25,7 @@ from torchface.rig import BlendshapeRig
 from torchface.take import Take
 from torchface.temporal.key_reduction import KeyReduction
 
-GLTF_ENDINGS = (".glb", ".gltf")
+GLTF_ENDINGS = (".glb", ".gltf", ".vrm")
 SCENE_ENDINGS = (*GLTF_ENDINGS, *USD_ENDINGS)
 """Files that may hold a rig, or a mesh without shapes."""
 ANIMATION_ENDINGS = (".glb", *USD_ENDINGS, MAYA_ENDING)
@@ -42,9 +42,9 @@ def load_rig(
     """A rig in millimetres from where its authors left it.
 
     Args:
-        path: a ``.glb`` or ``.gltf`` with morph targets; a ``.usd``, ``.usda``, ``.usdc`` or ``.usdz`` with blend
-            shapes; ICT-FaceKit's ``FaceXModel`` folder; or a folder of OBJ files, one of them neutral, every other a
-            shape of its file's name.
+        path: a ``.glb``, ``.gltf`` or ``.vrm`` with morph targets; a ``.usd``, ``.usda``, ``.usdc`` or ``.usdz`` with
+            blend shapes; ICT-FaceKit's ``FaceXModel`` folder; or a folder of OBJ files, one of them neutral, every
+            other a shape of its file's name.
         unit: ``"mm"``, ``"cm"`` or ``"m"``; if absent metres for glTF, what the file says for USD, centimetres for
             ICT, millimetres for OBJ.
         part: keep this annotated region only, such as ``"face"`` of an ICT head.

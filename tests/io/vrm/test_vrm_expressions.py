@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from planted.characters import Planted, write_character
+from torchface.io import load_mesh, load_rig
 from torchface.io.gltf.gltf_document import read_document
 from torchface.io.vrm.vrm_expressions import MorphBind, add_expressions, vrm_expressions, vrm_version
 from torchface.mesh import Mesh
@@ -40,3 +41,10 @@ def test_a_file_that_is_no_vrm_has_none(tmp_path: Path) -> None:
     assert vrm_version(document) is None
     assert vrm_expressions(document) == {}
     assert add_expressions(document, copy.deepcopy(document.root), {"jawOpen": [MorphBind(0, 0, 0)]}) == ()
+
+
+def test_an_avatar_is_read_as_a_rig(tmp_path: Path) -> None:
+    path = tmp_path / "avatar.vrm"
+    write_character(path, HEAD, SHAPES, Planted(vrm="VRMC_vrm"))
+    assert load_rig(path).names == tuple(SHAPES)
+    assert len(load_mesh(path).faces) > len(HEAD.faces)
