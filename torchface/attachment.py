@@ -7,13 +7,22 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import numpy as np
 import torch
 from torch import Tensor
 
-from torchface.errors import FileFormatError, NameMismatchError, ShapeError, TopologyError, ValueRangeError
+from torchface.errors import (
+    ArgumentTypeError,
+    FileFormatError,
+    NameMismatchError,
+    ShapeError,
+    TopologyError,
+    ValueRangeError,
+)
 from torchface.files.documents import read_json, write_json
 from torchface.geometry.similarity import similarity_transform
 from torchface.mesh import Mesh
+from torchface.number_checks import as_tensor, checked_type
 
 _FORMAT = "torchface.attachment/1"
 _MAX_FILE = 64 * 2**20
@@ -50,6 +59,11 @@ class Attachment:
     rest: Tensor | None = None
 
     def __post_init__(self) -> None:
+        for name, shape, dtype in (("triangles", "(M,)", torch.int64), ("barycentric", "(M,3)", None)):
+            value = as_tensor(name, getattr(self, name), shape, dtype or torch.get_default_dtype())
+            object.__setattr__(self, name, value)
+        if self.triangles.is_floating_point():
+            raise ArgumentTypeError(f"triangles: found {self.triangles.dtype}, expected whole numbers (M,)")
         count = len(self.triangles)
         if self.triangles.shape != (count,) or self.barycentric.shape != (count, 3):
             raise ShapeError(
@@ -80,7 +94,11 @@ class Attachment:
             >>> torch.allclose(sites.on(face.faces, face.vertices), face.vertices[face.landmarks[[30, 8]]])
             True
         """
-        ids = torch.as_tensor(ids, dtype=torch.int64)
+        checked_type("mesh", mesh, Mesh)
+        ids = as_tensor("ids", ids if isinstance(ids, Tensor | np.ndarray) else list(ids), "(M,)", torch.int64)
+        if ids.is_floating_point():
+            raise ArgumentTypeError(f"ids: found {ids.dtype}, expected whole numbers (M,)")
+        ids = ids.long()
         if ids.numel() and (int(ids.min()) < 0 or int(ids.max()) >= len(mesh.vertices)):
             raise TopologyError(
                 f"attachment: found vertex ids {int(ids.min())} to {int(ids.max())}, "

@@ -2,6 +2,7 @@
 
 __all__ = [
     "AlignmentError",
+    "ArgumentTypeError",
     "FileFormatError",
     "MissingExtraError",
     "NameMismatchError",
@@ -24,6 +25,18 @@ class TorchfaceError(Exception):
         ... except TorchfaceError as error:
         ...     print(error)
         head.dae: found the ending '.dae', expected .obj, .ply, .stl, .off, .glb, ...
+    """
+
+
+class ArgumentTypeError(TorchfaceError, TypeError):
+    """An argument is of another type than the docstring asks for, and cannot safely be made one.
+
+    Example:
+        >>> from torchface import transfer_deformation
+        >>> transfer_deformation("template.glb", None)
+        Traceback (most recent call last):
+            ...
+        torchface.errors.ArgumentTypeError: source: found the text 'template.glb', expected a BlendshapeRig...
     """
 
 

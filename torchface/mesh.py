@@ -12,6 +12,7 @@ from torch import Tensor
 
 from torchface.errors import ShapeError, TopologyError, ValueRangeError
 from torchface.geometry.meshes.trimesh_conversion import from_trimesh, to_trimesh
+from torchface.number_checks import as_tensor, checked_type
 
 if TYPE_CHECKING:
     import trimesh
@@ -53,6 +54,18 @@ class Annotations:
         )
 
 
+_TENSORS = (
+    ("vertices", "(V,3)", None),
+    ("faces", "(F,3)", torch.int64),
+    ("uvs", "(U,2)", None),
+    ("uv_faces", "(F,3)", torch.int64),
+    ("colors", "(V,3)", None),
+    ("texture", "(3,H,W)", None),
+    ("polygons", "(P,K)", torch.int64),
+)
+"""A mesh's tensors, their shapes, and the integers among them."""
+
+
 @dataclass(frozen=True, eq=False)
 class Mesh:
     """A mesh in millimetres, y up, z toward the viewer.
@@ -91,6 +104,12 @@ class Mesh:
     annotations: Annotations | None = None
 
     def __post_init__(self) -> None:
+        for name, shape, dtype in _TENSORS:
+            value = getattr(self, name)
+            if not isinstance(value, Tensor) and (value is not None or name in ("vertices", "faces")):
+                object.__setattr__(self, name, as_tensor(name, value, shape, dtype or torch.get_default_dtype()))
+        if self.annotations is not None:
+            checked_type("annotations", self.annotations, Annotations)
         _check_shape("vertices", self.vertices, (None, 3))
         _check_shape("faces", self.faces, (None, 3))
         if len(self.vertices) == 0:

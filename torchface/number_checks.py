@@ -1,13 +1,18 @@
-"""Numbers that callers give (settings, weights of terms, tolerances, counts, rates), checked in one way at the door."""
+"""What callers give (numbers, tensors, meshes, paths), checked in one way at the door."""
 
 from __future__ import annotations
 
 import math
+import os
 from numbers import Real
+from typing import TypeVar
 
+import numpy as np
 import torch
 
-from torchface.errors import FileFormatError, TorchfaceError, ValueRangeError
+from torchface.errors import ArgumentTypeError, FileFormatError, TorchfaceError, ValueRangeError
+
+Kind = TypeVar("Kind")
 
 LARGEST_WEIGHT = 1e12
 """The largest weight that a term of an energy may have: beyond it rounding leaves nothing of the other terms."""
@@ -67,13 +72,105 @@ def checked_count(
     return int(_real(value))
 
 
-def as_real(values: torch.Tensor) -> torch.Tensor:
+def as_tensor(name: str, value: object, expected: str, dtype: torch.dtype | None = None) -> torch.Tensor:
+    """The tensor itself; NumPy's arrays, and lists of numbers or of tensors of one shape, become one.
+
+    Args:
+        name: of the argument; begins the message.
+        value: what was given.
+        expected: the shape, such as ``(B,N)``.
+        dtype: of what is converted; NumPy's own, and torch's default of lists, if absent.
+
+    Raises:
+        ArgumentTypeError: it is something else, or floats where whole numbers are asked for.
+
+    Example:
+        >>> as_tensor("faces", np.array([[0, 1, 2]], dtype=np.int32), "(F,3)", torch.int64).dtype
+        torch.int64
+        >>> as_tensor("f", "0, 1", "(B,N)")
+        Traceback (most recent call last):
+        torchface.errors.ArgumentTypeError: f: found the text '0, 1', expected a tensor (B,N)
+    """
+    if isinstance(value, torch.Tensor):
+        return value
+    made = None
+    try:
+        if isinstance(value, np.ndarray) and value.dtype.kind in "fiub":
+            unsigned = value.dtype.kind == "u" and value.dtype.itemsize > 1
+            made = torch.from_numpy(np.array(value, dtype=np.int64 if unsigned else None, order="C"))
+        elif isinstance(value, list | tuple) and value:
+            stacked = all(isinstance(row, torch.Tensor) for row in value)
+            made = torch.stack(list(value)) if stacked else torch.tensor(np.array(value).tolist())
+    except (TypeError, ValueError, RuntimeError):  # of rows of other lengths, texts, objects
+        made = None
+    if made is None:
+        raise ArgumentTypeError(f"{name}: found {_described(value)}, expected a tensor {expected}")
+    if dtype is not None and not dtype.is_floating_point and made.is_floating_point():
+        raise ArgumentTypeError(f"{name}: found floats, expected whole numbers {expected}")
+    return made if dtype is None else made.to(dtype)
+
+
+_READ_BY = {
+    "BlendshapeRig": "torchface.load_rig",
+    "Mesh": "torchface.load_mesh",
+    "Take": "torchface.load_take",
+    "Attachment": "Attachment.load",
+}
+
+
+def checked_type(name: str, value: object, kind: type[Kind]) -> Kind:
+    """The value itself, where it is of a class.
+
+    Raises:
+        ArgumentTypeError: it is something else.
+
+    Example:
+        >>> checked_type("fps", "30", float)
+        Traceback (most recent call last):
+        torchface.errors.ArgumentTypeError: fps: found the text '30', expected a float
+    """
+    if isinstance(value, kind):
+        return value
+    article = "an" if kind.__name__[0] in "AEIO" else "a"
+    path = isinstance(value, str | os.PathLike) and kind.__name__ in _READ_BY
+    hint = f" ({_READ_BY[kind.__name__]} reads one from a file)" if path else ""
+    raise ArgumentTypeError(f"{name}: found {_described(value)}, expected {article} {kind.__name__}{hint}")
+
+
+def checked_path(name: str, value: object) -> None:
+    """Raises ``ArgumentTypeError`` for what is no path."""
+    if not isinstance(value, str | os.PathLike):
+        raise ArgumentTypeError(f"{name}: found {_described(value)}, expected a path")
+
+
+def _described(value: object) -> str:
+    if value is None:
+        return "None"
+    if isinstance(value, str | os.PathLike):
+        return f"the text {os.fspath(value)!r:.60}"
+    if isinstance(value, torch.Tensor):
+        return f"a tensor {tuple(value.shape)}"
+    if isinstance(value, np.ndarray):
+        return f"an array of {value.dtype}"
+    if isinstance(value, list | tuple):
+        kinds = sorted({type(row).__name__ for row in value})
+        return f"a {type(value).__name__} of {', '.join(kinds[:3])}" if kinds else f"an empty {type(value).__name__}"
+    if isinstance(value, type):
+        return f"the class {value.__name__}"
+    word = type(value).__name__
+    return f"{'an' if word[0] in 'AEIOaeio' else 'a'} {word}"
+
+
+def as_real(values: torch.Tensor, name: str = "values") -> torch.Tensor:
     """Whole numbers as floats of torch's default dtype: weights solved in an integer dtype would all be 0 or 1.
+
+    NumPy's arrays and lists become tensors of that dtype, see :func:`as_tensor`.
 
     Example:
         >>> as_real(torch.tensor([3, 4])).is_floating_point()
         True
     """
+    values = as_tensor(name, values, "of numbers", torch.get_default_dtype())
     return values if values.is_floating_point() or values.is_complex() else values.to(torch.get_default_dtype())
 
 

@@ -15,6 +15,7 @@ from torchface.correctives.activation import CorrectiveActivation
 from torchface.correctives.corrective_shapes import Corrective, Correctives
 from torchface.errors import NameMismatchError, ShapeError, ValueRangeError
 from torchface.mesh import Mesh, submesh
+from torchface.number_checks import as_tensor, checked_type
 from torchface.shape_names import arkit_sources, mapping
 from torchface.take import Track
 
@@ -54,6 +55,12 @@ class BlendshapeRig(nn.Module):
         self, neutral: Mesh, deltas: Tensor, names: Sequence[str], correctives: Correctives | None = None
     ) -> None:
         super().__init__()
+        checked_type("neutral", neutral, Mesh)
+        if correctives is not None:
+            checked_type("correctives", correctives, Correctives)
+        if isinstance(names, str):
+            raise NameMismatchError(f"names: found the text {names!r:.60}, expected a list of names: [{names!r:.60}]")
+        deltas = as_tensor("deltas", deltas, f"(N,{len(neutral.vertices)},3)", torch.get_default_dtype())
         if deltas.ndim != 3 or deltas.shape[1:] != neutral.vertices.shape:
             raise ShapeError(
                 f"deltas: found {tuple(deltas.shape)}, expected (N,{len(neutral.vertices)},3) for this neutral"
@@ -114,7 +121,8 @@ class BlendshapeRig(nn.Module):
             >>> rig.names
             ('shape_0', 'shape_1')
         """
-        vertices, faces, deltas = (torch.as_tensor(given) for given in (vertices, faces, deltas))
+        vertices, deltas = as_tensor("vertices", vertices, "(V,3)"), as_tensor("deltas", deltas, "(N,V,3)")
+        faces = as_tensor("faces", faces, "(F,3)")
         faces, uv_faces = faces.long(), rest.pop("uv_faces", None)
         if faces.ndim == 2 and faces.shape[1] > 3:
             uv_polygons = None if uv_faces is None else uv_faces.long()
@@ -159,7 +167,7 @@ class BlendshapeRig(nn.Module):
 
     def forward(self, weights: Tensor) -> Tensor:
         """Vertices (B,V,3) at weights (B,N), taken in the rig's dtype; NumPy's arrays and lists do as well."""
-        weights = torch.as_tensor(weights).to(self.deltas.dtype)
+        weights = as_tensor("weights", weights, f"(B,{len(self.names)})").to(self.deltas.dtype)
         if weights.ndim != 2 or weights.shape[1] != len(self.names):
             raise ShapeError(f"weights: found {tuple(weights.shape)}, expected (B,{len(self.names)})")
         moved = weights @ self.deltas.flatten(1)

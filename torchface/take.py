@@ -10,8 +10,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchface.errors import NameMismatchError, ShapeError, ValueRangeError
-from torchface.number_checks import as_real, check_rate
+from torchface.errors import ArgumentTypeError, NameMismatchError, ShapeError, ValueRangeError
+from torchface.number_checks import as_real, check_rate, checked_type
 from torchface.temporal.frame_grid import check_gaps, frame_grid
 from torchface.temporal.interpolation import frames_beside, values_at
 
@@ -43,8 +43,12 @@ class Track:
     confidence: Tensor | None = None
 
     def __post_init__(self) -> None:
+        if isinstance(self.names, str):
+            raise ArgumentTypeError(f"names: found the text {self.names!r:.60}, expected a list of names")
         object.__setattr__(self, "names", tuple(self.names))
-        object.__setattr__(self, "values", as_real(self.values))
+        object.__setattr__(self, "values", as_real(self.values, "track values"))
+        if self.confidence is not None:
+            object.__setattr__(self, "confidence", as_real(self.confidence, "track confidence"))
         if self.values.ndim != 3 or self.values.shape[1] != len(self.names):
             raise ShapeError(f"track: found values {tuple(self.values.shape)}, expected (T,{len(self.names)},D)")
         if self.confidence is not None and self.confidence.shape != self.values.shape[:2]:
@@ -117,6 +121,8 @@ class Take:
         check_rate(self.fps, "take", ValueRangeError)
         for name, width in _WIDTHS.items():
             track = getattr(self, name)
+            if track is not None:
+                checked_type(f"take: {name}", track, Track)
             if track is not None and track.values.shape[2] != width:
                 raise ShapeError(f"take: found {name} {tuple(track.values.shape)}, expected (T,C,{width})")
         if self.timecode is not None:

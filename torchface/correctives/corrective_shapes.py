@@ -10,8 +10,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchface.errors import NameMismatchError, ShapeError, ValueRangeError
-from torchface.number_checks import checked_number
+from torchface.errors import ArgumentTypeError, NameMismatchError, ShapeError, ValueRangeError
+from torchface.number_checks import as_tensor, checked_number, checked_type
 
 MOST_DRIVERS = 8
 """A combination shape is driven by two to eight shapes."""
@@ -107,6 +107,11 @@ class Correctives:
     definitions: tuple[Corrective, ...]
 
     def __post_init__(self) -> None:
+        object.__setattr__(self, "deltas", as_tensor("correctives: deltas", self.deltas, "(C,V,3)"))
+        if isinstance(self.definitions, Tensor | Corrective):
+            raise ArgumentTypeError("correctives: found no list of definitions, expected a list of Corrective")
+        for definition in self.definitions:
+            checked_type("correctives: definition", definition, Corrective)
         object.__setattr__(self, "definitions", tuple(self.definitions))
         check_definitions(self.definitions)
         if self.deltas.ndim != 3 or self.deltas.shape[2] != 3 or len(self.deltas) != len(self.definitions):

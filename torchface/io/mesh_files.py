@@ -14,6 +14,7 @@ from torchface.io.meshes.stl import read_stl, write_stl
 from torchface.io.usd.usd_reading import read_usd_mesh
 from torchface.io.usd.usd_writing import USD_ENDINGS, write_usd_mesh
 from torchface.mesh import Mesh
+from torchface.number_checks import checked_path, checked_type
 
 _READERS = {".obj": read_obj, ".ply": read_ply, ".stl": read_stl, ".off": read_off}
 _WRITERS = {
@@ -50,6 +51,7 @@ def load_mesh(path: str | Path, unit: str | None = None) -> Mesh:
         >>> torch.allclose(load_mesh("head.obj", unit="cm").vertices, 10 * load_mesh("head.obj").vertices)
         True
     """
+    checked_path("path", path)
     check_ending(path, *_READERS, *_GLTF, *USD_ENDINGS)
     suffix = Path(path).suffix.lower()
     if suffix in _GLTF:
@@ -75,5 +77,7 @@ def save_mesh(mesh: Mesh, path: str | Path) -> None:
         >>> torch.equal(load_mesh("head.glb").landmarks, head.landmarks)
         True
     """
+    checked_type("mesh", mesh, Mesh)
+    checked_path("path", path)
     check_ending(path, *_WRITERS)
     _WRITERS[Path(path).suffix.lower()](mesh, path)

@@ -21,6 +21,7 @@ from torchface.io.scenes.weight_keys import ShapeMatch, WeightKeys, common_keys,
 from torchface.io.usd.usd_library import require_usd
 from torchface.io.usd.usd_reading import read_usd_detail, read_usd_rig, read_usd_weights
 from torchface.io.usd.usd_writing import USD_ENDINGS, write_usd_rig
+from torchface.number_checks import checked_path, checked_type
 from torchface.rig import BlendshapeRig
 from torchface.take import Take
 from torchface.temporal.key_reduction import KeyReduction
@@ -63,6 +64,7 @@ def load_rig(
         >>> load_rig("actor.glb", shapes=["jawOpen", "mouthClose"])
         BlendshapeRig(Mesh(6419 vertices, 12760 triangles, 6380 polygons), 2 shapes)
     """
+    checked_path("path", path)
     path = Path(path)
     if path.is_dir():
         if is_ict_folder(path) and neutral is None:
@@ -103,6 +105,8 @@ def save_rig(rig: BlendshapeRig, path: str | Path, detail: DetailMaps | RegionMa
         >>> sorted(path.name for path in Path("actor").iterdir())
         ['jawOpen.obj', 'neutral.obj', 'rig.json']
     """
+    checked_type("rig", rig, BlendshapeRig)
+    checked_path("path", path)
     write_rig(rig, path, detail, None)
 
 
@@ -161,6 +165,9 @@ def save_animation(
         >>> save_animation(rig, take, "take.glb")
         ShapeMatch(driven=('jawOpen',), missing=(), unused=('tongueOut',))
     """
+    checked_type("rig", rig, BlendshapeRig)
+    checked_type("take", take, Take)
+    checked_path("path", path)
     check_ending(path, *ANIMATION_ENDINGS)
     keys, match = weight_keys(rig, take)
     keys, reduction = reduced_keys(rig, keys, path, reduce)
@@ -200,6 +207,7 @@ def load_animation(path: str | Path) -> Take | None:
         >>> load_animation("take.glb").weights.values.flatten().tolist()
         [0.0, 0.25, 0.5, 0.75, 1.0]
     """
+    checked_path("path", path)
     if Path(path).suffix.lower() in USD_ENDINGS:
         return read_usd_weights(path)
     return read_gltf_weights(path)
@@ -223,6 +231,7 @@ def load_detail_maps(path: str | Path) -> DetailMaps | None:
         >>> load_detail_maps("smooth.glb") is None
         True
     """
+    checked_path("path", path)
     if Path(path).suffix.lower() in USD_ENDINGS:
         return read_usd_detail(path)
     return read_gltf_detail(path)

@@ -24,6 +24,7 @@ from torchface.io.weights.ifacialmocap_text import is_ifacialmocap, load_ifacial
 from torchface.io.weights.json_recordings import load_weight_json
 from torchface.io.weights.live_link_csv import are_live_link_shapes, is_live_link, load_live_link, save_live_link
 from torchface.io.weights.weight_csv import ROTATIONS, load_weights_csv, save_weights_csv
+from torchface.number_checks import checked_path, checked_type
 from torchface.take import Take, Track
 
 MARKER_ENDINGS = (".c3d", ".trc")
@@ -73,6 +74,7 @@ def load_take(path: str | Path, unit: str | None = None) -> Take:
         >>> take.fps, take.weights.names, take.weights.values[1].flatten().tolist()
         (25.0, ('jawOpen', 'mouthPucker'), [0.5, 0.0])
     """
+    checked_path("path", path)
     check_ending(path, *TAKE_ENDINGS, *RECORDING_ENDINGS)
     path = Path(path)
     suffix = path.suffix.lower()
@@ -137,6 +139,8 @@ def save_take(take: Take, path: str | Path) -> None:
         >>> load_take("take.trc").markers.names
         ('chin', 'nose')
     """
+    checked_type("take", take, Take)
+    checked_path("path", path)
     check_ending(path, *TAKE_ENDINGS)
     path = Path(path)
     suffix = path.suffix.lower()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
+from torchface.number_checks import as_tensor
 from torchface.optim.box_checks import check_vectors, checked_tolerance, default_tolerance
 from torchface.optim.data_dependent import data_dependent, is_transformed
 from torchface.optim.implicit import BoxSolution
@@ -56,6 +57,8 @@ def box_qp(
         >>> box_qp(H, torch.tensor([[-1.0, -8.0], [2.0, -2.0]])).round(decimals=4).tolist()
         [[0.5, 1.0], [0.0, 0.5]]
     """
+    H = as_tensor("H", H, "(N,N) or (B,N,N)")
+    f = as_tensor("f", f, "(B,N)", H.dtype)
     if is_transformed():
         return _transformed_minimiser(H, f, lower, upper, tolerance)
     return _box_qp(H, f, lower, upper, start, tolerance)
@@ -107,6 +110,7 @@ class BoxQP(nn.Module):
         tolerance: float | None = None,
     ) -> None:
         super().__init__()
+        H = as_tensor("H", H, "(N,N) or (B,N,N)")
         self.tolerance = tolerance if tolerance is None else checked_tolerance(tolerance, H.dtype)
         if isinstance(H, nn.Parameter):
             self.H = H
@@ -120,6 +124,7 @@ class BoxQP(nn.Module):
 
     def forward(self, f: Tensor, start: Tensor | None = None) -> Tensor:
         """The minimisers (B,N) for f (B,N), of H's dtype; ``start`` is an initial guess (B,N)."""
+        f = as_tensor("f", f, "(B,N)", self.H.dtype)
         if is_transformed():
             return _transformed_minimiser(self.H, f, self.lower, self.upper, self.tolerance)
         return self._solved(f, start)

@@ -20,7 +20,7 @@ import torch
 from torch import Tensor, nn
 
 from torchface.errors import ShapeError, ValueRangeError
-from torchface.number_checks import checked_count, checked_number
+from torchface.number_checks import as_tensor, checked_count, checked_number
 from torchface.optim.box_checks import check_finite, check_vectors, checked_bounds, checked_hessian
 from torchface.optim.box_problem import metric
 from torchface.optim.data_dependent import is_transformed
@@ -90,6 +90,7 @@ class ProjectedGradient(nn.Module):
         self.tolerance = None if tolerance is None else checked_number("ProjectedGradient: tolerance", tolerance)
         self.through_steps = through_steps
         self._followed: Prepared[Tensor] = Prepared()
+        H = None if H is None else as_tensor("H", H, "(N,N) or (B,N,N)")
         if isinstance(H, nn.Parameter):
             self.H = H
         else:
@@ -124,6 +125,8 @@ class ProjectedGradient(nn.Module):
         H = self.H if H is None else H
         if H is None:
             raise ShapeError("ProjectedGradient: found no H, expected one here or where the module is made")
+        H = as_tensor("H", H, "(N,N) or (B,N,N)")
+        f = as_tensor("f", f, "(B,N)", H.dtype)
         if not (_recorded() or is_transformed()):
             check_vectors(H, f, start, _NAME)
             check_finite(f, start, _NAME)

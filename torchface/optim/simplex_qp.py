@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from torchface.errors import ShapeError, ValueRangeError
-from torchface.number_checks import checked_number
+from torchface.number_checks import as_tensor, checked_number
 from torchface.optim.implicit import SimplexSolution
 from torchface.optim.simplex_active_set import Mixture, SimplexProblems, solve_simplex
 
@@ -67,6 +67,7 @@ class SimplexQP:
     """
 
     def __init__(self, H: Tensor) -> None:
+        H = as_tensor("H", H, "(N,N) or (B,N,N)")
         _check_matrices(H)
         self._H = H
         exact = H.detach().double()
@@ -75,6 +76,7 @@ class SimplexQP:
     def __call__(self, f: Tensor, start: Tensor | None = None, tolerance: float | None = None) -> Tensor:
         """The minimisers for f; arguments and errors are those of ``simplex_qp``."""
         H = self._H
+        f = as_tensor("f", f, "(B,N)", H.dtype)
         _check_vectors(H, f, start)
         limit = _TOLERANCE[H.dtype]
         if tolerance is not None:

@@ -14,6 +14,7 @@ from torchface.geometry.meshes.operators import edges, vertex_normals
 from torchface.geometry.meshes.surface_index import SurfaceIndex, SurfacePoints
 from torchface.geometry.similarity import MAX_HEAD_SCALE, MIN_HEAD_SCALE, Similarity
 from torchface.mesh import Mesh
+from torchface.number_checks import checked_type
 from torchface.progress import Progress, silent
 from torchface.registration.hair_and_cloth import Cover
 from torchface.registration.model_fit import HasShape, ModelFit, ShapeModel, fit_to_scan, shape_model
@@ -133,6 +134,8 @@ def register(
         >>> bool(registered.distance.median() < 1)  # millimetres
         True
     """
+    checked_type("template", template, Mesh)
+    checked_type("scan", scan, Mesh)
     begin, progress = time.perf_counter(), progress or silent
     if texture_size < 0 or texture_size > 16384:
         raise ShapeError(f"texture_size: found {texture_size}, expected 0 to 16384")

@@ -14,6 +14,7 @@ from torchface.capture.markers.marker_solver import RIDGE, SPARSITY, MarkerSolve
 from torchface.errors import NameMismatchError, ShapeError
 from torchface.geometry.rotations import rotation_matrix, rotation_vector
 from torchface.geometry.similarity import Similarity
+from torchface.number_checks import checked_type
 from torchface.optim import BoxQP, box_qp
 from torchface.optim.box_checks import default_tolerance
 from torchface.optim.data_dependent import data_dependent
@@ -160,7 +161,7 @@ class HelmetSolver(nn.Module):
             NameMismatchError: the take has no markers, labels that the attachment does not know, or none that it knows.
             ValueRangeError: no frame shows any marker.
         """
-        if take.markers is None:
+        if checked_type("take", take, Take).markers is None:
             raise NameMismatchError("take: has no markers, expected a track of them")
         markers = self.markers.arrange(take.markers)
         rows = frames_seen(markers)

@@ -11,7 +11,7 @@ from torchface.capture.corrective_energy import CorrectiveEnergy, least_in_box
 from torchface.capture.energy import Quadratic, chunks_of_frames, pull_term
 from torchface.capture.markers.marker_solver import MarkerSolver, frames_seen
 from torchface.errors import NameMismatchError, ShapeError, ValueRangeError
-from torchface.number_checks import LARGEST_WEIGHT, checked_number
+from torchface.number_checks import LARGEST_WEIGHT, checked_number, checked_type
 from torchface.optim import box_qp
 from torchface.optim.box_checks import default_tolerance
 from torchface.optim.data_dependent import data_dependent
@@ -147,7 +147,7 @@ class HybridSolver(nn.Module):
             ShapeError: the curves have another number of frames than the take.
             NameMismatchError: labels or names that are not the solver's, or the take has no markers.
         """
-        if take.markers is None or len(take) != len(predicted) or len(take) != len(gamma):
+        if checked_type("take", take, Take).markers is None or len(take) != len(predicted) or len(take) != len(gamma):
             raise ShapeError(
                 f"hybrid solve: found {len(take)} frames of markers, {len(predicted)} of predictions, {len(gamma)} of "
                 "gamma, expected the same number"

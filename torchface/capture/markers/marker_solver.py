@@ -17,6 +17,7 @@ from torchface.correctives.activation import CorrectiveActivation
 from torchface.correctives.corrective_shapes import Corrective, definitions_from_records
 from torchface.errors import NameMismatchError, ShapeError, ValueRangeError
 from torchface.geometry.similarity import Similarity
+from torchface.number_checks import as_tensor, checked_type
 from torchface.optim import BoxQP, ProjectedGradient, box_qp
 from torchface.optim.box_checks import default_tolerance
 from torchface.optim.data_dependent import data_dependent
@@ -90,7 +91,8 @@ class MarkerSolver(nn.Module):
         program: ProjectedGradient | None = None,
     ) -> None:
         super().__init__()
-        attachment.check(rig.neutral)
+        checked_type("rig", rig, BlendshapeRig)
+        checked_type("attachment", attachment, Attachment).check(rig.neutral)
         own = program is not None and (
             program.H is not None or bool((program.lower != 0).any() | (program.upper != 1).any())
         )
@@ -261,6 +263,7 @@ class MarkerSolver(nn.Module):
             ShapeError: ``markers`` is not (B,M,3).
             ValueRangeError: a coordinate is infinite, or frames show no marker at all.
         """
+        markers = as_tensor("markers", markers, f"(B,{len(self.rest)},3)")
         if markers.ndim != 3 or markers.shape[1:] != self.rest.shape:
             raise ShapeError(f"markers: found {tuple(markers.shape)}, expected (B,{len(self.rest)},3)")
         missing = torch.isnan(markers).any(-1)
@@ -304,7 +307,7 @@ class MarkerSolver(nn.Module):
             >>> solved.weights.names == solver.names, bool(solved.weights.values.max() < 1e-3)
             (True, True)
         """
-        if take.markers is None:
+        if checked_type("take", take, Take).markers is None:
             raise NameMismatchError("take: has no markers, expected a track of them")
         markers = self.arrange(take.markers)
         rows = frames_seen(markers)

@@ -18,6 +18,7 @@ from torchface.capture.markers.rest_pose import (
 )
 from torchface.errors import ValueRangeError
 from torchface.geometry.similarity import Similarity
+from torchface.number_checks import checked_type
 from torchface.rig import BlendshapeRig
 from torchface.take import Take
 
@@ -72,7 +73,9 @@ def align_take(
         >>> round(align_take(rig, sites, take, neutral_frame=0).scale.item(), 3)
         10.0
     """
-    attachment.check(rig.neutral)
+    checked_type("rig", rig, BlendshapeRig)
+    checked_type("take", take, Take)
+    checked_type("attachment", attachment, Attachment).check(rig.neutral)
     rig = rig.linear("align_take")
     affine, paths = _seen_sites(rig, attachment, take)
     rest = affine[..., 0]

@@ -14,7 +14,7 @@ from torchface.capture.corrective_energy import CorrectiveEnergy
 from torchface.capture.markers.marker_solver import MarkerSolver, frames_seen, penalty_value
 from torchface.capture.markers.sparsity import with_sparsity
 from torchface.errors import NameMismatchError, ShapeError, TraceError, ValueRangeError
-from torchface.number_checks import LARGEST_WEIGHT, check_rate, checked_number
+from torchface.number_checks import LARGEST_WEIGHT, check_rate, checked_number, checked_type
 from torchface.optim.data_dependent import data_dependent
 from torchface.take import Take, Track
 from torchface.temporal import interpolated
@@ -97,7 +97,7 @@ class WholeTakeSolver(nn.Module):
             NameMismatchError: the take has no markers, labels that the attachment does not know, or none that it knows.
             ValueRangeError: no frame shows any marker, or a coordinate is infinite.
         """
-        if take.markers is None:
+        if checked_type("take", take, Take).markers is None:
             raise NameMismatchError("take: has no markers, expected a track of them")
         weights = self(self.markers.arrange(take.markers), take.fps, take.seconds)
         return replace(take, weights=Track(self.markers.names, weights[..., None]))

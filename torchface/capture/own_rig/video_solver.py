@@ -447,6 +447,8 @@ class VideoSolver(VideoSolverParts):
     def _check(
         self, landmarks: Tensor, rotation: Tensor | None, translation: Tensor | None, confidence: Tensor | None
     ) -> int:
+        if landmarks.ndim != 3:
+            raise ShapeError(f"landmarks: found {tuple(landmarks.shape)}, expected (T,{LANDMARKS},2), a row a frame")
         count = len(landmarks)
         expected = {"landmarks": (count, LANDMARKS, 2), "rotation": (count, 3, 3), "translation": (count, 3)}
         expected["confidence"] = (count, LANDMARKS)

@@ -13,6 +13,7 @@ from torchface.errors import FileFormatError, TopologyError
 from torchface.files.documents import Value
 from torchface.mesh import Annotations, Mesh, submesh
 from torchface.modeling.morphable.morphable_model import MorphableModel
+from torchface.number_checks import as_tensor, checked_type
 from torchface.rig import BlendshapeRig
 
 _MAX_BYTES = 2**31
@@ -87,6 +88,10 @@ class HeadModel(nn.Module):
         rig: BlendshapeRig | None = None,
     ) -> None:
         super().__init__()
+        checked_type("shape", shape, MorphableModel)
+        if color is not None:
+            checked_type("color", color, MorphableModel)
+        faces = as_tensor("faces", faces, "(F,3)", torch.int64)
         for name, model in (("shape", shape), ("color", color)):
             if model is not None and model.mean.shape != (len(shape.mean), 3):
                 raise TopologyError(

@@ -14,7 +14,7 @@ from torchface.errors import FileFormatError, ShapeError, ValueRangeError
 from torchface.files.documents import Value
 from torchface.geometry.sample_batches import Samples, SamplesInMemory
 from torchface.modeling.morphable.principal_components import principal_components
-from torchface.number_checks import as_real
+from torchface.number_checks import as_real, as_tensor
 from torchface.progress import Progress
 
 _MAX_BYTES = 2**31
@@ -113,6 +113,8 @@ class MorphableModel(nn.Module):
             >>> torch.allclose(streamed.standard_deviations, at_once.standard_deviations, rtol=1e-4)
             True
         """
+        if not hasattr(samples, "read"):
+            samples = as_tensor("samples", samples, "(M,V,C)", torch.get_default_dtype())
         count, most = samples.shape[0], components
         if len(samples.shape) != 3 or (isinstance(samples, Tensor) and not samples.is_floating_point()):
             raise ShapeError(f"samples: found {tuple(samples.shape)}, expected floats (M,V,C)")
@@ -157,7 +159,7 @@ class MorphableModel(nn.Module):
     def forward(self, coefficients: Tensor) -> Tensor:
         """Coefficients (B,K) to samples (B,V,C)."""
         self._check(coefficients)
-        coefficients = as_real(coefficients)
+        coefficients = as_real(coefficients, "coefficients")
         scaled = coefficients * self.standard_deviations.to(coefficients)
         offset = scaled @ self.components.flatten(1).to(coefficients)
         return self.mean.to(coefficients) + offset.reshape(-1, *self.mean.shape)

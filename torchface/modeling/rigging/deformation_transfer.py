@@ -14,6 +14,7 @@ from torchface.mesh import Mesh
 from torchface.modeling.rigging.part_clearance import clear_parts
 from torchface.modeling.rigging.penetration import inner_parts
 from torchface.modeling.rigging.transfer_system import ShapeTransfer
+from torchface.number_checks import checked_type
 from torchface.progress import Progress
 from torchface.rig import BlendshapeRig
 
@@ -156,6 +157,8 @@ def transfer_report(job: ShapeTransfer, names: tuple[str, ...]) -> TransferRepor
 
 
 def _check(source: BlendshapeRig, target: Mesh, contact_weight: float) -> None:
+    checked_type("source", source, BlendshapeRig)
+    checked_type("target", target, Mesh)
     if len(source.names) == 0:
         raise ValueRangeError("transfer_deformation: the source rig has 0 shapes; expected at least one")
     if len(source.neutral.faces) == 0:

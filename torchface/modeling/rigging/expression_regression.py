@@ -14,7 +14,7 @@ from torchface.geometry.sample_batches import Samples
 from torchface.geometry.similarity import Similarity, similarity_transform
 from torchface.mesh import Mesh
 from torchface.modeling.rigging.deformation_transfer import transfer_deformation
-from torchface.number_checks import LARGEST_WEIGHT, as_real, checked_count, checked_number
+from torchface.number_checks import LARGEST_WEIGHT, as_real, checked_count, checked_number, checked_type
 from torchface.progress import Progress
 from torchface.rig import BlendshapeRig
 from torchface.shape_names import mapping
@@ -216,14 +216,14 @@ class ExpressionRegression(nn.Module):
         Raises:
             ShapeError: the neutrals are not (B,V,3).
         """
-        neutrals = as_real(neutrals)
+        neutrals = as_real(neutrals, "neutrals")
         return neutrals[:, None] + self.offsets(neutrals)
 
     def offsets(self, neutrals: Tensor) -> Tensor:
         """How far each vertex goes in each expression, (B,N,V,3); see :meth:`forward`."""
         if neutrals.ndim != 3 or neutrals.shape[1:] != self.neutral_mean.shape:
             raise ShapeError(f"neutrals: found {tuple(neutrals.shape)}, expected (B,{len(self.neutral_mean)},3)")
-        neutrals = as_real(neutrals)
+        neutrals = as_real(neutrals, "neutrals")
         pose = self._pose(neutrals)
         aligned = pose.apply(neutrals)
         X = self._beyond(aligned) @ self.neutral_components.flatten(1).T.to(aligned)
@@ -243,7 +243,7 @@ class ExpressionRegression(nn.Module):
 
         Among those learned from the first part is 1 on average, and so is the second.
         """
-        neutrals = as_real(neutrals)
+        neutrals = as_real(neutrals, "neutrals")
         if self.deviations is None:
             return neutrals.new_full((len(neutrals),), torch.nan)
         beyond = self._beyond(self._pose(neutrals).apply(neutrals))
@@ -346,7 +346,9 @@ def neutral_rig(regression: ExpressionRegression, template: BlendshapeRig, neutr
         >>> neutral_rig(zoo.get_model("expressions"), template, template.neutral).learned.tolist()
         [True, False]
     """
-    expected = neutral.fingerprint()
+    checked_type("regression", regression, ExpressionRegression)
+    checked_type("template", template, BlendshapeRig)
+    expected = checked_type("neutral", neutral, Mesh).fingerprint()
     for what, found in (("template", template.neutral.fingerprint()), ("regression", regression.topology)):
         if found is not None and found != expected:
             raise TopologyError(

@@ -18,6 +18,7 @@ from torchface.capture.markers.rest_pose import check_not_collinear, check_not_m
 from torchface.capture.markers.surface_motion import SurfaceMotion, with_one
 from torchface.errors import ValueRangeError
 from torchface.geometry.similarity import Similarity
+from torchface.number_checks import checked_type
 from torchface.progress import Progress, silent
 from torchface.rig import BlendshapeRig
 from torchface.take import Take
@@ -108,7 +109,9 @@ def fit_attachment(
         True
     """
     progress = progress or silent
-    initial.check(rig.neutral)
+    checked_type("rig", rig, BlendshapeRig)
+    checked_type("rom", rom, Take)
+    checked_type("initial", initial, Attachment).check(rig.neutral)
     rig = rig.linear("fit_attachment")
     paths = marker_paths(rom, initial)
     motion = SurfaceMotion.of(rig, normals=standoff)

@@ -1,0 +1,163 @@
+"""What users pass by mistake ends in a clear error; NumPy's arrays and lists are taken where that is safe."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+import torchface
+from torchface import Attachment, BlendshapeRig, Mesh, Take, Track
+from torchface.capture import MarkerSolver, align_take, fit_attachment
+from torchface.capture.own_rig import VideoSolver
+from torchface.correctives import Corrective, Correctives
+from torchface.errors import ArgumentTypeError, TorchfaceError
+from torchface.modeling import (
+    ExpressionRegression,
+    HeadModel,
+    MorphableModel,
+    rig_from_neutral,
+    transfer_deformation,
+)
+from torchface.optim import BoxQP, ProjectedGradient, box_qp, simplex_qp
+from torchface.registration import register
+
+
+class Given:
+    """A small rig with markers and models, whole."""
+
+    def __init__(self, rig: BlendshapeRig) -> None:
+        self.rig, self.mesh = rig, rig.neutral
+        self.v, self.f, self.d = rig.vertices, rig.neutral.faces, rig.deltas
+        self.sites = Attachment.from_vertices(self.mesh, range(0, 600, 9))
+        self.solver = MarkerSolver(rig, self.sites)
+        self.markers = self.sites.on(self.f, rig(torch.zeros(3, len(rig.names))))
+        self.take = Take(30.0, markers=Track(self.sites.labels, self.markers))  # type: ignore[arg-type]
+        self.heads = self.v + torch.randn(4, *self.v.shape, generator=torch.Generator().manual_seed(0))
+        self.model = MorphableModel.fit(self.heads)
+        self.regression = ExpressionRegression.fit(self.heads, self.heads[:, None] + self.d[:1], names=["jawOpen"])
+        self.H, self.q = 2 * torch.eye(3).double(), -torch.ones(4, 3).double()
+
+
+@pytest.fixture(scope="module")
+def given(dome_rig: BlendshapeRig) -> Given:
+    return Given(dome_rig)
+
+
+MISTAKES: dict[str, tuple[Callable[[Given], Any], str]] = {
+    "a path for vertices": (lambda g: Mesh("head.obj", g.f), r"vertices: found the text 'head.obj', expected a tensor"),
+    "no faces": (lambda g: Mesh(g.v, None), r"faces: found None, expected a tensor \(F,3\)"),
+    "faces of floats": (lambda g: Mesh(g.v, g.f.float()), "faces: found torch.float32, expected torch.int64"),
+    "faces of a list of floats": (lambda g: Mesh(g.v, [[0.5, 1, 2]]), "faces: found floats, expected whole numbers"),
+    "points of two numbers": (lambda g: Mesh(g.v[:, :2], g.f), r"vertices: found \(\d+, 2\), expected"),
+    "a tensor for a neutral": (lambda g: BlendshapeRig(g.v, g.d, g.rig.names), "neutral: found a tensor .* a Mesh"),
+    "a path for a neutral": (lambda g: BlendshapeRig("a.glb", g.d, "x"), "neutral: .*torchface.load_mesh reads one"),
+    "one name as a text": (lambda g: BlendshapeRig(g.mesh, g.d[:1], "jawOpen"), r"expected a list of names: \['jaw"),
+    "too few names": (lambda g: BlendshapeRig(g.mesh, g.d, ["a"]), "found 1 names for 4 deltas"),
+    "weights by name": (lambda g: g.rig({"jawOpen": 1.0}), r"weights: found a dict, expected a tensor \(B,4\)"),
+    "a row of weights": (lambda g: g.rig(torch.zeros(4)), r"weights: found \(4,\), expected \(B,4\)"),
+    "too many weights": (lambda g: g.rig(torch.zeros(2, 9)), r"weights: found \(2, 9\), expected \(B,4\)"),
+    "correctives for names": (lambda g: BlendshapeRig(g.mesh, g.d, g.rig.names, g.d), "correctives: found a tensor"),
+    "definitions first": (
+        lambda g: Correctives((Corrective("c", g.rig.names[:2]),), g.d[:1]),  # type: ignore[arg-type]
+        "correctives: deltas: found a tuple of Corrective, expected a tensor",
+    ),
+    "one definition": (lambda g: Correctives(g.d[:1], Corrective("c", g.rig.names[:2])), "expected a list of Corr"),
+    "names for definitions": (lambda g: Correctives(g.d[:1], ["c"]), "definition: found the text 'c', expected a C"),
+    "sites the wrong way": (lambda g: Attachment(g.sites.barycentric, g.sites.triangles), "triangles: found torch.flo"),
+    "a rig for a mesh": (
+        lambda g: Attachment.from_vertices(g.rig, [1, 2]),
+        "mesh: found a BlendshapeRig, expected a M",
+    ),
+    "vertices between vertices": (
+        lambda g: Attachment.from_vertices(g.mesh, [1.5]),
+        "ids: found floats, expected whol",
+    ),
+    "a track of a text": (lambda g: Track("ab", torch.zeros(4, 2, 3)), "names: found the text 'ab', expected a list"),
+    "a flat track": (lambda g: Track(("a", "b"), torch.zeros(4, 2)), r"values \(4, 2\), expected \(T,2,D\)"),
+    "a tensor for a track": (lambda g: Take(30.0, markers=g.markers), "take: markers: found a tensor .* a Track"),
+    "a rate as a text": (lambda g: Take("30", markers=None), "take: found 30 frames a second, expected"),
+    "a mesh for a rig": (lambda g: MarkerSolver(g.mesh, g.sites), "rig: found a Mesh, expected a BlendshapeRig"),
+    "a path for a rig": (lambda g: MarkerSolver("a.glb", g.sites), "torchface.load_rig reads one from a file"),
+    "ids for sites": (lambda g: MarkerSolver(g.rig, [1, 2]), "attachment: found a list of int, expected an Attach"),
+    "sites before the rig": (lambda g: MarkerSolver(g.sites, g.rig), "rig: found an Attachment, expected a Blend"),
+    "a take for markers": (lambda g: g.solver(g.take), r"markers: found a Take, expected a tensor \(B,67,3\)"),
+    "one frame of markers": (lambda g: g.solver(g.markers[0]), r"markers: found \(67, 3\), expected \(B,67,3\)"),
+    "too few markers": (lambda g: g.solver(g.markers[:, :5]), r"markers: found \(3, 5, 3\), expected"),
+    "markers for a take": (lambda g: g.solver.solve_take(g.markers), "take: found a tensor .* expected a Take"),
+    "markers to align": (lambda g: align_take(g.rig, g.sites, g.markers), "take: found a tensor .* expected a Take"),
+    "ids to fit": (lambda g: fit_attachment(g.rig, g.take, [1]), "initial: found a list of int, expected an Att"),
+    "one row of f": (lambda g: box_qp(g.H, g.q[0]), r"found f \(3,\), expected \(B,3\) for H \(3, 3\)"),
+    "f before H": (lambda g: box_qp(g.q, g.H), r"found H \(4, 3\), expected \(N,N\)"),
+    "two precisions": (lambda g: box_qp(g.H, g.q.float()), "f of torch.float32 and H of torch.float64, expected the"),
+    "rows of other lengths": (lambda g: box_qp([[1.0], [1.0, 2.0]], g.q), "H: found a list of list, expected a tensor"),
+    "a text for H": (lambda g: BoxQP("H"), "H: found the text 'H', expected a tensor"),
+    "no H": (lambda g: ProjectedGradient()(g.q), "found no H, expected one here or where the module is made"),
+    "a simplex of other size": (lambda g: simplex_qp(g.H, g.q[:, :2]), r"f \(4, 2\) for H \(3, 3\), expected \(B,3\)"),
+    "meshes for samples": (lambda g: MorphableModel.fit([g.mesh] * 3), "samples: found a list of Mesh, expected a te"),
+    "flat samples": (lambda g: MorphableModel.fit(g.heads[..., 0]), r"samples: found \(4, \d+\), expected floats"),
+    "samples for a model": (lambda g: HeadModel(g.heads, None, g.f), "shape: found a tensor .* a MorphableModel"),
+    "too many coefficients": (lambda g: g.model(torch.zeros(1, 9)), r"coefficients: found \(1, 9\), expected \(B,3\)"),
+    "a mesh for neutrals": (lambda g: g.regression(g.mesh), r"neutrals: found a Mesh, expected a tensor"),
+    "one neutral": (lambda g: g.regression(g.v), r"neutrals: found \(\d+, 3\), expected \(B,\d+,3\)"),
+    "a face for a rig": (lambda g: transfer_deformation(g.mesh, g.rig), "source: found a Mesh, expected a Blendshape"),
+    "vertices for a face": (lambda g: transfer_deformation(g.rig, g.v), "target: found a tensor .* expected a Mesh"),
+    "a template first": (
+        lambda g: rig_from_neutral(g.rig, g.regression, g.mesh),
+        "regression: found a BlendshapeRig, expected an ExpressionRegression",
+    ),
+    "paths to register": (lambda g: register("a.obj", "b.obj"), "template: found the text 'a.obj', expected a Mesh"),
+    "no path": (lambda g: torchface.load_rig(None), "path: found None, expected a path"),
+    "a mesh for a path": (lambda g: torchface.load_mesh(g.mesh), "path: found a Mesh, expected a path"),
+    "a path before the rig": (lambda g: torchface.save_rig("a.glb", g.rig), "rig: found the text 'a.glb', expected"),
+    "vertices to save": (lambda g: torchface.save_mesh(g.v, "a.obj"), "mesh: found a tensor .* expected a Mesh"),
+    "weights to save": (lambda g: torchface.save_animation(g.rig, g.q, "a.glb"), "take: found a tensor .* a Take"),
+    "a track to save": (lambda g: torchface.save_take(g.take.markers, "a.csv"), "take: found a Track, expected a Take"),
+}
+
+
+@pytest.mark.parametrize("mistake", MISTAKES)
+def test_a_mistake_ends_in_an_error_that_names_the_argument(mistake: str, given: Given) -> None:
+    call, said = MISTAKES[mistake]
+    with pytest.raises(TorchfaceError, match=said):
+        call(given)
+
+
+def test_landmarks_of_one_frame_are_not_taken_for_68_frames(given: Given) -> None:
+    K = torch.tensor([[500.0, 0, 160], [0, 500, 120], [0, 0, 1]])
+    solver = VideoSolver(given.rig, torch.arange(0, 612, 9), K)
+    with pytest.raises(TorchfaceError, match=r"landmarks: found \(68, 2\), expected \(T,68,2\), a row a frame"):
+        solver(torch.zeros(68, 2))
+
+
+def test_arrays_and_lists_give_what_tensors_give(given: Given) -> None:
+    g = given
+    mesh = Mesh(g.v.double().numpy(), g.f.int().numpy())  # type: ignore[arg-type]
+    assert mesh.fingerprint() == g.mesh.fingerprint()
+    assert mesh.vertices.dtype == torch.float32
+    rig = BlendshapeRig(mesh, list(g.d), list(g.rig.names))  # type: ignore[arg-type]
+    assert torch.equal(rig([[0.5, 0, 0, 1]]), g.rig(torch.tensor([[0.5, 0, 0, 1]])))  # type: ignore[arg-type]
+    sites = Attachment(g.sites.triangles.numpy(), g.sites.barycentric.double().numpy())  # type: ignore[arg-type]
+    assert torch.equal(sites.on(g.f, g.v), g.sites.on(g.f, g.v))
+    assert torch.equal(Track(("a",), np.ones((2, 1, 3))).values, torch.ones(2, 1, 3))  # type: ignore[arg-type]
+    solved = g.solver(g.markers)
+    for other in (g.markers.numpy(), g.markers.tolist()):
+        torch.testing.assert_close(g.solver(other), solved, rtol=0, atol=1e-6)
+    expected = box_qp(g.H, g.q)
+    H, q = g.H.numpy(), g.q.numpy()
+    for found in (box_qp(H, q), BoxQP(H)(q), ProjectedGradient(H)(q)):  # type: ignore[arg-type]
+        assert found.dtype == torch.float64
+        torch.testing.assert_close(found, expected, rtol=0, atol=1e-6)
+    assert simplex_qp(H.tolist(), q.tolist()).dtype == torch.float32  # type: ignore[arg-type]
+    model = MorphableModel.fit(g.heads.numpy())  # type: ignore[arg-type]
+    torch.testing.assert_close(model(np.ones((1, 3))), g.model(torch.ones(1, 3)))  # type: ignore[arg-type]
+    torch.testing.assert_close(g.regression(g.v[None].numpy()), g.regression(g.v[None]))  # type: ignore[arg-type]
+
+
+def test_a_type_error_is_one_of_pythons_too(given: Given) -> None:
+    with pytest.raises(TypeError):
+        MarkerSolver(given.mesh, given.sites)  # type: ignore[arg-type]
+    assert issubclass(ArgumentTypeError, TorchfaceError)
