@@ -56,12 +56,11 @@ class Faces:
 NO_FACES = Faces([], torch.zeros(0, 4), torch.zeros(0, 68, 2), [])
 
 
-def load_faces(path: Path, folders_are_people: bool = False) -> Faces:
-    """The annotated faces of a folder of ``.pts`` files or of a dlib ``.xml``; those without all 68 are left out.
+def annotations(path: Path) -> list[tuple[Path, Tensor]]:
+    """Pictures and their 68 landmarks (68,2), of a folder of ``.pts`` files or of a dlib ``.xml``.
 
-    Args:
-        path: of either.
-        folders_are_people: pictures of a folder show one person; else each shows its own, a mirrored copy the same.
+    Raises:
+        FileFormatError: it is neither, a picture is missing, or there is no face with all 68.
     """
     found: list[tuple[Path, Tensor]] = []
     if path.suffix.lower() == ".xml":
@@ -78,6 +77,17 @@ def load_faces(path: Path, folders_are_people: bool = False) -> Faces:
         raise FileFormatError(f"{path}: found no folder and no .xml, expected iBUG's .pts files or dlib's XML")
     if not found:
         raise FileFormatError(f"{path}: found no face with 68 landmarks, expected at least one")
+    return found
+
+
+def load_faces(path: Path, folders_are_people: bool = False) -> Faces:
+    """The annotated faces of a folder of ``.pts`` files or of a dlib ``.xml``; those without all 68 are left out.
+
+    Args:
+        path: of either.
+        folders_are_people: pictures of a folder show one person; else each shows its own, a mirrored copy the same.
+    """
+    found = annotations(path)
     known: dict[Path, Tensor] = {}
     faces = NO_FACES
     for picture, points in found:
