@@ -10,12 +10,10 @@ from safetensors.torch import load_file, save_file
 from torch.utils.data import TensorDataset
 
 from torchface import zoo
-from torchface.errors import FileFormatError, ValueRangeError
-from torchface.io import save_image, save_pts
+from torchface.errors import FileFormatError
 from torchface.landmarks import LandmarkNetwork, NetworkSettings
 from train import landmark_network as recipe
 from train.face_pictures import StoredPictures
-from train.rendered_people.dense_points import dense_places
 from train.rendered_people.face_picture import draw_pictures
 from train.rendered_people.head_kind import performer_kind
 from train.run_log import read_log
@@ -33,30 +31,6 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
         names = ("rgba", "landmarks", "visible", "points", "point_visible", "weights")
         save_file({name: torch.stack([getattr(one, name) for one in drawn]) for name in names}, path)
     return paths
-
-
-def test_a_network_goes_on_learning_from_annotated_photographs(files: list[Path], tmp_path: Path) -> None:
-    """It comes nearer to them, and keeps what it read of the points that nobody has annotated."""
-    data = tmp_path / "photographs"
-    data.mkdir()
-    stored = load_file(files[0])
-    for number in range(3):
-        save_image(stored["rgba"][number, :3].float() / 255, data / f"{number}.png")
-        save_pts(stored["landmarks"][number], data / f"{number}.pts")
-    places, mirror = dense_places()
-    start = small().with_points(places, mirror)
-    zoo.save_model(start, tmp_path / "start", zoo.ModelCard("MIT", "none", {}, ""))
-    quick = NetworkSettings(steps=40, batch=4, rate=2e-3, average=0.5, heat=0.0)
-    settings = recipe.Settings(out=tmp_path / "own", start=str(tmp_path / "start"), data=data, network=quick)
-    tuned = recipe.train(settings)
-    before, after = zoo.describe(tmp_path / "own").metrics.values()
-    assert after < 0.7 * before
-    assert tuned.points == len(places)
-    assert "annotated pictures of photographs, after" in zoo.describe(tmp_path / "own").data
-    for name in ("1.pts", "2.pts"):
-        (data / name).unlink()
-    with pytest.raises(ValueRangeError, match="data: found 1 annotated face"):
-        recipe.train(settings)
 
 
 def small() -> LandmarkNetwork:
