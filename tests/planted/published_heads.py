@@ -59,6 +59,8 @@ def flame_arrays(rig: BlendshapeRig, shapes: int = 300) -> dict[str, Any]:
     for row, name in enumerate(("neck", "neck", "ear_left", "eyeball_left", "eyeball_right")):
         mask = regions[name] | regions["ear_right"] if row == 2 else regions[name]
         regressor[row, mask.numpy()] = 1 / int(mask.sum())
+    faces, inner = rig.neutral.faces, rig.neutral.landmarks[17:]
+    triangle = torch.stack([(faces == one).any(1).nonzero()[0, 0] for one in inner])
     return {
         "v_template": vertices,
         "shapedirs": basis.permute(1, 2, 0).numpy() / 1000,
@@ -66,6 +68,8 @@ def flame_arrays(rig: BlendshapeRig, shapes: int = 300) -> dict[str, Any]:
         "J_regressor": regressor,
         "weights": weights.numpy(),
         "posedirs": np.zeros((count, 3, 36), np.float32),
+        "lmk_face_idx": triangle.numpy(),
+        "lmk_b_coords": (faces[triangle] == inner[:, None]).float().numpy(),
         "kintree_table": np.array([[2**32 - 1, 0, 1, 1, 1], [0, 1, 2, 3, 4]]),
     }
 

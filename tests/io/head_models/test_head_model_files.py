@@ -1,6 +1,9 @@
 """Tests of the readers of others' head models: planted files of each layout, and malformed ones of each."""
 
 import pickle
+import subprocess
+import sys
+import types
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
@@ -8,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import scipy.sparse
 import torch
 from safetensors.numpy import save_file
 
@@ -112,10 +116,10 @@ def test_landmarks_are_read_of_the_files_beside(
     gnm = load_head_model_file(tmp_path / "gnm_head.npz")
     assert gnm.landmarks is not None
     assert torch.allclose(gnm.landmarks.on(gnm.neutral.vertices), truth, atol=1e-3)  # its contour in iBUG's order
-    faces = rig.neutral.faces
-    triangle = torch.stack([(faces == one).any(1).nonzero()[0, 0] for one in rig.neutral.landmarks[17:]])
-    corner = (faces[triangle] == rig.neutral.landmarks[17:, None]).float()
-    np.savez(tmp_path / "flame.npz", **arrays["flame"], lmk_face_idx=triangle.numpy(), lmk_b_coords=corner.numpy())
+    beside = ("lmk_face_idx", "lmk_b_coords")
+    np.savez(tmp_path / "flame.npz", **{name: v for name, v in arrays["flame"].items() if name not in beside})
+    assert load_head_model_file(tmp_path / "flame.npz").landmarks is None
+    np.savez(tmp_path / "flame_static_embedding.npz", **{name: arrays["flame"][name] for name in beside})
     flame = load_head_model_file(tmp_path / "flame.npz")
     assert flame.landmarks is not None
     assert flame.landmarks.rows.tolist() == list(range(17, 68))
@@ -238,3 +242,36 @@ def test_links_out_of_a_basel_file_and_giants_are_refused(rig: BlendshapeRig, tm
                 file.create_dataset("shape/model/pcaBasis", (rig.vertices.numel(), 10**7), "f4", chunks=(64, 64))
         with pytest.raises(FileFormatError, match="a link in place" if harm == "link" else "bytes, expected at most"):
             load_head_model_file(path)
+
+
+class Ch:
+    """Stands in for chumpy's class, which FLAME's older pickles hold."""
+
+    def __init__(self, x: np.ndarray) -> None:
+        self.x = x
+
+
+def test_the_pages_script_converts_a_pickle_and_runs_nothing(
+    arrays: dict[str, dict[str, Any]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    page = (Path(__file__).parents[3] / "docs" / "how_to" / "head_models.md").read_text()
+    script = page.split("```python")[1].split("```")[0]
+    (tmp_path / "convert.py").write_text(script)
+    held = dict(_small(arrays["flame"]))
+    held["J_regressor"] = scipy.sparse.csc_matrix(held["J_regressor"])
+    chumpy = types.ModuleType("chumpy")
+    monkeypatch.setitem(sys.modules, "chumpy", chumpy)
+    monkeypatch.setattr(chumpy, "Ch", Ch, raising=False)
+    monkeypatch.setattr(Ch, "__module__", "chumpy")
+    held["shapedirs"] = Ch(held["shapedirs"])
+    for name, document in (("good", held), ("evil", {"v_template": _Evil()})):
+        (tmp_path / f"{name}.pkl").write_bytes(pickle.dumps(document, protocol=2))
+    done = [
+        subprocess.run([sys.executable, "convert.py", f"{name}.pkl", f"{name}.npz"], cwd=tmp_path, capture_output=True)
+        for name in ("good", "evil")
+    ]
+    assert done[0].returncode == 0, done[0].stderr
+    model = load_head_model_file(tmp_path / "good.npz")
+    assert (len(model.identity), len(model.expressions)) == (300, 10)
+    assert b"is not an array" in done[1].stderr
+    assert not (tmp_path / "was_run").exists()

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from planted.published_heads import codes, expression_basis, flame_arrays, gnm_arrays, head
+from planted.published_heads import codes, expression_basis, flame_arrays, gnm_arrays, gnm_landmarks, head
 from torchface import Mesh, load_mesh, load_rig, load_take, save_mesh, save_rig
 from torchface.errors import FileFormatError, NameMismatchError
 from torchface.modeling import HeadModel
@@ -144,10 +144,12 @@ def test_audio2faces_weights_go_by_name(tmp_path: Path) -> None:
     assert "ARKit has no tongueTipUp" in lines[0]
 
 
+@pytest.mark.bench
 def test_a_published_model_is_a_head_model_with_its_rig(
     tmp_path: Path, rig: BlendshapeRig, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     np.savez(tmp_path / "gnm_head.npz", **gnm_arrays(rig))
+    gnm_landmarks(rig, tmp_path / "head_sparse_68.txt")
     few = performer(texture=False).select(SHAPES)
     monkeypatch.setattr(arkit_rig, "performer", lambda texture: few)
     model = load_head_model(tmp_path / "gnm_head.npz")

@@ -18,7 +18,7 @@ from torchface.rig import BlendshapeRig
 _ROUND, _LEAST_BALL, _SMALLEST_BALL, _LARGEST_BALL = 0.12, 12, 0.4, 2.4
 """How far from a sphere an eyeball may be, in radii, its fewest vertices, and its size in the template's."""
 _EYEBALL_REACH, _CORNEA = 1.35, 0.8  # radii; the cosine of how far it reaches from its middle
-_IN_THE_MOUTH, _MOUTH_HEIGHT = 60.0, 25.0  # millimetres
+_IN_THE_MOUTH, _MOUTH_HEIGHT = 75.0, 25.0  # millimetres
 _BITE, _BITE_BLEND = 0.2, 3.0
 """How much the line between upper and lower teeth rises toward the back, and the millimetres over which a part that
 both jaws share, such as gums in one piece, passes from the one to the other."""

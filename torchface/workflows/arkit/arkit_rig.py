@@ -25,11 +25,12 @@ from torchface.registration.landmark_files import load_scan_landmarks
 from torchface.rig import BlendshapeRig
 from torchface.shape_names import ARKIT, recognised_shapes
 from torchface.synthetic import performer
+from torchface.workflows.arkit.seen_landmarks import seen_landmarks
 
 TONGUE = "tongueOut"
 _HEAD, _BODY = 330.0, 600.0
 """Millimetres: of a mesh taller than the second the uppermost first are the head."""
-_MEDIAN_LIMIT = 3.0
+_MEDIAN_LIMIT, _STRETCH_LIMIT = 3.0, 1.0
 _BESIDE = 4.0
 
 
@@ -165,16 +166,20 @@ def _template(path: Path | None) -> BlendshapeRig:
 def _carried(source: Source, template: BlendshapeRig, landmarks: Path | None, progress: Progress) -> CarriedShapes:
     scan = _head_of(source.neutral)
     marks = _landmarks(source, template.neutral, landmarks)
+    if marks is None and template.neutral.annotations is not None:
+        marks = seen_landmarks(scan, template.neutral, progress)
     try:
         registration = register(template.neutral, scan, marks, texture_size=0, progress=progress)
     except AlignmentError as error:
         raise AlignmentError(
             f"{source.path}: {error}; give the face's landmarks (--landmarks FILE, from torchface pick)"
         ) from error
-    if not registration.record.median_distance < _MEDIAN_LIMIT:
+    record = registration.record
+    if not (record.median_distance < _MEDIAN_LIMIT and record.stretch < _STRETCH_LIMIT):
         raise AlignmentError(
-            f"{source.path}: found a head {registration.record.median_distance:.1f} mm from the registered template, "
-            f"expected less than {_MEDIAN_LIMIT:g}; give the face's landmarks (--landmarks FILE, from torchface pick)"
+            f"{source.path}: found a head {record.median_distance:.1f} mm from the registered template (median), whose "
+            f"edges are stretched by {record.stretch:.0%}, expected less than {_MEDIAN_LIMIT:g} mm and "
+            f"{_STRETCH_LIMIT:.0%}; give the face's landmarks (--landmarks FILE, from torchface pick)"
         )
     return shapes_on(template, source.neutral, registration=registration, progress=progress)
 

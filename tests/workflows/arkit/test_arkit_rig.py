@@ -1,0 +1,66 @@
+"""ARKit's shapes on real heads: ICT-FaceKit's, whose own shapes are the truth, stripped."""
+
+from pathlib import Path
+
+import pytest
+import torch
+
+from torchface import Mesh
+from torchface.errors import AlignmentError, ValueRangeError
+from torchface.geometry.rotations import rotation_matrix
+from torchface.io import load_ict_facekit, save_rig
+from torchface.rig import BlendshapeRig
+from torchface.synthetic import performer
+from torchface.workflows.arkit.arkit_rig import Source, make_arkit
+
+
+@pytest.mark.real
+@pytest.mark.bench
+def test_shapes_on_ict_go_the_way_of_its_own(ict_folder: Path) -> None:
+    """Two sculptors' shapes differ; those of jaw, lids and smile go the same way, and nothing is renumbered."""
+    rig = load_ict_facekit(ict_folder).with_arkit_names()
+    made = make_arkit(Source(ict_folder, rig.neutral, rig), everything=True)
+    assert len(made.made) == 51
+    assert torch.equal(made.rig.neutral.faces, rig.neutral.faces)
+    face = rig.neutral.annotations.regions["face"]  # type: ignore[union-attr]
+    names = [name for name in made.made if name in rig.names]
+    own, truth = (one.deltas[one.index(names)][:, face].flatten(1) for one in (made.rig, rig))
+    cosine = dict(zip(names, ((own * truth).sum(1) / (own.norm(dim=1) * truth.norm(dim=1))).tolist(), strict=True))
+    assert float(torch.tensor(list(cosine.values())).median()) > 0.75
+    for name, least in (("jawOpen", 0.88), ("eyeBlinkLeft", 0.75), ("mouthSmileRight", 0.7), ("mouthPucker", 0.8)):
+        assert cosine[name] > least, (name, cosine[name])
+    teeth = rig.neutral.annotations.regions["teeth"]  # type: ignore[union-attr]
+    opened = made.rig.deltas[made.rig.index(["jawOpen"])[0]][teeth].norm(dim=1)
+    upper, lower = opened < 0.5, opened > 10
+    assert bool((upper | lower).all())
+    assert float(lower.double().mean()) == pytest.approx(0.5, abs=0.1)
+
+
+@pytest.mark.real
+@pytest.mark.bench
+def test_a_turned_head_of_another_size_without_landmarks_is_found_by_its_looks(ict_folder: Path) -> None:
+    rig = load_ict_facekit(ict_folder).with_arkit_names()
+    turn = rotation_matrix(torch.tensor([[0.3, 2.0, 0.2]]))[0]
+    bare = Mesh(0.5 * rig.vertices @ turn.T + 300, rig.neutral.faces)
+    made = make_arkit(Source(Path("turned"), bare), everything=True)
+    assert made.carried is not None
+    assert made.carried.registration.record.start == "landmarks"
+    row = made.rig.index(["jawOpen"])[0]
+    own, truth = 2 * made.rig.deltas[row] @ turn, rig.deltas[rig.index(["jawOpen"])[0]]
+    face = rig.neutral.annotations.regions["face"]  # type: ignore[union-attr]
+    cosine = (own[face] * truth[face]).sum() / (own[face].norm() * truth[face].norm())
+    assert float(cosine) > 0.85
+
+
+def test_a_template_without_arkits_shapes_and_a_head_that_is_none_are_refused(tmp_path: Path) -> None:
+    actor = performer(texture=False).select(["jawOpen"])
+    save_rig(BlendshapeRig(actor.neutral, actor.deltas, ["Ears_Wiggle"]), tmp_path / "other.glb")
+    source = Source(Path("head"), actor.neutral)
+    with pytest.raises(ValueRangeError, match="found no shape of ARKit's names"):
+        make_arkit(source, tmp_path / "other.glb")
+    marks = actor.neutral.landmarks
+    crumpled = actor.vertices.clone()
+    crumpled[:, 2] = 5 * torch.sin(0.2 * crumpled[:, 0]) * torch.cos(0.2 * crumpled[:, 1])
+    with pytest.raises(AlignmentError, match=r"--landmarks FILE"):
+        make_arkit(Source(Path("crumpled"), actor.neutral.with_vertices(crumpled)))
+    assert len(marks) == 68
