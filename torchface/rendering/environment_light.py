@@ -67,13 +67,13 @@ class EnvironmentLight:
         up, around = torch.meshgrid(up, around, indexing="ij")
         toward = torch.stack([-up.cos() * around.sin(), -up.sin(), -up.cos() * around.cos()], -1)
         solid = up.cos() * (math.pi / height) * (2 * math.pi / width)
-        light = torch.einsum("hwk,hw,chw->kc", _harmonics(toward), solid, panorama.double())
+        light = torch.einsum("hwk,hw,chw->kc", harmonics(toward), solid, panorama.double())
         return EnvironmentLight(light * torch.tensor(_KEPT, dtype=torch.float64)[:, None])
 
     @property
     def mean(self) -> Tensor:
         """Light in the mean of all directions, (3,)."""
-        return self.coefficients[0] * _harmonics(torch.eye(3, dtype=torch.float64))[0, 0]
+        return self.coefficients[0] * harmonics(torch.eye(3, dtype=torch.float64))[0, 0]
 
     def scaled(self, factor: float) -> EnvironmentLight:
         """The same, so many times as bright."""
@@ -81,10 +81,10 @@ class EnvironmentLight:
 
     def irradiance(self, normals: Tensor) -> Tensor:
         """What it brings to surfaces with unit normals (...,3) in the camera's frame, (...,3), linear."""
-        return (_harmonics(normals) @ self.coefficients.to(normals)).clamp(min=0)
+        return (harmonics(normals) @ self.coefficients.to(normals)).clamp(min=0)
 
 
-def _harmonics(directions: Tensor) -> Tensor:
+def harmonics(directions: Tensor) -> Tensor:
     """The nine real spherical harmonics of degree 2 at most, (...,9)."""
     x, y, z = directions.unbind(-1)
     return torch.stack(

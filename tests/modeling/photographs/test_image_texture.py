@@ -28,6 +28,7 @@ def bare() -> Mesh:
 @pytest.mark.parametrize("planted", [BLUE, BROWN], ids=["blue", "brown"])
 def test_irises_come_back_from_a_picture(bare: Mesh, planted: Tensor) -> None:
     worn = with_part_colors(bare, planted)
+    assert bare.annotations is not None
     assert worn.colors is not None
     assert bare.colors is not None
     skin = ~part_vertices(bare)
@@ -37,6 +38,16 @@ def test_irises_come_back_from_a_picture(bare: Mesh, planted: Tensor) -> None:
     found = iris_color(bare, [render(worn, camera, lighting=EVEN, samples=1)], [camera])
     assert found is not None
     assert float((found - planted).norm()) < 0.12
+    fronts, wide = [], bare.colors.clone()  # irises of people's size; those of the coarse ball fade from their middle
+    for side in ("right", "left"):
+        ball = bare.annotations.regions[f"eyeball_{side}"].nonzero()[:, 0]
+        out = bare.vertices[ball] - bare.vertices[ball].mean(0)
+        fronts.append(bare.vertices[ball[out[:, 2].argmax()]].double())
+        wide[ball] = torch.where((out[:, 2] > 0.8 * out[:, 2].max())[:, None], planted, torch.tensor(1.0))
+    picture = render(replace(bare, colors=wide), camera, lighting=EVEN, samples=1)
+    ringed = iris_color(bare, [picture], [camera], camera.project(torch.stack(fronts))[None])
+    assert ringed is not None
+    assert float((ringed - planted).norm()) < 0.05
     far = look_at(eyes, 10.0, span=2000.0, width=320, height=200)
     assert iris_color(bare, [render(worn, far, lighting=EVEN, samples=1)], [far]) is None
 

@@ -12,9 +12,10 @@ from torchface.errors import AlignmentError, ShapeError, TopologyError
 from torchface.geometry.cameras.pinhole import Camera, look_at
 from torchface.mesh import Mesh
 from torchface.modeling.morphable.morphable_model import MorphableModel
-from torchface.modeling.photographs.skin_mask import skin_shares
+from torchface.modeling.photographs.skin_mask import FacePlaces, skin_shares
 from torchface.modeling.photographs.texture_fit import fit_colors
 from torchface.modeling.photographs.texture_projection import PhotoTexture, photo_texture
+from torchface.rendering.camera_visibility import PosedSurface
 from torchface.rendering.clay_shading import Lighting, render
 from torchface.synthetic import neutral_head
 from train.rendered_people.complexion import complexion_colors, draw_complexions
@@ -170,7 +171,9 @@ def test_hair_and_cloth_are_not_painted_on(subject: Mesh, skins: Tensor, cameras
         render(replace(subject, colors=dressed), c, lighting=EVEN, background=GREEN, samples=1) for c in cameras
     ]
     painted = photo_texture(subject, pictures, cameras, 256)
-    masked = photo_texture(subject, pictures, cameras, 256, confidence=skin_shares(subject, pictures, cameras))
+    shown = [PosedSurface.each(subject, 1)[0].shown_in(*one) for one in zip(pictures, cameras, strict=True)]
+    shares = skin_shares(shown, [FacePlaces.of(subject)] * len(shown), subject.faces)
+    masked = photo_texture(subject, pictures, cameras, 256, confidence=shares)
     skin = skins[40][regions["face"]].median(0).values
     for cloth, color in ((hair, black), (collar, blue)):
         assert float(((painted.colors[cloth] - color).norm(dim=-1) < 0.2).float().mean()) > 0.3

@@ -54,6 +54,7 @@ class ImageFit:
         covariance: of coefficients and weights of each expression, (K+EN,K+EN); rows of those that lie on their
             bound are zero.
         color: the colour model's fit to the photographs; None without one, or without photographs.
+        hair: its colour where the head has it as painted, (3,); None where photographs show a bald head.
     """
 
     mesh: Mesh
@@ -66,6 +67,7 @@ class ImageFit:
     noise: float
     covariance: Tensor
     color: ColorFit | None = None
+    hair: Tensor | None = None
 
     @property
     def errors(self) -> Tensor:
@@ -171,8 +173,9 @@ def fit_images(
     if images is None:
         return fit
     progress("projecting the photographs onto the head")
-    skin = photographed_skin(fit.posed, model.color, images, fit.cameras, settings.texture_size, settings.masked)
-    return replace(fit, mesh=skin.on(fit.mesh), posed=tuple(map(skin.on, fit.posed)), color=skin.fit)
+    size, masked, irises = settings.texture_size, settings.masked, settings.irises
+    skin = photographed_skin(fit.posed, model.color, images, fit.cameras, size, masked, irises)
+    return replace(fit, mesh=skin.on(fit.mesh), posed=tuple(map(skin.on, fit.posed)), color=skin.fit, hair=skin.hair)
 
 
 def _result(

@@ -104,6 +104,7 @@ class FitSettings:
         max_iterations: of Gauss-Newton.
         transfers: how often shapes are transferred to the head found; 0 keeps the template's.
         texture_size: of the skin, texels a side; 0 makes no texture.
+        irises: centres of the irises in each photograph, (I,2,2) pixels, NaN where unknown: their colour is there.
         masked: only skin and the face's features are projected onto the head; see ``photographed_skin``.
 
     Raises:
@@ -135,6 +136,7 @@ class FitSettings:
     max_iterations: int = 20
     transfers: int = 1
     texture_size: int = 1024
+    irises: Tensor | None = None
     masked: bool = True
 
     def __post_init__(self) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -10,14 +11,16 @@ from torch import Tensor
 
 from torchface.geometry.cameras.pinhole import Camera
 from torchface.geometry.meshes.operators import vertex_normals
-from torchface.io.gltf.region_materials import EYEBALL, part_material
+from torchface.io.gltf.region_materials import EYEBALL, IRIS, part_material
 from torchface.mesh import Mesh
 from torchface.modeling.morphable.morphable_model import MorphableModel
+from torchface.modeling.photographs.hair_cap import HairCap, hair_cap
 from torchface.modeling.photographs.landmark_view import LANDMARKS
-from torchface.modeling.photographs.skin_mask import skin_shares
+from torchface.modeling.photographs.skin_light import skin_light, unlit
+from torchface.modeling.photographs.skin_mask import FacePlaces, skin_shares
 from torchface.modeling.photographs.texture_fit import ColorFit, fit_colors
-from torchface.modeling.photographs.texture_projection import photo_texture
-from torchface.rendering.camera_visibility import shown_in
+from torchface.modeling.photographs.texture_projection import PhotoTexture, photo_texture
+from torchface.rendering.camera_visibility import PosedSurface, shown_in
 from torchface.rendering.clay_shading import sample_texture
 from torchface.rendering.raycast import RayCaster
 
@@ -26,16 +29,20 @@ _SHARE = (0.15, 0.40)
 """Of the eyeball between the lids, the darkest first: lashes and pupil, then the iris, then white and highlights."""
 
 _MIN_PIXELS = 40
+_IRIS_WIDTH, _MIN_RADIUS, _MIN_RING, _RING = 11.7, 2.5, 6, (0.45, 0.8)  # millimetres, pixels, pixels, radii
+_DARKEST = 0.07
 _IRIS_COSINE = 0.9  # of the angle between the eye's axis and the border of an iris 11 mm wide
 
 
 @dataclass(frozen=True, eq=False)
 class Skin:
-    """Colours of the vertices (V,3), a texture (3,size,size) where there is a layout, and the colour model's answer."""
+    """Colours of the vertices (V,3), a texture (3,size,size) where there is a layout, the colour model's answer, and
+    the hair's colour (3,) where it is painted."""
 
     colors: Tensor | None
     texture: Tensor | None
     fit: ColorFit | None
+    hair: Tensor | None = None
 
     def on(self, mesh: Mesh) -> Mesh:
         """A mesh with it; one without a layout or a colour model keeps its own."""
@@ -50,6 +57,7 @@ def photographed_skin(
     cameras: Sequence[Camera],
     size: int = 1024,
     masked: bool = True,
+    irises: Tensor | None = None,
 ) -> Skin:
     """A head's skin from photographs and a colour model.
 
@@ -60,28 +68,60 @@ def photographed_skin(
         cameras: one each.
         size: of the texture, texels a side; 0 makes none.
         masked: project only skin and the face's features onto the head; else also hair, clothes and what stands behind.
+        irises: centres of the eyes' irises in each photograph, (I,2,2) pixels, NaN where they are not known.
 
     Returns:
-        With texture coordinates: the photographs projected onto the head, where none shows it the colour model, else
-        the template's skin; of a template without colours, parts such as teeth have their material's, and the irises
-        their colour in the photographs. Without: the colour model's colours.
+        With texture coordinates: the photographs projected onto the head with their light divided out, where none shows
+        it the colour model, else the template's skin, and hair as a cap of its colour; of a template without colours,
+        parts such as teeth have their material's, and the irises their colour in the photographs. Without: the colour
+        model's colours.
     """
     fit = None if color is None else fit_colors(color, posed, images, cameras)
     mesh = posed[0]
     base = _own_colors(mesh) if fit is None else fit.colors
     if mesh.uvs is None or size == 0:
         return Skin(base, None, fit)
-    confidence = skin_shares(posed, images, cameras) if masked and _has_landmarks(mesh) else None
-    if base is not None:
-        texture = photo_texture(posed, images, cameras, size, base, confidence)
-        return Skin(texture.colors, texture.image, fit)
-    parts = part_vertices(mesh)
-    if parts.any() and not parts.all():
-        confidence = torch.ones(len(images), len(parts)) if confidence is None else confidence
-        confidence = torch.where(parts, 0.0, confidence)
-    texture = photo_texture(posed, images, cameras, size, base, confidence)
-    colored = with_part_colors(replace(mesh, colors=texture.colors), iris_color(posed, images, cameras))
-    return Skin(colored.colors, texture.image, fit)
+    parts, count = part_vertices(mesh), len(images)
+    confidence, lights, cap = None, None, None
+    if _has_landmarks(mesh):
+        surfaces, places = PosedSurface.each(posed, count), [FacePlaces.of(one) for one in posed]
+        shown = [
+            surface.shown_in(image, camera) for surface, image, camera in zip(surfaces, images, cameras, strict=True)
+        ]
+        lights = [
+            skin_light(at, surface.normals, camera, where.cheeks & ~parts)
+            for at, surface, camera, where in zip(shown, surfaces, cameras, places, strict=True)
+        ]
+        shown = [
+            replace(at, colors=unlit(at.colors, surface.normals, camera, light))
+            for at, surface, camera, light in zip(shown, surfaces, cameras, lights, strict=True)
+        ]
+        if masked:
+            confidence = skin_shares(shown, places, mesh.faces)
+            cap = hair_cap(shown, places, torch.where(parts, 1.0, confidence))
+    own = base is None and bool(parts.any()) and not bool(parts.all())
+    if own:
+        confidence = torch.where(parts, 0.0, torch.ones(count, len(parts)) if confidence is None else confidence)
+    texture = photo_texture(posed, images, cameras, size, base, confidence, lights)
+    if cap is not None:
+        texture = _capped(texture, cap, mesh, parts)
+    colors = texture.colors
+    if own:
+        iris = iris_color(posed, images, cameras, irises)
+        iris = torch.tensor(IRIS.color) if iris is None else iris
+        colored = with_part_colors(replace(mesh, colors=colors), iris)
+        colors = colors if colored.colors is None else colored.colors
+    return Skin(colors, texture.image, fit, None if cap is None else cap.color)
+
+
+def _capped(texture: PhotoTexture, cap: HairCap, mesh: Mesh, parts: Tensor) -> PhotoTexture:
+    """A texture with the hair painted over it, but not over parts (V,) that are no skin."""
+    place = cap.places.place
+    at = texture.texels.interpolate(torch.cat([place, (~parts).double()[:, None]], dim=1), mesh.faces.cpu())
+    image = texture.image.flatten(1)[:, texture.texels.texels].T.double()
+    painted = cap.painted(image, at[:, :3], at[:, 3] * cap.share(at[:, :3]))
+    colors = cap.painted(texture.colors.double(), place, ~parts * cap.share(place))
+    return replace(texture, image=texture.texels.image(painted), colors=colors.float())
 
 
 def _has_landmarks(mesh: Mesh) -> bool:
@@ -109,17 +149,23 @@ def part_vertices(mesh: Mesh) -> Tensor:
     return result
 
 
-def iris_color(posed: Mesh | Sequence[Mesh], images: Sequence[Tensor], cameras: Sequence[Camera]) -> Tensor | None:
+def iris_color(
+    posed: Mesh | Sequence[Mesh], images: Sequence[Tensor], cameras: Sequence[Camera], irises: Tensor | None = None
+) -> Tensor | None:
     """The irises' colour (3,), sRGB, or None where no photograph is large enough to show it.
 
-    Where the eyes look is not known: of what is seen of the eyeballs between the lids, the dark share that is neither
-    lash and pupil nor white counts.
+    Where the irises are known, rings about their centres count, without lids, lashes and highlights. Else what is seen
+    of the eyeballs between the lids: the dark share that is neither lash and pupil nor white.
 
     Args:
         posed: the head as the photographs show it, or as each of them does, its eyeballs annotated.
         images: photographs, (3,H,W) each.
         cameras: one each.
+        irises: centres in each photograph, (I,2,2) pixels.
     """
+    ringed = None if irises is None else _ring_color(irises, images, cameras, posed)
+    if ringed is not None:
+        return ringed
     meshes = [posed] * len(images) if isinstance(posed, Mesh) else posed
     regions = {} if meshes[0].annotations is None else meshes[0].annotations.regions
     balls = [mask.cpu() for name, mask in regions.items() if part_material(name) is EYEBALL and bool(mask.any())]
@@ -144,6 +190,46 @@ def iris_color(posed: Mesh | Sequence[Mesh], images: Sequence[Tensor], cameras: 
     order = colors.mean(1).argsort()
     first, last = (round(share * len(order)) for share in _SHARE)
     return colors[order[first : max(last, first + 1)]].median(0).values.clamp(0.03, 0.9).float()
+
+
+def _ring_color(
+    irises: Tensor, images: Sequence[Tensor], cameras: Sequence[Camera], posed: Mesh | Sequence[Mesh]
+) -> Tensor | None:
+    """The colour (3,) of rings about the irises' centres (I,2,2), the largest eye's; None where they are too small."""
+    best, widest = None, _MIN_RADIUS
+    meshes = [posed] * len(images) if isinstance(posed, Mesh) else posed
+    for mesh, image, camera, centres in zip(meshes, images, cameras, irises.double(), strict=True):
+        marks = mesh.vertices[mesh.landmarks][36:48].detach().cpu().double()
+        depth = float((marks @ camera.rotation.double()[2] + camera.translation.double()[2]).mean())
+        radius = 0.5 * _IRIS_WIDTH * float(camera.intrinsics[0, 0]) / depth
+        seen = camera.project(marks)
+        if radius < widest:
+            continue
+        found = []
+        for centre, lids in zip(centres, (seen[:6], seen[6:]), strict=True):
+            if not bool(torch.isfinite(centre).all()):
+                continue
+            side = torch.arange(-math.ceil(radius), math.ceil(radius) + 1, dtype=torch.float64)
+            dy, dx = torch.meshgrid(side, side, indexing="ij")
+            y, x = (centre[1] + dy).round().long(), (centre[0] + dx).round().long()
+            from_middle = ((x - centre[0]).square() + (y - centre[1]).square()).sqrt() / radius
+            # Between the lids at the iris: the upper one's shadow and lashes lie within a fifth of its width.
+            ring = (from_middle > _RING[0]) & (from_middle < _RING[1])
+            ring &= dy > torch.maximum(
+                lids[[1, 2], 1].mean() - centre[1] + 0.35 * radius, -0.6 * side.new_tensor(radius)
+            )
+            ring &= dy < lids[[4, 5], 1].mean() - centre[1] - 0.1 * radius
+            ring &= (x >= 0) & (y >= 0) & (x < image.shape[2]) & (y < image.shape[1])
+            found.append(image[:3, y[ring], x[ring]].T.double())
+        colors = torch.cat(found) if found else torch.zeros(0, 3)
+        if len(colors) < _MIN_RING:
+            continue
+        light = colors.mean(1)
+        kept = (light >= light.quantile(0.35)) & (light <= light.quantile(0.75))
+        color = colors[kept].median(0).values.float()
+        if float(color.max()) > _DARKEST:  # else nothing but pupil and shadow is seen
+            best, widest = color.clamp(0.03, 0.9), radius
+    return best
 
 
 def with_part_colors(mesh: Mesh, iris: Tensor | None) -> Mesh:

@@ -8,17 +8,17 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torchface.geometry.cameras.pinhole import Camera
 from torchface.geometry.meshes.vertex_graph import VertexGraph
 from torchface.mesh import Mesh
 from torchface.modeling.photographs.landmark_view import JAW, LANDMARKS
-from torchface.rendering.camera_visibility import PosedSurface, Shown
+from torchface.rendering.camera_visibility import Shown
 
 _FEATURES = 0.10
 _SURELY_SKIN = 0.75
 _NECK, _BEHIND = (0.05, 0.35), (0.05, 0.30)
 _FOREHEAD = 0.15
 """In distances between the eyes' outer corners, but for the second row: shares of the way to the face's outline."""
+_OVER_BROWS = 0.03
 _ALIKE, _UNLIKE = 1.8, 2.8
 # Of skin: of brightness, of two ratios of channels.
 _MIN_DEVIATIONS, _MAX_DEVIATIONS = (0.25, 0.06, 0.06), (0.45, 0.14, 0.14)
@@ -39,6 +39,7 @@ class FacePlaces:
         behind: length behind the ears' landmarks, (V,).
         chin: the chin's place, (3,).
         brows: how high the brows are.
+        ears: how far forward the ears' landmarks lie.
     """
 
     out: Tensor
@@ -48,6 +49,12 @@ class FacePlaces:
     behind: Tensor
     chin: Tensor
     brows: float
+    ears: float
+
+    @property
+    def cheeks(self) -> Tensor:
+        """Vertices that are surely skin, unless something hides them: no feature, and below the brows, (V,) bool."""
+        return (self.out < _SURELY_SKIN) & ~self.features & (self.place[:, 1] < self.brows)
 
     @staticmethod
     def of(mesh: Mesh) -> FacePlaces:
@@ -68,43 +75,35 @@ class FacePlaces:
         reach = _radius(outline - middle, torch.atan2(offsets[:, 1], offsets[:, 0]))
         length = offsets.norm(dim=1)
         features = torch.cdist(place, torch.cat([at[JAW:27], at[31:LANDMARKS]])).amin(1) < _FEATURES
-        ears = at[[0, 16], 2].mean()
-        return FacePlaces(
-            length / reach, length - reach, place, features, ears - place[:, 2], at[8], float(at[17:27, 1].mean())
-        )
+        ears, brows = float(at[[0, 16], 2].mean()), float(at[17:27, 1].mean())
+        return FacePlaces(length / reach, length - reach, place, features, ears - place[:, 2], at[8], brows, ears)
 
 
-def skin_shares(posed: Mesh | Sequence[Mesh], images: Sequence[Tensor], cameras: Sequence[Camera]) -> Tensor:
+def skin_shares(shown: Sequence[Shown], places: Sequence[FacePlaces], faces: Tensor) -> Tensor:
     """How far photographs show skin, or a feature of the face, at each vertex, (I,V) in [0,1].
 
-    Inside the face's outline everything is the person's. Around it counts what resembles the cheeks nearby, in
-    brightness and in the ratios of the channels; far below the chin and behind the ears nothing does.
+    Inside the face's outline, up to the brows, everything is the person's. Around it counts what resembles the cheeks
+    nearby, in brightness and in the ratios of the channels; far below the chin and behind the ears nothing does.
 
     Args:
-        posed: the head as the photographs show it, or as each of them does, with 68 landmarks.
-        images: photographs, (3,H,W) each.
-        cameras: one each.
+        shown: the photographs at the vertices.
+        places: where those lie beside the landmarks in each.
+        faces: of the mesh, (F,3).
     """
-    meshes = [posed] * len(images) if isinstance(posed, Mesh) else posed
-    graph = VertexGraph(meshes[0].faces.cpu(), len(meshes[0].vertices))
-    surfaces = PosedSurface.each(posed, len(images))
-    shares = [
-        _share(surface.shown_in(image, camera), FacePlaces.of(mesh), graph)
-        for mesh, surface, image, camera in zip(meshes, surfaces, images, cameras, strict=True)
-    ]
-    return torch.stack(shares)
+    graph = VertexGraph(faces.cpu(), len(shown[0].cosine))
+    return torch.stack([_share(one, where, graph) for one, where in zip(shown, places, strict=True)])
 
 
 def _share(shown: Shown, places: FacePlaces, graph: VertexGraph) -> Tensor:
     light = shown.colors.double().clamp(min=0.02).log()
     appearance = torch.stack([light.mean(1), light[:, 0] - light[:, 1], light[:, 2] - light[:, 1]], dim=1)
-    core = (
-        (places.out < _SURELY_SKIN) & ~places.features & (shown.cosine > _SQUARE) & (places.place[:, 1] < places.brows)
-    )
+    core = places.cheeks & (shown.cosine > _SQUARE)
     alike = torch.ones(len(appearance), dtype=torch.float64)
     if int(core.sum()) >= _MIN_VERTICES:
         alike = _alike(appearance, core, graph)
-    share = torch.where((places.out < _SURELY_SKIN) | (places.features & (places.out < 1)), 1.0, alike)
+    # Above the brows a fringe may hang before the forehead.
+    surely = (places.out < _SURELY_SKIN) & (places.place[:, 1] < places.brows + _OVER_BROWS)
+    share = torch.where(surely | (places.features & (places.out < 1)), 1.0, alike)
     below = places.beyond * (places.place[:, 1] < 0.5 * places.chin[1])
     falloff = (1 - _ramp(below, *_NECK)) * (1 - _ramp(places.behind, *_BEHIND))
     return graph.smoothed((share * falloff)[:, None], torch.ones_like(share), 2)[:, 0]

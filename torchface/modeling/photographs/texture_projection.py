@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -11,10 +11,12 @@ from torch import Tensor
 from torchface.errors import AlignmentError, ShapeError, TopologyError
 from torchface.geometry.cameras.pinhole import Camera
 from torchface.geometry.meshes.operators import border_vertices, components, edges
-from torchface.geometry.meshes.rasterization import rasterise_uvs
+from torchface.geometry.meshes.rasterization import TexelMap, rasterise_uvs
 from torchface.geometry.meshes.vertex_graph import VertexGraph
 from torchface.mesh import Mesh
+from torchface.modeling.photographs.skin_light import unlit
 from torchface.rendering.camera_visibility import PosedSurface, Shown, shown_in
+from torchface.rendering.environment_light import EnvironmentLight
 
 _SQUARELY = 0.2
 _MIN_CONFIDENCE = 0.5
@@ -35,11 +37,13 @@ class PhotoTexture:
         image: (3,size,size), first row on top.
         colors: of the vertices, (V,3).
         seen: how much of each vertex's colour comes from photographs, (V,) in [0,1].
+        texels: which of the image lie on the head.
     """
 
     image: Tensor
     colors: Tensor
     seen: Tensor
+    texels: TexelMap
 
 
 def photo_texture(
@@ -49,6 +53,7 @@ def photo_texture(
     size: int = 1024,
     base: Tensor | None = None,
     confidence: Tensor | None = None,
+    lights: Sequence[EnvironmentLight | None] | None = None,
 ) -> PhotoTexture:
     """Projects photographs onto a head.
 
@@ -66,6 +71,7 @@ def photo_texture(
         base: colours for what no photograph shows, (V,3), such as ``fit_colors`` gives; those nearby if absent.
         confidence: that each photograph shows the head at each vertex, (I,V) in [0,1], such as ``skin_shares`` gives;
             everywhere if absent.
+        lights: of each photograph, which is divided out; see ``skin_light``. Colours stay as they are if absent.
 
     Raises:
         ShapeError: not one camera an image, an image of another size than its camera's, or a base of another shape.
@@ -98,6 +104,11 @@ def photo_texture(
     at_vertices = [
         surface.shown_in(image, camera) for surface, image, camera in zip(surfaces, images, cameras, strict=True)
     ]
+    lights = [None] * len(images) if lights is None else lights
+    at_vertices = [
+        replace(shown, colors=unlit(shown.colors, surface.normals, camera, light))
+        for shown, surface, camera, light in zip(at_vertices, surfaces, cameras, lights, strict=True)
+    ]
     outside = _outer_border(vertices, faces)
     confidences = (
         torch.ones(len(images), len(vertices), dtype=torch.float64) if confidence is None else confidence.cpu().double()
@@ -121,18 +132,20 @@ def photo_texture(
     colors = torch.lerp(filled, blended, alpha[:, None])
     texels = rasterise_uvs(mesh.uvs.cpu(), mesh.uv_faces.cpu(), size, size)
     total, values = torch.zeros(2, 1, 1, dtype=torch.float64)
-    for i, (at, image, camera) in enumerate(zip(surfaces, images, cameras, strict=True)):  # a ray a texel each
+    for i, (at, image, camera, light) in enumerate(
+        zip(surfaces, images, cameras, lights, strict=True)
+    ):  # a ray a texel
         points = texels.interpolate(at.vertices, faces)
         outward = torch.nn.functional.normalize(texels.interpolate(at.normals, faces), dim=-1)
         shown = shown_in(image.cpu(), camera, at.caster, points, outward)
         weight = texels.interpolate(weights[i, :, None], faces) * (shown.cosine[:, None] > 0)
         tone = texels.interpolate(offsets[i], faces)
-        values = values + weight * (shown.colors.double() * gains[i] + tone)
+        values = values + weight * (unlit(shown.colors, outward, camera, light).double() * gains[i] + tone)
         total = total + weight
     under = texels.interpolate(filled, faces)
     share = texels.interpolate(alpha[:, None], faces) * (total > 0)
     values = torch.lerp(under, values / total.clamp(min=1e-9), share).clamp(0, 1)
-    return PhotoTexture(texels.image(values), colors.clamp(0, 1).float(), alpha.float())
+    return PhotoTexture(texels.image(values), colors.clamp(0, 1).float(), alpha.float(), texels)
 
 
 def _outer_border(vertices: Tensor, faces: Tensor) -> Tensor:

@@ -52,7 +52,7 @@ def with_readings(settings: FitSettings, found: Sequence[PhotographLandmarks], r
         rig: whose weights are solved for, with the 68 landmarks annotated.
     """
     readings = FaceReading.stacked([one.face for one in found])
-    settings, places = replace(settings, deviations=readings.deviation), found[0].places
+    settings, places = replace(settings, deviations=readings.deviation, irises=readings.iris), found[0].places
     if len(places) and len(places) == readings.points.shape[1]:
         surface = SurfacePoints(readings.points, readings.point_deviation, sites_on_rig(rig, places))
         settings = replace(settings, surface=surface)

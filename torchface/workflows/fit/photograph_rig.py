@@ -124,6 +124,9 @@ class FittedHead:
             lines.append(f"{path.name}: expression {', '.join(listed) or 'at rest'}")
         if fit.color is not None:
             lines.append(f"colour model: {float(fit.color.error.mean()):.3f} off, of 1 a channel")
+        if fit.hair is not None:
+            color = "".join(f"{round(255 * channel):02x}" for channel in fit.hair.tolist())
+            lines.append(f"hair: a cap of its colour #{color}, painted on the head; it is no geometry")
         lines.append(f"rig: {len(self.rig.vertices)} vertices, {len(self.rig.names)} shapes transferred")
         return lines + ([f"  note: {self.transfer_summary}"] if self.transfer_summary else [])
 

@@ -1,0 +1,73 @@
+"""Light planted on a head's skin is found in its picture and divided out of its colours."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+from torch import Tensor
+
+from torchface.geometry.cameras.pinhole import Camera, look_at
+from torchface.geometry.meshes.operators import vertex_normals
+from torchface.mesh import Mesh
+from torchface.modeling.photographs.image_texture import photographed_skin
+from torchface.modeling.photographs.skin_light import skin_light, unlit
+from torchface.modeling.photographs.skin_mask import FacePlaces
+from torchface.rendering.camera_visibility import PosedSurface
+from torchface.rendering.clay_shading import Lighting, render
+from torchface.synthetic import neutral_head
+
+SIDE = Lighting(lights=(((0.8, 0.2, 0.5), 0.8),), ambient=0.35, occlusion_rays=0, gloss=0.0)
+EVEN = Lighting(lights=(), ambient=1.0, occlusion_rays=0, gloss=0.0)
+SKIN, HAIR = torch.tensor([0.72, 0.52, 0.44]), torch.tensor([0.12, 0.08, 0.06])
+
+
+@pytest.fixture(scope="module")
+def head() -> Mesh:
+    mesh = neutral_head(texture=False)
+    return replace(mesh, colors=SKIN.repeat(len(mesh.vertices), 1))
+
+
+@pytest.fixture(scope="module")
+def camera(head: Mesh) -> Camera:
+    return look_at(head.vertices[head.landmarks].mean(0), 5.0, span=300.0, width=300, height=360)
+
+
+def test_light_from_the_side_is_divided_out(head: Mesh, camera: Camera) -> None:
+    picture = render(head, camera, lighting=SIDE, samples=1)
+    shown = PosedSurface.each(head, 1)[0].shown_in(picture, camera)
+    normals = vertex_normals(head.vertices.double(), head.faces)
+    cheeks = FacePlaces.of(head).cheeks
+    light = skin_light(shown, normals, camera, cheeks)
+    assert light is not None
+    seen = cheeks & (shown.cosine > 0.4)
+    even = unlit(shown.colors, normals, camera, light)
+
+    def spread(colors: Tensor) -> float:
+        return float(colors[seen].log().std(0).mean())
+
+    assert spread(even) < 0.45 * spread(shown.colors)
+    brighter = light.irradiance(torch.tensor([[1.0, 0, 0], [-1.0, 0, 0]]).double()).mean(1)
+    assert brighter[0] > brighter[1] + 0.3  # the light stands at the viewer's right
+    assert skin_light(shown, normals, camera, cheeks & (shown.cosine > 2)) is None
+
+
+def test_hair_is_a_cap_of_its_colour_and_a_bald_head_stays_bald(head: Mesh, camera: Camera) -> None:
+    places = FacePlaces.of(head)
+    high = places.place[:, 1] > 0.55
+    assert head.colors is not None
+    haired = replace(head, colors=torch.where(high[:, None], HAIR, head.colors))
+    found = {}
+    for name, mesh in (("bald", head), ("hair", haired)):
+        picture = render(mesh, camera, lighting=EVEN, samples=1)
+        found[name] = photographed_skin([head], None, [picture], [camera], 128)
+    assert found["bald"].hair is None
+    color, cap = found["hair"].hair, found["hair"].colors
+    assert color is not None
+    assert cap is not None
+    assert float((color - HAIR).norm()) < 0.06
+    behind = (places.behind > 0.8) & (places.place[:, 1] > 0.2)
+    assert float((cap[behind] - HAIR).norm(dim=1).median()) < 0.1  # no picture shows it
+    forehead = places.cheeks & (places.place[:, 1] < 0.3)
+    assert float((cap[forehead] - SKIN).norm(dim=1).median()) < 0.1

@@ -1,0 +1,110 @@
+"""Hair as a cap of its colour in the photographs: paint on the head, no geometry."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torchface.modeling.photographs.skin_mask import FacePlaces
+from torchface.rendering.camera_visibility import Shown
+
+# In distances between the eyes' outer corners, about the middle between them: how high hair begins over the face's
+# middle and how it falls toward the temples; from where to where before the ears' front it comes down to the ear; how
+# high over the ears, and how low in the neck.
+_HAIRLINE, _FALL, _TEMPLE = 0.76, 0.28, 0.7
+_SIDES, _SIDEBURN, _OVER_EARS = (-0.25, -0.02), 0.2, 0.3
+_BEHIND, _NAPE = (0.52, 0.64), -0.75
+_EDGE, _FRINGE = 0.045, 0.07
+_ABOVE_BROWS, _SQUARE, _UNLIKE = 0.06, 0.3, 0.5
+_LEAST, _SHARE = 20, 0.3
+_COLUMNS, _COLUMN, _FEW = 17, 0.05, 6  # across the forehead, half the width of each, vertices
+_STRANDS, _STRAND = 150.0, 0.10
+
+
+@dataclass(frozen=True, eq=False)
+class HairCap:
+    """Hair that photographs show.
+
+    Args:
+        color: sRGB, (3,).
+        line: how high it begins over the face at places from the right temple to the left, (17,).
+        places: of the vertices.
+    """
+
+    color: Tensor
+    line: Tensor
+    places: FacePlaces
+
+    def share(self, place: Tensor) -> Tensor:
+        """How much hair covers points (Q,) at places (Q,3)."""
+        y, behind = place[:, 1], self.places.ears - place[:, 2]
+        column = (place[:, 0] / _TEMPLE).clamp(-1, 1) * ((_COLUMNS - 1) // 2) + (_COLUMNS - 1) // 2
+        left = column.floor().long().clamp(max=_COLUMNS - 2)
+        line = torch.lerp(self.line[left], self.line[left + 1], column - left)
+        line = torch.lerp(line, torch.full_like(line, _SIDEBURN), _ramp(behind, *_SIDES))
+        line = torch.where(behind > _SIDES[1], _OVER_EARS, line)
+        line = torch.lerp(line, torch.full_like(line, _NAPE), _ramp(behind, *_BEHIND))
+        wave = 0.02 * (torch.sin(23 * place[:, 0]) + torch.sin(37 * place[:, 0] + 1.3))
+        return _ramp(y - line + wave, -_EDGE, _EDGE)
+
+    def painted(self, colors: Tensor, place: Tensor, share: Tensor) -> Tensor:
+        """Colours (Q,3) with the hair over them, in strands that hang down."""
+        around = torch.atan2(place[:, 0], place[:, 2] - self.places.ears)
+        strand = torch.sin(_STRANDS * around + 3 * torch.sin(7 * place[:, 1])) + torch.sin(2.3 * _STRANDS * around)
+        hair = self.color.to(colors) * (1 + _STRAND / 2 * strand[:, None]).to(colors)
+        return torch.lerp(colors, hair.clamp(0, 1), share[:, None].to(colors))
+
+
+def hair_cap(shown: Sequence[Shown], places: Sequence[FacePlaces], skin: Tensor) -> HairCap | None:
+    """The hair that photographs show above the brows; None where most of what they show there is skin.
+
+    Where it begins is, in each column of the forehead, the height that best parts skin below from hair above, so that a
+    fringe is hair and no second pair of brows.
+
+    Args:
+        shown: the photographs at the vertices.
+        places: where the vertices lie beside the landmarks in each.
+        skin: how far each shows skin, (I,V); see ``skin_shares``.
+    """
+    at, hair, colors = list[Tensor](), list[Tensor](), list[Tensor]()
+    for one, where, share in zip(shown, places, skin, strict=True):
+        seen = (one.cosine > _SQUARE) & (where.place[:, 1] > where.brows + _ABOVE_BROWS) & (where.behind < _SIDES[0])
+        at.append(where.place[seen, :2])
+        hair.append(share[seen] < _UNLIKE)
+        colors.append(one.colors[seen].double())
+    place, covered, color = torch.cat(at), torch.cat(hair), torch.cat(colors)
+    high = place[:, 1] > _HAIRLINE - _FALL
+    if int((covered & high).sum()) < max(_LEAST, _SHARE * int(high.sum())):
+        return None
+    across = torch.linspace(-1, 1, _COLUMNS, dtype=torch.float64) * _TEMPLE
+    usual = _HAIRLINE - _FALL * (across / _TEMPLE).square()
+    line = torch.stack([
+        _line(place[near, 1], covered[near], height)
+        for height, near in zip(usual, (place[:, :1] - across).abs().T < _COLUMN, strict=True)
+    ])  # fmt: skip
+    ends = torch.cat([line[:1], line, line[-1:]])
+    smooth = ends.unfold(0, 3, 1).mean(1)
+    return HairCap(color[covered & high].median(0).values.float(), smooth, places[0])
+
+
+def _line(heights: Tensor, hair: Tensor, usual: Tensor) -> Tensor:
+    """The height () above which most is hair and below which most is skin; the usual one where little is seen."""
+    if len(heights) < _FEW:
+        return usual
+    order = heights.argsort()
+    wrong = hair[order].double().cumsum(0) + (~hair[order]).double().flip(0).cumsum(0).flip(0)
+    best = int(wrong.argmin())
+    # All skin: hair begins above what is seen; all hair: at the lowest.
+    if best == len(order) - 1 and not bool(hair[order[-1]]):
+        return torch.maximum(usual, heights[order[-1]] + _EDGE)
+    line = heights[order[best]]
+    # The ends of a fringe hang thinner than half, down to the brows.
+    return line - _FRINGE if float(line) < float(usual) - 2 * _FRINGE else line
+
+
+def _ramp(value: Tensor, low: float, high: float) -> Tensor:
+    share = ((value - low) / (high - low)).clamp(0, 1)
+    return share * share * (3 - 2 * share)
