@@ -44,7 +44,10 @@ def savitzky_golay(values: Tensor, window: int, order: int = 2) -> Tensor:
     order = min(order, window - 1)
     if window == 1:
         return values.clone()
-    # Loaded here: scipy.signal takes longer to load than most takes to filter.
-    from scipy.signal import savgol_filter
-
-    return torch.from_numpy(savgol_filter(values.detach().cpu().numpy(), window, order, axis=0)).to(values)
+    half, flat = window // 2, values.detach().reshape(frames, -1).double()
+    powers = torch.arange(order + 1, device=flat.device)
+    at = torch.linspace(-1, 1, window, dtype=torch.float64, device=flat.device)[:, None] ** powers
+    fitted = at @ torch.linalg.pinv(at)  # a window's values to those of the polynomial through them
+    middle = flat.unfold(0, window, 1) @ fitted[half]
+    smooth = torch.cat([fitted[:half] @ flat[:window], middle, fitted[half + 1 :] @ flat[-window:]])
+    return smooth.reshape(values.shape).to(values)

@@ -13,7 +13,9 @@ from torch import Tensor
 from torchface import zoo
 from torchface.capture.priors import ShapePrior, StudentDensity
 from torchface.errors import NameMismatchError, ValueRangeError
-from torchface.landmarks import LandmarkNetwork, LandmarkTrees
+from torchface.landmarks import BoxNetwork, LandmarkNetwork, LandmarkTrees
+from torchface.landmarks.images.boxes.network_detector import NetworkDetector, graph_boxes
+from torchface.landmarks.images.checked_detector import PROPOSED, CheckedDetector, shipped_networks
 from torchface.landmarks.images.face_landmarker.mediapipe_finder import MediaPipeFinder
 from torchface.landmarks.images.landmark_finder import LandmarkFinder
 from torchface.landmarks.images.networks.crop_finder import BothSides
@@ -129,10 +131,18 @@ def eye_finder() -> EyeFinder:
     return graph_eye_finder(_graph(zoo.get_model(EYES, EyeNetwork)))
 
 
-def _graph(network: LandmarkNetwork | EyeNetwork) -> bytes:
+@cache
+def graph_detector() -> CheckedDetector:
+    """``shipped_detector`` in ONNX Runtime."""
+    boxes, landmarks = shipped_networks()
+    finder = graph_finder(_graph(landmarks), Path(DEFAULT_LANDMARKS))
+    return CheckedDetector(NetworkDetector(graph_boxes(_graph(boxes)), PROPOSED), finder)
+
+
+def _graph(network: LandmarkNetwork | EyeNetwork | BoxNetwork) -> bytes:
     def make() -> onnx.ModelProto:
         from torchface.onnx.network_graphs import network_model
 
         return network_model(network)
 
-    return cached_graph("networks", make, ("onnx", "landmarks/images/networks"), network=network)
+    return cached_graph("networks", make, ("onnx", "landmarks/images"), network=network)

@@ -17,9 +17,12 @@ from torchface.landmarks.images.face_crop import crop_transform, cut_crop, from_
 from torchface.landmarks.images.face_reading import confidence_of
 from torchface.landmarks.images.folded_normalisation import without_normalisation
 from torchface.landmarks.images.ibug_68 import turned_box
+from torchface.landmarks.images.networks.crop_finder import CropFinder, CropNetwork
 from torchface.landmarks.images.networks.landmark_network import LandmarkNetwork
 
-_PROPOSED = 0.3  # score from which the shipped box network's faces are looked at
+PROPOSED = 0.3
+"""Score from which the shipped box network's faces are looked at."""
+
 _MOST, _TURNED = 16, 3  # faces of a detector that are looked at, the likeliest; and of them in other turns
 _TURNS = ((0.0,), (math.pi / 3, -math.pi / 3, math.pi))  # beside the detector's tilt; the latter where no face is found
 # Presence and mean confidence round the landmarks: of 155 boxes of faces 132 have both, of 319 in pictures without 1.
@@ -35,7 +38,7 @@ class CheckedDetector:
 
     Args:
         detector: proposes faces with their tilts.
-        network: says whether they are faces.
+        network: says whether they are faces; or a finder that runs its graph.
 
     Example:
         >>> from torchface import zoo
@@ -45,8 +48,11 @@ class CheckedDetector:
         0
     """
 
-    def __init__(self, detector: FaceDetector, network: LandmarkNetwork) -> None:
-        self.detector, self.network = detector, without_normalisation(network).float()
+    def __init__(self, detector: FaceDetector, network: LandmarkNetwork | CropFinder) -> None:
+        self.detector, self.size, self.margin = detector, network.size, network.margin
+        self.network: CropNetwork = (
+            network.network if isinstance(network, CropFinder) else without_normalisation(network).float()
+        )
 
     @torch.inference_mode()
     def __call__(self, image: Tensor) -> FaceBoxes:
@@ -82,7 +88,7 @@ class CheckedDetector:
 
     def _look(self, image: Tensor, boxes: Tensor, tilts: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Landmarks (F,68,2), presence and mean confidence (F,) in boxes (F,4) that are turned by tilts (F,)."""
-        size, margin = self.network.size, self.network.margin
+        size, margin = self.size, self.margin
         ways = [crop_transform(box, tilt, size, margin) for box, tilt in zip(boxes, tilts.tolist(), strict=True)]
         crops = torch.stack([cut_crop(image, way, size) for way in ways])  # of different scales: one by one
         seen = self.network(crops.float() / 255)
@@ -91,12 +97,20 @@ class CheckedDetector:
 
 
 @cache
-def shipped_detector() -> CheckedDetector:
-    """The zoo's ``face_boxes``, checked by its ``landmark_network``; read once.
+def shipped_networks() -> tuple[BoxNetwork, LandmarkNetwork]:
+    """The ``face_boxes`` and the ``landmark_network`` that come with this package; read once.
 
     Raises:
         FileFormatError: one of them is missing or damaged.
     """
-    boxes = read_model(shipped_model("face_boxes"), {"face_boxes": BoxNetwork})
-    landmarks = read_model(shipped_model("landmark_network"), {"landmark_network": LandmarkNetwork})
-    return CheckedDetector(NetworkDetector(boxes, _PROPOSED), landmarks)
+    return (
+        read_model(shipped_model("face_boxes"), {"face_boxes": BoxNetwork}),
+        read_model(shipped_model("landmark_network"), {"landmark_network": LandmarkNetwork}),
+    )
+
+
+@cache
+def shipped_detector() -> CheckedDetector:
+    """The detector of :func:`shipped_networks`, which raises as that does."""
+    boxes, landmarks = shipped_networks()
+    return CheckedDetector(NetworkDetector(boxes, PROPOSED), landmarks)

@@ -26,6 +26,7 @@ from torchface.workflows.live.live_figures import LiveFigures, LiveReport
 from torchface.workflows.live.live_frames import LiveFrame, open_source, planes, solved_frames
 from torchface.workflows.live.recordings import FrameLog
 from torchface.workflows.live.weight_streams import WeightStreams
+from torchface.workflows.named_finders import graph_detector
 from torchface.workflows.track.take_solution import OFFSETS, offsets_of
 from torchface.workflows.track.track_files import save_curves
 from torchface.workflows.track.track_inputs import TrackInputs, TrackSettings, inputs_of, load_actor
@@ -45,7 +46,7 @@ class ActorSolver:
         self.names, models = inputs.actor.names, inputs.models
         if models.finder is None:
             raise ValueRangeError("--landmarks: found a table, expected what finds landmarks as the face moves")
-        self._tracker = LandmarkTracker(models.finder, models.appearance, face=inputs.settings.face)
+        self._tracker = LandmarkTracker(models.finder, models.appearance, graph_detector(), inputs.settings.face)
         self._calibration, self._filter = inputs.calibration, AdaptiveFilter(68, 2, LANDMARK_SETTINGS)
         solver = inputs.solver()
         self._solver = solver if offsets is None else solver.shifted(offsets)

@@ -22,6 +22,7 @@ from torchface.landmarks.images.landmark_finder import LandmarkFinder
 from torchface.landmarks.images.tracking.landmark_tracker import LandmarkTracker
 from torchface.landmarks.images.tracking.video_landmarks import naming_the_frame
 from torchface.progress import Progress
+from torchface.workflows.named_finders import graph_detector
 from torchface.workflows.track.track_inputs import TrackInputs
 from torchface.workflows.track.track_state import TrackState
 
@@ -54,14 +55,14 @@ def read_frames(inputs: TrackInputs, state: TrackState, progress: Progress) -> t
 def _track(inputs: TrackInputs, finder: LandmarkFinder, state: TrackState, progress: Progress) -> int:
     """Readings of all frames into the state; how many faces the first frame shows."""
     clip = inputs.clip
-    tracker = LandmarkTracker(finder, inputs.models.appearance, face=inputs.settings.face)
+    tracker = LandmarkTracker(finder, inputs.models.appearance, graph_detector(), inputs.settings.face)
     done, at, faces = state.done, 0, 0
     if done:  # a run that was killed goes on with all that it knew, and so gives the same landmarks
         tracker.resume(state.memory)
     frames = clip.color_frames()
     for first in frames:
         if at == 0:
-            faces = len(find_faces(first))
+            faces = len(find_faces(first, tracker.detector))
         piece = chain([first], islice(frames, PIECE - 1))  # one by one: 64 frames in 4K take half a gigabyte
         if at < done:
             at += sum(1 for _ in piece)
@@ -131,7 +132,7 @@ def _compare_with_pictures(boxes: Tensor, clip: VideoFile, path: Path) -> None:
     for number, frame in zip(numbers, islice(clip.frames(), 0, None, _STEP), strict=False):
         if not bool(torch.isfinite(boxes[number]).all()):
             continue
-        faces = find_faces(frame).boxes
+        faces = find_faces(frame, graph_detector()).boxes
         if len(faces):
             apart.append((float(overlaps(faces, boxes[number][None]).max()) < 0.1, faces[0], boxes[number]))
     if len(apart) > 1 and all(one[0] for one in apart):

@@ -93,7 +93,7 @@ def _track(inputs: TrackInputs, out: Path, filmed: bool, progress: Progress) -> 
         with _timed(seconds, "head"):
             head = person_head(inputs, inputs.heads, landmarks, reading, progress)
         inputs = replace(inputs, actor=head.rig)
-    trust, solver = reading.trust, inputs.solver(inputs.clip.fps, MOTION)
+    trust, solver = reading.trust, inputs.solver(inputs.clip.fps, MOTION if inputs.models.expected else None)
     offsets = known_offsets(inputs, out)
     if offsets is None or offsets.video != inputs.offsets_key:
         with _timed(seconds, "offsets"):
