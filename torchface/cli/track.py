@@ -11,7 +11,7 @@ from tyro.conf import Positional, arg
 from torchface.cli.batch_report import Cluster, Column, Jobs, TimeLimit, show_batch, skipped_lines
 from torchface.cli.command_options import Output, Reduce, picture_size
 from torchface.cli.progress_bars import progress_bars
-from torchface.cli.terminal import Quiet, console, print_lines, print_path
+from torchface.cli.terminal import Quiet, console, print_lines, print_path, print_table
 
 _COLUMNS = (
     Column("frames", "frames", "{}"),
@@ -46,6 +46,9 @@ def track(
     fps: float | None = None,
     size: str | None = None,
     reduce: Reduce = None,
+    solver: Literal["rig", "examples"] = "rig",
+    examples: tuple[Path, ...] = (),
+    method: Literal["all", "regional", "linear"] = "all",
     live: str | None = None,
     stream: str = "udp://127.0.0.1:11111",
     seconds: float | None = None,
@@ -98,6 +101,10 @@ def track(
             over it; or none.
         fps: Frames a second of a .csv of landmarks without VIDEO; by its times if absent.
         size: WIDTHxHEIGHT of the pictures that such landmarks were found in; the camera's if absent.
+        solver: By the rig, or by example expressions: weights.csv then has theirs, methods.csv the error and time of
+            each method on this video, overlay.mp4 the solved example's landmarks (red) over those found.
+        examples: What `torchface examples` wrote, for --solver examples; of several people the mean is taken.
+        method: With examples: all at once, the head first and then regions, or by a linear model of landmarks.
         live: A camera's number, such as 0, or a video file that is played in its own time.
         stream: Where --live sends to; Unreal listens on port 11111. vmc://HOST:PORT and osc://HOST:PORT/PREFIX
             send by the VMC protocol and as plain OSC.
@@ -115,6 +122,11 @@ def track(
     if (not video) == (live is None) and not (given and live is None):
         found = "neither" if not video else "both"
         raise ValueRangeError(f"track: found {found} of VIDEO and --live, expected one of the two")
+    if solver == "examples":
+        if live is not None or out is None or len(video) > 1 or rig is not None:
+            raise ValueRangeError("track: found --solver examples, expected one VIDEO, --examples and --out beside it")
+        _by_examples(video[0] if video else None, examples, out, method, landmarks, face, quiet)
+        return
     settings = TrackSettings(
         landmarks,
         appearance,
@@ -166,6 +178,28 @@ def _file(video: Path | None, rig: Path | None, out: Path, settings: object, qui
     for line in tracked.lines():
         console.print(line, highlight=False, soft_wrap=True)
     for path in (*tracked.products.values(), page):
+        print_path(path)
+
+
+def _by_examples(
+    video: Path | None,
+    examples: tuple[Path, ...],
+    out: Path,
+    method: Literal["all", "regional", "linear"],
+    landmarks: str,
+    face: int,
+    quiet: bool,
+) -> None:
+    from torchface.files.job_lock import job_lock
+    from torchface.workflows.examples.example_take import track_by_examples
+
+    with job_lock(out), progress_bars(quiet) as progress:
+        done = track_by_examples(video, examples, out, method, landmarks, face, progress)
+    print_table(
+        (one.method, f"{one.pixels:.2f} px, {one.share:.2%} of the eyes' distance, {one.milliseconds:.2f} ms a frame")
+        for one in done.figures
+    )
+    for path in done.products.values():
         print_path(path)
 
 
