@@ -28,6 +28,7 @@ HUBER_THRESHOLD = 0.005
 SPARSITY_RATIO = 0.1
 
 _RHO, _RELAXATION = 0.12, 1.8
+_RHO_NEAR = 0.03  # from a start near the end, of equations without noise: half the iterations
 _MAX_ITERATIONS, _TOLERANCE = 400, 2e-4
 _REFERENCE_FPS = 60.0
 # With correctives: steps at most, halvings of each, frames whose mean curvature stands for all, and the share of the
@@ -242,8 +243,9 @@ def smooth_in_box(H: Tensor, slopes: Tensor, fps: float, smoothness: float) -> T
     """
     check_rate(fps, "fps", ValueRangeError)
     own, threshold = smoothness * (fps / _REFERENCE_FPS) ** 4, HUBER_THRESHOLD * (_REFERENCE_FPS / fps) ** 2
-    start = torch.zeros_like(slopes)
-    return _SmoothProblem.of(H, len(slopes), own, threshold).least(lambda _: slopes, start, start)[0]
+    start = (-torch.linalg.solve(H, slopes.T).T).clamp(0, 1)
+    problem = _SmoothProblem.of(H, len(slopes), own, threshold, _RHO_NEAR)
+    return problem.least(lambda _: slopes, start, torch.zeros_like(slopes))[0]
 
 
 @dataclass(frozen=True, eq=False)
@@ -257,9 +259,9 @@ class _SmoothProblem:
     huber_threshold: float
 
     @staticmethod
-    def of(H: Tensor, frames: int, smoothness: float, huber_threshold: float) -> _SmoothProblem:
+    def of(H: Tensor, frames: int, smoothness: float, huber_threshold: float, share: float = _RHO) -> _SmoothProblem:
         values, vectors = torch.linalg.eigh(H)
-        rho = _RHO * float(H.diagonal().mean())
+        rho = share * float(H.diagonal().mean())
         waves = torch.arange(frames, dtype=H.dtype, device=H.device) * (math.pi / frames)
         bending = (2 - 2 * torch.cos(waves)).square()
         divisor = values + (2 * smoothness) * bending[:, None] + rho
