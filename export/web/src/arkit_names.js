@@ -35,8 +35,14 @@ export function sourcesOf(name) {
   return whole !== wanted && ROW.has(whole) ? [[ROW.get(whole), 1]] : [];
 }
 
-/** The weight of a shape of ARKit's weights: by its sources, or by a rule of torchface's mapping tables. */
-export function weightOf({ sources, rule }, weights) {
+/** The weight of a shape of ARKit's weights: by its sources, by a rule of torchface's mapping tables, or as a corrective. */
+export function weightOf({ sources, rule, drivers, knots }, weights) {
+  if (drivers) {
+    const product = drivers.reduce((all, one) => all * weightOf(one, weights), 1);
+    if (!knots) return product;
+    const [left, peak, right] = knots; // an in-between: up to its peak, then down
+    return Math.max(0, Math.min((product - left) / (peak - left), (right - product) / (right - peak)));
+  }
   const sum = (rule?.sum ?? sources).reduce((all, [row, factor]) => all + factor * weights[row], 0);
   if (!rule) return sum;
   const product = rule.product.reduce((all, row) => all * weights[row], 1);

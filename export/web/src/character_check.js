@@ -27,7 +27,10 @@ export function checkSize(size) {
 export function checkCharacter(bytes, sources = null) {
   const shape = (name) => {
     const given = sources === null ? sourcesOf(name) : (sources[name] ?? []);
-    return Array.isArray(given) ? { name, sources: given } : { name, sources: [...given.sum, ...given.product.map((row) => [row, 1])], rule: given };
+    if (Array.isArray(given)) return { name, sources: given };
+    if (!given.drivers) return { name, sources: [...given.sum, ...given.product.map((row) => [row, 1])], rule: given };
+    const drivers = given.drivers.map(shape); // a corrective, which follows other shapes
+    return { name, sources: drivers.flatMap((one) => one.sources), drivers, knots: given.knots };
   };
   checkSize(bytes.byteLength);
   const { document, binary } = readGlb(bytes);

@@ -14,15 +14,16 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from rig_samples import quad_sheet
+from rig_samples import corrective_sheet, quad_sheet
 from scipy.spatial.transform import Rotation
 
 from torchface import BlendshapeRig
 from torchface.errors import MissingExtraError, ValueRangeError
-from torchface.io import save_rig
+from torchface.io import load_rig, save_rig
 from torchface.io.gltf.accessors import read_floats
 from torchface.io.gltf.gltf_document import read_document
 from torchface.io.gltf.performance_animation import Performance, performed_glb
+from torchface.io.gltf.primitive_reading import read_target_names
 from torchface.progress import silent
 from torchface.shape_names import ARKIT, mapping
 from torchface.workflows.browser_app.built_page import installed_packages, page_sources
@@ -234,16 +235,29 @@ def with_bones(root: dict[str, Any]) -> None:
     root["scenes"][0]["nodes"].append(first)
 
 
+def of_vrm_0(root: dict[str, Any]) -> None:
+    """The same by VRM 0's table, whose characters look along -z; names say nothing."""
+    first = len(root["nodes"])
+    with_bones(root)
+    for number, node in enumerate(root["nodes"][first:]):
+        node["name"] = f"bone {number}"
+    parts = ("neck", "head", "leftEye", "rightEye")
+    bones = [{"bone": part, "node": first + number} for number, part in enumerate(parts)]
+    root["extensions"] = {"VRM": {"humanoid": {"humanBones": bones}}}
+
+
 def plain(root: dict[str, Any]) -> None:
     """Nothing changed: the head has no bone."""
 
 
-@pytest.mark.parametrize("edit", [with_bones, plain])
+@pytest.mark.parametrize("edit", [with_bones, of_vrm_0, plain])
 def test_a_take_in_the_characters_file_is_the_same_from_page_and_python(
     run: Run, tmp_path: Path, edit: Callable[[dict[str, Any]], None]
 ) -> None:
-    names = ("jawOpen", "mouthSmile_L", "antenna")
-    path = edited(sheet(tmp_path / "sheet.glb", names).read_bytes(), tmp_path / "bones.glb", edit)
+    path = sheet(tmp_path / "sheet.glb", ("jawOpen", "mouthSmile_L", "antenna"))
+    if edit is plain:
+        save_rig(corrective_sheet(), path)
+    path = edited(path.read_bytes(), tmp_path / "bones.glb", edit)
     rng = np.random.default_rng(3)
     angles = 0.4 * rng.normal(size=(5, 9))
     angles[:, [5, 8]] = 0  # eyes do not roll
@@ -255,7 +269,8 @@ def test_a_take_in_the_characters_file_is_the_same_from_page_and_python(
     job = {"glb": str(path), "rows": rows.tolist(), "sources": json.loads(character.page_table())["sources"]}
     (tmp_path / "page.glb").write_bytes(base64.b64decode(run("animation", job)))
     weights = character.weights(torch.from_numpy(arkit)).numpy()
-    ours = performed_glb(character.document, Performance(seconds, character.names, weights, angles))
+    all_names, targets = character.targets(torch.from_numpy(weights))
+    ours = performed_glb(character.document, Performance(seconds, all_names, targets.numpy(), angles))
     (tmp_path / "python.glb").write_bytes(ours)
     found, expected = (animated(tmp_path / name) for name in ("python.glb", "page.glb"))
     assert found.keys() == expected.keys()
@@ -264,11 +279,24 @@ def test_a_take_in_the_characters_file_is_the_same_from_page_and_python(
             keys, found[name] = (rows.reshape(-1, 4) for rows in (keys, found[name]))
             keys = keys * np.sign((keys * found[name]).sum(1, keepdims=True))
         np.testing.assert_allclose(found[name], keys, rtol=0, atol=2e-5, err_msg=str(name))
-    np.testing.assert_allclose(found["face", "weights"], weights.reshape(-1), atol=1e-6)
+    order = read_target_names(read_document(tmp_path / "python.glb"), 0)
+    expected_weights = targets.numpy()[:, [all_names.index(name) for name in order]]
+    np.testing.assert_allclose(found["face", "weights"], expected_weights.reshape(-1), atol=1e-6)
     whole = Rotation.from_euler("YXZ", angles[:, :3])
     if edit is plain:
+        rig = load_rig(path)
+        assert rig.activation is not None
+        followed = rig.activation(torch.from_numpy(weights)).numpy()
+        assert followed.max() > 0.1
+        np.testing.assert_allclose(targets[:, len(character.names) :], followed, atol=1e-6)
         turned = Rotation.from_quat(found["head", "rotation"].reshape(-1, 4))
         assert (turned * whole.inv()).magnitude().max() < 1e-5
+        return
+    if edit is of_vrm_0:
+        neck, own = (Rotation.from_quat(found[f"bone {i}", "rotation"].reshape(-1, 4)) for i in range(2))
+        tilt, back = Rotation.from_quat(TILT), Rotation.from_euler("Y", np.pi)
+        world = back * neck * own * (back * tilt * tilt).inv()
+        assert (world * whole.inv()).magnitude().max() < 1e-5
         return
     neck, own, left = (
         Rotation.from_quat(found[name, "rotation"].reshape(-1, 4))

@@ -14,9 +14,11 @@ import torch
 from torch import Tensor
 
 from torchface.capture.retargeting import ShapeMap, ShapeRule, load_shape_rules, shape_map
+from torchface.correctives.activation import CorrectiveActivation
 from torchface.errors import FileFormatError, NameMismatchError, NoShapesError
 from torchface.files.whole_files import read_file
 from torchface.io import load_rig, save_rig
+from torchface.io.gltf.corrective_extras import scene_correctives
 from torchface.io.gltf.gltf_document import Document, document_of
 from torchface.io.gltf.primitive_reading import read_target_names
 from torchface.io.tables.csv_table import quoted
@@ -39,11 +41,13 @@ class Character:
         name: for people.
         data: the file; its meshes and pictures may be compressed.
         shapes: from ARKit's names to the file's.
+        correctives: follows these where the file has some.
     """
 
     name: str
     data: bytes
     shapes: ShapeMap
+    correctives: CorrectiveActivation | None = None
 
     @cached_property
     def document(self) -> Document:
@@ -52,8 +56,15 @@ class Character:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Of its shapes."""
+        """Of its shapes, without correctives."""
         return self.shapes.to_names
+
+    def targets(self, weights: Tensor) -> tuple[tuple[str, ...], Tensor]:
+        """Names and weights (T,N+C) of all morph targets for weights (T,N) of the shapes."""
+        if self.correctives is None:
+            return self.names, weights
+        followers = tuple(definition.name for definition in self.correctives.definitions)
+        return (*self.names, *followers), torch.cat([weights, self.correctives(weights)], 1)
 
     def weights(self, arkit: Tensor) -> Tensor:
         """ARKit's weights (T,52) as the character's (T,N)."""
@@ -75,10 +86,12 @@ class Character:
 
     def page_table(self) -> bytes:
         """What drives each shape, as JSON for the page: rows of ``ARKIT`` and their factors, or a rule, by its name."""
-        shapes = self.shapes
-        return json.dumps(
-            {"name": self.name, "sources": {name: self._drive(i) for i, name in enumerate(shapes.to_names)}}
-        ).encode()
+        sources: dict[str, Any] = {name: self._drive(row) for row, name in enumerate(self.names)}
+        if self.correctives is not None:
+            knots = iter(self.correctives.knots.tolist())
+            for one in self.correctives.definitions:
+                sources[one.name] = {"drivers": one.drivers, "knots": next(knots) if one.is_in_between else None}
+        return json.dumps({"name": self.name, "sources": sources}).encode()
 
     def _drive(self, row: int) -> Any:
         shapes = self.shapes
@@ -102,14 +115,16 @@ def load_character(path: str | Path | None = None, table: Path | None = None) ->
         FileFormatError: it cannot be read, or is too large for the page.
         NameMismatchError: nothing drives any of its shapes.
     """
-    if path is None:
-        name, (data, names) = "the embedded performer", _written(None)
-    else:
-        name = Path(path).name if Path(path).suffix.lower() in _GLB else f"{Path(path).stem}.glb"
-        data, names = _taken(Path(path)) if Path(path).suffix.lower() in _GLB else _written(Path(path))
+    whole = path is not None and Path(path).suffix.lower() in _GLB
+    name = "the embedded performer" if path is None else Path(path).name if whole else f"{Path(path).stem}.glb"
+    data = _taken(Path(path)) if whole and path is not None else _written(path)
+    document = document_of(Path(path or name), data)
+    definitions = scene_correctives(document)
+    names = _shapes(document, {definition.name for definition in definitions})
     rules = _recognised(names) if table is None else load_shape_rules(table)
+    activation = CorrectiveActivation(definitions, names) if definitions else None
     try:
-        return Character(name, data, shape_map(ARKIT, names, rules))
+        return Character(name, data, shape_map(ARKIT, names, rules), activation)
     except NameMismatchError as error:
         if table is not None:
             raise NameMismatchError(f"{table}: {error}") from error
@@ -120,6 +135,17 @@ def load_character(path: str | Path | None = None, table: Path | None = None) ->
         ) from error
 
 
+def _shapes(document: Document, followers: set[str]) -> tuple[str, ...]:
+    """The names of all meshes' morph targets, each once, but for correctives."""
+    meshes = [read_target_names(document, i) for i in range(len(document.objects("meshes")))]
+    names = tuple(dict.fromkeys(name for mesh in meshes for name in mesh if name not in followers))
+    if not names:
+        raise NoShapesError(
+            f"{document.path}: found no morph target in its {len(meshes)} meshes, expected at least one for a rig"
+        )
+    return names
+
+
 def _recognised(names: Sequence[str]) -> dict[str, ShapeRule]:
     """Rules for shapes that other programs call otherwise, such as ``A25_Jaw_Open`` or ``Fcl_EYE_Close_L``."""
     known = mapping(ARKIT, names).any(1).tolist()
@@ -128,25 +154,17 @@ def _recognised(names: Sequence[str]) -> dict[str, ShapeRule]:
     return {name: ShapeRule({arkit: 1.0}) for arkit, shape in found for name in shape.names if name not in plain}
 
 
-def _taken(path: Path) -> tuple[bytes, tuple[str, ...]]:
+def _taken(path: Path) -> bytes:
     if path.is_file() and path.stat().st_size > LARGEST_CHARACTER:
         raise FileFormatError(
             f"{path}: found {path.stat().st_size / 2**20:.0f} MB, expected at most {LARGEST_CHARACTER / 2**20:.0f} MB "
             "for a character that moves live: export it with smaller textures, or the head alone"
         )
-    data = read_file(path)
-    document = document_of(path, data)
-    meshes = [read_target_names(document, i) for i in range(len(document.objects("meshes")))]
-    names = tuple(dict.fromkeys(name for mesh in meshes for name in mesh))
-    if not names:
-        raise NoShapesError(
-            f"{path}: found no morph target in its {len(meshes)} meshes, expected at least one for a rig"
-        )
-    return data, names
+    return read_file(path)
 
 
-def _written(path: Path | None) -> tuple[bytes, tuple[str, ...]]:
-    rig = performer() if path is None else load_rig(path).linear("the page's character")
+def _written(path: str | Path | None) -> bytes:
+    rig = performer() if path is None else load_rig(path)
     with TemporaryDirectory() as folder:
         save_rig(rig, Path(folder) / "character.glb")
-        return read_file(Path(folder) / "character.glb", LARGEST_CHARACTER), rig.names
+        return read_file(Path(folder) / "character.glb", LARGEST_CHARACTER)

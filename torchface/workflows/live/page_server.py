@@ -31,7 +31,7 @@ from torchface.workflows.live.live_view import LiveView
 
 _LARGEST_MESSAGE = 2**16
 _STATE_INTERVAL, _PICTURE_INTERVAL = 0.25, 1 / 15  # seconds
-_WAIT = 0.25
+_WAIT, _PATIENCE = 0.25, 2.0  # seconds; a browser opens connections that it may never use
 _HEADERS = {
     "X-Frame-Options": "DENY",
     "Referrer-Policy": "no-referrer",  # the address holds the token
@@ -88,6 +88,8 @@ class PageServer:
             free_port(HOST, port),
             process_request=self._answer,
             max_size=_LARGEST_MESSAGE,
+            open_timeout=_PATIENCE,
+            close_timeout=_PATIENCE,
             logger=logger,
             compression=None,
         )

@@ -243,8 +243,8 @@ class Recordings:
     def _write(self, log: FrameLog, folder: Path, found: int) -> None:
         take = log.take(self._fps)
         assert take.weights is not None
-        names = self._character.names
-        moved = replace(take, weights=Track(names, self._character.weights(take.weights.values[..., 0])[..., None]))
+        driven = self._character.weights(take.weights.values[..., 0])
+        moved = replace(take, weights=Track(self._character.names, driven[..., None]))
         summary = {
             "format": _FORMAT,
             "source": self._source,
@@ -256,9 +256,9 @@ class Recordings:
             "found": found,
             "files": [WEIGHTS, LIVE_LINK, ANIMATION],
         }
-        assert moved.weights is not None
+        names, targets = self._character.targets(driven)
         turns = np.stack([take.extras["columns"][name].numpy() for name in ROTATIONS], 1)
-        performance = Performance(take.times.numpy(), names, moved.weights.values[..., 0].numpy(), turns)
+        performance = Performance(take.times.numpy(), names, targets.numpy(), turns)
         with all_or_none():
             save_weights_csv(moved, folder / WEIGHTS)
             save_live_link(take, folder / LIVE_LINK)
