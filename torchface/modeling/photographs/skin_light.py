@@ -16,7 +16,7 @@ _ROUNDS = 8
 # Precision of the first and second degree beside as many vertices as count: cheeks and beards are no light.
 _HELD = (0.0, *(0.02,) * 3, *(0.10,) * 5)
 _HELD_TO_GREY = 0.3
-_FAINT, _BRIGHT, _TINT = 0.55, 2.0, 1.12  # beside the mean: what the estimate may divide by
+_FAINT, _BRIGHT, _TINT = 0.4, 2.2, 1.12  # beside the mean: what the estimate may divide by
 
 
 def skin_light(shown: Shown, normals: Tensor, camera: Camera, skin: Tensor) -> EnvironmentLight | None:
