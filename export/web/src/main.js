@@ -9,7 +9,7 @@ import { drawFace } from "./face_overlay.js";
 import { FrameRate } from "./frame_rate.js";
 import { offerGroups } from "./group_settings.js";
 import { ServerEngine } from "./server_engine.js";
-import { keepSettings, settings } from "./settings.js";
+import { choosePerson, keepSettings, settings } from "./settings.js";
 import { Stage } from "./stage.js";
 import { StateWords, isSeen } from "./state_words.js";
 import { isStream, layOutStream } from "./stream_view.js";
@@ -157,6 +157,17 @@ element("reset").addEventListener("click", () => {
   collect();
   speak("Begun anew");
 });
+function showPeople() {
+  element("person").value = settings.person;
+  element("people").replaceChildren(...Object.keys(settings.people).map((name) => Object.assign(document.createElement("option"), { value: name })));
+  offerGroups(element("groups"), collect);
+}
+element("person").addEventListener("change", ({ target }) => {
+  choosePerson(target.value.trim());
+  if (engine.running) engine.reset();
+  collect();
+  showPeople();
+});
 element("mirror").checked = settings.mirror;
 element("mirror").addEventListener("change", ({ target }) => {
   keepSettings({ mirror: target.checked });
@@ -185,7 +196,7 @@ setInterval(showRate, 500);
 
 collect();
 setMirror(mirrored);
-offerGroups(element("groups"), collect);
+showPeople();
 try {
   stage = new Stage(element("character"));
 } catch {

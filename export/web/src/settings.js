@@ -1,18 +1,27 @@
-// What the user set, remembered across reloads.
+// What the user set, remembered across reloads; what belongs to a person's face by the person's name.
 
 const KEY = "torchface";
-const START = { gain: 1, smoothing: 0.5, mirror: true, groups: {}, gains: {}, centre: null };
+const OWN = { groups: {}, gains: {}, centre: null }; // of a person
+const START = { gain: 1, smoothing: 0.5, mirror: true, person: "", people: {}, ...OWN };
 
 export const settings = { ...START, ...remembered() };
 
 /** Keeps what was changed. */
 export function keepSettings(changed) {
   Object.assign(settings, changed);
+  const { person, groups, gains, centre } = settings;
+  if (person) settings.people = { ...settings.people, [person]: { groups, gains, centre } };
   try {
     localStorage.setItem(KEY, JSON.stringify(settings));
   } catch {
     // a browser that keeps nothing, such as in private windows
   }
+}
+
+/** Takes what was kept of a person; a new one begins with what is usual. */
+export function choosePerson(name) {
+  const kept = Object.hasOwn(settings.people, name) ? settings.people[name] : {};
+  keepSettings({ person: name, ...OWN, ...kept });
 }
 
 function remembered() {

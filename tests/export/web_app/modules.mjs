@@ -38,6 +38,23 @@ const jobs = {
     });
   },
 
+  /** What is kept of two people who take turns, after a reload too. */
+  async people() {
+    const kept = new Map();
+    globalThis.localStorage = { getItem: (key) => kept.get(key) ?? null, setItem: (key, value) => kept.set(key, value) };
+    const { choosePerson, keepSettings, settings } = await load("settings");
+    const now = () => ({ person: settings.person, gain: settings.gain, gains: settings.gains, groups: settings.groups });
+    choosePerson("Anna");
+    keepSettings({ gains: { jawOpen: 2 }, gain: 1.5 });
+    choosePerson("__proto__");
+    const other = now();
+    keepSettings({ groups: { jaw: { gain: 0.5 } } });
+    choosePerson("Anna");
+    const again = now();
+    const reloaded = (await import(`${pathToFileURL(`${folder}/src/settings.js`).href}?again`)).settings;
+    return { other, again, reloaded, people: Object.keys(reloaded.people) };
+  },
+
   /** Settings of each shape, of groups and factors by shape. */
   async settings() {
     const { shapeSettings } = await load("weight_controls");

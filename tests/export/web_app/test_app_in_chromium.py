@@ -347,7 +347,19 @@ def test_tab_goes_through_the_controls_in_the_order_in_which_they_stand(opened: 
     return [one.id || one.textContent, outlineStyle, parseFloat(outlineWidth)];
     """
     found = []
-    wanted = ["calibrate", "reset", "gain", "smoothing", "mirror", "recenter", "freeze", "record", "choose", "own"]
+    wanted = [
+        "calibrate",
+        "reset",
+        "person",
+        "gain",
+        "smoothing",
+        "mirror",
+        "recenter",
+        "freeze",
+        "record",
+        "choose",
+        "own",
+    ]
     wanted += ["Groups of shapes", "", "Play", "CSV", ".glb", "Delete", "Licences"]
     for _ in wanted:
         ActionChains(driver).send_keys(Keys.TAB).perform()

@@ -132,6 +132,15 @@ def test_a_calibration_waits_until_the_face_rests_and_stands_while_none_is_seen(
     assert "Your face moves: let it rest." in {one["remark"] for one in told[: len(frames)]}
 
 
+def test_settings_of_a_face_are_kept_by_the_persons_name(run: Run) -> None:
+    told = run("people", [])
+    anna = {"person": "Anna", "gain": 1.5, "gains": {"jawOpen": 2}, "groups": {}}
+    assert told["other"] == {"person": "__proto__", "gain": 1.5, "gains": {}, "groups": {}}
+    assert told["again"] == anna
+    assert {name: told["reloaded"][name] for name in anna} == anna
+    assert "Anna" in told["people"]
+
+
 def test_settings_do_to_weights_what_they_do_where_python_solves(run: Run) -> None:
     generator = torch.Generator().manual_seed(0)
     controls = WeightControls()
