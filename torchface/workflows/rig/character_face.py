@@ -12,7 +12,7 @@ from torch import Tensor
 from torchface.geometry.meshes.operators import triangle_normals
 from torchface.geometry.meshes.surface_index import SurfaceIndex
 from torchface.geometry.spheres import nearest_sphere
-from torchface.io.gltf.character_scene import Character
+from torchface.io.gltf.character_scene import Block, Character
 from torchface.landmarks.images.checked_detector import shipped_detector
 from torchface.landmarks.images.ibug_68 import COUNT
 from torchface.landmarks.surfaces.eye_openings import eye_opening
@@ -30,7 +30,12 @@ _REACH, _BELOW, _NECK = 280.0, -210.0, 60.0  # millimetres of the reference: fro
 _EYE_REACH, _MOUTH_REACH, _SKIN_REACH = 48.0, 115.0, 8.0
 _BEFORE_LIPS, _MOUTH_HEIGHT = 4.0, 38.0
 _FACE_REACH = 95.0
-_STILL = re.compile(r"hair|hat\b|cap\b|helmet|glass|cloth|outfit|shirt|collar|scarf|hood|mask|earring|horn", re.I)
+_STILL = re.compile(
+    r"(?<!brow)(?<!brow[_ .])hair|(?<![a-z])(hat|cap)(?![a-z])|helmet|glass|cloth|outfit|shirt|collar|scarf|hood"
+    r"|(?<![a-z])mask|earring|(?<![a-z])horns?(?![a-z])",
+    re.IGNORECASE,
+)
+"""Names of what does not move with a face, wherever it lies."""
 _LEAST_ASTRAY, _ASTRAY = 15.0, 4.0  # millimetres, and times the median, that a point may lie from a head's
 _EYE_SPAN, _SHARES = 76.0, torch.linspace(0.04, 0.96, 17, dtype=torch.float64)
 _ROUND, _LEAST_BALL, _RADIUS, _INSIDE = 0.12, 12, (5.0, 32.0), 1.15
@@ -112,7 +117,7 @@ def _pieces(
     allowed = torch.zeros(int(part.max()) + 1, dtype=torch.bool)
     skin_faces = faces[part[faces[:, 0]] == skin_part]
     skin_tree = cKDTree(vertices[skin_faces.unique()].numpy())
-    still = torch.tensor([bool(_STILL.search(block.name)) for block in character.blocks])
+    still = torch.tensor([_is_still(block) for block in character.blocks])
     for one in part[faces[:, 0]].unique().tolist():  # a head has tens of parts
         rows = (part == one).nonzero()[:, 0]
         own = vertices[rows]
@@ -136,6 +141,12 @@ def _pieces(
         ~cut_joined[joined.of[rows]],
         landmarks,
     )
+
+
+def _is_still(block: Block) -> bool:
+    """Whether a block's name, or that of its one material, says that it does not move with a face."""
+    named = (block.name, *(block.materials if len(block.materials) == 1 else ()))
+    return any(_STILL.search(name) for name in named)
 
 
 def _skin_part(vertices: Tensor, faces: Tensor, part: Tensor, placed: Tensor) -> tuple[int, Tensor, float]:
