@@ -11,7 +11,7 @@ from torch import Tensor
 from torchface.errors import AlignmentError
 from torchface.geometry.cameras.pinhole import Camera, look_at
 from torchface.geometry.similarity import Similarity, similarity_transform
-from torchface.landmarks.images.boxes.face_box import FaceDetector
+from torchface.landmarks.images.boxes.face_box import FaceBoxes, FaceDetector
 from torchface.landmarks.images.face_reading import FaceReading
 from torchface.landmarks.images.ibug_68 import INNER, box_around
 from torchface.landmarks.images.landmark_finder import LandmarkFinder
@@ -28,7 +28,9 @@ _EYES = (36, 45)
 _LEAST_POINTS = 12
 _SLANTED = 0.25  # cosine between ray and normal below which a hit says nothing
 _ASTRAY = 0.5  # of the eyes' distance: a view's hit that is further from the median of all is left out
+_TRIED = 3  # places that are looked at from near
 _PRESENCE, _MISFIT = 0.6, 0.35
+_FACE_OF_HEAD = 0.5  # side of the box round a face, in sides of a picture that frames the head
 
 
 @dataclass(frozen=True, eq=False)
@@ -138,8 +140,16 @@ class FaceSearch:
             raise NoFaceOnSurfaceError(
                 f"found no face in {len(pictures)} pictures from around, expected a head", pictures
             )
-        first, others = _main(seen)
-        return self._from_near(surface, first, others, progress)
+        groups = _places(seen)
+        for number, group in enumerate(groups[:_TRIED]):
+            others = [one[0].middle for one in groups if one is not group and len(one) > 1 and one[0].score > 0.5]
+            elsewhere = torch.stack(others) if others else torch.zeros(0, 3, dtype=torch.float64)
+            try:
+                return self._from_near(surface, group[0], elsewhere, progress)
+            except NoFaceOnSurfaceError as error:
+                if number == 0:
+                    refused = error
+        raise refused
 
     def _around(
         self,
@@ -165,10 +175,12 @@ class FaceSearch:
                 pictures.append(picture)
                 image = _bytes(picture)
                 faces = self.detector(image)
+                if framed is not None and not len(faces.boxes):
+                    faces = _where_a_head_has_it()
                 for box, score, tilt in zip(faces.boxes, faces.scores.tolist(), faces.tilts.tolist(), strict=True):
                     reading = self.finder(image, box, tilt)
                     sighting = self._sighting(surface, camera, reading, score, plain)
-                    if sighting is not None:
+                    if sighting is not None and float(reading.presence) >= _PRESENCE:
                         found.append(sighting)
         return found
 
@@ -238,8 +250,16 @@ class _Sighting:
     plain: bool
 
 
-def _main(seen: list[_Sighting]) -> tuple[_Sighting, Tensor]:
-    """Of the faces that sightings agree on the surest, and where the others are that two sightings show."""
+def _where_a_head_has_it() -> FaceBoxes:
+    """The box in which a picture of a head alone shows its face: for faces that the detector does not know as such."""
+    side = _FACE_OF_HEAD * _SIDE
+    middle = 0.5 * _SIDE, 0.5 * _SIDE + 0.15 * side
+    box = torch.tensor([[middle[0] - side / 2, middle[1] - side / 2, side, side]])
+    return FaceBoxes(box, torch.tensor([0.5]))
+
+
+def _places(seen: list[_Sighting]) -> list[list[_Sighting]]:
+    """Sightings that agree on where a face is together, the surest first, in each too."""
     groups: list[list[_Sighting]] = []
     for one in sorted(seen, key=lambda sighting: -sighting.score):
         for group in groups:
@@ -248,9 +268,7 @@ def _main(seen: list[_Sighting]) -> tuple[_Sighting, Tensor]:
                 break
         else:
             groups.append([one])
-    groups.sort(key=lambda group: -sum(one.score for one in group))
-    others = [group[0].middle for group in groups[1:] if len(group) > 1 and group[0].score > 0.5]
-    return groups[0][0], torch.stack(others) if others else torch.zeros(0, 3, dtype=torch.float64)
+    return sorted(groups, key=lambda group: -sum(one.score for one in group))
 
 
 def _close_cameras(landmarks: Tensor) -> list[Camera]:
