@@ -24,6 +24,7 @@ from torchface.capture.anybody import (
 from torchface.errors import ValueRangeError
 from torchface.onnx import export_example_solver
 from torchface.onnx.example_graph import example_model
+from torchface.onnx.placed_example_graph import PlacedExamples
 from torchface.synthetic import performer
 
 
@@ -61,6 +62,25 @@ def test_many_steps_are_the_exact_solve(examples: ExampleShapes, kind: str) -> N
     assert np.abs(missing - solver(frames.double()).numpy()).max() < 0.05
 
 
+def test_the_module_with_the_similarity_eliminated_is_the_exact_solve(examples: ExampleShapes) -> None:
+    """Faces turned, moved, of another size, with noise and missing landmarks: each frame has a matrix of its own."""
+    solver = ExampleSolver(examples, AllAtOnce(), SolvedSimilarity())
+    generator = torch.Generator().manual_seed(1)
+    weights = torch.rand(8, 15, generator=generator) * (torch.rand(8, 15, generator=generator) < 0.3)
+    frames = examples.neutral + torch.einsum("pcn,bn->bpc", examples.basis, weights)
+    turn = torch.tensor([[0.9, -0.3], [0.3, 0.9]])
+    frames = (frames + torch.randn(frames.shape, generator=generator)) @ turn.T + 30
+    frames[4:, 20], frames[6:, 50:58] = torch.nan, torch.nan
+    found = PlacedExamples(solver)(frames, torch.zeros(8, 15))["weights"]
+    assert (found - solver(frames.double())).abs().max() < 1e-4
+
+
+@pytest.mark.bench  # torch.export takes seconds
+def test_the_graph_with_the_similarity_solved_for_is_the_exact_solve(examples: ExampleShapes, tmp_path: Path) -> None:
+    report = export_example_solver(ExampleSolver(examples, AllAtOnce(), SolvedSimilarity()), tmp_path / "placed.onnx")
+    assert all(gap.worst < 1e-3 for gap in report.gaps)
+
+
 def test_it_is_written_with_its_names_or_not_at_all(examples: ExampleShapes, tmp_path: Path) -> None:
     solver = ExampleSolver(examples)
     zoo.save_model(solver, tmp_path / "kept", zoo.ModelCard("MIT", "", {}, ""))
@@ -72,8 +92,8 @@ def test_it_is_written_with_its_names_or_not_at_all(examples: ExampleShapes, tmp
     assert all(name in session.get_modelmeta().custom_metadata_map["shape_names"] for name in examples.names)
     with pytest.raises(ValueRangeError, match="take more steps"):
         export_example_solver(solver, tmp_path / "poor.onnx", steps=1, steps_at_once=1)
-    with pytest.raises(ValueRangeError, match="with SolvedSimilarity, expected LandmarkBoxes"):
-        export_example_solver(ExampleSolver(examples, None, SolvedSimilarity()), tmp_path / "poor.onnx")
+    with pytest.raises(ValueRangeError, match="found Regional with the similarity solved for, expected all"):
+        export_example_solver(ExampleSolver(examples, Regional(), SolvedSimilarity()), tmp_path / "poor.onnx")
     with pytest.raises(ValueRangeError, match="found Distances, expected squared distances"):
         export_example_solver(ExampleSolver(examples, AllAtOnce(Distances())), tmp_path / "poor.onnx")
     assert not (tmp_path / "poor.onnx").exists()

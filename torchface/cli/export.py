@@ -193,7 +193,8 @@ def examples(
     Args:
         examples: What `torchface examples` wrote.
         out: The .onnx file to write.
-        solver: All shapes at once, the head first and then regions, or projected on a linear model of landmarks.
+        solver: All shapes at once, with size, roll and place solved for; the head first and then regions; or projected
+            on a linear model of landmarks. The last two place the face by boxes.
         quiet: Show no progress.
     """
     from torchface.capture.anybody import (
@@ -201,8 +202,10 @@ def examples(
         ExampleMethod,
         ExampleShapes,
         ExampleSolver,
+        LandmarkBoxes,
         LandmarkModel,
         Regional,
+        SolvedSimilarity,
     )
     from torchface.files.job_lock import file_lock
     from torchface.onnx import export_example_solver
@@ -215,7 +218,8 @@ def examples(
             "regional": Regional,
             "model": lambda: LandmarkModel.fit(shapes),
         }
-        made = ExampleSolver(shapes, methods[solver]())
+        placement = SolvedSimilarity() if solver == "all-at-once" else LandmarkBoxes()
+        made = ExampleSolver(shapes, methods[solver](), placement)
         progress("exporting and checking")
         report = export_example_solver(made, out)
     print_table(report.rows())

@@ -13,11 +13,12 @@ import onnxruntime
 import torch
 from torch import Tensor
 
-from torchface.capture.anybody import ExampleSolver
+from torchface.capture.anybody import ExampleSolver, SolvedSimilarity
 from torchface.errors import ValueRangeError
 from torchface.files.whole_files import write_file
 from torchface.onnx.checked_export import WrittenGraph
 from torchface.onnx.example_graph import STEPS, STEPS_AT_ONCE, example_model
+from torchface.onnx.placed_example_graph import placed_example_model
 
 _FRAMES, _FRAMES_A_POSE = 200, 10
 _NOISE = 0.005  # of the eyes' distance
@@ -87,9 +88,10 @@ def export_example_solver(
     (B,N) and ``carried`` (B,N), the next frame's ``previous``; zeros start. The metadata holds ``shape_names``.
 
     Args:
-        solver: of squared distances, or of a landmark model; with landmark boxes.
+        solver: of squared distances, or of a landmark model; with landmark boxes, or all at once with the similarity
+            solved for.
         path: the file to write; it appears only when it is complete and checked.
-        steps, steps_at_once: of splitting.
+        steps, steps_at_once: of splitting, with landmark boxes.
         landmarks: frames to check with, (T,68,2), none missing; random sparse weights with noise if absent.
         facts: further metadata.
 
@@ -105,7 +107,11 @@ def export_example_solver(
         True
     """
     exact = copy.deepcopy(solver).cpu()
-    content = example_model(exact, steps, steps_at_once, facts=facts).SerializeToString()
+    if isinstance(exact.placement, SolvedSimilarity):
+        model = placed_example_model(exact, facts=facts)
+    else:
+        model = example_model(exact, steps, steps_at_once, facts=facts)
+    content = model.SerializeToString()
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = options.inter_op_num_threads = 1
     options.log_severity_level = 3  # of what a branch leaves out

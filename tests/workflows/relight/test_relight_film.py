@@ -99,6 +99,7 @@ def test_the_face_is_relit_and_the_hand_before_it_is_not(filmed: Filmed, tmp_pat
         assert float(beside.mean()) > 4  # the cheek behind it is relit
 
 
+@pytest.mark.bench  # a light is searched for again, seconds
 def test_paint_lies_behind_the_hand_too(filmed: Filmed, tmp_path: Path) -> None:
     save_image(torch.tensor([0.1, 0.9, 0.1])[:, None, None].expand(3, 8, 8), tmp_path / "green.png")
     out = tmp_path / "painted.avi"

@@ -119,7 +119,7 @@ class SolvedSimilarity:
         one = torch.eye(2, dtype=guessed.dtype, device=guessed.device).expand(*guessed.shape[:2], 2, 2)
         eyes = (neutral[EYE_CORNERS[0]] - neutral[EYE_CORNERS[1]]).norm()
         free = -torch.cat([centred[..., None], turned[..., None], eyes * one], dim=-1)
-        scale = (1 / eyes).expand(len(landmarks), 2)
+        scale = (1 / eyes).expand(landmarks.shape[0], 2)
         offset = torch.where(seen[..., None], neutral - guessed, 0.0)
         return LandmarkEquations(neutral, basis, offset, scale, seen, free)
 
