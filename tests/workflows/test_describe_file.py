@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+import numpy as np
 import torch
 
 from torchface import Take, Track, save_take
@@ -17,3 +18,13 @@ def test_the_extent_of_markers_is_in_millimetres_and_knows_no_outlier(tmp_path: 
     rows = dict(describe(tmp_path / "take.c3d", None, None))
     assert rows["extent, mm"] == "80.0 x 120.0 x 30.0, of each marker's median place"
     assert "unit mm" in rows["kept besides"]
+
+
+def test_a_head_model_of_others_says_what_it_has(tmp_path: Path) -> None:
+    corners = np.random.default_rng(0).normal(size=(9, 3))
+    arrays = {"v_template": corners, "shapedirs": np.zeros((9, 3, 350)), "f": np.array([[0, 1, 2], [3, 4, 5]])}
+    np.savez(tmp_path / "flame.npz", **arrays)
+    rows = dict(describe(tmp_path / "flame.npz"))
+    assert rows["head model"].startswith("FLAME")
+    assert (rows["identity parameters"], rows["expression parameters"]) == ("300", "50")
+    assert (rows["joints"], rows["vertices"]) == ("none", "9")

@@ -15,7 +15,8 @@ from torchface.capture.anybody.examples.example_shapes import is_examples
 from torchface.capture.markers import MarkerSolver, observability
 from torchface.errors import FileFormatError
 from torchface.files.whole_files import read_file
-from torchface.io import load_animation, load_mesh, load_rig, load_take
+from torchface.io import HeadModelFile, load_animation, load_head_model_file, load_mesh, load_rig, load_take
+from torchface.io.head_models.head_model_files import is_head_model_file
 from torchface.io.images.image_files import IMAGE_ENDINGS, load_image
 from torchface.io.mesh_files import MESH_ENDINGS
 from torchface.io.rig_files import SCENE_ENDINGS
@@ -63,6 +64,8 @@ def describe(path: Path, attachment: Path | None = None, part: str | None = None
         raise FileFormatError(f"{path}: found no rig, expected one to test the markers of {attachment} on")
     if suffix in MESH_ENDINGS:
         return _mesh_rows(load_mesh(path))
+    if is_head_model_file(path):
+        return _head_model_rows(load_head_model_file(path))
     if suffix in (*TAKE_ENDINGS, *RECORDING_ENDINGS) and (suffix != ".json" or is_weight_json(path)):
         return _take_rows(load_take(path))
     if suffix == ".json" and is_examples(path):
@@ -92,6 +95,18 @@ def describe(path: Path, attachment: Path | None = None, part: str | None = None
     raise FileFormatError(
         f"{path}: found the ending {suffix!r}, expected a folder or one of {' '.join(sorted(endings))}"
     )
+
+
+def _head_model_rows(model: HeadModelFile) -> Rows:
+    joints = "none" if model.joints is None else ", ".join(model.joints.names)
+    return [
+        ("head model", f"{model.name}, licence: {model.licence}"),
+        ("identity parameters", str(len(model.identity))),
+        ("expression parameters", str(len(model.expressions))),
+        ("joints", joints),
+        ("places of landmarks", "none" if model.landmarks is None else str(len(model.landmarks.rows))),
+        *_mesh_rows(model.neutral),
+    ]
 
 
 def _example_rows(examples: ExampleShapes) -> Rows:

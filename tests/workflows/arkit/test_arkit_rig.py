@@ -4,14 +4,18 @@ from pathlib import Path
 
 import pytest
 import torch
+import trimesh
 
 from torchface import Mesh
 from torchface.errors import AlignmentError, ValueRangeError
 from torchface.geometry.rotations import rotation_matrix
 from torchface.io import load_ict_facekit, save_rig
+from torchface.mesh import Annotations
+from torchface.modeling.rigging.loose_parts import tongue_out
+from torchface.modeling.rigging.other_topology import shapes_on
 from torchface.rig import BlendshapeRig
 from torchface.synthetic import performer
-from torchface.workflows.arkit.arkit_rig import Source, make_arkit
+from torchface.workflows.arkit.arkit_rig import Source, head_of, make_arkit
 
 
 @pytest.mark.real
@@ -64,3 +68,38 @@ def test_a_template_without_arkits_shapes_and_a_head_that_is_none_are_refused(tm
     with pytest.raises(AlignmentError, match=r"--landmarks FILE"):
         make_arkit(Source(Path("crumpled"), actor.neutral.with_vertices(crumpled)))
     assert len(marks) == 68
+
+
+def test_a_tongue_of_its_own_goes_with_the_jaw_and_comes_out() -> None:
+    """A tongue is put into the performer's mouth: the tip comes before the lips, the root stays."""
+    actor = performer(texture=False).select(["jawOpen"])
+    lips = actor.vertices[actor.neutral.landmarks[60:]].mean(0)
+    ball = trimesh.creation.icosphere(3)
+    tongue = (
+        torch.from_numpy(ball.vertices).float() * torch.tensor([11.0, 5.0, 22.0]) + lips - torch.tensor([0, 4.0, 32.0])
+    )
+    count = len(actor.vertices)
+    faces = torch.cat([actor.neutral.faces, torch.from_numpy(ball.faces).long() + count])
+    head = Mesh(torch.cat([actor.vertices, tongue]), faces, annotations=Annotations(actor.neutral.landmarks))
+    carried = shapes_on(actor, head, (actor.neutral.landmarks, head.vertices[head.landmarks].double()))
+    own = torch.arange(len(head.vertices)) >= count
+    assert torch.equal(carried.tongue, own)
+    opened = carried.rig.deltas[0][own]
+    assert torch.allclose(torch.pdist(tongue[::9] + opened[::9]), torch.pdist(tongue[::9]), atol=0.1)
+    assert float(opened[:, 1].mean()) < -5
+    out = tongue_out(head.vertices, own, head.vertices[head.landmarks[48:]])
+    moved = tongue + out[own]
+    assert float(moved[:, 2].max() - head.vertices[head.landmarks[48:], 2].max()) == pytest.approx(12.0, abs=0.5)
+    assert float(out[~own].abs().max()) == 0
+    assert float(out[own][tongue[:, 2].argmin()].norm()) < 1e-3
+
+
+def test_of_a_whole_body_the_head_is_registered() -> None:
+    actor = performer(texture=False).neutral
+    below = torch.linspace(-1500, float(actor.vertices[:, 1].min()) - 10, 60)
+    body = torch.stack([torch.zeros(60), below, torch.zeros(60)], 1)
+    whole = Mesh(torch.cat([body, actor.vertices]), actor.faces + 60)
+    head = head_of(whole)
+    assert len(head.vertices) < len(whole.vertices)
+    assert float(head.vertices[:, 1].max() - head.vertices[:, 1].min()) < 331
+    assert head_of(actor) is actor

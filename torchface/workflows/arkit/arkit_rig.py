@@ -164,7 +164,7 @@ def _template(path: Path | None) -> BlendshapeRig:
 
 
 def _carried(source: Source, template: BlendshapeRig, landmarks: Path | None, progress: Progress) -> CarriedShapes:
-    scan = _head_of(source.neutral)
+    scan = head_of(source.neutral)
     marks = _landmarks(source, template.neutral, landmarks)
     if marks is None and template.neutral.annotations is not None:
         marks = seen_landmarks(scan, template.neutral, progress)
@@ -184,7 +184,7 @@ def _carried(source: Source, template: BlendshapeRig, landmarks: Path | None, pr
     return shapes_on(template, source.neutral, registration=registration, progress=progress)
 
 
-def _head_of(mesh: Mesh) -> Mesh:
+def head_of(mesh: Mesh) -> Mesh:
     """The head of a mesh that has a whole body; the mesh itself else."""
     height = mesh.vertices[:, 1]
     if float(height.max() - height.min()) < _BODY:
