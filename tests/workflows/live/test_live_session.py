@@ -234,7 +234,7 @@ def test_controls_reach_the_solver_and_reset_does_once(dome: Path, tmp_path: Pat
     assert {(told.gain, told.smoothing, told.pose) for told in solver.controls} == {(1.5, 0.25, 0)}
     assert solver.intervals[0] is None
     assert solver.intervals[1:] == pytest.approx([1 / 30, 1 / 30], abs=1e-6)
-    view = session.view()
+    view = session.next_view(None, 0.0)
     assert view is not None
     assert float(view.solved.weights[SMILE]) == 0.25
     assert view.solved.seen
@@ -307,7 +307,6 @@ def test_latency_is_told_within_a_hundredth() -> None:
     assert figures.latency(0.5) == pytest.approx(500, rel=0.01)
     assert figures.latency(0.99) == pytest.approx(990, rel=0.01)
     assert (figures.frames, figures.found) == (1000, 500)
-    assert figures.recent()[1] == pytest.approx(971, rel=0.02)
 
 
 def test_a_mapping_drives_a_character_of_other_names(dome_rig: BlendshapeRig, tmp_path: Path) -> None:

@@ -50,7 +50,7 @@ class Desk:
         weights, marks = torch.arange(52) / 52, torch.full((68, 2), 7.0)
         solved = LiveFrame(weights, FRONTAL, marks, gaze=torch.tensor([[0.1, 0.2], [0.3, 0.4]]), calibrated=0.5)
         picture = np.full((48, 64, 3), (200, 100, 50), np.uint8)
-        return LiveView(self.number / 100, 0.01, 9.0, picture, solved, self.number)
+        return LiveView(self.number / 100, 0.01, 9.0, picture, solved)
 
     def state(self) -> dict[str, Any]:
         return {"words": "here"}

@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections import deque
 from dataclasses import dataclass
 
 import numpy as np
 
 _LEAST, _MOST, _STEP = 0.05, 60_000.0, 1.01  # milliseconds; what is reported is within 1 %
 _BINS = math.ceil(math.log(_MOST / _LEAST) / math.log(_STEP))
-_RECENT, _MOST_RECENT = 2.0, 256  # seconds, frames
 
 
 class LiveFigures:
@@ -20,7 +18,6 @@ class LiveFigures:
         self.frames = self.found = 0
         self._histogram = np.zeros(_BINS + 1, np.int64)
         self._first = self._last = 0.0
-        self._recent: deque[tuple[float, float]] = deque(maxlen=_MOST_RECENT)
 
     def add(self, came: float, gone: float, seen: bool) -> None:
         """Counts a frame that came and was sent on at these times, in seconds."""
@@ -31,9 +28,6 @@ class LiveFigures:
         latency = 1000 * (gone - came)
         step = math.log(max(latency, _LEAST) / _LEAST) / math.log(_STEP)
         self._histogram[min(int(step), _BINS)] += 1
-        self._recent.append((gone, latency))
-        while gone - self._recent[0][0] > _RECENT:
-            self._recent.popleft()
 
     def latency(self, quantile: float) -> float:
         """From a frame's arrival to its packets on the way, milliseconds; 0 before the first."""
@@ -51,14 +45,6 @@ class LiveFigures:
     def fps(self) -> float:
         """Frames a second, over all."""
         return self.frames / max(self.seconds, 1e-9) if self.frames else 0.0
-
-    def recent(self) -> tuple[float, float]:
-        """Frames a second and the median latency of the last two seconds."""
-        recent = list(self._recent)
-        if len(recent) < 2:
-            return 0.0, 0.0
-        took = recent[-1][0] - recent[0][0]
-        return (len(recent) - 1) / max(took, 1e-9), float(np.median([latency for _, latency in recent]))
 
 
 @dataclass(frozen=True)

@@ -81,10 +81,6 @@ class LiveSession:
         self._takes: tuple[float, list[dict[str, Any]]] = (float("-inf"), [])
         self._lock = threading.RLock()
 
-    def view(self) -> LiveView | None:
-        """The newest moment; None before the first frame."""
-        return self._view
-
     def next_view(self, before: LiveView | None, seconds: float) -> LiveView | None:
         """The newest moment once there is another than ``before``; None where none came in time."""
         with self._changed:
@@ -197,7 +193,7 @@ class LiveSession:
                 self.figures.add(came, now, solved.seen)
                 interval = 0.0 if before is None else came - before
                 with self._changed:
-                    self._view = LiveView(came, interval, 1000 * (now - came), picture, wanted, self.figures.frames)
+                    self._view = LiveView(came, interval, 1000 * (now - came), picture, wanted)
                     self._changed.notify_all()
                 self._keep(came, wanted)
                 self._advance(interval, solved)

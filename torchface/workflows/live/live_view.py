@@ -26,7 +26,6 @@ class LiveView:
         latency: from its arrival to its packets on the way, milliseconds.
         picture: of the camera, uint8 (H,W,3), red first.
         solved: what was sent.
-        frames: how many there were before it.
     """
 
     came: float
@@ -34,7 +33,6 @@ class LiveView:
     latency: float
     picture: np.ndarray
     solved: LiveFrame
-    frames: int
 
     def message(self) -> bytes:
         """For ``export/web/src/server_engine.js``: kind and 0, milliseconds as a double, then floats."""
