@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 import scipy.sparse
 import torch
+from mutation import check_reader
 from safetensors.numpy import save_file
 
 from planted.published_heads import (
@@ -275,3 +276,21 @@ def test_the_pages_script_converts_a_pickle_and_runs_nothing(
     assert (len(model.identity), len(model.expressions)) == (300, 10)
     assert b"is not an array" in done[1].stderr
     assert not (tmp_path / "was_run").exists()
+
+
+def test_a_mutated_archive_is_read_or_refused(tmp_path: Path) -> None:
+    generator = np.random.default_rng(0)
+    few = {
+        "v_template": generator.normal(size=(12, 3)).astype(np.float32),
+        "shapedirs": generator.normal(size=(12, 3, 302)).astype(np.float32),
+        "f": generator.integers(0, 12, (8, 3)),
+    }
+    np.savez(tmp_path / "flame.npz", **few)
+    check_reader(load_head_model_file, [tmp_path / "flame.npz"], ".npz")
+
+
+def test_a_header_that_is_no_python_is_refused(tmp_path: Path) -> None:
+    header = b"{'descr': '<f4', 'fortran_order': False, 'shape': (4, 3), }" + b" " * 50 + b"(\n"
+    (tmp_path / "v.npy").write_bytes(b"\x93NUMPY\x01\x00" + len(header).to_bytes(2, "little") + header + bytes(48))
+    with pytest.raises(FileFormatError, match="found no readable arrays"):
+        load_head_model_file(tmp_path / "v.npy")

@@ -7,6 +7,7 @@ import zlib
 from collections.abc import Collection
 from dataclasses import dataclass
 from pathlib import Path
+from tokenize import TokenError
 from typing import Any
 
 import numpy as np
@@ -221,10 +222,13 @@ _KINDS = {
 
 def _header(file: Any) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
     version = np.lib.format.read_magic(file)
-    if version == (1, 0):
-        return np.lib.format.read_array_header_1_0(file, max_header_size=_HEADER)
-    if version == (2, 0):
-        return np.lib.format.read_array_header_2_0(file, max_header_size=_HEADER)
+    try:
+        if version == (1, 0):
+            return np.lib.format.read_array_header_1_0(file, max_header_size=_HEADER)
+        if version == (2, 0):
+            return np.lib.format.read_array_header_2_0(file, max_header_size=_HEADER)
+    except (SyntaxError, TokenError, TypeError, KeyError, RecursionError, MemoryError) as error:  # what parses Python
+        raise ValueError(f"no header of an array ({error})") from error
     raise ValueError(f"version {version} of an array")
 
 
