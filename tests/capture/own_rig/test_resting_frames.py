@@ -26,3 +26,12 @@ def test_blinks_and_looks_are_rest() -> None:
     assert bool(
         torch.isnan(activity_of_readings(read, torch.full_like(read, torch.inf), ["jawOpen", "cheekPuff"])).all()
     )
+
+
+def test_a_laugh_that_is_read_less_surely_is_no_rest() -> None:
+    read = torch.zeros(60, 2)
+    read[20:] = 0.9
+    deviation = 0.1 + 0.4 * read  # as networks state them
+    share = resting_share(activity_of_readings(read, deviation, ["mouthSmileLeft", "mouthSmileRight"]))
+    assert float(share[:20].min()) > 0.9
+    assert float(share[20:].max()) < 0.1

@@ -83,9 +83,8 @@ def estimate_offsets(
 
     An expression of most of a take is none that never ends, so the sums are over frames in which the face rests: a
     twelfth of the frames, or more where more are alike. Where weights were read, the readings' mean, whose error is
-    alike in all frames, says of the constant expression what penalty and rest only guess, and all frames count. With
-    modes of other people's heads, offsets are likely as far as those and the finder's habits explain them: no head has
-    its lips apart at rest.
+    alike in all frames, says of the constant expression what the penalty only guesses. With modes of other people's
+    heads, offsets are likely as far as those and the finder's habits explain them: no head has its lips apart at rest.
 
     Args:
         solver: of the rig, without offsets; its prior holds for the frames.
@@ -121,8 +120,6 @@ def estimate_offsets(
     chosen = shown[torch.linspace(0, len(shown) - 1, min(_SEARCHED, len(shown))).round().long()]
     likely = None if identity_modes is None else _likely_offsets(identity_modes.to(landmarks).double())
     with torch.no_grad():
-        if read is not None and neutral is None:
-            resting = torch.ones(len(landmarks), device=landmarks.device)
         rest = None if resting is None else resting[chosen].double()
         take = _Take(landmarks[chosen].double(), trust[chosen], rest, None if read is None else read.of_frames(chosen))
         return _estimated(solver, take, likely, neutral is not None)

@@ -45,9 +45,10 @@ def activity_of_weights(weights: Tensor, names: Sequence[str]) -> Tensor:
 def activity_of_readings(expression: Tensor, deviation: Tensor, names: Sequence[str]) -> Tensor:
     """The same of readings of weights (T,N) with their deviations (T,N); NaN in frames that say nothing.
 
-    What is read of a shape in the take's lowest frames is an error that is alike in all.
+    What is read of a shape in the take's lowest frames is an error that is alike in all. Deviations grow with weights:
+    a shape that is seen in some frames counts in all, or a laugh would count as rest.
     """
-    known = torch.isfinite(expression) & (deviation < _SEEN)
+    known = torch.isfinite(expression) & (deviation.nanquantile(0.1, dim=0) < _SEEN)
     values = torch.where(known, expression, torch.nan)
     beside = (values - values.nanquantile(0.1, dim=0).nan_to_num(0.0)).nan_to_num(0.0)
     return torch.where(known.any(1), activity_of_weights(beside, names), torch.nan)

@@ -39,6 +39,7 @@ _STRAYS = 0.35  # radians: what is further to the side or up is no looking strai
 # Frames that eyes open, and looking straight, as people usually have them count as: people squint and look aside for
 # seconds.
 _OPEN_FRAMES, _STRAIGHT_FRAMES = 90.0, 240.0
+_ANY_FRAME = 0.1  # what a frame counts beside one in which the face surely rests
 _VERGENCE = 0.12  # radians from straight, of each eye at most
 _LEAST_GAZE = 0.3  # trust, under which a gaze is that of before
 _DISAGREE = 0.08  # of openness by landmarks and by the eye network, at which lids' landmarks count half
@@ -178,7 +179,7 @@ def _levels(openness: Tensor, by_look: Tensor, shut: Tensor, counts: Tensor, res
             continue
         values = openness[is_open, eye] / by_look[is_open, eye]
         high = values.quantile(_HIGHEST)
-        own = _weighted_median(values, resting[is_open] + 1e-3).clamp(_LOWEST * high, high)
+        own = _weighted_median(values, resting[is_open] + _ANY_FRAME).clamp(_LOWEST * high, high)
         level.append(own + (_USUAL_OPEN - own) * _OPEN_FRAMES / (len(values) + _OPEN_FRAMES))
     return torch.stack(lowest), torch.stack(level)
 
