@@ -98,18 +98,22 @@ def train(settings: Settings, run: Run) -> Trained:
 
 
 def performed_groups(labels: list[ActionLabels]) -> tuple[RegionGroup, ...]:
-    """The usual groups, of those units that are performed.
+    """The groups that labels name, or the usual ones, of those units that are performed.
 
     Raises:
         TorchfaceError: a unit is performed that no group knows, or none is.
     """
     performed = {unit for own in labels for unit in own.units}
-    known = {unit for group in GROUPS for unit in group.units}
+    usual = next((own.groups for own in labels if own.groups), GROUPS)
+    known = {unit for group in usual for unit in group.units}
     if not performed or performed - known:
         found = ", ".join(sorted(performed)) or "none"
-        raise TorchfaceError(f"labels: found the units {found}, expected some of {', '.join(sorted(known))}")
+        raise TorchfaceError(
+            f"labels: found the units {found}, expected some of {', '.join(sorted(known))}; others need [[groups]] in "
+            "the labels, with name, regions and units"
+        )
     groups = []
-    for group in GROUPS:
+    for group in usual:
         units = tuple(unit for unit in group.units if unit in performed)
         other_units = tuple(unit for unit in group.other_units if unit in performed)
         if units:

@@ -13,7 +13,7 @@ from planted.camera_stage import RecordedSession, StageSettings, record_session
 from torchface import zoo
 from torchface.capture import ActionUnitClassifier
 from torchface.errors import NameMismatchError, TorchfaceError
-from torchface.io.action_labels import Performed, save_action_labels
+from torchface.io.action_labels import ActionLabels, Performed, RegionGroup, load_action_labels, save_action_labels
 from train import action_units as recipe
 from train.action_units import Settings, performed_groups, train
 
@@ -79,3 +79,19 @@ def test_labels_that_are_not_there_end_in_a_line(tmp_path: Path, capsys: pytest.
     with pytest.raises(SystemExit):
         recipe.RECIPE.main(words)
     assert "film.toml: found no such file" in " ".join(capsys.readouterr().err.split())
+
+
+def test_units_of_ones_own_are_grouped_by_the_labels(tmp_path: Path) -> None:
+    """A pucker to the right and a frown, which the usual groups do not know, in regions of their own."""
+    regions = {"mouth": (10.0, 10.0, 60.0, 40.0), "chin": (10.0, 50.0, 60.0, 80.0)}
+    performed = (Performed(("18R",), 5, 20), Performed(("15",), 30, 50))
+    groups = (RegionGroup("lips", ("mouth",), ("18R", "16"), ("15",)), RegionGroup("chin", ("chin", "mouth"), ("15",)))
+    labels = ActionLabels(60, 0, (5.0, 5.0), ((1.0, 1.0), (9.0, 1.0)), regions, performed, groups)
+    save_action_labels(labels, tmp_path / "own.toml")
+    again = load_action_labels(tmp_path / "own.toml")
+    assert again == labels
+    assert performed_groups([again]) == (replace(groups[0], units=("18R",)), groups[1])
+    with pytest.raises(NameMismatchError, match="group 'brows' has regions brow and units 4, expected some of mouth"):
+        replace(labels, groups=(RegionGroup("brows", ("brow",), ("4",)),))
+    with pytest.raises(TorchfaceError, match=r"found the units 15, 18R, expected .*; others need \[\[groups\]\]"):
+        performed_groups([replace(labels, groups=())])

@@ -39,6 +39,8 @@ def solve(
     action_units: str | None = None,
     video_labels: Path | None = None,
     table: Path | None = None,
+    units: tuple[str, ...] = (),
+    gamma: float | None = None,
     report: OptionalOutputPath = None,
     stream: str | None = None,
     sparsity: float | None = None,
@@ -85,6 +87,8 @@ def solve(
         video_labels: Where helmet, markers and regions are in the video, TOML; VIDEO with .toml for its ending if
             absent.
         table: What action units mean in the rig's shapes, TOML; built in for ARKit's and ICT-FaceKit's names.
+        units: Which of the classifier's action units lead, such as 4 9 18L; all if absent.
+        gamma: How much a prediction weighs at most, mm² over all markers; 4 if absent.
         report: A folder for a page: the face playing, the error of each marker, what was wrong, every curve.
         stream: Then send the solved frames in their own time: as Live Link Face does to udp://127.0.0.1:11111 for
             Unreal on this machine, by the VMC protocol to vmc://HOST:PORT, or to any other address that
@@ -102,6 +106,7 @@ def solve(
         insist: Write weights although the rig does not explain the markers.
         quiet: Show no progress.
     """
+    from torchface.capture.markers.hybrid_solver import GAMMA
     from torchface.errors import FileFormatError, ValueRangeError
     from torchface.files.job_lock import file_lock
     from torchface.workflows.batch.batch_items import check_folder, check_for_each, find_items, is_batch
@@ -117,7 +122,9 @@ def solve(
         raise FileFormatError(f"{labels}: found TOML, expected a .csv; labels of a video go to --video-labels")
     if (video is None) != (action_units is None):
         raise ValueRangeError("solve: found one of --video and --action-units, expected both or neither")
-    camera = None if video is None or action_units is None else HeadCamera(video, action_units, video_labels, table)
+    camera = None
+    if video is not None and action_units is not None:
+        camera = HeadCamera(video, action_units, video_labels, table, units, GAMMA if gamma is None else gamma)
 
     settings = SolveSettings(neutral, align, not keep_rest, slip, clean, frame_by_frame, insist=insist)
     if sparsity is not None:

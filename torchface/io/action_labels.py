@@ -41,6 +41,29 @@ class Performed:
 
 
 @dataclass(frozen=True)
+class RegionGroup:
+    """Regions whose features are merged, and the action units that they show.
+
+    Args:
+        name: of the group.
+        regions: names of its regions.
+        units: names of its action units.
+        other_units: units that move the regions too but are classified by other groups: they are classes of their own,
+            so that they are not taken for one of ``units``.
+
+    Example:
+        >>> forehead = RegionGroup("forehead", ("brow_left", "brow_right"), ("1+2", "4"))
+        >>> forehead.other_units
+        ()
+    """
+
+    name: str
+    regions: tuple[str, ...]
+    units: tuple[str, ...]
+    other_units: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
 class ActionLabels:
     """A head-camera video described.
 
@@ -51,6 +74,7 @@ class ActionLabels:
         markers: two markers on the sides of the face, (x,y) each.
         regions: boxes (left, top, right, bottom) by name.
         performed: what was done when, in any order; empty for a video that is only to be classified.
+        groups: which regions show which units, where these are others than the usual.
 
     Raises:
         ValueRangeError: a frame outside the video, an empty stretch or box, or a number that is not finite.
@@ -69,6 +93,7 @@ class ActionLabels:
     markers: tuple[Pixel, Pixel]
     regions: dict[str, Box]
     performed: tuple[Performed, ...] = ()
+    groups: tuple[RegionGroup, ...] = ()
 
     def __post_init__(self) -> None:
         if not 1 <= self.frames <= _MAX_FRAMES:
@@ -92,6 +117,12 @@ class ActionLabels:
                 )
             if not all(stretch.units) or not stretch.units or len(set(stretch.units)) < len(stretch.units):
                 raise NameMismatchError(f"labels: found the units {stretch.units!r}, expected distinct names")
+        for group in self.groups:
+            if not group.regions or not group.units or not set(group.regions) <= set(self.regions):
+                raise NameMismatchError(
+                    f"labels: group {group.name!r:.60} has regions {', '.join(group.regions)} and units "
+                    f"{', '.join(group.units)}, expected some of {', '.join(self.regions)}, and a unit"
+                )
 
     @property
     def units(self) -> tuple[str, ...]:
@@ -129,6 +160,15 @@ def load_action_labels(path: str | Path) -> ActionLabels:
                 Performed(stretch["units"].texts(), stretch["first"].whole(), stretch["last"].whole())
                 for stretch in performed
             ),
+            tuple(
+                RegionGroup(
+                    group["name"].text(),
+                    group["regions"].texts(),
+                    group["units"].texts(),
+                    group["other_units"].texts() if group["other_units"] else (),
+                )
+                for group in (document["groups"].rows() if document["groups"] else [])
+            ),
         )
     except (ValueRangeError, NameMismatchError) as error:
         raise type(error)(f"{path}: {error}") from error
@@ -155,6 +195,16 @@ def save_action_labels(labels: ActionLabels, path: str | Path) -> None:
             {"units": list(stretch.units), "first": stretch.first, "last": stretch.last} for stretch in labels.performed
         ],
     }
+    if labels.groups:
+        document["groups"] = [
+            {
+                "name": group.name,
+                "regions": list(group.regions),
+                "units": list(group.units),
+                "other_units": list(group.other_units),
+            }
+            for group in labels.groups
+        ]
     write_toml(path, document)
 
 

@@ -48,3 +48,9 @@ def test_where_the_video_ends_the_markers_are_alone() -> None:
     longer = resampled_curves(curves(90, 60), take(50, 60))
     assert "40 frames after the take" in longer.notes[0]
     assert len(longer.weights) == 50
+
+
+def test_gamma_is_the_largest_weight_of_a_prediction() -> None:
+    usual, weak = resampled_curves(curves(90, 60), take(90, 60)), resampled_curves(curves(90, 60), take(90, 60), 1.0)
+    torch.testing.assert_close(weak.gamma.values, usual.gamma.values / 4)
+    assert float(usual.gamma.values.max()) > 3

@@ -3,38 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 from torch.nn.functional import grid_sample
 
 from torchface.errors import NameMismatchError, ValueRangeError
-from torchface.io.action_labels import Box
-
-
-@dataclass(frozen=True)
-class RegionGroup:
-    """Regions whose features are merged, and the action units that they show.
-
-    Args:
-        name: of the group.
-        regions: names of its regions.
-        units: names of its action units.
-        other_units: units that move the regions too but are classified by other groups: they are classes of their own,
-            so that they are not taken for one of ``units``.
-
-    Example:
-        >>> forehead = RegionGroup("forehead", ("brow_left", "brow_right"), ("1+2", "4"))
-        >>> [group.name for group in GROUPS if set(group.units) & set(forehead.units)]
-        ['forehead']
-    """
-
-    name: str
-    regions: tuple[str, ...]
-    units: tuple[str, ...]
-    other_units: tuple[str, ...] = ()
-
+from torchface.io.action_labels import Box, RegionGroup
 
 GROUPS: tuple[RegionGroup, ...] = (
     RegionGroup("forehead", ("brow_left", "brow_right"), ("1+2", "4")),

@@ -9,9 +9,15 @@ import torch
 
 from torchface import zoo
 from torchface.capture import ActionUnitClassifier
-from torchface.capture.action_units import ActionUnitCurves, action_unit_curves, load_shape_table
+from torchface.capture.action_units import (
+    ActionUnitCurves,
+    CurveSettings,
+    action_unit_curves,
+    load_shape_table,
+)
 from torchface.capture.action_units.shape_table import built_in_tables
 from torchface.capture.markers import gamma_curves
+from torchface.capture.markers.hybrid_solver import GAMMA
 from torchface.errors import NameMismatchError
 from torchface.io.action_labels import load_action_labels
 from torchface.progress import Progress
@@ -31,12 +37,16 @@ class HeadCamera:
         labels: where helmet, markers and regions are in the video; the video's name with ``.toml`` if absent.
         table: action units in the rig's shapes: ``arkit``, ``ict`` or a file; whichever of the two has
             the rig's names if absent.
+        units: those that count; all of the classifier's if empty.
+        gamma: the largest weight of a prediction, mm² over all markers.
     """
 
     video: Path
     classifier: str | Path
     labels: Path | None = None
     table: str | Path | None = None
+    units: tuple[str, ...] = ()
+    gamma: float = GAMMA
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,10 +89,12 @@ def predicted_curves(
     classifier = zoo.get_model(camera.classifier, ActionUnitClassifier)
     labels = load_action_labels(camera.labels or camera.video.with_suffix(".toml"))
     table = load_shape_table(camera.table if camera.table is not None else _fitting_table(classifier.units, names))
-    return resampled_curves(action_unit_curves(classifier, camera.video, labels, table, names, progress=progress), take)
+    settings = CurveSettings(units=camera.units or None)
+    curves = action_unit_curves(classifier, camera.video, labels, table, names, settings, progress)
+    return resampled_curves(curves, take, camera.gamma)
 
 
-def resampled_curves(curves: ActionUnitCurves, take: Take) -> Predicted:
+def resampled_curves(curves: ActionUnitCurves, take: Take, gamma: float = GAMMA) -> Predicted:
     """Curves of a video, frame by frame of a take that began when it did; shapes it never moves are left out."""
     moved = curves.active.any(0)
     names = tuple(name for name, moves in zip(curves.names, moved.tolist(), strict=True) if moves)
@@ -103,8 +115,8 @@ def resampled_curves(curves: ActionUnitCurves, take: Take) -> Predicted:
     elif len(weights) - 1 - float(at[-1]) > 1.5:
         notes.append(f"the video goes on for {len(weights) - 1 - float(at[-1]):.0f} frames after the take; left out")
     notes.append("take and video are taken to begin together")
-    gamma = gamma_curves(active_frames, window=max(round(_BLEND_SECONDS * take.fps), _MIN_BLEND_FRAMES))
-    return Predicted(Track(names, there[..., None]), Track(names, gamma[..., None]), tuple(notes))
+    weighed = gamma_curves(active_frames, gamma, max(round(_BLEND_SECONDS * take.fps), _MIN_BLEND_FRAMES))
+    return Predicted(Track(names, there[..., None]), Track(names, weighed[..., None]), tuple(notes))
 
 
 def _fitting_table(units: tuple[str, ...], names: tuple[str, ...]) -> str:
