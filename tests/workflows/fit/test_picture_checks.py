@@ -12,7 +12,11 @@ import torch
 from PIL import Image, ImageDraw, ImageFilter, ImageOps
 from torch import Tensor
 
+from torchface.geometry.cameras.pinhole import look_at
 from torchface.landmarks import FaceReading, NoFaceError
+from torchface.modeling import ImageFit
+from torchface.synthetic import neutral_head
+from torchface.workflows.fit.fit_checks import strange_lines
 from torchface.workflows.fit.fit_landmarks import PhotographLandmarks, find_in_photographs
 from torchface.workflows.fit.picture_checks import picture_lines
 
@@ -76,6 +80,16 @@ def test_two_faces_of_one_size() -> None:
     pair = replace(found(face), boxes=torch.stack([face.box, face.box]))
     assert "2 faces of similar size; say which is meant with --face" in picture_lines(pair, skin())[0]
     assert picture_lines(replace(pair, asked=True), skin()) == []
+
+
+def test_landmarks_that_no_head_has_are_remarked_on() -> None:
+    marks = reading().landmarks.expand(2, -1, -1).double()
+    off = torch.tensor([2.0, 6.0])[:, None, None] * torch.tensor([1.0, 0.0]).expand(2, 68, 2)
+    empty, camera = torch.zeros(0), look_at(torch.zeros(3), 0.0, width=200, height=200)
+    fit = ImageFit(neutral_head(texture=False), (), empty, empty, (camera,) * 2, off, marks, 1.0, empty)
+    lines = strange_lines([Path("man.png"), Path("cat.png")], fit)
+    assert len(lines) == 1
+    assert "cat.png: found landmarks lie 6.7% of the eyes' distance" in lines[0]
 
 
 def test_hidden_landmarks_do_not_count() -> None:

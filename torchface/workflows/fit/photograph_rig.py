@@ -26,7 +26,13 @@ from torchface.rendering.clay_shading import Lighting, render, sample_texture
 from torchface.rendering.compositing import save_rendered_image
 from torchface.rendering.raycast import RayCaster
 from torchface.rig import BlendshapeRig
-from torchface.workflows.fit.fit_checks import ALONE, eyes_distances, landmark_lines, one_person_lines
+from torchface.workflows.fit.fit_checks import (
+    ALONE,
+    eyes_distances,
+    landmark_lines,
+    one_person_lines,
+    strange_lines,
+)
 from torchface.workflows.fit.fit_landmarks import (
     DEFAULT_LANDMARKS,
     PhotographLandmarks,
@@ -184,7 +190,9 @@ def fit_photographs(
     remarks += one_person_lines(photographs, marks, bare, insist or one_film)
     fit = fit_images(heads, rig, marks, sizes, images, settings.focal, fitting, progress)
     remarks += profile_lines(fit)
-    if not found:
+    if found:
+        remarks += strange_lines(photographs, fit)
+    else:
         remarks += landmark_lines(photographs, images, marks, settings.landmark_model, bare)
     # Photographs show little of eyeballs and teeth: parts of their own keep the template's skin.
     unseen = hidden_parts(rig.neutral, torch.zeros(len(rig.vertices), dtype=torch.bool))
