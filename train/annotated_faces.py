@@ -56,7 +56,7 @@ class Faces:
 NO_FACES = Faces([], torch.zeros(0, 4), torch.zeros(0, 68, 2), [])
 
 
-def annotations(path: Path) -> list[tuple[Path, Tensor]]:
+def annotated_landmarks(path: Path) -> list[tuple[Path, Tensor]]:
     """Pictures and their 68 landmarks (68,2), of a folder of ``.pts`` files or of a dlib ``.xml``.
 
     Raises:
@@ -87,7 +87,7 @@ def load_faces(path: Path, folders_are_people: bool = False) -> Faces:
         path: of either.
         folders_are_people: pictures of a folder show one person; else each shows its own, a mirrored copy the same.
     """
-    found = annotations(path)
+    found = annotated_landmarks(path)
     known: dict[Path, Tensor] = {}
     faces = NO_FACES
     for picture, points in found:

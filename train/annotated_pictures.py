@@ -14,7 +14,7 @@ from torchface.landmarks import LandmarkNetwork
 from torchface.landmarks.images.face_crop import crop_transform, cut_crop, from_crop
 from torchface.landmarks.images.ibug_68 import COUNT, INNER, box_around
 
-from .annotated_faces import annotations
+from .annotated_faces import annotated_landmarks
 from .rendered_people.face_picture import SIZE
 
 _AROUND = 1.85  # of the box that a picture holds, as rendered pictures do
@@ -37,7 +37,7 @@ def annotated_pictures(path: Path, network: LandmarkNetwork) -> tuple[TensorData
         FileFormatError: there are no such files, or one cannot be read.
         ValueRangeError: fewer than two faces.
     """
-    rows = [_picture(image, landmarks, network) for image, landmarks in annotations(path)]
+    rows = [_picture(image, landmarks, network) for image, landmarks in annotated_landmarks(path)]
     if len(rows) < 2:
         raise ValueRangeError(f"data: found {len(rows)} annotated face in {path}, expected two at least")
     kept = [i for i in range(len(rows)) if len(rows) < _LEAST_TESTED or i % TESTED != TESTED - 1]
@@ -50,7 +50,8 @@ def annotated_pictures(path: Path, network: LandmarkNetwork) -> tuple[TensorData
 def inner_error(network: LandmarkNetwork, pictures: TensorDataset) -> float:
     """Mean error of brows, eyes, nose and mouth, percent of the distance of the eyes' outer corners."""
     errors = []
-    for rgba, landmarks, *_ in pictures:
+    for row in range(len(pictures)):
+        rgba, landmarks, *_ = pictures[row]
         transform = crop_transform(box_around(landmarks), 0.0, network.size, network.margin)
         crop = cut_crop(rgba[:3], transform, network.size)
         found = from_crop(network(crop[None].float() / 255).landmarks[0], transform)

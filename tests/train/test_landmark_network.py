@@ -10,7 +10,8 @@ from safetensors.torch import load_file, save_file
 from torch.utils.data import TensorDataset
 
 from torchface import zoo
-from torchface.errors import FileFormatError
+from torchface.errors import FileFormatError, ValueRangeError
+from torchface.io import save_image, save_pts
 from torchface.landmarks import LandmarkNetwork, NetworkSettings
 from train import landmark_network as recipe
 from train.face_pictures import StoredPictures
@@ -31,6 +32,28 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
         names = ("rgba", "landmarks", "visible", "points", "point_visible", "weights")
         save_file({name: torch.stack([getattr(one, name) for one in drawn]) for name in names}, path)
     return paths
+
+
+@pytest.mark.bench  # the network that ships learns for seconds
+def test_the_network_learns_the_habit_of_annotators(files: list[Path], tmp_path: Path) -> None:
+    """Annotators who set all points lower: it comes nearer to them, and keeps its points and weights beside the 68."""
+    data = tmp_path / "photographs"
+    data.mkdir()
+    stored = load_file(files[0])
+    for number in range(3):
+        save_image(stored["rgba"][number, :3].float() / 255, data / f"{number}.png")
+        save_pts(stored["landmarks"][number] + torch.tensor([0.0, 8.0]), data / f"{number}.pts")
+    quick = NetworkSettings(steps=12, batch=4, rate=5e-4, average=0.5, heat=0.0)
+    settings = recipe.Settings(out=tmp_path / "own", start="zoo", data=data, network=quick)
+    tuned = recipe.train(settings)
+    before, after = zoo.describe(tmp_path / "own").metrics.values()
+    assert after < 0.8 * before
+    assert tuned.config == zoo.get_model("landmark_network", LandmarkNetwork).config
+    assert "annotated pictures of photographs, after landmark_network" in zoo.describe(tmp_path / "own").data
+    for name in ("1.pts", "2.pts"):
+        (data / name).unlink()
+    with pytest.raises(ValueRangeError, match="data: found 1 annotated face"):
+        recipe.train(settings)
 
 
 def small() -> LandmarkNetwork:

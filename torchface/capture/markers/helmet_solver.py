@@ -161,7 +161,8 @@ class HelmetSolver(nn.Module):
             NameMismatchError: the take has no markers, labels that the attachment does not know, or none that it knows.
             ValueRangeError: no frame shows any marker.
         """
-        if checked_type("take", take, Take).markers is None:
+        checked_type("take", take, Take)
+        if take.markers is None:
             raise NameMismatchError("take: has no markers, expected a track of them")
         markers = self.markers.arrange(take.markers)
         rows = frames_seen(markers)

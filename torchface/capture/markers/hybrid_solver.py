@@ -147,7 +147,8 @@ class HybridSolver(nn.Module):
             ShapeError: the curves have another number of frames than the take.
             NameMismatchError: labels or names that are not the solver's, or the take has no markers.
         """
-        if checked_type("take", take, Take).markers is None or len(take) != len(predicted) or len(take) != len(gamma):
+        checked_type("take", take, Take)
+        if take.markers is None or len(take) != len(predicted) or len(take) != len(gamma):
             raise ShapeError(
                 f"hybrid solve: found {len(take)} frames of markers, {len(predicted)} of predictions, {len(gamma)} of "
                 "gamma, expected the same number"

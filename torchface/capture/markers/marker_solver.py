@@ -307,7 +307,8 @@ class MarkerSolver(nn.Module):
             >>> solved.weights.names == solver.names, bool(solved.weights.values.max() < 1e-3)
             (True, True)
         """
-        if checked_type("take", take, Take).markers is None:
+        checked_type("take", take, Take)
+        if take.markers is None:
             raise NameMismatchError("take: has no markers, expected a track of them")
         markers = self.arrange(take.markers)
         rows = frames_seen(markers)

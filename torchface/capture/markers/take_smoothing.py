@@ -98,7 +98,8 @@ class WholeTakeSolver(nn.Module):
             NameMismatchError: the take has no markers, labels that the attachment does not know, or none that it knows.
             ValueRangeError: no frame shows any marker, or a coordinate is infinite.
         """
-        if checked_type("take", take, Take).markers is None:
+        checked_type("take", take, Take)
+        if take.markers is None:
             raise NameMismatchError("take: has no markers, expected a track of them")
         weights = self(self.markers.arrange(take.markers), take.fps, take.seconds)
         return replace(take, weights=Track(self.markers.names, weights[..., None]))

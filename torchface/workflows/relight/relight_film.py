@@ -204,8 +204,9 @@ def relight_film(
 
 def _painter(tracked: TrackedFilm, settings: RelightSettings) -> Draw | None:
     """Draws paint or another head on a frame; None where neither is asked for."""
+    moved: Callable[[int], Tensor] = tracked.vertices
     if settings.texture is not None:
-        paint, moved = FacePaint.of(tracked.rig.neutral, load_paint(settings.texture)), tracked.vertices
+        paint = FacePaint.of(tracked.rig.neutral, load_paint(settings.texture))
     elif settings.rig is not None:
         other = load_rig(settings.rig)
         paint, moved = _head(other, settings.rig), _placed(other, tracked, settings.rig)
