@@ -56,6 +56,7 @@ class ArrayFile:
     def __init__(self, path: str | Path, largest: int = LARGEST_ARRAYS) -> None:
         self.path = Path(path)
         self._left = largest
+        self._archive: dict[str, zipfile.ZipInfo] | None = None
         if not self.path.is_file():
             raise FileFormatError(f"{self.path}: found no such file, expected .npz or .safetensors")
         with self.path.open("rb") as file:
@@ -184,7 +185,7 @@ class ArrayFile:
         return {ONLY: _stored(shape, dtype)}
 
     def _npz_headers(self) -> dict[str, StoredArray]:
-        self._archive: dict[str, zipfile.ZipInfo] | None = {}
+        entries_by_name: dict[str, zipfile.ZipInfo] = {}
         stored = {}
         with zipfile.ZipFile(self.path) as archive:
             entries = archive.infolist()
@@ -196,11 +197,11 @@ class ArrayFile:
                 with archive.open(entry) as file:
                     shape, _, dtype = _header(file)
                 name = entry.filename.removesuffix(".npy")
-                stored[name], self._archive[name] = _stored(shape, dtype), entry
+                stored[name], entries_by_name[name] = _stored(shape, dtype), entry
+        self._archive = entries_by_name
         return stored
 
     def _safetensors_headers(self) -> dict[str, StoredArray]:
-        self._archive = None
         stored = {}
         with safe_open(self.path, framework="np") as file:
             for name in file.keys():  # noqa: SIM118
