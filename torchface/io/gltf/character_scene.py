@@ -254,8 +254,8 @@ class _Shelf:
         source = texture.get("source")
         if source is None:
             return None
+        image, location = document.item("images", source, "textures"), f"images[{source}]"
         if source not in self._images:
-            image, location = document.item("images", source, "textures"), f"images[{source}]"
             try:
                 if image.get("uri") is not None:
                     data = document.bytes_at(image["uri"], f"{location}.uri")
@@ -281,7 +281,7 @@ def _skinned(
     """Each vertex's matrix (C,4,4) to the scene at rest, and its weight on the head's bones (C,)."""
     skin, where = document.item("skins", index, "skin"), f"skins[{index}]"
     joints = document.array(skin, "joints", where)
-    if not joints or any(joint not in transforms for joint in joints):
+    if not joints or any(not isinstance(joint, int) or joint not in transforms for joint in joints):
         raise document.error(f"{where}.joints", "a joint outside of the scene", "nodes of the scene")
     binds = np.broadcast_to(np.eye(4), (len(joints), 4, 4))
     if skin.get("inverseBindMatrices") is not None:
@@ -319,10 +319,12 @@ def _head_bone(document: Document, transforms: dict[int, NDArray[np.float64]]) -
         if isinstance(bones, dict):
             bones = [{**bone, "bone": key} for key, bone in bones.items() if isinstance(bone, dict)]
         for bone in bones if isinstance(bones, list) else []:
-            if isinstance(bone, dict) and bone.get("bone") == _HEAD and bone.get("node") in transforms:
-                return int(bone["node"])
+            node = bone.get("node") if isinstance(bone, dict) and bone.get("bone") == _HEAD else None
+            if isinstance(node, int) and node in transforms:
+                return node
     nodes = document.objects("nodes")
-    joints = {joint for skin in document.objects("skins") for joint in skin.get("joints", []) if isinstance(joint, int)}
+    lists = [document.array(skin, "joints", "skins") for skin in document.objects("skins")]
+    joints = {joint for row in lists for joint in row if isinstance(joint, int)}
     for candidates in (sorted(joints & set(transforms)), sorted(transforms)):
         for node in candidates:
             name = str(nodes[node].get("name", ""))

@@ -167,35 +167,52 @@ def _extend_mesh(
     _extend_names(document, mesh, location, (*old, *names))
     zeros = [0.0] * len(names)
     if "weights" in mesh or not old:
-        mesh["weights"] = [*mesh.get("weights", []), *zeros]
-    nodes = {number for number, node in enumerate(root.get("nodes", [])) if node.get("mesh") == index}
+        mesh["weights"] = [*document.array(mesh, "weights", location), *zeros]
+    nodes = [number for number, node in enumerate(document.objects("nodes")) if node.get("mesh") == index]
     for number in nodes:
         if "weights" in root["nodes"][number]:
-            root["nodes"][number]["weights"] += zeros
+            root["nodes"][number]["weights"] = [*document.array(root["nodes"][number], "weights", "nodes"), *zeros]
     _extend_animations(document, root, nodes, len(old), len(names), writer)
 
 
 def _extend_names(document: Document, mesh: dict[str, Any], location: str, names: tuple[str, ...]) -> None:
     """The names where the file has them, at the mesh or at each of its primitives; else at the mesh."""
-    owners = [one for one in (mesh, *mesh["primitives"]) if "targetNames" in (one.get("extras") or {})] or [mesh]
+    owners = [one for one in (mesh, *mesh["primitives"]) if _has_names(one.get("extras"))] or [mesh]
     for owner in owners:
-        extras = owner.setdefault("extras", {})
+        extras = owner.get("extras") or {}
         if not isinstance(extras, dict):
             raise document.error(f"{location}.extras", type(extras).__name__, "an object, to name morph targets in")
-        extras["targetNames"] = list(names)
+        owner["extras"] = {**extras, "targetNames": list(names)}
+
+
+def _has_names(extras: object) -> bool:
+    return isinstance(extras, dict) and "targetNames" in extras
 
 
 def _extend_animations(
-    document: Document, root: dict[str, Any], nodes: set[int], old: int, new: int, writer: _Appended
+    document: Document, root: dict[str, Any], nodes: list[int], old: int, new: int, writer: _Appended
 ) -> None:
     """Zeros for the new targets in animations of the weights of these nodes."""
-    for animation in root.get("animations", []):
-        for channel in animation.get("channels", []):
-            target = channel.get("target", {})
-            if target.get("path") != "weights" or target.get("node") not in nodes or not old:
+    for number, kept in enumerate(document.objects("animations")):
+        if not kept:
+            continue
+        animation, where = root["animations"][number], f"animations[{number}]"
+        samplers = document.array(animation, "samplers", where)
+        for channel in document.array(animation, "channels", where):
+            target = document.record(document.record(channel, where).get("target"), where)
+            if not old or target.get("path") != "weights" or target.get("node") not in nodes:
                 continue
-            sampler = animation["samplers"][channel["sampler"]]
-            values = read_floats(document, sampler["output"], "animations", ("SCALAR",)).reshape(-1, old)
-            padded = np.pad(values, ((0, 0), (0, new))).reshape(-1, 1)
-            animation["samplers"].append({**sampler, "output": writer.numbers(padded)})
-            channel["sampler"] = len(animation["samplers"]) - 1
+            index = document.integer(channel, "sampler", where)
+            if index >= len(samplers):
+                raise document.error(f"{where}.channels", index, f"less than the {len(samplers)} samplers")
+            sampler = document.record(samplers[index], where)
+            values = read_floats(document, sampler.get("output"), where, ("SCALAR",))
+            if len(values) % old:
+                raise document.error(where, f"{len(values)} weights", f"{old} for each key")
+            samplers.append(
+                {
+                    **sampler,
+                    "output": writer.numbers(np.pad(values.reshape(-1, old), ((0, 0), (0, new))).reshape(-1, 1)),
+                }
+            )
+            channel["sampler"] = len(samplers) - 1
