@@ -162,11 +162,11 @@ def _table() -> dict[tuple[str, ...], str]:
         if not arkit.endswith(("Left", "Right")):
             for side in ("Left", "Right"):
                 add(f"{arkit}_{side}", f"{arkit}{side}")
-    for whole, aliases in _SIDED.items():
+    for whole, sided in _SIDED.items():
         for side in ("Left", "Right"):
-            for alias in aliases:
+            for alias in sided:
                 add(alias.replace("*", f"_{side}_").strip("_"), f"{whole}{side}")
-    for whole, aliases in _PLAIN.items():
-        for alias in aliases:
+    for whole, plain in _PLAIN.items():
+        for alias in plain:
             add(alias, whole)
     return table

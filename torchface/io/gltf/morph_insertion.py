@@ -145,14 +145,20 @@ def _extend_mesh(
     writer: _Appended,
 ) -> None:
     mesh, location = root["meshes"][index], f"meshes[{index}]"
+    if not isinstance(mesh, dict):
+        raise document.error(location, type(mesh).__name__, "an object")
     old = read_target_names(document, index)
     if twice := [name for name in names if name in old]:
         raise document.error(f"{location}.extras.targetNames", f"{twice[0]!r} already", "names that it lacks")
     written: dict[tuple[int, bool], list[dict[str, int]]] = {}
-    for number, primitive in enumerate(mesh["primitives"]):
+    for number, primitive in enumerate(document.array(mesh, "primitives", location)):
+        if not isinstance(primitive, dict):
+            raise document.error(f"{location}.primitives[{number}]", type(primitive).__name__, "an object")
         one = moved.get(number)
-        normals = "NORMAL" in primitive["attributes"]
-        count = document.item("accessors", primitive["attributes"]["POSITION"], location)["count"]
+        attributes = document.record(primitive.get("attributes"), location)
+        normals = "NORMAL" in attributes
+        accessor = document.item("accessors", attributes.get("POSITION"), f"{location}.primitives[{number}]")
+        count = document.integer(accessor, "count", location)
         key = (-count if one is None else id(one), normals)
         if key not in written:
             still = np.zeros((count, 3), np.float32)
@@ -163,7 +169,7 @@ def _extend_mesh(
                     turned = still if one is None or one.normals is None else one.normals[row]
                     target["NORMAL"] = writer.deltas(turned)
                 written[key].append(target)
-        primitive["targets"] = [*primitive.get("targets", []), *written[key]]
+        primitive["targets"] = [*document.array(primitive, "targets", location), *written[key]]
     _extend_names(document, mesh, location, (*old, *names))
     zeros = [0.0] * len(names)
     if "weights" in mesh or not old:

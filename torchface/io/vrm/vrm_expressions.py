@@ -60,8 +60,8 @@ def vrm_expressions(document: Document) -> dict[str, tuple[MorphBind, ...]]:
     for number, row in enumerate(_clips(document, extension)):
         where = f"{_V0}.blendShapeMaster.blendShapeGroups[{number}]"
         clip = document.record(row, where)
-        preset, name = clip.get("presetName"), clip.get("name")
-        key = preset if isinstance(preset, str) and preset not in ("", "unknown") else name
+        preset, own = clip.get("presetName"), clip.get("name")
+        key = preset if isinstance(preset, str) and preset not in ("", "unknown") else own
         if isinstance(key, str):
             rows = document.array(clip, "binds", where)
             found[key] = tuple(_bind_v0(document, document.record(bind, where), where) for bind in rows)
@@ -84,7 +84,7 @@ def add_expressions(
     known = {name.lower() for name in vrm_expressions(document)}
     new = {name: list(binds) for name, binds in added.items() if binds and name.lower() not in known}
     if version == _V1:
-        custom = root["extensions"][_V1].setdefault("expressions", {}).setdefault("custom", {})
+        custom = _child(_child(root["extensions"][_V1], "expressions", {}), "custom", {})
         for name, binds in new.items():
             custom[name] = {
                 "morphTargetBinds": [{"node": b.node, "index": b.target, "weight": b.weight} for b in binds],
@@ -94,7 +94,7 @@ def add_expressions(
                 "overrideMouth": "none",
             }
     elif version == _V0:
-        groups = root["extensions"][_V0].setdefault("blendShapeMaster", {}).setdefault("blendShapeGroups", [])
+        groups = _child(_child(root["extensions"][_V0], "blendShapeMaster", {}), "blendShapeGroups", [])
         for name, binds in new.items():
             meshes = {(b.mesh, b.target): b for b in binds}.values()  # a mesh that two nodes show is bound once
             rows = [{"mesh": b.mesh, "index": b.target, "weight": b.weight * _FULL_V0} for b in meshes]
@@ -103,6 +103,13 @@ def add_expressions(
     else:
         return ()
     return tuple(new)
+
+
+def _child(parent: dict[str, Any], key: str, empty: Any) -> Any:
+    """What a field holds; made where it is absent or null."""
+    if parent.get(key) is None:
+        parent[key] = empty
+    return parent[key]
 
 
 def _clips(document: Document, extension: dict[str, Any]) -> list[Any]:

@@ -203,7 +203,8 @@ class FaceSearch:
     ) -> FaceOnSurface:
         reference = self.reference.all
         eyes = float((reference[_EYES[0]] - reference[_EYES[1]]).norm())
-        pose, views = first.pose, []
+        pose = first.pose
+        views: list[Tensor] = []
         points, presence = torch.full_like(reference, torch.nan), 0.0
         for attempt in range(_ROUNDS):
             # In the reference's place the face looks along z, whatever way the surface is turned.

@@ -172,9 +172,9 @@ def _present(character: Character) -> dict[str, _Present]:
         ]
         found[arkit] = _Present(shape.names, tuple(binds))
     for expression, bound in vrm_expressions(character.document).items():
-        arkit = arkit_name(expression)
-        if arkit in ARKIT and bound and arkit not in found:
-            found[arkit] = _Present((expression,), bound)
+        named = arkit_name(expression)
+        if named is not None and named in ARKIT and bound and named not in found:
+            found[named] = _Present((expression,), bound)
     return {name: found[name] for name in ARKIT if name in found}
 
 
