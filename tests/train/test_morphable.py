@@ -5,11 +5,13 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from forked_runs import held, killed
 from scipy.spatial.transform import Rotation
 
+from planted.published_heads import gnm_arrays, gnm_landmarks, head
 from torchface import Mesh, load_mesh, save_mesh, zoo
 from torchface.color_space import to_linear, to_srgb
 from torchface.errors import TopologyError, TorchfaceError, ValueRangeError
@@ -266,3 +268,18 @@ def test_ict_among_scans_and_a_file_are_told(heads: list[Mesh], tmp_path: Path) 
         registered(tmp_path)
     with pytest.raises(TorchfaceError, match="found a file, expected a folder of registered meshes"):
         registered(tmp_path / "vertex_indices.json")
+
+
+@pytest.mark.bench
+def test_a_published_model_gets_arkits_shapes_and_keeps_its_licence(tmp_path: Path, without_pictures: None) -> None:
+    rig = head()
+    np.savez(tmp_path / "gnm_head.npz", **gnm_arrays(rig))
+    gnm_landmarks(rig, tmp_path / "head_sparse_68.txt")
+    train(Settings(published=tmp_path / "gnm_head.npz", out=tmp_path / "people", components=4))
+    model = zoo.get_model(tmp_path / "people", HeadModel)
+    assert model.shape.count == 4
+    assert model.rig is not None
+    assert len(model.rig.names) == 51
+    assert "Apache-2.0" in (tmp_path / "people" / "CARD.md").read_text()
+    with pytest.raises(TorchfaceError, match="--published"):
+        train(Settings(published=tmp_path / "gnm_head.npz", performers=3, out=tmp_path / "both"))
