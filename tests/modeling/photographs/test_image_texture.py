@@ -48,6 +48,11 @@ def test_irises_come_back_from_a_picture(bare: Mesh, planted: Tensor) -> None:
     ringed = iris_color(bare, [picture], [camera], camera.project(torch.stack(fronts))[None])
     assert ringed is not None
     assert float((ringed - planted).norm()) < 0.05
+    centres = camera.project(torch.stack(fronts)).expand(3, 2, 2)
+    sepia = (picture.mean(0) * torch.tensor([1.0, 0.75, 0.4])[:, None, None]).clamp(max=1)
+    three = iris_color([bare] * 3, [picture, sepia, picture], [camera] * 3, centres)
+    assert three is not None
+    assert torch.equal(three, ringed)  # one in sepia does not decide
     far = look_at(eyes, 10.0, span=2000.0, width=320, height=200)
     assert iris_color(bare, [render(worn, far, lighting=EVEN, samples=1)], [far]) is None
 

@@ -30,7 +30,7 @@ _SHARE = (0.15, 0.40)
 
 _MIN_PIXELS = 40
 _IRIS_WIDTH, _MIN_RADIUS, _MIN_RING, _RING = 11.7, 2.5, 6, (0.45, 0.8)  # millimetres, pixels, pixels, radii
-_DARKEST = 0.07
+_DARKEST, _LARGE = 0.07, 0.4  # of the largest iris' radius: in which photographs colours count
 _IRIS_COSINE = 0.9  # of the angle between the eye's axis and the border of an iris 11 mm wide
 
 
@@ -195,41 +195,44 @@ def iris_color(
 def _ring_color(
     irises: Tensor, images: Sequence[Tensor], cameras: Sequence[Camera], posed: Mesh | Sequence[Mesh]
 ) -> Tensor | None:
-    """The colour (3,) of rings about the irises' centres (I,2,2), the largest eye's; None where they are too small."""
-    best, widest = None, _MIN_RADIUS
+    """The colour (3,) of rings about the irises' centres (I,2,2), each channel's median of photographs that are large
+    enough, so that one in coloured light does not decide; None without any."""
+    found, radii = list[Tensor](), list[float]()
     meshes = [posed] * len(images) if isinstance(posed, Mesh) else posed
     for mesh, image, camera, centres in zip(meshes, images, cameras, irises.double(), strict=True):
         marks = mesh.vertices[mesh.landmarks][36:48].detach().cpu().double()
         depth = float((marks @ camera.rotation.double()[2] + camera.translation.double()[2]).mean())
         radius = 0.5 * _IRIS_WIDTH * float(camera.intrinsics[0, 0]) / depth
-        seen = camera.project(marks)
-        if radius < widest:
+        if radius < _MIN_RADIUS:
             continue
-        found = []
-        for centre, lids in zip(centres, (seen[:6], seen[6:]), strict=True):
-            if not bool(torch.isfinite(centre).all()):
-                continue
-            side = torch.arange(-math.ceil(radius), math.ceil(radius) + 1, dtype=torch.float64)
-            dy, dx = torch.meshgrid(side, side, indexing="ij")
-            y, x = (centre[1] + dy).round().long(), (centre[0] + dx).round().long()
-            from_middle = ((x - centre[0]).square() + (y - centre[1]).square()).sqrt() / radius
-            # Between the lids at the iris: the upper one's shadow and lashes lie within a fifth of its width.
-            ring = (from_middle > _RING[0]) & (from_middle < _RING[1])
-            ring &= dy > torch.maximum(
-                lids[[1, 2], 1].mean() - centre[1] + 0.35 * radius, -0.6 * side.new_tensor(radius)
-            )
-            ring &= dy < lids[[4, 5], 1].mean() - centre[1] - 0.1 * radius
-            ring &= (x >= 0) & (y >= 0) & (x < image.shape[2]) & (y < image.shape[1])
-            found.append(image[:3, y[ring], x[ring]].T.double())
-        colors = torch.cat(found) if found else torch.zeros(0, 3)
+        seen = camera.project(marks)
+        eyes = zip(centres, (seen[:6], seen[6:]), strict=True)
+        rings = [_ring(image, centre, lids, radius) for centre, lids in eyes if bool(torch.isfinite(centre).all())]
+        colors = torch.cat(rings) if rings else torch.zeros(0, 3)
         if len(colors) < _MIN_RING:
             continue
         light = colors.mean(1)
         kept = (light >= light.quantile(0.35)) & (light <= light.quantile(0.75))
         color = colors[kept].median(0).values.float()
         if float(color.max()) > _DARKEST:  # else nothing but pupil and shadow is seen
-            best, widest = color.clamp(0.03, 0.9), radius
-    return best
+            found.append(color.clamp(0.03, 0.9))
+            radii.append(radius)
+    large = [color for color, radius in zip(found, radii, strict=True) if radius >= _LARGE * max(radii)]
+    return torch.stack(large).quantile(0.5, dim=0) if large else None
+
+
+def _ring(image: Tensor, centre: Tensor, lids: Tensor, radius: float) -> Tensor:
+    """The colours (Q,3) of an image (3,H,W) round an iris' centre (2,), between lids of six landmarks (6,2)."""
+    side = torch.arange(-math.ceil(radius), math.ceil(radius) + 1, dtype=torch.float64)
+    dy, dx = torch.meshgrid(side, side, indexing="ij")
+    y, x = (centre[1] + dy).round().long(), (centre[0] + dx).round().long()
+    from_middle = ((x - centre[0]).square() + (y - centre[1]).square()).sqrt() / radius
+    # The upper lid's shadow and lashes lie within a fifth of the iris' width.
+    top = max(float(lids[[1, 2], 1].mean() - centre[1]) + 0.35 * radius, -0.6 * radius)
+    bottom = float(lids[[4, 5], 1].mean() - centre[1]) - 0.1 * radius
+    ring = (from_middle > _RING[0]) & (from_middle < _RING[1]) & (dy > top) & (dy < bottom)
+    ring &= (x >= 0) & (y >= 0) & (x < image.shape[2]) & (y < image.shape[1])
+    return image[:3, y[ring], x[ring]].T.double()
 
 
 def with_part_colors(mesh: Mesh, iris: Tensor | None) -> Mesh:
