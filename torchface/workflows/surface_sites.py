@@ -20,9 +20,9 @@ from torchface.synthetic.head.identity import mean_vertices
 from torchface.synthetic.head.performer import performer
 
 COUNTED = False
-"""Whether ``track`` and ``live`` count a network's points. On twelve films of other people, with the expression read too,
-they take ``track``'s error of weights from 0.126 to 0.131, the median correlation from 0.50 to 0.43, and twice the time:
-their errors are those of the landmarks and of the head."""
+"""Whether ``track`` and ``live`` count a network's points. On twelve films of other people, with the expression read
+too, they take ``track``'s error of weights from 0.126 to 0.131, the median correlation from 0.50 to 0.43, and twice the
+time: their errors are those of the landmarks and of the head."""
 
 SHARED = [*range(4, 13), *range(27, 68)]
 """Landmarks that all heads mean alike."""
