@@ -22,6 +22,7 @@ from torchface.modeling.photographs.texture_fit import ColorFit, fit_colors
 from torchface.modeling.photographs.texture_projection import PhotoTexture, photo_texture
 from torchface.rendering.camera_visibility import PosedSurface, shown_in
 from torchface.rendering.clay_shading import sample_texture
+from torchface.rendering.environment_light import EnvironmentLight
 from torchface.rendering.raycast import RayCaster
 
 _MIN_DIAMETER = 14.0  # across an eyeball; of smaller ones a photograph shows no iris
@@ -82,7 +83,9 @@ def photographed_skin(
     if mesh.uvs is None or size == 0:
         return Skin(base, None, fit)
     parts, count = part_vertices(mesh), len(images)
-    confidence, lights, cap = None, None, None
+    confidence: Tensor | None = None
+    lights: list[EnvironmentLight | None] | None = None
+    cap: HairCap | None = None
     if _has_landmarks(mesh):
         surfaces, places = PosedSurface.each(posed, count), [FacePlaces.of(one) for one in posed]
         shown = [

@@ -65,7 +65,7 @@ class LinearPoints:
         on_curves = local.interpolate(values).flatten(0, 1).transpose(0, 1)
         marks = values[place[: len(landmarks)]].transpose(0, 1)
         points = [as_annotated(marks) if sites.annotated else marks]
-        if sites.surface is not None:
+        if sites.surface is not None and sites.faces is not None:
             points.append(sites.surface.on(sites.faces, stacked).double())
         count = sum(part.shape[1] for part in points)
         rows = count + torch.arange(curves.valid.numel()).reshape(curves.valid.shape)
