@@ -43,7 +43,9 @@ def folder(tmp_path_factory: pytest.TempPathFactory, rig: BlendshapeRig, weights
     folder = tmp_path_factory.mktemp("arkit")
     np.savez(folder / "flame.npz", **flame_arrays(rig))
     exp = codes(rig, expression_basis(rig), weights).numpy()
-    np.savez(folder / "take.npz", exp=exp, pose=np.zeros((FRAMES, 6)), cam=np.zeros((FRAMES, 3)), fps=60.0)
+    shape = np.tile(np.array([1.0, -1.0, 0.5]), (FRAMES, 1))  # another person, to whom the codes mean the same
+    rest = {"pose": np.zeros((FRAMES, 6)), "cam": np.zeros((FRAMES, 3)), "fps": 60.0}
+    np.savez(folder / "take.npz", exp=exp, shape=shape, **rest)
     save_rig(rig, folder / "rig.glb")
     save_rig(rig.select(SHAPES), folder / "template.glb")
     return folder

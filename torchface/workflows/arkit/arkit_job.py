@@ -16,7 +16,6 @@ from torchface.files.whole_files import check_ending, check_writable, make_folde
 from torchface.io import load_take, save_rig
 from torchface.io.head_models.array_files import ONLY, ArrayFile
 from torchface.io.take_files import RECORDING_ENDINGS
-from torchface.modeling import transfer_deformation
 from torchface.number_checks import check_rate
 from torchface.optim import BoxQP
 from torchface.progress import Progress
@@ -111,7 +110,8 @@ def animation_to_weights(
     moving = load_moving_head(animation, head)
     rig, notes = arkit_shapes(head, settings, progress)
     if moving.person is not None:
-        rig = transfer_deformation(rig, rig.neutral.with_vertices(moving.person), progress=progress)
+        # As the model's expressions, which are the same on everybody: then a code has one answer.
+        rig = BlendshapeRig(rig.neutral.with_vertices(moving.person), rig.deltas, rig.names)
     solver = MeshSolver(rig)
     scale, note = _unit_factor(solver, moving.read(0, 1)[0], animation)
     read = (lambda begin, end: moving.read(begin, end) * scale) if scale != 1 else moving.read
@@ -343,7 +343,7 @@ def parameter_lines(solver: MeshSolver, head: Source, parameters: HeadParameters
     assert head.model is not None
     used = parameters.expressions.double().square().mean(0).sqrt()
     rows = head.model.expressions[: len(used)].double() * used[:, None, None]
-    meshes = torch.cat([head.neutral.vertices.double() + rows, head.neutral.vertices.double() - rows])
+    meshes = torch.cat([solver.rest + rows, solver.rest - rows])
     slopes, constant = solver.equations(meshes)
     left = solver.error(slopes, constant, BoxQP(solver.H, 0.0, 1.0)(slopes)).view(2, -1).amax(0)
     size = solver.error(slopes, constant, torch.zeros_like(slopes)).view(2, -1).amax(0)
