@@ -137,8 +137,8 @@ def first_network(settings: Settings) -> LandmarkNetwork:
     else:
         network = zoo.get_model(_ZOO if settings.start == "zoo" else settings.start, LandmarkNetwork)
     places, mirror = dense_places()
-    if network.points == len(places) and network.size == settings.size:
-        return network
+    if network.points == len(places):
+        return network if network.size == settings.size else network.resized(settings.size)
     with torch.random.fork_rng([]):
         torch.manual_seed(settings.network.seed)
         return network.with_points(places, mirror, size=settings.size)

@@ -50,7 +50,7 @@ def test_a_heat_map_with_one_hot_cell_is_read_at_its_place(network: LandmarkNetw
 def test_training_finds_what_is_there_to_be_seen(pictures: tuple[torch.Tensor, ...]) -> None:
     torch.manual_seed(0)
     untrained = LandmarkNetwork(**SMALL)
-    settings = NetworkSettings(steps=40, batch=8, rate=8e-3, average=0.8, workers=0, augmentation=CALM)
+    settings = NetworkSettings(steps=40, batch=8, rate=8e-3, average=0.8, workers=0, bfloat16=0.5, augmentation=CALM)
     crops = augmented(*pictures, 64, 1.25, torch.Generator().manual_seed(9), CALM)
 
     @torch.no_grad()
@@ -59,6 +59,15 @@ def test_training_finds_what_is_there_to_be_seen(pictures: tuple[torch.Tensor, .
 
     before = error(untrained.eval())
     assert error(LandmarkNetwork.fit(TensorDataset(*pictures), untrained, settings)) < 0.6 * before
+
+
+def test_a_network_of_another_size_computes_the_same() -> None:
+    torch.manual_seed(2)
+    network, crops = LandmarkNetwork(**SMALL).eval(), torch.rand(1, 3, 96, 96)
+    other = network.resized(96)
+    assert other.size == 96
+    for found, expected in zip(other.maps(crops), network.maps(crops), strict=True):
+        torch.testing.assert_close(found, expected, rtol=0, atol=0)
 
 
 def test_a_run_that_was_stopped_ends_as_one_that_was_not(pictures: tuple[torch.Tensor, ...], tmp_path) -> None:

@@ -234,6 +234,12 @@ class LandmarkNetwork(nn.Module):
         network.dense.mirror.copy_(mirror)
         return network
 
+    def resized(self, size: int) -> LandmarkNetwork:
+        """This network with crops of another size, pixels a side, of which it is to learn first."""
+        network = LandmarkNetwork.from_config(self.config | {"size": size})
+        network.load_state_dict(self.state_dict())
+        return network
+
     def forward(self, crops: Tensor) -> NetworkLandmarks:
         """Landmarks in crops, (B,3,S,S) in [0,1], red first.
 

@@ -50,6 +50,8 @@ class NetworkSettings(DescentSettings):
         heat: weight of the heat maps' form, which fades over the first half; 0 for a network that has learned it.
         dense: weight of the points beside the 68, where the network has some.
         expression: weight of the likelihood of blendshape weights, likewise.
+        bfloat16: share of the steps, the first, whose convolutions compute in bfloat16: twice as fast on processors
+            that have it.
         augmentation: how widely crops are drawn.
 
     Example:
@@ -63,6 +65,7 @@ class NetworkSettings(DescentSettings):
     heat: float = 0.5
     dense: float = 1.0
     expression: float = 2.0
+    bfloat16: float = 0.0
     augmentation: AugmentationSettings = field(default_factory=AugmentationSettings)
 
 
@@ -85,7 +88,7 @@ def fit_landmarks(
     check_pictures(pictures, expected, *shapes)
     if network.dense is not None and not bool(network.dense.form.bias.any()):
         _start_points(network.dense, pictures)
-    names = ("pair", "opening", "heat", "dense", "expression", "augmentation")
+    names = ("pair", "opening", "heat", "dense", "expression", "bfloat16", "augmentation")
     learned = {name: getattr(settings, name) for name in names}
     task = DescentTask(
         partial(_crops, pictures, network.size, network.margin, network.mirror, settings),
@@ -165,7 +168,9 @@ def _loss(
     within = ((marks > 1) & (marks < network.size - 2)).all(-1).float() * present[:, None]
     trusted = within * (0.4 + 0.6 * seen)
     truth, visible, weight = marks[:, :COUNT], seen[:, :COUNT], trusted[:, :COUNT]
-    heat, features, pooled = network.maps(images)
+    with torch.autocast(images.device.type, torch.bfloat16, enabled=share < settings.bfloat16):
+        maps = network.maps(images)
+    heat, features, pooled = (one.float() for one in maps)  # places are read to a part of a pixel
     reading, dense = network.readings(heat, features, pooled)
     places, distance = point_loss(reading.landmarks, truth, reading.deviation, weight)
     pairs = gap_loss(reading.landmarks, truth, weight, _PAIRS, 2)

@@ -117,7 +117,7 @@ def augmented(
     mirror = torch.where(mirrored, -1.0, 1.0)[:, None] * torch.tensor([1.0, 0.0]) + torch.tensor([0.0, 1.0])
     from_picture = to_crop * torch.cat([mirror, torch.ones(count, 1)], dim=1)[:, None]
     from_picture[..., 2] += torch.where(mirrored, rgba.shape[-1] - 1.0, 0.0)[:, None] * to_crop[..., 0]
-    cut = kornia.geometry.transform.warp_affine(rgba.float(), from_picture, (size, size), align_corners=True) / 255
+    cut = _warped(rgba, from_picture, size)
     points = points @ to_crop[:, :, :2].transpose(1, 2) + to_crop[:, None, :, 2]
     alpha = cut[:, 3:] * (1 - ((present == 0) & ~astray).float())[:, None, None, None]
     images = cut[:, :3] * alpha + _walls(count, size, generator) * (1 - alpha)
@@ -125,6 +125,16 @@ def augmented(
     images = _photographed(images, settings, generator)
     inside = ((points > -0.5) & (points < size - 0.5)).all(-1).float()
     return Crops(images, points, seen * inside, present, mirrored)
+
+
+def _warped(pictures: Tensor, maps: Tensor, size: int) -> Tensor:
+    """Pictures uint8 (B,4,H,W) under affine maps (B,2,3), (B,4,S,S) in [0,1]; 0 beyond their edges."""
+    # OpenCV's bytes take a third of the time of kornia's floats, and training waits for the crops.
+    warped = [
+        cv2.warpAffine(np.ascontiguousarray(picture), one, (size, size), flags=cv2.INTER_LINEAR)
+        for picture, one in zip(pictures.permute(0, 2, 3, 1).numpy(), maps.double().numpy(), strict=True)
+    ]
+    return torch.from_numpy(np.stack(warped)).permute(0, 3, 1, 2).float() / 255
 
 
 def _to_crop(middle: Tensor, side: Tensor, turn: Tensor, size: int) -> Tensor:
