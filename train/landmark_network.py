@@ -69,7 +69,7 @@ class Settings(RecipeSettings):
     seed: int = 1
     workers: int = 2
     start: str | None = None
-    size: int = 144
+    size: int = 176
     network: NetworkSettings = field(default_factory=NetworkSettings)
     data: Path | None = None
 
