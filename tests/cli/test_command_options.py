@@ -89,7 +89,7 @@ def words_for(words: tuple[str, ...], command: Any, values: dict[str, Path], fol
                 other.write_bytes(b"other")
             value = str(other)
         else:
-            value = "name"
+            value = "9" if int in option.holds else "name"
         given = option.words(value)
         (positional if len(given) == 1 else named).append(given)
     return line + [word for words in (*positional, *named) for word in words]
