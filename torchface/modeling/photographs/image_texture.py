@@ -109,10 +109,9 @@ def photographed_skin(
     if cap is not None:
         texture = _capped(texture, cap, mesh, parts)
     colors = texture.colors
-    if own:
-        iris = iris_color(posed, images, cameras, irises)
-        iris = torch.tensor(IRIS.color) if iris is None else iris
-        colored = with_part_colors(replace(mesh, colors=colors), iris)
+    iris = iris_color(posed, images, cameras, irises)
+    if own or iris is not None:
+        colored = with_part_colors(replace(mesh, colors=colors), torch.tensor(IRIS.color) if iris is None else iris)
         colors = colors if colored.colors is None else colored.colors
     return Skin(colors, texture.image, fit, None if cap is None else cap.color)
 
