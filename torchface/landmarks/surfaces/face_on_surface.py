@@ -29,7 +29,7 @@ _LEAST_POINTS = 12
 _SLANTED = 0.25  # cosine between ray and normal below which a hit says nothing
 _ASTRAY = 0.5  # of the eyes' distance: a view's hit that is further from the median of all is left out
 _TRIED = 3  # places that are looked at from near
-_PRESENCE, _MISFIT = 0.6, 0.35
+_PRESENCE, _MISFIT = 0.7, 0.35
 _FACE_OF_HEAD = 0.5  # side of the box round a face, in sides of a picture that frames the head
 
 
