@@ -44,10 +44,12 @@ def load_head_model_file(path: str | Path) -> HeadModelFile:
         MissingExtraError: an HDF5 file, and h5py is not installed.
 
     Example:
+        >>> import tempfile
         >>> import numpy as np
-        >>> corners = np.eye(4, 3)
-        >>> np.savez("tiny.npz", v_template=corners, shapedirs=np.zeros((4, 3, 400)), f=[[0, 1, 2], [0, 2, 3]])
-        >>> model = load_head_model_file("tiny.npz")
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     arrays = {"v_template": np.eye(4, 3), "shapedirs": np.zeros((4, 3, 400)), "f": [[0, 1, 2], [0, 2, 3]]}
+        ...     np.savez(f"{folder}/tiny.npz", **arrays)
+        ...     model = load_head_model_file(f"{folder}/tiny.npz")
         >>> model.name, len(model.identity), len(model.expressions)
         ('FLAME', 300, 100)
     """
