@@ -32,7 +32,7 @@ class ArgumentTypeError(TorchfaceError, TypeError):
     """An argument is of another type than the docstring asks for, and cannot safely be made one.
 
     Example:
-        >>> from torchface import transfer_deformation
+        >>> from torchface.modeling import transfer_deformation
         >>> transfer_deformation("template.glb", None)
         Traceback (most recent call last):
             ...

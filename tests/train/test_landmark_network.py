@@ -81,7 +81,14 @@ def test_the_recipe(files: list[Path], tmp_path: Path, monkeypatch: pytest.Monke
         out=tmp_path / "own", pictures=6, held_out=3, start=str(tmp_path / "start"), size=64, network=QUICK
     )
     model = recipe.train(settings)
-    assert model.config == {**SMALL, "channels": [8, 12, 16, 24], "blocks": [1, 1, 1], "points": 452, "hidden": 176}
+    assert model.config == {
+        **SMALL,
+        "channels": [8, 12, 16, 24],
+        "blocks": [1, 1, 1],
+        "points": 452,
+        "hidden": 176,
+        "expects": 1,
+    }
     assert model.places.shape == (452, 3)
     again = zoo.get_model(tmp_path / "own")
     assert isinstance(again, LandmarkNetwork)

@@ -291,6 +291,7 @@ def test_controls_reach_the_graph(opened: Open, recorded: Recorded) -> None:
     assert page.text("gain-value") == "1.5"
 
 
+@pytest.mark.bench
 def test_calibration_is_spoken_and_left_with_escape(opened: Open, recorded: Recorded) -> None:
     from selenium.webdriver.common.keys import Keys
 

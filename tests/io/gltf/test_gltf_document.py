@@ -254,7 +254,7 @@ def test_a_missing_file_an_unknown_suffix_and_an_unknown_unit(tmp_path: Path) ->
     with pytest.raises(FileFormatError, match=r"none.glb: found no such file"):
         load_rig(tmp_path / "none.glb")
     (tmp_path / "rig.fbx").write_bytes(b"x")
-    with pytest.raises(FileFormatError, match=r"rig.fbx: found a file that is no .glb, .gltf, .usd"):
+    with pytest.raises(FileFormatError, match=r"rig.fbx: found a file that is no .glb, .gltf, .vrm, .usd"):
         load_rig(tmp_path / "rig.fbx")
     with pytest.raises(FileFormatError, match=r"found the ending '.fbx', expected .obj, .ply"):
         load_mesh(tmp_path / "rig.fbx")

@@ -34,7 +34,7 @@ from torchface.shape_names import ARKIT, mapping
 from torchface.synthetic.head.performer import performer
 from torchface.workflows.live.live_actor import track_live
 from torchface.workflows.live.recordings import FrameLog
-from torchface.workflows.named_finders import load_finder
+from torchface.workflows.named_finders import graph_detector, load_finder
 from torchface.workflows.track import frame_readings
 from torchface.workflows.track.face_overlay import mesh_drawer, paint_drawer, undistorted
 from torchface.workflows.track.head_rotations import head_angles
@@ -195,7 +195,7 @@ def test_a_killed_run_goes_on_where_it_was_and_gives_the_same(done: Done, filmed
     assert done.left == (FOLDER,)
     assert done.steps == FRAMES - 2 * PIECE
     assert done.tracked.reused == 2 * PIECE
-    tracker = LandmarkTracker(load_finder().finder)
+    tracker = LandmarkTracker(load_finder().finder, detector=graph_detector())
     whole: list[torch.Tensor] = []
     whole.extend(tracker.step(frame).landmarks for frame in open_video(filmed.video).color_frames())
     assert torch.equal(done.tracked.reading.landmarks, torch.stack(whole))

@@ -63,7 +63,7 @@ class MeshSolver:
         >>> rig = performer(texture=False)
         >>> weights = torch.zeros(3, len(rig.names))
         >>> weights[:, rig.index(["jawOpen"])] = torch.tensor([[0.0], [0.5], [1.0]])
-        >>> turned = rig(weights) @ torch.tensor([[0.0, 0, -1], [0, 1, 0], [1, 0, 0]]) + 100.0
+        >>> turned = rig(weights).flip(2) * torch.tensor([-1.0, 1.0, 1.0]) + 100.0
         >>> found = MeshSolver(rig).solve(lambda a, b: turned[a:b], 3, 30.0, temporal=False)
         >>> bool((found.weights - weights).abs().max() < 0.01)
         True

@@ -43,7 +43,7 @@ def head_model_of(file: HeadModelFile, rig: BlendshapeRig | None = None, compone
     deviations = values.clamp(min=0).sqrt().flip(0)
     kept = int((deviations > _LEAST * deviations[0]).sum())
     kept = kept if components is None else min(kept, components)
-    toward = (vectors.flip(1)[:, :kept] / deviations[:kept]).float()
+    toward = (vectors.flip(1)[:, :kept] / deviations[:kept]).to(modes)
     mean = file.neutral.vertices
-    shape = MorphableModel(mean, (toward.T @ modes).unflatten(1, mean.shape), deviations[:kept].float())
+    shape = MorphableModel(mean, (toward.T @ modes).unflatten(1, mean.shape), deviations[:kept].to(modes))
     return HeadModel.on(file.neutral if rig is None else rig.neutral, shape, rig=rig)

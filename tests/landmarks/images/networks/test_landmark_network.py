@@ -181,7 +181,7 @@ def test_the_shipped_network_finds_photographed_faces(data: Path) -> None:
         truth = load_landmark_points(path).points.float()
         found = finder((255 * load_image(image)).round().byte(), box_around(truth), 0.0)
         assert found.presence > 0.9
-        assert float(found.visibility.mean()) > 0.9
+        assert float((found.visibility > 0.5).float().mean()) > 0.9
         eyes = (truth[36] - truth[45]).norm()
         errors.append(float((found.landmarks - truth)[INNER].norm(dim=1).mean() / eyes))
     # One of the four laughs with hair over his forehead, in grey.

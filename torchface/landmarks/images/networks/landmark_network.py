@@ -238,7 +238,7 @@ class LandmarkNetwork(nn.Module):
         """This network with crops of another size, pixels a side, of which it is to learn first."""
         network = LandmarkNetwork.from_config(self.config | {"size": size})
         network.load_state_dict(self.state_dict())
-        return network
+        return network.train(self.training)
 
     def forward(self, crops: Tensor) -> NetworkLandmarks:
         """Landmarks in crops, (B,3,S,S) in [0,1], red first.
