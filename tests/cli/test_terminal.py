@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+import warnings
 from pathlib import Path
 
 import pytest
@@ -109,6 +110,15 @@ def test_what_a_system_call_says_is_told_with_the_file(capsys: pytest.CaptureFix
     assert "error: /some/file: Permission denied" in capsys.readouterr().err
     with pytest.raises(OSError, match="nobody's"), plain_errors():
         raise OSError("nobody's")
+
+
+def test_a_warning_is_one_line_without_the_sources_path() -> None:
+    as_before = warnings.formatwarning
+    said = UserWarning("hat.vrm: left out:\nlights \x1b[2J")
+    with plain_errors():
+        lines = [warnings.formatwarning(said, UserWarning, "source.py", 58) for _ in range(2)]
+    assert lines == ["warning: hat.vrm: left out: lights \\x1b[2J\n", ""]
+    assert warnings.formatwarning is as_before
 
 
 def test_ctrl_c_ends_a_command_without_a_traceback() -> None:

@@ -37,7 +37,7 @@ def retime(
     Args:
         first: The first keyframe.
         last: The last keyframe.
-        frames: How many frames the motion lasts, both keyframes counted.
+        frames: How many frames the motion lasts, both keyframes counted; at least 2.
         model: The actor's model, by name or folder; see `torchface train enhancement`.
         out: Folder for everything.
         extend: Take the course of the whole captured motion where the keyframes meet a part of it, as a small smile

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import sys
+import warnings
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Annotated, Any
@@ -83,15 +84,18 @@ def serve_page(page: BrowserPage, line: str = "") -> None:
 def plain_errors() -> Iterator[None]:
     """Ends with a message and status 2 where the user made a mistake or a file cannot be used, with 130 on Ctrl-C.
 
-    What reads the output may stop doing so, as ``head`` does: that ends quietly, with 141.
+    What reads the output may stop doing so, as ``head`` does: that ends quietly, with 141. Each warning is one
+    line.
 
     Raises:
         SystemExit: in place of what was raised inside.
     """
+    as_before, warnings.formatwarning = warnings.formatwarning, _WarningLines()
     try:
         try:
             yield
         finally:
+            warnings.formatwarning = as_before
             sys.stdout.flush()
     except BrokenPipeError:
         # What is left in the buffer would raise again at the end.
@@ -108,6 +112,19 @@ def plain_errors() -> Iterator[None]:
     except KeyboardInterrupt:
         _say("stopped", "what was not complete is not written")
         raise SystemExit(_STOPPED) from None
+
+
+class _WarningLines:
+    """What Python prints of warnings: each text once, without the source's path and line."""
+
+    def __init__(self) -> None:
+        self._said: set[str] = set()
+
+    def __call__(self, message: Warning | str, *_: object, **__: object) -> str:
+        line = f"warning: {visible(' '.join(str(message).split()))}\n"
+        new = line not in self._said
+        self._said.add(line)
+        return line if new else ""
 
 
 def _say(what: str, line: str) -> None:

@@ -15,7 +15,8 @@ from torchface.geometry.mirrored_points import check_mirrored
 from torchface.geometry.similarity import Similarity, similarity_transform
 from torchface.mesh import Mesh
 
-_LEAST_TRIANGLES = 50
+LEAST_TRIANGLES = 50
+"""Of a surface that a template is registered to."""
 _CRUMB = 0.02
 _OFF_SURFACE = 15.0
 _WORST_LANDMARK_FIT = 0.1
@@ -50,9 +51,9 @@ class PreparedScan:
 
 def check_template(template: Mesh) -> None:
     """Raises ``TopologyError`` or ``ValueRangeError`` where nothing can be registered."""
-    if len(template.faces) < _LEAST_TRIANGLES:
+    if len(template.faces) < LEAST_TRIANGLES:
         raise TopologyError(
-            f"template: found {len(template.faces)} triangles, expected at least {_LEAST_TRIANGLES}, a face's mesh"
+            f"template: found {len(template.faces)} triangles, expected at least {LEAST_TRIANGLES}, a face's mesh"
         )
     if not float(triangle_areas(template.vertices, template.faces).sum()) > 0:
         raise ValueRangeError("template: found no triangle with any area, expected a face's mesh")
@@ -66,18 +67,18 @@ def prepare_scan(scan: Mesh, template: Mesh) -> PreparedScan:
         ValueRangeError: it has no area, or its extent shows another unit than millimetres.
     """
     triangles = len(scan.faces)
-    if triangles < _LEAST_TRIANGLES:
+    if triangles < LEAST_TRIANGLES:
         raise TopologyError(
             f"scan: found {len(scan.vertices)} vertices and {triangles} triangles, expected a surface of at least "
-            f"{_LEAST_TRIANGLES} triangles"
+            f"{LEAST_TRIANGLES} triangles"
         )
     vertices, place = torch.unique(scan.vertices.detach().cpu().double(), dim=0, return_inverse=True)
     faces = place[scan.faces.cpu()]
     areas = triangle_areas(vertices, faces)
     solid = areas > 0
-    if int(solid.sum()) < _LEAST_TRIANGLES:
+    if int(solid.sum()) < LEAST_TRIANGLES:
         raise ValueRangeError(
-            f"scan: found {int(solid.sum())} triangles with any area, expected at least {_LEAST_TRIANGLES}"
+            f"scan: found {int(solid.sum())} triangles with any area, expected at least {LEAST_TRIANGLES}"
         )
     points = vertices[faces[solid].flatten()]
     check_unit(

@@ -63,4 +63,8 @@ def test_keyframes_that_do_not_fit_are_named(actor, tmp_path: Path) -> None:
         first = Keyframe(weights, 0, rig) if last.path == rig else fine
         with pytest.raises(kind, match=said):
             retime_keyframes(first, last, 8, actor.model, out)
+    with pytest.raises(ValueRangeError, match="found the same file for both keyframes"):
+        retime_keyframes(Keyframe(cut), Keyframe(cut), 8, actor.model, out)
+    with pytest.raises(ValueRangeError, match="--frames: found 1, expected a whole number of at least 2"):
+        retime_keyframes(Keyframe(cut), fine, 1, actor.model, out)
     assert not out.exists()

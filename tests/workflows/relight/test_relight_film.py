@@ -123,6 +123,10 @@ def test_what_does_not_fit_is_named(filmed: Filmed, tmp_path: Path, capsys: pyte
         relight_film(filmed.film, tmp_path, out, light)
     with pytest.raises(ValueRangeError, match="found nothing to do, expected one of --light and --environment"):
         relight_film(filmed.film, filmed.track, out, RelightSettings())
+    with pytest.raises(FileFormatError, match=r"none\.avi"):  # before what else is wrong
+        relight_film(tmp_path / "none.avi", filmed.track, out, RelightSettings())
+    with pytest.raises(FileFormatError, match=r"r\.txt: found the ending '\.txt'"):
+        relight_film(tmp_path / "none.avi", tmp_path, tmp_path / "r.txt", light)
     with pytest.raises(ValueRangeError, match="found 'azimut=3', expected NAME=NUMBER with azimuth"):
         WantedLight.parse(("azimut=3",))
     assert not out.exists()

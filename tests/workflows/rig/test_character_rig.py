@@ -10,10 +10,11 @@ import torch
 
 from planted.characters import Planted, box_mesh, caricature, packed, unpacked, write_character
 from torchface.errors import AlignmentError, FileFormatError
+from torchface.geometry.similarity import Similarity
 from torchface.io.gltf.character_scene import Character, read_character
 from torchface.io.gltf.gltf_document import read_document
 from torchface.io.vrm.vrm_expressions import vrm_expressions
-from torchface.landmarks.surfaces.face_on_surface import FaceSearch
+from torchface.landmarks.surfaces.face_on_surface import FaceOnSurface, FaceSearch
 from torchface.mesh import Mesh
 from torchface.rig import BlendshapeRig
 from torchface.shape_names import ARKIT
@@ -112,6 +113,22 @@ def test_a_chair_is_refused_with_a_picture_of_what_was_seen(tmp_path: Path, monk
         rig_character(tmp_path / "chair.glb", tmp_path / "out.glb")
     assert (tmp_path / "out_face.png").is_file()
     assert not (tmp_path / "out.glb").exists()
+
+
+def test_a_face_on_a_flat_card_is_refused_by_the_files_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    card = Mesh(
+        torch.tensor([[-150.0, -150, 0], [150, -150, 0], [150, 150, 0], [-150, 150, 0]]),
+        torch.tensor([[0, 1, 2], [0, 2, 3]]),
+    )
+    write_character(tmp_path / "card.glb", card, how=Planted(body=False))
+    head = performer(texture=False).neutral
+    at = head.vertices[head.landmarks].double() * torch.tensor([1.0, 1.0, 0.0])
+    here = Similarity(torch.full((1,), 1e-3).double(), torch.eye(3).double()[None], torch.zeros(1, 3).double())
+    found = FaceOnSurface(1e-3 * at, here, 1.0, 0.1, (torch.zeros(3, 8, 8),), torch.zeros(0, 3))
+    monkeypatch.setattr(FaceSearch, "find", lambda *_: found)
+    with pytest.raises(AlignmentError, match=r"card\.glb: found no face: .*of 2 triangles.*out_face\.png"):
+        rig_character(tmp_path / "card.glb", tmp_path / "out.glb")
+    assert (tmp_path / "out_face.png").is_file()
 
 
 def test_files_that_are_no_characters_are_refused(tmp_path: Path) -> None:

@@ -18,6 +18,7 @@ from torchface.files.whole_files import all_or_none
 from torchface.io import MeshSequenceWriter, save_animation
 from torchface.io.tables.csv_table import write_table
 from torchface.mesh import Mesh
+from torchface.number_checks import checked_count
 from torchface.progress import Progress, silent
 from torchface.rig import BlendshapeRig
 from torchface.take import Take, Track
@@ -138,6 +139,12 @@ def retime_keyframes(
     Source: Facial Performance Enhancement Using Dynamic Shape Space Analysis, section 6.2.
     """
     progress = progress or silent
+    checked_count("--frames", frames, 2)
+    if first.path == last.path and first.frame is last.frame is None:
+        raise ValueRangeError(
+            f"{first.path}: found the same file for both keyframes (--from and --to), expected two meshes or two of "
+            "its frames, as in FILE@0 and FILE@12"
+        )
     if first.path == last.path and (first.frame or 0) >= (last.frame or 0):
         numbers = f"{first.frame or 0} and {last.frame or 0}"
         raise ValueRangeError(f"{first.path}: found keyframes {numbers}, expected the first before the last")

@@ -12,12 +12,13 @@ import torch
 from torch import Tensor
 
 from torchface.errors import AlignmentError, ValueRangeError
-from torchface.files.whole_files import check_writable
+from torchface.files.whole_files import check_ending, check_writable
 from torchface.geometry.similarity import similarity_transform
 from torchface.io import load_rig
 from torchface.io.images.image_files import load_paint
 from torchface.io.images.radiance_hdr import load_panorama
-from torchface.io.video import write_video
+from torchface.io.video import open_video, write_video
+from torchface.io.video.video_writing import WRITTEN_ENDINGS
 from torchface.progress import Progress, silent
 from torchface.rendering.environment_light import EnvironmentLight
 from torchface.rendering.point_light import PointLight
@@ -140,6 +141,8 @@ def relight_film(
     Source: thesis 4.2.11 and figure 80.
     """
     progress = progress or silent
+    check_ending(out, *WRITTEN_ENDINGS)
+    open_video(film)
     wanted = {"--light": settings.light, "--environment": settings.environment, "--texture": settings.texture}
     wanted["--rig"] = settings.rig
     if not any(wanted.values()) or all((settings.light, settings.environment)) or all((settings.texture, settings.rig)):

@@ -16,11 +16,16 @@ from torchface.io.gltf.character_scene import Block, Character
 from torchface.landmarks.images.checked_detector import shipped_detector
 from torchface.landmarks.images.ibug_68 import COUNT
 from torchface.landmarks.surfaces.eye_openings import eye_opening
-from torchface.landmarks.surfaces.face_on_surface import FaceOnSurface, FaceSearch, ReferencePoints
+from torchface.landmarks.surfaces.face_on_surface import (
+    FaceOnSurface,
+    FaceSearch,
+    NoFaceOnSurfaceError,
+    ReferencePoints,
+)
 from torchface.mesh import Mesh
 from torchface.modeling.rigging.other_topology import joined_vertices
 from torchface.progress import Progress
-from torchface.registration.scan_preparation import Landmarks
+from torchface.registration.scan_preparation import LEAST_TRIANGLES, Landmarks
 from torchface.rendering.textured_surface import Material, TexturedSurface
 from torchface.synthetic import neutral_head
 from torchface.workflows.named_finders import load_finder
@@ -116,6 +121,12 @@ def _pieces(
         faces = faces.flip(1)
     allowed = torch.zeros(int(part.max()) + 1, dtype=torch.bool)
     skin_faces = faces[part[faces[:, 0]] == skin_part]
+    if len(skin_faces) < LEAST_TRIANGLES:
+        raise NoFaceOnSurfaceError(
+            f"found no face: what looks like one lies on a piece of {len(skin_faces)} triangles, expected a head's "
+            f"surface of at least {LEAST_TRIANGLES}",
+            found.views,
+        )
     skin_tree = cKDTree(vertices[skin_faces.unique()].numpy())
     still = torch.tensor([_is_still(block) for block in character.blocks])
     for one in part[faces[:, 0]].unique().tolist():  # a head has tens of parts
