@@ -11,9 +11,9 @@ from torch import Tensor
 from torchface.geometry.cameras.pinhole import look_at
 from torchface.io.gltf.part_textures.iris_texture import painted_eye
 from torchface.mesh import Mesh
-from torchface.modeling.photographs.image_texture import iris_color, part_vertices, with_part_colors
+from torchface.modeling.photographs.image_texture import iris_color, part_vertices, with_iris, with_part_colors
 from torchface.rendering.clay_shading import Lighting, render
-from torchface.synthetic import neutral_head
+from torchface.synthetic import neutral_head, performer
 
 EVEN = Lighting(lights=(), ambient=1.0, occlusion_rays=0, gloss=0.0)
 BLUE, BROWN = torch.tensor([0.25, 0.40, 0.60]), torch.tensor([0.30, 0.19, 0.10])
@@ -71,3 +71,14 @@ def test_a_written_eyeball_wears_the_iris(bare: Mesh) -> None:
     assert bluest(with_part_colors(bare, BLUE)) > 0.2
     assert bluest(with_part_colors(bare, BROWN)) < 0.05
     assert bluest(bare) < 0.05  # colours that are skin's all over are no painted eye
+
+
+def test_painted_irises_take_a_colour_and_nothing_else_does() -> None:
+    head = performer().neutral
+    blue = torch.tensor([0.40, 0.50, 0.60])
+    texture, mesh = head.texture, with_iris(head, blue)
+    changed = (mesh.texture - texture).abs().amax(0) > 1e-6
+    assert 0 < float(changed.float().mean()) < 0.02
+    colors = mesh.texture[:, changed]
+    assert float((colors.median(1).values / colors.median(1).values.norm() - blue / blue.norm()).abs().max()) < 0.03
+    assert float(texture[:, changed].mean(0).max()) < 0.72  # the whites stay

@@ -22,7 +22,7 @@ from torchface.rendering.point_light import PointLight
 from torchface.rig import BlendshapeRig
 from torchface.synthetic import performer
 from torchface.take import Take, Track
-from torchface.workflows.relight.relight_film import RelightSettings, WantedLight, relight_film
+from torchface.workflows.relight.relight_film import RelightSettings, WantedLight, _doubts, relight_film
 from torchface.workflows.relight.tracked_film import read_tracked_film
 from torchface.workflows.track.head_rotations import rotation_columns
 from torchface.workflows.track.track_files import ANIMATION, LANDMARKS, SUMMARY, SUMMARY_FORMAT
@@ -97,6 +97,13 @@ def test_the_face_is_relit_and_the_hand_before_it_is_not(filmed: Filmed, tmp_pat
         assert float((hand <= 3).float().mean()) > 0.9
         beside = (new[t].float() - old[t].float()).abs().amax(0)[60:110, 95:110]
         assert float(beside.mean()) > 4  # the cheek behind it is relit
+
+
+def test_a_light_from_behind_the_head_is_doubted() -> None:
+    film = PointLight(torch.full((3,), 0.3), torch.full((3,), 0.6), torch.zeros(3))
+    behind, front = (WantedLight(azimuth=azimuth, ambient=0.25).beside(film) for azimuth in (-167.0, 60.0))
+    assert "azimuth=-167, 75% of all light" in _doubts(behind)[0]
+    assert not _doubts(front)
 
 
 @pytest.mark.bench  # a light is searched for again, seconds

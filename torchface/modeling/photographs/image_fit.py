@@ -55,6 +55,7 @@ class ImageFit:
             bound are zero.
         color: the colour model's fit to the photographs; None without one, or without photographs.
         hair: its colour where the head has it as painted, (3,); None where photographs show a bald head.
+        iris: the irises' colour, (3,); None where no photograph shows it.
     """
 
     mesh: Mesh
@@ -68,6 +69,7 @@ class ImageFit:
     covariance: Tensor
     color: ColorFit | None = None
     hair: Tensor | None = None
+    iris: Tensor | None = None
 
     @property
     def errors(self) -> Tensor:
@@ -175,7 +177,14 @@ def fit_images(
     progress("projecting the photographs onto the head")
     size, masked, irises = settings.texture_size, settings.masked, settings.irises
     skin = photographed_skin(fit.posed, model.color, images, fit.cameras, size, masked, irises)
-    return replace(fit, mesh=skin.on(fit.mesh), posed=tuple(map(skin.on, fit.posed)), color=skin.fit, hair=skin.hair)
+    return replace(
+        fit,
+        mesh=skin.on(fit.mesh),
+        posed=tuple(map(skin.on, fit.posed)),
+        color=skin.fit,
+        hair=skin.hair,
+        iris=skin.iris,
+    )
 
 
 def _result(

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from torchface.geometry.cameras.pinhole import Camera
 from torchface.geometry.meshes.operators import vertex_normals
+from torchface.geometry.meshes.rasterization import rasterise_uvs
 from torchface.io.gltf.region_materials import EYEBALL, IRIS, part_material
 from torchface.mesh import Mesh
 from torchface.modeling.morphable.morphable_model import MorphableModel
@@ -32,18 +33,20 @@ _SHARE = (0.15, 0.40)
 _MIN_PIXELS = 40
 _IRIS_WIDTH, _MIN_RADIUS, _MIN_RING, _RING = 11.7, 2.5, 6, (0.45, 0.8)  # millimetres, pixels, pixels, radii
 _DARKEST, _LARGE = 0.07, 0.4  # of the largest iris' radius: in which photographs colours count
+_WHITE = 0.72  # mean of the channels from which an eyeball's texel is no iris
 _IRIS_COSINE = 0.9  # of the angle between the eye's axis and the border of an iris 11 mm wide
 
 
 @dataclass(frozen=True, eq=False)
 class Skin:
-    """Colours of the vertices (V,3), a texture (3,size,size) where there is a layout, the colour model's answer, and
-    the hair's colour (3,) where it is painted."""
+    """Colours of the vertices (V,3), a texture (3,size,size) where there is a layout, the colour model's answer, the
+    hair's colour (3,) where it is painted, and the irises' (3,) where they are seen."""
 
     colors: Tensor | None
     texture: Tensor | None
     fit: ColorFit | None
     hair: Tensor | None = None
+    iris: Tensor | None = None
 
     def on(self, mesh: Mesh) -> Mesh:
         """A mesh with it; one without a layout or a colour model keeps its own."""
@@ -113,7 +116,7 @@ def photographed_skin(
     if own or iris is not None:
         colored = with_part_colors(replace(mesh, colors=colors), torch.tensor(IRIS.color) if iris is None else iris)
         colors = colors if colored.colors is None else colored.colors
-    return Skin(colors, texture.image, fit, None if cap is None else cap.color)
+    return Skin(colors, texture.image, fit, None if cap is None else cap.color, iris)
 
 
 def _capped(texture: PhotoTexture, cap: HairCap, mesh: Mesh, parts: Tensor) -> PhotoTexture:
@@ -235,6 +238,31 @@ def _ring(image: Tensor, centre: Tensor, lids: Tensor, radius: float) -> Tensor:
     ring = (from_middle > _RING[0]) & (from_middle < _RING[1]) & (dy > top) & (dy < bottom)
     ring &= (x >= 0) & (y >= 0) & (x < image.shape[2]) & (y < image.shape[1])
     return image[:3, y[ring], x[ring]].T.double()
+
+
+def with_iris(mesh: Mesh, iris: Tensor) -> Mesh:
+    """A mesh at rest whose texture has painted eyeballs, with their irises in another colour (3,), fibres and all."""
+    if mesh.texture is None or mesh.uvs is None or mesh.uv_faces is None or mesh.annotations is None:
+        return mesh
+    height, width = mesh.texture.shape[1:]
+    texture, vertices = mesh.texture.cpu().flatten(1).clone(), mesh.vertices.detach().cpu().double()
+    for name, mask in mesh.annotations.regions.items():
+        if part_material(name) is not EYEBALL or not bool(mask.any()):
+            continue
+        inside = mask.cpu()[mesh.faces.cpu()].all(1)
+        texels = rasterise_uvs(mesh.uvs, mesh.uv_faces[inside], height, width)
+        ball = vertices[mask.cpu()]
+        at = texels.interpolate(vertices - (ball.amin(0) + ball.amax(0)) / 2, mesh.faces.cpu()[inside])
+        from_axis = at[:, :2].norm(dim=1) / (0.5 * _IRIS_WIDTH)
+        front = (from_axis < 1.05) & (at[:, 2] > 0)
+        rows, from_axis = texels.texels[front], from_axis[front]
+        ring = texture[:, rows[(from_axis > _RING[0]) & (from_axis < _RING[1])]]
+        if ring.numel():
+            colors = texture[:, rows]
+            colored = colors * (iris.to(colors) / ring.median(1).values.clamp(min=0.02))[:, None]
+            dark = ((_WHITE - colors.mean(0)) / 0.1).clamp(0, 1)  # what is left of the white beside it stays
+            texture[:, rows] = torch.lerp(colors, colored.clamp(0, 1), dark)
+    return replace(mesh, texture=texture.view_as(mesh.texture).to(mesh.texture))
 
 
 def with_part_colors(mesh: Mesh, iris: Tensor | None) -> Mesh:

@@ -18,6 +18,7 @@ from torchface.io.landmarks.landmark_points import save_pts
 from torchface.io.video.video_file import VIDEO_ENDINGS
 from torchface.mesh import Mesh
 from torchface.modeling import FitSettings, ImageFit, fit_images, transfer_with_report
+from torchface.modeling.photographs.image_texture import with_iris
 from torchface.modeling.photographs.landmark_view import JAW
 from torchface.number_checks import checked_count
 from torchface.progress import Progress, silent
@@ -131,8 +132,11 @@ class FittedHead:
         if fit.color is not None:
             lines.append(f"colour model: {float(fit.color.error.mean()):.3f} off, of 1 a channel")
         if fit.hair is not None:
-            color = "".join(f"{round(255 * channel):02x}" for channel in fit.hair.tolist())
-            lines.append(f"hair: a cap of its colour #{color}, painted on the head; it is no geometry")
+            lines.append(f"hair: a cap of its colour {_code(fit.hair)}, painted on the head; it is no geometry")
+        if fit.iris is not None:
+            lines.append(f"irises: {_code(fit.iris)}, their colour in the photographs")
+        elif fit.mesh.texture is not None:
+            lines.append("irises: the template's; the photographs show too little of them, or eyes too small")
         lines.append(f"rig: {len(self.rig.vertices)} vertices, {len(self.rig.names)} shapes transferred")
         return lines + ([f"  note: {self.transfer_summary}"] if self.transfer_summary else [])
 
@@ -197,6 +201,7 @@ def fit_photographs(
     # Photographs show little of eyeballs and teeth: parts of their own keep the template's skin.
     unseen = hidden_parts(rig.neutral, torch.zeros(len(rig.vertices), dtype=torch.bool))
     dressed = with_template_skin(fit.mesh, rig.neutral, unseen)
+    dressed = dressed if fit.iris is None else with_iris(dressed, fit.iris)
     transferred = transfer_with_report(rig, dressed, progress=progress)
     progress("writing the rig and the overlays")
     overlays = tuple(out.with_name(f"{out.stem}_{i + 1}_{path.stem}.png") for i, path in enumerate(photographs))
@@ -253,6 +258,10 @@ def overlay(fit: ImageFit, view: int, image: Tensor, marks: Tensor) -> Tensor:
     for points, color in ((marks, _FOUND), (fit.landmarks[view], _FIT)):
         dotted = _dotted(dotted, (points - corner[:2]) * corner[2], color)
     return torch.cat([piece, over, dotted], dim=2)
+
+
+def _code(color: Tensor) -> str:
+    return "#" + "".join(f"{round(255 * channel):02x}" for channel in color.tolist())
 
 
 def _clay(mesh: Mesh) -> Mesh:

@@ -36,6 +36,8 @@ _LEARNED, _LIT = 24, 2  # frames from which the skin's look and the film's light
 _AMBIENT = 0.3  # of the wanted light, unless said
 _SPHERE = 0.25  # the mean of the clamped cosine over all directions
 _MOST = 100.0
+_BESIDE = 110.0  # degrees of azimuth beyond which a light reaches no front of a face
+_LEAST_SOURCE = 0.05  # share of the light below which its direction says nothing
 
 
 @dataclass(frozen=True)
@@ -161,7 +163,10 @@ def relight_film(
     whole = _light(tracked, {t: frames[t] for t in _of(learned, _LIT)})
     lights = {t: _light(tracked, {t: frames[t]}, whole) for t in learned} if settings.film_light == "each" else {}
     look = _look(tracked, frames, lights, whole) if settings.occluders else None
-    lines = [f"{tracked.video.count} frames, the face in {int(tracked.seen.sum())}; {_words(whole, 'the film')}"]
+    lines = [
+        f"{tracked.video.count} frames, the face in {int(tracked.seen.sum())}; {_words(whole, 'the film')}",
+        *_doubts(whole),
+    ]
     hidden: list[float] = []
 
     def new_light(old: PointLight) -> PointLight | EnvironmentLight:
@@ -296,8 +301,25 @@ def _of(rows: Sequence[int], count: int) -> list[int]:
     ]
 
 
+def _doubts(light: PointLight) -> list[str]:
+    """A warning where the film's light is not one that a face looking at the camera would show."""
+    around, _, ambient = _angles(light)
+    if abs(around) <= _BESIDE or 1 - ambient < _LEAST_SOURCE:
+        return []
+    return [
+        f"warning: the film's light is estimated from behind the head (azimuth={around:.0f}, {1 - ambient:.0%} of all "
+        "light); where the film shows a face lit from the front, the estimate is wrong, and so is the result: --light "
+        "and --environment are relative to it"
+    ]
+
+
 def _words(light: PointLight, what: str) -> str:
+    around, up, share = _angles(light)
+    return f"the light of {what}: azimuth={around:.0f} elevation={up:.0f} ambient={share:.2f}"
+
+
+def _angles(light: PointLight) -> tuple[float, float, float]:
+    """Azimuth and elevation, degrees, and the share from everywhere."""
     x, y, z = torch.nn.functional.normalize(light.position, dim=0).tolist()
     around, up = math.degrees(math.atan2(x, -z)), math.degrees(math.asin(max(-1.0, min(1.0, -y))))
-    share = float(light.ambient.mean() / (light.ambient + light.intensity).mean().clamp(min=1e-9))
-    return f"the light of {what}: azimuth={around:.0f} elevation={up:.0f} ambient={share:.2f}"
+    return around, up, float(light.ambient.mean() / (light.ambient + light.intensity).mean().clamp(min=1e-9))
