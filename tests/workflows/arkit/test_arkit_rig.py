@@ -15,6 +15,7 @@ from torchface.modeling.rigging.loose_parts import tongue_out
 from torchface.modeling.rigging.other_topology import shapes_on
 from torchface.rig import BlendshapeRig
 from torchface.synthetic import performer
+from torchface.workflows.arkit import arkit_rig
 from torchface.workflows.arkit.arkit_rig import Source, head_of, make_arkit
 
 
@@ -92,6 +93,62 @@ def test_a_tongue_of_its_own_goes_with_the_jaw_and_comes_out() -> None:
     assert float(moved[:, 2].max() - head.vertices[head.landmarks[48:], 2].max()) == pytest.approx(12.0, abs=0.5)
     assert float(out[~own].abs().max()) == 0
     assert float(out[own][tongue[:, 2].argmin()].norm()) < 1e-3
+
+
+def bare(rig: BlendshapeRig, size: float) -> BlendshapeRig:
+    """A rig of another size without landmarks and regions."""
+    return BlendshapeRig(Mesh(size * rig.vertices, rig.neutral.faces), size * rig.deltas, rig.names)
+
+
+def seen_as_they_are(rig: BlendshapeRig, size: float, patch: pytest.MonkeyPatch) -> None:
+    marks = rig.neutral.landmarks[17:]
+    places = size * rig.vertices[marks].double()
+    patch.setattr(arkit_rig, "seen_landmarks", lambda head, template, progress: (marks, places))
+
+
+def test_the_unit_does_not_matter(monkeypatch: pytest.MonkeyPatch) -> None:
+    actor = performer(texture=False)
+    seen_as_they_are(actor, 10.0, monkeypatch)
+    made = make_arkit(Source(Path("large.glb"), bare(actor, 10.0).neutral))
+    assert torch.equal(made.rig.vertices, 10.0 * actor.vertices)
+    row, own = made.rig.index(["jawOpen"])[0], actor.deltas[actor.index(["jawOpen"])[0]]
+    face = actor.neutral.annotations.regions["face"]  # type: ignore[union-attr]
+    assert float((made.rig.deltas[row] - 10 * own)[face].norm() / (10 * own)[face].norm()) < 0.05
+    assert made.pose is not None
+    assert float(made.pose.scale[0]) == pytest.approx(10.0, rel=0.02)
+    assert any(note.startswith("note: the head has 10 times the template's size") for note in made.notes)
+
+
+def test_a_rig_that_has_all_shapes_gets_landmarks_and_regions(monkeypatch: pytest.MonkeyPatch) -> None:
+    actor = performer(texture=False)
+    whole = BlendshapeRig(actor.neutral, torch.cat([actor.deltas, actor.deltas[:1]]), (*actor.names, "tongueOut"))
+    seen_as_they_are(actor, 2.5, monkeypatch)
+    own = bare(whole, 2.5)
+    made = make_arkit(Source(Path("all.glb"), own.neutral, own))
+    assert (len(made.kept), made.made, made.carried) == (52, (), None)
+    assert torch.equal(made.rig.vertices, own.vertices)
+    assert torch.equal(made.rig.deltas[made.rig.index(["jawOpen"])[0]], own.deltas[own.index(["jawOpen"])[0]])
+    apart = made.rig.vertices[made.rig.neutral.landmarks] - own.vertices[actor.neutral.landmarks]
+    assert float(apart.norm(dim=1).median()) < 2.5  # a millimetre at a head's size
+    regions = made.rig.neutral.annotations.regions  # type: ignore[union-attr]
+    known = actor.neutral.annotations.regions  # type: ignore[union-attr]
+    assert set(known) <= set(regions)
+    assert float((regions["face"] == known["face"]).double().mean()) > 0.95
+
+
+def test_another_unit_is_named_before_and_after_a_face_is_looked_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked = []
+    monkeypatch.setattr(arkit_rig, "seen_landmarks", lambda *given: asked.append(given))
+    large = bare(performer(texture=False), 1000.0).neutral
+    with pytest.raises(ValueRangeError, match="say --unit mm"):
+        make_arkit(Source(Path("head.obj"), large, unit="m"))
+    small = bare(performer(texture=False), 0.1).neutral
+    with pytest.raises(ValueRangeError, match="on the command line --unit cm"):
+        make_arkit(Source(Path("head.obj"), small))
+    assert not asked
+    with pytest.raises(AlignmentError, match="no face is seen"):  # glTF is in metres; what is no head has no size
+        make_arkit(Source(Path("ball.glb"), large))
+    assert len(asked) == 1
 
 
 def test_of_a_whole_body_the_head_is_registered() -> None:

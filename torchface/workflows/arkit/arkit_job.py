@@ -12,18 +12,21 @@ from torch import Tensor
 from torchface.capture.markers.mesh_solver import MeshSolution, MeshSolver
 from torchface.errors import FileFormatError, NameMismatchError, ValueRangeError
 from torchface.files.documents import Value, read_json
-from torchface.files.whole_files import check_ending, check_writable, make_folder, write_file
+from torchface.files.whole_files import all_or_none, check_ending, check_writable, make_folder, write_file
+from torchface.geometry.similarity import Similarity
 from torchface.io import load_take, save_rig
 from torchface.io.head_models.array_files import ONLY, ArrayFile
 from torchface.io.take_files import RECORDING_ENDINGS
 from torchface.number_checks import check_rate
 from torchface.optim import BoxQP
 from torchface.progress import Progress
+from torchface.rendering.compositing import save_rendered_image
 from torchface.rig import BlendshapeRig
 from torchface.shape_names import ARKIT, mapping, recognised_shapes
 from torchface.take import Take, Track
+from torchface.viz.figures.character_views import SHOWN, character_sheet
 from torchface.workflows.animated_meshes import load_animated
-from torchface.workflows.arkit.arkit_rig import Source, load_source, make_arkit
+from torchface.workflows.arkit.arkit_rig import Source, is_annotated, load_source, make_arkit
 from torchface.workflows.arkit.head_parameters import (
     HeadParameters,
     has_parameters,
@@ -32,6 +35,8 @@ from torchface.workflows.arkit.head_parameters import (
     save_parameters,
 )
 from torchface.workflows.rig.actor_rig import check_out
+from torchface.workflows.rig.character_face import plain_surface
+from torchface.workflows.rig.character_rig import FACE_SPAN, PICTURE_ENDING
 from torchface.workflows.weight_files import WeightFiles, write_weights
 
 _ENOUGH = 45  # of ARKit's shapes: such a rig is taken as it is
@@ -91,8 +96,24 @@ def arkit_head(
     progress("reading the head")
     made = make_arkit(load_source(source, unit), template, landmarks, everything, progress)
     progress("writing the rig")
-    save_rig(made.rig, out)
-    return made.lines()
+    with all_or_none():
+        save_rig(made.rig, out)
+        lines = made.lines()
+        if made.pose is not None and is_annotated(made.rig.neutral):
+            figure = out.with_name(f"{out.stem}{PICTURE_ENDING}")
+            save_rendered_image(_views(made.rig, made.pose), figure)
+            lines.insert(1, f"the face before and after: {figure}")
+    return lines
+
+
+def _views(rig: BlendshapeRig, pose: Similarity) -> Tensor:
+    """The face at rest and with shapes on, upright and at a head's size."""
+    back = pose.inverse()
+    upright = back.apply(rig.vertices.double())[0]
+    names = [name for some in SHOWN.values() for name in some if name in rig.names]
+    moved = {name: back.apply_vectors(rig.deltas[[rig.index([name])[0]]].double())[0] for name in names}
+    middle = upright[rig.neutral.landmarks[17:]].mean(0)
+    return character_sheet(plain_surface(upright, rig.neutral.faces), moved, middle, FACE_SPAN)
 
 
 def animation_to_weights(

@@ -9,19 +9,23 @@ import torch
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from torchface.errors import AlignmentError, NoShapesError, ValueRangeError
+from torchface.errors import AlignmentError, FileFormatError, NoShapesError, ValueRangeError
+from torchface.geometry.meshes.unit_check import check_unit, extent
+from torchface.geometry.similarity import Similarity, similarity_transform
 from torchface.io import load_mesh, load_rig
 from torchface.io.head_models.head_model_file import HeadModelFile
-from torchface.io.head_models.head_model_files import is_head_model_file, load_head_model_file
+from torchface.io.head_models.head_model_files import HEAD_MODEL_ENDINGS, is_head_model_file, load_head_model_file
 from torchface.io.mesh_files import MESH_ENDINGS
+from torchface.io.rig_files import SCENE_ENDINGS
 from torchface.mesh import Annotations, Mesh, submesh
 from torchface.modeling import HeadModel
 from torchface.modeling.morphable.published_models import head_model_of
 from torchface.modeling.rigging.loose_parts import tongue_out
 from torchface.modeling.rigging.other_topology import CarriedShapes, shapes_on
 from torchface.progress import Progress, silent
-from torchface.registration import register
+from torchface.registration import Registration, register
 from torchface.registration.landmark_files import load_scan_landmarks
+from torchface.registration.scan_preparation import Landmarks
 from torchface.rig import BlendshapeRig
 from torchface.shape_names import ARKIT, recognised_shapes
 from torchface.synthetic import performer
@@ -32,6 +36,9 @@ _HEAD, _BODY = 330.0, 600.0
 """Millimetres: of a mesh taller than the second the uppermost first are the head."""
 _MEDIAN_LIMIT, _STRETCH_LIMIT = 3.0, 1.0
 _BESIDE = 4.0
+_EXTENTS, _SIZES = (0.3, 8.0), (0.5, 2.0)
+"""A source's extent in the template's, and its head's size, in which its unit is not doubted."""
+_GIVE = "give the face's landmarks (--landmarks FILE, from torchface pick)"
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,12 +50,14 @@ class Source:
         neutral: its head at rest.
         rig: its own shapes; None where it has none that are kept.
         model: the head model that it is; None of a rig or a mesh.
+        unit: that the file was read in, where it was said.
     """
 
     path: Path
     neutral: Mesh
     rig: BlendshapeRig | None = None
     model: HeadModelFile | None = None
+    unit: str | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,8 +69,9 @@ class ArkitRig:
         kept: names that the source had itself.
         made: names that were made.
         others: the source's shapes that ARKit has not.
-        carried: how they were made; None where nothing was.
+        carried: how they were made, the head brought to the template's size; None where nothing was.
         notes: lines for people to read.
+        pose: that takes the template to the head, where it was registered.
     """
 
     rig: BlendshapeRig
@@ -70,6 +80,7 @@ class ArkitRig:
     others: tuple[str, ...]
     carried: CarriedShapes | None
     notes: tuple[str, ...] = ()
+    pose: Similarity | None = None
 
     def lines(self) -> list[str]:
         """For people to read."""
@@ -94,12 +105,15 @@ def load_source(path: Path, unit: str | None = None) -> Source:
         model = load_head_model_file(path)
         return Source(path, model.neutral, None, model)
     if path.is_file() and path.suffix.lower() in MESH_ENDINGS:
-        return Source(path, load_mesh(path, unit))
+        return Source(path, load_mesh(path, unit), unit=unit)
+    if path.is_file() and path.suffix.lower() not in SCENE_ENDINGS:
+        known = ", ".join((*SCENE_ENDINGS, *MESH_ENDINGS, *HEAD_MODEL_ENDINGS))
+        raise FileFormatError(f"{path}: found {path.suffix!r}, expected {known}, or a folder of OBJ files")
     try:
         rig = load_rig(path, unit)
     except NoShapesError:
-        return Source(path, load_mesh(path, unit))
-    return Source(path, rig.neutral, rig)
+        return Source(path, load_mesh(path, unit), unit=unit)
+    return Source(path, rig.neutral, rig, unit=unit)
 
 
 def make_arkit(
@@ -135,23 +149,31 @@ def make_arkit(
         left = {name: rig.deltas[row] for row, name in enumerate(rig.names) if row not in used}
         others = tuple(left)
         shapes |= left
-    carried, notes, neutral = None, [], source.neutral
+    carried, notes, neutral, pose = None, [], source.neutral, None
     if wanted:
         given = _template(template)
-        carried = _carried(source, given.select([n for n in given.names if n in ARKIT]), landmarks, progress)
-        neutral = annotated(source.neutral, carried)
+        given = given.select([n for n in given.names if n in ARKIT])
+        head = _sized(source, given.neutral, landmarks, progress)
+        registration = _registered(source, given.neutral, head, progress)
+        carried = shapes_on(given, head.whole, registration=registration, progress=progress)
+        pose = head.back(registration.pose)
+        sized = annotated(head.whole, given.neutral, registration)
+        neutral = replace(source.neutral, annotations=sized.annotations)
         made = {name: carried.rig.deltas[row] for row, name in enumerate(carried.rig.names) if name in wanted}
         if TONGUE in wanted and TONGUE not in made:
-            made |= _tongue(neutral, carried)
-        shapes = made | shapes
+            made |= _tongue(sized, carried)
+        shapes = {name: delta * head.size for name, delta in made.items()} | shapes
+        notes += head.notes()
         if missing := [name for name in wanted if name not in made]:
             notes.append(
                 f"left out: {', '.join(missing)}" + (": the head has no tongue of its own" if TONGUE in missing else "")
             )
+    elif not is_annotated(neutral):
+        neutral, notes, pose = _only_annotated(source, template, landmarks, progress)
     order = [name for name in (*ARKIT, *others) if name in shapes]
     deltas = torch.stack([shapes[name].to(neutral.vertices) for name in order])
     rig = BlendshapeRig(neutral, deltas, order)
-    return ArkitRig(rig, kept, tuple(n for n in order if n in wanted), others, carried, tuple(notes))
+    return ArkitRig(rig, kept, tuple(n for n in order if n in wanted), others, carried, tuple(notes), pose)
 
 
 def _template(path: Path | None) -> BlendshapeRig:
@@ -163,25 +185,105 @@ def _template(path: Path | None) -> BlendshapeRig:
     return rig
 
 
-def _carried(source: Source, template: BlendshapeRig, landmarks: Path | None, progress: Progress) -> CarriedShapes:
-    scan = head_of(source.neutral)
-    marks = _landmarks(source, template.neutral, landmarks)
-    if marks is None and template.neutral.annotations is not None:
-        marks = seen_landmarks(scan, template.neutral, progress)
+@dataclass(frozen=True, eq=False)
+class _SizedHead:
+    """A source at the template's size.
+
+    Args:
+        whole: all of it.
+        scan: what the template is registered to.
+        size: of the source beside it.
+        landmarks: template vertices and where they lie on it.
+    """
+
+    whole: Mesh
+    scan: Mesh
+    size: float
+    landmarks: Landmarks | None
+
+    def back(self, pose: Similarity) -> Similarity:
+        """A pose on it as one on the source."""
+        return Similarity(pose.scale * self.size, pose.rotation, pose.translation * self.size)
+
+    def notes(self) -> list[str]:
+        """For people to read."""
+        if _SIZES[0] < self.size < _SIZES[1]:
+            return []
+        return [f"note: the head has {self.size:.3g} times the template's size: is its unit right (--unit)?"]
+
+
+def _sized(source: Source, template: Mesh, path: Path | None, progress: Progress) -> _SizedHead:
+    """The source at the template's size, by its landmarks or by the face that is seen on it."""
+    mesh, beside = source.neutral, extent(template.vertices[template.faces.flatten()])
+    points = mesh.vertices[mesh.faces.flatten()]
+    if source.path.suffix.lower() in MESH_ENDINGS:  # which do not hold a unit
+        most = _EXTENTS[1] if source.unit is not None else torch.inf
+        check_unit(str(source.path), points, beside, "a template", _EXTENTS[0], most)
+    marks = _landmarks(source, template, path)
+    if marks is None and template.annotations is not None:
+        marks = seen_landmarks(mesh, template, progress)
+        if marks is None:
+            try:
+                check_unit(str(source.path), points, beside, "a template", *_EXTENTS)
+            except ValueRangeError as error:
+                raise AlignmentError(
+                    f"{error}; no face is seen in pictures of it, by which its size would be known"
+                ) from error
+    if marks is None:
+        return _SizedHead(mesh, head_of(mesh), 1.0, None)
+    ids, places = marks[0].cpu(), marks[1].double().cpu()
+    known = torch.isfinite(places).all(-1)
+    own = template.vertices.double().cpu()
+    if int(known.sum()) < 3:
+        return _SizedHead(mesh, head_of(mesh), 1.0, marks)
+    pose = similarity_transform(own[ids[known]][None], places[known][None])
+    size = float(pose.scale[0])
+    whole = mesh.with_vertices((mesh.vertices.double() / size).to(mesh.vertices))
+    upright = pose.inverse().apply(mesh.vertices.double().cpu())[0]
+    scan = whole
+    if float(upright[:, 1].max() - upright[:, 1].min()) > _BODY:
+        scan = submesh(whole, upright[:, 1] > own[:, 1].max() - _HEAD).mesh
+    return _SizedHead(whole, scan, size, (ids, places / size))
+
+
+def _registered(source: Source, template: Mesh, head: _SizedHead, progress: Progress) -> Registration:
     try:
-        registration = register(template.neutral, scan, marks, texture_size=0, progress=progress)
+        registration = register(template, head.scan, head.landmarks, texture_size=0, progress=progress)
     except AlignmentError as error:
-        raise AlignmentError(
-            f"{source.path}: {error}; give the face's landmarks (--landmarks FILE, from torchface pick)"
-        ) from error
+        found = str(error).removesuffix("; give landmarks")
+        raise AlignmentError(f"{source.path}: {found}; {_GIVE}") from error
     record = registration.record
     if not (record.median_distance < _MEDIAN_LIMIT and record.stretch < _STRETCH_LIMIT):
         raise AlignmentError(
             f"{source.path}: found a head {record.median_distance:.1f} mm from the registered template (median), whose "
             f"edges are stretched by {record.stretch:.0%}, expected less than {_MEDIAN_LIMIT:g} mm and "
-            f"{_STRETCH_LIMIT:.0%}; give the face's landmarks (--landmarks FILE, from torchface pick)"
+            f"{_STRETCH_LIMIT:.0%}; {_GIVE}"
         )
-    return shapes_on(template, source.neutral, registration=registration, progress=progress)
+    return registration
+
+
+def is_annotated(mesh: Mesh) -> bool:
+    """Whether a head has the 68 landmarks, and regions."""
+    notes = mesh.annotations
+    return notes is not None and notes.landmarks is not None and len(notes.landmarks) == 68 and bool(notes.regions)
+
+
+def _only_annotated(
+    source: Source, path: Path | None, landmarks: Path | None, progress: Progress
+) -> tuple[Mesh, list[str], Similarity | None]:
+    """A head that has all shapes with landmarks and regions; where none are found, as it is, and a note."""
+    template = _template(path).neutral
+    try:
+        head = _sized(source, template, landmarks, progress)
+        registration = _registered(source, template, head, progress)
+    except (AlignmentError, ValueRangeError) as error:
+        return source.neutral, [f"note: the rig has no landmarks and regions, which `track --rig` needs: {error}"], None
+    notes = annotated(head.whole, template, registration).annotations
+    lines = [
+        f"landmarks and regions: registered by {registration.record.start}; {registration.record.figures()}",
+        *head.notes(),
+    ]
+    return replace(source.neutral, annotations=notes), lines, head.back(registration.pose)
 
 
 def head_of(mesh: Mesh) -> Mesh:
@@ -195,7 +297,7 @@ def head_of(mesh: Mesh) -> Mesh:
 def _landmarks(source: Source, template: Mesh, path: Path | None) -> tuple[Tensor, Tensor] | None:
     """Template vertices and where they lie on the source: from a file, the model's places, or the same 68 vertices."""
     if path is not None:
-        return load_scan_landmarks(path, template, source.path)
+        return load_scan_landmarks(path, template, source.path, source.unit)
     ids = None if template.annotations is None else template.annotations.landmarks
     if ids is None or len(ids) != 68:
         return None
@@ -208,24 +310,22 @@ def _landmarks(source: Source, template: Mesh, path: Path | None) -> tuple[Tenso
     return None
 
 
-def annotated(neutral: Mesh, carried: CarriedShapes) -> Mesh:
+def annotated(head: Mesh, template: Mesh, registration: Registration) -> Mesh:
     """A head with the template's landmarks and regions where it has none of its own, so that other commands know it."""
-    own = neutral.annotations or Annotations()
-    template = carried.template.neutral.annotations
-    if template is None or not carried.places.any():
-        return neutral
-    on_head = carried.registration.mesh.vertices.double()
+    own, given = head.annotations or Annotations(), template.annotations
+    if given is None:
+        return head
+    on_head = registration.mesh.vertices.double()
     landmarks, regions = own.landmarks, dict(own.regions)
-    vertices = neutral.vertices.double().cpu()
-    if (landmarks is None or len(landmarks) != 68) and template.landmarks is not None:
-        landmarks = torch.from_numpy(cKDTree(vertices).query(on_head[template.landmarks])[1])
+    vertices = head.vertices.double().cpu()
+    if (landmarks is None or len(landmarks) != 68) and given.landmarks is not None:
+        landmarks = torch.from_numpy(cKDTree(vertices).query(on_head[given.landmarks])[1])
     distance, nearest = cKDTree(on_head).query(vertices)
-    scale = float(carried.registration.pose.scale[0])
-    near = torch.from_numpy(distance) < _BESIDE * scale
-    for name, mask in template.regions.items():
+    near = torch.from_numpy(distance) < _BESIDE * float(registration.pose.scale[0])
+    for name, mask in given.regions.items():
         if name not in regions:
             regions[name] = mask.cpu()[torch.from_numpy(nearest)] & near
-    return replace(neutral, annotations=Annotations(landmarks, regions, own.mirror, own.contacts))
+    return replace(head, annotations=Annotations(landmarks, regions, own.mirror, own.contacts))
 
 
 def _tongue(neutral: Mesh, carried: CarriedShapes) -> dict[str, Tensor]:

@@ -2,20 +2,26 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import torch
+from torch import Tensor
 
 from torchface.landmarks.images.checked_detector import shipped_detector
 from torchface.landmarks.images.ibug_68 import COUNT
 from torchface.landmarks.surfaces.face_on_surface import FaceSearch, NoFaceOnSurfaceError, ReferencePoints
 from torchface.mesh import Mesh
+from torchface.modeling.rigging.other_topology import joined_vertices
 from torchface.progress import Progress
 from torchface.registration.scan_preparation import Landmarks
-from torchface.rendering.textured_surface import Material, TexturedSurface
+from torchface.rendering.textured_surface import Material
 from torchface.synthetic import neutral_head
 from torchface.workflows.named_finders import load_finder
+from torchface.workflows.rig.character_face import find_skin, plain_surface, with_lids
 
 _SKIN = (0.8, 0.62, 0.53, 1.0)
 _ASTRAY, _LEAST_ASTRAY, _LEAST = 4.0, 15.0, 12
+_FLAT, _TOP = 0.4, 0.18  # of its height: how deep a body is at most, and how much of it the head is
 
 
 def seen_landmarks(head: Mesh, template: Mesh, progress: Progress) -> Landmarks | None:
@@ -30,21 +36,36 @@ def seen_landmarks(head: Mesh, template: Mesh, progress: Progress) -> Landmarks 
     reference, finder = neutral_head(texture=False), load_finder()
     points = ReferencePoints(reference.vertices[reference.landmarks], finder.places)
     search = FaceSearch(shipped_detector(), finder.finder, points)
-    plain = torch.zeros(len(head.faces), dtype=torch.int64)
-    no_uvs = torch.zeros(len(head.vertices), 2)
-    surface = TexturedSurface(head.vertices.double(), head.faces, no_uvs, plain, (Material(torch.tensor(_SKIN)),))
+    skin = (Material(torch.tensor(_SKIN)),)
+    surface = replace(plain_surface(head.vertices.double(), head.faces), materials=skin)
     try:
-        found = search.find(surface, None, progress)
+        found = search.find(surface, uppermost(head), progress)
     except NoFaceOnSurfaceError:
         return None
     placed = found.pose.inverse().apply(found.points)[0]
     apart = (placed - points.all).norm(dim=-1)
     usable = torch.isfinite(apart)
     usable &= apart < max(_LEAST_ASTRAY, _ASTRAY * float(apart[usable].median()))
-    if len(points.points) and torch.equal(template.faces, reference.faces):
-        usable[:COUNT] = False
-        ids = torch.cdist(points.all, reference.vertices.double()).argmin(1)
-    else:
+    if not (len(points.points) and torch.equal(template.faces, reference.faces)):
         usable[:17] = usable[COUNT:] = False
         ids = torch.cat([template.landmarks, torch.zeros(len(points.points), dtype=torch.int64)])
-    return (ids[usable], found.points[usable]) if int(usable.sum()) >= _LEAST else None
+        return (ids[usable], found.points[usable]) if int(usable.sum()) >= _LEAST else None
+    usable[:COUNT] = False
+    ids = torch.cdist(points.all, reference.vertices.double()).argmin(1)
+    upright = surface.moved(found.pose.inverse())
+    joined = joined_vertices(upright.vertices, upright.faces)
+    part = joined.part[joined.of]
+    skin, on_skin, _ = find_skin(upright.vertices, upright.faces, part, placed)
+    usable &= on_skin
+    if int(usable.sum()) < _LEAST:
+        return None
+    ids, places = with_lids((ids[usable], placed[usable]), reference, upright, part, skin, placed)
+    return ids, found.pose.apply(places)[0]
+
+
+def uppermost(mesh: Mesh) -> Tensor | None:
+    """The vertices (V,) bool where a whole body that stands upright has its head; None of a mesh that is no body."""
+    size = mesh.vertices.amax(0) - mesh.vertices.amin(0)
+    if float(size[[0, 2]].min()) > _FLAT * float(size[1]):
+        return None
+    return mesh.vertices[:, 1] > mesh.vertices[:, 1].max() - _TOP * size[1]

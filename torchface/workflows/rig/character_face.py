@@ -116,7 +116,7 @@ def _pieces(
     joined = joined_vertices(vertices, faces)
     part = joined.part[joined.of]
     placed = found.pose.inverse().apply(found.points)[0]
-    skin_part, on_skin, toward = _skin_part(vertices, faces, part, placed)
+    skin_part, on_skin, toward = find_skin(vertices, faces, part, placed)
     if toward < 0:  # the file's normals look inward
         faces = faces.flip(1)
     allowed = torch.zeros(int(part.max()) + 1, dtype=torch.bool)
@@ -142,7 +142,7 @@ def _pieces(
     cut_joined[joined.of[cut]] = True
     skin_rows, skin_local = skin_faces.unique(return_inverse=True)
     upright = surface.moved(found.pose.inverse())
-    landmarks = _with_lids(_landmarks(reference, points, placed, on_skin), reference, upright, part, skin_part, placed)
+    landmarks = with_lids(_landmarks(reference, points, placed, on_skin), reference, upright, part, skin_part, placed)
     return CharacterFace(
         found,
         vertices,
@@ -160,7 +160,7 @@ def _is_still(block: Block) -> bool:
     return any(_STILL.search(name) for name in named)
 
 
-def _skin_part(vertices: Tensor, faces: Tensor, part: Tensor, placed: Tensor) -> tuple[int, Tensor, float]:
+def find_skin(vertices: Tensor, faces: Tensor, part: Tensor, placed: Tensor) -> tuple[int, Tensor, float]:
     """The part that most of the found points lie on, which points do, (68+P,) bool, and how far it faces the viewer."""
     known = torch.isfinite(placed).all(-1)
     nearest = SurfaceIndex(vertices, faces).nearest(placed[known])
@@ -201,14 +201,14 @@ def _landmarks(reference: Mesh, points: ReferencePoints, placed: Tensor, on_skin
     return ids[usable], placed[usable]
 
 
-def _with_lids(
+def with_lids(
     landmarks: Landmarks, reference: Mesh, upright: TexturedSurface, part: Tensor, skin: int, placed: Tensor
 ) -> Landmarks:
     """The pairs with the lids' edges in place of the finder's points there, of each eye whose edges can be seen."""
     assert reference.annotations is not None
     regions = reference.annotations.regions
     eyeballs = regions["eyeball_left"] | regions["eyeball_right"]
-    template = _plain_surface(reference.vertices.double(), reference.faces)
+    template = plain_surface(reference.vertices.double(), reference.faces)
     template_skin = ~eyeballs[reference.faces].any(1)
     own_skin = part[upright.faces[:, 0]] == skin
     ids, targets = landmarks
@@ -222,7 +222,7 @@ def _with_lids(
         if near is None:
             continue
         middle = marks.mean(0)
-        shown = _plain_surface(upright.vertices, upright.faces[own_skin | near])
+        shown = plain_surface(upright.vertices, upright.faces[own_skin | near])
         found = eye_opening(shown, own_skin[own_skin | near], middle, _EYE_SPAN)
         known = eye_opening(template, template_skin, rest, _EYE_SPAN)
         if found is None or known is None:
@@ -258,7 +258,8 @@ def eye_parts(vertices: Tensor, faces: Tensor, part: Tensor, middle: Tensor, ski
     return (own != skin) & inside[faces].all(1)
 
 
-def _plain_surface(vertices: Tensor, faces: Tensor) -> TexturedSurface:
+def plain_surface(vertices: Tensor, faces: Tensor) -> TexturedSurface:
+    """A surface of white clay: vertices (V,3), faces (F,3)."""
     clay = (Material(torch.ones(4)),)
     return TexturedSurface(
         vertices, faces, torch.zeros(len(vertices), 2), torch.zeros(len(faces), dtype=torch.int64), clay

@@ -38,9 +38,10 @@ CHARACTER_ENDINGS = (".glb", VRM_ENDING)
 """Files of characters that are read and written."""
 PICTURE_ENDING = "_face.png"
 """Ends the name of the picture that lies beside a character's rig."""
+FACE_SPAN = 260.0
+"""Of each picture of the face, millimetres at a head's size."""
 
 _STILL_MM = 2e-3  # at a head's size; what moves less does not move
-_SPAN = 260.0  # of the pictures, millimetres at a head's size
 _FAR, _LEAST_MET = 4.0, 0.4  # millimetres of a head's size between face and template, and the face's share that is met
 _OF_SCANS = ("the scan has neither", "the scan's triangles")
 """Notes of a registration that say nothing of a character."""
@@ -263,7 +264,7 @@ class _Job:
             shapes[name] = moved
         landmarks = self.face.found.pose.inverse().apply(self.face.found.points[17:68])[0]
         middle = landmarks[torch.isfinite(landmarks).all(-1)].mean(0)
-        return character_sheet(upright, shapes, middle, _SPAN)
+        return character_sheet(upright, shapes, middle, FACE_SPAN)
 
     def _present_motion(self, shape: _Present) -> Tensor:
         moved = torch.zeros_like(self.character.vertices)
