@@ -36,8 +36,8 @@ def seen_landmarks(head: Mesh, template: Mesh, progress: Progress) -> Landmarks 
     reference, finder = neutral_head(texture=False), load_finder()
     points = ReferencePoints(reference.vertices[reference.landmarks], finder.places)
     search = FaceSearch(shipped_detector(), finder.finder, points)
-    skin = (Material(torch.tensor(_SKIN)),)
-    surface = replace(plain_surface(head.vertices.double(), head.faces), materials=skin)
+    clay = (Material(torch.tensor(_SKIN)),)
+    surface = replace(plain_surface(head.vertices.double(), head.faces), materials=clay)
     try:
         found = search.find(surface, uppermost(head), progress)
     except NoFaceOnSurfaceError:
