@@ -149,6 +149,10 @@ def test_another_unit_is_named_before_and_after_a_face_is_looked_for(monkeypatch
     with pytest.raises(AlignmentError, match="no face is seen"):  # glTF is in metres; what is no head has no size
         make_arkit(Source(Path("ball.glb"), large))
     assert len(asked) == 1
+    cube = trimesh.creation.box((150, 150, 150))
+    block = Mesh(torch.from_numpy(cube.vertices).float(), torch.from_numpy(cube.faces).long())
+    with pytest.raises(AlignmentError, match=r"cube\.glb: found 12 triangles, expected a head"):
+        make_arkit(Source(Path("cube.glb"), block))
 
 
 def test_of_a_whole_body_the_head_is_registered() -> None:

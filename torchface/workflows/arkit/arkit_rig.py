@@ -35,7 +35,7 @@ TONGUE = "tongueOut"
 _HEAD, _BODY = 330.0, 600.0
 """Millimetres: of a mesh taller than the second the uppermost first are the head."""
 _MEDIAN_LIMIT, _STRETCH_LIMIT = 3.0, 1.0
-_BESIDE = 4.0
+_BESIDE, _LEAST_TRIANGLES = 4.0, 50
 _EXTENTS, _SIZES = (0.3, 8.0), (0.5, 2.0)
 """A source's extent in the template's, and its head's size, in which its unit is not doubted."""
 _GIVE = "give the face's landmarks (--landmarks FILE, from torchface pick)"
@@ -215,6 +215,10 @@ class _SizedHead:
 def _sized(source: Source, template: Mesh, path: Path | None, progress: Progress) -> _SizedHead:
     """The source at the template's size, by its landmarks or by the face that is seen on it."""
     mesh, beside = source.neutral, extent(template.vertices[template.faces.flatten()])
+    if len(mesh.faces) < _LEAST_TRIANGLES:
+        raise AlignmentError(
+            f"{source.path}: found {len(mesh.faces)} triangles, expected a head of at least {_LEAST_TRIANGLES}"
+        )
     points = mesh.vertices[mesh.faces.flatten()]
     if source.path.suffix.lower() in MESH_ENDINGS:  # which do not hold a unit
         most = _EXTENTS[1] if source.unit is not None else torch.inf
@@ -251,7 +255,8 @@ def _registered(source: Source, template: Mesh, head: _SizedHead, progress: Prog
         registration = register(template, head.scan, head.landmarks, texture_size=0, progress=progress)
     except AlignmentError as error:
         found = str(error).removesuffix("; give landmarks")
-        raise AlignmentError(f"{source.path}: {found}; {_GIVE}") from error
+        unseen = "; no face is seen in pictures of it either" if head.landmarks is None else ""
+        raise AlignmentError(f"{source.path}: {found}{unseen}; {_GIVE}") from error
     record = registration.record
     if not (record.median_distance < _MEDIAN_LIMIT and record.stretch < _STRETCH_LIMIT):
         raise AlignmentError(
@@ -291,7 +296,8 @@ def head_of(mesh: Mesh) -> Mesh:
     height = mesh.vertices[:, 1]
     if float(height.max() - height.min()) < _BODY:
         return mesh
-    return submesh(mesh, height > height.max() - _HEAD).mesh
+    head = submesh(mesh, height > height.max() - _HEAD).mesh
+    return head if len(head.faces) >= _LEAST_TRIANGLES else mesh
 
 
 def _landmarks(source: Source, template: Mesh, path: Path | None) -> tuple[Tensor, Tensor] | None:
