@@ -3,9 +3,14 @@
 from pathlib import Path
 
 import numpy as np
+import pytest
 import torch
 
 from torchface import Take, Track, save_take
+from torchface.errors import FileFormatError
+from torchface.geometry.cameras.calibration import CameraCalibration
+from torchface.io import save_calibration
+from torchface.io.landmarks.landmark_points import save_pts
 from torchface.workflows.describe_file import describe
 
 
@@ -28,3 +33,25 @@ def test_a_head_model_of_others_says_what_it_has(tmp_path: Path) -> None:
     assert rows["head model"].startswith("FLAME")
     assert (rows["identity parameters"], rows["expression parameters"]) == ("300", "50")
     assert (rows["joints"], rows["vertices"]) == ("none", "9")
+
+
+def test_what_fit_and_arkit_write_is_known(tmp_path: Path) -> None:
+    save_pts(torch.tensor([[1.0, 2.0], [11.0, 32.0]]), tmp_path / "face.pts")
+    assert dict(describe(tmp_path / "face.pts"))["extent, pixels"] == "10.0 x 30.0"
+    K = torch.tensor([[900.0, 0, 319.5], [0, 900, 239.5], [0, 0, 1]], dtype=torch.float64)
+    save_calibration(CameraCalibration(K, torch.zeros(5, dtype=torch.float64), 640, 480), tmp_path / "c.toml")
+    assert dict(describe(tmp_path / "c.toml"))["focal length, pixels"] == "900.0, 900.0"
+    (tmp_path / "w_error.csv").write_text("frame,time,error_mm,motion_mm\n0,0,1,4\n1,0.04,2,8\n")
+    rows = dict(describe(tmp_path / "w_error.csv"))
+    assert rows["motion_mm"] == "mean 6.000, largest 8.000"
+    assert "weights" not in rows
+
+
+def test_folders_that_are_no_rigs_say_what_they_are(tmp_path: Path) -> None:
+    for name in ("a.glb", "neutral.obj"):
+        (tmp_path / name).touch()
+    with pytest.raises(FileFormatError, match=r"found a folder with 1: a\.glb, expected a file, such as .*a\.glb"):
+        describe(tmp_path)
+    (tmp_path / "model.toml").touch()
+    with pytest.raises(FileFormatError, match=r"found a learned model, .*zoo describe"):
+        describe(tmp_path)

@@ -117,6 +117,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
             tyro.cli(checked(export_model), prog="torchface export", args=words[1:])
         elif words[0] == "train":
             train(words[1:])
+        elif words[0] in COMMANDS:  # alone: what tyro says of a wrong value then names its help
+            tyro.cli(checked(COMMANDS[words[0]]), prog=f"torchface {words[0]}", args=words[1:])
         elif words[0] in GROUPS:
             group = GROUPS[words[0]]
             tyro.extras.subcommand_cli_from_dict(

@@ -51,11 +51,11 @@ def rig(
     has, by ARKit's or another program's names, are kept; a VRM gets an expression for each. NAME_face.png beside OUT
     shows the face.
 
-    An image beside it, NAME_registration.png, shows how the neutral scan was met: distances (blue 0 to red 1 mm,
-    grey where the scan shows no skin) and the mesh's lines. Hair, cloth and ears in pieces are taken from the template.
-
     The neutral scan gives the actor's face in the template's topology, deformation transfer its shapes. Scans of
     expressions make the shapes the actor's own; high-resolution scans give normal maps for wrinkles.
+
+    NAME_registration.png beside OUT shows how the neutral scan was met: distances (blue 0 to red 1 mm,
+    grey where the scan shows no skin) and the mesh's lines. Hair, cloth and ears in pieces are taken from the template.
 
     EXAMPLES holds scans (.obj, .ply, .stl, .off, .glb, .gltf). Each file's name says roughly what it shows, as in
     jawOpen.obj or jawOpen=0.6+mouthSmileLeft=0.5.obj; or a file weights.csv in the folder does, with the header

@@ -14,12 +14,25 @@ from torchface.capture.anybody import ExampleShapes, ExampleSolver, landmark_obs
 from torchface.capture.anybody.examples.example_shapes import is_examples
 from torchface.capture.markers import MarkerSolver, observability
 from torchface.errors import FileFormatError
+from torchface.files.models import DESCRIPTION
 from torchface.files.whole_files import read_file
-from torchface.io import HeadModelFile, load_animation, load_head_model_file, load_mesh, load_rig, load_take
+from torchface.geometry.cameras.calibration import CameraCalibration
+from torchface.io import (
+    HeadModelFile,
+    load_animation,
+    load_calibration,
+    load_head_model_file,
+    load_mesh,
+    load_rig,
+    load_take,
+)
 from torchface.io.head_models.head_model_files import is_head_model_file
 from torchface.io.images.image_files import IMAGE_ENDINGS, load_image
+from torchface.io.landmarks.landmark_points import load_landmark_points
 from torchface.io.mesh_files import MESH_ENDINGS
 from torchface.io.rig_files import SCENE_ENDINGS
+from torchface.io.tables.csv_table import TableReader
+from torchface.io.tables.numbered_csv import COLUMNS, read_numbered
 from torchface.io.take_files import RECORDING_ENDINGS, TAKE_ENDINGS
 from torchface.io.video import open_video
 from torchface.io.video.video_file import VIDEO_ENDINGS
@@ -33,6 +46,7 @@ from torchface.workflows.weight_files import weight_faults
 Rows = list[tuple[str, str]]
 
 _MAX_LENGTH = 240
+_LENGTH, _LONGEST_HEADER = "_mm", 4096  # ends the names of columns that are no weights
 _MAX_NAMED, _MAX_LISTED = 8, 10
 
 
@@ -48,6 +62,8 @@ def describe(path: Path, attachment: Path | None = None, part: str | None = None
         FileFormatError: nothing that torchface reads.
     """
     suffix = path.suffix.lower()
+    if path.is_dir():
+        _check_rig_folder(path)
     if path.is_dir() or suffix in SCENE_ENDINGS:
         mesh, rig = load_neutral(path, part=part)
         if rig is None and attachment is None:
@@ -66,6 +82,8 @@ def describe(path: Path, attachment: Path | None = None, part: str | None = None
         return _mesh_rows(load_mesh(path))
     if is_head_model_file(path):
         return _head_model_rows(load_head_model_file(path))
+    if _is_error_table(path):
+        return _error_rows(path)
     if suffix in (*TAKE_ENDINGS, *RECORDING_ENDINGS) and (suffix != ".json" or is_weight_json(path)):
         return _take_rows(load_take(path))
     if suffix == ".json" and is_examples(path):
@@ -74,6 +92,11 @@ def describe(path: Path, attachment: Path | None = None, part: str | None = None
         return _attachment_rows(Attachment.load(path))
     if suffix == ".onnx":
         return _graph_rows(path)
+    if suffix == ".pts":
+        points = load_landmark_points(path).points
+        return [("landmarks", f"{len(points)}, pixels"), ("extent, pixels", _extent(points[points.isfinite().all(1)]))]
+    if suffix == ".toml":
+        return _camera_rows(load_calibration(path))
     if suffix in VIDEO_ENDINGS:
         video = open_video(path)
         return [
@@ -91,10 +114,56 @@ def describe(path: Path, attachment: Path | None = None, part: str | None = None
         *TAKE_ENDINGS,
         *RECORDING_ENDINGS,
         ".onnx",
+        ".pts",
+        ".toml",
     )
     raise FileFormatError(
         f"{path}: found the ending {suffix!r}, expected a folder or one of {' '.join(sorted(endings))}"
     )
+
+
+def _check_rig_folder(folder: Path) -> None:
+    """Raises ``FileFormatError`` for folders that are no rig of OBJ files, with what holds what is in them."""
+    if (folder / DESCRIPTION).is_file():
+        raise FileFormatError(
+            f"{folder}: found a learned model, expected a rig; `torchface zoo describe {folder}` shows what is known "
+            "of it"
+        )
+    scenes = [path.name for path in sorted(folder.iterdir()) if path.suffix.lower() in SCENE_ENDINGS]
+    if scenes and sum(path.suffix.lower() == ".obj" for path in folder.iterdir()) < 2:
+        raise FileFormatError(
+            f"{folder}: found a folder with {_named(scenes)}, expected a file, such as {folder / scenes[0]}, or a "
+            "folder of OBJ files, a neutral and one for each shape"
+        )
+
+
+def _camera_rows(camera: CameraCalibration) -> Rows:
+    focal, centre = camera.intrinsics.diagonal()[:2].tolist(), camera.intrinsics[:2, 2].tolist()
+    return [
+        ("camera", f"{camera.width} x {camera.height} pixels"),
+        ("focal length, pixels", f"{focal[0]:.1f}, {focal[1]:.1f}"),
+        ("centre, pixels", f"{centre[0]:.1f}, {centre[1]:.1f}"),
+        ("distortion", "none" if not bool(camera.distortion.any()) else str(camera.distortion.tolist())),
+        ("error, pixels", "not measured" if camera.error is None else f"{camera.error:.2f}"),
+    ]
+
+
+def _is_error_table(path: Path) -> bool:
+    """Whether a file is a table of lengths, as `arkit --animation` writes them, and not of weights."""
+    if path.suffix.lower() != ".csv" or not path.is_file():
+        return False
+    with path.open(encoding="utf-8", errors="replace") as file:
+        names = file.readline(_LONGEST_HEADER).strip().split(",")
+    return len(names) > len(COLUMNS) and all(name.endswith(_LENGTH) for name in names[len(COLUMNS) :])
+
+
+def _error_rows(path: Path) -> Rows:
+    table, times, _ = read_numbered(TableReader(path))
+    rows = [("table", f"{len(table.numbers)} frames at {times.fps:g} a second; lengths in millimetres, no weights")]
+    for name in table.names[len(COLUMNS) :]:
+        values = torch.from_numpy(table.column(name).copy())
+        rows.append((name, f"mean {float(values.nanmean()):.3f}, largest {float(values.nan_to_num(0.0).max()):.3f}"))
+    return rows
 
 
 def _head_model_rows(model: HeadModelFile) -> Rows:

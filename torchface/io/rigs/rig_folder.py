@@ -54,7 +54,7 @@ def load_obj_folder(folder: str | Path, unit: str = "mm", neutral: str | None = 
     if len(candidates) != 1 or candidates[0] not in files:
         raise FileFormatError(
             f"{folder}: found {len(files)} OBJ files, of them neutral: {', '.join(candidates) or 'none'}; expected one "
-            "neutral (name it by neutral=) and a file for each shape"
+            "neutral, with that word in its name (in Python, name it by neutral=), and a file for each shape"
         )
     rest = files.pop(candidates[0])
     if not files:
