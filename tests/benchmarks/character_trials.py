@@ -112,7 +112,7 @@ def gaze_or_all(character: Character, own: dict[str, Tensor]) -> Tensor:
 
 
 def nearest_vertices(bare: Path) -> dict[str, Tensor]:
-    """The embedded performer's shapes on a character: his landmarks laid on its, each vertex moves as the nearest."""
+    """The embedded performer's shapes on a character: landmarks aligned, each vertex moves as the nearest."""
     character = read_character(read_document(bare))
     face = find_character_face(character, textured(character))
     template = performer(texture=False)

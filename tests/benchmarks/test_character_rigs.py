@@ -3,7 +3,7 @@
 Characters with a body, hair and a skeleton: a performer by code of another topology, the same as a caricature (eyes and
 lips larger, nose flatter), ICT-FaceKit's head, the same as a caricature, and Face Cap's head as three.js ships it. The
 template is the embedded performer. By nearest vertices each vertex moves as the template's nearest one, after the same
-landmarks were laid on each other. Cosine and relative error are those of all vertices of parts that the character's own
+landmarks were aligned. Cosine and relative error are those of all vertices of parts that the character's own
 shapes move.
 """
 

@@ -48,12 +48,12 @@ class MeshSolver:
 
     .. math:: \min_{0 \le w \le 1} \frac{1}{V} \lVert P (b + B w - y) \rVert^2 + \varepsilon \lVert w \rVert^2
 
-    Each mesh y is first laid on the rig by its steady vertices. P takes out what is left of the head's motion: the part
-    along the six directions in which the rig at rest is moved and turned. H is one matrix for all frames.
+    Each mesh y is first aligned with the rig by its steady vertices. P takes out what is left of the head's motion: the
+    part along the six directions in which the rig at rest is moved and turned. H is one matrix for all frames.
 
     Args:
         rig: N shapes; its correctives are left out with a warning.
-        ridge: :math:`\varepsilon`, as a share of the mean curvature of a weight: only what no vertex tells apart is
+        ridge: :math:`\varepsilon`, as a share of the mean curvature of a weight: only what no vertex shows is
             decided by it.
 
     Source: thesis 4.1.4, with every vertex as a marker.
@@ -93,7 +93,7 @@ class MeshSolver:
         self._columns = torch.cat([self._rows, self._rigid, self._around], 1)
 
     def aligned(self, meshes: Tensor) -> Tensor:
-        """Meshes (t,V,3) laid on the rig at rest by their steady vertices, (t,V,3) float64.
+        """Meshes (t,V,3) aligned with the rig at rest by their steady vertices, (t,V,3) float64.
 
         Raises:
             ShapeError: other vertices than the rig's.

@@ -62,7 +62,7 @@ def test_lids_of_photographs_lie_where_people_put_them(data: Path) -> None:
     assert isinstance(finder, EyedFinder)
     off = [errors(one, pictures, seeds=2)[..., 36:48, :].norm(dim=-1).mean() for one in (finder.finder, finder)]
     assert float(off[1]) < float(off[0])
-    assert float(off[1]) < 0.028
+    assert float(off[1]) < 0.027
 
 
 def test_lids_lie_between_by_inverse_variance_and_stay_where_the_eye_is_hidden() -> None:

@@ -175,15 +175,17 @@ def test_a_finder_runs_the_network_of_a_folder(network: LandmarkNetwork, tmp_pat
 
 @pytest.mark.real
 def test_the_shipped_network_finds_photographed_faces(data: Path) -> None:
-    finder, errors = load_finder(photographs=True).finder, []
+    finder, errors, visible = load_finder(photographs=True).finder, [], []
     for path in sorted((data / "images" / "people").glob("*.pts")):
         (image,) = (one for one in path.parent.glob(f"{path.stem}.*") if one.suffix != ".pts")
         truth = load_landmark_points(path).points.float()
         found = finder((255 * load_image(image)).round().byte(), box_around(truth), 0.0)
         assert found.presence > 0.9
         assert float((found.visibility > 0.5).float().mean()) > 0.9
+        visible.append(float(found.visibility.mean()))
         eyes = (truth[36] - truth[45]).norm()
         errors.append(float((found.landmarks - truth)[INNER].norm(dim=1).mean() / eyes))
     # One of the four laughs with hair over his forehead, in grey.
     assert sorted(errors)[1] < 0.045
     assert sum(errors) / len(errors) < 0.055
+    assert sum(visible) / len(visible) > 0.9

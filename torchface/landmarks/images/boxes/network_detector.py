@@ -6,7 +6,6 @@ from collections.abc import Callable
 
 import cv2
 import numpy as np
-import onnxruntime
 import torch
 from torch import Tensor
 
@@ -14,6 +13,7 @@ from torchface.errors import ValueRangeError
 from torchface.landmarks.images.boxes.box_network import INPUT_SIZE, BoxNetwork
 from torchface.landmarks.images.boxes.face_box import FaceBoxes, check_image, sorted_boxes
 from torchface.landmarks.images.folded_normalisation import without_normalisation
+from torchface.landmarks.images.graph_session import graph_session
 
 _MULTIPLE = 32  # pixels: the stride of the network's coarsest level
 _LEAST_SCORE = 0.4  # of a face
@@ -69,10 +69,7 @@ def graph_boxes(content: bytes) -> Callable[[Tensor], Tensor]:
     Args:
         content: what ``torchface.onnx.network_graphs.network_model`` exports.
     """
-    options = onnxruntime.SessionOptions()
-    options.intra_op_num_threads = options.inter_op_num_threads = 1
-    options.log_severity_level = 4
-    session = onnxruntime.InferenceSession(content, options, providers=["CPUExecutionProvider"])
+    session = graph_session(content)
 
     def network(pictures: Tensor) -> Tensor:
         (faces,) = session.run(["faces"], {"images": pictures.contiguous().numpy()})

@@ -7,13 +7,13 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
-import onnxruntime
 import torch
 from torch import Tensor
 
 from torchface.errors import ShapeError
 from torchface.landmarks.images.face_crop import cut_crops
 from torchface.landmarks.images.face_reading import FaceReading
+from torchface.landmarks.images.graph_session import graph_session
 from torchface.landmarks.images.landmark_finder import LandmarkFinder, finder_name
 from torchface.landmarks.images.networks.eye_crop import (
     EYE_LANDMARKS,
@@ -147,10 +147,7 @@ def graph_eye_finder(content: bytes) -> EyeFinder:
     Args:
         content: what ``torchface.onnx.network_graphs.network_model`` exports.
     """
-    options = onnxruntime.SessionOptions()
-    options.intra_op_num_threads = options.inter_op_num_threads = 1
-    options.log_severity_level = 4
-    session = onnxruntime.InferenceSession(content, options, providers=["CPUExecutionProvider"])
+    session = graph_session(content)
     _, _, height, width = session.get_inputs()[0].shape
 
     def network(crops: Tensor) -> EyeFindings:

@@ -19,6 +19,7 @@ from torch import Tensor
 from torchface.errors import FileFormatError
 from torchface.files.whole_files import read_file
 from torchface.landmarks.images.face_crop import CROP_MARGIN
+from torchface.landmarks.images.graph_session import graph_session
 from torchface.landmarks.images.ibug_68 import COUNT
 from torchface.landmarks.images.networks import graph_process
 from torchface.landmarks.images.networks.answering_process import AnsweringProcess
@@ -83,12 +84,7 @@ def graph_finder(content: bytes, path: Path) -> CropFinder:
         content: of an ONNX file.
         path: what messages call it.
     """
-    import onnxruntime
-
-    options = onnxruntime.SessionOptions()
-    options.intra_op_num_threads = options.inter_op_num_threads = 1
-    options.log_severity_level = 4
-    session = onnxruntime.InferenceSession(content, options, providers=["CPUExecutionProvider"])
+    session = graph_session(content)
     return _finder(signature(session), _OwnGraph(session), path)
 
 
