@@ -48,28 +48,24 @@ def chromium() -> str | None:
     )
 
 
-def pictures(browser: str, shots: Sequence[tuple[Path, Shot]], folder: Path, side: int = 512) -> list[Tensor]:
-    """What three.js draws of ``.glb`` files, a picture (3,side,side) a shot.
+def posted(browser: str, web: Path, page: str, folder: Path, files: dict[str, bytes]) -> dict:
+    """What a page of a folder posts, drawn without a GPU.
 
     Args:
         browser: see ``chromium``.
-        shots: the file, and what is seen of it.
+        web: the folder that is served.
+        page: of it, with its query.
         folder: for the browser's profile.
-        side: pixels.
+        files: what is served beside, by path.
     """
-    files = {f"/{i}.glb": file for i, file in enumerate(dict.fromkeys(file for file, _ in shots))}
-    names = {file: name for name, file in files.items()}
-    order = json.dumps(
-        {"side": side, "shots": [{"file": names[file], **asdict(shot)} for file, shot in shots]}
-    ).encode()
     results: list[dict] = []
     done = threading.Event()
 
     class Handler(SimpleHTTPRequestHandler):
         def do_GET(self) -> None:
-            if self.path not in ("/shots.json", *files):
+            body = files.get(self.path)
+            if body is None:
                 return super().do_GET()
-            body = files[self.path].read_bytes() if self.path in files else order
             self.send_response(200)
             self.send_header("Content-Length", str(len(body)))
             self.end_headers()
@@ -85,12 +81,12 @@ def pictures(browser: str, shots: Sequence[tuple[Path, Shot]], folder: Path, sid
         def log_message(self, *words: object) -> None:
             pass
 
-    server = ThreadingHTTPServer(("127.0.0.1", 0), partial(Handler, directory=str(WEB)))
+    server = ThreadingHTTPServer(("127.0.0.1", 0), partial(Handler, directory=str(web)))
     threading.Thread(target=server.serve_forever, daemon=True).start()
     flags = ["--headless", "--no-sandbox", "--disable-gpu", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
     flags += ["--no-first-run", "--disable-dev-shm-usage", f"--user-data-dir={folder / 'profile'}"]
-    page = f"http://127.0.0.1:{server.server_port}/look.html"
-    process = subprocess.Popen([browser, *flags, page], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    address = f"http://127.0.0.1:{server.server_port}/{page}"
+    process = subprocess.Popen([browser, *flags, address], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     try:
         assert done.wait(_SECONDS), "the page posted nothing"
     finally:
@@ -99,7 +95,31 @@ def pictures(browser: str, shots: Sequence[tuple[Path, Shot]], folder: Path, sid
         server.shutdown()
         server.server_close()
     assert "error" not in results[0], results[0]["error"]
-    rows = [base64.b64decode(url.partition(",")[2]) for url in results[0]["pictures"]]
+    return results[0]
+
+
+def pictures(browser: str, shots: Sequence[tuple[Path, Shot]], folder: Path, side: int = 512) -> list[Tensor]:
+    """What three.js draws of ``.glb`` files, a picture (3,side,side) a shot.
+
+    Args:
+        browser: see ``chromium``.
+        shots: the file, and what is seen of it.
+        folder: for the browser's profile.
+        side: pixels.
+    """
+    files = {f"/{i}.glb": file for i, file in enumerate(dict.fromkeys(file for file, _ in shots))}
+    names = {file: name for name, file in files.items()}
+    order = json.dumps(
+        {"side": side, "shots": [{"file": names[file], **asdict(shot)} for file, shot in shots]}
+    ).encode()
+    found = posted(
+        browser,
+        WEB,
+        "look.html",
+        folder,
+        {"/shots.json": order, **{name: file.read_bytes() for name, file in files.items()}},
+    )
+    rows = [base64.b64decode(url.partition(",")[2]) for url in found["pictures"]]
     return [decode_image(row, "the browser's picture") for row in rows]
 
 

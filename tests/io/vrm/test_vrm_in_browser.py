@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-import json
 import shutil
 import subprocess
-import threading
-from functools import partial
-from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from browser import chromium, posted
 
 from planted.characters import Planted, write_character
 from torchface.io.gltf.gltf_document import read_document
@@ -29,60 +26,24 @@ pytestmark = pytest.mark.browser
 @pytest.fixture(scope="module")
 def browser() -> str:
     """A Chromium, with three-vrm installed in ``web``; kept there for the next run."""
-    chromium = next((found for name in ("chromium", "google-chrome") if (found := shutil.which(name))), None)
+    found = chromium()
     npm = shutil.which("npm")
-    if chromium is None or npm is None:
+    if found is None or npm is None:
         pytest.skip("Chromium and npm are not installed; three-vrm comes from npm")
     if not (WEB / "node_modules" / "@pixiv").is_dir():
         command = [npm, "ci", "--no-audit", "--no-fund"]
         done = subprocess.run(command, cwd=WEB, capture_output=True, text=True, timeout=300, check=False)
         if done.returncode != 0:
             pytest.skip(f"npm could not install three-vrm: {done.stderr[-300:]}")
-    return chromium
+    return found
 
 
 def seen(browser: str, avatar: Path, folder: Path, animation: Path | None = None) -> dict:
     """What the page posts of an avatar."""
-    results: list[dict] = []
-    done = threading.Event()
-    files = {"/avatar.vrm": avatar, "/animation.vrma": animation}
-
-    class Handler(SimpleHTTPRequestHandler):
-        def do_GET(self) -> None:
-            file = files.get(self.path)
-            if file is None:
-                return super().do_GET()
-            body = file.read_bytes()
-            self.send_response(200)
-            self.send_header("Content-Length", str(len(body)))
-            self.end_headers()
-            self.wfile.write(body)
-            return None
-
-        def do_POST(self) -> None:
-            results.append(json.loads(self.rfile.read(int(self.headers["Content-Length"]))))
-            self.send_response(204)
-            self.end_headers()
-            done.set()
-
-        def log_message(self, *words: object) -> None:
-            pass
-
-    server = ThreadingHTTPServer(("127.0.0.1", 0), partial(Handler, directory=str(WEB)))
-    threading.Thread(target=server.serve_forever, daemon=True).start()
-    flags = ["--headless", "--no-sandbox", "--disable-gpu", "--no-first-run", "--disable-dev-shm-usage"]
-    page = f"http://127.0.0.1:{server.server_port}/avatar.html" + ("" if animation is None else "?animation=1")
-    command = [browser, *flags, f"--user-data-dir={folder / 'profile'}", page]
-    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-    try:
-        assert done.wait(120), "the page posted nothing"
-    finally:
-        process.terminate()
-        process.wait(30)
-        server.shutdown()
-        server.server_close()
-    assert "error" not in results[0], results[0]["error"]
-    return results[0]
+    files = {"/avatar.vrm": avatar.read_bytes()}
+    if animation is None:
+        return posted(browser, WEB, "avatar.html", folder, files)
+    return posted(browser, WEB, "avatar.html?animation=1", folder, files | {"/animation.vrma": animation.read_bytes()})
 
 
 @pytest.mark.parametrize(("version", "preset", "meta"), [("VRMC_vrm", "blinkLeft", "1"), ("VRM", "blink_l", "0")])
