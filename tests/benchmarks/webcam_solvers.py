@@ -29,7 +29,7 @@ from torchface.capture.own_rig import VideoState
 from torchface.files.content_keys import content_key
 from torchface.files.whole_files import write_file
 from torchface.geometry.cameras.calibration import assumed_calibration
-from torchface.landmarks.images.face_reading import READ_BY_NETWORKS, FaceReading
+from torchface.landmarks.images.face_reading import READ_FOR_SOLVER, FaceReading
 from torchface.landmarks.images.frame_reader.face_reader import STATE, FaceReader
 from torchface.onnx.webcam.webcam_solver_graph import webcam_solver_model
 from torchface.shape_names import ARKIT, mapping
@@ -65,7 +65,7 @@ Solver = Callable[[list[FaceReading], float, tuple[int, int]], Solved]
 def read_faces(frames: Tensor, fps: float, kept: Path) -> list[FaceReading]:
     """What the shipped networks read of a face in frames uint8 (T,3,H,W), as in a webcam's model; kept in a folder."""
     reader = FaceReader(webcam_networks()).eval()
-    key = content_key("faces read/4", reader=reader, frames=frames, fps=fps)[:16]
+    key = content_key("faces read/5", reader=reader, frames=frames, fps=fps)[:16]
     path = kept / f"{key}.safetensors"
     if not path.is_file():
         state, rows = torch.zeros(STATE), []
@@ -74,7 +74,7 @@ def read_faces(frames: Tensor, fps: float, kept: Path) -> list[FaceReading]:
                 reading, state = reader(frame.permute(1, 2, 0), torch.tensor(1 / fps), state)
             rows.append(reading)
         taken = FaceReading.stacked(rows)
-        write_file(path, save({name: getattr(taken, name).clone() for name in READ_BY_NETWORKS}))
+        write_file(path, save({name: getattr(taken, name).clone() for name in READ_FOR_SOLVER}))
     stored = load_file(path)
     return [FaceReading(**{name: values[row] for name, values in stored.items()}) for row in range(len(frames))]
 
@@ -110,14 +110,12 @@ def webcam_solver(readings: list[FaceReading], fps: float, size: tuple[int, int]
     """``WebcamSolver``'s graph as ``torchface live`` and the app run it; nobody calibrates anything."""
     session = _webcam_session()
     controls = WebcamControls().tensor().numpy()
-    points = next(one.shape[0] for one in session.get_inputs() if one.name == "points")  # none if it counts none
     state = np.zeros(session.get_inputs()[-1].shape, np.float32)
     fixed = {"size": np.array(size, np.float32), "interval": np.array(1 / fps, np.float32), "controls": controls}
     weights, gazes = [], []
     started = time.process_time()
     for reading in readings:  # a frame's state is the next one's
-        given = {name: getattr(reading, name).numpy() for name in READ_BY_NETWORKS}
-        given |= {name: given[name][:points] for name in ("points", "point_deviation")}
+        given = {name: getattr(reading, name).numpy() for name in READ_FOR_SOLVER}
         solved, gaze, state = session.run(["weights", "gaze", "next_state"], given | fixed | {"state": state})
         weights.append(torch.from_numpy(solved))
         gazes.append(torch.from_numpy(gaze))

@@ -160,9 +160,9 @@ def webcam_inputs() -> tuple[Tensor, ...]:
     pixels = seen_landmarks()[0].float()
     sure, both = torch.ones(68), torch.ones(2)
     return (
-        pixels, sure, sure, both[0], pixels[[36, 42]], 0.3 * both, 0 * both, both, torch.zeros(0, 2),
-        torch.zeros(0), torch.full((52,), torch.nan), torch.full((52,), torch.inf), torch.tensor([640.0, 480.0]),
-        torch.tensor(1 / 30), WebcamControls().tensor(), webcam_solver(0).start().pack(),
+        pixels, sure, sure, both[0], pixels[[36, 42]], 0.3 * both, 0 * both, both, torch.full((52,), torch.nan),
+        torch.full((52,), torch.inf), torch.tensor([640.0, 480.0]), torch.tensor(1 / 30), WebcamControls().tensor(),
+        webcam_solver(0).start().pack(),
     )  # fmt: skip
 
 

@@ -19,22 +19,12 @@ from torchface.synthetic.head.head_annotations import head_annotations
 from torchface.synthetic.head.identity import mean_vertices
 from torchface.synthetic.head.performer import performer
 
-COUNTED = False
-"""Whether ``track`` and ``live`` count a network's points. On twelve films of other people, with the expression read
-too, they take ``track``'s error of weights from 0.126 to 0.131, the median correlation from 0.50 to 0.43, and twice the
-time: their errors are those of the landmarks and of the head."""
-
 SHARED = [*range(4, 13), *range(27, 68)]
 """Landmarks that all heads mean alike."""
 
 _SMOOTHING, _OTHER_SIZE, _TURNED = 1.0, 0.2, 20.0  # the second a logarithm, the third in degrees
 _JAW, _LIDS = 8.0, 6.0  # millimetres that a whole motion of the jaw and of the lids counts when points are compared
 _AHEAD = 0.0  # z of a normal: what faces back lies inside a mouth
-
-
-def counted_sites(rig: BlendshapeRig, places: Tensor) -> Attachment | None:
-    """The sites of the points that solves count, see ``COUNTED``; none where a network finds no points."""
-    return sites_on_rig(rig, places) if COUNTED and len(places) else None
 
 
 def sites_on_rig(rig: BlendshapeRig, places: Tensor) -> Attachment:

@@ -203,3 +203,30 @@ def test_a_guided_calibration_finds_how_far_landmarks_go(
     assert float(state.gains[1].exp()) == pytest.approx(half, abs=0.15)
     assert float(state.weights[rows].mean()) > 0.9
     assert float(state.gains[[0, 2]].abs().max()) < 0.02
+
+
+def solved(solver: WebcamSolver, reading: FaceReading, frames: int = 8) -> Tensor:
+    state = solver.start()
+    for _ in range(frames):
+        state = solver.step(state, reading, 1 / FPS)
+    return state.shapes.double() @ solver.to_arkit.T
+
+
+def test_an_expression_that_is_read_decides_what_is_not_seen(solver: WebcamSolver) -> None:
+    puff, nobody = ARKIT.index("cheekPuff"), torch.zeros(solver.settings.coefficients).double()
+    unknown, sure = torch.full((52,), torch.inf), torch.full((52,), torch.inf)
+    sure[puff] = 0.002
+    read = replace(seen(solver, nobody, weights_of(), (0.05, 0.2, 0.0)), expression=weights_of(cheekPuff=0.5).float())
+    assert float(solved(solver, replace(read, expression_deviation=sure))[puff]) > 0.3
+    assert float(solved(solver, replace(read, expression_deviation=unknown))[puff]) < 0.15
+
+
+def test_antagonists_are_never_on_together(solver: WebcamSolver, person: Tensor) -> None:
+    state, pairs, nobody = solver.start(), solver.arkit_signed, torch.zeros_like(person)
+    for frame in range(12):
+        mouth = {"mouthLeft" if frame < 6 else "mouthRight": 0.6}
+        weights = weights_of(**mouth, **{"mouthSmileLeft" if frame % 4 < 2 else "mouthFrownLeft": 0.5})
+        state = solver.step(state, seen(solver, nobody, weights, (0.05, 0.2, 0.0)), 1 / FPS)
+        first, second = state.weights.double() @ pairs.T.clamp(min=0), state.weights.double() @ (-pairs.T).clamp(min=0)
+        assert float(torch.minimum(first, second).max()) < 1e-6
+    assert float(state.weights[ARKIT.index("mouthRight")]) > 0.2

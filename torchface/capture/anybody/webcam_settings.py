@@ -24,7 +24,6 @@ class WebcamSettings:
         learning: for how long a person is learned, seconds of good frames.
         memory: after how long what was learned counts for 1/e while learning goes on, seconds.
         rest_penalty: for how unlikely a lasting expression is held beside a person's own shape.
-        errors_alike: share of the errors' variance that neighbours have in common, where further points are found.
         openness_noise, gaze_noise: standard deviations, of openness as a share of the open eye's, of eyeLook's weights.
 
     Raises:
@@ -52,14 +51,12 @@ class WebcamSettings:
     rest_penalty: float = 6.0
     openness_noise: float = 0.1
     gaze_noise: float = 0.05
-    errors_alike: float = 0.5
 
     def __post_init__(self) -> None:
         for name in ("prior_strength", "sparsity", "ridge", "rest_penalty"):
             checked_number(name, getattr(self, name), 0.0, LARGEST_WEIGHT)
         for name in ("noise", "motion", "alike", "learning", "memory", "openness_noise", "gaze_noise"):
             checked_number(name, getattr(self, name), 0.0, LARGEST_WEIGHT, above=True)
-        for name in ("contour_slide", "errors_alike"):
-            checked_number(name, getattr(self, name), 0.0, 1.0)
+        checked_number("contour_slide", self.contour_slide, 0.0, 1.0)
         checked_count("steps", self.steps, 1)
         checked_count("coefficients", self.coefficients, 1)

@@ -6,66 +6,34 @@ import math
 from dataclasses import dataclass, replace
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 from torch.nn.functional import pad
 
-from torchface.attachment import Attachment
-from torchface.capture.antagonist_shapes import one_side, signed_quantities, weaker_sides
+from torchface.capture.antagonist_shapes import one_side, weaker_sides
 from torchface.capture.anybody.eye_signals import EyeSignals, EyesRead, eye_signals
-from torchface.capture.anybody.guided_gains import gain_factors, gain_groups, highest_weights, learned_gains
-from torchface.capture.anybody.person_landmarks import PersonLandmarks
-from torchface.capture.anybody.person_surface import PersonSurface
+from torchface.capture.anybody.guided_gains import gain_factors, highest_weights, learned_gains
+from torchface.capture.anybody.webcam_components import WebcamSolverParts
 from torchface.capture.anybody.webcam_outputs import LOST_FIT, OutputTables, calmed_state, lost_state
-from torchface.capture.anybody.webcam_settings import WebcamSettings
-from torchface.capture.anybody.webcam_state import StateLayout, WebcamControls, WebcamState
+from torchface.capture.anybody.webcam_state import WebcamControls, WebcamState
 from torchface.capture.energy import Quadratic
-from torchface.capture.own_rig.eye_geometry import (
-    CORNERS,
-    LOOKS,
-    arkit_names,
-    look_weights,
-    openness_rows,
-    seen_gaze,
-)
+from torchface.capture.own_rig.eye_geometry import CORNERS, look_weights, seen_gaze
 from torchface.capture.own_rig.face_points import EYE_CORNERS, JAW, LANDMARKS, FacePoints
-from torchface.capture.own_rig.gauss_newton import (
-    ErrorModes,
-    HeadState,
-    Linearised,
-    energy_of_step,
-    linearise,
-    split_step,
-)
-from torchface.capture.own_rig.surface_points import FaceSurfacePoints, alike_errors
+from torchface.capture.own_rig.gauss_newton import HeadState, Linearised, energy_of_step, linearise, split_step
 from torchface.capture.own_rig.weight_walk import faded, relative_trust, unseen_time, walk_information
-from torchface.capture.priors import ShapePrior
-from torchface.errors import NameMismatchError
 from torchface.geometry.cameras.affine_pose import affine_pose, orthonormal
 from torchface.geometry.cameras.calibration import ASSUMED_FIELD_OF_VIEW
-from torchface.landmarks.images.face_reading import READ_BY_NETWORKS, FaceReading, trust_of
+from torchface.landmarks.images.face_reading import READ_FOR_SOLVER, FaceReading, trust_of
 from torchface.optim.exported_operators import symmetric_inverse
-from torchface.rig import BlendshapeRig
-from torchface.shape_names import ARKIT, mapping
 
 _SPLITTING_STEPS = 30
-_UPRIGHT = (1 / 600, -1 / 600)  # of a face some way off; the camera's y goes down
-_BLINK_UNIT = 0.25  # what counts as a weight of 1 in the filter: of blinks, which it must not smooth away,
-_MOTION_UNITS = [0.5] * 3 + [100.0] * 3  # and of the head's motion, radians and millimetres
-_LOOK_EYES = (0, 0, 1, 1, 0, 0, 1, 1)  # whose each of ``LOOKS`` is
-_DAMPING_ROTATION, _DAMPING_TRANSLATION = 0.5, 500.0  # radians and millimetres that a step of a pose may well be
-_CONTOUR_TRUST = 0.5  # how much a landmark of the contour counts beside an inner one
 _ENOUGH = 20.0  # landmarks
 _LEAST_TRUST = 8.0  # of landmarks that nothing hides, together
 _PRESENT = 0.5
 _NEAR = 0.5  # of the eyes' distance
 _SHORTEST, _LONGEST = 1e-3, 0.5  # seconds
 _SETTLED = 0.15  # seconds after which the pose of a face that has just appeared has come to rest
-_FARTHEST_OFF = 1.0  # of a point: at a depth of 1; further off it is not seen
 _UNKNOWN, _FADE = 5.0, 0.4  # how much more sparse a face is that nothing is known of, and for how long, seconds
 _EAGER, _EAGER_FOR = 3.0, 0.7  # how much more the first frames of a person count, and for how long, seconds
-_LIDS = ("eyeBlink", "eyeWide", "eyeSquint")
-_LID_MOTION = 3.0
-_CONSTANTS = ("signed", "arkit_signed", "landmark_weights", "camera", "look_eyes", "upright", "damping", "filter_units")
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,8 +44,8 @@ class _Frame:
         rays: to the landmarks, (68,2), at a depth of 1.
         trust: in each, (68,).
         spread: of each, standard deviation of a coordinate, (68,), at a depth of 1.
-        points: rays to P points of the surface, (P,2), and their spread, (P,), likewise; NaN for what is not seen.
-        read: weights by ARKit's names as a network reads them, and their deviations, (52,) both; likewise.
+        read: weights by ARKit's names as a network reads them, and their deviations, (52,) both; NaN for what is not
+            seen.
         iris: rays to the irises, (2,2).
         eyes: how open they are.
         interval: seconds since the frame before, ().
@@ -88,7 +56,6 @@ class _Frame:
     rays: Tensor
     trust: Tensor
     spread: Tensor
-    points: tuple[Tensor, Tensor]
     read: tuple[Tensor, Tensor]
     iris: Tensor
     eyes: EyesRead
@@ -97,18 +64,7 @@ class _Frame:
     learns: Tensor
 
 
-@dataclass(frozen=True, eq=False)
-class _SurfaceSeen:
-    """Points of a surface (P) as a frame shows them, one over their deviations, those of the landmarks, (68,)."""
-
-    points: FaceSurfacePoints
-    rays: Tensor
-    precision: Tensor
-    landmarks: Tensor
-    alike: ErrorModes
-
-
-class WebcamSolver(nn.Module):
+class WebcamSolver(WebcamSolverParts):
     r"""Weights by ARKit's names, pose and gaze from what networks read of a face, for people it has never seen.
 
     Every frame it minimises ``VideoSolver``'s energy by a fixed number of Gauss and Newton's steps,
@@ -132,8 +88,6 @@ class WebcamSolver(nn.Module):
             (K,68,3), millimetres; see ``HeadModel``.
         prior: which weights faces have, one of Student's distributions.
         settings: what terms weigh.
-        surface: where on the rig's neutral mesh P further points lie that networks find; the modes are then of the
-            landmarks and of these, (K,68+P,3).
 
     Raises:
         ShapeError: the rig has no landmarks, or the modes are others.
@@ -156,84 +110,6 @@ class WebcamSolver(nn.Module):
         True
     """
 
-    to_arkit: Tensor
-    influence: Tensor
-    open_rows: Tensor
-    usual_openness: Tensor
-    look_shapes: Tensor
-    look_eyes: Tensor
-    gain_shapes: Tensor
-    signed: Tensor
-    arkit_signed: Tensor
-    walk: Tensor
-    landmark_weights: Tensor
-    camera: Tensor
-    upright: Tensor
-    damping: Tensor
-    filter_units: Tensor
-
-    def __init__(
-        self,
-        rig: BlendshapeRig,
-        identity_modes: Tensor | None = None,
-        prior: ShapePrior | None = None,
-        settings: WebcamSettings | None = None,
-        surface: Attachment | None = None,
-    ) -> None:
-        super().__init__()
-        self.settings = settings or WebcamSettings()
-        self.names: tuple[str, ...] = tuple(rig.names)
-        of_landmarks = identity_modes
-        if identity_modes is not None and surface is not None:
-            of_landmarks = identity_modes[:, :LANDMARKS]
-        self.person = PersonLandmarks(rig, of_landmarks, self.settings.coefficients)
-        self.surface = (
-            None
-            if surface is None
-            else PersonSurface(rig, surface, identity_modes, self.person, self.settings.errors_alike)
-        )
-        if prior is not None:
-            prior.require(rig.names)
-        to_arkit = mapping(rig.names, ARKIT).double()
-        if not bool(to_arkit.any()):
-            raise NameMismatchError(
-                f"rig: found none of ARKit's shapes among {', '.join(rig.names[:5])}, expected some"
-            )
-        self.prior = None if prior is None else prior.prepared(self.settings.prior_strength)
-        self.layout = StateLayout(len(rig.names), self.settings.coefficients)
-        called = arkit_names(rig.names)
-        rest, basis = self.person.rest[:LANDMARKS], self.person.basis[:LANDMARKS]
-        rows, usual = openness_rows(rest, basis, called)
-        landmark_weights = torch.tensor([_CONTOUR_TRUST] * JAW + [1.0] * (LANDMARKS - JAW))
-        moved = basis.square().sum(1) * landmark_weights[:, None]
-        for name, value in {
-            "to_arkit": to_arkit,
-            # Share of each landmark in the evidence of each shape, (68,N).
-            "influence": moved / moved.sum(0).clamp(min=1e-6),
-            "open_rows": rows,
-            "usual_openness": usual,
-            "look_shapes": mapping(LOOKS, rig.names).double(),
-            "gain_shapes": gain_groups(rig.names),
-            "signed": signed_quantities(rig.names),
-            "arkit_signed": signed_quantities(ARKIT),
-            "walk": torch.tensor([(_LID_MOTION if n.startswith(_LIDS) else 1.0) for n in called]),
-            "landmark_weights": landmark_weights,
-            "camera": torch.eye(3),
-            "look_eyes": torch.tensor(_LOOK_EYES),
-            "upright": torch.tensor(_UPRIGHT),
-            "damping": torch.tensor([_DAMPING_ROTATION] * 3 + [_DAMPING_TRANSLATION] * 3).double() ** -2,
-            "filter_units": torch.tensor(
-                [_BLINK_UNIT if n.startswith("eyeBlink") else 1.0 for n in ARKIT] + _MOTION_UNITS
-            ),
-        }.items():
-            # What no rig, person or prior brings is in no state.
-            kept = name not in _CONSTANTS
-            self.register_buffer(name, value.double() if value.is_floating_point() else value, persistent=kept)
-
-    def start(self) -> WebcamState:
-        """The state before the first frame, all zeros."""
-        return self.layout.start()
-
     def step(
         self,
         state: WebcamState,
@@ -251,17 +127,12 @@ class WebcamSolver(nn.Module):
             controls: what the user asks for.
             size: width and height of the picture, pixels; the camera is assumed from it.
         """
-        tensors = [getattr(reading, name).detach().float() for name in READ_BY_NETWORKS]
+        tensors = [getattr(reading, name).detach().float() for name in READ_FOR_SOLVER]
         pixels = torch.tensor([float(n) for n in size])
         with torch.inference_mode():
-            given = (
-                *tensors,
-                pixels,
-                torch.tensor(float(interval)),
-                (controls or WebcamControls()).tensor(),
-                state.pack(),
-            )
-            return self.layout.unpack(self(*given).clone())
+            asked = (controls or WebcamControls()).tensor()
+            after = self(*tensors, pixels, torch.tensor(float(interval)), asked, state.pack())
+            return self.layout.unpack(after.clone())
 
     def forward(  # noqa: PLR0913  # the inputs of a graph are tensors by their names
         self,
@@ -273,8 +144,6 @@ class WebcamSolver(nn.Module):
         openness: Tensor,
         closed: Tensor,
         eye_visibility: Tensor,
-        points: Tensor,
-        point_deviation: Tensor,
         expression: Tensor,
         expression_deviation: Tensor,
         size: Tensor,
@@ -298,7 +167,6 @@ class WebcamSolver(nn.Module):
             torch.where(visible[:, None] & shows_face, rays, self.person.rest[:LANDMARKS, :2] * self.upright),
             torch.where(shows_face, trust, 1.0),
             _known(deviation.double(), 0.0).clamp(0, 1e3) / focal,
-            ((points.double() - centre) / focal, point_deviation.double() / focal),
             (expression.double(), expression_deviation.double()),
             iris_rays,
             EyesRead(openness.double(), closed.double(), eye_visibility.double()),
@@ -325,19 +193,13 @@ class WebcamSolver(nn.Module):
         unit = eyes / (points.rest[EYE_CORNERS[0]] - points.rest[EYE_CORNERS[1]]).norm()
         variance = (self.settings.noise * eyes).square() + (0.5 * frame.spread).square()
         precision = frame.trust.sqrt() / (variance + self.person.person_remainder * unit**2).sqrt()
-        surface = self._surface_seen(frame, before, (rotation, translation), eyes, precision)
         head = HeadState(one_side(before.shapes.minimum(upper)[None], self.signed), rotation[None], translation[None])
         dual = pad(torch.zeros_like(before.shapes), (0, 6))
         damping = pad(self.damping, (len(self.names), 0))
         damped = Quadratic(damping.diag()[None], torch.zeros_like(damping)[None])
         for _ in range(self.settings.steps):  # each begins where the one before ends
             of_weights = known if self.prior is None else known + self.prior.energy(head.weights)
-            if surface is None:
-                energy = self._linearised(points, head, frame.rays, precision).energy() + damped
-            else:
-                at = self._linearised(points, head, frame.rays, surface.landmarks)
-                there = surface.points.linearised(head, self.camera, surface.rays[None], surface.precision[None])
-                energy = at.energy_beside(there, surface.alike) + damped
+            energy = self._linearised(points, head, frame.rays, precision).energy() + damped
             energy = energy + energy_of_step(of_weights, head.weights)
             # A step with both sides free says which of two antagonists it is.
             tried, _ = split_step(energy, head, upper, dual, _SPLITTING_STEPS, quick=True)
@@ -419,22 +281,6 @@ class WebcamSolver(nn.Module):
         precision = torch.where(torch.isnan(values), 0.0, deviation.square().reciprocal())
         pulled = precision * _known(values, 0.0)
         return Quadratic(((self.to_arkit.T * precision) @ self.to_arkit)[None], -(pulled @ self.to_arkit)[None])
-
-    def _surface_seen(
-        self, frame: _Frame, before: WebcamState, pose: tuple[Tensor, Tensor], eyes: Tensor, landmarks: Tensor
-    ) -> _SurfaceSeen | None:
-        """The surface's points of a frame, and how surely they and the landmarks are known, (68,), with them."""
-        if self.surface is None:
-            return None
-        points, (rays, spread) = self.surface.points(before.person), frame.points
-        known = ~torch.isnan(rays).any(1) & (spread < _FARTHEST_OFF)
-        counts = torch.where(known, points.facing(pose[0][None], pose[1][None])[0], 0.0).sqrt()
-        off = torch.where(known, spread, 1.0).square() + (self.settings.noise * eyes).square()
-        apart = (self.person.rest[EYE_CORNERS[0]] - self.person.rest[EYE_CORNERS[1]]).norm()
-        off = (off + self.surface.remainder * (eyes / apart).square()).sqrt()
-        own, alike = alike_errors(self.surface.modes, torch.cat([frame.trust.sqrt(), counts])[None])
-        seen = torch.where(known[:, None], rays, 0.0), counts / (own[0, LANDMARKS:] * off)
-        return _SurfaceSeen(points, *seen, landmarks / own[0, :LANDMARKS], alike)
 
     def _linearised(self, points: FacePoints, head: HeadState, rays: Tensor, precision: Tensor) -> Linearised:
         rows = points.chosen(head.weights, head.rotation, head.translation, self.camera)

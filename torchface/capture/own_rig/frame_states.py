@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from torch import Tensor
 
 from torchface.capture.energy import Quadratic
-from torchface.capture.own_rig.gauss_newton import ErrorModes, HeadState
+from torchface.capture.own_rig.gauss_newton import HeadState
 from torchface.capture.own_rig.state_estimate import Expectation, StateEstimate
 from torchface.errors import ValueRangeError
 
@@ -94,8 +94,6 @@ class FrameTerms:
         precision: of each, one over its standard deviation, 0 where not seen, (B,68).
         rotation, translation: the tracked pose, (B,3,3) and (B,3).
         expected: what is known before the frames are seen.
-        points, point_precision: of the surface, likewise, (B,P,2) and (B,P); none if absent.
-        alike: what errors of landmarks and points have in common.
         read: what readings say of the weights (B,N) themselves; nothing if absent.
     """
 
@@ -104,14 +102,10 @@ class FrameTerms:
     rotation: Tensor
     translation: Tensor
     expected: Expectation
-    points: Tensor | None = None
-    point_precision: Tensor | None = None
-    alike: ErrorModes | None = None
     read: Quadratic | None = None
 
     def tensors(self) -> tuple[Tensor, ...]:
         mean = self.expected.mean
         terms = (self.landmarks, self.precision, self.rotation, self.translation, self.expected.information)
         read = () if self.read is None else (self.read.H, self.read.f)
-        more = (x for x in (self.points, self.point_precision) if x is not None)
-        return (*terms, mean.weights, mean.rotation, mean.translation, *more, *read)
+        return (*terms, mean.weights, mean.rotation, mean.translation, *read)

@@ -101,45 +101,6 @@ class Linearised:
         J, r = self.jacobian.flatten(1, 2), self.residual.flatten(1)
         return Quadratic(J.transpose(1, 2) @ J, (r[:, None] @ J)[:, 0])
 
-    def energy_beside(self, points: Linearised, alike: ErrorModes) -> Quadratic:
-        """The energy of these landmarks and of points, which may be in single precision, less what errors share."""
-        other, count = points.energy(), self.residual.shape[1]
-        shared = alike.shared([(self, alike.modes[:, :count]), (points, alike.modes[:, count:])])
-        return self.energy() + Quadratic(other.H.to(shared.H), other.f.to(shared.f)) + shared
-
-
-@dataclass(frozen=True, eq=False)
-class ErrorModes:
-    r"""What the errors of L landmarks have in common, in units of what each errs by itself.
-
-    The errors' covariance, whitened by the independent part, is :math:`I + U U^\top`, the same for x and y. Its inverse
-    is :math:`I - U (I + U^\top U)^{-1} U^\top`, so that modes that many landmarks share count once.
-
-    Args:
-        modes: U, (B,L,M).
-        inner: :math:`(I + U^\top U)^{-1}`, (B,M,M).
-
-    Source: Woodbury 1950.
-    """
-
-    modes: Tensor
-    inner: Tensor
-
-    def shared(self, parts: list[tuple[Linearised, Tensor]]) -> Quadratic:
-        """What to add to the energy of independent errors, of a step (B,N+6); it is negative.
-
-        Args:
-            parts: landmarks with their rows of the modes, (B,L,M) in sum.
-        """
-        residual = jacobian = torch.zeros(1, dtype=self.modes.dtype, device=self.modes.device)
-        for at, modes in parts:
-            across = modes.to(at.jacobian).transpose(1, 2)
-            residual = residual + (across @ at.residual).to(residual)  # (B,M,2)
-            jacobian = jacobian + (across @ at.jacobian.flatten(2)).to(jacobian)  # (B,M,2(N+6))
-        scaled = (self.inner @ jacobian).unflatten(2, (2, -1)).flatten(1, 2)
-        jacobian = jacobian.unflatten(2, (2, -1)).flatten(1, 2)
-        return Quadratic(-(jacobian.transpose(1, 2) @ scaled), -(residual.flatten(1)[:, None] @ scaled)[:, 0])
-
 
 def linearise(
     points: FacePoints,

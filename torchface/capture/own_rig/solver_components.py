@@ -11,11 +11,9 @@ from typing import Any, Self
 import torch
 from torch import Tensor, nn
 
-from torchface.attachment import Attachment
 from torchface.capture.antagonist_shapes import signed_quantities
 from torchface.capture.own_rig.face_points import JAW, LANDMARKS, FacePoints, make_room_for_points
 from torchface.capture.own_rig.landmark_offsets import LandmarkOffsets, shifted_points
-from torchface.capture.own_rig.surface_points import FaceSurfacePoints, alike_over, smooth_modes
 from torchface.capture.own_rig.video_settings import VideoSettings
 from torchface.capture.own_rig.weight_walk import relative_trust
 from torchface.capture.priors import AdaptedDynamicsPrior, DynamicsPrior, ReciprocalPrior, ShapePrior
@@ -23,7 +21,6 @@ from torchface.correctives.activation import CorrectiveActivation
 from torchface.correctives.corrective_shapes import definitions_from_records
 from torchface.errors import FileFormatError, NameMismatchError, ShapeError, ValueRangeError
 from torchface.files.documents import Value
-from torchface.optim.prepared_tensors import Prepared
 from torchface.rig import BlendshapeRig
 
 CONTOUR_WEIGHT = 0.5
@@ -38,7 +35,6 @@ INITIAL_WEIGHT, DEFAULT_WEIGHT_STEP = 1.0, 0.1
 _LIDS, _LID_MOTION = re.compile(r"eye_?(blink|wide|squint)", re.IGNORECASE), 2.0
 
 _POINTS = ("rest", "basis", "rows", "valid", "side")
-_SURFACE = ("rest", "basis", "normals", "corrective_basis")
 _PRIORS: dict[str, type[ShapePrior]] = {"shape_prior": ShapePrior, "reciprocal_prior": ReciprocalPrior}
 _DYNAMICS: dict[str, type[DynamicsPrior] | type[AdaptedDynamicsPrior]] = {
     "dynamics_prior": DynamicsPrior,
@@ -57,10 +53,6 @@ class VideoSolverParts(nn.Module):
     valid: Tensor
     side: Tensor
     corrective_basis: Tensor | None
-    surface_rest: Tensor | None
-    surface_basis: Tensor | None
-    surface_normals: Tensor | None
-    surface_corrective_basis: Tensor | None
     signed: Tensor
     intrinsics: Tensor
     lower: Tensor
@@ -81,7 +73,6 @@ class VideoSolverParts(nn.Module):
         dynamics: DynamicsPrior | AdaptedDynamicsPrior | None = None,
         settings: VideoSettings | None = None,
         landmark_weights: Tensor | None = None,
-        surface: Attachment | None = None,
     ) -> None:
         super().__init__()
         settings = settings or VideoSettings()
@@ -96,13 +87,12 @@ class VideoSolverParts(nn.Module):
             if learned is not None:
                 learned.require(rig.names)
         points = FacePoints.of(rig, marks, slides=settings.contour_slide < 1)
-        found = None if surface is None else FaceSurfacePoints.of(rig, surface)
-        self._hold(rig.names, (points, found), intrinsics.detach(), weights, prior, dynamics, settings)
+        self._hold(rig.names, points, intrinsics.detach(), weights, prior, dynamics, settings)
 
     def _hold(
         self,
         names: Sequence[str],
-        seen: tuple[FacePoints, FaceSurfacePoints | None],
+        points: FacePoints,
         intrinsics: Tensor,
         landmark_weights: Tensor,
         prior: ShapePrior | None,
@@ -112,15 +102,9 @@ class VideoSolverParts(nn.Module):
         self.names: tuple[str, ...] = tuple(names)
         self.prior, self.dynamics = prior, dynamics
         self._settings = settings
-        points, surface = seen
         like = points.rest
         for name in _POINTS:
             self.register_buffer(name, getattr(points, name).detach())
-        for name in _SURFACE:
-            value = None if surface is None else getattr(surface, name)
-            # Products of thousands of rows take half the time in single precision, and pixels need no more.
-            self.register_buffer(f"surface_{name}", value.float() if name == "basis" and value is not None else value)
-        self._modes: Prepared[Tensor] = Prepared()
         self.activation = points.activation
         self.register_buffer("corrective_basis", points.corrective_basis)
         self.register_buffer("intrinsics", intrinsics.to(like, copy=True))
@@ -159,26 +143,6 @@ class VideoSolverParts(nn.Module):
         return FacePoints(*parts, self.activation, more)
 
     @property
-    def surface(self) -> FaceSurfacePoints | None:
-        """The points beside the 68 landmarks, float64; None where there are none."""
-        rest, normals, more = (
-            None if x is None else x.double()
-            for x in (self.surface_rest, self.surface_normals, self.surface_corrective_basis)
-        )
-        basis = self.surface_basis
-        if rest is None or basis is None or normals is None:
-            return None
-        return FaceSurfacePoints(rest, basis, normals, None if more is None else self.activation, more)
-
-    @property
-    def error_modes(self) -> Tensor:
-        """What errors of the landmarks and the surface's points have in common, (68+P,M); see ``smooth_modes``."""
-        marks, surface = self.rest[:LANDMARKS].detach().double(), self.surface
-        places = marks if surface is None else torch.cat([marks, surface.rest.detach()])
-
-        return self._modes.get((places,), lambda: self.settings.alike**0.5 * smooth_modes(places, alike_over(places)))
-
-    @property
     def walks(self) -> bool:
         """Whether weights are expected near those of the frame before, without a dynamics prior."""
         return self.dynamics is None and self.settings.motion > 0
@@ -188,23 +152,14 @@ class VideoSolverParts(nn.Module):
         made = copy.copy(self)
         made._buffers = dict(self._buffers)
         points = shifted_points(self.points, self.names, offsets.millimetres)
-        made.rest, made.basis, made._modes = points.rest, points.basis, Prepared()
+        made.rest, made.basis = points.rest, points.basis
         made._settings = replace(self.settings, relative_noise=offsets.noise)
         return made
 
     def with_settings(self, settings: VideoSettings) -> Self:
         """The same solver with other weights of terms; those of sparsity, ridge and motion stay."""
         made = copy.copy(self)
-        made._settings, made._modes = settings, Prepared()
-        return made
-
-    def with_surface_moved(self, offsets: Tensor) -> Self:
-        """The same solver with the surface's points (P,3) millimetres further."""
-        if self.surface_rest is None:
-            raise ShapeError("surface: found a solver without points of a surface, expected some")
-        made = copy.copy(self)
-        made._buffers, made._modes = dict(self._buffers), Prepared()
-        made.surface_rest = self.surface_rest + offsets.to(self.surface_rest)
+        made._settings = settings
         return made
 
     def shape_confidence(self, trust: Tensor) -> Tensor:
@@ -230,7 +185,6 @@ class VideoSolverParts(nn.Module):
             "settings": asdict(self.settings),
             "prior": _described(self.prior, _PRIORS),
             "dynamics": _described(self.dynamics, _DYNAMICS),
-            **({} if self.surface_rest is None else {"surface": len(self.surface_rest)}),
             **({} if self.activation is None else {"correctives": self.activation.records()}),
         }
 
@@ -264,24 +218,8 @@ class VideoSolverParts(nn.Module):
             CorrectiveActivation(definitions, names) if definitions else None,
             torch.zeros(count, 3, len(definitions), dtype=torch.float64) if definitions else None,
         )
-        surface = None
-        if "surface" in config:
-            sites = values["surface"].whole(1)
-            if sites > _MAX_POINTS:
-                raise FileFormatError(
-                    f"video solver: found {sites} points of the surface, expected {_MAX_POINTS} at most"
-                )
-            rest = torch.zeros(sites, 3, dtype=torch.float64)
-            more = points.corrective_basis
-            surface = FaceSurfacePoints(
-                rest,
-                rest.new_zeros(sites, 3, len(names)),
-                torch.zeros_like(rest),
-                points.activation,
-                None if more is None else rest.new_zeros(sites, 3, more.shape[2]),
-            )
         K, weights = torch.zeros(3, 3), torch.zeros(LANDMARKS)
-        self._hold(names, (points, surface), K, weights, prior, dynamics, VideoSettings(**settings))
+        self._hold(names, points, K, weights, prior, dynamics, VideoSettings(**settings))
         return self
 
     def check_state(self) -> None:

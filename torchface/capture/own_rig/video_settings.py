@@ -35,8 +35,6 @@ class VideoSettings:
         pose_trust: :math:`\kappa`, what the tracked pose is worth beside the frame's own landmarks.
         contour_slide: how much an error along the contour counts beside one across it, 0 to 1. At 1 contour landmarks
             are the vertices themselves.
-        alike: share of the errors' variance that neighbours have in common, where points of the surface are found
-            beside the landmarks; over a third of the eyes' distance.
         motion: how far a weight wanders in a second, standard deviation; lids go further. Without a dynamics prior each
             frame's weights are then a step of that random walk from the last frame's. 0 solves frames apart.
         interval: seconds from frame to frame where none are given.
@@ -58,7 +56,6 @@ class VideoSettings:
     dynamics_strength: float = 1.0
     pose_trust: float = 0.0
     contour_slide: float = 0.3
-    alike: float = 0.5
     motion: float = 0.0
     interval: float = 1 / 30
     tolerance: float = 3e-3
@@ -69,8 +66,7 @@ class VideoSettings:
             checked_number(name, getattr(self, name), 0.0, LARGEST_WEIGHT)
         for name in ("pixel_noise", "dynamics_strength", "tolerance", "interval"):
             checked_number(name, getattr(self, name), 0.0, LARGEST_WEIGHT, above=True)
-        for name in ("contour_slide", "alike"):
-            checked_number(name, getattr(self, name), 0.0, 1.0)
+        checked_number("contour_slide", self.contour_slide, 0.0, 1.0)
         checked_count("steps", self.steps, 1)
 
     @classmethod

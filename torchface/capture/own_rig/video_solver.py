@@ -4,36 +4,26 @@ from __future__ import annotations
 
 import torch
 from torch import Tensor
-from torch.nn.functional import pad
 
-from torchface.capture.antagonist_shapes import one_side, weaker_sides
-from torchface.capture.energy import Quadratic
+from torchface.capture.antagonist_shapes import one_side
 from torchface.capture.own_rig.face_measurements import FaceMeasurements
 from torchface.capture.own_rig.face_points import LANDMARKS
+from torchface.capture.own_rig.frame_solver import FrameSolver
 from torchface.capture.own_rig.frame_states import FrameTerms, VideoSolution, VideoState
-from torchface.capture.own_rig.gauss_newton import (
-    SLIDING_STEPS,
-    HeadState,
-    box_step,
-    energy_of_step,
-    linearise,
-)
-from torchface.capture.own_rig.solver_components import DEFAULT_WEIGHT_STEP, VideoSolverParts, check_not_negative
+from torchface.capture.own_rig.gauss_newton import HeadState
+from torchface.capture.own_rig.solver_components import DEFAULT_WEIGHT_STEP, check_not_negative
 from torchface.capture.own_rig.state_estimate import Expectation, StateEstimate
-from torchface.capture.own_rig.surface_points import alike_errors
 from torchface.capture.own_rig.weight_walk import faded, frame_intervals, unseen_time, walk_information
 from torchface.errors import ShapeError, ValueRangeError
 from torchface.geometry.cameras.pnp import solve_pnp
 from torchface.optim.data_dependent import data_dependent
-from torchface.optim.implicit import attach_gradients
 from torchface.progress import Progress, silent
 
 _MIN_LANDMARKS = 6
 _NEAR = 0.5  # of the eyes' distance
-_COARSEST, _FINEST = 1e-6, 1e-12  # residuals of a step's program
 
 
-class VideoSolver(VideoSolverParts):
+class VideoSolver(FrameSolver):
     r"""Solves 68 landmarks in one camera's frames for blendshape weights, and the head's pose with them.
 
     .. math::
@@ -48,13 +38,14 @@ class VideoSolver(VideoSolverParts):
 
     The term before the last is the dynamics prior's: x are weights and pose, m where the last frames lead to and V the
     variance of that. The thesis divides by V alone, as if the last frames' weights were true. They have a
-    covariance P, which a Kalman filter of the landmarks carries on; it tells directions in which the landmarks show
-    little, such as depth, from those that they show well, and so averages over the more frames the less one tells.
-    Without a dynamics prior m is the last frame's weights and V the variance of a random walk, where
-    ``settings.motion`` says how far weights wander; otherwise each frame is solved on its own.
+    covariance P, which a Kalman filter of the landmarks carries on; it is large in directions in which the landmarks
+    show little, such as depth, so these are averaged over more frames. Without a dynamics prior m is the last frame's
+    weights and V the variance of a random walk, where ``settings.motion`` says how far weights wander; otherwise each
+    frame is solved on its own.
 
     A pose tracked from stable landmarks is noisy, and biased by what the face does, so it is where the search starts,
-    no more, unless ``pose_trust`` is positive: D is the distance from it in what the frame's landmarks tell of a pose.
+    no more, unless ``pose_trust`` is positive: D is the distance from it in units of what the frame's landmarks say of
+    a pose.
 
     Args:
         rig: N shapes, of the person in the image.
@@ -64,7 +55,6 @@ class VideoSolver(VideoSolverParts):
         dynamics: how weights go on.
         settings: what the terms weigh, and when steps end; :math:`\sigma` grows with the face where they say so.
         landmark_weights: :math:`c`, (68,); 1 for inner landmarks, half for those of the contour if absent.
-        surface: where on the rig's neutral mesh further points lie that are found in the images.
 
     Raises:
         NameMismatchError: a prior was learned for other shapes than the rig has.
@@ -163,7 +153,7 @@ class VideoSolver(VideoSolverParts):
         states, state = [], self.start()
         first = int(enough.nonzero()[0, 0])
         intervals = frame_intervals(seconds, count, self.settings.interval)
-        # A frame leans on the one before, so frames come one after the other.
+        # A frame is solved from the one before.
         for t in range(first, count):
             turn, place, sure = (None if x is None else x[t] for x in (rotation, translation, confidence))
             more = None if measured is None else measured.of_frames(torch.tensor([t], device=landmarks.device))
@@ -211,9 +201,9 @@ class VideoSolver(VideoSolverParts):
         self._check_measured(measured)
         pixels = landmarks[None].double()
         rotation, translation, confidence = (None if x is None else x.double() for x in given)
-        seen = torch.isfinite(pixels).all(-1)
         # Filtered landmarks go on for some frames after a face was lost, with a confidence of 0.
-        trusted = int((self.landmark_trust(pixels, confidence) > 0).sum())
+        trust = self.landmark_trust(pixels, confidence)
+        trusted = int((trust > 0).sum())
         enough = trusted >= _MIN_LANDMARKS
         if state.head is None and not enough:
             raise ValueRangeError(
@@ -221,45 +211,29 @@ class VideoSolver(VideoSolverParts):
             )
         if rotation is None or translation is None or not _finite(rotation, translation):
             rotation, translation = self._pose_of(state, pixels, confidence, enough)
-        trust = self.landmark_trust(pixels, confidence) * enough
         interval = self.settings.interval if interval is None else interval
-        evidence = self.shape_confidence(trust)
+        evidence = self.shape_confidence(trust * enough)
         hidden = unseen_time(state.hidden, evidence, interval)
         expected = self._expected(state, rotation, translation, evidence, hidden, interval)
-        at = HeadState(expected.mean.weights, rotation, translation) if state.head is None else state.head
-        noise = self.noise(at.rotation, at.translation)
-        off = noise[:, None] if measured.deviation is None else _both(noise[:, None], measured.deviation)
-        precision = self._precision(seen if enough else torch.zeros_like(seen), confidence, off)
-        points, sure, alike = None, None, None
-        if enough and measured.points is not None and measured.point_deviation is not None and self.surface is not None:
-            points, counts, spread = self._surface_seen(measured.points, measured.point_deviation, at, noise[:, None])
-            own, alike = alike_errors(self.error_modes, torch.cat([(precision * off).detach(), counts], dim=1))
-            precision, sure = precision / own[:, :LANDMARKS], counts / (own[:, LANDMARKS:] * spread)
-        read = None if measured.weights is None or not enough else measured.weights.energy()
-        pixels = pixels.nan_to_num(0.0)
-        terms = FrameTerms(pixels, precision, rotation, translation, expected, points, sure, alike, read)
-        if state.head is not None and not enough:
-            weights = expected.mean.weights if self.walks else state.head.weights
-            held = HeadState(weights, rotation, translation)
-            return self._handed_on(state, terms, held, self.chosen(held), enough, hidden)
-        # After a gap the tracked pose is nearer than where the head was left.
-        near = (
-            expected.mean
-            if state.solved and state.estimate is not None
-            else HeadState(expected.mean.weights, rotation, translation)
-        )
-        begin = expected.mean.weights if state.head is None else state.head.weights
-        start = HeadState(one_side(begin.clamp(0, 1), self.signed), near.rotation, near.translation).mapped(
-            torch.detach
-        )
-        return self._handed_on(state, terms, *self.solve(terms, start), enough, hidden)
-
-    def _handed_on(
-        self, state: VideoState, terms: FrameTerms, head: HeadState, rows: Tensor, enough: bool, hidden: Tensor
-    ) -> VideoState:
+        tracked = HeadState(expected.mean.weights, rotation, translation)
+        last = state.head or tracked
+        noise = self.noise(last.rotation, last.translation)[:, None]
+        if measured.deviation is not None:
+            noise = (noise.square() + measured.deviation.double().square()).sqrt()
+        precision = self.precision(torch.isfinite(pixels).all(-1) & enough, confidence, noise)
+        read = measured.weights.energy() if enough and measured.weights is not None else None
+        terms = FrameTerms(pixels.nan_to_num(0.0), precision, rotation, translation, expected, read)
+        if enough:
+            # After a gap the tracked pose is nearer than where the head was left.
+            near = expected.mean if state.solved and state.estimate is not None else tracked
+            start = HeadState(one_side(last.weights.clamp(0, 1), self.signed), near.rotation, near.translation)
+            head, rows = self.solve(terms, start.mapped(torch.detach))
+        else:
+            head = tracked if self.walks else HeadState(last.weights, rotation, translation)
+            rows = self.chosen(head)
         if self.dynamics is None:
             return VideoState(head, None, state.window, enough, hidden)
-        estimate = terms.expected.updated(head, self.seen(terms, head, rows))
+        estimate = expected.updated(head, self.seen(terms, head, rows))
         window = torch.cat([state.window, head.weights[:, None]], dim=1)[:, -self.dynamics.window :]
         return VideoState(head, estimate, window, enough, hidden)
 
@@ -303,116 +277,6 @@ class VideoSolver(VideoSolverParts):
             steps, variance = mean.double() - state.window[:, -1], variance.double() / self.settings.dynamics_strength
         return estimate.predicted(steps, variance, self.motion_variance.double())
 
-    def solve(self, terms: FrameTerms, start: HeadState) -> tuple[HeadState, Tensor]:
-        """Weights (B,N) in [0,1] and poses of B frames on their own, from a start, float64.
-
-        Returns:
-            The states, and which of the rig's points each landmark is in them, (B,68).
-        """
-        exactness, box = (
-            min(max(0.1 * self.settings.tolerance, _FINEST), _COARSEST),
-            (self.lower.double(), self.upper.double()),
-        )
-        # Steps are many and small; what tensors keep for derivatives is a fifth of their cost.
-        with torch.inference_mode():
-            head, rows = start, self.chosen(start)
-            for iteration in range(self.settings.steps):
-                if 0 < iteration < SLIDING_STEPS:
-                    rows = self.chosen(head)
-                # The first step says which of two antagonists it is: in the next the other is at rest.
-                rest = weaker_sides(head.weights, self.signed) & (iteration > 0)
-                before, head = head, box_step(self.energy(terms, head, rows), head, *box, exactness, rest)
-                if iteration > 0:
-                    head = HeadState(one_side(head.weights, self.signed), head.rotation, head.translation)
-                if iteration > 0 and float((head.weights - before.weights).abs().max()) < self.settings.tolerance:
-                    break
-        # Copies, as autograd refuses tensors that were made without it.
-        head, rows = head.mapped(torch.clone), rows.clone()
-        if torch.is_grad_enabled() and any(x.requires_grad for x in terms.tensors()):
-            head = self._attached(terms, head, rows)
-        return head, rows
-
-    def chosen(self, head: HeadState) -> Tensor:
-        """Which of the rig's points each landmark is in B states, (B,68); see ``FacePoints.chosen``."""
-        return self.points.chosen(head.weights, head.rotation, head.translation, self.intrinsics.double())
-
-    def energy(self, terms: FrameTerms, head: HeadState, rows: Tensor) -> Quadratic:
-        """All terms linearised at a state, of a step from there, (B,N+6)."""
-        ridge = self.ridge.double()
-        penalty = Quadratic(ridge.diag(), self.l1_penalty.double() + ridge * pad(head.weights, (0, 6)))
-        total = self.seen(terms, head, rows) + terms.expected.energy(head) + penalty
-        return total if self.prior is None else total + energy_of_step(self.prior.energy(head.weights), head.weights)
-
-    def seen(self, terms: FrameTerms, head: HeadState, rows: Tensor) -> Quadratic:
-        """Landmarks and tracked poses linearised at a state, of a step from there, (B,N+6)."""
-        K, slide = self.intrinsics.double(), self.settings.contour_slide
-        at = linearise(self.points, head, rows, K, terms.landmarks, terms.precision, slide)
-        surface = self.surface
-        if terms.points is None or terms.point_precision is None or terms.alike is None or surface is None:
-            data = at.energy()
-        else:
-            points = surface.linearised(head, K, terms.points, terms.point_precision)
-            data = at.energy_beside(points, terms.alike)
-        if terms.read is not None:
-            data = data + energy_of_step(terms.read, head.weights)
-        if self.settings.pose_trust == 0:
-            return data
-        by_motion = at.jacobian[..., -6:].flatten(1, 2)
-        precision = self.settings.pose_trust * (by_motion.transpose(1, 2) @ by_motion)
-        off = head.step_from(HeadState(head.weights, terms.rotation, terms.translation))[:, -6:]
-        shapes = len(self.names)
-        H = pad(precision, (shapes, 0, shapes, 0))
-        return data + Quadratic(H, pad((precision @ off[..., None])[..., 0], (shapes, 0)))
-
-    def _attached(self, terms: FrameTerms, head: HeadState, rows: Tensor) -> HeadState:
-        """The converged state as a differentiable function of the terms."""
-
-        def gradient(x: Tensor) -> Tensor:
-            return self.energy(terms, head.moved(x[:, :-6], x[:, -6:]), rows).f
-
-        x = pad(head.weights, (0, 6))
-        x = attach_gradients(gradient, x, (x > self.lower) & (x < self.upper))
-        return head.moved(x[:, :-6], x[:, -6:])
-
-    def reprojection_errors(self, landmarks: Tensor, weights: Tensor, rotation: Tensor, translation: Tensor) -> Tensor:
-        """Root mean square distance of seen landmarks (T,68,2) to the rig's, (T,), pixels; NaN where none is seen."""
-        weights, rotation, translation = (x.detach().double() for x in (weights, rotation, translation))
-        points, K = self.points, self.intrinsics.double()
-        rows = points.chosen(weights, rotation, translation, K)
-        placed = points.at(weights)[torch.arange(len(rows), device=rows.device)[:, None], rows]
-        image = (placed @ rotation.transpose(-1, -2) + translation[:, None]) @ K.T
-        squared = (image[..., :2] / image[..., 2:] - landmarks.detach().double()).square().sum(-1)
-        return squared.nanmean(1).sqrt().to(landmarks.dtype)
-
-    def noise(self, rotation: Tensor, translation: Tensor) -> Tensor:
-        """The standard deviation of landmarks of heads at poses (B,3,3), (B,3), (B,), pixels."""
-        apart = self.points.eyes_distance(rotation, translation, self.intrinsics.double())
-        return (self.settings.relative_noise * apart).clamp(min=self.settings.pixel_noise)
-
-    def _precision(self, seen: Tensor, confidence: Tensor | None, noise: Tensor) -> Tensor:
-        weights = self.landmark_weights.double() * seen
-        if confidence is not None:
-            weights = weights * confidence
-        # The root's slope is infinite at 0.
-        return torch.where(weights > 0, weights, 1.0).sqrt() * (weights > 0) / noise
-
-    def _surface_seen(
-        self, points: Tensor, deviation: Tensor, head: HeadState, noise: Tensor
-    ) -> tuple[Tensor, Tensor, Tensor]:
-        """A frame's points of the surface (1,P,2), finite, the roots of what they count at about a pose, (1,P), and
-        their deviations, (1,P), pixels."""
-        points, deviation = points.double(), deviation.double()
-        known = torch.isfinite(points).all(-1) & torch.isfinite(deviation)
-        with torch.no_grad():
-            facing = self.surface.facing(head.rotation, head.translation)  # type: ignore[union-attr]
-        counts = torch.where(known, facing, 0.0).sqrt()
-        return torch.where(known[..., None], points, 0.0), counts, _both(noise, torch.where(known, deviation, 1.0))
-
-    def landmark_trust(self, landmarks: Tensor, confidence: Tensor | None) -> Tensor:
-        """How much each of landmarks (B,68,2) counts beside one that is surely seen, (B,68) float64."""
-        seen = torch.isfinite(landmarks).all(-1).double()
-        return seen if confidence is None else seen * confidence.detach().double().clamp(0, 1)
-
     def _near(self, head: HeadState, landmarks: Tensor) -> bool:
         """Whether most landmarks (1,68,2) are within half the eyes' distance of where a pose shows the rig at rest."""
         K = self.intrinsics.double()
@@ -434,10 +298,8 @@ class VideoSolver(VideoSolverParts):
         return pose.rotation, pose.translation
 
     def _check_measured(self, measured: FaceMeasurements) -> None:
-        points = 0 if self.surface_rest is None else len(self.surface_rest)
         found = {
             "deviation": (measured.deviation, (1, LANDMARKS)),
-            "points": (measured.points, (1, points, 2)),
             "weights": (None if measured.weights is None else measured.weights.rows[:1], (1, len(self.names))),
         }
         for name, (value, expected) in found.items():
@@ -461,11 +323,6 @@ class VideoSolver(VideoSolverParts):
         if confidence is not None:
             check_not_negative("confidence", confidence)
         return count
-
-
-def _both(noise: Tensor, deviation: Tensor) -> Tensor:
-    """The deviation of a sum of two independent errors."""
-    return (noise.square() + deviation.double().square()).sqrt()
 
 
 def _finite(*tensors: Tensor) -> bool:

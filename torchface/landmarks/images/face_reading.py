@@ -11,11 +11,11 @@ from torch import Tensor
 from torchface.landmarks.images.ibug_68 import COUNT, box_around
 from torchface.shape_names import ARKIT
 
-READ_BY_NETWORKS = (
-    "landmarks", "deviation", "visibility", "presence", "iris", "openness", "closed", "eye_visibility", "points",
-    "point_deviation", "expression", "expression_deviation",
+READ_FOR_SOLVER = (
+    "landmarks", "deviation", "visibility", "presence", "iris", "openness", "closed", "eye_visibility", "expression",
+    "expression_deviation",
 )  # fmt: skip
-"""The parts of a reading that networks give, in the order in which a webcam's solver takes them."""
+"""The parts of a reading that a webcam's solver takes, in its order."""
 
 HALF_CONFIDENCE = 0.02
 """The deviation, in sides of the face's box, of a confidence of one half."""

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from torchface import __version__
 from torchface.capture.anybody import WebcamControls
 from torchface.capture.anybody.webcam_state import CONTROLS, POSES
-from torchface.landmarks.images.face_reading import READ_BY_NETWORKS
+from torchface.landmarks.images.face_reading import READ_FOR_SOLVER
 from torchface.landmarks.images.frame_reader.face_reader import STATE, FaceReader
 from torchface.landmarks.images.frame_reader.picture_pieces import picture_size
 from torchface.onnx.exported_model import exported_model, half_stored
@@ -59,7 +59,7 @@ class WebcamGraph(nn.Module):
         controls = controls.clamp(min=0).minimum(torch.tensor(_HIGHEST))
         state = torch.where(torch.isfinite(state).all(), state, 0.0)
         reading, after = self.reader(image, interval, torch.where(controls[3] > 0, 0.0, state[:STATE]))
-        read = [getattr(reading, name) for name in READ_BY_NETWORKS]
+        read = [getattr(reading, name) for name in READ_FOR_SOLVER]
         answer = self.solver(*read, picture_size(image), interval, controls, state[STATE:])
         given = answer._asdict() | {name: getattr(reading, name) for name in ("landmarks", "iris", "presence")}
         given["next_state"] = torch.cat([after, answer.next_state])

@@ -12,12 +12,12 @@ from torch import Tensor, nn
 from torchface import __version__
 from torchface.capture.anybody import WebcamSolver
 from torchface.capture.anybody.webcam_state import CONTROLS, POSES
-from torchface.landmarks.images.face_reading import READ_BY_NETWORKS, FaceReading
+from torchface.landmarks.images.face_reading import READ_FOR_SOLVER, FaceReading
 from torchface.onnx.exported_model import exported_model
 from torchface.onnx.unrolled_operators import TRANSLATIONS
 from torchface.shape_names import ARKIT
 
-INPUTS = (*READ_BY_NETWORKS, "size", "interval", "controls", "state")
+INPUTS = (*READ_FOR_SOLVER, "size", "interval", "controls", "state")
 """A ``FaceReading``'s tensors, the picture's width and height (2,), seconds since the frame before (), ``CONTROLS``
 (5,) and the state (S,), zeros to start; all float32."""
 OUTPUTS = ("weights", "rotation", "translation", "gaze", "tracked", "calibrated", "error", "next_state")
@@ -66,10 +66,7 @@ def webcam_solver_model(solver: WebcamSolver) -> onnx.ModelProto:
     The metadata holds ``names`` (JSON list, of the weights), ``state`` (S), ``controls``, ``poses`` and ``version``.
     """
     reading = empty_reading()
-    if solver.surface is not None:
-        unseen = torch.full((len(solver.surface.rest), 2), torch.nan)
-        reading = replace(reading, points=unseen, point_deviation=unseen[:, 0] + torch.inf)
-    examples = [getattr(reading, name) for name in READ_BY_NETWORKS]
+    examples = [getattr(reading, name) for name in READ_FOR_SOLVER]
     examples += [torch.tensor([640.0, 480.0]), torch.tensor(1 / 30), torch.zeros(len(CONTROLS))]
     examples.append(torch.zeros(solver.layout.length))
     return exported_model(

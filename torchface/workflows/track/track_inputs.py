@@ -23,7 +23,6 @@ from torchface.modeling import HeadModel
 from torchface.number_checks import check_rate
 from torchface.rig import BlendshapeRig
 from torchface.workflows.named_heads import NamedHeads, load_head_model, matching
-from torchface.workflows.surface_sites import counted_sites
 from torchface.workflows.track.track_models import (
     DEFAULT_LANDMARKS,
     DEFAULT_PRIOR,
@@ -213,12 +212,12 @@ def solver_for(
 ) -> VideoSolver:
     """The solver of a rig, for landmarks that the models find, at a frame rate; see :meth:`TrackInputs.solver`."""
     settings = VideoSettings.of_found_landmarks(models.dynamics is not None, models.appearance is not None, fps)
-    surface, prior = counted_sites(rig, models.places), models.prior
+    prior = models.prior
     if motion is not None and models.dynamics is None:
         settings = replace(settings, motion=motion)
     if models.expected is not None:
         prior, settings = models.expected, replace(settings, sparsity=0.0)
-    return VideoSolver(rig, None, calibration.intrinsics, prior, models.dynamics, settings, surface=surface)
+    return VideoSolver(rig, None, calibration.intrinsics, prior, models.dynamics, settings)
 
 
 def _clip(video: Path | None, settings: TrackSettings) -> VideoFile:

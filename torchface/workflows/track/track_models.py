@@ -5,12 +5,12 @@ from __future__ import annotations
 import functools
 import re
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeVar
 
 import torch
-from torch import Tensor, nn
+from torch import nn
 
 from torchface import zoo
 from torchface.capture.priors import AdaptedDynamicsPrior, DynamicsPrior, ShapePrior, adapt_dynamics, unlearned
@@ -53,7 +53,6 @@ class TrackModels:
         unlearned: shapes of the rig that a prior says nothing of: they stay near rest.
         seeing: changes when what finds landmarks does.
         solving: changes when what solves does.
-        places: of the points that the finder finds beside the 68, on the performer's mean head, (P,3) millimetres.
     """
 
     finder: LandmarkFinder | None
@@ -63,7 +62,6 @@ class TrackModels:
     unlearned: tuple[str, ...] = ()
     seeing: str = ""
     solving: str = ""
-    places: Tensor = field(default_factory=lambda: torch.zeros(0, 3))
     expected: ShapePrior | None = None
 
 
@@ -108,7 +106,6 @@ def load_track_models(
             "seeing", finder=Path(landmarks) if named is None else named.source, appearance=_folder(appearance)
         ),
         content_key("solving", prior=learned, dynamics=_folder(dynamics), fps=fps),
-        torch.zeros(0, 3) if named is None else named.places,
         None if named is None or prior != DEFAULT_PRIOR else for_rig(named.expected, rig),
     )
 

@@ -109,7 +109,7 @@ def _track(inputs: TrackInputs, out: Path, filmed: bool, progress: Progress) -> 
         with _timed(seconds, "weights"):
             measured, sure = take_measurements(inputs, solver, reading), trust
             if measured is not None:
-                solver, sure = measuring_solver(solver, landmarks, reading, measured)
+                solver, sure = measuring_solver(solver, landmarks, reading)
             if eyes is not None:
                 measured, sure = with_eyes(inputs, solver, measured, eyes), eyes.agreed(sure)
             solution = new_solution(inputs, solver, landmarks, sure, times, progress, measured)

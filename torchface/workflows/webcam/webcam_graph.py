@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import replace
 
 import onnx
-import torch
 
 from torchface import zoo
 from torchface.capture.anybody import WebcamSettings, WebcamSolver
@@ -20,7 +19,6 @@ from torchface.progress import Progress, silent
 from torchface.synthetic.head.performer import performer
 from torchface.workflows.cached_graph import cached_graph
 from torchface.workflows.named_finders import expected_weights
-from torchface.workflows.surface_sites import counted_sites
 from torchface.workflows.track.track_models import DEFAULT_PRIOR, for_rig, load_priors
 
 __all__ = ["default_webcam_solver"]
@@ -87,11 +85,8 @@ def default_webcam_solver(settings: WebcamSettings | None = None) -> WebcamSolve
     if heads.landmarks is None:
         raise NameMismatchError(f"{HEADS}: found a HeadModel without landmarks, expected one with them")
     modes, network = heads.shape.modes[:, heads.landmarks], zoo.get_model(NETWORKS[1], LandmarkNetwork)
-    surface = counted_sites(rig, network.places)
-    if surface is not None:
-        modes = torch.cat([modes, surface.on(rig.neutral.faces, heads.shape.modes)], dim=1)
     settings, prior = settings or WebcamSettings(), load_priors(rig, DEFAULT_PRIOR, None).shapes
     expected = for_rig(expected_weights(network), rig)
     if expected is not None:
         prior, settings = expected, replace(settings, sparsity=0.0, prior_strength=1.0)
-    return WebcamSolver(rig, modes, prior, settings, surface)
+    return WebcamSolver(rig, modes, prior, settings)

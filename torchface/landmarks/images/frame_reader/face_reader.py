@@ -169,9 +169,9 @@ class FaceReader(nn.Module):
         anchor = torch.where(good & ~followed, relation(own, shown), anchor)
         after = torch.cat([torch.where(good, own, place), anchor, torch.stack(counts), size])
         face = read_eyes(image, looked, self.eyes)
-        nothing = dict.fromkeys(("landmarks", "iris", "openness", "closed", "points", "expression"), torch.nan)
+        nothing = dict.fromkeys(("landmarks", "iris", "openness", "closed", "expression"), torch.nan)
         nothing |= dict.fromkeys(("visibility", "presence", "eye_visibility"), 0.0)
-        nothing |= dict.fromkeys(("point_deviation", "expression_deviation"), torch.inf)
+        nothing["expression_deviation"] = torch.inf
         parts = {name: torch.where(good, getattr(face, name), value) for name, value in nothing.items()}
         return FaceReading(deviation=face.deviation, **parts), after
 
@@ -180,20 +180,18 @@ class FaceReader(nn.Module):
         network = self.landmarks
         found = network(cut_square(image, place, network.size, network.margin))
         pixel = place[2] * (network.margin / network.size)
-        marks, points = (from_square(one[0], place, network.size, network.margin) for one in (found[0], found.points))
+        marks = from_square(found[0][0], place, network.size, network.margin)
         parts = (
-            marks, pixel * found.deviation, found.visibility, found.presence, points, pixel * found.point_deviation,
-            found.expression, found.expression_deviation,
+            marks, pixel * found.deviation, found.visibility, found.presence, found.expression,
+            found.expression_deviation,
         )  # fmt: skip
         return torch.cat([part.flatten() for part in parts])
 
     def _unpacked(self, seen: Tensor) -> FaceReading:
-        points, shapes = self.landmarks.points, len(ARKIT)
-        parts = seen.split([2 * COUNT, COUNT, COUNT, 1, 2 * points, points, shapes, shapes])
+        parts = seen.split([2 * COUNT, COUNT, COUNT, 1, len(ARKIT), len(ARKIT)])
         return FaceReading(
-            parts[0].view(COUNT, 2), parts[1], parts[2], parts[3][0], points=parts[4].view(points, 2),
-            point_deviation=parts[5], expression=parts[6], expression_deviation=parts[7],
-        )  # fmt: skip
+            parts[0].view(COUNT, 2), *parts[1:3], parts[3][0], expression=parts[4], expression_deviation=parts[5]
+        )
 
 
 def _either(

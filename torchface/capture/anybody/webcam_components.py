@@ -1,0 +1,101 @@
+"""Components of the webcam's solver: what follows from the rig, people, the prior and ARKit's names, as buffers."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+from torchface.capture.antagonist_shapes import signed_quantities
+from torchface.capture.anybody.guided_gains import gain_groups
+from torchface.capture.anybody.person_landmarks import PersonLandmarks
+from torchface.capture.anybody.webcam_settings import WebcamSettings
+from torchface.capture.anybody.webcam_state import StateLayout, WebcamState
+from torchface.capture.own_rig.eye_geometry import LOOKS, arkit_names, openness_rows
+from torchface.capture.own_rig.face_points import JAW, LANDMARKS
+from torchface.capture.priors import ShapePrior
+from torchface.errors import NameMismatchError
+from torchface.rig import BlendshapeRig
+from torchface.shape_names import ARKIT, mapping
+
+_UPRIGHT = (1 / 600, -1 / 600)  # of a face some way off; the camera's y goes down
+_BLINK_UNIT = 0.25  # what counts as a weight of 1 in the filter: of blinks, which it must not smooth away,
+_MOTION_UNITS = [0.5] * 3 + [100.0] * 3  # and of the head's motion, radians and millimetres
+_LOOK_EYES = (0, 0, 1, 1, 0, 0, 1, 1)  # whose each of ``LOOKS`` is
+_DAMPING_ROTATION, _DAMPING_TRANSLATION = 0.5, 500.0  # radians and millimetres that a step of a pose may well be
+_CONTOUR_TRUST = 0.5  # how much a landmark of the contour counts beside an inner one
+_LIDS = ("eyeBlink", "eyeWide", "eyeSquint")
+_LID_MOTION = 3.0
+_CONSTANTS = ("signed", "arkit_signed", "landmark_weights", "camera", "look_eyes", "upright", "damping", "filter_units")
+
+
+class WebcamSolverParts(nn.Module):
+    """All that a webcam's solve computes with, as buffers and submodules; see ``WebcamSolver`` for the arguments."""
+
+    to_arkit: Tensor
+    influence: Tensor
+    open_rows: Tensor
+    usual_openness: Tensor
+    look_shapes: Tensor
+    look_eyes: Tensor
+    gain_shapes: Tensor
+    signed: Tensor
+    arkit_signed: Tensor
+    walk: Tensor
+    landmark_weights: Tensor
+    camera: Tensor
+    upright: Tensor
+    damping: Tensor
+    filter_units: Tensor
+
+    def __init__(
+        self,
+        rig: BlendshapeRig,
+        identity_modes: Tensor | None = None,
+        prior: ShapePrior | None = None,
+        settings: WebcamSettings | None = None,
+    ) -> None:
+        super().__init__()
+        self.settings = settings or WebcamSettings()
+        self.names: tuple[str, ...] = tuple(rig.names)
+        self.person = PersonLandmarks(rig, identity_modes, self.settings.coefficients)
+        if prior is not None:
+            prior.require(rig.names)
+        to_arkit = mapping(rig.names, ARKIT).double()
+        if not bool(to_arkit.any()):
+            raise NameMismatchError(
+                f"rig: found none of ARKit's shapes among {', '.join(rig.names[:5])}, expected some"
+            )
+        self.prior = None if prior is None else prior.prepared(self.settings.prior_strength)
+        self.layout = StateLayout(len(rig.names), self.settings.coefficients)
+        called = arkit_names(rig.names)
+        rest, basis = self.person.rest[:LANDMARKS], self.person.basis[:LANDMARKS]
+        rows, usual = openness_rows(rest, basis, called)
+        landmark_weights = torch.tensor([_CONTOUR_TRUST] * JAW + [1.0] * (LANDMARKS - JAW))
+        moved = basis.square().sum(1) * landmark_weights[:, None]
+        for name, value in {
+            "to_arkit": to_arkit,
+            # Share of each landmark in the evidence of each shape, (68,N).
+            "influence": moved / moved.sum(0).clamp(min=1e-6),
+            "open_rows": rows,
+            "usual_openness": usual,
+            "look_shapes": mapping(LOOKS, rig.names).double(),
+            "gain_shapes": gain_groups(rig.names),
+            "signed": signed_quantities(rig.names),
+            "arkit_signed": signed_quantities(ARKIT),
+            "walk": torch.tensor([(_LID_MOTION if n.startswith(_LIDS) else 1.0) for n in called]),
+            "landmark_weights": landmark_weights,
+            "camera": torch.eye(3),
+            "look_eyes": torch.tensor(_LOOK_EYES),
+            "upright": torch.tensor(_UPRIGHT),
+            "damping": torch.tensor([_DAMPING_ROTATION] * 3 + [_DAMPING_TRANSLATION] * 3).double() ** -2,
+            "filter_units": torch.tensor(
+                [_BLINK_UNIT if n.startswith("eyeBlink") else 1.0 for n in ARKIT] + _MOTION_UNITS
+            ),
+        }.items():
+            # What no rig, person or prior brings is in no state.
+            kept = name not in _CONSTANTS
+            self.register_buffer(name, value.double() if value.is_floating_point() else value, persistent=kept)
+
+    def start(self) -> WebcamState:
+        """The state before the first frame, all zeros."""
+        return self.layout.start()

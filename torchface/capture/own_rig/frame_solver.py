@@ -1,0 +1,117 @@
+"""Frame solver: the energy of frames on their own, and the weights and poses where it is least."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+from torch.nn.functional import pad
+
+from torchface.capture.antagonist_shapes import one_side, weaker_sides
+from torchface.capture.energy import Quadratic
+from torchface.capture.own_rig.frame_states import FrameTerms
+from torchface.capture.own_rig.gauss_newton import SLIDING_STEPS, HeadState, box_step, energy_of_step, linearise
+from torchface.capture.own_rig.solver_components import VideoSolverParts
+from torchface.optim.implicit import attach_gradients
+
+_COARSEST, _FINEST = 1e-6, 1e-12  # residuals of a step's program
+
+
+class FrameSolver(VideoSolverParts):
+    """The solve of B frames, each for itself, by Gauss and Newton; ``VideoSolver`` says what it minimises."""
+
+    def landmark_trust(self, landmarks: Tensor, confidence: Tensor | None) -> Tensor:
+        """How much each of landmarks (B,68,2) counts beside one that is surely seen, (B,68) float64."""
+        seen = torch.isfinite(landmarks).all(-1).double()
+        return seen if confidence is None else seen * confidence.detach().double().clamp(0, 1)
+
+    def noise(self, rotation: Tensor, translation: Tensor) -> Tensor:
+        """The standard deviation of landmarks of heads at poses (B,3,3), (B,3), (B,), pixels."""
+        apart = self.points.eyes_distance(rotation, translation, self.intrinsics.double())
+        return (self.settings.relative_noise * apart).clamp(min=self.settings.pixel_noise)
+
+    def precision(self, seen: Tensor, confidence: Tensor | None, noise: Tensor) -> Tensor:
+        """One over the standard deviation of each landmark, (B,68), 0 where not seen.
+
+        Args:
+            seen, confidence: of landmarks, (B,68).
+            noise: standard deviations of landmarks that count 1, (B,68) or (B,1), pixels.
+        """
+        weights = self.landmark_weights.double() * seen
+        if confidence is not None:
+            weights = weights * confidence
+        # The root's slope is infinite at 0.
+        return torch.where(weights > 0, weights, 1.0).sqrt() * (weights > 0) / noise
+
+    def solve(self, terms: FrameTerms, start: HeadState) -> tuple[HeadState, Tensor]:
+        """Weights (B,N) in [0,1] and poses of B frames on their own, from a start, float64.
+
+        Returns:
+            The states, and which of the rig's points each landmark is in them, (B,68).
+        """
+        exactness = min(max(0.1 * self.settings.tolerance, _FINEST), _COARSEST)
+        box = self.lower.double(), self.upper.double()
+        # Steps are many and small; what tensors keep for derivatives is a fifth of their cost.
+        with torch.inference_mode():
+            head, rows = start, self.chosen(start)
+            for iteration in range(self.settings.steps):
+                if 0 < iteration < SLIDING_STEPS:
+                    rows = self.chosen(head)
+                # The first step says which of two antagonists it is: in the next the other is at rest.
+                rest = weaker_sides(head.weights, self.signed) & (iteration > 0)
+                before, head = head, box_step(self.energy(terms, head, rows), head, *box, exactness, rest)
+                if iteration > 0:
+                    head = HeadState(one_side(head.weights, self.signed), head.rotation, head.translation)
+                if iteration > 0 and float((head.weights - before.weights).abs().max()) < self.settings.tolerance:
+                    break
+        # Copies, as autograd refuses tensors that were made without it.
+        head, rows = head.mapped(torch.clone), rows.clone()
+        if torch.is_grad_enabled() and any(x.requires_grad for x in terms.tensors()):
+            head = self._attached(terms, head, rows)
+        return head, rows
+
+    def chosen(self, head: HeadState) -> Tensor:
+        """Which of the rig's points each landmark is in B states, (B,68); see ``FacePoints.chosen``."""
+        return self.points.chosen(head.weights, head.rotation, head.translation, self.intrinsics.double())
+
+    def energy(self, terms: FrameTerms, head: HeadState, rows: Tensor) -> Quadratic:
+        """All terms linearised at a state, of a step from there, (B,N+6)."""
+        ridge = self.ridge.double()
+        penalty = Quadratic(ridge.diag(), self.l1_penalty.double() + ridge * pad(head.weights, (0, 6)))
+        total = self.seen(terms, head, rows) + terms.expected.energy(head) + penalty
+        return total if self.prior is None else total + energy_of_step(self.prior.energy(head.weights), head.weights)
+
+    def seen(self, terms: FrameTerms, head: HeadState, rows: Tensor) -> Quadratic:
+        """Landmarks and tracked poses linearised at a state, of a step from there, (B,N+6)."""
+        K, slide = self.intrinsics.double(), self.settings.contour_slide
+        at = linearise(self.points, head, rows, K, terms.landmarks, terms.precision, slide)
+        data = at.energy()
+        if terms.read is not None:
+            data = data + energy_of_step(terms.read, head.weights)
+        if self.settings.pose_trust == 0:
+            return data
+        by_motion = at.jacobian[..., -6:].flatten(1, 2)
+        precision = self.settings.pose_trust * (by_motion.transpose(1, 2) @ by_motion)
+        off = head.step_from(HeadState(head.weights, terms.rotation, terms.translation))[:, -6:]
+        shapes = len(self.names)
+        H = pad(precision, (shapes, 0, shapes, 0))
+        return data + Quadratic(H, pad((precision @ off[..., None])[..., 0], (shapes, 0)))
+
+    def _attached(self, terms: FrameTerms, head: HeadState, rows: Tensor) -> HeadState:
+        """The converged state as a differentiable function of the terms."""
+
+        def gradient(x: Tensor) -> Tensor:
+            return self.energy(terms, head.moved(x[:, :-6], x[:, -6:]), rows).f
+
+        x = pad(head.weights, (0, 6))
+        x = attach_gradients(gradient, x, (x > self.lower) & (x < self.upper))
+        return head.moved(x[:, :-6], x[:, -6:])
+
+    def reprojection_errors(self, landmarks: Tensor, weights: Tensor, rotation: Tensor, translation: Tensor) -> Tensor:
+        """Root mean square distance of seen landmarks (T,68,2) to the rig's, (T,), pixels; NaN where none is seen."""
+        weights, rotation, translation = (x.detach().double() for x in (weights, rotation, translation))
+        points, K = self.points, self.intrinsics.double()
+        rows = points.chosen(weights, rotation, translation, K)
+        placed = points.at(weights)[torch.arange(len(rows), device=rows.device)[:, None], rows]
+        image = (placed @ rotation.transpose(-1, -2) + translation[:, None]) @ K.T
+        squared = (image[..., :2] / image[..., 2:] - landmarks.detach().double()).square().sum(-1)
+        return squared.nanmean(1).sqrt().to(landmarks.dtype)
