@@ -25,6 +25,12 @@ def triangle_areas(vertices: Tensor, faces: Tensor) -> Tensor:
     return 0.5 * triangle_cross(vertices, faces).norm(dim=-1)
 
 
+def vertex_areas(vertices: Tensor, faces: Tensor) -> Tensor:
+    """A third of the triangles around each vertex, (V,), square millimetres."""
+    third = triangle_areas(vertices, faces).repeat_interleave(3) / 3
+    return third.new_zeros(len(vertices)).index_add_(0, faces.flatten(), third)
+
+
 def triangle_normals(vertices: Tensor, faces: Tensor) -> Tensor:
     """Unit normals (...,F,3); zero for a triangle without area."""
     return torch.nn.functional.normalize(triangle_cross(vertices, faces), dim=-1, eps=1e-20)

@@ -1,4 +1,4 @@
-"""The edges of lids on a surface whose eyeballs are parts of their own: where skin ends in a picture from the front."""
+"""The edges of lids on a head's skin without its eyeballs: where the skin, seen from the front, ends or falls away."""
 
 from __future__ import annotations
 
@@ -10,10 +10,11 @@ import torch
 from torch import Tensor
 
 from torchface.geometry.cameras.pinhole import look_at
-from torchface.rendering.textured_surface import TexturedSurface
+from torchface.rendering.raycast import RayCaster
 
 _SIDE = 320  # pixels of the picture
 _LEAST_WIDTH, _LEAST_HEIGHT = 0.12, 0.03  # of the opening, in sides of the picture
+_AROUND, _DEEP = 121, 0.1  # pixels over which skin closes the opening, and sides that the opening is deeper than that
 _EDGE = 2  # pixels from the opening to the skin that is taken for the lid's edge
 _SMOOTH = 5  # columns
 
@@ -40,22 +41,25 @@ class EyeOpening:
         return edges[0], edges[1]
 
 
-def eye_opening(surface: TexturedSurface, skin: Tensor, middle: Tensor, span: float) -> EyeOpening | None:
-    """The opening of an eye, seen from the front; none where skin does not end around it, as of closed or painted eyes.
+def eye_opening(vertices: Tensor, skin: Tensor, middle: Tensor, span: float) -> EyeOpening | None:
+    """The opening of an eye, seen from the front; none where the skin is whole there, as of closed or painted eyes.
 
     Args:
-        surface: upright, looking along z.
-        skin: which of its triangles are skin, (F,) bool; the others are the eyeball.
+        vertices: of a head, (V,3), upright, looking along z.
+        skin: its triangles without those of eyeballs and lashes, (F,3).
         middle: of the eye, (3,).
-        span: of the picture, in the surface's unit: about twice an eye's width.
+        span: of the picture, in the vertices' unit: about twice an eye's width.
     """
     camera = look_at(middle, 0.0, 0.0, span, _SIDE, _SIDE)
     origins, directions = (rays.reshape(-1, 3) for rays in camera.rays())
-    hits, _ = surface.first_opaque(origins, directions, plain=True)
-    is_skin = (hits.triangle >= 0) & skin[hits.triangle.clamp(min=0)]
+    hits = RayCaster(vertices, skin).cast(origins, directions)
+    behind = middle[2] - span
     points = (origins + hits.distance[:, None] * directions).reshape(_SIDE, _SIDE, 3)
-    open_pixels = (~is_skin).reshape(_SIDE, _SIDE).numpy().astype(np.uint8)
-    _, labels = cv2.connectedComponents(open_pixels, connectivity=4)
+    depth = points[..., 2].masked_fill((hits.triangle < 0).reshape(_SIDE, _SIDE), behind).clamp(min=behind)
+    front = depth.numpy().astype(np.float32)
+    around = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (_AROUND, _AROUND))
+    pit = (cv2.morphologyEx(front, cv2.MORPH_CLOSE, around) - front > _DEEP * span).astype(np.uint8)
+    _, labels = cv2.connectedComponents(pit, connectivity=4)
     centre = slice(_SIDE // 2 - _SIDE // 8, _SIDE // 2 + _SIDE // 8)
     counts = np.bincount(labels[centre, centre].ravel())
     counts[0] = 0

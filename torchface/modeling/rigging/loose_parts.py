@@ -6,10 +6,10 @@ from dataclasses import dataclass
 
 import torch
 from scipy import sparse
-from scipy.spatial import cKDTree
 from torch import Tensor
 
 from torchface.geometry.meshes.shell_energies import stretching_energy
+from torchface.geometry.meshes.surface_index import SurfaceIndex
 from torchface.geometry.similarity import Similarity, similarity_transform
 from torchface.geometry.spheres import nearest_sphere
 from torchface.optim.sparse import SparseCholesky
@@ -26,7 +26,7 @@ _BOTH_JAWS, _ARCH = 0.15, 30.0
 _JAW = "jaw"
 _TONGUE, _FILLED = 15.0, 0.2  # millimetres at least: teeth are smaller; and the share near the middle
 _TONGUE_OUT, _TONGUE_DOWN = 12.0, 8.0
-_ROOT, _STIFF = 0.3, 0.01
+_ROOT, _LYING, _STIFF = 0.3, 2.0, 0.01
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,22 +96,27 @@ def moved_parts(
 
 def _attached(head: _Head, faces: Tensor, left: Tensor) -> None:
     """Lets parts go with the skin where they touch it, and the rest of each with that: lashes stay straight."""
-    ids, skin = left.nonzero()[:, 0], (~head.loose).nonzero()[:, 0]
+    ids = left.nonzero()[:, 0]
     row = torch.full((len(left),), -1)
     row[ids] = torch.arange(len(ids))
     own = row[faces[left[faces].all(1)]]
     points = head.vertices[ids]
-    found = cKDTree(head.vertices[skin].numpy()).query(points.numpy())
-    distance, beside = (torch.from_numpy(one) for one in found)
+    place = SurfaceIndex(head.vertices, faces[~head.loose[faces].any(1)]).nearest(points)
+    corner, distance = faces[~head.loose[faces].any(1)][place.triangle], place.distance
     part = head.part[ids].unique(return_inverse=True)[1]
-    nearest = torch.full((int(part.max()) + 1,), torch.inf, dtype=torch.float64)
-    nearest = nearest.scatter_reduce(0, part, distance, "amin")
-    root = distance <= nearest[part] + _ROOT
+    near = torch.stack([_root_reach(distance[part == one]) for one in range(int(part.max()) + 1)])
+    root = distance <= near[part]
     weight = torch.where(root, 1.0, 1e-9).numpy()
-    guess = (head.deltas[:, skin[beside]] * root[:, None]).permute(1, 0, 2).flatten(1)
+    beside = torch.einsum("njkc,jk->njc", head.deltas[:, corner], place.barycentric)
+    guess = (beside * root[:, None]).permute(1, 0, 2).flatten(1)
     matrix = sparse.diags_array(weight) + _STIFF * stretching_energy(points, own)
     solved = SparseCholesky(matrix).solve(guess)
     head.deltas[:, ids] = solved.unflatten(1, (-1, 3)).permute(1, 0, 2)
+
+
+def _root_reach(distance: Tensor) -> Tensor:
+    """How near the skin a part's vertices are that go with it: as far as the nearest, or those of its nearer half."""
+    return torch.maximum(distance.min() + _ROOT, distance.median().clamp(max=_LYING))
 
 
 def _eyeballs(template: BlendshapeRig) -> list[Tensor]:

@@ -12,11 +12,12 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from torchface.errors import ValueRangeError
-from torchface.geometry.meshes.operators import border_vertices, corners, triangle_normals, vertex_normals
+from torchface.geometry.meshes.operators import border_vertices, corners, triangle_normals, vertex_areas, vertex_normals
 from torchface.geometry.meshes.shell_energies import stretching_energy
 from torchface.geometry.meshes.surface_index import triangle_coordinates
 from torchface.geometry.similarity import Similarity
 from torchface.mesh import Mesh
+from torchface.modeling.rigging.blinks_that_shut import SkinOfHead, eyes_seen, shut_blinks
 from torchface.modeling.rigging.deformation_transfer import transfer_with_report
 from torchface.modeling.rigging.loose_parts import moved_parts
 from torchface.modeling.rigging.part_clearance import clear_parts
@@ -36,6 +37,7 @@ _BLIND = 1e-3
 """How much the guess counts for a vertex that has no place on the template, beside one that has."""
 _SMOOTH = 0.4
 _SKIN_SHARE, _BODY_SHARE = 0.3, 0.15
+_OPEN = 0.1  # of an eye: what a blink that shuts it leaves at most
 _SAME_PLACE = 1e-4
 _ALIKE = 0.2
 
@@ -51,6 +53,8 @@ class CarriedShapes:
         distance: of each of the head's vertices to that face, (V,), millimetres of the template's size.
         places: which vertices have a place on it, (V,) bool; the others follow by smoothness or as loose parts.
         tongue: vertices of the head's own tongue, (V,) bool; none where it has none.
+        open_lids: what the blinks of the right and left eye leave open, as a share of the opening; None where its lids
+            cannot be told from the eye, as of painted or welded eyes, and its blink is the template's.
     """
 
     rig: BlendshapeRig
@@ -59,6 +63,23 @@ class CarriedShapes:
     distance: Tensor
     places: Tensor
     tongue: Tensor
+    open_lids: tuple[float | None, ...]
+
+    def lid_notes(self) -> list[str]:
+        """Of eyes that may not shut, for people to read."""
+        named = list(zip(("right", "left"), self.open_lids, strict=True))
+        unseen = [side for side, left in named if left is None]
+        notes = [
+            f"warning: {side} eye: its blink leaves {left:.0%} of it open"
+            for side, left in named
+            if (left or 0) > _OPEN
+        ]
+        if unseen:
+            notes.append(
+                f"warning: {' and '.join(unseen)} eye: the lids cannot be told from the eye (painted, shut or "
+                "one piece with the skin): look whether it shuts"
+            )
+        return notes
 
 
 def shapes_on(
@@ -117,6 +138,8 @@ def shapes_on(
     joined = joined_vertices(goal, target.faces.cpu())
     skin = _Skin.of(moved, registration, joined)
     deltas = skin.carried(moved.deltas.double())
+    head = SkinOfHead(joined.vertices, joined.faces, skin.loose, joined.part)
+    deltas, left = shut_blinks(head, deltas, moved.names, eyes_seen(head, _marks(moved)))
     parts = moved_parts(moved, joined.vertices, joined.faces, joined.part, skin.loose, deltas)
     deltas = parts.deltas
     still = torch.zeros(len(joined.vertices), dtype=torch.bool)
@@ -129,8 +152,16 @@ def shapes_on(
     placed = registration.pose.apply_vectors(deltas).to(target.vertices)
     rig = BlendshapeRig(target, placed, moved.names)
     return CarriedShapes(
-        rig, registration, moved, skin.distance[joined.of], skin.known[joined.of], parts.tongue[joined.of]
+        rig, registration, moved, skin.distance[joined.of], skin.known[joined.of], parts.tongue[joined.of], left
     )
+
+
+def _marks(rig: BlendshapeRig) -> Tensor:
+    """iBUG's 68 of a rig, (68,3); NaN where it does not know them."""
+    notes = rig.neutral.annotations
+    if notes is None or notes.landmarks is None or len(notes.landmarks) != 68:
+        return torch.full((68, 3), torch.nan, dtype=torch.float64)
+    return rig.vertices.detach().cpu().double()[notes.landmarks.cpu()]
 
 
 def _among(parts: InnerParts, bones: Tensor) -> InnerParts:
@@ -232,9 +263,9 @@ class _Skin:
         confidence = torch.exp(-((distance / _NEAR) ** 2)) * cosine.clamp(min=0) ** 2 * (seen * share).sum(1)
         confidence[beyond] *= _BLIND
         known = (confidence > 0.1) & ~beyond
-        part = joined.part
-        size = part.bincount().double()
-        near = torch.zeros_like(size).index_add_(0, part, known.double())
+        part, area = joined.part, vertex_areas(joined.vertices, joined.faces)
+        size = torch.zeros(int(part.max()) + 1, dtype=torch.float64).index_add_(0, part, area)
+        near = torch.zeros_like(size).index_add_(0, part, area * known)
         body = (near > _SKIN_SHARE * size) & (near > _BODY_SHARE * near.max())
         body[near.argmax()] = True
         return _Skin(joined, corner, share, confidence, distance, known, ~body[part])
@@ -242,12 +273,7 @@ class _Skin:
     def carried(self, deltas: Tensor) -> Tensor:
         """The template's deltas (N,T,3) at the head's vertices, (N,J,3); zero for loose parts."""
         vertices, faces = self.joined.vertices, self.joined.faces
-        area = torch.zeros(len(vertices), dtype=torch.float64)
-        a, b, c = corners(vertices, faces)
-        third = torch.linalg.cross(b - a, c - a).norm(dim=-1) / 6
-        for k in range(3):
-            area.index_add_(0, faces[:, k], third)
-        weight = area.clamp(min=1e-9) * self.confidence.clamp(min=_BLIND)
+        weight = vertex_areas(vertices, faces).clamp(min=1e-9) * self.confidence.clamp(min=_BLIND)
         guess = torch.einsum("njkc,jk->njc", deltas[:, self.corner], self.share)
         guess[:, self.distance > _FAR] = 0.0
         matrix = sparse.diags_array(weight.numpy()) + _SMOOTH**2 * stretching_energy(vertices, faces)

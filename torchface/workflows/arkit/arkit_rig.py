@@ -20,6 +20,7 @@ from torchface.io.rig_files import SCENE_ENDINGS
 from torchface.mesh import Annotations, Mesh, submesh
 from torchface.modeling import HeadModel
 from torchface.modeling.morphable.published_models import head_model_of
+from torchface.modeling.rigging.blinks_that_shut import BLINKS
 from torchface.modeling.rigging.loose_parts import tongue_out
 from torchface.modeling.rigging.other_topology import CarriedShapes, shapes_on
 from torchface.progress import Progress, silent
@@ -164,6 +165,7 @@ def make_arkit(
             made |= _tongue(sized, carried)
         shapes = {name: delta * head.size for name, delta in made.items()} | shapes
         notes += head.notes()
+        notes += carried.lid_notes() if set(BLINKS) & set(made) else []
         if missing := [name for name in wanted if name not in made]:
             notes.append(
                 f"left out: {', '.join(missing)}" + (": the head has no tongue of its own" if TONGUE in missing else "")

@@ -11,6 +11,7 @@ from torchface.landmarks.images.checked_detector import shipped_detector
 from torchface.landmarks.images.ibug_68 import COUNT
 from torchface.landmarks.surfaces.face_on_surface import FaceSearch, NoFaceOnSurfaceError, ReferencePoints
 from torchface.mesh import Mesh
+from torchface.modeling.rigging.blinks_that_shut import SkinOfHead
 from torchface.modeling.rigging.other_topology import joined_vertices
 from torchface.progress import Progress
 from torchface.registration.scan_preparation import Landmarks
@@ -59,7 +60,8 @@ def seen_landmarks(head: Mesh, template: Mesh, progress: Progress) -> Landmarks 
     usable &= on_skin
     if int(usable.sum()) < _LEAST:
         return None
-    ids, places = with_lids((ids[usable], placed[usable]), reference, upright, part, skin, placed)
+    own = SkinOfHead(upright.vertices, upright.faces, part != skin, part)
+    ids, places = with_lids((ids[usable], placed[usable]), reference, own, placed)
     return ids, found.pose.apply(places)[0]
 
 

@@ -11,11 +11,9 @@ from torch import Tensor
 
 from torchface.geometry.meshes.operators import triangle_normals
 from torchface.geometry.meshes.surface_index import SurfaceIndex
-from torchface.geometry.spheres import nearest_sphere
 from torchface.io.gltf.character_scene import Block, Character
 from torchface.landmarks.images.checked_detector import shipped_detector
 from torchface.landmarks.images.ibug_68 import COUNT
-from torchface.landmarks.surfaces.eye_openings import eye_opening
 from torchface.landmarks.surfaces.face_on_surface import (
     FaceOnSurface,
     FaceSearch,
@@ -23,6 +21,7 @@ from torchface.landmarks.surfaces.face_on_surface import (
     ReferencePoints,
 )
 from torchface.mesh import Mesh
+from torchface.modeling.rigging.blinks_that_shut import EYES, SkinOfHead, eyes_seen
 from torchface.modeling.rigging.other_topology import joined_vertices
 from torchface.progress import Progress
 from torchface.registration.scan_preparation import LEAST_TRIANGLES, Landmarks
@@ -42,9 +41,8 @@ _STILL = re.compile(
 )
 """Names of what does not move with a face, wherever it lies."""
 _LEAST_ASTRAY, _ASTRAY = 15.0, 4.0  # millimetres, and times the median, that a point may lie from a head's
-_EYE_SPAN, _SHARES = 76.0, torch.linspace(0.04, 0.96, 17, dtype=torch.float64)
-_ROUND, _LEAST_BALL, _RADIUS, _INSIDE = 0.12, 12, (5.0, 32.0), 1.15
-_EYES, _LIPS = (slice(36, 42), slice(42, 48)), slice(48, 68)
+_SHARES = torch.linspace(0.04, 0.96, 17, dtype=torch.float64)
+_LIPS = slice(48, 68)
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,8 +139,8 @@ def _pieces(
     cut_joined = torch.zeros(len(joined.vertices), dtype=torch.bool)
     cut_joined[joined.of[cut]] = True
     skin_rows, skin_local = skin_faces.unique(return_inverse=True)
-    upright = surface.moved(found.pose.inverse())
-    landmarks = with_lids(_landmarks(reference, points, placed, on_skin), reference, upright, part, skin_part, placed)
+    upright = SkinOfHead(vertices, faces, part != skin_part, part)
+    landmarks = with_lids(_landmarks(reference, points, placed, on_skin), reference, upright, placed)
     return CharacterFace(
         found,
         vertices,
@@ -174,7 +172,7 @@ def find_skin(vertices: Tensor, faces: Tensor, part: Tensor, placed: Tensor) -> 
 
 def _moves(own: Tensor, placed: Tensor, skin: cKDTree) -> bool:
     """Whether a loose part (n,3) belongs to eyes or mouth, or lies on the face as brows and lashes do."""
-    for eye in _EYES:
+    for eye in EYES:
         lids = placed[eye]
         centre = lids[torch.isfinite(lids).all(-1)].mean(0)
         if bool(((own - centre).norm(dim=-1) < _EYE_REACH).all()):
@@ -201,61 +199,28 @@ def _landmarks(reference: Mesh, points: ReferencePoints, placed: Tensor, on_skin
     return ids[usable], placed[usable]
 
 
-def with_lids(
-    landmarks: Landmarks, reference: Mesh, upright: TexturedSurface, part: Tensor, skin: int, placed: Tensor
-) -> Landmarks:
+def with_lids(landmarks: Landmarks, reference: Mesh, head: SkinOfHead, placed: Tensor) -> Landmarks:
     """The pairs with the lids' edges in place of the finder's points there, of each eye whose edges can be seen."""
     assert reference.annotations is not None
     regions = reference.annotations.regions
     eyeballs = regions["eyeball_left"] | regions["eyeball_right"]
-    template = plain_surface(reference.vertices.double(), reference.faces)
-    template_skin = ~eyeballs[reference.faces].any(1)
-    own_skin = part[upright.faces[:, 0]] == skin
+    rest = reference.vertices.double()
+    template = SkinOfHead(rest, reference.faces, eyeballs, eyeballs.long())
     ids, targets = landmarks
-    for eye, lids in ((_EYES[0], "lids_right"), (_EYES[1], "lids_left")):
-        rest = reference.vertices[reference.landmarks[eye]].double().mean(0)
-        marks = placed[eye]
-        marks = marks[torch.isfinite(marks).all(-1)]
-        if not len(marks):
-            continue
-        near = eye_parts(upright.vertices, upright.faces, part, marks.mean(0), skin)
-        if near is None:
-            continue
-        middle = marks.mean(0)
-        shown = plain_surface(upright.vertices, upright.faces[own_skin | near])
-        found = eye_opening(shown, own_skin[own_skin | near], middle, _EYE_SPAN)
-        known = eye_opening(template, template_skin, rest, _EYE_SPAN)
-        if found is None or known is None:
+    seen, known = eyes_seen(head, placed), eyes_seen(template, rest[reference.landmarks])
+    for own, there, lids in zip(seen, known, ("lids_right", "lids_left"), strict=True):
+        if own is None or there is None:
             continue
         pairs, points = [], []
         rim = (regions[lids] & ~eyeballs).nonzero()[:, 0]
-        for edge, own in zip(known.at(_SHARES), found.at(_SHARES), strict=True):
-            nearest = torch.cdist(edge, reference.vertices[rim].double()).argmin(1)
+        for edge, place in zip(there.at(_SHARES), own.at(_SHARES), strict=True):
+            nearest = torch.cdist(edge, rest[rim]).argmin(1)
             pairs.append(rim[nearest])
-            points.append(own + (reference.vertices[rim[nearest]].double() - edge))
+            points.append(place + (rest[rim[nearest]] - edge))
         outside = ~regions[lids][ids]
         ids = torch.cat([ids[outside], *pairs])
         targets = torch.cat([targets[outside], *points])
     return ids, targets
-
-
-def eye_parts(vertices: Tensor, faces: Tensor, part: Tensor, middle: Tensor, skin: int) -> Tensor | None:
-    """Triangles (F,) of the eyeball around a middle: of the roundest loose part there and what lies in it; or none."""
-    near = (vertices - middle).norm(dim=-1) < _EYE_REACH
-    best, ball = _ROUND, None
-    for one in part[faces[:, 0]].unique().tolist():  # a head has tens of parts
-        rows = (part == one).nonzero()[:, 0]
-        if one == skin or not bool(near[rows].all()) or len(rows) < _LEAST_BALL:
-            continue
-        centre, radius = nearest_sphere(vertices[rows])
-        off = float(((vertices[rows] - centre).norm(dim=-1) - radius).abs().mean()) / radius
-        if off < best and _RADIUS[0] < radius < _RADIUS[1]:
-            best, ball = off, (centre, radius)
-    if ball is None:
-        return None
-    inside = (vertices - ball[0]).norm(dim=-1) < _INSIDE * ball[1]
-    own = part[faces[:, 0]]
-    return (own != skin) & inside[faces].all(1)
 
 
 def plain_surface(vertices: Tensor, faces: Tensor) -> TexturedSurface:

@@ -21,6 +21,7 @@ from torchface.io.gltf.gltf_document import read_document
 from torchface.io.gltf.morph_insertion import AddedTargets, document_with_targets, write_edited
 from torchface.io.vrm.vrm_expressions import VRM_ENDING, MorphBind, add_expressions, vrm_expressions
 from torchface.landmarks.surfaces.face_on_surface import NoFaceOnSurfaceError
+from torchface.modeling.rigging.blinks_that_shut import BLINKS
 from torchface.modeling.rigging.loose_parts import tongue_out
 from torchface.modeling.rigging.other_topology import CarriedShapes, joined_vertices, shapes_on
 from torchface.progress import Progress, silent
@@ -293,6 +294,8 @@ class _Job:
             lines.append(f"    the others are at {', '.join(map(_place, found.others))}, in the file's unit")
         lines.append(f"template: {record.figures()}")
         lines += [f"  note: {note}" for note in record.notes if not note.startswith(_OF_SCANS)]
+        if any(name in self.made for name in BLINKS):
+            lines += [f"  {note}" for note in self.carried.lid_notes()]
         own = {name: names for name, names in present.items() if names != (name,)}
         if present:
             lines.append(f"already there: {len(present)} of ARKit's 52, kept as they are")

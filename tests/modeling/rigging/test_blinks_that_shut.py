@@ -1,0 +1,58 @@
+"""Blinks that leave eyes half open are made to shut them, before what lies in the eye; the rest of the face stays."""
+
+import pytest
+import torch
+from torch import Tensor
+
+from torchface.modeling.rigging.blinks_that_shut import BLINKS, SkinOfHead, eyes_seen, shut_blinks
+from torchface.rig import BlendshapeRig
+from torchface.synthetic import performer
+
+
+@pytest.fixture(scope="module")
+def actor() -> BlendshapeRig:
+    return performer(texture=False).select(BLINKS)
+
+
+def head_of(actor: BlendshapeRig, eyes: bool = True) -> tuple[SkinOfHead, Tensor]:
+    mesh = actor.neutral
+    regions = mesh.annotations.regions
+    balls = regions["eyeball_left"].long() + 2 * regions["eyeball_right"].long()
+    faces = mesh.faces if eyes else mesh.faces[balls[mesh.faces].amax(1) == 0]
+    head = SkinOfHead(mesh.vertices.double(), faces, balls > 0, balls)
+    return head, head.vertices[mesh.landmarks]
+
+
+@pytest.mark.parametrize("eyes", [True, False])
+def test_half_a_blink_is_made_whole(actor: BlendshapeRig, eyes: bool) -> None:
+    head, marks = head_of(actor, eyes)
+    openings = eyes_seen(head, marks)
+    half = 0.5 * actor.deltas.double()
+    shut, left = shut_blinks(head, half, actor.names, openings)
+    assert max(left) < 0.08
+    whole = shut_blinks(head, shut, actor.names, openings)[0]
+    assert float((whole - shut).abs().max()) < 1.0  # nothing is left to do
+    for row, opening in enumerate(openings):
+        assert opening is not None
+        corners, seen = marks[36 + 6 * row : 42 + 6 * row, 0], opening.upper[:, 0]
+        assert corners.min() - 1 < seen.min() < seen.max() < corners.max() + 1
+        assert float(seen.max() - seen.min()) > 0.7 * float(corners.max() - corners.min())
+        middle = marks[[37 + 6 * row, 41 + 6 * row]].mean(0)
+        lids = ((head.vertices - middle).norm(dim=-1) < 12) & ~head.loose
+        assert float((shut[row] - actor.deltas[row])[lids].norm()) < 0.7 * float(
+            (half[row] - actor.deltas[row])[lids].norm()
+        )
+    moved = (shut - half).norm(dim=-1).amax(0) > 0
+    assert not bool(moved[actor.neutral.annotations.regions["chin"]].any())
+    assert not bool(moved[head.loose].any())
+
+
+def test_painted_eyes_have_no_opening(actor: BlendshapeRig) -> None:
+    head, marks = head_of(actor)
+    whole = SkinOfHead(head.vertices, head.faces, torch.zeros_like(head.loose), head.part)
+    assert eyes_seen(whole, marks) == [None, None]
+    half = 0.5 * actor.deltas.double()
+    same, left = shut_blinks(whole, half, actor.names, [None, None])
+    assert torch.equal(same, half)
+    assert left == (None, None)
+    assert eyes_seen(head, torch.full_like(marks, torch.nan)) == [None, None]
