@@ -34,6 +34,7 @@ from torchface.geometry.similarity import Similarity
 from torchface.landmarks.images.boxes.box_network import BoxNetwork
 from torchface.landmarks.images.networks.eye_network import EyeNetwork
 from torchface.landmarks.images.networks.landmark_network import LandmarkNetwork
+from torchface.landmarks.images.networks.part_network import PartNetwork
 from torchface.landmarks.images.trees.landmark_trees import LandmarkTrees
 from torchface.modeling import ExpressionRegression, ExpressionSettings
 from torchface.modeling.morphable.head_model import HeadModel
@@ -368,6 +369,9 @@ EXAMPLES: dict[str, Example] = {
     ),
     "EyeNetwork": Example(
         network(lambda: EyeNetwork(16, 16, (4, 4, 4), (1, 1, 1), 6)), lambda: (random(2, 3, 16, 16).float(),)
+    ),
+    "PartNetwork": Example(
+        network(lambda: PartNetwork((4, 4, 4, 4), (1, 1, 1, 1))), lambda: (random(2, 3, 16, 32).float(),)
     ),
 }  # fmt: skip
 """By name, as the table has them."""

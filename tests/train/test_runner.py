@@ -27,8 +27,8 @@ from train.runner import Recipe, Run, recipe
 from train.settings_files import read_settings, write_settings
 
 RECIPES = (
-    "action_units", "appearance", "enhancement", "expression", "eye_network", "face_boxes", "landmark_network",
-    "landmark_trees", "marker_solver", "morphable", "priors", "uv_landmarks",
+    "action_units", "appearance", "enhancement", "expression", "eye_network", "face_boxes", "face_parts",
+    "landmark_network", "landmark_trees", "marker_solver", "morphable", "priors", "uv_landmarks",
 )  # fmt: skip
 
 

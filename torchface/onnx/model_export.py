@@ -13,6 +13,7 @@ from torchface.capture.priors import DynamicsPrior, ShapePrior
 from torchface.errors import ValueRangeError
 from torchface.landmarks import BoxNetwork, LandmarkNetwork, LandmarkTrees, UVLandmarkDetector
 from torchface.landmarks.images.networks.eye_network import EyeNetwork
+from torchface.landmarks.images.networks.part_network import PartNetwork
 from torchface.modeling import ExpressionRegression, HeadModel
 from torchface.onnx.checked_export import ExportReport
 from torchface.onnx.dynamics_prior_graph import export_dynamics_prior
@@ -33,6 +34,7 @@ _EXPORTS: dict[type[nn.Module], Callable[..., _Report]] = {
     UVLandmarkDetector: export_landmark_bank,
     LandmarkNetwork: export_network,
     EyeNetwork: export_network,
+    PartNetwork: export_network,
     BoxNetwork: export_network,
     LandmarkTrees: export_landmark_trees,
     DynamicsPrior: export_dynamics_prior,

@@ -1,4 +1,4 @@
-"""ONNX export of the networks that read images: landmarks, eyes, face boxes."""
+"""ONNX export of the networks that read images: landmarks, eyes, parts of faces, face boxes."""
 
 from __future__ import annotations
 
@@ -15,10 +15,11 @@ from torchface.landmarks.images.boxes.box_network import BoxNetwork
 from torchface.landmarks.images.folded_normalisation import without_normalisation
 from torchface.landmarks.images.networks.eye_network import EyeFindings, EyeNetwork
 from torchface.landmarks.images.networks.landmark_network import LandmarkNetwork, NetworkLandmarks
+from torchface.landmarks.images.networks.part_network import PART_MARGIN, PART_SIZE, PARTS, PartNetwork
 from torchface.onnx.checked_export import ExportReport, write_checked
 from torchface.onnx.exported_model import exported_model, half_stored
 
-ImageNetwork = LandmarkNetwork | EyeNetwork | BoxNetwork
+ImageNetwork = LandmarkNetwork | EyeNetwork | PartNetwork | BoxNetwork
 
 FACE_VALUES = ("x", "y", "side", "score", "cosine", "sine")
 """What the graph of face boxes gives for a face, in this order."""
@@ -59,6 +60,9 @@ def _form(network: ImageNetwork) -> _Form:
         }
         parity = {name: 0.1 if name in _PIXELS else 0.01 for name in EyeFindings._fields}
         return _Form("eyes", ("batch",), _cloudy(network.height, network.width), parity, facts)
+    if isinstance(network, PartNetwork):
+        facts = {"faces": "red, green, blue, 0 to 1", "shares": ", ".join(PARTS), "crop": str(PART_MARGIN)}
+        return _Form("faces", ("batch",), _cloudy(PART_SIZE, PART_SIZE), {"shares": 0.02}, facts)
     given = {"values": list(FACE_VALUES), "units": "pixels", "multiple": 32}
     return _Form("images", ("batch", None, "height", "width"), _cloudy(192, 256), {"faces": 2e-3}, given)
 
@@ -75,11 +79,14 @@ def export_network(network: ImageNetwork, path: str | Path, facts: Mapping[str, 
     gives ``landmarks`` (B,6,2), ``iris`` (B,2) and ``deviation`` (B,7), pixels of the crop, ``openness`` (B,), and
     ``closed`` and ``visibility`` (B,) in [0,1].
 
+    That of a ``PartNetwork`` takes ``faces`` (B,3,128,128), boxes enlarged by ``crop``, and gives the ``shares``
+    (B,10,128,128) of the parts that the metadata name.
+
     That of a ``BoxNetwork`` takes ``images`` (B,3,H,W), 64 pixels a side at least and best a multiple of 32. It gives
     ``faces`` (B,K,6), the likeliest first: x and y of the centre and side of the box, pixels, score in [0,1], cosine
     and sine of the roll angle, clockwise as the image is seen. What is no face has a score near 0.
 
-    Images are red, green, blue in [0,1]. Weights of the first two are stored in half precision.
+    Images are red, green, blue in [0,1]. Weights of the first three are stored in half precision.
 
     Args:
         network: what to export.
@@ -94,7 +101,7 @@ def export_network(network: ImageNetwork, path: str | Path, facts: Mapping[str, 
     for images in (form.example[:1], form.example, smaller):
         with torch.no_grad():
             found = network(images)
-        named = {"faces": found} if isinstance(found, Tensor) else found._asdict()
+        named = {next(iter(form.parity)): found} if isinstance(found, Tensor) else found._asdict()
         cases.append(({form.images: images}, named))
     units = {name: "pixels" if name in _PIXELS else "of 1" for name in form.parity}
     return write_checked(network_model(network, facts), path, cases, form.parity, units)
@@ -103,7 +110,11 @@ def export_network(network: ImageNetwork, path: str | Path, facts: Mapping[str, 
 def network_model(network: ImageNetwork, facts: Mapping[str, object] | None = None) -> onnx.ModelProto:
     """The graph; see :func:`export_network`."""
     form = _form(network)
-    task = {LandmarkNetwork: "landmark_network", EyeNetwork: "eye_network", BoxNetwork: "face_boxes"}[type(network)]
+    names = {
+        LandmarkNetwork: "landmark_network", EyeNetwork: "eye_network", PartNetwork: "face_parts",
+        BoxNetwork: "face_boxes",
+    }  # fmt: skip
+    task = names[type(network)]
     fused = without_normalisation(network)
     module = _Given(fused, _given(fused)) if isinstance(fused, LandmarkNetwork) else fused
     model = exported_model(

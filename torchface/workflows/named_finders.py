@@ -22,6 +22,8 @@ from torchface.landmarks.images.networks.crop_finder import BothSides
 from torchface.landmarks.images.networks.eye_finder import EyedFinder, EyeFinder, graph_eye_finder
 from torchface.landmarks.images.networks.eye_network import EyeNetwork
 from torchface.landmarks.images.networks.onnx_finder import graph_finder, onnx_finder
+from torchface.landmarks.images.networks.part_finder import PartFinder, graph_part_finder
+from torchface.landmarks.images.networks.part_network import PartNetwork
 from torchface.landmarks.images.trees.landmark_consensus import ConsensusSettings
 from torchface.landmarks.images.trees.tree_finder import PHOTOGRAPH, TreeFinder
 from torchface.shape_names import ARKIT
@@ -34,6 +36,9 @@ DEFAULT_LANDMARKS = "landmark_network"
 
 EYES = "eye_network"
 """The model of the zoo that reads eyes."""
+
+PARTS = "face_parts"
+"""The model of the zoo that says which part of a face each pixel shows."""
 
 BUNDLE = ".task"
 """The ending of MediaPipe's Face Landmarker bundles."""
@@ -132,6 +137,12 @@ def eye_finder() -> EyeFinder:
 
 
 @cache
+def part_finder() -> PartFinder:
+    """What says which part of a face each pixel of a photograph shows: the zoo's ``face_parts``."""
+    return graph_part_finder(_graph(zoo.get_model(PARTS, PartNetwork)))
+
+
+@cache
 def graph_detector() -> CheckedDetector:
     """``shipped_detector`` in ONNX Runtime."""
     boxes, landmarks = shipped_networks()
@@ -139,7 +150,7 @@ def graph_detector() -> CheckedDetector:
     return CheckedDetector(NetworkDetector(graph_boxes(_graph(boxes)), PROPOSED), finder)
 
 
-def _graph(network: LandmarkNetwork | EyeNetwork | BoxNetwork) -> bytes:
+def _graph(network: LandmarkNetwork | EyeNetwork | PartNetwork | BoxNetwork) -> bytes:
     def make() -> onnx.ModelProto:
         from torchface.onnx.network_graphs import network_model
 

@@ -17,6 +17,7 @@ from torchface.landmarks.images.appearance.appearance_model import AppearanceMod
 from torchface.landmarks.images.boxes.box_network import BoxNetwork
 from torchface.landmarks.images.networks.eye_network import EyeNetwork
 from torchface.landmarks.images.networks.landmark_network import LandmarkNetwork
+from torchface.landmarks.images.networks.part_network import PartNetwork
 from torchface.landmarks.images.trees.landmark_trees import LandmarkTrees
 from torchface.landmarks.scans.uv_detector import UVLandmarkDetector
 from torchface.modeling.morphable.head_model import HeadModel
@@ -32,6 +33,7 @@ KINDS: dict[str, type[nn.Module]] = {
     "expression_regression": ExpressionRegression,
     "eye_network": EyeNetwork,
     "face_boxes": BoxNetwork,
+    "face_parts": PartNetwork,
     "head": HeadModel,
     "landmark_network": LandmarkNetwork,
     "landmark_trees": LandmarkTrees,

@@ -15,6 +15,7 @@ from torchface.files.models import CARD, read_model
 from torchface.landmarks.images.boxes.box_network import BoxNetwork
 from torchface.landmarks.images.networks.eye_network import EyeNetwork
 from torchface.landmarks.images.networks.landmark_network import LandmarkNetwork
+from torchface.landmarks.images.networks.part_network import PartNetwork
 from torchface.landmarks.images.trees.landmark_trees import LandmarkTrees
 from torchface.landmarks.scans.uv_detector import UVLandmarkDetector
 from torchface.modeling.morphable.head_model import HeadModel
@@ -33,6 +34,8 @@ def get_model(name_or_path: Literal["dynamics_prior"], *, device: Device = "cpu"
 def get_model(name_or_path: Literal["expressions"], *, device: Device = "cpu") -> ExpressionRegression: ...
 @overload
 def get_model(name_or_path: Literal["eye_network"], *, device: Device = "cpu") -> EyeNetwork: ...
+@overload
+def get_model(name_or_path: Literal["face_parts"], *, device: Device = "cpu") -> PartNetwork: ...
 @overload
 def get_model(name_or_path: Literal["face_boxes"], *, device: Device = "cpu") -> BoxNetwork: ...
 @overload

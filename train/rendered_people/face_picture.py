@@ -76,12 +76,17 @@ def draw_pictures(
     return pictures
 
 
+def drawn_weights(generator: torch.Generator) -> Tensor:
+    """An expression, (52,) by ARKit's names."""
+    return (people_expression if uniform(0, 1, generator) < _PEOPLES else draw_expression)(generator)
+
+
 def _photograph(person: Person, generator: torch.Generator) -> FacePicture:
     kind, looks = person.kind, person.looks
-    weights = (people_expression if uniform(0, 1, generator) < _PEOPLES else draw_expression)(generator)
+    weights = drawn_weights(generator)
     posed = closed_lids(kind, person.head, weights)
     scene = surface(kind, person.head, posed, looks, generator)
-    camera = _camera(kind, posed, generator)
+    camera = drawn_camera(kind, posed, generator)
     pixels = camera.project(posed.double())
     landmarks = annotated(kind, pixels, looks).float()
     shown = render_person(person, scene, camera, generator)
@@ -98,7 +103,10 @@ def _photograph(person: Person, generator: torch.Generator) -> FacePicture:
     return FacePicture(stored, landmarks, visible, points, point_visible, weights, 0)
 
 
-def _camera(kind: HeadKind, posed: Tensor, generator: torch.Generator) -> Camera:
+def drawn_camera(
+    kind: HeadKind, posed: Tensor, generator: torch.Generator, size: int = SIZE, side: float = _BOX
+) -> Camera:
+    """A camera for pictures of ``size`` pixels in which the box of a posed head's (V,3) face has ``side``."""
     yaw = (
         float(torch.randn((), generator=generator)) * 20
         if uniform(0, 1, generator) < 0.7
@@ -111,10 +119,10 @@ def _camera(kind: HeadKind, posed: Tensor, generator: torch.Generator) -> Camera
     marks = posed[kind.landmarks].double()
     target, span = marks[27:].mean(0), 260.0
     for _ in range(2):  # once for the size, once for the perspective that changes with it
-        camera = look_at(target, yaw, pitch, span, SIZE, SIZE, view)
+        camera = look_at(target, yaw, pitch, span, size, size, view)
         box = box_around(camera.project(marks).float())
-        middle = box[:2] + box[2:] / 2 - (SIZE - 1) / 2
-        aside = (middle * span / SIZE).double()
-        span = span * float(box[2]) / _BOX
+        middle = box[:2] + box[2:] / 2 - (size - 1) / 2
+        aside = (middle * span / size).double()
+        span = span * float(box[2]) / side
         target = target + aside[0] * camera.rotation[0].double() + aside[1] * camera.rotation[1].double()
-    return look_at(target, yaw, pitch, span, SIZE, SIZE, view)
+    return look_at(target, yaw, pitch, span, size, size, view)

@@ -33,12 +33,14 @@ class RenderedPerson:
         distance: (H,W) millimetres, infinite where there is nothing.
         material: (H,W), -1 where there is nothing.
         exposure: what the light was multiplied by.
+        hits: of the rays through the pixels, in rows from the top.
     """
 
     image: Tensor
     distance: Tensor
     material: Tensor
     exposure: float
+    hits: Hits
 
 
 def render_person(
@@ -88,7 +90,7 @@ def render_person(
     lights = lights / torch.bincount(pixel, minlength=height * width).clamp(min=1)[:, None]
     image = torch.cat([to_srgb(lights) * seen[:, None], seen[:, None].float()], dim=1)
     distance = hits.distance.view(height, width)
-    return RenderedPerson(image.view(height, width, 4), distance, materials.view(height, width), exposure)
+    return RenderedPerson(image.view(height, width, 4), distance, materials.view(height, width), exposure, hits)
 
 
 def _finer_rays(caster: RayCaster, camera: Camera, materials: Tensor) -> tuple[Tensor, Hits, Tensor]:

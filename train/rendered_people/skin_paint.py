@@ -108,32 +108,50 @@ def _lines(p: Tensor, color: Tensor, looks: Looks) -> Tensor:
     return mix(color, dark, looks.wrinkles * (0.55 * forehead + 0.7 * fold + 0.6 * feet) * (p[:, 2] > 30))
 
 
-def _brows(p: Tensor, color: Tensor, looks: Looks, brow_lift: float) -> Tensor:
+def brow_share(p: Tensor, looks: Looks, brow_lift: float) -> Tensor:
+    """How dense someone's brows are at points (N,3) of the mean head, (N,), between their strokes too."""
     density, thickness, *_ = looks.brow
     x, y = p[:, 0].abs(), p[:, 1] - brow_lift
     along = (x - 9.0) / 41.0
     middle, half = _brow_line(x, looks)
     inside = 1 - ramp((y - middle).abs() / (half * thickness), 0.55, 1.15)
     ends = ramp(along, -0.05, 0.08) * (1 - ramp(along, 0.9, 1.04))
+    return density * 1.15 * inside * ends * (p[:, 2] > 40)
+
+
+def _brows(p: Tensor, color: Tensor, looks: Looks, brow_lift: float) -> Tensor:
+    x, y = p[:, 0].abs(), p[:, 1] - brow_lift
+    along = (x - 9.0) / 41.0
     lean = 0.9 - 0.6 * along.clamp(0, 1)
     stroke = torch.stack([(x - y * (1 - lean)) * 2.6, (y + x * (1 - lean)) * 0.45, p[:, 2] * 0.3], dim=1)
     hair = 0.72 + 0.4 * noise(stroke, 0.9, looks.seed + 9)
-    share = (density * 1.15 * inside * ends * hair * (p[:, 2] > 40)).clamp(0, 0.95)
+    share = (brow_share(p, looks, brow_lift) * hair).clamp(0, 0.95)
     return mix(color, tuple((0.75 * looks.hair).tolist()), share)
 
 
 def _hair_of_the_face(p: Tensor, color: Tensor, marks: Tensor, looks: Looks) -> Tensor:
     if not (looks.beard or looks.moustache or looks.stubble):
         return color
-    x, y, z = p[:, 0].abs(), p[:, 1], p[:, 2]
     lips = (marks[:, 0] > 0.25) | (marks[:, 1] > 0.3)
-    edge = -62.0 + 0.012 * (x - 20).clamp(min=0) ** 2 - 4 + 6 * noise(p, 9.0, looks.seed + 10)
-    area = ramp(edge - y, 0, 9) * ramp(z, -5, 15) * ramp(y, -140, -118)
-    upper = ramp(-44.5 - y, 0, 5) * (1 - ramp(-y, 68, 76)) * (1 - ramp(x, 26, 34)) * ramp(z, 60, 75)
+    area, upper = _beard_areas(p, looks)
     strands = 0.75 + 0.45 * noise(p * torch.tensor([2.5, 0.9, 2.0]), 1.3, looks.seed + 11)
     amount = torch.maximum(looks.beard * area, looks.moustache * upper) * strands
     amount = torch.maximum(amount, 0.5 * looks.stubble * torch.maximum(area, upper))
     return mix(color, tuple((0.85 * looks.hair).tolist()), 0.9 * amount * ~lips)
+
+
+def beard_share(p: Tensor, looks: Looks) -> Tensor:
+    """How dense someone's beard and moustache are at points (N,3) of the mean head, (N,), stubble left out."""
+    area, upper = _beard_areas(p, looks)
+    return torch.maximum(looks.beard * area, looks.moustache * upper)
+
+
+def _beard_areas(p: Tensor, looks: Looks) -> tuple[Tensor, Tensor]:
+    """Of beards and of moustaches, (N,) each."""
+    x, y, z = p[:, 0].abs(), p[:, 1], p[:, 2]
+    edge = -62.0 + 0.012 * (x - 20).clamp(min=0) ** 2 - 4 + 6 * noise(p, 9.0, looks.seed + 10)
+    area = ramp(edge - y, 0, 9) * ramp(z, -5, 15) * ramp(y, -140, -118)
+    return area, ramp(-44.5 - y, 0, 5) * (1 - ramp(-y, 68, 76)) * (1 - ramp(x, 26, 34)) * ramp(z, 60, 75)
 
 
 def _eye(p: Tensor, looks: Looks) -> Tensor:

@@ -113,7 +113,7 @@ def augmented(
     turn = torch.where(overturned, 75 + 210 * rand(count), turn)
     shift = torch.where(overturned[:, None], 0.05 * way, shift)
     middle = box[:, :2] + box[:, 2:] / 2 + shift * box[:, 2:]
-    to_crop = _to_crop(middle, side, torch.deg2rad(turn), size)
+    to_crop = to_crop_maps(middle, side, torch.deg2rad(turn), size)
     mirror = torch.where(mirrored, -1.0, 1.0)[:, None] * torch.tensor([1.0, 0.0]) + torch.tensor([0.0, 1.0])
     from_picture = to_crop * torch.cat([mirror, torch.ones(count, 1)], dim=1)[:, None]
     from_picture[..., 2] += torch.where(mirrored, rgba.shape[-1] - 1.0, 0.0)[:, None] * to_crop[..., 0]
@@ -122,7 +122,7 @@ def augmented(
     alpha = cut[:, 3:] * (1 - ((present == 0) & ~astray).float())[:, None, None, None]
     images = cut[:, :3] * alpha + _walls(count, size, generator) * (1 - alpha)
     images, seen = _with_occluders(images, points, seen, settings, generator)
-    images = _photographed(images, settings, generator)
+    images = photographed(images, settings, generator)
     inside = ((points > -0.5) & (points < size - 0.5)).all(-1).float()
     return Crops(images, points, seen * inside, present, mirrored)
 
@@ -137,7 +137,7 @@ def _warped(pictures: Tensor, maps: Tensor, size: int) -> Tensor:
     return torch.from_numpy(np.stack(warped)).permute(0, 3, 1, 2).float() / 255
 
 
-def _to_crop(middle: Tensor, side: Tensor, turn: Tensor, size: int) -> Tensor:
+def to_crop_maps(middle: Tensor, side: Tensor, turn: Tensor, size: int) -> Tensor:
     """Affine maps (B,2,3) from pictures to crops about a middle (B,2), turned counter-clockwise by ``turn``."""
     zoom = size / side
     cosine, sine = zoom * turn.cos(), zoom * turn.sin()
@@ -292,7 +292,7 @@ def with_blur(images: Tensor, generator: torch.Generator, share: float, widest: 
     return images
 
 
-def _photographed(images: Tensor, settings: AugmentationSettings, generator: torch.Generator) -> Tensor:
+def photographed(images: Tensor, settings: AugmentationSettings, generator: torch.Generator) -> Tensor:
     """What lights, lenses, sensors and codecs make of crops (B,3,S,S)."""
     count, _, size, _ = images.shape
 

@@ -1,0 +1,78 @@
+"""Parts of the face in a photograph whose landmarks are known: skin, hair, brows, eyes, glasses, hands, cloth."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+from torch.nn.functional import grid_sample
+
+from torchface.landmarks.images.face_crop import crop_transform, cut_crop
+from torchface.landmarks.images.graph_session import graph_session
+from torchface.landmarks.images.ibug_68 import turned_box
+from torchface.landmarks.images.networks.part_network import PART_MARGIN, PART_SIZE, PARTS
+
+_ROW = {name: number for number, name in enumerate(PARTS)}
+
+
+@dataclass(frozen=True, eq=False)
+class FaceParts:
+    """What a crop of a picture shows.
+
+    Args:
+        shares: of each of :data:`PARTS` in the crop's pixels, (10,S,S).
+        transform: from the picture's pixels to the crop's, (2,3) float64.
+    """
+
+    shares: Tensor
+    transform: Tensor
+
+    def at(self, pixels: Tensor, *names: str) -> Tensor:
+        """The share of some of :data:`PARTS` together at pixels (...,2) of the picture, (...); NaN beyond the crop."""
+        place = pixels.double() @ self.transform[:, :2].T + self.transform[:, 2]
+        size = self.shares.shape[-1]
+        grid = ((2 * place + 1) / size - 1).to(self.shares)
+        some = self.shares[[_ROW[name] for name in names]].sum(0)
+        values = grid_sample(
+            some[None, None], grid.reshape(1, 1, -1, 2), padding_mode="border", align_corners=False
+        ).reshape(place.shape[:-1])
+        return torch.where((grid.abs() <= 1).all(-1), values, torch.nan)
+
+
+@dataclass(frozen=True, eq=False)
+class PartFinder:
+    """Shows a network the upright crop of a face, and its mirror image.
+
+    Args:
+        network: from crops (B,3,S,S) float32 in [0,1], red first, to shares (B,10,S,S) of :data:`PARTS`.
+    """
+
+    network: Callable[[Tensor], Tensor]
+
+    @torch.no_grad()
+    def __call__(self, image: Tensor, landmarks: Tensor) -> FaceParts:
+        """The parts of the face with these landmarks.
+
+        Args:
+            image: uint8 (H,W), or (3,H,W) red first.
+            landmarks: iBUG's 68, (68,2) pixels; NaN for missing.
+        """
+        known = landmarks.float()
+        known = torch.where(known.isfinite(), known, known[known.isfinite().all(-1)].mean(0))
+        box, tilt = turned_box(known)
+        transform = crop_transform(box, float(tilt), PART_SIZE, PART_MARGIN)
+        crop = cut_crop(image, transform, PART_SIZE).float() / 255
+        both = self.network(torch.stack([crop, crop.flip(-1)]))
+        return FaceParts((both[0] + both[1].flip(-1)) / 2, transform)
+
+
+def graph_part_finder(content: bytes) -> PartFinder:
+    """The finder of a part network's graph, in ONNX Runtime on one thread.
+
+    Args:
+        content: what ``torchface.onnx.network_graphs.network_model`` exports.
+    """
+    session = graph_session(content)
+    return PartFinder(lambda crops: torch.from_numpy(session.run(["shares"], {"faces": crops.contiguous().numpy()})[0]))

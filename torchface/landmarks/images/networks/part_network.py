@@ -1,0 +1,153 @@
+"""Parts of a face in a picture by a small convolutional network: skin, hair, brows, eyes, glasses, hands, cloth."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Self
+
+import torch
+from torch import Tensor, nn
+from torch.nn.functional import interpolate, pixel_shuffle
+from torch.utils.data import Dataset
+
+from torchface.errors import ShapeError, ValueRangeError
+from torchface.files.documents import Value
+from torchface.landmarks.images.networks.eye_network import evened
+from torchface.landmarks.images.networks.heat_maps import convolution
+from torchface.progress import Progress, ValueLog
+
+if TYPE_CHECKING:
+    from torchface.landmarks.images.networks.part_training import PartSettings
+
+PARTS = ("background", "skin", "hair", "brows", "eyes", "lips", "teeth", "glasses", "hand", "cloth")
+"""In the order of the network's channels. Beards are hair, hats are cloth, all that is between the lips is teeth, and
+what a clear lens shows is what lies behind it."""
+PART_SIZE = 128
+"""Pixels a side of a crop."""
+PART_MARGIN = 1.7
+"""A crop's side in sides of the face's box."""
+_MOST_CHANNELS, _MOST_BLOCKS = 256, 8
+
+
+class PartNetwork(nn.Module):
+    r"""The share of each of :data:`PARTS` in each pixel by an encoder and decoder of separable convolutions.
+
+    .. math:: p_{c} = \mathrm{softmax}_c \, f(x)
+
+    with f at half of the crop's resolution; four scores a channel and cell, rearranged, give each pixel its own.
+
+    Args:
+        channels: at a half, a quarter, an eighth and a sixteenth of the resolution.
+        blocks: residual blocks there.
+
+    Source: Ronneberger, Fischer, Brox 2015 (encoder and decoder); Howard et al. 2017 (separable convolutions); Shi et
+    al. 2016 (pixels from channels).
+
+    Example:
+        >>> network = PartNetwork().eval()
+        >>> with torch.no_grad():
+        ...     shares = network(torch.full((1, 3, 128, 128), 0.5))
+        >>> shares.shape == (1, 10, 128, 128), bool((shares.sum(1) - 1).abs().max() < 1e-5)
+        (True, True)
+    """
+
+    def __init__(self, channels: tuple[int, ...] = (16, 32, 64, 96), blocks: tuple[int, ...] = (1, 1, 2, 3)) -> None:
+        super().__init__()
+        if len(channels) != 4 or not all(1 <= count <= _MOST_CHANNELS for count in channels):
+            raise ValueRangeError(f"channels: found {channels}, expected four numbers, 1 to {_MOST_CHANNELS} each")
+        if len(blocks) != 4 or not all(0 <= count <= _MOST_BLOCKS for count in blocks):
+            raise ValueRangeError(f"blocks: found {blocks}, expected four numbers, 0 to {_MOST_BLOCKS} each")
+        self.channels, self.blocks = tuple(channels), tuple(blocks)
+        down, before = [], 3
+        for number, (count, depth) in enumerate(zip(channels, blocks, strict=True)):
+            first = convolution(before, count, 2) if number == 0 else _separable(before, count, 2)
+            down.append(nn.Sequential(first, *[_Block(count) for _ in range(depth)]))
+            before = count
+        self.down = nn.ModuleList(down)
+        self.context = nn.Linear(channels[-1], channels[-1])
+        steps = list(zip(channels[:0:-1], channels[-2::-1], strict=True))
+        self.lift = nn.ModuleList(nn.Conv2d(deep, shallow, 1) for deep, shallow in steps)
+        self.mix = nn.ModuleList(_Block(shallow) for _, shallow in steps)
+        self.scores = nn.Conv2d(channels[0], 4 * len(PARTS), 1)
+
+    @classmethod
+    def fit(
+        cls,
+        pictures: Dataset[tuple[Tensor, ...]],
+        network: PartNetwork | None = None,
+        settings: PartSettings | None = None,
+        progress: Progress | None = None,
+        checkpoint: Path | None = None,
+        device: str | torch.device = "cpu",
+        log: ValueLog | None = None,
+    ) -> PartNetwork:
+        """Trains a network on pictures whose parts are known, by cross entropy.
+
+        Args:
+            pictures: indexed by numbers (B,), such as a ``TensorDataset``. Gives pictures uint8 (B,3,H,W), the number
+                of the part in :data:`PARTS` of each pixel uint8 (B,H,W), and the faces' boxes (B,4) pixels.
+            network: goes on from its weights; a new one if absent.
+            settings: how.
+            progress: called with each step and how far it is.
+            checkpoint: a file that is kept while it runs, and taken up by the next run with the same settings.
+            device: where the network computes.
+            log: called with what was measured, every fifty steps.
+
+        Returns:
+            The running mean of the weights, in evaluation mode, on the CPU.
+
+        Raises:
+            ShapeError: no picture, or other shapes.
+        """
+        from torchface.landmarks.images.networks.part_training import fit_parts
+
+        return fit_parts(pictures, network, settings, progress, checkpoint, device, log)
+
+    @property
+    def config(self) -> dict[str, Any]:
+        return {"channels": list(self.channels), "blocks": list(self.blocks)}
+
+    @classmethod
+    def from_config(cls, config: dict[str, Any]) -> Self:
+        given = Value("config", "", config).table()
+        return cls(*(tuple(one.whole() for one in given[name].rows()) for name in ("channels", "blocks")))
+
+    def forward(self, crops: Tensor) -> Tensor:
+        """Shares (B,10,H,W) of the parts in crops (B,3,H,W) in [0,1], red first; it has learned from 128 x 128.
+
+        Raises:
+            ShapeError: another shape, or sides that are no multiples of 16.
+        """
+        if crops.ndim != 4 or crops.shape[1] != 3 or any(side % 16 or side < 16 for side in crops.shape[2:]):
+            raise ShapeError(f"crops: found {tuple(crops.shape)}, expected (B,3,H,W), sides multiples of 16")
+        return self.logits(crops).softmax(1)
+
+    def logits(self, crops: Tensor) -> Tensor:
+        """Scores (B,10,S,S)."""
+        x, kept = evened(crops.to(self.scores.weight)), []
+        for stage in self.down:
+            x = stage(x)
+            kept.append(x)
+        x = x + self.context(x.mean((2, 3)))[:, :, None, None]
+        for lift, mix, beside in zip(self.lift, self.mix, kept[-2::-1], strict=True):
+            x = mix(interpolate(lift(x), scale_factor=2.0, mode="bilinear", align_corners=False) + beside)
+        return pixel_shuffle(self.scores(x), 2)
+
+
+def _separable(before: int, after: int, stride: int = 1) -> nn.Sequential:
+    """A convolution of 3 x 3 in each channel, then one over the channels, normalised and rectified."""
+    return nn.Sequential(
+        nn.Conv2d(before, before, 3, stride, 1, groups=before, bias=False), nn.BatchNorm2d(before),
+        nn.Conv2d(before, after, 1, bias=False), nn.BatchNorm2d(after), nn.ReLU(inplace=True),
+    )  # fmt: skip
+
+
+class _Block(nn.Module):
+    """Two separable convolutions beside an identity."""
+
+    def __init__(self, channels: int) -> None:
+        super().__init__()
+        self.first, self.second = _separable(channels, channels), _separable(channels, channels)[:-1]
+
+    def forward(self, x: Tensor) -> Tensor:
+        return torch.relu(x + self.second(self.first(x)))
