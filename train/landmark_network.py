@@ -204,23 +204,23 @@ def measures(seen: HeldOut) -> dict[str, float]:
         weight = visible[:, rows] * frontal[:, None]
         return 100 * float((off * weight).sum() / weight.sum())
 
-    told = {f"mean error of inner landmarks, {_SHARE}": error(found[:, INNER], INNER)}
+    errors = {f"mean error of inner landmarks, {_SHARE}": error(found[:, INNER], INNER)}
     read, true = openings(found, truth)[frontal], openings(truth, truth)[frontal]
     for name, rows in OPENINGS.items():
         both = torch.cov(torch.stack([true[:, rows].flatten(), read[:, rows].flatten()]))
-        told[f"{name}, correlation"] = float(both[0, 1] / (both[0, 0] * both[1, 1]).sqrt())
-        told[f"{name}, slope"] = float(both[0, 1] / both[0, 0])
+        errors[f"{name}, correlation"] = float(both[0, 1] / (both[0, 0] * both[1, 1]).sqrt())
+        errors[f"{name}, slope"] = float(both[0, 1] / both[0, 0])
     if seen.dense is not None:
-        told[f"mean error of other points, {_SHARE}"] = error(seen.found.points, slice(COUNT, None))
+        errors[f"mean error of other points, {_SHARE}"] = error(seen.found.points, slice(COUNT, None))
         shapes = torch.isfinite(seen.found.expression_deviation).all(0)
-        told["shapes that can be seen"] = float(shapes.sum())
+        errors["shapes that can be seen"] = float(shapes.sum())
         if bool(shapes.any()):
             read, weights = seen.found.expression[:, shapes], seen.weights[:, shapes]
             off = read.clamp(0, 1) - weights
-            told["error of their weights, root mean square"] = float(off.square().mean().sqrt())
-            told["their weights' own, about their means"] = float((weights - weights.mean(0)).square().mean().sqrt())
-            told["correlation of a shape, median"] = float(correlations(read, weights).median())
-    return told
+            errors["error of their weights, root mean square"] = float(off.square().mean().sqrt())
+            errors["their weights' own, about their means"] = float((weights - weights.mean(0)).square().mean().sqrt())
+            errors["correlation of a shape, median"] = float(correlations(read, weights).median())
+    return errors
 
 
 def correlations(found: Tensor, truth: Tensor) -> Tensor:

@@ -71,7 +71,7 @@ class Ruler:
     Args:
         neutral: (V,3), millimetres.
         faces: (F,3) int64.
-        low_pass: what tells fine from smooth.
+        low_pass: what separates fine from smooth.
     """
 
     def __init__(self, neutral: Tensor, faces: Tensor, low_pass: LowPass) -> None:

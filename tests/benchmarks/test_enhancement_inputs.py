@@ -1,7 +1,7 @@
 """The paper's own tests, a row and a picture each: where coarse animations come from, and what becomes of them.
 
 "Own pairs" are a model for inputs of one kind: what that kind shows of the database's frames is learned with them. The
-last column is how near any detail comes that is laid on the input's own smooth part: the truth's.
+last column is how near any detail comes that is added to the input's own smooth part: the truth's.
 """
 
 from __future__ import annotations

@@ -134,7 +134,7 @@ def classifier() -> ActionUnitClassifier:
 
 
 def solved(classifier: ActionUnitClassifier, one: Film, units: tuple[str, ...] | None, at_rest: bool = True) -> Solved:
-    """The take laid on the rig by its first frame, what is left at rest subtracted, solved twice."""
+    """The take aligned to the rig by its first frame, what is left at rest subtracted, solved twice."""
     alignment = align_take(one.rig, one.attachment, one.take, 0)
     sites = rest_residual(one.rig, one.attachment, one.take, alignment)
     solver = MarkerSolver(one.rig, sites, alignment)

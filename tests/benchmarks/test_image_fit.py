@@ -463,7 +463,7 @@ def landmarked(data: Path) -> dict[str, list[tuple[Path, Tensor]]]:
 def test_photographs_beside_eos(faces: Faces, data: Path) -> None:
     """Misfit to landmarks in photographs: the zoo's model, the model of people, and eos with that model.
 
-    Those of dlib's predictor are a reference, not the truth: both kinds are told apart.
+    Those of dlib's predictor are a reference, not the truth: both kinds are reported apart.
     """
     pytest.importorskip("eos", reason="eos is not installed (pip install '.[bench]')")
     torch.set_num_threads(1)

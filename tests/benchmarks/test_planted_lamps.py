@@ -1,7 +1,7 @@
-"""Claim: planted lamps come back within 5 degrees and 5 %, where plain least squares does not bring them back.
+"""Claim: planted lights come back within 5 degrees and 5 %, where plain least squares does not bring them back.
 
-Fifty random lamps, poses and expressions of the embedded performer, filmed with gloss, cast shadows and noise. Every
-second one has a third of the face in the shadow of a brim, from the brows up: of a lamp straight above that leaves next
+Fifty random lights, poses and expressions of the embedded performer, filmed with gloss, cast shadows and noise. Every
+second one has a third of the face in the shadow of a brim, from the brows up: of a light right above that leaves next
 to nothing, so there four of five are asked for. The peer minimises the thesis's objective by
 ``scipy.optimize.least_squares`` over the vertices that face the camera: no visibility, no cast shadow, no robustness.
 Times are of the process.

@@ -62,7 +62,7 @@ def openings(mesh: Mesh) -> list[Tensor]:
 
 
 class Lid:
-    """One eye's two lid contours, told apart by what the blink moves down."""
+    """One eye's two lid contours, separated by what the blink moves down."""
 
     def __init__(self, rig: BlendshapeRig, hole: Tensor, blink: int) -> None:
         assert rig.neutral.polygons is not None

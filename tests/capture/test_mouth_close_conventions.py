@@ -1,4 +1,4 @@
-"""ARKit's mouthClose and Audio2Face's: told apart, and made of each other."""
+"""ARKit's mouthClose and Audio2Face's: distinguished, and converted into each other."""
 
 from __future__ import annotations
 

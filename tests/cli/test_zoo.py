@@ -1,4 +1,4 @@
-"""``torchface zoo`` tells what models there are and which are damaged."""
+"""``torchface zoo`` lists what models there are and which are damaged."""
 
 from __future__ import annotations
 

@@ -304,7 +304,7 @@ def test_a_model_of_another_precision_prepares_anew(model, database):
     assert float((found - single).abs().max()) < 5e-3
     assert double.neutral.dtype == torch.float64
     again = double.to(torch.float32)
-    again.components = model.components  # half precision is not told apart from what was single
+    again.components = model.components  # half precision is not distinguished from what was single
     torch.testing.assert_close(again(frames), single, atol=2e-3, rtol=0)
     moved = copy.deepcopy(model)
     moved.coefficients *= 2.0

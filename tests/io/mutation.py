@@ -118,7 +118,7 @@ def check_reader(
         name: how a case's file name begins.
 
     Raises:
-        AssertionError: a case escaped; the message tells which bytes.
+        AssertionError: a case escaped; the message says which bytes.
     """
     with tempfile.TemporaryDirectory(prefix="mutated-") as folder:
         case = Path(folder, name + suffix)

@@ -82,7 +82,7 @@ def check_budget(reader: Callable[[Path], Any], path: Path, good: Path | None = 
         good: a small file that the child reads before, so that imports are not counted.
 
     Raises:
-        AssertionError: the budget was passed, or the child ended otherwise; the message tells how.
+        AssertionError: the budget was passed, or the child ended otherwise; the message says how.
     """
     cost = measure(reader, path, good)
     assert cost.within_budget(), (
@@ -154,7 +154,7 @@ def find_reader(job: dict[str, Any]) -> Callable[..., Any]:
 
 def limit_memory(megabytes: float) -> None:
     """Ends this process's growth at so many megabytes of addresses from here on, and forgets its peak so far."""
-    if not _STATUS.exists():  # only Linux both tells the size and keeps the limit
+    if not _STATUS.exists():  # only Linux both reports the size and keeps the limit
         return
     import resource
 

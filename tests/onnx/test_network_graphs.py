@@ -49,7 +49,7 @@ def test_other_sizes_than_it_was_exported_with(network: BoxNetwork, tmp_path: Pa
 def test_eyes_in_a_small_file(tmp_path: Path) -> None:
     torch.manual_seed(0)
     network = EyeNetwork()
-    for module in network.modules():  # statistics and heads as after training, not as at birth
+    for module in network.modules():  # statistics and heads as after training, not as initialised
         if isinstance(module, torch.nn.BatchNorm2d):
             module.running_mean.normal_(0, 0.2)  # type: ignore[union-attr, operator]
             module.running_var.uniform_(0.5, 2)  # type: ignore[union-attr, operator]

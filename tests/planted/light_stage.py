@@ -1,4 +1,4 @@
-"""A performer recorded in colour under a lamp of known place: gloss, cast shadows, noise, and the truth beside it."""
+"""A performer recorded in colour under a light of known place: gloss, cast shadows, noise, and the truth beside it."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class LightStageSettings:
         field_of_view: vertical, degrees.
         span: millimetres that the image's height covers at the face.
         turn: how far the head turns to each side, degrees; half as far up and down.
-        gloss: strength of highlights beside the lamp's; skin has about 0.15.
+        gloss: strength of highlights beside the light's; skin has about 0.15.
         shininess: exponent of the highlights.
         samples: rays a pixel side.
         noise: of the camera, standard deviation at full white, linear; shot noise, less where it is dark.
@@ -92,7 +92,7 @@ def render_lit_video(
         path: of the video; ``.avi`` and ``.mkv`` are lossless.
         rig: a performer with skin.
         weights: (T,N).
-        light: the lamp and the ambient light, in the camera's frame.
+        light: the point light and the ambient light, in the camera's frame.
         fps: frames a second.
         generator: of motion and noise.
         settings: how.

@@ -1,4 +1,4 @@
-"""A performer recorded by an ordinary camera in an ordinary room: grey frames with their 68 landmarks."""
+"""A performer recorded by an ordinary camera indoors: grey frames with their 68 landmarks."""
 
 from __future__ import annotations
 

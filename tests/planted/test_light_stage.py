@@ -1,4 +1,4 @@
-"""The film under a lamp shows what its settings say."""
+"""The film under a light shows what its settings say."""
 
 from __future__ import annotations
 

@@ -24,7 +24,7 @@ def error(result: Registration, truth: Tensor) -> Tensor:
 
 
 def turned_over(result: Registration, template: Mesh) -> int:
-    """Triangles whose normal opposes that of the template laid on the scan."""
+    """Triangles whose normal opposes that of the template aligned to the scan."""
     laid = result.pose.apply(template.vertices.double())[0]
     facing = triangle_cross(result.mesh.vertices.double(), template.faces) * triangle_cross(laid, template.faces)
     return int((facing.sum(-1) < 0).sum())

@@ -71,7 +71,7 @@ def without_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_places_and_lights_of_the_scans_are_gone(trained: tuple[Trained, Path], heads: list[Mesh]) -> None:
     model = trained[0].model
     plain = MorphableModel.fit(torch.stack([mesh.vertices for mesh in heads[:7]]))
-    # Performers stand where they stand; laid on each other they differ by less, and in form alone.
+    # Performers stand where they stand; aligned to each other they differ by less, and in form alone.
     assert 0.5 * plain.total_variance < model.shape.total_variance < plain.total_variance
     assert model.shape.count == 6
     for mesh in heads[:7]:

@@ -79,7 +79,7 @@ class Observability:
         if self.unseen:
             lines.append(f"not seen: {', '.join(self.unseen)}")
         if self.ambiguous:
-            lines.append(f"cannot be told from the other shapes: {', '.join(self.ambiguous)}")
+            lines.append(f"cannot be distinguished from the other shapes: {', '.join(self.ambiguous)}")
         if self.confusions:
             lines.append("changes of the weights that do not show:")
             lines.extend(f"  {confusion}" for confusion in self.confusions[:_SHOWN_CONFUSIONS])
@@ -100,7 +100,7 @@ def weight_observability(
     Args:
         basis: B, (M,C,N).
         names: of the N shapes.
-        noise: a direction whose unit change moves the points less drowns in it.
+        noise: a direction whose unit change moves the points less is not seen.
         points: what they are called.
         unit: of ``basis`` and ``noise``.
 

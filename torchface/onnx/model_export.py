@@ -61,9 +61,9 @@ def export_model(
 
     Example:
         >>> from torchface import zoo
-        >>> report = export_model(zoo.get_model("face_boxes"), "boxes.onnx", {"licence": "MIT"})
+        >>> report = export_model(zoo.get_model("face_landmarks"), "landmarks.onnx", {"licence": "MIT"})
         >>> report.path.name, max(report.parity.values()) < 0.1
-        ('boxes.onnx', True)
+        ('landmarks.onnx', True)
     """
     for kind, export in _EXPORTS.items():
         if isinstance(model, kind):

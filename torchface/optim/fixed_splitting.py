@@ -32,7 +32,7 @@ class FixedSplitting(nn.Module):
     diagonal, :math:`X' = X (2I - AX)`: A's condition is at most about :math:`N / \rho`, so a dozen products suffice.
 
     The constant c is formed in the precision of f, float64, in which a shape that moves markers by hundredths of a
-    millimetre does not drown in others that move them by centimetres; the steps run in that of the buffers, float32.
+    millimetre is not lost beside others that move them by centimetres; the steps run in that of the buffers, float32.
 
     Args:
         H: of all problems, (N,N), positive semidefinite; absent if each call brings one a problem.

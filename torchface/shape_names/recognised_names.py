@@ -56,7 +56,7 @@ _GAZE = {
     "eyeLookInRight": ("Eye_R_Look_L", "eyeLookLeftR"),
     "eyeLookOutRight": ("Eye_R_Look_R", "eyeLookRightR"),
 }
-"""Names in which an eye's side and the way it looks are told apart by their order."""
+"""Names in which an eye's side and the way it looks are distinguished by their order."""
 
 _PLAIN = {
     "jawForward": ("Jaw_Fwd", "JawThrust", "Jaw_Front"),

@@ -65,7 +65,7 @@ class EyePicture:
 def draw_eye_pictures(
     kinds: Sequence[HeadKind], shares: Sequence[float], first: int, count: int, seed: int, each: int = 5
 ) -> list[EyePicture]:
-    """Pictures by number, each of a person's eyes with lids, a gaze, a pose and lamps drawn for it.
+    """Pictures by number, each of a person's eyes with lids, a gaze, a pose and lights drawn for it.
 
     Args:
         kinds: of heads.

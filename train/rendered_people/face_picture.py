@@ -56,7 +56,7 @@ class FacePicture:
 def draw_pictures(
     kinds: Sequence[HeadKind], shares: Sequence[float], first: int, count: int, seed: int, each: int = 4
 ) -> list[FacePicture]:
-    """Pictures by number, each of a person, an expression, a pose and lamps drawn for it.
+    """Pictures by number, each of a person, an expression, a pose and lights drawn for it.
 
     Args:
         kinds: of heads.

@@ -206,7 +206,7 @@ def _lit(caster: RayCaster, camera: Camera, seen: _SeenSurface, generator: torch
         half = torch.nn.functional.normalize(toward - ways, dim=-1)
         shine = (normals * half).sum(-1).clamp(min=0) ** sharp * (falls > 0)
         mirrored = mirrored + strength * shine[:, None].float() * tint
-    # Lips keep most light from what is behind them, a lamp's too.
+    # Lips keep most light from what is behind them, a light source's too.
     behind = (seen.material == TEETH) | (seen.material == GUMS) | (seen.material == SOCKET)
     reached = torch.where(behind, seen.free.clamp(0, 1), 1.0).float()[:, None]
     return (seen.albedo.float() * light + gloss[:, None] * mirrored * 0.6) * reached

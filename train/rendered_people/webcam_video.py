@@ -93,12 +93,12 @@ def webcam_frames(
     settings: WebcamSettings = WebcamSettings(),
     progress: Progress | None = None,
 ) -> Iterator[WebcamFrame]:
-    """Renders frame by frame; lamps, background, hair and hand stay what they are.
+    """Renders frame by frame; lights, background, hair and hand stay what they are.
 
     Args:
         person: who sits there.
         performance: what they do.
-        seed: of the lamps, the room and the noise.
+        seed: of the lights, the background and the noise.
         settings: the camera.
         progress: called with each step and how far it is.
     """
@@ -131,7 +131,7 @@ def posed_head(person: Person, weights: Tensor) -> Tensor:
 def _seen(
     person: Person, posed: Tensor, camera: Camera, room: np.ndarray, seed: int, exposure: float | None
 ) -> tuple[WebcamFrame, float]:
-    """Someone before a room, as light falls, before the camera takes it; uint8. And the exposure."""
+    """Someone before a background, as light falls, before the camera takes it; uint8. And the exposure."""
     kind, looks = person.kind, person.looks
     pixels = camera.project(posed.double())
     landmarks = annotated(kind, pixels, looks).float()

@@ -1,4 +1,4 @@
-"""A helmet that slips leaves the weights alone, and its motion is told apart from them."""
+"""A helmet that slips leaves the weights alone, and its motion is separated from them."""
 
 from __future__ import annotations
 

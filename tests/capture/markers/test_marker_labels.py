@@ -65,5 +65,5 @@ def test_without_an_attachment_every_labelled_marker_counts() -> None:
     match = own_labels(["Actor:a", "Actor:b", "*3", "unlabeled4", "Actor:*5", "helmet"], {"helmet": ""})
     assert match.labels == ("a", "b")
     assert match.unmatched == ("*3", "unlabeled4", "Actor:*5", "helmet")
-    # Two subjects: the prefix is what tells them apart.
+    # Two subjects: the prefix is what distinguishes them.
     assert own_labels(["A:a", "B:a"]).labels == ("A:a", "B:a")

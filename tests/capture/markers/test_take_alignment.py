@@ -1,4 +1,4 @@
-"""A take is laid on the rig, whether it holds a neutral frame or not."""
+"""A take is aligned to the rig, whether it holds a neutral frame or not."""
 
 from __future__ import annotations
 
@@ -99,7 +99,7 @@ def test_a_mirrored_take_is_refused_with_both_distances(
         align_take(rig, attachment, mirrored, neutral_frame)
     with pytest.raises(AlignmentError, match="mirror image"):
         fit_attachment(rig, mirrored, attachment)
-    # Negated again, or insisted on, it is laid on the rig; its true scale is 1 / 1.07.
+    # Negated again, or insisted on, it is aligned to the rig; its true scale is 1 / 1.07.
     right = align_take(rig, attachment, flipped(mirrored, axis), 0)
     assert abs(float(right.scale[0]) * 1.07 - 1) < 0.03
     assert float(align_take(rig, attachment, mirrored, 0, insist=True).scale[0]) * 1.07 < 0.9

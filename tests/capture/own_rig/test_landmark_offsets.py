@@ -225,7 +225,7 @@ def test_frames_left_out_change_little() -> None:
 
 
 def test_what_was_read_of_an_expression_that_never_ends_is_no_offset() -> None:
-    """Half a smile and half a frown of the brows for the whole take, which no frame at rest tells from a wide mouth."""
+    """Half a smile and half a frown of the brows for a whole take, never at rest, which look like a wide mouth."""
     constant = {**dict.fromkeys(SMILE, 0.5), "browDownLeft": 0.5, "browDownRight": 0.5}
     weights, truth = talking(constant), planted_offsets()
     landmarks, solver = seen(person(), weights, truth), solver_of(person())

@@ -199,7 +199,7 @@ def test_several_frames_narrow_the_light_down(rig: BlendshapeRig) -> None:
 
 
 def test_from_a_file_to_its_light(tmp_path: Path, rig: BlendshapeRig) -> None:
-    """The first frame of a film tells the light of the others, while the head turns and speaks."""
+    """The first frame of a film gives the light of the others, while the head turns and speaks."""
     generator = torch.Generator().manual_seed(6)
     light = PointLight(torch.tensor([0.2, 0.2, 0.25]), torch.tensor([0.7, 0.6, 0.5]), torch.tensor([450.0, -350, 150]))
     film = render_lit_video(

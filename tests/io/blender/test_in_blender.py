@@ -63,7 +63,7 @@ def farthest(found: np.ndarray, expected: np.ndarray) -> float:
 
 
 def motion(rig: BlendshapeRig) -> np.ndarray:
-    """Each vertex with all its deltas, (V,(1+N)*3), millimetres: vertices that only touch are told apart."""
+    """Each vertex with all its deltas, (V,(1+N)*3), millimetres: vertices that only touch are kept apart."""
     return torch.cat([rig.vertices[None], rig.deltas]).permute(1, 0, 2).double().numpy()
 
 

@@ -105,7 +105,7 @@ def test_primitives_that_share_vertices_do_not_double_them(tmp_path: Path) -> No
     first = build.root["meshes"][0]["primitives"][0]
     second = {**first, "indices": build.accessor(np.array([0, 1, 3], np.uint16))}
     build.root["meshes"][0]["primitives"].append(second)
-    # A vertex that no position tells from another: welding by position would join the two.
+    # A vertex that no position distinguishes from another: welding by position would join the two.
     rig = load_rig(build.save(tmp_path / "face.gltf"))
     assert len(rig.neutral.vertices) == 4
     assert rig.neutral.faces.tolist() == [[0, 1, 2], [0, 2, 3], [0, 1, 3]]

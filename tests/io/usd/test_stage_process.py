@@ -277,7 +277,7 @@ CHILD = (
 WAITS = "import os; os.read(os.pipe()[0], 1)"
 
 
-@pytest.mark.skipif(sys.platform != "linux", reason="the system tells of a parent's end on Linux alone")
+@pytest.mark.skipif(sys.platform != "linux", reason="the system reports a parent's end on Linux alone")
 def test_the_process_ends_with_the_one_that_started_it() -> None:
     starts = f"import subprocess, sys; subprocess.run([sys.executable, '-c', {CHILD.format(100) + WAITS!r}])"
     parent = subprocess.Popen([sys.executable, "-c", starts], stdout=subprocess.PIPE)

@@ -121,7 +121,7 @@ def test_shapes_that_move_the_same_vertices_are_solved_together_and_alike() -> N
 
 
 def with_parts(rig: BlendshapeRig) -> tuple[BlendshapeRig, Tensor]:
-    """The rig with a small patch that rides on the bulge, and one vertex of no triangle that does too."""
+    """The rig with a small patch that moves with the bulge, and one vertex of no triangle that does too."""
     patch = torch.tensor([[0.0, 0, 0], [4, 0, 0], [0, 4, 0], [4, 4, 1]], dtype=torch.float64)
     summit = int(rig.deltas[0].norm(dim=-1).argmax())
     extra = torch.cat([patch, patch[:1] + 2]) + rig.vertices[summit] + torch.tensor([0.0, 0, 3])

@@ -77,7 +77,7 @@ def actor(dome_rig: BlendshapeRig, tmp_path_factory: pytest.TempPathFactory) -> 
 
 
 def inner_error(found: BlendshapeRig, true: BlendshapeRig) -> tuple[float, float]:
-    """Root mean square error of the neutral once laid on the truth, and of jawOpen, away from the border."""
+    """Root mean square error of the neutral once aligned to the truth, and of jawOpen, away from the border."""
     inside = (true.vertices[:, :2].abs() < 42).all(-1)
     own = found.vertices[inside].double()[None]
     pose = similarity_transform(own, true.vertices[inside].double()[None], scale=False)

@@ -114,7 +114,7 @@ def test_the_other_side_is_told_with_both_distances(actor: BlendshapeRig, given:
         match=r"other side: \S+ mm \(root mean square, across the skin\) .*, \S+ mm from the mirror image",
     ):
         check_side(actor, asked, shown(actor, other * 2 / 3), seen)
-    check_side(actor, asked, shown(actor, other), ~seen)  # what the scan does not show tells nothing
+    check_side(actor, asked, shown(actor, other), ~seen)  # what the scan does not show says nothing
 
 
 @pytest.mark.parametrize("given", [{"jawOpen": 1.0}, {"mouthSmileLeft": 0.5, "mouthSmileRight": 0.5}, {}])

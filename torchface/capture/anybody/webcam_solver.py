@@ -78,7 +78,7 @@ class WebcamSolver(WebcamSolverParts):
     identity and the finder's habits in one, :math:`z \sim N(0, I)`. They are learned beside it by an information filter
     that leaves out what expressions and pose explain; after some seconds they are held. Openness o of the eyes counts
     beside the person's own open and shut eyes, gaze beside where the person looks straight ahead. Weights are divided
-    by how far the person's landmarks go, which a guided calibration tells, and calmed.
+    by how far the person's landmarks go, which a guided calibration measures, and calmed.
 
     The same module is what ``torchface.onnx.webcam`` exports: no step depends on values but by clamps and choices.
 

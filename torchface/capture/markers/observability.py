@@ -11,7 +11,7 @@ def observability(solver: MarkerSolver, noise: float = 0.1) -> Observability:
 
     Args:
         solver: rig and attachment.
-        noise: millimetres; a direction whose unit change moves the markers less drowns in it.
+        noise: millimetres; a direction whose unit change moves the markers less is not seen.
 
     Source: thesis 4.1.4: the rank of B should be at least N.
 

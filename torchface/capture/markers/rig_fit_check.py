@@ -14,7 +14,7 @@ from torchface.geometry.similarity import Similarity, similarity_transform
 
 # Shares of the sites' mean distance from their centre, 45 to 70 mm on a head. On real takes the markers of a rig that
 # fits stay within 0.009 with noise of 0.3 mm and 0.03 with 1 mm, swaps and gaps included; those of another head's rig,
-# laid on it, and markers 3 mm off the skin within 0.03. A take moved by 5 mm has 0.03, one moved by 10 mm or turned
+# aligned to it, and markers 3 mm off the skin within 0.03. A take moved by 5 mm has 0.03, one moved by 10 mm or turned
 # by 5 degrees 0.05 to 0.06, sites 2 to 8 mm wrong 0.07, a helmet that slips by 10 mm 0.09, a take moved by 20 mm 0.13,
 # sites of the marker next to each 0.2, another head's attachment 0.8 to 1.3, centimetres or metres read as millimetres
 # 1.4 to 1.6.

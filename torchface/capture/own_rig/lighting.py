@@ -28,8 +28,8 @@ class LightFit:
     Args:
         light: in the camera's frame; its strengths belong to the albedo that was given.
         direction: unit, from the middle of what was seen toward the source, camera's frame, (3,).
-        distance: of the source from there, millimetres; 100,000 is the directional limit. A face is small beside a
-            room: how far away a source stands is found roughly, where it shines from well.
+        distance: of the source from there, millimetres; 100,000 is the directional limit. A face is small beside
+            that distance, so it is found roughly, the direction well.
         deviation: of the direction, degrees, as the curvature of the objective and the inliers' errors show; infinite
             where no source shows. Wrong geometry and wrong albedo come on top.
         errors: difference between shaded albedo and frame, sRGB, Euclidean, (T,V); NaN where not seen.

@@ -28,7 +28,7 @@ def load_panorama(path: str | Path) -> Tensor:
     if not data.startswith(_MAGIC):
         raise FileFormatError(
             f"{path}: found no Radiance picture, expected a panorama of light (.hdr, beginning with #?RADIANCE); "
-            "other programs convert OpenEXR, and a photograph does not hold the light of its lamps"
+            "other programs convert OpenEXR, and a photograph does not hold the strength of its light sources"
         )
     size = _SIZE.search(data[:_HEADER_BYTES])
     if size is None:

@@ -56,7 +56,7 @@ def cell_map(images: Tensor, layout: HogLayout) -> Tensor:
 
     Gradients vote with their magnitude for the two nearest orientations, of all channels the steepest; a cell is
     divided by the root mean square of the cells around, clipped, and its root taken, so that strong edges do not
-    drown faint ones.
+    hide faint ones.
 
     Args:
         images: (B,C,H,W) in [0,1].

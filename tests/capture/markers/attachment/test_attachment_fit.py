@@ -36,7 +36,7 @@ def by_nearest_vertex(rig: BlendshapeRig, sites: Attachment) -> Attachment:
 
 
 def error_with(rig: BlendshapeRig, sites: Attachment, take: Take, true: Tensor) -> float:
-    """Mean error of the weights, the take laid on these sites and what is left at rest subtracted."""
+    """Mean error of the weights, the take aligned to these sites and what is left at rest subtracted."""
     alignment = align_take(rig, sites, take)
     solved = MarkerSolver(rig, rest_residual(rig, sites, take, alignment), alignment).solve_take(take)
     assert solved.weights is not None

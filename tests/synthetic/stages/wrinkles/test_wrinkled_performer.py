@@ -1,4 +1,4 @@
-"""A performer whose skin wrinkles: neutral kept, depth with compression, lag in time, pores that ride."""
+"""A performer whose skin wrinkles: neutral kept, depth with compression, lag in time, pores that move with the skin."""
 
 from __future__ import annotations
 
@@ -81,7 +81,7 @@ def test_a_step_is_followed_with_the_time_constant(
     assert (left - expected).abs().max() < 0.02
 
 
-def test_pores_ride_on_the_skin(person: WrinkledPerformer) -> None:
+def test_pores_move_with_the_skin(person: WrinkledPerformer) -> None:
     weights = brow_raise(person, torch.tensor([0.0, 0.8]))
     height = (person.smooth(weights) - person.subdivided(weights)).norm(dim=-1)
     assert height[0].quantile(0.99) > 0.02

@@ -246,7 +246,7 @@ def landmark_observability(solver: ExampleSolver, noise: float = 0.5) -> Observa
 
     Args:
         solver: examples and placement.
-        noise: percent of the eyes' distance; a direction whose unit change moves the landmarks less drowns in it.
+        noise: percent of the eyes' distance; a direction whose unit change moves the landmarks less is not seen.
 
     Example:
         >>> from torchface.capture.anybody import paper_examples
