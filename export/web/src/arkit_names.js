@@ -1,5 +1,7 @@
 // ARKit's 52 blendshapes in Live Link Face's order, which is the graph's, and what other rigs call the same shapes.
 
+import { RECOGNISED } from "./shape_tables.js";
+
 const both = (...names) => names.flatMap((name) => [`${name}Left`, `${name}Right`]);
 const eye = (side) =>
   ["Blink", "LookDown", "LookIn", "LookOut", "LookUp", "Squint", "Wide"].map((name) => `eye${name}${side}`);
@@ -20,9 +22,21 @@ const canonical = (name) =>
 
 const ROW = new Map(ARKIT.map((name, row) => [canonical(name), row]));
 
+const PREFIX = /^(.*__(?=facs_)|.*(?=Fcl_)(?<!^)|.*[.:|](?=[^.:|]{3,}$)|(?:facs_)?(?:bs|jnt|ctrl|cbs)_|facs_|[at]\d\d_|arkit[_ ]|(?:head|face|blendshapes?|bs)\d*_(?=[a-z]))/i;
+const SUFFIX = /(_div\d+|_hd\d*|\.\d{3})$/i;
+const SPELLING = { eyes: "eye", brows: "brow", eyebrow: "brow", eyebrows: "brow", lips: "lip", l: "left", r: "right", lt: "left", rt: "right" };
+const BY_WORDS = new Map(Object.entries(RECOGNISED).flatMap(([name, all]) => all.map((words) => [words, name])));
+
+/** ARKit's name of a shape that another program has named, as torchface's `shape_names.arkit_name`. */
+export function arkitName(name) {
+  for (let before = ""; before !== name; ) [before, name] = [name, name.replace(PREFIX, "").replace(SUFFIX, "")];
+  const words = (name.match(/[A-Z]+(?![a-z])|[A-Z]?[a-z]+|\d+/g) ?? []).map((word) => SPELLING[word.toLowerCase()] ?? word.toLowerCase());
+  return BY_WORDS.get(words.join(" ")) ?? BY_WORDS.get(words.sort().join(" "));
+}
+
 /**
  * What a shape takes of ARKit's weights, as torchface's `shape_names.mapping`: a whole shape drives both halves of a
- * split one, two halves give the whole their mean.
+ * split one, two halves give the whole their mean. Names of other programs count as those of ARKit that they mean.
  *
  * @returns {[number, number][]} rows of ARKIT and their factors; none for a shape that ARKit does not know.
  */
@@ -32,7 +46,9 @@ export function sourcesOf(name) {
   const halves = [`${wanted}left`, `${wanted}right`];
   if (halves.every((half) => ROW.has(half))) return halves.map((half) => [ROW.get(half), 0.5]);
   const whole = wanted.replace(/(left|right)$/, "");
-  return whole !== wanted && ROW.has(whole) ? [[ROW.get(whole), 1]] : [];
+  if (whole !== wanted && ROW.has(whole)) return [[ROW.get(whole), 1]];
+  const known = arkitName(name);
+  return known === undefined || canonical(known) === wanted ? [] : sourcesOf(known);
 }
 
 /** The weight of a shape of ARKit's weights: by its sources, by a rule of torchface's mapping tables, or as a corrective. */

@@ -43,7 +43,7 @@ export class CameraEngine {
       status("Asking for the camera…");
       const loaded = this.#loaded(); // while the user is asked
       loaded.catch(() => {}); // said once the camera is there
-      this.#stream = await openCamera(this.#video, () => this.stop("The camera was unplugged or taken away."));
+      this.takes.stream = this.#stream = await openCamera(this.#video, () => this.stop("The camera was unplugged, or may no longer be used."));
       this.#page.running(true);
       status("Loading the solver…");
       await loaded;
@@ -55,9 +55,11 @@ export class CameraEngine {
 
   stop(problem = "") {
     this.#pump?.stop();
-    if (this.#stream !== null) closeCamera(this.#video, this.#stream);
+    const stream = this.#stream;
     this.#pump = this.#stream = null;
     this.#page.running(false);
+    this.takes.stream = null;
+    if (stream !== null) closeCamera(this.#video, stream); // after the recording, whose film ends with it
     if (problem) this.#page.problem(problem);
   }
 

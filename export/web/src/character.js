@@ -9,21 +9,22 @@ import { characterLoader } from "./character_loader.js";
 import { CharacterError } from "./glb_container.js";
 import { upright } from "./head_angles.js";
 
-const NECKS = 0.3; // of the head's rotation, where there is a neck
+export const NECKS = 0.3; // of the head's rotation, where there is a neck
 const STILL = 1e-6; // of the character's size: what moves less does not move
 const RAISED = -0.5; // of an arm's way downwards; arms that hang lower stay
 const HANGING = [0.22, -0.97, 0.08]; // an arm at rest: outwards, up, forwards
 const LOOKS = ARKIT.flatMap((name, row) => (name.startsWith("eyeLook") ? [row] : []));
 
 /**
- * Reads a character; throws a `CharacterError` in plain words for one that a face cannot move.
+ * Reads a character; throws a `CharacterError` in plain words for one that cannot be used.
  *
  * @param {ArrayBuffer} bytes of a .glb or .vrm.
  * @param {string} name of the file.
  * @param {object | null} sources of each shape by its name, where ARKit's names do not say them; see `sourcesOf`.
+ * @param {Record<string, string>} changed what the user says that names mean; see `changedNames`.
  */
-export async function readCharacter(bytes, name, sources = null) {
-  const check = checkCharacter(bytes, sources);
+export async function readCharacter(bytes, name, sources = null, changed = {}) {
+  const check = checkCharacter(bytes, sources, changed);
   let gltf;
   const nodes = new Map();
   try {
@@ -33,20 +34,20 @@ export async function readCharacter(bytes, name, sources = null) {
   } catch (error) {
     throw new CharacterError(`The character cannot be read (${error.message ?? error}). Export it once more.`);
   }
-  return new Character(gltf, check, name, nodes);
+  return new Character(gltf, check, nodes, { bytes, name, sources, changed });
 }
 
-class Character {
+export class Character {
   #moved = [];
   #turned = [];
+  #given;
 
-  constructor(gltf, check, name, nodes) {
-    this.name = name;
-    this.check = check;
+  constructor(gltf, check, nodes, given) {
+    [this.name, this.check, this.#given] = [given.name, check, given];
     this.root = new THREE.Group(); // turns with the head where the character has no bone for it
     this.root.add(gltf.scene);
     if (looksBack(check.document)) gltf.scene.rotation.y = Math.PI;
-    this.root.updateWorldMatrix(true, true);
+    this.root.updateMatrixWorld(true); // of skins too
     for (const side of ["left", "right"]) hang(nodes.get(`${side}UpperArm`)?.object, nodes.get(`${side}LowerArm`)?.object);
     gltf.scene.traverse((object) => this.#addShapes(object, check, gltf.parser.associations));
     this.box = this.#box();
@@ -71,10 +72,20 @@ class Character {
 
   /** The nodes of the file that a recording turns, each with its rotation in each frame; see `animatedGlb`. */
   turnedNodes(take) {
-    const found = this.#turned.map((one) => ({ node: one.node, quaternions: take.frames.map((frame) => one.local(frame).toArray()) }));
+    const found = this.#turned.map((one) => ({ node: one.node, object: one.object, quaternions: take.frames.map((frame) => one.local(frame).toArray()) }));
     if (this.hasHead) return found;
     const quaternions = take.frames.map(({ rotation }) => turn(rotation).toArray());
-    return [...found, { node: null, pivot: this.root.position.toArray(), quaternions }];
+    return [...found, { node: null, object: this.root, pivot: this.root.position.toArray(), quaternions }];
+  }
+
+  /** Rows of a mesh's morph targets that are driven, each with its shape. */
+  shapesOf(mesh) {
+    return this.#moved.find(({ object }) => object === mesh)?.shapes ?? [];
+  }
+
+  /** The character once more, at rest, which nothing else poses. */
+  again(changed = this.#given.changed) {
+    return readCharacter(this.#given.bytes, this.name, this.#given.sources, changed);
   }
 
   dispose() {
@@ -138,13 +149,12 @@ class Character {
 
 /** A node that is turned about its own origin, in the world's directions, from where it rests. */
 class Turned {
-  #object;
   #way;
   #above;
   #rest;
 
   constructor({ object, node }, way) {
-    [this.#object, this.node, this.#way] = [object, node, way];
+    [this.object, this.node, this.#way] = [object, node, way];
     this.#above = object.parent.getWorldQuaternion(new THREE.Quaternion());
     this.#rest = object.quaternion.clone();
   }
@@ -154,12 +164,12 @@ class Turned {
   }
 
   pose(frame) {
-    this.#object.quaternion.copy(this.local(frame));
+    this.object.quaternion.copy(this.local(frame));
   }
 }
 
 /** A share of the head's rotation, in the world's directions. */
-function turn(rotation, share = 1) {
+export function turn(rotation, share = 1) {
   const rows = upright(rotation), turned = new THREE.Quaternion();
   if (!rows.every(Number.isFinite)) return turned;
   const [a, b, c, d, e, f, g, h, i] = rows;
@@ -181,7 +191,7 @@ function hang(upper, lower) {
 }
 
 /** Of the gaze's angles to the person's left, which is x, and up. */
-function gazeTurn(gaze, eye) {
+export function gazeTurn(gaze, eye) {
   const [aside, up] = [gaze[2 * eye], gaze[2 * eye + 1]];
   if (!Number.isFinite(aside + up)) return new THREE.Quaternion();
   return new THREE.Quaternion().setFromEuler(new THREE.Euler(-up, aside, 0, "YXZ"));

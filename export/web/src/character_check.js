@@ -21,12 +21,13 @@ export function checkSize(size) {
  *
  * @param {ArrayBuffer} bytes the whole file.
  * @param {Record<string, [number, number][] | object> | null} sources or rules of shapes by name; by ARKit's names if absent.
+ * @param {Record<string, string>} changed ARKit's name, or none, of shapes whose own names say something else.
  * @returns {{document: object, binary: Uint8Array, meshes: Map<number, Shape[]>, driven: string[], unknown: string[]}}
  *   of each mesh its shapes in the file's order, each `{name, sources, rule}`; names each once.
  */
-export function checkCharacter(bytes, sources = null) {
+export function checkCharacter(bytes, sources = null, changed = {}) {
   const shape = (name) => {
-    const given = sources === null ? sourcesOf(name) : (sources[name] ?? []);
+    const given = Object.hasOwn(changed, name) ? sourcesOf(changed[name]) : sources === null ? sourcesOf(name) : (sources[name] ?? []);
     if (Array.isArray(given)) return { name, sources: given };
     if (!given.drivers) return { name, sources: [...given.sum, ...given.product.map((row) => [row, 1])], rule: given };
     const drivers = given.drivers.map(shape); // a corrective, which follows other shapes
@@ -57,11 +58,6 @@ export function checkCharacter(bytes, sources = null) {
   const all = [...new Map([...meshes.values()].flat().map((one) => [one.name, one])).values()];
   const driven = all.filter((one) => one.sources.length > 0).map((one) => one.name);
   const unknown = all.filter((one) => one.sources.length === 0).map((one) => one.name);
-  if (driven.length === 0)
-    throw new CharacterError(
-      `None of the character's ${unknown.length} shapes has a name that ARKit knows, such as jawOpen. ` +
-        `Found: ${listed(unknown)}. Rename them, or bring them over with torchface transfer --names arkit.`,
-    );
   return { document, binary, meshes, driven, unknown };
 }
 

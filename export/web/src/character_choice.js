@@ -3,6 +3,7 @@
 import { readCharacter } from "./character.js";
 import { checkSize, listed } from "./character_check.js";
 import { forgetFile, keepFile, keptFile } from "./kept_files.js";
+import { changedNames } from "./shape_name_table.js";
 import { hideProblem, showCharacterLine, showProblem } from "./words.js";
 
 const KEY = "character";
@@ -12,9 +13,10 @@ const element = (id) => document.getElementById(id);
  * Lets the user choose; a file that cannot be used leaves the character before where it is.
  *
  * @param {(character: object) => void} use is given each one that can be used.
+ * @param {(file: File) => void} useTake is given each recording that is dropped.
  */
-export function offerCharacters(use) {
-  const take = (file) => taken(file, use, null, true);
+export function offerCharacters(use, useTake) {
+  const take = (file) => (/\.csv$/i.test(file.name) ? useTake(file) : taken(file, use, null, true));
   element("choose").addEventListener("click", () => element("file").click());
   element("file").addEventListener("change", ({ target }) => {
     if (target.files.length > 0) take(target.files[0]);
@@ -32,7 +34,7 @@ export function offerCharacters(use) {
   document.addEventListener("dragleave", (event) => event.relatedTarget === null && dropping(event, false));
   document.addEventListener("drop", (event) => {
     dropping(event, false);
-    if (event.dataTransfer.files.length > 0) take(event.dataTransfer.files[0]);
+    for (const file of event.dataTransfer.files) take(file);
   });
 }
 
@@ -54,17 +56,20 @@ export async function shippedCharacter(use, remembered = true) {
 async function taken(file, use, sources, keep) {
   try {
     checkSize(file.size);
-    const character = await readCharacter(await file.arrayBuffer(), file.name, sources);
-    use(character);
+    use(await readCharacter(await file.arrayBuffer(), file.name, sources, changedNames(file.name)));
     element("own").hidden = sources !== null;
     if (keep) await keepFile(KEY, file).catch(() => {}); // a browser that keeps nothing
-    const { driven, unknown } = character.check;
-    const others = unknown.length > 0 ? `; these stay still: ${listed(unknown)}` : "";
-    showCharacterLine(`${file.name}: your face moves ${driven.length} of its ${driven.length + unknown.length} shapes${others}`);
     hideProblem("character");
     return true;
   } catch (error) {
     showProblem("character", `${file.name}: ${error.message}`);
     return false;
   }
+}
+
+/** Says which of a character's shapes the face moves. */
+export function tellCharacter({ name, check: { driven, unknown } }) {
+  const others = unknown.length > 0 ? `; these stay still: ${listed(unknown)}` : "";
+  const hint = driven.length === 0 ? ". Say below, at Names of shapes, which of ARKit's each of them means" : "";
+  showCharacterLine(`${name}: your face moves ${driven.length} of its ${driven.length + unknown.length} shapes${others}${hint}`);
 }

@@ -53,7 +53,7 @@ function keys(shapes, rest, take) {
 }
 
 /** Appends numbers to the buffer, with the views and accessors that tell where they are. */
-class KeyWriter {
+export class KeyWriter {
   #document;
   #chunks;
   #size;
@@ -72,7 +72,7 @@ class KeyWriter {
     const byteOffset = Math.ceil(this.#size / 4) * 4;
     this.#chunks.push([byteOffset, new Uint8Array(values.buffer)]);
     this.#size = byteOffset + values.byteLength;
-    const count = values.length / { SCALAR: 1, VEC4: 4 }[type];
+    const count = values.length / { SCALAR: 1, VEC3: 3, VEC4: 4 }[type];
     const limits = bounds ? { min: [values[0]], max: [values.at(-1)] } : {};
     accessors.push({ bufferView: bufferViews.length, componentType: FLOAT, count, type, ...limits });
     bufferViews.push({ buffer: 0, byteOffset, byteLength: values.byteLength });

@@ -1,7 +1,8 @@
 // A recording as the iPhone app Live Link Face writes it, and torchface's save_live_link: timecode, 52 weights, rotations.
 
-import { ARKIT } from "./arkit_names.js";
-import { headAngles } from "./head_angles.js";
+import { ARKIT, sourcesOf } from "./arkit_names.js";
+import { headAngles, headRotation } from "./head_angles.js";
+import { LONGEST, Take, USUAL_RATES } from "./take.js";
 
 const ROTATIONS = ["Head", "LeftEye", "RightEye"].flatMap((part) => ["Yaw", "Pitch", "Roll"].map((axis) => part + axis));
 const HEADER = [
@@ -15,6 +16,42 @@ export function liveLinkCsv(take) {
     return [timecode(seconds, take.rate), ARKIT.length + ROTATIONS.length, ...numbers.map(decimal)].join(",");
   });
   return [HEADER.join(","), ...rows, ""].join("\n");
+}
+
+/**
+ * The take of a CSV with ARKit's shapes: of Live Link Face with its timecode, or of torchface with `time` in seconds.
+ *
+ * @throws {Error} in plain words where it is none.
+ */
+export function readLiveLinkCsv(text) {
+  const [header, ...lines] = text.split(/\r?\n/).filter((line) => line.trim());
+  const names = (header ?? "").split(",").map((name) => name.trim());
+  const column = new Map(names.map((name, i) => [name.toLowerCase(), i]));
+  const shapes = names.flatMap((name, i) => sourcesOf(name).map(([row]) => [row, i]));
+  const clock = column.get("timecode"), time = column.get("time");
+  if (shapes.length === 0 || (clock ?? time) === undefined)
+    throw new Error("this is no recording of ARKit's shapes. A .csv of Live Link Face or of torchface begins with Timecode or frame,time and their names.");
+  const rows = lines.map((line) => line.split(","));
+  const seconds = clock === undefined ? rows.map((row) => Number(row[time])) : clockSeconds(rows.map((row) => row[clock]));
+  const take = new Take();
+  rows.forEach((row, frame) => {
+    const number = (name) => Number(row[column.get(name.toLowerCase())] ?? 0) || 0;
+    const angles = (part) => ["Yaw", "Pitch", "Roll"].map((axis) => number(part + axis));
+    const weights = new Float32Array(ARKIT.length);
+    for (const [shape, i] of shapes) weights[shape] = Math.min(1, Math.max(0, Number(row[i]) || 0));
+    const [left, right] = [angles("LeftEye"), angles("RightEye")];
+    const gaze = Float32Array.of(-right[0], -right[1], -left[0], -left[1]);
+    if (Number.isFinite(seconds[frame])) take.add(1000 * seconds[frame], { weights, rotation: headRotation(angles("Head")), gaze });
+  });
+  if (take.frames.length === 0 || take.duration > LONGEST) throw new Error("its times are missing, do not rise, or are longer than an hour.");
+  return take;
+}
+
+/** Frames count up to the rate, which is the least usual one above the largest. */
+function clockSeconds(texts) {
+  const clocks = texts.map((text) => (text ?? "").split(/[:;]/).map(Number));
+  const most = clocks.reduce((all, clock) => Math.max(all, clock[3] || 0), 0), rate = USUAL_RATES.find((usual) => usual > most) ?? 240;
+  return clocks.map(([hours, minutes, seconds, frames]) => 3600 * hours + 60 * minutes + seconds + frames / rate);
 }
 
 /**

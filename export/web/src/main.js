@@ -4,11 +4,12 @@ import "./style.css";
 
 import { Calibration, tone } from "./calibration.js";
 import { CameraEngine } from "./camera_engine.js";
-import { offerCharacters, shippedCharacter } from "./character_choice.js";
+import { offerCharacters, shippedCharacter, tellCharacter } from "./character_choice.js";
 import { drawFace } from "./face_overlay.js";
 import { FrameRate } from "./frame_rate.js";
 import { offerGroups } from "./group_settings.js";
 import { ServerEngine } from "./server_engine.js";
+import { changedNames, giveNames, offerNames } from "./shape_name_table.js";
 import { choosePerson, keepSettings, settings } from "./settings.js";
 import { Stage } from "./stage.js";
 import { StateWords, isSeen } from "./state_words.js";
@@ -151,6 +152,7 @@ element("calibrate").addEventListener("click", startCalibration);
 element("prompt-stop").addEventListener("click", endCalibration);
 element("recenter").addEventListener("click", recenter);
 element("freeze").addEventListener("click", freeze);
+element("save-names").addEventListener("click", () => character && giveNames(character));
 element("reset").addEventListener("click", () => {
   engine.reset();
   keepSettings({ gains: {}, centre: null });
@@ -206,8 +208,12 @@ const use = (chosen) => {
   character = chosen;
   stage?.show(chosen);
   if (newest !== null) stage?.pose(newest);
+  if (stream) return;
+  tellCharacter(chosen);
+  offerNames(element("names"), chosen, async () => use(await chosen.again(changedNames(chosen.name))));
+  engine.nameShapes?.(changedNames(chosen.name));
 };
-if (!stream) offerCharacters(use);
+if (!stream) offerCharacters(use, (file) => takes.take(file));
 shippedCharacter(use).catch((error) => showProblem("character", `The character could not be loaded: ${error.message}.`));
 takes.refresh();
 if (server || stream) engine.start();

@@ -2,7 +2,7 @@
 
 import { Take } from "./take.js";
 
-const FRAME = 1, PICTURE = 2; // first number of a message
+const FRAME = 1, PICTURE = 2, KEEP = 3; // first number of a message
 const AGAIN = 1000; // milliseconds until a lost connection is tried again
 const PARTS = {
   weights: 52, rotation: 9, gaze: 4, landmarks: 136, iris: 4,
@@ -61,7 +61,7 @@ export class ServerEngine {
 
   #send(message) {
     if (this.#socket?.readyState !== WebSocket.OPEN) throw new Error("torchface does not answer.");
-    this.#socket.send(JSON.stringify(message));
+    this.#socket.send(message instanceof Blob ? message : JSON.stringify(message));
   }
 
   #set(running) {
@@ -118,8 +118,8 @@ class ServerTakes {
     return true;
   }
 
-  start() {
-    this.#send({ record: true });
+  start(filmed = false) {
+    this.#send({ record: true, film: filmed });
     this.recording = { seconds: 0, frames: 0 };
   }
 
@@ -133,9 +133,28 @@ class ServerTakes {
   }
 
   async take(id) {
-    const answer = await fetch(`./takes/${encodeURIComponent(id)}`);
+    return Take.ofRows(new Float32Array(await (await this.#file(id)).arrayBuffer()));
+  }
+
+  async film(id) {
+    return (await this.#file(id, "/film")).blob();
+  }
+
+  async #file(id, part = "") {
+    const answer = await fetch(`./takes/${encodeURIComponent(id)}${part}`);
     if (!answer.ok) throw new Error(`${id}: ${await answer.text()}`);
-    return Take.ofRows(new Float32Array(await answer.arrayBuffer()));
+    return answer;
+  }
+
+  /** A message of numbers: what it is, the bytes of the name, which is filled up to whole numbers, and the rows. */
+  keep(name, take) {
+    const bytes = new TextEncoder().encode(name), room = new Uint8Array(-bytes.length & 3);
+    this.#send(new Blob([Uint32Array.of(KEEP, bytes.length), bytes, room, take.rows]));
+  }
+
+  /** Has the film of a take solved once more, with more time. */
+  solve(id) {
+    this.#send({ solve: id });
   }
 
   rename(id, name) {

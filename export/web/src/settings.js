@@ -2,7 +2,7 @@
 
 const KEY = "torchface";
 const OWN = { groups: {}, gains: {}, centre: null }; // of a person
-const START = { gain: 1, smoothing: 0.5, mirror: true, person: "", people: {}, ...OWN };
+const START = { gain: 1, smoothing: 0.5, mirror: true, keepFilm: false, person: "", people: {}, names: {}, ...OWN };
 
 export const settings = { ...START, ...remembered() };
 

@@ -19,16 +19,22 @@ export class Stage {
   #pace = new DrawingPace(1);
   #asked = false;
   #drawing = false;
+  #film;
 
-  /** @param {HTMLCanvasElement} canvas whose size the page's layout says; throws where there is no WebGL. */
-  constructor(canvas) {
-    this.#renderer = new THREE.WebGLRenderer({ canvas, antialias: !this.#software, alpha: true });
+  /**
+   * @param {HTMLCanvasElement} canvas whose size the page's layout says; throws where there is no WebGL.
+   * @param {{width: number, height: number, background: string} | null} film of one that is drawn for a film, by `drawNow`.
+   */
+  constructor(canvas, film = null) {
+    this.#film = film;
+    this.#renderer = new THREE.WebGLRenderer({ canvas, antialias: film !== null || !this.#software, alpha: true });
+    if (film !== null) this.#scene.background = new THREE.Color(film.background);
     this.#renderer.toneMapping = THREE.NeutralToneMapping;
     const key = new THREE.DirectionalLight(0xfff4e8, 2.2), rim = new THREE.DirectionalLight(0xdce8ff, 0.8);
     key.position.set(-0.6, 0.8, 1);
     rim.position.set(0.9, 0.5, -0.6);
     this.#scene.add(key, rim, new THREE.HemisphereLight(0xffffff, 0x9a8476, 1.5));
-    new ResizeObserver(() => this.#fit()).observe(canvas);
+    if (film === null) new ResizeObserver(() => this.#fit()).observe(canvas);
   }
 
   /** Puts a character in the place of the one before, which is let go. */
@@ -64,20 +70,30 @@ export class Stage {
     }
   }
 
+  /** Draws the character as it is posed. */
+  drawNow() {
+    this.#morphing?.update();
+    this.#renderer.render(this.#scene, this.#camera);
+  }
+
+  dispose() {
+    this.#character?.dispose();
+    this.#renderer.dispose();
+  }
+
   /** Milliseconds that drawing took. */
   async #drawnNow() {
     const began = performance.now();
     if (this.#renderer.getPixelRatio() !== this.#pace.ratio) this.#renderer.setPixelRatio(this.#pace.ratio);
-    this.#morphing?.update();
-    this.#renderer.render(this.#scene, this.#camera);
+    this.drawNow();
     await drawn(this.#renderer.getContext());
     return performance.now() - began;
   }
 
   #fit() {
-    const { clientWidth: width, clientHeight: height } = this.#renderer.domElement;
+    const { clientWidth, clientHeight } = this.#renderer.domElement, { width, height } = this.#film ?? { width: clientWidth, height: clientHeight };
     if (width === 0 || height === 0) return;
-    this.#pace = new DrawingPace(Math.min(this.#software ? 1 : MOST_PIXELS, window.devicePixelRatio));
+    this.#pace = new DrawingPace(this.#film ? 1 : Math.min(this.#software ? 1 : MOST_PIXELS, window.devicePixelRatio));
     this.#renderer.setPixelRatio(this.#pace.ratio);
     this.#renderer.setSize(width, height, false);
     this.#camera.aspect = width / height;
@@ -91,7 +107,7 @@ export class Stage {
       [this.#camera.near, this.#camera.far] = [distance / 50, distance * 20];
     }
     this.#camera.updateProjectionMatrix();
-    this.draw();
+    if (this.#film === null) this.draw();
   }
 }
 

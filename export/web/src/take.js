@@ -1,6 +1,7 @@
 // A recording: weights and rotations of each frame, at the camera's own times.
 
 export const LONGEST = 3600; // seconds; about 40 MB
+export const USUAL_RATES = [15, 20, 24, 25, 30, 50, 60, 120]; // frames a second
 const ROW = 66;
 
 export class Take {
@@ -30,6 +31,13 @@ export class Take {
     return take;
   }
 
+  /** The part from one time to another, seconds, beginning at 0. */
+  part(from, to) {
+    const part = new Take();
+    for (const frame of this.frames) if (frame.seconds >= from && frame.seconds <= to) part.add(1000 * frame.seconds, frame);
+    return part;
+  }
+
   get rows() {
     const rows = new Float32Array(ROW * this.frames.length);
     this.frames.forEach(({ seconds, weights, rotation, gaze }, i) => rows.set([seconds, ...weights, ...rotation, ...gaze], ROW * i));
@@ -53,6 +61,6 @@ export class Take {
     const steps = this.seconds.slice(1).map((time, i) => time - this.frames[i].seconds);
     if (steps.length === 0) return 30;
     const median = steps.sort((a, b) => a - b)[steps.length >> 1];
-    return [15, 20, 24, 25, 30, 50, 60].reduce((a, b) => (Math.abs(b * median - 1) < Math.abs(a * median - 1) ? b : a));
+    return USUAL_RATES.reduce((a, b) => (Math.abs(b * median - 1) < Math.abs(a * median - 1) ? b : a));
   }
 }

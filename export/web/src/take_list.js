@@ -1,8 +1,12 @@
-// The list of takes: played, renamed, deleted, and given as files.
+// The list of takes: played, trimmed, renamed, deleted, and given as files.
 
-import { animatedGlb } from "./glb_animation.js";
-import { liveLinkCsv } from "./live_link_csv.js";
-import { showProblem, speak } from "./words.js";
+import { readLiveLinkCsv } from "./live_link_csv.js";
+import { keepSettings, settings } from "./settings.js";
+import { give, KINDS } from "./take_files.js";
+import { hideProblem, showProblem, speak } from "./words.js";
+
+const FILM = "film";
+const LARGEST = 128 * 2 ** 20; // bytes
 
 const element = (id) => document.getElementById(id);
 
@@ -20,6 +24,8 @@ export class TakeList {
   constructor(takes, character, show) {
     [this.#takes, this.#character, this.#show] = [takes, character, show];
     element("record").addEventListener("click", () => this.toggle());
+    element("keep-film").checked = settings.keepFilm;
+    element("keep-film").addEventListener("change", ({ target }) => keepSettings({ keepFilm: target.checked }));
   }
 
   get playing() {
@@ -28,7 +34,10 @@ export class TakeList {
 
   toggle() {
     if (this.#takes.recording) this.stop();
-    else this.#tried(() => this.#takes.start(), "Recording");
+    else {
+      this.#playing?.stop();
+      this.#tried(() => this.#takes.start(settings.keepFilm), "Recording");
+    }
     this.tell();
   }
 
@@ -52,6 +61,7 @@ export class TakeList {
   async refresh() {
     try {
       const found = await this.#takes.list();
+      if (this.#playing?.button === null) this.#playing.stop(); // its row goes
       element("takes").replaceChildren(...found.map((one) => this.#row(one)));
       element("no-takes").hidden = found.length > 0;
     } catch {
@@ -59,7 +69,7 @@ export class TakeList {
     }
   }
 
-  #row({ id, name, seconds, frames }) {
+  #row({ id, name, seconds, frames, film = "", solvable = false }) {
     const row = document.createElement("li");
     const title = Object.assign(document.createElement("input"), { value: name, maxLength: 60, className: "name" });
     title.setAttribute("aria-label", "Name of the take");
@@ -71,14 +81,90 @@ export class TakeList {
       made.addEventListener("click", () => this.#tried(() => act(made)));
       return made;
     };
+    const saving = Object.assign(document.createElement("select"), { className: "save" });
+    saving.setAttribute("aria-label", `Save ${name} as`);
+    saving.append(new Option("Save as…", ""), ...Object.keys(KINDS).map((kind) => new Option(kind, kind)));
+    if (film) saving.append(new Option("the camera's film", FILM));
+    saving.addEventListener("change", () => {
+      const kind = saving.value;
+      saving.value = "";
+      if (kind) this.#tried(() => (kind === FILM ? this.#giveFilm(id, name, film) : this.#save(id, name, kind)));
+    });
     row.append(
       title, facts,
       button("Play", "play", (made) => this.#play(id, made)),
-      button("CSV", "csv", async () => give(`${name}.csv`, liveLinkCsv(await this.#takes.take(id)), "text/csv")),
-      button(".glb", "glb", async () => give(`${name}.glb`, this.#animation(await this.#takes.take(id)), "model/gltf-binary")),
+      button("Trim", "trim", () => this.#trim(id, name, row)),
+      saving,
+      ...(solvable ? [button("Solve again", "solve", () => this.#takes.solve(id))] : []),
       button("Delete", "delete", () => this.#takes.remove(id)),
     );
     return row;
+  }
+
+  async #save(id, name, kind) {
+    const working = element("working");
+    try {
+      working.value = `Making ${name}${kind} …`;
+      const progress = (done) => (working.value = `Making ${name}${kind}: ${Math.round(100 * done)} %`);
+      give(name, kind, await KINDS[kind](await this.#takes.take(id), this.#character(), progress));
+    } finally {
+      working.value = "";
+    }
+  }
+
+  async #giveFilm(id, name, suffix) {
+    give(`${name} camera`, suffix, await this.#takes.film(id));
+  }
+
+  /** Two times to be set, shown on the character as they are; what lies between becomes a take of its own. */
+  async #trim(id, name, row) {
+    const open = row.querySelector(".trimming");
+    this.#playing?.stop();
+    if (open) return open.remove();
+    const take = await this.#takes.take(id), part = Object.assign(document.createElement("div"), { className: "trimming" });
+    const [from, to] = [["from", 0], ["to", take.duration]].map(([word, value]) => {
+      const input = Object.assign(document.createElement("input"), { type: "range", min: 0, max: take.duration, step: 0.01, value });
+      const label = document.createElement("label"), time = document.createElement("output");
+      const tell = () => (time.value = `${Number(input.value).toFixed(2)} s`);
+      label.append(`${word} `, time, input);
+      tell();
+      input.addEventListener("input", () => {
+        tell();
+        this.#still(take.frames.findLast(({ seconds }) => seconds <= Number(input.value)) ?? take.frames[0]);
+      });
+      part.append(label);
+      return input;
+    });
+    const keep = Object.assign(document.createElement("button"), { type: "button", textContent: "Keep this part" });
+    keep.addEventListener("click", () => this.#tried(async () => {
+      const kept = take.part(Number(from.value), Number(to.value));
+      if (kept.frames.length === 0) throw new Error("No frame lies between these two times.");
+      this.#playing?.stop();
+      await this.#takes.keep(`${name}, part`, kept);
+    }, "Kept"));
+    part.append(keep);
+    row.append(part);
+  }
+
+  /** Shows one frame until something else is shown. */
+  #still(frame) {
+    this.#playing ??= { button: null, stop: () => (this.#playing = null) };
+    this.#show(frame);
+  }
+
+  /** Takes a recording that was dropped on the page. */
+  async take(file) {
+    await this.#tried(async () => {
+      if (file.size > LARGEST) throw new Error(`${file.name}: the page takes recordings of up to ${LARGEST / 2 ** 20} MB.`);
+      let take;
+      try {
+        take = readLiveLinkCsv(await file.text());
+      } catch (error) {
+        throw new Error(`${file.name}: ${error.message}`);
+      }
+      await this.#takes.keep(file.name.replace(/\.csv$/i, ""), take);
+      hideProblem("takes");
+    }, "Taken");
   }
 
   async #play(id, button) {
@@ -100,11 +186,6 @@ export class TakeList {
     requestAnimationFrame(next);
   }
 
-  #animation(take) {
-    const character = this.#character();
-    return animatedGlb(character.check, take, character.turnedNodes(take));
-  }
-
   async #tried(act, words = "") {
     try {
       await act();
@@ -113,10 +194,4 @@ export class TakeList {
       showProblem("takes", error.message);
     }
   }
-}
-
-function give(name, made, type) {
-  const address = URL.createObjectURL(new Blob([made], { type }));
-  Object.assign(document.createElement("a"), { href: address, download: name.replace(/[\\/:*?"<>|]/g, "-") }).click();
-  setTimeout(() => URL.revokeObjectURL(address), 60_000); // the browser may ask first where to put it
 }

@@ -62,17 +62,63 @@ const jobs = {
     return shapeSettings(groups, gains);
   },
 
-  /** A .glb as base64 with a take of one frame or more, given as rows. */
-  async animation() {
+  /** A take of one frame or more, given as rows, as a file of a kind, base64. */
+  async save() {
     globalThis.self = globalThis;
     const { readCharacter } = await load("character");
-    const { animatedGlb } = await load("glb_animation");
+    const { KINDS } = await load("take_files");
     const { Take } = await load("take");
-    const { glb, rows, sources } = JSON.parse(input);
+    const { glb, rows, kind, sources = null, changed } = JSON.parse(input);
     const data = readFileSync(glb);
-    const character = await readCharacter(data.buffer.slice(data.byteOffset, data.byteOffset + data.length), "file", sources);
-    const take = Take.ofRows(Float32Array.from(rows.flat()));
-    return Buffer.from(animatedGlb(character.check, take, character.turnedNodes(take))).toString("base64");
+    const character = await readCharacter(data.buffer.slice(data.byteOffset, data.byteOffset + data.length), "file", sources, changed);
+    const made = await KINDS[kind](Take.ofRows(Float32Array.from(rows.flat())), character);
+    return Buffer.from(await new Blob([made]).arrayBuffer()).toString("base64");
+  },
+
+  /** Where each mesh's vertices are in each frame of a take, as three.js has them. */
+  async places() {
+    globalThis.self = globalThis;
+    const { readCharacter } = await load("character");
+    const { Take } = await load("take");
+    const { Vector3 } = await import("three");
+    const { glb, rows } = JSON.parse(input), data = readFileSync(glb), meshes = [];
+    const character = await readCharacter(data.buffer.slice(data.byteOffset, data.byteOffset + data.length), "file");
+    character.root.traverse((object) => object.isMesh && meshes.push(object));
+    return Take.ofRows(Float32Array.from(rows.flat())).frames.map((frame) => {
+      character.pose(frame);
+      character.root.updateMatrixWorld(true);
+      return meshes.map((mesh) => Array.from({ length: mesh.geometry.attributes.position.count }, (_, i) => mesh.getVertexPosition(i, new Vector3()).applyMatrix4(mesh.matrixWorld).toArray()));
+    });
+  },
+
+  /** Rows of the take of a .csv, or what is said of one that is none. */
+  async csv() {
+    const { readLiveLinkCsv } = await load("live_link_csv");
+    try {
+      return Array.from(readLiveLinkCsv(input.toString()).rows);
+    } catch (error) {
+      return error.message;
+    }
+  },
+
+  /** Tables of names, and what ARKit calls a list of names. */
+  async tables() {
+    const { arkitName } = await load("arkit_names");
+    return { ...(await load("shape_tables")), names: JSON.parse(input).map((name) => arkitName(name) ?? null) };
+  },
+
+  /** VRM's expressions of weights. */
+  async expressions() {
+    const { vrmExpressions } = await load("vrm_animation");
+    return JSON.parse(input).map(vrmExpressions);
+  },
+
+  /** The time of a part of a take that begins at 10 s. */
+  async part() {
+    const { Take } = await load("take");
+    const take = new Take(), nothing = new Float32Array(9);
+    for (let i = 0; i < 30; i++) take.add(10_000 + 100 * i, { weights: nothing, rotation: nothing, gaze: nothing });
+    return take.part(...JSON.parse(input)).seconds;
   },
 
   /** Times and rate of a recording of frames at these milliseconds. */

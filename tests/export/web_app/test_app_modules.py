@@ -14,18 +14,20 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from planted.characters import Planted, write_character
 from rig_samples import corrective_sheet, quad_sheet
 from scipy.spatial.transform import Rotation
 
 from torchface import BlendshapeRig
 from torchface.errors import MissingExtraError, ValueRangeError
-from torchface.io import load_rig, save_rig
+from torchface.io import load_rig, load_take, save_rig
 from torchface.io.gltf.accessors import read_floats
 from torchface.io.gltf.gltf_document import read_document
 from torchface.io.gltf.performance_animation import Performance, performed_glb
 from torchface.io.gltf.primitive_reading import read_target_names
+from torchface.io.weights.weight_csv import save_weights_csv
 from torchface.progress import silent
-from torchface.shape_names import ARKIT, mapping
+from torchface.shape_names import ARKIT, VRM1, mapping, recognised_names
 from torchface.workflows.browser_app.built_page import installed_packages, page_sources
 from torchface.workflows.browser_app.character import load_character
 from torchface.workflows.live.live_frames import LiveFrame
@@ -72,6 +74,27 @@ def test_names_are_taken_as_torchface_takes_them(run: Run) -> None:
         for column, factor in sources:
             found[row, column] = factor
     torch.testing.assert_close(found, mapping(ARKIT, names))
+
+
+def test_names_of_other_programs_are_recognised_by_the_same_tables(run: Run) -> None:
+    names = ["Fcl_EYE_Close_L", "A25_Jaw_Open", "facs_bs_MouthSmileLeft_div2", "Eye_R_Look_L", "browInnerUp_L", "Fcl_Joy"]
+    names += ["head_lod0_mesh__eyes_blink", "BrowRaiseInnerL", "mixamorig:jawOpen.001", "LipCornerPullerR", "V_Open", ""]
+    told = run("tables", names)
+    table: dict[str, list[str]] = {}
+    for words, arkit in recognised_names._table().items():
+        table.setdefault(arkit, []).append(" ".join(words))
+    assert told["RECOGNISED"] == table
+    assert told["names"] == [recognised_names.arkit_name(name) for name in names]
+    assert told["VRM_POSES"] == VRM1.poses
+    assert told["VRM_BOTH"] == {whole: list(two) for whole, two in VRM1.both.items()}
+
+
+def test_expressions_of_a_vrm_animation_are_those_that_vmc_sends(run: Run) -> None:
+    weights = torch.rand(5, 52, generator=torch.Generator().manual_seed(0)) * 0.7
+    found = run("expressions", weights.tolist())
+    expected = VRM1.from_arkit(weights)
+    for row, one in zip(expected, found, strict=True):
+        np.testing.assert_allclose([one[name] for name in VRM1.names], row, atol=1e-4)
 
 
 POSES = (
@@ -228,6 +251,10 @@ def test_morph_targets_summed_for_software_drawing_are_those_of_three(run: Run, 
     assert not told["left"]
 
 
+def saved(run: Run, job: dict[str, Any], kind: str) -> bytes:
+    return base64.b64decode(run("save", {**job, "kind": kind}))
+
+
 TILT = [0.0, 0.0, 0.3826834, 0.9238795]  # 45 degrees about z: bones rarely lie along the axes
 
 
@@ -276,7 +303,7 @@ def test_a_take_in_the_characters_file_is_the_same_from_page_and_python(
     rows = np.column_stack([seconds, arkit, head.reshape(5, 9), -angles[:, [6, 7, 3, 4]]])
     character = load_character(path)
     job = {"glb": str(path), "rows": rows.tolist(), "sources": json.loads(character.page_table())["sources"]}
-    (tmp_path / "page.glb").write_bytes(base64.b64decode(run("animation", job)))
+    (tmp_path / "page.glb").write_bytes(saved(run, job, ".glb"))
     weights = character.weights(torch.from_numpy(arkit)).numpy()
     all_names, targets = character.targets(torch.from_numpy(weights))
     ours = performed_glb(character.document, Performance(seconds, all_names, targets.numpy(), angles))
@@ -317,6 +344,73 @@ def test_a_take_in_the_characters_file_is_the_same_from_page_and_python(
     way = (tilt * tilt * left * (tilt * tilt * tilt).inv()).apply([0.0, 0.0, 1.0])  # beside a head at rest
     np.testing.assert_allclose(np.arctan2(way[:, 0], way[:, 2]), -angles[:, 3], atol=1e-5)
     np.testing.assert_allclose(np.arcsin(way[:, 1]), -angles[:, 4], atol=1e-5)
+
+
+def planted_rows(count: int = 5) -> np.ndarray:
+    """Rows of a take: seconds, weights, rotation, gaze."""
+    rng = np.random.default_rng(3)
+    head = np.diag([1.0, -1.0, -1.0]) @ Rotation.from_euler("YXZ", 0.3 * rng.normal(size=(count, 3))).as_matrix()
+    parts = (np.arange(count) / 30, rng.random((count, 52)), head.reshape(count, 9), 0.2 * rng.normal(size=(count, 4)))
+    return np.column_stack(parts)
+
+
+def test_a_take_comes_back_from_its_csv(run: Run, tmp_path: Path) -> None:
+    rows, character = planted_rows(40), sheet(tmp_path / "sheet.glb", ("jawOpen",))
+    (tmp_path / "take.csv").write_bytes(saved(run, {"glb": str(character), "rows": rows.tolist()}, ".csv"))
+    np.testing.assert_allclose(np.reshape(run("csv", tmp_path / "take.csv"), rows.shape), rows, rtol=0, atol=2e-6)
+    take = load_take(tmp_path / "take.csv")
+    save_weights_csv(take, tmp_path / "weights.csv")
+    again = np.reshape(run("csv", tmp_path / "weights.csv"), rows.shape)
+    np.testing.assert_allclose(again[:, :53], rows[:, :53], rtol=0, atol=2e-6)
+    for text in ("", "a,b\n1,2\n", "frame,time,antenna\n0,0,1\n", "Timecode,jawOpen\n"):
+        (tmp_path / "other.csv").write_text(text)
+        assert isinstance(run("csv", tmp_path / "other.csv"), str), text
+
+
+def test_a_part_of_a_take_begins_at_0(run: Run) -> None:
+    np.testing.assert_allclose(run("part", [0.95, 1.25]), [0, 0.1, 0.2], atol=1e-6)
+
+
+def without_pictures(root: dict[str, Any]) -> None:
+    """Node reads none."""
+    for name in ("images", "textures"):
+        root.pop(name, None)
+    for material in root["materials"]:
+        material.get("pbrMetallicRoughness", {}).pop("baseColorTexture", None)
+
+
+@pytest.mark.parametrize("kind", ["skinned", "bones", "plain"])
+def test_openusd_moves_a_saved_character_as_three_does(run: Run, tmp_path: Path, kind: str) -> None:
+    from pxr import Gf, Usd, UsdGeom, UsdSkel
+
+    path, names = tmp_path / "character.glb", ("jawOpen", "mouthSmile_L", "antenna")
+    if kind == "skinned":
+        mesh = quad_sheet()
+        deltas = torch.randn(len(names), len(mesh.vertices), 3, generator=torch.Generator().manual_seed(0))
+        write_character(path, mesh, dict(zip(names, deltas, strict=True)), Planted(vrm="VRM"))
+        edited(path.read_bytes(), path, without_pictures)
+    else:
+        sheet(path, names)
+    if kind == "bones":
+        edited(path.read_bytes(), path, with_bones)
+    job = {"glb": str(path), "rows": planted_rows().tolist()}
+    (tmp_path / "take.usdz").write_bytes(saved(run, job, ".usdz"))
+    stage = Usd.Stage.Open(str(tmp_path / "take.usdz"))
+    root = UsdSkel.Root(stage.GetPrimAtPath("/Character"))
+    animation = UsdSkel.Animation(stage.GetPrimAtPath("/Character/Animation"))
+    assert list(animation.GetBlendShapesAttr().Get()) == ["jawOpen", "mouthSmile_L"]
+    assert UsdSkel.BakeSkinning(root, Gf.Interval.GetFullInterval())
+    meshes = [prim for prim in stage.Traverse() if prim.IsA(UsdGeom.Mesh)]
+    expected = run("places", job)
+    times = animation.GetRotationsAttr().GetTimeSamples() or animation.GetBlendShapeWeightsAttr().GetTimeSamples()
+    assert len(times) == len(expected)
+    for time, frame in zip(times, expected, strict=True):
+        assert len(meshes) == len(frame)
+        for prim, places in zip(meshes, frame, strict=True):
+            points = np.array(UsdGeom.Mesh(prim).GetPointsAttr().Get(time))
+            world = np.array(UsdGeom.Xformable(prim).ComputeLocalToWorldTransform(time))
+            np.testing.assert_allclose(points @ world[:3, :3] + world[3, :3], places, rtol=0, atol=2e-5)
+    assert np.ptp(np.array(expected[0][0]) - np.array(expected[-1][0]), axis=0).max() > 1e-3
 
 
 def test_arms_that_stand_off_hang_and_arms_that_hang_stay(run: Run, tmp_path: Path) -> None:
