@@ -22,6 +22,7 @@ def live(
     calibrate: bool = False,
     to: UseAppendAction[tuple[str, ...]] = (),
     record: Annotated[Path | None, Output(_FILES)] = None,
+    takes: Path | None = None,
     page: bool = True,
     port: int = 8080,
     size: str = "640x480",
@@ -55,6 +56,8 @@ def live(
         record: Record from the first frame on into this folder: weights.csv by the character's names, live_link.csv,
             animation.glb (the character's own file with weights, head, neck and eyes), summary.json. The page's button
             records into `recordings` without.
+        takes: The folder of the page's takes, where its button records too; files that lie in it (CSV of Live Link Face,
+            iFacialMocap's and Face Cap's text, JSON of face anchors) become takes. `recordings` if absent.
         page: Open the page in the browser.
         port: The first port to try for the page.
         size: WIDTHxHEIGHT to ask the camera for.
@@ -80,7 +83,7 @@ def live(
     from torchface.workflows.live.live_anybody import LiveSettings, go_live, person_solver
 
     settings = LiveSettings(
-        camera, character, mapping, to, record, calibrate, page, port, loop, seconds, enhance, sides
+        camera, character, mapping, to, record, takes, calibrate, page, port, loop, seconds, enhance, sides
     )
 
     def opened(url: str) -> None:

@@ -56,8 +56,9 @@ export async function shippedCharacter(use, remembered = true) {
 async function taken(file, use, sources, keep) {
   try {
     checkSize(file.size);
-    use(await readCharacter(await file.arrayBuffer(), file.name, sources, changedNames(file.name)));
+    const character = await readCharacter(await file.arrayBuffer(), file.name, sources, changedNames(file.name));
     element("own").hidden = sources !== null;
+    use(character);
     if (keep) await keepFile(KEY, file).catch(() => {}); // a browser that keeps nothing
     hideProblem("character");
     return true;

@@ -211,7 +211,7 @@ const use = (chosen) => {
   if (stream) return;
   tellCharacter(chosen);
   offerNames(element("names"), chosen, async () => use(await chosen.again(changedNames(chosen.name))));
-  engine.nameShapes?.(changedNames(chosen.name));
+  engine.nameShapes?.(element("own").hidden ? changedNames(chosen.name) : {});
 };
 if (!stream) offerCharacters(use, (file) => takes.take(file));
 shippedCharacter(use).catch((error) => showProblem("character", `The character could not be loaded: ${error.message}.`));

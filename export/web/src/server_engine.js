@@ -2,7 +2,8 @@
 
 import { Take } from "./take.js";
 
-const FRAME = 1, PICTURE = 2, KEEP = 3; // first number of a message
+const FRAME = 1, PICTURE = 2; // first number of a message
+const PART = 2 ** 15; // bytes of a take in a message
 const AGAIN = 1000; // milliseconds until a lost connection is tried again
 const PARTS = {
   weights: 52, rotation: 9, gaze: 4, landmarks: 136, iris: 4,
@@ -15,6 +16,7 @@ export class ServerEngine {
   #socket = null;
   #ended = false;
   #sent = "";
+  #names = {};
   running = false;
   threads = 1;
 
@@ -35,6 +37,7 @@ export class ServerEngine {
     this.#socket.onopen = () => {
       this.#sent = "";
       this.sendControls();
+      this.nameShapes(this.#names);
     };
     this.#socket.onmessage = ({ data }) => (typeof data === "string" ? this.#take(JSON.parse(data)) : this.#show(data));
     this.#socket.onclose = () => {
@@ -59,9 +62,15 @@ export class ServerEngine {
     this.#socket.send(message);
   }
 
+  /** Says what names of the shapes of torchface's character mean, for what it records. */
+  nameShapes(names) {
+    this.#names = names;
+    if (this.#socket?.readyState === WebSocket.OPEN) this.#send({ names });
+  }
+
   #send(message) {
     if (this.#socket?.readyState !== WebSocket.OPEN) throw new Error("torchface does not answer.");
-    this.#socket.send(message instanceof Blob ? message : JSON.stringify(message));
+    this.#socket.send(message instanceof Uint8Array ? message : JSON.stringify(message));
   }
 
   #set(running) {
@@ -146,10 +155,10 @@ class ServerTakes {
     return answer;
   }
 
-  /** A message of numbers: what it is, the bytes of the name, which is filled up to whole numbers, and the rows. */
   keep(name, take) {
-    const bytes = new TextEncoder().encode(name), room = new Uint8Array(-bytes.length & 3);
-    this.#send(new Blob([Uint32Array.of(KEEP, bytes.length), bytes, room, take.rows]));
+    const bytes = new Uint8Array(take.rows.buffer);
+    this.#send({ keep: name, bytes: bytes.length });
+    for (let at = 0; at < bytes.length; at += PART) this.#send(bytes.subarray(at, at + PART));
   }
 
   /** Has the film of a take solved once more, with more time. */

@@ -30,11 +30,15 @@ def watched(page: Page, what: str) -> Any:
     return page.driver.execute_script(f"return JSON.parse(JSON.stringify({what}))")
 
 
-def blob(page: Page, button: str) -> bytes:
-    """What a button of the newest take downloads."""
+def blob(page: Page, kind: str) -> bytes:
+    """What saving the newest take as a kind of file downloads."""
     count = page.driver.execute_script("return watched.blobs.length")
-    page.driver.execute_script("document.querySelector(`#takes .${arguments[0]}`).click()", button)
-    until(lambda: page.driver.execute_script("return watched.blobs.length") > count)
+    choose = (
+        "const e = document.querySelector('#takes .save'); e.value = arguments[0]; e.dispatchEvent(new Event('change'))"
+    )
+    page.driver.execute_script(choose, kind)
+    until(lambda: page.driver.execute_script("return watched.blobs.length") > count or page.problem)
+    assert not page.problem, page.problem
     script = "const done = arguments[0]; watched.text(watched.blobs.at(-1)).then(done)"
     return base64.b64decode(page.driver.execute_async_script(script))
 
@@ -78,8 +82,8 @@ def record(page: Page, folder: Path, frames: int) -> Recorded:
     solved = page.driver.execute_script(
         "return watched.solved.map(s => ({...s, weights: [...s.weights], rotation: [...s.rotation]}))"
     )
-    (folder / "take.csv").write_bytes(blob(page, "csv"))
-    (folder / "take.glb").write_bytes(blob(page, "glb"))
+    (folder / "take.csv").write_bytes(blob(page, ".csv"))
+    (folder / "take.glb").write_bytes(blob(page, ".glb"))
     return Recorded(sent, solved, folder / "take.csv", folder / "take.glb")
 
 

@@ -15,7 +15,7 @@ from app_browser import Page, Server, elsewhere, film_camera, static_host
 from film import planted_film, write_y4m
 from headless_chromium import headless_chromium, until
 from planted_graph import write_planted_graph
-from recorded_take import Recorded, allow_camera, assert_same_weights, record, watch, watched
+from recorded_take import Recorded, allow_camera, assert_same_weights, blob, record, watch, watched
 from rig_samples import quad_sheet
 from test_gltf_viewers import WEB, assert_valid, node  # noqa: F401  (its packages)
 
@@ -26,6 +26,7 @@ from torchface.io.gltf.animation_reading import read_gltf_weights
 from torchface.io.weights.live_link_csv import load_live_link
 from torchface.shape_names import ARKIT
 from torchface.workflows.browser_app import export_app
+from torchface.workflows.browser_app.character import load_character
 from torchface.workflows.track.head_rotations import head_angles
 
 pytestmark = pytest.mark.browser
@@ -345,7 +346,7 @@ def test_tab_goes_through_the_controls_in_the_order_in_which_they_stand(opened: 
     driver.execute_script("document.getElementById('start').focus()")
     focused = """
     const one = document.activeElement, { outlineStyle, outlineWidth } = getComputedStyle(one);
-    return [one.id || one.textContent, outlineStyle, parseFloat(outlineWidth)];
+    return [one.id || (one.tagName === "SELECT" ? one.className : one.textContent), outlineStyle, parseFloat(outlineWidth)];
     """
     found = []
     wanted = [
@@ -358,10 +359,11 @@ def test_tab_goes_through_the_controls_in_the_order_in_which_they_stand(opened: 
         "recenter",
         "freeze",
         "record",
+        "keep-film",
         "choose",
         "own",
     ]
-    wanted += ["Groups of shapes", "", "Play", "CSV", ".glb", "Delete", "Licences"]
+    wanted += ["Groups of shapes", "Names of shapes", "", "Play", "Trim", "save", "Delete", "Licences"]
     for _ in wanted:
         ActionChains(driver).send_keys(Keys.TAB).perform()
         found.append(driver.execute_script(focused))
@@ -410,12 +412,15 @@ def test_axe_core_finds_nothing_and_nothing_is_wider_than_the_page(
     driver.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", screen)
     driver.execute_script((WEB / "node_modules" / "axe-core" / "axe.min.js").read_text())
     page.start()
-    driver.execute_script("document.querySelector('details').open = true")
+    opening = "for (const one of document.querySelectorAll('details')) one.open = arguments[0]"
+    driver.execute_script(opening, True)
+    driver.execute_script("document.querySelector('#takes .trim').click()")
+    until(lambda: driver.execute_script("return document.querySelector('.trimming') !== null"))
     page.click("calibrate")
     assert driver.execute_async_script(AXE) == []
     assert driver.execute_script("return document.documentElement.scrollWidth") <= width
     page.click("prompt-stop")
-    driver.execute_script("document.querySelector('details').open = false")
+    driver.execute_script(opening, False)
     driver.execute_cdp_cmd("Emulation.clearDeviceMetricsOverride", {})
 
 
@@ -425,14 +430,12 @@ def broken(folder: Path) -> dict[str, tuple[Path, str]]:
     save_rig(sheet(("jawOpen", "mouthClose")), good)
     data = good.read_bytes()
     save_mesh(quad_sheet(), folder / "still.glb")
-    save_rig(sheet(("alpha", "beta")), folder / "strange.glb")
     (folder / "text.glb").write_text("not a character")
     (folder / "cut.glb").write_bytes(data[: len(data) // 2])
     with (folder / "huge.glb").open("wb") as file:
         file.truncate(200 * 2**20)
     return {
         "still": (folder / "still.glb", "no morph targets"),
-        "strange": (folder / "strange.glb", "Found: alpha, beta"),
         "text": (folder / "text.glb", "no .glb file"),
         "cut": (folder / "cut.glb", "cut short"),
         "huge": (folder / "huge.glb", "200 MB"),
@@ -451,6 +454,59 @@ def test_a_character_that_cannot_be_used_is_explained_and_the_one_before_stays(o
     chooser.send_keys(str(tmp_path / "good.glb"))
     until(lambda: page.text("character-line") == "good.glb: your face moves 2 of its 2 shapes")
     assert page.problem == ""
+
+
+def test_names_of_shapes_are_changed_and_kept_for_the_character(opened: Open, tmp_path: Path) -> None:
+    page, driver = opened.page, opened.page.driver
+    save_rig(sheet(("alpha", "beta")), tmp_path / "strange.glb")
+    driver.find_element("id", "file").send_keys(str(tmp_path / "strange.glb"))
+    until(lambda: "moves 0 of its 2 shapes; these stay still: alpha, beta. Say below" in page.text("character-line"))
+    row = "const e = document.querySelector('[aria-label=\"alpha means\"]'); "
+    driver.execute_script(row + "e.value = 'jawOpen'; e.dispatchEvent(new Event('change'))")
+    known = "strange.glb: your face moves 1 of its 2 shapes; these stay still: beta"
+    until(lambda: page.text("character-line") == known)
+    driver.refresh()
+    until(lambda: page.text("character-line") == known)
+    assert driver.execute_script(row + "return e.value") == "jawOpen"
+    count = driver.execute_script("return watched.blobs.length")
+    driver.execute_script("document.getElementById('save-names').click()")
+    until(lambda: driver.execute_script("return watched.blobs.length") > count)
+    text = driver.execute_async_script("const done = arguments[0]; watched.blobs.at(-1).text().then(done)")
+    (tmp_path / "names.toml").write_text(text)
+    moved = load_character(tmp_path / "strange.glb", tmp_path / "names.toml")
+    assert moved.shapes.undriven == ("beta",)
+
+
+def test_takes_are_trimmed_taken_from_a_file_and_deleted(opened: Open, recorded: Recorded, tmp_path: Path) -> None:
+    page, driver = opened.page, opened.page.driver
+    names = "return [...document.querySelectorAll('#takes .name')].map(e => e.value)"
+    count = len(driver.execute_script(names))
+    press = "document.querySelector(arguments[0]).click()"
+    driver.execute_script(press, "#takes .trim")
+    slide = "const e = document.querySelectorAll('.trimming input'); e[0].value = 0.2; e[1].value = 0.55; "
+    until(lambda: driver.execute_script("return document.querySelector('.trimming') !== null"))
+    driver.execute_script(slide + "for (const one of e) one.dispatchEvent(new Event('input'))")
+    driver.execute_script(press, ".trimming button")
+    until(lambda: len(driver.execute_script(names)) == count + 1)
+    assert driver.execute_script(names)[0].endswith(", part")
+    (tmp_path / "part.csv").write_bytes(blob(page, ".csv"))
+    seconds, whole = load_take(tmp_path / "part.csv").times, load_take(recorded.csv).times
+    inside = whole[(whole >= 0.2) & (whole <= 0.55)]
+    torch.testing.assert_close(seconds, inside - inside[0], rtol=0, atol=2e-3)
+    drop = """
+    const given = new DataTransfer(); given.items.add(new File([arguments[0]], arguments[1]));
+    document.body.dispatchEvent(new DragEvent("drop", { dataTransfer: given, bubbles: true }));
+    """
+    driver.execute_script(drop, (tmp_path / "part.csv").read_text(), "phone.csv")
+    until(lambda: driver.execute_script(names)[0] == "phone")
+    (tmp_path / "again.csv").write_bytes(blob(page, ".csv"))
+    weights = [load_take(tmp_path / name).weights for name in ("part.csv", "again.csv")]
+    torch.testing.assert_close(weights[0].values, weights[1].values, rtol=0, atol=1e-6)
+    driver.execute_script(drop, "a,b\n1,2\n", "table.csv")
+    assert "table.csv: this is no recording of ARKit's shapes" in until(lambda: page.problem)
+    for left in (count + 1, count):
+        driver.execute_script(press, "#takes .delete")
+        until(lambda left=left: len(driver.execute_script(names)) == left)
 
 
 @pytest.mark.real

@@ -14,10 +14,12 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from planted.characters import Planted, write_character
+from browser import posted
 from rig_samples import corrective_sheet, quad_sheet
 from scipy.spatial.transform import Rotation
+from test_vrm_in_browser import browser as vrm_browser  # noqa: F401  (three-vrm's packages)
 
+from planted.characters import Planted, write_character
 from torchface import BlendshapeRig
 from torchface.errors import MissingExtraError, ValueRangeError
 from torchface.io import load_rig, load_take, save_rig
@@ -34,6 +36,7 @@ from torchface.workflows.live.live_frames import LiveFrame
 from torchface.workflows.live.weight_controls import WeightControls, read_weight_settings
 
 pytestmark = pytest.mark.browser
+VRM_WEB = Path(__file__).parents[2] / "io" / "vrm" / "web"
 Run = Callable[[str, object], Any]
 
 
@@ -77,8 +80,22 @@ def test_names_are_taken_as_torchface_takes_them(run: Run) -> None:
 
 
 def test_names_of_other_programs_are_recognised_by_the_same_tables(run: Run) -> None:
-    names = ["Fcl_EYE_Close_L", "A25_Jaw_Open", "facs_bs_MouthSmileLeft_div2", "Eye_R_Look_L", "browInnerUp_L", "Fcl_Joy"]
-    names += ["head_lod0_mesh__eyes_blink", "BrowRaiseInnerL", "mixamorig:jawOpen.001", "LipCornerPullerR", "V_Open", ""]
+    names = [
+        "Fcl_EYE_Close_L",
+        "A25_Jaw_Open",
+        "facs_bs_MouthSmileLeft_div2",
+        "Eye_R_Look_L",
+        "browInnerUp_L",
+        "Fcl_Joy",
+    ]
+    names += [
+        "head_lod0_mesh__eyes_blink",
+        "BrowRaiseInnerL",
+        "mixamorig:jawOpen.001",
+        "LipCornerPullerR",
+        "V_Open",
+        "",
+    ]
     told = run("tables", names)
     table: dict[str, list[str]] = {}
     for words, arkit in recognised_names._table().items():
@@ -411,6 +428,43 @@ def test_openusd_moves_a_saved_character_as_three_does(run: Run, tmp_path: Path,
             world = np.array(UsdGeom.Xformable(prim).ComputeLocalToWorldTransform(time))
             np.testing.assert_allclose(points @ world[:3, :3] + world[3, :3], places, rtol=0, atol=2e-5)
     assert np.ptp(np.array(expected[0][0]) - np.array(expected[-1][0]), axis=0).max() > 1e-3
+
+
+@pytest.mark.parametrize("own", [False, True])
+def test_three_vrm_plays_a_saved_vrm_animation(run: Run, tmp_path: Path, vrm_browser: str, own: bool) -> None:  # noqa: F811
+    """VRM's expressions on any avatar, ARKit's on one that has them; head, neck and gaze."""
+    avatar, mesh = tmp_path / "avatar.vrm", quad_sheet()
+    names = ("jawOpen", "smile")
+    deltas = torch.randn(2, len(mesh.vertices), 3, generator=torch.Generator().manual_seed(0))
+    expressions = {"happy": "smile", "aa": "jawOpen"}
+    write_character(
+        avatar, mesh, dict(zip(names, deltas, strict=True)), Planted(vrm="VRMC_vrm", expressions=expressions)
+    )
+
+    def with_own(root: dict[str, Any]) -> None:
+        without_pictures(root)
+        bind = {"morphTargetBinds": [{"node": 0, "index": 0, "weight": 1.0}]}
+        root["extensions"]["VRMC_vrm"]["expressions"]["custom"] = {"JawOpen": bind} if own else {}
+
+    edited(avatar.read_bytes(), avatar, with_own)
+    rows = np.repeat(planted_rows(1), 2, axis=0)
+    rows[1, 0] = 1.0  # one pose for a second
+    rows[:, 62:] = [0.2, 0.1, 0.2, 0.1]
+    (tmp_path / "take.vrma").write_bytes(saved(run, {"glb": str(avatar), "rows": rows.tolist()}, ".vrma"))
+    import pygltflib
+
+    assert pygltflib.GLTF2.load_binary(str(tmp_path / "take.vrma")).animations[0].name == "performance"
+    files = {"/avatar.vrm": avatar.read_bytes(), "/animation.vrma": (tmp_path / "take.vrma").read_bytes()}
+    found = posted(vrm_browser, VRM_WEB, "avatar.html?animation=1", tmp_path, files)
+    head = np.diag([1.0, -1.0, -1.0]) @ rows[0, 53:62].reshape(3, 3)
+    angle = Rotation.from_matrix(head).magnitude()
+    assert found["turned"]["head"] == pytest.approx(0.7 * angle, abs=1e-3)
+    assert found["turned"]["neck"] == pytest.approx(0.3 * angle, abs=1e-3)
+    weights = torch.tensor(rows[:1, 1:53], dtype=torch.float32)
+    clips = dict(zip(VRM1.names, VRM1.from_arkit(weights)[0].tolist(), strict=True))
+    expected = {"JawOpen": float(weights[0, ARKIT.index("jawOpen")])} if own else {n: clips[n] for n in expressions}
+    for name, value in expected.items():
+        assert found["shown"][name] == pytest.approx(value, abs=1e-3), name
 
 
 def test_arms_that_stand_off_hang_and_arms_that_hang_stay(run: Run, tmp_path: Path) -> None:

@@ -20,19 +20,23 @@ from torchface.capture.anybody import WebcamControls
 from torchface.cli import main
 from torchface.errors import FileFormatError, ValueRangeError
 from torchface.io.gltf.animation_reading import read_gltf_weights
+from torchface.io.video import open_video
+from torchface.io.video.video_packets import pyav
 from torchface.landmarks.images.boxes.face_box import FaceBoxes
 from torchface.shape_names import ARKIT
 from torchface.workflows.browser_app import character as characters
 from torchface.workflows.browser_app.character import load_character
 from torchface.workflows.live import live_anybody
 from torchface.workflows.live import recordings as recordings_module
-from torchface.workflows.live.live_anybody import LiveSettings, go_live
+from torchface.workflows.live.kept_takes import film_of, kept_takes, remove_take, take_file
+from torchface.workflows.live.live_anybody import LiveSettings, go_live, import_recordings
 from torchface.workflows.live.live_figures import LiveFigures
 from torchface.workflows.live.live_frames import LiveFrame
 from torchface.workflows.live.live_session import LiveSession, Notes
 from torchface.workflows.live.recordings import FrameLog, Recordings
 from torchface.workflows.live.session_prompts import STEPS, FaceWatch, GuidedCalibration
 from torchface.workflows.live.weight_streams import WeightStreams
+from torchface.workflows.track.head_rotations import head_rotations
 
 
 @pytest.fixture(scope="module")
@@ -161,6 +165,72 @@ def test_several_recordings_lie_beside_each_other(dome: Path, tmp_path: Path) ->
         "out/take_3",
     ]
     assert len(load_take(tmp_path / "out" / "take_3" / "weights.csv")) == 5
+
+
+def test_a_take_is_kept_from_rows_read_again_and_imported_from_files(dome: Path, tmp_path: Path) -> None:
+    told: list[str] = []
+    session, recordings = a_session(Endless(1), tmp_path / "takes", dome, told)
+    generator = torch.Generator().manual_seed(0)
+    head = head_rotations(0.3 * torch.randn(6, 3, generator=generator))
+    parts = (torch.arange(6)[:, None] / 24, torch.rand(6, 52, generator=generator), head.flatten(1))
+    rows = torch.cat([*parts, 0.2 * torch.randn(6, 4, generator=generator)], 1)
+    session.keep("my part", rows.numpy())
+    (kept,) = kept_takes(tmp_path / "takes")
+    assert (kept.name, kept.frames, kept.filmed) == ("my part", 6, False)
+    again = np.frombuffer(take_file(tmp_path / "takes", kept.place), "<f4").reshape(-1, 66)
+    np.testing.assert_allclose(again, rows, atol=2e-6)
+    for wrong in (rows[:0], rows.flip(0), rows * torch.nan):
+        with pytest.raises(ValueRangeError, match="expected a take's rows"):
+            session.keep("none", wrong.numpy())
+    (tmp_path / "takes" / "phone.csv").write_bytes((tmp_path / "takes" / "live_link.csv").read_bytes())
+    (tmp_path / "takes" / "notes.csv").write_text("frame,time,antenna\n0,0,1\n1,0.1,1\n")
+    for _ in range(2):  # once each
+        import_recordings(tmp_path / "takes", recordings, told.append)
+    assert sorted(take.name for take in kept_takes(tmp_path / "takes")) == ["my part", "phone.csv"]
+    assert sum("notes.csv: left out: take: found no weights by ARKit's names" in one for one in told) == 2
+
+
+def test_a_takes_film_has_its_pictures_at_their_times(dome: Path, tmp_path: Path) -> None:
+    session, recordings = a_session(Endless(20, fps=25.0), tmp_path / "out", dome, [])
+    session.record(True, filmed=True)
+    session.run()
+    recordings.finish()
+    (kept,) = kept_takes(tmp_path / "out")
+    assert kept.filmed
+    video = open_video(film_of(tmp_path / "out", kept.place))
+    assert (video.width, video.height, video.count, video.fps) == (64, 48, 20, pytest.approx(25, abs=0.1))
+    shades = torch.stack([frame.float().mean() for frame in video.color_frames()])
+    torch.testing.assert_close(shades, 40.0 + torch.arange(20), rtol=0, atol=3)
+    remove_take(tmp_path / "out", kept.place)
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_film_that_cannot_be_written_leaves_the_take(
+    dome: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(*_: object, **__: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    session, recordings = a_session(Endless(20), tmp_path / "out", dome, [])
+    monkeypatch.setattr(pyav(), "open", full)
+    session.record(True, filmed=True)
+    session.run()
+    (saved,) = recordings.finish()
+    assert (saved.frames, saved.error) == (20, "")
+    assert "film.mp4: the film ends: [Errno 28] No space left" in saved.note
+    assert not [path for path in (tmp_path / "out").iterdir() if "film" in path.name]
+
+
+def test_names_of_shapes_mean_what_the_user_says(dome: Path) -> None:
+    character = load_character(dome)
+    first, second = character.names[:2]
+    weights = torch.rand(4, 52, generator=torch.Generator().manual_seed(0))
+    moved = character.renamed({first: "tongueOut", second: "", "elsewhere": "jawOpen", character.names[2]: "nonsense"})
+    found, before = moved.weights(weights), character.weights(weights)
+    assert torch.equal(found[:, 0], weights[:, ARKIT.index("tongueOut")])
+    assert not found[:, 1].any()
+    assert torch.equal(found[:, 2:], before[:, 2:])
+    assert second in moved.shapes.undriven
 
 
 def test_a_full_disk_ends_the_recording_and_not_the_session(

@@ -42,6 +42,7 @@ class Desk:
 
     def __init__(self) -> None:
         self.messages: list[Mapping[str, Any]] = []
+        self.kept: list[tuple[str, np.ndarray]] = []
         self.number, self.closed = 0, False
 
     def next_view(self, before: LiveView | None, seconds: float) -> LiveView | None:
@@ -54,6 +55,9 @@ class Desk:
 
     def state(self) -> dict[str, Any]:
         return {"words": "here"}
+
+    def keep(self, name: str, rows: np.ndarray) -> None:
+        self.kept.append((name, rows))
 
     def left(self) -> None:
         self.closed = True
@@ -138,6 +142,23 @@ def test_the_pages_socket_gives_frames_pictures_and_state_and_takes_wishes(serve
     shown = cv2.imdecode(np.frombuffer(small, np.uint8, offset=8), cv2.IMREAD_COLOR)
     assert shown.shape == (48, 64, 3)
     assert np.abs(shown[24, 32].astype(int) - (50, 100, 200)).max() < 8
+
+
+def test_the_page_hands_takes_over(server: PageServer, desk: Desk) -> None:
+    rows = np.random.default_rng(0).random((5000, 66), np.float32)  # more than a message of the stream's socket
+    data = rows.tobytes()
+    parts = [data[at : at + 2**15] for at in range(0, len(data), 2**15)]
+    with connect(server.url.replace("http", "ws") + "socket") as socket:
+        for wrong in (b"", b"row", '{"keep": "a"}', '{"keep": "a", "bytes": 7}', '{"keep": "a", "bytes": 1e12}'):
+            socket.send(wrong)
+        socket.send(json.dumps({"keep": "left off", "bytes": len(data)}))
+        socket.send(parts[0])
+        socket.send(json.dumps({"keep": "Prüfung", "bytes": len(data)}))
+        for part in parts:
+            socket.send(part)
+        until(lambda: desk.kept, 10)
+    assert [name for name, _ in desk.kept] == ["Prüfung"]
+    np.testing.assert_array_equal(desk.kept[0][1], rows)
 
 
 def test_the_streams_socket_gives_frames_alone_and_takes_nothing(server: PageServer, desk: Desk) -> None:

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -73,6 +73,20 @@ class Character:
             rows = slice(first, first + _BLOCK)
             moved[rows] = self.shapes(arkit[rows])
         return moved
+
+    def renamed(self, meanings: Mapping[str, str]) -> Character:
+        """With other meanings of shapes: ARKit's name, or none for one that stays still, by the shape's name."""
+        shapes, products = self.shapes, list(self.shapes.products)
+        matrix, limits = shapes.matrix.clone(), [getattr(shapes, name).clone() for name in ("gain", "lower", "upper")]
+        for name, arkit in meanings.items():
+            if name in self.names and arkit in ("", *ARKIT):
+                row = self.names.index(name)
+                matrix[row], products[row] = 0, ()
+                for limit, value in zip(limits, (1.0, 0.0, 1.0), strict=True):
+                    limit[row] = value
+                if arkit:
+                    matrix[row, ARKIT.index(arkit)] = 1
+        return replace(self, shapes=ShapeMap(ARKIT, self.names, matrix, tuple(products), *limits))
 
     def notes(self) -> tuple[str, ...]:
         """What the user should know of it."""

@@ -8,15 +8,18 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
-from scipy.spatial.transform import Rotation
+from torch import Tensor
 
 from torchface.errors import FileFormatError
 from torchface.files.documents import parse_json
 from torchface.files.whole_files import delete_file, read_file, write_file
 from torchface.io.weights.live_link_csv import load_live_link
 from torchface.io.weights.weight_csv import ROTATIONS
+from torchface.shape_names import ARKIT, mapping
+from torchface.take import Take
+from torchface.workflows.live.take_film import FILM
+from torchface.workflows.track.head_rotations import head_rotations
 
 WEIGHTS, LIVE_LINK, ANIMATION, SUMMARY = "weights.csv", "live_link.csv", "animation.glb", "summary.json"
 
@@ -33,16 +36,20 @@ class KeptTake:
         place: its folder's name; ``first`` for the one in the folder itself.
         name: for people.
         seconds, frames: how long it is.
+        filmed: whether the camera's film is kept.
     """
 
     place: str
     name: str
     seconds: float
     frames: int
+    filmed: bool = False
 
     def fields(self) -> dict[str, Any]:
         """For the page."""
-        return {"id": self.place, "name": self.name, "seconds": self.seconds, "frames": self.frames}
+        film = Path(FILM).suffix if self.filmed else ""
+        facts = {"id": self.place, "name": self.name, "seconds": self.seconds, "frames": self.frames}
+        return {**facts, "film": film, "solvable": self.filmed}
 
 
 def kept_takes(folder: Path) -> list[KeptTake]:
@@ -54,9 +61,8 @@ def kept_takes(folder: Path) -> list[KeptTake]:
                 with suppress(FileFormatError, ValueError, TypeError, KeyError):
                     facts = _summary(place)
                     name = _FIRST if place == folder else place.name
-                    take = KeptTake(
-                        name, str(facts.get("name", place.name)), float(facts["seconds"]), int(facts["frames"])
-                    )
+                    called, filmed = str(facts.get("name", place.name)), (place / FILM).is_file()
+                    take = KeptTake(name, called, float(facts["seconds"]), int(facts["frames"]), filmed)
                     found.append(((place / SUMMARY).stat().st_mtime, take))
     return [take for _, take in sorted(found, key=lambda one: -one[0])]
 
@@ -68,7 +74,7 @@ def rename_take(folder: Path, place: str, name: str) -> None:
         FileFormatError: there is no such take, or its summary cannot be written.
     """
     path = _place(folder, place)
-    changed = {**_summary(path), "name": "".join(c for c in name if c.isprintable())[:_LONGEST_NAME] or path.name}
+    changed = {**_summary(path), "name": printable(name) or path.name}
     write_file(path / SUMMARY, json.dumps(changed, indent=1).encode())
 
 
@@ -79,29 +85,50 @@ def remove_take(folder: Path, place: str) -> None:
         FileFormatError: there is no such take, or it cannot be deleted.
     """
     path = _place(folder, place)
-    for name in (SUMMARY, WEIGHTS, LIVE_LINK, ANIMATION):
+    for name in (SUMMARY, WEIGHTS, LIVE_LINK, ANIMATION, FILM):
         if (path / name).exists():
             delete_file(path / name)
     with suppress(OSError):
         path.rmdir()
 
 
-def take_rows(folder: Path, place: str) -> bytes:
-    """A take for the page: little-endian floats, rows of seconds, weights (52), rotation (9) and gaze (4).
+def printable(name: str) -> str:
+    """A name without what cannot be shown, and not too long."""
+    return "".join(c for c in name if c.isprintable())[:_LONGEST_NAME]
+
+
+def take_file(folder: Path, place: str) -> bytes:
+    """A take for the page: little-endian floats, see :func:`take_rows`; or its film, where ``/film`` is behind its name.
 
     Raises:
         FileFormatError: there is no such take, or it cannot be read.
     """
-    path = _place(folder, place)
-    take = load_live_link(path / LIVE_LINK)
-    columns = take.extras["columns"]
-    angles = torch.stack([columns[name] for name in ROTATIONS], 1).double().numpy()
-    head = np.diag([1.0, -1.0, -1.0]) @ Rotation.from_euler("YXZ", angles[:, :3]).as_matrix()
+    if place.endswith("/film"):
+        return read_file(film_of(folder, place.removesuffix("/film")))
+    return take_rows(load_live_link(_place(folder, place) / LIVE_LINK)).numpy().astype("<f4").tobytes()
+
+
+def film_of(folder: Path, place: str) -> Path:
+    """The camera's film of a take."""
+    return _place(folder, place) / FILM
+
+
+def take_rows(take: Take) -> Tensor:
+    """A take's rows (T,66): seconds, ARKit's weights (52), rotation (9) and gaze (4).
+
+    Raises:
+        FileFormatError: none of its weights is ARKit's.
+    """
+    names = () if take.weights is None else take.weights.names
+    shapes = mapping(names, ARKIT)
+    if take.weights is None or not shapes.any():
+        raise FileFormatError("take: found no weights by ARKit's names, expected some")
+    columns, still = take.extras.get("columns", {}), torch.zeros(len(take))
+    angles = torch.stack([torch.as_tensor(columns.get(name, still)) for name in ROTATIONS], 1).double().nan_to_num(0.0)
     gaze = -angles[:, [6, 7, 3, 4]]  # the right eye first, to the person's left and up
-    assert take.weights is not None
-    seconds = take.times.numpy()
-    rows = np.column_stack([seconds - seconds[0], take.weights.values[..., 0].numpy(), head.reshape(-1, 9), gaze])
-    return rows.astype("<f4").tobytes()
+    weights = (take.weights.values[..., 0].float() @ shapes.T).nan_to_num(0.0).clamp(0, 1)
+    seconds = (take.times - take.times[0])[:, None]
+    return torch.cat([seconds, weights.double(), head_rotations(angles[:, :3]).flatten(1), gaze], 1)
 
 
 def _place(folder: Path, place: str) -> Path:

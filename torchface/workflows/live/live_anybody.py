@@ -14,8 +14,10 @@ import torch
 from torchface.capture.anybody import WebcamControls
 from torchface.errors import TorchfaceError, ValueRangeError
 from torchface.files.job_lock import job_lock
+from torchface.io import load_take
 from torchface.io.protocols.stream_address import is_source, parse_source
 from torchface.io.protocols.weight_sender import find_receiver
+from torchface.io.take_files import RECORDING_ENDINGS
 from torchface.landmarks.images.checked_detector import shipped_detector
 from torchface.number_checks import checked_number
 from torchface.onnx.webcam.webcam_session import WebcamSession
@@ -26,7 +28,15 @@ from torchface.workflows.browser_app.built_page import built_page
 from torchface.workflows.browser_app.character import load_character
 from torchface.workflows.enhance.enhance_animation import EnhanceSettings, enhance_animation, load_model
 from torchface.workflows.live.camera import DEFAULT_SIZE
-from torchface.workflows.live.kept_takes import ANIMATION, take_rows
+from torchface.workflows.live.kept_takes import (
+    ANIMATION,
+    LIVE_LINK,
+    WEIGHTS,
+    kept_takes,
+    printable,
+    take_file,
+    take_rows,
+)
 from torchface.workflows.live.live_figures import LiveReport
 from torchface.workflows.live.live_frames import FaceSolver, FrameSource, LiveFrame, Say, SourceSettings, open_source
 from torchface.workflows.live.live_session import LiveSession, Notes
@@ -92,6 +102,7 @@ class LiveSettings:
         mapping: a table for shapes of other names.
         addresses: see :func:`torchface.io.open_sender`.
         record: a folder to record into from the first frame on.
+        takes: a folder of takes for the page, which also takes the recordings that lie there.
         calibrate: begin with the guided calibration.
         page: open the page in the browser.
         port: the first that the page tries.
@@ -106,6 +117,7 @@ class LiveSettings:
     mapping: Path | None = None
     addresses: tuple[str, ...] = ()
     record: Path | None = None
+    takes: Path | None = None
     calibrate: bool = False
     page: bool = True
     port: int = 8080
@@ -170,7 +182,10 @@ def go_live(
             solver = make_solver(progress)
             watch = FaceWatch(lambda picture: shipped_detector()(picture).boxes.tolist())
         streams = stack.enter_context(WeightStreams(settings.addresses, ARKIT, source.video.fps, notes))
-        recordings = Recordings(settings.record or RECORDINGS, character, source.video.path.name, source.video.fps)
+        folder = settings.record or settings.takes or RECORDINGS
+        recordings = Recordings(folder, character, source.video.path.name, source.video.fps)
+        if settings.takes is not None:
+            import_recordings(settings.takes, recordings, notes)
         session = LiveSession(source, solver, streams, recordings, notes, say, watch)
         if settings.record is not None:
             recordings.start(settings.record)
@@ -181,7 +196,7 @@ def go_live(
         try:
             if page is not None:
                 files = {CHARACTER: character.data, TABLE: character.page_table()}
-                takes = partial(take_rows, recordings.folder)
+                takes = partial(take_file, recordings.folder)
                 server = PageServer(page, files, takes, session, settings.port)
                 stack.callback(server.stop)
                 opened(server.url)
@@ -196,7 +211,23 @@ def go_live(
         if session.figures.frames == 0:
             raise ValueRangeError(f"{settings.camera}: found no frame, expected at least one")
         wrong = received.receiver.counts.words() if received is not None else ""
-        return LiveReport(session.figures, source.dropped, (*((wrong,) if wrong else ()), *streams.notes())), saved
+        more = (wrong, *(take.note for take in saved), *streams.notes())
+        return LiveReport(session.figures, source.dropped, tuple(note for note in more if note)), saved
+
+
+def import_recordings(folder: Path, recordings: Recordings, say: Say) -> None:
+    """Makes takes of the recordings that lie in a folder as files, such as a phone's, once each."""
+    known = {take.name for take in kept_takes(folder)}
+    for path in sorted(folder.glob("*")):
+        if path.suffix.lower() in (".csv", *RECORDING_ENDINGS) and printable(path.name) not in (
+            WEIGHTS,
+            LIVE_LINK,
+            *known,
+        ):
+            try:
+                recordings.keep(path.name, take_rows(load_take(path)).float())
+            except TorchfaceError as error:
+                say(f"{path}: left out: {error}")
 
 
 ENHANCED = "enhanced"

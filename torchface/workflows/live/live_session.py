@@ -6,17 +6,26 @@ import threading
 import time
 from collections import deque
 from collections.abc import Mapping
+from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from multiprocessing import get_context
+from pathlib import Path
 from typing import Any
+
+import numpy as np
+import torch
 
 from torchface.capture.anybody import WebcamControls
 from torchface.errors import FileFormatError, TorchfaceError, ValueRangeError
 from torchface.progress import Progress, silent
-from torchface.workflows.live.kept_takes import kept_takes, remove_take, rename_take
+from torchface.workflows.live.kept_takes import film_of, kept_takes, remove_take, rename_take, take_rows
 from torchface.workflows.live.live_figures import LiveFigures
 from torchface.workflows.live.live_frames import FaceSolver, FrameSource, LiveFrame, Say, solved_frames
 from torchface.workflows.live.live_view import LiveView
+from torchface.workflows.live.received_source import ReceivedSource
 from torchface.workflows.live.recordings import Recordings
 from torchface.workflows.live.session_prompts import FOLLOWED, GuidedCalibration, Watch
+from torchface.workflows.live.take_film import solved_again
 from torchface.workflows.live.weight_controls import WeightControls, read_weight_settings
 from torchface.workflows.live.weight_streams import WeightStreams
 
@@ -80,6 +89,7 @@ class LiveSession:
         self._changed = threading.Condition()
         self._takes: tuple[float, list[dict[str, Any]]] = (float("-inf"), [])
         self._lock = threading.RLock()
+        self._solving: threading.Thread | None = None
 
     def next_view(self, before: LiveView | None, seconds: float) -> LiveView | None:
         """The newest moment once there is another than ``before``; None where none came in time."""
@@ -117,7 +127,7 @@ class LiveSession:
         return takes
 
     def asked(self, message: Mapping[str, Any]) -> None:
-        """Does what a page asks for: ``controls``, ``reset``, ``record``, ``rename`` or ``remove``.
+        """Does what a page asks for: `controls`, `reset`, `record`, `rename`, `remove`, `solve` or `names`.
 
         Raises:
             TorchfaceError: it cannot be done; the notes say why.
@@ -128,7 +138,9 @@ class LiveSession:
             if message.get("reset") is True:
                 self.reset()
             if isinstance(on := message.get("record"), bool):
-                self._notes(self.record(on))
+                self._notes(self.record(on, message.get("film") is True))
+            if isinstance(names := message.get("names"), dict):
+                self._recordings.name_shapes({str(name): str(arkit) for name, arkit in names.items()})
             folder, forgotten = self._recordings.folder, float("-inf")
             if isinstance(names := message.get("rename"), list) and len(names) == 2:
                 rename_take(folder, str(names[0]), str(names[1]))
@@ -136,9 +148,42 @@ class LiveSession:
             if isinstance(place := message.get("remove"), str):
                 remove_take(folder, place)
                 self._takes = forgotten, []
+            if isinstance(place := message.get("solve"), str):
+                self._solve(film_of(folder, place), place)
         except TorchfaceError as error:
             self._notes(str(error))
             raise
+
+    def keep(self, name: str, rows: np.ndarray) -> None:
+        """Keeps a take that a page has made or was given, rows (T,66).
+
+        Raises:
+            TorchfaceError: it cannot be kept; the notes say why.
+        """
+        try:
+            self._recordings.keep(name, torch.from_numpy(rows.copy()))
+        except TorchfaceError as error:
+            self._notes(str(error))
+            raise
+
+    def _solve(self, film: Path, place: str) -> None:
+        """Solves a film in a process of its own, beside what goes on."""
+        if self._solving is not None and self._solving.is_alive():
+            raise ValueRangeError("solve again: found a film that is being solved, expected one at a time")
+        name = next((take.name for take in kept_takes(self._recordings.folder) if take.place == place), place)
+        self._notes(f"{name}: being solved once more, with the whole take; this takes some minutes")
+
+        def solve() -> None:
+            try:
+                with ProcessPoolExecutor(1, get_context("spawn")) as process:
+                    rows = process.submit(solved_again, film).result()
+                self.keep(f"{name}, solved again", take_rows(rows).float().numpy())
+                self._notes(f"{name}: solved again")
+            except (TorchfaceError, OSError, BrokenProcessPool) as error:
+                self._notes(f"{name}: not solved again: {error}")
+
+        self._solving = threading.Thread(target=solve, name="torchface-solve-again", daemon=True)
+        self._solving.start()
 
     def left(self) -> None:
         """A page was closed, which may have asked for a pose."""
@@ -163,8 +208,8 @@ class LiveSession:
         """Has the solver forget the person."""
         self._forget, self._calibration = True, None
 
-    def record(self, on: bool) -> str:
-        """Begins or ends a recording; says in words what happened.
+    def record(self, on: bool, filmed: bool = False) -> str:
+        """Begins or ends a recording, with the camera's film if asked; says in words what happened.
 
         Raises:
             FileFormatError: nothing can be written there.
@@ -173,7 +218,8 @@ class LiveSession:
             if on == self._recordings.running:
                 return "already recording" if on else "nothing is being recorded"
             if on:
-                return f"recording into {self._recordings.start()}"
+                seen = filmed and not isinstance(self._source, ReceivedSource)  # which has no pictures
+                return f"recording into {self._recordings.start(filmed=seen)}"
             self._recordings.stop()
             return "recorded; its files are being written"
 
@@ -195,7 +241,7 @@ class LiveSession:
                 with self._changed:
                     self._view = LiveView(came, interval, 1000 * (now - came), picture, wanted)
                     self._changed.notify_all()
-                self._keep(came, wanted)
+                self._keep(came, wanted, picture)
                 self._advance(interval, solved)
                 before = came
                 if self._watch is not None:
@@ -215,10 +261,10 @@ class LiveSession:
         pose = self._pose if self._calibration is None else self._calibration.pose
         return WebcamControls(pose, self.gain, self.smoothing, reset=forget)
 
-    def _keep(self, came: float, solved: LiveFrame) -> None:
+    def _keep(self, came: float, solved: LiveFrame, picture: np.ndarray) -> None:
         with self._lock:
             try:
-                self._recordings.add(came, solved)
+                self._recordings.add(came, solved, picture)
             except FileFormatError as error:  # a full disk ends the recording and not the session
                 self._recordings.stop()
                 self._notes(f"the recording ended: {error}")

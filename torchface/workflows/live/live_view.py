@@ -8,11 +8,16 @@ import cv2
 import numpy as np
 import torch
 
+from torchface.errors import ValueRangeError
 from torchface.workflows.live.live_frames import LiveFrame
 
 FRAME, PICTURE = 1, 2
 """First number of a message."""
 
+ROW = 66
+"""Numbers of a take's frame: seconds, weights, rotation, gaze."""
+
+_LARGEST_TAKE = 2**26  # bytes; an hour at 60 frames a second
 _WIDTH, _QUALITY = 320, 70  # of the camera's small picture
 
 
@@ -51,3 +56,29 @@ class LiveView:
         small = self.picture if width <= _WIDTH else cv2.resize(self.picture, size, interpolation=cv2.INTER_AREA)
         coded = cv2.imencode(".jpg", small[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])[1]
         return np.array([PICTURE, 0], "<u4").tobytes() + coded.tobytes()
+
+
+class TakeUpload:
+    """A take that a page hands over in parts.
+
+    Args:
+        name: for people.
+        size: bytes of all parts.
+
+    Raises:
+        ValueRangeError: no take has so many.
+    """
+
+    def __init__(self, name: str, size: object) -> None:
+        if not isinstance(size, int) or not 0 < size <= _LARGEST_TAKE or size % (4 * ROW):
+            raise ValueRangeError(f"page: found a take of {size!r:.20} bytes, expected rows, at most {_LARGEST_TAKE}")
+        self.name, self._size, self._data = name, size, bytearray()
+
+    def is_whole_with(self, part: bytes) -> bool:
+        """Takes a part; whether it was the last."""
+        self._data += part[: self._size - len(self._data)]
+        return len(self._data) == self._size
+
+    def rows(self) -> np.ndarray:
+        """The rows (T,66), see :func:`torchface.workflows.live.kept_takes.take_rows`."""
+        return np.frombuffer(self._data, "<f4").reshape(-1, ROW)

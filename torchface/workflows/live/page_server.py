@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any, Protocol
 from urllib.parse import unquote
 
+import numpy as np
 from websockets.datastructures import Headers
 from websockets.exceptions import ConnectionClosed
 from websockets.http11 import Request, Response
@@ -27,7 +28,7 @@ from torchface.errors import TorchfaceError
 from torchface.files.whole_files import read_file
 from torchface.viz.browser.browser_page import HOST, free_port
 from torchface.viz.browser.origin_check import is_allowed, without_token
-from torchface.workflows.live.live_view import LiveView
+from torchface.workflows.live.live_view import LiveView, TakeUpload
 
 _LARGEST_MESSAGE = 2**16
 _STATE_INTERVAL, _PICTURE_INTERVAL = 0.25, 1 / 15  # seconds
@@ -58,6 +59,13 @@ class LiveDesk(Protocol):
 
         Raises:
             TorchfaceError: it cannot be done.
+        """
+
+    def keep(self, name: str, rows: np.ndarray) -> None:
+        """Keeps a take that a page has made or was given, rows (T,66) as of :func:`kept_takes.take_rows`.
+
+        Raises:
+            TorchfaceError: it cannot be kept.
         """
 
     def left(self) -> None:
@@ -145,23 +153,33 @@ class PageServer:
         private = connection.request is not None and without_token(connection.request.path, self._token) is not None
         sender = threading.Thread(target=self._send, args=(connection, private), daemon=True)
         sender.start()
+        upload: TakeUpload | None = None
         try:
             for message in connection:
                 if private:
-                    self._take(message)
+                    upload = self._take(message, upload)
         except ConnectionClosed:
             pass
         if private:
             self._desk.left()
         sender.join(2 * _WAIT)
 
-    def _take(self, message: str | bytes) -> None:
+    def _take(self, message: str | bytes, upload: TakeUpload | None) -> TakeUpload | None:
+        """Does what a message asks for; the take that a page is still handing over."""
         try:
+            if isinstance(message, bytes):
+                if upload is not None and upload.is_whole_with(message):
+                    self._desk.keep(upload.name, upload.rows())
+                    return None
+                return upload
             asked = json.loads(message)
+            if isinstance(asked, dict) and "keep" in asked:
+                return TakeUpload(str(asked["keep"]), asked.get("bytes"))
             if isinstance(asked, dict):
                 self._desk.asked(asked)
         except (TorchfaceError, ValueError, OSError, RecursionError):
             pass  # a message that is none; what went wrong with one that is stands in the notes
+        return None
 
     def _send(self, connection: ServerConnection, private: bool) -> None:
         shown: LiveView | None = None

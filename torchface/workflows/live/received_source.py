@@ -21,6 +21,7 @@ from torchface.shape_names import ARKIT
 from torchface.temporal.one_euro import OneEuroSettings, one_euro_step
 from torchface.workflows.live.live_frames import LiveFrame, Say
 from torchface.workflows.live.session_prompts import STEPS
+from torchface.workflows.track.head_rotations import head_rotations
 
 _FPS = 60.0  # of phones, where times do not say
 _SIZE = (480, 360)
@@ -112,7 +113,7 @@ class ReceivedSolver:
         ever = self._state is not None
         return LiveFrame(
             weights,
-            rotation_of_angles(rotations[:3]) if ever else torch.full((3, 3), torch.nan),
+            head_rotations(rotations[:3]) if ever else torch.full((3, 3), torch.nan),
             torch.full((68, 2), torch.nan),
             # To the person's left and up, the right eye first; yaw is to the right, pitch down.
             gaze=-torch.stack([rotations[6:8], rotations[3:5]]),
@@ -127,17 +128,6 @@ class ReceivedSolver:
         settings = OneEuroSettings(_CUTOFF * _SPREAD**-smoothing, _SPEED, _CUTOFF)
         self._state = one_euro_step(values, *self._state, interval, settings)
         return self._state[0]
-
-
-def rotation_of_angles(angles: Tensor) -> Tensor:
-    """The rotation (3,3) from the rig to a camera that looks at it, of Live Link Face's yaw, pitch and roll (3,)."""
-    (sy, sx, sz), (cy, cx, cz) = angles.sin().tolist(), angles.cos().tolist()
-    rows = [
-        [cy * cz + sy * sx * sz, sy * sx * cz - cy * sz, sy * cx],
-        [cx * sz, cx * cz, -sx],
-        [cy * sx * sz - sy * cz, cy * sx * cz + sy * sz, cy * cx],
-    ]
-    return torch.tensor([1.0, -1.0, -1.0])[:, None] * torch.tensor(rows)
 
 
 class ReceivedWatch:

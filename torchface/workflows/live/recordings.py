@@ -7,11 +7,11 @@ import os
 import shutil
 import signal
 import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
-from types import TracebackType
+from types import MappingProxyType, TracebackType
 
 import numpy as np
 import torch
@@ -27,8 +27,9 @@ from torchface.io.weights.weight_csv import ROTATIONS, save_weights_csv
 from torchface.shape_names import ARKIT
 from torchface.take import Take, Track
 from torchface.workflows.browser_app.character import Character
-from torchface.workflows.live.kept_takes import ANIMATION, LIVE_LINK, SUMMARY, WEIGHTS
+from torchface.workflows.live.kept_takes import ANIMATION, LIVE_LINK, SUMMARY, WEIGHTS, printable
 from torchface.workflows.live.live_frames import LiveFrame
+from torchface.workflows.live.take_film import FILM, TakeFilm
 
 _EVEN = 1e-6  # seconds by which times that are even may be off
 _LOOK = 128  # frames between looks at how full the disk is
@@ -135,11 +136,12 @@ _MAX_TAKES = 10_000
 
 @dataclass(frozen=True)
 class SavedTake:
-    """One recording on the disk, or why it is not there."""
+    """One recording on the disk, or why it is not there; ``note`` says what is missing beside it."""
 
     folder: Path
     frames: int
     error: str = ""
+    note: str = ""
 
 
 class Recordings:
@@ -153,8 +155,10 @@ class Recordings:
     """
 
     def __init__(self, folder: Path, character: Character, source: str, fps: float) -> None:
-        self._folder, self._character, self._source, self._fps = folder, character, source, fps
+        self._folder, self._given, self._source, self._fps = folder, character, source, fps
+        self._character = character
         self._log: FrameLog | None = None
+        self._film: TakeFilm | None = None
         self._place = folder
         self._begun: set[Path] = set()  # whose files may still be in the making
         self._began, self._found = 0.0, 0
@@ -180,23 +184,52 @@ class Recordings:
         """Where the takes lie."""
         return self._folder
 
-    def start(self, place: Path | None = None) -> Path:
+    def name_shapes(self, meanings: Mapping[str, str]) -> None:
+        """Takes what names of the character's shapes mean, see :meth:`Character.renamed`."""
+        self._character = self._given.renamed(meanings)
+
+    def start(self, place: Path | None = None, filmed: bool = False) -> Path:
         """Begins a take and returns its folder.
 
         Args:
             place: whose files it replaces; a new one if absent.
+            filmed: keep the camera's film too.
 
         Raises:
             FileFormatError: nothing can be written there.
         """
         self._place = place or self._next()
         self._begun.add(self._place)
-        columns = _columns(ARKIT) + 2 * _columns(self._character.names)  # Live Link, weights, animation
-        self._log, self._found = FrameLog(make_folder(self._place), ARKIT, columns), 0
+        self._log, self._found = self._new_log(self._place), 0
+        self._film = TakeFilm(self._place / FILM) if filmed else None
         return self._place
 
-    def add(self, came: float, frame: LiveFrame) -> None:
-        """Keeps a frame, if a take runs.
+    def keep(self, name: str, rows: Tensor) -> None:
+        """Makes a take of rows (T,66): seconds, ARKit's weights, rotation and gaze.
+
+        Raises:
+            FileFormatError: nothing can be written.
+            ValueRangeError: they are no take's.
+        """
+        if not len(rows) or not rows.isfinite().all() or not (rows[1:, 0] > rows[:-1, 0]).all():
+            raise ValueRangeError(
+                "take: found times that do not rise, or no numbers, expected a take's rows"
+            )
+        place = self._next()
+        self._begun.add(place)
+        with self._new_log(place) as log:
+            for row in rows:  # as frames come
+                rotation, gaze = row[53:62].reshape(3, 3), row[62:].reshape(2, 2)
+                frame = LiveFrame(row[1:53].clamp(0, 1), rotation, torch.zeros(0, 2), gaze=gaze)
+                log.append(float(row[0]), frame.weights, frame.rotations)
+            self._write(log, place, len(rows), {"name": printable(name) or place.name})
+
+    def _new_log(self, place: Path) -> FrameLog:
+        columns = _columns(ARKIT) + 2 * _columns(self._character.names)  # Live Link, weights, animation
+        return FrameLog(make_folder(place), ARKIT, columns)
+
+    def add(self, came: float, frame: LiveFrame, picture: np.ndarray | None = None) -> None:
+        """Keeps a frame, if a take runs, and its picture, if it is filmed.
 
         Raises:
             FileFormatError: the disk is full.
@@ -207,13 +240,17 @@ class Recordings:
             self._began = came
         self._log.append(came, frame.weights, frame.rotations)
         self._found += frame.seen
+        if self._film is not None and picture is not None:
+            self._film.add(came, picture)
 
     def stop(self) -> None:
         """Ends the take that runs; its files are made beside what goes on, see :meth:`finish`."""
         log, self._log = self._log, None
+        film, self._film = self._film, None
         if log is None:
             return
-        thread = threading.Thread(target=self._save, args=(log, self._place, self._found), name="torchface-recording")
+        given = (log, self._place, self._found, film)
+        thread = threading.Thread(target=self._save, args=given, name="torchface-recording")
         self._saving.append(thread)
         thread.start()
 
@@ -231,16 +268,18 @@ class Recordings:
         numbered = (self._folder / f"take_{number}" for number in range(2, _MAX_TAKES))
         return next(folder for folder in numbered if folder not in self._begun and not folder.exists())
 
-    def _save(self, log: FrameLog, folder: Path, found: int) -> None:
+    def _save(self, log: FrameLog, folder: Path, found: int, film: TakeFilm | None) -> None:
         with log:
             try:
+                if film is not None:  # before the summary, by which a take is listed
+                    film.close()
                 if log.count:
                     self._write(log, folder, found)
-                self.saved.append(SavedTake(folder, log.count))
+                self.saved.append(SavedTake(folder, log.count, note=film.problem if film is not None else ""))
             except (TorchfaceError, OSError) as error:
                 self.saved.append(SavedTake(folder, log.count, str(error)))
 
-    def _write(self, log: FrameLog, folder: Path, found: int) -> None:
+    def _write(self, log: FrameLog, folder: Path, found: int, more: Mapping[str, str] = MappingProxyType({})) -> None:
         take = log.take(self._fps)
         assert take.weights is not None
         driven = self._character.weights(take.weights.values[..., 0])
@@ -255,6 +294,7 @@ class Recordings:
             "seconds": round(float(take.times[-1]), 3),
             "found": found,
             "files": [WEIGHTS, LIVE_LINK, ANIMATION],
+            **more,
         }
         names, targets = self._character.targets(driven)
         turns = np.stack([take.extras["columns"][name].numpy() for name in ROTATIONS], 1)
