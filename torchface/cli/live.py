@@ -56,8 +56,8 @@ def live(
         record: Record from the first frame on into this folder: weights.csv by the character's names, live_link.csv,
             animation.glb (the character's own file with weights, head, neck and eyes), summary.json. The page's button
             records into `recordings` without.
-        takes: The folder of the page's takes, where its button records too; files that lie in it (CSV of Live Link Face,
-            iFacialMocap's and Face Cap's text, JSON of face anchors) become takes. `recordings` if absent.
+        takes: The folder of the page's takes, where its button records too; recordings that lie in it (CSV of Live Link
+            Face, iFacialMocap's and Face Cap's text, JSON of face anchors) become takes. `recordings` if absent.
         page: Open the page in the browser.
         port: The first port to try for the page.
         size: WIDTHxHEIGHT to ask the camera for.

@@ -98,7 +98,7 @@ def printable(name: str) -> str:
 
 
 def take_file(folder: Path, place: str) -> bytes:
-    """A take for the page: little-endian floats, see :func:`take_rows`; or its film, where ``/film`` is behind its name.
+    """A take for the page: little-endian floats, see :func:`take_rows`; its film where ``/film`` ends the name.
 
     Raises:
         FileFormatError: there is no such take, or it cannot be read.

@@ -212,9 +212,7 @@ class Recordings:
             ValueRangeError: they are no take's.
         """
         if not len(rows) or not rows.isfinite().all() or not (rows[1:, 0] > rows[:-1, 0]).all():
-            raise ValueRangeError(
-                "take: found times that do not rise, or no numbers, expected a take's rows"
-            )
+            raise ValueRangeError("take: found times that do not rise, or no numbers, expected a take's rows")
         place = self._next()
         self._begun.add(place)
         with self._new_log(place) as log:
