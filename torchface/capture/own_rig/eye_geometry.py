@@ -27,7 +27,7 @@ _BEHIND, _ABOVE, _OUTWARD, _IRIS = 9.5, 1.8, 1.8, 11.5
 _WIDEST = 0.9  # of an eyeball's radius
 _LEAST_TURN = 0.1  # radians; eyeballs that turn less are turned by something else than shapes
 SURELY_OPEN, SURELY_SHUT = 0.3, 0.9
-_LEAST_OPEN = 0.35  # of an eye that is surely not shut
+_LEAST_OPEN = 0.15  # of an eye that is surely not shut
 _UNSEEN = 0.3  # of an eye that is hidden, its twin's openness counts for less
 
 

@@ -40,7 +40,8 @@ _STRAYS = 0.35  # radians: what is further to the side or up is no looking strai
 # seconds.
 _OPEN_FRAMES, _STRAIGHT_FRAMES = 90.0, 240.0
 _ANY_FRAME = 0.1  # what a frame counts beside one in which the face surely rests
-_VERGENCE = 0.12  # radians from straight, of each eye at most
+# Radians from straight, of each eye: less is what eyes were read apart by mistake, more is none.
+_APART, _VERGENCE = 0.05, 0.12
 _LEAST_GAZE = 0.3  # trust, under which a gaze is that of before
 _DISAGREE = 0.08  # of openness by landmarks and by the eye network, at which lids' landmarks count half
 _EYES = tuple(range(36, 42)), tuple(range(42, 48))
@@ -202,7 +203,7 @@ def _one_gaze(raw: Tensor, trust: Tensor) -> tuple[Tensor, Tensor]:
     share = (trust + 1e-3)[..., None]
     both = (share * ahead).sum(1) / share.sum(1)
     cross = 0.5 * (ahead[:, 0, 0] - ahead[:, 1, 0]) * (trust.amin(1) > _LEAST_GAZE)
-    cross = cross.clamp(-_VERGENCE / 4, _VERGENCE)
+    cross = (cross - _APART).clamp(0, _VERGENCE)
     made = both[:, None].expand(-1, 2, 2).clone()
     made[:, 0, 0] += cross
     made[:, 1, 0] -= cross
