@@ -10,6 +10,7 @@ from torch import Tensor
 
 from torchface import Attachment, BlendshapeRig, Take, Track
 from torchface.capture import MarkerSolver
+from torchface.capture.energy import Quadratic
 from torchface.errors import NameMismatchError, ShapeError, TopologyError, ValueRangeError
 from torchface.geometry.similarity import Similarity
 from torchface.optim import ProjectedGradient
@@ -117,6 +118,40 @@ def test_bad_takes_say_what_is_wrong(setting: tuple[MarkerSolver, Tensor, Tensor
         solver(markers)
     with pytest.raises(ShapeError, match=r"expected \(B,40,3\)"):
         solver(markers[:, :39])
+
+
+def test_antagonists_are_one_quantity_whose_sign_may_change(
+    small_rig: BlendshapeRig, small_attachment: Attachment
+) -> None:
+    """Their motions are not exactly opposite, so noise turns both on; of the two signs it is the one of less energy."""
+    deltas, names = small_rig.deltas.clone(), ["jawLeft", "jawRight", *small_rig.names[2:]]
+    deltas[1] = 0.3 * deltas[1] - deltas[0]
+    rig = BlendshapeRig(small_rig.neutral, deltas, names)
+    at = torch.linspace(-0.9, 0.9, 21).double()  # from the one side to the other during the take
+    true = torch.full((21, 12), 0.4).double()
+    true[:, 0], true[:, 1] = at.clamp(min=0), (-at).clamp(min=0)
+    markers = small_attachment.on(rig.neutral.faces, rig.double()(true))
+    markers = markers + 0.5 * torch.randn(markers.shape, generator=torch.Generator().manual_seed(1)).double()
+    markers[::4, :5] = torch.nan
+    solver = MarkerSolver(rig, small_attachment, antagonists=True)
+    assert int((MarkerSolver(rig, small_attachment)(markers)[:, :2] > 0).all(1).sum()) > 5
+    weights = solver(markers)
+    assert float(weights[:, :2].amin(1).max()) == 0
+    assert float((weights[:, 0] - weights[:, 1] - at).abs().max()) < 0.15
+    sides = []
+    for side in (0, 1):
+        kept = [number for number in range(12) if number != side]
+        one = BlendshapeRig(rig.neutral, rig.deltas[kept], [names[number] for number in kept])
+        sides.append(
+            torch.zeros_like(weights).index_copy(1, torch.tensor(kept), MarkerSolver(one, small_attachment)(markers))
+        )
+    energy = solver.energy(markers)
+    assert isinstance(energy, Quadratic)
+    better = (energy.value(sides[0]) < energy.value(sides[1]))[:, None]
+    torch.testing.assert_close(weights, torch.where(better, *sides), rtol=0, atol=1e-6)
+    again = MarkerSolver.from_config(solver.config)
+    again.load_state_dict(solver.state_dict())
+    torch.testing.assert_close(again(markers), weights, rtol=0, atol=1e-6)
 
 
 def test_bad_settings_say_what_is_wrong(small_rig: BlendshapeRig, small_attachment: Attachment) -> None:

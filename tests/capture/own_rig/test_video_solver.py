@@ -238,6 +238,20 @@ def test_frames_without_a_face_are_bridged(small: BlendshapeRig) -> None:
     assert (whole.weights - weights)[gap].abs().mean() < (causal.weights - weights)[gap].abs().mean()
 
 
+def test_antagonists_change_sides_during_a_take() -> None:
+    """Also where weights are expected near those of the frame before, which were of the other side."""
+    rig = whole_rig().select([*SEEN, "mouthRight"])
+    rotation, translation = poses(25)
+    at = torch.linspace(-0.7, 0.7, 25).double()
+    true = torch.zeros(25, len(rig.names)).double()
+    true[:, rig.names.index("mouthLeft")], true[:, rig.names.index("mouthRight")] = at.clamp(min=0), (-at).clamp(min=0)
+    solver = VideoSolver(rig, None, K, settings=VideoSettings(sparsity=0.0, pixel_noise=0.5, motion=2.0))
+    solved = solver(film(rig, true, rotation, translation, 0.2)).weights
+    left, right = (solved[:, rig.names.index(name)] for name in ("mouthLeft", "mouthRight"))
+    assert float(torch.minimum(left, right).max()) == 0
+    assert float((left - right - at).abs().max()) < 0.12
+
+
 def test_landmarks_that_are_not_trusted_are_no_face(small: BlendshapeRig) -> None:
     """A filter carries landmarks on for some frames after a face was lost, when nothing is sure of them."""
     found = film(small, acted(8), *poses(8))

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from torchface.attachment import Attachment
+from torchface.capture.antagonist_shapes import one_side, signed_quantities, weaker_sides
 from torchface.capture.corrective_energy import CorrectiveEnergy, least_in_box
 from torchface.capture.energy import Quadratic, chunks_of_frames, marker_term, ridge_term, sparsity_term
 from torchface.correctives.activation import CorrectiveActivation
@@ -56,6 +57,8 @@ class MarkerSolver(nn.Module):
         ridge: :math:`\varepsilon`, mm² a marker for a squared weight of 1; as ``sparsity``.
         program: solves the quadratic programs in place of ``box_qp``: without an H of its own, bounds 0 and 1. With
             correctives it solves what their Gauss-Newton starts from.
+        antagonists: of two shapes that undo each other, such as jawLeft and jawRight, one is 0: the smaller one of a
+            frame where both come out above 0, which is then solved again.
 
     Raises:
         TopologyError: the attachment belongs to another mesh.
@@ -89,6 +92,7 @@ class MarkerSolver(nn.Module):
         sparsity: float | Tensor = SPARSITY,
         ridge: float | Tensor = RIDGE,
         program: ProjectedGradient | None = None,
+        antagonists: bool = False,
     ) -> None:
         super().__init__()
         checked_type("rig", rig, BlendshapeRig)
@@ -107,7 +111,7 @@ class MarkerSolver(nn.Module):
         if rig.correctives is not None:
             moved = attachment.on(faces, rig.correctives.deltas).permute(1, 2, 0).contiguous()
             self._correct(rig.correctives.definitions, moved)
-        self.program = program
+        self.program, self.antagonists = program, antagonists
 
     def _register(
         self,
@@ -131,7 +135,7 @@ class MarkerSolver(nn.Module):
             moved = None if alignment is None else getattr(alignment, name).to(rest)
             self.register_buffer(f"alignment_{name}", moved)
         self.activation: CorrectiveActivation | None = None
-        self.program = None
+        self.program, self.antagonists = None, False
         self.register_buffer("corrective_basis", None)
         self._prepared: dict[float, Prepared[BoxQP]] = {}
         self._prepared_rows: Prepared[tuple[Tensor, Tensor]] = Prepared()
@@ -164,6 +168,7 @@ class MarkerSolver(nn.Module):
             "aligned": self.alignment is not None,
             **({} if self.activation is None else {"correctives": self.activation.records()}),
             **({} if self.program is None else {"program": self.program.config}),
+            **({"antagonists": True} if self.antagonists else {}),
             # In the state, with their shapes.
             "tensors": {
                 name: list(value.shape)
@@ -202,6 +207,7 @@ class MarkerSolver(nn.Module):
             self._correct(definitions, torch.zeros(len(labels), 3, len(definitions)))
         if "program" in config:
             self.program = ProjectedGradient(**config["program"])
+        self.antagonists = config.get("antagonists", False) is True
         return self
 
     @property
@@ -270,11 +276,15 @@ class MarkerSolver(nn.Module):
         _check_seen(missing)
         tolerance = default_tolerance(markers.dtype)
         initial = None if initial is None else initial.double()
-        gaps = missing.any(-1)
+        weights = self._solved(markers, missing.any(-1), initial, tolerance)
+        return (self._one_sided(markers, weights, tolerance) if self.antagonists else weights).to(markers.dtype)
+
+    def _solved(self, markers: Tensor, gaps: Tensor, initial: Tensor | None, tolerance: float) -> Tensor:
+        """Weights (B,N), float64."""
         if self.activation is not None:
-            return self._corrected(markers, gaps, initial, tolerance).to(markers.dtype)
+            return self._corrected(markers, gaps, initial, tolerance)
         if not bool(gaps.any()):
-            return self._complete(markers, initial, tolerance).to(markers.dtype)
+            return self._complete(markers, initial, tolerance)
         whole = (~gaps).nonzero()[:, 0]
         rows, parts = [whole], [self._complete(markers[whole], None if initial is None else initial[whole], tolerance)]
         # A frame with gaps has an H of its own; a chunk of them bounds the memory.
@@ -287,7 +297,22 @@ class MarkerSolver(nn.Module):
             else:
                 parts.append(self.program(energy.f, energy.H, guess))
         weights = markers.new_zeros(len(markers), len(self.names), dtype=torch.float64)
-        return weights.index_copy(0, torch.cat(rows), torch.cat(parts)).to(markers.dtype)
+        return weights.index_copy(0, torch.cat(rows), torch.cat(parts))
+
+    def _one_sided(self, markers: Tensor, weights: Tensor, tolerance: float) -> Tensor:
+        """Weights (B,N), float64, solved again with the weaker of two antagonists at 0 where both are above."""
+        signed = signed_quantities(self.names).to(weights)
+        weaker = weaker_sides(weights.detach(), signed)
+        both = (weaker & (weights > 0)).any(1)
+        for held in weaker[both].unique(dim=0):  # frames with the same sides at rest share a box
+            for rows in chunks_of_frames((both & (weaker == held).all(1)).nonzero()[:, 0], len(self.names)):
+                energy, upper = self.energy(markers[rows]), (~held).to(weights)
+                if isinstance(energy, Quadratic):
+                    part = box_qp(energy.H, energy.f, 0.0, upper, tolerance=tolerance)
+                else:
+                    part = least_in_box(energy, weights[rows], torch.zeros_like(upper), upper, tolerance, False)
+                weights = weights.index_copy(0, rows, part)
+        return one_side(weights, signed)
 
     def solve_take(self, take: Take) -> Take:
         """The take with weights solved from its markers, matched by label.
