@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import Positional, UseAppendAction, arg
 
 from torchface.cli.command_options import Output, picture_size
 from torchface.cli.progress_bars import progress_bars
 from torchface.cli.terminal import Quiet, console, print_lines, print_path
+
+if TYPE_CHECKING:
+    from torchface.progress import Progress
+    from torchface.workflows.live.live_frames import FaceSolver
 
 _FILES = ("weights.csv", "live_link.csv", "animation.glb")
 
@@ -26,6 +32,7 @@ def live(
     page: bool = True,
     port: int = 8080,
     size: str = "640x480",
+    landmarks: str | None = None,
     loop: bool = False,
     seconds: float | None = None,
     enhance: str | None = None,
@@ -61,6 +68,8 @@ def live(
         page: Open the page in the browser.
         port: The first port to try for the page.
         size: WIDTHxHEIGHT to ask the camera for.
+        landmarks: What finds the 68 landmarks, as `torchface track` takes it: a model by name or folder, an .onnx file,
+            or MediaPipe's Face Landmarker, .task; the webcam's own graph, which is the quickest, if absent.
         loop: Play a video file again and again.
         seconds: After which it ends; until Ctrl+C if absent.
         enhance: An actor's model, by name or folder, as `torchface enhance` takes it: when the session ends, each take
@@ -82,6 +91,11 @@ def live(
     check_source(camera)
     from torchface.workflows.live.live_anybody import LiveSettings, go_live, person_solver
 
+    solver: Callable[[Progress], FaceSolver] = person_solver
+    if landmarks is not None:
+        from torchface.workflows.live.finder_solver import FinderSolver
+
+        solver = partial(FinderSolver, landmarks)
     settings = LiveSettings(
         camera, character, mapping, to, record, takes, calibrate, page, port, loop, seconds, enhance, sides
     )
@@ -94,7 +108,7 @@ def live(
         console.print(words, highlight=False, soft_wrap=True)
 
     with progress_bars(quiet) as progress:
-        report, saved = go_live(settings, say, opened, person_solver, progress)
+        report, saved = go_live(settings, say, opened, solver, progress)
     print_lines(report.lines())
     for take in saved:
         if take.error:

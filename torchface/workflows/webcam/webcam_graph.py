@@ -8,6 +8,7 @@ import onnx
 
 from torchface import zoo
 from torchface.capture.anybody import WebcamSettings, WebcamSolver
+from torchface.capture.priors import ShapePrior
 from torchface.errors import NameMismatchError
 from torchface.landmarks import BoxNetwork, LandmarkNetwork
 from torchface.landmarks.images.frame_reader.face_reader import FaceReader, WebcamNetworks
@@ -80,13 +81,21 @@ def default_webcam_solver(settings: WebcamSettings | None = None) -> WebcamSolve
         >>> default_webcam_solver().names[:2]
         ('eyeBlinkLeft', 'eyeLookDownLeft')
     """
+    return webcam_solver(expected_weights(zoo.get_model(NETWORKS[1], LandmarkNetwork)), settings)
+
+
+def webcam_solver(expected: ShapePrior | None, settings: WebcamSettings | None = None) -> WebcamSolver:
+    """The same for what a finder reads that expects these weights; None for one that reads no expression.
+
+    Raises:
+        NameMismatchError: the zoo's model of heads is another kind of model.
+    """
     rig = performer(texture=False)
     heads = zoo.get_model(HEADS, HeadModel)
     if heads.landmarks is None:
         raise NameMismatchError(f"{HEADS}: found a HeadModel without landmarks, expected one with them")
-    modes, network = heads.shape.modes[:, heads.landmarks], zoo.get_model(NETWORKS[1], LandmarkNetwork)
     settings, prior = settings or WebcamSettings(), load_priors(rig, DEFAULT_PRIOR, None).shapes
-    expected = for_rig(expected_weights(network), rig)
-    if expected is not None:
-        prior, settings = expected, replace(settings, sparsity=0.0, prior_strength=1.0)
-    return WebcamSolver(rig, modes, prior, settings)
+    own = for_rig(expected, rig)
+    if own is not None:
+        prior, settings = own, replace(settings, sparsity=0.0, prior_strength=1.0)
+    return WebcamSolver(rig, heads.shape.modes[:, heads.landmarks], prior, settings)

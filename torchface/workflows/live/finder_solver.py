@@ -1,0 +1,48 @@
+"""Solver of anybody's frames for landmarks that a finder by name finds, in place of the webcam's graph."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+
+from torchface.capture.anybody import WebcamControls
+from torchface.landmarks.images.tracking.landmark_tracker import LandmarkTracker
+from torchface.progress import Progress, silent
+from torchface.shape_names import ARKIT
+from torchface.workflows.live.live_frames import LiveFrame, planes
+from torchface.workflows.named_finders import graph_detector, load_finder
+from torchface.workflows.webcam.webcam_graph import webcam_solver
+
+_USUAL = 1 / 30  # seconds
+
+
+class FinderSolver:
+    """Solves frames for ARKit's weights, as ``WebcamSolver`` does, from what a tracker reads.
+
+    Args:
+        landmarks: what finds landmarks; see :func:`~torchface.workflows.named_finders.load_finder`.
+        progress: called with each step.
+
+    Raises:
+        NameMismatchError, ValueRangeError, FileFormatError, MissingExtraError: as of ``load_finder``.
+    """
+
+    names = ARKIT
+
+    def __init__(self, landmarks: str, progress: Progress = silent) -> None:
+        progress(f"reading {landmarks}")
+        named = load_finder(landmarks)
+        self._tracker = LandmarkTracker(named.finder, detector=graph_detector())
+        self._solver = webcam_solver(named.expected)
+        self._state = self._solver.start()
+
+    def step(self, picture: np.ndarray, interval: float | None, controls: WebcamControls) -> LiveFrame:
+        """Solves the next frame; see :class:`torchface.workflows.live.live_frames.FaceSolver`."""
+        height, width = picture.shape[:2]
+        reading = self._tracker.step(planes(picture))
+        self._state = state = self._solver.step(self._state, reading, interval or _USUAL, controls, (width, height))
+        ever = bool(state.rotation.any())
+        rotation = state.rotation if ever else torch.full((3, 3), torch.nan)
+        return LiveFrame(
+            state.weights, rotation, reading.landmarks, reading.iris, state.gaze, calibrated=float(state.calibrated)
+        )
