@@ -7,8 +7,9 @@ from pathlib import Path
 
 import pytest
 
+from planted.label_files import save_action_labels
 from torchface.errors import FileFormatError, NameMismatchError, ValueRangeError
-from torchface.io.action_labels import ActionLabels, Performed, load_action_labels, save_action_labels
+from torchface.io.action_labels import ActionLabels, Performed, load_action_labels
 
 LABELS = ActionLabels(
     100,

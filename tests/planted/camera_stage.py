@@ -15,11 +15,12 @@ from torch import Tensor
 from planted.action_performance import ActionPerformance, PerformanceSettings, perform_action_units
 from planted.head_camera_images import MARKER_RADIUS, HeadCameraRenderer
 from planted.helmet_camera import HELMET_POINT, CameraFlaws, helmet_camera, shaken_cameras
+from planted.label_files import save_action_labels
 from planted.reflective_paint import reflective_paint
 from torchface.attachment import Attachment
 from torchface.geometry.cameras.pinhole import Camera
 from torchface.geometry.meshes.operators import vertex_normals
-from torchface.io.action_labels import ActionLabels, Box, save_action_labels
+from torchface.io.action_labels import ActionLabels, Box
 from torchface.io.take_files import save_take
 from torchface.io.video import VideoFile, write_video
 from torchface.progress import Progress, silent

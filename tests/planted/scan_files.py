@@ -8,7 +8,6 @@ from pathlib import Path
 from torchface.files.documents import write_json
 from torchface.files.whole_files import all_or_none, made_folder
 from torchface.io.mesh_files import save_mesh
-from torchface.landmarks.scans.scan_annotations import save_annotations
 from torchface.mesh import Mesh
 from torchface.synthetic.stages.scanner import RawScan, ScannerSettings, scan_head
 
@@ -47,10 +46,14 @@ def write_scans(
     Returns:
         The paths of the OBJ files.
     """
-    paths, annotations = [], {}
+    paths, scans = [], {}
     for i, head in enumerate(heads):
         scan = scan_head(head, seed + i, settings)
         paths.append(write_scan(scan, folder, f"scan_{i:03d}"))
-        annotations[paths[-1].name] = scan.annotation
-    save_annotations(annotations, Path(folder) / "annotations.json")
+        parts = {"points": scan.annotation.points, "lines": scan.annotation.lines}
+        scans[paths[-1].name] = {
+            part: {name: value.tolist() for name, value in values.items()} for part, values in parts.items()
+        }
+    document = {"format": "torchface.scan-annotations/1", "unit": "mm", "scans": scans}
+    write_json(Path(folder) / "annotations.json", document)
     return paths

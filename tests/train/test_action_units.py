@@ -10,10 +10,11 @@ import torch
 
 from planted.action_performance import ACTION_UNITS, PerformanceSettings
 from planted.camera_stage import RecordedSession, StageSettings, record_session
+from planted.label_files import save_action_labels
 from torchface import zoo
 from torchface.capture import ActionUnitClassifier
 from torchface.errors import NameMismatchError, TorchfaceError
-from torchface.io.action_labels import ActionLabels, Performed, RegionGroup, load_action_labels, save_action_labels
+from torchface.io.action_labels import ActionLabels, Performed, RegionGroup, load_action_labels
 from train import action_units as recipe
 from train.action_units import Settings, performed_groups, train
 

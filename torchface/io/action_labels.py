@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import Any
 
 from torchface.errors import NameMismatchError, ValueRangeError
-from torchface.files.documents import Value, read_toml, write_toml
+from torchface.files.documents import Value, read_toml
 
-__all__ = ["ActionLabels", "Performed", "load_action_labels", "save_action_labels"]
+__all__ = ["ActionLabels", "Performed", "load_action_labels"]
 
 _FORMAT = "torchface.action_labels/1"
 _MAX_BYTES = 2**22
@@ -131,18 +131,19 @@ class ActionLabels:
 
 
 def load_action_labels(path: str | Path) -> ActionLabels:
-    """Reads what :func:`save_action_labels` wrote, or a person with a text editor.
+    """Reads what a person wrote with a text editor.
 
     Raises:
         FileFormatError: the file is missing, too large, no TOML, or lacks a field.
         ValueRangeError, NameMismatchError: what it says cannot be; see :class:`ActionLabels`.
 
     Example:
-        >>> brows = {"brow_left": (60.0, 40.0, 90.0, 60.0)}
-        >>> labels = ActionLabels(300, 0, (5.0, 5.0), ((20.0, 80.0), (110.0, 80.0)), brows)
-        >>> save_action_labels(labels, "take.toml")
-        >>> load_action_labels("take.toml") == labels
-        True
+        >>> from torchface.files.documents import write_toml
+        >>> labels = {"format": "torchface.action_labels/1", "frames": 300, "neutral": 0, "helmet": [5, 5]}
+        >>> labels |= {"markers": [[20, 80], [110, 80]], "regions": {"brow_left": [60, 40, 90, 60]}}
+        >>> write_toml("take.toml", labels | {"performed": [{"units": ["4"], "first": 30, "last": 90}]})
+        >>> load_action_labels("take.toml").units
+        ('4',)
     """
     document = read_toml(path, _FORMAT, _MAX_BYTES)
     helmet, left, right = (
@@ -172,40 +173,6 @@ def load_action_labels(path: str | Path) -> ActionLabels:
         )
     except (ValueRangeError, NameMismatchError) as error:
         raise type(error)(f"{path}: {error}") from error
-
-
-def save_action_labels(labels: ActionLabels, path: str | Path) -> None:
-    """Writes TOML; the file appears only when it is complete.
-
-    Example:
-        >>> from pathlib import Path
-        >>> brows = {"brow_left": (60.0, 40.0, 90.0, 60.0)}
-        >>> save_action_labels(ActionLabels(300, 0, (5.0, 5.0), ((20.0, 80.0), (110.0, 80.0)), brows), "take.toml")
-        >>> "brow_left" in Path("take.toml").read_text()
-        True
-    """
-    document: dict[str, Any] = {
-        "format": _FORMAT,
-        "frames": labels.frames,
-        "neutral": labels.neutral,
-        "helmet": list(labels.helmet),
-        "markers": [list(point) for point in labels.markers],
-        "regions": {name: list(box) for name, box in labels.regions.items()},
-        "performed": [
-            {"units": list(stretch.units), "first": stretch.first, "last": stretch.last} for stretch in labels.performed
-        ],
-    }
-    if labels.groups:
-        document["groups"] = [
-            {
-                "name": group.name,
-                "regions": list(group.regions),
-                "units": list(group.units),
-                "other_units": list(group.other_units),
-            }
-            for group in labels.groups
-        ]
-    write_toml(path, document)
 
 
 def _pixels(value: Value, count: int = 2) -> Any:

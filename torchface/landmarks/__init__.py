@@ -7,7 +7,7 @@ from torchface.landmarks.images.boxes.box_training import BoxTrainingSettings, L
 from torchface.landmarks.images.boxes.face_box import FaceBoxes, NoFaceError
 from torchface.landmarks.images.boxes.network_detector import NetworkDetector
 from torchface.landmarks.images.face_reading import FaceReading
-from torchface.landmarks.images.find_faces import find_face, find_faces
+from torchface.landmarks.images.find_faces import find_faces
 from torchface.landmarks.images.landmark_finder import LandmarkFinder
 from torchface.landmarks.images.networks.eye_network import EyeFindings, EyeNetwork
 from torchface.landmarks.images.networks.landmark_network import LandmarkNetwork, NetworkLandmarks
@@ -22,7 +22,7 @@ from torchface.landmarks.scans.cylinder import CylinderLayout, UnwrappedHead, un
 from torchface.landmarks.scans.detector_settings import DetectorSettings
 from torchface.landmarks.scans.face_frame import FaceFrame
 from torchface.landmarks.scans.landmark_pairs import AutomaticLandmarks, LandmarkPairs
-from torchface.landmarks.scans.scan_annotations import ScanAnnotation, load_annotations, save_annotations
+from torchface.landmarks.scans.scan_annotations import ScanAnnotation, load_annotations
 from torchface.landmarks.scans.scan_landmarks import (
     ScanLandmarks,
     appearance_image,
@@ -70,13 +70,11 @@ __all__ = [
     "UnwrappedHead",
     "appearance_image",
     "curvature_image",
-    "find_face",
     "find_faces",
     "find_landmarks",
     "landmark_jitter",
     "line_image",
     "load_annotations",
-    "save_annotations",
     "scan_landmarks",
     "trace_contour",
     "track_landmarks",

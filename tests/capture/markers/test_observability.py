@@ -7,9 +7,10 @@ import math
 import pytest
 import torch
 
+from planted.sparsity_rule import sparsity_by_rule
 from torchface import Attachment, BlendshapeRig
 from torchface.capture import MarkerSolver
-from torchface.capture.markers import observability, sparsity_by_rule
+from torchface.capture.markers import observability
 from torchface.capture.markers.sparsity import with_sparsity
 
 

@@ -6,9 +6,10 @@ import pytest
 import torch
 from torch import Tensor
 
+from planted.sparsity_rule import sparsity_by_rule
 from torchface import Attachment, BlendshapeRig
 from torchface.capture import MarkerSolver
-from torchface.capture.markers import observability, sparsity_by_rule
+from torchface.capture.markers import observability
 from torchface.capture.markers.marker_solver import SPARSITY
 from torchface.optim import box_qp
 

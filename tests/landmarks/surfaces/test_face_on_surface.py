@@ -38,7 +38,7 @@ def test_points_lie_where_the_head_has_them(search: FaceSearch, turn: tuple[floa
     placed = 0.01 * head.vertices.double() @ rotation.T + 5.0  # in another unit, elsewhere
     found = search.find(surface(placed, head.faces))
     ids = torch.cdist(search.reference.points.double(), mean).argmin(1)
-    error = (found.points[68:] - placed[ids]).norm(dim=-1) / found.eye_distance
+    error = (found.points[68:] - placed[ids]).norm(dim=-1) / (found.points[36] - found.points[45]).norm()
     assert float(error.nanmedian()) < 0.035
     assert float(torch.isfinite(error).double().mean()) > 0.9
     forward = found.pose.rotation[0] @ torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)

@@ -11,7 +11,6 @@ from torchface.capture.markers.marker_solver import MarkerSolver
 from torchface.capture.markers.mesh_solver import MeshSolution, MeshSolver
 from torchface.capture.markers.observability import observability
 from torchface.capture.markers.rig_fit_check import FitCheck, check_fit
-from torchface.capture.markers.sparsity import sparsity_by_rule
 from torchface.capture.markers.take_alignment import align_take, rest_residual
 from torchface.capture.markers.take_smoothing import WholeTakeSolver
 from torchface.capture.weight_observability import Observability
@@ -42,5 +41,4 @@ __all__ = [
     "own_labels",
     "rest_residual",
     "sites_by_shape",
-    "sparsity_by_rule",
 ]

@@ -27,9 +27,9 @@ from torchface.rig import BlendshapeRig
 from torchface.take import Take, Track
 from torchface.temporal import interpolated
 
-# On six real takes with 0.3 mm of noise the paper's rule (``sparsity_by_rule``) gives 0.03 to 0.07, where the weights
-# come out a fifth too small. At 0.01, of the rule's order of magnitude still, as many shapes are active as in truth (25
-# of 53) and the error of the weights is near its minimum with 50 markers as with 100.
+# On six real takes with 0.3 mm of noise the paper's rule (β‖w‖₁ as large as the squared error, thesis 4.1.4) gives 0.03
+# to 0.07, where the weights come out a fifth too small. At 0.01, of the rule's order of magnitude still, as many shapes
+# are active as in truth (25 of 53) and the error of the weights is near its minimum with 50 markers as with 100.
 SPARSITY = 0.01
 # Small against the smallest curvature that 100 markers give 53 real shapes, yet enough for layouts that see less.
 RIDGE = 1e-3
@@ -52,8 +52,8 @@ class MarkerSolver(nn.Module):
         rig: N shapes; its correctives count.
         attachment: where the M markers sit on it; its ``residual``, where it has one, is added to the points.
         alignment: moves marker space into rig space, one similarity; none if absent. Errors count in rig space.
-        sparsity: :math:`\beta`, mm² a marker for a weight of 1; see ``sparsity_by_rule``. A tensor of one number is
-            kept as a parameter (``nn.Parameter``) or a buffer, and the weights are differentiable in it.
+        sparsity: :math:`\beta`, mm² a marker for a weight of 1. A tensor of one number is kept as a parameter
+            (``nn.Parameter``) or a buffer, and the weights are differentiable in it.
         ridge: :math:`\varepsilon`, mm² a marker for a squared weight of 1; as ``sparsity``.
         program: solves the quadratic programs in place of ``box_qp``: without an H of its own, bounds 0 and 1. With
             correctives it solves what their Gauss-Newton starts from.

@@ -1,4 +1,4 @@
-"""Searches of an image for faces: all of them, and one by its number."""
+"""Searches of an image for faces: all of them, and some of which one of a number must be there."""
 
 from __future__ import annotations
 
@@ -27,21 +27,6 @@ def find_faces(image: Tensor, detector: FaceDetector | None = None) -> FaceBoxes
     return (detector or shipped_detector())(image)
 
 
-def find_face(image: Tensor, number: int = 0, detector: FaceDetector | None = None) -> Tensor:
-    """The box of one face: x, y, width, height, (4,) pixels; see :func:`find_some_faces`.
-
-    Example:
-        >>> import torch
-        >>> from torchface.landmarks import NoFaceError
-        >>> try:
-        ...     box = find_face(torch.full((120, 160), 128, dtype=torch.uint8))
-        ... except NoFaceError as error:
-        ...     print(error)
-        image of 160 x 120: found no face, expected one at least
-    """
-    return find_some_faces(image, number, detector).boxes[number]
-
-
 def find_some_faces(image: Tensor, number: int = 0, detector: FaceDetector | None = None) -> FaceBoxes:
     """All faces in an image, the largest first, one of this number among them.
 
@@ -49,6 +34,9 @@ def find_some_faces(image: Tensor, number: int = 0, detector: FaceDetector | Non
         image: uint8 (H,W), or (3,H,W) red first.
         number: of the face that must be there, from 0.
         detector: see :func:`find_faces`.
+
+    Raises:
+        NoFaceError: there is none of this number.
     """
     faces = find_faces(image, detector)
     if not 0 <= number < len(faces):

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import torch
 from torch import Tensor
 
-from torchface.files.documents import Value, read_json, write_json
+from torchface.files.documents import Value, read_json
 from torchface.landmarks.scans.uv_landmark_names import UV_LANDMARK_NAMES
 
 _FORMAT = "torchface.scan-annotations/1"
@@ -41,25 +40,6 @@ class ScanAnnotation:
         )
 
 
-def save_annotations(annotations: Mapping[str, ScanAnnotation], path: str | Path) -> None:
-    """Writes annotations by scan file name as JSON; the file appears only when it is complete.
-
-    Example:
-        >>> known = ScanAnnotation({"nose": torch.tensor([0.0, 0.0, 110.0])})
-        >>> save_annotations({"scan.obj": known}, "annotations.json")
-        >>> sorted(load_annotations("annotations.json"))
-        ['scan.obj']
-    """
-    scans = {
-        name: {
-            "points": {label: point.tolist() for label, point in one.points.items()},
-            "lines": {label: line.tolist() for label, line in one.lines.items()},
-        }
-        for name, one in annotations.items()
-    }
-    write_json(path, {"format": _FORMAT, "unit": "mm", "scans": scans})
-
-
 def load_annotations(path: str | Path) -> dict[str, ScanAnnotation]:
     """Reads annotations by scan file name.
 
@@ -70,9 +50,10 @@ def load_annotations(path: str | Path) -> dict[str, ScanAnnotation]:
         FileFormatError: the file is missing, too large, not such JSON, or a number is none.
 
     Example:
-        >>> known = ScanAnnotation({"nose": torch.tensor([0.0, 0.0, 110.0])})
-        >>> save_annotations({"scan.obj": known}, "annotations.json")
-        >>> load_annotations("annotations.json")["scan.obj"].points["nose"].tolist()
+        >>> from torchface.files.documents import write_json
+        >>> scans = {"a.obj": {"points": {"nose": [0.0, 0.0, 110.0]}}}
+        >>> write_json("annotations.json", {"format": "torchface.scan-annotations/1", "unit": "mm", "scans": scans})
+        >>> load_annotations("annotations.json")["a.obj"].points["nose"].tolist()
         [0.0, 0.0, 110.0]
     """
     document = read_json(path, _FORMAT, _MAX_BYTES)

@@ -77,11 +77,6 @@ class FaceOnSurface:
         inner = self.points[INNER]
         return inner[torch.isfinite(inner).all(-1)].mean(0)
 
-    @property
-    def eye_distance(self) -> float:
-        """From one eye's outer corner to the other's, in the surface's unit."""
-        return float((self.points[_EYES[0]] - self.points[_EYES[1]]).norm())
-
 
 class NoFaceOnSurfaceError(AlignmentError):
     """A surface shows no face; ``views`` are pictures of what was seen.

@@ -18,7 +18,7 @@ from torchface.landmarks.images.boxes.face_box import (
     NoFaceError,
     overlaps,
 )
-from torchface.landmarks.images.find_faces import find_face, find_faces
+from torchface.landmarks.images.find_faces import find_faces, find_some_faces
 from torchface.landmarks.images.ibug_68 import box_around
 from torchface.rendering.clay_shading import render
 from torchface.synthetic import performer
@@ -63,7 +63,7 @@ def test_the_box_is_that_of_the_landmarks(face: tuple[Tensor, Tensor]) -> None:
 
 def test_the_mirrored_face_has_the_mirrored_box(face: tuple[Tensor, Tensor]) -> None:
     picture, _ = face
-    here, there = find_face(picture), find_face(picture.flip(-1))
+    here, there = (find_faces(one).boxes[0] for one in (picture, picture.flip(-1)))
     across = torch.cat([picture.shape[-1] - 1 - there[:1] - there[2:3], there[1:]])
     assert float(overlaps(here[None], across[None])) > 0.9
 
@@ -73,9 +73,9 @@ def test_faces_come_largest_first_and_by_number(two_faces: tuple[Tensor, Tensor]
     faces = find_faces(image)
     assert len(faces) == 2
     assert float(overlaps(faces.boxes, boxes).diagonal().min()) > 0.6
-    assert torch.equal(find_face(image, 1), faces.boxes[1])
+    assert torch.equal(find_some_faces(image, 1).boxes, faces.boxes)
     with pytest.raises(NoFaceError, match="found 2 faces, expected more than 2"):
-        find_face(image, 2)
+        find_some_faces(image, 2)
 
 
 def test_a_large_picture_gives_the_same_box(face: tuple[Tensor, Tensor]) -> None:
@@ -91,7 +91,7 @@ def test_no_face_is_said() -> None:
     assert len(find_faces(noise)) == 0
     assert len(find_faces(torch.zeros(8, 8, dtype=torch.uint8))) == 0
     with pytest.raises(NoFaceError, match="image of 160 x 120: found no face"):
-        find_face(noise)
+        find_some_faces(noise)
     with pytest.raises(ShapeError, match="expected uint8"):
         find_faces(noise / 255)
 

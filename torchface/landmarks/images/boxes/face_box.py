@@ -19,8 +19,8 @@ class NoFaceError(TorchfaceError):
     """An image shows no face, or fewer than asked for.
 
     Example:
-        >>> from torchface.landmarks import find_face
-        >>> find_face(torch.full((120, 160), 128, dtype=torch.uint8))
+        >>> from torchface.landmarks.images.find_faces import find_some_faces
+        >>> find_some_faces(torch.full((120, 160), 128, dtype=torch.uint8))
         Traceback (most recent call last):
             ...
         torchface.landmarks.images.boxes.face_box.NoFaceError: image of 160 x 120: found no face, expected one at least

@@ -53,11 +53,6 @@ class AnsweringProcess:
         self._late: threading.Timer | None = None
         self._seconds = 0.0
 
-    @property
-    def alive(self) -> bool:
-        """Whether it runs."""
-        return self._process.poll() is None
-
     @contextmanager
     def within(self, seconds: float) -> Iterator[None]:
         """What is sent and received here must take no longer; else the process is killed."""
