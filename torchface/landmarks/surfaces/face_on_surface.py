@@ -13,7 +13,7 @@ from torchface.geometry.cameras.pinhole import Camera, look_at
 from torchface.geometry.similarity import Similarity, similarity_transform
 from torchface.landmarks.images.boxes.face_box import FaceBoxes, FaceDetector
 from torchface.landmarks.images.face_reading import FaceReading
-from torchface.landmarks.images.ibug_68 import INNER, box_around
+from torchface.landmarks.images.ibug_68 import COUNT, INNER, box_around
 from torchface.landmarks.images.landmark_finder import LandmarkFinder
 from torchface.progress import Progress, silent
 from torchface.rendering.textured_surface import TexturedSurface
@@ -23,7 +23,7 @@ _RINGS = ((0.0, 10), (28.0, 9), (-28.0, 9), (58.0, 5), (-58.0, 5), (90.0, 1), (-
 _SURE = 0.7  # score of a face from which no further ring is looked at
 _CLOSE = ((0.0, 0.0), (-16.0, 0.0), (16.0, 0.0), (-32.0, 0.0), (32.0, 0.0), (0.0, 14.0), (0.0, -14.0))
 _CLOSE_SPAN = 2.6  # of the picture, in extents of the reference's landmarks
-_ROUNDS = 2
+_ROUNDS, _FEWER = 2, 5  # and how many of the close views the first has
 _EYES = (36, 45)
 _LEAST_POINTS = 12
 _SLANTED = 0.25  # cosine between ray and normal below which a hit says nothing
@@ -40,10 +40,12 @@ class ReferencePoints:
     Args:
         landmarks: iBUG's 68, (68,3).
         points: the other points of the finder, (P,3).
+        surface: the head; where it is given, what the finder always has off on it is taken out of what it finds.
     """
 
     landmarks: Tensor
     points: Tensor
+    surface: TexturedSurface | None = None
 
     @property
     def all(self) -> Tensor:
@@ -200,21 +202,16 @@ class FaceSearch:
         eyes = float((reference[_EYES[0]] - reference[_EYES[1]]).norm())
         pose = first.pose
         views: list[Tensor] = []
-        points, presence = torch.full_like(reference, torch.nan), 0.0
+        points, presence, bias = torch.full_like(reference, torch.nan), 0.0, torch.zeros_like(reference)
         for attempt in range(_ROUNDS):
             # In the reference's place the face looks along z, whatever way the surface is turned.
             near = surface.moved(pose.inverse())
-            seen, views, read = [], [], []
-            cameras = _close_cameras(self.reference.landmarks)
-            for number, camera in enumerate(cameras if attempt else cameras[:5]):
-                progress("looking at the face", number, len(cameras))
-                picture = near.draw(camera, first.plain, (-1.0) ** number).picture
-                box = box_around(camera.project(self.reference.landmarks.double())).float()
-                reading = self.finder(_bytes(picture), box, 0.0)
-                seen.append(_placed(near, camera, reading, first.plain, eyes))
-                views.append(_marked(picture, reading))
-                read.append(float(reading.presence))
-            found = _together([one[0] for one in seen], [one[1] for one in seen], _ASTRAY * eyes)
+            cameras = _close_cameras(self.reference.landmarks)[: None if attempt else _FEWER]
+            found, views, read = self._look(near, cameras, first.plain, progress)
+            if attempt and self.reference.surface is not None:
+                bias = self._look(self.reference.surface, cameras, False, progress)[0] - reference
+                bias[:COUNT] = 0.0  # the 68 follow annotators' habits, not the reference's vertices
+            found = found - torch.nan_to_num(bias)
             if int(torch.isfinite(found).all(-1).sum()) < _LEAST_POINTS:
                 break
             better, _ = _robust_pose(reference[INNER.start :], found[INNER.start :])
@@ -233,6 +230,22 @@ class FaceSearch:
                 views,
             )
         return result
+
+    def _look(
+        self, near: TexturedSurface, cameras: Sequence[Camera], plain: bool, progress: Progress
+    ) -> tuple[Tensor, list[Tensor], list[float]]:
+        """The points (68+P,3) on a surface in the reference's place, what was seen, and how likely each is a face."""
+        eyes = float((self.reference.landmarks[_EYES[0]] - self.reference.landmarks[_EYES[1]]).norm())
+        seen, views, read = [], [], []
+        for number, camera in enumerate(cameras):
+            progress("looking at the face", number, len(cameras))
+            picture = near.draw(camera, plain, (-1.0) ** number).picture
+            box = box_around(camera.project(self.reference.landmarks.double())).float()
+            reading = self.finder(_bytes(picture), box, 0.0)
+            seen.append(_placed(near, camera, reading, plain, eyes))
+            views.append(_marked(picture, reading))
+            read.append(float(reading.presence))
+        return _together([one[0] for one in seen], [one[1] for one in seen], _ASTRAY * eyes), views, read
 
 
 @dataclass(frozen=True, eq=False)

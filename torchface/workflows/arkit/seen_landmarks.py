@@ -2,25 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import torch
 from torch import Tensor
 
-from torchface.landmarks.images.checked_detector import shipped_detector
 from torchface.landmarks.images.ibug_68 import COUNT
-from torchface.landmarks.surfaces.face_on_surface import FaceSearch, NoFaceOnSurfaceError, ReferencePoints
+from torchface.landmarks.surfaces.face_on_surface import NoFaceOnSurfaceError
 from torchface.mesh import Mesh
 from torchface.modeling.rigging.blinks_that_shut import SkinOfHead
 from torchface.modeling.rigging.other_topology import joined_vertices
 from torchface.progress import Progress
 from torchface.registration.scan_preparation import Landmarks
-from torchface.rendering.textured_surface import Material
-from torchface.synthetic import neutral_head
-from torchface.workflows.named_finders import load_finder
-from torchface.workflows.rig.character_face import find_skin, plain_surface, with_lids
+from torchface.workflows.rig.character_face import SKIN, character_search, find_skin, plain_surface, with_lids
 
-_SKIN = (0.8, 0.62, 0.53, 1.0)
 _ASTRAY, _LEAST_ASTRAY, _LEAST = 4.0, 15.0, 12
 _FLAT, _TOP = 0.4, 0.18  # of its height: how deep a body is at most, and how much of it the head is
 
@@ -34,11 +27,9 @@ def seen_landmarks(head: Mesh, template: Mesh, progress: Progress) -> Landmarks 
             68 without their contour.
         progress: called with each picture.
     """
-    reference, finder = neutral_head(texture=False), load_finder()
-    points = ReferencePoints(reference.vertices[reference.landmarks], finder.places)
-    search = FaceSearch(shipped_detector(), finder.finder, points)
-    clay = (Material(torch.tensor(_SKIN)),)
-    surface = replace(plain_surface(head.vertices.double(), head.faces), materials=clay)
+    reference, search = character_search()
+    points = search.reference
+    surface = plain_surface(head.vertices.double(), head.faces, SKIN)
     try:
         found = search.find(surface, uppermost(head), progress)
     except NoFaceOnSurfaceError:

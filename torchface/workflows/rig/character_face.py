@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -40,6 +41,7 @@ _STILL = re.compile(
     re.IGNORECASE,
 )
 """Names of what does not move with a face, wherever it lies."""
+SKIN = (0.8, 0.65, 0.56, 1.0)
 _LEAST_ASTRAY, _ASTRAY = 15.0, 4.0  # millimetres, and times the median, that a point may lie from a head's
 _SHARES = torch.linspace(0.04, 0.96, 17, dtype=torch.float64)
 _LIPS = slice(48, 68)
@@ -89,18 +91,22 @@ def find_character_face(
     Raises:
         NoFaceOnSurfaceError: it shows none.
     """
-    reference = neutral_head(texture=False)
-    finder = load_finder()
-    points = ReferencePoints(reference.vertices[reference.landmarks], finder.places)
-    search = FaceSearch(shipped_detector(), finder.finder, points)
+    reference, search = character_search()
     framed = None if character.head is None else character.head > _HEAD_SHARE
     found = search.find(surface, framed, progress)
-    return _pieces(character, surface, found, reference, points)
+    return _pieces(character, found, reference, search.reference)
+
+
+def character_search() -> tuple[Mesh, FaceSearch]:
+    """The embedded performer's mean head, and what finds faces on surfaces by it."""
+    reference, finder = neutral_head(texture=False), load_finder()
+    clay = plain_surface(reference.vertices.double(), reference.faces, SKIN)
+    points = ReferencePoints(reference.vertices[reference.landmarks], finder.places, clay)
+    return reference, FaceSearch(shipped_detector(), finder.finder, points)
 
 
 def _pieces(
     character: Character,
-    surface: TexturedSurface,
     found: FaceOnSurface,
     reference: Mesh,
     points: ReferencePoints,
@@ -223,9 +229,9 @@ def with_lids(landmarks: Landmarks, reference: Mesh, head: SkinOfHead, placed: T
     return ids, targets
 
 
-def plain_surface(vertices: Tensor, faces: Tensor) -> TexturedSurface:
-    """A surface of white clay: vertices (V,3), faces (F,3)."""
-    clay = (Material(torch.ones(4)),)
+def plain_surface(vertices: Tensor, faces: Tensor, color: Sequence[float] = (1.0, 1.0, 1.0, 1.0)) -> TexturedSurface:
+    """A surface of one colour, white clay if absent: vertices (V,3), faces (F,3)."""
+    clay = (Material(torch.tensor(color)),)
     return TexturedSurface(
         vertices, faces, torch.zeros(len(vertices), 2), torch.zeros(len(faces), dtype=torch.int64), clay
     )
