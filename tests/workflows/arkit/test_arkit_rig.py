@@ -25,7 +25,7 @@ def test_shapes_on_ict_go_the_way_of_its_own(ict_folder: Path) -> None:
     """Two sculptors' shapes differ; those of jaw, lids and smile go the same way, and nothing is renumbered."""
     rig = load_ict_facekit(ict_folder).with_arkit_names()
     made = make_arkit(Source(ict_folder, rig.neutral, rig), everything=True)
-    assert len(made.made) == 51
+    assert len(made.made) == 52
     assert torch.equal(made.rig.neutral.faces, rig.neutral.faces)
     face = rig.neutral.annotations.regions["face"]  # type: ignore[union-attr]
     names = [name for name in made.made if name in rig.names]
@@ -84,7 +84,7 @@ def test_a_tongue_of_its_own_goes_with_the_jaw_and_comes_out() -> None:
     head = Mesh(torch.cat([actor.vertices, tongue]), faces, annotations=Annotations(actor.neutral.landmarks))
     carried = shapes_on(actor, head, (actor.neutral.landmarks, head.vertices[head.landmarks].double()))
     own = torch.arange(len(head.vertices)) >= count
-    assert torch.equal(carried.tongue, own)
+    assert torch.equal(carried.tongue > 0, own)
     opened = carried.rig.deltas[0][own]
     assert torch.allclose(torch.pdist(tongue[::9] + opened[::9]), torch.pdist(tongue[::9]), atol=0.1)
     assert float(opened[:, 1].mean()) < -5

@@ -29,6 +29,7 @@ _LEAST_POINTS = 12
 _SLANTED = 0.25  # cosine between ray and normal below which a hit says nothing
 _ASTRAY = 0.5  # of the eyes' distance: a view's hit that is further from the median of all is left out
 _TRIED = 3  # places that are looked at from near
+_LOST = 0.07  # of the eyes' distance: what is off by more on the reference is no habit of the finder
 _PRESENCE, _MISFIT = 0.7, 0.35
 _FACE_OF_HEAD = 0.5  # side of the box round a face, in sides of a picture that frames the head
 
@@ -210,6 +211,7 @@ class FaceSearch:
             found, views, read = self._look(near, cameras, first.plain, progress)
             if attempt and self.reference.surface is not None:
                 bias = self._look(self.reference.surface, cameras, False, progress)[0] - reference
+                bias[bias.norm(dim=-1) > _LOST * eyes] = 0.0
                 bias[:COUNT] = 0.0  # the 68 follow annotators' habits, not the reference's vertices
             found = found - torch.nan_to_num(bias)
             if int(torch.isfinite(found).all(-1).sum()) < _LEAST_POINTS:

@@ -8,6 +8,7 @@ import torch
 from scipy import sparse
 from torch import Tensor
 
+from torchface.geometry.meshes.operators import vertex_normals
 from torchface.geometry.meshes.shell_energies import stretching_energy
 from torchface.geometry.meshes.surface_index import SurfaceIndex
 from torchface.geometry.similarity import Similarity, similarity_transform
@@ -25,6 +26,13 @@ both jaws share, such as gums in one piece, passes from the one to the other."""
 _BOTH_JAWS, _ARCH = 0.15, 30.0
 _JAW = "jaw"
 _TONGUE, _FILLED = 15.0, 0.2  # millimetres at least: teeth are smaller; and the share near the middle
+_BACK, _BEHIND_TEETH, _TEETH, _LEAST_BACK, _FALLS = (
+    (0.3, 0.55),
+    12.0,
+    8.0,
+    8,
+    4.0,
+)  # of half the arch's width; millimetres
 _TONGUE_OUT, _TONGUE_DOWN = 12.0, 8.0
 _ROOT, _LYING, _STIFF = 0.3, 2.0, 0.01
 
@@ -46,7 +54,7 @@ class LooseParts:
     Args:
         deltas: (N,J,3), millimetres.
         bones: vertices of eyeballs and of what lies in the mouth, (J,) bool.
-        tongue: vertices of the tongue, (J,) bool.
+        tongue: how much each vertex is of the tongue, (J,) in [0,1].
     """
 
     deltas: Tensor
@@ -72,10 +80,10 @@ def moved_parts(
         deltas: of the skin, (N,J,3).
 
     """
-    deltas, tongue = deltas.clone(), torch.zeros(len(vertices), dtype=torch.bool)
+    deltas, tongue = deltas.clone(), torch.zeros(len(vertices), dtype=torch.float64)
     loose = loose & (torch.bincount(faces.flatten(), minlength=len(vertices)) > 0)
     if not loose.any():
-        return LooseParts(deltas, tongue, tongue)
+        return LooseParts(deltas, tongue > 0, tongue)
     head = _Head(vertices, part, loose, deltas)
     left = loose.clone()
     for eyeball in _eyeballs(template):
@@ -83,7 +91,7 @@ def moved_parts(
     notes = template.neutral.annotations
     if notes is not None and notes.landmarks is not None and len(notes.landmarks) == 68:
         mouth = template.vertices.double().cpu()[notes.landmarks.cpu()[48:68]]
-        inside, share, tongue = _in_the_mouth(head, left, mouth)
+        inside, share, tongue = _in_the_mouth(head, faces, left, mouth)
         jaw = _jaw_motions(template)
         ids = inside.nonzero()[:, 0]
         if len(ids):
@@ -177,12 +185,12 @@ def _is_of_the_eye(points: Tensor, radius: float) -> bool:
     return float(away.min()) > _CORNEA
 
 
-def _in_the_mouth(head: _Head, left: Tensor, lips: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Vertices (J,) of parts behind the lips, how much each goes with the jaw (J,), and those of the tongue (J,)."""
+def _in_the_mouth(head: _Head, faces: Tensor, left: Tensor, lips: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Vertices (J,) of parts behind the lips, how much each goes with the jaw (J,), and with the tongue (J,)."""
     middle = lips.mean(0)
-    inside, tongue = torch.zeros_like(left), torch.zeros_like(left)
-    share = torch.zeros(len(left), dtype=torch.float64)
-    widest = _FILLED
+    inside = torch.zeros_like(left)
+    share, tongue = torch.zeros(2, len(left), dtype=torch.float64)
+    widest, gums = _FILLED, []
     for one in head.part[left].unique().tolist():  # every tooth is a part
         rows = (head.part == one) & left
         away = head.vertices[rows] - middle
@@ -196,11 +204,43 @@ def _in_the_mouth(head: _Head, left: Tensor, lips: Tensor) -> tuple[Tensor, Tens
         width, _, depth = (away.amax(0) - away.amin(0)).tolist()
         above = float((low < 0.5).double().mean())
         both = width > _ARCH and _BOTH_JAWS < above < 1 - _BOTH_JAWS
+        if both:
+            gums.append((rows, below))
         share[rows] = low * low * (3 - 2 * low) if both else float(below.mean() > 0)
         filled = float((away[:, 0].abs() < 5.0).double().mean())  # gums are an arch, hollow in the middle
         if float(below.mean()) > 0 and not both and width > _TONGUE and depth > _TONGUE and filled > widest:
-            widest, tongue = filled, rows
+            widest, tongue = filled, rows.double()
+    if not tongue.any():
+        for rows, below in gums:
+            tongue += _tongue_of_gums(head.vertices, faces, rows, below)
     return inside, share, tongue
+
+
+def _tongue_of_gums(vertices: Tensor, faces: Tensor, rows: Tensor, below: Tensor) -> Tensor:
+    """How much each vertex (J,) is of a tongue in one piece with gums: harmonic from its back to the arch around it."""
+    none = torch.zeros(len(vertices), dtype=torch.float64)
+    ids = rows.nonzero()[:, 0]
+    place = torch.full((len(vertices),), -1)
+    place[ids] = torch.arange(len(ids))
+    own, points = place[faces[rows[faces].all(1)]], vertices[ids]
+    facing = vertex_normals(points, own)
+    across = (points[:, 0] - (points[:, 0].amax() + points[:, 0].amin()) / 2).abs()
+    across = across / across.max().clamp(min=1e-6)
+    behind = points[:, 2].max() - points[:, 2]
+    low = below > 0
+    back = low & (facing[:, 1] > 0.5) & (across < _BACK[0]) & (behind > _BEHIND_TEETH)
+    arch = ~low | (across > _BACK[1]) | (behind < _TEETH)
+    upper_side = arch & low & (facing[:, 1] > 0.5)
+    if int(back.sum()) < _LEAST_BACK or not bool(upper_side.any()):
+        return none
+    gum = float(points[upper_side, 1].median())
+    if float(points[back, 1].quantile(0.9)) < gum:  # the mouth's floor
+        return none
+    back &= points[:, 1] > gum - _FALLS
+    weight = torch.where(back | arch, 1e3, 1e-6)
+    system = sparse.diags_array(weight.double().numpy()) + stretching_energy(points, own)
+    none[ids] = SparseCholesky(system).solve((weight * back).double()[:, None])[:, 0].clamp(0, 1)
+    return none
 
 
 def _jaw_motions(template: BlendshapeRig) -> Similarity:
@@ -228,16 +268,15 @@ def tongue_out(vertices: Tensor, tongue: Tensor, lips: Tensor) -> Tensor:
 
     Args:
         vertices: (V,3), millimetres, z toward the viewer.
-        tongue: mask (V,), not empty.
+        tongue: how much each vertex is of it, (V,) in [0,1], not all zero.
         lips: points of the lips, (L,3).
 
     Source: ARKit's description of the shape.
     """
-    own = vertices[tongue].double()
-    depth = own[:, 2]
-    share = (depth - depth.min()) / (depth.max() - depth.min()).clamp(min=1e-6)
-    share = share * share * (3 - 2 * share)
-    out = (lips[:, 2].double().max() + _TONGUE_OUT - depth.max()).clamp(min=0.0)
-    delta = torch.zeros_like(vertices, dtype=torch.float64)
-    delta[tongue] = torch.stack([torch.zeros_like(share), -_TONGUE_DOWN * share.square(), out * share], 1)
-    return delta.to(vertices)
+    weight = tongue.double()
+    depth = vertices[:, 2].double()
+    own = depth[weight > 0.5 * weight.max()]
+    share = ((depth - own.min()) / (own.max() - own.min()).clamp(min=1e-6)).clamp(0, 1)
+    share = weight * share * share * (3 - 2 * share)
+    out = (lips[:, 2].double().max() + _TONGUE_OUT - own.max()).clamp(min=0.0)
+    return torch.stack([torch.zeros_like(share), -_TONGUE_DOWN * share.square(), out * share], 1).to(vertices)

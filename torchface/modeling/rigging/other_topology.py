@@ -52,7 +52,7 @@ class CarriedShapes:
         template: the template's rig on the head's face, in the template's topology, place and size.
         distance: of each of the head's vertices to that face, (V,), millimetres of the template's size.
         places: which vertices have a place on it, (V,) bool; the others follow by smoothness or as loose parts.
-        tongue: vertices of the head's own tongue, (V,) bool; none where it has none.
+        tongue: how much each vertex is of the head's own tongue, (V,) in [0,1]; all zero where it has none.
         open_lids: what the blinks of the right and left eye leave open, as a share of the opening; None where its lids
             cannot be told from the eye, as of painted or welded eyes, and its blink is the template's.
     """

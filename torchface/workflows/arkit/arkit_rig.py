@@ -340,7 +340,7 @@ def _tongue(neutral: Mesh, carried: CarriedShapes) -> dict[str, Tensor]:
     notes = neutral.annotations
     mask = carried.tongue
     if notes is not None and not mask.any():
-        mask = next((region for name, region in notes.regions.items() if name.lower() == "tongue"), mask)
+        mask = next((region.double() for name, region in notes.regions.items() if name.lower() == "tongue"), mask)
     if not mask.any() or notes is None or notes.landmarks is None or len(notes.landmarks) != 68:
         return {}
     pose = carried.registration.pose

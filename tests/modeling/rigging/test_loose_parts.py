@@ -1,0 +1,40 @@
+"""Tongues are found where they are one piece with gums, and come out; a mouth's floor is none."""
+
+import torch
+from torch import Tensor
+
+from torchface.modeling.rigging.loose_parts import _tongue_of_gums, tongue_out
+
+
+def gums(height: float) -> tuple[Tensor, Tensor, Tensor]:
+    """A floor of 60 by 60 mm with a rim (the arch) and a hill of a height in its middle; the hill's vertices."""
+    side = 31
+    across, depth = torch.meshgrid(
+        torch.linspace(-30, 30, side).double(), torch.linspace(-62, -2, side).double(), indexing="ij"
+    )
+    rim = (across.abs() > 22) | (depth > -8)
+    hill = (across.abs() < 12) & (depth < -14)
+    up = torch.where(rim, -6.0, torch.where(hill, -18.0 + height, -18.0))
+    grid = torch.arange(side * side).view(side, side)
+    a, b, c, d = grid[:-1, :-1], grid[1:, :-1], grid[1:, 1:], grid[:-1, 1:]
+    faces = torch.cat([torch.stack(one, -1).reshape(-1, 3) for one in ((a, c, b), (a, d, c))])
+    return torch.stack([across, up, depth], -1).reshape(-1, 3), faces, hill.flatten()
+
+
+def test_a_tongue_in_one_piece_with_gums_comes_out_and_the_arch_stays() -> None:
+    points, faces, hill = gums(18.0)
+    tongue = _tongue_of_gums(
+        points, faces, torch.ones(len(points), dtype=torch.bool), -points[:, 1] - 0.2 * points[:, 2]
+    )
+    assert float(tongue[hill].min()) > 0.8
+    assert float(tongue[(points[:, 0].abs() > 20) | (points[:, 2] > -8)].max()) < 0.01
+    out = tongue_out(points, tongue, torch.zeros(20, 3, dtype=torch.float64))
+    tip = points + out
+    assert 8.0 < float(tip[hill, 2].max()) < 12.5  # before the lips
+    assert float(tip[hill, 1].max()) < float(points[hill, 1].max()) + 1e-6
+
+
+def test_a_mouths_floor_is_no_tongue() -> None:
+    points, faces, _ = gums(0.0)
+    below = -points[:, 1] - 0.2 * points[:, 2]
+    assert not bool(_tongue_of_gums(points, faces, torch.ones(len(points), dtype=torch.bool), below).any())
