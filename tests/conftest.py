@@ -174,3 +174,13 @@ def dome_rig() -> BlendshapeRig:
         bulge[..., None] * direction[:, None],
         ["jawOpen", "browInnerUp", "mouthSmileLeft", "mouthSmileRight"],
     )
+
+
+@pytest.fixture
+def receiver() -> Iterator[Any]:
+    """An ``OscReceiver`` on a port of its own."""
+    from osc_receiver import OscReceiver
+
+    opened = OscReceiver()
+    yield opened
+    opened.server.server_close()

@@ -19,6 +19,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from planted.asked_expressions import EXAMPLES
 from torchface.geometry.meshes.operators import vertex_normals
 from torchface.io import load_take
 from torchface.io.rigs.ict_facekit import load_ict_facekit, load_identity_modes
@@ -32,20 +33,6 @@ from torchface.shape_names import ARKIT, mapping
 from torchface.synthetic import draw_identities, performer
 from torchface.synthetic.stages.weight_curves import perform
 from torchface.viz.figures.face_views import THREE_QUARTER, frame_face
-
-EXAMPLES = [
-    "mouthSmileLeft mouthSmileRight browInnerUp eyeLookUpLeft eyeLookUpRight jawForward",
-    "jawOpen mouthRight browDownLeft browDownRight eyeLookDownLeft eyeLookDownRight",
-    "mouthPucker jawLeft eyeBlinkLeft eyeBlinkRight noseSneerLeft",
-    "mouthFrownLeft mouthFrownRight mouthShrugLower mouthShrugUpper browOuterUpLeft eyeWideLeft eyeWideRight",
-    "mouthStretchLeft mouthStretchRight mouthRollLower mouthRollUpper cheekSquintLeft cheekSquintRight eyeSquintLeft "
-    "eyeSquintRight",
-    "cheekPuff mouthPressLeft mouthPressRight jawRight browOuterUpRight eyeLookInLeft eyeLookOutRight",
-    "mouthUpperUpLeft mouthUpperUpRight mouthLowerDownLeft mouthLowerDownRight noseSneerRight eyeLookOutLeft "
-    "eyeLookInRight",
-    "mouthFunnel mouthLeft mouthDimpleLeft mouthDimpleRight browDownLeft",
-]
-"""What the person is asked to do, each shape at 0.9: every shape once, apart from others that move the same skin."""
 
 PICTURES = Path("out/example_rigging")
 GUESSED = RiggingSchedule(gamma=(25.0, 25.0))

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 import torch
-from torch import Tensor
 
+from planted.timed_motion import motion, random_points, slow_then_fast
 from tests.enhancement.conftest import Database
 from torchface.enhancement import EnhancementModel
 from torchface.enhancement.animation_retiming import at_moments, retimed_moments
@@ -13,19 +13,6 @@ from torchface.enhancement.timing.actor_timing import ActorTiming
 from torchface.enhancement.timing.motion_keyframes import find_keyframes
 from torchface.enhancement.timing.retiming_path import project_sequence
 from torchface.errors import ShapeError, TorchfaceError, ValueRangeError
-
-
-def random_points(seed: int, count: int, dimensions: int = 3) -> Tensor:
-    return torch.randn(count, dimensions, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
-
-
-def slow_then_fast(frames: int) -> Tensor:
-    return torch.linspace(0, 1, frames, dtype=torch.float64) ** 3
-
-
-def motion(progress: Tensor) -> Tensor:
-    """Features (n,4,9) of a face that goes straight from rest to an extreme."""
-    return progress[:, None, None] * random_points(5, 36).flatten()[:36].reshape(1, 4, 9)
 
 
 def test_keyframes_are_kept_exactly(model: EnhancementModel, database: Database) -> None:

@@ -66,15 +66,6 @@ def test_what_is_not_performed_is_left_out_what_is_unknown_is_named(session: Rec
         train(Settings(video=(session.video.path,), labels=(tmp_path / "together.toml",), out=tmp_path / "x", size=32))
 
 
-def test_the_command_says_what_it_wants(capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit) as ended:
-        recipe.RECIPE.main(["--help"])
-    assert not ended.value.code
-    shown = capsys.readouterr().out
-    assert "--video" in shown
-    assert "--labels" in shown
-
-
 def test_labels_that_are_not_there_end_in_a_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     words = ["--video", str(tmp_path / "film.mp4"), "--labels", str(tmp_path / "film.toml")]
     with pytest.raises(SystemExit):

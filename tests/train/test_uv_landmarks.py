@@ -27,7 +27,6 @@ from torchface.landmarks.scans.landmark_pairs import scan_pairs, template_featur
 from torchface.landmarks.scans.uv_landmark_names import LINES
 from torchface.synthetic import draw_identities, neutral_head, performer
 from torchface.synthetic.stages.scanner import Photography, ScannerSettings, eyes_closed
-from train import uv_landmarks as recipe
 from train.scan_landmark_errors import landmark_errors
 from train.uv_landmarks import Settings, Trained, train
 
@@ -151,13 +150,3 @@ def test_annotations_that_cannot_be_used_are_named(folder: Path, tmp_path: Path)
     (tmp_path / "else.json").write_text('{"format": "something"}')
     with pytest.raises(FileFormatError, match="scan-annotations"):
         load_annotations(tmp_path / "else.json")
-
-
-def test_the_command_says_what_it_wants(capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit) as ended:
-        recipe.RECIPE.main(["--help"])
-    assert not ended.value.code
-    shown = capsys.readouterr().out
-    assert "--scans" in shown
-    assert "--annotations" in shown
-    assert "--performers" in shown

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-import struct
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,6 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from mutation import check_reader
 from PIL import Image
+from rewritten_glb import rewrite
 from rig_samples import sheet_rig
 from torch import Tensor
 
@@ -106,19 +105,6 @@ def test_maps_that_do_not_fit_the_rig_are_refused_and_nothing_is_written(tmp_pat
     with pytest.raises(TopologyError, match="texture coordinates"):
         save_rig(bare, tmp_path / "a.glb", maps)
     assert not (tmp_path / "a.glb").exists()
-
-
-def rewrite(path: Path, change: object) -> None:
-    """Applies ``change`` to the JSON of a .glb."""
-    data = path.read_bytes()
-    size = struct.unpack_from("<I", data, 12)[0]
-    root = json.loads(data[20 : 20 + size])
-    change(root)  # type: ignore[operator]
-    text = json.dumps(root).encode()
-    text += b" " * (-len(text) % 4)
-    rest = data[20 + size :]
-    head = b"glTF" + struct.pack("<II", 2, 20 + len(text) + len(rest)) + struct.pack("<I", len(text)) + b"JSON"
-    path.write_bytes(head + text + rest)
 
 
 def test_broken_lists_are_refused(tmp_path: Path) -> None:

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import json
-import struct
 from pathlib import Path
-from typing import Any
 
 import pytest
 import torch
 from mutation import check_reader
+from rewritten_glb import rewrite
 from rig_samples import sheet_rig
 from test_gltf_viewers import assert_three_moves_it_alike, assert_valid, node  # noqa: F401  (its packages)
 from torch import Tensor
@@ -99,19 +97,6 @@ def test_maps_that_do_not_fit_are_refused(tmp_path: Path) -> None:
         made.blend(torch.zeros(2, 4))
 
 
-def rewrite(path: Path, change: object) -> None:
-    """Applies ``change`` to the list in the JSON of a .glb."""
-    data = path.read_bytes()
-    size = struct.unpack_from("<I", data, 12)[0]
-    root: dict[str, Any] = json.loads(data[20 : 20 + size])
-    change(root["meshes"][0]["extras"]["torchface"]["wrinkleRegions"], root)  # type: ignore[operator]
-    text = json.dumps(root).encode()
-    text += b" " * (-len(text) % 4)
-    rest = data[20 + size :]
-    head = b"glTF" + struct.pack("<II", 2, 20 + len(text) + len(rest)) + struct.pack("<I", len(text)) + b"JSON"
-    path.write_bytes(head + text + rest)
-
-
 def test_broken_lists_are_refused(tmp_path: Path) -> None:
     for number, (change, message) in enumerate(
         (
@@ -128,7 +113,7 @@ def test_broken_lists_are_refused(tmp_path: Path) -> None:
     ):
         path = tmp_path / f"{number}.glb"
         save_rig(sheet_rig(), path, maps())
-        rewrite(path, change)
+        rewrite(path, lambda root: change(root["meshes"][0]["extras"]["torchface"]["wrinkleRegions"], root))  # noqa: B023
         with pytest.raises(FileFormatError, match=message):
             load_region_maps(path)
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from contextlib import closing
 
 import pytest
@@ -19,13 +18,6 @@ from torchface.shape_names import ARKIT
 
 WEIGHTS = torch.arange(52) / 64
 ROTATION = torch.arange(1, 10) / 16
-
-
-@pytest.fixture
-def receiver() -> Iterator[OscReceiver]:
-    opened = OscReceiver()
-    yield opened
-    opened.server.server_close()
 
 
 def test_a_frame_arrives_as_plain_osc_in_one_bundle(receiver: OscReceiver) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Iterator
 from contextlib import closing
 from typing import Any
 
@@ -21,13 +20,6 @@ from torchface.shape_names import ARKIT, VRM0, VRM1
 
 WEIGHTS = torch.arange(52) / 64
 ROTATION = torch.arange(1, 10) / 16
-
-
-@pytest.fixture
-def receiver() -> Iterator[OscReceiver]:
-    opened = OscReceiver()
-    yield opened
-    opened.server.server_close()
 
 
 def test_a_frame_arrives_by_the_vmc_protocol(receiver: OscReceiver) -> None:

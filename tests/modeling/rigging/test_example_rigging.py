@@ -10,6 +10,7 @@ import torch
 from scipy.optimize import lsq_linear
 from torch import Tensor
 
+from planted.asked_expressions import EXAMPLES
 from torchface.errors import ShapeError, TopologyError, TorchfaceError, ValueRangeError
 from torchface.mesh import Mesh
 from torchface.modeling.rigging.deformation_transfer import transfer_with_report
@@ -21,18 +22,6 @@ from torchface.synthetic import draw_identities, performer
 
 SHORT = RiggingSchedule(iterations=4)
 KNOWN = RiggingSchedule(iterations=2, gamma=(1e9, 1e9))
-EXAMPLES = [
-    "mouthSmileLeft mouthSmileRight browInnerUp eyeLookUpLeft eyeLookUpRight jawForward",
-    "jawOpen mouthRight browDownLeft browDownRight eyeLookDownLeft eyeLookDownRight",
-    "mouthPucker jawLeft eyeBlinkLeft eyeBlinkRight noseSneerLeft",
-    "mouthFrownLeft mouthFrownRight mouthShrugLower mouthShrugUpper browOuterUpLeft eyeWideLeft eyeWideRight",
-    "mouthStretchLeft mouthStretchRight mouthRollLower mouthRollUpper cheekSquintLeft cheekSquintRight eyeSquintLeft "
-    "eyeSquintRight",
-    "cheekPuff mouthPressLeft mouthPressRight jawRight browOuterUpRight eyeLookInLeft eyeLookOutRight",
-    "mouthUpperUpLeft mouthUpperUpRight mouthLowerDownLeft mouthLowerDownRight noseSneerRight eyeLookOutLeft "
-    "eyeLookInRight",
-    "mouthFunnel mouthLeft mouthDimpleLeft mouthDimpleRight browDownLeft",
-]
 
 
 def dome(height: float, side: int = 21) -> Mesh:

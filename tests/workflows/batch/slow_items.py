@@ -6,6 +6,7 @@ import os
 import signal
 import time
 import warnings
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -65,3 +66,12 @@ class SpellJob:
     def attempts(self, name: str) -> int:
         """How often an item was begun."""
         return len(list(self.log.glob(f"{name}.*")))
+
+
+def written_words(folder: Path, texts: Mapping[str, str]) -> Path:
+    """The folder ``words`` with a file of each text, beside ``log``, in a folder."""
+    for name in ("words", "log"):
+        (folder / name).mkdir()
+    for name, text in texts.items():
+        (folder / "words" / f"{name}.txt").write_text(text)
+    return folder / "words"

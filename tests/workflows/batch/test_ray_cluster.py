@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from slow_items import WORDS, SpellJob
+from slow_items import WORDS, SpellJob, written_words
 
 from torchface.errors import ValueRangeError
 from torchface.workflows.batch import ray_cluster
@@ -69,11 +69,7 @@ def cluster(shared_cluster: Any) -> Any:
 
 @pytest.fixture
 def words(tmp_path: Path) -> Path:
-    (tmp_path / "words").mkdir()
-    (tmp_path / "log").mkdir()
-    for name, text in TEXTS.items():
-        (tmp_path / "words" / f"{name}.txt").write_text(text)
-    return tmp_path / "words"
+    return written_words(tmp_path, TEXTS)
 
 
 def run(words: Path, options: BatchOptions, pause: float = 0.0, **more: Any) -> BatchReport:

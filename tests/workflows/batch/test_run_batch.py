@@ -15,7 +15,7 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
-from slow_items import WORDS, SpellJob
+from slow_items import WORDS, SpellJob, written_words
 
 from torchface.errors import FileFormatError, ValueRangeError
 from torchface.workflows.batch import run_batch as module
@@ -30,11 +30,7 @@ TEXT, NONE = pickle.dumps("done"), pickle.dumps(None)
 
 @pytest.fixture
 def words(tmp_path: Path) -> Path:
-    (tmp_path / "words").mkdir()
-    (tmp_path / "log").mkdir()
-    for name, text in TEXTS.items():
-        (tmp_path / "words" / f"{name}.txt").write_text(text)
-    return tmp_path / "words"
+    return written_words(tmp_path, TEXTS)
 
 
 def run(words: Path, out: str = "out", options: BatchOptions = module.ONE_BY_ONE) -> BatchReport:

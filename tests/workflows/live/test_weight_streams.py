@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import socket
 import time
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -18,13 +17,6 @@ from torchface.workflows.live import weight_streams
 from torchface.workflows.live.weight_streams import WeightStreams, mapped_sender
 
 JAW = ARKIT.index("jawOpen")
-
-
-@pytest.fixture
-def receiver() -> Iterator[OscReceiver]:
-    opened = OscReceiver()
-    yield opened
-    opened.server.server_close()
 
 
 def drained(receiver: socket.socket) -> list[bytes]:
