@@ -49,6 +49,7 @@ UNSHOWN = {
         "landmarks.AppearanceFit",
         "landmarks.AppearanceModel",
         "onnx.export_dynamics_prior",
+        "onnx.export_hybrid_solver",
         "onnx.export_wrinkle_weights",
         "onnx.export_video_solver",
         "synthetic.stages.RawScan",

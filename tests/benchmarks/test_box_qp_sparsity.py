@@ -15,7 +15,7 @@ from torchface import Attachment, BlendshapeRig
 from torchface.capture import MarkerSolver
 from torchface.capture.markers import observability
 from torchface.capture.markers.marker_solver import SPARSITY
-from torchface.capture.markers.sparsity import with_sparsity
+from torchface.capture.markers.take_smoothing import with_sparsity
 
 matplotlib.use("Agg")
 OUT = Path(__file__).resolve().parents[2] / "out" / "benchmarks"

@@ -11,8 +11,7 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from torchface import Attachment, BlendshapeRig, zoo
-from torchface.capture import MarkerSolver
+from torchface import BlendshapeRig, zoo
 from torchface.cli import main
 from torchface.errors import ValueRangeError
 from torchface.landmarks import DetectorSettings, UVLandmarkDetector
@@ -120,11 +119,10 @@ def test_the_bank_finds_what_the_detector_finds(detector: UVLandmarkDetector, tm
 
 
 def test_the_command_exports_models_of_a_folder(
-    head: HeadModel, dome_rig: BlendshapeRig, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    head: HeadModel, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    solver = MarkerSolver(dome_rig, Attachment.from_vertices(dome_rig.neutral, range(0, 600, 9)))
-    kinds = {"head": "head_decoder", "solver": "solver"}
-    for name, model in zip(kinds, (head, solver), strict=True):
+    kinds = {"head": "head_decoder", "trees": "face_landmarks"}
+    for name, model in zip(kinds, (head, zoo.get_model("face_landmarks")), strict=True):
         zoo.save_model(model, tmp_path / name, zoo.ModelCard("MIT", "noise", {"error": 1.5}, "none"))
         out = tmp_path / f"{name}.onnx"
         main(["export", str(tmp_path / name), "--out", str(out), "--quiet"])

@@ -14,10 +14,9 @@ from torch import Tensor
 from torchface import Attachment, BlendshapeRig, __version__
 from torchface.capture import HybridSolver, MarkerSolver
 from torchface.errors import ValueRangeError
-from torchface.onnx import SolverReport, export_hybrid_solver, export_solver, solver_graph_export
+from torchface.onnx import SolverReport, export_hybrid_solver, export_model, export_solver, solver_graph_export
 from torchface.onnx.solver_graph_export import (
     GraphSteps,
-    export_marker_solver,
     hide_markers,
     random_frames,
     solver_graph,
@@ -34,7 +33,9 @@ def run(path: Path, *inputs: Tensor) -> Tensor:
 
 @pytest.fixture(scope="module")
 def written(turned_bumps: MarkerSolver, tmp_path_factory: pytest.TempPathFactory) -> SolverReport:
-    return export_marker_solver(turned_bumps, tmp_path_factory.mktemp("graph") / "solver.onnx")
+    report = export_model(turned_bumps, tmp_path_factory.mktemp("graph") / "solver.onnx", {"data": "planted"})
+    assert isinstance(report, SolverReport)
+    return report
 
 
 def test_the_file_is_the_graph(written: SolverReport, turned_bumps: MarkerSolver) -> None:
@@ -67,7 +68,7 @@ def test_the_metadata_says_what_goes_in_and_out(written: SolverReport, turned_bu
     assert tuple(json.loads(metadata["shape_names"])) == turned_bumps.names
     assert tuple(json.loads(metadata["marker_labels"])) == turned_bumps.labels
     assert metadata["units"] == "millimetres"
-    assert metadata["version"] == __version__
+    assert (metadata["version"], metadata["data"]) == (__version__, "planted")
     assert json.loads(metadata["steps"]) == [66, 96]
     assert {opset.domain for opset in onnx.load(written.path).opset_import} == {""}
 

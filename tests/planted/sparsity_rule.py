@@ -5,7 +5,7 @@ from __future__ import annotations
 from torch import Tensor
 
 from torchface.capture import MarkerSolver
-from torchface.capture.markers.sparsity import with_sparsity
+from torchface.capture.markers.take_smoothing import with_sparsity
 
 
 def sparsity_by_rule(solver: MarkerSolver, markers: Tensor) -> float:

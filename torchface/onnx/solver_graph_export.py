@@ -200,14 +200,7 @@ def export_hybrid_solver(
     says, and ``gamma`` (B,N), how much that counts, mm² over all markers. Where gamma is zero in a whole batch it
     computes what the other graph does. It is checked with random predictions for a seventh of the weights.
 
-    Args, Raises: as :func:`export_solver`; a rig with correctives takes ``HybridCorrectiveGraph``'s steps.
-
-    Example:
-        >>> from torchface.synthetic import performer
-        >>> rig = performer(texture=False).select(["jawOpen", "browInnerUp", "mouthPucker"])
-        >>> sites = Attachment.from_vertices(rig.neutral, rig.neutral.landmarks)
-        >>> export_hybrid_solver(rig, sites, "hybrid.onnx").path.name
-        'hybrid.onnx'
+    Args, Raises, example: as :func:`export_solver`; a rig with correctives takes ``CorrectiveGraph``'s steps.
     """
     solver = MarkerSolver(rig, attachment, alignment, sparsity, ridge).cpu().float()
     frames = _frames(solver, markers)

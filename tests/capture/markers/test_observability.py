@@ -11,7 +11,7 @@ from planted.sparsity_rule import sparsity_by_rule
 from torchface import Attachment, BlendshapeRig
 from torchface.capture import MarkerSolver
 from torchface.capture.markers import observability
-from torchface.capture.markers.sparsity import with_sparsity
+from torchface.capture.markers.take_smoothing import with_sparsity
 
 
 def with_shapes(rig: BlendshapeRig, **more: torch.Tensor) -> BlendshapeRig:

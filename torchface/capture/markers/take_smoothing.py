@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -12,7 +13,6 @@ from torch import Tensor, nn
 
 from torchface.capture.corrective_energy import CorrectiveEnergy
 from torchface.capture.markers.marker_solver import MarkerSolver, frames_seen, penalty_value
-from torchface.capture.markers.sparsity import with_sparsity
 from torchface.errors import NameMismatchError, ShapeError, TraceError, ValueRangeError
 from torchface.number_checks import LARGEST_WEIGHT, check_rate, checked_number, checked_type
 from torchface.optim.data_dependent import data_dependent
@@ -226,6 +226,17 @@ class WholeTakeSolver(nn.Module):
 
     def extra_repr(self) -> str:
         return f"smoothness={self.smoothness:g}, huber_threshold={self.huber_threshold:g}, sparsity={self.sparsity:g}"
+
+
+def with_sparsity(solver: MarkerSolver, sparsity: float) -> MarkerSolver:
+    """The same solver with another sparsity."""
+    other = copy.copy(solver)
+    # A learned sparsity of the solver is a parameter or a buffer of its own, and stays with it.
+    other._parameters = {name: value for name, value in solver._parameters.items() if name != "sparsity"}
+    other._buffers = {name: value for name, value in solver._buffers.items() if name != "sparsity"}
+    other.sparsity = float(sparsity)
+    other.regularization(solver.rest)
+    return other
 
 
 def smooth_in_box(H: Tensor, slopes: Tensor, fps: float, smoothness: float) -> Tensor:
