@@ -114,9 +114,8 @@ def _encode(container: OutputContainer, first: Tensor, others: Iterator[Tensor],
     for frame in chain([first], others):  # the encoder takes one frame at a time
         if frame.shape != first.shape:
             raise ShapeError(f"frames: found {tuple(frame.shape)}, expected {tuple(first.shape)} as the first")
-        pixels = to_bytes(frame).numpy()
-        if pixels.ndim == 3:
-            pixels = np.ascontiguousarray(pixels.transpose(1, 2, 0))
+        pixels = frame.numpy() if frame.dtype == torch.uint8 else to_bytes(frame).numpy()
+        pixels = np.ascontiguousarray(pixels if pixels.ndim == 2 else pixels.transpose(1, 2, 0))
         coded = reformatter.reformat(av.VideoFrame.from_ndarray(pixels, layout), format=stream.pix_fmt, **lossy)
         coded.pts, coded.time_base = count, 1 / stream.codec_context.framerate
         container.mux(stream.encode(coded))

@@ -73,7 +73,7 @@ def side_by_side_drawer(tracked: Tracked) -> Callable[[int, Tensor], Tensor]:
         )  # fmt: skip
 
     def draw(t: int, frame: Tensor) -> Tensor:
-        pixels = np.ascontiguousarray(frame.permute(1, 2, 0).numpy())
+        pixels = cv2.merge(list(frame.numpy()))  # a fifth of the time of a copy by NumPy
         both = np.empty((_HEIGHT, 2 * width, 3), np.uint8)
         if maps is None:
             left = cv2.warpAffine(pixels, view[:2], (width, _HEIGHT), borderValue=BACKGROUND)
