@@ -8,7 +8,7 @@ from pathlib import Path
 
 from torchface.errors import FileFormatError
 from torchface.files.whole_files import check_ending
-from torchface.geometry.meshes.normal_maps import DetailMaps
+from torchface.geometry.meshes.normal_maps import DetailMaps, SurfaceMaps
 from torchface.geometry.meshes.region_maps import RegionMaps
 from torchface.io.gltf.animation_reading import read_gltf_weights
 from torchface.io.gltf.detail_textures import read_gltf_detail
@@ -82,7 +82,7 @@ def load_rig(
     return rig if part is None else rig.part(region(rig.neutral, part))
 
 
-def save_rig(rig: BlendshapeRig, path: str | Path, detail: DetailMaps | RegionMaps | None = None) -> None:
+def save_rig(rig: BlendshapeRig, path: str | Path, detail: DetailMaps | RegionMaps | SurfaceMaps | None = None) -> None:
     """Writes a rig for other programs, and so that ``load_rig`` gives the same one.
 
     Args:
@@ -91,7 +91,8 @@ def save_rig(rig: BlendshapeRig, path: str | Path, detail: DetailMaps | RegionMa
             correctives among them); a ``.usda``, ``.usdc``, ``.usd`` or ``.usdz``; a ``.ma`` for Maya, which
             ``load_rig`` does not read; or a name without an ending, for a folder of ``neutral.obj`` and an OBJ a shape.
             It appears only when it is complete.
-        detail: detail maps of its shapes, or of its regions, for ``.glb`` alone.
+        detail: detail maps of its shapes, or of its regions, or the surface's normals and roughness, for ``.glb``
+            alone.
 
     Raises:
         FileFormatError: another ending, a folder that holds another rig, or one that cannot be written to.
@@ -111,16 +112,17 @@ def save_rig(rig: BlendshapeRig, path: str | Path, detail: DetailMaps | RegionMa
 
 
 def write_rig(
-    rig: BlendshapeRig, path: str | Path, detail: DetailMaps | RegionMaps | None, keys: WeightKeys | None
+    rig: BlendshapeRig, path: str | Path, detail: DetailMaps | RegionMaps | SurfaceMaps | None, keys: WeightKeys | None
 ) -> None:
     """Writes a rig, with ``keys`` as the animation of its shapes; see :func:`save_rig`."""
     check_rig_ending(path)
     suffix = Path(path).suffix.lower()
     if suffix == ".glb":
         write_gltf_rig(rig, path, detail, keys)
-    elif isinstance(detail, RegionMaps):
+    elif isinstance(detail, RegionMaps | SurfaceMaps):
         kind = f"a {suffix} file" if suffix else "a folder of OBJ files"
-        raise FileFormatError(f"{path}: found wrinkle maps by region for {kind}, expected .glb for them")
+        found = "wrinkle maps by region" if isinstance(detail, RegionMaps) else "maps of the surface"
+        raise FileFormatError(f"{path}: found {found} for {kind}, expected .glb for them")
     elif suffix in USD_ENDINGS:
         write_usd_rig(rig, path, keys, detail)
     elif suffix == MAYA_ENDING:
@@ -135,7 +137,7 @@ def save_animation(
     rig: BlendshapeRig,
     take: Take,
     path: str | Path,
-    detail: DetailMaps | RegionMaps | None = None,
+    detail: DetailMaps | RegionMaps | SurfaceMaps | None = None,
     reduce: float | None = None,
 ) -> ShapeMatch:
     """Writes a rig with the take's weights as its animation, a key a frame at its time, linear between.

@@ -1,7 +1,18 @@
-"""A performer made by code: head, identities, expressions, skin."""
+"""A performer made by code: head, identities, expressions, skin; and the character that is shown of it."""
 
+from torchface.synthetic.head.character import Character, character
 from torchface.synthetic.head.identity import IDENTITY, IdentityParameter, draw_identities
 from torchface.synthetic.head.neutral_head import neutral_head
 from torchface.synthetic.head.performer import performer
+from torchface.synthetic.head.skin_maps import Look
 
-__all__ = ["IDENTITY", "IdentityParameter", "draw_identities", "neutral_head", "performer"]
+__all__ = [
+    "IDENTITY",
+    "Character",
+    "IdentityParameter",
+    "Look",
+    "character",
+    "draw_identities",
+    "neutral_head",
+    "performer",
+]

@@ -1,4 +1,5 @@
-"""Cache of ONNX graphs: each is exported once, and anew where its models or its code have changed."""
+"""Cache of files that are made by code in seconds: each is made once, and anew where its models or its code have
+changed."""
 
 from __future__ import annotations
 
@@ -18,25 +19,31 @@ from torchface.files.whole_files import all_or_none, read_file, write_file
 
 
 def cached_graph(kind: str, make: Callable[[], onnx.ModelProto], code: Sequence[str], **models: object) -> bytes:
-    """A graph's file: from the cache where it is there and whole, else exported; kept if the cache can be written to.
+    """An ONNX graph's file; see :func:`cached_file`."""
+    return cached_file(kind, ".onnx", lambda: make().SerializeToString(), code, **models)
+
+
+def cached_file(kind: str, ending: str, make: Callable[[], bytes], code: Sequence[str], **models: object) -> bytes:
+    """A file's content: from the cache where it is there and whole, else made; kept if the cache can be written to.
 
     Args:
-        kind: of the graph, a plain name.
-        make: exports it, in seconds to a minute.
+        kind: of the file, a plain name.
+        ending: of its name.
+        make: makes it, in seconds to a minute.
         code: folders of this package whose code says what becomes of the models.
-        models: what the graph is made of, as :func:`~torchface.files.content_keys.content_key` takes it.
+        models: what the file is made of, as :func:`~torchface.files.content_keys.content_key` takes it.
     """
     package = Path(torchface.__file__).parent
     sources = {one: sorted((package / one).rglob("*.py")) for one in code}
     key = content_key(f"{kind} 2", torch=str(torch.__version__), sources=sources, models=models)[:32]
     with suppress(FileFormatError):  # not there, or damaged
-        path = cache_folder(kind) / f"{key}.onnx"
+        path = cache_folder(kind) / f"{key}{ending}"
         content = read_file(path)
         if read_file(path.with_suffix(".sha256")).decode("ascii", "replace") == hashlib.sha256(content).hexdigest():
             return content
-    content = make().SerializeToString()
+    content = make()
     with suppress(FileFormatError), all_or_none():
-        path = cache_folder(kind) / f"{key}.onnx"
+        path = cache_folder(kind) / f"{key}{ending}"
         write_file(path, content)
         write_file(path.with_suffix(".sha256"), hashlib.sha256(content).hexdigest().encode())
     return content

@@ -16,6 +16,14 @@ _MIN_Z = 0.02  # a slope of 89 degrees; steeper ones have no finite height
 
 
 @dataclass(frozen=True, eq=False)
+class SurfaceMaps:
+    """How a face at rest shades: unit normals in tangent space (3,H,W), and roughness from 0 to 1, (1,H,W)."""
+
+    neutral: Tensor
+    roughness: Tensor
+
+
+@dataclass(frozen=True, eq=False)
 class DetailMaps:
     """One normal map a shape, and the face's at rest.
 

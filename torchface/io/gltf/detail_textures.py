@@ -17,13 +17,13 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchface.errors import NameMismatchError, TopologyError
-from torchface.geometry.meshes.normal_maps import DetailMaps, decode_normals, encode_normals
+from torchface.geometry.meshes.normal_maps import DetailMaps, SurfaceMaps, decode_normals, encode_normals
 from torchface.geometry.meshes.operators import vertex_normals
 from torchface.geometry.meshes.tangent_space import tangent_space
 from torchface.io.gltf.buffers import BufferWriter
 from torchface.io.gltf.gltf_document import Document, read_document
 from torchface.io.gltf.gltf_reading import read_texture
-from torchface.io.images.image_files import encode_png
+from torchface.io.images.image_files import encode_jpeg, encode_png
 from torchface.mesh import Mesh
 
 _LIST = "wrinkleMaps"
@@ -53,6 +53,17 @@ def write_detail(
         for name, normals in zip(detail.names, detail.maps, strict=True)
     ]
     root["meshes"][0]["extras"]["torchface"][_LIST] = listed
+
+
+def write_surface(surface: SurfaceMaps, root: dict[str, Any], buffers: BufferWriter) -> None:
+    """Adds normals and roughness to the first material of a document under construction, as JPEG."""
+    skin = root["materials"][0]
+    normals = encode_jpeg(encode_normals(surface.neutral))
+    skin["normalTexture"] = {"index": buffers.texture(root, normals, "image/jpeg", "skin_normals")}
+    rough = surface.roughness[0]
+    channels = encode_jpeg(torch.stack([torch.ones_like(rough), rough, torch.zeros_like(rough)]))
+    index = buffers.texture(root, channels, "image/jpeg", "skin_roughness")
+    skin["pbrMetallicRoughness"] |= {"roughnessFactor": 1.0, "metallicRoughnessTexture": {"index": index}}
 
 
 def check_detail(detail: DetailMaps, mesh: Mesh, names: Sequence[str]) -> None:

@@ -13,12 +13,12 @@ from torch import Tensor
 from torchface.correctives.corrective_shapes import Corrective
 from torchface.errors import TopologyError
 from torchface.files.whole_files import replaced_file
-from torchface.geometry.meshes.normal_maps import DetailMaps
+from torchface.geometry.meshes.normal_maps import DetailMaps, SurfaceMaps
 from torchface.geometry.meshes.region_maps import RegionMaps
 from torchface.geometry.meshes.uv_seams import split_at_seams
 from torchface.io.gltf.buffers import BufferWriter
 from torchface.io.gltf.corrective_extras import all_targets, write_correctives
-from torchface.io.gltf.detail_textures import corner_tangents, write_detail
+from torchface.io.gltf.detail_textures import corner_tangents, write_detail, write_surface
 from torchface.io.gltf.gltf_document import glb_pieces
 from torchface.io.gltf.mesh_extras import write_extras, write_order
 from torchface.io.gltf.part_textures.head_primitives import surfaces
@@ -32,7 +32,10 @@ from torchface.rig import BlendshapeRig
 
 
 def write_gltf_rig(
-    rig: BlendshapeRig, path: str | Path, detail: DetailMaps | RegionMaps | None = None, keys: WeightKeys | None = None
+    rig: BlendshapeRig,
+    path: str | Path,
+    detail: DetailMaps | RegionMaps | SurfaceMaps | None = None,
+    keys: WeightKeys | None = None,
 ) -> None:
     """Writes a rig as ``.glb`` in metres.
 
@@ -47,7 +50,7 @@ def write_gltf_rig(
         rig: the rig.
         path: the file; it appears only when it is complete.
         detail: detail maps of its shapes, see ``torchface.io.gltf.detail_textures``, or of its regions, see
-            ``torchface.io.gltf.wrinkle_textures``.
+            ``torchface.io.gltf.wrinkle_textures``; or the surface's normals and roughness, with which images are JPEG.
         keys: an animation of its shapes, linear between keys.
     """
     _write(path, rig.neutral, *all_targets(rig), keys and _with_correctives(rig, keys), detail, _definitions(rig))
@@ -64,7 +67,7 @@ def _write(
     deltas: Tensor,
     names: tuple[str, ...],
     keys: WeightKeys | None,
-    detail: DetailMaps | RegionMaps | None = None,
+    detail: DetailMaps | RegionMaps | SurfaceMaps | None = None,
     correctives: Sequence[Corrective] = (),
 ) -> None:
     if len(mesh.faces) == 0:
@@ -74,7 +77,10 @@ def _write(
     mirrored = None if tangents is None else tangents[..., 3] < 0
     uv_faces = None if mesh.uv_faces is None else mesh.uv_faces.numpy()
     split = split_at_seams(len(mesh.vertices), mesh.faces.numpy(), uv_faces, mirrored)
-    writer, materials = PrimitiveWriter(mesh, split, buffers, tangents), MaterialWriter(mesh, buffers)
+    writer, materials = (
+        PrimitiveWriter(mesh, split, buffers, tangents),
+        MaterialWriter(mesh, buffers, jpeg=isinstance(detail, SurfaceMaps)),
+    )
     parts = surfaces(mesh, mesh.texture is not None or detail is not None)
     if all(surface.part is not None for surface in parts):  # nothing but eyeballs: none is another's child
         parts = [replace(surface, part=None) for surface in parts]
@@ -108,6 +114,8 @@ def _write(
     }
     if isinstance(detail, RegionMaps):
         write_region_maps(detail, root, buffers)
+    elif isinstance(detail, SurfaceMaps):
+        write_surface(detail, root, buffers)
     elif detail is not None:
         write_detail(detail, mesh, names, root, buffers)
     if keys is not None:

@@ -15,7 +15,7 @@ from torchface.geometry.meshes.uv_seams import Split
 from torchface.io.gltf.buffers import BufferWriter
 from torchface.io.gltf.part_textures.head_primitives import Surface
 from torchface.io.gltf.region_materials import SKIN
-from torchface.io.images.image_files import encode_png
+from torchface.io.images.image_files import encode_jpeg, encode_png
 from torchface.io.length_units import millimetres_per
 from torchface.mesh import Mesh
 
@@ -130,10 +130,11 @@ class MaterialWriter:
     Args:
         mesh: on the CPU.
         buffers: where images go.
+        jpeg: whether images of three channels are JPEG, which is smaller; else all are PNG.
     """
 
-    def __init__(self, mesh: Mesh, buffers: BufferWriter) -> None:
-        self.mesh, self.buffers = mesh, buffers
+    def __init__(self, mesh: Mesh, buffers: BufferWriter, jpeg: bool = False) -> None:
+        self.mesh, self.buffers, self._jpeg = mesh, buffers, jpeg
         self.fields: dict[str, Any] = {"materials": []}
         self._textures: dict[int, int] = {}
 
@@ -167,5 +168,7 @@ class MaterialWriter:
 
     def _texture(self, image: Tensor, name: str) -> int:
         if id(image) not in self._textures:
-            self._textures[id(image)] = self.buffers.texture(self.fields, encode_png(image), name=name)
+            jpeg = self._jpeg and len(image) == 3
+            data, kind = (encode_jpeg(image), "image/jpeg") if jpeg else (encode_png(image), "image/png")
+            self._textures[id(image)] = self.buffers.texture(self.fields, data, kind, name)
         return self._textures[id(image)]

@@ -5,8 +5,9 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 
+import numpy as np
 import torch
-from scipy.interpolate import PchipInterpolator
+from scipy.interpolate import CubicSpline, PchipInterpolator
 from torch import Tensor
 
 from torchface.synthetic.head.signed_distance import EYE_CENTRE, EYE_RADIUS, gradient, project
@@ -141,14 +142,15 @@ def mouth_rings(border: Tensor, onto_form: OntoForm) -> Tensor:
     rings[-1] = line[None]
     sign = torch.where(is_upper, 1.0, -1.0).double()
     sign[HALF_LIP] = 0.0
-    open_share = 1 - spread**3
-    for drop, back, narrow in (
-        (0.9, 2.6, 1.0), (3.5, 6.0, 0.99), (8.0, 10.0, 0.97), (13.0, 16.0, 0.95),
-        (16.0, 24.0, 0.92), (16.0, 34.0, 0.86), (13.0, 44.0, 0.72),
+    open_share = (1 - spread**3).clamp(min=0.0)
+    # Close behind the lips, then out into the cheeks, so that teeth and gums have room.
+    for drop, back, wide in (
+        (0.9, 2.6, 1.0), (4.0, 4.6, 1.0), (9.0, 5.6, 1.03), (14.0, 8.0, 1.10),
+        (19.0, 18.0, 1.30), (20.0, 34.0, 1.40), (14.0, 54.0, 1.20),
     ):  # fmt: skip
         loop = line.clone()
-        loop[:, 0] *= narrow
-        loop[:, 1] += sign * (drop * open_share.clamp(min=0.0) + 0.2 * drop * (sign != 0))
+        loop[:, 0] *= wide
+        loop[:, 1] += sign * (drop * open_share + 0.2 * drop * (sign != 0))
         loop[:, 2] -= back
         rings.append(loop[None])
     assert len(rings) - 1 + MOUTH_BORDER - 1 == MOUTH_CONTACT + 7
@@ -181,37 +183,113 @@ def nostril_rings(border: Tensor, onto_form: OntoForm) -> Tensor:
     return torch.stack(rings)
 
 
+# The ear's outline round its middle, seen from its side: bearing (degrees, 0 forward, 90 up), then millimetres forward
+# and up, how free it stands of the head (0 grown on, 1 free), and how strong the rolled rim is there.
+_EAR_OUTLINE = np.array([
+    (-65, 7.0, -24.0, 0.0, 0.0), (-35, 11.0, -12.5, 0.0, 0.0), (0, 12.5, 0.0, 0.0, 0.0), (28, 13.0, 9.0, 0.0, 0.5),
+    (58, 10.0, 20.5, 0.2, 1.0), (80, 4.5, 28.5, 0.6, 1.0), (102, -5.0, 30.5, 0.95, 1.0), (126, -13.5, 25.0, 1.0, 1.0),
+    (153, -18.5, 14.0, 1.0, 1.0), (185, -19.0, 1.0, 1.0, 0.95), (213, -15.5, -10.5, 1.0, 0.8),
+    (240, -10.5, -20.5, 0.8, 0.35), (262, -4.5, -28.0, 0.42, 0.0), (280, 1.5, -29.0, 0.15, 0.0),
+    (295, 7.0, -24.0, 0.0, 0.0),
+])  # fmt: skip
+_ANTIHELIX = ((-2.0, -14.5), (-8.0, -8.5), (-10.5, 0.0), (-9.5, 8.0), (-6.5, 14.0), (-2.5, 21.0))
+_LOWER_CRUS = ((-8.5, 10.5), (-3.0, 13.0), (4.0, 14.0))
+_HELIX_ROOT = ((12.5, 8.0), (7.5, 3.0), (1.5, 1.0))
+_EAR_SHELL = (0.92, 0.82, 0.71, 0.58, 0.43, 0.27)
+"""How far from the middle to the outline the rings of the ear's front lie."""
+
+
+def _ridge(spots: Tensor, line: tuple[tuple[float, float], ...], width: float) -> Tensor:
+    """1 on a line of points in the ear's plane, falling off over a width, for spots (...,2)."""
+    knots = torch.tensor(line, dtype=spots.dtype)
+    way = knots[1:] - knots[:-1]
+    along = (((spots[..., None, :] - knots[:-1]) * way).sum(-1) / (way**2).sum(-1)).clamp(0, 1)
+    near = (spots[..., None, :] - knots[:-1] - along[..., None] * way).norm(dim=-1).amin(-1)
+    return torch.exp(-((near / width) ** 2))
+
+
+def _hump(spots: Tensor, forward: float, up: float, wide: float, tall: float) -> Tensor:
+    return torch.exp(-(((spots[..., 0] - forward) / wide) ** 2) - ((spots[..., 1] - up) / tall) ** 2)
+
+
+def _ear_relief(spots: Tensor, inside: Tensor, rolled: Tensor) -> Tensor:
+    """How far the ear's front stands out of the head's side: rim, furrow, inner ridge, bowl, the flaps round it.
+
+    Args:
+        spots: forward and up from the middle, (K,L,2), mm.
+        inside: how far within the outline, (K,L), mm.
+        rolled: how strong the rim is, (L,).
+    """
+    plane = 8.0 - 0.42 * spots[..., 0] - 0.22 * (-14 - spots[..., 1]).clamp(min=0)
+    rim = rolled * (2.6 * torch.exp(-(((inside - 2.2) / 1.7) ** 2)) - 2.6 * torch.exp(-(((inside - 6.3) / 2.0) ** 2)))
+    inner = 2.6 * _ridge(spots, _ANTIHELIX, 2.7) + 1.7 * _ridge(spots, _LOWER_CRUS, 2.2)
+    bowl = 10.5 * _hump(spots, 1.0, -4.5, 6.0, 7.5) + 6.0 * _hump(spots, 2.5, 7.0, 7.0, 3.6)
+    flaps = 6.0 * _hump(spots, 10.5, -3.5, 3.4, 4.8) + 2.4 * _hump(spots, -0.5, -15.5, 3.6, 3.0)
+    return plane + rim + inner - bowl + flaps + 3.2 * _ridge(spots, _HELIX_ROOT, 2.4) + _hump(spots, 0, -24, 6, 5)
+
+
+def _evenly(bearing: Tensor) -> Tensor:
+    """Bearings (L,), degrees, moved so that points on the ear's outline are nearly as far from each other."""
+    dense = np.linspace(-65, 295, 721)
+    length = np.concatenate(
+        [
+            [0],
+            np.cumsum(
+                np.linalg.norm(
+                    np.diff(CubicSpline(_EAR_OUTLINE[:, 0], _EAR_OUTLINE[:, 1:3], bc_type="periodic")(dense), axis=0),
+                    axis=1,
+                )
+            ),
+        ]
+    )
+    turns, rest = np.divmod(bearing.numpy() + 65, 360)
+    place = turns + np.interp(rest - 65, dense, length) / length[-1]
+    step = np.sign(place[-1] - place[0]) / len(place)
+    even = step * np.arange(len(place))
+    place = 0.15 * place + 0.85 * (even + (place - even).mean())
+    return torch.from_numpy(np.interp((place % 1) * length[-1], length, dense))
+
+
 def ear_rings(border: Tensor, onto_form: OntoForm) -> Tensor:
-    """Rings (11,L,3): root, back of the shell, rim, fold, inner ridge, bowl."""
+    """Rings (11,L,3): three up the shell's back, the edge, six over its front into the bowl."""
     del onto_form
     lean = math.radians(14)
     upward = torch.tensor([0.0, math.cos(lean), -math.sin(lean)]).double()
     forward = torch.tensor([0.0, math.sin(lean), math.cos(lean)]).double()
-    outward = torch.tensor([1.0, 0.0, 0.0]).double()
     centre = torch.tensor([0.0, -13.0, -9.5]).double()
     offset = border - border.mean(0)
-    angle = torch.atan2(offset @ upward / 1.7, offset @ forward)
-    sine, cosine = angle.sin(), angle.cos()
-    back = ((0.35 - cosine) / 1.35).clamp(0, 1) ** 0.8  # 0 where the ear grows from the cheek, 1 at its free edge
-    tall = 36.6 * sine
-    wide = 17.5 * cosine * (1 + 0.22 * sine) - 1.5 * sine
-    lobe = (-sine - 0.45).clamp(min=0) / 0.55
-    rim = 16.5 * back * (1 - 0.45 * lobe) + 1.2 * (1 - back)
-    hollow = 1 - lobe
-    rings = [border]
-    base = border @ outward  # the head under the ear
-    for size, height in (
-        (0.62, 0.0 * rim), (0.64, 0.45 * rim), (0.96, 0.92 * rim), (1.0, rim + 1.0), (0.93, rim + 1.8),
-        (0.85, rim - 2.4 * hollow), (0.68, 0.80 * rim + 0.6 + 1.2 * hollow), (0.56, 0.62 * rim + 0.5),
-        (0.46, 0.42 * rim - 4.0 * hollow), (0.30, 0.28 * rim - 6.0),
-    ):  # fmt: skip
-        # In front the ear grows out of the cheek: there each loop lies inside the one before.
-        reach = size * back + (1 - back) * min(size, 0.98 - 0.045 * len(rings))
-        spot = centre + (reach * tall)[:, None] * upward + (reach * wide)[:, None] * forward
-        root = 67.0 + 0.65 * (base - 67.0) * (1 - back)
-        spot[:, 0] = root + height
-        rings.append(spot)
-    return torch.stack(rings)
+    bearing = torch.rad2deg(torch.atan2(offset @ upward / 1.7, offset @ forward))
+    bearing = _evenly(torch.from_numpy(np.unwrap(bearing.numpy(), period=360)))
+    curve = CubicSpline(_EAR_OUTLINE[:, 0], _EAR_OUTLINE[:, 1:3], bc_type="periodic")
+    outline = torch.from_numpy(curve(bearing.numpy()))
+    free, rolled = torch.from_numpy(PchipInterpolator(_EAR_OUTLINE[:, 0], _EAR_OUTLINE[:, 3:])(bearing.numpy())).T
+    outline[:, 1] *= 1.064
+    middle = torch.tensor([0.0, -2.0]).double()
+    shares = torch.tensor((1.0, *_EAR_SHELL)).double()[:, None, None]
+    spots = middle + shares * (outline - middle)
+    inside = (1 - shares[..., 0]) * (outline - middle).norm(dim=-1)
+    relief = _ear_relief(spots, inside, rolled)
+    # Where the ear grows out of the cheek its edge lies on the head.
+    relief = relief - (1 - free) * (relief[:1] - 0.6) * torch.exp(-inside / 5.0)
+    relief[0] -= 1.0 * free
+    edge = relief[0]
+    behind = torch.stack([middle + share * (outline - middle) for share in (0.34, 0.56, 1.0)])
+    start = torch.stack([(border - centre) @ forward, (border - centre) @ upward], 1)
+    before = torch.stack([share * outline + (1 - share) * start for share in (0.3, 0.6, 0.85)])
+    up_the_back = torch.stack([0.0 * edge, 0.5 * edge, edge - 3.0])
+    level = torch.tensor([0.0, 0.1, 0.3]).double()[:, None]
+    spots = torch.cat([behind * free[:, None] + before * (1 - free)[:, None], spots])
+    height = torch.cat([up_the_back * free + level * (1 - free), relief])
+    keeps = torch.tensor([1.0, 0.95, 0.9, 0.85, 0.75, 0.6, 0.45, 0.3, 0.2, 0.1]).double()[:, None]
+    root = 67.0 + (border[:, 0] - 67.0) * (1 - free) * keeps
+    placed = centre + spots[..., :1] * forward + spots[..., 1:] * upward
+    placed[..., 0] = root + height
+    rings = torch.cat([border[None], placed])
+    for _ in range(4):  # evens out where the shell's back begins
+        around = (rings[1:4].roll(1, 1) + rings[1:4].roll(-1, 1)) / 2
+        around[:2] = (around[:2] + (rings[:2] + rings[2:4]) / 2) / 2
+        rings[1:4] = 0.5 * rings[1:4] + 0.5 * around
+    return rings
 
 
 def eyeball_points(loops: Tensor, front: Tensor, back: Tensor) -> tuple[Tensor, Tensor, Tensor]:

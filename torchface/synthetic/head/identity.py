@@ -110,7 +110,7 @@ def _cheeks(p: Tensor, _: _Parts) -> Tensor:
 
 def _ear_scale(p: Tensor, parts: _Parts) -> Tensor:
     root = torch.stack([p[:, 0].sign() * 68, torch.full_like(p[:, 0], -13.0), torch.full_like(p[:, 0], -8.0)], 1)
-    return (p - root) / 62.0 * parts.ear[:, None]
+    return (p - root) / 53.0 * parts.ear[:, None]
 
 
 def _ear_turn(p: Tensor, parts: _Parts) -> Tensor:
@@ -297,8 +297,11 @@ def _parts(count: int) -> _Parts:
         rings = both_sides(t.rings["mouth"])[side]
         upper[rings[:, :13]], lower[rings[:, 14:]] = share.expand(-1, 13), share.expand(-1, 13)
         ring[rings] = swell.expand(-1, 27)
+        shell = mean_vertices()[both_sides(t.rings["ear"])[side]][..., 0].abs()
+        free = ramp(shell[4] - shell[0], -6.0, 12.0)  # in front its edge lies on the cheek
+        held = torch.tensor([0.0, 0.12, 0.25, 0.4, 0.55, 0.7, 0.85] + [1.0] * 4).double()[:, None]
         grown = torch.tensor([0.0, 0.6, 0.72] + [1.0] * 8).double()[:, None]
-        ear[both_sides(t.rings["ear"])[side]] = grown.expand(-1, t.rings["ear"].shape[1])
+        ear[both_sides(t.rings["ear"])[side]] = held + free * (grown - held)
         ear[both_sides(t.caps["ear"])[side]] = 1.0
     assert MOUTH_BORDER == 5
     return _Parts(ear, upper, lower, ring)

@@ -82,8 +82,8 @@ def vertex_marks() -> Tensor:
 
 def noise(points: Tensor, millimetres: float, seed: int) -> Tensor:
     """Smooth random values (N,) in about [-1,1] that change over a length; the same at the same point everywhere."""
-    place = points / millimetres / 32
-    wrapped = (place - place.floor()) * 2 - 1
+    place = points / millimetres / 32 + 0.37  # turns back at the lattice's ends, none of which lies on the midline
+    wrapped = (place - 2 * (place / 2).round()).abs() * 2 - 1
     grid = wrapped.view(1, 1, 1, -1, 3)
     return torch.nn.functional.grid_sample(_lattice(seed), grid, padding_mode="border", align_corners=True)[0, 0, 0, 0]
 
@@ -105,7 +105,19 @@ def mix(color: Tensor, other: tuple[float, ...], share: Tensor) -> Tensor:
 
 
 def _paint(p: Tensor, marks: Tensor) -> Tensor:
-    lips, mouth, depth, socket, lash, eyeball, nostril, ear = marks.unbind(1)
+    color = skin_color(p, marks)
+    fine, pores = noise(p, 4.5, 2), noise(p, 0.9, 3)
+    color = mix(color, HAIR, _cropped_hair(p, fine, pores) * (1 - marks[:, 7]))
+    color = mix(color, HAIR, _brows(p))
+    color = inner_color(color, marks)
+    is_ball = marks[:, 5] > 0.5
+    color[is_ball] = eye_color(p[is_ball])
+    return color.clamp(0, 1)
+
+
+def skin_color(p: Tensor, marks: Tensor, freckles: float = 1.0, red_lips: float = 1.0) -> Tensor:
+    """Colours (N,3) of bare skin and lips at points (N,3) of the mean head with their marks (N,8)."""
+    lips, ear = marks[:, 0], marks[:, 7]
     color = torch.tensor(SKIN).expand(len(p), 3).clone()
     broad, fine, pores = noise(p, 16.0, 1), noise(p, 4.5, 2), noise(p, 0.9, 3)
     red = 0.55 * blob(p, (40, -30, 62), (22, 18, 30)) + 0.4 * blob(p, (3, -36, 108), (15, 10, 14))
@@ -117,19 +129,19 @@ def _paint(p: Tensor, marks: Tensor) -> Tensor:
     color = color * (1 + 0.035 * broad + 0.03 * fine + 0.028 * pores)[:, None]
     freckled = blob(p, (22, -18, 82), (28, 14, 30)) + 0.35 * blob(p, (20, 40, 90), (50, 26, 40))
     spots = ramp(noise(p, 1.2, 4) + 0.35 * noise(p, 5.0, 5), 0.66, 1.0)
-    color = mix(color, (0.55, 0.34, 0.24), 0.32 * spots * freckled)
-    color = mix(color, HAIR, _cropped_hair(p, fine, pores) * (1 - ear))
-    color = mix(color, HAIR, _brows(p))
+    color = mix(color, (0.55, 0.34, 0.24), 0.32 * freckles * spots * freckled)
     lip_tone = torch.tensor(LIPS) * (1 + 0.10 * noise(p * torch.tensor([4.0, 0.7, 0.7]), 2.2, 6))[:, None]
-    color = color + (lip_tone - color) * (0.9 * ramp(lips, 0.25, 0.85))[:, None]
-    color = mix(color, (0.40, 0.15, 0.14), ramp(mouth, 0.3, 1.0) * 0.9)
-    color = mix(color, (0.13, 0.04, 0.04), depth**0.7 * ramp(mouth, 0.5, 1.0))
+    return color + (lip_tone - color) * (0.9 * red_lips * ramp(lips, 0.25, 0.85)).clamp(0, 1)[:, None]
+
+
+def inner_color(color: Tensor, marks: Tensor) -> Tensor:
+    """Colours (N,3) with the mouth's inside, the sockets, the lids' wet edges and the nostrils."""
+    mouth, depth, socket, lash, nostril = marks[:, [1, 2, 3, 4, 6]].unbind(1)
+    color = mix(color, (0.48, 0.19, 0.18), ramp(mouth, 0.3, 1.0) * 0.9)
+    color = mix(color, (0.30, 0.09, 0.09), depth**0.7 * ramp(mouth, 0.5, 1.0))
     color = mix(color, (0.74, 0.46, 0.41), ramp(socket, 0.2, 0.8))
     color = mix(color, (0.12, 0.08, 0.07), 0.9 * lash * (1 - socket))
-    color = mix(color, (0.22, 0.10, 0.08), 0.92 * nostril)
-    is_ball = eyeball > 0.5
-    color[is_ball] = _eye(p[is_ball])
-    return color.clamp(0, 1)
+    return mix(color, (0.22, 0.10, 0.08), 0.92 * nostril)
 
 
 def brow_line(x: Tensor) -> tuple[Tensor, Tensor]:
@@ -165,18 +177,28 @@ def _cropped_hair(p: Tensor, fine: Tensor, pores: Tensor) -> Tensor:
     return 0.66 * ramp(y - edge + 5.0 * fine, -6.0, 11.0) * (0.86 + 0.3 * pores)
 
 
-def _eye(p: Tensor) -> Tensor:
+def eye_color(p: Tensor, brown: tuple[float, float, float] = (0.33, 0.24, 0.14)) -> Tensor:
+    """Colours (N,3) of points of an eyeball: sclera with veins, limbal ring, iris of a colour, pupil, highlight."""
     centre = torch.tensor(EYE_CENTRE)
     offset = torch.cat([p[:, :1].abs(), p[:, 1:]], dim=1) - centre
-    polar = torch.acos(torch.nn.functional.normalize(offset, dim=1)[:, 2].clamp(-1, 1))
+    way = torch.nn.functional.normalize(offset, dim=1)
+    polar = torch.acos(way[:, 2].clamp(-1, 1))
     angle = torch.atan2(offset[:, 1], offset[:, 0])
     color = torch.tensor((0.86, 0.83, 0.80)).expand(len(p), 3).clone()
+    veins = ramp(1 - (noise(p * torch.tensor([1.0, 2.2, 1.0]), 2.6, 11).abs() * 6), 0.3, 1.0)
+    color = mix(color, (0.78, 0.45, 0.42), 0.16 * veins * ramp(polar, 0.55, 0.9))
     color = mix(color, (0.78, 0.52, 0.48), 0.75 * ramp(polar, 0.75, 1.5))
+    color = color * (1 - 0.30 * ramp(way[:, 1], 0.12, 0.42))[:, None]  # the upper lid's shade
     spokes = torch.stack([angle.cos() * 9, angle.sin() * 9, polar * 2.5], dim=1)
-    iris = torch.tensor((0.33, 0.24, 0.14)) * (1 + 0.45 * noise(spokes, 1.0, 8))[:, None]
-    iris = mix(iris, (0.46, 0.34, 0.17), 1 - ramp(polar, 0.17, 0.34))
-    iris = mix(iris, (0.09, 0.06, 0.05), ramp(polar, 0.35, 0.45))
+    iris = torch.tensor(brown) * (1 + 0.45 * noise(spokes, 1.0, 8))[:, None]
+    light = torch.tensor(brown) * 1.35 + 0.05
+    iris = iris + (light - iris) * (1 - ramp(polar, 0.17, 0.34))[:, None]
+    caustic = ramp(-(way[:, 1] + 0.6 * way[:, 0]), -0.05, 0.35)  # light gathers opposite the highlight
+    iris = iris * (0.8 + 0.75 * caustic)[:, None]
+    iris = mix(iris, (0.07, 0.05, 0.045), 0.9 * ramp(polar, 0.36, 0.44))
     color = color + (iris - color) * (1 - ramp(polar, 0.425, 0.475))[:, None]
     color = mix(color, (0.015, 0.012, 0.012), 1 - ramp(polar, 0.165, 0.195))
-    glint = torch.nn.functional.normalize(offset, dim=1) - torch.tensor([-0.13, 0.20, 0.97])
-    return mix(color, (1.0, 1.0, 1.0), 0.9 * (1 - ramp(glint.norm(dim=1), 0.04, 0.09)))
+    for x, y, size, strength in ((-0.15, 0.20, 0.075, 0.95), (0.13, -0.17, 0.05, 0.25)):
+        glint = way - torch.nn.functional.normalize(torch.tensor([x, y, 0.97]), dim=0)
+        color = mix(color, (1.0, 1.0, 1.0), strength * (1 - ramp(glint.norm(dim=1), 0.5 * size, size)))
+    return color

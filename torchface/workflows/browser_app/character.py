@@ -17,13 +17,16 @@ from torchface.capture.retargeting import ShapeMap, ShapeRule, load_shape_rules,
 from torchface.correctives.activation import CorrectiveActivation
 from torchface.errors import FileFormatError, NameMismatchError, NoShapesError
 from torchface.files.whole_files import read_file
+from torchface.geometry.meshes.normal_maps import SurfaceMaps
 from torchface.io import load_rig, save_rig
 from torchface.io.gltf.corrective_extras import scene_correctives
 from torchface.io.gltf.gltf_document import Document, document_of
 from torchface.io.gltf.primitive_reading import read_target_names
 from torchface.io.tables.csv_table import quoted
+from torchface.rig import BlendshapeRig
 from torchface.shape_names import ARKIT, mapping, recognised_shapes
-from torchface.synthetic import performer
+from torchface.synthetic import character
+from torchface.workflows.cached_graph import cached_file
 
 LARGEST_CHARACTER = 100 * 2**20
 """Bytes; what the page itself takes (``export/web/src/character_check.js``)."""
@@ -178,7 +181,17 @@ def _taken(path: Path) -> bytes:
 
 
 def _written(path: str | Path | None) -> bytes:
-    rig = performer() if path is None else load_rig(path)
+    if path is None:
+        return cached_file("character", ".glb", _embedded, ("synthetic/head", "io/gltf"))
+    return _saved(load_rig(path))
+
+
+def _embedded() -> bytes:
+    shown = character()
+    return _saved(shown.rig, shown.surface)
+
+
+def _saved(rig: BlendshapeRig, surface: SurfaceMaps | None = None) -> bytes:
     with TemporaryDirectory() as folder:
-        save_rig(rig, Path(folder) / "character.glb")
+        save_rig(rig, Path(folder) / "character.glb", surface)
         return read_file(Path(folder) / "character.glb", LARGEST_CHARACTER)

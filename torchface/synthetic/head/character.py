@@ -1,0 +1,181 @@
+"""The performer as a character to be shown: skin maps, teeth, gums, tongue, hair, and all 52 of ARKit's shapes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+from torchface.errors import TopologyError
+from torchface.geometry.meshes.normal_maps import SurfaceMaps
+from torchface.geometry.similarity import similarity_transform
+from torchface.mesh import Annotations, Mesh
+from torchface.rig import BlendshapeRig
+from torchface.synthetic.head.hair import GrownPart, brow_hairs, lashes, scalp_hair
+from torchface.synthetic.head.handle_weights import handle_weights
+from torchface.synthetic.head.identity import mean_vertices
+from torchface.synthetic.head.performer import performer
+from torchface.synthetic.head.skin_maps import Look, skin_maps
+from torchface.synthetic.head.teeth_and_tongue import HeadPart, mouth_parts, tongue_out
+from torchface.synthetic.head.topology import MOUTH_CONTACT, topology
+from torchface.synthetic.head.uv_layout import unwrapping
+
+_OPEN_FOR_TONGUE = 0.33  # of jawOpen, without which the tongue would go through the teeth
+_WITH_THE_JAW = ("teeth_lower", "gums_lower", "tongue")
+_STILL = 0.01  # millimetres
+
+
+@dataclass(frozen=True, eq=False)
+class Character:
+    """A rig to be shown, and how its skin shades.
+
+    Args:
+        rig: its neutral's first vertices are the performer's; then come teeth, gums, tongue and hair.
+        surface: normals and roughness, in the layout of the neutral's texture; ``save_rig`` takes them as detail.
+    """
+
+    rig: BlendshapeRig
+    surface: SurfaceMaps
+
+
+def character(rig: BlendshapeRig | None = None, look: Look | None = None, size: int = 2048) -> Character:
+    """A head of the performer's topology with all that belongs to a face.
+
+    Args:
+        rig: ``performer()`` or another rig of its topology, whose shapes stay as they are.
+        look: colours; a fair man's of 30 if absent.
+        size: texels of a side of the images.
+
+    Returns:
+        The rig's shapes, in which the lower teeth go with the jaw and hair with the skin, and ``tongueOut`` where the
+        rig has ``jawOpen``.
+
+    Raises:
+        TopologyError: the rig has another topology.
+
+    Example:
+        >>> from torchface.synthetic import performer
+        >>> actor = performer(texture=False)
+        >>> shown = character(actor, size=64).rig
+        >>> shown.names == (*actor.names, "tongueOut"), sorted(shown.neutral.annotations.regions)[-3:]
+        (True, ['teeth_upper', 'tongue', 'upper_lip'])
+    """
+    rig = performer(texture=False) if rig is None else rig
+    count = topology().count
+    quads = rig.neutral.polygons
+    if len(rig.vertices) != count or quads is None or not torch.equal(quads, topology().quads):
+        raise TopologyError(f"character: found {rig.neutral}, expected the performer's topology of {count} vertices")
+    skin, moved = rig.vertices.double(), rig.deltas.double()
+    mouth = _InTheMouth(rig)
+    pieces = {"skin": (skin, moved)}
+    parts: dict[str, HeadPart] = {}
+    for name, part in mouth_parts().items():
+        parts[name] = part
+        pieces[name] = mouth.placed(part.vertices, name in _WITH_THE_JAW)
+    for name, grown in (("hair", scalp_hair()), ("brow_hair", brow_hairs()), ("lash_hair", lashes())):
+        parts[name] = grown.part
+        pieces[name] = _grown(grown, skin, moved)
+    vertices = torch.cat([points for points, _ in pieces.values()])
+    deltas = torch.cat([motion for _, motion in pieces.values()], 1)
+    deltas[deltas.norm(dim=-1) < _STILL] = 0
+    names = rig.names
+    if "jawOpen" in names and "tongueOut" not in names:
+        out = _OPEN_FOR_TONGUE * deltas[names.index("jawOpen")]
+        start = sum(len(pieces[name][0]) for name in list(pieces)[: list(pieces).index("tongue")])
+        tongue = slice(start, start + len(pieces["tongue"][0]))
+        out[tongue] = mouth.place(tongue_out()) - vertices[tongue]
+        deltas, names = torch.cat([deltas, out[None]]), (*names, "tongueOut")
+    maps = skin_maps(look or Look(), size)
+    neutral = _mesh(rig.neutral, vertices, parts, maps.color)
+    return Character(BlendshapeRig(neutral, deltas.float(), names), maps.surface)
+
+
+def _mesh(skin: Mesh, vertices: Tensor, parts: dict[str, HeadPart], color: Tensor) -> Mesh:
+    """The mesh of skin and parts, with annotations of both."""
+    flat, notes = unwrapping(), skin.annotations or Annotations()
+    quads, uvs, uv_quads = [topology().quads], [flat.uvs], [flat.quads]
+    masks = {name: torch.zeros(len(vertices), dtype=torch.bool) for name in (*notes.regions, *parts)}
+    for name, mask in notes.regions.items():
+        masks[name][: len(mask)] = mask
+    start, corner = len(skin.vertices), len(flat.uvs)
+    for name, part in parts.items():
+        end = start + len(part.vertices)
+        masks[name][start:end] = True
+        own, index = torch.unique(part.uvs.reshape(-1, 2), dim=0, return_inverse=True)
+        quads.append(part.quads + start)
+        uvs.append(own)
+        uv_quads.append(index.view(-1, 4) + corner)
+        start, corner = end, corner + len(own)
+    mean = torch.cat([mean_vertices(), *(part.vertices for part in parts.values())])
+    mirror = torch.from_numpy(cKDTree(mean.numpy()).query(mean.numpy() * [-1, 1, 1])[1]).long()
+    mirror[: topology().count] = topology().mirror
+    return Mesh.from_polygons(
+        vertices.float(),
+        torch.cat(quads),
+        torch.cat(uvs).float(),
+        torch.cat(uv_quads),
+        annotations=Annotations(notes.landmarks, masks, mirror, notes.contacts),
+        texture=color,
+    )
+
+
+class _InTheMouth:
+    """Where parts of the mean head's mouth lie in another head, and how its jaw moves them.
+
+    Args:
+        rig: of the performer's topology.
+    """
+
+    def __init__(self, rig: BlendshapeRig) -> None:
+        line = topology().rings["mouth"][MOUTH_CONTACT]
+        skin, mean = rig.vertices.double(), mean_vertices()
+        self._from, self._to = mean[line[[0, 26]]].mean(0), skin[line[[0, 26]]].mean(0)
+        wide = float(skin[line[13], 0] / mean[line[13], 0])
+        self._scale = torch.tensor([wide, 1.0, 1.0], dtype=torch.float64)
+        weights = handle_weights()
+        bone = (weights.jaw > 0.9999) & (weights.lip_ring < 0)
+        rest, count = skin[bone], len(rig.names)
+        posed = rest + rig.deltas.double()[:, bone]
+        posed[[not name.startswith("jaw") for name in rig.names]] = rest
+        self._jaw = similarity_transform(rest.expand(count, -1, -1), posed, scale=False)
+
+    def place(self, points: Tensor) -> Tensor:
+        """Points (P,3) of the mean head in this one."""
+        return self._to + (points - self._from) * self._scale
+
+    def placed(self, points: Tensor, with_jaw: bool) -> tuple[Tensor, Tensor]:
+        """A part (P,3) in this head and its motion in each shape, (N,P,3)."""
+        here = self.place(points)
+        moved = self._jaw.apply(here)
+        return here, moved - here if with_jaw else torch.zeros_like(moved)
+
+
+def _grown(grown: GrownPart, skin: Tensor, moved: Tensor) -> tuple[Tensor, Tensor]:
+    """A part that skin carries on this head, and its motion in each shape."""
+    host = lambda values: (values[..., grown.hosts, :] * grown.weights[..., None]).sum(-2)  # noqa: E731
+    root = host(mean_vertices())
+    offset = grown.part.vertices - root
+    here = host(skin)
+    motion = host(moved)
+    if grown.turns:
+        motion = motion + _turned(here, motion, offset, skin)
+    return here + offset, motion
+
+
+def _turned(roots: Tensor, motion: Tensor, offset: Tensor, skin: Tensor) -> Tensor:
+    """What offsets (V,3) change by where their roots (V,3) go round the nearer eye by a motion (N,V,3)."""
+    centre = torch.zeros_like(roots)
+    for side in (0, 1):
+        ball = topology().eyeball.flatten()
+        middle = skin[ball if side == 0 else topology().mirror[ball]]
+        here = roots[:, 0] > 0 if side == 0 else roots[:, 0] <= 0
+        centre[here] = (middle.amin(0) + middle.amax(0)) / 2
+    a = torch.nn.functional.normalize(roots - centre, dim=-1).expand_as(motion)
+    b = torch.nn.functional.normalize(roots + motion - centre, dim=-1)
+    # The smallest rotation of a onto b, applied to the offset.
+    axis = torch.linalg.cross(a, b)
+    cosine = (a * b).sum(-1, keepdim=True)
+    spun = torch.linalg.cross(axis, offset.expand_as(axis))
+    return spun + torch.linalg.cross(axis, spun) / (1 + cosine)
