@@ -32,7 +32,6 @@ UNSHOWN = {
         "capture.action_units.action_unit_curves",
         "capture.action_units.classify",
         "capture.action_units.read_regions",
-        "onnx.ActionUnitReport",
         "onnx.export_action_units",
     ),
     "wants a textured scan, and seconds": (

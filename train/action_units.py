@@ -1,7 +1,8 @@
 """``torchface train action_units --video FILE --labels FILE``: a classifier of action units, of one or more performers.
 
 The labels say where helmet, markers and regions are in the video, and which units are performed when; levels of
-intensity are found without labels.
+intensity are found without labels. Without videos, embedded performers are painted and filmed by code: 6 take about
+six minutes of one core.
 """
 
 from __future__ import annotations
@@ -12,18 +13,29 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from torchface import TorchfaceError, zoo
+from torchface import Take, TorchfaceError, Track, zoo
 from torchface.capture import ActionUnitClassifier
-from torchface.capture.action_units import GROUPS, RegionGroup, RegionVideo, TrainingSettings, classify, read_regions
+from torchface.capture.action_units import RegionGroup, RegionVideo, TrainingSettings, classify, read_regions
 from torchface.capture.action_units.classifier import group_regions
+from torchface.capture.action_units.painted_regions import performed_groups
+from torchface.errors import ValueRangeError
+from torchface.files.whole_files import make_folder
 from torchface.io.action_labels import ActionLabels, load_action_labels
+from torchface.io.rig_files import save_rig
+from torchface.io.take_files import save_take
 from torchface.io.video import open_video
+from torchface.progress import Progress
 from torchface.rendering.compositing import headed, save_rendered_image, sheet
+from torchface.synthetic import draw_identities
 
 from .classifier_evaluation import Split, cross_validation, labelled_intensities, level_agreement
+from .filmed_performers.action_performance import PerformanceSettings
+from .filmed_performers.camera_stage import StageSettings, record_session
 from .model_cards import model_card
 from .recipe_settings import RecipeSettings
 from .runner import Recipe, Run, metric_lines, recipe
+
+_FPS = 30.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -31,20 +43,29 @@ class Settings(RecipeSettings):
     """What the recipe does.
 
     Args:
-        video: Head-camera videos, one a performer; the others' faces are warped to the first performer's.
+        video: Head-camera videos, one a performer; the others' faces are warped to the first performer's. Embedded
+            performers are filmed if absent.
         labels: What is in each of them, as TOML.
         test_video: Videos of performers to test on.
         test_labels: What is in each of those.
+        films: Folder for the films of embedded performers; beside each are its marker take, rig, sites and weights.
+        performers: Embedded performers to learn from.
+        held_out: Embedded performers to test on.
+        repetitions: Of each action unit, by an embedded performer.
         size: Pixels a side that every region is brought to.
         folds: In how many turns the cross-validation leaves performers out, of a single one whole repetitions; 0 leaves
             it out.
         training: How it is trained.
     """
 
-    video: tuple[Path, ...]
-    labels: tuple[Path, ...]
+    video: tuple[Path, ...] = ()
+    labels: tuple[Path, ...] = ()
     test_video: tuple[Path, ...] = ()
     test_labels: tuple[Path, ...] = ()
+    films: Path = Path("out/action_unit_films")
+    performers: int = 4
+    held_out: int = 2
+    repetitions: int = 5
     out: Path = Path("models/action_units")
     size: int = 48
     folds: int = 5
@@ -67,12 +88,19 @@ def train(settings: Settings, run: Run) -> Trained:
         TorchfaceError: there are not as many labels as videos, or a video or its labels cannot be used.
     """
     progress = run.progress
-    labels = _labels(settings.video, settings.labels)
-    test_labels = _labels(settings.test_video, settings.test_labels) if settings.test_video else []
+    if settings.video or settings.labels:
+        learned = _labelled(settings.video, settings.labels)
+        held_out = _labelled(settings.test_video, settings.test_labels) if settings.test_video else []
+        data, licence = "head-camera videos", "that of the videos"
+    else:
+        films = filmed(settings, progress)
+        learned, held_out = films[: settings.performers], films[settings.performers :]
+        data, licence = "films of embedded performers; no person's face", "MIT"
+    labels = [own for _, own in learned]
     groups = performed_groups(labels)
     names = group_regions(groups)
     videos: list[RegionVideo] = []
-    for path, own in zip(settings.video, labels, strict=True):
+    for path, own in learned:
         reference = videos[0].neutral if videos else None
         videos.append(read_regions(open_video(path), own, names, reference, settings.size))
         progress(f"{path.name}: {own.frames} frames, {len(own.performed)} repetitions")
@@ -85,40 +113,17 @@ def train(settings: Settings, run: Run) -> Trained:
         accuracy = cross_validation(videos, labels, groups, settings.training, folds, split)
         metrics = {f"cross-validated accuracy, {name}": value for name, value in accuracy.items()}
         metrics["cross-validated accuracy"] = sum(accuracy.values()) / len(accuracy)
-    for path, own in zip(settings.test_video, test_labels, strict=True):
+    for path, own in held_out:
         video = read_regions(open_video(path), own, names, classifier.neutral, settings.size)
         truth = labelled_intensities(video, own, groups, settings.training)
         agreement = level_agreement(classify(classifier, video), truth, settings.training.levels)
         metrics |= {f"{path.stem}, {name}": value for name, value in agreement.items()}
         progress(f"{path.name}: {agreement['within_one']:.1%} within one level")
-    save(classifier, settings, metrics, labels)
+    frames = sum(own.frames for own in labels)
+    save(classifier, settings, metrics, f"{frames} frames of {len(labels)} {data}.", licence)
     picture = levels_picture(videos[0], labelled_intensities(videos[0], labels[0], groups, settings.training), groups)
     save_rendered_image(picture, settings.out / "levels.png")
     return Trained(classifier, metrics)
-
-
-def performed_groups(labels: list[ActionLabels]) -> tuple[RegionGroup, ...]:
-    """The groups that labels name, or the usual ones, of those units that are performed.
-
-    Raises:
-        TorchfaceError: a unit is performed that no group knows, or none is.
-    """
-    performed = {unit for own in labels for unit in own.units}
-    usual = next((own.groups for own in labels if own.groups), GROUPS)
-    known = {unit for group in usual for unit in group.units}
-    if not performed or performed - known:
-        found = ", ".join(sorted(performed)) or "none"
-        raise TorchfaceError(
-            f"labels: found the units {found}, expected some of {', '.join(sorted(known))}; others need [[groups]] in "
-            "the labels, with name, regions and units"
-        )
-    groups = []
-    for group in usual:
-        units = tuple(unit for unit in group.units if unit in performed)
-        other_units = tuple(unit for unit in group.other_units if unit in performed)
-        if units:
-            groups.append(RegionGroup(group.name, group.regions, units, other_units))
-    return tuple(groups)
 
 
 def levels_picture(video: RegionVideo, truth: Tensor, groups: tuple[RegionGroup, ...]) -> Tensor:
@@ -137,14 +142,13 @@ def levels_picture(video: RegionVideo, truth: Tensor, groups: tuple[RegionGroup,
 
 
 def save(
-    classifier: ActionUnitClassifier, settings: Settings, metrics: dict[str, float], labels: list[ActionLabels]
+    classifier: ActionUnitClassifier, settings: Settings, metrics: dict[str, float], data: str, licence: str
 ) -> None:
     """Writes the model with its effective settings, measured accuracy and card."""
-    frames = sum(own.frames for own in labels)
     card = model_card(
         settings,
-        licence="that of the videos",
-        data=f"{frames} frames of {len(labels)} head-camera videos.",
+        licence=licence,
+        data=data,
         metrics=metrics,
         text=(
             f"Action units {', '.join(classifier.units)} recognised by strokes of reflective paint in a head-camera "
@@ -157,10 +161,33 @@ def save(
     zoo.save_model(classifier, settings.out, card)
 
 
-def _labels(videos: tuple[Path, ...], paths: tuple[Path, ...]) -> list[ActionLabels]:
+def filmed(settings: Settings, progress: Progress) -> list[tuple[Path, ActionLabels]]:
+    """Films of embedded performers, written to ``settings.films``, and their labels; those held out come last.
+
+    Raises:
+        ValueRangeError: no performer to learn from.
+    """
+    count = settings.performers + settings.held_out
+    if not settings.performers or not settings.repetitions:
+        raise ValueRangeError("found --performers 0 or --repetitions 0, expected 1 or more")
+    folder = make_folder(settings.films)
+    stage = StageSettings(performance=PerformanceSettings(settings.repetitions, min(3, settings.repetitions), fps=_FPS))
+    films = []
+    for number, identity in enumerate(draw_identities(count, torch.Generator().manual_seed(settings.seed))):
+        generator = torch.Generator().manual_seed(settings.seed + 1 + number)
+        one = record_session(folder, f"p{number}", identity, generator, stage, progress)
+        save_rig(one.rig, folder / f"p{number}.glb")
+        one.attachment.save(folder / f"p{number}.json")
+        weights = Track(one.rig.names, one.performance.weights[..., None])
+        save_take(Take(_FPS, weights=weights), folder / f"p{number}.csv")
+        films.append((one.video.path, one.labels))
+    return films
+
+
+def _labelled(videos: tuple[Path, ...], paths: tuple[Path, ...]) -> list[tuple[Path, ActionLabels]]:
     if not videos or len(videos) != len(paths):
         raise TorchfaceError(f"found {len(videos)} videos and {len(paths)} files of labels, expected one for each")
-    return [load_action_labels(path) for path in paths]
+    return [(video, load_action_labels(path)) for video, path in zip(videos, paths, strict=True)]
 
 
 RECIPE = Recipe(Settings, train, __doc__, lambda _, trained: metric_lines(trained.metrics, "8.2%"))

@@ -16,8 +16,6 @@ import torch
 from safetensors.torch import load_file, save_file
 from torch import Tensor
 
-from planted.action_performance import ACTION_UNITS
-from planted.camera_stage import record_session
 from torchface.capture.action_units import (
     GROUPS,
     ActionUnitClassifier,
@@ -37,6 +35,8 @@ from torchface.landmarks.scans.hog import HogLayout, cell_map
 from torchface.onnx import export_action_units
 from torchface.synthetic import draw_identities
 from train.classifier_evaluation import cross_validation, level_agreement
+from train.filmed_performers.action_performance import ACTION_UNITS
+from train.filmed_performers.camera_stage import record_session
 
 FILMS = Path(__file__).resolve().parents[2] / "out" / "action_unit_films"
 NAMES = group_regions(GROUPS)

@@ -14,9 +14,6 @@ import torch
 from safetensors.torch import load_file, save_file
 from torch import Tensor
 
-from planted.action_performance import MOVES, PerformanceSettings
-from planted.camera_stage import SIDE_MARKERS, StageSettings, record_session, stage_markers
-from planted.head_camera_images import MARKER_RADIUS
 from torchface import Attachment, BlendshapeRig, Take, load_take
 from torchface.capture import ActionUnitClassifier, CurveSettings, HybridSolver, MarkerSolver, align_take
 from torchface.capture.action_units import GROUPS, ActionUnitCurves, action_unit_curves, load_shape_table, read_regions
@@ -29,6 +26,9 @@ from torchface.rendering.clay_shading import render
 from torchface.rendering.compositing import caption, save_rendered_image, sheet
 from torchface.synthetic import draw_identities, performer
 from torchface.synthetic.stages.marker_stage import StageFlaws
+from train.filmed_performers.action_performance import MOVES, PerformanceSettings
+from train.filmed_performers.camera_stage import SIDE_MARKERS, StageSettings, record_session, stage_markers
+from train.filmed_performers.head_camera_images import MARKER_RADIUS
 
 OUT = Path(__file__).resolve().parents[2] / "out" / "hybrid"
 LED = ("4", "9", "6+43", "18L")

@@ -70,11 +70,11 @@ def test_a_graph_that_computes_something_else_is_not_written(
 ) -> None:
     right = graph.action_unit_model
 
-    def wrong(model: ActionUnitClassifier) -> object:
+    def wrong(model: ActionUnitClassifier, facts: object) -> object:
         part = model.group_classifiers()[0]
         kept = part.intensities.clone()
         part.intensities.add_(0.1)
-        made = right(model)
+        made = right(model, None)
         part.intensities.copy_(kept)
         return made
 

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import pytest
 
-from planted.label_files import save_action_labels
 from torchface.errors import FileFormatError, NameMismatchError, ValueRangeError
 from torchface.io.action_labels import ActionLabels, Performed, load_action_labels
+from train.filmed_performers.label_files import save_action_labels
 
 LABELS = ActionLabels(
     100,

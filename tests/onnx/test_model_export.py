@@ -6,6 +6,7 @@ import json
 from pathlib import Path
 
 import numpy as np
+import onnx
 import onnxruntime
 import pytest
 import torch
@@ -18,10 +19,12 @@ from torchface.landmarks import DetectorSettings, UVLandmarkDetector
 from torchface.landmarks.scans.hog import HogLayout
 from torchface.modeling import ExpressionRegression, ExpressionSettings, HeadModel, MorphableModel
 from torchface.onnx import export_model
+from torchface.onnx.checked_export import write_checked
 from torchface.onnx.uv_landmark_graph import LandmarkBank, export_landmark_bank
 
 FACTS = {"licence": "MIT", "data": "noise", "metrics": {"error": 1.5}, "recipe": "none"}
 SIZE = 160
+MODELS = Path(__file__).resolve().parents[2] / "models"
 
 
 def noise(*shape: int, seed: int = 0) -> Tensor:
@@ -146,3 +149,22 @@ def test_what_has_no_graph_is_named(regression: ExpressionRegression, dome_rig: 
     with pytest.raises(ValueRangeError, match="form 'expressions'"):
         export_model(whole, tmp_path / "x.onnx")
     assert not (tmp_path / "x.onnx").exists()
+
+
+def test_infinite_deviations_agree_and_others_are_a_gap(tmp_path: Path) -> None:
+    tensor = onnx.helper.make_tensor_value_info
+    values = [tensor(name, onnx.TensorProto.FLOAT, (2,)) for name in ("x", "y")]
+    node = onnx.helper.make_node("Identity", ["x"], ["y"])
+    graph = onnx.helper.make_graph([node], "same", values[:1], values[1:])
+    model = onnx.helper.make_model(graph, opset_imports=[onnx.helper.make_opsetid("", 18)], ir_version=9)
+    x, units = {"x": torch.tensor([torch.inf, 2.0])}, {"y": "pixels"}
+    report = write_checked(model, tmp_path / "same.onnx", [(x, {"y": x["x"]})], {"y": 1e-3}, units)
+    assert report.parity == {"y": 0.0}
+    with pytest.raises(ValueRangeError, match="differ from PyTorch's by"):
+        write_checked(model, tmp_path / "x.onnx", [(x, {"y": torch.tensor([9.0, 2.0])})], {"y": 1e-3}, units)
+
+
+@pytest.mark.bench
+@pytest.mark.parametrize("name", [path.parent.name for path in sorted(MODELS.glob("*/model.toml"))])
+def test_every_shipped_model_is_exported(name: str, tmp_path: Path) -> None:
+    assert export_model(zoo.get_model(MODELS / name), tmp_path / "it.onnx").path.stat().st_size > 1000

@@ -8,15 +8,16 @@ from pathlib import Path
 import pytest
 import torch
 
-from planted.action_performance import ACTION_UNITS, PerformanceSettings
-from planted.camera_stage import RecordedSession, StageSettings, record_session
-from planted.label_files import save_action_labels
 from torchface import zoo
 from torchface.capture import ActionUnitClassifier
+from torchface.capture.action_units.painted_regions import performed_groups
 from torchface.errors import NameMismatchError, TorchfaceError
 from torchface.io.action_labels import ActionLabels, Performed, RegionGroup, load_action_labels
 from train import action_units as recipe
-from train.action_units import Settings, performed_groups, train
+from train.action_units import Settings, train
+from train.filmed_performers.action_performance import ACTION_UNITS, PerformanceSettings
+from train.filmed_performers.camera_stage import RecordedSession, StageSettings, record_session
+from train.filmed_performers.label_files import save_action_labels
 
 
 @pytest.fixture(scope="module")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -48,7 +49,10 @@ class ActionUnitReport(WrittenGraph):
 
 
 def export_action_units(
-    classifier: ActionUnitClassifier, path: str | Path, regions: Tensor | None = None
+    classifier: ActionUnitClassifier,
+    path: str | Path,
+    regions: Tensor | None = None,
+    facts: Mapping[str, object] | None = None,
 ) -> ActionUnitReport:
     """Writes a classifier as ONNX, and checks it.
 
@@ -60,12 +64,13 @@ def export_action_units(
         classifier: a trained one.
         path: the file to write; it appears only when it is complete and checked.
         regions: patterns to check with, (T,R,h,w); its neutral ones warped at random if absent.
+        facts: further metadata, such as licence and data.
 
     Raises:
         ValueRangeError: ONNX Runtime and PyTorch disagree where no vote hangs in the balance; nothing is written.
     """
     classifier = classifier.cpu().float().eval()
-    model = action_unit_model(classifier)
+    model = action_unit_model(classifier, facts)
     content = model.SerializeToString()
     session = one_thread_session(content)
     frames = _test_frames(classifier) if regions is None else regions.float()
@@ -81,7 +86,7 @@ def export_action_units(
     return ActionUnitReport(Path(path), len(content), agreement, _milliseconds(session, frames, rest))
 
 
-def action_unit_model(classifier: ActionUnitClassifier) -> onnx.ModelProto:
+def action_unit_model(classifier: ActionUnitClassifier, facts: Mapping[str, object] | None = None) -> onnx.ModelProto:
     """The graph of :class:`IntensityVotes`."""
     rest = classifier.neutral
     return exported_model(
@@ -93,6 +98,7 @@ def action_unit_model(classifier: ActionUnitClassifier) -> onnx.ModelProto:
             "regions": list(classifier.regions),
             "units": list(classifier.units),
             "version": __version__,
+            **(facts or {}),
         },
         {"regions": ("batch",)},
     )

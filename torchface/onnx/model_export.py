@@ -7,7 +7,7 @@ from pathlib import Path
 
 from torch import nn
 
-from torchface.capture import ExampleSolver, MarkerSolver
+from torchface.capture import ActionUnitClassifier, ExampleSolver, MarkerSolver
 from torchface.capture.own_rig import VideoSolver
 from torchface.capture.priors import DynamicsPrior, ShapePrior
 from torchface.errors import ValueRangeError
@@ -15,6 +15,7 @@ from torchface.landmarks import BoxNetwork, LandmarkNetwork, LandmarkTrees, UVLa
 from torchface.landmarks.images.networks.eye_network import EyeNetwork
 from torchface.landmarks.images.networks.part_network import PartNetwork
 from torchface.modeling import ExpressionRegression, HeadModel
+from torchface.onnx.action_unit_graph import ActionUnitReport, export_action_units
 from torchface.onnx.checked_export import ExportReport
 from torchface.onnx.dynamics_prior_graph import export_dynamics_prior
 from torchface.onnx.example_graph_export import ExampleReport, export_example_solver
@@ -27,7 +28,7 @@ from torchface.onnx.solver_graph_export import SolverReport, export_marker_solve
 from torchface.onnx.uv_landmark_graph import export_landmark_bank
 from torchface.onnx.video_graph_export import VideoReport, write_video_solver
 
-_Report = ExportReport | SolverReport | VideoReport | ExampleReport
+_Report = ExportReport | SolverReport | VideoReport | ExampleReport | ActionUnitReport
 _EXPORTS: dict[type[nn.Module], Callable[..., _Report]] = {
     HeadModel: export_head_decoder,
     ExpressionRegression: export_expression_regression,
@@ -42,12 +43,13 @@ _EXPORTS: dict[type[nn.Module], Callable[..., _Report]] = {
     MarkerSolver: export_marker_solver,
     VideoSolver: write_video_solver,
     ExampleSolver: export_example_solver,
+    ActionUnitClassifier: export_action_units,
 }
 
 
 def export_model(
     model: nn.Module, path: str | Path, facts: Mapping[str, object] | None = None
-) -> ExportReport | SolverReport | VideoReport | ExampleReport:
+) -> ExportReport | SolverReport | VideoReport | ExampleReport | ActionUnitReport:
     """Writes a model as ONNX, and checks it against PyTorch.
 
     Args:

@@ -8,6 +8,7 @@ from typing import Any, Literal, TypeVar, overload
 import torch
 from torch import nn
 
+from torchface.capture.action_units.classifier import ActionUnitClassifier
 from torchface.capture.markers.marker_solver import MarkerSolver
 from torchface.capture.priors import DynamicsPrior, ShapePrior
 from torchface.errors import FileFormatError, NameMismatchError, ValueRangeError
@@ -28,6 +29,8 @@ Model = TypeVar("Model", bound=nn.Module)
 Device = str | torch.device
 
 
+@overload
+def get_model(name_or_path: Literal["action_units"], *, device: Device = "cpu") -> ActionUnitClassifier: ...
 @overload
 def get_model(name_or_path: Literal["dynamics_prior"], *, device: Device = "cpu") -> DynamicsPrior: ...
 @overload

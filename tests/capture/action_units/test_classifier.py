@@ -9,8 +9,6 @@ import numpy as np
 import pytest
 import torch
 
-from planted.action_performance import MOVES
-from planted.camera_stage import RecordedSession
 from torchface import zoo
 from torchface.capture import CurveSettings
 from torchface.capture.action_units import (
@@ -31,6 +29,8 @@ from torchface.capture.action_units.weight_targets import smooth_intensities
 from torchface.errors import FileFormatError, NameMismatchError, ShapeError, ValueRangeError
 from torchface.onnx import export_action_units
 from train.classifier_evaluation import cross_validation, level_agreement
+from train.filmed_performers.action_performance import MOVES
+from train.filmed_performers.camera_stage import RecordedSession
 
 
 def planted(session: RecordedSession, units: tuple[str, ...]) -> torch.Tensor:

@@ -5,12 +5,12 @@ from __future__ import annotations
 import pytest
 import torch
 
-from planted.action_performance import MOVES
-from planted.camera_stage import RecordedSession, stage_markers
 from torchface.capture import ActionUnitClassifier, CurveSettings, HybridSolver, MarkerSolver
 from torchface.capture.action_units import RegionVideo, action_unit_curves, load_shape_table
 from torchface.capture.markers import gamma_curves, rest_residual
 from torchface.synthetic.stages.marker_stage import record
+from train.filmed_performers.action_performance import MOVES
+from train.filmed_performers.camera_stage import RecordedSession, stage_markers
 
 LED = ("4", "9", "6+43", "18L")
 

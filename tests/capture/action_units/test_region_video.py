@@ -7,11 +7,11 @@ from dataclasses import replace
 import pytest
 import torch
 
-from planted.camera_stage import RecordedSession
 from torchface.capture.action_units import RegionVideo, read_regions
 from torchface.capture.action_units.painted_regions import region_grid, sample_regions
 from torchface.errors import FileFormatError, NameMismatchError, ShapeError, ValueRangeError
 from torchface.io.video import write_video
+from train.filmed_performers.camera_stage import RecordedSession
 
 
 def test_a_region_of_its_own_size_is_a_cut() -> None:

@@ -6,10 +6,10 @@ from pathlib import Path
 
 import pytest
 
-from planted.camera_stage import RecordedSession
 from torchface import load_take, save_rig, zoo
 from torchface.capture.action_units import ActionUnitClassifier
 from torchface.cli import main
+from train.filmed_performers.camera_stage import RecordedSession
 
 
 def test_the_video_leads_what_markers_hardly_see(

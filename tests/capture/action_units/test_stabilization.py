@@ -7,12 +7,12 @@ from dataclasses import replace
 import pytest
 import torch
 
-from planted.camera_stage import SIDE_MARKERS, RecordedSession
-from planted.head_camera_images import MARKER_RADIUS
-from planted.helmet_camera import HELMET_POINT, helmet_camera
 from torchface.capture.action_units import RegionVideo
 from torchface.capture.action_units.stabilization import PointTracker, steady_transforms
 from torchface.errors import AlignmentError, ShapeError
+from train.filmed_performers.camera_stage import SIDE_MARKERS, RecordedSession
+from train.filmed_performers.head_camera_images import MARKER_RADIUS
+from train.filmed_performers.helmet_camera import HELMET_POINT, helmet_camera
 
 
 def test_points_are_followed_through_the_shake(session: RecordedSession) -> None:
@@ -28,7 +28,8 @@ def test_points_are_followed_through_the_shake(session: RecordedSession) -> None
     ])  # fmt: skip
     assert (truth - truth[0]).norm(dim=1).max() > 0.6
     assert not found.isnan().any()
-    error = (found[:, 0] - found[labels.neutral, 0]) - (truth - truth[labels.neutral])
+    error = found[:, 0] - truth
+    error -= error.mean(0)  # where on the bolt the point was set, with the noise of one frame
     assert error.norm(dim=1).quantile(0.95) < 0.45
     # The markers themselves, where the true markers were.
     rows = [session.recording.take.markers.names.index(name) for name in SIDE_MARKERS]  # type: ignore[union-attr]

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 
 from torchface.capture.action_units.gabor import GaborBank
 from torchface.capture.action_units.one_vs_one_svm import OneVsOne
-from torchface.capture.action_units.painted_regions import GROUPS, RegionGroup
+from torchface.capture.action_units.painted_regions import RegionGroup, performed_groups
 from torchface.capture.action_units.region_video import RegionVideo
 from torchface.errors import NameMismatchError, ShapeError, ValueRangeError
 from torchface.files.documents import Value
@@ -149,7 +149,7 @@ class ActionUnitClassifier(nn.Module):
         cls,
         videos: Sequence[RegionVideo],
         labels: Sequence[ActionLabels],
-        groups: Sequence[RegionGroup] = GROUPS,
+        groups: Sequence[RegionGroup] | None = None,
         settings: TrainingSettings = DEFAULT_TRAINING,
         progress: Progress | None = None,
     ) -> ActionUnitClassifier:
@@ -158,7 +158,7 @@ class ActionUnitClassifier(nn.Module):
         Args:
             videos: each performer's regions; all but the first warped to the first's ``neutral``.
             labels: of each video, with what was performed.
-            groups: which regions show which units.
+            groups: which regions show which units; the labels', or the usual ones, of what is performed, if absent.
             settings: of the training.
             progress: called with each step and how far it is.
 
@@ -183,6 +183,7 @@ class ActionUnitClassifier(nn.Module):
         """
         from torchface.capture.action_units.classifier_training import fit_classifier
 
+        groups = performed_groups(labels) if groups is None else groups
         return fit_classifier(videos, labels, groups, settings, progress)
 
     @property

@@ -9,18 +9,41 @@ from torch import Tensor
 from torch.nn.functional import grid_sample
 
 from torchface.errors import NameMismatchError, ValueRangeError
-from torchface.io.action_labels import Box, RegionGroup
+from torchface.io.action_labels import ActionLabels, Box, RegionGroup
 
 GROUPS: tuple[RegionGroup, ...] = (
     RegionGroup("forehead", ("brow_left", "brow_right"), ("1+2", "4")),
     RegionGroup("between_brows", ("between_brows",), ("9",), ("1+2", "4")),
     RegionGroup("eyes", ("eye_left", "eye_right"), ("7", "45", "6+43"), ("4",)),
-    RegionGroup("mouth", ("mouth",), ("18L",), ("9",)),
+    RegionGroup("mouth", ("mouth",), ("18L", "18R"), ("9",)),
 )
-"""The forehead's two regions and the two eyes merge their features; ``18L`` is the lip pucker to the left.
+"""The forehead's two regions and the two eyes merge their features; ``18L``, ``18R`` are lip puckers to either side.
 
 Between the brows AU 4 shows too, but other performers' lowered brows are classified better by the strokes over them.
 """
+
+
+def performed_groups(labels: Sequence[ActionLabels]) -> tuple[RegionGroup, ...]:
+    """The groups that labels name, or the usual ones, of those units that are performed.
+
+    Raises:
+        NameMismatchError: a unit is performed that no group knows, or none is.
+    """
+    performed = {unit for own in labels for unit in own.units}
+    usual = next((own.groups for own in labels if own.groups), GROUPS)
+    known = {unit for group in usual for unit in group.units}
+    if not performed or performed - known:
+        found = ", ".join(sorted(performed)) or "none"
+        raise NameMismatchError(
+            f"labels: found the units {found}, expected some of {', '.join(sorted(known))}; others need [[groups]] in "
+            "the labels, with name, regions and units"
+        )
+    shown = [
+        RegionGroup(group.name, group.regions, *(tuple(unit for unit in units if unit in performed) for units in both))
+        for group in usual
+        for both in [(group.units, group.other_units)]
+    ]
+    return tuple(group for group in shown if group.units)
 
 
 def region_grid(boxes: Mapping[str, Box], names: Sequence[str], size: int, width: int, height: int) -> Tensor:

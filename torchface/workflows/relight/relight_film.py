@@ -13,16 +13,19 @@ from torch import Tensor
 
 from torchface.errors import AlignmentError, ValueRangeError
 from torchface.files.whole_files import check_ending, check_writable
+from torchface.geometry.cameras.pinhole import Camera
+from torchface.geometry.meshes.operators import vertex_normals
 from torchface.geometry.similarity import similarity_transform
 from torchface.io import load_rig
 from torchface.io.images.image_files import load_paint
 from torchface.io.images.radiance_hdr import load_panorama
 from torchface.io.video import open_video, write_video
 from torchface.io.video.video_writing import WRITTEN_ENDINGS
+from torchface.mesh import Mesh
 from torchface.progress import Progress, silent
 from torchface.rendering.environment_light import EnvironmentLight
 from torchface.rendering.point_light import PointLight
-from torchface.rendering.texture_overlay import FacePaint, overlay, relight
+from torchface.rendering.texture_overlay import FacePaint, overlay, relight, skin_faces
 from torchface.rendering.uncovered_skin import UncoveredSkin
 from torchface.rig import BlendshapeRig
 from torchface.take import Track
@@ -38,6 +41,8 @@ _SPHERE = 0.25  # the mean of the clamped cosine over all directions
 _MOST = 100.0
 _BESIDE = 110.0  # degrees of azimuth beyond which a light reaches no front of a face
 _LEAST_SOURCE = 0.05  # share of the light below which its direction says nothing
+_BEYOND = 25.0  # millimetres beyond the face, over neck, ears and scalp, in which the new light fades out
+_GRAZING = 0.3  # cosine to the view below which it fades out: there a tracked head and the filmed one part
 
 
 @dataclass(frozen=True)
@@ -160,12 +165,14 @@ def relight_film(
     draw = _painter(tracked, settings)
     learned = _spread(tracked.seen, _LEARNED)
     frames = dict(zip(learned, _frames(tracked, learned, progress), strict=True))
-    whole = _light(tracked, {t: frames[t] for t in _of(learned, _LIT)})
-    lights = {t: _light(tracked, {t: frames[t]}, whole) for t in learned} if settings.film_light == "each" else {}
+    found = _light(tracked, {t: frames[t] for t in _of(learned, _LIT)})
+    whole, near = _reaching(found), _near_face(tracked.rig.neutral)
+    each = learned if settings.film_light == "each" else []
+    lights = {t: _reaching(_light(tracked, {t: frames[t]}, whole)) for t in each}
     look = _look(tracked, frames, lights, whole) if settings.occluders else None
     lines = [
-        f"{tracked.video.count} frames, the face in {int(tracked.seen.sum())}; {_words(whole, 'the film')}",
-        *_doubts(whole),
+        f"{tracked.video.count} frames, the face in {int(tracked.seen.sum())}; {_words(found, 'the film')}",
+        *_doubts(found),
     ]
     hidden: list[float] = []
 
@@ -174,9 +181,9 @@ def relight_film(
             return light.beside(old)
         if panorama is None:
             return old
-        found = EnvironmentLight.of(panorama, settings.turn)
+        around = EnvironmentLight.of(panorama, settings.turn)
         mean = float((old.ambient + _SPHERE * old.intensity).mean())
-        return found.scaled(settings.exposure * mean / max(float(found.mean.mean()), 1e-9))
+        return around.scaled(settings.exposure * mean / max(float(around.mean.mean()), 1e-9))
 
     def drawn() -> Iterator[Tensor]:
         old, at = whole, 0
@@ -185,13 +192,14 @@ def relight_film(
             for frame in chunk:
                 if bool(tracked.seen[at]):
                     if settings.film_light == "each":
-                        old = _light(tracked, {at: frame}, old)
+                        old = _reaching(_light(tracked, {at: frame}, old))
                     new = new_light(old)
                     vertices, camera = tracked.vertices(at), tracked.camera(at)
                     result = frame
                     mesh, lens = tracked.rig.neutral, tracked.calibration
                     if changed:
-                        result = relight(frame, vertices, mesh, old, new, camera, lens)
+                        share = near * _facing(vertices, mesh, camera)
+                        result = relight(frame, vertices, mesh, old, new, camera, lens, share)
                     if draw is not None:
                         result = draw(at, result, new)
                     if look is not None:
@@ -308,9 +316,32 @@ def _doubts(light: PointLight) -> list[str]:
         return []
     return [
         f"warning: the film's light is estimated from behind the head (azimuth={around:.0f}, {1 - ambient:.0%} of all "
-        "light); where the film shows a face lit from the front, the estimate is wrong, and so is the result: --light "
-        "and --environment are relative to it"
+        "light), where it reaches no skin that the film shows; the film's light is taken to be even"
     ]
+
+
+def _reaching(light: PointLight) -> PointLight:
+    """The light without a source behind the head, of which a face that looks at the camera gets nothing."""
+    return replace(light, intensity=torch.zeros_like(light.intensity)) if _doubts(light) else light
+
+
+def _near_face(mesh: Mesh) -> Tensor:
+    """1 on the face, eyes and mouth, less with the distance from it, (V,); 1 everywhere on a head without regions."""
+    regions = {} if mesh.annotations is None else mesh.annotations.regions
+    if "face" not in regions:
+        return torch.ones(len(mesh.vertices))
+    inner = torch.zeros(len(mesh.vertices), dtype=torch.bool)
+    inner[mesh.faces[~skin_faces(mesh)].flatten()] = True
+    face = regions["face"].cpu() | inner
+    distance = torch.cdist(mesh.vertices, mesh.vertices[face]).amin(1)
+    return (1 - distance / _BEYOND).clamp(0, 1)
+
+
+def _facing(vertices: Tensor, mesh: Mesh, camera: Camera) -> Tensor:
+    """1 where the surface looks toward the camera, 0 at its outline, (V,)."""
+    ways = camera.rotation.T @ -camera.translation - vertices.double()
+    cosine = (vertex_normals(vertices.double(), mesh.faces) * torch.nn.functional.normalize(ways, dim=1)).sum(1)
+    return (cosine / _GRAZING).clamp(0, 1).float()
 
 
 def _words(light: PointLight, what: str) -> str:

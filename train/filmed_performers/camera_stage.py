@@ -12,11 +12,6 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from planted.action_performance import ActionPerformance, PerformanceSettings, perform_action_units
-from planted.head_camera_images import MARKER_RADIUS, HeadCameraRenderer
-from planted.helmet_camera import HELMET_POINT, CameraFlaws, helmet_camera, shaken_cameras
-from planted.label_files import save_action_labels
-from planted.reflective_paint import reflective_paint
 from torchface.attachment import Attachment
 from torchface.geometry.cameras.pinhole import Camera
 from torchface.geometry.meshes.operators import vertex_normals
@@ -30,6 +25,12 @@ from torchface.synthetic.head.identity import both_sides, mean_vertices
 from torchface.synthetic.head.performer import performer
 from torchface.synthetic.head.topology import EYE_RIM, topology
 from torchface.synthetic.stages.marker_stage import Recording, StageFlaws, place_markers, record
+
+from .action_performance import ActionPerformance, PerformanceSettings, perform_action_units
+from .head_camera_images import MARKER_RADIUS, HeadCameraRenderer
+from .helmet_camera import HELMET_POINT, CameraFlaws, helmet_camera, shaken_cameras
+from .label_files import save_action_labels
+from .reflective_paint import reflective_paint
 
 SIDE_MARKERS = ("SIDE_L", "SIDE_R")
 """Labels of the two markers by which images are stabilised."""

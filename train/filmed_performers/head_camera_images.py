@@ -5,12 +5,13 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from planted.helmet_camera import helmet_plates
 from torchface.attachment import Attachment
 from torchface.geometry.meshes.operators import vertex_normals
 from torchface.rendering.clay_shading import sample_texture
 from torchface.rendering.raycast import RayCaster
 from torchface.rig import BlendshapeRig
+
+from .helmet_camera import helmet_plates
 
 MARKER_RADIUS = 1.7
 _MARKER_GREY, _PAINT_GREY, _SKIN_GAIN = 1.5, 1.25, 0.72

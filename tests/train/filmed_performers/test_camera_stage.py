@@ -7,8 +7,12 @@ from dataclasses import replace
 import pytest
 import torch
 
-from planted.action_performance import ACTION_UNITS, MOVES, PerformanceSettings
-from planted.camera_stage import (
+from torchface.io import load_take
+from torchface.io.action_labels import load_action_labels
+from torchface.io.video import open_video
+from torchface.synthetic import draw_identities, performer
+from train.filmed_performers.action_performance import ACTION_UNITS, MOVES, PerformanceSettings
+from train.filmed_performers.camera_stage import (
     SIDE_MARKERS,
     RecordedSession,
     StageSettings,
@@ -16,13 +20,9 @@ from planted.camera_stage import (
     render_video,
     stage_markers,
 )
-from planted.head_camera_images import HeadCameraRenderer
-from planted.helmet_camera import HELMET_POINT, CameraFlaws, helmet_camera, shaken_cameras
-from planted.reflective_paint import reflective_paint
-from torchface.io import load_take
-from torchface.io.action_labels import load_action_labels
-from torchface.io.video import open_video
-from torchface.synthetic import draw_identities, performer
+from train.filmed_performers.head_camera_images import HeadCameraRenderer
+from train.filmed_performers.helmet_camera import HELMET_POINT, CameraFlaws, helmet_camera, shaken_cameras
+from train.filmed_performers.reflective_paint import reflective_paint
 
 QUICK = PerformanceSettings(repetitions=1, combination_repetitions=1, combinations=(("4", "9"),), fps=8.0, pace=1.5)
 STILL = CameraFlaws(noise=0.0, blur=0.0, shake_rotation=0.0, shake_translation=0.0)

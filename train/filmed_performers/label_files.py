@@ -1,4 +1,4 @@
-"""Files of labels of head-camera videos."""
+"""Files of labels of head-camera videos, as a person writes them."""
 
 from __future__ import annotations
 

@@ -9,18 +9,11 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from torchface.capture.action_units import load_shape_table
 from torchface.io.action_labels import Performed
 
-MOVES: dict[str, dict[str, float]] = {
-    "1+2": {"browInnerUp": 1.0, "browOuterUpLeft": 1.0, "browOuterUpRight": 1.0},
-    "4": {"browDownLeft": 1.0, "browDownRight": 1.0},
-    "7": {"eyeSquintLeft": 1.0, "eyeSquintRight": 1.0},
-    "9": {"noseSneerLeft": 1.0, "noseSneerRight": 1.0},
-    "45": {"eyeBlinkLeft": 1.0, "eyeBlinkRight": 1.0},
-    "6+43": {"eyeBlinkLeft": 0.95, "eyeBlinkRight": 0.95, "cheekSquintLeft": 1.0, "cheekSquintRight": 1.0},
-    "18L": {"mouthPucker": 0.9, "mouthLeft": 0.8},
-}
-"""What the face does for an action unit at full intensity, in ARKit's shapes; ``18L`` is the lip pucker to the left."""
+MOVES: dict[str, dict[str, float]] = load_shape_table("arkit").units
+"""What the face does for an action unit at full intensity, in ARKit's shapes."""
 
 ACTION_UNITS: tuple[str, ...] = tuple(MOVES)
 
