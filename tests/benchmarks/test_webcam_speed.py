@@ -24,9 +24,8 @@ from torch import Tensor, nn
 from torchface.io.video import open_video
 from torchface.landmarks.images.face_landmarker.mediapipe_finder import MediaPipeTracker
 from torchface.onnx.network_graphs import network_model
-from torchface.onnx.webcam.webcam_model import WebcamGraph, webcam_model
+from torchface.onnx.webcam.webcam_model import WebcamAnswer, WebcamGraph, webcam_model
 from torchface.onnx.webcam.webcam_session import WebcamSession
-from torchface.onnx.webcam.webcam_solver_graph import WebcamAnswer
 from torchface.shape_names import ARKIT
 from torchface.workflows.webcam.webcam_graph import webcam_graph, webcam_module
 

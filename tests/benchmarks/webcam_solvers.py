@@ -14,6 +14,7 @@ import torch
 from safetensors.torch import load_file, save
 from torch import Tensor
 
+from planted.webcam_solver_file import webcam_solver_model
 from torchface.capture.anybody import (
     AllAtOnce,
     ExampleShapes,
@@ -31,7 +32,6 @@ from torchface.files.whole_files import write_file
 from torchface.geometry.cameras.calibration import assumed_calibration
 from torchface.landmarks.images.face_reading import READ_FOR_SOLVER, FaceReading
 from torchface.landmarks.images.frame_reader.face_reader import STATE, FaceReader
-from torchface.onnx.webcam.webcam_solver_graph import webcam_solver_model
 from torchface.shape_names import ARKIT, mapping
 from torchface.synthetic import performer
 from torchface.temporal.adaptive_kalman import LANDMARK_SETTINGS, AdaptiveFilter

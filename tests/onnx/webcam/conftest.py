@@ -9,8 +9,7 @@ from torch import Tensor, nn
 from torchface.landmarks import FaceReading
 from torchface.landmarks.images.frame_reader.face_reader import STATE
 from torchface.landmarks.images.frame_reader.picture_pieces import picture_size
-from torchface.onnx.webcam.webcam_model import WebcamGraph, webcam_model
-from torchface.onnx.webcam.webcam_solver_graph import WebcamAnswer
+from torchface.onnx.webcam.webcam_model import WebcamAnswer, WebcamGraph, webcam_model
 from torchface.shape_names import ARKIT
 
 

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import onnx
 import torch
 from torch import Tensor, nn
 
 from torchface import __version__
-from torchface.capture.anybody import WebcamControls
+from torchface.capture.anybody import WebcamControls, WebcamSolver
 from torchface.capture.anybody.webcam_state import CONTROLS, POSES
 from torchface.landmarks.images.face_reading import READ_FOR_SOLVER
 from torchface.landmarks.images.frame_reader.face_reader import STATE, FaceReader
@@ -18,7 +18,6 @@ from torchface.landmarks.images.frame_reader.picture_pieces import picture_size
 from torchface.onnx.exported_model import exported_model, half_stored
 from torchface.onnx.network_graphs import halves
 from torchface.onnx.unrolled_operators import TRANSLATIONS
-from torchface.onnx.webcam.webcam_solver_graph import WebcamAnswer
 from torchface.shape_names import ARKIT
 
 OUTPUTS = (
@@ -27,6 +26,38 @@ OUTPUTS = (
 
 _SHORTEST, _LONGEST, _USUAL = 1e-3, 1.0, 1 / 30  # seconds
 _HIGHEST = (5.0, 10.0, 1.0, 1.0, 1.0)
+
+
+class WebcamAnswer(NamedTuple):
+    """A frame's outputs: as of ``WebcamState``, and the state for the next frame."""
+
+    weights: Tensor
+    rotation: Tensor
+    translation: Tensor
+    gaze: Tensor
+    tracked: Tensor
+    calibrated: Tensor
+    error: Tensor
+    next_state: Tensor
+
+
+class WebcamSolverGraph(nn.Module):
+    """``WebcamSolver`` with named outputs beside its state, float32.
+
+    Args:
+        solver: as it is to be exported.
+    """
+
+    def __init__(self, solver: WebcamSolver) -> None:
+        super().__init__()
+        self.solver, self.state_size = solver, solver.layout.length
+
+    def forward(self, *given: Tensor) -> WebcamAnswer:
+        """The frame's answer, of ``READ_FOR_SOLVER``, the picture's size (2,), seconds since the frame before (),
+        ``CONTROLS`` (5,) and the state (S,), zeros to start; all float32."""
+        vector = self.solver(*given)
+        state = self.solver.layout.unpack(vector)
+        return WebcamAnswer._make([*(getattr(state, name) for name in WebcamAnswer._fields[:-1]), vector])
 
 
 class AnswerSolver(Protocol):
@@ -45,7 +76,7 @@ class WebcamGraph(nn.Module):
 
     Args:
         reader: reads faces.
-        solver: solves weights of ``webcam_solver_graph.INPUTS``.
+        solver: solves weights, such as ``WebcamSolverGraph``.
     """
 
     def __init__(self, reader: FaceReader, solver: AnswerSolver) -> None:

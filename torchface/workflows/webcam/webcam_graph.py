@@ -14,8 +14,7 @@ from torchface.landmarks import BoxNetwork, LandmarkNetwork
 from torchface.landmarks.images.frame_reader.face_reader import FaceReader, WebcamNetworks
 from torchface.landmarks.images.networks.eye_network import EyeNetwork
 from torchface.modeling import HeadModel
-from torchface.onnx.webcam.webcam_model import WebcamGraph, webcam_model
-from torchface.onnx.webcam.webcam_solver_graph import WebcamSolverGraph
+from torchface.onnx.webcam.webcam_model import WebcamGraph, WebcamSolverGraph, webcam_model
 from torchface.progress import Progress, silent
 from torchface.synthetic.head.performer import performer
 from torchface.workflows.cached_graph import cached_graph

@@ -1,13 +1,11 @@
-"""The webcam's solver as an ONNX graph: the very module, with its state as one vector."""
+"""The webcam's solver alone as an ONNX graph, without the networks that read pictures."""
 
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import NamedTuple
 
 import onnx
 import torch
-from torch import Tensor, nn
 
 from torchface import __version__
 from torchface.capture.anybody import WebcamSolver
@@ -15,44 +13,10 @@ from torchface.capture.anybody.webcam_state import CONTROLS, POSES
 from torchface.landmarks.images.face_reading import READ_FOR_SOLVER, FaceReading
 from torchface.onnx.exported_model import exported_model
 from torchface.onnx.unrolled_operators import TRANSLATIONS
+from torchface.onnx.webcam.webcam_model import WebcamAnswer, WebcamSolverGraph
 from torchface.shape_names import ARKIT
 
 INPUTS = (*READ_FOR_SOLVER, "size", "interval", "controls", "state")
-"""A ``FaceReading``'s tensors, the picture's width and height (2,), seconds since the frame before (), ``CONTROLS``
-(5,) and the state (S,), zeros to start; all float32."""
-OUTPUTS = ("weights", "rotation", "translation", "gaze", "tracked", "calibrated", "error", "next_state")
-"""As of ``WebcamState``, and the state for the next frame."""
-
-
-class WebcamAnswer(NamedTuple):
-    """A frame's outputs, in the order of ``OUTPUTS``."""
-
-    weights: Tensor
-    rotation: Tensor
-    translation: Tensor
-    gaze: Tensor
-    tracked: Tensor
-    calibrated: Tensor
-    error: Tensor
-    next_state: Tensor
-
-
-class WebcamSolverGraph(nn.Module):
-    """``WebcamSolver`` with named outputs beside its state, float32.
-
-    Args:
-        solver: as it is to be exported.
-    """
-
-    def __init__(self, solver: WebcamSolver) -> None:
-        super().__init__()
-        self.solver, self.state_size = solver, solver.layout.length
-
-    def forward(self, *given: Tensor) -> WebcamAnswer:
-        """The frame's answer, of ``INPUTS`` in their order."""
-        vector = self.solver(*given)
-        state = self.solver.layout.unpack(vector)
-        return WebcamAnswer._make([*(getattr(state, name) for name in OUTPUTS[:-1]), vector])
 
 
 def empty_reading() -> FaceReading:
@@ -61,7 +25,7 @@ def empty_reading() -> FaceReading:
 
 
 def webcam_solver_model(solver: WebcamSolver) -> onnx.ModelProto:
-    """The model of a solver: ``INPUTS`` to ``OUTPUTS``.
+    """The model of a solver: ``INPUTS`` to ``WebcamAnswer._fields``.
 
     The metadata holds ``names`` (JSON list, of the weights), ``state`` (S), ``controls``, ``poses`` and ``version``.
     """
@@ -72,7 +36,7 @@ def webcam_solver_model(solver: WebcamSolver) -> onnx.ModelProto:
     return exported_model(
         WebcamSolverGraph(solver),
         dict(zip(INPUTS, examples, strict=True)),
-        OUTPUTS,
+        WebcamAnswer._fields,
         {
             "task": "webcam_solver",
             "names": list(ARKIT),

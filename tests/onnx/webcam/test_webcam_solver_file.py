@@ -9,11 +9,12 @@ import onnxruntime
 import pytest
 import torch
 
+from planted.webcam_solver_file import INPUTS, empty_reading, webcam_solver_model
 from torchface import zoo
 from torchface.capture.anybody import WebcamSettings, WebcamSolver
 from torchface.capture.anybody.webcam_state import CONTROLS
 from torchface.landmarks.images.face_reading import READ_FOR_SOLVER
-from torchface.onnx.webcam.webcam_solver_graph import INPUTS, OUTPUTS, empty_reading, webcam_solver_model
+from torchface.onnx.webcam.webcam_model import WebcamAnswer
 from torchface.shape_names import ARKIT
 from torchface.synthetic import performer
 
@@ -27,7 +28,7 @@ def parity(settings: WebcamSettings, frames: int) -> float:
     assert json.loads(facts["names"]) == list(ARKIT)
     assert json.loads(facts["state"]) == solver.layout.length
     assert [one.name for one in model.graph.input] == list(INPUTS)
-    assert [one.name for one in model.graph.output] == list(OUTPUTS)
+    assert [one.name for one in model.graph.output] == list(WebcamAnswer._fields)
     session = onnxruntime.InferenceSession(model.SerializeToString(), providers=["CPUExecutionProvider"])
     generator = torch.Generator().manual_seed(2)
     rest = rig.vertices[rig.neutral.landmarks]
@@ -52,7 +53,7 @@ def parity(settings: WebcamSettings, frames: int) -> float:
         with torch.no_grad():
             expected = solver(*given.values())
         outputs = session.run(None, {name: value.numpy() for name, value in given.items()})
-        named = dict(zip(OUTPUTS, outputs, strict=True))
+        named = dict(zip(WebcamAnswer._fields, outputs, strict=True))
         apart = np.abs(named["next_state"] - expected.numpy())
         worst = max(worst, float((apart / (1 + np.abs(expected.numpy()))).max()))
         np.testing.assert_array_equal(named["weights"], named["next_state"][: len(ARKIT)])
