@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from torchface.errors import ShapeError, ValueRangeError
 from torchface.geometry.similarity import Similarity, similarity_transform
 from torchface.landmarks.scans.cylinder import CylinderLayout, unwrap
-from torchface.landmarks.scans.pose_search import PoseSearch, find_pose, nose_candidates, protrusion, refine
+from torchface.landmarks.scans.pose_search import find_pose, nose_candidates, protrusion, refine
 from torchface.landmarks.scans.surface_sample import sample_surface
 from torchface.landmarks.scans.uv_landmark_names import MIRRORED, UV_LANDMARK_NAMES
 from torchface.mesh import Mesh
@@ -113,21 +113,18 @@ class FaceFrame(nn.Module):
         frame.nose.copy_(torch.cat([mean[:1], direction]))
         return frame
 
-    def locate(self, scan: Mesh, search: PoseSearch | None = None) -> Similarity:
+    def locate(self, scan: Mesh) -> Similarity:
         """The pose of a scan, from its space to this frame, a batch of one.
 
         Args:
             scan: in any pose, millimetres.
-            search: how to look.
 
         Raises:
             ValueRangeError: no part of the scan looks like a face.
         """
         sample = sample_surface(scan)
         nose, direction = self.nose
-        pose, rest = find_pose(
-            self.surface, self.normals, nose, direction, sample, nose_candidates(sample), search or PoseSearch()
-        )
+        pose, rest = find_pose(self.surface, self.normals, nose, direction, sample, nose_candidates(sample))
         if rest > _MAX_MISFIT:
             raise ValueRangeError(
                 f"scan: found no face; the likeliest place differs from the mean face by {rest:.1f} mm on average, "

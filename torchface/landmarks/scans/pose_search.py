@@ -19,6 +19,13 @@ _REACH = 12.0  # millimetres; what is further away is as wrong as it gets
 _NEAR, _FAR = 9.0, 26.0  # millimetres round a point that may be a nose
 _APART = 9.0  # millimetres between two such points
 _FACING = 0.5  # cosine of the angle between normals beyond which points do not match
+_ROLLS = 24  # turns about the nose's direction that are tried
+_TILT = 18.0  # degrees that the nose's direction is tilted up, down, left and right, beside as it is
+_SURVIVORS = 700, 30  # hypotheses that go on after a first look, and after a first refinement
+# How far a point's match may lie in each round of the first refinement, and of the last one, millimetres.
+_FIRST_REACHES = (25.0, 22.0, 19.0, 16.0, 14.0, 12.0)
+_REACHES = (25.0, 20.0, 16.0, 12.0, 12.0, 9.0, 9.0, 7.0, 7.0, 6.0, 6.0, 5.0, 5.0, 5.0, 5.0)
+_LARGEST_SCALE = 1.2  # the head may be this many times larger or smaller than the mean
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,36 +85,15 @@ def nose_candidates(surface: SurfaceSample) -> NoseCandidates:
     return NoseCandidates(looked[taken], direction[taken])
 
 
-@dataclass(frozen=True, eq=False)
-class PoseSearch:
-    """How a pose is looked for.
-
-    Args:
-        rolls: turns about the nose's direction that are tried.
-        tilt: the nose's direction is tried as it is, and tilted up, down, left and right by so many degrees.
-        survivors: how many hypotheses go on after a first look, and after a first refinement.
-        first_reaches: how far a point's match may lie in each round of the first refinement, millimetres.
-        reaches: the same for the last one.
-        largest_scale: the head may be this many times larger or smaller than the mean.
-    """
-
-    rolls: int = 24
-    tilt: float = 18.0
-    survivors: tuple[int, int] = (700, 30)
-    first_reaches: tuple[float, ...] = (25.0, 22.0, 19.0, 16.0, 14.0, 12.0)
-    reaches: tuple[float, ...] = (25.0, 20.0, 16.0, 12.0, 12.0, 9.0, 9.0, 7.0, 7.0, 6.0, 6.0, 5.0, 5.0, 5.0, 5.0)
-    largest_scale: float = 1.2
-
-
-def hypotheses(nose: Tensor, direction: Tensor, found: NoseCandidates, search: PoseSearch) -> Similarity:
+def hypotheses(nose: Tensor, direction: Tensor, found: NoseCandidates) -> Similarity:
     """Poses that bring a nose at ``nose`` (3,), looking along ``direction`` (3,), onto each candidate, every roll."""
     rotations = []
     base = _frame(direction[None])[0]
-    lean = math.radians(search.tilt)
+    lean = math.radians(_TILT)
     across = _frame(found.directions)
     for axis, angle in ((0, 0.0), (0, lean), (0, -lean), (1, lean), (1, -lean)):
-        for k in range(search.rolls):
-            roll_and_tilt = _turn(2 * math.pi * k / search.rolls, 2) @ _turn(angle, axis)
+        for k in range(_ROLLS):
+            roll_and_tilt = _turn(2 * math.pi * k / _ROLLS, 2) @ _turn(angle, axis)
             rotations.append(across @ roll_and_tilt @ base.T)
     rotation = torch.cat(rotations)
     target = found.points.repeat(len(rotations), 1)
@@ -129,7 +115,6 @@ def refine(
     normals: Tensor,
     surface: SurfaceSample,
     reaches: tuple[float, ...],
-    largest_scale: float = 1.2,
 ) -> Similarity:
     r"""Similarity ICP, point to plane, for a batch of poses.
 
@@ -153,7 +138,7 @@ def refine(
         # A little ridge: a pose that no point supports stays where it is.
         normal_matrix = weighted.transpose(-1, -2) @ columns + 1e-3 * eye
         step = torch.linalg.solve(normal_matrix, (weighted * residual[..., None]).sum(1))
-        scale = (poses.scale * (1 + step[:, 6].clamp(-0.1, 0.1))).clamp(1 / largest_scale, largest_scale)
+        scale = (poses.scale * (1 + step[:, 6].clamp(-0.1, 0.1))).clamp(1 / _LARGEST_SCALE, _LARGEST_SCALE)
         poses = poses.moved(step[:, :3].clamp(-0.3, 0.3), scale / poses.scale, step[:, 3:6], centre[:, 0])
     return poses
 
@@ -165,7 +150,6 @@ def find_pose(
     direction: Tensor,
     surface: SurfaceSample,
     found: NoseCandidates,
-    search: PoseSearch,
 ) -> tuple[Similarity, float]:
     """The pose of points (N,3) with normals (N,3) in a scan, and its misfit in millimetres.
 
@@ -174,17 +158,16 @@ def find_pose(
         nose, direction: the face's nose and where it looks, each (3,).
         surface: the scan.
         found: where noses may be on it.
-        search: how to look.
     """
-    tried = hypotheses(nose, direction, found, search)
+    tried = hypotheses(nose, direction, found)
     few = slice(None, None, max(1, len(points) // 60))
     some = slice(None, None, max(1, len(points) // 400))
     rough = misfit(tried, points[few], normals[few], surface)
-    tried = tried[rough.argsort()[: search.survivors[0]]]
-    tried = refine(tried, points[few], normals[few], surface, search.first_reaches, search.largest_scale)
+    tried = tried[rough.argsort()[: _SURVIVORS[0]]]
+    tried = refine(tried, points[few], normals[few], surface, _FIRST_REACHES)
     score = misfit(tried, points[few], normals[few], surface)
-    tried = tried[score.argsort()[: search.survivors[1]]]
-    tried = refine(tried, points[some], normals[some], surface, search.reaches, search.largest_scale)
+    tried = tried[score.argsort()[: _SURVIVORS[1]]]
+    tried = refine(tried, points[some], normals[some], surface, _REACHES)
     score = misfit(tried, points[some], normals[some], surface)
     winner = score.argmin()[None]
     return tried[winner], float(score[winner])
