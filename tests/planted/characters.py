@@ -13,10 +13,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchface.geometry.meshes.operators import edges, vertex_normals
+from torchface.geometry.meshes.operators import components, edges, vertex_normals
 from torchface.io.gltf.buffers import BufferWriter
 from torchface.io.images.image_files import encode_png
-from torchface.mesh import Mesh
+from torchface.mesh import Mesh, submesh
 from torchface.rig import BlendshapeRig
 
 _BONES = (("Hips", None, -900.0), ("Spine", 0, -650.0), ("Neck", 1, -140.0), ("Head", 2, -60.0))
@@ -311,3 +311,28 @@ def _vrm(root: dict[str, Any], how: Planted, shapes: list[str]) -> None:
             "blendShapeMaster": {"blendShapeGroups": groups},
         }
     }
+
+
+def decimated(rig: BlendshapeRig, count: int) -> BlendshapeRig:
+    """The rig with at most so many triangles: vertices of one cell of a grid, one part and one side are one."""
+    vertices, faces = rig.vertices.double(), rig.neutral.faces
+    part, facing = components(faces, len(vertices)), vertex_normals(vertices, faces)
+    cell = 1.0
+    while len(faces) > count:
+        key = torch.cat([(vertices / cell).round().long(), facing.round().long(), part[:, None]], 1)
+        _, of = key.unique(dim=0, return_inverse=True)
+        kept = torch.zeros(int(of.max()) + 1, dtype=torch.int64)
+        kept[of.flip(0)] = torch.arange(len(of)).flip(0)
+        faces = of[rig.neutral.faces]
+        faces = faces[(faces != faces.roll(1, 1)).all(1)]
+        cell *= 1.1
+    return BlendshapeRig.from_tensors(rig.vertices[kept], faces, rig.deltas[:, kept], rig.names)
+
+
+def without(rig: BlendshapeRig, *regions: str) -> BlendshapeRig:
+    """The rig without some of its regions, holes in their place."""
+    notes = rig.neutral.annotations
+    assert notes is not None
+    gone = torch.stack([notes.regions[name] for name in regions]).any(0)
+    piece = submesh(rig.neutral, ~gone)
+    return BlendshapeRig(piece.mesh, rig.deltas[:, piece.vertex_ids], rig.names)

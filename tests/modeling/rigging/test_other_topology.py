@@ -1,5 +1,7 @@
 """Tests of shapes on another topology: the embedded performer's head with other vertices has the performer's shapes."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 
@@ -98,3 +100,18 @@ def test_vertices_split_at_a_seam_are_one_and_lips_that_touch_are_two() -> None:
     assert joined.of[1] == joined.of[4]
     assert joined.of[2] == joined.of[7]
     assert joined.part[joined.of[0]] == joined.part[joined.of[5]] != joined.part[joined.of[8]]
+
+
+def test_lips_in_one_piece_are_warned_of(carried: CarriedShapes) -> None:
+    assert carried.notes() == []
+    mesh, marks = carried.rig.neutral, carried.rig.neutral.landmarks
+    upper, lower = marks[[61, 62, 63]], marks[[67, 66, 65]]
+    between = torch.cat(
+        [torch.stack([upper, lower, lower.roll(1)], 1), torch.stack([upper, lower.roll(1), upper.roll(1)], 1)]
+    )
+    welded = Mesh(mesh.vertices, torch.cat([mesh.faces, between]))
+    rig = BlendshapeRig(welded, carried.rig.deltas, carried.rig.names)
+    (note,) = replace(carried, rig=rig, open_lids=(0.0, 0.0)).notes()
+    assert "lips are one piece" in note
+    (note,) = replace(carried, open_lids=(0.4, 0.0)).notes()
+    assert note == "warning: right eye: its blink leaves 40% of it open"

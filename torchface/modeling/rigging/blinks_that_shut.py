@@ -80,7 +80,8 @@ def shut_blinks(
         head: at rest.
         deltas: (N,J,3) float64.
         names: of the shapes; those that mean ARKit's blinks are changed.
-        openings: of the right and left eye; of one that is not seen the blink stays, and what it leaves is None.
+        openings: of the right and left eye; of one that is not seen the blink stays, and what it leaves is None; where no shape
+            means its blink, 0.
     """
     shapes, left = mapping(names, BLINKS) > 0.5, []
     if any(one is not None for one in openings):
@@ -88,7 +89,7 @@ def shut_blinks(
     for row, opening in enumerate(openings):
         own = shapes[row].nonzero()[:, 0].tolist()
         if opening is None or not own:
-            left.append(None)
+            left.append(None if own else 0.0)
             continue
         lids = _Lids.of(head, opening, index)
         for shape in own:

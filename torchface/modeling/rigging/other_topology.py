@@ -12,7 +12,14 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from torchface.errors import ValueRangeError
-from torchface.geometry.meshes.operators import border_vertices, corners, triangle_normals, vertex_areas, vertex_normals
+from torchface.geometry.meshes.operators import (
+    border_vertices,
+    corners,
+    edges,
+    triangle_normals,
+    vertex_areas,
+    vertex_normals,
+)
 from torchface.geometry.meshes.shell_energies import stretching_energy
 from torchface.geometry.meshes.surface_index import triangle_coordinates
 from torchface.geometry.similarity import Similarity
@@ -28,6 +35,7 @@ from torchface.progress import Progress, silent
 from torchface.registration import Registration, hidden_parts, register, with_template_skin
 from torchface.registration.scan_preparation import Landmarks
 from torchface.rig import BlendshapeRig
+from torchface.shape_names import mapping
 
 _NORMAL_REACH = 6.0
 """A normal that points the other way counts as far as twice these millimetres: lips that touch stay apart."""
@@ -38,6 +46,7 @@ _BLIND = 1e-3
 _SMOOTH = 0.4
 _SKIN_SHARE, _BODY_SHARE = 0.3, 0.15
 _OPEN = 0.1  # of an eye: what a blink that shuts it leaves at most
+_JAW, _LIP, _DRAWN, _LEAST_DRAWN = "jawOpen", 10.0, 4.0, 3  # millimetres round the lips' line, times their length
 _SAME_PLACE = 1e-4
 _ALIKE = 0.2
 
@@ -65,8 +74,8 @@ class CarriedShapes:
     tongue: Tensor
     open_lids: tuple[float | None, ...]
 
-    def lid_notes(self) -> list[str]:
-        """Of eyes that may not shut, for people to read."""
+    def notes(self) -> list[str]:
+        """Of eyes that may not shut and lips that do not part, for people to read."""
         named = list(zip(("right", "left"), self.open_lids, strict=True))
         unseen = [side for side, left in named if left is None]
         notes = [
@@ -79,7 +88,26 @@ class CarriedShapes:
                 f"warning: {' and '.join(unseen)} eye: the lids cannot be told from the eye (painted, shut or "
                 "one piece with the skin): look whether it shuts"
             )
+        if self._lips_in_one_piece():
+            notes.append(
+                "warning: the lips are one piece: jawOpen stretches the skin between them; cut the mesh along the lips"
+            )
         return notes
+
+    def _lips_in_one_piece(self) -> bool:
+        """Whether opening the jaw draws edges out from one lip to the other."""
+        marks, jaw = _marks(self.template), mapping(self.rig.names, [_JAW])[0] > 0.5
+        if not bool(jaw.any()) or bool(marks.isnan().any()):
+            return False
+        back = self.registration.pose.inverse()
+        rest = back.apply(self.rig.vertices.detach().cpu().double())[0]
+        posed = rest + back.apply_vectors(self.rig.deltas[jaw][:1].detach().cpu().double())[0]
+        lips = marks[60:68]
+        beside = (rest - lips.mean(0)).abs() < torch.tensor([float(lips[4, 0] - lips[0, 0]) / 3, _LIP, _LIP])
+        ends = edges(self.rig.neutral.faces.cpu())
+        ends = ends[beside.all(1)[ends].all(1)]
+        before, after = ((one[ends[:, 0]] - one[ends[:, 1]]).norm(dim=-1) for one in (rest, posed))
+        return int(((after > _DRAWN * before) & (after - before > _LIP)).sum()) >= _LEAST_DRAWN
 
 
 def shapes_on(

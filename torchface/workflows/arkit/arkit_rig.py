@@ -165,7 +165,7 @@ def make_arkit(
             made |= _tongue(sized, carried)
         shapes = {name: delta * head.size for name, delta in made.items()} | shapes
         notes += head.notes()
-        notes += carried.lid_notes() if set(BLINKS) & set(made) else []
+        notes += carried.notes() if {*BLINKS, "jawOpen"} & set(made) else []
         if missing := [name for name in wanted if name not in made]:
             notes.append(
                 f"left out: {', '.join(missing)}" + (": the head has no tongue of its own" if TONGUE in missing else "")

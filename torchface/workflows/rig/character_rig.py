@@ -294,8 +294,8 @@ class _Job:
             lines.append(f"    the others are at {', '.join(map(_place, found.others))}, in the file's unit")
         lines.append(f"template: {record.figures()}")
         lines += [f"  note: {note}" for note in record.notes if not note.startswith(_OF_SCANS)]
-        if any(name in self.made for name in BLINKS):
-            lines += [f"  {note}" for note in self.carried.lid_notes()]
+        if any(name in self.made for name in (*BLINKS, _JAW)):
+            lines += [f"  {note}" for note in self.carried.notes()]
         own = {name: names for name, names in present.items() if names != (name,)}
         if present:
             lines.append(f"already there: {len(present)} of ARKit's 52, kept as they are")
