@@ -7,7 +7,7 @@ RUN := $(VENV)/$(BIN)/python
 export OMP_WAIT_POLICY ?= PASSIVE
 STAMP := $(VENV)/.installed
 
-.PHONY: demo test test-blender test-cluster bench fuzz lint style types imports licences docs app clean
+.PHONY: demo test test-blender test-cluster bench fuzz lint style types imports licences docs gallery app clean
 
 $(STAMP): pyproject.toml constraints.txt
 	@echo "installing into $(VENV), a few minutes"
@@ -70,6 +70,10 @@ licences: $(VENV)/.installed-lint
 docs: $(VENV)/.installed-docs
 	OMP_NUM_THREADS=2 $(RUN) -m sphinx -W --keep-going -d out/docs_doctrees docs out/docs
 	@echo "open out/docs/index.html"
+
+# The pictures of docs/how_to/gallery.md: characters by code, rigged.
+gallery: $(VENV)/.installed-test
+	PYTHONPATH=.:tests $(RUN) docs/make_gallery.py
 
 demo: $(STAMP)
 	$(VENV)/$(BIN)/torchface demo $(if $(TEMPLATE),--template "$(TEMPLATE)") $(if $(TAKE),--take "$(TAKE)") $(if $(TARGET),--target "$(TARGET)")

@@ -80,8 +80,8 @@ def shut_blinks(
         head: at rest.
         deltas: (N,J,3) float64.
         names: of the shapes; those that mean ARKit's blinks are changed.
-        openings: of the right and left eye; of one that is not seen the blink stays, and what it leaves is None; where no shape
-            means its blink, 0.
+        openings: of the right and left eye; of one that is not seen the blink stays, and what it leaves is None; where
+            no shape means its blink, 0.
     """
     shapes, left = mapping(names, BLINKS) > 0.5, []
     if any(one is not None for one in openings):
