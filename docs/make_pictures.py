@@ -20,9 +20,9 @@ from torchface.rendering.compositing import caption, from_pillow, save_rendered_
 from torchface.rendering.point_light import PointLight, vertex_albedo
 from torchface.rendering.texture_overlay import FacePaint, overlay, relight
 from torchface.shape_names import ARKIT, mapping
-from torchface.synthetic import draw_identities, performer
+from torchface.synthetic import IDENTITY, Character, Look, character, draw_identities, performer
 from torchface.synthetic.stages.scanner import eyes_closed, scan_head
-from torchface.viz.figures.face_views import FRONT, PROFILE, THREE_QUARTER, clay_colors, face_views
+from torchface.viz.figures.face_views import FRONT, PROFILE, THREE_QUARTER, clay_colors, face_views, frame_face
 from torchface.viz.figures.registration_views import registration_sheet
 from torchface.workflows.fit.photograph_rig import fit_photographs
 
@@ -32,30 +32,53 @@ POSES = {
     "eyeBlink": ("eyeBlinkLeft", "eyeBlinkRight"),
     "jawOpen": ("jawOpen",),
     "mouthSmile": ("mouthSmileLeft", "mouthSmileRight"),
-    "mouthPucker": ("mouthPucker",),
+    "tongueOut": ("tongueOut",),
     "browInnerUp, eyeWide": ("browInnerUp", "browOuterUpLeft", "browOuterUpRight", "eyeWideLeft", "eyeWideRight"),
     "noseSneer, browDown": ("noseSneerLeft", "noseSneerRight", "browDownLeft", "browDownRight"),
 }
 
 
+PEOPLE = (
+    ({"jaw_width": -1.4, "brow_ridge": -1.6, "neck_width": -1.8, "upper_lip": 1.2, "lower_lip": 1.0, "nose_width": -0.8,
+      "face_height": -1.2, "brow_height": 0.8, "eye_opening": 0.8}, Look(age=25.0, hair=(0.33, 0.19, 0.10), lips=1.1)),
+    ({"jaw_width": 1.2, "chin_protrusion": 1.0, "nose_width": 1.6, "lip_fullness": 1.5, "upper_lip": 1.5,
+      "lower_lip": 1.3}, Look(melanin=0.8, age=35.0, hair=(0.05, 0.045, 0.04), iris=(0.16, 0.10, 0.06), freckles=0.0)),
+    ({"cheek_fullness": 1.0, "ear_size": 1.5, "nose_length": 1.2, "upper_lip": -1.2, "nose_tip_size": 1.0},
+     Look(age=72.0, hair=(0.62, 0.61, 0.60), iris=(0.30, 0.40, 0.47))),
+    ({"jaw_width": -1.6, "brow_ridge": -1.4, "neck_width": -1.8, "nose_width": 1.0, "upper_lip": 1.6, "lower_lip": 1.6,
+      "face_height": -1.0, "eye_opening": 0.6},
+     Look(melanin=0.5, age=45.0, hair=(0.07, 0.05, 0.045), iris=(0.2, 0.12, 0.07))),
+    ({"nose_bridge": -1.2, "face_width": 1.0, "cheekbones": 1.0, "eye_slant": 0.8, "face_height": -0.8},
+     Look(melanin=0.12, age=28.0, hair=(0.04, 0.035, 0.035), iris=(0.16, 0.10, 0.06), freckles=0.3)),
+    ({"jaw_width": -1.2, "brow_ridge": -1.5, "neck_width": -1.6, "nose_length": 0.8, "upper_lip": -0.8,
+      "ear_size": 1.0}, Look(age=68.0, hair=(0.72, 0.70, 0.68), iris=(0.33, 0.42, 0.36))),
+)  # fmt: skip
+"""Offsets of ``IDENTITY`` in standard deviations, and looks: three women and three men."""
+
+
 def performer_sheet() -> torch.Tensor:
-    """Three views and clay, six expressions, six other heads."""
-    rig = performer()
-    views = [caption(face_views(rig.neutral, (yaw,), **SIZE), "neutral") for yaw in (FRONT, THREE_QUARTER, PROFILE)]
-    views += [
-        caption(face_views(rig.neutral, (yaw,), clay_colors(rig.neutral), **SIZE), "form")
-        for yaw in (FRONT, THREE_QUARTER, PROFILE)
-    ]
-    expressions = []
-    for title, names in POSES.items():
+    """Three views and clay, six expressions, six other people."""
+    shown = character()
+
+    def view(one: Character, yaw: float, *names: str, colors: torch.Tensor | None = None) -> torch.Tensor:
+        rig = one.rig
         weights = mapping(ARKIT, rig.names)[:, [ARKIT.index(name) for name in names]].sum(1)
         posed = rig.neutral.with_vertices(rig(weights[None])[0])
-        expressions.append(caption(face_views(posed, (20.0,), framed_by=rig.neutral, **SIZE), title))
-    heads = [
-        caption(face_views(performer(identity).neutral, (20.0,), **SIZE), f"identity {i + 1}")
-        for i, identity in enumerate(draw_identities(6, torch.Generator().manual_seed(3)))
-    ]
-    return sheet([*views, *expressions, *heads], 6)
+        maps = None if colors is not None else one.surface.neutral
+        return render(posed, frame_face(rig.neutral, yaw, **SIZE), colors, samples=3, normal_map=maps)
+
+    yaws = (FRONT, THREE_QUARTER, PROFILE)
+    cells = [caption(view(shown, yaw), "neutral") for yaw in yaws]
+    cells += [caption(view(shown, yaw, colors=clay_colors(shown.rig.neutral)), "form") for yaw in yaws]
+    cells += [caption(view(shown, 20.0, *names), title) for title, names in POSES.items()]
+    order = [parameter.name for parameter in IDENTITY]
+    for offsets, look in PEOPLE:
+        identity = torch.zeros(len(order))
+        for name, value in offsets.items():
+            identity[order.index(name)] = value
+        one = character(performer(identity, texture=False), look, size=1024)
+        cells.append(caption(view(one, 20.0), f"another person, {look.age:.0f}"))
+    return sheet(cells, 6)
 
 
 def registration_picture() -> torch.Tensor:

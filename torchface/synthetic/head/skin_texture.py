@@ -123,7 +123,7 @@ def skin_color(p: Tensor, marks: Tensor, freckles: float = 1.0, red_lips: float 
     red = 0.55 * blob(p, (40, -30, 62), (22, 18, 30)) + 0.4 * blob(p, (3, -36, 108), (15, 10, 14))
     red += 0.3 * blob(p, (0, -100, 88), (22, 12, 20)) + 0.35 * ear + 0.18 * broad.clamp(min=0) + 0.08 * fine
     color = mix(color, (0.76, 0.43, 0.37), 0.62 * red)
-    dark = 0.5 * blob(p, (29, -11, 76), (14, 5.5, 14)) + 0.45 * blob(p, (22, 6, 80), (10, 7, 14))
+    dark = 0.35 * blob(p, (29, -11, 76), (14, 5.5, 14)) + 0.22 * blob(p, (22, 6, 80), (10, 7, 14))
     color = mix(color, (0.53, 0.36, 0.33), 0.75 * dark)
     color = mix(color, (0.87, 0.70, 0.59), 0.35 * blob(p, (0, 45, 92), (34, 18, 40)))
     color = color * (1 + 0.035 * broad + 0.03 * fine + 0.028 * pores)[:, None]
