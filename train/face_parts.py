@@ -37,6 +37,7 @@ class Settings(RecipeSettings):
         folder: Where pictures are kept.
         ict: ICT-FaceKit's FaceXModel folder; embedded performers alone without.
         workers: Processes that render.
+        start: A network to go on from, by name or folder; a new one if absent.
         network: How the network is trained.
     """
 
@@ -47,6 +48,7 @@ class Settings(RecipeSettings):
     ict: Path | None = None
     seed: int = 1
     workers: int = 2
+    start: str | None = None
     network: PartSettings = field(default_factory=PartSettings)
 
     devices: ClassVar[tuple[str, ...]] = ANY_DEVICE
@@ -69,7 +71,8 @@ def train(settings: Settings, run: Run) -> PartNetwork:
     people = EACH * SCENES
     held_out = people * -(-settings.held_out // people)  # whole people
     learned = StoredPartPictures(files, held_out)
-    model = PartNetwork.fit(learned, None, settings.network, run.progress, run.checkpoint, run.device, run.log)
+    first = None if settings.start is None else zoo.get_model(settings.start, PartNetwork)
+    model = PartNetwork.fit(learned, first, settings.network, run.progress, run.checkpoint, run.device, run.log)
     save(model, settings, overlaps(model, StoredPartPictures(files, 0, held_out)))
     return model
 

@@ -81,10 +81,12 @@ def fit(
     given = tuple(Path(landmark) for landmark in landmarks)
     if len(landmarks) == 1 and not is_landmark_file(given[0]):
         given, landmark_model = (), landmarks[0]
-    fitting = FitSettings(texture_size=texture_size, masked=not everything, one_expression=one_expression)
+    fitting = FitSettings(texture_size=texture_size, one_expression=one_expression)
     if inner_weight is not None:
         fitting = replace(fitting, inner_weight=inner_weight)
-    settings = PhotographSettings(fitting, template, part, focal, face, landmark_model, names, prior, insist)
+    settings = PhotographSettings(
+        fitting, template, part, focal, face, landmark_model, names, prior, insist, everything
+    )
     with file_lock(out), progress_bars(quiet) as progress:
         made = fit_photographs(photographs, given, model, out, settings, progress)
     for line in [*made.lines(), *naming_lines(made.rig, names)]:

@@ -8,6 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from tests.planted.planted_parts import planted_parts
 from torchface.geometry.cameras.pinhole import Camera, look_at
 from torchface.geometry.meshes.operators import vertex_normals
 from torchface.mesh import Mesh
@@ -61,7 +62,8 @@ def test_hair_is_a_cap_of_its_colour_and_a_bald_head_stays_bald(head: Mesh, came
     found = {}
     for name, mesh in (("bald", head), ("hair", haired)):
         picture = render(mesh, camera, lighting=EVEN, samples=1)
-        found[name] = photographed_skin([head], None, [picture], [camera], 128)
+        parts = planted_parts(picture, {"hair": HAIR, "background": torch.zeros(3)}, 0.05)
+        found[name] = photographed_skin([head], None, [picture], [camera], 128, [parts])
     assert found["bald"].hair is None
     color, cap = found["hair"].hair, found["hair"].colors
     assert color is not None

@@ -8,14 +8,15 @@ import pytest
 import torch
 from torch import Tensor
 
+from tests.planted.planted_parts import planted_parts
 from torchface.errors import AlignmentError, ShapeError, TopologyError
 from torchface.geometry.cameras.pinhole import Camera, look_at
+from torchface.geometry.meshes.vertex_graph import VertexGraph
 from torchface.mesh import Mesh
 from torchface.modeling.morphable.morphable_model import MorphableModel
-from torchface.modeling.photographs.skin_mask import FacePlaces, skin_shares
+from torchface.modeling.photographs.skin_mask import FacePlaces, ShownParts
 from torchface.modeling.photographs.texture_fit import fit_colors
 from torchface.modeling.photographs.texture_projection import PhotoTexture, photo_texture
-from torchface.rendering.camera_visibility import PosedSurface
 from torchface.rendering.clay_shading import Lighting, render
 from torchface.synthetic import neutral_head
 from train.rendered_people.complexion import complexion_colors, draw_complexions
@@ -171,8 +172,12 @@ def test_hair_and_cloth_are_not_painted_on(subject: Mesh, skins: Tensor, cameras
         render(replace(subject, colors=dressed), c, lighting=EVEN, background=GREEN, samples=1) for c in cameras
     ]
     painted = photo_texture(subject, pictures, cameras, 256)
-    shown = [PosedSurface.each(subject, 1)[0].shown_in(*one) for one in zip(pictures, cameras, strict=True)]
-    shares = skin_shares(shown, [FacePlaces.of(subject)] * len(shown), subject.faces)
+    places, graph = FacePlaces.of(subject), VertexGraph(subject.faces, len(subject.vertices))
+    shares = torch.stack([
+        ShownParts.of(planted_parts(picture, {"hair": black, "cloth": blue, "background": GREEN}),
+                      camera.project(subject.vertices.double()), places, graph).own
+        for picture, camera in zip(pictures, cameras, strict=True)
+    ])  # fmt: skip
     masked = photo_texture(subject, pictures, cameras, 256, confidence=shares)
     skin = skins[40][regions["face"]].median(0).values
     for cloth, color in ((hair, black), (collar, blue)):

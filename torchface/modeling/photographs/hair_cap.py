@@ -18,7 +18,7 @@ _HAIRLINE, _FALL, _TEMPLE = 0.76, 0.28, 0.7
 _SIDES, _SIDEBURN, _OVER_EARS = (-0.25, -0.02), 0.2, 0.3
 _BEHIND, _NAPE = (0.52, 0.64), -0.75
 _EDGE, _FRINGE = 0.045, 0.07
-_ABOVE_BROWS, _SQUARE, _UNLIKE = 0.06, 0.3, 0.5
+_ABOVE_BROWS, _SQUARE, _HAIR = 0.06, 0.3, 0.5
 _LEAST, _SHARE = 20, 0.3
 _COLUMNS, _COLUMN, _FEW = 17, 0.05, 6  # across the forehead, half the width of each, vertices
 _STRANDS, _STRAND = 150.0, 0.10
@@ -58,7 +58,7 @@ class HairCap:
         return torch.lerp(colors, hair.clamp(0, 1), share[:, None].to(colors))
 
 
-def hair_cap(shown: Sequence[Shown], places: Sequence[FacePlaces], skin: Tensor) -> HairCap | None:
+def hair_cap(shown: Sequence[Shown], places: Sequence[FacePlaces], hair: Tensor) -> HairCap | None:
     """The hair that photographs show above the brows; None where most of what they show there is skin.
 
     Where it begins is, in each column of the forehead, the height that best parts skin below from hair above, so that a
@@ -67,15 +67,15 @@ def hair_cap(shown: Sequence[Shown], places: Sequence[FacePlaces], skin: Tensor)
     Args:
         shown: the photographs at the vertices.
         places: where the vertices lie beside the landmarks in each.
-        skin: how far each shows skin, (I,V); see ``skin_shares``.
+        hair: how far each shows hair, (I,V); see ``ShownParts``.
     """
-    at, hair, colors = list[Tensor](), list[Tensor](), list[Tensor]()
-    for one, where, share in zip(shown, places, skin, strict=True):
+    at, found, colors = list[Tensor](), list[Tensor](), list[Tensor]()
+    for one, where, share in zip(shown, places, hair, strict=True):
         seen = (one.cosine > _SQUARE) & (where.place[:, 1] > where.brows + _ABOVE_BROWS) & (where.behind < _SIDES[0])
         at.append(where.place[seen, :2])
-        hair.append(share[seen] < _UNLIKE)
+        found.append(share[seen] > _HAIR)
         colors.append(one.colors[seen].double())
-    place, covered, color = torch.cat(at), torch.cat(hair), torch.cat(colors)
+    place, covered, color = torch.cat(at), torch.cat(found), torch.cat(colors)
     high = place[:, 1] > _HAIRLINE - _FALL
     if int((covered & high).sum()) < max(_LEAST, _SHARE * int(high.sum())):
         return None

@@ -175,8 +175,8 @@ def fit_images(
     if images is None:
         return fit
     progress("projecting the photographs onto the head")
-    size, masked, irises = settings.texture_size, settings.masked, settings.irises
-    skin = photographed_skin(fit.posed, model.color, images, fit.cameras, size, masked, irises)
+    size, parts, irises = settings.texture_size, settings.parts, settings.irises
+    skin = photographed_skin(fit.posed, model.color, images, fit.cameras, size, parts, irises)
     return replace(
         fit,
         mesh=skin.on(fit.mesh),

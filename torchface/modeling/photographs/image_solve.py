@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Protocol
@@ -12,6 +13,7 @@ from torch import Tensor
 from torchface.attachment import Attachment
 from torchface.errors import ShapeError
 from torchface.geometry.cameras.pinhole import MAX_SIDE
+from torchface.landmarks.images.networks.part_finder import FaceParts
 from torchface.modeling.photographs.landmark_view import (
     JAW,
     LANDMARKS,
@@ -105,7 +107,8 @@ class FitSettings:
         transfers: how often shapes are transferred to the head found; 0 keeps the template's.
         texture_size: of the skin, texels a side; 0 makes no texture.
         irises: centres of the irises in each photograph, (I,2,2) pixels, NaN where unknown: their colour is there.
-        masked: only skin and the face's features are projected onto the head; see ``photographed_skin``.
+        parts: what each photograph shows, skin, hair, hands: skin and the face's features alone are projected onto the
+            head; all of it if absent.
 
     Raises:
         ValueRangeError: a setting is NaN, infinite or out of its range.
@@ -137,7 +140,7 @@ class FitSettings:
     transfers: int = 1
     texture_size: int = 1024
     irises: Tensor | None = None
-    masked: bool = True
+    parts: Sequence[FaceParts] | None = None
 
     def __post_init__(self) -> None:
         for name in ("inner_weight", "expression_mean", "expression_ridge", "asymmetry", "identity_bound"):

@@ -12,13 +12,15 @@ from torch import Tensor
 from torchface.geometry.cameras.pinhole import Camera
 from torchface.geometry.meshes.operators import vertex_normals
 from torchface.geometry.meshes.rasterization import rasterise_uvs
+from torchface.geometry.meshes.vertex_graph import VertexGraph
 from torchface.io.gltf.region_materials import EYEBALL, IRIS, part_material
+from torchface.landmarks.images.networks.part_finder import FaceParts
 from torchface.mesh import Mesh
 from torchface.modeling.morphable.morphable_model import MorphableModel
 from torchface.modeling.photographs.hair_cap import HairCap, hair_cap
 from torchface.modeling.photographs.landmark_view import LANDMARKS
 from torchface.modeling.photographs.skin_light import skin_light, unlit
-from torchface.modeling.photographs.skin_mask import FacePlaces, skin_shares
+from torchface.modeling.photographs.skin_mask import FacePlaces, ShownParts
 from torchface.modeling.photographs.texture_fit import ColorFit, fit_colors
 from torchface.modeling.photographs.texture_projection import PhotoTexture, photo_texture
 from torchface.rendering.camera_visibility import PosedSurface, shown_in
@@ -26,6 +28,7 @@ from torchface.rendering.clay_shading import sample_texture
 from torchface.rendering.environment_light import EnvironmentLight
 from torchface.rendering.raycast import RayCaster
 
+_BARE = 0.7  # share of skin from which a vertex tells the light
 _MIN_DIAMETER = 14.0  # across an eyeball; of smaller ones a photograph shows no iris
 _SHARE = (0.15, 0.40)
 """Of the eyeball between the lids, the darkest first: lashes and pupil, then the iris, then white and highlights."""
@@ -60,7 +63,7 @@ def photographed_skin(
     images: Sequence[Tensor],
     cameras: Sequence[Camera],
     size: int = 1024,
-    masked: bool = True,
+    parts: Sequence[FaceParts] | None = None,
     irises: Tensor | None = None,
 ) -> Skin:
     """A head's skin from photographs and a colour model.
@@ -71,7 +74,8 @@ def photographed_skin(
         images: photographs, (3,H,W) each.
         cameras: one each.
         size: of the texture, texels a side; 0 makes none.
-        masked: project only skin and the face's features onto the head; else also hair, clothes and what stands behind.
+        parts: what each shows: skin and the face's features alone are projected onto the head, and hair becomes a cap;
+            if absent also hair, clothes and what stands behind.
         irises: centres of the eyes' irises in each photograph, (I,2,2) pixels, NaN where they are not known.
 
     Returns:
@@ -85,7 +89,7 @@ def photographed_skin(
     base = _own_colors(mesh) if fit is None else fit.colors
     if mesh.uvs is None or size == 0:
         return Skin(base, None, fit)
-    parts, count = part_vertices(mesh), len(images)
+    others, count = part_vertices(mesh), len(images)
     confidence: Tensor | None = None
     lights: list[EnvironmentLight | None] | None = None
     cap: HairCap | None = None
@@ -94,23 +98,28 @@ def photographed_skin(
         shown = [
             surface.shown_in(image, camera) for surface, image, camera in zip(surfaces, images, cameras, strict=True)
         ]
+        graph = VertexGraph(mesh.faces.cpu(), len(mesh.vertices))
+        known = [
+            ShownParts.of(one, camera.project(surface.vertices), where, graph)
+            for one, camera, surface, where in zip(parts or [None] * count, cameras, surfaces, places, strict=True)
+        ]
         lights = [
-            skin_light(at, surface.normals, camera, where.cheeks & ~parts)
-            for at, surface, camera, where in zip(shown, surfaces, cameras, places, strict=True)
+            skin_light(at, surface.normals, camera, where.cheeks & ~others & (one.bare > _BARE))
+            for at, surface, camera, where, one in zip(shown, surfaces, cameras, places, known, strict=True)
         ]
         shown = [
             replace(at, colors=unlit(at.colors, surface.normals, camera, light))
             for at, surface, camera, light in zip(shown, surfaces, cameras, lights, strict=True)
         ]
-        if masked:
-            confidence = skin_shares(shown, places, mesh.faces)
-            cap = hair_cap(shown, places, torch.where(parts, 1.0, confidence))
-    own = base is None and bool(parts.any()) and not bool(parts.all())
+        if parts is not None:
+            confidence = torch.stack([one.own for one in known])
+            cap = hair_cap(shown, places, torch.where(others, 0.0, torch.stack([one.hair for one in known])))
+    own = base is None and bool(others.any()) and not bool(others.all())
     if own:
-        confidence = torch.where(parts, 0.0, torch.ones(count, len(parts)) if confidence is None else confidence)
+        confidence = torch.where(others, 0.0, torch.ones(count, len(others)) if confidence is None else confidence)
     texture = photo_texture(posed, images, cameras, size, base, confidence, lights)
     if cap is not None:
-        texture = _capped(texture, cap, mesh, parts)
+        texture = _capped(texture, cap, mesh, others)
     colors = texture.colors
     iris = iris_color(posed, images, cameras, irises)
     if own or iris is not None:

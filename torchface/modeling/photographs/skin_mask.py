@@ -2,28 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 from torchface.geometry.meshes.vertex_graph import VertexGraph
+from torchface.landmarks.images.networks.part_finder import FaceParts
 from torchface.mesh import Mesh
 from torchface.modeling.photographs.landmark_view import JAW, LANDMARKS
-from torchface.rendering.camera_visibility import Shown
 
-_FEATURES = 0.10
-_SURELY_SKIN = 0.75
+_FEATURES = ("brows", "eyes", "lips", "teeth")
+_NOSE = -0.45
+_NEAR_FEATURES, _SURELY_SKIN = 0.10, 0.75
 _NECK, _BEHIND = (0.05, 0.35), (0.05, 0.30)
 _FOREHEAD = 0.15
 """In distances between the eyes' outer corners, but for the second row: shares of the way to the face's outline."""
-_OVER_BROWS = 0.03
-_ALIKE, _UNLIKE = 1.8, 2.8
-# Of skin: of brightness, of two ratios of channels.
-_MIN_DEVIATIONS, _MAX_DEVIATIONS = (0.25, 0.06, 0.06), (0.45, 0.14, 0.14)
-_SQUARE, _MIN_VERTICES, _AROUND = 0.35, 30, 60
-_ITERATIONS = 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,55 +68,42 @@ class FacePlaces:
         offsets = place[:, :2] - middle
         reach = _radius(outline - middle, torch.atan2(offsets[:, 1], offsets[:, 0]))
         length = offsets.norm(dim=1)
-        features = torch.cdist(place, torch.cat([at[JAW:27], at[31:LANDMARKS]])).amin(1) < _FEATURES
+        features = torch.cdist(place, torch.cat([at[JAW:27], at[31:LANDMARKS]])).amin(1) < _NEAR_FEATURES
         ears, brows = float(at[[0, 16], 2].mean()), float(at[17:27, 1].mean())
         return FacePlaces(length / reach, length - reach, place, features, ears - place[:, 2], at[8], brows, ears)
 
 
-def skin_shares(shown: Sequence[Shown], places: Sequence[FacePlaces], faces: Tensor) -> Tensor:
-    """How far photographs show skin, or a feature of the face, at each vertex, (I,V) in [0,1].
-
-    Inside the face's outline, up to the brows, everything is the person's. Around it counts what resembles the cheeks
-    nearby, in brightness and in the ratios of the channels; far below the chin and behind the ears nothing does.
+@dataclass(frozen=True, eq=False)
+class ShownParts:
+    """What a photograph shows at each vertex, (V,) in [0,1] each; of hidden vertices it says nothing.
 
     Args:
-        shown: the photographs at the vertices.
-        places: where those lie beside the landmarks in each.
-        faces: of the mesh, (F,3).
+        own: the person's skin, brows, eyes, lips, teeth, beard: all that is painted on the head.
+        bare: skin alone.
+        hair: hair, the beard not.
     """
-    graph = VertexGraph(faces.cpu(), len(shown[0].cosine))
-    return torch.stack([_share(one, where, graph) for one, where in zip(shown, places, strict=True)])
 
+    own: Tensor
+    bare: Tensor
+    hair: Tensor
 
-def _share(shown: Shown, places: FacePlaces, graph: VertexGraph) -> Tensor:
-    light = shown.colors.double().clamp(min=0.02).log()
-    appearance = torch.stack([light.mean(1), light[:, 0] - light[:, 1], light[:, 2] - light[:, 1]], dim=1)
-    core = places.cheeks & (shown.cosine > _SQUARE)
-    alike = torch.ones(len(appearance), dtype=torch.float64)
-    if int(core.sum()) >= _MIN_VERTICES:
-        alike = _alike(appearance, core, graph)
-    # Above the brows a fringe may hang before the forehead.
-    surely = (places.out < _SURELY_SKIN) & (places.place[:, 1] < places.brows + _OVER_BROWS)
-    share = torch.where(surely | (places.features & (places.out < 1)), 1.0, alike)
-    below = places.beyond * (places.place[:, 1] < 0.5 * places.chin[1])
-    falloff = (1 - _ramp(below, *_NECK)) * (1 - _ramp(places.behind, *_BEHIND))
-    return graph.smoothed((share * falloff)[:, None], torch.ones_like(share), 2)[:, 0]
+    @staticmethod
+    def of(parts: FaceParts | None, pixels: Tensor, places: FacePlaces, graph: VertexGraph) -> ShownParts:
+        """At the places of the vertices in the photograph, (V,2) pixels.
 
-
-def _alike(appearance: Tensor, core: Tensor, graph: VertexGraph) -> Tensor:
-    """How much each vertex (V,) resembles the skin of the core nearest to it."""
-    lower, upper = (appearance.new_tensor(bound) for bound in (_MIN_DEVIATIONS, _MAX_DEVIATIONS))
-    weight = core.double()
-    middle = appearance[core].median(0).values
-    deviations = (1.4826 * (appearance[core] - middle).abs().median(0).values).clamp(lower, upper)
-    for _ in range(_ITERATIONS):  # what is no skin loses its weight, and the median moves
-        far = ((appearance - middle) / deviations).square().sum(1)
-        weight = core * torch.exp(-0.5 * far / 4)
-        middle = (weight[:, None] * appearance).sum(0) / weight.sum()
-    local = graph.smoothed(appearance, weight, _AROUND)
-    coverage = graph.smoothed(weight[:, None], torch.ones_like(weight), _AROUND)
-    expected = torch.lerp(middle.expand_as(appearance), local, (coverage / 0.02).clamp(max=1))
-    return 1 - _ramp(((appearance - expected) / deviations).square().sum(1).sqrt(), _ALIKE, _UNLIKE)
+        Without parts all inside the face's outline is the person's. Far below the chin and behind the ears nothing is.
+        """
+        below = places.beyond * (places.place[:, 1] < 0.5 * places.chin[1])
+        falloff = (1 - _ramp(below, *_NECK)) * (1 - _ramp(places.behind, *_BEHIND))
+        if parts is None:
+            inside = (places.out < 1).double() * falloff
+            return ShownParts(inside, inside, torch.zeros_like(inside))
+        bare, features, hair = (
+            parts.at(pixels, *names).double().nan_to_num(0.0) for names in (("skin",), _FEATURES, ("hair",))
+        )
+        beard = hair * _ramp(_NOSE - places.place[:, 1], 0.0, 0.1) * (places.out < 1)
+        own = graph.smoothed(((bare + features + beard) * falloff)[:, None], torch.ones_like(bare), 2)[:, 0]
+        return ShownParts(own, bare * falloff, hair - beard)
 
 
 def _radius(outline: Tensor, angle: Tensor) -> Tensor:

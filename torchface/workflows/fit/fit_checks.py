@@ -18,8 +18,8 @@ MISFIT = 0.045
 """Of the eyes' distance: landmarks that lie further from the fit are remarked on; those found in three photographs
 of people at most 2.4 % without the contour."""
 
-ONE_PERSON, OTHERS = 3.0, -3.0
-"""Logarithms of odds (20 to 1): photographs above the first show one person, below the second they do not.
+ONE_PERSON, OTHERS = 3.0, 1.5
+"""Logarithms of odds: photographs above the first (20 to 1) show one person, those below the second are refused.
 
 Of 39 pairs of photographs of one person each all were above 3.8 (68 landmarks, the modes of ICT-FaceKit), of 1,042
 pairs of two people a quarter below -3 and half below 1.6.

@@ -43,8 +43,9 @@ from torchface.workflows.fit.fit_landmarks import (
     warn_if_stored_turned,
 )
 from torchface.workflows.fit.fit_readings import with_readings
-from torchface.workflows.fit.picture_checks import picture_lines, profile_lines
+from torchface.workflows.fit.picture_checks import cover_lines, picture_lines, profile_lines
 from torchface.workflows.fit.video_pictures import video_pictures
+from torchface.workflows.named_finders import part_finder
 from torchface.workflows.named_heads import NamedHeads, load_head_model, matching
 from torchface.workflows.rig.actor_rig import check_out
 from torchface.workflows.rig_names import Naming, renamed
@@ -70,6 +71,7 @@ class PhotographSettings:
         names: of the written shapes; see ``rig_names.renamed``.
         prior: which weights faces have: a shape prior by name or folder, or "none".
         insist: also where photographs do not seem to show one person.
+        everything: paint hair, clothes and what hangs before the face on the head.
     """
 
     fit: FitSettings = field(default_factory=FitSettings)
@@ -81,6 +83,7 @@ class PhotographSettings:
     names: Naming | None = None
     prior: str | Path = DEFAULT_PRIOR
     insist: bool = False
+    everything: bool = False
 
     def __post_init__(self) -> None:
         if self.face is not None:
@@ -186,10 +189,15 @@ def fit_photographs(
         alone = replace(ALONE, annotated=bool(found))
         return fit_images(heads, rig, points, some, camera=settings.focal, settings=alone)
 
+    progress("finding skin, hair and what covers them")
+    parts = [part_finder()((255 * image[:3].clamp(0, 1)).byte(), one) for image, one in zip(images, marks, strict=True)]
     fitting = replace(settings.fit, expression_prior=prior, annotated=bool(found))
+    fitting = fitting if settings.everything else replace(fitting, parts=parts)
     if found:
         fitting = with_readings(fitting, found, rig)
     remarks = [line for one, image in zip(found, images, strict=False) for line in picture_lines(one, image, insist)]
+    for photograph, one, points in zip(photographs, parts, marks, strict=True):
+        remarks += cover_lines(photograph, one, points)
     # The tracker has followed one face through a film.
     remarks += one_person_lines(photographs, marks, bare, insist or one_film)
     fit = fit_images(heads, rig, marks, sizes, images, settings.focal, fitting, progress)

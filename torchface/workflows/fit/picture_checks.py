@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
+import cv2
 import torch
 from torch import Tensor
 
 from torchface.landmarks import NoFaceError
+from torchface.landmarks.images.networks.part_finder import FaceParts
 from torchface.modeling import ImageFit
 from torchface.workflows.fit.fit_landmarks import PhotographLandmarks
 
@@ -21,6 +25,10 @@ _RED, _BLUE = (
 )  # logarithms of red and blue over green of skin; 8 faces 0.20 to 0.51, -0.53 to -0.08
 _FLAT, _FLAT_GREY = 0.65, 0.18  # share of pixels like their neighbours; 9 photographs at most 0.12
 _PROFILE = 50.0  # degrees
+_GRID = 40
+_COVERS = {
+    "glasses": (0.12, "dark glasses hide"), "hand": (0.06, "a hand hides"), "cloth": (0.10, "cloth (a mask?) hides"),
+}  # fmt: skip
 _PARTS = {"nose": slice(27, 36), "mouth": slice(48, 68)}
 
 
@@ -74,6 +82,30 @@ def profile_lines(fit: ImageFit) -> list[str]:
         listed = ", ".join(f"{turn:.0f}°" for turn in turns)
         return [f"WARNING: only profiles ({listed}): how wide the face is they do not show; add a view from the front"]
     return []
+
+
+def cover_lines(photograph: Path, parts: FaceParts, landmarks: Tensor) -> list[str]:
+    """What stands before a face, for people to read; nothing where nothing does.
+
+    Args:
+        photograph: the file.
+        parts: what it shows.
+        landmarks: of the face, (68,2) pixels; NaN for missing.
+    """
+    known = landmarks[landmarks.isfinite().all(-1)]
+    outline = torch.from_numpy(cv2.convexHull(known.float().numpy())[:, 0]).double()
+    low, high = outline.amin(0), outline.amax(0)
+    steps = torch.linspace(0, 1, _GRID, dtype=torch.float64)
+    grid = torch.cartesian_prod(*(low[k] + (high[k] - low[k]) * steps for k in (0, 1)))
+    edge = torch.roll(outline, -1, 0) - outline
+    aside = edge[:, 0] * (grid[:, None, 1] - outline[:, 1]) - edge[:, 1] * (grid[:, None, 0] - outline[:, 0])
+    inside = grid[(aside >= 0).all(1) | (aside <= 0).all(1)]
+    lines = []
+    for name, (least, words) in _COVERS.items():
+        share = float(parts.at(inside, name).nanmean())
+        if share > least:
+            lines.append(f"WARNING: {photograph.name}: {words} {share:.0%} of the face; its skin there is completed")
+    return lines
 
 
 def _hidden_parts(found: PhotographLandmarks) -> dict[str, float]:

@@ -81,7 +81,7 @@ class PartNetwork(nn.Module):
         device: str | torch.device = "cpu",
         log: ValueLog | None = None,
     ) -> PartNetwork:
-        """Trains a network on pictures whose parts are known, by cross entropy.
+        """Trains a network on pictures whose parts are known, by cross entropy and overlap (Milletari et al. 2016).
 
         Args:
             pictures: indexed by numbers (B,), such as a ``TensorDataset``. Gives pictures uint8 (B,3,H,W), the number
