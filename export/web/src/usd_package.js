@@ -192,9 +192,12 @@ async function materialPrim(material, number, images) {
   for (const [field, input, output, colored] of MAPS) {
     const texture = material[field];
     if (!texture) continue;
-    const png = await texturePng(texture), file = `textures/${images.length}.png`;
-    if (png === null) continue;
-    images.push([file, png]);
+    if (!images.some(([, , source]) => source === texture.source)) {
+      const png = await texturePng(texture);
+      if (png === null) continue;
+      images.push([`textures/${images.length}.png`, png, texture.source]); // materials share pictures
+    }
+    const [file] = images.find(([, , source]) => source === texture.source);
     const factor = { rgb: (material[{ map: "color", emissiveMap: "emissive" }[field]] ?? new THREE.Color(1, 1, 1)).toArray(), g: [1, material.roughness, 1], b: [1, 1, material.metalness] }[output];
     const scale = input === "normal" ? [2, 2, 2, 1] : [...factor, 1];
     shaders.push(prim("Shader", field, [], [

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,6 +15,7 @@ from headless_chromium import until
 
 from torchface.io.weights.live_link_csv import load_live_link
 
+_TYPES = ("text/csv", "model/gltf-binary", "model/vnd.usdz+zip", "video/mp4")
 _WATCH = (Path(__file__).parent / "watched_worker.js").read_text()
 
 
@@ -32,14 +34,13 @@ def watched(page: Page, what: str) -> Any:
 
 def blob(page: Page, kind: str) -> bytes:
     """What saving the newest take as a kind of file downloads."""
-    count = page.driver.execute_script("return watched.blobs.length")
-    choose = (
-        "const e = document.querySelector('#takes .save'); e.value = arguments[0]; e.dispatchEvent(new Event('change'))"
-    )
-    page.driver.execute_script(choose, kind)
-    until(lambda: page.driver.execute_script("return watched.blobs.length") > count or page.problem)
+    given = f"watched.blobs.filter(({{ type }}) => {json.dumps(_TYPES)}.includes(type))"  # and no pictures of textures
+    count = page.driver.execute_script(f"return {given}.length")
+    choose = "e.value = arguments[0]; e.dispatchEvent(new Event('change'))"
+    page.driver.execute_script(f"const e = document.querySelector('#takes .save'); {choose}", kind)
+    until(lambda: page.driver.execute_script(f"return {given}.length") > count or page.problem)
     assert not page.problem, page.problem
-    script = "const done = arguments[0]; watched.text(watched.blobs.at(-1)).then(done)"
+    script = f"const done = arguments[0]; watched.text({given}.at(-1)).then(done)"
     return base64.b64decode(page.driver.execute_async_script(script))
 
 

@@ -17,7 +17,13 @@ from torchface.color_space import to_srgb
 from torchface.errors import FileFormatError, TorchfaceError
 from torchface.io.gltf.accessors import read_floats
 from torchface.io.gltf.gltf_document import Document
-from torchface.io.gltf.primitive_reading import BYTES_A_CORNER, BYTES_A_VERTEX, read_target_names, read_triangles
+from torchface.io.gltf.primitive_reading import (
+    BYTES_A_CORNER,
+    BYTES_A_VERTEX,
+    DECOMPRESSED,
+    read_target_names,
+    read_triangles,
+)
 from torchface.io.gltf.scene import node_transforms
 from torchface.io.images.image_samples import decode_samples
 
@@ -176,11 +182,7 @@ class _Shelf:
         document, location = self.document, f"meshes[{mesh}].primitives[{group[0][0]}]"
         first = group[0][1]
         if "KHR_draco_mesh_compression" in document.record(first.get("extensions"), f"{location}.extensions"):
-            raise document.error(
-                location,
-                "Draco compression",
-                "plain data; decompress it: npx @gltf-transform/cli copy IN.glb OUT.glb",
-            )
+            raise document.error(location, "Draco compression", DECOMPRESSED)
         attributes = document.record(first.get("attributes"), f"{location}.attributes")
         if "POSITION" not in attributes:
             raise document.error(f"{location}.attributes", "no POSITION", "one")

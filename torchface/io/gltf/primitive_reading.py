@@ -93,6 +93,10 @@ def read_part(document: Document, index: int) -> Part | None:
     )
 
 
+DECOMPRESSED = "plain data; decompress it: npx @gltf-transform/cli copy IN.glb OUT.glb"
+"""What is expected in place of Draco's compression, which the page reads and torchface does not."""
+
+
 @dataclass(frozen=True)
 class _Block:
     """The vertices of one set of accessors; ``first`` is where they begin in the part."""
@@ -107,7 +111,7 @@ class _Block:
 
 def _read_block(document: Document, primitive: dict[str, Any], location: str, first: int) -> _Block:
     if "KHR_draco_mesh_compression" in document.record(primitive.get("extensions"), f"{location}.extensions"):
-        raise document.error(location, "Draco compression", "plain data; decompress the file first")
+        raise document.error(location, "Draco compression", DECOMPRESSED)
     attributes = document.record(primitive.get("attributes"), f"{location}.attributes")
     if "POSITION" not in attributes:
         raise document.error(f"{location}.attributes", "no POSITION", "one")
