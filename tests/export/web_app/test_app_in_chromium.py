@@ -228,6 +228,21 @@ def test_a_refused_camera_is_explained_and_may_be_allowed_then(opened: Open, rec
     assert page.problem == ""
 
 
+def test_a_permission_that_is_withdrawn_is_explained_and_ends_the_take(opened: Open, recorded: Recorded) -> None:
+    page, count = opened.page, "return document.querySelectorAll('#takes li').length"
+    page.start()
+    before = page.driver.execute_script(count)
+    page.click("record")
+    until(lambda: page.recorded_frames >= 3)
+    allow_camera(page.driver, "denied")
+    assert "may no longer be used" in until(lambda: page.problem)
+    until(lambda: page.driver.execute_script(count) == before + 1)
+    page.driver.execute_script("document.querySelector('#takes .delete').click()")
+    until(lambda: page.driver.execute_script(count) == before)
+    allow_camera(page.driver, "granted")
+    page.start()
+
+
 def test_a_face_is_lost_and_found(opened: Open, recorded: Recorded) -> None:
     page = opened.page
     page.start()
