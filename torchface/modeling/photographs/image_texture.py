@@ -99,9 +99,10 @@ def photographed_skin(
             surface.shown_in(image, camera) for surface, image, camera in zip(surfaces, images, cameras, strict=True)
         ]
         graph = VertexGraph(mesh.faces.cpu(), len(mesh.vertices))
+        seen: Sequence[FaceParts | None] = parts or [None] * count
         known = [
             ShownParts.of(one, camera.project(surface.vertices), where, graph)
-            for one, camera, surface, where in zip(parts or [None] * count, cameras, surfaces, places, strict=True)
+            for one, camera, surface, where in zip(seen, cameras, surfaces, places, strict=True)
         ]
         lights = [
             skin_light(at, surface.normals, camera, where.cheeks & ~others & (one.bare > _BARE))

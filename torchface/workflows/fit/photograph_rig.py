@@ -196,8 +196,8 @@ def fit_photographs(
     if found:
         fitting = with_readings(fitting, found, rig)
     remarks = [line for one, image in zip(found, images, strict=False) for line in picture_lines(one, image, insist)]
-    for photograph, one, points in zip(photographs, parts, marks, strict=True):
-        remarks += cover_lines(photograph, one, points)
+    for photograph, shown, points in zip(photographs, parts, marks, strict=True):
+        remarks += cover_lines(photograph, shown, points)
     # The tracker has followed one face through a film.
     remarks += one_person_lines(photographs, marks, bare, insist or one_film)
     fit = fit_images(heads, rig, marks, sizes, images, settings.focal, fitting, progress)

@@ -90,7 +90,8 @@ def fit_parts(
 
 def _draw(pictures: Dataset[tuple[Tensor, ...]], settings: PartSettings, step: int) -> PartCrops:
     numbers, generator = draw_numbers(pictures, settings, step)
-    return part_crops(*pictures[numbers], generator, settings)
+    images, parts, boxes = pictures[numbers]
+    return part_crops(images, parts, boxes, generator, settings)
 
 
 def part_crops(
