@@ -103,8 +103,8 @@ def scalp_hair() -> GrownPart:
     height = (
         amount * _height(points) + 2.2 * locks(points) * amount.sqrt() * ramp(amount, 0, 0.5) - 0.7 * (1 - amount) ** 6
     )
-    part = HeadPart(points + height[:, None] * ways, index[whole], uvs[whole].float())
-    return GrownPart(part, hosts, weights)
+    cap = HeadPart(points + height[:, None] * ways, index[whole], uvs[whole].float())
+    return GrownPart(cap, hosts, weights)
 
 
 def _height(points: Tensor) -> Tensor:
