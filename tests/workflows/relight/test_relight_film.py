@@ -22,7 +22,15 @@ from torchface.rendering.point_light import PointLight
 from torchface.rig import BlendshapeRig
 from torchface.synthetic import performer
 from torchface.take import Take, Track
-from torchface.workflows.relight.relight_film import RelightSettings, WantedLight, _doubts, relight_film
+from torchface.workflows.relight.relight_film import (
+    RelightSettings,
+    WantedLight,
+    _doubts,
+    _facing,
+    _near_face,
+    _reaching,
+    relight_film,
+)
 from torchface.workflows.relight.tracked_film import read_tracked_film
 from torchface.workflows.track.head_rotations import rotation_columns
 from torchface.workflows.track.track_files import ANIMATION, LANDMARKS, SUMMARY, SUMMARY_FORMAT
@@ -104,6 +112,22 @@ def test_a_light_from_behind_the_head_is_doubted() -> None:
     behind, front = (WantedLight(azimuth=azimuth, ambient=0.25).beside(film) for azimuth in (-167.0, 60.0))
     assert "azimuth=-167, 75% of all light" in _doubts(behind)[0]
     assert not _doubts(front)
+    assert _reaching(front) is front
+    assert float(_reaching(behind).intensity.abs().max()) == 0
+    assert torch.equal(_reaching(behind).ambient, behind.ambient)
+
+
+def test_the_new_light_fades_out_beside_the_face_and_at_its_outline(filmed: Filmed) -> None:
+    mesh, camera = filmed.rig.neutral, filmed.cameras[0]
+    assert mesh.annotations is not None
+    regions = mesh.annotations.regions
+    near = _near_face(mesh)
+    assert bool((near[regions["face"]] == 1).all())
+    assert bool((near[regions["eyeball_left"]] == 1).all())
+    assert float(near[mesh.vertices[:, 2] < -60].max()) == 0  # the back of the head
+    facing = _facing(filmed.rig.vertices, mesh, camera)
+    assert float(facing[mesh.landmarks[30]]) > 0.9  # the tip of the nose
+    assert float(facing[mesh.vertices[:, 2] < -60].median()) == 0
 
 
 @pytest.mark.bench  # a light is searched for again, seconds

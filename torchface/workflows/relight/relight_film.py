@@ -42,6 +42,7 @@ _MOST = 100.0
 _BESIDE = 110.0  # degrees of azimuth beyond which a light reaches no front of a face
 _LEAST_SOURCE = 0.05  # share of the light below which its direction says nothing
 _BEYOND = 25.0  # millimetres beyond the face, over neck, ears and scalp, in which the new light fades out
+_INNER = ("eye", "lids", "brow", "nose", "upper_lip", "lower_lip")
 _GRAZING = 0.3  # cosine to the view below which it fades out: there a tracked head and the filmed one part
 
 
@@ -330,18 +331,27 @@ def _near_face(mesh: Mesh) -> Tensor:
     regions = {} if mesh.annotations is None else mesh.annotations.regions
     if "face" not in regions:
         return torch.ones(len(mesh.vertices))
-    inner = torch.zeros(len(mesh.vertices), dtype=torch.bool)
-    inner[mesh.faces[~skin_faces(mesh)].flatten()] = True
-    face = regions["face"].cpu() | inner
-    distance = torch.cdist(mesh.vertices, mesh.vertices[face]).amin(1)
+    face = regions["face"].cpu() | _inner(mesh)
+    exact = "donot_use_mm_for_euclid_dist"
+    distance = torch.cdist(mesh.vertices, mesh.vertices[face], compute_mode=exact).amin(1)
     return (1 - distance / _BEYOND).clamp(0, 1)
 
 
+def _inner(mesh: Mesh) -> Tensor:
+    """Eyes, nose and mouth, (V,) bool."""
+    inner = torch.zeros(len(mesh.vertices), dtype=torch.bool)
+    inner[mesh.faces[~skin_faces(mesh)].flatten()] = True
+    for name, mask in ({} if mesh.annotations is None else mesh.annotations.regions).items():
+        if name.startswith(_INNER):
+            inner |= mask.cpu()
+    return inner
+
+
 def _facing(vertices: Tensor, mesh: Mesh, camera: Camera) -> Tensor:
-    """1 where the surface looks toward the camera, 0 at its outline, (V,)."""
+    """1 where the surface looks toward the camera and in the middle of the face, 0 at the outline, (V,)."""
     ways = camera.rotation.T @ -camera.translation - vertices.double()
     cosine = (vertex_normals(vertices.double(), mesh.faces) * torch.nn.functional.normalize(ways, dim=1)).sum(1)
-    return (cosine / _GRAZING).clamp(0, 1).float()
+    return torch.where(_inner(mesh), 1.0, (cosine / _GRAZING).clamp(0, 1).float())
 
 
 def _words(light: PointLight, what: str) -> str:
