@@ -137,7 +137,8 @@ def first_network(settings: Settings) -> LandmarkNetwork:
     else:
         network = zoo.get_model(_ZOO if settings.start == "zoo" else settings.start, LandmarkNetwork)
     places, mirror = dense_places()
-    if network.points == len(places):
+    if network.dense is not None and network.points == len(places):
+        network.dense.places.copy_(places)  # the performer may have changed since it learned
         return network if network.size == settings.size else network.resized(settings.size)
     with torch.random.fork_rng([]):
         torch.manual_seed(settings.network.seed)

@@ -24,7 +24,7 @@ SHARED = [*range(4, 13), *range(27, 68)]
 
 _SMOOTHING, _OTHER_SIZE, _TURNED = 1.0, 0.2, 20.0  # the second a logarithm, the third in degrees
 _JAW, _LIDS = 8.0, 6.0  # millimetres that a whole motion of the jaw and of the lids counts when points are compared
-_AHEAD = 0.0  # z of a normal: what faces back lies inside a mouth
+_AHEAD = -0.8  # z of a normal: what faces further back lies inside a mouth; edges of lids do less
 
 
 def sites_on_rig(rig: BlendshapeRig, places: Tensor) -> Attachment:
