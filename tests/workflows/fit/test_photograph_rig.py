@@ -141,6 +141,8 @@ def test_photographs_without_a_face_are_said(studio: Path, tmp_path: Path) -> No
             out,
             PhotographSettings(template=template, landmark_model=studio / "heads"),
         )
+    with pytest.raises(FileFormatError, match=r"head\.glb: found a mesh, expected photographs; torchface rig"):
+        fit_photographs([tmp_path / "head.glb"], [], studio / "heads", out)
     assert not out.exists()
 
 

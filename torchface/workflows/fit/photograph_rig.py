@@ -9,12 +9,15 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+from torchface.errors import FileFormatError
 from torchface.files.whole_files import all_or_none
 from torchface.geometry.cameras.calibration import CameraCalibration
 from torchface.geometry.cameras.pinhole import Camera
 from torchface.io import save_calibration, save_rig
 from torchface.io.images.image_files import load_image
 from torchface.io.landmarks.landmark_points import save_pts
+from torchface.io.mesh_files import MESH_ENDINGS
+from torchface.io.rig_files import SCENE_ENDINGS
 from torchface.io.video.video_file import VIDEO_ENDINGS
 from torchface.mesh import Mesh
 from torchface.modeling import FitSettings, ImageFit, fit_images, transfer_with_report
@@ -165,6 +168,9 @@ def fit_photographs(
     """
     progress, insist = progress or silent, settings.insist
     check_out(out)
+    for path in photographs:
+        if path.suffix.lower() in (*MESH_ENDINGS, *SCENE_ENDINGS):
+            raise FileFormatError(f"{path}: found a mesh, expected photographs; torchface rig makes a rig of a mesh")
     progress("reading the model")
     named = NamedHeads.of(model)
     heads, rig = matching(load_head_model(named.name), settings.template, settings.part)
