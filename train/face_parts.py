@@ -83,7 +83,8 @@ def overlaps(model: PartNetwork, pictures: StoredPartPictures) -> dict[str, floa
     generator, counts = torch.Generator().manual_seed(0), torch.zeros(len(PARTS), len(PARTS))
     for start in range(0, len(pictures), _TEST_BATCH):
         numbers = torch.arange(start, min(start + _TEST_BATCH, len(pictures)))
-        crops = part_crops(*pictures[numbers], generator, PartSettings())
+        images, parts, boxes = pictures[numbers]
+        crops = part_crops(images, parts, boxes, generator, PartSettings())
         counts += _confusion(model(crops.images).argmax(1), crops.parts)
     both = counts.diagonal()
     shares = 100 * both / (counts.sum(0) + counts.sum(1) - both).clamp(min=1)

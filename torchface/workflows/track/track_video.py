@@ -70,9 +70,11 @@ def track_video(
             dynamics prior, or the offsets are another rig's or finder's; or another run is writing into ``out``.
         NameMismatchError: a model is missing, or a prior has learned other shapes than the rig has.
     """
+    progress = progress or silent
     with within_job(out):
+        progress("reading the models")
         inputs = load_inputs(video, rig, settings or TrackSettings())
-        return _track(inputs, out, video is not None, progress or silent)
+        return _track(inputs, out, video is not None, progress)
 
 
 def _track(inputs: TrackInputs, out: Path, filmed: bool, progress: Progress) -> Tracked:

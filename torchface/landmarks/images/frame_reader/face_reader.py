@@ -188,9 +188,16 @@ class FaceReader(nn.Module):
         return torch.cat([part.flatten() for part in parts])
 
     def _unpacked(self, seen: Tensor) -> FaceReading:
-        parts = seen.split([2 * COUNT, COUNT, COUNT, 1, len(ARKIT), len(ARKIT)])
+        marks, deviation, visibility, presence, expression, uncertain = seen.split(
+            [2 * COUNT, COUNT, COUNT, 1, len(ARKIT), len(ARKIT)]
+        )
         return FaceReading(
-            parts[0].view(COUNT, 2), *parts[1:3], parts[3][0], expression=parts[4], expression_deviation=parts[5]
+            marks.view(COUNT, 2),
+            deviation,
+            visibility,
+            presence[0],
+            expression=expression,
+            expression_deviation=uncertain,
         )
 
 
