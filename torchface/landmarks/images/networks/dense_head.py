@@ -15,7 +15,13 @@ WEIGHTS = len(ARKIT)
 LEAST_SLOPE = 0.15
 """Slope of a weight as it is read over the true one, under which the weight cannot be seen."""
 
-_OWN, _SHARED, _UNDER = 3, 3, 8  # numbers read off the features of a point: its own, and those that all others see
+_OWN, _SHARED, _UNDER = 3, 2, 8  # numbers read off the features of a point: its own, and those that all others see
+_CELLS, _DEEP, _EXTENT = (
+    6,
+    4,
+    1.8,
+)  # deep features: cells a side, numbers of a cell, and half the side, of a face's size
+_FORM, _MOVE, _SURE, _SEEN = 56, 88, 16, 64  # ranks of maps to all points, and units that see where points were found
 _LEAST_VARIANCE = 1e-3  # added to those of weights: shapes that hardly moved may move
 _OFFSET = 0.1  # of the face's size, a unit of what features move a point by
 
@@ -42,8 +48,8 @@ class DenseHead(nn.Module):
     .. math:: x_p = \bar x_p + F_p g + A_p f(\bar x_p + F_p g) + B_p h
 
     with g the 68 landmarks in the face's own frame, f the features under a place, and h hidden units that see g, the
-    features under all landmarks and points, and the deepest features' mean. Weights are read off h. They are divided by
-    how far they are drawn toward their mean:
+    features under all landmarks and points, the deepest features on a grid in the face's frame, and their mean. Weights
+    are read off h and off where points were found. They are divided by how far they are drawn toward their mean:
 
     .. math:: z = (r - b) / a, \qquad r = a w + b + \varepsilon
 
@@ -59,6 +65,7 @@ class DenseHead(nn.Module):
 
     places: Tensor
     mirror: Tensor
+    cells: Tensor
     slope: Tensor
     offset: Tensor
     spread: Tensor
@@ -76,41 +83,59 @@ class DenseHead(nn.Module):
         # Of the weights of faces that it learned from: mean, and L of the precision L L^T.
         self.register_buffer("mean", torch.zeros(WEIGHTS) if expects else None)
         self.register_buffer("factor", torch.zeros(WEIGHTS, WEIGHTS) if expects else None)
-        self.form = nn.Linear(2 * COUNT, 2 * points)
+        cells = _EXTENT * torch.linspace(-1, 1, _CELLS)
+        self.register_buffer("cells", torch.cartesian_prod(cells, cells).flip(1))
+        rank = min(_FORM, 2 * points)
+        self.form = nn.Sequential(nn.Linear(2 * COUNT, rank, bias=False), nn.Linear(rank, 2 * points))
         self.local = nn.Parameter(0.05 * torch.randn(points, channels, _OWN + _SHARED))
         self.under = nn.Parameter(0.1 * torch.randn(COUNT, channels, _UNDER))
-        self.mix = nn.Linear(2 * COUNT + COUNT * _UNDER + points * _SHARED + deep, hidden)
+        self.deep = nn.Parameter(0.1 * torch.randn(_CELLS**2, deep, _DEEP))
+        self.mix = nn.Linear(2 * COUNT + COUNT * _UNDER + points * _SHARED + deep + _CELLS**2 * _DEEP, hidden)
         self.again = nn.Linear(hidden, hidden)
-        self.move = nn.Linear(hidden, 2 * points, bias=False)
-        self.sure = nn.Linear(hidden, points)
+        self.move = nn.Sequential(nn.Linear(hidden, _MOVE, bias=False), nn.Linear(_MOVE, 2 * points, bias=False))
+        self.sure = nn.Sequential(nn.Linear(hidden, _SURE, bias=False), nn.Linear(_SURE, points))
+        self.seen = nn.Linear(2 * COUNT + 2 * points + hidden, _SEEN)
         self.weights = nn.Linear(hidden, 2 * WEIGHTS)
-        nn.init.zeros_(self.form.bias)
-        nn.init.constant_(self.sure.bias, -2.0)  # a seventh of the face's size
+        self.more = nn.Linear(_SEEN, 2 * WEIGHTS, bias=False)
+        nn.init.zeros_(self.form[1].bias)
+        nn.init.zeros_(self.more.weight)
+        nn.init.constant_(self.sure[1].bias, -2.0)  # a seventh of the face's size
 
-    def forward(self, landmarks: Tensor, under: Tensor, features: Tensor, pooled: Tensor, size: int) -> DenseReading:
+    def forward(self, landmarks: Tensor, under: Tensor, features: Tensor, deep: Tensor, size: int) -> DenseReading:
         """What is read.
 
         Args:
             landmarks: iBUG's 68, (B,68,2) pixels of the crop.
             under: features under each, (B,68,C).
             features: (B,C,h,w).
-            pooled: the deepest features' mean, (B,D).
+            deep: the deepest features, (B,D,h',w').
             size: pixels a side of the crop.
         """
         middle, axes = face_frame(landmarks)
         own = in_face_frame(landmarks, landmarks).flatten(1)
         base = self.form(own).unflatten(1, (-1, 2))
-        pixels = base @ axes + middle
-        grid = (pixels[:, None] + 0.5) * (2 / size) - 1
-        sampled = grid_sample(features, grid, padding_mode="border", align_corners=False)[:, :, 0].transpose(1, 2)
-        local = _each(sampled, self.local)
-        read = [own, _each(under, self.under).flatten(1), local[..., _OWN:].flatten(1), pooled]
+        local = _each(_sampled(features, base @ axes + middle, size), self.local)
+        cells = _each(_sampled(deep, self.cells @ axes + middle, size), self.deep)
+        shared = [_each(under, self.under), local[..., _OWN:]]
+        read = [own, *(one.flatten(1) for one in shared), deep.mean((2, 3)), cells.flatten(1)]
         hidden = torch.relu(self.mix(torch.cat(read, 1)))
         hidden = hidden + torch.relu(self.again(hidden))
-        moved = base + _OFFSET * (local[..., :2] + self.move(hidden).unflatten(1, (-1, 2)))
+        apart = local[..., :2] + self.move(hidden).unflatten(1, (-1, 2))
+        moved = base + _OFFSET * apart
         deviation = (local[..., 2] + self.sure(hidden)).clamp(-8, 4).exp() * axes[:, :1].norm(dim=2)
-        raw, logarithm = self.weights(hidden).split(WEIGHTS, 1)
+        seen = torch.relu(self.seen(torch.cat([own, apart.flatten(1), hidden], 1)))
+        raw, logarithm = (self.weights(hidden) + self.more(seen)).split(WEIGHTS, 1)
         return DenseReading(moved @ axes + middle, deviation, raw, (logarithm - 2).clamp(-5, 2).exp())
+
+    @torch.no_grad()
+    def start_form(self, matrix: Tensor, base: Tensor, own: Tensor) -> None:
+        """Has points (2P,) begin as ``base`` + the part of ``matrix`` (2P,136) of its rank @ (landmarks - ``own``)."""
+        left, values, right = torch.linalg.svd(matrix, full_matrices=False)
+        rank = len(self.form[0].weight)
+        root = values[:rank].sqrt()
+        self.form[0].weight.copy_(root[:, None] * right[:rank])
+        self.form[1].weight.copy_(left[:, :rank] * root)
+        self.form[1].bias.copy_(base - self.form[1].weight @ (self.form[0].weight @ own))
 
     def unshrunk(self, raw: Tensor, deviation: Tensor) -> tuple[Tensor, Tensor]:
         """Weights (B,52) that are the true ones and noise, and the noise's deviation: infinite for those not seen."""
@@ -159,6 +184,12 @@ def in_face_frame(points: Tensor, landmarks: Tensor) -> Tensor:
     """Points (B,L,2) of faces with landmarks (B,68,2), in the faces' own frames."""
     middle, axes = face_frame(landmarks)
     return (points - middle) @ axes.transpose(1, 2) / axes.square().sum(2)[:, None]
+
+
+def _sampled(features: Tensor, pixels: Tensor, size: int) -> Tensor:
+    """Features (B,C,h,w) of crops of ``size`` pixels a side at places (B,L,2), (B,L,C)."""
+    grid = (pixels[:, None] + 0.5) * (2 / size) - 1
+    return grid_sample(features, grid, padding_mode="border", align_corners=False)[:, :, 0].transpose(1, 2)
 
 
 def _each(features: Tensor, rows: Tensor) -> Tensor:

@@ -251,33 +251,32 @@ class LandmarkNetwork(nn.Module):
         return self.read(*self.maps(crops))
 
     def maps(self, crops: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Heat maps (B,68,S/4,S/4), decoder features (B,C,S/4,S/4) and the deepest features' mean (B,D)."""
+        """Heat maps (B,68,S/4,S/4), decoder features (B,C,S/4,S/4) and the deepest features (B,D,S/16,S/16)."""
         quarter = self.quarter(self.stem(2 * crops - 1))
         eighth = self.eighth(quarter)
         deep = self.sixteenth(eighth)
-        pooled = deep.mean((2, 3))
-        deep = deep + self.context(pooled)[:, :, None, None]
-        eighth = self.mix_eighth(doubled(self.up_eighth(deep)) + eighth)
+        whole = deep + self.context(deep.mean((2, 3)))[:, :, None, None]
+        eighth = self.mix_eighth(doubled(self.up_eighth(whole)) + eighth)
         features = self.mix_quarter(doubled(self.up_quarter(eighth)) + self.skip_quarter(quarter))
-        return self.heat(features), features, pooled
+        return self.heat(features), features, deep
 
-    def read(self, heat: Tensor, features: Tensor, pooled: Tensor) -> NetworkLandmarks:
+    def read(self, heat: Tensor, features: Tensor, deep: Tensor) -> NetworkLandmarks:
         """Landmarks from what ``maps`` gives."""
-        found, dense = self.readings(heat, features, pooled)
+        found, dense = self.readings(heat, features, deep)
         if dense is None or self.dense is None:
             return found
         weights = self.dense.unshrunk(dense.raw, dense.raw_deviation)
         return NetworkLandmarks(*found[:4], dense.points, dense.point_deviation, *weights)
 
-    def readings(self, heat: Tensor, features: Tensor, pooled: Tensor) -> tuple[NetworkLandmarks, DenseReading | None]:
+    def readings(self, heat: Tensor, features: Tensor, deep: Tensor) -> tuple[NetworkLandmarks, DenseReading | None]:
         """The 68 alone, and what the head for points reads as it has learned it; None without one."""
         points, under, widening = read_heat(heat, features, STRIDE)
         local = (under[..., None] * self.local).sum(2) + self.local_bias
         deviation = (local[..., 0] + widening).exp().clamp(*DEVIATION_RANGE)
-        presence = self.presence(pooled)[:, 0].sigmoid()
+        presence = self.presence(deep.mean((2, 3)))[:, 0].sigmoid()
         found = NetworkLandmarks.of_68(points, deviation, local[..., 1].sigmoid(), presence)
         if self.dense is None:
             return found, None
         # The head describes where the 68 are; it does not move them.
-        dense = self.dense(points.detach(), under, features, pooled, self.size)
+        dense = self.dense(points.detach(), under, features, deep, self.size)
         return found, dense._replace(point_deviation=dense.point_deviation.clamp(*DEVIATION_RANGE))

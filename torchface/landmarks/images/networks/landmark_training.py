@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from functools import partial
 from pathlib import Path
 
@@ -11,6 +11,7 @@ from torch import Tensor
 from torch.nn.functional import binary_cross_entropy, smooth_l1_loss
 from torch.utils.data import Dataset
 
+from torchface.errors import ValueRangeError
 from torchface.files.content_keys import content_key
 from torchface.landmarks.images.ibug_68 import COUNT, MIRROR_68
 from torchface.landmarks.images.networks.dense_head import DenseHead, DenseReading, in_face_frame
@@ -29,7 +30,7 @@ from torchface.optim import DescentRun, DescentSettings, DescentTask, descend
 from torchface.progress import Progress, ValueLog, silent
 from torchface.shape_names import ARKIT, mirror
 
-_METHOD = "landmark network/3"
+_METHOD = "landmark network/4"
 # Pairs of landmarks whose distance is what is read off a face: how far lids and lips are open, how high brows are.
 _PAIRS = torch.tensor([[37, 41], [38, 40], [43, 47], [44, 46], [61, 67], [62, 66], [63, 65], [51, 57], [48, 54],
                        [19, 37], [24, 44]])  # fmt: skip
@@ -38,6 +39,7 @@ _OPENINGS = ((0, 1), (2, 3), (4, 5, 6), (7,), (8,), (9,), (10,))
 _HEAT = 1.0  # standard deviation of the heat map asked for, cells
 _OPENING, _SLOPE, _VARIED = 10.0, 10.0, 0.02  # weights of an opening's error and slope; squares that make a slope
 _STARTED, _RIDGE = 1024, 1e-2  # pictures, and share of their number
+_APART = 16  # steps from one time that a crop is shown to the next
 
 
 @dataclass(frozen=True)
@@ -52,6 +54,8 @@ class NetworkSettings(DescentSettings):
         expression: weight of the likelihood of blendshape weights, likewise.
         bfloat16: share of the steps, the first, whose convolutions compute in bfloat16: twice as fast on processors
             that have it.
+        shown: in how many steps each crop is shown: drawing one takes as long as learning from it. A divisor of
+            ``batch``.
         augmentation: how widely crops are drawn.
 
     Example:
@@ -66,7 +70,13 @@ class NetworkSettings(DescentSettings):
     dense: float = 1.0
     expression: float = 2.0
     bfloat16: float = 0.0
+    shown: int = 1
     augmentation: AugmentationSettings = field(default_factory=AugmentationSettings)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.shown < 1 or self.batch % self.shown:
+            raise ValueRangeError(f"shown: found {self.shown}, expected a divisor of the batch's {self.batch} crops")
 
 
 def fit_landmarks(
@@ -86,12 +96,12 @@ def fit_landmarks(
         expected += f", points ({network.points},2), their visibility, and weights ({len(ARKIT)},)"
         shapes += [(network.points, 2), (network.points,), (len(ARKIT),)]
     check_pictures(pictures, expected, *shapes)
-    if network.dense is not None and not bool(network.dense.form.bias.any()):
+    if network.dense is not None and not bool(network.dense.form[1].bias.any()):
         _start_points(network.dense, pictures)
-    names = ("pair", "opening", "heat", "dense", "expression", "bfloat16", "augmentation")
+    names = ("pair", "opening", "heat", "dense", "expression", "bfloat16", "shown", "augmentation")
     learned = {name: getattr(settings, name) for name in names}
     task = DescentTask(
-        partial(_crops, pictures, network.size, network.margin, network.mirror, settings),
+        _Drawn(pictures, network.size, network.margin, network.mirror, settings),
         partial(_loss, network, settings, device),
         content_key(_METHOD, settings=learned, config=network.config),
         "training the network",
@@ -111,21 +121,36 @@ def _start_points(head: DenseHead, pictures: Dataset[tuple[Tensor, ...]]) -> Non
     own, base = (in_face_frame(one, landmarks).flatten(1) for one in (landmarks, points))
     mean, about = own.mean(0), own - own.mean(0)
     normal = about.T @ about + _RIDGE * len(own) * torch.eye(own.shape[1])
-    head.form.weight.copy_(torch.linalg.solve(normal, about.T @ (base - base.mean(0))).T)
-    head.form.bias.copy_(base.mean(0) - head.form.weight @ mean)
+    head.start_form(torch.linalg.solve(normal, about.T @ (base - base.mean(0))).T, base.mean(0), mean)
 
 
-def _crops(
-    pictures: Dataset[tuple[Tensor, ...]],
-    size: int,
-    margin: float,
-    mirrored: Tensor,
-    settings: NetworkSettings,
-    step: int,
-) -> tuple[Crops, Tensor]:
-    """The crops of a step, and the weights (B,52) that they show; none (B,0) for a network of the 68 alone."""
-    numbers, generator = draw_numbers(pictures, settings, step)
-    return cropped(pictures[numbers], size, margin, mirrored, generator, settings.augmentation)
+@dataclass(frozen=True, eq=False)
+class _Drawn:
+    """Crops of a step, and the weights (B,52) that they show; none (B,0) for a network of the 68 alone."""
+
+    pictures: Dataset[tuple[Tensor, ...]]
+    size: int
+    margin: float
+    mirrored: Tensor
+    settings: NetworkSettings
+    kept: dict[int, tuple[Crops, Tensor]] = field(default_factory=dict)
+
+    def __call__(self, step: int) -> tuple[Crops, Tensor]:
+        steps = [step - _APART * again for again in range(self.settings.shown)]
+        for number in [one for one in self.kept if one < steps[-1]]:
+            del self.kept[number]
+        for number in set(steps) - self.kept.keys():
+            self.kept[number] = self._fresh(number)
+        crops, weights = zip(*(self.kept[one] for one in steps), strict=True)
+        return Crops(*(torch.cat([getattr(one, part.name) for one in crops]) for part in fields(Crops))), torch.cat(
+            weights
+        )
+
+    def _fresh(self, step: int) -> tuple[Crops, Tensor]:
+        numbers, generator = draw_numbers(self.pictures, self.settings, step)
+        numbers = numbers[: self.settings.batch // self.settings.shown]
+        how = self.size, self.margin, self.mirrored, generator, self.settings.augmentation
+        return cropped(self.pictures[numbers], *how)
 
 
 def cropped(
@@ -170,8 +195,8 @@ def _loss(
     truth, visible, weight = marks[:, :COUNT], seen[:, :COUNT], trusted[:, :COUNT]
     with torch.autocast(images.device.type, torch.bfloat16, enabled=share < settings.bfloat16):
         maps = network.maps(images)
-    heat, features, pooled = (one.float() for one in maps)  # places are read to a part of a pixel
-    reading, dense = network.readings(heat, features, pooled)
+    heat, features, deep = (one.float() for one in maps)  # places are read to a part of a pixel
+    reading, dense = network.readings(heat, features, deep)
     places, distance = point_loss(reading.landmarks, truth, reading.deviation, weight)
     pairs = gap_loss(reading.landmarks, truth, weight, _PAIRS, 2)
     hidden = binary_cross_entropy(reading.visibility.clamp(1e-5, 1 - 1e-5), visible, reduction="none")
