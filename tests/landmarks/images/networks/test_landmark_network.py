@@ -42,7 +42,7 @@ def test_a_heat_map_with_one_hot_cell_is_read_at_its_place(network: LandmarkNetw
     heat = torch.full((1, 68, 16, 16), -60.0)
     rows, columns = torch.arange(68) // 16 + 3, torch.arange(68) % 16
     heat[0, torch.arange(68), rows, columns] = 60.0
-    found = network.read(heat, torch.zeros(1, 16, 16, 16), torch.zeros(1, 24)).landmarks[0]
+    found = network.read(heat, torch.zeros(1, 16, 16, 16), torch.zeros(1, 24, 4, 4)).landmarks[0]
     # Four pixels a cell, pixel centres at integers: the first cell's middle is at 1.5.
     torch.testing.assert_close(found, torch.stack([4.0 * columns + 1.5, 4.0 * rows + 1.5], dim=1))
 
