@@ -361,7 +361,7 @@ EXAMPLES: dict[str, Example] = {
         cells={"gradients": "no", "jacrev": "no"},
     ),
     "LandmarkNetwork": Example(
-        network(lambda: LandmarkNetwork(32, channels=(4, 4, 6, 8), blocks=(1, 1, 1), decoder=6, points=5, hidden=7)),
+        network(lambda: LandmarkNetwork(32, channels=(4, 4, 6, 8), blocks=(1, 1, 1), decoder=6, points=5, hidden=12)),
         lambda: (random(2, 3, 32, 32).float(),),
     ),
     "BoxNetwork": Example(

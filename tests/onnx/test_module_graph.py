@@ -71,10 +71,10 @@ def test_what_iterates_until_it_is_solved_names_the_layer_that_exports(tmp_path:
 
 class Rounded(nn.Module):
     def forward(self, x: Tensor) -> Tensor:
-        return x / 0
+        return (x - x) / 0
 
 
-def test_what_is_not_finite_is_not_written(tmp_path: Path) -> None:
+def test_what_is_no_number_is_not_written(tmp_path: Path) -> None:
     with pytest.raises(ValueRangeError, match="ONNX Runtime's output differ from PyTorch's by inf"):
         export_module(Rounded(), {"x": torch.ones(2, 1)}, tmp_path / "x.onnx")
     assert not list(tmp_path.iterdir())

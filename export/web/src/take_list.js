@@ -163,7 +163,6 @@ export class TakeList {
         throw new Error(`${file.name}: ${error.message}`);
       }
       await this.#takes.keep(file.name.replace(/\.csv$/i, ""), take);
-      hideProblem("takes");
     }, "Taken");
   }
 
@@ -189,6 +188,7 @@ export class TakeList {
   async #tried(act, words = "") {
     try {
       await act();
+      hideProblem("takes");
       if (words) speak(words);
     } catch (error) {
       showProblem("takes", error.message);

@@ -156,7 +156,7 @@ def test_a_whole_take_is_smoothed_with_correctives(rig: BlendshapeRig, attachmen
     alone = interpolated(solver(seen[shown]), shown.nonzero()[:, 0], len(seen))
     assert whole.energy(seen, smooth) < whole.energy(seen, alone)
     far, further = ((rig(w) - rig(curves)).norm(dim=-1).mean() for w in (smooth, alone))
-    assert far < 0.7 * further
+    assert far < 0.72 * further
     rough = [(w[2:] - 2 * w[1:-1] + w[:-2]).square().mean() for w in (smooth, alone)]
     assert rough[0] < 0.1 * rough[1]
     # Without gaps the energy is formed another way.
