@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
 import torch
 from torch import Tensor, nn
@@ -97,9 +97,9 @@ class DenseHead(nn.Module):
         self.seen = nn.Linear(2 * COUNT + 2 * points + hidden, _SEEN)
         self.weights = nn.Linear(hidden, 2 * WEIGHTS)
         self.more = nn.Linear(_SEEN, 2 * WEIGHTS, bias=False)
-        nn.init.zeros_(self.form[1].bias)
+        nn.init.zeros_(self._form()[1].bias)
         nn.init.zeros_(self.more.weight)
-        nn.init.constant_(self.sure[1].bias, -2.0)  # a seventh of the face's size
+        nn.init.constant_(cast(nn.Linear, self.sure[1]).bias, -2.0)  # a seventh of the face's size
 
     def forward(self, landmarks: Tensor, under: Tensor, features: Tensor, deep: Tensor, size: int) -> DenseReading:
         """What is read.
@@ -130,12 +130,20 @@ class DenseHead(nn.Module):
     @torch.no_grad()
     def start_form(self, matrix: Tensor, base: Tensor, own: Tensor) -> None:
         """Has points (2P,) begin as ``base`` + the part of ``matrix`` (2P,136) of its rank @ (landmarks - ``own``)."""
+        narrow, wide = self._form()
         left, values, right = torch.linalg.svd(matrix, full_matrices=False)
-        rank = len(self.form[0].weight)
-        root = values[:rank].sqrt()
-        self.form[0].weight.copy_(root[:, None] * right[:rank])
-        self.form[1].weight.copy_(left[:, :rank] * root)
-        self.form[1].bias.copy_(base - self.form[1].weight @ (self.form[0].weight @ own))
+        root = values[: narrow.out_features].sqrt()
+        narrow.weight.copy_(root[:, None] * right[: len(root)])
+        wide.weight.copy_(left[:, : len(root)] * root)
+        wide.bias.copy_(base - wide.weight @ (narrow.weight @ own))
+
+    @property
+    def started(self) -> bool:
+        """Whether points have a form to begin with, by :meth:`start_form` or by learning."""
+        return bool(self._form()[1].bias.any())
+
+    def _form(self) -> tuple[nn.Linear, nn.Linear]:
+        return cast(nn.Linear, self.form[0]), cast(nn.Linear, self.form[1])
 
     def unshrunk(self, raw: Tensor, deviation: Tensor) -> tuple[Tensor, Tensor]:
         """Weights (B,52) that are the true ones and noise, and the noise's deviation: infinite for those not seen."""

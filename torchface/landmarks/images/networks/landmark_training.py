@@ -96,7 +96,7 @@ def fit_landmarks(
         expected += f", points ({network.points},2), their visibility, and weights ({len(ARKIT)},)"
         shapes += [(network.points, 2), (network.points,), (len(ARKIT),)]
     check_pictures(pictures, expected, *shapes)
-    if network.dense is not None and not bool(network.dense.form[1].bias.any()):
+    if network.dense is not None and not network.dense.started:
         _start_points(network.dense, pictures)
     names = ("pair", "opening", "heat", "dense", "expression", "bfloat16", "shown", "augmentation")
     learned = {name: getattr(settings, name) for name in names}
