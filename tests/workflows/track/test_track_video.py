@@ -110,7 +110,7 @@ def done(filmed: Filmed, tmp_path_factory: pytest.TempPathFactory) -> Done:
     out = tmp_path_factory.mktemp("tracked") / "out"
     settings = TrackSettings(camera=filmed.camera)
 
-    def killed(what: str, frames: int, total: int) -> None:
+    def killed(what: str, frames: int = 0, total: int = 0) -> None:
         if what == "tracking landmarks" and frames == 2 * PIECE + 2:
             raise KeyboardInterrupt
 
