@@ -1,6 +1,6 @@
 """A performer made by code: head, identities, expressions, skin; and the character that is shown of it."""
 
-from torchface.synthetic.head.character import Character, character
+from torchface.synthetic.head.embedded_character import Character, character
 from torchface.synthetic.head.identity import IDENTITY, IdentityParameter, draw_identities
 from torchface.synthetic.head.neutral_head import neutral_head
 from torchface.synthetic.head.performer import performer

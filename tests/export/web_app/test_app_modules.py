@@ -96,14 +96,14 @@ def test_names_of_other_programs_are_recognised_by_the_same_tables(run: Run) -> 
         "V_Open",
         "",
     ]
-    told = run("tables", names)
+    answer = run("tables", names)
     table: dict[str, list[str]] = {}
     for words, arkit in recognised_names._table().items():
         table.setdefault(arkit, []).append(" ".join(words))
-    assert told["RECOGNISED"] == table
-    assert told["names"] == [recognised_names.arkit_name(name) for name in names]
-    assert told["VRM_POSES"] == VRM1.poses
-    assert told["VRM_BOTH"] == {whole: list(two) for whole, two in VRM1.both.items()}
+    assert answer["RECOGNISED"] == table
+    assert answer["names"] == [recognised_names.arkit_name(name) for name in names]
+    assert answer["VRM_POSES"] == VRM1.poses
+    assert answer["VRM_BOTH"] == {whole: list(two) for whole, two in VRM1.both.items()}
 
 
 def test_expressions_of_a_vrm_animation_are_those_that_vmc_sends(run: Run) -> None:

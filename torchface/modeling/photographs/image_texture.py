@@ -28,7 +28,7 @@ from torchface.rendering.clay_shading import sample_texture
 from torchface.rendering.environment_light import EnvironmentLight
 from torchface.rendering.raycast import RayCaster
 
-_BARE = 0.7  # share of skin from which a vertex tells the light
+_BARE = 0.7  # share of skin from which a vertex counts for the light
 _MIN_DIAMETER = 14.0  # across an eyeball; of smaller ones a photograph shows no iris
 _SHARE = (0.15, 0.40)
 """Of the eyeball between the lids, the darkest first: lashes and pupil, then the iris, then white and highlights."""

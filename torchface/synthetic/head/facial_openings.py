@@ -143,7 +143,7 @@ def mouth_rings(border: Tensor, onto_form: OntoForm) -> Tensor:
     sign = torch.where(is_upper, 1.0, -1.0).double()
     sign[HALF_LIP] = 0.0
     open_share = (1 - spread**3).clamp(min=0.0)
-    # Close behind the lips, then out into the cheeks, so that teeth and gums have room.
+    # Close behind the lips, then out into the cheeks, so that teeth and gums have their place.
     for drop, back, wide in (
         (0.9, 2.6, 1.0), (4.0, 4.6, 1.0), (9.0, 5.6, 1.03), (14.0, 8.0, 1.10),
         (19.0, 18.0, 1.30), (20.0, 34.0, 1.40), (14.0, 54.0, 1.20),
