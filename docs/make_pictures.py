@@ -21,6 +21,7 @@ from torchface.rendering.point_light import PointLight, vertex_albedo
 from torchface.rendering.texture_overlay import FacePaint, overlay, relight
 from torchface.shape_names import ARKIT, mapping
 from torchface.synthetic import IDENTITY, Character, Look, character, draw_identities, performer
+from torchface.synthetic.head.embedded_character import shown_rig
 from torchface.synthetic.stages.scanner import eyes_closed, scan_head
 from torchface.viz.figures.face_views import FRONT, PROFILE, THREE_QUARTER, clay_colors, face_views, frame_face
 from torchface.viz.figures.registration_views import registration_sheet
@@ -92,7 +93,7 @@ def registration_picture() -> torch.Tensor:
 
 def fit_picture() -> torch.Tensor:
     """Three photographs of another head, the head fitted to them, and its rig in views no photograph shows."""
-    actor = performer(draw_identities(1, torch.Generator().manual_seed(21))[0])
+    actor = shown_rig(performer(draw_identities(1, torch.Generator().manual_seed(21))[0], texture=False))
     weights = torch.zeros(1, len(actor.names))
     weights[0, actor.index(["mouthSmileLeft", "mouthSmileRight"])] = 0.7
     smiling = actor.neutral.with_vertices(actor(weights)[0])
@@ -124,7 +125,7 @@ def fit_picture() -> torch.Tensor:
 
 def relight_picture() -> torch.Tensor:
     """A frame of a video, the same with mirrored light, and with face paint in the frame's light."""
-    rig = performer(draw_identities(1, torch.Generator().manual_seed(5))[0])
+    rig = shown_rig(performer(draw_identities(1, torch.Generator().manual_seed(5))[0], texture=False))
     weights = torch.zeros(1, len(rig.names))
     weights[0, rig.index(["mouthSmileLeft", "mouthSmileRight", "cheekSquintLeft", "cheekSquintRight"])] = 0.55
     planted = PointLight(

@@ -57,10 +57,10 @@ def shoot(chromium: Any, rig: BlendshapeRig, path: Path) -> None:
 @pytest.mark.browser
 @pytest.mark.skipif(FOLDER is None, reason="set TORCHFACE_PICTURES to the folder that the README's pictures lie in")
 def test_the_picture_is_small_enough_for_a_readme(chromium: Any) -> None:
-    from torchface.synthetic import performer
+    from torchface.synthetic import character
 
     assert FOLDER is not None
     path = Path(FOLDER) / "viewer.png"
     path.parent.mkdir(parents=True, exist_ok=True)
-    shoot(chromium, performer(), path)
+    shoot(chromium, character().rig, path)
     assert path.stat().st_size < 400_000

@@ -92,6 +92,14 @@ def character(rig: BlendshapeRig | None = None, look: Look | None = None, size: 
     return Character(BlendshapeRig(neutral, deltas.float(), names), maps.surface)
 
 
+def shown_rig(rig: BlendshapeRig, size: int = 1024) -> BlendshapeRig:
+    """The character of a performer's rig, with the rig's shapes alone; a rig of another topology as it is."""
+    quads = rig.neutral.polygons
+    if quads is None or not torch.equal(quads, topology().quads):
+        return rig
+    return character(rig, size=size).rig.select(rig.names)
+
+
 def _mesh(skin: Mesh, vertices: Tensor, parts: dict[str, HeadPart], color: Tensor) -> Mesh:
     """The mesh of skin and parts, with annotations of both."""
     flat, notes = unwrapping(), skin.annotations or Annotations()

@@ -40,6 +40,7 @@ from torchface.progress import Progress, silent
 from torchface.rig import BlendshapeRig
 from torchface.shape_names import ARKIT, mapping
 from torchface.synthetic import draw_identities, performer
+from torchface.synthetic.head.embedded_character import shown_rig
 from torchface.synthetic.stages.makeup_layout import MakeupLayout, makeup_layout
 from torchface.synthetic.stages.marker_stage import Recording, StageFlaws, place_markers, record
 from torchface.synthetic.stages.weight_curves import perform
@@ -133,12 +134,12 @@ class DemoResult:
 def embedded_scene(seed: int, frames: int = 1800) -> Scene:
     """The mean performer's rig, a performer drawn at random, and a synthetic performance."""
     generator = torch.Generator().manual_seed(seed)
-    truth = performer(draw_identities(1, generator)[0])
+    truth = shown_rig(performer(draw_identities(1, generator)[0], texture=False))
     weights = perform(frames, generator)
     assert weights.weights is not None
     return Scene(
         f"The embedded performer, head {seed}",
-        performer(),
+        shown_rig(performer(texture=False)),
         truth.neutral,
         truth,
         truth.weights_from(weights.weights),
