@@ -14,9 +14,11 @@ from torchface.geometry.similarity import similarity_transform
 from torchface.mesh import Annotations, Mesh
 from torchface.rig import BlendshapeRig
 from torchface.synthetic.head.hair import GrownPart, brow_hairs, lashes, scalp_hair
+from torchface.synthetic.head.hair_locks import hair_locks
 from torchface.synthetic.head.handle_weights import handle_weights
 from torchface.synthetic.head.identity import mean_vertices
 from torchface.synthetic.head.performer import performer
+from torchface.synthetic.head.shirt import about_neck, shirt
 from torchface.synthetic.head.skin_maps import Look, skin_maps
 from torchface.synthetic.head.teeth_and_tongue import HeadPart, mouth_parts, tongue_out
 from torchface.synthetic.head.topology import MOUTH_CONTACT, topology
@@ -25,6 +27,7 @@ from torchface.synthetic.head.uv_layout import unwrapping
 _OPEN_FOR_TONGUE = 0.33  # of jawOpen, without which the tongue would go through the teeth
 _WITH_THE_JAW = ("teeth_lower", "gums_lower", "tongue")
 _STILL = 0.01  # millimetres
+_CAP = {"short": 0.6, "long": 0.18, "tied": 0.2}
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,9 +77,18 @@ def character(rig: BlendshapeRig | None = None, look: Look | None = None, size: 
     for name, part in mouth_parts().items():
         parts[name] = part
         pieces[name] = mouth.placed(part.vertices, name in _WITH_THE_JAW)
-    for name, grown in (("hair", scalp_hair()), ("brow_hair", brow_hairs()), ("lash_hair", lashes())):
+    look = look or Look()
+    locks = hair_locks(look.haircut)
+    for name, grown in (
+        ("hair", scalp_hair(_CAP[look.haircut])),
+        ("hair_locks", locks),
+        ("brow_hair", brow_hairs()),
+        ("lash_hair", lashes()),
+    ):
         parts[name] = grown.part
         pieces[name] = _grown(grown, skin, moved)
+    parts["shirt"] = shirt()
+    pieces["shirt"] = about_neck(shirt().vertices, skin), torch.zeros(len(moved), len(shirt().vertices), 3).double()
     vertices = torch.cat([points for points, _ in pieces.values()])
     deltas = torch.cat([motion for _, motion in pieces.values()], 1)
     deltas[deltas.norm(dim=-1) < _STILL] = 0
@@ -87,7 +99,7 @@ def character(rig: BlendshapeRig | None = None, look: Look | None = None, size: 
         tongue = slice(start, start + len(pieces["tongue"][0]))
         out[tongue] = mouth.place(tongue_out()) - vertices[tongue]
         deltas, names = torch.cat([deltas, out[None]]), (*names, "tongueOut")
-    maps = skin_maps(look or Look(), size)
+    maps = skin_maps(look, size)
     neutral = _mesh(rig.neutral, vertices, parts, maps.color)
     return Character(BlendshapeRig(neutral, deltas.float(), names), maps.surface)
 

@@ -73,9 +73,13 @@ def locks(points: Tensor) -> Tensor:
     return 0.65 * noise(at, 5.0, 24) + 0.35 * noise(at, 2.2, 25)
 
 
-@lru_cache(maxsize=1)
-def scalp_hair() -> GrownPart:
-    """The cap: the scalp's quads cut finer and raised by the hair's height; it has the scalp's place on the page."""
+@lru_cache(maxsize=2)
+def scalp_hair(thick: float) -> GrownPart:
+    """The cap under the locks: the scalp's quads cut finer and raised; it has the scalp's place on the page.
+
+    Args:
+        thick: how much of the height of cropped hair it has.
+    """
     t, flat, v = topology(), unwrapping(), mean_vertices()
     normals = vertex_normals(v, fan_triangulation(t.quads))
     bare = torch.zeros(t.count, dtype=torch.bool)
@@ -100,9 +104,8 @@ def scalp_hair() -> GrownPart:
     hosts = quads.repeat_interleave(len(blend), 0)
     points, ways, weights, hosts = points[first], ways[first], weights[first], hosts[first]
     amount = hair_share(points)
-    height = (
-        amount * _height(points) + 2.2 * locks(points) * amount.sqrt() * ramp(amount, 0, 0.5) - 0.7 * (1 - amount) ** 6
-    )
+    waves = 2.2 * locks(points) * amount.sqrt() * ramp(amount, 0, 0.5)
+    height = thick * (amount * _height(points) + waves) - 0.7 * (1 - amount) ** 6
     cap = HeadPart(points + height[:, None] * ways, index[whole], uvs[whole].float())
     return GrownPart(cap, hosts, weights)
 

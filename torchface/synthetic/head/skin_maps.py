@@ -13,7 +13,9 @@ from torchface.geometry.meshes.normal_maps import SurfaceMaps
 from torchface.geometry.meshes.rasterization import TexelMap, rasterise_uvs
 from torchface.mesh import fan_triangulation
 from torchface.synthetic.head.hair import HAIR_PATCH, flow, hair_share
+from torchface.synthetic.head.hair_locks import LOCK_PATCH, Style, strand_shade
 from torchface.synthetic.head.identity import mean_vertices, ramp
+from torchface.synthetic.head.shirt import SHIRT_PATCH, cloth
 from torchface.synthetic.head.skin_texture import (
     blob,
     brow_line,
@@ -39,9 +41,10 @@ class Look:
     Args:
         melanin: pigment of the skin, from 0, northern European, to 1, the darkest.
         age: of the skin, years.
-        hair, iris: sRGB in [0,1].
+        hair, iris, shirt: sRGB in [0,1].
         lips: how much redder than the skin the lips are, 1 as usual.
         freckles: how strong they are, 1 as usual.
+        haircut: "short", "long" to the shoulders, or "tied" at the back.
 
     Example:
         >>> Look(age=70.0, hair=(0.6, 0.6, 0.6)).melanin
@@ -54,6 +57,8 @@ class Look:
     iris: tuple[float, float, float] = (0.33, 0.24, 0.14)
     lips: float = 1.0
     freckles: float = 1.0
+    haircut: Style = "short"
+    shirt: tuple[float, float, float] = (0.23, 0.28, 0.34)
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,7 +83,7 @@ def skin_maps(look: Look, size: int = 2048) -> SkinMaps:
     ball = eyeball > 0.5
     old = max(0.0, (look.age - 32.0) / 40.0)
     creases = _creases(p) * old
-    color = _pigmented(skin_color(p, marks, look.freckles, look.lips), look.melanin)
+    color = _pigmented(skin_color(p, marks, look.freckles, 0.75 * look.lips), look.melanin)
     color = color * (1 - 0.22 * creases.clamp(0, 1))[:, None]
     color = mix(color, (0.42, 0.27, 0.19), 0.35 * min(old, 1.0) * ramp(noise(p, 3.2, 41), 0.62, 0.85))
     strand = _strands(p)
@@ -90,6 +95,7 @@ def skin_maps(look: Look, size: int = 2048) -> SkinMaps:
     color = inner_color(color, marks)
     color[ball] = eye_color(p[ball], look.iris)
     height = _height(p, lips, hair, strand, old) - 0.30 * creases
+    height = height + _neck(p) * (1 - ramp(hair, 0.0, 0.3))
     height = height * (1 - ramp(eyeball + socket + mouth + nostril, 0.1, 0.4))
     rough = _roughness(p, lips, mouth, hair, lash, ball)
     images = texels.image(torch.cat([color.clamp(0, 1), rough[:, None]], 1))
@@ -156,6 +162,19 @@ def _height(p: Tensor, lips: Tensor, hair: Tensor, strand: Tensor, old: float) -
     )
 
 
+def _neck(p: Tensor) -> Tensor:
+    """Relief of the throat, millimetres, (M,): the muscle from the ear to the breastbone, the larynx, the windpipe."""
+    folded = torch.cat([p[:, :1].abs(), p[:, 1:]], 1)
+    start, end = torch.tensor([[50.0, -48.0, -24.0], [11.0, -168.0, 24.0]])
+    along = ((folded - start) @ (end - start) / (end - start).square().sum()).clamp(0, 1)
+    apart = (folded - start - along[:, None] * (end - start)).norm(dim=1)
+    muscle = 5.0 * torch.exp(-((apart / 8.5) ** 2)) * ramp(along, 0.05, 0.3)
+    front = (p[:, 2] > -20) * ramp(-p[:, 1], 96, 108)
+    larynx = 4.5 * torch.exp(-((p[:, 0] / 8.0) ** 2) - ((p[:, 1] + 124) / 10.0) ** 2)
+    windpipe = 1.6 * torch.exp(-((p[:, 0] / 11.0) ** 2)) * ramp(-p[:, 1], 118, 140)
+    return muscle + (larynx + windpipe) * front
+
+
 def _roughness(p: Tensor, lips: Tensor, mouth: Tensor, hair: Tensor, lash: Tensor, ball: Tensor) -> Tensor:
     rough = 0.60 - 0.14 * blob(p, (4, -20, 100), (14, 26, 26)) - 0.08 * blob(p, (0, 40, 92), (34, 20, 40))
     rough = rough + 0.05 * noise(p, 2.0, 34)
@@ -183,7 +202,12 @@ def _normals(texels: TexelMap, p: Tensor, height: Tensor) -> Tensor:
 def _paint_parts(color: Tensor, rough: Tensor, look: Look) -> None:
     """Teeth, gums, tongue and single hairs on their rectangles of the page; coordinates run right and up in them."""
     size = color.shape[1]
-    for name, (left, low, right, high) in {**PAGE, "hair": HAIR_PATCH}.items():
+    for name, (left, low, right, high) in {
+        **PAGE,
+        "hair": HAIR_PATCH,
+        "locks": LOCK_PATCH,
+        "shirt": SHIRT_PATCH,
+    }.items():
         rows = torch.arange(int((1 - high) * size) - _MARGIN, int((1 - low) * size) + _MARGIN)
         columns = torch.arange(int(left * size) - _MARGIN, int(right * size) + _MARGIN)
         v = ((1 - (rows + 0.5) / size - low) / (high - low)).clamp(0, 1)[:, None].expand(-1, len(columns))
@@ -191,7 +215,14 @@ def _paint_parts(color: Tensor, rough: Tensor, look: Look) -> None:
         at = torch.stack([u.flatten(), v.flatten(), torch.zeros(u.numel())], 1)
         paint = _PART_PAINT[name](at, look)
         color[:, rows[:, None], columns] = paint.T.view(3, *u.shape).clamp(0, 1)
-        rough[:, rows[:, None], columns] = {"teeth": 0.2, "gums": 0.3, "tongue": 0.4, "hair": 0.6}[name]
+        rough[:, rows[:, None], columns] = {
+            "teeth": 0.2,
+            "gums": 0.3,
+            "tongue": 0.4,
+            "hair": 0.6,
+            "locks": 0.5,
+            "shirt": 0.9,
+        }[name]
 
 
 def _teeth(at: Tensor, look: Look) -> Tensor:
@@ -224,4 +255,12 @@ def _hairs(at: Tensor, look: Look) -> Tensor:
     return 1.05 * torch.tensor(look.hair) * shade[:, None]
 
 
-_PART_PAINT = {"teeth": _teeth, "gums": _gums, "tongue": _tongue, "hair": _hairs}
+def _locks(at: Tensor, look: Look) -> Tensor:
+    return torch.tensor(look.hair) * strand_shade(at[:, 0], 1 - at[:, 1])[:, None]
+
+
+def _shirt(at: Tensor, look: Look) -> Tensor:
+    return torch.tensor(look.shirt) * cloth(at)[:, None]
+
+
+_PART_PAINT = {"teeth": _teeth, "gums": _gums, "tongue": _tongue, "hair": _hairs, "locks": _locks, "shirt": _shirt}
