@@ -13,12 +13,11 @@ import onnxruntime
 import torch
 from torch import Tensor
 
-from torchface.capture.anybody import ExampleSolver, SolvedSimilarity
+from torchface.capture.anybody import ExampleSolver
 from torchface.errors import ValueRangeError
 from torchface.files.whole_files import write_file
-from torchface.onnx.checked_export import WrittenGraph
-from torchface.onnx.example_graph import STEPS, STEPS_AT_ONCE, example_model
-from torchface.onnx.placed_example_graph import placed_example_model
+from torchface.onnx.checked_export import WrittenGraph, one_thread_session
+from torchface.onnx.example_graph import STEPS, example_model
 
 _FRAMES, _FRAMES_A_POSE = 200, 10
 _NOISE = 0.005  # of the eyes' distance
@@ -78,7 +77,6 @@ def export_example_solver(
     solver: ExampleSolver,
     path: str | Path,
     steps: int = STEPS,
-    steps_at_once: int = STEPS_AT_ONCE,
     landmarks: Tensor | None = None,
     facts: Mapping[str, object] | None = None,
 ) -> ExampleReport:
@@ -91,7 +89,7 @@ def export_example_solver(
         solver: of squared distances, or of a landmark model; with landmark boxes, or all at once with the similarity
             solved for.
         path: the file to write; it appears only when it is complete and checked.
-        steps, steps_at_once: of splitting, with landmark boxes.
+        steps: of splitting.
         landmarks: frames to check with, (T,68,2), none missing; random sparse weights with noise if absent.
         facts: further metadata.
 
@@ -107,15 +105,8 @@ def export_example_solver(
         True
     """
     exact = copy.deepcopy(solver).cpu()
-    if isinstance(exact.placement, SolvedSimilarity):
-        model = placed_example_model(exact, facts=facts)
-    else:
-        model = example_model(exact, steps, steps_at_once, facts=facts)
-    content = model.SerializeToString()
-    options = onnxruntime.SessionOptions()
-    options.intra_op_num_threads = options.inter_op_num_threads = 1
-    options.log_severity_level = 3  # of what a branch leaves out
-    session = onnxruntime.InferenceSession(content, options, providers=["CPUExecutionProvider"])
+    content = example_model(exact, steps, facts).SerializeToString()
+    session = one_thread_session(content)
     frames = _random_frames(exact) if landmarks is None else landmarks.detach().cpu().float()
     hidden = torch.rand(frames.shape[:2], generator=torch.Generator().manual_seed(1)) < _HIDDEN
     missing = torch.where(hidden[..., None], torch.nan, frames)

@@ -2,20 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import json
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import onnx
 import torch
-from onnx import TensorProto, numpy_helper
+from onnx import TensorProto, helper, numpy_helper
 from torch import Tensor
 
 from torchface import __version__
 from torchface.landmarks.images.trees.landmark_trees import FAINTEST, LandmarkTrees
 from torchface.onnx.checked_export import ExportReport, write_checked
-from torchface.onnx.graph_builder import GraphBuilder
+from torchface.onnx.operator_set import IR_VERSION, OPSET
 
 PixelType = Literal["uint8", "float32"]
 """What the image's values are: 0 to 255, or [0,1]."""
@@ -23,13 +24,57 @@ PixelType = Literal["uint8", "float32"]
 _PARITY = 0.1  # pixels; a rounding error may read the pixel beside, which moves a face by some hundredths
 
 
-class _IntegerBuilder(GraphBuilder):
-    """A builder that also keeps integers of few bytes."""
+class _Graph:
+    """Nodes and constants of a graph, written node by node.
+
+    The exported module takes 3.5 times as long: its exporter makes of reads in tables what ONNX Runtime is slow at.
+    """
+
+    def __init__(self) -> None:
+        self._nodes: list[onnx.NodeProto] = []
+        self._constants: dict[str, onnx.TensorProto] = {}
 
     def stored(self, name: str, values: Tensor) -> str:
         """A constant of the tensor's own type."""
-        self._root._constants[name] = numpy_helper.from_array(np.ascontiguousarray(values.numpy()), name)
+        array = np.ascontiguousarray(values.detach().cpu().numpy())
+        self._constants[name] = numpy_helper.from_array(array, name)
         return name
+
+    def constant(self, name: str, value: Tensor | float | Sequence[int]) -> str:
+        """A float32 constant; integers, given as a sequence, stay int64."""
+        if isinstance(value, Tensor):
+            return self.stored(name, value.float())
+        return self.stored(name, torch.tensor(value, dtype=torch.float32 if isinstance(value, float) else torch.int64))
+
+    def op(self, kind: str, *inputs: str, output: str | None = None, **attributes: Any) -> str:
+        """Adds a node with one output and returns the output's name; axes to reduce may be an attribute."""
+        if "axes" in attributes:
+            axes = attributes.pop("axes")
+            inputs = (*inputs, self.constant(f"axes {axes}", axes))
+        output = output or f"v{len(self._nodes)}"
+        self._nodes.append(helper.make_node(kind, list(inputs), [output], **attributes))
+        return output
+
+    def model(
+        self, inputs: Mapping[str, tuple[int, Sequence[int | str]]], landmarks: int, facts: Mapping[str, object]
+    ) -> onnx.ModelProto:
+        """The checked model.
+
+        Args:
+            inputs: type and shape of each.
+            landmarks: how many it finds.
+            facts: metadata; what is not text becomes JSON.
+        """
+        given = [helper.make_tensor_value_info(name, kind, list(shape)) for name, (kind, shape) in inputs.items()]
+        found = helper.make_tensor_value_info("landmarks", TensorProto.FLOAT, ["faces", landmarks, 2])
+        graph = helper.make_graph(self._nodes, "landmark_trees", given, [found], list(self._constants.values()))
+        model = helper.make_model(graph, producer_name="torchface", opset_imports=[helper.make_opsetid("", OPSET)])
+        model.ir_version = IR_VERSION
+        helper.set_model_props(
+            model, {key: value if isinstance(value, str) else json.dumps(value) for key, value in facts.items()}
+        )
+        onnx.checker.check_model(model, full_check=True)
+        return model
 
 
 def export_landmark_trees(
@@ -71,7 +116,7 @@ def landmark_trees_model(
     model: LandmarkTrees, facts: Mapping[str, object] | None = None, pixels: PixelType = "uint8"
 ) -> onnx.ModelProto:
     """The graph."""
-    build = _IntegerBuilder()
+    build = _Graph()
     op, constant = build.op, build.constant
     count = len(model.mean)
     mean = model.mean - model.mean.mean(0)
@@ -120,28 +165,26 @@ def landmark_trees_model(
         shapes = op("Add", shapes, moved)
     found = op("Where", usable, shapes, constant("nothing", float("nan")))
     op("Reshape", found, "points", output="landmarks")
-    graph = build.model(
-        "landmark_trees",
-        {"image": ("height", "width"), "boxes": ("faces", 4)},
-        {"landmarks": ("faces", count, 2)},
+    byte = pixels == "uint8"
+    return build.model(
+        {
+            "image": (TensorProto.UINT8 if byte else TensorProto.FLOAT, ("height", "width")),
+            "boxes": (TensorProto.FLOAT, ("faces", 4)),
+        },
+        count,
         {
             "task": "face_landmarks",
             "landmarks": "iBUG 68" if count == 68 else str(count),
-            "image": "grey, 0 to 255" if pixels == "uint8" else "grey, 0 to 1",
+            "image": "grey, 0 to 255" if byte else "grey, 0 to 1",
             "boxes": "x, y, width, height in pixels, as OpenCV's face detector gives them",
             "units": "pixels",
             "version": __version__,
             **(facts or {}),
         },
     )
-    if pixels == "uint8":
-        graph.graph.input[0].type.tensor_type.elem_type = TensorProto.UINT8
-        del graph.graph.value_info[:]
-        onnx.checker.check_model(graph, full_check=True)
-    return graph
 
 
-def _start(build: _IntegerBuilder, model: LandmarkTrees) -> str:
+def _start(build: _Graph, model: LandmarkTrees) -> str:
     """The mean shape in each box, (B,2L), as one product: box middle and side are linear in what follows."""
     op, constant = build.op, build.constant
     count = len(model.mean)
@@ -158,7 +201,7 @@ def _start(build: _IntegerBuilder, model: LandmarkTrees) -> str:
     )
 
 
-def _leaves(build: _IntegerBuilder, model: LandmarkTrees, cascade: int, grey: str) -> str:
+def _leaves(build: _Graph, model: LandmarkTrees, cascade: int, grey: str) -> str:
     """The sum (B,1,K) of the leaves that grey values (B,P) lead to: all trees go down a level together."""
     op = build.op
     trees, depth = model.sizes["trees"], model.sizes["depth"]
