@@ -53,10 +53,11 @@ def hair_locks(style: Style) -> GrownPart:
         sides.append(torch.nn.functional.normalize(torch.linalg.cross(way, up), dim=1))
         ups.append(up)
         if row + 1 < rows:
-            points.append(_held(style, here + step[:, None] * way, height[:, row + 1]))
+            stride = step * (0.35 + 1.3 * row / (rows - 2))  # short at first, where the head curves
+            points.append(_held(style, here + stride[:, None] * way, height[:, row + 1]))
     line = torch.stack(points, 1)
     for _ in range(3):  # evens out where they were pushed
-        line[:, 1:-1] = 0.5 * line[:, 1:-1] + 0.25 * (line[:, :-2] + line[:, 2:])
+        line[:, 2:-1] = 0.5 * line[:, 2:-1] + 0.25 * (line[:, 1:-2] + line[:, 3:])
     width = _widths(style, roots, rows) * (1 + 0.2 * jitter[:, 2:].clamp(-1.5, 1.5))
     part = _strips(line, torch.stack(sides, 1), (1.0 if style == "short" else 0.5) * torch.stack(ups, 1), width)
     hosts, weights = hosts.repeat_interleave(3 * rows, 0), weights.repeat_interleave(3 * rows, 0)
@@ -238,4 +239,4 @@ def strand_shade(across: Tensor, along: Tensor) -> Tensor:
     """Light and dark of strands on the locks' patch, at shares (M,) across it and along from the root, about 1."""
     at = torch.stack([across * 90, along * 5, 0 * along], 1)
     fine = 0.55 * noise(at, 1.0, 61) + 0.35 * noise(at * torch.tensor([0.35, 1.0, 1.0]), 1.0, 62)
-    return (0.70 + 0.45 * ramp(along, 0.0, 0.55)) * (1 + 0.42 * fine)
+    return (0.74 + 0.45 * ramp(along, 0.0, 0.55)) * (1 + 0.5 * fine)

@@ -100,8 +100,9 @@ def skin_maps(look: Look, size: int = 2048) -> SkinMaps:
     rough = _roughness(p, lips, mouth, hair, lash, ball)
     images = texels.image(torch.cat([color.clamp(0, 1), rough[:, None]], 1))
     color_image, rough_image = images[:3], images[3:]
-    _paint_parts(color_image, rough_image, look)
-    return SkinMaps(color_image, SurfaceMaps(_normals(texels, p, height), rough_image))
+    normals = _normals(texels, p, height)
+    _paint_parts(color_image, rough_image, normals, look)
+    return SkinMaps(color_image, SurfaceMaps(normals, rough_image))
 
 
 @lru_cache(maxsize=1)
@@ -199,7 +200,7 @@ def _normals(texels: TexelMap, p: Tensor, height: Tensor) -> Tensor:
     return torch.nn.functional.normalize(normals, dim=0)
 
 
-def _paint_parts(color: Tensor, rough: Tensor, look: Look) -> None:
+def _paint_parts(color: Tensor, rough: Tensor, normals: Tensor, look: Look) -> None:
     """Teeth, gums, tongue and single hairs on their rectangles of the page; coordinates run right and up in them."""
     size = color.shape[1]
     for name, (left, low, right, high) in {
@@ -215,12 +216,17 @@ def _paint_parts(color: Tensor, rough: Tensor, look: Look) -> None:
         at = torch.stack([u.flatten(), v.flatten(), torch.zeros(u.numel())], 1)
         paint = _PART_PAINT[name](at, look)
         color[:, rows[:, None], columns] = paint.T.view(3, *u.shape).clamp(0, 1)
+        if name == "locks":  # strands catch the light one by one
+            shade = paint.mean(1).view(u.shape)
+            tilt = 1.1 * torch.gradient(shade / shade.mean(), dim=1)[0]
+            normals[0, rows[:, None], columns] = -tilt
+            normals[2, rows[:, None], columns] = (1 - tilt.square().clamp(max=0.8)).sqrt()
         rough[:, rows[:, None], columns] = {
             "teeth": 0.2,
             "gums": 0.3,
             "tongue": 0.4,
             "hair": 0.6,
-            "locks": 0.5,
+            "locks": 0.58,
             "shirt": 0.9,
         }[name]
 
