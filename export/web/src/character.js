@@ -8,6 +8,7 @@ import { checkCharacter } from "./character_check.js";
 import { characterLoader } from "./character_loader.js";
 import { CharacterError } from "./glb_container.js";
 import { upright } from "./head_angles.js";
+import { wrinkleMaps } from "./wrinkle_maps.js";
 
 export const NECKS = 0.3; // of the head's rotation, where there is a neck
 const STILL = 1e-6; // of the character's size: what moves less does not move
@@ -27,14 +28,16 @@ export async function readCharacter(bytes, name, sources = null, changed = {}) {
   const check = checkCharacter(bytes, sources, changed);
   let gltf;
   const nodes = new Map();
+  let wrinkles;
   try {
     gltf = await (await characterLoader(check.document)).parseAsync(bytes, "");
     for (const [part, node] of Object.entries(characterBones(check.document)))
       nodes.set(part, { node, object: await gltf.parser.getDependency("node", node) });
+    wrinkles = await wrinkleMaps(gltf, check.document);
   } catch (error) {
     throw new CharacterError(`The character cannot be read (${error.message ?? error}). Export it once more.`);
   }
-  return new Character(gltf, check, nodes, { bytes, name, sources, changed });
+  return new Character(gltf, check, nodes, wrinkles, { bytes, name, sources, changed });
 }
 
 export class Character {
@@ -42,8 +45,8 @@ export class Character {
   #turned = [];
   #given;
 
-  constructor(gltf, check, nodes, given) {
-    [this.name, this.check, this.#given] = [given.name, check, given];
+  constructor(gltf, check, nodes, wrinkles, given) {
+    [this.name, this.check, this.wrinkles, this.#given] = [given.name, check, wrinkles, given];
     this.root = new THREE.Group(); // turns with the head where the character has no bone for it
     this.root.add(gltf.scene);
     if (looksBack(check.document)) gltf.scene.rotation.y = Math.PI;
@@ -90,6 +93,7 @@ export class Character {
 
   dispose() {
     this.root.removeFromParent();
+    for (const one of this.wrinkles) one.dispose();
     this.root.traverse((object) => {
       object.geometry?.dispose();
       for (const material of [object.material ?? []].flat()) {

@@ -73,6 +73,7 @@ export class Stage {
   /** Draws the character as it is posed. */
   drawNow() {
     this.#morphing?.update();
+    for (const one of this.#character?.wrinkles ?? []) one.update(this.#renderer);
     this.#renderer.render(this.#scene, this.#camera);
   }
 

@@ -219,8 +219,8 @@ def _paint_parts(color: Tensor, rough: Tensor, normals: Tensor, look: Look) -> N
         if name == "locks":  # strands catch the light one by one
             shade = paint.mean(1).view(u.shape)
             tilt = 1.1 * torch.gradient(shade / shade.mean(), dim=1)[0]
-            normals[0, rows[:, None], columns] = -tilt
-            normals[2, rows[:, None], columns] = (1 - tilt.square().clamp(max=0.8)).sqrt()
+            bent = torch.stack([-tilt, 0 * tilt, torch.ones_like(tilt)])
+            normals[:, rows[:, None], columns] = torch.nn.functional.normalize(bent, dim=0)
         rough[:, rows[:, None], columns] = {
             "teeth": 0.2,
             "gums": 0.3,
