@@ -22,7 +22,8 @@ from torchface.synthetic import performer
 pytestmark = [pytest.mark.browser, pytest.mark.bench]
 SOURCES = Path(__file__).resolve().parents[3] / "export" / "web" / "src"
 PAGE = """<!doctype html><meta charset="utf-8"><script type="importmap">
-{"imports": {"three": "/node_modules/three/build/three.module.js", "three/addons/": "/node_modules/three/examples/jsm/"}}
+{"imports": {"three": "/node_modules/three/build/three.module.js",
+  "three/addons/": "/node_modules/three/examples/jsm/"}}
 </script><script type="module">
 import { readCharacter } from "/src/character.js";
 import { Stage } from "/src/stage.js";
