@@ -211,10 +211,10 @@ def test_all_frames_at_once(
     for name in ("PIQP", "OSQP 1e-5", "quadprog", "ProxQP 1e-8"):
         if f"{name}, one by one" in found:
             assert found[f"{name}, one by one"].milliseconds >= 5 * rows[0].milliseconds
-    assert found["DAQP, one by one"].milliseconds >= 1.2 * rows[0].milliseconds
+    assert found["DAQP, one by one"].milliseconds >= 1.6 * rows[0].milliseconds
     coarse = found["torchface, float32, to 6e-5"]
     assert coarse.gap <= 1e-5
-    assert found["DAQP, one by one"].milliseconds >= 1.8 * coarse.milliseconds
+    assert found["DAQP, one by one"].milliseconds >= 2.5 * coarse.milliseconds
 
 
 def session_of(capture: Capture, path: Path) -> onnxruntime.InferenceSession:

@@ -64,7 +64,7 @@ class _Unsolved:
         self.problem, self.tolerance = problem, tolerance
         self._factors = factors
         self.state = start_splitting(problem, start)
-        self.x = self.state.z.clone()
+        self.x = self.state.z
         self._rows = torch.arange(len(self.x), device=self.x.device)
 
     @property
@@ -75,7 +75,10 @@ class _Unsolved:
 
     def without(self, found: Tensor, gradient: Tensor | None = None) -> bool:
         """Takes what was found, and the gradient there, and leaves out what it solves; whether that is all."""
-        self.x[self._rows] = found
+        if len(self._rows) == len(self.x):
+            self.x = found
+        else:
+            self.x[self._rows] = found
         keep = self.problem.unsolved(found, self.tolerance, gradient).nonzero()[:, 0]
         if len(keep) < len(self._rows):
             self._rows, self.problem = self._rows[keep], self.problem.rows(keep)

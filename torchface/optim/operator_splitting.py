@@ -23,6 +23,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -133,19 +134,29 @@ def splitting_steps(
     # From zero, where the gradient is f, there is less to form.
     cold = not bool(state.z.any())
     constant = _times(problem.f, factors.offset) if cold else factors.constant(state.z, problem.gradient(state.z))
-    lower, upper, matrix = problem.lower.to(dtype), problem.upper.to(dtype), factors.step.to(dtype)
-    constant, z, t = constant.to(dtype), state.z.to(dtype, copy=True), state.t.to(dtype, copy=True)
-    product: Callable[..., Tensor] = torch.addmm
+    matrix, (lower, upper) = factors.step.to(dtype), _bounds(problem, dtype)
     if matrix.ndim == 3:
-        product, constant, z, t = torch.baddbmm, constant[:, None], z[:, None], t[:, None]
-    v = torch.empty_like(z)
+        matrix, product = matrix.transpose(1, 2), torch.baddbmm
+        constant, z, t = (x.to(dtype, copy=True)[..., None] for x in (constant, state.z, state.t))
+    else:  # a problem a column: products are a fifth quicker so
+        matrix, product = matrix.T.contiguous(), torch.addmm
+        constant, z, t = (x.new_empty(x.T.shape, dtype=dtype).copy_(x.T) for x in (constant, state.z, state.t))
+    v, share = torch.empty_like(z), 2 - factors.relaxation
     for _ in range(steps):  # each needs the one before
-        product(constant, t, matrix, out=v)
-        v.add_(z, alpha=2 - factors.relaxation)
+        product(constant, matrix, t, out=v)
+        v.add_(z, alpha=share)
         torch.clamp(v, lower, upper, out=z)
         torch.lerp(v, z, 2.0, out=t)  # 2 z - v
-    z, t = z.view_as(problem.f).double(), t.view_as(problem.f).double()
+    z, t = (torch.empty_like(problem.f).copy_(x.T if x.ndim == 2 else x[..., 0]) for x in (z, t))
     return SplittingState(problem.clip(z), t)  # in float32 a bound may have been rounded to the wrong side of itself
+
+
+def _bounds(problem: BoxProblem, dtype: torch.dtype) -> tuple[Any, Any]:
+    """Numbers where all variables have the same, by which clamps are quicker, else (N,1)."""
+    lower, upper = problem.lower.to(dtype), problem.upper.to(dtype)
+    if bool(((lower == lower[0]) & (upper == upper[0])).all()):
+        return float(lower[0]), float(upper[0])
+    return lower[:, None], upper[:, None]
 
 
 def _times(x: Tensor, matrix: Tensor) -> Tensor:

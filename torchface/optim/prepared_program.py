@@ -65,7 +65,7 @@ class PreparedProgram:
         if f.dtype == torch.float64:
             return x
         # Rounding must not step over a bound.
-        return torch.minimum(torch.maximum(x.to(f.dtype), self.lower.to(f)), self.upper.to(f))
+        return x.to(f.dtype).clamp_(self.lower.to(f), self.upper.to(f))
 
     def _solve_few(self, f: Array, tolerance: float) -> Tensor:
         f = f.astype(np.float64, copy=False)
