@@ -13,11 +13,19 @@ from torchface.cli import main
 from torchface.errors import AlignmentError, FileFormatError, ShapeError, ValueRangeError
 from torchface.geometry.cameras.calibration import CameraCalibration
 from torchface.geometry.cameras.distortion import distort, undistort
-from torchface.geometry.rotations import rotation_matrix
-from torchface.io import load_calibration, load_image, save_image
+from torchface.geometry.rotations import rotation_matrix, rotation_vector
+from torchface.io import load_calibration, load_cameras, load_image, save_image
 from torchface.io.video import write_video
 from torchface.progress import silent
-from torchface.workflows.calibrate_camera import Board, View, calibrate, calibrate_views, find_boards, find_corners
+from torchface.workflows.calibrate_camera import (
+    Board,
+    View,
+    calibrate,
+    calibrate_beside,
+    calibrate_views,
+    find_boards,
+    find_corners,
+)
 
 BOARD = Board(7, 5, 25.0)
 K = torch.tensor([[520.0, 0, 310.5], [0, 524, 247.2], [0, 0, 1]], dtype=torch.float64)
@@ -133,6 +141,31 @@ def test_a_video_will_do(pictures: list[Tensor], tmp_path: Path, capsys: pytest.
     main(["calibrate", str(video.path), "--corners", "7x5", "--out", str(out), "--quiet"])
     assert "6 of 6 views used" in capsys.readouterr().err
     torch.testing.assert_close(load_calibration(out).intrinsics.diagonal(), K.diagonal(), rtol=0.01, atol=0)
+
+
+def test_two_cameras_are_put_where_they_are(
+    rays: Tensor, pictures: list[Tensor], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The second one stands 60 mm to the right and is turned to the board."""
+    turn, stand = rotation_matrix(torch.tensor([[0.0, 0.14, 0.01]]).double())[0], torch.tensor([60.0, 4, -5]).double()
+    seen = []
+    for vector, place in zip(TURNS, PLACES, strict=True):
+        middle = turn @ (torch.tensor([*place, 420.0]).double() - stand)
+        board = rotation_vector((turn @ rotation_matrix(torch.tensor([vector]).double())[0])[None])[0].tolist()
+        seen.append(filmed(rays, board, middle[:2].tolist(), float(middle[2])))
+    films = [
+        str(write_video(iter(shown), tmp_path / f"{name}.avi", 10.0).path)
+        for name, shown in (("left", pictures), ("right", seen))
+    ]
+    out = tmp_path / "rig.toml"
+    main(["calibrate", films[0], "--beside", films[1], "--corners", "7x5", "--out", str(out), "--quiet"])
+    assert "right: 60." in capsys.readouterr().err
+    right = load_cameras(out)[1]
+    assert right.name == "right"
+    torch.testing.assert_close(right.rotation, turn, atol=6e-3, rtol=0)
+    torch.testing.assert_close(-right.rotation.T @ right.translation, stand, atol=1.0, rtol=0)
+    with pytest.raises(AlignmentError, match="the board in 2 views"):
+        calibrate_beside([Path(films[0]), write_video(iter(seen[:2]), tmp_path / "short.avi", 10.0).path], BOARD, out)
 
 
 def test_useless_pictures_are_refused(pictures: list[Tensor]) -> None:

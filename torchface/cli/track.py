@@ -6,7 +6,7 @@ from contextlib import nullcontext
 from pathlib import Path
 from typing import Annotated, Literal
 
-from tyro.conf import Positional, arg
+from tyro.conf import Positional, UseAppendAction, arg
 
 from torchface.cli.batch_report import Cluster, Column, Jobs, TimeLimit, show_batch, skipped_lines
 from torchface.cli.command_options import Output, Reduce, picture_size
@@ -35,6 +35,8 @@ def track(
     offsets: Path | None = None,
     neutral_frame: int | None = None,
     camera: Path | None = None,
+    videos: Annotated[UseAppendAction[tuple[Path, ...]], arg(name="video")] = (),
+    cameras: Path | None = None,
     texture: Path | None = None,
     face: int = 0,
     one_person: bool = False,
@@ -89,6 +91,9 @@ def track(
         neutral_frame: A frame of VIDEO, from 0, in which the face has no expression: what the rig differs by there is
             taken out. Without it the frames in which the face rests are found.
         camera: The camera's calibration, as `torchface calibrate` writes it; a focal length is assumed without.
+        videos: Films of one take by several cameras, again for each, in the order of --cameras; the overlay is of the
+            first. In place of VIDEO.
+        cameras: Where these cameras lie, as `torchface calibrate --beside` writes it.
         texture: An image to put on the face in the overlay, in the rig's texture coordinates, under the video's light.
         face: Which of several faces to follow, from 0, the largest first.
         one_person: All frames show the actor: solve those after a cut too in which the face looks like another's.
@@ -118,6 +123,11 @@ def track(
     from torchface.workflows.track.video_job import VIDEOS, VideoJob
     from torchface.workflows.weight_files import checked_reduction
 
+    beside = videos[1:]
+    if videos:
+        if video or live is not None or solver == "examples" or cluster is not None:
+            raise ValueRangeError("track: found --video beside VIDEO, --live, --cluster or examples, expected it alone")
+        video = videos[:1]
     given = landmarks.lower().endswith(".csv")
     if (not video) == (live is None) and not (given and live is None):
         found = "neither" if not video else "both"
@@ -146,6 +156,8 @@ def track(
         anybody,
         head_model,
         neutral_frame,
+        beside,
+        cameras,
     )
     if live is not None:
         if rig is None:

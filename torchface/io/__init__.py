@@ -1,6 +1,6 @@
 """Files in and out: meshes, rigs, takes; lengths become millimetres coming in and the file's unit going out."""
 
-from torchface.io.camera_files import load_calibration, save_calibration
+from torchface.io.camera_files import load_calibration, load_cameras, save_calibration, save_cameras
 from torchface.io.gltf.wrinkle_textures import load_region_maps
 from torchface.io.head_models.head_model_file import HeadJoints, HeadModelFile, SurfacePlaces
 from torchface.io.head_models.head_model_files import load_head_model_file
@@ -38,6 +38,7 @@ __all__ = [
     "WeightSender",
     "load_animation",
     "load_calibration",
+    "load_cameras",
     "load_correspondences",
     "load_detail_maps",
     "load_head_model_file",
@@ -54,6 +55,7 @@ __all__ = [
     "open_sender",
     "save_animation",
     "save_calibration",
+    "save_cameras",
     "save_correspondences",
     "save_image",
     "save_image16",

@@ -135,11 +135,12 @@ def splitting_steps(
     cold = not bool(state.z.any())
     constant = _times(problem.f, factors.offset) if cold else factors.constant(state.z, problem.gradient(state.z))
     matrix, (lower, upper) = factors.step.to(dtype), _bounds(problem, dtype)
+    product: Callable[..., Tensor] = torch.addmm if matrix.ndim == 2 else torch.baddbmm
     if matrix.ndim == 3:
-        matrix, product = matrix.transpose(1, 2), torch.baddbmm
+        matrix = matrix.transpose(1, 2)
         constant, z, t = (x.to(dtype, copy=True)[..., None] for x in (constant, state.z, state.t))
     else:  # a problem a column: products are a fifth quicker so
-        matrix, product = matrix.T.contiguous(), torch.addmm
+        matrix = matrix.T.contiguous()
         constant, z, t = (x.new_empty(x.T.shape, dtype=dtype).copy_(x.T) for x in (constant, state.z, state.t))
     v, share = torch.empty_like(z), 2 - factors.relaxation
     for _ in range(steps):  # each needs the one before

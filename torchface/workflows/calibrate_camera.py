@@ -1,4 +1,4 @@
-"""From images of a checkerboard to a camera's calibration on disk."""
+"""From images of a checkerboard to the calibration of a camera, or of several that are fixed to each other, on disk."""
 
 from __future__ import annotations
 
@@ -15,10 +15,11 @@ from torch import Tensor
 from torchface.color_space import grey_images
 from torchface.errors import AlignmentError, FileFormatError, ShapeError, ValueRangeError
 from torchface.files.whole_files import check_ending, check_writable, make_folder
-from torchface.geometry.cameras.calibration import CameraCalibration
-from torchface.io.camera_files import save_calibration
+from torchface.geometry.cameras.calibration import CameraCalibration, PlacedCamera
+from torchface.io.camera_files import save_calibration, save_cameras
 from torchface.io.images.image_files import load_image
 from torchface.io.video import open_video
+from torchface.io.video.timecodes import start_of
 from torchface.progress import Progress, silent
 from torchface.rendering.compositing import caption, save_rendered_image, sheet
 
@@ -145,6 +146,68 @@ def calibrate(paths: Sequence[Path], board: Board, out: Path, progress: Progress
         overlay([view for view in views if view.name in report.used], report.calibration, board), overlay_path
     )
     return replace(report, overlay_path=overlay_path)
+
+
+def calibrate_beside(
+    films: Sequence[Path], board: Board, out: Path, progress: Progress | None = None
+) -> tuple[list[CalibrationReport], list[PlacedCamera], list[str]]:
+    """Calibrates cameras that are fixed to each other, from their films of one checkerboard, and writes them.
+
+    Args:
+        films: of each camera, taken at once; those without timecodes began together.
+        board: the checkerboard, seen by the first camera and each other one at once.
+        out: the ``.toml`` to write; see :func:`~torchface.io.camera_files.save_cameras`.
+        progress: called with each step and how far it is.
+
+    Returns:
+        A report of each camera, the cameras, and lines about how they lie.
+
+    Raises:
+        FileFormatError, AlignmentError: as of :func:`calibrate`; or fewer than five moments show the board to two.
+    """
+    progress = progress or silent
+    check_ending(out, ".toml")
+    check_writable(out)
+    reports, views = [], []
+    for film in films:
+        found, left_out = find_boards(_images([film]), board, progress)
+        reports.append(calibrate_views(found, board, left_out))
+        views.append({int(view.name.split()[-1]): view for view in found if view.name in reports[-1].used})
+    rates, starts = [open_video(film).fps for film in films], [start_of(film) for film in films]
+    nowhere = torch.eye(3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64)
+    cameras = [PlacedCamera(reports[0].calibration, *nowhere, films[0].stem)]
+    lines = []
+    for film, report, rate, start in zip(films[1:], reports[1:], rates[1:], starts[1:], strict=True):
+        progress(f"looking for the board in {film.name} and {films[0].name} at once")
+        begin = 0.0 if start is None or starts[0] is None else start - starts[0]
+        wanted = {round((number / rates[0] - begin) * rate): view for number, view in views[0].items()}
+        pairs = []
+        for number, frame in enumerate(open_video(film).frames()):
+            if number in wanted and (corners := find_corners(frame, board)) is not None:
+                first = wanted[number].corners
+                # Some boards look the same after half a turn.
+                alike = ((first[-1] - first[0]) * (corners[-1] - corners[0])).sum() > 0
+                pairs.append((first, corners if alike else corners.flip(0)))
+        if len(pairs) < _MIN_VIEWS:
+            raise AlignmentError(
+                f"calibrate: found the board in {films[0].name} and {film.name} at once at {len(pairs)} moments, "
+                f"expected {_MIN_VIEWS} at least: hold it where both cameras see all of it"
+            )
+        one, other = reports[0].calibration, report.calibration
+        first_seen, then_seen = ([pair[k].numpy().reshape(-1, 1, 2) for pair in pairs] for k in (0, 1))
+        (K1, d1), (K2, d2) = ((x.intrinsics.numpy(), x.distortion.numpy()) for x in (one, other))
+        points, size = [board.points.numpy()] * len(pairs), (one.width, one.height)
+        held = cv2.CALIB_FIX_INTRINSIC
+        error, *_, R, t, _, _ = cv2.stereoCalibrate(points, first_seen, then_seen, K1, d1, K2, d2, size, flags=held)
+        place = torch.from_numpy(np.asarray(R)), torch.from_numpy(np.asarray(t).ravel())
+        cameras.append(PlacedCamera(other, *place, film.stem))
+        lines.append(
+            f"{film.stem}: {float((place[0].T @ place[1]).norm()):.1f} mm from {films[0].stem}, "
+            f"from {len(pairs)} moments, {error:.3f} pixels off root mean square"
+        )
+    make_folder(out.parent)
+    save_cameras(cameras, out)
+    return reports, cameras, lines
 
 
 def find_boards(

@@ -2,14 +2,25 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
 from torchface.capture.antagonist_shapes import one_side, weaker_sides
 from torchface.capture.energy import Quadratic
+from torchface.capture.own_rig.face_measurements import CameraView
+from torchface.capture.own_rig.face_points import LANDMARKS
 from torchface.capture.own_rig.frame_states import FrameTerms
-from torchface.capture.own_rig.gauss_newton import SLIDING_STEPS, HeadState, box_step, energy_of_step, linearise
+from torchface.capture.own_rig.gauss_newton import (
+    SLIDING_STEPS,
+    HeadState,
+    Linearised,
+    box_step,
+    energy_of_step,
+    linearise,
+)
 from torchface.capture.own_rig.solver_components import VideoSolverParts
 from torchface.optim.implicit import attach_gradients
 
@@ -19,14 +30,18 @@ _COARSEST, _FINEST = 1e-6, 1e-12  # residuals of a step's program
 class FrameSolver(VideoSolverParts):
     """The solve of B frames, each for itself, by Gauss and Newton; ``VideoSolver`` says what it minimises."""
 
-    def landmark_trust(self, landmarks: Tensor, confidence: Tensor | None) -> Tensor:
-        """How much each of landmarks (B,68,2) counts beside one that is surely seen, (B,68) float64."""
+    def landmark_trust(self, landmarks: Tensor, confidence: Tensor | None, views: Sequence[CameraView] = ()) -> Tensor:
+        """How much each of landmarks (B,68,2) counts beside one that is surely seen, by any camera, (B,68) float64."""
         seen = torch.isfinite(landmarks).all(-1).double()
-        return seen if confidence is None else seen * confidence.detach().double().clamp(0, 1)
+        seen = seen if confidence is None else seen * confidence.detach().double().clamp(0, 1)
+        for view in views:
+            seen = torch.maximum(seen, view.seen.to(seen))
+        return seen
 
-    def noise(self, rotation: Tensor, translation: Tensor) -> Tensor:
-        """The standard deviation of landmarks of heads at poses (B,3,3), (B,3), (B,), pixels."""
-        apart = self.points.eyes_distance(rotation, translation, self.intrinsics.double())
+    def noise(self, rotation: Tensor, translation: Tensor, intrinsics: Tensor | None = None) -> Tensor:
+        """The standard deviation of landmarks of heads at poses (B,3,3), (B,3), (B,), pixels of one camera's."""
+        K = self.intrinsics if intrinsics is None else intrinsics
+        apart = self.points.eyes_distance(rotation, translation, K.double())
         return (self.settings.relative_noise * apart).clamp(min=self.settings.pixel_noise)
 
     def precision(self, seen: Tensor, confidence: Tensor | None, noise: Tensor) -> Tensor:
@@ -46,16 +61,16 @@ class FrameSolver(VideoSolverParts):
         """Weights (B,N) in [0,1] and poses of B frames on their own, from a start, float64.
 
         Returns:
-            The states, and which of the rig's points each landmark is in them, (B,68).
+            The states, and which of the rig's points each landmark is in them, (B,68), then in other views.
         """
         exactness = min(max(0.1 * self.settings.tolerance, _FINEST), _COARSEST)
         box = self.lower.double(), self.upper.double()
         # Steps are many and small; what tensors keep for derivatives is a fifth of their cost.
         with torch.inference_mode():
-            head, rows = start, self.chosen(start)
+            head, rows = start, self.chosen(start, terms.views)
             for iteration in range(self.settings.steps):
                 if 0 < iteration < SLIDING_STEPS:
-                    rows = self.chosen(head)
+                    rows = self.chosen(head, terms.views)
                 # The first step says which of two antagonists it is: in the next the other is at rest.
                 rest = weaker_sides(head.weights, self.signed) & (iteration > 0)
                 before, head = head, box_step(self.energy(terms, head, rows), head, *box, exactness, rest)
@@ -69,9 +84,12 @@ class FrameSolver(VideoSolverParts):
             head = self._attached(terms, head, rows)
         return head, rows
 
-    def chosen(self, head: HeadState) -> Tensor:
-        """Which of the rig's points each landmark is in B states, (B,68); see ``FacePoints.chosen``."""
-        return self.points.chosen(head.weights, head.rotation, head.translation, self.intrinsics.double())
+    def chosen(self, head: HeadState, views: Sequence[CameraView] = ()) -> Tensor:
+        """Which of the rig's points each landmark is in B states, (B,68), then in views; see ``FacePoints.chosen``."""
+        cameras = [(head.rotation, head.translation, self.intrinsics.double())]
+        cameras += [(*view.pose(head.rotation, head.translation), view.intrinsics.double()) for view in views]
+        rows = [self.points.chosen(head.weights, *camera) for camera in cameras]
+        return torch.cat(rows, dim=1) if views else rows[0]
 
     def energy(self, terms: FrameTerms, head: HeadState, rows: Tensor) -> Quadratic:
         """All terms linearised at a state, of a step from there, (B,N+6)."""
@@ -83,8 +101,11 @@ class FrameSolver(VideoSolverParts):
     def seen(self, terms: FrameTerms, head: HeadState, rows: Tensor) -> Quadratic:
         """Landmarks and tracked poses linearised at a state, of a step from there, (B,N+6)."""
         K, slide = self.intrinsics.double(), self.settings.contour_slide
-        at = linearise(self.points, head, rows, K, terms.landmarks, terms.precision, slide)
+        own = rows[:, :LANDMARKS] if terms.views else rows
+        at = linearise(self.points, head, own, K, terms.landmarks, terms.precision, slide)
         data = at.energy()
+        for number, view in enumerate(terms.views, 1):
+            data = data + self._seen_by(view, head, rows[:, LANDMARKS * number : LANDMARKS * (number + 1)])
         if terms.read is not None:
             data = data + energy_of_step(terms.read, head.weights)
         if self.settings.pose_trust == 0:
@@ -95,6 +116,15 @@ class FrameSolver(VideoSolverParts):
         shapes = len(self.names)
         H = pad(precision, (shapes, 0, shapes, 0))
         return data + Quadratic(H, pad((precision @ off[..., None])[..., 0], (shapes, 0)))
+
+    def _seen_by(self, view: CameraView, head: HeadState, rows: Tensor) -> Quadratic:
+        """Another view's landmarks linearised at a state, of a step from there before the first camera, (B,N+6)."""
+        K, precision = view.intrinsics.double(), self.landmark_weights.double().sqrt() / view.deviation
+        there = HeadState(head.weights, *view.pose(head.rotation, head.translation))
+        at = linearise(self.points, there, rows, K, view.landmarks, precision, self.settings.contour_slide)
+        # Turns and moves before the first camera are those before this one, turned.
+        turned = (at.jacobian[..., -6:].unflatten(-1, (2, 3)) @ view.rotation.to(K)).flatten(-2)
+        return Linearised(at.residual, torch.cat([at.jacobian[..., :-6], turned], dim=-1)).energy()
 
     def _attached(self, terms: FrameTerms, head: HeadState, rows: Tensor) -> HeadState:
         """The converged state as a differentiable function of the terms."""

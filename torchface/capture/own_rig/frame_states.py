@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from torch import Tensor
 
 from torchface.capture.energy import Quadratic
+from torchface.capture.own_rig.face_measurements import CameraView
 from torchface.capture.own_rig.gauss_newton import HeadState
 from torchface.capture.own_rig.state_estimate import Expectation, StateEstimate
 from torchface.errors import ValueRangeError
@@ -95,6 +96,7 @@ class FrameTerms:
         rotation, translation: the tracked pose, (B,3,3) and (B,3).
         expected: what is known before the frames are seen.
         read: what readings say of the weights (B,N) themselves; nothing if absent.
+        views: of other cameras, with finite landmarks; their deviations count all noise, infinite where not seen.
     """
 
     landmarks: Tensor
@@ -103,9 +105,10 @@ class FrameTerms:
     translation: Tensor
     expected: Expectation
     read: Quadratic | None = None
+    views: tuple[CameraView, ...] = ()
 
     def tensors(self) -> tuple[Tensor, ...]:
         mean = self.expected.mean
         terms = (self.landmarks, self.precision, self.rotation, self.translation, self.expected.information)
         read = () if self.read is None else (self.read.H, self.read.f)
-        return (*terms, mean.weights, mean.rotation, mean.translation, *read)
+        return (*terms, mean.weights, mean.rotation, mean.translation, *read, *(view.landmarks for view in self.views))

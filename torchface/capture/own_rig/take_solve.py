@@ -51,13 +51,12 @@ def solve_take(
         frame_intervals(seconds, len(landmarks), solver.settings.interval)  # checks them
         even = even_times(seconds)
         points, trust = (values_at(x, seconds, even) for x in (landmarks, confidence))
-        if bool(solver.shows_face(points, trust).any()):
-            nearest = frames_beside(seconds, even)[0]
-            there = None if measured is None else measured.of_frames(nearest)
+        there = None if measured is None else measured.of_frames(frames_beside(seconds, even)[0])
+        if bool(solver.shows_face(points, trust, () if there is None else there.views).any()):
             solution = solve_take(solver, points, trust, None, whole_take, progress, there)
             weights, translation = (values_at(x, even, seconds) for x in (solution.weights, solution.translation))
             rotation = rotations_at(solution.rotation, even, seconds)
-            return solver.solution(landmarks, confidence, weights, rotation, translation)
+            return solver.solution(landmarks, confidence, weights, rotation, translation, measured)
     if whole_take and solver.dynamics is not None:
         return solve_whole_take(solver, landmarks, confidence=confidence, progress=progress, measured=measured)
     with torch.no_grad():
@@ -66,7 +65,7 @@ def solve_take(
         return solution
     when = torch.arange(len(landmarks), device=landmarks.device) if seconds is None else seconds
     weights = values_at(solution.weights[solution.solved], when[solution.solved], when)
-    return solver.solution(landmarks, confidence, weights, solution.rotation, solution.translation)
+    return solver.solution(landmarks, confidence, weights, solution.rotation, solution.translation, measured)
 
 
 def solve_whole_take(
@@ -123,7 +122,7 @@ def solve_whole_take(
     rows = (frames - first).clamp(min=0)  # frames before the first face have its state
     weights, turned, moved = (x[rows].to(landmarks.dtype) for x in (head.weights, head.rotation, head.translation))
     weights = values_at(weights[enough], frames[enough], frames)
-    return solver.solution(landmarks, confidence, weights, turned, moved)
+    return solver.solution(landmarks, confidence, weights, turned, moved, measured)
 
 
 def even_times(seconds: Tensor) -> Tensor:

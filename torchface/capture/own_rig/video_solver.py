@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import replace
+
 import torch
 from torch import Tensor
 
 from torchface.capture.antagonist_shapes import one_side
-from torchface.capture.own_rig.face_measurements import FaceMeasurements
+from torchface.capture.own_rig.face_measurements import CameraView, FaceMeasurements
 from torchface.capture.own_rig.face_points import LANDMARKS
 from torchface.capture.own_rig.frame_solver import FrameSolver
 from torchface.capture.own_rig.frame_states import FrameTerms, VideoSolution, VideoState
@@ -108,24 +111,32 @@ class VideoSolver(FrameSolver):
             torch.stack([getattr(state, name) for state in states]).to(landmarks.dtype)
             for name in ("weights", "rotation", "translation")
         )
-        return self.solution(landmarks, confidence, weights, rotations, translations)
+        return self.solution(landmarks, confidence, weights, rotations, translations, measured)
 
     def solution(
-        self, landmarks: Tensor, confidence: Tensor | None, weights: Tensor, rotation: Tensor, translation: Tensor
+        self,
+        landmarks: Tensor,
+        confidence: Tensor | None,
+        weights: Tensor,
+        rotation: Tensor,
+        translation: Tensor,
+        measured: FaceMeasurements | None = None,
     ) -> VideoSolution:
         """Weights (T,N) and poses (T,3,3), (T,3) of T frames, with what the frames' landmarks say of them.
 
         Args:
-            landmarks, confidence: as of ``forward``.
+            landmarks, confidence, measured: as of ``forward``.
             weights, rotation, translation: as solved.
         """
         errors = self.reprojection_errors(landmarks, weights, rotation, translation)
-        seen = self.shape_confidence(self.landmark_trust(landmarks, confidence)).to(landmarks.dtype)
-        return VideoSolution(weights, rotation, translation, errors, self.shows_face(landmarks, confidence), seen)
+        views = () if measured is None else measured.views
+        seen = self.shape_confidence(self.landmark_trust(landmarks, confidence, views)).to(landmarks.dtype)
+        solved = self.shows_face(landmarks, confidence, views)
+        return VideoSolution(weights, rotation, translation, errors, solved, seen)
 
-    def shows_face(self, landmarks: Tensor, confidence: Tensor | None) -> Tensor:
-        """Which of frames (T,68,2) show at least six landmarks that are trusted, (T,) bool."""
-        return (self.landmark_trust(landmarks, confidence) > 0).sum(1) >= _MIN_LANDMARKS
+    def shows_face(self, landmarks: Tensor, confidence: Tensor | None, views: Sequence[CameraView] = ()) -> Tensor:
+        """Which of frames (T,68,2) show at least six landmarks that are trusted, by any camera, (T,) bool."""
+        return (self.landmark_trust(landmarks, confidence, views) > 0).sum(1) >= _MIN_LANDMARKS
 
     def states(
         self,
@@ -142,9 +153,10 @@ class VideoSolver(FrameSolver):
         Frames before the first face have its state.
         """
         count = self._check(landmarks, rotation, translation, confidence)
-        enough = self.shows_face(landmarks, confidence)
+        views = () if measured is None else measured.views
+        enough = self.shows_face(landmarks, confidence, views)
         if not bool(enough.any()):
-            trusted = (self.landmark_trust(landmarks, confidence) > 0).sum(1)
+            trusted = (self.landmark_trust(landmarks, confidence, views) > 0).sum(1)
             raise ValueRangeError(
                 f"landmarks: found at most {max(trusted.tolist(), default=0)} that are trusted in any of {count} "
                 f"frames, expected at least {_MIN_LANDMARKS} in some frame"
@@ -202,7 +214,7 @@ class VideoSolver(FrameSolver):
         pixels = landmarks[None].double()
         rotation, translation, confidence = (None if x is None else x.double() for x in given)
         # Filtered landmarks go on for some frames after a face was lost, with a confidence of 0.
-        trust = self.landmark_trust(pixels, confidence)
+        trust = self.landmark_trust(pixels, confidence, measured.views)
         trusted = int((trust > 0).sum())
         enough = trusted >= _MIN_LANDMARKS
         if state.head is None and not enough:
@@ -210,7 +222,7 @@ class VideoSolver(FrameSolver):
                 f"landmarks: found {trusted} in the first frame, expected at least {_MIN_LANDMARKS} to start"
             )
         if rotation is None or translation is None or not _finite(rotation, translation):
-            rotation, translation = self._pose_of(state, pixels, confidence, enough)
+            rotation, translation = self._pose_of(state, pixels, confidence, enough, measured.views)
         interval = self.settings.interval if interval is None else interval
         evidence = self.shape_confidence(trust * enough)
         hidden = unseen_time(state.hidden, evidence, interval)
@@ -222,7 +234,8 @@ class VideoSolver(FrameSolver):
             noise = (noise.square() + measured.deviation.double().square()).sqrt()
         precision = self.precision(torch.isfinite(pixels).all(-1) & enough, confidence, noise)
         read = measured.weights.energy() if enough and measured.weights is not None else None
-        terms = FrameTerms(pixels.nan_to_num(0.0), precision, rotation, translation, expected, read)
+        views = tuple(self._whitened(view, last) for view in measured.views) if enough else ()
+        terms = FrameTerms(pixels.nan_to_num(0.0), precision, rotation, translation, expected, read, views)
         if enough:
             # After a gap the tracked pose is nearer than where the head was left.
             near = expected.mean if state.solved and state.estimate is not None else tracked
@@ -236,6 +249,12 @@ class VideoSolver(FrameSolver):
         estimate = expected.updated(head, self.seen(terms, head, rows))
         window = torch.cat([state.window, head.weights[:, None]], dim=1)[:, -self.dynamics.window :]
         return VideoState(head, estimate, window, enough, hidden)
+
+    def _whitened(self, view: CameraView, head: HeadState) -> CameraView:
+        """A view of one frame with finite landmarks, and deviations with the solver's own noise for a head there."""
+        noise = self.noise(*view.pose(head.rotation, head.translation), view.intrinsics)[:, None]
+        deviation = (noise.square() + view.deviation.double().square()).sqrt().masked_fill(~view.seen, torch.inf)
+        return replace(view, landmarks=view.landmarks.double().nan_to_num(0.0), deviation=deviation)
 
     def _expected(
         self,
@@ -286,12 +305,22 @@ class VideoSolver(FrameSolver):
         return float(off) < _NEAR * float(self.points.eyes_distance(head.rotation, head.translation, K).detach())
 
     def _pose_of(
-        self, state: VideoState, landmarks: Tensor, confidence: Tensor | None, enough: bool
+        self,
+        state: VideoState,
+        landmarks: Tensor,
+        confidence: Tensor | None,
+        enough: bool,
+        views: Sequence[CameraView] = (),
     ) -> tuple[Tensor, Tensor]:
-        """Of the frame before, or by all landmarks where that showed no face, or one far from here."""
+        """Of the frame before, or by the camera that saw most, where that showed no face, or one far from here."""
         if state.head is not None and (not enough or (state.solved and self._near(state.head, landmarks))):
             return state.head.rotation, state.head.translation
         trust = self.landmark_weights.double() * self.landmark_trust(landmarks, confidence)
+        best = max(views, key=lambda view: int(view.seen.sum()), default=None)
+        if best is not None and int(best.seen.sum()) > int((trust > 0).sum()):
+            trust = self.landmark_weights.double() * best.seen
+            pose = solve_pnp(self.rest[:LANDMARKS], best.landmarks.detach().double(), best.intrinsics, trust)
+            return best.pose_before_first(pose.rotation, pose.translation)
         pose = solve_pnp(self.rest[:LANDMARKS], landmarks.detach(), self.intrinsics, trust)
         if state.head is not None and not _finite(pose.rotation, pose.translation):
             return state.head.rotation, state.head.translation

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from torchface.errors import ShapeError, ValueRangeError
 
-__all__ = ["CameraCalibration", "assumed_calibration"]
+__all__ = ["CameraCalibration", "PlacedCamera", "assumed_calibration"]
 
 ASSUMED_FIELD_OF_VIEW = 60.0
 """Degrees across the longer side: what webcams and phones have, near enough, where nothing is known."""
@@ -84,6 +84,47 @@ class CameraCalibration:
         intrinsics[:2, 2] += (scale[:2] - 1) / 2
         error = None if self.error is None else self.error * float(scale[0])
         return replace(self, intrinsics=intrinsics, width=width, height=height, error=error)
+
+
+@dataclass(frozen=True, eq=False)
+class PlacedCamera:
+    """A camera of several that are fixed to each other, such as a helmet's.
+
+    Args:
+        calibration: its own.
+        rotation, translation: first camera to this one, (3,3) and (3,), millimetres.
+        name: for people.
+        offset: when its film began after the first one's, seconds; None where timecodes say so.
+
+    Raises:
+        ShapeError: rotation or translation of another shape.
+        ValueRangeError: no rotation, or numbers that are not finite.
+
+    Example:
+        >>> one = assumed_calibration(640, 480)
+        >>> PlacedCamera(one, torch.eye(3), torch.tensor([-60.0, 0, 0]), "right").translation.tolist()
+        [-60.0, 0.0, 0.0]
+    """
+
+    calibration: CameraCalibration
+    rotation: Tensor
+    translation: Tensor
+    name: str = ""
+    offset: float | None = None
+
+    def __post_init__(self) -> None:
+        if self.rotation.shape != (3, 3) or self.translation.shape != (3,):
+            raise ShapeError(
+                f"camera {self.name}: found rotation {tuple(self.rotation.shape)} and translation "
+                f"{tuple(self.translation.shape)}, expected (3,3) and (3,)"
+            )
+        R = self.rotation.double()
+        turned = torch.isfinite(R).all() and (R @ R.T - torch.eye(3).to(R)).abs().max() < 1e-3 and torch.det(R) > 0
+        if not (turned and torch.isfinite(self.translation).all()):
+            raise ValueRangeError(
+                f"camera {self.name}: found rotation {self.rotation.tolist()}, translation "
+                f"{self.translation.tolist()}, expected a rotation matrix and finite millimetres"
+            )
 
 
 def assumed_calibration(width: int, height: int, field_of_view: float = ASSUMED_FIELD_OF_VIEW) -> CameraCalibration:

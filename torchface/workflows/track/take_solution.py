@@ -248,7 +248,7 @@ def new_solution(
     except ValueRangeError as error:
         raise ValueRangeError(f"{inputs.clip.path}: {error}") from error
     weights = calmed(solution.weights, solver.names, inputs.clip.fps)
-    return solver.solution(landmarks, trust, weights, solution.rotation, solution.translation)
+    return solver.solution(landmarks, trust, weights, solution.rotation, solution.translation, measured)
 
 
 def calmed(weights: Tensor, names: Sequence[str], fps: float) -> Tensor:

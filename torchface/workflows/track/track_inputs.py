@@ -66,6 +66,8 @@ class TrackSettings:
         offsets: a file of fixed offsets between this rig's landmarks and this finder's; those in the folder of results,
             or estimated with the take, if absent.
         neutral_frame: of the video, in which the face has no expression: offsets are estimated there.
+        beside: films of the same take by other cameras, in the order of ``cameras``, whose first is the video's.
+        cameras: how these cameras lie, see :func:`~torchface.io.camera_files.load_cameras`.
     """
 
     landmarks: str | Path = DEFAULT_LANDMARKS
@@ -86,6 +88,8 @@ class TrackSettings:
     anybody: bool = False
     heads: str | Path | None = None
     neutral_frame: int | None = None
+    beside: tuple[Path, ...] = ()
+    cameras: Path | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -148,12 +152,7 @@ def load_inputs(video: Path | None, rig: Path | None, settings: TrackSettings) -
             the take is too short for the dynamics prior.
         NameMismatchError: a model is missing, or a prior has learned other shapes than the rig has.
     """
-    clip = _clip(video, settings)
-    clip.check()
-    times, rate_varies = clip.uneven_seconds()
-    if times is not None:
-        clip = replace(clip, fps=check_rate(float((len(times) - 1) / times[-1]), str(clip.path)))
-        warnings.warn(f"{clip.path}: found a variable frame rate: {rate_varies}; {_AT_ITS_TIMES}", stacklevel=4)
+    clip, times, rate_varies = with_times(_clip(video, settings))
     if rig is None or settings.anybody:
         named = NamedHeads.of(settings.heads)
         heads, actor = matching(load_head_model(named.name), rig, settings.part)
@@ -170,6 +169,16 @@ def load_inputs(video: Path | None, rig: Path | None, settings: TrackSettings) -
                 f"{settings.texture}: found a rig without texture coordinates, expected some to put it on"
             )
     return replace(inputs, times=times, rate_varies=rate_varies)
+
+
+def with_times(clip: VideoFile) -> tuple[VideoFile, Tensor | None, str]:
+    """A checked film at its mean rate, when its frames are shown where that varies, and how, of which it warns."""
+    clip.check()
+    times, varies = clip.uneven_seconds()
+    if times is not None:
+        clip = replace(clip, fps=check_rate(float((len(times) - 1) / times[-1]), str(clip.path)))
+        warnings.warn(f"{clip.path}: found a variable frame rate: {varies}; {_AT_ITS_TIMES}", stacklevel=5)
+    return clip, times, varies
 
 
 def inputs_of(clip: VideoFile, actor: BlendshapeRig, settings: TrackSettings) -> TrackInputs:

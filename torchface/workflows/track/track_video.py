@@ -8,6 +8,9 @@ from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
+import torch
+
+from torchface.capture.own_rig import FaceMeasurements
 from torchface.files.checkpoints import read_checkpoint, write_checkpoint
 from torchface.files.content_keys import content_key
 from torchface.files.documents import write_json
@@ -16,6 +19,7 @@ from torchface.files.whole_files import all_or_none
 from torchface.io import save_rig
 from torchface.progress import Progress, silent
 from torchface.rendering.point_light import PointLight
+from torchface.workflows.track.camera_views import OtherCamera, other_cameras
 from torchface.workflows.track.face_overlay import video_light
 from torchface.workflows.track.frame_readings import read_frames
 from torchface.workflows.track.overlay_video import write_overlay
@@ -73,11 +77,11 @@ def track_video(
     progress = progress or silent
     with within_job(out):
         progress("reading the models")
-        inputs = load_inputs(video, rig, settings or TrackSettings())
-        return _track(inputs, out, video is not None, progress)
+        inputs, others = other_cameras(load_inputs(video, rig, settings or TrackSettings()))
+        return _track(inputs, others, out, video is not None, progress)
 
 
-def _track(inputs: TrackInputs, out: Path, filmed: bool, progress: Progress) -> Tracked:
+def _track(inputs: TrackInputs, others: list[OtherCamera], out: Path, filmed: bool, progress: Progress) -> Tracked:
     state = TrackState(out, inputs.reading_key)
     seconds: dict[str, float] = {}
     reused = state.done
@@ -104,7 +108,7 @@ def _track(inputs: TrackInputs, out: Path, filmed: bool, progress: Progress) -> 
             warn_of_offsets(offsets, estimated, inputs)
         offsets = offsets or estimated
     solver = solver if offsets is None else solver.shifted(offsets)
-    key = solution_key(inputs, solver, offsets, times)
+    key = content_key(solution_key(inputs, solver, offsets, times), views=[other.key for other in others])
     eyes = seen_eyes(inputs, solver, landmarks, reading)
     solution = kept_solution(state, key)
     if solution is None:
@@ -114,6 +118,10 @@ def _track(inputs: TrackInputs, out: Path, filmed: bool, progress: Progress) -> 
                 solver, sure = measuring_solver(solver, landmarks, reading)
             if eyes is not None:
                 measured, sure = with_eyes(inputs, solver, measured, eyes), eyes.agreed(sure)
+            if others:
+                shown = torch.arange(len(landmarks)) / inputs.clip.fps if times is None else times
+                views = tuple(other.view(shown, out, solver, progress) for other in others)
+                measured = replace(measured or FaceMeasurements(), views=views)
             solution = new_solution(inputs, solver, landmarks, sure, times, progress, measured)
         keep_solution(state, key, solution)
     tracked = Tracked(
