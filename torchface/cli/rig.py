@@ -39,6 +39,8 @@ def rig(
     detail_size: int = 2048,
     names: Literal["arkit"] | None = None,
     colors: bool = True,
+    inner_mouth: bool = False,
+    eyes: bool = False,
     jobs: Jobs = 1,
     cluster: Cluster = None,
     time_limit: TimeLimit = None,
@@ -46,10 +48,10 @@ def rig(
 ) -> None:
     """Make an actor's own rig from raw scans and a template rig, or put ARKit's shapes on a character's face.
 
-    Without --template and --neutral SCAN is a character, a .glb or .vrm with or without a body. Its face is found, in
-    any pose and unit; OUT is the same file with ARKit's shapes on the face and nothing else changed. Shapes that it
-    has, by ARKit's or another program's names, are kept; a VRM gets an expression for each. NAME_face.png beside OUT
-    shows the face.
+    Without --template and --neutral SCAN is a character, a .glb, .vrm or USD file with or without a body. Its face is
+    found, in any pose and unit; OUT is the same file with ARKit's shapes on the face and nothing else changed. Shapes
+    that it has, by ARKit's or another program's names, are kept; a VRM gets an expression for each. NAME_face.png
+    beside OUT shows the face.
 
     The neutral scan gives the actor's face in the template's topology, deformation transfer its shapes. Scans of
     expressions make the shapes the actor's own; high-resolution scans give normal maps for wrinkles.
@@ -99,6 +101,9 @@ def rig(
             shapes merged (browInnerUp, cheekPuff); shapes that ARKit lacks keep theirs. All keep theirs if absent.
         colors: Find hair by the scans' colours and keep them. --no-colors where they are not the person's: a map of
             distances or curvature, say.
+        inner_mouth: Give a character the inside of a mouth that its mesh lacks: a bag, teeth, gums, a tongue; lips in
+            one piece are cut apart.
+        eyes: Give a character eyeballs that its mesh lacks; eyes in one piece with the skin are cut out.
         quiet: Show no progress.
     """
     from torchface.errors import ValueRangeError
@@ -112,8 +117,12 @@ def rig(
 
     if template is None and neutral is None and scan:
         of_scans = {"--landmarks": landmarks, "--examples": examples, "--detail": detail, "--expressions": expressions}
-        _rig_character(scan, out, [flag for flag, value in of_scans.items() if value is not None], quiet)
+        _rig_character(
+            scan, out, (inner_mouth, eyes), [flag for flag, value in of_scans.items() if value is not None], quiet
+        )
         return
+    if inner_mouth or eyes:
+        raise ValueRangeError("--inner-mouth, --eyes: for a character's file, without --template and --neutral")
     options = RigOptions(
         part, unit, pose_weights(pose), detector, model, texture_size, detail_size, names, colors, expressions
     )
@@ -156,18 +165,27 @@ def rig(
     print_path(out)
 
 
-def _rig_character(scan: tuple[Path, ...], out: Path, given: list[str], quiet: bool) -> None:
+def _rig_character(scan: tuple[Path, ...], out: Path, parts: tuple[bool, bool], given: list[str], quiet: bool) -> None:
     from torchface.errors import ValueRangeError
     from torchface.workflows.rig.character_rig import check_character, rig_character
+    from torchface.workflows.rig.usd_character import USD_ENDINGS, rig_usd_character
 
     if given or len(scan) > 1:
         found = " and ".join(given) or f"{len(scan)} files"
         raise ValueRangeError(
             f"found {found} without --template, expected one for scans, or one character's file alone"
         )
-    check_character(scan[0])
+    usd = scan[0].suffix.lower() in USD_ENDINGS
+    if usd and any(parts):
+        raise ValueRangeError("--inner-mouth, --eyes: for a .glb or .vrm, found a USD file; export it as .glb")
+    if not usd:
+        check_character(scan[0])
     with progress_bars(quiet) as progress:
-        report = rig_character(scan[0], out, progress)
+        report = (
+            rig_usd_character(scan[0], out, progress)
+            if usd
+            else rig_character(scan[0], out, progress, inner_mouth=parts[0], eyes=parts[1])
+        )
     for line in report.lines():
         console.print(line, highlight=False)
     print_path(out)

@@ -20,4 +20,4 @@ from torchface.workflows.rig.character_face import _is_still
     ],
 )
 def test_hair_and_what_is_worn_stay_still(name: str, material: str, still: bool) -> None:
-    assert _is_still(Block(0, 0, (0,), name, (material,), slice(0, 1), ())) is still
+    assert _is_still(Block(0, 0, (0,), name, (material,), slice(0, 1), (), ())) is still

@@ -54,6 +54,11 @@ class BufferWriter:
         indices = flat.astype("<u2" if flat.max() < 65535 else "<u4")
         return self._accessor(indices, self.view(indices.tobytes(), target=_ELEMENT_BUFFER), bounds=False)
 
+    def joints(self, rows: NDArray[np.float32]) -> int:
+        """An accessor of four joints a vertex."""
+        numbers = rows.astype("<u2")
+        return self._accessor(numbers, self.view(numbers.tobytes(), target=_ARRAY_BUFFER), bounds=False)
+
     def deltas(self, rows: NDArray[np.float32]) -> int:
         """An accessor (C,3) of a morph target: the rows that move and their numbers, or all rows if that is smaller."""
         moved = np.flatnonzero((rows != 0).any(1))

@@ -44,6 +44,7 @@ class Block:
         materials: names of the primitives' materials.
         rows: where the vertices lie among the character's.
         names: of the mesh's morph targets.
+        triangles: how many each primitive has.
     """
 
     node: int
@@ -53,6 +54,7 @@ class Block:
     materials: tuple[str, ...]
     rows: slice
     names: tuple[str, ...]
+    triangles: tuple[int, ...]
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,6 +88,11 @@ class Character:
     blocks: tuple[Block, ...]
     head: Tensor | None
     head_bone: str
+
+    @property
+    def first_triangles(self) -> list[int]:
+        """The row of each block's first triangle among ``faces``."""
+        return [0, *np.cumsum([sum(block.triangles) for block in self.blocks])[:-1].tolist()]
 
     def targets(self, block: Block) -> Tensor:
         """The morph targets (N,C,3) of a block's own array."""
@@ -221,6 +228,7 @@ class _Shelf:
                 tuple(str(material.get("name", "")) for material in materials),
                 slice(self._count, self._count + count),
                 names,
+                tuple(len(faces) for faces in self.faces[-len(group) :]),
             )
         )
         self.vertices.append(placed)

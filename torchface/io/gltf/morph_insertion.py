@@ -57,10 +57,8 @@ def document_with_targets(
     Raises:
         FileFormatError: the file keeps its data elsewhere, or a mesh has such a name already.
     """
-    root, first = copy.deepcopy(document.root), document.root.get("buffers") or [{}]
-    if document.binary is None or first[0].get("uri") is not None:
-        raise document.error("buffers[0]", "its data in another file", "a .glb that holds it (gltf-transform copy)")
-    writer = _Appended(document, root)
+    root = copy.deepcopy(document.root)
+    writer = AppendedArrays(document, root)
     for mesh in sorted({one.mesh for one in added}):
         moved: Mapping[int, AddedTargets] = {
             primitive: one for one in added if one.mesh == mesh for primitive in one.primitives
@@ -105,16 +103,43 @@ def _other_chunks(path: Path) -> list[tuple[int, bytes]]:
     return found
 
 
-class _Appended:
-    """Accessors and bufferViews behind those of a document."""
+class AppendedArrays:
+    """Accessors and bufferViews behind those of a document whose first buffer is its binary chunk.
+
+    Raises:
+        FileFormatError: the file keeps its data elsewhere.
+    """
 
     def __init__(self, document: Document, root: dict[str, Any]) -> None:
+        first = document.root.get("buffers") or [{}]
+        if document.binary is None or first[0].get("uri") is not None:
+            raise document.error("buffers[0]", "its data in another file", "a .glb that holds it (gltf-transform copy)")
         self.document, self.root, self.buffers = document, root, BufferWriter()
         self.first_accessor = len(root.get("accessors", []))
         self.first_view = len(root.get("bufferViews", []))
 
     def deltas(self, rows: NDArray[np.float32]) -> int:
         return self.first_accessor + self.buffers.deltas(np.ascontiguousarray(rows, np.float32))
+
+    def vertices(self, rows: NDArray[np.float32]) -> int:
+        return self.first_accessor + self.buffers.vertices(np.ascontiguousarray(rows, np.float32))
+
+    def joints(self, rows: NDArray[np.float32]) -> int:
+        return self.first_accessor + self.buffers.joints(rows)
+
+    def triangles(self, faces: NDArray[np.int64]) -> int:
+        return self.first_accessor + self.buffers.triangles(faces)
+
+    def texture(self, image: bytes) -> int:
+        """A texture of a PNG, by a sampler of its own."""
+        added: dict[str, Any] = {}
+        self.buffers.texture(added, image)
+        numbers = {key: len(self.root.get(key, [])) for key in ("samplers", "images", "textures")}
+        added["images"][0]["bufferView"] += self.first_view
+        added["textures"][0] = {"source": numbers["images"], "sampler": numbers["samplers"]}
+        for key in numbers:
+            self.root.setdefault(key, []).extend(added[key])
+        return numbers["textures"]
 
     def numbers(self, rows: NDArray[np.float32]) -> int:
         return self.first_accessor + self.buffers.keys(np.ascontiguousarray(rows, np.float32))
@@ -142,7 +167,7 @@ def _extend_mesh(
     index: int,
     moved: Mapping[int, AddedTargets],
     names: tuple[str, ...],
-    writer: _Appended,
+    writer: AppendedArrays,
 ) -> None:
     mesh, location = root["meshes"][index], f"meshes[{index}]"
     if not isinstance(mesh, dict):
@@ -196,7 +221,7 @@ def _has_names(extras: object) -> bool:
 
 
 def _extend_animations(
-    document: Document, root: dict[str, Any], nodes: list[int], old: int, new: int, writer: _Appended
+    document: Document, root: dict[str, Any], nodes: list[int], old: int, new: int, writer: AppendedArrays
 ) -> None:
     """Zeros for the new targets in animations of the weights of these nodes."""
     for number, kept in enumerate(document.objects("animations")):

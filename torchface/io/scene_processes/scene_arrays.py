@@ -91,7 +91,7 @@ def scene_rig(scene: Scene, unit: str | None = None) -> BlendshapeRig | None:
         scene: what was found.
         unit: of the file's numbers; what the file says if absent.
     """
-    pieces = _pieces(scene, unit)
+    pieces = pieces_of(scene, unit)
     names = all_names(pieces)
     if not names:
         return None
@@ -103,10 +103,11 @@ def scene_rig(scene: Scene, unit: str | None = None) -> BlendshapeRig | None:
 
 def scene_mesh(scene: Scene, unit: str | None = None) -> Mesh:
     """All meshes together at rest; see :func:`scene_rig`."""
-    return _mesh(scene, _pieces(scene, unit))
+    return _mesh(scene, pieces_of(scene, unit))
 
 
-def _pieces(scene: Scene, unit: str | None) -> list[Piece]:
+def pieces_of(scene: Scene, unit: str | None = None) -> list[Piece]:
+    """Each mesh of a scene in its place; see :func:`scene_rig`."""
     pieces = [_piece(scene, number, unit) for number in range(len(scene.record["meshes"]))]
     _reserve(scene, joined_size(pieces))
     return pieces
@@ -209,7 +210,7 @@ def _piece(scene: Scene, number: int, unit: str | None) -> Piece:
     record = scene.record["meshes"][number]
     arrays = {name.partition("/")[2]: array for name, array in scene.arrays.items() if name.startswith(f"{number}/")}
     points, location = arrays["points"], f"{scene.path}: {record['place']}"
-    linear, translation = _transform(scene, record, unit)
+    linear, translation = mesh_transform(scene, record, unit)
     shapes, names = record["shapes"], list(_names(record, [shape["name"] for shape in record["shapes"]]))
     _reserve(scene, 12 * len(points) * sum(1 + len(shape["between"]) for shape in shapes))
     vertices = _finite(points @ linear + translation, f"{location}: points")
@@ -251,7 +252,7 @@ def _piece(scene: Scene, number: int, unit: str | None) -> Piece:
     )
 
 
-def _transform(
+def mesh_transform(
     scene: Scene, record: dict[str, Any], unit: str | None
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """From points to millimetres, y up: rows times (3,3), plus (3,)."""

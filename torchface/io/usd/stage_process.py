@@ -283,6 +283,7 @@ class _MeshReader:
         return {
             "name": str(self.prim.GetName()),
             "place": self.place,
+            "path": str(self.prim.GetPath()),
             "matrix": matrix.ravel().tolist(),
             "notes": notes if isinstance(notes, str) else None,
             "shapes": self._shapes(),

@@ -124,36 +124,42 @@ class FaceSearch:
             NoFaceOnSurfaceError: no picture shows one, or what they show is none from near.
         """
         progress = progress or silent
-        seen: list[_Sighting] = []
         pictures: list[Tensor] = []
-        frames = [framed] if framed is not None and bool(framed.any()) else []
-        for frame in [*frames, None]:
-            for plain in (False, True) if any(one.texture is not None for one in surface.materials) else (False,):
-                seen = self._around(surface, frame, plain, pictures, progress)
-                if seen:
-                    break
-            if seen:
+        refused = None
+        # What is taken for a face for sure may be none from near; then all directions are looked at.
+        for sure in (_SURE, torch.inf):
+            for group, others in self._candidates(surface, framed, sure, pictures, progress):
+                try:
+                    return self._from_near(surface, group, others, progress)
+                except NoFaceOnSurfaceError as error:
+                    refused = refused or error
+            if refused is None:
                 break
-        if not seen:
-            raise NoFaceOnSurfaceError(
-                f"found no face in {len(pictures)} pictures from around, expected a head", pictures
-            )
-        groups = _places(seen)
-        for number, group in enumerate(groups[:_TRIED]):
+        raise refused or NoFaceOnSurfaceError(
+            f"found no face in {len(pictures)} pictures from around, expected a head", pictures
+        )
+
+    def _candidates(
+        self, surface: TexturedSurface, framed: Tensor | None, sure: float, pictures: list[Tensor], progress: Progress
+    ) -> list[tuple[_Sighting, Tensor]]:
+        """The surest sightings, each of another place, and where other faces are."""
+        seen: list[_Sighting] = []
+        textured = any(one.texture is not None for one in surface.materials)
+        for frame in [framed, None] if framed is not None and bool(framed.any()) else [None]:
+            for plain in (False, True) if textured else (False,):
+                seen = seen or self._around(surface, frame, plain, sure, pictures, progress)
+        groups, found = _places(seen), []
+        for group in groups[:_TRIED]:
             others = [one[0].middle for one in groups if one is not group and len(one) > 1 and one[0].score > 0.5]
-            elsewhere = torch.stack(others) if others else torch.zeros(0, 3, dtype=torch.float64)
-            try:
-                return self._from_near(surface, group[0], elsewhere, progress)
-            except NoFaceOnSurfaceError as error:
-                if number == 0:
-                    refused = error
-        raise refused
+            found.append((group[0], torch.stack(others) if others else torch.zeros(0, 3, dtype=torch.float64)))
+        return found
 
     def _around(
         self,
         surface: TexturedSurface,
         framed: Tensor | None,
         plain: bool,
+        sure: float,
         pictures: list[Tensor],
         progress: Progress,
     ) -> list[_Sighting]:
@@ -164,7 +170,7 @@ class FaceSearch:
         middle, span = (low + high) / 2, 1.05 * float((corners - (low + high) / 2).norm(dim=-1).max()) * 2
         found: list[_Sighting] = []
         for number, (pitch, count) in enumerate(self.rings):
-            if found and max(one.score for one in found) >= _SURE:
+            if found and max(one.score for one in found) >= sure:
                 break
             for step in range(count):
                 progress("looking for the face", len(pictures), 0)

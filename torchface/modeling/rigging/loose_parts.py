@@ -34,6 +34,7 @@ _BACK, _BEHIND_TEETH, _TEETH, _LEAST_BACK, _FALLS = (
     4.0,
 )  # of half the arch's width; millimetres
 _TONGUE_OUT, _TONGUE_DOWN = 12.0, 8.0
+_OPEN, _TONGUE_RISE, _TONGUE_DROP = 0.33, 2.0, 15.0  # of jawOpen; millimetres over the lower teeth, and at the tip
 _ROOT, _LYING, _STIFF = 0.3, 2.0, 0.01
 
 
@@ -261,15 +262,17 @@ def _jaw_motions(template: BlendshapeRig) -> Similarity:
     return Similarity(torch.ones_like(motion.scale), rotation, translation)
 
 
-def tongue_out(vertices: Tensor, tongue: Tensor, lips: Tensor) -> Tensor:
+def tongue_out(vertices: Tensor, tongue: Tensor, lips: Tensor, jaw_open: Tensor | None = None) -> Tensor:
     """What ``tongueOut`` adds to a head whose tongue is a part of its own, (V,3), millimetres.
 
-    The tongue's tip comes out before the lips and a little down, its root stays.
+    The jaw opens a third, without which the tongue would go through teeth and lip; the tongue's tip comes out over the
+    lower lip and down, its root stays.
 
     Args:
         vertices: (V,3), millimetres, z toward the viewer.
         tongue: how much each vertex is of it, (V,) in [0,1], not all zero.
         lips: points of the lips, (L,3).
+        jaw_open: the head's ``jawOpen``, (V,3); the jaw stays if absent.
 
     Source: ARKit's description of the shape.
     """
@@ -279,4 +282,8 @@ def tongue_out(vertices: Tensor, tongue: Tensor, lips: Tensor) -> Tensor:
     share = ((depth - own.min()) / (own.max() - own.min()).clamp(min=1e-6)).clamp(0, 1)
     share = weight * share * share * (3 - 2 * share)
     out = (lips[:, 2].double().max() + _TONGUE_OUT - own.max()).clamp(min=0.0)
-    return torch.stack([torch.zeros_like(share), -_TONGUE_DOWN * share.square(), out * share], 1).to(vertices)
+    if jaw_open is None:
+        return torch.stack([torch.zeros_like(share), -_TONGUE_DOWN * share.square(), out * share], 1).to(vertices)
+    # Before the lips it falls; up to there it stays over teeth and lip, which go down with the jaw.
+    over = torch.stack([torch.zeros_like(share), _TONGUE_RISE * share - _TONGUE_DROP * share**12, out * share], 1)
+    return (over + _OPEN * (1 - share[:, None]) * jaw_open.double()).to(vertices)

@@ -22,7 +22,6 @@ from torchface.geometry.meshes.operators import (
 )
 from torchface.geometry.meshes.shell_energies import stretching_energy
 from torchface.geometry.meshes.surface_index import triangle_coordinates
-from torchface.geometry.similarity import Similarity
 from torchface.mesh import Mesh
 from torchface.modeling.rigging.blinks_that_shut import SkinOfHead, eyes_seen, shut_blinks
 from torchface.modeling.rigging.deformation_transfer import transfer_with_report
@@ -160,7 +159,7 @@ def shapes_on(
         registration = register(template.neutral, target, landmarks, texture_size=0, progress=progress)
     to_template = registration.pose.inverse()
     goal = to_template.apply(target.vertices.detach().cpu().double())[0]
-    fitted = _fitted(template, registration, to_template)
+    fitted = fitted_template(template, registration)
     moved = transfer_with_report(template, fitted, progress=progress).rig
     progress("carrying the shapes over")
     joined = joined_vertices(goal, target.faces.cpu())
@@ -199,9 +198,9 @@ def _among(parts: InnerParts, bones: Tensor) -> InnerParts:
     return replace(parts, vertices=parts.vertices[kept], group=group, hard=parts.hard[kept])
 
 
-def _fitted(template: BlendshapeRig, registration: Registration, to_template: Similarity) -> Mesh:
-    """The registered template in its own place and size, its inner parts where they belong in this head."""
-    vertices = to_template.apply(registration.mesh.vertices.detach().cpu().double())[0]
+def fitted_template(template: BlendshapeRig, registration: Registration) -> Mesh:
+    """A registered template in its own place and size, its inner parts where they belong in this head."""
+    vertices = registration.pose.inverse().apply(registration.mesh.vertices.detach().cpu().double())[0]
     fitted = template.neutral.with_vertices(vertices.to(template.vertices))
     fitted = place_parts(template, fitted, inner_parts(template))
     return with_template_skin(fitted, template.neutral, hidden_parts(template.neutral, registration.matched))

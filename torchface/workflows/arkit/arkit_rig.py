@@ -345,7 +345,9 @@ def _tongue(neutral: Mesh, carried: CarriedShapes) -> dict[str, Tensor]:
         return {}
     pose = carried.registration.pose
     upright = pose.inverse().apply(neutral.vertices.double())[0]
-    delta = tongue_out(upright, mask, upright[notes.landmarks[48:]])
+    jaw = carried.rig.names.index("jawOpen") if "jawOpen" in carried.rig.names else None
+    opening = None if jaw is None else pose.inverse().apply_vectors(carried.rig.deltas[jaw][None].double())[0]
+    delta = tongue_out(upright, mask, upright[notes.landmarks[48:]], opening)
     return {TONGUE: pose.apply_vectors(delta[None])[0]}
 
 

@@ -57,6 +57,7 @@ class CharacterFace:
         rows: the character's vertices in ``head``, (K,).
         head: the pieces that move with the face.
         skin: what the template is registered to.
+        skin_rows: the character's vertices in ``skin``, (S,).
         movable: which of the head's vertices may move, (K,) bool: not those at the cut through the neck.
         landmarks: template vertices and where they lie, as ``register`` takes them.
     """
@@ -66,8 +67,14 @@ class CharacterFace:
     rows: Tensor
     head: Mesh
     skin: Mesh
+    skin_rows: Tensor
     movable: Tensor
     landmarks: Landmarks
+
+    def on(self, character: Character) -> CharacterFace:
+        """The same face on a character that has got more vertices."""
+        reference, search = character_search()
+        return face_pieces(character, self.found, reference, search.reference)
 
 
 def textured(character: Character) -> TexturedSurface:
@@ -94,7 +101,7 @@ def find_character_face(
     reference, search = character_search()
     framed = None if character.head is None else character.head > _HEAD_SHARE
     found = search.find(surface, framed, progress)
-    return _pieces(character, found, reference, search.reference)
+    return face_pieces(character, found, reference, search.reference)
 
 
 def character_search() -> tuple[Mesh, FaceSearch]:
@@ -105,12 +112,7 @@ def character_search() -> tuple[Mesh, FaceSearch]:
     return reference, FaceSearch(shipped_detector(), finder.finder, points)
 
 
-def _pieces(
-    character: Character,
-    found: FaceOnSurface,
-    reference: Mesh,
-    points: ReferencePoints,
-) -> CharacterFace:
+def face_pieces(character: Character, found: FaceOnSurface, reference: Mesh, points: ReferencePoints) -> CharacterFace:
     """The head's pieces, by where they lie: what the points lie on is skin, the rest eyes, teeth, lashes or still."""
     vertices = found.pose.inverse().apply(character.vertices)[0]
     eyes = points.landmarks[36:48].double().mean(0)
@@ -153,6 +155,7 @@ def _pieces(
         rows,
         Mesh(vertices[rows].float(), local.reshape(-1, 3)),
         Mesh(vertices[skin_rows].float(), skin_local.reshape(-1, 3)),
+        skin_rows,
         ~cut_joined[joined.of[rows]],
         landmarks,
     )

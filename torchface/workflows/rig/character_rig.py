@@ -19,13 +19,15 @@ from torchface.geometry.meshes.operators import vertex_normals
 from torchface.io.gltf.character_scene import Block, Character, read_character
 from torchface.io.gltf.gltf_document import read_document
 from torchface.io.gltf.morph_insertion import AddedTargets, document_with_targets, write_edited
+from torchface.io.gltf.part_insertion import document_with_parts
+from torchface.io.images.image_files import encode_png
 from torchface.io.vrm.vrm_expressions import VRM_ENDING, MorphBind, add_expressions, vrm_expressions
 from torchface.landmarks.surfaces.face_on_surface import NoFaceOnSurfaceError
 from torchface.modeling.rigging.blinks_that_shut import BLINKS
 from torchface.modeling.rigging.loose_parts import tongue_out
 from torchface.modeling.rigging.other_topology import CarriedShapes, joined_vertices, shapes_on
 from torchface.progress import Progress, silent
-from torchface.registration import register
+from torchface.registration import Registration, register
 from torchface.rendering.compositing import save_rendered_image, sheet
 from torchface.rendering.textured_surface import TexturedSurface
 from torchface.rig import BlendshapeRig
@@ -33,6 +35,7 @@ from torchface.shape_names import ARKIT
 from torchface.shape_names.recognised_names import arkit_name, recognised_shapes
 from torchface.synthetic import performer
 from torchface.viz.figures.character_views import SHOWN, character_sheet
+from torchface.workflows.rig.added_parts import added_parts
 from torchface.workflows.rig.character_face import CharacterFace, find_character_face, textured
 
 CHARACTER_ENDINGS = (".glb", VRM_ENDING)
@@ -49,7 +52,6 @@ _OF_SCANS = ("the scan has neither", "the scan's triangles")
 _TONGUE, _JAW, _CLOSE = "tongueOut", "jawOpen", "mouthClose"
 _CONVERT = {
     ".fbx": "export it from Blender as .glb (File, Export, glTF 2.0, with Shape Keys and Skinning)",
-    ".usd": "export it from Blender or usdview's host as .glb",
     ".gltf": "pack it: npx @gltf-transform/cli copy IN.gltf OUT.glb",
 }
 
@@ -80,7 +82,9 @@ class CharacterReport:
         return list(self.notes)
 
 
-def rig_character(path: Path, out: Path, progress: Progress | None = None) -> CharacterReport:
+def rig_character(
+    path: Path, out: Path, progress: Progress | None = None, *, inner_mouth: bool = False, eyes: bool = False
+) -> CharacterReport:
     """Puts ARKit's shapes on the face of a character; everything else of its file stays as it is.
 
     The face is found by its bone's name and by looking at the character from around. The embedded performer is
@@ -94,6 +98,8 @@ def rig_character(path: Path, out: Path, progress: Progress | None = None) -> Ch
         path: a ``.glb`` or ``.vrm``.
         out: the file to write, of the same ending.
         progress: called with each step.
+        inner_mouth: give it a bag, teeth, gums and a tongue where it has none; lips in one piece are cut apart.
+        eyes: give it eyeballs where it has none; eyes in one piece with the skin are cut out.
 
     Raises:
         FileFormatError: another kind of file, or a broken one.
@@ -117,10 +123,22 @@ def rig_character(path: Path, out: Path, progress: Progress | None = None) -> Ch
         present = _present(character)
         missing = [name for name in ARKIT if name not in present]
         template = performer(texture=False)
-        carried = _carried(template, face, path, progress)
+        registration = _registered(template, face, path, progress)
+        parts: tuple[str, ...] = ()
+        if inner_mouth or eyes:
+            progress("adding parts")
+            given = added_parts(character, face, template, registration, (inner_mouth, eyes))
+            parts = given.notes
+            if given.blocks:
+                document = document_with_parts(character, given.blocks, encode_png(given.page))
+                character = read_character(document)
+                surface, face = textured(character), face.on(character)
+        carried = shapes_on(
+            template, face.head, face.landmarks, registration=registration, movable=face.movable, progress=progress
+        )
         rig = _with_tongue(carried)
         made = tuple(name for name in missing if name in rig.names)
-        job = _Job(character, face, carried, rig, made)
+        job = _Job(character, face, carried, rig, made, parts)
         progress("writing the character")
         added = job.targets()
         root, data = document_with_targets(document, added, made) if added else (copy.deepcopy(document.root), b"")
@@ -139,9 +157,9 @@ def check_character(path: Path) -> None:
     """Raises ``FileFormatError`` for files that are no ``.glb`` or ``.vrm``, with the way to make one."""
     ending = path.suffix.lower()
     if ending not in CHARACTER_ENDINGS:
-        how = _CONVERT.get(ending[:4] if ending.startswith(".usd") else ending, "export it as .glb")
+        how = _CONVERT.get(ending, "export it as .glb")
         raise FileFormatError(
-            f"{path}: found {ending!r}, expected a character's .glb or .vrm ({how}), or --template for a scan"
+            f"{path}: found {ending!r}, expected a character's .glb, .vrm or USD ({how}), or --template for a scan"
         )
 
 
@@ -180,8 +198,8 @@ def _present(character: Character) -> dict[str, _Present]:
     return {name: found[name] for name in ARKIT if name in found}
 
 
-def _carried(template: BlendshapeRig, face: CharacterFace, path: Path, progress: Progress) -> CarriedShapes:
-    """The template's shapes on the head; refused where its face does not come to lie on the head."""
+def _registered(template: BlendshapeRig, face: CharacterFace, path: Path, progress: Progress) -> Registration:
+    """The template on the head; refused where its face does not come to lie on it."""
     registration = register(template.neutral, face.skin, face.landmarks, texture_size=0, progress=progress)
     region = template.neutral.annotations.regions["face"]  # type: ignore[union-attr]
     met = float(registration.matched[region].double().mean())
@@ -191,9 +209,7 @@ def _carried(template: BlendshapeRig, face: CharacterFace, path: Path, progress:
             f"{path}: the template lies {far:.1f} mm from the face (median, at a head's size; expected at most "
             f"{_FAR:g}) and meets {met:.0%} of it (expected at least {_LEAST_MET:.0%}): is it a face?"
         )
-    return shapes_on(
-        template, face.head, face.landmarks, registration=registration, movable=face.movable, progress=progress
-    )
+    return registration
 
 
 def _with_tongue(carried: CarriedShapes) -> BlendshapeRig:
@@ -202,7 +218,8 @@ def _with_tongue(carried: CarriedShapes) -> BlendshapeRig:
     if not bool(carried.tongue.any()):
         return rig
     lips = carried.registration.mesh.vertices[carried.registration.mesh.landmarks[48:68]]
-    out = tongue_out(rig.vertices, carried.tongue, lips)
+    jaw = rig.deltas[rig.names.index(_JAW)] if _JAW in rig.names else None
+    out = tongue_out(rig.vertices, carried.tongue, lips, jaw)
     return BlendshapeRig(rig.neutral, torch.cat([rig.deltas, out[None].to(rig.deltas)]), (*rig.names, _TONGUE))
 
 
@@ -215,6 +232,7 @@ class _Job:
     carried: CarriedShapes
     rig: BlendshapeRig
     made: tuple[str, ...]
+    parts: tuple[str, ...]
 
     def targets(self) -> list[AddedTargets]:
         """The new morph targets of the meshes that move, in their own axes and unit."""
@@ -294,6 +312,7 @@ class _Job:
             lines.append(f"    the others are at {', '.join(map(_place, found.others))}, in the file's unit")
         lines.append(f"template: {record.figures()}")
         lines += [f"  note: {note}" for note in record.notes if not note.startswith(_OF_SCANS)]
+        lines += [f"parts: {note}" for note in self.parts]
         if any(name in self.made for name in (*BLINKS, _JAW)):
             lines += [f"  {note}" for note in self.carried.notes()]
         own = {name: names for name, names in present.items() if names != (name,)}
