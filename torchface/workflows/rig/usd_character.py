@@ -73,7 +73,7 @@ def _write_glb(scene: Scene, path: Path) -> None:
     buffers = BufferWriter()
     root: dict[str, Any] = {"nodes": [{"name": "scene", "children": []}], "meshes": []}
     for piece in pieces_of(scene):
-        attributes = {"POSITION": buffers.vertices(piece.vertices.numpy() / np.float32(1000))}
+        attributes = {"POSITION": buffers.vertices((piece.vertices / 1000).numpy())}
         primitive: dict[str, Any] = {"attributes": attributes, "indices": buffers.triangles(piece.faces.numpy())}
         mesh: dict[str, Any] = {"name": piece.name, "primitives": [primitive]}
         if piece.names:
