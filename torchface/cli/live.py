@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from tyro.conf import Positional, UseAppendAction, arg
 
@@ -33,6 +33,9 @@ def live(
     port: int = 8080,
     size: str = "640x480",
     landmarks: str | None = None,
+    solver: Literal["webcam", "examples"] = "webcam",
+    examples: tuple[Path, ...] = (),
+    method: Literal["all", "regional", "linear"] = "all",
     loop: bool = False,
     seconds: float | None = None,
     enhance: str | None = None,
@@ -70,6 +73,10 @@ def live(
         size: WIDTHxHEIGHT to ask the camera for.
         landmarks: What finds the 68 landmarks, as `torchface track` takes it: a model by name or folder, an .onnx file,
             or MediaPipe's Face Landmarker, .task; the webcam's own graph, which is the quickest, if absent.
+        solver: The webcam's own, or by example expressions as the dissertation's program: the page's picture then shows
+            the solved example's landmarks (red) over those found (green).
+        examples: What `torchface examples` wrote, or folders of it, for --solver examples; of several people the mean.
+        method: With examples: all at once, the head first and then regions, or by a linear model of landmarks.
         loop: Play a video file again and again.
         seconds: After which it ends; until Ctrl+C if absent.
         enhance: An actor's model, by name or folder, as `torchface enhance` takes it: when the session ends, each take
@@ -77,7 +84,7 @@ def live(
         cameras: Only list the cameras.
         quiet: Show no progress.
     """
-    from torchface.errors import FileFormatError
+    from torchface.errors import FileFormatError, ValueRangeError
     from torchface.workflows.live.camera_devices import check_source, list_cameras
 
     if cameras:
@@ -91,11 +98,20 @@ def live(
     check_source(camera)
     from torchface.workflows.live.live_anybody import LiveSettings, go_live, person_solver
 
-    solver: Callable[[Progress], FaceSolver] = person_solver
-    if landmarks is not None:
+    make_solver: Callable[[Progress], FaceSolver] = person_solver
+    if (solver == "examples") != bool(examples):
+        raise ValueRangeError("live: found one of --solver examples and --examples FILE, expected both or neither")
+    if examples:
+        from torchface.workflows.live.finder_solver import ExamplesSolver
+
+        files = [one for path in examples for one in (sorted(path.glob("*.json")) if path.is_dir() else [path])]
+        if not files:
+            raise FileFormatError(f"{examples[0]}: found no .json, expected what `torchface examples` wrote")
+        make_solver = partial(ExamplesSolver, files, method, landmarks)
+    elif landmarks is not None:
         from torchface.workflows.live.finder_solver import FinderSolver
 
-        solver = partial(FinderSolver, landmarks)
+        make_solver = partial(FinderSolver, landmarks)
     settings = LiveSettings(
         camera, character, mapping, to, record, takes, calibrate, page, port, loop, seconds, enhance, sides
     )
@@ -108,7 +124,7 @@ def live(
         console.print(words, highlight=False, soft_wrap=True)
 
     with progress_bars(quiet) as progress:
-        report, saved = go_live(settings, say, opened, solver, progress)
+        report, saved = go_live(settings, say, opened, make_solver, progress)
     print_lines(report.lines())
     for take in saved:
         if take.error:

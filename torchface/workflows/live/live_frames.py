@@ -144,6 +144,7 @@ class LiveFrame:
         gaze: right eye first, to the person's left and up, (2,2) radians.
         calibrated: how far the person is learned, in [0,1].
         found: whether a face is there, where no landmarks say so.
+        drawn: the picture with what was solved drawn over it, uint8 (H,W,3); the page shows it in the picture's place.
     """
 
     weights: Tensor
@@ -153,6 +154,7 @@ class LiveFrame:
     gaze: Tensor = field(default_factory=lambda: torch.zeros(2, 2))
     calibrated: float = 1.0
     found: bool = False
+    drawn: np.ndarray | None = None
 
     @cached_property
     def seen(self) -> bool:

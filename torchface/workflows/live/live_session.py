@@ -239,7 +239,8 @@ class LiveSession:
                 self.figures.add(came, now, solved.seen)
                 interval = 0.0 if before is None else came - before
                 with self._changed:
-                    self._view = LiveView(came, interval, 1000 * (now - came), picture, wanted)
+                    shown = picture if solved.drawn is None else solved.drawn
+                    self._view = LiveView(came, interval, 1000 * (now - came), shown, wanted)
                     self._changed.notify_all()
                 self._keep(came, wanted, picture)
                 self._advance(interval, solved)
