@@ -7,6 +7,7 @@ import tempfile
 from pathlib import Path
 
 import torch
+from matplotlib.figure import Figure
 
 from planted.face_paint import face_paint
 from planted.light_stage import LightStageSettings, render_lit_video
@@ -16,70 +17,82 @@ from torchface.io import load_image, load_rig, save_image
 from torchface.io.video import open_video
 from torchface.registration import register
 from torchface.rendering.clay_shading import render
-from torchface.rendering.compositing import caption, from_pillow, save_rendered_image, sheet
+from torchface.rendering.compositing import caption, from_figure, from_pillow, save_rendered_image, sheet
 from torchface.rendering.point_light import PointLight, vertex_albedo
 from torchface.rendering.texture_overlay import FacePaint, overlay, relight
-from torchface.shape_names import ARKIT, mapping
 from torchface.synthetic import IDENTITY, Character, Look, character, draw_identities, performer
 from torchface.synthetic.head.embedded_character import shown_rig
 from torchface.synthetic.stages.scanner import eyes_closed, scan_head
-from torchface.viz.figures.face_views import FRONT, PROFILE, THREE_QUARTER, clay_colors, face_views, frame_face
+from torchface.synthetic.stages.weight_curves import perform
+from torchface.viz.figures.face_views import FRONT, PROFILE, THREE_QUARTER, face_views
 from torchface.viz.figures.registration_views import registration_sheet
-from torchface.workflows.fit.photograph_rig import fit_photographs
+from torchface.workflows.fit.photograph_rig import PhotographSettings, fit_photographs
 
 HERE = Path(__file__).resolve().parent
 SIZE = {"width": 232, "height": 290}
-POSES = {
-    "eyeBlink": ("eyeBlinkLeft", "eyeBlinkRight"),
-    "jawOpen": ("jawOpen",),
-    "mouthSmile": ("mouthSmileLeft", "mouthSmileRight"),
-    "tongueOut": ("tongueOut",),
-    "browInnerUp, eyeWide": ("browInnerUp", "browOuterUpLeft", "browOuterUpRight", "eyeWideLeft", "eyeWideRight"),
-    "noseSneer, browDown": ("noseSneerLeft", "noseSneerRight", "browDownLeft", "browDownRight"),
-}
-
-
 PEOPLE = (
     ({"jaw_width": -1.4, "brow_ridge": -1.6, "neck_width": -1.8, "upper_lip": 1.2, "lower_lip": 1.0, "nose_width": -0.8,
-      "face_height": -1.2, "brow_height": 0.8, "eye_opening": 0.8}, Look(age=25.0, hair=(0.33, 0.19, 0.10), lips=1.1)),
+      "face_height": -1.2, "brow_height": 0.8, "eye_opening": 0.8},
+     Look(age=25.0, hair=(0.33, 0.19, 0.10), lips=1.2, haircut="long", shirt=(0.42, 0.20, 0.22))),
     ({"jaw_width": 1.2, "chin_protrusion": 1.0, "nose_width": 1.6, "lip_fullness": 1.5, "upper_lip": 1.5,
       "lower_lip": 1.3}, Look(melanin=0.8, age=35.0, hair=(0.05, 0.045, 0.04), iris=(0.16, 0.10, 0.06), freckles=0.0)),
     ({"cheek_fullness": 1.0, "ear_size": 1.5, "nose_length": 1.2, "upper_lip": -1.2, "nose_tip_size": 1.0},
      Look(age=72.0, hair=(0.62, 0.61, 0.60), iris=(0.30, 0.40, 0.47))),
     ({"jaw_width": -1.6, "brow_ridge": -1.4, "neck_width": -1.8, "nose_width": 1.0, "upper_lip": 1.6, "lower_lip": 1.6,
       "face_height": -1.0, "eye_opening": 0.6},
-     Look(melanin=0.5, age=45.0, hair=(0.07, 0.05, 0.045), iris=(0.2, 0.12, 0.07))),
+     Look(melanin=0.5, age=45.0, hair=(0.07, 0.05, 0.045), iris=(0.2, 0.12, 0.07), haircut="long",
+          shirt=(0.26, 0.33, 0.28))),
     ({"nose_bridge": -1.2, "face_width": 1.0, "cheekbones": 1.0, "eye_slant": 0.8, "face_height": -0.8},
      Look(melanin=0.12, age=28.0, hair=(0.04, 0.035, 0.035), iris=(0.16, 0.10, 0.06), freckles=0.3)),
     ({"jaw_width": -1.2, "brow_ridge": -1.5, "neck_width": -1.6, "nose_length": 0.8, "upper_lip": -0.8,
-      "ear_size": 1.0}, Look(age=68.0, hair=(0.72, 0.70, 0.68), iris=(0.33, 0.42, 0.36))),
+      "ear_size": 1.0}, Look(age=68.0, hair=(0.72, 0.70, 0.68), iris=(0.33, 0.42, 0.36), haircut="tied",
+                              shirt=(0.30, 0.24, 0.34))),
 )  # fmt: skip
 """Offsets of ``IDENTITY`` in standard deviations, and looks: three women and three men."""
 
 
 def performer_sheet() -> torch.Tensor:
-    """Three views and clay, six expressions, six other people."""
+    """The character from three sides, frames of a performance over its curves, six other people."""
     shown = character()
 
-    def view(one: Character, yaw: float, *names: str, colors: torch.Tensor | None = None) -> torch.Tensor:
+    def view(one: Character, yaw: float, width: int, weights: torch.Tensor | None = None) -> torch.Tensor:
         rig = one.rig
-        weights = mapping(ARKIT, rig.names)[:, [ARKIT.index(name) for name in names]].sum(1)
-        posed = rig.neutral.with_vertices(rig(weights[None])[0])
-        maps = None if colors is not None else one.surface.neutral
-        return render(posed, frame_face(rig.neutral, yaw, **SIZE), colors, samples=3, normal_map=maps)
+        posed = rig.neutral if weights is None else rig.neutral.with_vertices(rig(weights[None])[0])
+        camera = look_at(torch.tensor([0.0, -14.0, 0.0]), yaw, span=300.0, width=width, height=width * 9 // 8)
+        return render(posed, camera, samples=3, normal_map=one.surface.neutral)
 
-    yaws = (FRONT, THREE_QUARTER, PROFILE)
-    cells = [caption(view(shown, yaw), "neutral") for yaw in yaws]
-    cells += [caption(view(shown, yaw, colors=clay_colors(shown.rig.neutral)), "form") for yaw in yaws]
-    cells += [caption(view(shown, 20.0, *names), title) for title, names in POSES.items()]
+    sides = [view(shown, yaw, 396) for yaw in (FRONT, THREE_QUARTER, PROFILE)]
+    take = perform(420, torch.Generator().manual_seed(66))
+    assert take.weights is not None
+    weights = shown.rig.weights_from(take.weights)
+    frames = list(range(12, 420, 47))
+    strip = [view(shown, 15.0, 129, weights[frame]) for frame in frames]
     order = [parameter.name for parameter in IDENTITY]
+    people = []
     for offsets, look in PEOPLE:
         identity = torch.zeros(len(order))
         for name, value in offsets.items():
             identity[order.index(name)] = value
-        one = character(performer(identity, texture=False), look, size=1024)
-        cells.append(caption(view(one, 20.0), f"another person, {look.age:.0f}"))
-    return sheet(cells, 6)
+        people.append(view(character(performer(identity, texture=False), look, size=1024), 22.0, 196))
+    rows = [sheet(sides, 3), sheet(strip, 9), _curves(weights, shown.rig.names, frames, take.fps), sheet(people, 6)]
+    return sheet(rows, 1)
+
+
+def _curves(weights: torch.Tensor, names: tuple[str, ...], frames: list[int], fps: float) -> torch.Tensor:
+    """The most active shapes over time, with the frames that are shown marked."""
+    figure = Figure(figsize=(11.96, 1.5), dpi=100)
+    axes = figure.add_axes((0.004, 0.05, 0.992, 0.92))
+    lively = [row for row in weights.std(0).argsort(descending=True).tolist() if not names[row].endswith("Right")]
+    for row in lively[:8]:
+        axes.plot(torch.arange(len(weights)) / fps, weights[:, row], label=names[row], linewidth=1.6)
+    for frame in frames:
+        axes.axvline(frame / fps, color="0.75", linewidth=0.8, zorder=0)
+    half = (frames[1] - frames[0]) / 2
+    axes.set(xlim=((frames[0] - half) / fps, (frames[-1] + half) / fps), ylim=(-0.02, 1.02), xticks=[], yticks=[])
+    axes.legend(loc="upper right", fontsize=7, ncols=4, framealpha=0.85)
+    for side in axes.spines.values():
+        side.set_visible(False)
+    return from_figure(figure)
 
 
 def registration_picture() -> torch.Tensor:
@@ -110,7 +123,7 @@ def fit_picture() -> torch.Tensor:
             points.write_text(f"version: 1\nn_points: {len(ids)}\n{{\n{rows}\n}}\n")
             cells.append(caption(_half(load_image(path)), "photograph"))
         files = [path.with_suffix(".pts") for path in photographs]
-        fit_photographs(photographs, files, "head", Path(folder) / "rig.glb")
+        fit_photographs(photographs, files, "head", Path(folder) / "rig.glb", PhotographSettings(insist=True))
         rig = load_rig(Path(folder) / "rig.glb")
     jaw = torch.zeros(1, len(rig.names))
     jaw[0, rig.names.index("jawOpen")] = 0.7
@@ -161,7 +174,7 @@ def main() -> None:
     save_rendered_image(performer_sheet(), HERE / "images" / "performer.jpg")
     save_rendered_image(registration_picture(), HERE / "images" / "registration.jpg")
     save_rendered_image(fit_picture(), HERE / "images" / "fit.jpg")
-    save_rendered_image(relight_picture(), HERE / "images" / "relight.png")
+    save_rendered_image(relight_picture(), HERE / "images" / "relight.jpg")
     with Image.open(HERE.parent / "out" / "demo" / "frame_1.png") as image:
         save_rendered_image(from_pillow(image), HERE / "images" / "demo.jpg")
 

@@ -14,6 +14,7 @@ from torch import Tensor
 from torchface.color_space import to_linear
 from torchface.errors import ShapeError
 from torchface.geometry.meshes.normal_maps import encode_normals
+from torchface.geometry.meshes.operators import vertex_normals
 from torchface.geometry.meshes.uv_seams import split_at_seams
 from torchface.io.gltf.buffers import BufferWriter
 from torchface.io.gltf.gltf_document import glb_pieces
@@ -31,7 +32,7 @@ if TYPE_CHECKING:
     import viser
 
 _MIN_MOVE = 1e-4
-_TEXTURED_SCALE = 1.0008
+_OVER = 0.12  # millimetres that the textured mesh lies over the pieces
 
 
 class HeadOnPage:
@@ -58,7 +59,7 @@ class HeadOnPage:
     ) -> None:
         self._server = server
         self._parts = split_parts(mesh)
-        self._vertices = mesh.vertices.detach().cpu().float()
+        self._vertices, self._faces = mesh.vertices.detach().cpu().float(), mesh.faces.cpu()
         self._normal_map = normal_map if mesh.uvs is not None else None
         has_colors = (mesh.texture is not None and mesh.uvs is not None) or mesh.colors is not None
         self._textured = TexturedHead(mesh) if has_colors or self._normal_map is not None else None
@@ -81,14 +82,11 @@ class HeadOnPage:
         ]
         self._textured_node = None
         if self._textured is not None:
-            centre = (self._vertices.amin(0) + self._vertices.amax(0)) / 2
-            position = origin + SCALE * (1 - _TEXTURED_SCALE) * centre.double().numpy()
             self._textured_node = server.scene.add_glb(
                 f"/{name}/textured",
                 self._glb(self._textured),
-                # Slightly larger about its centre, so that it covers the pieces.
-                scale=SCALE * _TEXTURED_SCALE * millimetres_per("m"),
-                position=position,
+                scale=SCALE * millimetres_per("m"),
+                position=origin,
                 cast_shadow=False,
                 receive_shadow=False,
             )
@@ -138,7 +136,8 @@ class HeadOnPage:
         self._texture_shown = True
 
     def _glb(self, textured: TexturedHead) -> bytes:
-        return textured.glb(self._vertices, None if self._normal_map is None else self._normal_map())
+        over = self._vertices + _OVER * vertex_normals(self._vertices, self._faces)
+        return textured.glb(over, None if self._normal_map is None else self._normal_map())
 
     def refresh_texture(self) -> None:
         """Marks the texture as out of date, so that the next :meth:`settle` makes it anew."""
