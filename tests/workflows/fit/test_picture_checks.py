@@ -14,11 +14,13 @@ from torch import Tensor
 
 from torchface.geometry.cameras.pinhole import look_at
 from torchface.landmarks import FaceReading, NoFaceError
+from torchface.landmarks.images.networks.part_finder import FaceParts
+from torchface.landmarks.images.networks.part_network import PARTS
 from torchface.modeling import ImageFit
 from torchface.synthetic import neutral_head
 from torchface.workflows.fit.fit_checks import strange_lines
 from torchface.workflows.fit.fit_landmarks import PhotographLandmarks, find_in_photographs
-from torchface.workflows.fit.picture_checks import picture_lines
+from torchface.workflows.fit.picture_checks import cover_lines, picture_lines
 
 
 def skin() -> Tensor:
@@ -49,7 +51,7 @@ def test_a_face_that_is_shown_well_is_not_remarked_on() -> None:
     [
         (lambda image: image.mean(0).expand(3, -1, -1), "no colours"),
         (lambda image: (image * 4).round() / 4, "without grain"),
-        (lambda image: image.flip(0), "colours that skin has not (red -0.19"),
+        (lambda image: image.flip(0), "colours that skin has not (red 0.83"),
         (lambda image: torch.full_like(image, 0.7), "a drawing, a statue"),
     ],
 )
@@ -78,8 +80,30 @@ def test_hidden_and_small_faces() -> None:
 def test_two_faces_of_one_size() -> None:
     face = reading()
     pair = replace(found(face), boxes=torch.stack([face.box, face.box]))
-    assert "2 faces of similar size; say which is meant with --face" in picture_lines(pair, skin())[0]
+    assert "2 faces of similar size; the largest is taken, --face names another" in picture_lines(pair, skin())[0]
     assert picture_lines(replace(pair, asked=True), skin()) == []
+    few = found(reading(25.0))
+    crowd = replace(few, boxes=few.boxes.expand(7, 4))
+    with pytest.raises(NoFaceError, match=r"found 7 faces of similar size, the largest 33 pixels .* --face .*6 at \("):
+        picture_lines(crowd, skin())
+    assert "25 pixels between" in picture_lines(replace(crowd, asked=True), skin())[0]
+
+
+@pytest.mark.parametrize(
+    ("part", "least"), [("glasses", "dark glasses hide"), ("hand", "a hand hides"), ("cloth", "cloth (a mask?) hides")]
+)
+def test_what_stands_before_a_face_is_said_with_its_share(part: str, least: str) -> None:
+    """A band of a square face: of a fifth of it there is a warning, of a fortieth there is none."""
+    square = torch.tensor([[40.0, 40], [140, 40], [140, 140], [40, 140]]).repeat(17, 1).double()
+
+    def lines(rows: int) -> list[str]:
+        shares = torch.zeros(len(PARTS), 180, 180)
+        shares[PARTS.index("skin")] = 1.0
+        shares[PARTS.index("skin"), 60 : 60 + rows], shares[PARTS.index(part), 60 : 60 + rows] = 0.0, 1.0
+        return cover_lines(Path("a.png"), FaceParts(shares, torch.eye(2, 3, dtype=torch.float64)), square)
+
+    assert lines(0) == lines(2) == []
+    assert lines(20) == [f"WARNING: a.png: {least} 20% of the face; its skin there is completed"]
 
 
 def test_landmarks_that_no_head_has_are_remarked_on() -> None:

@@ -18,11 +18,11 @@ MISFIT = 0.045
 """Of the eyes' distance: landmarks that lie further from the fit are remarked on; those found in three photographs
 of people at most 2.4 % without the contour."""
 
-ONE_PERSON, OTHERS = 3.0, 1.5
-"""Logarithms of odds: photographs above the first (20 to 1) show one person, those below the second are refused.
+ONE_PERSON, OTHERS = 0.95, 0.82
+"""Probabilities: photographs above the first show one person, those below the second are refused.
 
-Of 39 pairs of photographs of one person each all were above 3.8 (68 landmarks, the modes of ICT-FaceKit), of 1,042
-pairs of two people a quarter below -3 and half below 1.6.
+Of 39 pairs of photographs of one person each all were above 0.97 (68 landmarks, the modes of ICT-FaceKit), of 1,042
+pairs of two people a quarter below 0.05 and half below 0.83.
 """
 
 ALONE = FitSettings(transfers=0, unknown_deviation=0.0, contour_slide=0.3)
@@ -73,21 +73,22 @@ def one_person_lines(photographs: Sequence[Path], marks: Tensor, bare: BareFit, 
     if len(photographs) < 2:
         return []
     alone = [bare(marks[i : i + 1], [i]) for i in range(len(marks))]
-    odds = same_person(alone)
-    worst = int(odds.argmin())
-    if float(odds[worst]) >= ONE_PERSON:
+    sure = same_person(alone).sigmoid()
+    worst = int(sure.argmin())
+    if float(sure[worst]) >= ONE_PERSON:
         return []
     joint = float(misfits(bare(marks, list(range(len(marks))))).square().mean().sqrt())
     each = float(torch.stack([misfits(fit)[0] for fit in alone]).square().mean().sqrt())
-    listed = ", ".join(f"{path.name} {value:+.1f}" for path, value in zip(photographs, odds.tolist(), strict=True))
+    listed = ", ".join(f"{path.name} {share:.0%}" for path, share in zip(photographs, sure.tolist(), strict=True))
     figures = (
-        f"logarithm of the odds that each shows the head of the others: {listed}, expected above {ONE_PERSON:+.0f}; "
-        f"residual of the landmarks {joint:.1%} of the eyes' distance together, {each:.1%} alone"
+        f"probability that each shows the person of the others, by the form of the heads alone: {listed}, expected "
+        f"above {ONE_PERSON:.0%}; landmarks lie {joint:.1%} of the eyes' distance from one head "
+        f"for all, {each:.1%} from a head for each"
     )
-    if float(odds[worst]) < OTHERS and not insist:
+    if float(sure[worst]) < OTHERS and not insist:
         raise AlignmentError(
             f"{photographs[worst].name}: shows another person than the rest, or its landmarks are wrong ({figures}); "
-            "fit it alone, or say --insist if they are one person"
+            "leave it out, or say --insist if they are one person"
         )
     return [f"WARNING: these photographs may show different people; their mean would be nobody ({figures})"]
 

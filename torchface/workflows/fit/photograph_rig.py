@@ -19,7 +19,6 @@ from torchface.io.landmarks.landmark_points import save_pts
 from torchface.io.mesh_files import MESH_ENDINGS
 from torchface.io.rig_files import SCENE_ENDINGS
 from torchface.io.video.video_file import VIDEO_ENDINGS
-from torchface.mesh import Mesh
 from torchface.modeling import FitSettings, ImageFit, fit_images, transfer_with_report
 from torchface.modeling.photographs.image_texture import with_iris
 from torchface.modeling.photographs.landmark_view import JAW
@@ -28,7 +27,6 @@ from torchface.progress import Progress, silent
 from torchface.registration import hidden_parts, with_template_skin
 from torchface.rendering.clay_shading import Lighting, render, sample_texture
 from torchface.rendering.compositing import save_rendered_image
-from torchface.rendering.raycast import RayCaster
 from torchface.rig import BlendshapeRig
 from torchface.workflows.fit.fit_checks import (
     ALONE,
@@ -54,8 +52,9 @@ from torchface.workflows.rig.actor_rig import check_out
 from torchface.workflows.rig_names import Naming, renamed
 from torchface.workflows.track.track_models import DEFAULT_PRIOR, load_priors
 
-_OVER, _MARGIN, _SHARE = 480, 0.45, 0.7
+_OVER, _MARGIN = 480, 0.45
 _LIGHT = Lighting(occlusion_rays=0)
+_WHITE, _BLACK = (1.0, 1.0, 1.0), (0.0, 0.0, 0.0)
 _FOUND, _FIT = (0.1, 1.0, 0.2), (1.0, 0.1, 0.1)
 
 
@@ -252,7 +251,7 @@ def _pictures(
 
 
 def overlay(fit: ImageFit, view: int, image: Tensor, marks: Tensor) -> Tensor:
-    """A photograph, the fit over it, and the landmarks: found green, fitted red; (3,H,W), cut to the head.
+    """A photograph, the head before it with its skin, and the landmarks: found green, fitted red; (3,H,W), cut to it.
 
     Args:
         fit: of I photographs.
@@ -262,12 +261,10 @@ def overlay(fit: ImageFit, view: int, image: Tensor, marks: Tensor) -> Tensor:
     """
     camera, corner = _cut(fit.cameras[view], marks)
     piece = _sampled(image, corner)
-    mesh = fit.posed[view]
-    drawn = render(_clay(mesh), camera, lighting=_LIGHT, samples=1)
-    origins, directions = camera.rays()
-    caster = RayCaster(mesh.vertices, mesh.faces)
-    hit = (caster.cast(origins.reshape(-1, 3), directions.reshape(-1, 3)).triangle >= 0).view(_OVER, _OVER)
-    over = torch.where(hit, (1 - _SHARE) * piece + _SHARE * drawn, piece)
+    drawn, behind = (
+        render(fit.posed[view], camera, lighting=_LIGHT, background=color, samples=1) for color in (_WHITE, _BLACK)
+    )
+    over = torch.where((drawn - behind).mean(0) < 0.5, drawn, piece)
     dotted = piece
     for points, color in ((marks, _FOUND), (fit.landmarks[view], _FIT)):
         dotted = _dotted(dotted, (points - corner[:2]) * corner[2], color)
@@ -276,11 +273,6 @@ def overlay(fit: ImageFit, view: int, image: Tensor, marks: Tensor) -> Tensor:
 
 def _code(color: Tensor) -> str:
     return "#" + "".join(f"{round(255 * channel):02x}" for channel in color.tolist())
-
-
-def _clay(mesh: Mesh) -> Mesh:
-    """The bare form: what the photographs gave would hide where the form is wrong."""
-    return Mesh(mesh.vertices, mesh.faces)
 
 
 def _cut(camera: Camera, marks: Tensor) -> tuple[Camera, Tensor]:

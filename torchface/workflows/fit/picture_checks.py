@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 
 import cv2
@@ -53,6 +54,13 @@ def picture_lines(found: PhotographLandmarks, image: Tensor, insist: bool = Fals
         refusals.append(f"hardly a face (likelihood {float(face.presence):.2f}), expected one of a person")
     if {"eyes", "mouth"} <= set(hidden):
         refusals.append(f"eyes and mouth hidden (visible to {hidden['eyes']:.0%} and {hidden['mouth']:.0%})")
+    rivals = _rivals(found)
+    if rivals and eyes < _FEW_EYES:
+        places = ", ".join(f"{k} at ({x:.0f}, {y:.0f})" for k, (x, y, *_) in enumerate(found.boxes[:20].tolist()))
+        refusals.append(
+            f"{rivals + 1} faces of similar size, the largest {float(face.box[2]):.0f} pixels wide, expected one, or "
+            f"--face with the number of one ({places})"
+        )
     if refusals and not insist:
         raise NoFaceError(f"{name}: found {'; '.join(refusals)}; give another photograph, or say --insist")
     lines = [f"found {refusal}" for refusal in refusals]
@@ -64,13 +72,15 @@ def picture_lines(found: PhotographLandmarks, image: Tensor, insist: bool = Fals
         f"the {part} hidden (visible to {share:.0%}; sunglasses, a mask, a hand?): there the head is the model's guess"
         for part, share in hidden.items()
     ]
-    areas = found.boxes[:, 2] * found.boxes[:, 3]
-    rivals = [
-        k for k, area in enumerate(areas.tolist()) if k != found.number and area > _RIVAL * float(areas[found.number])
-    ]
-    if rivals and not found.asked:
-        lines.append(f"{len(rivals) + 1} faces of similar size; say which is meant with --face")
+    if rivals and eyes >= _FEW_EYES:
+        lines.append(f"{rivals + 1} faces of similar size; the largest is taken, --face names another")
     return [f"WARNING: {name}: {line}" for line in [*lines, *_color_lines(image, face.box)]]
+
+
+def _rivals(found: PhotographLandmarks) -> int:
+    """How many other faces are so large that one of them may be meant; none where the user has said which."""
+    areas = found.boxes[:, 2] * found.boxes[:, 3]
+    return 0 if found.asked else int((areas > _RIVAL * areas[found.number]).sum()) - 1
 
 
 def profile_lines(fit: ImageFit) -> list[str]:
@@ -137,8 +147,8 @@ def _color_lines(image: Tensor, box: Tensor) -> list[str]:
     red, green, blue = middle.flatten(1).median(dim=1).values.clamp(min=0.02).log().tolist()
     if not (_RED[0] < red - green < _RED[1] and _BLUE[0] < blue - green < _BLUE[1]):
         lines.append(
-            f"colours that skin has not (red {red - green:+.2f}, blue {blue - green:+.2f} beside green, natural "
-            f"logarithms): a filter, coloured light, paint?"
+            f"colours that skin has not (red {math.exp(red - green):.2f} and blue {math.exp(blue - green):.2f} of "
+            f"green): a filter, coloured light, paint?"
         )
     return lines
 
