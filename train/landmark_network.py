@@ -20,7 +20,6 @@ from torchface import zoo
 from torchface.errors import ValueRangeError
 from torchface.landmarks import LandmarkNetwork, NetworkSettings
 from torchface.landmarks.images.ibug_68 import COUNT, INNER
-from torchface.landmarks.images.networks.dense_head import DenseReading
 from torchface.landmarks.images.networks.heat_map_training import new_network
 from torchface.landmarks.images.networks.landmark_network import NetworkLandmarks
 from torchface.landmarks.images.networks.landmark_training import cropped, openings
@@ -32,7 +31,6 @@ from .model_cards import model_card
 from .recipe_settings import ANY_DEVICE, RecipeSettings
 from .rendered_people.dense_points import dense_places
 from .runner import Recipe, Run, metric_lines, recipe
-from .tensor_shards import Shards
 
 _TEST_BATCH = 64
 # Of a network that has learned already: photographs are few, and what it knows beside them is to stay.
@@ -99,7 +97,7 @@ def train(settings: Settings, run: Run) -> LandmarkNetwork:
         learned, first_network(settings), settings.network, progress, run.checkpoint, run.device, run.log
     )
     middle = EACH * ((count + len(pictures)) // (2 * EACH))
-    calibrate(model, held_out(model, pictures, count, middle), Shards(files, ["weights"]).read(0, count)["weights"])
+    calibrate(model, held_out(model, pictures, count, middle))
     save(model, settings, measures(held_out(model, pictures, middle, len(pictures))))
     return model
 
@@ -153,13 +151,11 @@ class HeldOut:
         crops: what it was shown, and where all marks are.
         weights: that are posed, (M,52).
         found: by the network, as it is calibrated.
-        dense: the same as it was learned; None of a network without points.
     """
 
     crops: Crops
     weights: Tensor
     found: NetworkLandmarks
-    dense: DenseReading | None
 
 
 @torch.no_grad()
@@ -168,30 +164,23 @@ def held_out(model: LandmarkNetwork, pictures: StoredExpressions, first: int, la
     plain = AugmentationSettings(turn=8.0, hidden=0.0, absent=0.0)
     generator = torch.Generator().manual_seed(0)
     shown: list[Crops] = []
-    weights, found, dense = [], [], []
+    weights, found = [], []
     for start in range(first, last, _TEST_BATCH):
         numbers = torch.arange(start, min(start + _TEST_BATCH, last))
         crops, posed = cropped(pictures[numbers], model.size, model.margin, model.mirror, generator, plain)
-        maps = model.maps(crops.images)
-        found.append(model.read(*maps))
-        dense.append(model.readings(*maps)[1])
+        found.append(model(crops.images))
         shown.append(replace(crops, images=crops.images[:0]))
         weights.append(posed)
     crops = Crops(*(torch.cat([getattr(one, part.name) for one in shown]) for part in fields(Crops)))
-    raw = [one for one in dense if one is not None]
     return HeldOut(
-        crops,
-        torch.cat(weights),
-        NetworkLandmarks(*(torch.cat(part) for part in zip(*found, strict=True))),
-        DenseReading(*(torch.cat(part) for part in zip(*raw, strict=True))) if raw else None,
+        crops, torch.cat(weights), NetworkLandmarks(*(torch.cat(part) for part in zip(*found, strict=True)))
     )
 
 
-def calibrate(model: LandmarkNetwork, seen: HeldOut, learned: Tensor) -> None:
-    """Measures how far the network draws weights toward their means, and how wrong its deviations are; keeps mean and
-    covariance of the weights that it learned from, (K,52)."""
-    if model.dense is not None and seen.dense is not None:
-        model.dense.calibrate(seen.dense.raw, seen.dense.raw_deviation, seen.weights, learned)
+def calibrate(model: LandmarkNetwork, seen: HeldOut) -> None:
+    """Measures how wrong the network's deviations of weights are."""
+    if model.dense is not None:
+        model.dense.calibrate(seen.found.expression, seen.found.expression_deviation, seen.weights)
 
 
 def measures(seen: HeldOut) -> dict[str, float]:
@@ -211,16 +200,12 @@ def measures(seen: HeldOut) -> dict[str, float]:
         both = torch.cov(torch.stack([true[:, rows].flatten(), read[:, rows].flatten()]))
         errors[f"{name}, correlation"] = float(both[0, 1] / (both[0, 0] * both[1, 1]).sqrt())
         errors[f"{name}, slope"] = float(both[0, 1] / both[0, 0])
-    if seen.dense is not None:
+    if seen.found.points.shape[1]:
         errors[f"mean error of other points, {_SHARE}"] = error(seen.found.points, slice(COUNT, None))
-        shapes = torch.isfinite(seen.found.expression_deviation).all(0)
-        errors["shapes that can be seen"] = float(shapes.sum())
-        if bool(shapes.any()):
-            read, weights = seen.found.expression[:, shapes], seen.weights[:, shapes]
-            off = read.clamp(0, 1) - weights
-            errors["error of their weights, root mean square"] = float(off.square().mean().sqrt())
-            errors["their weights' own, about their means"] = float((weights - weights.mean(0)).square().mean().sqrt())
-            errors["correlation of a shape, median"] = float(correlations(read, weights).median())
+        off, own = seen.found.expression - seen.weights, seen.weights - seen.weights.mean(0)
+        errors["error of weights, root mean square"] = float(off.square().mean().sqrt())
+        errors["weights' own, about their means"] = float(own.square().mean().sqrt())
+        errors["correlation of a shape, median"] = float(correlations(seen.found.expression, seen.weights).median())
     return errors
 
 
@@ -243,7 +228,7 @@ def save(
         text=(
             "iBUG's 68 landmarks of a face in a crop of a colour or grey image and 452 further points of its surface, "
             "with the deviation to be expected of each; which of the 68 something hides, whether there is a face at "
-            "all, and the weights of ARKit's 52 blendshapes with deviations, infinite for what cannot be seen. Good "
+            "all, and the weights of ARKit's 52 blendshapes that are to be expected, with deviations. Good "
             "for faces within 60 degrees of frontal, from 24 pixels a box, at any roll that the crop is turned by. "
             + ("The figures are of rendered people that it had not seen; " if not data else "")
             + "tests/benchmarks/test_real_faces.py measures it on photographs."

@@ -87,7 +87,6 @@ def test_the_recipe(files: list[Path], tmp_path: Path, monkeypatch: pytest.Monke
         "blocks": [1, 1, 1],
         "points": 452,
         "hidden": 176,
-        "expects": 1,
     }
     assert model.places.shape == (452, 3)
     again = zoo.get_model(tmp_path / "own")

@@ -11,7 +11,6 @@ import torch
 from torch import Tensor
 
 from torchface import zoo
-from torchface.capture.priors import ShapePrior, StudentDensity
 from torchface.errors import NameMismatchError, ValueRangeError
 from torchface.landmarks import BoxNetwork, LandmarkNetwork, LandmarkTrees
 from torchface.landmarks.images.boxes.network_detector import NetworkDetector, graph_boxes
@@ -26,7 +25,6 @@ from torchface.landmarks.images.networks.part_finder import PartFinder, graph_pa
 from torchface.landmarks.images.networks.part_network import PartNetwork
 from torchface.landmarks.images.trees.landmark_consensus import ConsensusSettings
 from torchface.landmarks.images.trees.tree_finder import PHOTOGRAPH, TreeFinder
-from torchface.shape_names import ARKIT
 from torchface.workflows.cached_graph import cached_graph
 
 __all__ = ["NamedFinder", "load_finder"]
@@ -43,8 +41,6 @@ PARTS = "face_parts"
 BUNDLE = ".task"
 """The ending of MediaPipe's Face Landmarker bundles."""
 
-_GAUSSIAN = 1e6  # degrees of freedom
-
 
 @dataclass(frozen=True)
 class NamedFinder:
@@ -54,13 +50,13 @@ class NamedFinder:
         finder: finds them.
         source: the file or folder, for keys of what depends on it.
         places: of the points that it finds beside the 68, on the embedded performer's mean head, (P,3) millimetres.
-        expected: which weights it learned from, where it reads expressions: what solves expect beside its readings.
+        expects: whether it reads which weights are to be expected, so that solves need no other prior.
     """
 
     finder: LandmarkFinder
     source: Path | str
     places: Tensor = field(default_factory=lambda: torch.zeros(0, 3))
-    expected: ShapePrior | None = None
+    expects: bool = False
 
 
 def load_finder(
@@ -94,7 +90,7 @@ def load_finder(
     model = zoo.get_model(name_or_path)
     if isinstance(model, LandmarkNetwork):
         finder = network_finder(model, str(name_or_path), photographs)
-        return NamedFinder(finder, zoo.find(name_or_path), model.places, expected_weights(model))
+        return NamedFinder(finder, zoo.find(name_or_path), model.places, model.points > 0)
     if not isinstance(model, LandmarkTrees):
         raise NameMismatchError(
             f"{option}: found {name_or_path}, a {type(model).__name__}, expected a LandmarkTrees or LandmarkNetwork"
@@ -104,15 +100,6 @@ def load_finder(
         return NamedFinder(TreeFinder(model, starts, str(name_or_path)), zoo.find(name_or_path))
     except ValueRangeError as error:
         raise ValueRangeError(f"{name_or_path}: {error}") from error
-
-
-def expected_weights(network: LandmarkNetwork) -> ShapePrior | None:
-    """The Gaussian of the weights that a network learned from, by ARKit's names; None where it does not say."""
-    learned = network.learned_weights
-    if learned is None:
-        return None
-    density = StudentDensity(learned[1], _GAUSSIAN, learned[0])
-    return ShapePrior(ARKIT, [tuple(range(len(ARKIT)))], [density])
 
 
 def network_finder(network: LandmarkNetwork, name: str, photographs: bool = False) -> EyedFinder:

@@ -204,13 +204,13 @@ def _split(
     solution = here
     for _ in range(_REWEIGHTINGS):  # each penalty is by the weights that the one before led to
         read, falls = mean.read, 1.0 if expression is None else 1 / (1 + expression / _SOFTENING)
-        penalty = pad(_PENALTY * falls * torch.ones_like(mean.weights), (0, len(likely)))
+        penalty = pad((read is None) * _PENALTY * falls * torch.ones_like(mean.weights), (0, len(likely)))
         program = H
         if solver is not None and solver.prior is not None:
             learned = solver.prior.energy((mean.weights if expression is None else expression)[None])
-            strength = (_PRIOR if read is None else 1.0) / solver.prior.strength
+            strength = _PRIOR / solver.prior.strength
             program = H + strength * pad(learned.H[0], 2 * (0, len(likely)))
-            penalty = (read is None) * penalty + strength * pad(learned.f[0], (0, len(likely)))
+            penalty = penalty + strength * pad(learned.f[0], (0, len(likely)))
         if solver is not None and read is not None:
             program = program + pad(read.H[0], 2 * (0, len(likely)))
             penalty = penalty + pad(read.f[0], (0, len(likely)))

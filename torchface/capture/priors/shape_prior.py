@@ -150,11 +150,6 @@ class ShapePrior(nn.Module):
             f[:, rows] = factor[:, None] * pull
         return Quadratic(H, f)
 
-    @property
-    def centered(self) -> bool:
-        """Whether it expects what people's faces do on average rather than rest: solvers then need no penalty."""
-        return any(getattr(density, "center", None) is not None for density in self.densities)
-
     def parts(self, weights: Tensor) -> list[tuple[Density, Tensor]]:
         """Each group's density, with its columns of weights (B,N)."""
         densities: list[Any] = list(self.densities)

@@ -1,4 +1,4 @@
-"""Student's t-distribution of weights, with its mode at rest or at a mean."""
+"""Student's t-distribution of weights, with its mode at rest."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ PARTING_VARIANCE = 3e-5
 
 
 class StudentDensity(nn.Module):
-    r"""Student's t-distribution in D dimensions, with its mode at rest unless a center is given.
+    r"""Student's t-distribution in D dimensions, with its mode at rest.
 
-    .. math:: p(x) \propto \Big( 1 + \frac{(x - c)^\top \Sigma^{-1} (x - c)}{\nu} \Big)^{-(\nu + D)/2}
+    .. math:: p(x) \propto \Big( 1 + \frac{x^\top \Sigma^{-1} x}{\nu} \Big)^{-(\nu + D)/2}
 
     Weights do not scatter about their mean: a face keeps coming back to rest, and other takes go further than those
     seen. So the mode is at zero and the tails are heavy: an expression beyond those learned from is drawn back less,
@@ -30,7 +30,6 @@ class StudentDensity(nn.Module):
     Args:
         factor: L with :math:`\Sigma^{-1} = L L^\top`, lower triangular, (D,D).
         degrees_of_freedom: :math:`\nu`, positive; a large number for a Gaussian.
-        center: c, (D,); rest, 0, if absent.
 
     Source: Liu and Rubin 1995 for the fit; Lange, Little and Taylor 1989 for the bound.
 
@@ -43,15 +42,13 @@ class StudentDensity(nn.Module):
 
     factor: Tensor
     degrees_of_freedom: Tensor
-    center: Tensor | None
 
-    def __init__(self, factor: Tensor, degrees_of_freedom: float | Tensor, center: Tensor | None = None) -> None:
+    def __init__(self, factor: Tensor, degrees_of_freedom: float | Tensor) -> None:
         super().__init__()
         if factor.ndim != 2 or factor.shape[0] != factor.shape[1]:
             raise ShapeError(f"Student density: found a factor of {tuple(factor.shape)}, expected (D,D)")
         self.register_buffer("factor", factor.detach().float().contiguous())
         self.register_buffer("degrees_of_freedom", torch.as_tensor(degrees_of_freedom).detach().float().reshape(()))
-        self.register_buffer("center", None if center is None else center.detach().float())
 
     @classmethod
     def fit(
@@ -107,7 +104,7 @@ class StudentDensity(nn.Module):
     def below_peak(self, samples: Tensor) -> Tensor:
         """:math:`\\log p` of samples (B,D) less that of their likeliest, (B,)."""
         nu = self.degrees_of_freedom.to(samples)
-        distance = (self._off(samples) @ self.factor.to(samples)).square().sum(1)
+        distance = (samples @ self.factor.to(samples)).square().sum(1)
         return -0.5 * (nu + samples.shape[1]) * torch.log1p(distance / nu)
 
     def bound(self, samples: Tensor) -> tuple[Tensor, Tensor]:
@@ -120,14 +117,9 @@ class StudentDensity(nn.Module):
             H (B,D,D) and f (B,D) of :math:`\tfrac12 x^\top H x + f^\top x`.
         """
         factor, nu = self.factor.to(samples), self.degrees_of_freedom.to(samples)
-        distance, precision = (self._off(samples) @ factor).square().sum(1), factor @ factor.T
+        distance, precision = (samples @ factor).square().sum(1), factor @ factor.T
         scale = (nu + samples.shape[1]) / (nu + distance)
-        if self.center is None:
-            return scale[:, None, None] * precision, torch.zeros_like(samples)
-        return scale[:, None, None] * precision, -scale[:, None] * (precision @ self.center.to(samples))
-
-    def _off(self, samples: Tensor) -> Tensor:
-        return samples if self.center is None else samples - self.center.to(samples)
+        return scale[:, None, None] * precision, torch.zeros_like(samples)
 
     def mapped(self, matrix: Tensor, floor: Tensor) -> StudentDensity:
         """The density of y = Mx with a variance added to each y.
@@ -142,13 +134,12 @@ class StudentDensity(nn.Module):
         return StudentDensity(
             torch.linalg.cholesky(torch.cholesky_inverse(torch.linalg.cholesky(covariance))),
             self.degrees_of_freedom,
-            None if self.center is None else matrix @ self.center.double(),
         )
 
     @property
     def config(self) -> dict[str, Any]:
         """Sizes from which :meth:`from_config` makes a density for the state to be loaded into."""
-        return {"kind": "student", "dimensions": len(self.factor)} | ({} if self.center is None else {"centered": True})
+        return {"kind": "student", "dimensions": len(self.factor)}
 
     @classmethod
     def from_config(cls, config: Mapping[str, Any]) -> StudentDensity:
@@ -160,9 +151,7 @@ class StudentDensity(nn.Module):
         (dimensions,) = checked_sizes(config, "dimensions")
         if dimensions > 2**14:
             raise FileFormatError(f"Student density: found {dimensions} dimensions, expected at most {2**14}")
-        return cls(
-            torch.zeros(dimensions, dimensions), 1.0, torch.zeros(dimensions) if config.get("centered") else None
-        )
+        return cls(torch.zeros(dimensions, dimensions), 1.0)
 
 
 def _sample_weights(x: Tensor, precision: Tensor | None, degrees_of_freedom: float) -> Tensor:
@@ -182,7 +171,6 @@ class StudentGroups(nn.Module):
     """
 
     precisions: Tensor
-    center: Tensor
     freedoms: Tensor
     sizes: Tensor
 
@@ -192,20 +180,18 @@ class StudentGroups(nn.Module):
         like = densities[0].factor.double()
         sizes = like.new_tensor([float(len(group)) for group in groups])
         shapes = int(sizes.sum())
-        precisions, center = like.new_zeros(len(groups), shapes, shapes), like.new_zeros(shapes)
+        precisions = like.new_zeros(len(groups), shapes, shapes)
         for precision, group, density in zip(precisions, groups, densities, strict=True):
             rows, factor = torch.tensor(group, device=like.device), density.factor.double()
             precision[rows[:, None], rows] = factor @ factor.T
-            center[rows] = like.new_zeros(len(group)) if density.center is None else density.center.double()
         freedoms = torch.stack([density.degrees_of_freedom for density in densities]).double()
-        tables = {"precisions": precisions, "center": center, "freedoms": freedoms, "sizes": sizes}
+        tables = {"precisions": precisions, "freedoms": freedoms, "sizes": sizes}
         for name, value in tables.items():
             self.register_buffer(name, value)
 
     def energy(self, weights: Tensor) -> Quadratic:
         """As of ``ShapePrior.energy``, at weights (1,N) float64."""
-        off = weights[0] - self.center
-        distance = (self.precisions @ off) @ off
+        distance = (self.precisions @ weights[0]) @ weights[0]
         factors = self.strength * (self.freedoms + self.sizes) / (self.freedoms + distance)
         precision = (factors[:, None, None] * self.precisions).sum(0)
-        return Quadratic(precision[None], -(precision @ self.center)[None])
+        return Quadratic(precision[None], torch.zeros_like(weights))

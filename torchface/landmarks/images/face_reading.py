@@ -52,9 +52,9 @@ class FaceReading:
         points: other points of the face's surface, those of the network that found them, (...,P,2) pixels of the whole
             picture; P is 0 if absent, NaN where there is no face.
         point_deviation: standard deviation of a coordinate of each, (...,P) pixels: large where a point is hidden.
-        expression: weights of blendshapes by ARKit's names, measured from the picture alone: the true ones and noise,
-            so also beyond 0 and 1, (...,52); NaN, if absent too, where nothing measured them.
-        expression_deviation: standard deviation of the noise, (...,52); infinite for what cannot be seen.
+        expression: weights of blendshapes by ARKit's names, as they are to be expected of the picture alone, (...,52);
+            NaN, if absent too, where nothing read them.
+        expression_deviation: standard deviation of the truth about them, (...,52); infinite for what cannot be seen.
         search_box: x, y, width, height of the box that the face was looked for in, (...,4) pixels; the box round the
             landmarks if absent.
 

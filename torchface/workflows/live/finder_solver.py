@@ -40,7 +40,7 @@ class FinderSolver:
         progress(f"reading {landmarks}")
         named = load_finder(landmarks)
         self._tracker = LandmarkTracker(named.finder, detector=graph_detector())
-        self._solver = webcam_solver(named.expected)
+        self._solver = webcam_solver(named.expects)
         self._state = self._solver.start()
 
     def step(self, picture: np.ndarray, interval: float | None, controls: WebcamControls) -> LiveFrame:

@@ -136,7 +136,7 @@ def new_offsets(
         ValueRangeError: the neutral frame is none of the take, or shows no face.
     """
     read = None
-    if solver.prior is not None and solver.prior.centered and bool(torch.isfinite(reading.expression_deviation).any()):
+    if inputs.models.expects and bool(torch.isfinite(reading.expression_deviation).any()):
         read = WeightReadings.of_expression(reading.expression, reading.expression_deviation, solver.names)
     offsets = estimate_offsets(
         solver, landmarks, reading.trust, known_rest(reading), identity_modes(), inputs.settings.neutral_frame, read

@@ -224,8 +224,8 @@ def solver_for(
     prior = models.prior
     if motion is not None and models.dynamics is None:
         settings = replace(settings, motion=motion)
-    if models.expected is not None:
-        prior, settings = models.expected, replace(settings, sparsity=0.0)
+    if models.expects:
+        prior, settings = None, replace(settings, sparsity=0.0)
     return VideoSolver(rig, None, calibration.intrinsics, prior, models.dynamics, settings)
 
 

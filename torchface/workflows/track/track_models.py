@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeVar
@@ -20,6 +20,7 @@ from torchface.landmarks import AppearanceModel
 from torchface.landmarks.images.landmark_finder import LandmarkFinder
 from torchface.modeling import HeadModel
 from torchface.rig import BlendshapeRig
+from torchface.shape_names import ARKIT
 from torchface.workflows.named_finders import DEFAULT_LANDMARKS, load_finder
 
 HEADS = "head"
@@ -47,12 +48,12 @@ class TrackModels:
         finder: finds landmarks in any face; absent where they are given.
         appearance: refines them on the actor's own.
         prior: which weights faces have.
-        expected: which weights the finder's network learned from, for the rig's shapes: what its readings of
-            expressions are solved with instead, where no prior was named; None where it reads none.
         dynamics: how weights go on.
         unlearned: shapes of the rig that a prior says nothing of: they stay near rest.
         seeing: changes when what finds landmarks does.
         solving: changes when what solves does.
+        expects: whether the finder reads which weights of the rig's shapes are to be expected: then solves have no
+            other prior.
     """
 
     finder: LandmarkFinder | None
@@ -62,7 +63,7 @@ class TrackModels:
     unlearned: tuple[str, ...] = ()
     seeing: str = ""
     solving: str = ""
-    expected: ShapePrior | None = None
+    expects: bool = False
 
 
 def is_table(landmarks: str | Path | None) -> bool:
@@ -106,13 +107,8 @@ def load_track_models(
             "seeing", finder=Path(landmarks) if named is None else named.source, appearance=_folder(appearance)
         ),
         content_key("solving", prior=learned, dynamics=_folder(dynamics), fps=fps),
-        None if named is None or prior != DEFAULT_PRIOR else for_rig(named.expected, rig),
+        named is not None and named.expects and prior == DEFAULT_PRIOR and _knows(ARKIT, rig),
     )
-
-
-def for_rig(expected: ShapePrior | None, rig: BlendshapeRig) -> ShapePrior | None:
-    """What a network expects, for a rig's shapes; None where it knows less than half of them."""
-    return expected.renamed(rig.names) if expected is not None and _knows(expected, rig) else None
 
 
 @dataclass(frozen=True)
@@ -143,7 +139,7 @@ def load_priors(
 ) -> FittedPriors:
     """Reads priors and brings them to a rig and a frame rate; see :func:`load_track_models`."""
     prior = None if prior == NO_PRIOR else prior
-    if prior == DEFAULT_PRIOR and not _knows(zoo.get_model(DEFAULT_PRIOR), rig):
+    if prior == DEFAULT_PRIOR and not _knows(zoo.get_model(DEFAULT_PRIOR, ShapePrior).names, rig):
         prior = None
     spread = _DEFAULT_DEVIATION if prior == DEFAULT_PRIOR else 0.0
     shapes = None if prior is None else _read("--prior", prior, ShapePrior)
@@ -156,9 +152,9 @@ def load_priors(
     )
 
 
-def _knows(learned: nn.Module, rig: BlendshapeRig) -> bool:
-    """Whether a prior has learned at least half of a rig's shapes."""
-    return isinstance(learned, ShapePrior) and 2 * len(unlearned(learned.names, rig.names)) <= len(rig.names)
+def _knows(names: Sequence[str], rig: BlendshapeRig) -> bool:
+    """Whether at least half of a rig's shapes are among names."""
+    return 2 * len(unlearned(names, rig.names)) <= len(rig.names)
 
 
 def _widened(prior: ShapePrior, deviation: float) -> ShapePrior:

@@ -99,7 +99,7 @@ def _track(inputs: TrackInputs, others: list[OtherCamera], out: Path, filmed: bo
         with _timed(seconds, "head"):
             head = person_head(inputs, inputs.heads, landmarks, reading, progress)
         inputs = replace(inputs, actor=head.rig)
-    trust, solver = reading.trust, inputs.solver(inputs.clip.fps, MOTION if inputs.models.expected else None)
+    trust, solver = reading.trust, inputs.solver(inputs.clip.fps, MOTION if inputs.models.expects else None)
     offsets = known_offsets(inputs, out)
     if offsets is None or offsets.video != inputs.offsets_key:
         with _timed(seconds, "offsets"):

@@ -8,7 +8,6 @@ import onnx
 
 from torchface import zoo
 from torchface.capture.anybody import WebcamSettings, WebcamSolver
-from torchface.capture.priors import ShapePrior
 from torchface.errors import NameMismatchError
 from torchface.landmarks import BoxNetwork, LandmarkNetwork
 from torchface.landmarks.images.frame_reader.face_reader import FaceReader, WebcamNetworks
@@ -18,8 +17,7 @@ from torchface.onnx.webcam.webcam_model import WebcamGraph, WebcamSolverGraph, w
 from torchface.progress import Progress, silent
 from torchface.synthetic.head.performer import performer
 from torchface.workflows.cached_graph import cached_graph
-from torchface.workflows.named_finders import expected_weights
-from torchface.workflows.track.track_models import DEFAULT_PRIOR, for_rig, load_priors
+from torchface.workflows.track.track_models import DEFAULT_PRIOR, load_priors
 
 __all__ = ["default_webcam_solver"]
 
@@ -80,11 +78,11 @@ def default_webcam_solver(settings: WebcamSettings | None = None) -> WebcamSolve
         >>> default_webcam_solver().names[:2]
         ('eyeBlinkLeft', 'eyeLookDownLeft')
     """
-    return webcam_solver(expected_weights(zoo.get_model(NETWORKS[1], LandmarkNetwork)), settings)
+    return webcam_solver(zoo.get_model(NETWORKS[1], LandmarkNetwork).points > 0, settings)
 
 
-def webcam_solver(expected: ShapePrior | None, settings: WebcamSettings | None = None) -> WebcamSolver:
-    """The same for what a finder reads that expects these weights; None for one that reads no expression.
+def webcam_solver(expects: bool, settings: WebcamSettings | None = None) -> WebcamSolver:
+    """The same, without the prior where a finder reads which weights are to be expected.
 
     Raises:
         NameMismatchError: the zoo's model of heads is another kind of model.
@@ -94,7 +92,6 @@ def webcam_solver(expected: ShapePrior | None, settings: WebcamSettings | None =
     if heads.landmarks is None:
         raise NameMismatchError(f"{HEADS}: found a HeadModel without landmarks, expected one with them")
     settings, prior = settings or WebcamSettings(), load_priors(rig, DEFAULT_PRIOR, None).shapes
-    own = for_rig(expected, rig)
-    if own is not None:
-        prior, settings = own, replace(settings, sparsity=0.0, prior_strength=1.0)
+    if expects:
+        prior, settings = None, replace(settings, sparsity=0.0)
     return WebcamSolver(rig, heads.shape.modes[:, heads.landmarks], prior, settings)

@@ -12,8 +12,6 @@ from torchface.landmarks.images.ibug_68 import COUNT, tilt_around
 from torchface.shape_names import ARKIT
 
 WEIGHTS = len(ARKIT)
-LEAST_SLOPE = 0.15
-"""Slope of a weight as it is read over the true one, under which the weight cannot be seen."""
 
 _OWN, _SHARED, _UNDER = 3, 2, 8  # numbers read off the features of a point: its own, and those that all others see
 _CELLS, _DEEP, _EXTENT = (
@@ -22,7 +20,6 @@ _CELLS, _DEEP, _EXTENT = (
     1.8,
 )  # deep features: cells a side, numbers of a cell, and half the side, of a face's size
 _FORM, _MOVE, _SURE, _SEEN = 56, 88, 16, 64  # ranks of maps to all points, and units that see where points were found
-_LEAST_VARIANCE = 1e-3  # added to those of weights: shapes that hardly moved may move
 _OFFSET = 0.1  # of the face's size, a unit of what features move a point by
 
 
@@ -32,14 +29,14 @@ class DenseReading(NamedTuple):
     Args:
         points: (B,P,2) pixels of the crop.
         point_deviation: standard deviation of a coordinate, (B,P) pixels.
-        raw: weights by ARKit's names as they were learned, (B,52): drawn toward their means.
-        raw_deviation: of ``raw``, (B,52).
+        expression: weights by ARKit's names as they are to be expected, (B,52).
+        expression_deviation: standard deviation of the truth about them, (B,52).
     """
 
     points: Tensor
     point_deviation: Tensor
-    raw: Tensor
-    raw_deviation: Tensor
+    expression: Tensor
+    expression_deviation: Tensor
 
 
 class DenseHead(nn.Module):
@@ -49,16 +46,13 @@ class DenseHead(nn.Module):
 
     with g the 68 landmarks in the face's own frame, f the features under a place, and h hidden units that see g, the
     features under all landmarks and points, the deepest features on a grid in the face's frame, and their mean. Weights
-    are read off h and off where points were found. They are divided by how far they are drawn toward their mean:
-
-    .. math:: z = (r - b) / a, \qquad r = a w + b + \varepsilon
+    are read off h and off where points were found.
 
     Args:
         points: P.
         hidden: units of h.
         channels: of the features.
         deep: deepest features.
-        expects: whether it says which weights it learned from; :meth:`calibrate` makes it so.
 
     Source: Wood et al. 2022 (many points with a deviation each, from rendered pictures).
     """
@@ -66,23 +60,13 @@ class DenseHead(nn.Module):
     places: Tensor
     mirror: Tensor
     cells: Tensor
-    slope: Tensor
-    offset: Tensor
     spread: Tensor
-    mean: Tensor | None
-    factor: Tensor | None
 
-    def __init__(self, points: int, hidden: int, channels: int, deep: int, expects: bool = False) -> None:
+    def __init__(self, points: int, hidden: int, channels: int, deep: int) -> None:
         super().__init__()
         self.register_buffer("places", torch.zeros(points, 3))
         self.register_buffer("mirror", torch.arange(points))
-        # Of raw weights over true ones, of held-out pictures: slope and offset, and errors in stated deviations.
-        self.register_buffer("slope", torch.ones(WEIGHTS))
-        self.register_buffer("offset", torch.zeros(WEIGHTS))
-        self.register_buffer("spread", torch.ones(WEIGHTS))
-        # Of the weights of faces that it learned from: mean, and L of the precision L L^T.
-        self.register_buffer("mean", torch.zeros(WEIGHTS) if expects else None)
-        self.register_buffer("factor", torch.zeros(WEIGHTS, WEIGHTS) if expects else None)
+        self.register_buffer("spread", torch.ones(WEIGHTS))  # errors of weights in stated deviations, of held-out faces
         cells = _EXTENT * torch.linspace(-1, 1, _CELLS)
         self.register_buffer("cells", torch.cartesian_prod(cells, cells).flip(1))
         rank = min(_FORM, 2 * points)
@@ -124,8 +108,9 @@ class DenseHead(nn.Module):
         moved = base + _OFFSET * apart
         deviation = (local[..., 2] + self.sure(hidden)).clamp(-8, 4).exp() * axes[:, :1].norm(dim=2)
         seen = torch.relu(self.seen(torch.cat([own, apart.flatten(1), hidden], 1)))
-        raw, logarithm = (self.weights(hidden) + self.more(seen)).split(WEIGHTS, 1)
-        return DenseReading(moved @ axes + middle, deviation, raw, (logarithm - 2).clamp(-5, 2).exp())
+        weights, logarithm = (self.weights(hidden) + self.more(seen)).split(WEIGHTS, 1)
+        stated = self.spread * (logarithm - 2).clamp(-5, 2).exp()
+        return DenseReading(moved @ axes + middle, deviation, weights, stated)
 
     @torch.no_grad()
     def start_form(self, matrix: Tensor, base: Tensor, own: Tensor) -> None:
@@ -145,34 +130,10 @@ class DenseHead(nn.Module):
     def _form(self) -> tuple[nn.Linear, nn.Linear]:
         return cast(nn.Linear, self.form[0]), cast(nn.Linear, self.form[1])
 
-    def unshrunk(self, raw: Tensor, deviation: Tensor) -> tuple[Tensor, Tensor]:
-        """Weights (B,52) that are the true ones and noise, and the noise's deviation: infinite for those not seen."""
-        seen = self.slope >= LEAST_SLOPE
-        slope = torch.where(seen, self.slope, 1.0)
-        return (raw - self.offset) / slope, torch.where(seen, self.spread * deviation / slope, torch.inf)
-
     @torch.no_grad()
-    def calibrate(self, raw: Tensor, deviation: Tensor, truth: Tensor, learned: Tensor | None = None) -> None:
-        """Measures how far weights are drawn toward their means, by regression of what is read on the truth.
-
-        Args:
-            raw, deviation: as read of faces of people that were not learned from, (M,52).
-            truth: (M,52); a weight that does not vary counts as one that cannot be seen.
-            learned: weights of faces that were learned from, (K,52), whose mean and covariance solvers expect where
-                nothing is seen; the truth if absent.
-        """
-        population = (truth if learned is None else learned).double()
-        covariance = torch.cov(population.T) + _LEAST_VARIANCE * torch.eye(WEIGHTS).double()
-        precision = torch.cholesky_inverse(torch.linalg.cholesky(covariance))
-        self.mean = population.mean(0).to(self.slope)
-        self.factor = torch.linalg.cholesky(precision).to(self.slope).contiguous()
-        about, mean = truth - truth.mean(0), raw.mean(0)
-        variance = about.square().mean(0)
-        slope = (about * (raw - mean)).mean(0) / variance.clamp(min=1e-6)
-        slope = torch.where(variance > 1e-5, slope, 0.0)
-        self.slope.copy_(slope)
-        self.offset.copy_(mean - slope * truth.mean(0))
-        self.spread.copy_(((raw - slope * truth - self.offset) / deviation).square().mean(0).sqrt())
+    def calibrate(self, expression: Tensor, deviation: Tensor, truth: Tensor) -> None:
+        """Measures errors in stated deviations of faces of people that were not learned from, (M,52) each."""
+        self.spread.copy_(((expression - truth) / (deviation / self.spread)).square().mean(0).sqrt())
 
 
 def face_frame(landmarks: Tensor) -> tuple[Tensor, Tensor]:

@@ -36,9 +36,9 @@ class NetworkLandmarks(NamedTuple):
         presence: probability that the crop shows a face in the place it expects, (B,).
         points: the network's other points, (B,P,2) pixels of the crop.
         point_deviation: standard deviation of a coordinate of each, (B,P) pixels: large where a point is hidden.
-        expression: weights of blendshapes by ARKit's names, the true ones and noise, so also beyond 0 and 1, (B,52);
-            NaN of a network without points.
-        expression_deviation: standard deviation of the noise, (B,52); infinite for what cannot be seen.
+        expression: weights of blendshapes by ARKit's names as they are to be expected, (B,52): their usual means where
+            nothing is seen; NaN of a network without points.
+        expression_deviation: standard deviation of the truth about them, (B,52).
     """
 
     landmarks: Tensor
@@ -75,7 +75,6 @@ class LandmarkNetwork(nn.Module):
         decoder: channels of the decoder at a quarter.
         points: P, how many points of the face it finds beside the 68: where they are, ``places`` has.
         hidden: units of the head that finds them and reads the expression.
-        expects: whether that head says which weights it learned from.
 
     Source: Newell, Yang, Deng 2016 (encoder and decoder); Sun et al. 2018 (means of heat maps); Kumar et al. 2020
     (uncertainty and visibility beside places).
@@ -98,7 +97,6 @@ class LandmarkNetwork(nn.Module):
         decoder: int = 32,
         points: int = 0,
         hidden: int = 176,
-        expects: bool = False,
     ) -> None:
         super().__init__()
         if not (32 <= size <= _MOST_SIZE and size % 16 == 0 and 0.5 <= margin <= 4):
@@ -133,7 +131,7 @@ class LandmarkNetwork(nn.Module):
         self.local_bias = nn.Parameter(torch.zeros(COUNT, 2))
         self.presence = nn.Linear(sixteenth, 1)
         self.points, self.hidden = points, hidden
-        self.dense = DenseHead(points, hidden, decoder, sixteenth, expects) if points else None
+        self.dense = DenseHead(points, hidden, decoder, sixteenth) if points else None
 
     @classmethod
     def fit(
@@ -185,29 +183,21 @@ class LandmarkNetwork(nn.Module):
         return {
             "size": self.size, "margin": self.margin, "channels": list(self.channels), "blocks": list(self.blocks),
             "decoder": self.decoder, "points": self.points, "hidden": self.hidden,
-            "expects": int(self.learned_weights is not None),
         }  # fmt: skip
 
     @classmethod
     def from_config(cls, config: dict[str, Any]) -> Self:
-        given = Value("config", "", {"points": 0, "hidden": 176, "expects": 0} | config).table()
+        given = Value("config", "", {"points": 0, "hidden": 176} | config).table()
         return cls(
             given["size"].whole(), given["margin"].number(), tuple(one.whole() for one in given["channels"].rows()),
             tuple(one.whole() for one in given["blocks"].rows()), given["decoder"].whole(),
-            given["points"].whole(), given["hidden"].whole(), bool(given["expects"].whole()),
+            given["points"].whole(), given["hidden"].whole(),
         )  # fmt: skip
 
     @property
     def places(self) -> Tensor:
         """Where its points are on the embedded performer's mean head, (P,3) millimetres."""
         return torch.zeros(0, 3) if self.dense is None else self.dense.places
-
-    @property
-    def learned_weights(self) -> tuple[Tensor, Tensor] | None:
-        """Mean (52,) and L (52,52) of the precision L L^T of the weights of faces that it learned from, if known."""
-        if self.dense is None or self.dense.mean is None or self.dense.factor is None:
-            return None
-        return self.dense.mean, self.dense.factor
 
     @property
     def mirror(self) -> Tensor:
@@ -225,7 +215,7 @@ class LandmarkNetwork(nn.Module):
             hidden: units of the head.
             size: of its crops, pixels a side; as this one's if absent. Of crops of another size it is to learn first.
         """
-        config = {"points": len(places), "hidden": hidden, "size": size or self.size, "expects": 0}
+        config = {"points": len(places), "hidden": hidden, "size": size or self.size}
         network = LandmarkNetwork.from_config(self.config | config)
         own = {name: value for name, value in self.state_dict().items() if not name.startswith("dense.")}
         network.load_state_dict(network.state_dict() | own)
@@ -263,13 +253,10 @@ class LandmarkNetwork(nn.Module):
     def read(self, heat: Tensor, features: Tensor, deep: Tensor) -> NetworkLandmarks:
         """Landmarks from what ``maps`` gives."""
         found, dense = self.readings(heat, features, deep)
-        if dense is None or self.dense is None:
-            return found
-        weights = self.dense.unshrunk(dense.raw, dense.raw_deviation)
-        return NetworkLandmarks(*found[:4], dense.points, dense.point_deviation, *weights)
+        return found if dense is None else NetworkLandmarks(*found[:4], *dense)
 
     def readings(self, heat: Tensor, features: Tensor, deep: Tensor) -> tuple[NetworkLandmarks, DenseReading | None]:
-        """The 68 alone, and what the head for points reads as it has learned it; None without one."""
+        """The 68 alone, and what the head for points reads; None without one."""
         points, under, widening = read_heat(heat, features, STRIDE)
         local = (under[..., None] * self.local).sum(2) + self.local_bias
         deviation = (local[..., 0] + widening).exp().clamp(*DEVIATION_RANGE)

@@ -264,7 +264,7 @@ def weight_loss(dense: DenseReading, weights: Tensor, present: Tensor) -> Tensor
 
     Source: Seitzer et al. 2022 (half of the deviation's square as weight).
     """
-    deviation = dense.raw_deviation
-    likelihood = 0.5 * ((dense.raw - weights) / deviation).square() + deviation.log()
+    deviation = dense.expression_deviation
+    likelihood = 0.5 * ((dense.expression - weights) / deviation).square() + deviation.log()
     each = (likelihood * deviation.detach()).mean(1)
     return (each * present).sum() / present.sum().clamp(min=1)
