@@ -75,7 +75,6 @@ def _picture(path: Path, landmarks: Tensor, network: LandmarkNetwork) -> tuple[T
     if network.dense is None:
         return row
     own = crop_transform(box_around(marks), 0.0, network.size, network.margin)
-    _, dense = network.readings(*network.maps(cut_crop(picture, own, network.size)[None].float() / 255))
-    assert dense is not None
-    points = from_crop(dense.points[0], own).float()
-    return *row, points, torch.ones(len(points), dtype=torch.bool), dense.raw[0].float()
+    found = network(cut_crop(picture, own, network.size)[None].float() / 255)
+    points = from_crop(found.points[0], own).float()
+    return *row, points, torch.ones(len(points), dtype=torch.bool), found.expression[0].float()

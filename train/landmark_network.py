@@ -172,9 +172,7 @@ def held_out(model: LandmarkNetwork, pictures: StoredExpressions, first: int, la
         shown.append(replace(crops, images=crops.images[:0]))
         weights.append(posed)
     crops = Crops(*(torch.cat([getattr(one, part.name) for one in shown]) for part in fields(Crops)))
-    return HeldOut(
-        crops, torch.cat(weights), NetworkLandmarks(*(torch.cat(part) for part in zip(*found, strict=True)))
-    )
+    return HeldOut(crops, torch.cat(weights), NetworkLandmarks(*(torch.cat(part) for part in zip(*found, strict=True))))
 
 
 def calibrate(model: LandmarkNetwork, seen: HeldOut) -> None:
