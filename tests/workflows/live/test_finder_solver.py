@@ -40,7 +40,7 @@ class Planted:
 
 
 def test_weights_follow_what_the_finder_reads(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(finder_solver, "load_finder", lambda name: NamedFinder(None, Path(name)))
+    monkeypatch.setattr(finder_solver, "load_finder", lambda name: NamedFinder(None, Path(name)))  # type: ignore[arg-type]
     monkeypatch.setattr(finder_solver, "LandmarkTracker", lambda finder, detector: Planted())
     monkeypatch.setattr(finder_solver, "graph_detector", lambda: None)
     solver, picture = FinderSolver("planted.onnx"), np.zeros((240, 320, 3), np.uint8)
@@ -56,7 +56,7 @@ def test_weights_follow_what_the_finder_reads(monkeypatch: pytest.MonkeyPatch) -
 
 @pytest.mark.parametrize("method", ["all", "regional", "linear"])
 def test_examples_follow_too_and_are_drawn(method: Method, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(finder_solver, "load_finder", lambda name: NamedFinder(None, Path(name)))
+    monkeypatch.setattr(finder_solver, "load_finder", lambda name: NamedFinder(None, Path(name)))  # type: ignore[arg-type]
     monkeypatch.setattr(finder_solver, "LandmarkTracker", lambda finder, detector: Planted())
     monkeypatch.setattr(finder_solver, "graph_detector", lambda: None)
     rig_examples(performer(texture=False)).save(tmp_path / "examples.json")

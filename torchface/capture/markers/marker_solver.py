@@ -111,7 +111,7 @@ class MarkerSolver(nn.Module):
         if rig.correctives is not None:
             moved = attachment.on(faces, rig.correctives.deltas).permute(1, 2, 0).contiguous()
             self._correct(rig.correctives.definitions, moved)
-        self.program, self.antagonists = program, antagonists
+        self.program, self.antagonists = program, checked_type("antagonists", antagonists, bool)
 
     def _register(
         self,
