@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 # What a report prints of each confusion, and how many of them; the tuples hold all.
-_SHOWN_SHAPES, _SHOWN_CONFUSIONS = 4, 8
+_SHOWN_SHAPES, _SHOWN_CONFUSIONS, _SHOWN_NAMES = 4, 8, 12
 
 
 @dataclass(frozen=True)
@@ -72,20 +72,28 @@ class Observability:
     unit: str = "mm"
 
     def __str__(self) -> str:
+        clear = self.shapes - len({*self.unseen, *self.ambiguous})
         lines = [
+            f"the {self.points} show {clear} of the {self.shapes} shapes clearly; {len(self.unseen)} they do not see, "
+            f"{len(self.ambiguous)} look to them like others: a solve brings those to rest or mixes them",
             f"{self.count} {self.points} see {self.visible} of {self.shapes} directions of the weights above "
-            f"{self.noise:g} {self.unit}; rank {self.rank}, condition {self.condition:.3g}"
+            f"{self.noise:g} {self.unit}; rank {self.rank}, condition {self.condition:.3g}",
         ]
         if self.unseen:
-            lines.append(f"not seen: {', '.join(self.unseen)}")
+            lines.append(f"not seen: {_first(self.unseen)}")
         if self.ambiguous:
-            lines.append(f"cannot be distinguished from the other shapes: {', '.join(self.ambiguous)}")
+            lines.append(f"cannot be distinguished from the other shapes: {_first(self.ambiguous)}")
         if self.confusions:
             lines.append("changes of the weights that do not show:")
             lines.extend(f"  {confusion}" for confusion in self.confusions[:_SHOWN_CONFUSIONS])
         if len(self.confusions) > _SHOWN_CONFUSIONS:
             lines.append(f"  and {len(self.confusions) - _SHOWN_CONFUSIONS} more")
         return "\n".join(lines)
+
+
+def _first(names: Sequence[str]) -> str:
+    more = len(names) - _SHOWN_NAMES
+    return ", ".join(names[:_SHOWN_NAMES]) + (f" and {more} more" if more > 0 else "")
 
 
 def weight_observability(

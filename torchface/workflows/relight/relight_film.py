@@ -21,21 +21,26 @@ from torchface.io.images.image_files import load_paint
 from torchface.io.images.radiance_hdr import load_panorama
 from torchface.io.video import open_video, write_video
 from torchface.io.video.video_writing import WRITTEN_ENDINGS
+from torchface.landmarks.images.networks.part_finder import FaceParts
 from torchface.mesh import Mesh
 from torchface.progress import Progress, silent
 from torchface.rendering.environment_light import EnvironmentLight
+from torchface.rendering.gaussian_blur import gaussian_blur
 from torchface.rendering.point_light import PointLight
 from torchface.rendering.texture_overlay import FacePaint, overlay, relight, skin_faces
-from torchface.rendering.uncovered_skin import UncoveredSkin
 from torchface.rig import BlendshapeRig
 from torchface.take import Track
+from torchface.workflows.named_finders import part_finder
 from torchface.workflows.relight.tracked_film import TrackedFilm, read_tracked_film
 from torchface.workflows.track.face_overlay import light_of
 
 FilmLight = Literal["once", "each"]
 Draw = Callable[[int, Tensor, PointLight | EnvironmentLight], Tensor]
 _CHUNK = 8
-_LEARNED, _LIT = 24, 2  # frames from which the skin's look and the film's light are learned
+_LIT = 2  # frames from which the film's light is estimated
+_BEFORE_SKIN = ("glasses", "hand", "cloth", "hair", "background")
+_BEFORE_HEAD, _NAMED, _LEAST_HIDDEN = ("hand",), ("hand", "glasses"), 0.005
+_HIDDEN, _EDGE, _SOFT = 0.5, 0.3, 0.7  # the share of what is before a face, and pixels of the network's crop
 _AMBIENT = 0.3  # of the wanted light, unless said
 _SPHERE = 0.25  # the mean of the clamped cosine over all directions
 _MOST = 100.0
@@ -164,13 +169,11 @@ def relight_film(
     progress("reading the track")
     tracked = read_tracked_film(film, track, settings.camera)
     draw = _painter(tracked, settings)
-    learned = _spread(tracked.seen, _LEARNED)
-    frames = dict(zip(learned, _frames(tracked, learned, progress), strict=True))
-    found = _light(tracked, {t: frames[t] for t in _of(learned, _LIT)})
+    lit = _spread(tracked.seen, _LIT)
+    found = _light(tracked, dict(zip(lit, _frames(tracked, lit, progress), strict=True)))
     whole, near = _reaching(found), _near_face(tracked.rig.neutral)
-    each = learned if settings.film_light == "each" else []
-    lights = {t: _reaching(_light(tracked, {t: frames[t]}, whole)) for t in each}
-    look = _look(tracked, frames, lights, whole) if settings.occluders else None
+    finder = part_finder() if settings.occluders else None
+    before = _BEFORE_HEAD if settings.rig is not None else _BEFORE_SKIN
     lines = [
         f"{tracked.video.count} frames, the face in {int(tracked.seen.sum())}; {_words(found, 'the film')}",
         *_doubts(found),
@@ -203,9 +206,10 @@ def relight_film(
                         result = relight(frame, vertices, mesh, old, new, camera, lens, share)
                     if draw is not None:
                         result = draw(at, result, new)
-                    if look is not None:
-                        mask = look.mask(frame, vertices, mesh.faces, camera, old, lens)
-                        hidden.append(float((mask < 0.5).float().mean()))
+                    if finder is not None:
+                        parts = finder(frame, tracked.landmarks[at])
+                        mask = _shown(frame, parts, before)
+                        hidden.append(float((parts.of(*_NAMED) > 0.5).float().mean()))
                         result = torch.lerp(frame.float(), result.float(), mask).round().to(torch.uint8)
                     yield result[None]
                 else:
@@ -214,8 +218,10 @@ def relight_film(
                 progress("relighting", at, tracked.video.count)
 
     write_video(drawn(), out, tracked.video.fps)
-    if hidden:
-        lines.append(f"left as they are: {max(hidden):.1%} of the pixels of a frame at most, which lie before the face")
+    if max(hidden, default=0.0) > _LEAST_HIDDEN:
+        lines.append(
+            f"hands or glasses cover {max(hidden):.0%} of the picture of the face at most; they stay as they are"
+        )
     return lines
 
 
@@ -262,18 +268,13 @@ def _placed(other: BlendshapeRig, tracked: TrackedFilm, path: Path) -> Callable[
     return vertices
 
 
-def _look(
-    tracked: TrackedFilm, frames: dict[int, Tensor], lights: dict[int, PointLight], whole: PointLight
-) -> UncoveredSkin:
-    rows = list(frames)
-    return UncoveredSkin.of(
-        list(frames.values()),
-        [tracked.vertices(t) for t in rows],
-        tracked.rig.neutral.faces,
-        [tracked.camera(t) for t in rows],
-        [lights.get(t, whole) for t in rows],
-        tracked.calibration,
-    )
+def _shown(frame: Tensor, parts: FaceParts, before: Sequence[str]) -> Tensor:
+    """How far each pixel of a frame (3,H,W) shows what some parts do not hide, (H,W) in [0,1]; 1 beyond their crop."""
+    y, x = torch.meshgrid(torch.arange(frame.shape[1]), torch.arange(frame.shape[2]), indexing="ij")
+    hidden = parts.at(torch.stack([x, y], -1), *before).nan_to_num(0.0)
+    sigma = max(1.0, _SOFT / float(parts.transform[:, :2].det().abs().sqrt()))
+    smooth = gaussian_blur(hidden[None, None], sigma)[0, 0]
+    return ((_HIDDEN - smooth) / _EDGE + 0.5).clamp(0, 1)
 
 
 def _light(tracked: TrackedFilm, frames: dict[int, Tensor], fallback: PointLight | None = None) -> PointLight:
@@ -293,7 +294,7 @@ def _frames(tracked: TrackedFilm, wanted: Sequence[int], progress: Progress) -> 
     for chunk in tracked.video.color_chunks(_CHUNK):
         frames += [chunk[t - at].clone() for t in wanted if at <= t < at + len(chunk)]
         at += len(chunk)
-        progress("learning how the face looks", at, tracked.video.count)
+        progress("looking for the light", at, tracked.video.count)
         if len(frames) == len(wanted):
             break
     return frames
@@ -302,12 +303,6 @@ def _frames(tracked: TrackedFilm, wanted: Sequence[int], progress: Progress) -> 
 def _spread(seen: Tensor, count: int) -> list[int]:
     rows = seen.nonzero()[:, 0]
     return rows[torch.linspace(0, len(rows) - 1, min(count, len(rows))).round().long().unique()].tolist()
-
-
-def _of(rows: Sequence[int], count: int) -> list[int]:
-    return [
-        rows[i] for i in sorted({round(x) for x in torch.linspace(0, len(rows) - 1, min(count, len(rows))).tolist()})
-    ]
 
 
 def _doubts(light: PointLight) -> list[str]:

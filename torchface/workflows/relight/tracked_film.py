@@ -32,6 +32,7 @@ class TrackedFilm:
         rig: the actor's.
         weights: of its shapes, (T,N).
         rotation, translation: from the rig to the camera, (T,3,3) and (T,3) millimetres.
+        landmarks: iBUG's 68 as they were found, (T,68,2) pixels.
         seen: frames that show the face, (T,) bool.
         calibration: of the camera.
     """
@@ -41,6 +42,7 @@ class TrackedFilm:
     weights: Tensor
     rotation: Tensor
     translation: Tensor
+    landmarks: Tensor
     seen: Tensor
     calibration: CameraCalibration
 
@@ -103,4 +105,5 @@ def read_tracked_film(film: Path, track: Path, camera: Path | None = None) -> Tr
         intrinsics = torch.tensor([[focal, 0, middle[0]], [0, focal, middle[1]], [0, 0, 1]], dtype=torch.float64)
         calibration = CameraCalibration(intrinsics, torch.zeros(5, dtype=torch.float64), video.width, video.height)
     weights = rig.weights_from(animation.weights)
-    return TrackedFilm(video, rig, weights, head_rotations(pose[:, 3:]), pose[:, :3], seen, calibration)
+    marks_found = marks.landmarks.values
+    return TrackedFilm(video, rig, weights, head_rotations(pose[:, 3:]), pose[:, :3], marks_found, seen, calibration)

@@ -61,7 +61,7 @@ def webcam_graph(progress: Progress | None = None) -> bytes:
     """
 
     def make() -> onnx.ModelProto:
-        (progress or silent)("making the webcam's graph, once")
+        (progress or silent)("making the webcam's graph, once: about a minute")
         licences = {name: zoo.describe(name).licence for name in MODELS}
         return webcam_model(webcam_module(), {"licence": "MIT", "licences": licences})
 

@@ -29,14 +29,17 @@ class FaceParts:
     shares: Tensor
     transform: Tensor
 
+    def of(self, *names: str) -> Tensor:
+        """The share of some of :data:`PARTS` together in the crop's pixels, (S,S)."""
+        return self.shares[[_ROW[name] for name in names]].sum(0)
+
     def at(self, pixels: Tensor, *names: str) -> Tensor:
         """The share of some of :data:`PARTS` together at pixels (...,2) of the picture, (...); NaN beyond the crop."""
         place = pixels.double() @ self.transform[:, :2].T + self.transform[:, 2]
         size = self.shares.shape[-1]
         grid = ((2 * place + 1) / size - 1).to(self.shares)
-        some = self.shares[[_ROW[name] for name in names]].sum(0)
         values = grid_sample(
-            some[None, None], grid.reshape(1, 1, -1, 2), padding_mode="border", align_corners=False
+            self.of(*names)[None, None], grid.reshape(1, 1, -1, 2), padding_mode="border", align_corners=False
         ).reshape(place.shape[:-1])
         return torch.where((grid.abs() <= 1).all(-1), values, torch.nan)
 
