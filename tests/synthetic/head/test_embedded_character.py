@@ -11,7 +11,9 @@ from torchface.geometry.similarity import similarity_transform
 from torchface.io import load_rig, save_rig
 from torchface.modeling import inner_parts
 from torchface.shape_names import ARKIT
-from torchface.synthetic import Look, character, draw_identities, performer
+from torchface.synthetic import IDENTITY, Look, character, draw_identities, performer
+from torchface.synthetic.head.hair_locks import hair_locks
+from torchface.synthetic.head.signed_distance import signed_distance
 from torchface.synthetic.head.skin_maps import skin_maps
 from torchface.synthetic.head.topology import topology
 
@@ -117,6 +119,37 @@ def test_looks_differ_in_tone_age_and_hair() -> None:
     assert (old.surface.neutral[2] < 0.999).double().mean() > (fair.surface.neutral[2] < 0.999).double().mean()
     assert fair.surface.roughness.min() >= 0.05
     assert fair.surface.roughness.max() <= 1
+
+
+@pytest.mark.parametrize(("haircut", "lowest"), [("short", 30.0), ("long", -185.0), ("tied", -70.0)])
+def test_locks_lie_on_the_head_and_reach_as_far_as_the_haircut(haircut, lowest) -> None:
+    points = hair_locks(haircut).part.vertices
+    assert signed_distance(points).min() > -2.5  # roots alone are under the skin
+    assert abs(points[:, 1].min() - lowest) < 20
+    face = (points[:, 2] > 60) & (points[:, 1] < 30)
+    assert not face.any()
+
+
+def test_haircuts_follow_other_heads(shown) -> None:
+    large = torch.zeros(len(IDENTITY))
+    large[[parameter.name for parameter in IDENTITY].index("head_width")] = 3.0
+    wide = character(performer(large, texture=False), size=64).rig
+    skin = slice(0, topology().count)
+    spread = lambda rig, part: float(rig.vertices[part, 0].max() - rig.vertices[part, 0].min())  # noqa: E731
+    locks = shown.rig.neutral.annotations.regions["hair_locks"]
+    scalp = shown.rig.neutral.annotations.regions["cranium"]
+    assert spread(wide, skin) > spread(shown.rig, skin) + 2
+    assert abs(spread(wide, locks) - spread(wide, scalp) - spread(shown.rig, locks) + spread(shown.rig, scalp)) < 4
+
+
+def test_shirt_stands_round_the_neck_and_stays(shown) -> None:
+    rig, regions = shown.rig, shown.rig.neutral.annotations.regions
+    cloth, end = rig.vertices[regions["shirt"]], rig.vertices[topology().grid[-1]]
+    near = cloth[(cloth[:, 1] - end[:, 1].mean()).abs() < 8]
+    middle = end.mean(0)
+    assert (near - middle)[:, [0, 2]].norm(dim=1).min() > 0.9 * (end - middle)[:, [0, 2]].norm(dim=1).min()
+    assert cloth[:, 1].min() < end[:, 1].min() - 60
+    assert rig.deltas[:, regions["shirt"]].abs().max() == 0
 
 
 def test_file_has_images_as_jpeg_and_comes_back(shown, tmp_path) -> None:

@@ -5,6 +5,7 @@ import torch
 
 from torchface.io import load_detail_maps, load_mesh
 from torchface.mesh import Annotations, Mesh
+from torchface.synthetic import character
 from torchface.viz.browser.head_mesh import TexturedHead
 from torchface.viz.browser.html_lists import pick_list, shape_list
 from torchface.viz.browser.single_color_parts import split_parts, triangle_texture
@@ -96,3 +97,11 @@ def test_names_from_files_cannot_become_markup() -> None:
     assert "<img" not in shape_list([(evil, 0.5)])
     assert "<img" not in pick_list([("markers", "1")], [evil])
     assert "0.50" in shape_list([(evil, 0.5)])
+
+
+def test_small_irises_keep_their_colour_beside_a_large_head() -> None:
+    head = character(size=256).rig.neutral
+    eye = head.annotations.regions["eyeball_left"]
+    colors = [part.color for part in split_parts(head) if eye[part.vertex_ids].all()]
+    assert max(min(color) for color in colors) > 0.6  # white
+    assert min(max(color) for color in colors) < 0.4  # iris or pupil

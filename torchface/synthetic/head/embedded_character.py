@@ -179,7 +179,9 @@ def _grown(grown: GrownPart, skin: Tensor, moved: Tensor) -> tuple[Tensor, Tenso
     offset = grown.part.vertices - root
     here = host(skin)
     motion = host(moved)
-    if grown.turns:
+    if not grown.turns:  # wider on a wider head
+        offset = offset * ((here.amax(0) - here.amin(0)) / (root.amax(0) - root.amin(0)))
+    else:
         motion = motion + _turned(here, motion, offset, skin)
     return here + offset, motion
 

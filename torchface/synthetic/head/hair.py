@@ -24,7 +24,6 @@ WHORL = (8.0, 88.0, -52.0)
 """Where the hair of the head starts from."""
 HAIR_PATCH = (0.62, 0.955, 0.70, 0.985)
 """Place on the page that brows and lashes are coloured from."""
-_CUTS = 2  # edges that an edge of the scalp is cut into
 _BROW_HAIRS, _LASHES = 260, 3
 
 
@@ -65,17 +64,9 @@ def flow(points: Tensor) -> Tensor:
     return torch.stack([bearing * 55.0 + 0.10 * out, out], 1)
 
 
-def locks(points: Tensor) -> Tensor:
-    """Height of the hair's locks over points (N,3), in about [-1,1]."""
-    f = flow(points.float())
-    bent = f[:, 0] + 5.0 * noise(points.float(), 22.0, 23)
-    at = torch.stack([bent, 0.16 * f[:, 1], torch.zeros_like(bent)], 1)
-    return 0.65 * noise(at, 5.0, 24) + 0.35 * noise(at, 2.2, 25)
-
-
 @lru_cache(maxsize=2)
 def scalp_hair(thick: float) -> GrownPart:
-    """The cap under the locks: the scalp's quads cut finer and raised; it has the scalp's place on the page.
+    """The cap under the locks: the scalp's quads raised; it has the scalp's place on the page.
 
     Args:
         thick: how much of the height of cropped hair it has.
@@ -88,26 +79,12 @@ def scalp_hair(thick: float) -> GrownPart:
     share = hair_share(v)
     keep = (share[t.quads] > 0).any(1) & ~bare[t.quads].any(1)
     quads, uv_quads = t.quads[keep], flat.quads[keep]
-    step = torch.linspace(0, 1, _CUTS + 1, dtype=torch.float64)
-    a, b = (s.flatten() for s in torch.meshgrid(step, step, indexing="ij"))
-    blend = torch.stack([(1 - a) * (1 - b), (1 - a) * b, a * b, a * (1 - b)], 1)  # (K,4)
-    ids = torch.arange((_CUTS + 1) ** 2).view(_CUTS + 1, -1)
-    small = torch.stack([ids[:-1, :-1], ids[:-1, 1:], ids[1:, 1:], ids[1:, :-1]], -1).reshape(-1, 4)
-    points = torch.einsum("kc,qcx->qkx", blend, v[quads]).reshape(-1, 3)
-    ways = torch.nn.functional.normalize(torch.einsum("kc,qcx->qkx", blend, normals[quads]).reshape(-1, 3), dim=1)
-    uvs = torch.einsum("kc,qcx->qkx", blend, flat.uvs[uv_quads].double()).reshape(-1, 2)
-    whole = (torch.arange(len(quads))[:, None, None] * len(blend) + small).reshape(-1, 4)
-    # Points that neighbouring quads share are one.
-    merged, index = torch.unique((points * 1e4).round().long(), dim=0, return_inverse=True)
-    first = torch.full((len(merged),), len(points)).scatter_reduce(0, index, torch.arange(len(points)), "amin")
-    weights = blend.repeat(len(quads), 1)
-    hosts = quads.repeat_interleave(len(blend), 0)
-    points, ways, weights, hosts = points[first], ways[first], weights[first], hosts[first]
+    ids, index = quads.unique(return_inverse=True)
+    points, ways = v[ids], torch.nn.functional.normalize(normals[ids], dim=1)
     amount = hair_share(points)
-    waves = 2.2 * locks(points) * amount.sqrt() * ramp(amount, 0, 0.5)
-    height = thick * (amount * _height(points) + waves) - 0.7 * (1 - amount) ** 6
-    cap = HeadPart(points + height[:, None] * ways, index[whole], uvs[whole].float())
-    return GrownPart(cap, hosts, weights)
+    height = thick * amount * _height(points) - 0.7 * (1 - amount) ** 6
+    cap = HeadPart(points + height[:, None] * ways, index, flat.uvs[uv_quads].float())
+    return GrownPart(cap, ids[:, None].expand(-1, 3), torch.full((len(ids), 3), 1 / 3, dtype=torch.float64))
 
 
 def _height(points: Tensor) -> Tensor:

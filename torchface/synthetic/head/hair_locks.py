@@ -53,11 +53,17 @@ def hair_locks(style: Style) -> GrownPart:
         sides.append(torch.nn.functional.normalize(torch.linalg.cross(way, up), dim=1))
         ups.append(up)
         if row + 1 < rows:
-            stride = step * (0.35 + 1.3 * row / (rows - 2))  # short at first, where the head curves
+            # Short at first, where the head curves, and no farther than the shoulders or the knot.
+            stride = step * (0.35 + 1.3 * row / (rows - 2))
+            if style == "long":
+                stride = stride * (0.04 + 0.96 * ramp(here[:, 1], -170, -140))
+            elif style == "tied":
+                stride = stride.minimum(0.7 * (torch.tensor(KNOT).double() - here).norm(dim=1))
             points.append(_held(style, here + stride[:, None] * way, height[:, row + 1]))
     line = torch.stack(points, 1)
     for _ in range(3):  # evens out where they were pushed
         line[:, 2:-1] = 0.5 * line[:, 2:-1] + 0.25 * (line[:, 1:-2] + line[:, 3:])
+    line[:, 1:] = _held(style, line[:, 1:].reshape(-1, 3), height[:, 1:].reshape(-1)).view(count, rows - 1, 3)
     width = _widths(style, roots, rows) * (1 + 0.2 * jitter[:, 2:].clamp(-1.5, 1.5))
     part = _strips(line, torch.stack(sides, 1), (1.0 if style == "short" else 0.5) * torch.stack(ups, 1), width)
     hosts, weights = hosts.repeat_interleave(3 * rows, 0), weights.repeat_interleave(3 * rows, 0)
@@ -214,13 +220,13 @@ def _strips(line: Tensor, sides: Tensor, ups: Tensor, width: Tensor) -> HeadPart
 
 def _knot() -> HeadPart:
     """A bun: locks wound about an axis that points away from the head."""
-    turns, rows = 26, 12
+    turns, rows = 18, 22
     centre = torch.tensor(KNOT).double()
     axis = torch.nn.functional.normalize(torch.tensor([0.0, 0.25, -1.0]).double(), dim=0)
     right = torch.tensor([1.0, 0.0, 0.0]).double()
     upward = torch.linalg.cross(axis, right)
     start = torch.arange(turns).double()[:, None] * 2.39996
-    angle = start + torch.linspace(0, 2.6, rows, dtype=torch.float64)
+    angle = start + torch.linspace(0, 6.8, rows, dtype=torch.float64)
     polar = 0.25 + 1.35 * torch.frac(torch.arange(turns).double() * 0.618)[:, None] + 0.25 * torch.sin(2 * angle)
     out = polar.cos()[..., None] * axis + polar.sin()[..., None] * (
         angle.cos()[..., None] * right + angle.sin()[..., None] * upward

@@ -18,7 +18,7 @@ from torchface.viz.figures.region_colors import drawn_triangles
 _MAX_COMPONENTS = 16
 _MAX_COLORS = 6
 _MIN_COLOR_DISTANCE = 0.72  # over the number of colours
-_MIN_FRACTION = 0.004
+_MIN_FRACTION = 0.006
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,7 +56,7 @@ def split_parts(mesh: Mesh) -> list[Part]:
         if not members.any():
             continue
         counts = torch.bincount(classes[members], minlength=len(palette))
-        stray = counts < _MIN_FRACTION * len(mesh.faces)
+        stray = counts < _MIN_FRACTION * int(members.sum())
         piece[members & stray[classes]] = number * len(palette) + int(counts.argmax())
     parts = []
     for label in piece.unique().tolist():

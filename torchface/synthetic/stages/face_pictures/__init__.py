@@ -1,1 +1,0 @@
-"""Colour pictures of synthetic people with exact landmarks, for networks to learn from."""
