@@ -28,8 +28,9 @@ from torchface.io.landmarks.dlib_xml import load_dlib_faces
 from torchface.io.landmarks.landmark_points import load_landmark_points
 from torchface.io.rigs.ict_facekit import load_ict_facekit, load_identity_modes
 from torchface.modeling import FitSettings, HeadModel, ImageFit, MorphableModel, fit_images, transfer_deformation
+from torchface.modeling.photographs.fit_problem import Problem, State, whitening
 from torchface.modeling.photographs.image_fit import contour_curves
-from torchface.modeling.photographs.image_solve import Problem, State, solve, whitening
+from torchface.modeling.photographs.image_solve import solve
 from torchface.modeling.photographs.landmark_view import (
     JAW,
     LANDMARKS,

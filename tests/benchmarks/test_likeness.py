@@ -20,7 +20,7 @@ from torchface.geometry.cameras.pinhole import look_at
 from torchface.geometry.similarity import similarity_transform
 from torchface.io import load_identity_modes
 from torchface.io.rigs.ict_facekit import region
-from torchface.modeling import FitSettings, fit_images
+from torchface.modeling import FitSettings, ImageFit, fit_images
 from torchface.workflows.fit.fit_landmarks import find_in_photographs
 from torchface.workflows.fit.fit_readings import with_readings
 from torchface.workflows.surface_sites import sites_on_rig
@@ -81,6 +81,15 @@ def aligned(head: Tensor, goal: Tensor) -> Tensor:
     return similarity_transform(head[None].double(), goal[None].double()).apply(head[None].double())[0]
 
 
+def normalised(fit: ImageFit, truth: Tensor) -> float:
+    """The error of coefficients in the deviations that the fit states, 1 on average if they are right."""
+    count = len(truth)
+    covariance = fit.covariance[:count, :count].double()
+    free = covariance.diagonal() > 0
+    off = (fit.coefficients.double() - truth)[free]
+    return float((off @ torch.linalg.solve(covariance[free][:, free], off) / free.sum()).sqrt())
+
+
 def test_likeness_of_rendered_people(ict_folder: Path) -> None:
     torch.set_num_threads(1)
     whole = ict_head_model(ict_folder)
@@ -91,7 +100,9 @@ def test_likeness_of_rendered_people(ict_folder: Path) -> None:
     modes = load_identity_modes(ict_folder).deltas[:, face]
     mean, faces, landmarks = model.shape.mean, rig.neutral.faces, rig.neutral.landmarks
     errors: dict[str, list[tuple[float, float]]] = {name: [] for name in [*WAYS, "mean head"]}
-    heads = []
+    heads, coefficients = [], model.shape.modes.double().flatten(1)
+    known = torch.linalg.lstsq(coefficients.T, modes.double().flatten(1).T).solution
+    stated: dict[str, list[float]] = {name: [] for name in WAYS}
     for who in people(ict_folder):
         found = [find_in_photographs([Path(f"{k}.png")], [one])[0] for k, one in enumerate(who.pictures)]
         sites = sites_on_rig(rig, found[0].places)
@@ -111,6 +122,7 @@ def test_likeness_of_rendered_people(ict_folder: Path) -> None:
             marks = torch.stack([one.confident for one in some])
             fit = fit_images(model, rig, marks, (SIZE, SIZE), settings=with_readings(settings, some, rig))
             errors[name].append(error(fit.mesh.vertices))
+            stated[name].append(normalised(fit, known @ who.coefficients.double()))
             if len(rows) == 1:
                 heads.append(aligned(points(fit.mesh.vertices), points(mean)).flatten())
         errors["mean head"].append(error(mean))
@@ -121,6 +133,9 @@ def test_likeness_of_rendered_people(ict_folder: Path) -> None:
     print(f"\n{PEOPLE} people, two pictures each: {'face mm':>10s}{'points mm':>11s}")
     for name, (whole_face, spots) in medians.items():
         print(f"{name:34s}{whole_face:10.2f}{spots:11.2f}")
+    deviations = {name: float(torch.tensor(rows).median()) for name, rows in stated.items()}
+    print("errors of coefficients in stated deviations: " + ", ".join(f"{n} {v:.2f}" for n, v in deviations.items()))
     print(f"the nearest head is the same person's for {nearest} of {len(heads)}")
     assert medians["both"][1] < 0.75 * medians["mean head"][1]
     assert nearest > 0.2 * len(heads)
+    assert all(0.7 < value < 1.4 for value in deviations.values())

@@ -11,8 +11,8 @@ from torchface.modeling.detail.scan_alignment import ScanAlignment, align_scan
 from torchface.modeling.morphable.head_model import HeadModel, Heads
 from torchface.modeling.morphable.morphable_model import MorphableModel
 from torchface.modeling.morphable.published_models import head_model_of
+from torchface.modeling.photographs.fit_settings import FitSettings
 from torchface.modeling.photographs.image_fit import ImageFit, fit_images
-from torchface.modeling.photographs.image_solve import FitSettings
 from torchface.modeling.photographs.texture_fit import ColorFit, fit_colors
 from torchface.modeling.photographs.texture_projection import PhotoTexture, photo_texture
 from torchface.modeling.rigging.deformation_transfer import (

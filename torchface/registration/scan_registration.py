@@ -318,7 +318,10 @@ def _final_notes(template: Mesh, scan: Mesh, deformer: Deformer, texture_size: i
     notes = []
     folded = int(deformer.folded_triangles().sum())
     if folded:
-        notes.append(f"{folded} triangles of the result are turned over")
+        notes.append(
+            f"{folded} triangles of the result are turned over, mostly at holes, lids, lips and ears; correct landmarks "
+            "there, or smooth them in a mesh editor"
+        )
     if not has_colors(scan):
         notes.append(
             "the scan has neither a texture with coordinates nor vertex colours (is the image that its material "

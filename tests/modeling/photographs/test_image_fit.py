@@ -23,9 +23,10 @@ from torchface.landmarks.images.ibug_68 import as_annotated
 from torchface.mesh import Mesh
 from torchface.modeling.morphable.head_model import HeadModel
 from torchface.modeling.morphable.morphable_model import MorphableModel
+from torchface.modeling.photographs.fit_problem import Problem
+from torchface.modeling.photographs.fit_settings import FitSettings, SurfacePoints
 from torchface.modeling.photographs.image_fit import ImageFit, contour_curves, fit_images
 from torchface.modeling.photographs.image_input import annotated_vertices
-from torchface.modeling.photographs.image_solve import FitSettings, Problem, SurfacePoints
 from torchface.modeling.photographs.landmark_view import LandmarkSites, LinearPoints
 from torchface.modeling.rigging.deformation_transfer import transfer_deformation
 from torchface.rig import BlendshapeRig

@@ -15,6 +15,8 @@ from torchface.geometry.cameras.sliding_contour import LevelCurves, level_curves
 from torchface.geometry.similarity import similarity_transform
 from torchface.mesh import Mesh
 from torchface.modeling.morphable.head_model import HeadModel
+from torchface.modeling.photographs.fit_problem import Problem, State
+from torchface.modeling.photographs.fit_settings import FitSettings
 from torchface.modeling.photographs.image_input import (
     annotated_vertices,
     check_images,
@@ -22,7 +24,7 @@ from torchface.modeling.photographs.image_input import (
     checked_sizes,
     lens,
 )
-from torchface.modeling.photographs.image_solve import FitSettings, Problem, State, covariance, solve, solve_either
+from torchface.modeling.photographs.image_solve import covariance, solve, solve_either
 from torchface.modeling.photographs.image_texture import photographed_skin
 from torchface.modeling.photographs.landmark_view import JAW, LANDMARKS, LandmarkSites, LinearPoints, Views
 from torchface.modeling.photographs.smooth_differences import smooth_differences

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from torchface.errors import ShapeError, TopologyError, ValueRangeError
 from torchface.modeling.morphable.head_model import HeadModel
-from torchface.modeling.photographs.image_solve import FitSettings
+from torchface.modeling.photographs.fit_settings import FitSettings
 from torchface.modeling.photographs.landmark_view import JAW, LANDMARKS
 from torchface.rig import BlendshapeRig
 

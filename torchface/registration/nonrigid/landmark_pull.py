@@ -95,4 +95,7 @@ class LandmarkPull:
         if not remarks:
             return []
         let_go = "; those along the jaw were let go" if (self.contour & (off > _DISAGREES)).any() else ""
-        return [f"landmarks disagree with the surface: {' and '.join(remarks)}{let_go}"]
+        return [
+            f"landmarks disagree with the surface: {' and '.join(remarks)}{let_go}. Look at them in the report's "
+            "pictures, correct them in their file or leave those out"
+        ]

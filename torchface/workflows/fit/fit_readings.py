@@ -12,7 +12,7 @@ from torchface.capture.energy import Quadratic
 from torchface.capture.weight_readings import WeightReadings
 from torchface.landmarks import FaceReading
 from torchface.modeling import FitSettings
-from torchface.modeling.photographs.image_solve import ExpressionPrior, SurfacePoints, WeightQuadratic
+from torchface.modeling.photographs.fit_settings import ExpressionPrior, SurfacePoints, WeightQuadratic
 from torchface.rig import BlendshapeRig
 from torchface.workflows.fit.fit_landmarks import PhotographLandmarks
 from torchface.workflows.surface_sites import sites_on_rig

@@ -1,0 +1,130 @@
+"""Settings of a fit to photographs: the noise of points, the priors on faces, and what is made of them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+from torch import Tensor
+
+from torchface.attachment import Attachment
+from torchface.errors import ShapeError
+from torchface.geometry.cameras.pinhole import MAX_SIDE
+from torchface.landmarks.images.networks.part_finder import FaceParts
+from torchface.modeling.photographs.landmark_view import LANDMARKS
+from torchface.number_checks import LARGEST_WEIGHT, checked_count, checked_number
+
+
+class WeightQuadratic(Protocol):
+    """An energy ½ wᵀ H w + fᵀ w of weights (E,N): H (E,N,N) or (N,N), f (E,N)."""
+
+    @property
+    def H(self) -> Tensor: ...
+    @property
+    def f(self) -> Tensor: ...
+
+
+class ExpressionPrior(Protocol):
+    """Which weights faces have, as ``ShapePrior`` knows it."""
+
+    def energy(self, weights: Tensor) -> WeightQuadratic:
+        """A quadratic that touches minus the log density at weights (E,N) from above."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class SurfacePoints:
+    """Points of the face's surface as a dense network finds them beside the 68 landmarks.
+
+    Args:
+        points: (I,P,2) pixels; NaN for missing.
+        deviations: standard deviations of a coordinate as they are stated, (I,P) pixels.
+        sites: where they lie on the rig's mesh, P of them.
+    """
+
+    points: Tensor
+    deviations: Tensor
+    sites: Attachment
+
+
+@dataclass(frozen=True)
+class FitSettings:
+    """The noise of landmarks, the priors on faces, and what is made of them.
+
+    Args:
+        inner_weight: of a squared error at brows, eyes, nose and mouth beside one at the contour.
+        contour_slide: how much less an error along the face's contour counts than one across it, 0 to 1; 1 takes
+            contour landmarks as points.
+        sliding: contour landmarks of the far side move to the visible silhouette, as people and detectors mark them;
+            False where they are vertices that may be hidden. Absent, what fits better is taken.
+        deviations: what each landmark is expected to be off by, (I,68) pixels: they count beside their view's
+            median, from half to four times it. All alike if absent.
+        surface: further points of the face; with them errors of neighbours are taken to go together.
+        annotated: landmarks lie where annotators put them, and what learns from them, rather than on the heads'
+            vertices; see ``as_annotated`` and ``annotated_vertices``.
+        expression_prior: which weights of the rig's shapes go together, in place of the mean and the ridge below.
+        sparsity: beside that prior, for a weight of 1.
+        expression_mean: how strong a shape is on average, in weights; the prior falls exponentially.
+        expression_ridge: prior deviation of a weight beside that.
+        asymmetry: prior deviation of the difference between a shape's weight and its mirror image's. Faces move almost
+            alike on both sides, and 68 landmarks of a rotated head hardly distinguish a lopsided smile from it.
+        one_expression: all photographs show the same one, as taken at once; else each has its own.
+        identity_bound: on each coefficient, standard deviations.
+        unknown_deviation: of a coordinate, millimetres: smooth differences of heads that the model does not know, on
+            average; how large this person's are is estimated. 0 holds heads to the model.
+        noise: of an inner landmark, pixels; estimated from the residuals if absent.
+        focal_deviation: relative deviation of the true focal length from the given one; 0 takes it as exact.
+        shared_focal: one focal length for all photographs.
+        max_iterations: of Gauss-Newton.
+        transfers: how often shapes are transferred to the head found; 0 keeps the template's.
+        texture_size: of the skin, texels a side; 0 makes no texture.
+        irises: centres of the irises in each photograph, (I,2,2) pixels, NaN where unknown: their colour is there.
+        parts: what each photograph shows, skin, hair, hands: skin and the face's features alone are projected onto the
+            head; all of it if absent.
+
+    Raises:
+        ValueRangeError: a setting is NaN, infinite or out of its range.
+        ShapeError: deviations of another shape.
+
+    Example:
+        >>> FitSettings(focal_deviation=0.05, shared_focal=True).identity_bound
+        3.0
+    """
+
+    inner_weight: float = 2.0
+    contour_slide: float = 0.5
+    sliding: bool | None = None
+    deviations: Tensor | None = None
+    surface: SurfacePoints | None = None
+    annotated: bool = False
+    expression_prior: ExpressionPrior | None = None
+    sparsity: float = 1.0
+    expression_mean: float = 0.2
+    expression_ridge: float = 0.5
+    asymmetry: float = 0.1
+    one_expression: bool = False
+    identity_bound: float = 3.0
+    unknown_deviation: float = 1.0
+    noise: float | None = None
+    focal_deviation: float = 0.0
+    shared_focal: bool = True
+    max_iterations: int = 20
+    transfers: int = 1
+    texture_size: int = 1024
+    irises: Tensor | None = None
+    parts: Sequence[FaceParts] | None = None
+
+    def __post_init__(self) -> None:
+        for name in ("inner_weight", "expression_mean", "expression_ridge", "asymmetry", "identity_bound"):
+            checked_number(name, getattr(self, name), 0.0, LARGEST_WEIGHT, above=True)
+        if self.deviations is not None and self.deviations.shape[1:] != (LANDMARKS,):
+            raise ShapeError(f"deviations: found {tuple(self.deviations.shape)}, expected (I,{LANDMARKS})")
+        if self.noise is not None:
+            checked_number("noise", self.noise, above=True)
+        checked_number("contour_slide", self.contour_slide, 0.0, 1.0)
+        for name in ("focal_deviation", "sparsity", "unknown_deviation"):
+            checked_number(name, getattr(self, name))
+        checked_count("max_iterations", self.max_iterations, 1)
+        checked_count("transfers", self.transfers)
+        checked_count("texture_size", self.texture_size, 0, MAX_SIDE)
