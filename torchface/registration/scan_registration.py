@@ -319,7 +319,7 @@ def _final_notes(template: Mesh, scan: Mesh, deformer: Deformer, texture_size: i
     folded = int(deformer.folded_triangles().sum())
     if folded:
         notes.append(
-            f"{folded} triangles of the result are turned over, mostly at holes, lids, lips and ears; correct landmarks "
+            f"{folded} triangles of the result are turned over, as at holes, lids, lips and ears; correct landmarks "
             "there, or smooth them in a mesh editor"
         )
     if not has_colors(scan):
