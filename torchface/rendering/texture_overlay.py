@@ -100,6 +100,7 @@ def overlay(
     light: PointLight | EnvironmentLight,
     camera: Camera,
     calibration: CameraCalibration | None = None,
+    share: Tensor | None = None,
 ) -> Tensor:
     r"""A frame with paint on the face, lit as the face is.
 
@@ -115,6 +116,7 @@ def overlay(
         light: as ``estimate_light`` finds it; its strengths belong to an albedo that the paint replaces.
         camera: of the frame.
         calibration: of a lens that bends the frame; paint is bent with it.
+        share: how far each vertex is painted, (V,) in [0,1]; all of it if absent.
 
     Returns:
         A frame of the same kind; the same where the face lies outside.
@@ -126,6 +128,8 @@ def overlay(
     if len(covered.pixel) == 0:
         return frame
     colors = paint.at(covered, _coarseness(covered, paint))
+    if share is not None:
+        colors = colors * covered.of_vertices(share.double()[:, None], paint.mesh.faces.cpu()).float()
     painted = (colors[:, 3] > 1e-4).nonzero()[:, 0]
     if len(painted) == 0:
         return frame

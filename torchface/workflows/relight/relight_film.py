@@ -104,6 +104,10 @@ class WantedLight:
         return PointLight.directional(self.ambient * whole, (1 - self.ambient) * whole, toward)
 
 
+_FROM_ABOVE = WantedLight(azimuth=20.0, elevation=40.0, strength=1.1, ambient=0.45)
+_CHIN, _NECK = 8, (5.0, 45.0)  # its landmark, and millimetres below it over which another head fades into the neck
+
+
 @dataclass(frozen=True)
 class RelightSettings:
     """What the film is to show.
@@ -228,16 +232,21 @@ def relight_film(
 def _painter(tracked: TrackedFilm, settings: RelightSettings) -> Draw | None:
     """Draws paint or another head on a frame; None where neither is asked for."""
     moved: Callable[[int], Tensor] = tracked.vertices
+    share: Tensor | None = None
     if settings.texture is not None:
         paint = FacePaint.of(tracked.rig.neutral, load_paint(settings.texture))
     elif settings.rig is not None:
         other = load_rig(settings.rig)
         paint, moved = _head(other, settings.rig), _placed(other, tracked, settings.rig)
+        height = other.vertices[:, 1] - other.vertices[other.neutral.landmarks[_CHIN], 1]
+        share = ((height + _NECK[1]) / (_NECK[1] - _NECK[0])).clamp(0, 1)
     else:
         return None
 
     def draw(frame: int, image: Tensor, light: PointLight | EnvironmentLight) -> Tensor:
-        return overlay(image, moved(frame), paint, light, tracked.camera(frame), tracked.calibration)
+        if settings.rig is not None and isinstance(light, PointLight) and not bool(light.intensity.any()):
+            light = _FROM_ABOVE.beside(light)  # a head in light without a direction would look flat
+        return overlay(image, moved(frame), paint, light, tracked.camera(frame), tracked.calibration, share)
 
     return draw
 
