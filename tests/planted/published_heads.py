@@ -159,7 +159,7 @@ def write_eos(rig: BlendshapeRig, path: Path) -> None:
     pieces = [struct.pack("<I", 4), model(rig.vertices, identity_modes())]
     pieces.append(model(torch.full((count, 3), 0.5), torch.eye(3 * count)[:1].reshape(1, count, 3)))
     basis = expression_basis(rig)
-    pieces.append(struct.pack("<BiQ", 0, 0, len(basis)))
+    pieces.append(struct.pack("<BiQ", 0, 1, len(basis)))
     for row, delta in enumerate(basis):
         name = f"shape_{row}".encode()
         pieces.append(struct.pack("<Q", len(name)) + name + matrix(delta.reshape(-1, 1)))

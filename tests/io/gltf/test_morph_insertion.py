@@ -84,3 +84,21 @@ def test_a_skinned_character_stands_where_its_skeleton_puts_it(tmp_path: Path) -
     hair = next(block for block in character.blocks if block.name.startswith("Hair"))
     assert bool((character.head[:4] == 1).all() and (character.head[hair.rows] == 1).all())
     assert float(character.head.mean()) < 1  # the body is not the head
+
+
+def test_an_empty_target_is_filled_in_its_place(tmp_path: Path) -> None:
+    whole, out = tmp_path / "in.glb", tmp_path / "out.glb"
+    count = write_character(whole, HEAD, {"tongueOut": torch.zeros(4, 3), "smile": torch.ones(4, 3)})
+    document = read_document(whole)
+    moved = np.full((2, count, 3), 0.01, np.float32)
+    added = AddedTargets(0, (0,), moved)
+    root, data = document_with_targets(document, [added], ["jawOpen", "tongueOut"], ["tongueOut"])
+    write_edited(document, root, data, out)
+    character = read_character(read_document(out))
+    (block, *_) = character.blocks
+    assert block.names == ("tongueOut", "smile", "jawOpen")
+    assert bool((character.targets(block)[[0, 2]] == 0.01).all())
+    take = read_gltf_weights(out)
+    assert take is not None
+    assert take.weights is not None
+    assert take.weights.names == block.names

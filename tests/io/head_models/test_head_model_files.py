@@ -318,3 +318,15 @@ def test_a_header_that_is_no_python_is_refused(tmp_path: Path) -> None:
     (tmp_path / "v.npy").write_bytes(b"\x93NUMPY\x01\x00" + len(header).to_bytes(2, "little") + header + bytes(48))
     with pytest.raises(FileFormatError, match="found no readable arrays"):
         load_head_model_file(tmp_path / "v.npy")
+
+
+def test_eos_itself_reads_the_planted_file_and_its_own_is_read(rig: BlendshapeRig, tmp_path: Path) -> None:
+    models = pytest.importorskip("eos").morphablemodel
+    write_eos(rig, tmp_path / "planted.bin")
+    model = models.load_model(str(tmp_path / "planted.bin"))
+    mean = np.asarray(model.get_shape_model().get_mean()).reshape(-1, 3)
+    assert np.array_equal(mean, rig.vertices.numpy())
+    models.save_model(model, str(tmp_path / "saved.bin"))
+    saved, planted = (load_head_model_file(tmp_path / name) for name in ("saved.bin", "planted.bin"))
+    assert torch.equal(saved.expressions, planted.expressions)
+    assert saved.expression_names == planted.expression_names

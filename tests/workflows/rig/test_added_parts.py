@@ -89,7 +89,7 @@ def test_the_mouth_opens_and_no_tooth_stands_before_a_lip(rigged: tuple[Path, Pa
     ahead = torch.tensor([[0.0, 0.0, -1.0]], dtype=torch.float64)
     for name, depth in (("jawOpen", 12.0), ("", 0.0)):
         posed = rest + (motion(character, name) if name else 0.0)
-        middle = performer(texture=False).vertices[performer(texture=False).landmarks[[62, 66]]].double().mean(0)
+        middle = performer(texture=False).vertices[performer(texture=False).neutral.landmarks[[62, 66]]].double().mean(0)
         eye = middle + torch.tensor([[0.0, -8.0 if name else 1.5, 100.0]])
         front = float(RayCaster(posed, skin).cast(eye, ahead).distance)
         whole = float(RayCaster(posed, character.faces).cast(eye, ahead).distance)

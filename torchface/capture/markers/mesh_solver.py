@@ -21,7 +21,7 @@ CALM = 0.02
 it settles is which of several like explanations of a frame goes on."""
 _RIDGE = 1e-6
 _STEADY = 1.0  # millimetres; a vertex that shapes move by this counts a quarter for the head's place
-_CHUNK = 2**22  # numbers of vertices at once
+_CHUNK = 2**20  # numbers of vertices at once
 _NUMBERS = "meshes: found NaN or infinity, expected millimetres in every frame"
 
 

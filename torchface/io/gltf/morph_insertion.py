@@ -42,7 +42,7 @@ class AddedTargets:
 
 
 def document_with_targets(
-    document: Document, added: Sequence[AddedTargets], names: Sequence[str]
+    document: Document, added: Sequence[AddedTargets], names: Sequence[str], filled: Sequence[str] = ()
 ) -> tuple[dict[str, Any], bytes]:
     """The file's JSON with morph targets behind those that it has, and the bytes that come behind its binary chunk.
 
@@ -52,7 +52,8 @@ def document_with_targets(
     Args:
         document: a ``.glb`` whose first buffer is its binary chunk.
         added: at least one.
-        names: of the new morph targets, none of which such a mesh has.
+        names: of the new morph targets; a mesh has none of them but those ``filled``.
+        filled: of them those that take the place of the target of that name in a mesh that has one.
 
     Raises:
         FileFormatError: the file keeps its data elsewhere, or a mesh has such a name already.
@@ -63,7 +64,7 @@ def document_with_targets(
         moved: Mapping[int, AddedTargets] = {
             primitive: one for one in added if one.mesh == mesh for primitive in one.primitives
         }
-        _extend_mesh(document, root, mesh, moved, tuple(names), writer)
+        _extend_mesh(document, root, mesh, moved, (tuple(names), frozenset(filled)), writer)
     return writer.finished()
 
 
@@ -166,14 +167,15 @@ def _extend_mesh(
     root: dict[str, Any],
     index: int,
     moved: Mapping[int, AddedTargets],
-    names: tuple[str, ...],
+    wanted: tuple[tuple[str, ...], frozenset[str]],
     writer: AppendedArrays,
 ) -> None:
+    names, filled = wanted
     mesh, location = root["meshes"][index], f"meshes[{index}]"
     if not isinstance(mesh, dict):
         raise document.error(location, type(mesh).__name__, "an object")
     old = read_target_names(document, index)
-    if twice := [name for name in names if name in old]:
+    if twice := [name for name in names if name in old and name not in filled]:
         raise document.error(f"{location}.extras.targetNames", f"{twice[0]!r} already", "names that it lacks")
     written: dict[tuple[int, bool], list[dict[str, int]]] = {}
     for number, primitive in enumerate(document.array(mesh, "primitives", location)):
@@ -194,16 +196,23 @@ def _extend_mesh(
                     turned = still if one is None or one.normals is None else one.normals[row]
                     target["NORMAL"] = writer.deltas(turned)
                 written[key].append(target)
-        primitive["targets"] = [*document.array(primitive, "targets", location), *written[key]]
-    _extend_names(document, mesh, location, (*old, *names))
-    zeros = [0.0] * len(names)
+        targets = list(document.array(primitive, "targets", location))
+        for name, target in zip(names, written[key], strict=True):
+            if name in old:
+                targets[old.index(name)] = target
+            else:
+                targets.append(target)
+        primitive["targets"] = targets
+    added = tuple(name for name in names if name not in old)
+    _extend_names(document, mesh, location, (*old, *added))
+    zeros = [0.0] * len(added)
     if "weights" in mesh or not old:
         mesh["weights"] = [*document.array(mesh, "weights", location), *zeros]
     nodes = [number for number, node in enumerate(document.objects("nodes")) if node.get("mesh") == index]
     for number in nodes:
         if "weights" in root["nodes"][number]:
             root["nodes"][number]["weights"] = [*document.array(root["nodes"][number], "weights", "nodes"), *zeros]
-    _extend_animations(document, root, nodes, len(old), len(names), writer)
+    _extend_animations(document, root, nodes, len(old), len(added), writer)
 
 
 def _extend_names(document: Document, mesh: dict[str, Any], location: str, names: tuple[str, ...]) -> None:

@@ -141,7 +141,7 @@ class _Archive:
 
     def expressions(self) -> tuple[Tensor, tuple[str, ...], Tensor]:
         """Blendshapes by name, or a model's components and its mean."""
-        if self.integer("<i") == 0:
+        if self.integer("<i") == 1:  # of a variant of a model and blendshapes
             named = [(self.text(), self.matrix()) for _ in range(self.count(16))]
             rows = [torch.from_numpy(delta.reshape(-1, 3).astype(np.float32)) for _, delta in named]
             if len({len(row) for row in rows}) > 1:

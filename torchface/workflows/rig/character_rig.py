@@ -120,7 +120,7 @@ def rig_character(
             save_rendered_image(sheet(list(error.views)[:24], min(8, len(error.views))), figure)
             raise AlignmentError(f"{path}: {error}; what was seen is in {figure}") from error
         found_after = time.perf_counter() - begin
-        present = _present(character)
+        present, empty = _present(character)
         missing = [name for name in ARKIT if name not in present]
         template = performer(texture=False)
         registration = _registered(template, face, path, progress)
@@ -138,10 +138,12 @@ def rig_character(
         )
         rig = _with_tongue(carried)
         made = tuple(name for name in missing if name in rig.names)
-        job = _Job(character, face, carried, rig, made, parts)
+        job = _Job(character, face, carried, rig, made, parts, empty)
         progress("writing the character")
         added = job.targets()
-        root, data = document_with_targets(document, added, made) if added else (copy.deepcopy(document.root), b"")
+        root, data = (
+            document_with_targets(document, added, made, empty) if added else (copy.deepcopy(document.root), b"")
+        )
         expressions = add_expressions(document, root, job.binds(present, added))
         with all_or_none():
             write_edited(document, root, data, out)
@@ -176,8 +178,11 @@ class _Present:
     binds: tuple[MorphBind, ...]
 
 
-def _present(character: Character) -> dict[str, _Present]:
-    """The shapes that a character has, by ARKit's names: as morph targets, else as a VRM's expressions."""
+def _present(character: Character) -> tuple[dict[str, _Present], tuple[str, ...]]:
+    """The shapes that a character has, by ARKit's names: as morph targets, else as a VRM's expressions.
+
+    Behind them ARKit's names of targets by which nothing moves: they count as missing.
+    """
     blocks: dict[tuple[int, int], Block] = {}
     for block in character.blocks:
         blocks.setdefault((block.node, block.mesh), block)
@@ -191,11 +196,23 @@ def _present(character: Character) -> dict[str, _Present]:
             if name in block.names
         ]
         found[arkit] = _Present(shape.names, tuple(binds))
+    empty = tuple(
+        name
+        for name, shape in found.items()
+        if shape.names == (name,)
+        and not any(
+            bool(character.targets(block)[bind.target].any())
+            for bind in shape.binds
+            for block in character.blocks
+            if (block.node, block.mesh) == (bind.node, bind.mesh)
+        )
+    )
+    found = {name: shape for name, shape in found.items() if name not in empty}
     for expression, bound in vrm_expressions(character.document).items():
         named = arkit_name(expression)
         if named is not None and named in ARKIT and bound and named not in found:
             found[named] = _Present((expression,), bound)
-    return {name: found[name] for name in ARKIT if name in found}
+    return {name: found[name] for name in ARKIT if name in found}, empty
 
 
 def _registered(template: BlendshapeRig, face: CharacterFace, path: Path, progress: Progress) -> Registration:
@@ -233,6 +250,7 @@ class _Job:
     rig: BlendshapeRig
     made: tuple[str, ...]
     parts: tuple[str, ...]
+    empty: tuple[str, ...]
 
     def targets(self) -> list[AddedTargets]:
         """The new morph targets of the meshes that move, in their own axes and unit."""
@@ -267,8 +285,14 @@ class _Job:
         meshes = {one.mesh for one in added}
         blocks = {(block.node, block.mesh): block for block in self.character.blocks if block.mesh in meshes}
         for row, name in enumerate(self.made):
-            bound[name] = tuple(MorphBind(node, mesh, len(block.names) + row) for (node, mesh), block in blocks.items())
+            bound[name] = tuple(MorphBind(node, mesh, self._row(block, row)) for (node, mesh), block in blocks.items())
         return {name: bound[name] for name in ARKIT if name in bound}
+
+    def _row(self, block: Block, row: int) -> int:
+        """The number that a made shape has among a block's targets: that of its name, else behind those there were."""
+        name = self.made[row]
+        before = sum(one not in block.names for one in self.made[:row])
+        return block.names.index(name) if name in block.names else len(block.names) + before
 
     def views(self, surface: TexturedSurface, present: dict[str, _Present]) -> Tensor:
         """The face at rest and with shapes on, those that were there among them."""
@@ -323,6 +347,8 @@ class _Job:
         lines += self._doubts(there)
         missing = [name for name in ARKIT if name not in self.made and name not in present]
         lines.append(f"made: {len(self.made)} shapes" + (f"; not made: {', '.join(missing)}" if missing else ""))
+        if self.empty:
+            lines.append(f"  note: {', '.join(self.empty)}: there, but nothing moved by it, so it counts as missing")
         if expressions:
             lines.append(f"expressions added to the VRM: {len(expressions)}")
         return [*lines, f"in all {seconds[1]:.1f} s"]
