@@ -87,9 +87,10 @@ def test_the_mouth_opens_and_no_tooth_stands_before_a_lip(rigged: tuple[Path, Pa
     skin = character.faces[: block.triangles[0]]
     rest = 1000 * character.vertices
     ahead = torch.tensor([[0.0, 0.0, -1.0]], dtype=torch.float64)
+    actor = performer(texture=False)
+    middle = actor.vertices[actor.neutral.landmarks[[62, 66]]].double().mean(0)
     for name, depth in (("jawOpen", 12.0), ("", 0.0)):
         posed = rest + (motion(character, name) if name else 0.0)
-        middle = performer(texture=False).vertices[performer(texture=False).neutral.landmarks[[62, 66]]].double().mean(0)
         eye = middle + torch.tensor([[0.0, -8.0 if name else 1.5, 100.0]])
         front = float(RayCaster(posed, skin).cast(eye, ahead).distance)
         whole = float(RayCaster(posed, character.faces).cast(eye, ahead).distance)
