@@ -201,7 +201,8 @@ def _soft_shadow(covered: Footprint, light: PointLight) -> Tensor:
 def _light_on(covered: Footprint, light: PointLight | EnvironmentLight, lit: Tensor | None = None) -> Tensor:
     """Red, green and blue light at the samples, (S,3); ``lit`` is the share of the source that each sees, if known."""
     if isinstance(light, EnvironmentLight):
-        return light.irradiance(covered.normals).float()
+        # Without shadows the rims of lids and lips would shine.
+        return covered.softened(light.irradiance(covered.normals).float(), sigma=_BESIDE)
     lit = _soft_shadow(covered, light) if lit is None else lit
     return irradiance(covered.points, covered.normals, light, lit.double()).float()
 

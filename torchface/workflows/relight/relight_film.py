@@ -48,7 +48,7 @@ _BESIDE = 110.0  # degrees of azimuth beyond which a light reaches no front of a
 _LEAST_SOURCE = 0.05  # share of the light below which its direction says nothing
 _BEYOND = 25.0  # millimetres beyond the face, over neck, ears and scalp, in which the new light fades out
 _INNER = ("eye", "lids", "brow", "nose", "upper_lip", "lower_lip")
-_GRAZING = 0.3  # cosine to the view below which it fades out: there a tracked head and the filmed one part
+_GRAZING = 0.12  # cosine to the view below which it fades out: there a tracked head and the filmed one part
 
 
 @dataclass(frozen=True)
