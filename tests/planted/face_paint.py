@@ -21,7 +21,7 @@ def face_paint(size: int = 1024) -> Tensor:
     """
     regions = head_annotations().regions
     lips = (regions["upper_lip"] | regions["lower_lip"]).float()[:, None]
-    covered, values = texel_values(size, torch.cat([mean_vertices().float(), lips], dim=1))
+    texels, values = texel_values(size, torch.cat([mean_vertices().float(), lips], dim=1))
     x, y, front = values[:, 0].abs(), values[:, 1], values[:, 2] > 20
     eyes = ((x - 30) / 30) ** 2 + ((y - 3 - 0.18 * (x - 30)) / 19) ** 2
     outline = torch.minimum(eyes, (x / 14) ** 2 + ((y - 2) / 11) ** 2)  # 1 at the edge of the mask
@@ -35,7 +35,7 @@ def face_paint(size: int = 1024) -> Tensor:
         paint[:, :3] = torch.lerp(paint[:, :3], torch.tensor(color).expand(len(values), 3), _over(share, paint[:, 3]))
         paint[:, 3] = share + paint[:, 3] * (1 - share)
     image = torch.zeros(size * size, 4)
-    image[covered] = paint
+    image[texels.texels] = paint
     return image.T.reshape(4, size, size).contiguous()
 
 

@@ -8,6 +8,7 @@ from functools import lru_cache
 import torch
 from torch import Tensor
 
+from torchface.geometry.meshes.rasterization import TexelMap
 from torchface.synthetic.head.identity import both_sides, mean_vertices, ramp
 from torchface.synthetic.head.skin_texture import texel_values
 from torchface.synthetic.head.topology import EYE_RIM, MOUTH_BORDER, topology
@@ -42,18 +43,18 @@ def reflective_paint(size: int = 1024, generator: torch.Generator | None = None,
         generator: of the painter's hand; without it every stroke lies where it should.
         unsteadiness: how far strokes lie off, standard deviation in millimetres.
     """
-    covered, values = _painted_texels(size)
+    texels, values = _painted_texels(size)
     points = values[:, :3]
     if generator is not None:
         points = points + unsteadiness * _wander(points, generator)
     paint = torch.zeros(size * size)
     amount = torch.stack([_strokes(points), _lid_dashes(values), _lip_dashes(values)]).amax(0)
-    paint[covered] = amount * (points[:, 2] > 40)
+    paint[texels.texels] = amount * (points[:, 2] > 40)
     return paint.view(size, size)
 
 
 @lru_cache(maxsize=2)
-def _painted_texels(size: int) -> tuple[Tensor, Tensor]:
+def _painted_texels(size: int) -> tuple[TexelMap, Tensor]:
     return texel_values(size, torch.cat([mean_vertices().float(), _ring_places()], dim=1))
 
 

@@ -10,8 +10,7 @@ from torch import Tensor
 
 from torchface.color_space import to_linear, to_srgb
 from torchface.geometry.meshes.normal_maps import SurfaceMaps
-from torchface.geometry.meshes.rasterization import TexelMap, rasterise_uvs
-from torchface.mesh import fan_triangulation
+from torchface.geometry.meshes.rasterization import TexelMap
 from torchface.synthetic.head.hair import HAIR_PATCH, flow, hair_share
 from torchface.synthetic.head.hair_locks import LOCK_PATCH, Style, strand_shade
 from torchface.synthetic.head.identity import mean_vertices, ramp
@@ -24,11 +23,10 @@ from torchface.synthetic.head.skin_texture import (
     mix,
     noise,
     skin_color,
+    texel_values,
     vertex_marks,
 )
 from torchface.synthetic.head.teeth_and_tongue import PAGE
-from torchface.synthetic.head.topology import topology
-from torchface.synthetic.head.uv_layout import unwrapping
 
 _MELANIN = (1.9, 2.2, 2.4)
 _MARGIN = 6  # texels round a part's rectangle
@@ -108,9 +106,7 @@ def skin_maps(look: Look, size: int = 2048) -> SkinMaps:
 @lru_cache(maxsize=1)
 def _texels(size: int) -> tuple[TexelMap, Tensor, Tensor]:
     """Texels of the skin's page, the mean head's points there (M,3) and their marks (M,8)."""
-    flat, faces = unwrapping(), fan_triangulation(topology().quads)
-    texels = rasterise_uvs(flat.uvs, fan_triangulation(flat.quads), size, size)
-    values = texels.interpolate(torch.cat([mean_vertices().float(), vertex_marks()], 1), faces).float()
+    texels, values = texel_values(size, torch.cat([mean_vertices().float(), vertex_marks()], 1))
     return texels, values[:, :3].contiguous(), values[:, 3:]
 
 

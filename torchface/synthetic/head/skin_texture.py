@@ -6,11 +6,10 @@ from functools import lru_cache
 
 import numpy as np
 import torch
-from scipy.ndimage import distance_transform_edt
 from torch import Tensor
 
+from torchface.geometry.meshes.rasterization import TexelMap, rasterise_uvs
 from torchface.mesh import fan_triangulation
-from torchface.rendering.raycast import RayCaster
 from torchface.synthetic.head.facial_openings import lid_order
 from torchface.synthetic.head.head_annotations import head_annotations
 from torchface.synthetic.head.identity import both_sides, mean_vertices, ramp
@@ -28,28 +27,15 @@ _MARKS = 8
 @lru_cache(maxsize=2)
 def skin_texture() -> Tensor:
     """The skin texture of every performer, (3,1024,1024), first row on top."""
-    covered, values = texel_values(_SIZE, torch.cat([mean_vertices().float(), vertex_marks()], dim=1))
-    color = _paint(values[:, :3], values[:, 3:])
-    image = torch.zeros(_SIZE * _SIZE, 3)
-    image[covered] = color
-    # What no triangle covers repeats its nearest neighbour, so that no border colour bleeds in.
-    nearest = distance_transform_edt(~covered.view(_SIZE, _SIZE).numpy(), return_distances=False, return_indices=True)
-    image = image.view(_SIZE, _SIZE, 3)[torch.from_numpy(nearest[0]), torch.from_numpy(nearest[1])]
-    return image.permute(2, 0, 1).contiguous()
+    texels, values = texel_values(_SIZE, torch.cat([mean_vertices().float(), vertex_marks()], dim=1))
+    return texels.image(_paint(values[:, :3], values[:, 3:]))
 
 
-def texel_values(size: int, table: Tensor) -> tuple[Tensor, Tensor]:
-    """Which texels a triangle covers (size²,), and for those the values (N,C) of a table (V,C) of the vertices."""
-    flat, t = unwrapping(), topology()
-    uv_faces, faces = fan_triangulation(flat.quads), fan_triangulation(t.quads)
-    page = torch.cat([flat.uvs.double() * size, torch.zeros(len(flat.uvs), 1, dtype=torch.float64)], dim=1)
-    step = torch.arange(size, dtype=torch.float64) + 0.5
-    across, up = torch.meshgrid(step, size - step, indexing="xy")
-    starts = torch.stack([across.flatten(), up.flatten(), torch.full((size * size,), 10.0).double()], dim=1)
-    hits = RayCaster(page, uv_faces).cast(starts, torch.tensor([0.0, 0.0, -1.0]).double().expand_as(starts))
-    covered = hits.triangle >= 0
-    corners, barycentric = faces[hits.triangle[covered]], hits.barycentric[covered].float()
-    return covered, (table[corners] * barycentric[..., None]).sum(1)
+def texel_values(size: int, table: Tensor) -> tuple[TexelMap, Tensor]:
+    """The M texels of the skin's page, and the values (M,C) there of a table (V,C) of the vertices."""
+    flat = unwrapping()
+    texels = rasterise_uvs(flat.uvs, fan_triangulation(flat.quads), size, size)
+    return texels, texels.interpolate(table, fan_triangulation(topology().quads)).float()
 
 
 def vertex_marks() -> Tensor:
