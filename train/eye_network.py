@@ -9,20 +9,18 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import ClassVar
 
 import torch
 from torch import Tensor
 
 from torchface import zoo
-from torchface.errors import ValueRangeError
 from torchface.landmarks.images.networks.eye_augmentation import EyeAugmentation, augmented_eyes
 from torchface.landmarks.images.networks.eye_network import EyeNetwork
 from torchface.landmarks.images.networks.eye_training import EyeSettings
 
 from .eye_pictures import EACH, PART, StoredEyePictures, eye_picture_files
 from .model_cards import model_card
-from .recipe_settings import ANY_DEVICE, RecipeSettings
+from .recipe_settings import RenderedSettings
 from .runner import Recipe, Run, metric_lines, recipe
 
 _TEST_BATCH = 100
@@ -31,15 +29,10 @@ _SIZES = {"600": 1.0, "120": 0.5, "60": 0.25}
 
 
 @dataclass(frozen=True, kw_only=True)
-class Settings(RecipeSettings):
+class Settings(RenderedSettings):
     """What the recipe does.
 
     Args:
-        pictures: How many to render.
-        held_out: Of them, the first, of people whom it does not learn from, kept for the test.
-        folder: Where pictures are kept.
-        ict: ICT-FaceKit's FaceXModel folder; embedded performers alone without.
-        workers: Processes that render.
         network: How the network is trained.
     """
 
@@ -47,12 +40,7 @@ class Settings(RecipeSettings):
     pictures: int = 14_000
     held_out: int = 400
     folder: Path = Path("out/eye_pictures")
-    ict: Path | None = None
-    seed: int = 1
-    workers: int = 2
     network: EyeSettings = field(default_factory=EyeSettings)
-
-    devices: ClassVar[tuple[str, ...]] = ANY_DEVICE
 
 
 @recipe
@@ -63,10 +51,7 @@ def train(settings: Settings, run: Run) -> EyeNetwork:
         ValueRangeError: fewer pictures than are held out and a part more.
     """
     progress = run.progress
-    if settings.pictures < settings.held_out + PART:
-        raise ValueRangeError(
-            f"pictures: found {settings.pictures}, expected {settings.held_out} to hold out and {PART} more at least"
-        )
+    settings.check_count(PART)
     files = eye_picture_files(
         settings.folder, settings.pictures, settings.seed, settings.ict, settings.workers, progress
     )
@@ -127,11 +112,10 @@ def _gap(points: Tensor) -> Tensor:
 
 def save(model: EyeNetwork, settings: Settings, metrics: dict[str, float]) -> None:
     """Writes the model with its card."""
-    heads = "embedded performers" if settings.ict is None else "ICT-FaceKit's heads (MIT) and embedded performers"
     card = model_card(
         settings,
         licence="MIT",
-        data=f"{settings.pictures} rendered pictures of both eyes of {heads}; no person's photograph.",
+        data=settings.rendered_data("both eyes of "),
         metrics=metrics,
         text=(
             "Reads an upright crop of a right eye, or of a left one in a mirror: six landmarks of the lids and the "

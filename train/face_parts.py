@@ -9,34 +9,27 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import ClassVar
 
 import torch
 from torch import Tensor
 
 from torchface import zoo
-from torchface.errors import ValueRangeError
 from torchface.landmarks.images.networks.part_network import PARTS, PartNetwork
 from torchface.landmarks.images.networks.part_training import PartSettings, part_crops
 
 from .model_cards import model_card
 from .part_pictures import EACH, PART, SCENES, StoredPartPictures, part_picture_files
-from .recipe_settings import ANY_DEVICE, RecipeSettings
+from .recipe_settings import RenderedSettings
 from .runner import Recipe, Run, metric_lines, recipe
 
 _TEST_BATCH = 48
 
 
 @dataclass(frozen=True, kw_only=True)
-class Settings(RecipeSettings):
+class Settings(RenderedSettings):
     """What the recipe does.
 
     Args:
-        pictures: How many to render.
-        held_out: Of them, the first, of people whom it does not learn from, kept for the test.
-        folder: Where pictures are kept.
-        ict: ICT-FaceKit's FaceXModel folder; embedded performers alone without.
-        workers: Processes that render.
         start: A network to go on from, by name or folder; a new one if absent.
         network: How the network is trained.
     """
@@ -45,13 +38,8 @@ class Settings(RecipeSettings):
     pictures: int = 4800
     held_out: int = 240
     folder: Path = Path("out/part_pictures")
-    ict: Path | None = None
-    seed: int = 1
-    workers: int = 2
     start: str | None = None
     network: PartSettings = field(default_factory=PartSettings)
-
-    devices: ClassVar[tuple[str, ...]] = ANY_DEVICE
 
 
 @recipe
@@ -61,10 +49,7 @@ def train(settings: Settings, run: Run) -> PartNetwork:
     Raises:
         ValueRangeError: fewer pictures than are held out and a part more.
     """
-    if settings.pictures < settings.held_out + PART:
-        raise ValueRangeError(
-            f"pictures: found {settings.pictures}, expected {settings.held_out} to hold out and {PART} more at least"
-        )
+    settings.check_count(PART)
     files = part_picture_files(
         settings.folder, settings.pictures, settings.seed, settings.ict, settings.workers, run.progress
     )
@@ -99,11 +84,10 @@ def _confusion(found: Tensor, truth: Tensor) -> Tensor:
 
 def save(model: PartNetwork, settings: Settings, metrics: dict[str, float]) -> None:
     """Writes the model with its card."""
-    heads = "embedded performers" if settings.ict is None else "ICT-FaceKit's heads (MIT) and embedded performers"
     card = model_card(
         settings,
         licence="MIT",
-        data=f"{settings.pictures} rendered pictures of {heads}; no person's photograph.",
+        data=settings.rendered_data(),
         metrics=metrics,
         text=(
             "Reads an upright crop of 1.7 boxes of a face and says of each pixel whether it shows background, skin, "

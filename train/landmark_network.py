@@ -11,16 +11,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
-from typing import ClassVar
 
 import torch
 from torch import Tensor
 
 from torchface import zoo
-from torchface.errors import ValueRangeError
 from torchface.landmarks import LandmarkNetwork, NetworkSettings
 from torchface.landmarks.images.ibug_68 import COUNT, INNER
-from torchface.landmarks.images.networks.heat_map_training import new_network
 from torchface.landmarks.images.networks.landmark_network import NetworkLandmarks
 from torchface.landmarks.images.networks.landmark_training import cropped, openings
 from torchface.landmarks.images.networks.picture_augmentation import AugmentationSettings, Crops
@@ -28,7 +25,7 @@ from torchface.landmarks.images.networks.picture_augmentation import Augmentatio
 from .annotated_pictures import annotated_pictures, inner_error
 from .face_pictures import EACH, PART, StoredExpressions, picture_files
 from .model_cards import model_card
-from .recipe_settings import ANY_DEVICE, RecipeSettings
+from .recipe_settings import RenderedSettings
 from .rendered_people.dense_points import dense_places
 from .runner import Recipe, Run, metric_lines, recipe
 
@@ -42,15 +39,10 @@ OPENINGS = {"lid opening": [0, 1], "lips' gap": [2], "mouth's width": [4], "brow
 
 
 @dataclass(frozen=True, kw_only=True)
-class Settings(RecipeSettings):
+class Settings(RenderedSettings):
     """What the recipe does.
 
     Args:
-        pictures: How many to render.
-        held_out: Of them, the last, of people whom it does not learn from, kept for the test.
-        folder: Where pictures are kept, for other recipes too.
-        ict: ICT-FaceKit's FaceXModel folder; embedded performers alone without.
-        workers: Processes that render.
         start: A network to go on from, by name or folder; zoo for the one that ships; a new one if absent.
         size: Pixels a side of the crops that it learns from.
         network: How the network is trained.
@@ -63,15 +55,10 @@ class Settings(RecipeSettings):
     pictures: int = 15_000
     held_out: int = 480
     folder: Path = Path("out/face_pictures")
-    ict: Path | None = None
-    seed: int = 1
-    workers: int = 2
     start: str | None = None
     size: int = 176
     network: NetworkSettings = field(default_factory=NetworkSettings)
     data: Path | None = None
-
-    devices: ClassVar[tuple[str, ...]] = ANY_DEVICE
 
 
 @recipe
@@ -85,10 +72,7 @@ def train(settings: Settings, run: Run) -> LandmarkNetwork:
     progress = run.progress
     if settings.data is not None:
         return fine_tuned(settings, settings.data, run)
-    if settings.pictures < settings.held_out + PART:
-        raise ValueRangeError(
-            f"pictures: found {settings.pictures}, expected {settings.held_out} to hold out and {PART} more at least"
-        )
+    settings.check_count(PART)
     files = picture_files(settings.folder, settings.pictures, settings.seed, settings.ict, settings.workers, progress)
     pictures = StoredExpressions(files)
     count = EACH * ((len(pictures) - settings.held_out) // EACH)  # whole people
@@ -131,7 +115,7 @@ def fine_tuned(settings: Settings, data: Path, run: Run) -> LandmarkNetwork:
 def first_network(settings: Settings) -> LandmarkNetwork:
     """The network that goes on learning, with a head for the points: a new one, or the one that the settings name."""
     if settings.start is None:
-        network = new_network(LandmarkNetwork, settings.network.seed)
+        network = LandmarkNetwork.drawn(settings.network.seed)
     else:
         network = zoo.get_model(_ZOO if settings.start == "zoo" else settings.start, LandmarkNetwork)
     places, mirror = dense_places()
@@ -217,11 +201,10 @@ def save(
     model: LandmarkNetwork, settings: Settings, metrics: dict[str, float], data: str = "", licence: str = "MIT"
 ) -> None:
     """Writes the model with its card; its data are rendered pictures unless they are named."""
-    heads = "embedded performers" if settings.ict is None else "ICT-FaceKit's heads (MIT) and embedded performers"
     card = model_card(
         settings,
         licence=licence,
-        data=data or f"{settings.pictures} rendered pictures of {heads}; no person's photograph.",
+        data=data or settings.rendered_data(),
         metrics=metrics,
         text=(
             "iBUG's 68 landmarks of a face in a crop of a colour or grey image and 452 further points of its surface, "

@@ -76,6 +76,44 @@ class RecipeSettings:
         return device
 
 
+@dataclass(frozen=True, kw_only=True)
+class RenderedSettings(RecipeSettings):
+    """What a recipe does that learns from rendered people alone.
+
+    Args:
+        pictures: How many to render.
+        held_out: Of them, of people whom it does not learn from, kept for the test.
+        folder: Where pictures are kept, for other recipes too.
+        ict: ICT-FaceKit's FaceXModel folder; embedded performers alone without.
+        workers: Processes that render.
+    """
+
+    pictures: int = 5000
+    held_out: int = 240
+    folder: Path = Path("out/pictures")
+    ict: Path | None = None
+    seed: int = 1
+    workers: int = 2
+
+    devices: ClassVar[tuple[str, ...]] = ANY_DEVICE
+
+    def check_count(self, part: int) -> None:
+        """Refuses fewer pictures than are held out and a ``part`` more.
+
+        Raises:
+            ValueRangeError: so few.
+        """
+        if self.pictures < self.held_out + part:
+            raise ValueRangeError(
+                f"pictures: found {self.pictures}, expected {self.held_out} to hold out and {part} more at least"
+            )
+
+    def rendered_data(self, of: str = "") -> str:
+        """What it learns from, for a card; ``of`` says which part of people pictures show."""
+        heads = "embedded performers" if self.ict is None else "ICT-FaceKit's heads (MIT) and embedded performers"
+        return f"{self.pictures} rendered pictures of {of}{heads}; no person's photograph."
+
+
 def _check_numbers(settings: Any, above: str = "") -> None:
     """No number of a recipe may be negative, infinite or beyond what a machine holds, nested ones included."""
     for name, value in ((f"{above}{own.name}", getattr(settings, own.name)) for own in fields(settings)):

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple, Self
+from typing import Any, NamedTuple, Self
 
 import torch
 from torch import Tensor, nn
@@ -13,10 +12,8 @@ from torchface.errors import ShapeError, ValueRangeError
 from torchface.files.documents import Value
 from torchface.landmarks.images.networks.eye_crop import CROP_HEIGHT, CROP_WIDTH
 from torchface.landmarks.images.networks.heat_maps import ResidualBlock, convolution, doubled, read_heat
-from torchface.progress import Progress, ValueLog
-
-if TYPE_CHECKING:
-    from torchface.landmarks.images.networks.eye_training import EyeSettings
+from torchface.landmarks.images.networks.picture_network import PictureNetwork
+from torchface.optim import DescentSettings, DescentTask
 
 POINTS = 7
 """Six landmarks of the lids, then the iris's centre."""
@@ -49,7 +46,7 @@ class EyeFindings(NamedTuple):
     visibility: Tensor
 
 
-class EyeNetwork(nn.Module):
+class EyeNetwork(PictureNetwork):
     r"""Lids and iris by a convolutional encoder and decoder whose heat maps are read by their means.
 
     .. math:: x_l = \sum_p \mathrm{softmax}(h_l)_p \, p
@@ -62,6 +59,10 @@ class EyeNetwork(nn.Module):
         channels: at a half, a quarter and an eighth of the resolution.
         blocks: residual blocks there.
         hidden: units between features and what is read of the whole eye.
+
+    :meth:`fit` takes cut-out pictures of both eyes, uint8 (B,4,H,W), see ``train/rendered_people/eye_picture.py``; then
+    what is known of them, in the order of ``EyeLabels``. It minimises what a ``LandmarkNetwork`` does of places, gaps
+    of the lids, the form of heat maps, errors of openness and cross entropies.
 
     Source: Newell, Yang, Deng 2016 (encoder and decoder); Sun et al. 2018 (means of heat maps).
 
@@ -106,43 +107,15 @@ class EyeNetwork(nn.Module):
         self.told = nn.Sequential(nn.Linear(eighth + POINTS * half, hidden), nn.ReLU(), nn.Linear(hidden, 3))
 
     @classmethod
-    def fit(
-        cls,
-        pictures: Dataset[tuple[Tensor, ...]],
-        network: EyeNetwork | None = None,
-        settings: EyeSettings | None = None,
-        progress: Progress | None = None,
-        checkpoint: Path | None = None,
-        device: str | torch.device = "cpu",
-        log: ValueLog | None = None,
-    ) -> EyeNetwork:
-        r"""Trains an eye network on pictures.
+    def _usual_settings(cls) -> DescentSettings:
+        from torchface.landmarks.images.networks.eye_training import EyeSettings
 
-        .. math:: \sum_l v_l \Bigl( r_l + 3 \ln(1 + r_l / 0.7) + \tfrac{r_l}{2 \sigma_l} + \ln \sigma_l \Bigr)
-            + \text{gap of the lids} + \text{form of heat maps} + \text{openness} + \text{cross entropies}
+        return EyeSettings()
 
-        with :math:`r_l` the distance from the truth in pixels of the crop; see :meth:`LandmarkNetwork.fit`.
+    def _task(self, pictures: Dataset[Any], settings: Any, device: str | torch.device) -> DescentTask[Any]:
+        from torchface.landmarks.images.networks.eye_training import eye_task
 
-        Args:
-            pictures: indexed by numbers (B,), such as a ``TensorDataset``. Gives cut-out pictures of both eyes, uint8
-                (B,4,H,W), see ``train/rendered_people/eye_picture.py``; then what is known of them, in the order
-                of ``EyeLabels``.
-            network: goes on from its weights; a new one if absent.
-            settings: how.
-            progress: called with each step and how far it is.
-            checkpoint: a file that is kept while it runs, and taken up by the next run with the same settings.
-            device: where the network computes.
-            log: called with what was measured, every fifty steps.
-
-        Returns:
-            The running mean of the weights, in evaluation mode, on the CPU.
-
-        Raises:
-            ShapeError: no picture, or other shapes.
-        """
-        from torchface.landmarks.images.networks.eye_training import fit_eyes
-
-        return fit_eyes(pictures, network, settings, progress, checkpoint, device, log)
+        return eye_task(self, pictures, settings, device)
 
     @property
     def config(self) -> dict[str, Any]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from functools import partial
-from pathlib import Path
 
 import torch
 from torch import Tensor
@@ -19,11 +18,9 @@ from torchface.landmarks.images.networks.heat_map_training import (
     draw_numbers,
     gap_loss,
     heat_loss,
-    new_network,
     point_loss,
 )
-from torchface.optim import DescentRun, DescentSettings, DescentTask, descend
-from torchface.progress import Progress, ValueLog, silent
+from torchface.optim import DescentSettings, DescentTask
 
 _METHOD = "eye network/2"
 _LIDS = torch.tensor([[1, 5], [2, 4]])  # upper and lower landmarks, opposite each other
@@ -49,32 +46,23 @@ class EyeSettings(DescentSettings):
     augmentation: EyeAugmentation = field(default_factory=EyeAugmentation)
 
 
-def fit_eyes(
-    pictures: Dataset[tuple[Tensor, ...]],
-    network: EyeNetwork | None,
-    settings: EyeSettings | None,
-    progress: Progress | None,
-    checkpoint: Path | None,
-    device: str | torch.device,
-    log: ValueLog | None,
-) -> EyeNetwork:
-    """See :meth:`EyeNetwork.fit`."""
+def eye_task(
+    network: EyeNetwork, pictures: Dataset[tuple[Tensor, ...]], settings: EyeSettings, device: str | torch.device
+) -> DescentTask[EyeCrops]:
+    """What a network learns of pictures; see :class:`EyeNetwork`."""
     check_pictures(
         pictures,
         "uint8 (4,H,W), landmarks (68,2), visibility (12,), irises (2,2), openness (2,) and bare eyeball (2,)",
         (68, 2), (12,), (2, 2), (2,), (2,),
     )  # fmt: skip
-    settings = settings or EyeSettings()
-    network = network or new_network(EyeNetwork, settings.seed)
     learned = {"gap": settings.gap, "heat": settings.heat, "augmentation": settings.augmentation}
-    task = DescentTask(
+    return DescentTask(
         partial(_crops, pictures, (network.width, network.height), settings),
         partial(_loss, network, settings, device),
         content_key(_METHOD, settings=learned, config=network.config),
         "training on eyes",
         "pixels off",
     )
-    return descend(network, task, settings, DescentRun(progress or silent, log, checkpoint, device))
 
 
 def _crops(pictures: Dataset[tuple[Tensor, ...]], size: tuple[int, int], settings: EyeSettings, step: int) -> EyeCrops:

@@ -1,19 +1,16 @@
-"""Parts of all trainings of networks with heat maps: first weights, batches, losses of places, gaps and maps."""
+"""Parts of all trainings of networks with heat maps: batches, losses of places, gaps and maps."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any, TypeVar
+from typing import Any
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 from torch.utils.data import Dataset
 
 from torchface.errors import ShapeError
 from torchface.landmarks.images.networks.heat_maps import cell_places
 from torchface.optim import DescentSettings
-
-Network = TypeVar("Network", bound=nn.Module)
 
 
 def check_pictures(pictures: Dataset[tuple[Tensor, ...]], expected: str, *shapes: tuple[int, ...]) -> None:
@@ -30,13 +27,6 @@ def check_pictures(pictures: Dataset[tuple[Tensor, ...]], expected: str, *shapes
     if not count or rgba.dtype != torch.uint8 or rgba.ndim != 4 or rgba.shape[1] != 4 or forms != list(shapes):
         found = ", ".join(f"{one.dtype} {tuple(one.shape)}" for one in (rgba, *labels)).replace("torch.", "")
         raise ShapeError(f"pictures: found {count}, the first {found}; expected at least one, {expected}")
-
-
-def new_network(make: Callable[[], Network], seed: int) -> Network:
-    """A network with first weights drawn by a seed."""
-    with torch.random.fork_rng([]):
-        torch.manual_seed(seed)
-        return make()
 
 
 def draw_numbers(pictures: Dataset[Any], settings: DescentSettings, step: int) -> tuple[Tensor, torch.Generator]:

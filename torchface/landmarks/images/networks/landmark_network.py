@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple, Self
+from typing import Any, NamedTuple, Self
 
 import torch
 from torch import Tensor, nn
@@ -14,10 +13,8 @@ from torchface.files.documents import Value
 from torchface.landmarks.images.ibug_68 import COUNT
 from torchface.landmarks.images.networks.dense_head import WEIGHTS, DenseHead, DenseReading
 from torchface.landmarks.images.networks.heat_maps import ResidualBlock, convolution, doubled, read_heat
-from torchface.progress import Progress, ValueLog
-
-if TYPE_CHECKING:
-    from torchface.landmarks.images.networks.landmark_training import NetworkSettings
+from torchface.landmarks.images.networks.picture_network import PictureNetwork
+from torchface.optim import DescentSettings, DescentTask
 
 STRIDE = 4
 """Pixels of the crop a side of a heat map's cell."""
@@ -59,7 +56,7 @@ class NetworkLandmarks(NamedTuple):
         return cls(landmarks, deviation, visibility, presence, *points, *unseen)
 
 
-class LandmarkNetwork(nn.Module):
+class LandmarkNetwork(PictureNetwork):
     r"""Landmarks by a convolutional encoder and decoder whose heat maps are read by their means.
 
     .. math:: x_l = \sum_p \mathrm{softmax}(h_l)_p \, p
@@ -76,8 +73,17 @@ class LandmarkNetwork(nn.Module):
         points: P, how many points of the face it finds beside the 68: where they are, ``places`` has.
         hidden: units of the head that finds them and reads the expression.
 
+    :meth:`fit` takes cut-out faces, uint8 (B,4,H,W), see ``train/rendered_people/face_picture.py``; iBUG's 68, (B,68,2)
+    pixels; and which of them nothing hides, (B,68) bool. For a network with points also these, (B,P,2) and (B,P) bool,
+    and the weights of blendshapes by ARKit's names that are posed, (B,52). It minimises, with :math:`r_l` the distance
+    from the truth in pixels of the crop,
+
+    .. math:: \sum_l v_l \Bigl( r_l + 3 \ln(1 + r_l / 0.7) + \tfrac{r_l}{2 \sigma_l} + \ln \sigma_l \Bigr)
+        + \text{distances of pairs} + \text{openings} + \text{form of heat maps}
+        + \text{cross entropy of } v \text{ and presence} + \text{likelihood of points and weights}
+
     Source: Newell, Yang, Deng 2016 (encoder and decoder); Sun et al. 2018 (means of heat maps); Kumar et al. 2020
-    (uncertainty and visibility beside places).
+    (uncertainty and visibility beside places); Feng et al. 2018 (a loss that is steep near zero).
 
     Example:
         >>> from torchface import zoo
@@ -134,49 +140,15 @@ class LandmarkNetwork(nn.Module):
         self.dense = DenseHead(points, hidden, decoder, sixteenth) if points else None
 
     @classmethod
-    def fit(
-        cls,
-        pictures: Dataset[tuple[Tensor, ...]],
-        network: LandmarkNetwork | None = None,
-        settings: NetworkSettings | None = None,
-        progress: Progress | None = None,
-        checkpoint: Path | None = None,
-        device: str | torch.device = "cpu",
-        log: ValueLog | None = None,
-    ) -> LandmarkNetwork:
-        r"""Trains a landmark network on pictures.
+    def _usual_settings(cls) -> DescentSettings:
+        from torchface.landmarks.images.networks.landmark_training import NetworkSettings
 
-        .. math:: \sum_l v_l \Bigl( r_l + 3 \ln(1 + r_l / 0.7) + \tfrac{r_l}{2 \sigma_l} + \ln \sigma_l \Bigr)
-            + \text{distances of pairs} + \text{openings} + \text{form of heat maps}
-            + \text{cross entropy of } v \text{ and presence} + \text{likelihood of points and weights}
+        return NetworkSettings()
 
-        with :math:`r_l` the distance from the truth in pixels of the crop.
+    def _task(self, pictures: Dataset[Any], settings: Any, device: str | torch.device) -> DescentTask[Any]:
+        from torchface.landmarks.images.networks.landmark_training import landmark_task
 
-        Args:
-            pictures: indexed by numbers (B,), such as ``TensorDataset(rgba, landmarks, visible)``; each batch is asked
-                for by a ``DataLoader``'s workers. Gives cut-out faces, uint8 (B,4,H,W), see
-                ``train/rendered_people/face_picture.py``; iBUG's 68, (B,68,2) pixels; and which of them nothing hides,
-                (B,68) bool. For a network with points also these, (B,P,2) and (B,P) bool, and the weights of
-                blendshapes by ARKit's names that are posed, (B,52).
-            network: goes on from its weights; a new one if absent.
-            settings: how.
-            progress: called with each step and how far it is.
-            checkpoint: a file that is kept while it runs, and taken up by the next run with the same settings; more
-                pictures may have come by then.
-            device: where the network computes.
-            log: called with what was measured, every fifty steps.
-
-        Returns:
-            The running mean of the weights, in evaluation mode, on the CPU.
-
-        Raises:
-            ShapeError: no picture, or other shapes.
-
-        Source: Feng et al. 2018 (a loss that is steep near zero); Kumar et al. 2020 (likelihood with visibility).
-        """
-        from torchface.landmarks.images.networks.landmark_training import fit_landmarks
-
-        return fit_landmarks(pictures, network, settings, progress, checkpoint, device, log)
+        return landmark_task(self, pictures, settings, device)
 
     @property
     def config(self) -> dict[str, Any]:

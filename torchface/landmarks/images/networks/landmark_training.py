@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, fields
 from functools import partial
-from pathlib import Path
 
 import torch
 from torch import Tensor
@@ -21,13 +20,11 @@ from torchface.landmarks.images.networks.heat_map_training import (
     draw_numbers,
     gap_loss,
     heat_loss,
-    new_network,
     point_loss,
 )
 from torchface.landmarks.images.networks.landmark_network import STRIDE, LandmarkNetwork
 from torchface.landmarks.images.networks.picture_augmentation import AugmentationSettings, Crops, augmented
-from torchface.optim import DescentRun, DescentSettings, DescentTask, descend
-from torchface.progress import Progress, ValueLog, silent
+from torchface.optim import DescentSettings, DescentTask
 from torchface.shape_names import ARKIT, mirror
 
 _METHOD = "landmark network/4"
@@ -79,18 +76,13 @@ class NetworkSettings(DescentSettings):
             raise ValueRangeError(f"shown: found {self.shown}, expected a divisor of the batch's {self.batch} crops")
 
 
-def fit_landmarks(
+def landmark_task(
+    network: LandmarkNetwork,
     pictures: Dataset[tuple[Tensor, ...]],
-    network: LandmarkNetwork | None,
-    settings: NetworkSettings | None,
-    progress: Progress | None,
-    checkpoint: Path | None,
+    settings: NetworkSettings,
     device: str | torch.device,
-    log: ValueLog | None,
-) -> LandmarkNetwork:
-    """See :meth:`LandmarkNetwork.fit`."""
-    settings = settings or NetworkSettings()
-    network = network or new_network(LandmarkNetwork, settings.seed)
+) -> DescentTask[tuple[Crops, Tensor]]:
+    """What a network learns of pictures; see :class:`LandmarkNetwork`."""
     expected, shapes = "uint8 (4,H,W), landmarks (68,2) and visibility (68,)", [(68, 2), (68,)]
     if network.points:
         expected += f", points ({network.points},2), their visibility, and weights ({len(ARKIT)},)"
@@ -100,14 +92,13 @@ def fit_landmarks(
         _start_points(network.dense, pictures)
     names = ("pair", "opening", "heat", "dense", "expression", "bfloat16", "shown", "augmentation")
     learned = {name: getattr(settings, name) for name in names}
-    task = DescentTask(
+    return DescentTask(
         _Drawn(pictures, network.size, network.margin, network.mirror, settings),
         partial(_loss, network, settings, device),
         content_key(_METHOD, settings=learned, config=network.config),
         "training the network",
         "pixels off",
     )
-    return descend(network, task, settings, DescentRun(progress or silent, log, checkpoint, device))
 
 
 @torch.no_grad()

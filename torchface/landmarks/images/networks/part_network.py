@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-from typing import TYPE_CHECKING, Any, Self
+from typing import Any, Self
 
 import torch
 from torch import Tensor, nn
@@ -14,10 +13,8 @@ from torchface.errors import ShapeError, ValueRangeError
 from torchface.files.documents import Value
 from torchface.landmarks.images.networks.eye_network import evened
 from torchface.landmarks.images.networks.heat_maps import convolution
-from torchface.progress import Progress, ValueLog
-
-if TYPE_CHECKING:
-    from torchface.landmarks.images.networks.part_training import PartSettings
+from torchface.landmarks.images.networks.picture_network import PictureNetwork
+from torchface.optim import DescentSettings, DescentTask
 
 PARTS = ("background", "skin", "hair", "brows", "eyes", "lips", "teeth", "glasses", "hand", "cloth")
 """In the order of the network's channels. Beards are hair, hats are cloth, all that is between the lips is teeth, and
@@ -29,7 +26,7 @@ PART_MARGIN = 1.7
 _MOST_CHANNELS, _MOST_BLOCKS = 256, 8
 
 
-class PartNetwork(nn.Module):
+class PartNetwork(PictureNetwork):
     r"""The share of each of :data:`PARTS` in each pixel by an encoder and decoder of separable convolutions.
 
     .. math:: p_{c} = \mathrm{softmax}_c \, f(x)
@@ -39,6 +36,9 @@ class PartNetwork(nn.Module):
     Args:
         channels: at a half, a quarter, an eighth and a sixteenth of the resolution.
         blocks: residual blocks there.
+
+    :meth:`fit` takes pictures uint8 (B,3,H,W), the number of the part in :data:`PARTS` of each pixel uint8 (B,H,W), and
+    the faces' boxes (B,4) pixels. It minimises cross entropy and lack of overlap (Milletari et al. 2016).
 
     Source: Ronneberger, Fischer, Brox 2015 (encoder and decoder); Howard et al. 2017 (separable convolutions); Shi et
     al. 2016 (pixels from channels).
@@ -71,37 +71,15 @@ class PartNetwork(nn.Module):
         self.scores = nn.Conv2d(channels[0], 4 * len(PARTS), 1)
 
     @classmethod
-    def fit(
-        cls,
-        pictures: Dataset[tuple[Tensor, ...]],
-        network: PartNetwork | None = None,
-        settings: PartSettings | None = None,
-        progress: Progress | None = None,
-        checkpoint: Path | None = None,
-        device: str | torch.device = "cpu",
-        log: ValueLog | None = None,
-    ) -> PartNetwork:
-        """Trains a network on pictures whose parts are known, by cross entropy and overlap (Milletari et al. 2016).
+    def _usual_settings(cls) -> DescentSettings:
+        from torchface.landmarks.images.networks.part_training import PartSettings
 
-        Args:
-            pictures: indexed by numbers (B,), such as a ``TensorDataset``. Gives pictures uint8 (B,3,H,W), the number
-                of the part in :data:`PARTS` of each pixel uint8 (B,H,W), and the faces' boxes (B,4) pixels.
-            network: goes on from its weights; a new one if absent.
-            settings: how.
-            progress: called with each step and how far it is.
-            checkpoint: a file that is kept while it runs, and taken up by the next run with the same settings.
-            device: where the network computes.
-            log: called with what was measured, every fifty steps.
+        return PartSettings()
 
-        Returns:
-            The running mean of the weights, in evaluation mode, on the CPU.
+    def _task(self, pictures: Dataset[Any], settings: Any, device: str | torch.device) -> DescentTask[Any]:
+        from torchface.landmarks.images.networks.part_training import part_task
 
-        Raises:
-            ShapeError: no picture, or other shapes.
-        """
-        from torchface.landmarks.images.networks.part_training import fit_parts
-
-        return fit_parts(pictures, network, settings, progress, checkpoint, device, log)
+        return part_task(self, pictures, settings, device)
 
     @property
     def config(self) -> dict[str, Any]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import partial
-from pathlib import Path
 from typing import NamedTuple
 
 import cv2
@@ -16,11 +15,10 @@ from torch.utils.data import Dataset
 
 from torchface.errors import ShapeError
 from torchface.files.content_keys import content_key
-from torchface.landmarks.images.networks.heat_map_training import draw_numbers, new_network
+from torchface.landmarks.images.networks.heat_map_training import draw_numbers
 from torchface.landmarks.images.networks.part_network import PART_MARGIN, PART_SIZE, PARTS, PartNetwork
 from torchface.landmarks.images.networks.picture_augmentation import AugmentationSettings, photographed, to_crop_maps
-from torchface.optim import DescentRun, DescentSettings, DescentTask, descend
-from torchface.progress import Progress, ValueLog, silent
+from torchface.optim import DescentSettings, DescentTask
 
 _METHOD = "part network/2"
 _RARE = torch.tensor([1.0, 1.0, 1.0, 2.0, 2.0, 2.0, 2.0, 2.0, 1.0, 1.0])  # of brows, eyes, lips, teeth, glasses
@@ -55,16 +53,10 @@ class PartCrops(NamedTuple):
     parts: Tensor
 
 
-def fit_parts(
-    pictures: Dataset[tuple[Tensor, ...]],
-    network: PartNetwork | None,
-    settings: PartSettings | None,
-    progress: Progress | None,
-    checkpoint: Path | None,
-    device: str | torch.device,
-    log: ValueLog | None,
-) -> PartNetwork:
-    """See :meth:`PartNetwork.fit`."""
+def part_task(
+    network: PartNetwork, pictures: Dataset[tuple[Tensor, ...]], settings: PartSettings, device: str | torch.device
+) -> DescentTask[PartCrops]:
+    """What a network learns of pictures; see :class:`PartNetwork`."""
     count: int = len(pictures)  # type: ignore[arg-type]  # data sets by number have a length
     images, parts, boxes = pictures[torch.arange(min(count, 1))]
     fits = images.dtype == parts.dtype == torch.uint8 and images.shape[1:2] == (3,)
@@ -73,19 +65,14 @@ def fit_parts(
             f"pictures: found {count}, of the first {images.dtype} {tuple(images.shape)}, {parts.dtype} "
             f"{tuple(parts.shape)}, {tuple(boxes.shape)}; expected one at least, uint8 (1,3,H,W), uint8 (1,H,W), (1,4)"
         )
-    settings, network = (
-        settings or PartSettings(),
-        network or new_network(PartNetwork, (settings or PartSettings()).seed),
-    )
     names = ("turn", "scale", "shift", "grey", "bfloat16")
-    task = DescentTask(
+    return DescentTask(
         partial(_draw, pictures, settings),
         partial(_loss, network, settings, device),
         content_key(_METHOD, settings={name: getattr(settings, name) for name in names}, config=network.config),
         "training on parts of faces",
         "% of the pixels wrong",
     )
-    return descend(network, task, settings, DescentRun(progress or silent, log, checkpoint, device))
 
 
 def _draw(pictures: Dataset[tuple[Tensor, ...]], settings: PartSettings, step: int) -> PartCrops:

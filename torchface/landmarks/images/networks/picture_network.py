@@ -1,0 +1,69 @@
+"""Base of the networks that learn from pictures of faces: how they are trained."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from pathlib import Path
+from typing import Any, Self
+
+import torch
+from torch import Tensor, nn
+from torch.utils.data import Dataset
+
+from torchface.optim import DescentRun, DescentSettings, DescentTask, descend
+from torchface.progress import Progress, ValueLog, silent
+
+
+class PictureNetwork(nn.Module):
+    """A network that learns from pictures; its class says of which form they are."""
+
+    @classmethod
+    def fit(
+        cls,
+        pictures: Dataset[tuple[Tensor, ...]],
+        network: Self | None = None,
+        settings: DescentSettings | None = None,
+        progress: Progress | None = None,
+        checkpoint: Path | None = None,
+        device: str | torch.device = "cpu",
+        log: ValueLog | None = None,
+    ) -> Self:
+        """Trains a network on pictures.
+
+        Args:
+            pictures: indexed by numbers (B,), such as a ``TensorDataset``; each batch is asked for by a
+                ``DataLoader``'s workers. What they give, the class says.
+            network: goes on from its weights; a new one if absent.
+            settings: how; those of the class by default.
+            progress: called with each step and how far it is.
+            checkpoint: a file that is kept while it runs, and taken up by the next run with the same settings; more
+                pictures may have come by then.
+            device: where the network computes.
+            log: called with what was measured, every fifty steps.
+
+        Returns:
+            The running mean of the weights, in evaluation mode, on the CPU.
+
+        Raises:
+            ShapeError: no picture, or other shapes.
+        """
+        settings = settings or cls._usual_settings()
+        network = network or cls.drawn(settings.seed)
+        task = network._task(pictures, settings, device)
+        return descend(network, task, settings, DescentRun(progress or silent, log, checkpoint, device))
+
+    @classmethod
+    def drawn(cls, seed: int) -> Self:
+        """An untrained network whose weights a seed draws."""
+        with torch.random.fork_rng([]):
+            torch.manual_seed(seed)
+            return cls()
+
+    @classmethod
+    @abstractmethod
+    def _usual_settings(cls) -> DescentSettings:
+        """Those of a training that says nothing else."""
+
+    @abstractmethod
+    def _task(self, pictures: Dataset[Any], settings: Any, device: str | torch.device) -> DescentTask[Any]:
+        """What it learns of pictures, which are checked."""
