@@ -20,7 +20,7 @@ from torchface.modeling import ImageFit
 from torchface.synthetic import neutral_head
 from torchface.workflows.fit.fit_checks import strange_lines
 from torchface.workflows.fit.fit_landmarks import PhotographLandmarks, find_in_photographs
-from torchface.workflows.fit.picture_checks import cover_lines, picture_lines
+from torchface.workflows.fit.picture_checks import cover_lines, picture_lines, profile_lines
 
 
 def skin() -> Tensor:
@@ -114,6 +114,22 @@ def test_landmarks_that_no_head_has_are_remarked_on() -> None:
     lines = strange_lines([Path("man.png"), Path("cat.png")], fit)
     assert len(lines) == 1
     assert "cat.png: found landmarks lie 6.7% of the eyes' distance" in lines[0]
+
+
+def test_profiles_alone_are_remarked_on() -> None:
+    """A head seen from 70° to either side, beside a view from the front, and from 30°."""
+    empty = torch.zeros(0)
+
+    def lines(*yaws: float) -> list[str]:
+        cameras = tuple(look_at(torch.zeros(3), yaw, width=200, height=200) for yaw in yaws)
+        marks = torch.zeros(len(yaws), 68, 2)
+        return profile_lines(ImageFit(neutral_head(texture=False), (), empty, empty, cameras, marks, marks, 1.0, empty))
+
+    assert lines(30.0) == lines(70.0, 0.0) == []
+    (line,) = lines(70.0, -70.0)
+    assert "only profiles" in line
+    assert "70°" in line
+    assert "-70°" in line
 
 
 def test_hidden_landmarks_do_not_count() -> None:

@@ -12,7 +12,7 @@ from torchface.geometry.cameras.calibration import assumed_calibration
 from torchface.io.video import VideoFile
 from torchface.landmarks import FaceReading
 from torchface.synthetic import performer
-from torchface.workflows.track.face_overlay import camera_at
+from torchface.workflows.track.face_overlay import camera_at, with_dots
 from torchface.workflows.track.overlay_video import head_window, side_by_side_drawer
 from torchface.workflows.track.track_inputs import TrackInputs, TrackSettings
 from torchface.workflows.track.track_models import TrackModels
@@ -57,3 +57,11 @@ def test_the_rig_stands_where_the_camera_sees_it_and_shows_what_is_suspect() -> 
     lost = replace(tracked, reading=replace(reading, landmarks=gone))
     assert (side_by_side_drawer(lost)(0, picture)[:, y, window.width + x] < 50).all()
     assert lost.suspect_spans() == [(0, 0, "no face")]
+
+
+def test_dots_leave_the_frame_as_it_is() -> None:
+    frame = torch.zeros(40, 50, 3, dtype=torch.uint8).permute(2, 0, 1)  # as decoders give it
+    drawn = with_dots(frame, torch.tensor([[10.0, 10.0]]), torch.tensor([[30.0, 20.0]]))
+    assert not frame.any()
+    assert drawn[:, 10, 10].tolist() == [60, 230, 60]
+    assert drawn[:, 20, 30].tolist() == [250, 70, 60]

@@ -17,8 +17,6 @@ from torchface.rig import BlendshapeRig
 from torchface.workflows.fit.fit_landmarks import PhotographLandmarks
 from torchface.workflows.surface_sites import sites_on_rig
 
-_SHARE = 0.7  # of the deviations that a network states of an expression, reckoned with beside a prior about rest
-
 
 @dataclass(frozen=True, eq=False)
 class ReadExpressions:
@@ -58,7 +56,7 @@ def with_readings(settings: FitSettings, found: Sequence[PhotographLandmarks], r
         settings = replace(settings, surface=surface)
     if bool(torch.isfinite(readings.expression).any()):
         read = WeightReadings.of_expression(
-            readings.expression.double(), _SHARE * readings.expression_deviation.double(), rig.names
+            readings.expression.double(), readings.expression_deviation.double(), rig.names
         )
         settings = replace(settings, expression_prior=ReadExpressions(settings.expression_prior, read))
     return settings

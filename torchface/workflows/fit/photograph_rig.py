@@ -19,13 +19,14 @@ from torchface.io.landmarks.landmark_points import save_pts
 from torchface.io.mesh_files import MESH_ENDINGS
 from torchface.io.rig_files import SCENE_ENDINGS
 from torchface.io.video.video_file import VIDEO_ENDINGS
+from torchface.landmarks.images.face_crop import cut_crop
 from torchface.modeling import FitSettings, ImageFit, fit_images, transfer_with_report
 from torchface.modeling.photographs.image_texture import with_iris
 from torchface.modeling.photographs.landmark_view import JAW
 from torchface.number_checks import checked_count
 from torchface.progress import Progress, silent
 from torchface.registration import hidden_parts, with_template_skin
-from torchface.rendering.clay_shading import Lighting, render, sample_texture
+from torchface.rendering.clay_shading import Lighting, render
 from torchface.rendering.compositing import save_rendered_image
 from torchface.rig import BlendshapeRig
 from torchface.workflows.fit.fit_checks import (
@@ -50,12 +51,12 @@ from torchface.workflows.named_finders import part_finder
 from torchface.workflows.named_heads import NamedHeads, load_head_model, matching
 from torchface.workflows.rig.actor_rig import check_out
 from torchface.workflows.rig_names import Naming, renamed
+from torchface.workflows.track.face_overlay import with_dots
 from torchface.workflows.track.track_models import DEFAULT_PRIOR, load_priors
 
 _OVER, _MARGIN = 480, 0.45
 _LIGHT = Lighting(occlusion_rays=0)
 _WHITE, _BLACK = (1.0, 1.0, 1.0), (0.0, 0.0, 0.0)
-_FOUND, _FIT = (0.1, 1.0, 0.2), (1.0, 0.1, 0.1)
 
 
 @dataclass(frozen=True)
@@ -260,15 +261,14 @@ def overlay(fit: ImageFit, view: int, image: Tensor, marks: Tensor) -> Tensor:
         marks: its landmarks, (68,2).
     """
     camera, corner = _cut(fit.cameras[view], marks)
-    piece = _sampled(image, corner)
+    shift = torch.cat([torch.eye(2, dtype=torch.float64), -corner[:2, None]], dim=1)
+    piece = cut_crop((255 * image[:3].clamp(0, 1)).round().byte(), corner[2] * shift, _OVER)
     drawn, behind = (
         render(fit.posed[view], camera, lighting=_LIGHT, background=color, samples=1) for color in (_WHITE, _BLACK)
     )
-    over = torch.where((drawn - behind).mean(0) < 0.5, drawn, piece)
-    dotted = piece
-    for points, color in ((marks, _FOUND), (fit.landmarks[view], _FIT)):
-        dotted = _dotted(dotted, (points - corner[:2]) * corner[2], color)
-    return torch.cat([piece, over, dotted], dim=2)
+    dotted = with_dots(piece, *((points - corner[:2]) * corner[2] for points in (marks, fit.landmarks[view])))
+    over = torch.where((drawn - behind).mean(0) < 0.5, drawn, piece / 255)
+    return torch.cat([piece / 255, over, dotted / 255], dim=2)
 
 
 def _code(color: Tensor) -> str:
@@ -286,23 +286,3 @@ def _cut(camera: Camera, marks: Tensor) -> tuple[Camera, Tensor]:
     zoom[:2, 2] = -corner * scale
     piece = Camera(zoom @ camera.intrinsics, camera.rotation, camera.translation, _OVER, _OVER)
     return piece, torch.cat([corner, torch.tensor([scale], dtype=torch.float64)])
-
-
-def _sampled(image: Tensor, piece: Tensor) -> Tensor:
-    steps = torch.arange(_OVER, dtype=torch.float64) / piece[2]
-    y, x = torch.meshgrid(steps + piece[1], steps + piece[0], indexing="ij")
-    height, width = image.shape[1:]
-    uv = torch.stack([(x + 0.5) / width, 1 - (y + 0.5) / height], dim=-1).reshape(-1, 2)
-    return sample_texture(image, uv).T.reshape(3, _OVER, _OVER)
-
-
-def _dotted(image: Tensor, points: Tensor, color: tuple[float, float, float]) -> Tensor:
-    """The image with a dot of three pixels at each point (L,2)."""
-    spots = points[torch.isfinite(points).all(-1)].round().long()
-    spots = spots[((spots >= 1) & (spots < _OVER - 1)).all(-1)]
-    step = torch.tensor([-1, 0, 1])
-    y = (spots[:, 1, None, None] + step[:, None]).expand(-1, 3, 3).flatten()
-    x = (spots[:, 0, None, None] + step[None, :]).expand(-1, 3, 3).flatten()
-    image = image.clone()
-    image[:, y, x] = torch.tensor(color)[:, None]
-    return image

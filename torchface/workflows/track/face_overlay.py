@@ -185,7 +185,7 @@ def _part_of(camera: Camera, x0: int, y0: int, x1: int, y1: int, step: int) -> C
 
 def with_dots(frame: Tensor, landmarks: Tensor, solved: Tensor) -> Tensor:
     """Landmarks on a frame, uint8 (3,H,W): those given (L,2) green, the solved rig's (L,2) red."""
-    canvas = np.ascontiguousarray(frame.permute(1, 2, 0).numpy())
+    canvas = np.array(frame.permute(1, 2, 0).numpy(), order="C")  # a copy: the frame stays as it is
     radius = max(1.0, 0.004 * max(frame.shape[1:]))
     scale = 2**_SUBPIXEL
     for points, color, size in ((solved, _SOLVED, 0.7 * radius), (landmarks, _FOUND, radius)):
