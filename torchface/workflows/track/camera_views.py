@@ -46,6 +46,13 @@ class OtherCamera:
         camera, place = self.inputs.calibration, (self.camera.rotation, self.camera.translation)
         return content_key(METHOD, read=self.inputs.reading_key, camera=camera, place=place, begin=self.begin)
 
+    @property
+    def line(self) -> str:
+        """For people to read."""
+        beside = float((self.camera.rotation.T @ self.camera.translation).norm())
+        film = f"{self.camera.name}: {self.inputs.clip.path.name}"
+        return f"camera {film}, {beside:.0f} mm from the first, its film begins {self.begin:+.3f} s after the first's"
+
     def view(self, times: Tensor, out: Path, solver: VideoSolver, progress: Progress) -> CameraView:
         """What it saw in the first one's frames, which are shown at ``times`` (T,) seconds.
 

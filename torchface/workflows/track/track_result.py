@@ -54,6 +54,7 @@ class Tracked:
         outliers: landmarks that lie where no face has them, and so are not trusted, (T,68) bool; none if absent.
         others: spans of frames that show another face, which are not solved.
         head: the person's, where it was solved with the take.
+        cameras: the others that saw the take, a line each.
         eyes: what the frames show of the eyes; None where nobody looked at them.
     """
 
@@ -73,6 +74,7 @@ class Tracked:
     others: Sequence[AnotherFace] = ()
     head: PersonHead | None = None
     eyes: TakeEyes | None = None
+    cameras: Sequence[str] = ()
 
     def __len__(self) -> int:
         return len(self.landmarks)
@@ -205,6 +207,7 @@ class Tracked:
             )
         else:
             lines.append(f"camera: as given, {self.calibration.error:.2f} px from what it was fitted to")
+        lines.extend(self.cameras)
         if self.faces > 1:
             lines.append(f"{self.faces} faces in the first frame; --face N picks another than the one followed")
         few = int((self.seen & (self.stable < MIN_STABLE)).sum())
@@ -239,9 +242,10 @@ class Tracked:
                 f"the rig fits the landmarks poorly ({100 * float(errors.nanmedian() / span):.0f} % of the distance of "
                 "the eyes): is it this person's own?"
             )
-        if self.inputs.models.unlearned:
+        if unlearned := self.inputs.models.unlearned:
+            more = f" and {len(unlearned) - _MAX_NAMED} more" if len(unlearned) > _MAX_NAMED else ""
             lines.append(
-                f"the priors have not learned {', '.join(self.inputs.models.unlearned)}: they hold these near rest"
+                f"the priors have not learned {', '.join(unlearned[:_MAX_NAMED])}{more}: they hold these near rest"
             )
         if self.reused:
             lines.append(f"landmarks of {self.reused} frames were known from an earlier run")

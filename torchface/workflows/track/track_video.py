@@ -138,6 +138,7 @@ def _track(inputs: TrackInputs, others: list[OtherCamera], out: Path, filmed: bo
         others=judged.others,
         head=head,
         eyes=eyes,
+        cameras=[other.line for other in others],
     )
     with all_or_none():
         tracked.products.update(write_curves(tracked, out))
