@@ -102,7 +102,7 @@ def live(
     if (solver == "examples") != bool(examples):
         raise ValueRangeError("live: found one of --solver examples and --examples FILE, expected both or neither")
     if examples:
-        from torchface.workflows.live.finder_solver import ExamplesSolver
+        from torchface.workflows.examples.live_examples import ExamplesSolver
 
         files = [one for path in examples for one in (sorted(path.glob("*.json")) if path.is_dir() else [path])]
         if not files:

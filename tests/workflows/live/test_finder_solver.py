@@ -8,16 +8,14 @@ import numpy as np
 import pytest
 import torch
 
-from torchface.capture.anybody import WebcamControls, rig_examples
+from torchface.capture.anybody import WebcamControls
 from torchface.errors import NameMismatchError
 from torchface.landmarks.images.face_reading import FaceReading
 from torchface.shape_names import ARKIT
 from torchface.synthetic import performer
-from torchface.workflows.examples.example_take import Method
 from torchface.workflows.live import finder_solver
-from torchface.workflows.live.finder_solver import ExamplesSolver, FinderSolver
+from torchface.workflows.live.finder_solver import FinderSolver
 from torchface.workflows.named_finders import NamedFinder
-from torchface.workflows.track.head_rotations import head_angles
 
 
 class Planted:
@@ -52,24 +50,6 @@ def test_weights_follow_what_the_finder_reads(monkeypatch: pytest.MonkeyPatch) -
     assert frames[-1].seen
     assert float(smile[-1]) > float(smile[0]) + 0.25
     assert float(frames[-1].weights[ARKIT.index("jawOpen")]) < 0.15
-
-
-@pytest.mark.parametrize("method", ["all", "regional", "linear"])
-def test_examples_follow_too_and_are_drawn(method: Method, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(finder_solver, "load_finder", lambda name: NamedFinder(None, Path(name)))  # type: ignore[arg-type]
-    monkeypatch.setattr(finder_solver, "LandmarkTracker", lambda finder, detector: Planted())
-    monkeypatch.setattr(finder_solver, "graph_detector", lambda: None)
-    rig_examples(performer(texture=False)).save(tmp_path / "examples.json")
-    solver, picture = ExamplesSolver([tmp_path / "examples.json"], method), np.zeros((240, 320, 3), np.uint8)
-    frames = [solver.step(picture, 1 / 30, WebcamControls()) for _ in range(8)]
-    assert not frames[0].seen
-    smile = [float(frame.weights[ARKIT.index("mouthSmileLeft")]) for frame in frames]
-    assert smile[-1] > smile[1] + (0.3 if method == "all" else 0.1)
-    assert float(head_angles(frames[-1].rotation.double()).abs().max()) < 0.1
-    drawn = frames[-1].drawn
-    assert drawn is not None
-    assert ((drawn[..., 0] > 150) & (drawn[..., 1] < 100)).sum() > 20  # the solved example's, red
-    assert not picture.any()
 
 
 def test_a_table_finds_nothing_as_the_face_moves() -> None:

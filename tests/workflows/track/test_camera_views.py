@@ -160,15 +160,17 @@ def test_two_rendered_films_show_more_than_one(tmp_path: Path) -> None:
     settings = LightStageSettings(width=320, height=240, samples=1, turn=0.0)
     turn = rotation_matrix(torch.tensor([[0.0, math.radians(25), 0.0]]))[0]
     turned = BlendshapeRig(actor.neutral.with_vertices(actor.vertices @ turn.T), actor.deltas @ turn.T, actor.names)
+    seen = []
     for name, rig in (("left", actor), ("right", turned)):
         generator = torch.Generator().manual_seed(0)
         film = render_lit_video(tmp_path / f"{name}.avi", rig, weights, light, 30.0, generator, settings)
+        seen.append(film.cameras[0])
     save_rig(actor, tmp_path / "rig.glb")
-    R, t = film.cameras[0].rotation.double(), film.cameras[0].translation.double()
-    beside = R @ turn.double() @ R.T
-    own = CameraCalibration(film.cameras[0].intrinsics.double(), torch.zeros(5).double(), 320, 240, 0.1)
+    (R, t), (R2, t2) = ((one.rotation.double(), one.translation.double()) for one in seen)
+    beside = R2 @ turn.double() @ R.T
+    own = CameraCalibration(seen[0].intrinsics.double(), torch.zeros(5).double(), 320, 240, 0.1)
     nowhere = torch.eye(3).double(), torch.zeros(3).double()
-    placed = [PlacedCamera(own, *nowhere, "left"), PlacedCamera(own, beside, t - beside @ t, "right", 0.0)]
+    placed = [PlacedCamera(own, *nowhere, "left"), PlacedCamera(own, beside, t2 - beside @ t, "right", 0.0)]
     save_cameras(placed, tmp_path / "cameras.toml")
     two = TrackSettings(overlay="none", beside=(tmp_path / "right.avi",), cameras=tmp_path / "cameras.toml")
     (tmp_path / "one").mkdir()

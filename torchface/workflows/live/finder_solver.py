@@ -1,23 +1,16 @@
-"""Solvers of anybody's frames for landmarks that a finder by name finds: as the webcam's graph, or by examples."""
+"""Solver of anybody's frames for landmarks that a finder by name finds, in place of the webcam's graph."""
 
 from __future__ import annotations
-
-import math
-from collections.abc import Sequence
-from pathlib import Path
 
 import numpy as np
 import torch
 
-from torchface.capture.anybody import ExampleShapes, WebcamControls, character_matrix, paper_expressions
+from torchface.capture.anybody import WebcamControls
 from torchface.landmarks.images.tracking.landmark_tracker import LandmarkTracker
 from torchface.progress import Progress, silent
 from torchface.shape_names import ARKIT
-from torchface.workflows.examples.example_take import Method, averaged_examples, example_solver
 from torchface.workflows.live.live_frames import LiveFrame, planes
-from torchface.workflows.named_finders import DEFAULT_LANDMARKS, graph_detector, load_finder
-from torchface.workflows.track.face_overlay import with_dots
-from torchface.workflows.track.head_rotations import head_rotations
+from torchface.workflows.named_finders import graph_detector, load_finder
 from torchface.workflows.webcam.webcam_graph import webcam_solver
 
 _USUAL = 1 / 30  # seconds
@@ -53,46 +46,3 @@ class FinderSolver:
         return LiveFrame(
             state.weights, rotation, reading.landmarks, reading.iris, state.gaze, calibrated=float(state.calibrated)
         )
-
-
-class ExamplesSolver:
-    """Solves frames by example expressions, as the dissertation's program does, for ARKit's weights and a turned head.
-
-    Args:
-        examples: what ``torchface examples`` wrote; of several people the mean is taken.
-        method: all shapes at once, the head first and then regions, or by a linear model of landmarks.
-        landmarks: what finds them; see :func:`~torchface.workflows.named_finders.load_finder`.
-        progress: called with each step.
-
-    Raises:
-        FileFormatError, NameMismatchError, ValueRangeError, MissingExtraError: a file is no examples, or as of
-            ``load_finder``.
-    """
-
-    names = ARKIT
-
-    def __init__(
-        self, examples: Sequence[Path], method: Method, landmarks: str | None = None, progress: Progress = silent
-    ) -> None:
-        shapes = averaged_examples([ExampleShapes.load(path) for path in examples])
-        self._solver, self._before = example_solver(shapes, method), torch.zeros(0)
-        self._matrix = character_matrix(shapes.names, ARKIT)
-        turns = {one.name: (math.radians(one.yaw), 0.0, -math.radians(one.roll)) for one in paper_expressions()}
-        self._turns = torch.tensor([turns.get(name, (0.0, 0.0, 0.0)) for name in shapes.names])
-        progress(f"reading {landmarks or DEFAULT_LANDMARKS}")
-        self._tracker = LandmarkTracker(load_finder(landmarks or DEFAULT_LANDMARKS).finder, detector=graph_detector())
-
-    def step(self, picture: np.ndarray, interval: float | None, controls: WebcamControls) -> LiveFrame:
-        """Solves the next frame; of nobody anything is learned on the way."""
-        frame = planes(picture)
-        marks = self._tracker.step(frame).landmarks
-        if not bool(torch.isfinite(marks).all()):
-            return LiveFrame(torch.zeros(len(ARKIT)), torch.full((3, 3), torch.nan), marks)
-        with torch.no_grad():
-            fit = self._solver.fit(marks[None], self._before if len(self._before) else None)
-            self._before, solved = fit.weights, self._solver.landmarks(fit)[0]
-        angles = fit.weights[0] @ self._turns.to(fit.weights)
-        angles[2] -= torch.atan2(fit.placement.matrix[0, 1, 0], fit.placement.matrix[0, 0, 0])
-        weights = (self._matrix.to(fit.weights) @ fit.weights[0]).clamp(0, 1)
-        drawn = with_dots(frame, marks, solved).permute(1, 2, 0).numpy()
-        return LiveFrame(weights, head_rotations(angles), marks, drawn=drawn)
