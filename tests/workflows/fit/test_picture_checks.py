@@ -53,6 +53,10 @@ def test_a_face_that_is_shown_well_is_not_remarked_on() -> None:
         (lambda image: (image * 4).round() / 4, "without grain"),
         (lambda image: image.flip(0), "colours that skin has not (red 0.83"),
         (lambda image: torch.full_like(image, 0.7), "a drawing, a statue"),
+        (
+            lambda image: image[:1] * torch.tensor([1.0, 0.8, 0.7])[:, None, None],
+            "one hue all over (red over green differs",
+        ),
     ],
 )
 def test_pictures_that_are_not_plain_photographs(change: Callable[[Tensor], Tensor], line: str) -> None:
@@ -84,7 +88,9 @@ def test_two_faces_of_one_size() -> None:
     assert picture_lines(replace(pair, asked=True), skin()) == []
     few = found(reading(25.0))
     crowd = replace(few, boxes=few.boxes.expand(7, 4))
-    with pytest.raises(NoFaceError, match=r"found 7 faces of similar size, the largest 33 pixels .* --face .*6 at \("):
+    with pytest.raises(
+        NoFaceError, match=r"found 7 of 7 faces of similar size, the largest 33 pixels .* --face .*6 at \("
+    ):
         picture_lines(crowd, skin())
     assert "25 pixels between" in picture_lines(replace(crowd, asked=True), skin())[0]
 

@@ -56,10 +56,8 @@ class FitSettings:
         inner_weight: of a squared error at brows, eyes, nose and mouth beside one at the contour.
         contour_slide: how much less an error along the face's contour counts than one across it, 0 to 1; 1 takes
             contour landmarks as points.
-        sliding: contour landmarks of the far side move to the visible silhouette, as people and detectors mark them;
-            False where they are vertices that may be hidden. Absent, what fits better is taken.
-        deviations: what each landmark is expected to be off by, (I,68) pixels: they count beside their view's
-            median, from half to four times it. All alike if absent.
+        sliding: contour landmarks of the far side move to the visible silhouette; what fits better if absent.
+        deviations: what each landmark is expected to be off by, (I,68) pixels, counted beside their view's median.
         surface: further points of the face; with them errors of neighbours are taken to go together.
         annotated: landmarks lie where annotators put them, and what learns from them, rather than on the heads'
             vertices; see ``as_annotated`` and ``annotated_vertices``.
@@ -67,12 +65,10 @@ class FitSettings:
         sparsity: beside that prior, for a weight of 1.
         expression_mean: how strong a shape is on average, in weights; the prior falls exponentially.
         expression_ridge: prior deviation of a weight beside that.
-        asymmetry: prior deviation of the difference between a shape's weight and its mirror image's. Faces move almost
-            alike on both sides, and 68 landmarks of a rotated head hardly distinguish a lopsided smile from it.
+        asymmetry: prior deviation of the difference between a shape's weight and its mirror image's.
         one_expression: all photographs show the same one, as taken at once; else each has its own.
         identity_bound: on each coefficient, standard deviations.
-        unknown_deviation: of a coordinate, millimetres: smooth differences of heads that the model does not know, on
-            average; how large this person's are is estimated. 0 holds heads to the model.
+        unknown_deviation: of differences that the model does not know, millimetres on average; 0 holds heads to it.
         noise: of an inner landmark, pixels; estimated from the residuals if absent.
         focal_deviation: relative deviation of the true focal length from the given one; 0 takes it as exact.
         shared_focal: one focal length for all photographs.
@@ -80,8 +76,7 @@ class FitSettings:
         transfers: how often shapes are transferred to the head found; 0 keeps the template's.
         texture_size: of the skin, texels a side; 0 makes no texture.
         irises: centres of the irises in each photograph, (I,2,2) pixels, NaN where unknown: their colour is there.
-        parts: what each photograph shows, skin, hair, hands: skin and the face's features alone are projected onto the
-            head; all of it if absent.
+        parts: what each photograph shows: skin and features alone are projected onto the head; all if absent.
 
     Raises:
         ValueRangeError: a setting is NaN, infinite or out of its range.

@@ -95,11 +95,8 @@ def fit_images(
               \lVert P_i(\bar S + u + \sum_k a_k s_k + \sum_n w_{in} B_n)_{v_l} - q_{il} \rVert^2 / \sigma^2
               + \lVert a \rVert^2 + \lVert u \rVert^2_{GP} + \sum_i \rho(w_i), \quad |a| \le 3, \; 0 \le w \le 1
 
-    for all photographs of one person together, each with an expression of its own or all with one; u are smooth
-    differences of heads that the model does not know. PnP gives initial poses; then identity, expression,
-    poses and focal length move at once, each step a quadratic program in a box. Landmarks of the face's contour slide
-    to where the silhouette is. At the end the shapes that show are transferred to the head found, and it is fitted
-    again.
+    u are smooth differences of heads that the model does not know. PnP gives initial poses; then all moves at once,
+    each step a quadratic program in a box. At the end the shapes that show are transferred to the head found.
 
     Args:
         model: heads at rest.

@@ -65,8 +65,7 @@ class PhotographSettings:
 
     Args:
         fit: the noise of landmarks, the priors on faces, the skin.
-        template: a rig with the model's topology; the model's own if absent, else the embedded performer where its
-            topology is the model's.
+        template: a rig with the model's topology; the model's own, or the embedded performer, if absent.
         part: an annotated region that template and model are cut to, such as ``"face"`` of an ICT head.
         focal: length in pixels, if given.
         face: which of several, from 0: in the order of an XML, or where landmarks are found the largest first.

@@ -24,6 +24,7 @@ _RED, _BLUE = (
     (0.03, 1.0),
     (-1.1, 0.1),
 )  # logarithms of red and blue over green of skin; 8 faces 0.20 to 0.51, -0.53 to -0.08
+_ONE_HUE = 0.02  # of red over green, its logarithm's middle 80 %; 19 photographs 0.11 to 0.76, clay 0.008
 _FLAT, _FLAT_GREY = 0.65, 0.18  # share of pixels like their neighbours; 9 photographs at most 0.12
 _PROFILE = 50.0  # degrees
 _GRID = 40
@@ -58,8 +59,8 @@ def picture_lines(found: PhotographLandmarks, image: Tensor, insist: bool = Fals
     if rivals and eyes < _FEW_EYES:
         places = ", ".join(f"{k} at ({x:.0f}, {y:.0f})" for k, (x, y, *_) in enumerate(found.boxes[:20].tolist()))
         refusals.append(
-            f"{rivals + 1} faces of similar size, the largest {float(face.box[2]):.0f} pixels wide, expected one, or "
-            f"--face with the number of one ({places})"
+            f"{rivals + 1} of {len(found.boxes)} faces of similar size, the largest {float(face.box[2]):.0f} pixels "
+            f"wide, expected one, or --face with the number of one ({places})"
         )
     if refusals and not insist:
         raise NoFaceError(f"{name}: found {'; '.join(refusals)}; give another photograph, or say --insist")
@@ -144,6 +145,10 @@ def _color_lines(image: Tensor, box: Tensor) -> list[str]:
         lines.append(f"{flat:.0%} of the face without grain, which photographs have: {what}? It may be nobody's head")
     if grey:
         return [*lines, "no colours: the skin is grey, and what it hides of the eyes' colour too"]
+    ratio = (middle[0].clamp(min=0.02) / middle[1].clamp(min=0.02)).log().flatten()
+    low, high = ratio.quantile(ratio.new_tensor([0.1, 0.9])).tolist()
+    if high - low < _ONE_HUE:
+        lines.append(f"one hue all over (red over green differs by {high - low:.1%}): a statue, a mask?")
     red, green, blue = middle.flatten(1).median(dim=1).values.clamp(min=0.02).log().tolist()
     if not (_RED[0] < red - green < _RED[1] and _BLUE[0] < blue - green < _BLUE[1]):
         lines.append(
