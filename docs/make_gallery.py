@@ -45,7 +45,9 @@ def main() -> None:
         with tempfile.TemporaryDirectory() as folder:
             bare, out = Path(folder) / "bare.glb", Path(folder) / "rigged.glb"
             write_character(bare, make().neutral, how=how)
-            print(name, *rig_character(bare, out).lines(), sep="\n  ")
+            bare_skin = name == "holes"
+            report = rig_character(bare, out, inner_mouth=bare_skin, eyes=bare_skin)
+            print(name, *report.lines(), sep="\n  ")
             with Image.open(Path(folder) / f"rigged{PICTURE_ENDING}") as image:
                 picture = image.convert("RGB").resize((WIDTH, WIDTH * image.height // image.width))
         picture.save(IMAGES / f"gallery_{name}.jpg", quality=88)
