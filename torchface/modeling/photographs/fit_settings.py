@@ -59,8 +59,7 @@ class FitSettings:
         sliding: contour landmarks of the far side move to the visible silhouette; what fits better if absent.
         deviations: what each landmark is expected to be off by, (I,68) pixels, counted beside their view's median.
         surface: further points of the face; with them errors of neighbours are taken to go together.
-        annotated: landmarks lie where annotators put them, and what learns from them, rather than on the heads'
-            vertices; see ``as_annotated`` and ``annotated_vertices``.
+        annotated: landmarks lie where annotators put them; see ``as_annotated`` and ``annotated_vertices``.
         expression_prior: which weights of the rig's shapes go together, in place of the mean and the ridge below.
         sparsity: beside that prior, for a weight of 1.
         expression_mean: how strong a shape is on average, in weights; the prior falls exponentially.

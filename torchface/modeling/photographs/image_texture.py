@@ -74,15 +74,12 @@ def photographed_skin(
         images: photographs, (3,H,W) each.
         cameras: one each.
         size: of the texture, texels a side; 0 makes none.
-        parts: what each shows: skin and the face's features alone are projected onto the head, and hair becomes a cap;
-            if absent also hair, clothes and what stands behind.
+        parts: what each shows: skin and the face's features alone are projected onto the head; all if absent.
         irises: centres of the eyes' irises in each photograph, (I,2,2) pixels, NaN where they are not known.
 
     Returns:
-        With texture coordinates: the photographs projected onto the head with their light divided out, where none shows
-        it the colour model, else the template's skin, and hair as a cap of its colour; of a template without colours,
-        parts such as teeth have their material's, and the irises their colour in the photographs. Without: the colour
-        model's colours.
+        With texture coordinates: the photographs projected onto the head, their light divided out; where none shows it
+        the colour model, else the template's skin; hair as a cap. Without: the colour model's colours.
     """
     fit = None if color is None else fit_colors(color, posed, images, cameras)
     mesh = posed[0]

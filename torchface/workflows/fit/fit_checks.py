@@ -153,9 +153,7 @@ def same_person(fits: Sequence[ImageFit]) -> Tensor:
 
     .. math:: \log \frac{p(q_i, q_{\ne i} \mid \text{one } a)}{p(q_i)\, p(q_{\ne i})}, \qquad a \sim N(0, I)
 
-    with landmarks :math:`q` taken to be Gaussian about each fit's coefficients :math:`a`, expression and camera
-    unknown. It is 0 where a photograph holds no evidence, positive where it fits to the others, negative where another
-    head explains it better.
+    with landmarks :math:`q` taken to be Gaussian about each fit's coefficients :math:`a`; 0 is no evidence.
 
     Args:
         fits: one a photograph, each fitted alone with the same model, I of them.

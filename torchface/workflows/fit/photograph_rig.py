@@ -158,8 +158,7 @@ def fit_photographs(
 
     Args:
         photographs: image files, or videos, of which frames are chosen.
-        landmarks: 68 in iBUG's order for each photograph, in files (.pts, .ljson) or in one of dlib's XML for all;
-            where there are none they are found, and written as .pts beside ``out``.
+        landmarks: files of 68 for each photograph, or one of dlib's XML; found, and written beside ``out``, if absent.
         model: a head model by name or folder; see ``zoo.get_model``. The best at hand if absent.
         out: the ``.glb`` or folder to write, see ``save_rig``; overlays are written beside it.
         settings: whose shapes, which lens, which face of several.
