@@ -28,6 +28,7 @@ _APART = 0.02  # millimetres between lips that were cut, so that they are two
 _CREASE, _COLUMNS, _LEAN = 2.5, 61, 0.06  # millimetres round the template's line where the lips' own is looked for
 _LINED, _OF_LIPS, _INSIDE = 4.0, 0.6, 30.0  # rays so far from the lips' line meet a mouth's inside behind the lips
 _HOLE, _HOLE_OFF = (0.35, 2.0), 14.0  # a hole's width beside the template's opening, millimetres between both
+_THICK, _OUT = 2.0, 15.0  # millimetres: of the skin before a mouth's bag, and how far it may have come through
 _LOOSE = 12  # vertices of loose parts from which a mouth has teeth and an eye an eyeball
 
 
@@ -333,9 +334,9 @@ class _Fitting:
         cap = t.caps[name].flatten()
         inside[cap if left else t.mirror[cap]] = True
         inside[t.mirror[cap] if name == "mouth" else cap[:0]] = True
-        self._add_region(inside)
+        self._add_region(inside, behind=name == "mouth")
 
-    def _add_region(self, inside: Tensor) -> None:
+    def _add_region(self, inside: Tensor, behind: bool = False) -> None:
         """Adds the triangles of the template whose vertices are all inside, with their places on the page."""
         mesh = self._shown
         assert mesh.uvs is not None
@@ -343,10 +344,22 @@ class _Fitting:
         kept = inside[mesh.faces].all(1)
         pairs = torch.stack([mesh.faces[kept], mesh.uv_faces[kept]], -1).reshape(-1, 2)
         own, of = pairs.unique(dim=0, return_inverse=True)
+        places = self._template[own[:, 0]]
         rows = self._append(
-            self._template[own[:, 0]], mesh.uvs[own[:, 1]].double(), torch.full((len(own),), self._host)
+            self._behind_skin(places) if behind else places,
+            mesh.uvs[own[:, 1]].double(),
+            torch.full((len(own),), self._host),
         )
         self._faces.append(rows[of].reshape(-1, 3))
+
+    def _behind_skin(self, places: Tensor) -> Tensor:
+        """Places (P,3), those that stand before the skin behind it: some chins are nearer to the mouth than others."""
+        far = places + torch.tensor([0.0, 0.0, _INSIDE], dtype=torch.float64)
+        ahead = torch.tensor([[0.0, 0.0, -1.0]], dtype=torch.float64).expand_as(far)
+        before = self._caster.cast(far, ahead).distance - _INSIDE  # negative where the skin stands before a place
+        moved = places.clone()
+        moved[:, 2] -= torch.where(before < _OUT, (before + _THICK).clamp(min=0.0), 0.0)
+        return moved
 
     def _append(self, places: Tensor, uvs: Tensor | None, host: Tensor) -> Tensor:
         self._new.append((places, uvs, host))
