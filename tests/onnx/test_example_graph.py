@@ -64,6 +64,8 @@ def test_the_graph_is_the_exact_solve(examples: ExampleShapes, method: object, t
         solver = ExampleSolver(examples, method if isinstance(method, Regional) else LandmarkModel.fit(examples))
     report = export_example_solver(solver, tmp_path / "solver.onnx")
     assert all(gap.worst < 1e-3 for gap in report.gaps)
+    session = onnxruntime.InferenceSession(report.path, providers=["CPUExecutionProvider"])
+    assert [one.name for one in session.get_outputs()] == ["weights", "carried"]
 
 
 def test_it_is_written_with_its_names_or_not_at_all(examples: ExampleShapes, tmp_path: Path) -> None:

@@ -91,6 +91,8 @@ def exported_model(
     )(program.model)
     _with_known_casts(program.model)
     _shorten_names(program.model)
+    for value, name in zip(program.model.graph.outputs, outputs, strict=True):
+        value.name = name  # which what a loop gives has lost where the loop is written out
     model = program.model_proto
     del model.graph.value_info[:], model.metadata_props[:]
     for value in (*model.graph.input, *model.graph.output):
