@@ -38,7 +38,7 @@ def film(path: Path, left_out: int | None) -> Path:
             weights[begin:end, ARKIT.index(name)] = ramp * STRENGTH.get(name, SMILE if "Smile" in name else 0.8)
     acted = sitting(weights, FPS, generator, SittingSettings(distance=450))
     frames = webcam_frames(person, acted, 21, WebcamSettings(320, 240, focal=300))
-    write_video((frame.picture.permute(1, 2, 0) for frame in frames), path, FPS)
+    write_video((frame.picture[None] for frame in frames), path, FPS)
     return path
 
 

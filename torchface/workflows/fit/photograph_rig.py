@@ -20,6 +20,7 @@ from torchface.io.mesh_files import MESH_ENDINGS
 from torchface.io.rig_files import SCENE_ENDINGS
 from torchface.io.video.video_file import VIDEO_ENDINGS
 from torchface.landmarks.images.face_crop import cut_crop
+from torchface.mesh import Mesh
 from torchface.modeling import FitSettings, ImageFit, fit_images, transfer_with_report
 from torchface.modeling.photographs.image_texture import with_iris
 from torchface.modeling.photographs.landmark_view import JAW
@@ -169,6 +170,8 @@ def fit_photographs(
     for path in photographs:
         if path.suffix.lower() in (*MESH_ENDINGS, *SCENE_ENDINGS):
             raise FileFormatError(f"{path}: found a mesh, expected photographs; torchface rig makes a rig of a mesh")
+        if not path.is_file():
+            raise FileFormatError(f"{path}: found no such file, expected a photograph or a video")
     progress("reading the model")
     named = NamedHeads.of(model)
     heads, rig = matching(load_head_model(named.name), settings.template, settings.part)
@@ -220,7 +223,7 @@ def fit_photographs(
     with all_or_none():
         save_rig(renamed(transferred.rig, settings.names), out)
         for i, (path, image) in enumerate(zip(overlays, images, strict=True)):  # one photograph at a time
-            save_rendered_image(overlay(fit, i, image, marks[i]), path)
+            save_rendered_image(overlay(fit, i, image, marks[i], dressed), path)
         for path, camera, (width, height), error in zip(overlays, fit.cameras, sizes, fit.errors.tolist(), strict=True):
             calibration = CameraCalibration(camera.intrinsics.double(), torch.zeros(5).double(), width, height, error)
             save_calibration(calibration, path.with_suffix(".toml"))
@@ -249,7 +252,7 @@ def _pictures(
     return names, images, found
 
 
-def overlay(fit: ImageFit, view: int, image: Tensor, marks: Tensor) -> Tensor:
+def overlay(fit: ImageFit, view: int, image: Tensor, marks: Tensor, head: Mesh | None = None) -> Tensor:
     """A photograph, the head before it with its skin, and the landmarks: found green, fitted red; (3,H,W), cut to it.
 
     Args:
@@ -257,13 +260,13 @@ def overlay(fit: ImageFit, view: int, image: Tensor, marks: Tensor) -> Tensor:
         view: which of them.
         image: it, (3,H,W).
         marks: its landmarks, (68,2).
+        head: at rest, with the skin and the eyes that are shown; the fit's if absent.
     """
     camera, corner = _cut(fit.cameras[view], marks)
+    posed = replace(head or fit.mesh, vertices=fit.posed[view].vertices)
     shift = torch.cat([torch.eye(2, dtype=torch.float64), -corner[:2, None]], dim=1)
     piece = cut_crop((255 * image[:3].clamp(0, 1)).round().byte(), corner[2] * shift, _OVER)
-    drawn, behind = (
-        render(fit.posed[view], camera, lighting=_LIGHT, background=color, samples=1) for color in (_WHITE, _BLACK)
-    )
+    drawn, behind = (render(posed, camera, lighting=_LIGHT, background=color, samples=1) for color in (_WHITE, _BLACK))
     dotted = with_dots(piece, *((points - corner[:2]) * corner[2] for points in (marks, fit.landmarks[view])))
     over = torch.where((drawn - behind).mean(0) < 0.5, drawn, piece / 255)
     return torch.cat([piece / 255, over, dotted / 255], dim=2)
