@@ -26,7 +26,7 @@ from torchface.synthetic.stages.scanner import eyes_closed, scan_head
 from torchface.synthetic.stages.weight_curves import perform
 from torchface.viz.figures.face_views import FRONT, PROFILE, THREE_QUARTER, face_views
 from torchface.viz.figures.registration_views import registration_sheet
-from torchface.workflows.fit.photograph_rig import PhotographSettings, fit_photographs
+from torchface.workflows.fit.photograph_rig import fit_photographs
 
 HERE = Path(__file__).resolve().parent
 SIZE = {"width": 232, "height": 290}
@@ -123,7 +123,7 @@ def fit_picture() -> torch.Tensor:
             points.write_text(f"version: 1\nn_points: {len(ids)}\n{{\n{rows}\n}}\n")
             cells.append(caption(_half(load_image(path)), "photograph"))
         files = [path.with_suffix(".pts") for path in photographs]
-        fit_photographs(photographs, files, "head", Path(folder) / "rig.glb", PhotographSettings(insist=True))
+        fit_photographs(photographs, files, "head", Path(folder) / "rig.glb")
         rig = load_rig(Path(folder) / "rig.glb")
     jaw = torch.zeros(1, len(rig.names))
     jaw[0, rig.names.index("jawOpen")] = 0.7

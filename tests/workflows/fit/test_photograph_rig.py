@@ -340,6 +340,22 @@ def test_photographs_of_one_performer_are_one_person(studio: Path, tmp_path: Pat
     assert made.remarks == ()
 
 
+def test_exact_landmarks_of_one_head_are_of_one_person() -> None:
+    """As of a rendered head: what is left over is the model's form of it, and says nothing of another person."""
+    heads, rig = matching(load_head_model("head"))
+    person = performer(draw_identities(1, torch.Generator().manual_seed(3))[0], texture=False)
+    smile = torch.zeros(1, len(person.names))
+    smile[:, person.index(["mouthSmileLeft", "mouthSmileRight"])] = 0.7
+    points = person(smile)[0][person.neutral.landmarks]
+    cameras = [look_at(points.mean(0), yaw, span=300.0, width=464, height=580) for yaw in (-35.0, 0.0, 35.0)]
+    marks = torch.stack([camera.project(points.double()) for camera in cameras])
+
+    def bare(some: Tensor, rows: list[int]) -> ImageFit:
+        return fit_images(heads, rig, some, [(464, 580)] * len(rows), settings=ALONE)
+
+    assert one_person_lines([Path(f"{i}.png") for i in range(3)], marks, bare) == []
+
+
 def test_frames_of_a_video_are_fitted(studio: Path, tmp_path: Path) -> None:
     frames = [(load_image(studio / f"p{i}.png") * 255).round().to(torch.uint8) for i in (0, 0, 1, 1, 2, 2)]
     frames[1] = (255 * gaussian_blur(frames[0].float()[None] / 255, 3.0)[0]).to(torch.uint8)

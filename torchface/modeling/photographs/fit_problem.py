@@ -55,13 +55,13 @@ class Problem:
     @property
     def least_noise(self) -> float:
         """Of an inner landmark, pixels: finders err alike in neighbours, which their residuals do not show."""
-        least = _MIN_NOISE * float(self.focal.mean())
+        eyes = float((self.found[:, 36] - self.found[:, 45]).norm(dim=-1).nan_to_num(0.0).mean())
+        least = max(_MIN_NOISE * float(self.focal.mean()), self.settings.least_noise * eyes)
         if not self.settings.annotated:
             return least
         if self.settings.surface is not None and self.settings.deviations is not None:
             return max(least, _STATED_68 * float(_typical(self.settings.deviations).mean()))
-        eyes = (self.found[:, 36] - self.found[:, 45]).norm(dim=-1)
-        return max(least, _FOUND_NOISE * float(eyes.nan_to_num(0.0).mean()))
+        return max(least, _FOUND_NOISE * eyes)
 
     @cached_property
     def mixing(self) -> Tensor | None:

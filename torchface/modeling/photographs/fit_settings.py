@@ -69,6 +69,7 @@ class FitSettings:
         identity_bound: on each coefficient, standard deviations.
         unknown_deviation: of differences that the model does not know, millimetres on average; 0 holds heads to it.
         noise: of an inner landmark, pixels; estimated from the residuals if absent.
+        least_noise: that such an estimate comes down to, of the distance of the eyes' outer corners.
         focal_deviation: relative deviation of the true focal length from the given one; 0 takes it as exact.
         shared_focal: one focal length for all photographs.
         max_iterations: of Gauss-Newton.
@@ -101,6 +102,7 @@ class FitSettings:
     identity_bound: float = 3.0
     unknown_deviation: float = 1.0
     noise: float | None = None
+    least_noise: float = 0.0
     focal_deviation: float = 0.0
     shared_focal: bool = True
     max_iterations: int = 20
@@ -117,7 +119,7 @@ class FitSettings:
         if self.noise is not None:
             checked_number("noise", self.noise, above=True)
         checked_number("contour_slide", self.contour_slide, 0.0, 1.0)
-        for name in ("focal_deviation", "sparsity", "unknown_deviation"):
+        for name in ("focal_deviation", "sparsity", "unknown_deviation", "least_noise"):
             checked_number(name, getattr(self, name))
         checked_count("max_iterations", self.max_iterations, 1)
         checked_count("transfers", self.transfers)
