@@ -26,6 +26,11 @@ def test_page_holds_tables_and_pictures_and_nothing_half_written(tmp_path: Path)
     assert sorted(path.name for path in page.parent.iterdir()) == ["index.html", "one.png"]
 
 
+def test_lines_become_a_list(tmp_path: Path) -> None:
+    text = write_page(tmp_path, "Title", [Section("Done", "one & two\nthree")]).read_text()
+    assert "<ul>\n<li>one &amp; two</li>\n<li>three</li>\n</ul>" in text
+
+
 HOSTILE = """</title></style><script>alert(1)</script>"><img src=x onerror='alert(1)'>&lt;script&gt;\u202e\u2028"""
 
 

@@ -20,7 +20,7 @@ table { border-collapse: collapse; margin: .6rem 0 } th, td { padding: .15rem .8
 td + td { font-variant-numeric: tabular-nums; text-align: right } th + th { text-align: right }
 summary { cursor: pointer; color: #1f5fa8 }
 thead { border-bottom: 1px solid #999 } tbody tr:nth-child(even) { background: #f6f6f6 }
-p { max-width: 60rem } td + td.long { text-align: left; max-width: 60rem }
+p, ul { max-width: 60rem } td + td.long { text-align: left; max-width: 60rem }
 """
 # Characters beyond which a cell is text, not a figure.
 _LONG = 60
@@ -37,7 +37,8 @@ class Table:
 
 @dataclass(frozen=True, eq=False)
 class Section:
-    """A heading, a paragraph, ready-made HTML, then tables and figures (3,H,W) by file name, in this order."""
+    """A heading, a paragraph or, where the text has several lines, a list of them, ready-made HTML, then tables and
+    figures (3,H,W) by file name, in this order."""
 
     title: str
     text: str = ""
@@ -65,7 +66,7 @@ def _write(folder: Path, title: str, sections: Sequence[Section]) -> Path:
     for section in sections:
         parts.append(f"<h2>{as_markup(section.title)}</h2>\n")
         if section.text:
-            parts.append(f"<p>{as_markup(section.text)}</p>\n")
+            parts.append(_text(section.text))
         parts.append(section.markup)
         parts.extend(_table(table) for table in section.tables)
         for name, figure in section.figures:
@@ -75,6 +76,13 @@ def _write(folder: Path, title: str, sections: Sequence[Section]) -> Path:
     page = folder / "index.html"
     write_file(page, "".join(parts).encode())
     return page
+
+
+def _text(text: str) -> str:
+    lines = text.split("\n")
+    if len(lines) == 1:
+        return f"<p>{as_markup(text)}</p>\n"
+    return "<ul>\n" + "".join(f"<li>{as_markup(line)}</li>\n" for line in lines) + "</ul>\n"
 
 
 def _table(table: Table) -> str:

@@ -33,7 +33,7 @@ def write_enhance_page(done: Enhanced, out: Path, height: int = _HEIGHT) -> Path
     shown = [shown_frame(done.animation, done.model, done.frames, t) for t in spread_frames(done, _SHOWN)]
     files = ", ".join(f"{what}: {path.name}" for what, path in done.products.items())
     sections = [
-        Section("What was done", ". ".join(done.lines()) + f". Files: {files}."),
+        Section("What was done", "\n".join([*done.lines(), f"files: {files}"])),
         Section(
             "Frames",
             "The input as its file has it, its low frequencies on the model's mesh, and those with the model's detail; "

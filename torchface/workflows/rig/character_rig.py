@@ -21,6 +21,7 @@ from torchface.io.gltf.gltf_document import read_document
 from torchface.io.gltf.morph_insertion import AddedTargets, document_with_targets, write_edited
 from torchface.io.gltf.part_insertion import document_with_parts
 from torchface.io.images.image_files import encode_png
+from torchface.io.mesh_files import MESH_ENDINGS
 from torchface.io.vrm.vrm_expressions import VRM_ENDING, MorphBind, add_expressions, vrm_expressions
 from torchface.landmarks.surfaces.face_on_surface import NoFaceOnSurfaceError
 from torchface.modeling.rigging.blinks_that_shut import BLINKS
@@ -159,7 +160,8 @@ def check_character(path: Path) -> None:
     """Raises ``FileFormatError`` for files that are no ``.glb`` or ``.vrm``, with the way to make one."""
     ending = path.suffix.lower()
     if ending not in CHARACTER_ENDINGS:
-        how = _CONVERT.get(ending, "export it as .glb")
+        converted = f"torchface convert {path.name} {path.stem}.glb" if ending in MESH_ENDINGS else "export it as .glb"
+        how = _CONVERT.get(ending, converted)
         raise FileFormatError(
             f"{path}: found {ending!r}, expected a character's .glb, .vrm or USD ({how}), or --template for a scan"
         )

@@ -50,7 +50,7 @@ def write_solve_page(folder: Path, title: str, report: SolveReport) -> Path:
     fps, weights = solution.take.fps, solution.weights.float()
     shown = solution.take.even_rows()
     make_folder(folder)
-    done = "; ".join(line for line in report.lines() if not line.startswith(("  ", "warning:")))
+    done = "\n".join(line for line in report.lines() if not line.startswith(("  ", "warning:")))
     sections = [
         Section(
             "The performance",

@@ -29,7 +29,7 @@ def write_track_page(tracked: Tracked, out: Path) -> Path:
     fps, solution, texture = tracked.video.fps, tracked.solution, tracked.inputs.settings.texture
     files = ", ".join(f"{name}: {path.name}" for name, path in tracked.products.items())
     sections = [
-        Section("What was done", "; ".join(tracked.lines()) + f". Files: {files}."),
+        Section("What was done", "\n".join([*tracked.lines(), f"files: {files}"])),
         Section("Figures", tables=[Table(("figure", "value"), figures(tracked))]),
         Section(
             "Frames",

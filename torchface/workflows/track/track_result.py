@@ -238,9 +238,11 @@ class Tracked:
             lines.append(f"often at their bound of 1: {named}")
         span = (self.landmarks[:, 36] - self.landmarks[:, 45]).norm(dim=1).nanmedian()
         if float(errors.nanmedian()) > _POOR * float(span):
+            share = f"{100 * float(errors.nanmedian() / span):.0f} % of the distance of the eyes"
             lines.append(
-                f"the rig fits the landmarks poorly ({100 * float(errors.nanmedian() / span):.0f} % of the distance of "
-                "the eyes): is it this person's own?"
+                f"the rig fits the landmarks poorly ({share}): is it this person's own?"
+                if self.head is None
+                else f"the head solved with the take fits the landmarks poorly ({share}); --rig takes this person's own"
             )
         if unlearned := self.inputs.models.unlearned:
             more = f" and {len(unlearned) - _MAX_NAMED} more" if len(unlearned) > _MAX_NAMED else ""
