@@ -7,7 +7,7 @@ import warnings
 import numpy as np
 import pytest
 import torch
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from torchface.errors import FileFormatError
@@ -31,6 +31,7 @@ def test_an_even_rate_stays_even_however_times_are_rounded(fps: float, digits: i
 
 
 @given(st.lists(st.integers(1, 5), min_size=4, max_size=60), st.sampled_from([24.0, 60000 / 1001, 120.0]))
+@example([1] * 16 + [3] + [5] * 11, 60000 / 1001)  # which 58,741 / 980 meets as exactly
 def test_dropped_frames_are_on_the_grid_exactly(steps: list[int], fps: float) -> None:
     numbers = np.cumsum([0, *[1] * 60, *steps])
     for given_numbers in (numbers, None):

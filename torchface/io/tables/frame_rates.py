@@ -30,6 +30,7 @@ _UNEVEN, _LIKE = 0.02, 0.2  # of a frame: so far from an even rate, and from the
 _FULL, _MILLISECOND = 1e-9, 1e-3
 _NEAR = 0.002  # by which clocks and stated rates differ; 60 and 60000/1001 do by 0.001
 _DIGITS = (1e-2, 1e-3, 1e-4, 1e-5, 1e-6)
+_BROADCAST = tuple(1000 * whole / 1001 for whole in (24, 30, 48, 60, 120))
 _SLOWEST = 3.0  # seconds from frame to frame: no film's, while milliseconds of 240 frames a second are beyond
 _UNITS = ("milliseconds", "microseconds", "nanoseconds")
 
@@ -156,6 +157,9 @@ def _rate(count: float, duration: float, resolution: float, stated: float | None
     if abs(rate - written) <= _FULL * rate:
         return written
     rounding = resolution if resolution <= max(_MILLISECOND, _NEAR * duration) else _FULL
+    usual = next((one for one in _BROADCAST if abs(count / one - duration) <= rounding), None)
+    if usual is not None:  # a fraction that meets a rounded duration by chance is no nearer the truth
+        return usual
     for digits in (_FULL, rounding):
         simple = simplest_rate(rate, lambda other, d=digits: abs(count / other - duration) <= d)  # type: ignore[misc]
         if simple != rate:

@@ -32,7 +32,8 @@ if TYPE_CHECKING:
     import viser
 
 _MIN_MOVE = 1e-4
-_OVER = 0.12  # millimetres that the textured mesh lies over the pieces
+OVER = 0.12
+"""Millimetres that the textured mesh lies over the pieces."""
 
 
 class HeadOnPage:
@@ -136,7 +137,7 @@ class HeadOnPage:
         self._texture_shown = True
 
     def _glb(self, textured: TexturedHead) -> bytes:
-        over = self._vertices + _OVER * vertex_normals(self._vertices, self._faces)
+        over = self._vertices + OVER * vertex_normals(self._vertices, self._faces)
         return textured.glb(over, None if self._normal_map is None else self._normal_map())
 
     def refresh_texture(self) -> None:

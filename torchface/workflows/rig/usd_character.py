@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from torchface.errors import FileFormatError
-from torchface.files.whole_files import check_ending, replaced_file
+from torchface.files.whole_files import check_ending, replaced_file, write_file
 from torchface.io.gltf.buffers import BufferWriter
 from torchface.io.gltf.character_scene import read_character
 from torchface.io.gltf.gltf_document import glb_pieces, read_document
@@ -50,7 +50,7 @@ def rig_usd_character(path: Path, out: Path, progress: Progress | None = None) -
             picture = Path(folder, f"rigged{PICTURE_ENDING}")
             figure = out.with_name(f"{out.stem}{PICTURE_ENDING}")
             if picture.is_file():
-                figure.write_bytes(picture.read_bytes())
+                write_file(figure, picture.read_bytes())
         _write_shapes(scene, made, report.made, Path(folder))
         with replaced_file(out) as temporary:
             target = temporary.with_suffix(path.suffix)  # OpenUSD goes by the ending
@@ -84,7 +84,7 @@ def _write_glb(scene: Scene, path: Path) -> None:
         root["nodes"][0]["children"].append(len(root["nodes"]))
         root["nodes"].append({"name": piece.name, "mesh": len(root["meshes"])})
         root["meshes"].append(mesh)
-    path.write_bytes(b"".join(glb_pieces(root, buffers, path)))
+    write_file(path, b"".join(glb_pieces(root, buffers, path)))
 
 
 def _write_shapes(scene: Scene, made: Path, names: tuple[str, ...], folder: Path) -> None:
@@ -103,5 +103,5 @@ def _write_shapes(scene: Scene, made: Path, names: tuple[str, ...], folder: Path
             moved = np.flatnonzero((delta != 0).any(1))
             arrays[f"{len(meshes)}/{row}/rows"], arrays[f"{len(meshes)}/{row}/offsets"] = moved, delta[moved]
         meshes.append({"path": record["path"], "names": new})
-    (folder / "shapes.json").write_text(json.dumps(meshes))
+    write_file(folder / "shapes.json", json.dumps(meshes).encode())
     np.savez(folder / "shapes.npz", **arrays)
