@@ -11,7 +11,9 @@ import torch
 
 from torchface.capture.anybody import WebcamControls
 from torchface.io.video import VideoFile, write_video
+from torchface.landmarks.images.face_reading import FaceReading
 from torchface.shape_names import ARKIT
+from torchface.synthetic import performer
 from torchface.workflows.live.live_frames import LiveFrame
 
 JAW = ARKIT.index("jawOpen")
@@ -26,8 +28,27 @@ def film(path: Path, jaws: Sequence[float], fps: float = 25.0) -> Path:
     return path
 
 
+class GrowingSmile:
+    """Reads a smile that grows, of the embedded performer straight before the camera; no face at first."""
+
+    def __init__(self) -> None:
+        self.number = -1
+
+    def step(self, image: torch.Tensor) -> FaceReading:
+        self.number += 1
+        if self.number == 0:
+            return FaceReading.lost()
+        rig, sure = performer(texture=False), torch.ones(68)
+        weights = torch.zeros(1, len(rig.names))
+        weights[0, rig.index(["mouthSmileLeft", "mouthSmileRight"])] = min(0.1 * self.number, 0.8)
+        head = rig(weights)[0, rig.neutral.landmarks] * torch.tensor([1.0, -1, -1]) + torch.tensor([0.0, 0, 500])
+        width, height = image.shape[2], image.shape[1]
+        pixels = width * head[:, :2] / head[:, 2:] + 0.5 * (torch.tensor([width, height]) - 1)
+        return FaceReading(pixels, 0.5 * sure, sure, sure[0])
+
+
 class ShadeSolver:
-    """Jaw by the picture's shade times the gain, smile by smoothing; keeps what it was told."""
+    """Jaw by the picture's shade times the gain, smile by smoothing; keeps its controls."""
 
     names = ARKIT
 

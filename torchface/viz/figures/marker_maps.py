@@ -80,7 +80,7 @@ def _views(mesh: Mesh, points: Tensor, colors: np.ndarray, labels: Sequence[str]
 
 def _view(mesh: Mesh, points: Tensor, colors: np.ndarray, labels: Sequence[str], yaw: float) -> Tensor:
     camera = frame_face(mesh, yaw, width=_WIDTH, height=_HEIGHT)
-    image = render(as_seen(mesh), camera, _paint(mesh), replace(DEFAULT_LIGHTING, occlusion_rays=4), samples=1)
+    image = render(as_seen(mesh), camera, _paint(mesh), replace(DEFAULT_LIGHTING, occlusion_rays=0))
     figure = Figure(figsize=(_WIDTH / 100, _HEIGHT / 100), dpi=100)
     axes: Axes = figure.add_axes((0, 0, 1, 1))
     axes.imshow(image.permute(1, 2, 0).numpy())

@@ -34,7 +34,7 @@ _LOOSE = 12  # vertices of loose parts from which a mouth has teeth and an eye a
 
 @dataclass(frozen=True, eq=False)
 class AddedParts:
-    """What is added to a character's file, and what people are told of it.
+    """What is added to a character's file, and what is said of it.
 
     Args:
         blocks: of the file, with their new vertices; none where nothing was missing.
