@@ -19,11 +19,7 @@ def to_srgb(light: Tensor) -> Tensor:
 
 
 def grey_images(images: Tensor) -> Tensor:
-    """Images (B,1,H,W) or (B,3,H,W) as grey ones (B,1,H,W), by the luma of BT.601.
-
-    Raises:
-        ShapeError: of another shape.
-    """
+    """Images (B,1,H,W) or (B,3,H,W) as grey ones (B,1,H,W), by the luma of BT.601."""
     if images.ndim != 4 or images.shape[1] not in (1, 3):
         raise ShapeError(f"images: found {tuple(images.shape)}, expected (B,1,H,W) or (B,3,H,W)")
     if images.shape[1] == 1:

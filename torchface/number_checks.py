@@ -81,9 +81,6 @@ def as_tensor(name: str, value: object, expected: str, dtype: torch.dtype | None
         expected: the shape, such as ``(B,N)``.
         dtype: of what is converted; NumPy's own, and torch's default of lists, if absent.
 
-    Raises:
-        ArgumentTypeError: it is something else, or floats where whole numbers are asked for.
-
     Example:
         >>> as_tensor("faces", np.array([[0, 1, 2]], dtype=np.int32), "(F,3)", torch.int64).dtype
         torch.int64
@@ -120,9 +117,6 @@ _READ_BY = {
 
 def checked_type(name: str, value: object, kind: type[Kind]) -> Kind:
     """The value itself, where it is of a class.
-
-    Raises:
-        ArgumentTypeError: it is something else.
 
     Example:
         >>> checked_type("fps", "30", float)
@@ -175,11 +169,7 @@ def as_real(values: torch.Tensor, name: str = "values") -> torch.Tensor:
 
 
 def check_rate(fps: object, where: str, error: type[TorchfaceError] = FileFormatError) -> float:
-    """The rate itself, where it can be one of a camera's; ``where`` begins the message.
-
-    Raises:
-        TorchfaceError: ``error``, for a rate that is no camera's.
-    """
+    """The rate itself, where it can be one of a camera's; ``where`` begins the message."""
     number = _real(fps)
     if not MIN_FPS <= number <= MAX_FPS:
         raise error(f"{where}: found {fps!s:.40} frames a second, expected {MIN_FPS} to {MAX_FPS:.0f}")

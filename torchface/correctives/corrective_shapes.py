@@ -180,11 +180,7 @@ def check_definitions(definitions: Sequence[Corrective]) -> None:
 
 
 def definitions_from_records(records: object) -> tuple[Corrective, ...]:
-    """The definitions of plain values from a file, such as ``Corrective.record`` gives.
-
-    Raises:
-        NameMismatchError, ValueRangeError: no such values, or of what no rig can have.
-    """
+    """The definitions of plain values from a file, such as ``Corrective.record`` gives."""
     if not isinstance(records, list):
         raise NameMismatchError(f"correctives: found {records!r:.80}, expected a list")
     definitions = []

@@ -76,11 +76,7 @@ def _check_weights(weights: Track, count: int) -> None:
 
 
 def _check_sequences(sequences: Tensor, count: int) -> None:
-    """Raises or warns where the sequences (K,) do not fit a database.
-
-    Raises:
-        ValueRangeError: not one number a frame, or a sequence in pieces.
-    """
+    """Raises or warns where the sequences (K,) do not fit a database."""
     if sequences.shape != (count,) or sequences.is_floating_point():
         raise ValueRangeError(
             f"sequences: found {sequences.dtype} {tuple(sequences.shape)}, expected ({count},) int64: the number of "
@@ -99,12 +95,7 @@ def _check_sequences(sequences: Tensor, count: int) -> None:
 
 
 def _check_topology(frames: Tensor | MeshSequence, faces: Tensor, neutral: Tensor) -> None:
-    """Raises where frames, triangles and neutral are not of one topology.
-
-    Raises:
-        TopologyError: they are not.
-        ValueRangeError: there are fewer than two frames, or the neutral is not finite.
-    """
+    """Raises where frames, triangles and neutral are not of one topology."""
     shape = tuple(frames.shape)
     if neutral.ndim != 2 or neutral.shape[1] != 3 or not bool(torch.isfinite(neutral).all()):
         raise ValueRangeError(f"neutral: found {tuple(neutral.shape)}, expected (V,3), finite")

@@ -109,9 +109,6 @@ def expression_score(found: Tensor, found_names: Sequence[str], true: Tensor, fp
         true: of ARKit's shapes, (T,52).
         fps: frames a second.
 
-    Raises:
-        ShapeError: the frames differ in number.
-
     Example:
         >>> true = torch.zeros(90, 52)
         >>> true[:, ARKIT.index("jawOpen")] = torch.linspace(0, 9, 90).sin().square()

@@ -36,11 +36,7 @@ def content_key(method: str, **inputs: object) -> str:
 
 
 def file_digest(path: str | Path) -> str:
-    """The SHA-256 of a file's bytes, read a block at a time.
-
-    Raises:
-        FileFormatError: it cannot be read.
-    """
+    """The SHA-256 of a file's bytes, read a block at a time."""
     digest = hashlib.sha256()
     try:
         with Path(path).open("rb") as file:

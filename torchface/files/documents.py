@@ -155,11 +155,7 @@ def read_toml(path: str | Path, marker: str | None = None, max_bytes: int = _MAX
 
 
 def parse_json(data: bytes) -> Any:
-    """The value that JSON text in UTF-8 stands for, its nesting and its numbers checked before it is built.
-
-    Raises:
-        ValueError: not JSON, nested too deep, too many lists and tables, or a whole number of more than 64 bits.
-    """
+    """The value that JSON text in UTF-8 stands for, its nesting and its numbers checked before it is built."""
     plain = _ESCAPE.sub(b"", data) if b"\\" in data else data
     if sum(map(plain.count, _BRACKETS)) > 4 * _MAX_CONTAINERS:
         raise ValueError(

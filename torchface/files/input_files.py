@@ -32,9 +32,6 @@ def kept_inputs(inputs: Iterable[Path], outputs: Iterable[tuple[str, Path]]) -> 
     Args:
         inputs: files and folders; what is not there is left out. Of a folder those files are kept that are read.
         outputs: of options by name, files and folders; and names of files in such folders.
-
-    Raises:
-        FileFormatError: an output is the same file or folder as an input or as another output.
     """
     outer = _kept.get() or _Inputs({}, (), ())
     names: dict[Identity, Path] = {}

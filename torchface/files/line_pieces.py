@@ -40,11 +40,7 @@ def line_pieces(
 
 
 def word_pieces(path: Path, data: bytes, start: int = 0) -> Iterator[list[bytes]]:
-    """The words behind a place, as many at a time as stand in a piece; lines do not matter.
-
-    Raises:
-        FileFormatError: a word is longer than a piece.
-    """
+    """The words behind a place, as many at a time as stand in a piece; lines do not matter."""
     while start < len(data):
         words = data[start : start + _PIECE].split()
         if start + _PIECE < len(data) and not data[start + _PIECE - 1 : start + _PIECE].isspace():

@@ -26,11 +26,7 @@ def model_roots(package: Path, home: str | None) -> list[Path]:
 
 
 def shipped_model(name: str) -> Path:
-    """The folder of a model that comes with torchface.
-
-    Raises:
-        FileFormatError: it is not there.
-    """
+    """The folder of a model that comes with torchface."""
     package = Path(__file__).resolve().parents[1]
     for root in model_roots(package, None):
         if is_model(root, name):
@@ -63,11 +59,7 @@ def is_model(root: Path, name: str) -> bool:
 
 
 def model_names(root: Path) -> list[str]:
-    """Names of the models that a root holds, sorted, damaged ones among them.
-
-    Raises:
-        OSError: the root cannot be listed.
-    """
+    """Names of the models that a root holds, sorted, damaged ones among them."""
     return sorted(entry.name for entry in root.iterdir() if is_model(root, entry.name))
 
 

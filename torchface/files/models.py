@@ -82,11 +82,7 @@ def write_model(
 
 
 def read_record(folder: str | Path) -> ModelRecord:
-    """What ``model.toml`` says.
-
-    Raises:
-        FileFormatError: the file is missing, too large, no TOML, of a newer format, or lacks a field.
-    """
+    """What ``model.toml`` says."""
     document = read_toml(_inside(Path(folder), DESCRIPTION))
     version = document["format"].whole(1, expected=str(FORMAT))
     if version > FORMAT:
@@ -140,9 +136,6 @@ def read_model(folder: str | Path, kinds: Mapping[str, type[Model]]) -> Model:
 def check_claims(folder: Path, kinds: Mapping[str, type[nn.Module]]) -> ModelRecord:
     """The record of a folder whose state may not be there yet: of one of these kinds, its size no more than its config
     asks for.
-
-    Raises:
-        FileFormatError: ``model.toml`` cannot be used, or says otherwise.
     """
     record = _known_record(folder, kinds)
     _, expected = _bare_model(folder / DESCRIPTION, record, kinds)

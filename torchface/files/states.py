@@ -81,12 +81,7 @@ def read_state(
 
 
 def check_size(path: Path, size: int) -> None:
-    """Refuses a state that has not as many bytes as its description says.
-
-    Raises:
-        FileFormatError: it has more or fewer.
-        OSError: the file cannot be looked at.
-    """
+    """Refuses a state that has not as many bytes as its description says."""
     bytes_there = path.stat().st_size
     if bytes_there != size:
         raise FileFormatError(f"{path}: found {bytes_there} bytes, expected {size}: cut off, or of another model")

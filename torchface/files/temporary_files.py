@@ -48,11 +48,7 @@ def new_temporary(path: Path, mode: int = 0o666) -> tuple[int, Path]:
 
 
 def open_plain(path: Path, flags: int, mode: int = 0o666) -> int:
-    """A descriptor as ``os.open`` gives it; a link is not followed.
-
-    Raises:
-        OSError: as ``os.open`` does, and where the name is a link's.
-    """
+    """A descriptor as ``os.open`` gives it; a link is not followed."""
     return os.open(path, flags | _PLAIN, mode)
 
 

@@ -25,11 +25,7 @@ _waiting: ContextVar[list[tuple[Path | None, Path]] | None] = ContextVar("waitin
 
 
 def read_file(path: str | Path, largest: int = LARGEST_FILE) -> bytes:
-    """The bytes of a file.
-
-    Raises:
-        FileFormatError: the file is missing, no plain file, empty, or larger than ``largest`` bytes.
-    """
+    """The bytes of a file."""
     path = Path(path)
     try:
         if not path.exists():
@@ -48,11 +44,7 @@ def read_file(path: str | Path, largest: int = LARGEST_FILE) -> bytes:
 
 
 def write_file(path: str | Path, data: bytes) -> None:
-    """Writes a file that appears only when it is complete and on the disk; see :func:`replaced_file`.
-
-    Raises:
-        FileFormatError: the folder is missing or cannot be written to.
-    """
+    """Writes a file that appears only when it is complete and on the disk; see :func:`replaced_file`."""
     path = Path(path)
     with _replaced(path) as (handle, _):
         rest = memoryview(data)
@@ -110,11 +102,7 @@ def all_or_none() -> Iterator[None]:
 
 
 def delete_file(path: Path) -> None:
-    """Deletes a file where there is one; inside :func:`all_or_none` with the others.
-
-    Raises:
-        FileFormatError: it cannot be deleted.
-    """
+    """Deletes a file where there is one; inside :func:`all_or_none` with the others."""
     check_no_input(path)
     waiting = _waiting.get()
     if waiting is not None:
@@ -128,11 +116,7 @@ def delete_file(path: Path) -> None:
 
 @contextmanager
 def made_folder(folder: str | Path) -> Iterator[Path]:
-    """The folder, made with those above it where it is not there yet; what was made and stayed empty goes again.
-
-    Raises:
-        FileFormatError: it cannot be made.
-    """
+    """The folder, made with those above it where it is not there yet; what was made and stayed empty goes again."""
     folder = Path(folder)
     missing = [above for above in (folder, *folder.parents) if not os.path.lexists(above)]
     make_folder(folder)
@@ -145,11 +129,7 @@ def made_folder(folder: str | Path) -> Iterator[Path]:
 
 
 def make_folder(folder: str | Path) -> Path:
-    """The folder, made with those above it where it is not there yet.
-
-    Raises:
-        FileFormatError: it cannot be made.
-    """
+    """The folder, made with those above it where it is not there yet."""
     folder = Path(folder)
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -178,12 +158,7 @@ def check_ending(path: str | Path, *endings: str) -> None:
 
 
 def check_writable(*files: Path | None, folder: Path | None = None) -> None:
-    """Looks whether files, or a folder for several, could be made, before long work; makes nothing.
-
-    Raises:
-        FileFormatError: what is there above one of them is no folder, or may not be written to; or in its place is
-            something else.
-    """
+    """Looks whether files, or a folder for several, could be made, before long work; makes nothing."""
     for path in files:
         if path is not None:
             try:
@@ -298,11 +273,7 @@ def _second_name(path: Path) -> Path | None:
 
 
 def sync_folder(folder: Path) -> None:
-    """Has the names in a folder, such as one just renamed, on the disk.
-
-    Raises:
-        OSError: the disk fails.
-    """
+    """Has the names in a folder, such as one just renamed, on the disk."""
     if sys.platform == "win32":  # folders cannot be opened there
         return
     try:

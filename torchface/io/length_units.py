@@ -15,11 +15,7 @@ _MILLIMETRES = {"mm": 1.0, "cm": 10.0, "m": 1000.0}
 
 
 def millimetres_per(unit: str) -> float:
-    """How many millimetres a file's unit has: ``"mm"``, ``"cm"`` or ``"m"``.
-
-    Raises:
-        ValueRangeError: the unit is another one.
-    """
+    """How many millimetres a file's unit has: ``"mm"``, ``"cm"`` or ``"m"``."""
     if unit not in _MILLIMETRES:
         raise ValueRangeError(f"unit: found {unit!r}, expected one of {', '.join(map(repr, _MILLIMETRES))}")
     return _MILLIMETRES[unit]

@@ -240,12 +240,7 @@ def load_detail_maps(path: str | Path) -> DetailMaps | None:
 
 
 def check_rig_ending(path: str | Path) -> None:
-    """Refuses what no rig can be written to.
-
-    Raises:
-        FileFormatError: another ending than ``.glb``, USD's, ``.ma`` and none, which stands for a folder of OBJ files.
-        MissingExtraError: USD, and usd-core is not installed.
-    """
+    """Refuses what no rig can be written to."""
     suffix = Path(path).suffix.lower()
     if suffix not in ("", *ANIMATION_ENDINGS):
         known = ", ".join(ANIMATION_ENDINGS)

@@ -71,9 +71,6 @@ def write_checked(
         cases: inputs by name, and the outputs that PyTorch gives for them.
         allowed: by output, how far apart the two may be.
         units: of the outputs.
-
-    Raises:
-        ValueRangeError: they are further apart; nothing is written.
     """
     content = model.SerializeToString()
     session = one_thread_session(content)

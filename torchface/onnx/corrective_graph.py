@@ -31,9 +31,6 @@ class CorrectiveGraph(nn.Module):
     Args:
         solver: the exact solve, of a rig with correctives.
         steps: of Gauss-Newton.
-
-    Raises:
-        ValueRangeError: the rig has no correctives, which ``SolverGraph`` is for.
     """
 
     def __init__(self, solver: MarkerSolver, steps: int = STEPS) -> None:

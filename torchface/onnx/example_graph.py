@@ -38,9 +38,6 @@ class ExampleGraph(nn.Module):
         solver: with landmark boxes, of squared distances or of a landmark model; or of squared distances all at once
             with the similarity solved for.
         steps: of splitting.
-
-    Raises:
-        ValueRangeError: it is another solver.
     """
 
     neutral: Tensor
@@ -159,11 +156,7 @@ def _check(solver: ExampleSolver) -> None:
 def example_model(
     solver: ExampleSolver, steps: int = STEPS, facts: Mapping[str, object] | None = None
 ) -> onnx.ModelProto:
-    """The solver as ONNX: ``landmarks`` (B,68,2) and ``previous`` (B,N) to ``weights`` and ``carried`` (B,N).
-
-    Raises:
-        ValueRangeError: there is no graph for such a solver.
-    """
+    """The solver as ONNX: ``landmarks`` (B,68,2) and ``previous`` (B,N) to ``weights`` and ``carried`` (B,N)."""
     metadata = {
         "task": "example_solver",
         "shape_names": list(solver.names),

@@ -32,9 +32,6 @@ def export_expression_regression(
         model: in float32.
         path: the file to write.
         facts: further metadata, such as licence and data.
-
-    Raises:
-        ValueRangeError: the form is another, or ONNX Runtime and PyTorch differ; nothing is written.
     """
     if model.form != "offsets":
         raise ValueRangeError(f"{path}: found a regression of the form {model.form!r}, expected 'offsets'")

@@ -29,9 +29,6 @@ def export_head_decoder(model: HeadModel, path: str | Path, facts: Mapping[str, 
         model: in float32.
         path: the file to write.
         facts: further metadata, such as licence and data.
-
-    Raises:
-        ValueRangeError: ONNX Runtime and PyTorch differ; nothing is written.
     """
     graph = head_decoder_model(model, facts)
     cases = []

@@ -93,9 +93,6 @@ def export_landmark_trees(
         path: the file to write.
         facts: further metadata, such as licence and data.
         pixels: of the image.
-
-    Raises:
-        ValueRangeError: ONNX Runtime and PyTorch differ; nothing is written.
     """
     generator = torch.Generator().manual_seed(0)
     cases = []

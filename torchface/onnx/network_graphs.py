@@ -92,9 +92,6 @@ def export_network(network: ImageNetwork, path: str | Path, facts: Mapping[str, 
         network: what to export.
         path: the file to write.
         facts: further metadata, such as licence and data.
-
-    Raises:
-        ValueRangeError: ONNX Runtime and PyTorch differ; nothing is written.
     """
     form, cases = _form(network.eval()), []
     smaller = form.example[..., : form.example.shape[-1] - 64] if "width" in form.sizes else form.example

@@ -137,9 +137,6 @@ def export_landmark_bank(
         path: the file to write.
         facts: further metadata, such as licence and data.
         images: to check with; cloudy noise if absent.
-
-    Raises:
-        ValueRangeError: ONNX Runtime and PyTorch differ; nothing is written.
     """
     bank = LandmarkBank(detector).eval()
     if images is None:

@@ -247,9 +247,6 @@ class GaussNewtonStep(nn.Module):
 
     Args:
         solver: the exact solve.
-
-    Raises:
-        ValueRangeError: the solver's prior is none of Student's distributions.
     """
 
     upper: Tensor

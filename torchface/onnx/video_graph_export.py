@@ -147,10 +147,6 @@ def check_frames(video: Track, camera: CameraCalibration) -> CheckFrames:
     Args:
         video: landmarks as found, (T,68,2), pixels of the camera's images.
         camera: whose lens bends them.
-
-    Raises:
-        ShapeError: other landmarks than the 68.
-        ValueRangeError: no frame shows a face.
     """
     if video.values.shape[1:] != (LANDMARKS, 2):
         raise ShapeError(f"video: found landmarks {tuple(video.values.shape)}, expected (T,{LANDMARKS},2)")

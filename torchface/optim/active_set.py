@@ -36,9 +36,6 @@ def primal_dual_active_set(problem: BoxProblem, start: Tensor, iterations: int =
         problem: B problems, float64.
         start: in the box, (B,N); its variables at a bound are the first active set.
         iterations: at most so many factorisations.
-
-    Raises:
-        ValueRangeError: ``iterations`` is negative or no whole number.
     """
     checked_count("primal_dual_active_set: iterations", iterations)
     found, slope = start.clone(), problem.gradient(start)
@@ -77,9 +74,6 @@ def projected_newton(problem: BoxProblem, start: Tensor, tolerance: float, itera
         start: feasible points, (B,N).
         tolerance: on ``problem.residual``; a problem that reaches it is left alone.
         iterations: at most so many steps.
-
-    Raises:
-        ValueRangeError: ``tolerance`` or ``iterations`` is negative or no number.
     """
     checked_number("projected_newton: tolerance", tolerance)
     checked_count("projected_newton: iterations", iterations)

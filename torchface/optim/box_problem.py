@@ -89,11 +89,7 @@ class BoxProblem:
 
 
 def check_box(name: str, lower: Tensor, upper: Tensor) -> None:
-    """Checks bounds (N,): numbers, or infinite for none, and none above the other.
-
-    Raises:
-        ValueRangeError: a bound is NaN, ``lower`` exceeds ``upper``, or no number can meet one.
-    """
+    """Checks bounds (N,): numbers, or infinite for none, and none above the other."""
     if bool(((lower <= upper) & (lower < torch.inf) & (upper > -torch.inf)).all()):
         return
     for which, bound in (("lower", lower), ("upper", upper)):

@@ -33,10 +33,6 @@ def mean_shift(points: Tensor, bandwidth: float, weights: Tensor | None = None) 
         bandwidth: h, in the points' unit.
         weights: how often each point counts, (N,); once if absent.
 
-    Raises:
-        ShapeError: there is no point, or another number of weights.
-        ValueRangeError: a point is NaN or infinite, a weight negative or NaN, or ``bandwidth`` not positive.
-
     Source: Comaniciu and Meer 2002; the same rules as scikit-learn's ``MeanShift(bin_seeding=True)``.
     """
     if points.ndim != 2 or len(points) == 0:

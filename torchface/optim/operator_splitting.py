@@ -85,11 +85,7 @@ def suited_rho(H: Tensor) -> Tensor:
 
 
 def prepare_splitting(H: Tensor, rho: float | Tensor = RHO, relaxation: float = RELAXATION) -> SplittingFactors:
-    """Factors H (N,N) or (B,N,N), float64, with one ``rho`` or (B,).
-
-    Raises:
-        ValueRangeError: ``rho``, where it is a number, is not positive, or ``relaxation`` not in (0,2].
-    """
+    """Factors H (N,N) or (B,N,N), float64, with one ``rho`` or (B,)."""
     if not isinstance(rho, Tensor):
         checked_number("prepare_splitting: rho", rho, above=True)
     checked_number("prepare_splitting: relaxation", relaxation, 0.0, 2.0, above=True)
@@ -126,9 +122,6 @@ def splitting_steps(
         state: where to start.
         steps: how many.
         dtype: in which the steps run; what goes in and comes out is float64.
-
-    Raises:
-        ValueRangeError: ``steps`` is negative or no whole number.
     """
     checked_count("splitting_steps: steps", steps)
     # From zero, where the gradient is f, there is less to form.

@@ -38,11 +38,7 @@ class PreparedProgram:
     @classmethod
     @torch.no_grad()
     def of(cls, H: Tensor, lower: float | Tensor, upper: float | Tensor) -> PreparedProgram:
-        """Checks H and bounds, numbers or (N,).
-
-        Raises:
-            ShapeError, ValueRangeError: as ``box_qp`` says.
-        """
+        """Checks H and bounds, numbers or (N,)."""
         exact = checked_hessian(H)
         return cls(exact, *checked_bounds(lower, upper, exact))
 
@@ -53,9 +49,6 @@ class PreparedProgram:
             f: (B,N).
             start: (B,N), or none.
             tolerance: on the residual of ``box_qp``.
-
-        Raises:
-            ValueRangeError: f is not finite or too steep, or a problem has no minimum.
         """
         if self._are_few(len(f)):
             x = self._solve_few(f.detach().numpy(), tolerance)

@@ -23,10 +23,6 @@ class SparseCholesky:
     Args:
         matrix: :math:`A`, (n,n), any scipy sparse format, symmetric positive definite. Only its lower triangle is read.
 
-    Raises:
-        ShapeError: the matrix is not square.
-        ValueRangeError: an entry is NaN or infinite, or the matrix is not positive definite.
-
     Source: QDLDL (Stellato, Banjac, Goulart, Bemporad, Boyd 2020), in the order of AMD (Amestoy, Davis, Duff 1996).
 
     Example:
@@ -66,9 +62,6 @@ class SparseCholesky:
 
         Returns:
             x, of the same kind, shape, floating dtype and device as ``rhs``; computed in float64.
-
-        Raises:
-            ShapeError: ``rhs`` does not have n rows.
         """
         if rhs.ndim not in (1, 2) or rhs.shape[0] != self.size:
             raise ShapeError(f"SparseCholesky: found a right-hand side {tuple(rhs.shape)}, expected ({self.size},*)")

@@ -74,12 +74,7 @@ class ModelFit:
 
 
 def shape_model(model: object, template: Mesh) -> ShapeModel:
-    """The model of shape in what was given: itself, or that of a head model.
-
-    Raises:
-        ShapeError: it has no mean and modes of positions.
-        TopologyError: it is of other vertices than the template.
-    """
+    """The model of shape in what was given: itself, or that of a head model."""
     shape = getattr(model, "shape", model)
     if not isinstance(shape, ShapeModel):
         raise ShapeError(f"model: found {type(model).__name__}, expected a model with mean (V,3) and modes (K,V,3)")

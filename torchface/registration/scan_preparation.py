@@ -60,12 +60,7 @@ def check_template(template: Mesh) -> None:
 
 
 def prepare_scan(scan: Mesh, template: Mesh) -> PreparedScan:
-    """Checks size and unit, joins vertices that lie at one place, drops small loose parts, turns the outside out.
-
-    Raises:
-        TopologyError: the scan is empty or tiny.
-        ValueRangeError: it has no area, or its extent shows another unit than millimetres.
-    """
+    """Checks size and unit, joins vertices that lie at one place, drops small loose parts, turns the outside out."""
     triangles = len(scan.faces)
     if triangles < LEAST_TRIANGLES:
         raise TopologyError(

@@ -43,11 +43,7 @@ class PosedSurface:
 
     @staticmethod
     def each(posed: Mesh | Sequence[Mesh], count: int) -> list[PosedSurface]:
-        """One a photograph: of a mesh that all of them show, or of one for each.
-
-        Raises:
-            ShapeError: there are more or fewer meshes than photographs.
-        """
+        """One a photograph: of a mesh that all of them show, or of one for each."""
         meshes = [posed] if isinstance(posed, Mesh) else list(posed)
         if len(meshes) not in (1, count):
             raise ShapeError(f"posed: found {len(meshes)} meshes for {count} photographs, expected one, or one each")

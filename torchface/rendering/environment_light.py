@@ -24,10 +24,6 @@ class EnvironmentLight:
         coefficients: :math:`A_l L_{lm} / \pi` of red, green, blue in the camera's frame (x right, y down, z forward),
             (9,3); light of 1 from everywhere shows the albedo as it is.
 
-    Raises:
-        ShapeError: not (9,3).
-        ValueRangeError: not finite.
-
     Source: Ramamoorthi and Hanrahan 2001, An Efficient Representation for Irradiance Environment Maps.
 
     Example:
@@ -52,10 +48,6 @@ class EnvironmentLight:
             panorama: equirectangular, linear, (3,H,W), first row straight up; its middle is where the camera stands,
                 its right half lies at the viewer's left.
             turn: of the panorama about the vertical, degrees; positive moves its middle to the viewer's right.
-
-        Raises:
-            ShapeError: not (3,H,W).
-            ValueRangeError: negative or not finite.
         """
         if panorama.ndim != 3 or panorama.shape[0] != 3 or 0 in panorama.shape:
             raise ShapeError(f"panorama: found {tuple(panorama.shape)}, expected (3,H,W)")

@@ -27,9 +27,6 @@ def frame_grid(seconds: Tensor, fps: float) -> tuple[float, Tensor]:
     Returns:
         Places a second, a multiple of ``fps``, and the place of each frame, (T,) int64, rising from 0.
 
-    Raises:
-        ValueRangeError: gaps so long that the grid would be nearly all gap.
-
     Example:
         >>> frame_grid(torch.tensor([0.0, 0.1, 0.3, 0.4]), fps=10.0)
         (10.0, tensor([0, 1, 3, 4]))

@@ -49,10 +49,6 @@ def kept_keys(times: Tensor, values: Tensor, bound: float) -> Tensor:
     Returns:
         (T,) bool; the first and the last sample are keys.
 
-    Raises:
-        ShapeError: the shapes do not fit.
-        ValueRangeError: ``bound`` is not above 0.
-
     Source: Gritzali and Papakonstantinou 1983; Imai and Iri 1988.
 
     Example:

@@ -60,11 +60,7 @@ class AnimatedMesh:
     colors: Callable[[int, int], Tensor] | None = None
 
     def require_topology_of(self, other: AnimatedMesh, hint: str = "") -> None:
-        """Checks that both have the same vertices and triangles.
-
-        Raises:
-            TopologyError: they do not; ``hint`` ends the message.
-        """
+        """Checks that both have the same vertices and triangles."""
         own, theirs = self.neutral, other.neutral
         if len(own.vertices) != len(theirs.vertices) or not torch.equal(own.faces, theirs.faces):
             same = "other triangles" if own.faces.shape == theirs.faces.shape else f"{len(theirs.faces)} triangles"
@@ -154,11 +150,7 @@ def _of_weights(path: Path, rig: BlendshapeRig | None) -> AnimatedMesh:
 
 
 def moved_mesh(path: Path, rig: BlendshapeRig, take: Take) -> AnimatedMesh:
-    """A rig that a take's weights move.
-
-    Raises:
-        NameMismatchError: they are of other shapes.
-    """
+    """A rig that a take's weights move."""
     assert take.weights is not None
     try:
         weights = rig.weights_from(take.weights).to(rig.deltas)
@@ -197,11 +189,7 @@ def _of_folder(folder: Path, rig: BlendshapeRig | None) -> AnimatedMesh:
 
 
 def meshes_over_time(path: Path, files: list[Path], rig: BlendshapeRig | None) -> AnimatedMesh:
-    """Meshes of one topology, a file a frame.
-
-    Raises:
-        TopologyError: one has another, or the rig has.
-    """
+    """Meshes of one topology, a file a frame."""
     first = load_mesh(files[0])
 
     @lru_cache(maxsize=_KEPT)  # vertices and colours of a frame are asked for after one another

@@ -119,12 +119,7 @@ def _annotated(folder: Path, video: VideoFile) -> dict[int, Tensor]:
 
 
 def _images(video: VideoFile, numbers: list[int]) -> dict[int, Tensor]:
-    """Frames (3,H,W), uint8, by number, in one pass: codecs seek wrongly too often.
-
-    Raises:
-        FileFormatError: the video is shorter.
-        ValueRangeError: they do not fit into memory.
-    """
+    """Frames (3,H,W), uint8, by number, in one pass: codecs seek wrongly too often."""
     wanted, images = set(numbers), {}
     most = _MAX_PIXEL_BYTES // (3 * video.width * video.height)
     if len(wanted) > most:

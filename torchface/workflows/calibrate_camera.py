@@ -123,11 +123,6 @@ def calibrate(paths: Sequence[Path], board: Board, out: Path, progress: Progress
         out: the ``.toml`` to write; beside it an image of the corners found, and of views without distortion.
         progress: called with each step and how far it is.
 
-    Raises:
-        FileFormatError: ``out`` is no ``.toml``, or a file is broken.
-        ShapeError: the images differ in size.
-        AlignmentError: the board is found in fewer than five views, or they leave the focal length open.
-
     Source: Zhang 2000; thesis 4.2.4.
     """
     progress = progress or silent
@@ -161,9 +156,6 @@ def calibrate_beside(
 
     Returns:
         A report of each camera, the cameras, and lines about how they lie.
-
-    Raises:
-        FileFormatError, AlignmentError: as of :func:`calibrate`; or fewer than five moments show the board to two.
     """
     progress = progress or silent
     check_ending(out, ".toml")

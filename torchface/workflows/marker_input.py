@@ -154,11 +154,7 @@ def read_range_of_motion(
 
 
 def frame_span(frames: str | None, count: int) -> slice:
-    """The rows that ``A:B`` means of a take of ``count`` frames.
-
-    Raises:
-        ValueRangeError: it is another text, or leaves no frame.
-    """
+    """The rows that ``A:B`` means of a take of ``count`` frames."""
     if frames is None:
         return slice(0, count)
     match = _SPAN.fullmatch(frames)

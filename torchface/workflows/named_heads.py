@@ -55,11 +55,7 @@ class NamedHeads:
 
 
 def load_head_model(name_or_path: str | Path) -> HeadModel:
-    """A head model by name or folder, see ``zoo.get_model``; or a file of others, see ``published_head``.
-
-    Raises:
-        NameMismatchError: there is none of this name, or it is of another kind.
-    """
+    """A head model by name or folder, see ``zoo.get_model``; or a file of others, see ``published_head``."""
     if is_head_model_file(name_or_path):
         return published_head(Path(name_or_path))
     return zoo.get_model(name_or_path, HeadModel)

@@ -27,11 +27,7 @@ class Posed:
 
 
 def pose_weights(words: Sequence[str]) -> dict[str, float]:
-    """``["jawOpen=0.5"]`` as a dictionary.
-
-    Raises:
-        ValueRangeError: a word is not NAME=NUMBER.
-    """
+    """``["jawOpen=0.5"]`` as a dictionary."""
     weights = {}
     for word in words:
         name, equals, number = word.partition("=")
@@ -76,11 +72,7 @@ def load_posed(
 
 
 def pose_row(rig: BlendshapeRig, weights: Mapping[str, float]) -> Tensor:
-    """Weights (N,) of a rig by name, in any of the spellings that ``torchface.shape_names`` reads.
-
-    Raises:
-        NameMismatchError: a name means no shape of the rig.
-    """
+    """Weights (N,) of a rig by name, in any of the spellings that ``torchface.shape_names`` reads."""
     names = tuple(weights)
     matrix = mapping(names, rig.names)
     unknown = [name for name, used in zip(names, matrix.any(0), strict=True) if not used]

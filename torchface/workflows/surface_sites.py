@@ -37,9 +37,6 @@ def sites_on_rig(rig: BlendshapeRig, places: Tensor) -> Attachment:
     Args:
         rig: with the 68 landmarks annotated.
         places: of the points on the mean head, (P,3), millimetres; see ``LandmarkNetwork.places``.
-
-    Raises:
-        ShapeError: the rig has no landmarks.
     """
     actor = performer(texture=False)
     template = actor.neutral.with_vertices(mean_vertices().float())

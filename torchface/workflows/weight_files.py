@@ -51,11 +51,7 @@ class WeightFiles:
 
 
 def checked_reduction(bound: float | None) -> float | None:
-    """The bound of ``--reduce``, where it is one.
-
-    Raises:
-        ValueRangeError: it is not above 0 and at most 1.
-    """
+    """The bound of ``--reduce``, where it is one."""
     return bound if bound is None else checked_number("--reduce", bound, 0.0, 1.0, above=True)
 
 

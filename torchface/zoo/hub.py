@@ -46,11 +46,7 @@ class HubReference:
 
 
 def hub_reference(text: str) -> HubReference | None:
-    """What ``hf://owner/name[@revision][/folder]`` says; None where the text is of no such kind.
-
-    Raises:
-        NameMismatchError: it begins so and goes on otherwise.
-    """
+    """What ``hf://owner/name[@revision][/folder]`` says; None where the text is of no such kind."""
     if not text.startswith("hf:/"):
         return None
     match = _REFERENCE.fullmatch(text)

@@ -24,11 +24,7 @@ Between the brows AU 4 shows too, but other performers' lowered brows are classi
 
 
 def performed_groups(labels: Sequence[ActionLabels]) -> tuple[RegionGroup, ...]:
-    """The groups that labels name, or the usual ones, of those units that are performed.
-
-    Raises:
-        NameMismatchError: a unit is performed that no group knows, or none is.
-    """
+    """The groups that labels name, or the usual ones, of those units that are performed."""
     performed = {unit for own in labels for unit in own.units}
     usual = next((own.groups for own in labels if own.groups), GROUPS)
     known = {unit for group in usual for unit in group.units}

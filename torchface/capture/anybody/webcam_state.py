@@ -183,11 +183,7 @@ class StateLayout:
         return self.unpack(torch.zeros(self.length))
 
     def unpack(self, vector: Tensor) -> WebcamState:
-        """A state of its vector (S,).
-
-        Raises:
-            ShapeError: of another length.
-        """
+        """A state of its vector (S,)."""
         if vector.shape != (self.length,):
             raise ShapeError(f"webcam state: found {tuple(vector.shape)}, expected ({self.length},)")
         parts = vector.split([prod(size) for size in self.sizes.values()])

@@ -447,11 +447,7 @@ def check_labels(found: Sequence[str], known: Sequence[str]) -> None:
 
 
 def frames_seen(markers: Tensor) -> Tensor:
-    """The frames of markers (T,M,3) that show at least one, (K,) int64.
-
-    Raises:
-        ValueRangeError: there is none.
-    """
+    """The frames of markers (T,M,3) that show at least one, (K,) int64."""
     rows = (~torch.isnan(markers).any(-1)).any(-1).nonzero()[:, 0]
     if not len(rows):
         raise ValueRangeError(f"markers: found none in any of {len(markers)} frames, expected some")

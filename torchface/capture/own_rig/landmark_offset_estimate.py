@@ -100,9 +100,6 @@ def estimate_offsets(
         The offsets and the noise that is left; None where fewer than ten frames show a face, which are too few to know
         an expression from an offset.
 
-    Raises:
-        ValueRangeError: the neutral frame is none of the take, or shows no face.
-
     Source: Candès, Wakin and Boyd 2008 for the penalty.
     """
     trust = solver.landmark_trust(landmarks, confidence)

@@ -36,10 +36,6 @@ class LandmarkOffsets:
             of the eyes' outer corners.
         rig, finder: digests of what they were estimated with; empty if not known.
         video, source: digest and name of the video that they were estimated from; empty if not known.
-
-    Raises:
-        ShapeError: not (68,3).
-        ValueRangeError: a number that is not finite, an offset beyond 100 mm or a noise that is not positive.
     """
 
     millimetres: Tensor
@@ -83,11 +79,7 @@ class LandmarkOffsets:
 
     @staticmethod
     def load(path: str | Path) -> LandmarkOffsets:
-        """Reads what :meth:`save` wrote.
-
-        Raises:
-            FileFormatError: the file is no such document.
-        """
+        """Reads what :meth:`save` wrote."""
         document = read_json(path)
         if document["format"].found != _FORMAT:
             raise document["format"].error(f"{_FORMAT!r}: landmark offsets as torchface track writes them")
@@ -103,11 +95,7 @@ class LandmarkOffsets:
             raise FileFormatError(f"{path}: {error}") from error
 
     def require(self, rig: str, finder: str, source: str | Path = "landmark offsets") -> None:
-        """Refuses offsets of another rig or finder than the digests say.
-
-        Raises:
-            ValueRangeError: they are; the message says of which, and what to do.
-        """
+        """Refuses offsets of another rig or finder than the digests say."""
         for what, stated, other in (("rig", self.rig, rig), ("finder of landmarks", self.finder, finder)):
             if stated and other and stated != other:
                 raise ValueRangeError(

@@ -47,9 +47,6 @@ def outlier_landmarks(
     Returns:
         (T,68) bool; false in frames with fewer than eight trusted landmarks.
 
-    Raises:
-        ShapeError: the shapes do not fit each other.
-
     Example:
         >>> from torchface.synthetic import performer
         >>> rest, reach = landmark_reach(performer(texture=False))

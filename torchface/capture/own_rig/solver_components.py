@@ -173,11 +173,7 @@ class VideoSolverParts(nn.Module):
 
     @property
     def config(self) -> dict[str, Any]:
-        """What :meth:`from_config` needs beside the state: plain values only.
-
-        Raises:
-            NameMismatchError: a prior is of a class that cannot be saved.
-        """
+        """What :meth:`from_config` needs beside the state: plain values only."""
         return {
             "names": list(self.names),
             "points": len(self.rest),
@@ -223,11 +219,7 @@ class VideoSolverParts(nn.Module):
         return self
 
     def check_state(self) -> None:
-        """Refuses a state that no rig and camera give.
-
-        Raises:
-            ValueRangeError: points that there are not, a camera without a focal length, or negative weights.
-        """
+        """Refuses a state that no rig and camera give."""
         if bool(((self.rows < 0) | (self.rows >= len(self.rest))).any()):
             raise ValueRangeError(f"video solver: found rows beyond its {len(self.rest)} points, expected rows of them")
         K = self.intrinsics

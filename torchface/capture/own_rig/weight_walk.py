@@ -51,12 +51,7 @@ def walk_information(variance: Tensor, evidence: Tensor, interval: float | Tenso
 
 
 def frame_intervals(seconds: Tensor | None, count: int, interval: float) -> list[float]:
-    """Seconds (T,) from the frame before to each of T frames; the first frame has the usual interval.
-
-    Raises:
-        ShapeError: not one time a frame.
-        ValueRangeError: times that do not rise.
-    """
+    """Seconds (T,) from the frame before to each of T frames; the first frame has the usual interval."""
     if seconds is None:
         return [interval] * count
     if seconds.shape != (count,):

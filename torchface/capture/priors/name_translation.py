@@ -42,11 +42,7 @@ def unlearned(learned: Sequence[str], names: Sequence[str]) -> tuple[str, ...]:
 
 
 def require_same_names(learned: Sequence[str], names: Sequence[str]) -> None:
-    """Checks that a rig's shapes are those that a prior is for.
-
-    Raises:
-        NameMismatchError: they are others, or in another order.
-    """
+    """Checks that a rig's shapes are those that a prior is for."""
     if tuple(names) == tuple(learned):
         return
     lacking = [name for name in learned if name not in set(names)]

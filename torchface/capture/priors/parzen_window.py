@@ -132,11 +132,7 @@ def automatic_bandwidth(samples: Tensor, seed: int = 0) -> float:
 
 
 def checked_sizes(config: Mapping[str, Any], *names: str) -> tuple[int, ...]:
-    """Whole numbers of a config whose product fits the memory.
-
-    Raises:
-        FileFormatError: one is missing, no whole number from 1, or all together are too large.
-    """
+    """Whole numbers of a config whose product fits the memory."""
     sizes = tuple(Value("density", "", config)[name].whole(1) for name in names)
     if math.prod(sizes) > _MAX_NUMBERS:
         raise FileFormatError(f"density: found sizes {sizes}, expected at most {_MAX_NUMBERS} numbers")

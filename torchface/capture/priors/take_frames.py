@@ -44,11 +44,7 @@ class TakeFrames:
                 yield seen if self.group is None else seen[:, list(self.group)]
 
     def count(self) -> int:
-        """How many frames there are.
-
-        Raises:
-            ValueRangeError: none.
-        """
+        """How many frames there are."""
         total = sum(map(len, self))
         if not total:
             raise ValueRangeError("prior: found no two frames with all weights, expected takes to learn from")

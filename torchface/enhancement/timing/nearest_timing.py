@@ -80,12 +80,7 @@ def nearest_timing(
 
 
 def captured_sequences(database: Tensor, sequences: Tensor) -> list[Tensor]:
-    """The captured sequences (n,P,C) of two frames or more, of features (K,P,C) and each frame's number (K,).
-
-    Raises:
-        ShapeError: the shapes do not fit.
-        ValueRangeError: none has two frames.
-    """
+    """The captured sequences (n,P,C) of two frames or more, of features (K,P,C) and each frame's number (K,)."""
     captured = [database[sequences == number] for number in sequences.unique()]
     captured = [sequence for sequence in captured if len(sequence) > 1]
     if not captured:
@@ -96,12 +91,7 @@ def captured_sequences(database: Tensor, sequences: Tensor) -> list[Tensor]:
 
 
 def check_keyframes(keyframes: Tensor, shape: tuple[int, ...]) -> None:
-    """Refuses what is no pair of features of this shape with a motion between them.
-
-    Raises:
-        ShapeError: another shape.
-        ValueRangeError: the two are equal.
-    """
+    """Refuses what is no pair of features of this shape with a motion between them."""
     if keyframes.ndim != 3 or len(keyframes) != 2 or keyframes.shape[1:] != shape:
         raise ShapeError(f"keyframes: found features {tuple(keyframes.shape)}, expected (2,*) of {tuple(shape)}")
     if not float((keyframes[1] - keyframes[0]).abs().max()) > 1e-7:

@@ -155,12 +155,7 @@ class WrinkleWeights(nn.Module):
         return self.of_moments(self.moments(vertices.index_select(1, self.sites) - self.neutral))
 
     def predict(self, vertices: Tensor) -> Tensor:
-        """As :meth:`forward`, which an engine has as a graph, with its input checked.
-
-        Raises:
-            TopologyError: of another number of vertices.
-            ValueRangeError: NaN or infinity.
-        """
+        """As :meth:`forward`, which an engine has as a graph, with its input checked."""
         if vertices.ndim != 3 or vertices.shape[1:] != (self.vertex_count, 3):
             raise TopologyError(
                 f"vertices: found {tuple(vertices.shape)}, expected (T,{self.vertex_count},3): poses of the rig that "

@@ -62,12 +62,7 @@ class SurfaceIndex:
         self._border: tuple[Tensor, Tensor] | None = None
 
     def nearest(self, points: Tensor) -> SurfacePoints:
-        """The nearest surface point of each query (Q,3).
-
-        Raises:
-            ShapeError: not (Q,3).
-            ValueRangeError: a query is NaN or infinite.
-        """
+        """The nearest surface point of each query (Q,3)."""
         queries = _checked(points)
         triangle = torch.zeros(len(queries), dtype=torch.int64)
         second, third = queries.new_zeros(len(queries)), queries.new_zeros(len(queries))

@@ -68,11 +68,7 @@ def blender_program() -> str:
 
 
 def blender_command(script: str | Path) -> list[str]:
-    """How to run a script of Blender's; its own words come behind.
-
-    Raises:
-        MissingExtraError: there is no Blender.
-    """
+    """How to run a script of Blender's; its own words come behind."""
     program = blender_program()
     if "python" in Path(program).name.lower():
         return [program, "-I", str(script)]

@@ -110,11 +110,7 @@ class Character:
 
 
 def read_character(document: Document) -> Character:
-    """The character in a glTF document.
-
-    Raises:
-        FileFormatError: it is broken, or shows no triangle.
-    """
+    """The character in a glTF document."""
     transforms = node_transforms(document)
     bone = _head_bone(document, transforms)
     under = _descendants(document, bone) if bone is not None else set()

@@ -27,11 +27,7 @@ def write_correctives(definitions: Sequence[Corrective]) -> dict[str, Any]:
 
 
 def scene_correctives(document: Document) -> tuple[Corrective, ...]:
-    """The definitions of the first mesh that has any.
-
-    Raises:
-        FileFormatError: as of ``read_correctives``.
-    """
+    """The definitions of the first mesh that has any."""
     for i, mesh in enumerate(document.objects("meshes")):
         extras = mesh.get("extras")
         ours = extras.get("torchface") if isinstance(extras, dict) else None
@@ -41,11 +37,7 @@ def scene_correctives(document: Document) -> tuple[Corrective, ...]:
 
 
 def read_correctives(document: Document, extras: Mapping[str, Any], location: str) -> tuple[Corrective, ...]:
-    """The definitions that a record of ours holds; none where it has no such field.
-
-    Raises:
-        FileFormatError: the field is broken, or defines what no rig can have.
-    """
+    """The definitions that a record of ours holds; none where it has no such field."""
     try:
         return definitions_from_records(extras.get(_FIELD, []))
     except (NameMismatchError, ValueRangeError) as error:
@@ -55,11 +47,7 @@ def read_correctives(document: Document, extras: Mapping[str, Any], location: st
 def rig_of_targets(
     document: Document, neutral: Mesh, deltas: Tensor, names: Sequence[str], definitions: Sequence[Corrective]
 ) -> BlendshapeRig:
-    """The rig of a file's morph targets (N+C,V,3), of which some are correctives.
-
-    Raises:
-        FileFormatError: a corrective has no target or a driver that is no shape.
-    """
+    """The rig of a file's morph targets (N+C,V,3), of which some are correctives."""
     if not definitions:
         return BlendshapeRig(neutral, deltas, names)
     row = {name: i for i, name in enumerate(names)}

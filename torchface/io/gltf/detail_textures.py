@@ -35,12 +35,7 @@ _UNPACKED_PER_BYTE = 1024
 def write_detail(
     detail: DetailMaps, mesh: Mesh, names: Sequence[str], root: dict[str, Any], buffers: BufferWriter
 ) -> None:
-    """Adds maps to a document under construction whose first mesh and material are the face's.
-
-    Raises:
-        TopologyError: the mesh has no texture coordinates.
-        NameMismatchError: a map belongs to no shape.
-    """
+    """Adds maps to a document under construction whose first mesh and material are the face's."""
     check_detail(detail, mesh, names)
     if detail.neutral is not None:
         image = encode_png(encode_normals(detail.neutral))
@@ -67,12 +62,7 @@ def write_surface(surface: SurfaceMaps, root: dict[str, Any], buffers: BufferWri
 
 
 def check_detail(detail: DetailMaps, mesh: Mesh, names: Sequence[str]) -> None:
-    """Checks that a rig's file can hold maps.
-
-    Raises:
-        TopologyError: the mesh has no texture coordinates.
-        NameMismatchError: a map belongs to no shape.
-    """
+    """Checks that a rig's file can hold maps."""
     if mesh.uvs is None:
         raise TopologyError("detail: found detail maps for a mesh without texture coordinates, expected uvs")
     missing = [name for name in detail.names if name not in names]
@@ -81,11 +71,7 @@ def check_detail(detail: DetailMaps, mesh: Mesh, names: Sequence[str]) -> None:
 
 
 def corner_tangents(mesh: Mesh) -> NDArray[np.float32]:
-    """glTF's tangents at each triangle's corners, (F,3,4); the last number is the bitangent's sign.
-
-    Raises:
-        TopologyError: the mesh has no texture coordinates.
-    """
+    """glTF's tangents at each triangle's corners, (F,3,4); the last number is the bitangent's sign."""
     if mesh.uvs is None or mesh.uv_faces is None:
         raise TopologyError("detail: found detail maps for a mesh without texture coordinates, expected uvs")
     points, faces = mesh.vertices.detach().cpu().double(), mesh.faces.cpu()
@@ -96,11 +82,7 @@ def corner_tangents(mesh: Mesh) -> NDArray[np.float32]:
 
 
 def read_gltf_detail(path: str | Path) -> DetailMaps | None:
-    """The detail maps of a ``.glb``; none where it has neither such maps nor a normal texture.
-
-    Raises:
-        FileFormatError: not glTF 2, a broken list, images of different sizes, or more of them than the file can hold.
-    """
+    """The detail maps of a ``.glb``; none where it has neither such maps nor a normal texture."""
     document = read_document(path)
     listed, mesh = _listed(document)
     names = [_name(document, entry, i) for i, entry in enumerate(listed)]
@@ -176,11 +158,7 @@ class TextureReader:
         self._unpacked, self._allowed = 0, max(_UNPACKED_ALWAYS, _UNPACKED_PER_BYTE * Path(path).stat().st_size)
 
     def read(self, index: object, location: str) -> Tensor:
-        """An image (3,H,W) in [0,1].
-
-        Raises:
-            FileFormatError: there is no such texture, or it is one too many.
-        """
+        """An image (3,H,W) in [0,1]."""
         self._document.item("textures", index, f"{location}.texture")
         assert isinstance(index, int)
         image = read_texture(self._document, index)

@@ -195,11 +195,7 @@ class Document:
 
 
 def read_document(path: str | Path) -> Document:
-    """Opens a ``.glb`` or ``.gltf``, by its first bytes.
-
-    Raises:
-        FileFormatError: missing, empty, truncated, not glTF 2, or an extension it requires is not known.
-    """
+    """Opens a ``.glb`` or ``.gltf``, by its first bytes."""
     path = Path(path)
     document = document_of(path, read_file(path))
     for name in document.array(document.root, "extensionsRequired", "document"):
@@ -211,11 +207,7 @@ def read_document(path: str | Path) -> Document:
 
 
 def document_of(path: Path, data: bytes) -> Document:
-    """A document of a file's bytes, whatever extensions it requires: its vertices may be compressed.
-
-    Raises:
-        FileFormatError: truncated, or not glTF 2.
-    """
+    """A document of a file's bytes, whatever extensions it requires: its vertices may be compressed."""
     if data[:4] == _MAGIC:
         text, binary = _chunks(path, data)
     else:

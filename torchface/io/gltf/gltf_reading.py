@@ -41,9 +41,6 @@ def read_gltf_rig(path: str | Path, unit: str = "m") -> BlendshapeRig:
     Args:
         path: a ``.glb`` or ``.gltf``.
         unit: what the file's numbers are; glTF says metres.
-
-    Raises:
-        FileFormatError: not glTF 2, truncated, broken; ``NoShapesError`` without morph targets.
     """
     document = read_document(path)
     neutral, deltas, names = _read(document, millimetres_per(unit))
@@ -55,11 +52,7 @@ def read_gltf_rig(path: str | Path, unit: str = "m") -> BlendshapeRig:
 
 
 def read_gltf_mesh(path: str | Path, unit: str = "m") -> Mesh:
-    """The scene of a glTF file as one mesh, morph targets at rest; see ``read_gltf_rig``.
-
-    Raises:
-        FileFormatError: not glTF 2, truncated, broken, or without triangles.
-    """
+    """The scene of a glTF file as one mesh, morph targets at rest; see ``read_gltf_rig``."""
     return _read(read_document(path), millimetres_per(unit))[0]
 
 

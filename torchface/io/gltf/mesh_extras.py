@@ -52,11 +52,7 @@ def read_mesh_count(document: Document, extras: object, location: str) -> int:
 
 
 def read_order(document: Document, extras: object, location: str, count: int) -> NDArray[np.int64] | None:
-    """For each of ``count`` triangles its row in the mesh as authored; none where the file has them in that order.
-
-    Raises:
-        FileFormatError: the field is broken.
-    """
+    """For each of ``count`` triangles its row in the mesh as authored; none where the file has them in that order."""
     record = _record(document, extras, location)
     if "triangles" not in record:
         return None
@@ -70,11 +66,7 @@ def read_order(document: Document, extras: object, location: str, count: int) ->
 
 
 def read_polygons(document: Document, extras: object, location: str, triangles: NDArray[np.int64]) -> Tensor | None:
-    """The polygons (P,K) whose fans the triangles (F,3) are; none where they are not, as after an edit elsewhere.
-
-    Raises:
-        FileFormatError: the field is broken, or its table of polygons would fill the memory.
-    """
+    """The polygons (P,K) whose fans the triangles (F,3) are; none where they are not, as after an edit elsewhere."""
     record = _record(document, extras, location)
     if "polygons" not in record:
         return None
@@ -94,11 +86,7 @@ def read_polygons(document: Document, extras: object, location: str, triangles: 
 
 
 def read_annotations(document: Document, extras: object, location: str, count: int) -> Annotations | None:
-    """The annotations of a mesh of ``count`` vertices; none where the file has none, or for another vertex count.
-
-    Raises:
-        FileFormatError: a list is broken or names a vertex that is not there.
-    """
+    """The annotations of a mesh of ``count`` vertices; none where the file has none, or for another vertex count."""
     record = _record(document, extras, location)
     if record.get("vertices") != count:
         return None

@@ -54,9 +54,6 @@ def document_with_targets(
         added: at least one.
         names: of the new morph targets; a mesh has none of them but those ``filled``.
         filled: of them those that take the place of the target of that name in a mesh that has one.
-
-    Raises:
-        FileFormatError: the file keeps its data elsewhere, or a mesh has such a name already.
     """
     root = copy.deepcopy(document.root)
     writer = AppendedArrays(document, root)
@@ -105,11 +102,7 @@ def _other_chunks(path: Path) -> list[tuple[int, bytes]]:
 
 
 class AppendedArrays:
-    """Accessors and bufferViews behind those of a document whose first buffer is its binary chunk.
-
-    Raises:
-        FileFormatError: the file keeps its data elsewhere.
-    """
+    """Accessors and bufferViews behind those of a document whose first buffer is its binary chunk."""
 
     def __init__(self, document: Document, root: dict[str, Any]) -> None:
         first = document.root.get("buffers") or [{}]

@@ -50,9 +50,6 @@ def document_with_parts(character: Character, blocks: Sequence[ExtendedBlock], p
         character: as the file has it.
         blocks: those that change.
         page: a PNG, the image of the parts.
-
-    Raises:
-        FileFormatError: the file keeps its data elsewhere.
     """
     document = character.document
     root, writer = copy.deepcopy(document.root), None

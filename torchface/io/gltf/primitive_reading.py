@@ -50,11 +50,7 @@ class Part:
 
 
 def read_part(document: Document, index: int) -> Part | None:
-    """The triangles of mesh ``index``; none where it has only points and lines.
-
-    Raises:
-        FileFormatError: broken accessors, primitives of different morph targets, or names that do not match them.
-    """
+    """The triangles of mesh ``index``; none where it has only points and lines."""
     location = f"meshes[{index}]"
     mesh = document.item("meshes", index, location)
     blocks: dict[str, _Block] = {}

@@ -48,9 +48,6 @@ class ArrayFile:
     Args:
         path: ``.npz``, ``.safetensors`` or ``.npy``.
         largest: bytes that all arrays that are read may take.
-
-    Raises:
-        FileFormatError: the file is missing, a pickle, damaged, or announces arrays of objects.
     """
 
     def __init__(self, path: str | Path, largest: int = LARGEST_ARRAYS) -> None:

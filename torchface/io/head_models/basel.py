@@ -49,12 +49,7 @@ def is_hdf5(path: Path) -> bool:
 
 
 def read_basel(path: Path) -> HeadModelFile:
-    """Reads shape, expression and colour.
-
-    Raises:
-        MissingExtraError: h5py is not installed.
-        FileFormatError: a data set is missing, of another shape, in another file, or too large.
-    """
+    """Reads shape, expression and colour."""
     h5py = import_extra("h5py", "h5py", "hdf5", f"{path.name}, a file of HDF5,")
     note_read(path)
     try:

@@ -37,11 +37,7 @@ def is_eos(path: Path) -> bool:
 
 
 def read_eos(path: Path) -> HeadModelFile:
-    """Reads shape, colour, expressions and landmarks; blendshapes that eos keeps in a file of their own are left out.
-
-    Raises:
-        FileFormatError: truncated, of other sizes, or not finite.
-    """
+    """Reads shape, colour, expressions and landmarks; blendshapes in a file of their own are left out."""
     archive = _Archive(path)
     version = archive.integer("<I")
     mean, identity, faces = archive.model()

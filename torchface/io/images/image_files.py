@@ -62,20 +62,12 @@ def save_image16(image: Tensor, path: str | Path) -> None:
 
 
 def decode_image(data: bytes, source: str) -> Tensor:
-    """The image (3,H,W) in ``data``; ``source`` names it in errors.
-
-    Raises:
-        FileFormatError: as :func:`~torchface.io.images.image_samples.decode_samples`.
-    """
+    """The image (3,H,W) in ``data``; ``source`` names it in errors."""
     return decode_samples(data, source).colors()
 
 
 def encode_png(image: Tensor) -> bytes:
-    """(3,H,W), or (4,H,W) with opacity, in [0,1] as the bytes of a PNG, 8 bits a channel.
-
-    Raises:
-        ShapeError: the image is not (3,H,W) or (4,H,W) with at least one pixel.
-    """
+    """(3,H,W), or (4,H,W) with opacity, in [0,1] as the bytes of a PNG, 8 bits a channel."""
     if image.ndim != 3 or image.shape[0] not in (3, 4) or 0 in image.shape:
         raise ShapeError(f"image: found {tuple(image.shape)}, expected (3,H,W) or (4,H,W) with at least one pixel")
     array = image.detach().clamp(0, 1).mul(255).round().to(torch.uint8).permute(1, 2, 0).cpu().numpy()
@@ -93,11 +85,7 @@ def encode_jpeg(image: Tensor, quality: int = 90) -> bytes:
 
 
 def encode_png16(image: Tensor) -> bytes:
-    """(3,H,W) in [0,1] as the bytes of a PNG, 16 bits a channel: in a normal map 8 bits show as steps in highlights.
-
-    Raises:
-        ShapeError: the image is not (3,H,W) with at least one pixel.
-    """
+    """(3,H,W) in [0,1] as the bytes of a PNG, 16 bits a channel: in a normal map 8 bits show as steps in highlights."""
     import cv2
 
     if image.ndim != 3 or image.shape[0] != 3 or 0 in image.shape:
@@ -124,9 +112,5 @@ def save_normal_map(normals: Tensor, path: str | Path) -> None:
 
 
 def load_paint(path: str | Path) -> Tensor:
-    """An image file as red, green, blue and alpha, (4,H,W) float32 in [0,1]; one without transparency is opaque.
-
-    Raises:
-        FileFormatError: the file is missing, no image, or unpacks to far more pixels than its size lets expect.
-    """
+    """An image file as red, green, blue and alpha, (4,H,W) float32 in [0,1]; one without transparency is opaque."""
     return decode_samples(read_file(path), str(path), planes=4).paint()

@@ -19,11 +19,7 @@ _HEADER_BYTES, _MOST_PIXELS = 65536, 2**27
 
 
 def load_panorama(path: str | Path) -> Tensor:
-    """An equirectangular Radiance picture (``.hdr``), linear, (3,H,W) float32, first row straight up.
-
-    Raises:
-        FileFormatError: the file is missing, damaged, of another kind, not twice as wide as high, or too large.
-    """
+    """An equirectangular Radiance picture (``.hdr``), linear, (3,H,W) float32, first row straight up."""
     data = read_file(Path(path))
     if not data.startswith(_MAGIC):
         raise FileFormatError(

@@ -77,9 +77,6 @@ def openface_times(numbers: np.ndarray, times: np.ndarray, path: Path) -> tuple[
 
     Where a video's rate varies, OpenCV may say 1,000 frames a second, and OpenFace writes timestamps by it: then the
     rate is unknown, and :data:`UNKNOWN_RATE` is taken, with a ``UserWarning``.
-
-    Raises:
-        FileFormatError: as of ``numbered_times``.
     """
     found, extras = numbered_times(numbers, times, path, first=1)
     if found.fps != _OPENCV_RATE:

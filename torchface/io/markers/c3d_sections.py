@@ -87,11 +87,7 @@ def _decode(data: bytes) -> str:
 
 
 def read_sections(data: bytes, path: Path) -> Sections:
-    """Reads header and parameters from a whole file.
-
-    Raises:
-        FileFormatError: a section is damaged or cut off.
-    """
+    """Reads header and parameters from a whole file."""
     if len(data) < 2 * BLOCK or data[1] != _MAGIC or data[0] < 2:
         raise FileFormatError(
             f"{path}: found no C3D header, expected byte 2 to be 80 and a file of 1,024 bytes or more"

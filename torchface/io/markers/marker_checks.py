@@ -27,12 +27,7 @@ _SPELLINGS = {
 
 
 def millimetres(file_unit: str, path: Path, field: str, unit: str | None) -> float:
-    """Millimetres in a file's unit, or in the ``unit`` that the caller says it is.
-
-    Raises:
-        ValueRangeError: ``unit`` is none.
-        FileFormatError: the file's is none, and the caller says nothing.
-    """
+    """Millimetres in a file's unit, or in the ``unit`` that the caller says it is."""
     expected = ", ".join(UNITS)
     if unit is not None:
         if unit not in UNITS:
@@ -75,9 +70,6 @@ def marker_take(
     """A take of markers (T,M,3) in millimetres, read from ``path`` in a unit of ``factor`` millimetres.
 
     A marker with a NaN coordinate was not seen, nor one at (0, 0, 0), which recorders write for it.
-
-    Raises:
-        FileFormatError: there is no frame, no marker, or none was seen in any frame.
     """
     if values.shape[0] == 0 or values.shape[1] == 0:
         raise FileFormatError(

@@ -76,10 +76,6 @@ def write_maya_rig(rig: BlendshapeRig, path: str | Path, keys: WeightKeys | None
         rig: the rig.
         path: it appears only when it is complete.
         keys: an animation of its shapes.
-
-    Raises:
-        FileFormatError: the folder cannot be written to, or in-betweens lie within a thousandth of each other.
-        TopologyError: the mesh has no triangle.
     """
     path = Path(path)
     if len(rig.neutral.faces) == 0:

@@ -69,11 +69,7 @@ def face_bytes(data: bytes) -> bytes | None:
 
 
 def write_obj(mesh: Mesh, path: str | Path) -> None:
-    """Writes polygons (or triangles), seams and vertex colours, in millimetres; a texture beside it, with a material.
-
-    Raises:
-        FileFormatError: the folder cannot be written to.
-    """
+    """Writes polygons (or triangles), seams, vertex colours, in millimetres; a texture beside it, with a material."""
     path = Path(path)
     with all_or_none():
         if mesh.texture is not None:

@@ -41,12 +41,7 @@ class Statements:
 
 
 def read_statements(path: Path, data: bytes) -> Statements:
-    """What is read of an OBJ.
-
-    Raises:
-        FileFormatError: no OBJ, no vertex, no face, or a number that is none.
-        TopologyError: a face names a vertex that is not there.
-    """
+    """What is read of an OBJ."""
     vertices, faces = [], []
     coordinates: list[bytes] = []
     coordinate_count = 0
@@ -86,11 +81,7 @@ def read_statements(path: Path, data: bytes) -> Statements:
 
 
 def read_vertices(path: Path, data: bytes) -> NDArray[np.float64]:
-    """The numbers of each vertex alone, (V,3) and more.
-
-    Raises:
-        FileFormatError: no OBJ, or a number that is none.
-    """
+    """The numbers of each vertex alone, (V,3) and more."""
     table = _plain_vertices(path, data)
     if table is not None:
         return table
@@ -100,11 +91,7 @@ def read_vertices(path: Path, data: bytes) -> NDArray[np.float64]:
 
 
 def texture_coordinates(path: Path, lines: Iterable[bytes]) -> NDArray[np.float32]:
-    """The texture coordinates (T,2) that the lines of ``Statements`` say.
-
-    Raises:
-        FileFormatError: a line holds less than two numbers, text, NaN or infinity.
-    """
+    """The texture coordinates (T,2) that the lines of ``Statements`` say."""
     tables = []
     for piece in lines:
         rows = [b" ".join(line.split()[:2]) for line in piece.split(b"\n")] if piece else []

@@ -67,11 +67,7 @@ def read_off(path: str | Path, unit: str = "mm") -> Mesh:
 
 
 def write_off(mesh: Mesh, path: str | Path) -> None:
-    """Writes vertices in the mesh's order and triangles, in millimetres.
-
-    Raises:
-        FileFormatError: the folder cannot be written to.
-    """
+    """Writes vertices in the mesh's order and triangles, in millimetres."""
     from trimesh import Trimesh
     from trimesh.exchange.off import export_off
 

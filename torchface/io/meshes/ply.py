@@ -51,11 +51,7 @@ def read_ply(path: str | Path, unit: str = "mm") -> Mesh:
 
 
 def write_ply(mesh: Mesh, path: str | Path) -> None:
-    """Writes polygons (or triangles) and vertex colours, binary, in millimetres.
-
-    Raises:
-        FileFormatError: the folder cannot be written to.
-    """
+    """Writes polygons (or triangles) and vertex colours, binary, in millimetres."""
     positions = mesh.vertices.detach().cpu().numpy()
     fields: list[tuple[str, str]] = [(axis, "<f4") for axis in "xyz"]
     if mesh.colors is not None:

@@ -48,11 +48,7 @@ class Lists:
 
 
 def read_tables(path: Path, data: bytes, wanted: Collection[str]) -> tuple[dict[str, dict[str, Any]], list[Element]]:
-    """The columns by name of the wanted elements, arrays (P,) or ``Lists``, and all elements as the header names them.
-
-    Raises:
-        FileFormatError: no PLY, another format, truncated, or text among the numbers.
-    """
+    """Columns by name of the wanted elements, arrays (P,) or ``Lists``, and all elements as the header names them."""
     elements, order, start = _header(path, data)
     # A unit of the body is a byte where it is binary, a number where it is text.
     body = _words(path, data[start:]) if order == "" else np.frombuffer(data, np.uint8, offset=start)

@@ -14,11 +14,7 @@ _MAX_TABLE = 20_000_000
 
 
 def pad_polygons(source: str, sizes: NDArray[np.int64], corners: NDArray[np.int64]) -> Tensor:
-    """Rows (P,K) padded with -1 from corner counts (P,) and all corners in a line (C,).
-
-    Raises:
-        FileFormatError: one polygon has so many corners that the padded table would fill the memory.
-    """
+    """Rows (P,K) padded with -1 from corner counts (P,) and all corners in a line (C,)."""
     widest, largest = int(sizes.max()), max(_MAX_TABLE, 3 * len(corners) // 2)
     if len(sizes) * widest > largest:
         raise FileFormatError(

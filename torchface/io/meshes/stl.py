@@ -55,11 +55,7 @@ def read_stl(path: str | Path, unit: str = "mm") -> Mesh:
 
 
 def write_stl(mesh: Mesh, path: str | Path) -> None:
-    """Writes triangles, binary, in millimetres.
-
-    Raises:
-        FileFormatError: the folder cannot be written to.
-    """
+    """Writes triangles, binary, in millimetres."""
     from trimesh.exchange.stl import export_stl
 
     write_file(path, export_stl(mesh.to_trimesh()))

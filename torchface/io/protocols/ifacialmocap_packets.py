@@ -51,11 +51,7 @@ class IFacialMocapPackets:
         self._arkit = ArkitWeights(names)
 
     def __call__(self, weights: Tensor, rotations: Tensor | None) -> list[bytes]:
-        """The packet of a frame: weights (N,), rotations (9,) in radians; NaN is sent as 0.
-
-        Raises:
-            ShapeError: another number of weights than names, or of rotations than nine.
-        """
+        """The packet of a frame: weights (N,), rotations (9,) in radians; NaN is sent as 0."""
         percent = (100 * self._arkit(weights).clamp(0, 1)).round().int().tolist()
         head, left, right = degrees_of_rotations(rotations_sent(rotations))
         fields = [f"{name}-{value}" for name, value in zip(_NAMES, percent, strict=True)]
@@ -65,11 +61,7 @@ class IFacialMocapPackets:
 
 
 def read_ifacialmocap(packet: bytes) -> list[ReceivedFace]:
-    """The face of a packet; a handshake of another receiver has none.
-
-    Raises:
-        FileFormatError: no such text.
-    """
+    """The face of a packet; a handshake of another receiver has none."""
     if packet.startswith(_HANDSHAKES):
         return []
     try:

@@ -35,11 +35,7 @@ class ArkitWeights:
             raise NameMismatchError(f"stream: found the shapes {', '.join(names[:5])}, expected some of ARKit's")
 
     def __call__(self, weights: Tensor) -> Tensor:
-        """Weights (N,) as (52,), float32; NaN becomes 0.
-
-        Raises:
-            ShapeError: another number of weights than names.
-        """
+        """Weights (N,) as (52,), float32; NaN becomes 0."""
         if weights.shape != self._matrix.shape[1:]:
             raise ShapeError(f"stream: found weights {tuple(weights.shape)}, expected ({self._matrix.shape[1]},)")
         return self._matrix @ weights.detach().float().cpu().nan_to_num(0.0)
@@ -75,11 +71,7 @@ class LiveLinkPackets:
         self._head = bytes([_VERSION]) + b"".join(struct.pack("!i", len(text)) + text for text in texts)
 
     def __call__(self, weights: Tensor, rotations: Tensor | None) -> list[bytes]:
-        """The packet of the next frame: weights (N,), rotations (9,) in radians; NaN is sent as 0.
-
-        Raises:
-            ShapeError: another number of weights than names, or of rotations than nine.
-        """
+        """The packet of the next frame: weights (N,), rotations (9,) in radians; NaN is sent as 0."""
         numbers = torch.cat([self._arkit(weights), rotations_sent(rotations)]).tolist()
         time = _TIME.pack(self._sent, 0.0, *self._rate)
         self._sent += 1
@@ -88,9 +80,6 @@ class LiveLinkPackets:
 
 def read_live_link(packet: bytes) -> list[ReceivedFace]:
     """The face of a packet of the app; one without values is of a face that the app does not see.
-
-    Raises:
-        FileFormatError: another version, or bytes that are no such packet.
 
     Example:
         >>> (face,) = read_live_link(LiveLinkPackets(["jawOpen"], fps=60.0)(torch.tensor([0.5]), None)[0])
@@ -122,11 +111,7 @@ def read_live_link(packet: bytes) -> list[ReceivedFace]:
 
 
 def packet_rate(packet: bytes) -> float:
-    """Frames a second that a whole packet states.
-
-    Raises:
-        FileFormatError: it states none that a camera has.
-    """
+    """Frames a second that a whole packet states."""
     at = 1
     for _ in range(2):
         at += 4 + int.from_bytes(packet[at : at + 4], "big")

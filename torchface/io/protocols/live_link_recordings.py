@@ -27,9 +27,6 @@ def recorded_packets(path: str | Path) -> Iterator[bytes]:
 
     The file is gzip of the version, one byte, the number of packets, and of each packet its size and bytes, sizes and
     number four bytes, the highest first.
-
-    Raises:
-        FileFormatError: the file is damaged, or too large once it is unpacked.
     """
     path = Path(path)
     unpack = zlib.decompressobj(31)

@@ -53,9 +53,6 @@ def osc_bundles(messages: Iterable[bytes], largest: int = LARGEST) -> list[bytes
 def read_osc(packet: bytes) -> list[Message]:
     """The messages of a packet, those of bundles in their order.
 
-    Raises:
-        FileFormatError: the bytes are no OSC.
-
     Example:
         >>> read_osc(osc_bundles([osc_message("/a", 1.5), osc_message("/b", True)])[0])
         [('/a', (1.5,)), ('/b', (True,))]

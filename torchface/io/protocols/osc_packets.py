@@ -38,11 +38,7 @@ class OscPackets:
         self._addresses += [f"{prefix}/rotations/{name}" for name in ROTATIONS]
 
     def __call__(self, weights: Tensor, rotations: Tensor | None) -> list[bytes]:
-        """The packets of a frame: weights (N,), rotations (9,) in radians; NaN is sent as 0.
-
-        Raises:
-            ShapeError: another number of weights than names, or of rotations than nine.
-        """
+        """The packets of a frame: weights (N,), rotations (9,) in radians; NaN is sent as 0."""
         if weights.shape != (self._count,):
             raise ShapeError(f"stream: found weights {tuple(weights.shape)}, expected ({self._count},)")
         values = torch.cat([weights.detach().float().cpu().nan_to_num(0.0), rotations_sent(rotations)]).tolist()
@@ -50,11 +46,7 @@ class OscPackets:
 
 
 def names_for_osc(names: Sequence[str]) -> Sequence[str]:
-    """The names, which addresses must be able to hold.
-
-    Raises:
-        NameMismatchError: one has what OSC gives another meaning.
-    """
+    """The names, which addresses must be able to hold."""
     strange = [name for name in names if not name or _NOT_IN_ADDRESSES.search(name)]
     if strange:
         raise NameMismatchError(
@@ -84,11 +76,7 @@ class OscReader:
         self._arkit = False
 
     def __call__(self, packet: bytes) -> list[ReceivedFace]:
-        """The face after a packet; none if it has nothing of a face.
-
-        Raises:
-            FileFormatError: no OSC.
-        """
+        """The face after a packet; none if it has nothing of a face."""
         known = [self._take(message) for message in read_osc(packet) if message[0].startswith(self._prefix)]
         if not any(known):
             return []

@@ -127,11 +127,7 @@ def parse_source(address: str) -> StreamAddress:
 
 
 def resolved(parts: StreamAddress, address: str) -> tuple[socket.AddressFamily, Any]:
-    """Family and socket address, the host looked up.
-
-    Raises:
-        ValueRangeError: the host is not known.
-    """
+    """Family and socket address, the host looked up."""
     try:
         family, _, _, _, target = socket.getaddrinfo(parts.host, parts.port, type=socket.SOCK_DGRAM)[0]
     except (OSError, ValueError) as error:  # ValueError: a name that no host can have, such as a..b

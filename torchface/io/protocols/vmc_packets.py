@@ -54,11 +54,7 @@ class VmcPackets:
         self._clock, self._began = clock, clock()
 
     def __call__(self, weights: Tensor, rotations: Tensor | None) -> list[bytes]:
-        """The packets of a frame: weights (N,), rotations (9,) in radians.
-
-        Raises:
-            ShapeError: another number of weights than names, or of rotations than nine.
-        """
+        """The packets of a frame: weights (N,), rotations (9,) in radians."""
         messages = [
             osc_message("/VMC/Ext/OK", 1),
             osc_message("/VMC/Ext/T", self._clock() - self._began),
@@ -97,11 +93,7 @@ class VmcReader:
         self._bones = dict[str, Quaternion]()
 
     def __call__(self, packet: bytes) -> list[ReceivedFace]:
-        """The faces that a packet completes.
-
-        Raises:
-            FileFormatError: no OSC, or values of other kinds than the protocol's.
-        """
+        """The faces that a packet completes."""
         faces = []
         for address, values in read_osc(packet):
             if address == "/VMC/Ext/Blend/Val":

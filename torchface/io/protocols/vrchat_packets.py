@@ -113,11 +113,7 @@ class VrchatPackets:
         self._sent = sent
 
     def __call__(self, weights: Tensor, rotations: Tensor | None) -> list[bytes]:
-        """The packets of a frame: weights (N,), rotations (9,) in radians, of which the eyes' count.
-
-        Raises:
-            ShapeError: another number of weights than names, or of rotations than nine.
-        """
+        """The packets of a frame: weights (N,), rotations (9,) in radians, of which the eyes' count."""
         parameters, eyes = dict[str, float](), list[bytes]()
         turned = rotations_sent(rotations)
         if self._own:

@@ -216,12 +216,7 @@ class _Calls:
     def __call__(
         self, kind: str, data: Mapping[str, Any], seconds: float = _WAIT, goes_on: Callable[[], bool] = lambda: True
     ) -> dict[str, Any]:
-        """The data of the answer.
-
-        Raises:
-            _RefusedError: the answer is an error.
-            ValueError: the answer is none that the API gives, or none comes.
-        """
+        """The data of the answer."""
         self._count += 1
         number, end = f"torchface-{self._count}", time.monotonic() + seconds
         request = {"apiName": "VTubeStudioPublicAPI", "apiVersion": "1.0", "requestID": number, "messageType": kind}
@@ -250,11 +245,7 @@ class _Calls:
 
 
 def checked_token_file(path: str, address: str) -> Path:
-    """The file of a token.
-
-    Raises:
-        ValueRangeError: its folder does not exist.
-    """
+    """The file of a token."""
     file = Path(path).expanduser()
     if not file.parent.is_dir():
         raise ValueRangeError(f"stream: found {address!r:.200}, whose token's folder {file.parent} does not exist")

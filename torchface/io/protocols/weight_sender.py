@@ -110,11 +110,7 @@ class WeightSender:
 
 
 def find_receiver(address: str) -> None:
-    """Looks an address up before any work.
-
-    Raises:
-        ValueRangeError: the text is no address, or its host is not known.
-    """
+    """Looks an address up before any work."""
     resolved(parse_address(address), address)
 
 

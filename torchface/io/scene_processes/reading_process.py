@@ -36,11 +36,7 @@ def read_scene(command: Sequence[str], path: Path, reader: str, seconds: float) 
 
 
 def run_process(command: Sequence[str], what: str, reader: str, seconds: float) -> str:
-    """Runs a process to its end; what it said last, for an error's text.
-
-    Raises:
-        FileFormatError: it crashed, or took too long.
-    """
+    """Runs a process to its end; what it said last, for an error's text."""
     environment = {name: value for name, value in os.environ.items() if name not in _FOREIGN}
     environment |= {"PXR_WORK_THREAD_LIMIT": "1", "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
     with tempfile.TemporaryFile() as output:

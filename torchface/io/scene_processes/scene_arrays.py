@@ -70,11 +70,7 @@ class Scene:
 
 
 def load_scene(path: Path, folder: Path) -> Scene:
-    """What a process left in ``folder`` of the file ``path``.
-
-    Raises:
-        FileFormatError: it refused the file.
-    """
+    """What a process left in ``folder`` of the file ``path``."""
     refused = folder / "refused.json"
     if refused.exists():
         found, expected = json.loads(refused.read_text())
@@ -176,11 +172,7 @@ def _named_meshes(scene: Scene) -> list[list[dict[str, Any]]]:
 
 
 def scene_weights(scene: Scene) -> Take | None:
-    """The animation of the scene's shapes; see ``torchface.io.load_animation``.
-
-    Raises:
-        FileFormatError: keys that are no frames, or NaN.
-    """
+    """The animation of the scene's shapes; see ``torchface.io.load_animation``."""
     if scene.record.get("animation") is None:
         return None
     renamed: dict[str, str] = {}

@@ -55,12 +55,7 @@ class ShapeMatch:
 
 
 def weight_keys(rig: BlendshapeRig, take: Take) -> tuple[WeightKeys, ShapeMatch]:
-    """A take's weights on a rig's shapes, a key a frame at its time; names are matched by ``shape_names.mapping``.
-
-    Raises:
-        NameMismatchError: no channel drives any shape.
-        ValueRangeError: the take has no weights or no frame, or a weight is NaN.
-    """
+    """A take's weights on a rig's shapes, a key a frame at its time; names are matched by ``shape_names.mapping``."""
     track = take.weights
     if track is None or len(track) == 0 or track.values.shape[2] != 1:
         content = "no weights" if track is None else f"weights {tuple(track.values.shape)}"

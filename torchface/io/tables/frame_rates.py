@@ -197,11 +197,7 @@ def _counted(times: np.ndarray) -> np.ndarray:
 
 
 def numbering_extras(numbers: np.ndarray, first: int, where: str) -> dict[str, Any]:
-    """What ``Take.extras`` keeps of a file's frame numbers (T,): nothing where they simply count up from ``first``.
-
-    Raises:
-        FileFormatError: a number is no whole one, is negative, or does not rise.
-    """
+    """What ``Take.extras`` keeps of a file's frame numbers (T,): nothing where they simply count up from ``first``."""
     if not np.all((numbers >= 0) & (numbers <= _MAX_FRAME_NUMBER) & (numbers == np.floor(numbers))):
         raise FileFormatError(
             f"{where}: found frame numbers that are negative or no whole numbers, expected 0, 1, 2, ..."

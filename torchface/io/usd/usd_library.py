@@ -14,11 +14,7 @@ _MODULES = ("Gf", "Sdf", "Tf", "Usd", "UsdGeom", "UsdShade", "UsdSkel", "UsdUtil
 
 
 def require_usd() -> None:
-    """Checks that usd-core is installed.
-
-    Raises:
-        MissingExtraError: it is not.
-    """
+    """Checks that usd-core is installed."""
     if importlib.util.find_spec("pxr") is None:
         raise MissingExtraError(
             "USD: usd-core is not installed, expected it for .usd, .usda, .usdc and .usdz; "
@@ -27,10 +23,6 @@ def require_usd() -> None:
 
 
 def usd_library() -> Any:
-    """The modules of ``pxr`` as attributes.
-
-    Raises:
-        MissingExtraError: usd-core is not installed.
-    """
+    """The modules of ``pxr`` as attributes."""
     require_usd()
     return SimpleNamespace(**{name: importlib.import_module(f"pxr.{name}") for name in _MODULES})

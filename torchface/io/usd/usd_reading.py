@@ -47,17 +47,12 @@ def read_usd_mesh(path: str | Path, unit: str | None = None) -> Mesh:
 
 
 def read_usd_weights(path: str | Path) -> Take | None:
-    """The weights that a file's ``SkelAnimation`` gives its shapes; none where nothing moves them.
-
-    Raises:
-        MissingExtraError: usd-core is not installed.
-        FileFormatError: as :func:`read_usd_rig`; or keys that are no frames.
-    """
+    """The weights that a file's ``SkelAnimation`` gives its shapes; none where nothing moves them."""
     return scene_weights(read_stage(path))
 
 
 def read_stage(path: str | Path, *options: str) -> Scene:
-    """What the process finds in a file, see ``stage_process``; errors as of :func:`read_usd_rig`."""
+    """What the process finds in a file, see ``stage_process``."""
     require_usd()
     path = Path(path)
     size = checked_size(path)
@@ -67,11 +62,7 @@ def read_stage(path: str | Path, *options: str) -> Scene:
 
 
 def checked_size(path: Path) -> int:
-    """Bytes of a plain file that is there, not empty and not beyond reason.
-
-    Raises:
-        FileFormatError: it is not.
-    """
+    """Bytes of a plain file that is there, not empty and not beyond reason."""
     try:
         if not path.exists():
             raise FileFormatError(f"{path}: found no such file, expected an existing one")
@@ -89,12 +80,7 @@ _UNPACKED_ALWAYS, _UNPACKED_PER_BYTE = 2**28, 1024  # as of glTF's
 
 
 def read_usd_detail(path: str | Path) -> DetailMaps | None:
-    """The detail maps of a USD file; none where it has neither such maps nor a normal texture.
-
-    Raises:
-        MissingExtraError: usd-core is not installed.
-        FileFormatError: as of ``read_usd_rig``; images of different sizes, or more of them than the file can hold.
-    """
+    """The detail maps of a USD file; none where it has neither such maps nor a normal texture."""
     scene = read_stage(path, "--maps")
     allowed = max(_UNPACKED_ALWAYS, _UNPACKED_PER_BYTE * scene.record["bytes"])
     images: dict[str, Tensor] = {}

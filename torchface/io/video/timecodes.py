@@ -11,11 +11,7 @@ _TIMECODE = re.compile(r"(\d{1,2}):(\d{2}):(\d{2})([:;.])(\d{2,3})")
 
 
 def start_of(film: str | Path) -> float | None:
-    """When a film's first frame was taken by its timecode, seconds from midnight; None where it has none.
-
-    Raises:
-        FileFormatError: the file cannot be read.
-    """
+    """When a film's first frame was taken by its timecode, seconds from midnight; None where it has none."""
     path = Path(film)
     with open_container(path) as (container, stream):
         rate = float(stream.average_rate or stream.guessed_rate or 0)

@@ -57,11 +57,7 @@ def packets_of(container: InputContainer, stream: VideoStream, errors: list[str]
 
 
 def read_packets(path: Path) -> Packets:
-    """Reads packets without decoding them, up to the first that cannot be read.
-
-    Raises:
-        FileFormatError: as ``open_container``.
-    """
+    """Reads packets without decoding them, up to the first that cannot be read."""
     seconds, hidden = array("d"), 0
     with open_container(path) as (container, stream):
         for packet in packets_of(container, stream, []):
@@ -76,11 +72,7 @@ def read_packets(path: Path) -> Packets:
 
 
 def key_frame_sizes(path: Path) -> Iterator[tuple[float, int, int]]:
-    """Decodes the key frames alone and gives the time in seconds, width and height of each, upright.
-
-    Raises:
-        FileFormatError: as ``open_container``.
-    """
+    """Decodes the key frames alone and gives the time in seconds, width and height of each, upright."""
     with open_container(path) as (container, stream):
         tick = float(stream.time_base or 0)
         for packet in packets_of(container, stream, []):
@@ -99,11 +91,7 @@ def quarter_turns(frame: VideoFrame) -> int:
 
 
 def square_size(path: Path, stream: VideoStream, width: int, height: int) -> tuple[int, int]:
-    """The size at which a stored frame has square pixels: what is narrow in it is made wider, nothing narrower.
-
-    Raises:
-        FileFormatError: its pixels are more than four times as wide as high or as high as wide, or it is too large.
-    """
+    """The size at which a stored frame has square pixels: what is narrow in it is made wider, nothing narrower."""
     ratio = float(stream.sample_aspect_ratio or 1)
     if not 1 / _MAX_ASPECT <= ratio <= _MAX_ASPECT:
         raise FileFormatError(
@@ -131,11 +119,7 @@ _MOV_BOXES = (b"ftyp", b"moov", b"mdat", b"wide", b"free", b"skip")
 
 
 def pyav() -> Any:
-    """PyAV, loaded with the first video: its wheel brings GPL libraries, which nothing else should load or need.
-
-    Raises:
-        MissingExtraError: it is not installed.
-    """
+    """PyAV, loaded with the first video: its wheel brings GPL libraries, which nothing else should load or need."""
     return import_extra("av", "av", "", "video")
 
 

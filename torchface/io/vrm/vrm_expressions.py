@@ -40,9 +40,6 @@ def vrm_expressions(document: Document) -> dict[str, tuple[MorphBind, ...]]:
     """The expressions of a VRM by name and what morph targets each drives; none of a file that is no VRM.
 
     Presets have their preset's name (``blinkLeft``, in VRM 0 ``blink_l``), others their own.
-
-    Raises:
-        FileFormatError: the extension is broken.
     """
     version = vrm_version(document)
     if version is None:

@@ -22,11 +22,7 @@ def arkit_row(name: str) -> int | None:
 
 
 def finite_number(text: str, where: str) -> float:
-    """The number that a text stands for.
-
-    Raises:
-        FileFormatError: it stands for none, or is not finite.
-    """
+    """The number that a text stands for."""
     try:
         value = float(text) if len(text) <= _MAX_TEXT else math.nan
     except ValueError:

@@ -38,9 +38,6 @@ def read_frame(text: str, where: str = "packet") -> tuple[Tensor, Tensor]:
             behind ``-`` or, in the second version, ``&``; angles in degrees.
         where: names the source in errors.
 
-    Raises:
-        FileFormatError: not one of ARKit's shapes, or what stands for a number is none.
-
     Source: iFacialMocap, communication specifications, ifacialmocap.com/for-developer.
     """
     weights, angles, known = [0.0] * len(ARKIT), [[0.0] * 3 for _ in range(3)], 0

@@ -98,11 +98,7 @@ class CheckedDetector:
 
 @cache
 def shipped_networks() -> tuple[BoxNetwork, LandmarkNetwork]:
-    """The ``face_boxes`` and the ``landmark_network`` that come with this package; read once.
-
-    Raises:
-        FileFormatError: one of them is missing or damaged.
-    """
+    """The ``face_boxes`` and the ``landmark_network`` that come with this package; read once."""
     return (
         read_model(shipped_model("face_boxes"), {"face_boxes": BoxNetwork}),
         read_model(shipped_model("landmark_network"), {"landmark_network": LandmarkNetwork}),

@@ -34,9 +34,6 @@ def find_some_faces(image: Tensor, number: int = 0, detector: FaceDetector | Non
         image: uint8 (H,W), or (3,H,W) red first.
         number: of the face that must be there, from 0.
         detector: see :func:`find_faces`.
-
-    Raises:
-        NoFaceError: there is none of this number.
     """
     faces = find_faces(image, detector)
     if not 0 <= number < len(faces):

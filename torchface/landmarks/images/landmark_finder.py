@@ -40,12 +40,7 @@ def finder_name(finder: LandmarkFinder) -> str:
 
 
 def find_in_box(finder: LandmarkFinder, image: Tensor, box: Tensor, tilt: float = 0.0) -> FaceReading:
-    """What a finder reads in a box, checked: it may be anybody's.
-
-    Raises:
-        ShapeError: it gave another count of landmarks, or other shapes; the message names the finder.
-        ValueRangeError: it gave landmarks that are not finite, negative deviations, or likelihoods outside of [0,1].
-    """
+    """What a finder reads in a box, checked: it may be anybody's."""
     reading, name = finder(image, box, tilt), finder_name(finder)
     shapes = tuple(tuple(one.shape) for one in (reading.landmarks, reading.deviation, reading.visibility))
     if shapes != ((COUNT, 2), (COUNT,), (COUNT,)):

@@ -70,11 +70,7 @@ class LineShape:
         return straight + length * _at(self.offset, share), length * _at(self.deviation, share)
 
     def profiles(self, left: Tensor, right: Tensor, columns: Tensor) -> Tensor:
-        """The expected profiles across the line at columns (N,), (N,2·REACH+1).
-
-        Raises:
-            ValueRangeError: the profile was not learned.
-        """
+        """The expected profiles across the line at columns (N,), (N,2·REACH+1)."""
         if self.profile is None:
             raise ValueRangeError("LineShape: found no profile, expected one learned from images")
         share = ((columns.double() - left[0].double()) / (right[0] - left[0]).double()).clamp(0, 1)

@@ -119,9 +119,6 @@ class FaceSearch:
             surface: any unit, turned by any angle.
             framed: vertices (V,) bool that the pictures from around frame, such as those of a head's bone.
             progress: called with each picture.
-
-        Raises:
-            NoFaceOnSurfaceError: no picture shows one, or what they show is none from near.
         """
         progress = progress or silent
         pictures: list[Tensor] = []

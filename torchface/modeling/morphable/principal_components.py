@@ -161,11 +161,7 @@ def _learned(mean: Tensor, components: Tensor, values: Tensor, trace: float, cou
 
 
 def _rank(values: Tensor, floor: float, count: int) -> int:
-    """How many eigenvalues (K,), falling, are more than rounding.
-
-    Raises:
-        ValueRangeError: none.
-    """
+    """How many eigenvalues (K,), falling, are more than rounding."""
     rank = int((values > max(floor, _NO_VARIANCE * float(values[0]))).sum())
     if rank == 0:
         raise ValueRangeError(f"samples: found {count} that are all the same, expected some that differ")

@@ -33,10 +33,6 @@ def choose_frames(
         sharpness: of each frame, (T,), in any unit; the sharper half of the frames is chosen from. Not regarded if
             absent.
 
-    Raises:
-        ShapeError: the shapes do not fit each other.
-        ValueRangeError: no frame shows a face.
-
     Example:
         >>> from torchface.geometry.cameras.pinhole import look_at
         >>> from torchface.synthetic import neutral_head

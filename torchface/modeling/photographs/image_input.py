@@ -68,12 +68,7 @@ def annotated_vertices(mean: Tensor, landmarks: Tensor) -> Tensor:
 
 
 def checked_sizes(landmarks: Tensor, image_size: tuple[int, int] | Sequence[tuple[int, int]]) -> Tensor:
-    """The photographs' sizes, (I,2): width and height.
-
-    Raises:
-        ShapeError: not (I,68,2), or not one size for all or for each.
-        ValueRangeError: too few landmarks in a view, or landmarks outside its image.
-    """
+    """The photographs' sizes, (I,2): width and height."""
     if landmarks.ndim != 3 or landmarks.shape[1:] != (LANDMARKS, 2) or len(landmarks) == 0:
         raise ShapeError(
             f"landmarks: found {tuple(landmarks.shape)}, expected (I,{LANDMARKS},2) with at least one view"
@@ -120,11 +115,7 @@ def _check_view(i: int, marks: Tensor, size: Tensor) -> None:
 
 
 def lens(camera: float | Tensor | None, sizes: Tensor, settings: FitSettings) -> tuple[Tensor, FitSettings]:
-    """Intrinsics (I,3,3), and the settings with what is known of the focal length.
-
-    Raises:
-        ShapeError, ValueRangeError: as for ``camera`` in ``fit_images``.
-    """
+    """Intrinsics (I,3,3), and the settings with what is known of the focal length."""
     count = len(sizes)
     if isinstance(camera, Tensor) and camera.ndim > 0:
         intrinsics = camera.detach().cpu().double()

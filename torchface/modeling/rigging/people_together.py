@@ -16,12 +16,7 @@ _ROUNDS = 4
 
 
 def align_neutrals(neutrals: Samples) -> tuple[Tensor, Similarity]:
-    """The mean (V,3) of neutrals (M,V,3) aligned with it, rotation and translation only, and each one's pose, float64.
-
-    Raises:
-        ShapeError: they are not (M,V,3) of two people at least.
-        ValueRangeError: a neutral holds NaN or infinity.
-    """
+    """Mean (V,3) of neutrals (M,V,3) aligned with it, and each one's rigid pose, float64."""
     count, _, channels = neutrals.shape
     if count < 2 or channels != 3:
         raise ShapeError(f"neutrals: found {tuple(neutrals.shape)}, expected (M,V,3) of at least two people")

@@ -189,11 +189,6 @@ def checked_sculpt(path: object, sculpt: Mesh, rig: BlendshapeRig, shown: Tensor
         rig: of V vertices.
         shown: what the rig shows at the pose, (V,3).
         align: ``"remove"`` a motion of the whole mesh, ``"keep"`` it as part of the sculpt, or refuse it if absent.
-
-    Raises:
-        TopologyError: another topology or order of vertices.
-        ValueRangeError: another unit.
-        AlignmentError: the whole mesh has moved.
     """
     ours = rig.neutral
     if len(sculpt.vertices) != len(ours.vertices):

@@ -50,9 +50,6 @@ class WebcamSession:
     Args:
         model: the graph, as ``torchface export webcam`` writes it.
         name: of the file, for messages.
-
-    Raises:
-        FileFormatError: it is no such graph.
     """
 
     controls: WebcamControls
@@ -89,12 +86,7 @@ class WebcamSession:
         return torch.from_numpy(self._state.copy())
 
     def resume(self, state: Tensor) -> None:
-        """Goes on from a ``state``.
-
-        Raises:
-            ShapeError: it is of another graph.
-            ValueRangeError: a number in it is not finite.
-        """
+        """Goes on from a ``state``."""
         if state.shape != self._start.shape:
             raise ShapeError(f"state: found {tuple(state.shape)}, expected {self._start.shape}")
         if not bool(torch.isfinite(state).all()):
@@ -112,10 +104,6 @@ class WebcamSession:
             frame: uint8 (H,W,3) or (H,W,4), red first, as a camera or a canvas gives it; of any size from 64 pixels,
                 which may change from one to the next.
             interval: seconds since the picture before.
-
-        Raises:
-            ShapeError: no such picture; the message says what to do with a grey one.
-            ValueRangeError: the interval is not positive and finite.
         """
         pixels = frame.detach().cpu().numpy() if isinstance(frame, Tensor) else np.asarray(frame)
         if pixels.dtype != np.uint8 or pixels.ndim != 3 or pixels.shape[2] not in (3, 4):

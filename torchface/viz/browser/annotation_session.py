@@ -52,11 +52,7 @@ class AnnotationSession:
         return float((points - points.mean(0)).square().sum(1).mean().sqrt())
 
     def show(self, number: int) -> None:
-        """Switches to another frame.
-
-        Raises:
-            ValueRangeError: there is no such frame.
-        """
+        """Switches to another frame."""
         if not 0 <= number < len(self.frames):
             raise ValueRangeError(f"frame: found {number}, expected 0 to {len(self.frames) - 1}")
         self.number, self._grabbed = number, None
@@ -105,11 +101,7 @@ class AnnotationSession:
         self._history[self.number].append(self._history[self.number][0].clone())
 
     def save(self) -> Path:
-        """Writes the frame's image and landmarks.
-
-        Raises:
-            FileFormatError: the folder cannot be written to.
-        """
+        """Writes the frame's image and landmarks."""
         frame = self.frame
         path = save_annotated_frame(AnnotatedFrame(frame.name, frame.image, self.landmarks), self.folder)
         self.saved.add(frame.name)

@@ -36,11 +36,7 @@ _BRAND = (46, 92, 138)
 
 
 def import_viser() -> Any:
-    """The ``viser`` package.
-
-    Raises:
-        MissingExtraError: it is not installed.
-    """
+    """The ``viser`` package."""
     return import_extra("viser", "viser", "viewer", "the viewer")
 
 

@@ -97,11 +97,7 @@ class PickSession:
         return None if self.scan is None else _first_hit(self._scan_caster, self.scan, origin, direction)
 
     def pick_landmark(self, point: SurfacePoint, mirrored: bool = False, row: int | None = None) -> int:
-        """Sets landmark ``row``, the next one if absent, to the vertex; mirrored its twin too. Returns the row.
-
-        Raises:
-            ValueRangeError: all landmarks are picked and no row is named.
-        """
+        """Sets landmark ``row``, the next one if absent, to the vertex; mirrored its twin too. Returns the row."""
         row = self.next_landmark if row is None else row
         if row is None:
             raise ValueRangeError(f"landmarks: all {len(self.picks.landmarks)} are picked; choose one to move")
@@ -133,11 +129,7 @@ class PickSession:
         self._history.append(replace(self.picks, waiting=point.vertex))
 
     def pick_scan(self, point: SurfacePoint) -> str:
-        """Ends the pair that waits; returns its label.
-
-        Raises:
-            ValueRangeError: none waits, or its vertex has a pair.
-        """
+        """Ends the pair that waits; returns its label."""
         picks = self.picks
         if picks.waiting is None:
             raise ValueRangeError("correspondences: found a point on the scan first, expected one on the template")
@@ -167,22 +159,14 @@ class PickSession:
         return _surface_point(self.mesh, int(nearest.triangle[0]), nearest.barycentric[0])
 
     def landmarks(self) -> LandmarkVertices:
-        """The landmarks picked so far.
-
-        Raises:
-            ValueRangeError: none is.
-        """
+        """The landmarks picked so far."""
         rows = [row for row, vertex in enumerate(self.picks.landmarks) if vertex is not None]
         _need(rows, "landmark")
         ids = torch.tensor([self.picks.landmarks[row] for row in rows], dtype=torch.int64)
         return LandmarkVertices(ids, tuple(self.landmark_set.names[row] for row in rows), self.mesh.fingerprint())
 
     def attachment(self) -> Attachment:
-        """The marker sites.
-
-        Raises:
-            ValueRangeError: there is none.
-        """
+        """The marker sites."""
         _need(self.picks.markers, "marker")
         triangles = torch.tensor([point.triangle for _, point in self.picks.markers], dtype=torch.int64)
         barycentric = torch.tensor([point.barycentric for _, point in self.picks.markers])
@@ -190,11 +174,7 @@ class PickSession:
         return Attachment(triangles, barycentric, labels).made_for(self.mesh)
 
     def correspondences(self) -> Correspondences:
-        """The complete pairs.
-
-        Raises:
-            ValueRangeError: there is none.
-        """
+        """The complete pairs."""
         _need(self.picks.pairs, "correspondence")
         labels, vertices, points = zip(*self.picks.pairs, strict=True)
         values = torch.tensor(points, dtype=torch.float64)

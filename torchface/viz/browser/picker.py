@@ -79,11 +79,7 @@ class Picker(BrowserPage):
         self.server.scene.on_click()(self._clicked)
 
     def click(self, origin: Tensor, direction: Tensor) -> str:
-        """Picks what a ray, millimetres, meets in the page's scene; returns what it did, in words.
-
-        Raises:
-            ValueRangeError: the click cannot be a pick now; the message says why.
-        """
+        """Picks what a ray, millimetres, meets in the page's scene; returns what it did, in words."""
         with self._lock:
             point, on_scan = self._nearest(origin, direction)
             message = "Nothing there." if point is None else self._pick(point, on_scan)
@@ -260,11 +256,7 @@ def _write(session: PickSession, folder: Path, rig: BlendshapeRig | None) -> lis
 
 
 def annotated(session: PickSession) -> Mesh:
-    """The session's mesh with its landmarks as annotations, everything else kept.
-
-    Raises:
-        ValueRangeError: a landmark is missing.
-    """
+    """The session's mesh with its landmarks as annotations, everything else kept."""
     vertices = session.picks.landmarks
     missing = [name for name, vertex in zip(session.landmark_set.names, vertices, strict=True) if vertex is None]
     if missing:

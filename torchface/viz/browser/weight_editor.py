@@ -74,12 +74,7 @@ class WeightEditor:
         return not torch.equal(self.weights, self._loaded)
 
     def set(self, name: str, value: float) -> tuple[str, ...]:
-        """Moves one shape, or with ``symmetric`` both twins, in the frame in view; returns the names that were set.
-
-        Raises:
-            NameMismatchError: the rig has no such shape.
-            ValueRangeError: the value is NaN or infinite.
-        """
+        """Moves one shape, or with ``symmetric`` both twins, in the frame in view; returns the names that were set."""
         if name not in self.names:
             raise NameMismatchError(f"weights: found {name!r}, expected a shape of the rig: {self.names[0]}, ...")
         if not abs(value) < float("inf"):

@@ -97,11 +97,7 @@ class ArkitRig:
 
 
 def load_source(path: Path, unit: str | None = None) -> Source:
-    """A head model of others, a rig, or a mesh without shapes.
-
-    Raises:
-        FileFormatError: it is none of these.
-    """
+    """A head model of others, a rig, or a mesh without shapes."""
     if is_head_model_file(path):
         model = load_head_model_file(path)
         return Source(path, model.neutral, None, model)
@@ -132,10 +128,6 @@ def make_arkit(
         landmarks: of the source, see ``load_scan_landmarks``; its own if absent, else found by its shape.
         everything: make all of them, also those that it has.
         progress: called with each step and how far it is.
-
-    Raises:
-        AlignmentError: the template does not come to lie on the source.
-        ValueRangeError: the template has none of ARKit's shapes.
     """
     progress = progress or silent
     rig = None if source.rig is None else source.rig.linear("torchface arkit")
@@ -358,10 +350,6 @@ def published_head(path: Path, components: int | None = None, progress: Progress
         path: see ``load_head_model_file``.
         components: of its shape, of the largest deviations; all if absent.
         progress: called with each step and how far it is.
-
-    Raises:
-        FileFormatError: no head model.
-        AlignmentError: the template does not come to lie on it.
     """
     model = load_head_model_file(path)
     made = make_arkit(Source(path, model.neutral, None, model), progress=progress)

@@ -66,9 +66,6 @@ def read_parameters(arrays: ArrayFile, model: HeadModelFile) -> HeadParameters:
         arrays: ``exp`` (T,E), and ``jaw`` (T,3) or ``pose`` (T,6), the head's rotation before the jaw's, or all joints'
             (T,3J), ``eyes`` (T,6), ``shape`` (K,) or (T,K), of which the mean counts; or other spellings of these.
         model: that they move.
-
-    Raises:
-        FileFormatError: no expression parameters, more than the model has, or other numbers of frames.
     """
     key = arrays.first(EXPRESSIONS)
     if key is None:
@@ -202,11 +199,7 @@ def _shape_rotations(joints: HeadJoints, rig: BlendshapeRig) -> Tensor:
 
 
 def save_parameters(parameters: HeadParameters, joints: HeadJoints | None, fps: float, path: Path) -> None:
-    """Writes ``.npz``: ``exp``, ``fps``, and of models with joints ``jaw`` and ``eyes``, as readers of FLAME take them.
-
-    Raises:
-        FileFormatError: the file cannot be written.
-    """
+    """Writes ``.npz``: ``exp``, ``fps``, and of models with joints ``jaw`` and ``eyes``, as FLAME's readers take them."""
     arrays = {"exp": parameters.expressions.numpy(), "fps": np.array(fps, np.float32)}
     if joints is not None and parameters.rotations is not None:
         arrays["pose"] = parameters.rotations.flatten(1).numpy()

@@ -116,12 +116,7 @@ def _listed(names: Sequence[str]) -> str:
 
 
 def load_sites(path: Path, mesh: Mesh, owner: str | Path = "the mesh") -> Attachment:
-    """A first guess of marker sites: an attachment, or labelled vertices, as ``torchface pick`` writes both.
-
-    Raises:
-        FileFormatError: it is neither.
-        TopologyError: it belongs to another mesh.
-    """
+    """A first guess of marker sites: an attachment, or labelled vertices, as ``torchface pick`` writes both."""
     try:
         sites = Attachment.load(path)
     except FileFormatError as error:
@@ -145,9 +140,6 @@ def cleaned_fit(
 ) -> tuple[AttachmentFit, Cleanup]:
     """Sites from a range of motion that may have swapped labels, spikes and markers that drift: fitted, and where
     something is wrong with the take cleaned with these sites and fitted again. What does not fit is not refused.
-
-    Raises:
-        TorchfaceError: take and first guess do not fit each other, or the take shows no motion.
     """
     progress = progress or silent
     take, swaps = _in_order(take)
@@ -236,13 +228,7 @@ def attach(
     picture: Path | None = None,
     progress: Progress | None = None,
 ) -> AttachReport:
-    """Reads, finds the sites, writes them, and a picture of them where one is wanted; see ``torchface attach --help``.
-
-    Raises:
-        AlignmentError: the rig does not explain the markers, or they are mirrored, unless the settings insist.
-        ValueRangeError: the take leaves most sites or shapes uncertain, unless the settings insist.
-        TorchfaceError: a file is broken, the take shows no motion, or the files do not fit each other.
-    """
+    """Reads, finds the sites, writes them, and a picture where one is wanted; see ``torchface attach --help``."""
     progress = progress or silent
     check_writable(out, picture)
     if picture is not None:
@@ -307,11 +293,7 @@ class MotionJob:
         return content_key(_METHOD, take=item.path, settings=item.settings_of(self))
 
     def run(self, item: BatchItem, out: Path) -> Made:
-        """Finds the sites of a take and writes ``NAME.json`` and a picture of them, ``NAME.png``.
-
-        Raises:
-            TorchfaceError: they cannot be found.
-        """
+        """Finds the sites of a take and writes ``NAME.json`` and a picture of them, ``NAME.png``."""
         job, sites, picture = item.settings_of(self), out / f"{item.name}.json", out / f"{item.name}.png"
         done = attach(job.rig, item.path, sites, job.settings, picture)
         last = done.fit.errors[-1]

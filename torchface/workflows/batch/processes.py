@@ -125,11 +125,7 @@ def _start(job: BatchJob, out: Path) -> tuple[Connection, SpawnProcess]:
 
 
 def _received(pipe: Connection, worker: _Worker) -> Outcome | None:
-    """What a process says: that it is ready, None, or the outcome of its item; one that says something else is killed.
-
-    Raises:
-        EOFError: it has died, or is killed.
-    """
+    """What a process says: that it is ready, None, or the outcome of its item; one that says else is killed."""
     try:
         data = pipe.recv_bytes(_MOST_BYTES)
     except ConnectionError as error:

@@ -37,12 +37,7 @@ _POLL = 1.0  # seconds between looks at how many CPUs the cluster has
 
 
 def check_cluster(address: str) -> None:
-    """Raises within 20 seconds where no cluster answers at an address.
-
-    Raises:
-        MissingExtraError: ray is not installed.
-        ValueRangeError: nobody answers there, or something that is no Ray cluster.
-    """
+    """Raises within 20 seconds where no cluster answers at an address."""
     if _import_ray().is_initialized():
         return
     if address != "auto":

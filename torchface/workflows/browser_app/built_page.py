@@ -64,11 +64,7 @@ def _build(sources: Path, kept: Path, progress: Progress) -> None:
 
 
 def installed_packages(sources: Path, npm: str, progress: Progress) -> Path:
-    """The folder with the installed ``node_modules``, once for each ``package-lock.json``.
-
-    Raises:
-        MissingExtraError: npm failed.
-    """
+    """The folder with the installed ``node_modules``, once for each ``package-lock.json``."""
     key = content_key("browser app packages/1", files=[sources / name for name in _PACKAGES])
     kept = cache_folder("app") / f"packages-{key[:32]}"
     if kept.is_dir():

@@ -127,10 +127,6 @@ def load_character(path: str | Path | None = None, table: Path | None = None) ->
         path: a ``.glb`` or ``.vrm``, which is taken as it is, or what else holds a rig; the embedded performer if
             absent.
         table: for shapes of other names than ARKit's; see :func:`torchface.capture.retargeting.load_shape_rules`.
-
-    Raises:
-        FileFormatError: it cannot be read, or is too large for the page.
-        NameMismatchError: nothing drives any of its shapes.
     """
     whole = path is not None and Path(path).suffix.lower() in _GLB
     name = "the embedded performer" if path is None else Path(path).name if whole else f"{Path(path).stem}.glb"

@@ -47,11 +47,7 @@ class AnimationJob:
         return content_key(_METHOD, animation=item.path, own=own, model=model_content(own.model))
 
     def run(self, item: BatchItem, out: Path) -> Made:
-        """Enhances an animation and writes the folder ``NAME``.
-
-        Raises:
-            TorchfaceError: it cannot be enhanced.
-        """
+        """Enhances an animation and writes the folder ``NAME``."""
         own, folder = item.settings_of(self), out / item.name
         done = enhance_animation(item.path, own.model, folder, own.settings)
         page = write_enhance_page(done, folder, own.height)

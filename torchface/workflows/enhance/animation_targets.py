@@ -93,11 +93,7 @@ def animation_targets(
 
 
 def write_targets(targets: AnimationTargets, neutral: Mesh, fps: float, path: Path) -> None:
-    """Writes them as an animated ``.glb``.
-
-    Raises:
-        FileFormatError: it cannot be written.
-    """
+    """Writes them as an animated ``.glb``."""
     names = tuple(f"{targets.kind.removesuffix('s')}_{i + 1:03d}" for i in range(len(targets.deltas)))
     rig = BlendshapeRig(neutral, targets.deltas, names)
     save_animation(rig, Take(fps, weights=Track(names, targets.weights[..., None])), path)

@@ -62,12 +62,7 @@ class CoarseAnimation:
 
 
 def same_topology(animated: AnimatedMesh, model: Mesh, fps: float | None) -> CoarseAnimation:
-    """An animation that has the model's vertices and triangles already.
-
-    Raises:
-        AlignmentError: it is of another size, or another head.
-        ValueRangeError: a frame holds NaN.
-    """
+    """An animation that has the model's vertices and triangles already."""
     step = max(1, animated.count // _SAMPLED)
     some = torch.cat([animated.read(t, t + 1) for t in range(0, animated.count, step)])
     check_finite(some, animated.path, step)
@@ -150,11 +145,7 @@ def check_scale(scale: float, path: Path) -> None:
 
 
 def residual_notes(residual: float, path: Path) -> list[str]:
-    """What the distance of an input's face at rest from the model's says.
-
-    Raises:
-        AlignmentError: they are not of one head, or their vertices stand in another order.
-    """
+    """What the distance of an input's face at rest from the model's says."""
     if residual > NO_HEAD_MM:
         raise AlignmentError(
             f"{path}: found vertices {residual:.1f} mm (root mean square) from the model's at rest, aligned "

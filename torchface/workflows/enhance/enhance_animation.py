@@ -102,11 +102,7 @@ class Enhanced:
 
 
 def load_model(name_or_path: str) -> EnhancementModel:
-    """An actor's model by name or folder, see ``zoo.get_model``.
-
-    Raises:
-        NameMismatchError: there is none of this name, or it is of another kind.
-    """
+    """An actor's model by name or folder, see ``zoo.get_model``."""
     model = zoo.get_model(name_or_path)
     if not isinstance(model, EnhancementModel):
         raise NameMismatchError(

@@ -165,11 +165,7 @@ def _piece(state: Path, begin: int) -> Path:
 
 
 def retimed_animation(animation: CoarseAnimation, model: EnhancementModel, progress: Progress) -> CoarseAnimation:
-    """The animation with its keyframes where they are, and the motions between them in the actor's timing.
-
-    Raises:
-        TorchfaceError: a frame cannot be read.
-    """
+    """The animation with its keyframes where they are, and the motions between them in the actor's timing."""
     step, features = piece_size(len(model.neutral)), []
     for begin in range(0, animation.count, step):
         progress("reading for the timing", begin, animation.count)

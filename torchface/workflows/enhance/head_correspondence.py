@@ -54,11 +54,7 @@ class HeadCorrespondence:
     how: str = ""
 
     def notes(self, path: Path) -> list[str]:
-        """Lines for people to read on the head of a file.
-
-        Raises:
-            AlignmentError: it is another head, or its vertices stand in another order.
-        """
+        """Lines for people to read on the head of a file."""
         notes = residual_notes(self.residual, path)
         if not self.how:
             return notes

@@ -43,11 +43,7 @@ class MarkerSites:
     correspondence: HeadCorrespondence | None = None
 
     def on_model(self, model: Mesh) -> Attachment:
-        """The same sites on the model's triangles.
-
-        Raises:
-            AlignmentError: a site is not near the model's surface.
-        """
+        """The same sites on the model's triangles."""
         if self.rig is None or self.correspondence is None:
             return self.attachment
         points = self.attachment.on(self.rig.neutral.faces, self.correspondence.bent)

@@ -81,12 +81,7 @@ class Keyframe:
         return Keyframe(Path(text), None, rig) if found is None else Keyframe(Path(found[1]), int(found[2]), rig)
 
     def vertices(self, model: EnhancementModel) -> Tensor:
-        """(V,3) in the model's topology.
-
-        Raises:
-            TopologyError: it has another.
-            ValueRangeError: there is no such frame, or it is not finite.
-        """
+        """(V,3) in the model's topology."""
         animated = load_animated(self.path, self.rig)
         found, expected = animated.neutral.faces, model.faces
         if len(animated.neutral.vertices) != len(model.neutral) or not torch.equal(found, expected.to(found)):
@@ -131,10 +126,6 @@ def retime_keyframes(
         fps: frames a second; the model's if absent.
         extend: time it as the whole captured motion of which the keyframes meet a part.
         progress: called with each step.
-
-    Raises:
-        ValueRangeError: the keyframes are equal, or the first comes after the last in their file.
-        TopologyError: one is of another topology, or its vertices are in another order.
 
     Source: Facial Performance Enhancement Using Dynamic Shape Space Analysis, section 6.2.
     """

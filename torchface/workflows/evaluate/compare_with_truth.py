@@ -79,12 +79,6 @@ def evaluate(
     Writes ``regions.csv``, ``frames.csv``, ``shapes.csv`` where both have weights, and ``summary.json``;
     :func:`torchface.workflows.evaluate.evaluate_page.write_evaluation_page` makes the report. Scans are registered into
     ``out/registered``, and those that are there from an earlier run are taken as they are.
-
-    Raises:
-        TopologyError: result and truth have not the same vertices and triangles.
-        ShapeError: they have not the same number of frames.
-        ValueRangeError: there is nothing to compare, or too much.
-        TorchfaceError: any file is broken.
     """
     with within_job(out):
         return _evaluate(result, truth, out, settings, progress or silent)

@@ -102,11 +102,6 @@ def expression_benchmark(
         films: a folder with the true weights of each film, ``FILM.csv``.
         out: folder for ``methods.csv``, ``shapes.csv`` and the report ``index.html``.
         progress: called with each step and how far it is.
-
-    Raises:
-        ValueRangeError: no film has truth, or no method has a result.
-        ShapeError: a result has another number of frames than its film.
-        FileFormatError: a file is damaged.
     """
     progress = progress or silent
     with within_job(out):

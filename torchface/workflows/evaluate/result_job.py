@@ -46,11 +46,7 @@ class ResultJob:
         )
 
     def run(self, item: BatchItem, out: Path) -> Made:
-        """Compares a result with its truth and writes the folder ``NAME``.
-
-        Raises:
-            TorchfaceError: they cannot be compared.
-        """
+        """Compares a result with its truth and writes the folder ``NAME``."""
         folder = out / item.name
         evaluation = evaluate(item.path, [self._truth(item)], folder, item.settings_of(self.settings))
         page = write_evaluation_page(evaluation, folder, self.height)

@@ -76,11 +76,7 @@ class ExampleTake:
 
 
 def averaged_examples(people: Sequence[ExampleShapes]) -> ExampleShapes:
-    """The mean of several people's examples, each moved onto the first's neutral by a similarity.
-
-    Raises:
-        NameMismatchError: not all have the first's expressions.
-    """
+    """The mean of several people's examples, each moved onto the first's neutral by a similarity."""
     first = people[0]
     rows = []
     for one in people:
@@ -108,11 +104,7 @@ def example_solver(examples: ExampleShapes, method: Method) -> ExampleSolver:
 def solve_by_examples(
     examples: ExampleShapes, landmarks: Tensor, method: Method
 ) -> tuple[Tensor, Tensor, MethodFigures]:
-    """Weights (T,N) and solved landmarks (T,68,2) of frames (T,68,2), one after the other, and how the method fared.
-
-    Raises:
-        ValueRangeError: no frame shows all 68.
-    """
+    """Weights (T,N) and solved landmarks (T,68,2) of frames (T,68,2), one after the other, and how the method fared."""
     seen = torch.isfinite(landmarks).all(2).all(1).nonzero()[:, 0]
     if not len(seen):
         raise ValueRangeError("landmarks: found no frame with all 68, expected a face")
@@ -151,10 +143,6 @@ def track_by_examples(
         landmarks: what finds them, or a ``.csv`` that holds them.
         face: which of several.
         progress: called with each step and how far it is.
-
-    Raises:
-        FileFormatError: a file is missing or damaged.
-        ValueRangeError: no frame shows a face, or video and landmarks differ in length.
     """
     progress = progress or silent
     if not examples:

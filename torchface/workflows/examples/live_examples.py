@@ -28,10 +28,6 @@ class ExamplesSolver:
         method: all shapes at once, the head first and then regions, or by a linear model of landmarks.
         landmarks: what finds them; see :func:`~torchface.workflows.named_finders.load_finder`.
         progress: called with each step.
-
-    Raises:
-        FileFormatError, NameMismatchError, ValueRangeError, MissingExtraError: a file is no examples, or as of
-            ``load_finder``.
     """
 
     names = ARKIT

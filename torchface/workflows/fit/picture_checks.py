@@ -41,9 +41,6 @@ def picture_lines(found: PhotographLandmarks, image: Tensor, insist: bool = Fals
         found: the face.
         image: the photograph, (3,H,W) in [0,1].
         insist: report also what is refused otherwise.
-
-    Raises:
-        NoFaceError: it shows hardly a face: too few pixels, eyes and mouth hidden, or nothing like one.
     """
     face, name = found.face, found.photograph.name
     eyes = float((face.landmarks[36] - face.landmarks[45]).norm())

@@ -44,10 +44,6 @@ def video_pictures(
         progress: called with how many frames are read.
         model: finds landmarks; by name or folder.
         face: which of several, from 0, the largest first.
-
-    Raises:
-        FileFormatError: the video cannot be decoded.
-        ValueRangeError: no frame shows a face.
     """
     clip = open_video(video)
     clip.check()

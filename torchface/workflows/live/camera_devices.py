@@ -44,9 +44,6 @@ def check_source(camera: str) -> None:
 
     Args:
         camera: a device's number, a path, or an address, which is not looked at.
-
-    Raises:
-        FileFormatError: it is not there.
     """
     if re.fullmatch("[0-9]{1,3}", camera):
         if sys.platform == "linux" and not Path(f"/dev/video{int(camera)}").exists():

@@ -22,9 +22,6 @@ class FinderSolver:
     Args:
         landmarks: what finds landmarks; see :func:`~torchface.workflows.named_finders.load_finder`.
         progress: called with each step.
-
-    Raises:
-        NameMismatchError, ValueRangeError, FileFormatError, MissingExtraError: as of ``load_finder``.
     """
 
     names = ARKIT

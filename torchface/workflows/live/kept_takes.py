@@ -68,22 +68,14 @@ def kept_takes(folder: Path) -> list[KeptTake]:
 
 
 def rename_take(folder: Path, place: str, name: str) -> None:
-    """Gives a take another name for people; its folder stays.
-
-    Raises:
-        FileFormatError: there is no such take, or its summary cannot be written.
-    """
+    """Gives a take another name for people; its folder stays."""
     path = _place(folder, place)
     changed = {**_summary(path), "name": printable(name) or path.name}
     write_file(path / SUMMARY, json.dumps(changed, indent=1).encode())
 
 
 def remove_take(folder: Path, place: str) -> None:
-    """Deletes a take's files, and its folder where nothing else is in it.
-
-    Raises:
-        FileFormatError: there is no such take, or it cannot be deleted.
-    """
+    """Deletes a take's files, and its folder where nothing else is in it."""
     path = _place(folder, place)
     for name in (SUMMARY, WEIGHTS, LIVE_LINK, ANIMATION, FILM):
         if (path / name).exists():
@@ -98,11 +90,7 @@ def printable(name: str) -> str:
 
 
 def take_file(folder: Path, place: str) -> bytes:
-    """A take for the page: little-endian floats, see :func:`take_rows`; its film where ``/film`` ends the name.
-
-    Raises:
-        FileFormatError: there is no such take, or it cannot be read.
-    """
+    """A take for the page: little-endian floats, see :func:`take_rows`; its film where ``/film`` ends the name."""
     if place.endswith("/film"):
         return read_file(film_of(folder, place.removesuffix("/film")))
     return take_rows(load_live_link(_place(folder, place) / LIVE_LINK)).numpy().astype("<f4").tobytes()
@@ -114,11 +102,7 @@ def film_of(folder: Path, place: str) -> Path:
 
 
 def take_rows(take: Take) -> Tensor:
-    """A take's rows (T,66): seconds, ARKit's weights (52), rotation (9) and gaze (4).
-
-    Raises:
-        FileFormatError: none of its weights is ARKit's.
-    """
+    """A take's rows (T,66): seconds, ARKit's weights (52), rotation (9) and gaze (4)."""
     names = () if take.weights is None else take.weights.names
     shapes = mapping(names, ARKIT)
     if take.weights is None or not shapes.any():

@@ -79,11 +79,7 @@ class PersonSolver:
 
 
 def person_solver(progress: Progress) -> PersonSolver:
-    """A solver for whoever sits before a camera; the first time it is made, which takes a minute.
-
-    Raises:
-        FileFormatError: a model is damaged, or the cache cannot be written to.
-    """
+    """A solver for whoever sits before a camera; the first time it is made, which takes a minute."""
     return PersonSolver(WebcamSession(webcam_graph(progress)))
 
 

@@ -127,11 +127,7 @@ class LiveSession:
         return takes
 
     def asked(self, message: Mapping[str, Any]) -> None:
-        """Does what a page asks for: `controls`, `reset`, `record`, `rename`, `remove`, `solve` or `names`.
-
-        Raises:
-            TorchfaceError: it cannot be done; the notes say why.
-        """
+        """Does what a page asks for: `controls`, `reset`, `record`, `rename`, `remove`, `solve` or `names`."""
         try:
             if "controls" in message:
                 self._set(message["controls"])
@@ -155,11 +151,7 @@ class LiveSession:
             raise
 
     def keep(self, name: str, rows: np.ndarray) -> None:
-        """Keeps a take that a page has made or was given, rows (T,66).
-
-        Raises:
-            TorchfaceError: it cannot be kept; the notes say why.
-        """
+        """Keeps a take that a page has made or was given, rows (T,66)."""
         try:
             self._recordings.keep(name, torch.from_numpy(rows.copy()))
         except TorchfaceError as error:
@@ -209,11 +201,7 @@ class LiveSession:
         self._forget, self._calibration = True, None
 
     def record(self, on: bool, filmed: bool = False) -> str:
-        """Begins or ends a recording, with the camera's film if asked; says in words what happened.
-
-        Raises:
-            FileFormatError: nothing can be written there.
-        """
+        """Begins or ends a recording, with the camera's film if asked; says in words what happened."""
         with self._lock:
             if on == self._recordings.running:
                 return "already recording" if on else "nothing is being recorded"

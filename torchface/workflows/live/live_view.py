@@ -64,9 +64,6 @@ class TakeUpload:
     Args:
         name: for people.
         size: bytes of all parts.
-
-    Raises:
-        ValueRangeError: no take has so many.
     """
 
     def __init__(self, name: str, size: object) -> None:

@@ -55,18 +55,10 @@ class LiveDesk(Protocol):
         """What the page shows beside the frames."""
 
     def asked(self, message: Mapping[str, Any]) -> None:
-        """Does what a page asks for.
-
-        Raises:
-            TorchfaceError: it cannot be done.
-        """
+        """Does what a page asks for."""
 
     def keep(self, name: str, rows: np.ndarray) -> None:
-        """Keeps a take that a page has made or was given, rows (T,66) as of :func:`kept_takes.take_rows`.
-
-        Raises:
-            TorchfaceError: it cannot be kept.
-        """
+        """Keeps a take that a page has made or was given, rows (T,66) as of :func:`kept_takes.take_rows`."""
 
     def left(self) -> None:
         """A page was closed, which may have asked for a pose."""

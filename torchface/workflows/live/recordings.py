@@ -65,11 +65,7 @@ class FrameLog:
         self._file = os.fdopen(handle, "r+b", buffering=2**18)
 
     def append(self, came: float, weights: Tensor, rotations: Tensor) -> None:
-        """Adds a frame: when it came in seconds of any clock, weights (N,), rotations (9,).
-
-        Raises:
-            FileFormatError: the disk is full, but for what the files of the frames before need.
-        """
+        """Adds a frame: when it came in seconds of any clock, weights (N,), rotations (9,)."""
         if self.count % _LOOK == 0:
             self._check_room()
         if self.count == 0:
@@ -194,9 +190,6 @@ class Recordings:
         Args:
             place: whose files it replaces; a new one if absent.
             filmed: keep the camera's film too.
-
-        Raises:
-            FileFormatError: nothing can be written there.
         """
         self._place = place or self._next()
         self._begun.add(self._place)
@@ -205,12 +198,7 @@ class Recordings:
         return self._place
 
     def keep(self, name: str, rows: Tensor) -> None:
-        """Makes a take of rows (T,66): seconds, ARKit's weights, rotation and gaze.
-
-        Raises:
-            FileFormatError: nothing can be written.
-            ValueRangeError: they are no take's.
-        """
+        """Makes a take of rows (T,66): seconds, ARKit's weights, rotation and gaze."""
         if not len(rows) or not rows.isfinite().all() or not (rows[1:, 0] > rows[:-1, 0]).all():
             raise ValueRangeError("take: found times that do not rise, or no numbers, expected a take's rows")
         place = self._next()
@@ -227,11 +215,7 @@ class Recordings:
         return FrameLog(make_folder(place), ARKIT, columns)
 
     def add(self, came: float, frame: LiveFrame, picture: np.ndarray | None = None) -> None:
-        """Keeps a frame, if a take runs, and its picture, if it is filmed.
-
-        Raises:
-            FileFormatError: the disk is full.
-        """
+        """Keeps a frame, if a take runs, and its picture, if it is filmed."""
         if self._log is None:
             return
         if self._log.count == 0:

@@ -84,11 +84,7 @@ class TakeFilm:
 
 
 def solved_again(film: Path) -> Take:
-    """The take of a film, its head and all of its frames solved together, by ARKit's names.
-
-    Raises:
-        TorchfaceError: there is no face in it, or it cannot be read.
-    """
+    """The take of a film, its head and all of its frames solved together, by ARKit's names."""
     from torchface.workflows.track.track_files import LIVE_LINK  # a session needs nothing of tracking
     from torchface.workflows.track.track_inputs import TrackSettings
     from torchface.workflows.track.track_video import track_video

@@ -78,11 +78,7 @@ class WeightControls:
 
 
 def read_weight_settings(found: Mapping[str, object]) -> WeightSettings:
-    """Settings of a page's message.
-
-    Raises:
-        ValueRangeError: they are none.
-    """
+    """Settings of a page's message."""
     centre = found.get("centre")
     rotation = gaze = None
     if isinstance(centre, Mapping):

@@ -106,11 +106,7 @@ def register_scans(
 
 
 def load_shape_model(name_or_path: str | Path) -> MorphableModel | HeadModel:
-    """A model of heads by name or folder, see ``zoo.get_model``; or a file of others, of its own topology.
-
-    Raises:
-        NameMismatchError: there is none of this name, or it is of another kind.
-    """
+    """A model of heads by name or folder, see ``zoo.get_model``; or a file of others, of its own topology."""
     if is_head_model_file(name_or_path):
         return head_model_of(load_head_model_file(name_or_path))
     model = zoo.get_model(name_or_path)

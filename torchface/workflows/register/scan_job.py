@@ -76,11 +76,7 @@ class ScanJob:
         )
 
     def run(self, item: BatchItem, out: Path) -> Made:
-        """Registers a scan and writes ``NAME.glb``.
-
-        Raises:
-            TorchfaceError: it cannot be registered.
-        """
+        """Registers a scan and writes ``NAME.glb``."""
         points = None if self.landmarks is None else landmark_file(self.landmarks, item.path)
         registration, count = self._registered(item.path, points)
         record, result = registration.record, out / f"{item.name}.glb"

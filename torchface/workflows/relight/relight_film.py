@@ -73,11 +73,7 @@ class WantedLight:
 
     @staticmethod
     def parse(words: Sequence[str]) -> WantedLight:
-        """Of words such as ``azimuth=60``.
-
-        Raises:
-            ValueRangeError: another name, no number, or one out of range.
-        """
+        """Of words such as ``azimuth=60``."""
         bounds = {"azimuth": (-360, 360), "elevation": (-90, 90), "ambient": (0, 1)}
         names = tuple(WantedLight.__dataclass_fields__)
         found: dict[str, float] = {}
@@ -149,11 +145,6 @@ def relight_film(
 
     Returns:
         Lines for people to read.
-
-    Raises:
-        FileFormatError: a file is missing, damaged or of another kind.
-        ValueRangeError: film and track differ in length, or nothing is asked for.
-        AlignmentError: the film shows too little of the face for an estimate of its light.
 
     Source: thesis 4.2.11 and figure 80.
     """

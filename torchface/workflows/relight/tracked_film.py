@@ -63,10 +63,6 @@ def read_tracked_film(film: Path, track: Path, camera: Path | None = None) -> Tr
         film: a video.
         track: the folder.
         camera: the calibration with which it was tracked; needed where there was one.
-
-    Raises:
-        FileFormatError: the folder is not of ``torchface track``, or was tracked from a head that moves alone.
-        ValueRangeError: the film has another number of frames than the track, or the calibration is missing.
     """
     for name in (SUMMARY, LANDMARKS, ANIMATION):
         if not (track / name).is_file():

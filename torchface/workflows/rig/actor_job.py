@@ -52,11 +52,7 @@ class ActorJob:
         return content_key(_METHOD, files=files, own=replace(own, options=contents))
 
     def run(self, item: BatchItem, out: Path) -> Made:
-        """Makes a rig and writes ``NAME.glb`` and ``NAME_registration.png``.
-
-        Raises:
-            TorchfaceError: it cannot be made.
-        """
+        """Makes a rig and writes ``NAME.glb`` and ``NAME_registration.png``."""
         own, path = self._own(item), out / f"{item.name}.glb"
         done = rig_actor(item.path, own.template, path, own.landmarks, own.examples, own.detail, own.options)
         record = done.neutral.record

@@ -274,10 +274,6 @@ def load_expressions(name_or_path: str | Path, template: BlendshapeRig, path: Pa
         name_or_path: see ``zoo.get_model``.
         template: the rig.
         path: where the rig was read; None for the embedded performer.
-
-    Raises:
-        TopologyError: it has learned from meshes of another topology.
-        NameMismatchError: it is no such model, or has none of the template's shapes.
     """
     model = zoo.get_model(name_or_path, ExpressionRegression)
     wanted, named = template.neutral.fingerprint(), "the embedded performer" if path is None else str(path)

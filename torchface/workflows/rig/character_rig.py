@@ -101,10 +101,6 @@ def rig_character(
         progress: called with each step.
         inner_mouth: give it a bag, teeth, gums and a tongue where it has none; lips in one piece are cut apart.
         eyes: give it eyeballs where it has none; eyes in one piece with the skin are cut out.
-
-    Raises:
-        FileFormatError: another kind of file, or a broken one.
-        AlignmentError: no face, or one that the template does not come to lie on.
     """
     check_character(path)
     check_ending(out, path.suffix.lower())

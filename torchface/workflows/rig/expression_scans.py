@@ -51,12 +51,7 @@ class Expression:
 
 
 def weights_row(weights: dict[str, float], names: Sequence[str], where: str) -> Tensor:
-    """Weights (N,) of a rig's shapes from some of them by name, in any spelling that ``shape_names`` reads.
-
-    Raises:
-        NameMismatchError: a name that means no shape of the rig.
-        ValueRangeError: a weight outside [0,1].
-    """
+    """Weights (N,) of a rig's shapes from some of them by name, in any spelling that ``shape_names`` reads."""
     given = tuple(weights)
     matrix = mapping(given, names)
     unknown = [name for name, used in zip(given, matrix.any(0).tolist(), strict=True) if not used]

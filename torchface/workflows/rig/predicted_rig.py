@@ -73,10 +73,6 @@ def predict_rig(
         template: a rig; the embedded performer if absent.
         options: ``part``, ``unit`` and ``names`` are used.
         progress: called with each step and how far it is.
-
-    Raises:
-        TopologyError: head, template and regression have not the same topology.
-        NameMismatchError: the regression has none of the template's shapes, or ``expressions`` is no such model.
     """
     options, progress = options or RigOptions(), progress or silent
     check_out(out)

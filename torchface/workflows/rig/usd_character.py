@@ -33,11 +33,6 @@ def rig_usd_character(path: Path, out: Path, progress: Progress | None = None) -
         path: ``.usd``, ``.usda``, ``.usdc`` or ``.usdz``.
         out: of the same ending.
         progress: called with each step.
-
-    Raises:
-        FileFormatError: a broken file, or what cannot be edited.
-        AlignmentError: as of :func:`rig_character`.
-        MissingExtraError: usd-core is not installed.
     """
     check_ending(out, path.suffix.lower())
     scene = read_stage(path)

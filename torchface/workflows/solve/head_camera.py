@@ -81,10 +81,6 @@ def predicted_curves(
         take: whose frames are meant.
         names: of the rig's shapes.
         progress: called with each step and how far it is.
-
-    Raises:
-        NameMismatchError: the model is no classifier, or no table fits the rig.
-        TorchfaceError: the video or a file beside it cannot be used.
     """
     classifier = zoo.get_model(camera.classifier, ActionUnitClassifier)
     labels = load_action_labels(camera.labels or camera.video.with_suffix(".toml"))

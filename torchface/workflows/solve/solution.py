@@ -192,10 +192,6 @@ def solve_markers(
         settings: which of these steps.
         predicted: what a head camera saw, for the hybrid solve.
         progress: called with each step and how far it is.
-
-    Raises:
-        AlignmentError: the rig does not explain the markers, unless the settings insist.
-        TorchfaceError: take and attachment do not fit each other, or the settings do not fit the take.
     """
     progress = progress or silent
     whole = predicted is None and not settings.frame_by_frame

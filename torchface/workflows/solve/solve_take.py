@@ -61,12 +61,7 @@ def solve_take(
     settings: SolveSettings,
     progress: Progress | None = None,
 ) -> SolveReport:
-    """Reads, solves, writes; see ``torchface solve --help``.
-
-    Raises:
-        ValueRangeError: the take holds no markers.
-        TorchfaceError: any file is broken or does not fit the others.
-    """
+    """Reads, solves, writes; see ``torchface solve --help``."""
     progress = progress or silent
     outputs.check(outputs.report)
     if outputs.stream is not None:

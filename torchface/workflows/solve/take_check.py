@@ -70,12 +70,7 @@ class Coverage:
 
 
 def check_coverage(attachment: Attachment, take: Take, shapes: int, insist: bool = False) -> Coverage:
-    """Counts the attachment's markers in a take.
-
-    Raises:
-        NameMismatchError: they are too few for the rig's shapes, unless ``insist``.
-        AlignmentError: they lie on a line or in one spot.
-    """
+    """Counts the attachment's markers in a take."""
     assert take.markers is not None
     labels = attachment.labels or ()
     known = take.markers.select([name for name in take.markers.names if name in labels])
@@ -108,9 +103,6 @@ def check_explained(solver: MarkerSolver, take: Take, aligned: bool, slip: bool,
         aligned: the take was aligned with the rig.
         slip: the helmet's motion will be taken out.
         insist: refuse nothing.
-
-    Raises:
-        AlignmentError: hardly at all, unless ``insist``; the message says what is the likely cause.
     """
     assert take.markers is not None
     markers = solver.arrange(take.markers).double()
@@ -145,9 +137,6 @@ def check_head(rig: BlendshapeRig, attachment: Attachment, take: Take, insist: b
 
     Returns:
         Warnings where the residual of the take is that of another head.
-
-    Raises:
-        AlignmentError: the attachment was made for a head of another shape, unless ``insist``.
     """
     warnings = []
     distance = attachment.rest_distance(rig.neutral)

@@ -57,11 +57,7 @@ class TakeJob:
         )
 
     def run(self, item: BatchItem, out: Path) -> Made:
-        """Solves a take and writes ``NAME.csv``.
-
-        Raises:
-            TorchfaceError: it cannot be solved.
-        """
+        """Solves a take and writes ``NAME.csv``."""
         camera = None if self.camera is None else item.settings_of(self.camera)
         files = item.path_of(self.rig), item.path, item.path_of(self.attachment)
         inputs = TakeInputs(*files, self.part, camera, item.settings_of(self.options))

@@ -53,9 +53,6 @@ def stream_weights(
         address: where to and how; see :func:`torchface.io.open_sender`.
         clock, wait: what time it is, and to let it pass, in seconds.
         times: when each frame is due, seconds after the first; ``fps`` a second if absent.
-
-    Raises:
-        ValueRangeError: the address is none, or there was no frame.
     """
     sent: list[Tensor] = []
     latency: list[float] = []

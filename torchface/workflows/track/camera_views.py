@@ -54,11 +54,7 @@ class OtherCamera:
         return f"camera {film}, {beside:.0f} mm from the first, its film begins {self.begin:+.3f} s after the first's"
 
     def view(self, times: Tensor, out: Path, solver: VideoSolver, progress: Progress) -> CameraView:
-        """What it saw in the first one's frames, which are shown at ``times`` (T,) seconds.
-
-        Raises:
-            ValueRangeError: its film shows no face.
-        """
+        """What it saw in the first one's frames, which are shown at ``times`` (T,) seconds."""
         inputs, name = self.inputs, self.camera.name or self.inputs.clip.path.stem
         state = TrackState(out / "state" / name, inputs.reading_key)
         reading, _ = read_frames(inputs, state, lambda what, *count: progress(f"{name}: {what}", *count))
@@ -87,13 +83,7 @@ def _deviation(inputs: TrackInputs, solver: VideoSolver, reading: FaceReading) -
 
 
 def other_cameras(first: TrackInputs) -> tuple[TrackInputs, list[OtherCamera]]:
-    """The first film's inputs with its camera of the file, and the other cameras; none where no film is beside it.
-
-    Raises:
-        FileFormatError: the file of cameras is damaged.
-        ValueRangeError: not as many films as cameras, another aspect, a film that begins after the first one has
-            ended, or no rig of the actor's own, whose size the cameras would measure.
-    """
+    """The first film's inputs with its camera of the file, and the other cameras; none where no film is beside it."""
     settings = first.settings
     if not settings.beside and settings.cameras is None:
         return first, []

@@ -54,13 +54,7 @@ def mesh_drawer(tracked: Tracked) -> Callable[[int, Tensor], Tensor]:
 
 
 def paint_drawer(tracked: Tracked, texture: Path) -> Callable[[int, Tensor], Tensor]:
-    """Draws frame number t, uint8 (3,H,W), with paint on the face, lit as the video is.
-
-    Raises:
-        FileFormatError: the texture cannot be read.
-        TopologyError: the rig has no texture coordinates.
-        AlignmentError: the video shows too little of the face for an estimate of the light.
-    """
+    """Draws frame number t, uint8 (3,H,W), with paint on the face, lit as the video is."""
     rig = tracked.rig
     paint = FacePaint.of(rig.neutral, load_paint(texture))
     light = video_light(tracked) if tracked.light is None else tracked.light
@@ -80,9 +74,6 @@ def video_light(tracked: Tracked) -> PointLight:
 
     A rig without colours is taken to have skin of one colour: the light's direction is found all the same, its colour
     then holds what the skin differs by.
-
-    Raises:
-        AlignmentError: the frames show too little of the face.
     """
     rig, visible = tracked.rig, tracked.seen.nonzero()[:, 0]
     wanted = visible[torch.linspace(0, len(visible) - 1, min(_LIGHT_FRAMES, len(visible))).round().long()].tolist()
@@ -100,11 +91,7 @@ def video_light(tracked: Tracked) -> PointLight:
 def light_of(
     neutral: Mesh, frames: Tensor, vertices: Tensor, cameras: list[Camera], calibration: CameraCalibration
 ) -> PointLight:
-    """The light of frames (T,3,H,W) that show a mesh as vertices (T,V,3), beside its colours or skin of one colour.
-
-    Raises:
-        AlignmentError: the frames show too little of the face.
-    """
+    """The light of frames (T,3,H,W) that show a mesh as vertices (T,V,3), beside its colours or skin of one colour."""
     try:
         albedo = vertex_albedo(neutral)
     except ValueRangeError:

@@ -33,12 +33,7 @@ _COMPARED, _STEP = 5, 10  # frames of a table that are compared with pictures, a
 
 
 def read_frames(inputs: TrackInputs, state: TrackState, progress: Progress) -> tuple[FaceReading, int]:
-    """The face in all frames, (T,...), and how many faces the first frame shows; 0 where a table gives landmarks.
-
-    Raises:
-        FileFormatError: the video cannot be decoded.
-        ValueRangeError: no frame shows a face; or see :func:`given_reading`.
-    """
+    """The face in all frames, (T,...), and how many faces the first frame shows; 0 where a table gives landmarks."""
     clip, finder, faces = inputs.clip, inputs.models.finder, 0
     if finder is None:
         reading = given_reading(Path(inputs.settings.landmarks), clip)
@@ -85,10 +80,6 @@ def given_reading(path: Path, clip: VideoFile) -> FaceReading:
     Args:
         path: the table; see :func:`~torchface.io.landmarks.landmark_tables.load_landmark_table`.
         clip: the video that they are of.
-
-    Raises:
-        FileFormatError: no such table.
-        ValueRangeError: another number of frames than the video has, or landmarks outside of its pictures.
     """
     table = load_landmark_table(path)
     if len(table.points) != clip.count:

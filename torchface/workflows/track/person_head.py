@@ -58,9 +58,6 @@ def person_head(
         landmarks: smoothed, (T,68,2) pixels of a camera without distortion.
         reading: of the frames, (T,...): how far each landmark is trusted.
         progress: called with each step.
-
-    Raises:
-        ValueRangeError: no frame shows a face.
     """
     progress("solving the head")
     rig, clip, trust = inputs.actor, inputs.clip, reading.trust

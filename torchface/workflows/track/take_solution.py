@@ -98,12 +98,7 @@ def smoothed_landmarks(inputs: TrackInputs, reading: FaceReading, times: Tensor 
 
 
 def known_offsets(inputs: TrackInputs, out: Path) -> LandmarkOffsets | None:
-    """The offsets that the user gives, or those of this video in the folder of results; None where there are none.
-
-    Raises:
-        FileFormatError: what the user gives is no such file.
-        ValueRangeError: it is of another rig or finder.
-    """
+    """The offsets that the user gives, or those of this video in the folder of results; None where there are none."""
     if inputs.settings.offsets is not None:
         return offsets_of(inputs.settings.offsets, inputs)
     if not (out / OFFSETS).is_file():
@@ -116,12 +111,7 @@ def known_offsets(inputs: TrackInputs, out: Path) -> LandmarkOffsets | None:
 
 
 def offsets_of(path: Path, inputs: TrackInputs) -> LandmarkOffsets:
-    """A file's offsets, which must be this rig's and this finder's.
-
-    Raises:
-        FileFormatError: it is no such file.
-        ValueRangeError: they are another rig's or finder's.
-    """
+    """A file's offsets, which must be this rig's and this finder's."""
     offsets = LandmarkOffsets.load(path)
     offsets.require(_rig_digest(inputs.actor), _finder_digest(inputs), path)
     return offsets
@@ -130,11 +120,7 @@ def offsets_of(path: Path, inputs: TrackInputs) -> LandmarkOffsets:
 def new_offsets(
     inputs: TrackInputs, solver: VideoSolver, landmarks: Tensor, reading: FaceReading
 ) -> LandmarkOffsets | None:
-    """The offsets of a take's smoothed landmarks (T,68,2) and their reading (T,...); None where it is too short.
-
-    Raises:
-        ValueRangeError: the neutral frame is none of the take, or shows no face.
-    """
+    """The offsets of a take's smoothed landmarks (T,68,2) and their reading (T,...); None where it is too short."""
     read = None
     if inputs.models.expects and bool(torch.isfinite(reading.expression_deviation).any()):
         read = WeightReadings.of_expression(reading.expression, reading.expression_deviation, solver.names)
@@ -238,11 +224,7 @@ def new_solution(
     progress: Progress,
     measured: FaceMeasurements | None = None,
 ) -> VideoSolution:
-    """Weights and poses of smoothed landmarks (T,68,2), trusted (T,68).
-
-    Raises:
-        ValueRangeError: no frame shows enough of them; the message names the video or table.
-    """
+    """Weights and poses of smoothed landmarks (T,68,2), trusted (T,68)."""
     try:
         solution = solve_take(solver, landmarks, trust, times, inputs.settings.whole_take, progress, measured)
     except ValueRangeError as error:

@@ -144,14 +144,7 @@ class TrackInputs:
 
 
 def load_inputs(video: Path | None, rig: Path | None, settings: TrackSettings) -> TrackInputs:
-    """Reads and checks everything; warns of a video of variable frame rate. Without a rig anybody is tracked.
-
-    Raises:
-        FileFormatError: the video or another file cannot be read.
-        ValueRangeError: neither video nor table; the rig has no 68 landmarks; the calibration is of another aspect; or
-            the take is too short for the dynamics prior.
-        NameMismatchError: a model is missing, or a prior has learned other shapes than the rig has.
-    """
+    """Reads and checks everything; warns of a video of variable frame rate. Without a rig anybody is tracked."""
     clip, times, rate_varies = with_times(_clip(video, settings))
     if rig is None or settings.anybody:
         named = NamedHeads.of(settings.heads)
@@ -182,11 +175,7 @@ def with_times(clip: VideoFile) -> tuple[VideoFile, Tensor | None, str]:
 
 
 def inputs_of(clip: VideoFile, actor: BlendshapeRig, settings: TrackSettings) -> TrackInputs:
-    """The inputs of a video or a camera that is open: its calibration, and models for its frame rate.
-
-    Raises:
-        See :func:`load_inputs`.
-    """
+    """The inputs of a video or a camera that is open: its calibration, and models for its frame rate."""
     calibration = _calibration(clip, settings.camera)
     models = load_track_models(
         actor, settings.landmarks, settings.appearance, settings.prior, settings.dynamics, clip.fps
@@ -195,12 +184,7 @@ def inputs_of(clip: VideoFile, actor: BlendshapeRig, settings: TrackSettings) ->
 
 
 def load_actor(rig: Path, part: str | None) -> BlendshapeRig:
-    """The actor's rig, with its 68 landmarks.
-
-    Raises:
-        ValueRangeError: it has no such landmarks.
-        TorchfaceError: it cannot be read.
-    """
+    """The actor's rig, with its 68 landmarks."""
     actor = load_rig(rig, part=part)
     notes = actor.neutral.annotations
     count = 0 if notes is None or notes.landmarks is None else len(notes.landmarks)

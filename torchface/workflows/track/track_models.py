@@ -86,13 +86,6 @@ def load_track_models(
         landmarks, appearance, prior, dynamics: the models; for landmarks also a table of them; ``prior`` may be "none".
             The prior by default is left out where it has learned less than half of the rig's shapes.
         fps: frames a second of the video, to which the dynamics prior is brought; its own if absent.
-
-    Raises:
-        NameMismatchError: there is none of a name, one is of another kind, or a prior has learned less than half of
-            the rig's shapes.
-        ValueRangeError: trees find other landmarks than the 68, or the dynamics prior is of a frame rate more than
-            eight times as high or as low.
-        FileFormatError: a model is damaged.
     """
     named = None if is_table(landmarks) else load_finder(landmarks)
     priors = load_priors(rig, prior, dynamics, fps)
@@ -124,9 +117,6 @@ class FittedPriors:
 def identity_modes() -> torch.Tensor:
     """What a standard deviation of each of K ways of being another person adds to the 68 landmarks, (K,68,3), of the
     zoo's model of heads.
-
-    Raises:
-        NameMismatchError: that is another kind of model.
     """
     heads = zoo.get_model(HEADS, HeadModel)
     if heads.landmarks is None:

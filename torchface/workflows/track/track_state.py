@@ -63,11 +63,7 @@ class TrackState:
         return torch.where(looks.any(1, keepdim=True), looks / looks.norm(dim=1, keepdim=True), torch.nan)
 
     def append(self, piece: FaceReading, looks: Tensor, memory: Tensor) -> None:
-        """Keeps the reading of the next frames (T,...), their looks (T,C), and the tracker's memory after them.
-
-        Raises:
-            FileFormatError: the folder cannot be written to.
-        """
+        """Keeps the reading of the next frames (T,...), their looks (T,C), and the tracker's memory after them."""
         make_folder(self.folder)
         self.memory = memory
         # A byte a number is enough for a correlation.

@@ -66,13 +66,6 @@ def track_video(
 
     A run killed at any moment leaves complete files only. Started again, it goes on behind the landmarks that it had,
     and makes anew what depends on something that has changed.
-
-    Raises:
-        FileFormatError: the video cannot be decoded, changes its size or repeats times of frames; or another file is
-            broken.
-        ValueRangeError: there is no face in the video, the rig has no 68 landmarks, the take is too short for the
-            dynamics prior, or the offsets are another rig's or finder's; or another run is writing into ``out``.
-        NameMismatchError: a model is missing, or a prior has learned other shapes than the rig has.
     """
     progress = progress or silent
     with within_job(out):

@@ -40,11 +40,7 @@ class VideoJob:
         return content_key(_METHOD, video=item.path, rig=job.rig, settings=job.settings, **contents)
 
     def run(self, item: BatchItem, out: Path) -> Made:
-        """Tracks a video and writes the folder ``NAME``.
-
-        Raises:
-            TorchfaceError: it cannot be tracked.
-        """
+        """Tracks a video and writes the folder ``NAME``."""
         job, folder = item.settings_of(self), out / item.name
         done = track_video(item.path, job.rig, folder, job.settings)
         page = write_track_page(done, folder)

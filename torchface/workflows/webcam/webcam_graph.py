@@ -32,11 +32,7 @@ _CODE = ("onnx", "capture", "landmarks/images", "synthetic/head")  # whose code 
 
 
 def webcam_networks() -> WebcamNetworks:
-    """The zoo's.
-
-    Raises:
-        NameMismatchError: one of them is another kind of model.
-    """
+    """The zoo's."""
     boxes, landmarks, eyes = NETWORKS
     return WebcamNetworks(
         zoo.get_model(boxes, BoxNetwork), zoo.get_model(landmarks, LandmarkNetwork), zoo.get_model(eyes, EyeNetwork)
@@ -44,11 +40,7 @@ def webcam_networks() -> WebcamNetworks:
 
 
 def webcam_module() -> WebcamGraph:
-    """What the graph is exported from.
-
-    Raises:
-        NameMismatchError: a model of the zoo is of another kind.
-    """
+    """What the graph is exported from."""
     return WebcamGraph(FaceReader(webcam_networks()), WebcamSolverGraph(default_webcam_solver()))
 
 
@@ -82,11 +74,7 @@ def default_webcam_solver(settings: WebcamSettings | None = None) -> WebcamSolve
 
 
 def webcam_solver(expects: bool, settings: WebcamSettings | None = None) -> WebcamSolver:
-    """The same, without the prior where a finder reads which weights are to be expected.
-
-    Raises:
-        NameMismatchError: the zoo's model of heads is another kind of model.
-    """
+    """The same, without the prior where a finder reads which weights are to be expected."""
     rig = performer(texture=False)
     heads = zoo.get_model(HEADS, HeadModel)
     if heads.landmarks is None:

@@ -22,11 +22,7 @@ _DECIMALS = 4
 
 
 def is_examples(path: str | Path) -> bool:
-    """Whether a JSON file says that it holds examples.
-
-    Raises:
-        FileFormatError: the file is missing, too large or no JSON.
-    """
+    """Whether a JSON file says that it holds examples."""
     document = read_json(path, max_bytes=_MAX_BYTES)
     return isinstance(document.found, dict) and document.found.get("format") == _FORMAT
 

@@ -33,10 +33,6 @@ def check_sites(
         off_skin: distance of each marker from its site that lasts over the take, (M,), millimetres.
         radius: of the sites at rest, mean distance from their centre, millimetres.
         uncertainty: of sites and shapes.
-
-    Raises:
-        AlignmentError: markers stay far from the skin: all or most of them, or some.
-        ValueRangeError: most sites, or most shapes that the markers see, are uncertain.
     """
     typical, offset, limit = float(error.median()), float(off_skin.median()), DOUBTFUL_SHARE * radius
     if not typical <= limit:

@@ -164,13 +164,7 @@ def check_attachment(fit: AttachmentFit, rig: BlendshapeRig) -> None:
 
 
 def marker_paths(take: Take, attachment: Attachment) -> Tensor:
-    """A take's markers in the order of an attachment, (T,M,3), float64.
-
-    Raises:
-        NameMismatchError: the take has no markers, or one that the attachment does not know.
-        ValueRangeError: a marker of the attachment is seen in no frame, or a coordinate is infinite.
-        AlignmentError: the markers lie on a line, so no pose is determined.
-    """
+    """A take's markers in the order of an attachment, (T,M,3), float64."""
     track = take.markers
     labels = tuple(attachment.labels or ())
     check_labels(() if track is None else track.names, labels)

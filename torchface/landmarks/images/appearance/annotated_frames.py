@@ -31,12 +31,7 @@ class AnnotatedFrame:
 
 
 def load_annotated_frames(folder: str | Path) -> list[AnnotatedFrame]:
-    """Every image of a folder that has a ``.pts`` beside it, by name.
-
-    Raises:
-        FileFormatError: no such folder, none in it, or a file that cannot be read.
-        ShapeError: other than 68 landmarks.
-    """
+    """Every image of a folder that has a ``.pts`` beside it, by name."""
     folder = Path(folder)
     if not folder.is_dir():
         raise FileFormatError(f"{folder}: found no such folder, expected one with images and .pts files")
@@ -55,12 +50,7 @@ def load_annotated_frames(folder: str | Path) -> list[AnnotatedFrame]:
 
 
 def save_annotated_frame(frame: AnnotatedFrame, folder: str | Path) -> Path:
-    """Writes ``name.png`` if there is none, then ``name.pts``; returns the latter's path.
-
-    Raises:
-        FileFormatError: the folder cannot be written to.
-        ValueRangeError: a landmark is NaN.
-    """
+    """Writes ``name.png`` if there is none, then ``name.pts``; returns the latter's path."""
     folder = Path(folder)
     image_path, points = folder / f"{frame.name}.png", folder / f"{frame.name}.pts"
     with made_folder(folder), all_or_none():

@@ -36,10 +36,6 @@ class LiteNetwork:
         content: the file's bytes.
         name: what messages call it.
         given, wanted: shapes of the input and of outputs.
-
-    Raises:
-        FileFormatError: it is no such network, has other inputs or outputs, or takes too much memory.
-        MissingExtraError: LiteRT is not installed.
     """
 
     def __init__(self, content: bytes, name: str, given: tuple[int, ...], wanted: tuple[tuple[int, ...], ...]) -> None:
@@ -63,11 +59,7 @@ class LiteNetwork:
         self._outputs = [outputs[row]["index"] for row in rows]
 
     def __call__(self, values: np.ndarray) -> tuple[np.ndarray, ...]:
-        """The outputs of float32 values of the input's shape.
-
-        Raises:
-            FileFormatError: the network cannot be run, or gives what is not finite.
-        """
+        """The outputs of float32 values of the input's shape."""
         self._interpreter.set_tensor(self._input, values)
         try:
             self._interpreter.invoke()
@@ -95,12 +87,7 @@ class LandmarkerBundle:
 
 
 def load_bundle(path: str | Path) -> LandmarkerBundle:
-    """Reads a bundle; nothing is unpacked but its networks, and nothing larger than they may be.
-
-    Raises:
-        FileFormatError: it is no zip, damaged, or has not the three networks once each.
-        MissingExtraError: LiteRT is not installed.
-    """
+    """Reads a bundle; nothing is unpacked but its networks, and nothing larger than they may be."""
     path = Path(path)
     content = read_file(path, _MAX_BYTES)
     try:

@@ -26,9 +26,6 @@ class AnsweringProcess:
         error: what is raised where it fails.
         environment: of the process; this one's if absent.
         folder: where it runs; this one's if absent.
-
-    Raises:
-        OSError: it cannot be started.
     """
 
     def __init__(
@@ -65,11 +62,7 @@ class AnsweringProcess:
             self._late.cancel()
 
     def send(self, content: bytes) -> None:
-        """Hands it a request.
-
-        Raises:
-            TorchfaceError: of the class ``error``: it has ended.
-        """
+        """Hands it a request."""
         pipe = self._open(self._process.stdin)
         try:
             pipe.write(content)
@@ -78,11 +71,7 @@ class AnsweringProcess:
             raise self._broken("has ended") from error
 
     def receive(self, count: int, what: str = "has ended in the midst of an answer") -> bytes:
-        """The next bytes of an answer.
-
-        Raises:
-            TorchfaceError: of the class ``error``: it has ended, in words ``what``, or was killed at the time limit.
-        """
+        """The next bytes of an answer."""
         content = self._open(self._process.stdout).read(count)
         if len(content) < count:
             raise self._broken(what)

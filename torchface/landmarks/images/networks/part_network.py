@@ -91,11 +91,7 @@ class PartNetwork(PictureNetwork):
         return cls(*(tuple(one.whole() for one in given[name].rows()) for name in ("channels", "blocks")))
 
     def forward(self, crops: Tensor) -> Tensor:
-        """Shares (B,10,H,W) of the parts in crops (B,3,H,W) in [0,1], red first; it has learned from 128 x 128.
-
-        Raises:
-            ShapeError: another shape, or sides that are no multiples of 16.
-        """
+        """Shares (B,10,H,W) of the parts in crops (B,3,H,W) in [0,1], red first; it has learned from 128 x 128."""
         if crops.ndim != 4 or crops.shape[1] != 3 or any(side % 16 or side < 16 for side in crops.shape[2:]):
             raise ShapeError(f"crops: found {tuple(crops.shape)}, expected (B,3,H,W), sides multiples of 16")
         return self.logits(crops).softmax(1)

@@ -43,9 +43,6 @@ class PictureNetwork(nn.Module):
 
         Returns:
             The running mean of the weights, in evaluation mode, on the CPU.
-
-        Raises:
-            ShapeError: no picture, or other shapes.
         """
         settings = settings or cls._usual_settings()
         network = network or cls.drawn(settings.seed)

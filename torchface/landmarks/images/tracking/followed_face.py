@@ -57,11 +57,7 @@ class FollowedFace:
 
     @classmethod
     def unpack(cls, packed: Tensor) -> FollowedFace:
-        """What :meth:`pack` packed.
-
-        Raises:
-            ShapeError: not (1212,).
-        """
+        """What :meth:`pack` packed."""
         if packed.shape != (MEMORY,):
             raise ShapeError(f"resume: found a memory of {tuple(packed.shape)}, expected ({MEMORY},)")
         *parts, counts = packed.float().split([5, 3, _LOOK, 4])
