@@ -199,7 +199,7 @@ def _shape_rotations(joints: HeadJoints, rig: BlendshapeRig) -> Tensor:
 
 
 def save_parameters(parameters: HeadParameters, joints: HeadJoints | None, fps: float, path: Path) -> None:
-    """Writes ``.npz``: ``exp``, ``fps``, and of models with joints ``jaw`` and ``eyes``, as FLAME's readers take them."""
+    """Writes ``.npz``: ``exp``, ``fps``, of models with joints ``jaw`` and ``eyes``, as FLAME's readers take them."""
     arrays = {"exp": parameters.expressions.numpy(), "fps": np.array(fps, np.float32)}
     if joints is not None and parameters.rotations is not None:
         arrays["pose"] = parameters.rotations.flatten(1).numpy()
