@@ -250,7 +250,6 @@ def submesh(mesh: Mesh, keep: Tensor) -> Submesh:
     """The part of a mesh whose vertices are kept; a face stays when all its corners do.
 
     Args:
-        mesh: the whole.
         keep: a boolean mask (V,) or vertex ids (K,) int64; order of the whole is kept.
 
     Example:

@@ -37,9 +37,7 @@ def checked_number(
     Args:
         name: of the argument, setting or field; begins the message.
         value: an ``int``, a ``float``, one of numpy's, or a tensor of one number.
-        least, most: the range.
         above: the range is open at ``least``.
-        error: what is raised.
 
     Example:
         >>> checked_number("ridge", 0.5)
@@ -77,7 +75,6 @@ def as_tensor(name: str, value: object, expected: str, dtype: torch.dtype | None
 
     Args:
         name: of the argument; begins the message.
-        value: what was given.
         expected: the shape, such as ``(B,N)``.
         dtype: of what is converted; NumPy's own, and torch's default of lists, if absent.
 

@@ -244,7 +244,6 @@ def _merged_correctives(correctives: Correctives, renamed: Mapping[str, str]) ->
     the sum of what all of them showed there.
 
     Args:
-        correctives: of the rig before.
         renamed: for each shape what it is called afterwards; a shape that is not in it keeps its name.
     """
     groups: dict[tuple[str, ...], list[int]] = {}

@@ -19,9 +19,7 @@ def retimed_moments(model: EnhancementModel, features: Tensor, fps: float) -> Te
     """Which moment of an animation each region shows in each frame, (R,T), in frames, never falling.
 
     Args:
-        model: of the actor.
         features: of the animation's frames, (T,P,9).
-        fps: of the animation.
     """
     prepared = model.prepared
     weights = prepared.patch_weights

@@ -123,7 +123,6 @@ class LearnedFrames:
     Args:
         features: of every frame, (K,P,9).
         motion: mean displacements of the patches' smooth part, (K,P,3), millimetres.
-        basis: of the details.
     """
 
     features: Tensor

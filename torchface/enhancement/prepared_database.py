@@ -103,7 +103,6 @@ class PreparedDatabase:
         sequences: the number of each frame's sequence, (K,) int64.
         features: of the frames' patches, (K,P,9).
         coefficients: of the frames' details, (K,r).
-        regions: of the face.
         settings: how frames are split and detail is found.
         weights: of the actor's rig in the frames, (K,N), where they are known.
         weight_terms: of the map from them, (R,3), see ``WeightMap``.

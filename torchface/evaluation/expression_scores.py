@@ -78,7 +78,6 @@ class ExpressionScore:
         restless: shapes that are never below 0.05 though the truth rests, (52,) bool.
         lag: milliseconds by which weights come late.
         jitter: of weights where the truth rests, as :func:`~torchface.evaluation.weight_jitter` has it.
-        blinks: counted.
         both: share of frames with antagonists both above 0.1, which the truth does not have.
     """
 
@@ -222,11 +221,7 @@ def _meets(one: tuple[int, int], other: tuple[int, int]) -> bool:
 
 @dataclass(frozen=True, eq=False)
 class MethodScore:
-    """A method's scores over films.
-
-    Args:
-        films: by name.
-    """
+    """A method's scores over films."""
 
     films: dict[str, ExpressionScore]
 

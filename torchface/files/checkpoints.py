@@ -22,7 +22,6 @@ def write_checkpoint(path: Path, tensors: Mapping[str, Tensor], key: str) -> Non
 
     Args:
         path: of the file; its folder must be there.
-        tensors: by name.
         key: of what the tensors were made of, see :func:`~torchface.files.content_keys.content_key`.
     """
     packed = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}

@@ -117,7 +117,6 @@ class Value:
 
         Args:
             shape: the size of each axis, None where any will do.
-            dtype: of the tensor.
             expected: for the error; the shape if absent.
         """
         whole = not dtype.is_floating_point
@@ -142,7 +141,6 @@ def read_json(path: str | Path, marker: str | None = None, max_bytes: int = _MAX
     """The document of a JSON file.
 
     Args:
-        path: of the file.
         marker: what its field ``format`` must be.
         max_bytes: a larger file is refused.
     """

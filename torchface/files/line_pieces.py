@@ -17,8 +17,6 @@ def line_pieces(
     """The text between two places, in pieces that end where a line does.
 
     Args:
-        path: names the file in errors.
-        data: the whole text.
         start: where to begin.
         end: where to stop; the end of the text if absent.
         unread: beginnings of lines that nobody reads: those of any length are left out.

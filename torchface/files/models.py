@@ -29,14 +29,11 @@ class ModelRecord:
     """What is known of a saved model without loading it.
 
     Args:
-        kind: which class it is of.
         licence: under which it may be used, such as ``MIT``.
-        data: what it has learned from.
         metrics: what was measured on data held out.
         recipe: the command that makes it again.
         url: where it comes from.
         settings: of the recipe, the effective ones.
-        sha256: of the state.
         size: of the state, bytes.
         config: what its class is built from.
     """

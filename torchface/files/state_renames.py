@@ -40,7 +40,6 @@ def current_state_keys(kind: str, stored: Collection[str], expected: Collection[
 
     Args:
         kind: of the model, a key of :data:`STATE_RENAMES`.
-        stored: keys of the file.
         expected: keys of the module's own state.
 
     Returns:

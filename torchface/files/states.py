@@ -53,7 +53,6 @@ def read_state(
     """A state in the shapes and types of ``expected``, and the bytes it came from.
 
     Args:
-        path: of the file.
         expected: the module's own state; tensors on the meta device will do.
         size: how many bytes the file should have.
         kind: of the model, for keys that were renamed; see ``state_renames``.

@@ -35,7 +35,6 @@ def new_temporary(path: Path, mode: int = 0o666) -> tuple[int, Path]:
     """A new file under a temporary name beside ``path``, open for reading and writing.
 
     Args:
-        path: of what it will become.
         mode: permissions, of which the process's umask takes its part.
 
     Returns:

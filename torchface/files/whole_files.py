@@ -59,9 +59,6 @@ def replaced_file(path: str | Path) -> Iterator[Path]:
     Before it does it is on the disk. An error in the block, or a process that is killed, leaves what was there before.
     A file that is replaced hands on its permissions; a link in the place of ``path`` is replaced and not followed.
 
-    Args:
-        path: of the file.
-
     Returns:
         The temporary path: an empty file beside ``path``.
     """
@@ -142,7 +139,6 @@ def check_ending(path: str | Path, *endings: str) -> None:
     """Refuses a file whose name does not end as what is written into it.
 
     Args:
-        path: of the file.
         endings: those that it may have, with their dots, lower case; upper case will do, too.
 
     Example:

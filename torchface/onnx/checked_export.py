@@ -21,7 +21,6 @@ class WrittenGraph:
     """A graph's file.
 
     Args:
-        path: the file.
         size: in bytes.
     """
 
@@ -66,11 +65,9 @@ def write_checked(
     """Runs a graph on cases of different batch sizes and writes it if it agrees.
 
     Args:
-        model: the graph.
         path: the file to write; it appears only when it is complete and checked.
         cases: inputs by name, and the outputs that PyTorch gives for them.
         allowed: by output, how far apart the two may be.
-        units: of the outputs.
     """
     content = model.SerializeToString()
     session = one_thread_session(content)

@@ -30,7 +30,6 @@ class CorrectiveGraph(nn.Module):
 
     Args:
         solver: the exact solve, of a rig with correctives.
-        steps: of Gauss-Newton.
     """
 
     def __init__(self, solver: MarkerSolver, steps: int = STEPS) -> None:

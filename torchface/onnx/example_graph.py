@@ -37,7 +37,6 @@ class ExampleGraph(nn.Module):
     Args:
         solver: with landmark boxes, of squared distances or of a landmark model; or of squared distances all at once
             with the similarity solved for.
-        steps: of splitting.
     """
 
     neutral: Tensor

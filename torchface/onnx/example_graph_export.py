@@ -32,8 +32,6 @@ class ExampleGap:
     """How far the graph is from the exact solve, on the frames that it was checked with.
 
     Args:
-        frames: what they were.
-        mean, worst: difference of a weight.
         error: mean distance of landmarks over the eyes', percent: the graph's and the exact solve's.
     """
 

@@ -36,7 +36,6 @@ def exported_model(
 
     Args:
         module: of the inputs in their order.
-        inputs: examples by name.
         outputs: names of what the module returns.
         metadata: values that are not text become JSON.
         sizes: names of the first axes of inputs, which may then have any size, None for one that keeps the example's;

@@ -30,7 +30,6 @@ def export_expression_regression(
 
     Args:
         model: in float32.
-        path: the file to write.
         facts: further metadata, such as licence and data.
     """
     if model.form != "offsets":

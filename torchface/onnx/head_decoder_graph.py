@@ -27,7 +27,6 @@ def export_head_decoder(model: HeadModel, path: str | Path, facts: Mapping[str, 
 
     Args:
         model: in float32.
-        path: the file to write.
         facts: further metadata, such as licence and data.
     """
     graph = head_decoder_model(model, facts)

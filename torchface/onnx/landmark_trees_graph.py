@@ -89,10 +89,7 @@ def export_landmark_trees(
     It gives ``landmarks`` (B,L,2), pixels, x right and y down; a box that is not finite gives NaN.
 
     Args:
-        model: what to export.
-        path: the file to write.
         facts: further metadata, such as licence and data.
-        pixels: of the image.
     """
     generator = torch.Generator().manual_seed(0)
     cases = []

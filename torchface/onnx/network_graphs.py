@@ -32,11 +32,9 @@ class _Form:
     """The graph of a network.
 
     Args:
-        images: the input's name.
         sizes: names of the input's axes that may have any size.
         example: an input, 2 images or more.
         parity: by output, how far ONNX Runtime may be from PyTorch.
-        metadata: what the graph is for.
     """
 
     images: str
@@ -89,8 +87,6 @@ def export_network(network: ImageNetwork, path: str | Path, facts: Mapping[str, 
     Images are red, green, blue in [0,1]. Weights of the first three are stored in half precision.
 
     Args:
-        network: what to export.
-        path: the file to write.
         facts: further metadata, such as licence and data.
     """
     form, cases = _form(network.eval()), []

@@ -47,7 +47,6 @@ class SolverGap:
 
     Args:
         missing: share of markers missing.
-        worst, median: over the frames.
         parity: largest difference of a weight between ONNX Runtime and the same graph in PyTorch.
         rounding: the same between PyTorch in single and in double precision: what shapes that the markers hardly see
             owe to rounding alone.

@@ -133,8 +133,6 @@ def export_landmark_bank(
     ``landmark_names`` and ``appearance``.
 
     Args:
-        detector: with what it has learned.
-        path: the file to write.
         facts: further metadata, such as licence and data.
         images: to check with; cloudy noise if absent.
     """

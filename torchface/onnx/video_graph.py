@@ -243,11 +243,7 @@ def _where(condition: Tensor, one: HeadState, other: HeadState) -> HeadState:
 
 
 class GaussNewtonStep(nn.Module):
-    r"""Moves weights and pose toward the least of ``VideoSolver.energy`` linearised where they are, weights in [0,1].
-
-    Args:
-        solver: the exact solve.
-    """
+    r"""Moves weights and pose to the least of ``VideoSolver.energy`` linearised where they are, weights in [0,1]."""
 
     upper: Tensor
 

@@ -148,8 +148,6 @@ def fixed_loop(step: Callable[..., tuple[Tensor, ...]], count: int, carried: tup
 
     Args:
         step: takes tensors and gives as many of the same shapes.
-        count: of calls.
-        carried: what the first takes.
 
     Example:
         >>> fixed_loop(lambda x, y: (y, x + y), 5, (torch.tensor(0), torch.tensor(1)))

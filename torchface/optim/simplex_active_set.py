@@ -82,7 +82,6 @@ def solve_simplex(problems: SimplexProblems, start: Mixture) -> Tensor:
     part, it always lowers the energy, so no set comes twice.
 
     Args:
-        problems: any number of them.
         start: points of the simplex; their positive variables take part first.
     """
     variables = problems.f.shape[1]

@@ -46,7 +46,6 @@ class Cover:
     Args:
         template: with 68 annotated landmarks.
         exposed: ids of the vertices that look for a place on the scan.
-        surface: the scan.
         colors: of the scan; without them only ears are judged.
     """
 

@@ -109,11 +109,8 @@ def fit_to_scan(
     explain it misses by patches, not by vertices: however many there are, a square of :math:`\ell` = 20 mm counts once.
 
     Args:
-        model: mean and modes.
-        faces: of the template.
         start: the template aligned with the scan, (V,3) float64.
         exposed: vertices that look for a correspondence, ids.
-        scan: the surface.
         landmarks: template vertices (L,) and where they belong (L,3) float64; none of them is needed.
         largest_angle: between the normals of a correspondence, degrees.
 

@@ -69,7 +69,6 @@ def vertex_colors(source: ScanColors, nearest: SurfacePoints, trusted: Tensor) -
     """Colours (V,3) of the registered mesh's vertices; one that the scan does not show has its nearest neighbour's.
 
     Args:
-        source: the scan.
         nearest: of each vertex.
         trusted: which vertices lie on the scan, (V,) bool.
     """
@@ -122,7 +121,6 @@ def resampled_texture(mesh: Mesh, colors: Tensor, shown: Tensor, source: ScanCol
         mesh: registered, with texture coordinates.
         colors: of its vertices, (V,3).
         shown: how much of the colour is the scan's, (V,) in [0,1].
-        source: the scan.
         size: texels a side.
     """
     if mesh.uvs is None or mesh.uv_faces is None:

@@ -70,7 +70,6 @@ def shown_in(
 
     Args:
         image: the photograph, in the camera's size.
-        camera: that took it.
         caster: the mesh that the points lie on, which hides some of them.
         points: millimetres.
         normals: unit.

@@ -33,7 +33,6 @@ class Footprint:
         points: in the camera's frame, (S,3), millimetres.
         normals: there, unit, smooth, (S,3).
         caster: the mesh in the camera's frame.
-        height, width: of the image.
     """
 
     pixel: Tensor
@@ -98,7 +97,6 @@ def footprint(
         vertices: (V,3), millimetres.
         faces: (F,3) int64; all of them hide what is behind them.
         shows: the triangles wanted, (F,) bool.
-        camera: of the image.
         calibration: of a lens that bends the image; rays are bent with it, so that nothing has to be warped.
     """
     points = in_camera_frame(camera, vertices)

@@ -97,8 +97,6 @@ def lit_by(position: Tensor, caster: RayCaster, points: Tensor, normals: Tensor)
 
     Args:
         position: in the frame of the points, millimetres.
-        caster: the mesh that casts shadows.
-        points: on it.
         normals: unit.
     """
     toward = torch.nn.functional.normalize(position.double() - points.double(), dim=-1)

@@ -85,7 +85,6 @@ class QuickClay:
 
         Args:
             vertices: (V,3), millimetres.
-            camera: of the image.
             tint: how far each vertex is marked, (V,) in [0,1]; none if absent.
         """
         image = np.empty((camera.height, camera.width, 3), np.uint8)

@@ -59,7 +59,6 @@ class FacePaint:
         """Paint of an image in the mesh's texture coordinates.
 
         Args:
-            mesh: with texture coordinates.
             texture: red, green, blue (sRGB) and alpha, (4,h,w), uint8 or in [0,1], first row on top; alpha 0 leaves
                 the video as it is.
         """
@@ -114,7 +113,6 @@ def overlay(
         vertices: of the face in it, (V,3), millimetres.
         paint: see :meth:`FacePaint.of`.
         light: as ``estimate_light`` finds it; its strengths belong to an albedo that the paint replaces.
-        camera: of the frame.
         calibration: of a lens that bends the frame; paint is bent with it.
         share: how far each vertex is painted, (V,) in [0,1]; all of it if absent.
 
@@ -159,10 +157,7 @@ def relight(
     Args:
         frame: (3,H,W) sRGB, uint8 or in [0,1].
         vertices: of the face in it, (V,3), millimetres.
-        mesh: its topology.
         light: of the frame, as ``estimate_light`` finds it.
-        new_light: wanted instead.
-        camera: of the frame.
         calibration: of a lens that bends the frame.
         share: how far each vertex is relit, (V,) in [0,1]; fade it out where hair or collar begins. All of it if
             absent.

@@ -41,7 +41,6 @@ class TexturedSurface:
         faces: (F,3) int64.
         uvs: (V,2), origin at the lower left.
         material: which of the materials each triangle has, (F,) int64.
-        materials: all.
 
     Example:
         >>> from torchface.geometry.cameras.pinhole import look_at
@@ -65,7 +64,6 @@ class TexturedSurface:
         """A picture of the surface, a ray a pixel.
 
         Args:
-            camera: sees it.
             plain: in clay, where textures cannot be read.
             side: where the light stands above the camera: -1 to its left, 1 to its right.
         """

@@ -109,10 +109,7 @@ def one_euro_step(
     """The next filtered values (...) and their speeds (...), a second; see :class:`OneEuroFilter`.
 
     Args:
-        values: of this frame.
-        before, speed: filtered, of the frame before.
         interval: seconds since then.
-        settings: cutoffs.
         unit: what counts as much as a value of 1, of each channel.
         opening: factor of the cutoff of the values.
     """

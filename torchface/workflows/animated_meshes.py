@@ -38,7 +38,6 @@ class AnimatedMesh:
     Args:
         path: where it came from.
         neutral: its topology and annotations; at rest where it came with a rig, else as in its first frame.
-        count: of frames.
         read: vertices (t,V,3) of the frames from one number up to another, without it; NaN where a frame has none.
         fps: frames a second, where that is known.
         weights: what moves it, where that is known.

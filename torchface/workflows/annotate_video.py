@@ -49,7 +49,6 @@ def prepare_annotation(video: Path, folder: Path, track: Tracker, count: int = 1
     More frames asked for later hold the earlier ones.
 
     Args:
-        video: the file.
         folder: made if missing.
         track: finds the landmarks; called only where it must be.
         count: how many frames.

@@ -28,7 +28,6 @@ def cached_file(kind: str, ending: str, make: Callable[[], bytes], code: Sequenc
 
     Args:
         kind: of the file, a plain name.
-        ending: of its name.
         make: makes it, in seconds to a minute.
         code: folders of this package whose code says what becomes of the models.
         models: what the file is made of, as :func:`~torchface.files.content_keys.content_key` takes it.

@@ -80,13 +80,11 @@ class CalibrationReport:
     """A camera, and what it rests on.
 
     Args:
-        calibration: the camera.
         used: names of the images used.
         errors: reprojection of each, root mean square, (M,), pixels.
         left_out: names of the others, and why.
         focal_deviation: standard deviation of the focal length, relative to it.
         tilt: the largest angle between the boards of two views, degrees.
-        overlay_path: the overlay written.
     """
 
     calibration: CameraCalibration
@@ -119,7 +117,6 @@ def calibrate(paths: Sequence[Path], board: Board, out: Path, progress: Progress
 
     Args:
         paths: image files of one size, or one video.
-        board: the checkerboard.
         out: the ``.toml`` to write; beside it an image of the corners found, and of views without distortion.
         progress: called with each step and how far it is.
 
@@ -209,7 +206,6 @@ def find_boards(
 
     Args:
         images: names and images, uint8 (H,W), of one size.
-        board: the checkerboard.
         progress: called with the number of images done.
     """
     views: list[View] = []
@@ -263,7 +259,6 @@ def calibrate_views(views: Sequence[View], board: Board, left_out: Sequence[tupl
 
     Args:
         views: with the board, of one size.
-        board: the checkerboard.
         left_out: images without it, and why; those left out here are added.
     """
     left = list(left_out)

@@ -110,7 +110,6 @@ def scale_warnings(scale: float, held: bool, read_as: str | None = None) -> list
     """Warnings where the scale that fits a take to its performer's rig best is not 1.
 
     Args:
-        scale: of the best alignment.
         held: the take was aligned at scale 1 all the same.
         read_as: the unit that its markers were read in, where it is known.
     """

@@ -107,8 +107,6 @@ def network_finder(network: LandmarkNetwork, name: str, photographs: bool = Fals
     third of PyTorch's time for single crops.
 
     Args:
-        network: finds landmarks in crops.
-        name: what messages call it.
         photographs: show it each crop's mirror image too.
     """
     finder = graph_finder(_graph(network), Path(name))

@@ -67,7 +67,6 @@ def matching(
     """A model, and the rig whose shapes its heads are to have, of one topology.
 
     Args:
-        model: of heads.
         template: a rig; the one that travels with the model if absent, else the embedded performer.
         part: an annotated region, such as ``"face"``, that both are cut to; a model of that part alone stays as it is.
     """

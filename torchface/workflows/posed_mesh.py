@@ -49,7 +49,6 @@ def load_posed(
         path: a mesh file, a rig file or a rig's folder.
         weights: the pose, by shape name in any of the spellings that ``torchface.shape_names`` reads.
         take: the pose from a frame of a weight take instead.
-        frame: which.
         part: keep this annotated region only.
     """
     if weights or take is not None:

@@ -36,7 +36,6 @@ class Retargeted:
 
     Args:
         take: weights by the target's names.
-        shapes: what drove what.
         warnings: what a file leaves out, what examples do not determine.
         notes: what was learned of examples, and how many keys files have.
     """
@@ -128,7 +127,6 @@ def _mouth_closed(
     Args:
         take: weights by the target's names.
         source: that the weights are of; ARKit's if absent.
-        target: that moves.
         ruled: shapes that a table drives: what it says of either is left alone.
     """
     assert take.weights is not None

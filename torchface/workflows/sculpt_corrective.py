@@ -47,11 +47,9 @@ def sculpt_corrective(
     """Reads a rig, its animation and its detail maps, adds a corrective, writes all of it.
 
     Args:
-        path: the rig's file.
         at: the pose, NAME=WEIGHT in words, or several in one.
         sculpt: the rig in that pose, as an artist changed it, in its topology.
         out: the rig's new file; see ``torchface convert``.
-        options: see there.
         progress: called with each step.
 
     Returns:

@@ -103,7 +103,6 @@ def jaw_and_lids(rig: BlendshapeRig, landmarks: Tensor) -> tuple[Tensor, Tensor]
     """How far the jaw and the lids move each vertex down, (V,), of the chin's and the lids' motion; None without them.
 
     Args:
-        rig: with shapes of ARKit's meanings.
         landmarks: vertices of iBUG's 68.
     """
     shapes = mapping(ARKIT, rig.names)

@@ -95,7 +95,6 @@ def write_weights(take: Take, files: WeightFiles, rig: BlendshapeRig) -> tuple[l
     Args:
         take: weights by the rig's names.
         files: what is written; ``live_link`` has ARKit's names by :func:`torchface.shape_names.mapping`.
-        rig: that the animation moves.
 
     Returns:
         Warnings, and other lines for people to read.

@@ -85,7 +85,6 @@ def _fetched(reference: HubReference, file: str, size: int, exactly: bool = Fals
     """A file of a model as a plain file on this machine, fetched where it is not there yet and its size is allowed.
 
     Args:
-        reference: the model.
         file: its name in the model's folder.
         size: the most bytes that it may have.
         exactly: it must have as many.

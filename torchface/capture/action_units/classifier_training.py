@@ -95,7 +95,6 @@ def label_group(
         patterns: the group's regions over all videos, one after the other, (T,G,h,w).
         labels: of each video.
         group: regions and units.
-        settings: levels and seed.
     """
     classes = torch.zeros(len(patterns), dtype=torch.int64)
     rows: list[tuple[float, ...]] = [(0.0,) * len(group.units)]
@@ -227,7 +226,6 @@ def intensity_levels(images: Tensor, at_rest: Tensor, levels: int = 4, seed: int
         images: one region, or several side by side, in every repetition of the action, (T,...).
         at_rest: frames just before and after a repetition, (T,) bool.
         levels: k; the lowest is rest.
-        seed: of k-means.
 
     Returns:
         (T,) int64 from 0 to ``levels - 1``.
@@ -265,7 +263,6 @@ def local_warps(images: Tensor, amplitude: float, generator: torch.Generator, al
     """Regions (T,R,h,w), each frame and region warped by a smooth field of its own.
 
     Args:
-        images: patterns.
         amplitude: standard deviation of the control points' displacement, pixels.
         generator: where the randomness comes from.
         alike: into how many parts the regions fall that get the same field, region by region.

@@ -48,7 +48,6 @@ def pattern_levels(neutral: Tensor, names: Sequence[str]) -> PatternLevels:
 
     Args:
         neutral: regions of an image of the face at rest, (R,h,w) in [0,1].
-        names: of the regions.
 
     Source: Otsu 1979; thesis 4.1.9.
     """

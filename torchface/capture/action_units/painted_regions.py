@@ -49,7 +49,6 @@ def region_grid(boxes: Mapping[str, Box], names: Sequence[str], size: int, width
         boxes: (left, top, right, bottom) by name.
         names: which regions, R, in which order.
         size: pixels a side that every region is brought to.
-        width, height: of the image.
     """
     lacking = [name for name in names if name not in boxes]
     if lacking:

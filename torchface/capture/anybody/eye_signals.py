@@ -67,7 +67,6 @@ def eye_signals(
     """A frame's signals, beside what has been learned of the person's eyes, and what that becomes.
 
     Args:
-        read: of the frame.
         gaze: where the eyes seem to look, (2,2), NaN where nobody said.
         usual: openness of eyes at rest, (2,).
         looking: what looking up or down adds to the rig's openness at weights (8,) of ``LOOKS``, (2,8).

@@ -174,7 +174,6 @@ def unit_of_scale(scale: float, read_as: str | None = None) -> str:
     """The unit in which coordinates are that must grow by this factor to be millimetres.
 
     Args:
-        scale: the factor.
         read_as: the unit that they were read in; of unknown ones those too small were read as millimetres, and those
             too large are.
 

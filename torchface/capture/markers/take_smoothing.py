@@ -302,7 +302,6 @@ class _TakeData:
     """What markers ask of each frame of a rig with correctives, over all M markers, seen or not.
 
     Args:
-        solver: of the markers.
         energy: of frames that show all; None where a frame has gaps, whose residuals are then formed anew.
         seen: in rig space, (T,M,3).
     """

@@ -31,7 +31,6 @@ class AnotherFace:
     """A span of frames that shows another face.
 
     Args:
-        first, last: its frames.
         likeness: the largest correlation of looks, of its frames and the actor's.
         apart: the mean distance of its landmarks of eyes and nose from the actor's, in distances of the eyes.
     """

@@ -116,7 +116,6 @@ def linearise(
     .. math:: r_l = W_l \big( \pi(K (R (b_l + B_l w) + t)) - q_l \big)
 
     Args:
-        points: the rig's.
         head: the state where to linearise.
         rows: which point each landmark is, (B,68); see ``FacePoints.chosen``.
         intrinsics: K, (3,3).

@@ -185,8 +185,6 @@ def _split(
     """The mean residual as offsets and a constant expression, (N,), which is none where no solver is given.
 
     Args:
-        mean: of the frames.
-        before, expression: of the round before.
         likely: covariance of the offsets, (204,204).
         solver: with the prior of the expression.
     """

@@ -49,7 +49,6 @@ class SourceFit:
             skin has, (3,Q,3).
         residuals: shaded albedo minus frame, sRGB, (Q,3); 0 where blown out.
         trust: robust weight of each vertex, in (0,1], (Q,).
-        cost: the objective.
     """
 
     source: LightSource

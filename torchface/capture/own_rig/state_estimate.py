@@ -64,7 +64,6 @@ class Expectation:
         """After a frame whose landmarks were linearised at a state.
 
         Args:
-            head: the state.
             seen: the landmarks' energy, of a step from there.
 
         Source: Kalman 1960, in its information form.

@@ -74,7 +74,6 @@ class TakeEyes:
         Args:
             rest, basis: of the 68 landmarks, (68,3) and (68,3,N).
             names: of the rig's N shapes.
-            eyeballs: of the rig.
         """
         called = arkit_names(names)
         opened, _ = openness_rows(rest.double(), basis.double(), called)

@@ -27,7 +27,6 @@ class _Steps:
     """What the first pass finds.
 
     Args:
-        count: of all windows.
         center: mean of the frames that follow them, (N,).
         limits: smallest and largest weight, (2,).
         coefficients: of the autoregression, (J,N).

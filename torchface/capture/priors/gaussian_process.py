@@ -172,10 +172,8 @@ def posterior(
     """The posterior of a process given the statistics of its frames.
 
     Args:
-        kernel: of the process.
         inducing: Z, (M,F).
         whitening: of :func:`whitening_of`, (M,M).
-        statistics: of all frames.
         redundancy: number of correlated frames that count as one independent frame.
     """
     noise = kernel.noise * redundancy

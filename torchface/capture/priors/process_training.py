@@ -25,7 +25,6 @@ def fitted_kernel(inputs: Tensor, targets: Tensor, inducing: Tensor, active: Ten
         targets: (B,n), scaled.
         inducing: (M,O·N).
         active: 1 for inputs that the kernel uses, else 0, (O,N).
-        iterations: of Adam.
 
     Source: Titsias 2009.
     """
@@ -71,7 +70,6 @@ class LeftOutProcess:
     folds make of a part, and ``compare`` how well. Memory is two matrices a fold.
 
     Args:
-        kernel: of the process.
         inducing: Z, (M,F).
         targets: n.
         folds: K; what is left out together has one number below it.
@@ -92,7 +90,6 @@ class LeftOutProcess:
         """Takes up a part.
 
         Args:
-            fold: its number.
             inputs: (B,F).
             targets: under autoregression coefficients learned from the other folds, (B,n).
         """

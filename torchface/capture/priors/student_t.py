@@ -167,7 +167,6 @@ class StudentGroups(nn.Module):
     Args:
         groups: rows of the N shapes, one tuple a density; every shape in one group.
         densities: one a group.
-        strength: of the energy.
     """
 
     precisions: Tensor

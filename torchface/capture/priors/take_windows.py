@@ -52,7 +52,6 @@ class TakeWindows:
         takes: weights of each, (T,N); a list, or what reads them from a disk.
         window: J.
         input_noise: standard deviation of noise that is added to the windows.
-        seed: of the noise.
     """
 
     takes: Sequence[Tensor]

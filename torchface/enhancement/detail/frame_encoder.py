@@ -25,7 +25,6 @@ class Encoder:
         alignment: aligns frames with the neutral.
         low_pass: smooths their displacements.
         frames: turns the vertices' frames with their smooth part.
-        gradients: takes the features of patches.
         detail: encodes what the smooth part lacks.
     """
 
@@ -67,7 +66,6 @@ class FrameAlignment:
 
         Args:
             frames: (B,V,3), millimetres; differentiable.
-            name: what a message calls them.
 
         Returns:
             Displacements (B,V,3), and the similarity of scale 1 from where the frames were.

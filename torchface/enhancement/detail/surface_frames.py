@@ -92,7 +92,6 @@ class PatchGradients:
     means are too: no gradient of a single vertex is ever formed.
 
     Args:
-        frames: of the mesh.
         shares: of the vertices in the patches, (P,V), rows of sum 1.
         tangents: the matrix (2V,V) that ``frames`` is made of.
     """
@@ -121,7 +120,6 @@ class PatchGradients:
 
         Args:
             displacements: (B,V,3), millimetres; differentiable.
-            turned: the frames under them.
         """
         count, vertices, _ = displacements.shape
         columns = displacements.permute(1, 2, 0).reshape(vertices, 3 * count)

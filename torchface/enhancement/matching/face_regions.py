@@ -94,9 +94,7 @@ def regions_of_motion(
         patches: the patch of each triangle, (F,) int64.
         neutral: (V,3), millimetres, upright, looking along z.
         faces: (F,3) int64.
-        count: of regions.
         landmarks: vertex ids of the 68 iBUG landmarks.
-        seed: of the clustering.
 
     Returns:
         The regions; each is connected but for parts of the mesh that hang on nothing.

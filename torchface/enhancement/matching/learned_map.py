@@ -26,7 +26,6 @@ class LearnedMap:
     left. How much of it counts, :math:`\beta`, see :func:`map_shares`.
 
     Args:
-        projection: of the same database.
         coefficients: C, (K,r).
         components: principal components of each region's features.
         ridge: as a share of their mean variance.
@@ -67,7 +66,6 @@ def map_shares(
     animation lacks much motion that goes on linearly it is near 1; of wrinkles alone, which saturate, it is less.
 
     Args:
-        projection: of the database.
         coefficients: of its details, (K,r).
         reach: see :class:`LearnedMap`, (R,).
         products: of the details' components with each other over each region, (R,r,r).

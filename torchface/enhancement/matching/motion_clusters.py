@@ -38,10 +38,8 @@ def motion_clusters(
         motion: how far each patch is from its mean place or shape in every frame, (K,P,C).
         centres: of the patches, (P,3), millimetres.
         pairs: neighbouring patches, (E,2).
-        count: of clusters.
         midline: the plane of symmetry is x = ``midline``.
         apart: patches, such as those of the mouth, whose clusters stay two halves.
-        seed: of the eigenvectors' search.
 
     Returns:
         The cluster of each patch, (P,), from 0 to ``count`` - 1.

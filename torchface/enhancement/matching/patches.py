@@ -26,9 +26,7 @@ def grow_patches(faces: Tensor, vertex_count: int, size: int = 100, seed: int = 
 
     Args:
         faces: (F,3) int64.
-        vertex_count: of the mesh.
         size: vertices a patch, about.
-        seed: draws the first triangles.
 
     Returns:
         The patch of each triangle, (F,) int64, numbered from 0 without gaps. Every patch is connected by edges, and

@@ -32,7 +32,6 @@ def named_regions(
         neutral: (V,3), millimetres.
         faces: (F,3) int64.
         landmarks: vertex ids of the 68 iBUG landmarks; without them all are numbered, and none is voluntary.
-        eyes: names of the last regions.
     """
     numbered = [f"region_{number:02d}" for number in range(count - len(eyes))]
     names = [*numbered, *eyes]

@@ -26,7 +26,6 @@ class WeightMap:
     its limit v, for unseen expressions or another rig's weights, :math:`c_0` takes over.
 
     Args:
-        projection: of the database.
         weights: of its frames, (K,N).
         coefficients: C, of their details, (K,r).
         terms: :math:`\ell, \epsilon, v` of each region, (R,3), see :func:`weight_terms`.
@@ -77,7 +76,6 @@ def weight_terms(projection: RegionProjection, weights: Tensor, coefficients: Te
     limit is twice the variance below which 95 % of them lie.
 
     Args:
-        projection: of the database.
         weights: of its frames, (K,N).
         coefficients: of their details, (K,r).
         sequences: the number of each frame's sequence, (K,) int64.

@@ -46,7 +46,6 @@ class ActorTiming:
         database: features of the captured frames, (K,P,C).
         sequences: the number of each captured frame's sequence, (K,).
         weights: of patches in each region, (R,P).
-        fps: of the captured frames.
     """
 
     def __init__(self, database: Tensor, sequences: Tensor, weights: Tensor, fps: float) -> None:
@@ -119,7 +118,6 @@ class LearnedTiming:
             database: features of the captured frames, (K,P,C).
             sequences: the number of each frame's sequence, (K,).
             region: share of each patch in the region, (P,).
-            fps: of the captured frames.
 
         Returns:
             None where the region has fewer than ``LEAST_MOTIONS`` motions.

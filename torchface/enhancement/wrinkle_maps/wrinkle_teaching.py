@@ -27,7 +27,6 @@ def captured_poses(model: EnhancementModel, shapes: Tensor) -> Tensor:
     over the features of patches, which small deformations add up in.
 
     Args:
-        model: the actor's.
         shapes: :math:`z_i`, features of the rig's shapes at weight 1 on the model's mesh, (N,P,9); see
             ``EnhancementModel.features``.
 
@@ -75,9 +74,7 @@ def taught_details(
     """What the model adds to frames of a rig on its mesh, in the axes of the rig's own skin.
 
     Args:
-        model: the actor's.
         read: frames (t,V,3) from one number up to another, without it, on the model's mesh, millimetres.
-        count: of frames.
         progress: called with each step and how far it is.
 
     Returns:

@@ -47,7 +47,6 @@ class WrinkleWeights(nn.Module):
         region_names: of the R regions.
         maps: M.
         vertices: of the rig, V.
-        sites: vertices that are looked at.
         components: q, numbers a region.
         centers: K, poses that kernels sit on.
     """
@@ -114,7 +113,6 @@ class WrinkleWeights(nn.Module):
             poses: the rig's vertices, (K,V,3), millimetres, each in any rigid place.
             weights: of the maps at these poses, (K,R,M), in [0,1].
             region_weights: the share of each region in each vertex of the rig, (R,V).
-            region_names: of the regions.
             sites: vertices to look at, (S,); some 2,000, evenly picked, if absent.
             components: numbers that are kept a region.
         """

@@ -22,7 +22,6 @@ def distort(pixels: Tensor, calibration: CameraCalibration) -> Tensor:
 
     Args:
         pixels: of the pinhole camera, (...,2); NaN stays NaN.
-        calibration: of the camera.
 
     Returns:
         Pixels in the camera's images, (...,2).
@@ -41,7 +40,6 @@ def undistort(pixels: Tensor, calibration: CameraCalibration) -> Tensor:
 
     Args:
         pixels: in the camera's images, (...,2); NaN stays NaN.
-        calibration: of the camera.
 
     Returns:
         Pixels of the pinhole camera, (...,2); NaN so far outside of the calibrated image that the model folds back

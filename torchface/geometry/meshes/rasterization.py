@@ -27,7 +27,6 @@ class TexelMap:
     """The M texels of a texture that lie in a triangle; the rest of the texture is outside the charts.
 
     Args:
-        height, width: of the texture.
         texels: row-major indices, first row on top, ascending, (M,) int64.
         triangles: (M,) int64.
         barycentric: of the texel's centre in its triangle, (M,3) float64.

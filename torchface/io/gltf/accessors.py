@@ -28,8 +28,6 @@ def read_floats(
     """Rows (C,D) of an attribute; integers are normalised where the accessor says so.
 
     Args:
-        document: the file.
-        index: the accessor.
         where: who asks, for errors.
         types: what D may be, such as ``("VEC3",)``.
         count: the C that it must be.

@@ -38,12 +38,9 @@ class Block:
     """Vertices that some primitives of one mesh share.
 
     Args:
-        node, mesh: indices in the file.
         primitives: of the mesh, which share the vertices.
         name: the node's and the mesh's, for people and for rules by name.
-        materials: names of the primitives' materials.
         rows: where the vertices lie among the character's.
-        names: of the mesh's morph targets.
         triangles: how many each primitive has.
     """
 

@@ -146,12 +146,7 @@ def normal_texture(document: Document, mesh: dict[str, Any]) -> int | None:
 
 
 class TextureReader:
-    """Reads a file's textures, as long as they unpack to no more than such a file can hold.
-
-    Args:
-        document: of the file.
-        path: the file.
-    """
+    """Reads a file's textures, as long as they unpack to no more than such a file can hold."""
 
     def __init__(self, document: Document, path: str | Path) -> None:
         self._document = document

@@ -44,8 +44,6 @@ class Document:
     """A glTF document whose every access is checked; errors name the file and the place in it.
 
     Args:
-        path: the file.
-        root: the JSON object.
         binary: the binary chunk of a ``.glb``.
     """
 
@@ -259,8 +257,6 @@ def glb_pieces(root: dict[str, Any], buffers: BufferWriter, source: str | Path =
 
     Args:
         root: nodes, meshes, materials and what else the document has.
-        buffers: of its accessors.
-        source: names it in errors.
     """
     root = {
         "asset": {"version": "2.0", "generator": "torchface"},

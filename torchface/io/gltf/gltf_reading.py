@@ -153,7 +153,6 @@ def rejoined(document: Document, instanced: Sequence[tuple[Instance, Part]]) -> 
     """The parts of a scene as one, in the scene's axes; none where they were not written as one.
 
     Args:
-        document: the file.
         found: the scene's meshes and where they stand.
     """
     first = instanced[0]

@@ -29,7 +29,6 @@ class AddedTargets:
     """What new morph targets move of vertices that some primitives of a mesh share.
 
     Args:
-        mesh: its index in the file.
         primitives: those that share the vertices.
         positions: (N,C,3) in the mesh's own axes and unit, one for each new name.
         normals: the same of the normals, or none.

@@ -25,7 +25,6 @@ class ExtendedBlock:
     """A block of a character with n vertices more, behind the C that it has.
 
     Args:
-        block: its number.
         shares: of the block's own vertices, by which the new ones take what they are not given, (n,C), sparse.
         places: in the scene, (n,3).
         normals: in the scene, (n,3).
@@ -47,8 +46,6 @@ def document_with_parts(character: Character, blocks: Sequence[ExtendedBlock], p
     """The character's file with more vertices, in memory: accessors, bufferViews and bytes behind those it has.
 
     Args:
-        character: as the file has it.
-        blocks: those that change.
         page: a PNG, the image of the parts.
     """
     document = character.document

@@ -29,7 +29,6 @@ class Performance:
 
     Args:
         seconds: of each frame, (T,).
-        names: of the weights.
         weights: (T,N).
         rotations: Live Link Face's yaw, pitch and roll of head, left and right eye, (T,9) radians.
     """

@@ -29,7 +29,6 @@ class Part:
     Args:
         positions: (C,3), the file's unit and the mesh's own axes.
         deltas: (N,C,3), one a name.
-        names: of the morph targets.
         triangles: (F,3) into the C vertices.
         uvs: (C,2), origin at the lower left.
         colors: (C,3) in [0,1], encoded as images are.

@@ -31,7 +31,6 @@ class PrimitiveWriter:
 
     Args:
         mesh: on the CPU.
-        split: of it.
         buffers: where accessors go.
         tangents: glTF's, at each triangle's corners, (F,3,4), for the first primitive; its material has a normal map.
     """
@@ -47,8 +46,6 @@ class PrimitiveWriter:
         """A primitive without morph targets yet.
 
         Args:
-            surface: its triangles.
-            material: index of its material.
             origin: the node's place (3,), millimetres.
         """
         triangles = self.split.triangles[surface.triangles.numpy()]

@@ -11,7 +11,6 @@ class PartMaterial:
     """The look of a part that nobody has painted.
 
     Args:
-        name: of the material.
         words: a region whose name holds one of them is made of it.
         color: sRGB in [0,1].
         roughness: 0 a mirror, 1 chalk.

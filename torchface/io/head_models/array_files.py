@@ -110,7 +110,6 @@ class ArrayFile:
         """An array of real numbers in float32.
 
         Args:
-            name: of the array.
             shape: what it has to be; None for any size.
             finite: whether NaN and numbers beyond any length are refused.
         """

@@ -38,7 +38,6 @@ class ImageHeader:
     """An image as its file describes it.
 
     Args:
-        kind: Pillow's name of the format.
         width, height: pixels, as they are stored.
         samples: of a pixel, such as 3.
         bits: of a sample.
@@ -64,12 +63,7 @@ class ImageHeader:
 
 
 def read_header(data: bytes, source: str) -> ImageHeader | None:
-    """The header of a PNG, JPEG, WebP or TIFF; None for a file that may be BMP, TGA or PPM, whose own is plain.
-
-    Args:
-        data: the whole file.
-        source: names it in errors.
-    """
+    """The header of a PNG, JPEG, WebP or TIFF; None for a file that may be BMP, TGA or PPM, whose own is plain."""
     try:
         if data.startswith(_PNG):
             return _png(data, source)

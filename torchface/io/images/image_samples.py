@@ -64,8 +64,6 @@ def decode_samples(data: bytes, source: str, planes: int = 3) -> Samples:
     of some kilobytes unpacks to gigabytes.
 
     Args:
-        data: the whole file.
-        source: names it in errors.
         planes: that the caller makes of it.
     """
     header = read_header(data, source)

@@ -39,7 +39,6 @@ def first_directory(data: bytes, source: str) -> dict[int, tuple[int, ...]]:
 
     Args:
         data: a TIFF or BigTIFF, or the content of an EXIF block.
-        source: names it in errors.
     """
     values: dict[int, tuple[int, ...]] = {}
     try:

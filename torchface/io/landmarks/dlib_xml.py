@@ -41,9 +41,6 @@ def load_dlib_faces(path: str | Path) -> list[LabelledFace]:
 
     Nothing outside the file is opened; a file that declares entities is refused.
 
-    Args:
-        path: the file.
-
     Returns:
         The faces in the file's order; those without landmarks have points (0,2). Boxes marked to be ignored are left
         out.

@@ -51,7 +51,6 @@ def load_c3d(path: str | Path, unit: str | None = None) -> Take:
     ``extras["frame_numbers"]``. Analog channels are skipped.
 
     Args:
-        path: the file.
         unit: ``"mm"``, ``"cm"``, ``"m"`` or ``"in"``; else what ``POINT:UNITS`` says.
 
     Returns:

@@ -73,9 +73,7 @@ def write_maya_rig(rig: BlendshapeRig, path: str | Path, keys: WeightKeys | None
     vertex colours and annotations are left out.
 
     Args:
-        rig: the rig.
         path: it appears only when it is complete.
-        keys: an animation of its shapes.
     """
     path = Path(path)
     if len(rig.neutral.faces) == 0:

@@ -44,7 +44,6 @@ def read_obj_vertices(path: str | Path, neutral: Mesh, topology: bytes | None, u
     """The vertices (V,3) of a shape whose faces are those of ``neutral``; fast for many files.
 
     Args:
-        path: the shape's file.
         neutral: the mesh at rest.
         topology: ``face_bytes`` of the neutral's file; a shape with the same bytes there is not parsed further.
         unit: the file's unit.
@@ -86,7 +85,6 @@ def write_obj_shapes(mesh: Mesh, shapes: Iterable[tuple[str, Tensor]], neutral: 
     Args:
         mesh: the neutral, as ``write_obj`` wrote it.
         shapes: the name and the vertices (V,3) of each; its file is called so.
-        neutral: the mesh's own file.
     """
     surface, material = _surface_lines(mesh), _material_line(mesh, Path(neutral))
     with all_or_none():

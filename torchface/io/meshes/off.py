@@ -23,7 +23,6 @@ def read_off(path: str | Path, unit: str = "mm") -> Mesh:
     """The mesh in an OFF file: vertices in the file's order, triangles; polygons are cut, colours left out.
 
     Args:
-        path: the file.
         unit: the file's unit, ``"mm"``, ``"cm"`` or ``"m"``.
     """
     path, scale = Path(path), millimetres_per(unit)

@@ -23,7 +23,6 @@ def read_ply(path: str | Path, unit: str = "mm") -> Mesh:
     """The mesh in a PLY file.
 
     Args:
-        path: the file.
         unit: the file's unit, ``"mm"``, ``"cm"`` or ``"m"``.
     """
     path, scale = Path(path), millimetres_per(unit)

@@ -27,7 +27,6 @@ def read_stl(path: str | Path, unit: str = "mm") -> Mesh:
     """The mesh in an STL file; vertices are numbered by first appearance.
 
     Args:
-        path: the file.
         unit: the file's unit, ``"mm"``, ``"cm"`` or ``"m"``.
     """
     from trimesh.exchange.stl import load_stl_binary  # takes a while to import

@@ -15,8 +15,6 @@ class PacketCounts:
     """What came.
 
     Args:
-        taken: frames that were taken.
-        lost: frames whose numbers are missing.
         late: those that came after a newer one.
         others: of a second sender while the first was there.
         jumps: how often the sender's count was set.
@@ -64,7 +62,6 @@ class FrameOrder:
         """Whether a frame is taken; counts it.
 
         Args:
-            sender: whom it is from.
             number: how the sender counts it; None where it does not.
             now: seconds.
         """

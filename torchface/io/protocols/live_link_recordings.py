@@ -55,9 +55,6 @@ def load_live_link_packets(path: str | Path) -> Take:
 
     Frames that came late or twice are put in order. Those of no face are NaN.
 
-    Args:
-        path: the file.
-
     Returns:
         weights (T,52,1) by ARKit's names; head and eye rotations in ``extras["columns"]``, radians.
     """

@@ -81,7 +81,6 @@ class VTubeStudioSender:
     opened again. Beside the parameters that every model has, 52 of its own are made, named as ARKit's with a capital.
 
     Args:
-        address: names the receiver in messages.
         host, port: where VTube Studio listens.
         names: of the weights that come, (N,).
         token: the file of the token; in the user's cache if absent.

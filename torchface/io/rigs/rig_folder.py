@@ -79,9 +79,7 @@ def save_obj_folder(rig: BlendshapeRig, folder: str | Path, detail: DetailMaps |
     neutral, detail maps are called ``<shape>_normals.png``. ``load_obj_folder`` gives the same rig.
 
     Args:
-        rig: the rig.
         folder: made where it is missing; what it holds of the same rig is replaced when all is written.
-        detail: detail maps of its shapes.
     """
     folder = Path(folder)
     _check_names(rig, folder)

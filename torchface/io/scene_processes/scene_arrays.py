@@ -84,7 +84,6 @@ def scene_rig(scene: Scene, unit: str | None = None) -> BlendshapeRig | None:
     """All meshes together as a rig, in millimetres, y up; none where nothing has a shape.
 
     Args:
-        scene: what was found.
         unit: of the file's numbers; what the file says if absent.
     """
     pieces = pieces_of(scene, unit)

@@ -24,7 +24,6 @@ class Piece:
         uv_faces: (F,3).
         colors: (V,3).
         polygons: (P,K), padded with -1.
-        annotations: of its vertices.
         deltas: (N,V,3).
         names: of its N shapes.
     """

@@ -134,8 +134,6 @@ class TextLines:
     """The lines of a UTF-8 file with their ends, decoded as they are asked for.
 
     Args:
-        path: names the file in errors.
-        data: its bytes.
         newline: as ``open`` takes it.
     """
 

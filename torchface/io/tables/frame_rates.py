@@ -89,7 +89,6 @@ def frame_times(times: np.ndarray, source: TimeSource) -> FrameTimes:
 
     Args:
         times: of the frames, (T,), seconds.
-        source: what is known of them.
     """
     times = np.array(times, np.float64)  # of its own: a column holds its table in memory
     if not np.isfinite(times).all():

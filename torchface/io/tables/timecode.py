@@ -29,7 +29,6 @@ class Timing:
 
     Args:
         fps: frames a second, a usual rate where the clock runs within 0.2 % of one.
-        measured: what the clock itself says.
         seconds: when each frame is shown, (T,) from 0, where they come unevenly.
     """
 

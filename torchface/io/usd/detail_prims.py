@@ -24,9 +24,7 @@ def write_wrinkles(
     """Adds maps to a material.
 
     Args:
-        usd: the library.
         stage: where the material is.
-        material: its path.
         detail: of 8 bits a channel in the file.
         stem: what names of image files begin with.
 

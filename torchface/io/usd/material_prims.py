@@ -43,9 +43,7 @@ def write_materials(usd: Any, stage: Any, prim: Any, mesh: Mesh, root: str, stem
     """Binds materials to a mesh prim; parts that regions name are ``GeomSubset``s of its polygons.
 
     Args:
-        usd: the library.
         stage: where ``root`` is.
-        prim: the mesh's.
         mesh: on the CPU.
         root: path of the prim that gets a scope of materials.
         stem: what names of image files begin with.

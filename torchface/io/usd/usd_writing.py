@@ -55,7 +55,6 @@ def write_usd_rig(
     of shading show is left out.
 
     Args:
-        rig: the rig.
         path: ``.usda`` is text, ``.usdc`` and ``.usd`` are binary, with the texture as a PNG of the same name beside
             them, and images of eyes and lashes that no texture shows; ``.usdz`` holds all. It appears only when it is
             complete.

@@ -274,7 +274,6 @@ def rate_changes(seconds: np.ndarray, fps: float) -> str:
 
     Args:
         seconds: when each frame is shown, (P,), in any order; a repeated time counts once.
-        fps: what the header says.
     """
     durations = np.diff(np.unique(seconds[np.isfinite(seconds)]))
     if len(durations) < 3:

@@ -162,8 +162,6 @@ def frames_beside(path: Path, codec: str, width: int, height: int, bits: int) ->
     """How many frames may be decoded beside one another, at least one, within the budget of memory.
 
     Args:
-        path: the file.
-        codec: FFmpeg's name.
         width, height: pixels.
         bits: of a pixel.
     """

@@ -19,7 +19,6 @@ class MorphBind:
 
     Args:
         node: that shows the mesh.
-        mesh: index in the file.
         target: index among the mesh's morph targets.
         weight: at the expression's full strength, 1 for the whole target.
     """
@@ -73,8 +72,6 @@ def add_expressions(
     An expression that the file has by the same name, in any case of letters, is kept as it is.
 
     Args:
-        document: as it was read.
-        root: its JSON, which is changed.
         added: by name what each drives.
     """
     version = vrm_version(document)

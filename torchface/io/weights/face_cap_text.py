@@ -44,9 +44,6 @@ def load_face_cap(path: str | Path) -> Take:
     milliseconds, the head's place (3) and degrees (3), of both eyes two degrees each, the weights. Other lines are
     passed over.
 
-    Args:
-        path: the text file.
-
     Returns:
         weights (T,N,1), names as the file spells them; rotations in ``extras["columns"]``, radians.
     """

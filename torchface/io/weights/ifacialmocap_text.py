@@ -36,7 +36,6 @@ def read_frame(text: str, where: str = "packet") -> tuple[Tensor, Tensor]:
     Args:
         text: ``jawOpen-12|eyeBlink_L-7|...|=head#x,y,z,px,py,pz|rightEye#x,y,z|leftEye#x,y,z|``, weights in percent
             behind ``-`` or, in the second version, ``&``; angles in degrees.
-        where: names the source in errors.
 
     Source: iFacialMocap, communication specifications, ifacialmocap.com/for-developer.
     """
@@ -62,9 +61,6 @@ def read_frame(text: str, where: str = "packet") -> tuple[Tensor, Tensor]:
 
 def load_ifacialmocap(path: str | Path) -> Take:
     """Reads a recording: a line a frame, 60 a second.
-
-    Args:
-        path: the text file.
 
     Returns:
         weights (T,52,1) by ARKit's names; head and eye rotations in ``extras["columns"]``, radians.

@@ -38,9 +38,6 @@ def load_weight_json(path: str | Path) -> Take:
     numbers by ARKit's names and, where the app wrote them, ``transform``, ``leftEyeTransform`` and
     ``rightEyeTransform``: 16 numbers by columns, or four columns of four.
 
-    Args:
-        path: the file.
-
     Returns:
         weights (T,N,1), names as the file spells them, such as Audio2Face's 52 and 16 of the tongue; rotations in
         ``extras["columns"]``, radians, where there are transforms.

@@ -28,9 +28,6 @@ def load_weights_csv(path: str | Path) -> Take:
     head and eye rotations by Live Link Face's names (``HeadYaw``, ...) are no shapes: they go to ``timecode`` and to
     ``extras["columns"]``, where :func:`torchface.io.weights.live_link_csv.load_live_link` has them.
 
-    Args:
-        path: the file.
-
     Returns:
         weights (T,N,1), float32, names as the file spells them.
     """

@@ -43,7 +43,6 @@ def appearance_landmarks(appearance: AppearanceModel, grey: Tensor, start: Tenso
     """Landmarks (68,2) where the face looks more as the person does; the start (68,2) where it does not.
 
     Args:
-        appearance: of the person.
         grey: the image, uint8 (H,W).
         start: (68,2), pixels.
     """

@@ -37,7 +37,6 @@ class CheckedDetector:
     Each box is looked at turned upright as the detector says, then once more round what was found.
 
     Args:
-        detector: proposes faces with their tilts.
         network: says whether they are faces; or a finder that runs its graph.
 
     Example:

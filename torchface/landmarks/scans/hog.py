@@ -60,7 +60,6 @@ def cell_map(images: Tensor, layout: HogLayout) -> Tensor:
 
     Args:
         images: (B,C,H,W) in [0,1].
-        layout: of the windows.
 
     Returns:
         (B,bins,H/stride+1,W/stride+1).

@@ -53,7 +53,6 @@ class TemplateFeatures:
     """Where a template has the landmarks and lines: found once, used for every scan.
 
     Args:
-        landmarks: vertex ids by name.
         lines: by name, vertex ids (N,) and their shares (N,) in [0,1] of the line's length, from its left end.
     """
 

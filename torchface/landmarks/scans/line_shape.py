@@ -49,9 +49,7 @@ class LineShape:
         """The mean course of pixel lines, each (N,2) from its left to its right corner; two lines at least.
 
         Args:
-            lines: as annotated.
             images: what each line runs through, (C,S,S); without them the profile is not learned.
-            corner_deviation: see the class.
         """
         rows = torch.stack([_offsets(line.double()) for line in lines])
         shape = LineShape(rows.mean(0), rows.std(0).clamp(min=_MIN_DEVIATION), corner_deviation)

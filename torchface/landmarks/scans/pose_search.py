@@ -64,11 +64,7 @@ def protrusion(points: Tensor, normals: Tensor, queries: Tensor) -> tuple[Tensor
 
 
 def nose_candidates(surface: SurfaceSample) -> NoseCandidates:
-    """The points of a scan that stand out most, no two close together; hair, ears and collars are among them.
-
-    Args:
-        surface: the scan's sample.
-    """
+    """The points of a scan that stand out most, no two close together; hair, ears and collars are among them."""
     thinned = slice(0, 4 * _QUERIES)
     looked = surface.points[:_QUERIES]
     height, direction = protrusion(surface.points[thinned], surface.normals[thinned], looked)
@@ -154,9 +150,7 @@ def find_pose(
     """The pose of points (N,3) with normals (N,3) in a scan, and its misfit in millimetres.
 
     Args:
-        points, normals: a face.
         nose, direction: the face's nose and where it looks, each (3,).
-        surface: the scan.
         found: where noses may be on it.
     """
     tried = hypotheses(nose, direction, found)

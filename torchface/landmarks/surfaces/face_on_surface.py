@@ -100,7 +100,6 @@ class FaceSearch:
 
     Args:
         detector: of faces in pictures, at any roll.
-        finder: of landmarks in boxes.
         reference: where a head has those points.
         rings: of directions from which the surface is seen, the likeliest first: pitch in degrees and their number.
     """

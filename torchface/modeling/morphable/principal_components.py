@@ -233,8 +233,6 @@ class LeadingComponents:
     Args:
         values: eigenvalues of the scatter matrix, the largest first, (K,) float64.
         vectors: its orthonormal eigenvectors, (K,D) float64.
-        trace: the sum of all eigenvalues.
-        passes: over the samples.
     """
 
     values: Tensor
@@ -266,7 +264,6 @@ def leading_components(
         size: D.
         count: K.
         checkpoint: a folder for the basis of each finished pass, from which a killed run goes on.
-        key: of the samples.
         report: called with the blocks that are done and how many there are at most.
 
     Source: Halko, Martinsson, Tropp 2011, Finding structure with randomness, algorithm 4.4.

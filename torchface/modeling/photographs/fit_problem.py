@@ -29,7 +29,6 @@ class Problem:
         identities: K; the last ``smooth`` of them are differences that the head model does not know.
         found: landmarks and points of the surface, (I,68+P,2), NaN for missing.
         focal: the expected focal lengths, (I,), pixels.
-        settings: see there.
         twins: rows of shapes that mirror each other, (P,2); none if absent.
         smooth: see ``smooth_differences``.
     """
@@ -137,7 +136,6 @@ class State:
 
     Args:
         coefficients: (D,).
-        views: the cameras.
         rows: which point each landmark is, (I,68).
         noise: of an inner landmark, pixels.
         unknown: the variance of differences that the head model does not know, in what is expected of them.

@@ -31,7 +31,6 @@ class HairCap:
     Args:
         color: sRGB, (3,).
         line: how high it begins over the face at places from the right temple to the left, (17,).
-        places: of the vertices.
     """
 
     color: Tensor
@@ -65,7 +64,6 @@ def hair_cap(shown: Sequence[Shown], places: Sequence[FacePlaces], hair: Tensor)
     fringe is hair and no second pair of brows.
 
     Args:
-        shown: the photographs at the vertices.
         places: where the vertices lie beside the landmarks in each.
         hair: how far each shows hair, (I,V); see ``ShownParts``.
     """

@@ -146,8 +146,6 @@ def solve(problem: Problem, state: State, free: Tensor | None = None) -> State:
     """Gauss-Newton until nothing changes.
 
     Args:
-        problem: see there.
-        state: the initial guess.
         free: which coefficients may change, (D,) bool; all if absent.
     """
     lower, upper = problem.bounds()

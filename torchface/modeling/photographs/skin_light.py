@@ -27,9 +27,7 @@ def skin_light(shown: Shown, normals: Tensor, camera: Camera, skin: Tensor) -> E
     First for the mean of the channels, then for each, held to that: what is red all over is the skin, not the light.
 
     Args:
-        shown: the photograph at the vertices.
         normals: unit, (V,3), in the world.
-        camera: that took it.
         skin: vertices that are surely skin, (V,) bool.
 
     Source: Ramamoorthi and Hanrahan 2001 (irradiance in spherical harmonics).

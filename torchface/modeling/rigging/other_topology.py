@@ -260,7 +260,6 @@ class _Skin:
     """Where a head's vertices lie on the fitted template.
 
     Args:
-        joined: the head.
         corner: template vertices around each place, (J,3).
         share: of each corner, (J,3).
         confidence: (J,).

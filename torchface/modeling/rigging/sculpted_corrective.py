@@ -185,7 +185,6 @@ def checked_sculpt(path: object, sculpt: Mesh, rig: BlendshapeRig, shown: Tensor
 
     Args:
         path: of the sculpt, for messages.
-        sculpt: as it was read.
         rig: of V vertices.
         shown: what the rig shows at the pose, (V,3).
         align: ``"remove"`` a motion of the whole mesh, ``"keep"`` it as part of the sculpt, or refuse it if absent.

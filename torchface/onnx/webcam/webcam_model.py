@@ -75,7 +75,6 @@ class WebcamGraph(nn.Module):
     finite as a start.
 
     Args:
-        reader: reads faces.
         solver: solves weights, such as ``WebcamSolverGraph``.
     """
 
@@ -104,10 +103,6 @@ def webcam_model(graph: WebcamGraph, facts: Mapping[str, object] | None = None) 
     ``CONTROLS``; ``state`` (S,), zeros to start. Outputs are ``weights`` (52,), ``rotation`` (3,3), ``translation``
     (3,), millimetres, ``gaze`` (2,2), radians, ``landmarks`` (68,2) and ``iris`` (2,2), pixels, NaN without a face,
     ``presence`` (), ``calibrated`` () and ``next_state`` (S,).
-
-    Args:
-        graph: what computes it.
-        facts: further metadata, such as licence.
     """
     size = STATE + graph.solver.state_size
     examples = {

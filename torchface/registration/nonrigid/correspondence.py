@@ -47,9 +47,7 @@ def correspondences(
 
     Args:
         current: template vertices, (V,3) float64.
-        faces: of the template.
         vertices: ids of those that look for one, (n,).
-        scan: the surface.
         reach: millimetres.
         largest_angle: degrees.
 

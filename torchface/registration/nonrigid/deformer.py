@@ -39,8 +39,6 @@ class Deformer:
 
     Args:
         vertices: the template aligned with the scan, (V,3) float64.
-        faces: its triangles.
-        scan: the surface.
         landmarks: what is known of where vertices belong; none of them is needed.
         contacts: what touches at rest.
         schedule: of its constants; the stages are given one by one to ``run``.

@@ -66,7 +66,6 @@ class LinearStep:
     gradients, preconditioned with one factorisation of the uncoupled system of mean weights, which is kept.
 
     Args:
-        subspace: which maps.
         vertices: template vertices that have correspondences, (n,).
         landmarks: template vertices that have landmarks, (L,).
         stiffness: :math:`\alpha`.
@@ -130,7 +129,6 @@ class LinearStep:
 
         Args:
             maps: X so far, (4V,3).
-            data: the correspondences.
             tolerance: at which residual, as a share of the first, the iteration ends.
         """
         weights, normals = data.weights[:, None], data.normals

@@ -43,8 +43,6 @@ class ContactPull:
 
         Args:
             current: vertices, (V,3) float64.
-            scan: the surface.
-            caster: of the same surface.
         """
         ends = [scan.among_nearest_samples(current[self.pairs[:, k]]) for k in (0, 1)]
         first, second = (end.points for end in ends)

@@ -142,11 +142,7 @@ def _mesh(skin: Mesh, vertices: Tensor, parts: dict[str, HeadPart], color: Tenso
 
 
 class _InTheMouth:
-    """Where parts of the mean head's mouth lie in another head, and how its jaw moves them.
-
-    Args:
-        rig: of the performer's topology.
-    """
+    """Where parts of the mean head's mouth lie in another head, and how its jaw moves them."""
 
     def __init__(self, rig: BlendshapeRig) -> None:
         line = topology().rings["mouth"][MOUTH_CONTACT]

@@ -29,11 +29,7 @@ _ROLL_UPPER = {
 
 
 class Mouth:
-    """The measurements of one head's mouth, from which its shapes are made.
-
-    Args:
-        head: whose mouth.
-    """
+    """The measurements of one head's mouth, from which its shapes are made."""
 
     def __init__(self, head: Anatomy) -> None:
         self.head = head

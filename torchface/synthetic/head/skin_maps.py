@@ -72,7 +72,6 @@ def skin_maps(look: Look, size: int = 2048) -> SkinMaps:
     """The images of a person.
 
     Args:
-        look: of the person.
         size: texels of a side.
     """
     texels, p, marks = _texels(size)

@@ -28,7 +28,6 @@ def _lids(head: Anatomy, upper: Tensor | float, lower: Tensor | float, lean: flo
     """The left lids moved by shares of their own way to where they meet; negative opens. Displacement (V,3).
 
     Args:
-        head: whose lids.
         upper, lower: share of the way at weight 1, one number a lid or (17,) along it from the inner corner.
         lean: how far the upper skin fold follows beyond the edge's own motion, millimetres up.
     """

@@ -43,7 +43,6 @@ def fuse(
         eyes: viewpoints, (E,3).
         voxel: millimetres a side.
         noise: of each view's depth.
-        generator: of the noise.
 
     Returns:
         Vertices (V,3) float64 and faces (F,3).
@@ -81,7 +80,6 @@ def surface_net(cells: Tensor, values: Tensor, shape: Tensor, origin: Tensor, vo
         values: (N,).
         shape: of the grid, (3,).
         origin: of its first point, (3,).
-        voxel: its spacing.
 
     Returns:
         Vertices (V,3) and faces (F,3): a vertex in each cube with both signs, a quad (two triangles) round each edge.

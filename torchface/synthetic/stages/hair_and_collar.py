@@ -38,7 +38,6 @@ def dressed(head: Mesh, landmarks: Tensor, dress: Dress, generator: torch.Genera
     Args:
         head: in the head's space (y up, z forward), fine enough to carry the lumps, with vertex colours.
         landmarks: the 68 of iBUG, (68,3).
-        dress: what to put on.
         generator: of the lumps.
     """
     vertices = head.vertices.double()

@@ -70,7 +70,6 @@ class BrowserPage:
     """A page and its server, until it is closed.
 
     Args:
-        label: heads the panel.
         port: the first to try, 0 for any.
     """
 
@@ -125,7 +124,6 @@ def frame_camera(server: viser.ViserServer, mesh: Mesh, width: float = 1.0) -> N
     """Sets the camera before a mesh, looking along -z: round its landmarks where annotated, else the whole of it.
 
     Args:
-        server: the page.
         mesh: at rest, millimetres.
         width: how many times the mesh's own width must fit in, to its right.
     """
@@ -187,7 +185,6 @@ class SharedInput:
     """A slider, dropdown or checkbox of the page, which distinguishes changes by the user from those by the program.
 
     Args:
-        handle: viser's.
         lock: held while ``act`` runs.
         act: called with the newest value after the user changed it.
     """

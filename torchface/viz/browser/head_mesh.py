@@ -43,9 +43,7 @@ class HeadOnPage:
     the textured mesh follows when the head has come to rest.
 
     Args:
-        server: the page.
         mesh: what to show, millimetres.
-        name: of its nodes.
         offset: where to, millimetres.
         normal_map: gives the normal map (3,H,W) of the pose, or nothing; called when the head has come to rest.
     """

@@ -54,8 +54,6 @@ class LandmarkEditor(BrowserPage):
     frame's files and switches to the next.
 
     Args:
-        session: the frames.
-        label: heads the panel.
         port: the first to try, 0 for any.
     """
 

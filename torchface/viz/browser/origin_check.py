@@ -42,7 +42,6 @@ def is_allowed(host: str | None, origin: str | None, port: int) -> bool:
     Args:
         host: the request's ``Host``.
         origin: its ``Origin``; None where it has none.
-        port: that it came to.
     """
     places = {f"{name}:{port}" for name in _HOSTS} | (set(_HOSTS) if port == 80 else set())
     return host in places and (origin is None or origin in {f"http://{name}" for name in places})
@@ -53,7 +52,6 @@ def without_token(path: str, token: str) -> str | None:
 
     Args:
         path: of the request, such as ``/TOKEN/index.html``.
-        token: of the page.
 
     Example:
         >>> without_token("/secret/index.html?a=1", "secret"), without_token("/index.html", "secret")
@@ -73,7 +71,6 @@ def only_this_page(title: str, token: str, accepts: Callable[[bytes | str], bool
     no setting for any of these.
 
     Args:
-        title: of the browser's tab.
         token: that a request for the page, and for its socket, must name.
         accepts: which messages of a browser get through; a browser that sends a hundred others is disconnected.
     """

@@ -37,7 +37,6 @@ class Picks:
 
     Args:
         landmarks: vertex ids in the set's order, nothing where not picked yet.
-        markers: label and place.
         pairs: label, template vertex, scan point in the scan's space.
         waiting: the template vertex whose scan point is still to come.
     """
@@ -53,7 +52,6 @@ class PickSession:
 
     Args:
         mesh: what landmarks and markers go on; the template of the pairs.
-        scan: what the pairs lead to.
         landmark_set: names and order; landmarks that the mesh brings, if as many, are picked already.
 
     Every change can be undone, one step a click.

@@ -45,7 +45,6 @@ class Picker(BrowserPage):
         out: the folder that *Save* writes to; the page shows it and cannot change it.
         landmark_set: names and order of the landmarks.
         mode: what the first click picks: one of ``MODES``.
-        label: heads the panel.
         port: the first to try, 0 for any.
     """
 
@@ -222,7 +221,6 @@ def save_picks(session: PickSession, folder: str | Path, rig: BlendshapeRig | No
     ==================== =======================================================================================
 
     Args:
-        session: the picks.
         folder: where to; made if missing.
         rig: the rig whose neutral the session's mesh is, so that its shapes are kept.
 

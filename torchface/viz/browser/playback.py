@@ -11,7 +11,6 @@ class Playback:
     """The state of a timeline; moments are seconds of one clock, such as ``time.monotonic()``.
 
     Args:
-        frames: of the take.
         fps: frames a second at speed 1.
         speed: 1 is the take's own.
         loop: begin again at the end.

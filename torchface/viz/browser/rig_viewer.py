@@ -37,11 +37,9 @@ class RigViewer(BrowserPage):
     """A rig in the browser.
 
     Args:
-        rig: what moves.
         take: weights to play and edit, mapped to the rig's names; one neutral pose if absent.
         out: where *Save* writes; a path that the page shows and cannot change.
         detail: wrinkle maps of the rig's shapes, shown while the head rests.
-        label: heads the panel.
         port: the first to try, 0 for any.
     """
 

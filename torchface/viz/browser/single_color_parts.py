@@ -41,9 +41,6 @@ def split_parts(mesh: Mesh) -> list[Part]:
 
     Colours are those of the texture, else of the vertices, else of what regions are named; few classes, for shapes in
     motion. Every triangle lands in one part, but for those of clear shells over the eye and of lashes.
-
-    Args:
-        mesh: what to cut.
     """
     mesh = mesh.to("cpu")
     colors, drawn = _triangle_colors(mesh)

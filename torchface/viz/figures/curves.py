@@ -97,7 +97,6 @@ def compared_curves(
         true, smooth, single: weights (T,N).
         names: of the shapes, N.
         fps: frames a second.
-        first, last: the frames that are drawn.
     """
     lines = -(-len(names) // 2)
     figure = Figure(figsize=(12, 1.7 * lines), dpi=100, layout="constrained")

@@ -48,10 +48,8 @@ class Panel:
     """One of the faces side by side.
 
     Args:
-        title: under it.
         take: which of the player's; the one that the viewer of the page has chosen if absent.
         error: coloured by the distance to the first take's face.
-        markers: with the markers on it.
         yaw: from where it is seen, degrees.
     """
 
@@ -81,10 +79,8 @@ class Player:
         fps: frames a second.
         choices: rows of ``takes`` between which the viewer of the page chooses; the first to begin with.
         reference: row of ``takes`` whose curves lie under the others'.
-        curves: shapes whose curves are drawn.
         markers: over the panels that ask for them.
         maximum: distance at the end of the colours, millimetres.
-        start: the frame to begin with.
     """
 
     takes: Sequence[Played]

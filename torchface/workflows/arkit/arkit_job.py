@@ -66,7 +66,6 @@ class MovingHead:
     """An animation as meshes of one topology.
 
     Args:
-        count: of frames.
         read: vertices (t,V,3), millimetres, of the frames from one number up to another, without it.
         fps: frames a second, where that is known.
         person: the head at rest that moves (V,3); None for the source's own.
@@ -194,7 +193,6 @@ def load_moving_head(path: Path, head: Source) -> MovingHead:
     Args:
         path: parameters or vertices of frames (``.npz``, ``.npy``, ``.safetensors``), face anchors (``.json``), or what
             ``load_animated`` reads.
-        head: whose topology the meshes have.
     """
     if path.suffix.lower() == ".json":
         return _face_anchors(path, len(head.neutral.vertices))

@@ -66,7 +66,6 @@ class ArkitRig:
     """A head with ARKit's shapes, and how it came to them.
 
     Args:
-        rig: on the source's own vertices.
         kept: names that the source had itself.
         made: names that were made.
         others: the source's shapes that ARKit has not.
@@ -184,9 +183,7 @@ class _SizedHead:
     """A source at the template's size.
 
     Args:
-        whole: all of it.
         scan: what the template is registered to.
-        size: of the source beside it.
         landmarks: template vertices and where they lie on it.
     """
 

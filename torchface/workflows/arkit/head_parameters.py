@@ -65,7 +65,6 @@ def read_parameters(arrays: ArrayFile, model: HeadModelFile) -> HeadParameters:
     Args:
         arrays: ``exp`` (T,E), and ``jaw`` (T,3) or ``pose`` (T,6), the head's rotation before the jaw's, or all joints'
             (T,3J), ``eyes`` (T,6), ``shape`` (K,) or (T,K), of which the mean counts; or other spellings of these.
-        model: that they move.
     """
     key = arrays.first(EXPRESSIONS)
     if key is None:

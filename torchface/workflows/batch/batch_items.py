@@ -76,7 +76,6 @@ class ItemKind:
     Args:
         noun: what one is called.
         done: what it is afterwards, such as "registered".
-        endings: of its files.
         is_item: whether a file with one of the endings, or a folder, is one; every file and no folder if absent.
     """
 

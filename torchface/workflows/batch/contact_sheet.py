@@ -35,7 +35,6 @@ def contact_sheet(outcomes: Sequence[Outcome], out: Path) -> Tensor:
 
     Args:
         outcomes: of all items; the first :data:`MOST_PICTURES` are shown.
-        out: the folder of results.
     """
     pictured = outcomes[:MOST_PICTURES]
     pictures = [_picture(outcome, out) for outcome in pictured]

@@ -34,7 +34,6 @@ class Made:
 
     Args:
         results: the files, inside the folder of results.
-        figures: what was measured.
         headline: the most telling of it, a few words for the contact sheet.
         notes: what people should know before they use the results.
         picture: for the contact sheet, (3,H,W) in [0,1].
@@ -54,7 +53,6 @@ class Outcome:
     """What became of one item.
 
     Args:
-        item: its name and path.
         results: the files; empty where it was skipped.
         figures, headline, notes: see :class:`Made`.
         error: why it was skipped; empty where it was not.

@@ -61,9 +61,6 @@ def in_processes(
 
     Args:
         job: what is done with each.
-        items: to be worked on.
-        out: the folder of results.
-        count: of processes.
         time_limit: seconds that an item may take.
     """
     limit = inf if time_limit is None else time_limit
@@ -171,7 +168,6 @@ def lost(item: BatchItem, end: str) -> Outcome:
     """The outcome of an item whose process has died.
 
     Args:
-        item: what it was working on.
         end: how it ended.
     """
     return Outcome(item, error=f"the process that worked on it {end}")

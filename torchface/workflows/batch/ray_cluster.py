@@ -91,9 +91,7 @@ def on_cluster(
 
     Args:
         job: what is done with each; travels once to each machine.
-        items: to be worked on.
         out: the folder of results, where all machines see it.
-        address: of the cluster.
         time_limit: seconds that an item may take.
     """
     ray = _import_ray()

@@ -54,7 +54,6 @@ class BatchReport:
     """What became of a batch.
 
     Args:
-        kind: of its items.
         outcomes: one an item, in the order found.
         out: the folder of results and records.
         left_out: what lay beside the items and is none.
@@ -105,8 +104,6 @@ def run_batch(
 
     Args:
         job: what is done with each.
-        kind: of the items.
-        inputs: the items.
         out: the folder of results, made where it is missing; not one that holds items.
         options: where the items are worked on.
         progress: called with how many items are done, and of how many; those of an earlier run count at once.

@@ -117,12 +117,7 @@ _OUTPUTS = (
 
 
 def check_webcam_graph(data: bytes, path: str | Path) -> None:
-    """Looks at inputs, outputs and names of shapes; runs nothing.
-
-    Args:
-        data: the file's bytes.
-        path: names it in errors.
-    """
+    """Looks at inputs, outputs and names of shapes; runs nothing."""
     wanted = f"expected the graph of torchface export webcam ({', '.join(_INPUTS)} to {', '.join(_OUTPUTS)})"
     options = onnxruntime.SessionOptions()
     options.log_severity_level = 3  # errors alone

@@ -57,7 +57,6 @@ class Scene:
 
     Args:
         title: for the report.
-        template: the rig to transfer.
         head: the new neutral.
         truth: the rig that really is the new head's.
         weights: (T,N), in the order of ``truth.names``.
@@ -101,19 +100,16 @@ class DemoResult:
     """What came out, beside what was true.
 
     Args:
-        scene: what was played.
         rig: the template transferred to the head.
         transfer: how that went.
         attachment: where the markers sat.
         layout: the make-up artist's, which has names for it; none where the rig has too little for one.
-        recording: the take with its truth.
         solved: the take solved at once, which is what the files hold.
         frame_by_frame: every frame on its own.
         seconds: what the solve at once took.
         face: mask (V,) of the vertices that the mesh errors are about.
         seen: what the markers observe of the rig.
         solver: how the exported solver compares.
-        files: what was written, by purpose.
     """
 
     scene: Scene
@@ -204,7 +200,6 @@ def run_demo(scene: Scene, out: Path, seed: int = 0, progress: Progress | None =
     Args:
         scene: see ``embedded_scene`` and ``scene_from``.
         out: the folder; made if absent.
-        seed: of noise and gaps.
         progress: called with each step and how far it is.
 
     Returns:

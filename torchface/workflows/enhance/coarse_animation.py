@@ -27,8 +27,6 @@ class CoarseAnimation:
 
     Args:
         path: where it came from.
-        kind: what that is, in words.
-        count: of frames.
         read: vertices (t,V,3) of the frames from one number up to another, without it, millimetres.
         fps: frames a second.
         shown: what the file itself holds of these frames, in the same place: (t,N,3), NaN where a point was not seen.

@@ -67,7 +67,6 @@ def read_coarse(path: Path, model: Mesh, settings: InputSettings, state: Path, p
         path: ``.c3d``, ``.trc``, ``.csv`` of markers or weights, ``.glb``, ``.safetensors``, a mesh, a folder of
             meshes, or the folder of ``torchface track``.
         model: the model's neutral.
-        settings: what belongs to the input.
         state: a folder for what a later run may take up.
         progress: called with each step and how far it is.
     """
@@ -118,7 +117,6 @@ def other_topology(
     """An animation of other vertices, spread over the model's by the thin shell.
 
     Args:
-        animated: what moves.
         model: the model's neutral.
         correspondence: of ``animated.neutral`` with it.
         fps: frames a second; as the file has them if absent.

@@ -62,12 +62,7 @@ class Enhanced:
     """What came of an animation.
 
     Args:
-        animation: what was enhanced.
-        model: the actor's.
-        model_name: as it was asked for.
-        frames: the result.
         mesh: the model's neutral, framed by what moves.
-        products: files by what they are.
         notes: lines for people to read; warnings begin with ``warning: ``.
     """
 

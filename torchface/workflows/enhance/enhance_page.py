@@ -23,8 +23,6 @@ def write_enhance_page(done: Enhanced, out: Path, height: int = _HEIGHT) -> Path
     """Writes the report's page and figures into a folder.
 
     Args:
-        done: what came of the animation.
-        out: the folder.
         height: of each view of a face, pixels.
 
     Returns:

@@ -42,7 +42,6 @@ class ShownFrame:
     """One frame, its head held still in the neutral's place.
 
     Args:
-        number: of the frame.
         given: what the input's file holds, (N,3), millimetres; NaN points were not seen.
         coarse: that on the model's mesh, (V,3).
         smooth: its low frequencies, to which detail is added, (V,3).

@@ -32,7 +32,6 @@ class EnhancedFrames:
     """What came of an animation.
 
     Args:
-        sequence: the enhanced meshes, on disk.
         colors: their vertex colours, on disk; None where the model has none.
         distances: of each region from the database, relative to the database's own spread, (T,R).
         outside: frames and regions that the database does not hold, (T,R) bool.
@@ -71,8 +70,6 @@ def enhance_frames(
     """Enhances an animation into files of a folder.
 
     Args:
-        animation: in the model's vertices.
-        model: the actor's.
         out: the folder of results, held for this run.
         state: a folder for what a killed run leaves to the next.
         key: of everything that the frames come from; what another key left is made anew.

@@ -33,7 +33,6 @@ class MarkerSites:
     """Where markers sit on the model, and the rig that says so.
 
     Args:
-        attachment: as the user gave it.
         rig: whose mesh it belongs to; None where that is the model's.
         correspondence: how the rig's neutral lies on the model's, where there is a rig.
     """
@@ -90,7 +89,6 @@ def marker_animation(
     from those before and after.
 
     Args:
-        path: the take.
         sites: where its markers sit.
         model: the model's neutral.
         neutral: a frame with the face at rest, from which motion counts; else from the sites.

@@ -38,9 +38,6 @@ class Retimed:
 
     Args:
         curves: how far each region has come in each frame, (R,T), 0 first and 1 last.
-        names: of the regions.
-        fps: of the frames.
-        products: files by what they are.
     """
 
     curves: Tensor
@@ -65,9 +62,7 @@ class Keyframe:
     """A mesh, or a frame of an animation as ``FILE@NUMBER``.
 
     Args:
-        path: of the file.
         frame: its number, from 0; None for a file of one mesh.
-        rig: that weights move.
     """
 
     path: Path

@@ -25,7 +25,6 @@ class RigOnModel:
     """How a rig lies on a model's mesh.
 
     Args:
-        rig: the rig.
         correspondence: of its neutral with the model's.
         dense: vertices (T,V,3) of the model's mesh for the rig's own (T,N,3).
         notes: lines for people to read; warnings begin with ``warning: ``.

@@ -34,7 +34,6 @@ def bake_region_maps(
         model: the model's neutral.
         displacements: of the maps, (M,3,V), millimetres along two tangents and the normal of the model's neutral.
         shares: of the regions in the rig's vertices, (R,N).
-        regions: their names.
         scale: from the rig's millimetres to the model's.
         size: of the maps, texels a side.
         progress: called with each step and how far it is.

@@ -52,7 +52,6 @@ class WrinkleSettings:
     Args:
         maps: how many.
         size: of each, texels a side.
-        poses: that weights are learned from.
         pairs: vertices of the rig and where they lie on the model; found by registration if absent.
         part: keep this annotated region of the rig only.
         animation: weights that the ``.glb`` plays, with the maps' weights beside it.
@@ -71,13 +70,10 @@ class ExportedWrinkles:
     """What was made, and how much of the actor's detail it shows.
 
     Args:
-        maps: the maps.
-        wrinkles: what gives their weights.
         missed_by_maps: of the model's detail on poses whose weights were not learned, with the best weights, root mean
             square, as a share.
         missed: the same with the weights that are found for them.
         graphs: how the graphs were checked.
-        products: files by what they are.
         notes: lines for people to read; warnings begin with ``warning: ``.
     """
 

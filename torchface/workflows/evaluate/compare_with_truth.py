@@ -112,8 +112,6 @@ def compare(
     """Compares frame by frame.
 
     Args:
-        found: the result.
-        true: of its topology.
         settings: which frames, and how.
         scans: the truth's scans, where it was registered to such.
     """

@@ -20,8 +20,6 @@ def write_evaluation_page(evaluation: Evaluation, out: Path, height: int = 290) 
     """Writes the report's page and figures into a folder.
 
     Args:
-        evaluation: what came of it.
-        out: the folder.
         height: of each view of a face, pixels.
 
     Returns:

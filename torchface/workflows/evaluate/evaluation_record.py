@@ -25,7 +25,6 @@ class Compared:
     """One frame as it was compared, for figures.
 
     Args:
-        frame: of the result.
         found, true: vertices (V,3); the found ones as they were compared, aligned with the truth where asked for.
         errors: (V,), millimetres; NaN was not compared.
     """
@@ -41,7 +40,6 @@ class Evaluation:
     """How far a result is from the truth.
 
     Args:
-        result, truth: names of the files.
         mesh: topology and annotations, in the pose that errors are painted on.
         frames: which of the result were compared, (T,) int64.
         fps: frames a second, where that is known.

@@ -59,7 +59,6 @@ class ExpressionBenchmark:
     """Scores of methods over films.
 
     Args:
-        films: names of the films.
         frames: how many they have together.
         methods: scores by the methods' names; the last is ``NOTHING``.
         missing: films without a result, by method, which counts as nothing that moves.

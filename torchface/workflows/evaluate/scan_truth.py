@@ -28,8 +28,6 @@ class ScanTruth:
 
     Args:
         animated: the registered meshes, a frame each; NaN where the scan does not show a vertex.
-        scans: their files.
-        unit: of the files.
         notes: what there is to say of each.
     """
 

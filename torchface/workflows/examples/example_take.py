@@ -66,7 +66,6 @@ class ExampleTake:
         weights: of the examples, (T,N); NaN where no face was found.
         solved: where the chosen method puts the landmarks, (T,68,2).
         figures: one for each method.
-        products: files by what they are.
     """
 
     weights: Tensor
@@ -141,7 +140,6 @@ def track_by_examples(
         out: the folder for ``weights.csv``, ``landmarks.csv``, ``methods.csv`` and ``overlay.mp4``.
         method: whose weights are written and drawn.
         landmarks: what finds them, or a ``.csv`` that holds them.
-        face: which of several.
         progress: called with each step and how far it is.
     """
     progress = progress or silent

@@ -37,7 +37,6 @@ def guided_examples(
         camera: a camera's number, or a video file that was recorded to the same clock, read at once.
         say: called with what the person should do, and the count-down.
         seconds: for each expression.
-        landmarks: what finds landmarks.
     """
     checked_number("--seconds", seconds, 0.1, 60.0)
     tracker = LandmarkTracker(load_finder(landmarks).finder)

@@ -50,7 +50,6 @@ def strange_lines(photographs: Sequence[Path], fit: ImageFit) -> list[str]:
 
     Args:
         photographs: the files, I of them.
-        fit: of them.
     """
     # A contour that a model cannot follow is the model's fault.
     inner = fit.residuals[:, JAW:].square().sum(-1).nanmean(1).sqrt() / eyes_distances(fit.landmarks)
@@ -68,7 +67,6 @@ def one_person_lines(photographs: Sequence[Path], marks: Tensor, bare: BareFit, 
     Args:
         photographs: the files, I of them.
         marks: their landmarks, (I,68,2).
-        bare: see there.
         insist: report it only.
     """
     if len(photographs) < 2:
@@ -108,7 +106,6 @@ def landmark_lines(
         images: they, (3,H,W).
         marks: the landmarks given, (I,68,2).
         finder: finds landmarks; by name or folder.
-        bare: see there.
     """
     lines = []
     for i, misfit in enumerate(

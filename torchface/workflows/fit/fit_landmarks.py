@@ -28,7 +28,6 @@ def landmarks_of(photographs: Sequence[Path], files: Sequence[Path], face: int |
     """The landmarks (68,2) of each photograph: a file each, or one of dlib's XML that names them, or a table.
 
     Args:
-        photographs: image files.
         files: of landmarks; a table has a row a photograph.
         face: which of several in an XML, from 0, numbered as where no file is given: as they are detected, the largest
             first; after them those that are not detected.
@@ -149,9 +148,6 @@ class PhotographLandmarks:
     """What was found in one photograph.
 
     Args:
-        photograph: the file.
-        model: what found it.
-        face: landmarks, box, confidence.
         number: which of the faces it is, from 0, the largest first.
         boxes: of all faces, x, y, width, height, (F,4) pixels.
         size: of the photograph, width and height.

@@ -24,7 +24,6 @@ class ReadExpressions:
 
     Args:
         prior: of any face; none if absent.
-        readings: of the photographs' expressions.
     """
 
     prior: ExpressionPrior | None

@@ -98,12 +98,10 @@ class FittedHead:
     """What was made, and how near it comes to the photographs.
 
     Args:
-        rig: the person's.
         fit: see ``ImageFit``.
         overlays: the files written, one a photograph: it, the fit over it, landmarks found (green) and fitted (red).
         transfer_summary: on triangles without area; empty where there are none.
         found: the landmarks that no file gave; empty where files gave them.
-        remarks: what speaks against the fit.
         heads: what there is to say of the head model.
         shown: the photographs, and the frames of videos, by their names.
     """
@@ -257,7 +255,6 @@ def overlay(fit: ImageFit, view: int, image: Tensor, marks: Tensor, head: Mesh |
 
     Args:
         fit: of I photographs.
-        view: which of them.
         image: it, (3,H,W).
         marks: its landmarks, (68,2).
         head: at rest, with the skin and the eyes that are shown; the fit's if absent.

@@ -38,7 +38,6 @@ def picture_lines(found: PhotographLandmarks, image: Tensor, insist: bool = Fals
     """What speaks against a photograph, for people to read; nothing where it shows one face well.
 
     Args:
-        found: the face.
         image: the photograph, (3,H,W) in [0,1].
         insist: report also what is refused otherwise.
     """
@@ -96,7 +95,6 @@ def cover_lines(photograph: Path, parts: FaceParts, landmarks: Tensor) -> list[s
     """What stands before a face, for people to read; nothing where nothing does.
 
     Args:
-        photograph: the file.
         parts: what it shows.
         landmarks: of the face, (68,2) pixels; NaN for missing.
     """

@@ -39,7 +39,6 @@ def video_pictures(
     """Chooses frames of a video to fit a head to.
 
     Args:
-        video: the file.
         rest: landmarks of a head at rest, (68,3) millimetres.
         progress: called with how many frames are read.
         model: finds landmarks; by name or folder.

@@ -38,7 +38,6 @@ class ActorSolver:
     """Landmarks, pose and weights one frame at a time.
 
     Args:
-        inputs: of the camera.
         offsets: between the rig's landmarks and those that the models find.
     """
 
@@ -85,10 +84,8 @@ def track_live(
 
     Args:
         camera: a device's number, or a video file, which is played at its own rate.
-        rig: the actor's.
         addresses: see :func:`torchface.io.open_sender`.
         out: a folder for the curves of what was sent; none are kept without.
-        settings: models, calibration, face.
         seconds: after which it ends; until it is interrupted (Ctrl-C) or the video ends if absent.
         progress: called with the number of frames sent.
     """

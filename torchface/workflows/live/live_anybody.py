@@ -51,11 +51,7 @@ _USUAL = 1 / 30  # seconds
 
 
 class PersonSolver:
-    """Solves frames for ARKit's weights.
-
-    Args:
-        session: runs the graph.
-    """
+    """Solves frames for ARKit's weights."""
 
     def __init__(self, session: WebcamSession) -> None:
         self._session = session
@@ -133,7 +129,6 @@ def go_live(
     """Solves, sends, records and shows what a camera sees, until it ends or is interrupted.
 
     Args:
-        settings: what with.
         say: called with what the user should know while it runs, and without a page what a calibration asks for.
         opened: called with the page's address.
         make_solver: gives what solves the frames, by ARKit's names; called with the progress of its steps.

@@ -52,7 +52,6 @@ class LiveReport:
     """What was sent.
 
     Args:
-        figures: of its frames.
         dropped: frames that came while another was solved.
         notes: what the user should know, such as receivers that were not there.
     """

@@ -114,7 +114,6 @@ def open_source(camera: str, say: Say, settings: SourceSettings = _DEFAULT) -> F
     Args:
         camera: ``"0"``, ``"1"``, ... or a path.
         say: called with what happens to the camera on the way.
-        settings: of either.
     """
     if re.fullmatch("[0-9]{1,3}", camera):
         return Camera(int(camera), say, settings.size)
@@ -180,7 +179,6 @@ class FaceSolver(Protocol):
         Args:
             picture: uint8 (H,W,3), red first.
             interval: seconds since the frame before; absent for the first.
-            controls: what the user set.
         """
 
 

@@ -55,7 +55,6 @@ class LiveSession:
     """The loop over frames, and what a page may ask of it meanwhile.
 
     Args:
-        source: of frames.
         solver: by ARKit's names.
         streams: where weights are sent to.
         recordings: what keeps them when asked to.

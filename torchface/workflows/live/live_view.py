@@ -30,7 +30,6 @@ class LiveView:
         interval: since the frame before, seconds.
         latency: from its arrival to its packets on the way, milliseconds.
         picture: of the camera, uint8 (H,W,3), red first.
-        solved: what was sent.
     """
 
     came: float

@@ -68,10 +68,8 @@ class PageServer:
     """Serves the page until it is stopped.
 
     Args:
-        folder: of the page's files.
         character: ``character.glb`` and ``character.json``, by name.
         takes: gives the rows of a take by its name.
-        desk: the session.
         port: the first to try, 0 for any.
     """
 

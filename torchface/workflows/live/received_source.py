@@ -75,7 +75,6 @@ class ReceivedSolver:
     """What a received face is for the session: corrected for the person, smoothed, held and relaxed while it is lost.
 
     Args:
-        source: of the faces.
         say: called with guided poses that were not held.
     """
 
@@ -134,7 +133,6 @@ class ReceivedWatch:
     """Words about the sender, for the status line; each change is said.
 
     Args:
-        source: of the faces.
         say: called with a change.
     """
 

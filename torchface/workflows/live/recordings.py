@@ -145,7 +145,6 @@ class Recordings:
 
     Args:
         folder: of the first take; later ones lie in it as ``take_2`` and so on.
-        character: whose animation is written.
         source: names the camera or video in the summary.
         fps: frames a second, where the frames do not say.
     """

@@ -23,7 +23,6 @@ class MappedSender:
 
     Args:
         sender: of the weights by the table's names.
-        shapes: leads to them.
     """
 
     def __init__(self, sender: FrameSender, shapes: ShapeMap) -> None:

@@ -137,9 +137,7 @@ def relight_film(
     """Reads a film and its track, and writes the film anew.
 
     Args:
-        film: a video.
         track: the folder that ``torchface track`` wrote of it.
-        out: the video to write.
         settings: what it is to show.
         progress: called with each step and how far it is.
 

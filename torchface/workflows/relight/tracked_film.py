@@ -28,13 +28,10 @@ class TrackedFilm:
     """A film and the face in it.
 
     Args:
-        video: the film.
-        rig: the actor's.
         weights: of its shapes, (T,N).
         rotation, translation: from the rig to the camera, (T,3,3) and (T,3) millimetres.
         landmarks: iBUG's 68 as they were found, (T,68,2) pixels.
         seen: frames that show the face, (T,) bool.
-        calibration: of the camera.
     """
 
     video: VideoFile
@@ -60,8 +57,6 @@ def read_tracked_film(film: Path, track: Path, camera: Path | None = None) -> Tr
     """Reads a film and the folder that ``torchface track`` wrote of it.
 
     Args:
-        film: a video.
-        track: the folder.
         camera: the calibration with which it was tracked; needed where there was one.
     """
     for name in (SUMMARY, LANDMARKS, ANIMATION):

@@ -179,7 +179,6 @@ def rig_actor(
 
     Args:
         scan: the actor at rest, any topology and pose.
-        template: a rig.
         out: the file or folder to write; see ``save_rig``.
         landmarks: of the scan; see ``load_scan_landmarks``. Found by shape alone if absent.
         examples: a folder of scans of expressions; see ``expressions_in``. Landmark files named as the scans may lie
@@ -272,7 +271,6 @@ def load_expressions(name_or_path: str | Path, template: BlendshapeRig, path: Pa
 
     Args:
         name_or_path: see ``zoo.get_model``.
-        template: the rig.
         path: where the rig was read; None for the embedded performer.
     """
     model = zoo.get_model(name_or_path, ExpressionRegression)

@@ -57,9 +57,7 @@ def added_parts(
     """The parts that a character lacks.
 
     Args:
-        character: with the face.
         face: where it is.
-        template: the embedded performer.
         registration: of the template with ``face.skin``.
         wanted: the inside of the mouth, and eyes.
     """

@@ -74,7 +74,6 @@ def expressions_in(folder: Path, names: Sequence[str]) -> list[Expression]:
 
     Args:
         folder: scans, and ``weights.csv`` where the names do not give it.
-        names: the rig's shapes.
     """
     if not folder.is_dir():
         raise FileFormatError(f"{folder}: found no such folder, expected one with scans: {LAYOUT}")
@@ -148,7 +147,6 @@ def check_side(actor: BlendshapeRig, weights: Tensor, found: Tensor, seen: Tenso
     A head alone looks like another head when it is mirrored; an expression of one side does not.
 
     Args:
-        actor: the transferred rig.
         weights: of the expression, (N,).
         found: the registered vertices, aligned with the rig, (V,3).
         seen: vertices that the scan shows, (V,) bool.

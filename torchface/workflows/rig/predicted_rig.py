@@ -67,7 +67,6 @@ def predict_rig(
     """Makes a rig of a head in the template's topology and writes it, with a report ``NAME_shapes/index.html``.
 
     Args:
-        head: a mesh.
         out: the file or folder to write; see ``save_rig``.
         expressions: the regression, by name or folder.
         template: a rig; the embedded performer if absent.

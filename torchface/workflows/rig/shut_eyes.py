@@ -45,7 +45,6 @@ def with_eye_note(
 
     Args:
         rig: the template; one without shapes that shut both eyes is not judged.
-        scan: as it was registered.
         registration: of the template in the pose ``shown``.
         shown: the template's weights that the scan is taken to show, (N,).
         other_fit: registers the template at weights (N,) to the scan.

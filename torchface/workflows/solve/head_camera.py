@@ -32,7 +32,6 @@ class HeadCamera:
     """A video of the face with painted patterns, and its classifier.
 
     Args:
-        video: the file.
         classifier: a trained ``ActionUnitClassifier``, by name or folder.
         labels: where helmet, markers and regions are in the video; the video's name with ``.toml`` if absent.
         table: action units in the rig's shapes: ``arkit``, ``ict`` or a file; whichever of the two has
@@ -77,9 +76,6 @@ def predicted_curves(
     take the markers are left alone.
 
     Args:
-        camera: video, classifier, labels, table.
-        take: whose frames are meant.
-        names: of the rig's shapes.
         progress: called with each step and how far it is.
     """
     classifier = zoo.get_model(camera.classifier, ActionUnitClassifier)

@@ -80,8 +80,6 @@ class Solution:
     """The solution of a take's markers.
 
     Args:
-        rig: that was solved.
-        take: with the solved weights.
         markers: as the solve used them, (T,M,3), in rig space, without slip, bad samples NaN.
         attachment: the sites, with what was subtracted at rest; of the take's markers.
         alignment: marker space to rig space, where one was estimated.
@@ -123,9 +121,7 @@ class SolveReport:
     """The report of a solve.
 
     Args:
-        solution: of the take's markers.
         seen: fraction of the samples of the attachment's markers that were seen.
-        seconds: what the solve itself took.
         predicted: what the head camera saw, where there was a video.
         sent: what was streamed, where that was asked for.
         warnings: what the user should know before they use the weights.
@@ -186,10 +182,8 @@ def solve_markers(
     """A take's weights: aligned with the rig, cleaned, freed of slip and of what is left at rest, solved.
 
     Args:
-        rig: the performer's.
         attachment: where the markers sit; markers match by label.
         take: markers, in any space.
-        settings: which of these steps.
         predicted: what a head camera saw, for the hybrid solve.
         progress: called with each step and how far it is.
     """

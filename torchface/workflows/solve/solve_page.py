@@ -40,8 +40,6 @@ def write_solve_page(folder: Path, title: str, report: SolveReport) -> Path:
 
     Args:
         folder: where to; made if absent.
-        title: what was solved.
-        report: of the solve.
 
     Returns:
         The page's path.

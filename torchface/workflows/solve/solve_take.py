@@ -26,7 +26,6 @@ class TakeInputs:
 
     Args:
         rig: a file or folder of the performer's rig.
-        take: a file of markers.
         attachment: a file that says where the markers sit on the rig.
         part: an annotated region that the rig is cut to, such as ``"face"``.
         camera: what a head camera saw of the take.

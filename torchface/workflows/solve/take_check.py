@@ -35,9 +35,7 @@ class Coverage:
     """The markers of an attachment that a take shows.
 
     Args:
-        markers: of the attachment.
         present: of them, seen in some frame of the take.
-        shapes: of the rig.
         poor: frames that show some markers, but fewer coordinates than the rig has shapes while most frames show more.
     """
 
@@ -98,7 +96,6 @@ def check_explained(solver: MarkerSolver, take: Take, aligned: bool, slip: bool,
     """How well a rig explains a take's markers.
 
     Args:
-        solver: rig and attachment.
         take: markers in rig space, all known to the solver.
         aligned: the take was aligned with the rig.
         slip: the helmet's motion will be taken out.
@@ -131,7 +128,6 @@ def check_head(rig: BlendshapeRig, attachment: Attachment, take: Take, insist: b
 
     Args:
         rig: whose mesh has the attachment's triangles.
-        attachment: the sites.
         take: markers in rig space, without the helmet's motion.
         insist: warn in place of the error.
 
@@ -171,7 +167,6 @@ def neutral_warnings(rig: BlendshapeRig, attachment: Attachment, take: Take, fra
     """Warnings where a frame that is given as neutral moves the face more than the calmest frame of its take.
 
     Args:
-        rig, attachment: of the take.
         take: markers, in any space.
         frame: the one that is to be neutral.
         scale: an alignment estimates the scale.
@@ -204,7 +199,6 @@ def label_warnings(solver: MarkerSolver, take: Take, slip: bool) -> list[str]:
     """Warnings for labels that are exchanged in the whole take or in part of it; for takes that are not cleaned.
 
     Args:
-        solver: rig and attachment.
         take: markers in rig space.
         slip: the helmet moves on the head.
     """

@@ -48,7 +48,6 @@ def stream_weights(
 
     Args:
         frames: (N,) each; each is taken when it is due.
-        names: of the weights.
         fps: frames a second; a frame that comes too early waits, one that comes too late goes at once.
         address: where to and how; see :func:`torchface.io.open_sender`.
         clock, wait: what time it is, and to let it pass, in seconds.

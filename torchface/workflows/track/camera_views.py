@@ -31,7 +31,6 @@ class OtherCamera:
     """A camera beside the first, and its film.
 
     Args:
-        inputs: of its film.
         camera: where it stands.
         begin: when its film began after the first one's, seconds.
     """

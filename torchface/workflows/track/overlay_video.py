@@ -31,8 +31,6 @@ def write_overlay(tracked: Tracked, path: Path, progress: Progress) -> None:
     """Writes the overlay of a whole video, as its settings ask for; it appears when it is complete.
 
     Args:
-        tracked: what was solved.
-        path: of the video to write.
         progress: called with each step and how far it is.
     """
     settings = tracked.inputs.settings

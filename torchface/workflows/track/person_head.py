@@ -28,7 +28,6 @@ class PersonHead:
 
     Args:
         rig: the head found, with the shapes of the model's rig transferred to it.
-        fit: to the frames.
         frames: their numbers, (F,).
     """
 
@@ -54,7 +53,6 @@ def person_head(
 
     Args:
         inputs: whose actor is the rig of the model's mean head.
-        heads: of the rig's topology.
         landmarks: smoothed, (T,68,2) pixels of a camera without distortion.
         reading: of the frames, (T,...): how far each landmark is trusted.
         progress: called with each step.

@@ -97,11 +97,9 @@ class TrackInputs:
     """What tracking starts from.
 
     Args:
-        settings: as the user gave them.
         clip: the video; or what stands for it, where a table gives the landmarks and there is none.
         actor: the rig, with 68 landmarks.
         calibration: of the camera, at the video's resolution.
-        models: what tracks and solves.
         times: when each frame is shown, (T,) seconds, where the frame rate varies.
         rate_varies: how, in words.
         heads: of the rig's topology, from which the person's is solved; None where the rig is the person's.

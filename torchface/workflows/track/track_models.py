@@ -47,7 +47,6 @@ class TrackModels:
     Args:
         finder: finds landmarks in any face; absent where they are given.
         appearance: refines them on the actor's own.
-        prior: which weights faces have.
         dynamics: how weights go on.
         unlearned: shapes of the rig that a prior says nothing of: they stay near rest.
         seeing: changes when what finds landmarks does.

@@ -39,10 +39,8 @@ class Tracked:
     """What came of a video.
 
     Args:
-        inputs: what it was tracked from.
         reading: the face in all frames, (T,...).
         landmarks: the reading's as a camera without distortion has them, filtered along time, (T,68,2), pixels.
-        solution: weights and refined poses.
         times: when each frame is shown, (T,) seconds, where the frame rate varies; even at the video's if absent.
         offsets: between the rig's landmarks and those found; None where the take is too short for an estimate.
         faces: how many there are in the first frame.

@@ -37,9 +37,7 @@ class WebcamReport:
     """What was written.
 
     Args:
-        path: the file.
         size: in bytes.
-        frames: that it was checked with.
         landmarks: the largest mean distance of a frame's landmarks between ONNX Runtime and PyTorch, over that of the
             eyes' outer corners.
         weights: the largest difference of a weight.
@@ -117,7 +115,6 @@ def webcam_parity(session: WebcamSession, graph: WebcamGraph, frames: Sequence[n
 
     Args:
         session: runs the graph, from where it is.
-        graph: what it was exported from.
         frames: uint8 (H,W,3).
 
     Returns:

@@ -32,7 +32,6 @@ def check_sites(
         error: root mean square distance of each marker to its site, (M,), millimetres.
         off_skin: distance of each marker from its site that lasts over the take, (M,), millimetres.
         radius: of the sites at rest, mean distance from their centre, millimetres.
-        uncertainty: of sites and shapes.
     """
     typical, offset, limit = float(error.median()), float(off_skin.median()), DOUBTFUL_SHARE * radius
     if not typical <= limit:

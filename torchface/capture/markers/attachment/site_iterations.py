@@ -65,11 +65,9 @@ class SiteSolver:
     """Solves for sites, weights and pose; holds what is the same in all iterations.
 
     Args:
-        motion: of the rig's surface.
         search: for candidate triangles.
         initial: the initial guess of the sites at rest, (M,3), millimetres.
         standoff: estimate the markers' distance from the skin.
-        scale: estimate the take's scale.
     """
 
     motion: SurfaceMotion
@@ -256,7 +254,6 @@ class SiteSearch:
         Args:
             lifted: affine maps of the vertices, (V,3,N+1).
             points: the sites at rest.
-            moments: of the take.
         """
         around = self.near(points, _NEIGHBOURHOOD)
         used, row = around.unique(return_inverse=True)

@@ -95,8 +95,6 @@ def site_uncertainty(fit: SitesOnTake, seconds: float, names: Sequence[str], lab
     Args:
         fit: sites, pose and weights, spread over the take.
         seconds: how long the take is.
-        names: of the shapes.
-        labels: of the markers.
     """
     affine, moved, weights = fit.affine, fit.moved, fit.weights
     residual = moved - torch.einsum("mcn,tn->tmc", affine[..., 1:], weights) - affine[..., 0]

@@ -41,7 +41,6 @@ def find_swaps(seen: Tensor, prediction: Prediction, fps: float) -> list[Swap]:
 
     Args:
         seen: markers in rig space, (T,M,3), NaN for not seen.
-        prediction: of these markers.
         fps: frames a second.
     """
     outlier = prediction.outliers
@@ -125,7 +124,6 @@ def whole_take_exchanges(seen: Tensor, prediction: Prediction) -> list[tuple[int
 
     Args:
         seen: markers in rig space, (T,M,3), NaN for not seen.
-        prediction: of these markers.
     """
     own = prediction.distance.nanmedian(0).values
     out = (own > prediction.limit).nonzero()[:, 0]

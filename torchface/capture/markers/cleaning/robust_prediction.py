@@ -49,7 +49,6 @@ def predict_markers(
     badly gets larger limits.
 
     Args:
-        solver: rig, attachment, sparsity.
         seen: markers in rig space, (T,M,3), float64, NaN for not seen.
         slip: the helmet may move; six rigid columns model it.
         ignored: markers that are predicted from the others alone, (M,) bool.

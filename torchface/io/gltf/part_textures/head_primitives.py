@@ -25,7 +25,6 @@ def painted_lashes(mesh: Mesh, triangles: Tensor, material: PartMaterial) -> Pai
     """Hairs for lashes whose cards each begin at a lid.
 
     Args:
-        mesh: the head.
         triangles: rows of its faces that are lashes, (K,).
         material: whose colour they have.
     """

@@ -37,7 +37,6 @@ def eye_centre(mesh: Mesh, triangles: Tensor) -> Tensor:
     """The point (3,) about which an eyeball rotates: the centre of the sphere that most of its outer shell lies on.
 
     Args:
-        mesh: the head.
         triangles: rows of its faces that are the eyeball, (K,).
     """
     return _sphere(_shells(mesh, triangles)[0].unique(), mesh)[0]
@@ -47,7 +46,6 @@ def painted_eye(mesh: Mesh, triangles: Tensor) -> list[tuple[Tensor, PartMateria
     """The layers of an eyeball that looks along z, or where its pupil is: rows of the faces, material, paint of each.
 
     Args:
-        mesh: the head.
         triangles: rows of its faces that are the eyeball, (K,).
     """
     outer, inner = _shells(mesh, triangles)

@@ -20,7 +20,6 @@ class AnnotatedFrame:
     """An image with landmarks.
 
     Args:
-        name: of its files, without ending.
         image: (3,H,W), uint8 or in [0,1].
         landmarks: iBUG's 68, (68,2) pixels.
     """

@@ -83,7 +83,6 @@ class AppearanceLevel(nn.Module):
         """By how much the template should move, (B,Q).
 
         Args:
-            residual: at the current alignment.
             state: the current shape along the motions (B,Q), 0 for the similarity's.
             precision: of the shape along each, (Q,), 0 for the similarity's.
             terms: of :meth:`curvature_terms`.

@@ -33,7 +33,6 @@ def dense_features(images: Tensor, kind: Features) -> Tensor:
 
     Args:
         images: grey, (B,1,H,W) in [0,1].
-        kind: which.
 
     Returns:
         (B,C,H,W), C as in ``CHANNELS``.

@@ -198,7 +198,6 @@ def _said_faces(maps: FaceMaps, scale: int) -> Tensor:
     """The face of every cell (B,h*w,6), as :meth:`BoxNetwork.forward` gives faces.
 
     Args:
-        maps: of images.
         scale: pixels a pixel of the images.
     """
     likely, geometry = maps.centre.sigmoid(), maps.geometry

@@ -33,8 +33,6 @@ class LiteNetwork:
     """One TensorFlow Lite network of float32 tensors.
 
     Args:
-        content: the file's bytes.
-        name: what messages call it.
         given, wanted: shapes of the input and of outputs.
     """
 

@@ -145,7 +145,6 @@ class MediaPipeFinder:
 
     Args:
         bundle: the networks, or the file that holds them.
-        name: what messages call it.
     """
 
     def __init__(self, bundle: LandmarkerBundle | str | Path, name: str = "mediapipe") -> None:

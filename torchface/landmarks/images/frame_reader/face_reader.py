@@ -73,8 +73,6 @@ class WebcamNetworks:
     """What read faces.
 
     Args:
-        boxes: finds faces in pictures.
-        landmarks: finds landmarks in a face.
         eyes: finds lids and irises in an eye.
     """
 
@@ -91,7 +89,6 @@ class FaceReader(nn.Module):
     Tensor operations alone: it is exported as it is.
 
     Args:
-        networks: what read it.
         settings: when a face counts as found and as lost.
     """
 
@@ -215,7 +212,6 @@ def read_eyes(image: Tensor, face: FaceReading, network: EyeNetwork) -> FaceRead
 
     Args:
         image: uint8 (H,W,C), red first.
-        face: with finite landmarks.
         network: is shown both eyes, the left in a mirror.
 
     Returns:

@@ -45,7 +45,6 @@ def search(
 
     Args:
         image: uint8 (H,W,C).
-        network: finds boxes.
         settings: where faces are looked for.
         place: where the face was last (5,); side 0 where there was none.
         waiting: whether another face than one near there is refused where several are about, () bool.

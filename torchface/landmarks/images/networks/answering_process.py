@@ -21,7 +21,6 @@ class AnsweringProcess:
     """A process whose requests go in at its standard input and whose answers come out at its standard output.
 
     Args:
-        command: the process.
         name: what it is, for messages.
         error: what is raised where it fails.
         environment: of the process; this one's if absent.

@@ -66,10 +66,8 @@ class CropFinder:
     """Finds landmarks by showing a network the face's box, turned upright.
 
     Args:
-        network: what finds them in crops.
         size: pixels a side of a crop, S.
         margin: a crop's side in sides of the face's box.
-        name: what messages call it.
     """
 
     network: CropNetwork

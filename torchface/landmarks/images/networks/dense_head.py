@@ -51,8 +51,6 @@ class DenseHead(nn.Module):
     Args:
         points: P.
         hidden: units of h.
-        channels: of the features.
-        deep: deepest features.
 
     Source: Wood et al. 2022 (many points with a deviation each, from rendered pictures).
     """

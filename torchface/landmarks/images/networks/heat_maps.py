@@ -36,7 +36,6 @@ def cell_places(heat: Tensor, stride: int) -> Tensor:
     """Where the cells of heat maps (B,L,h,w) lie in the crop, (h*w,2) pixels.
 
     Args:
-        heat: the maps.
         stride: pixels of the crop a side of a cell.
     """
     y, x = ((torch.arange(side).to(heat) + 0.5) * stride - 0.5 for side in heat.shape[2:])

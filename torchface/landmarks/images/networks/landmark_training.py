@@ -156,7 +156,6 @@ def cropped(
 
     Args:
         pictures: see :meth:`LandmarkNetwork.fit`.
-        size, margin: of the network.
         mirrored: a network's ``mirror``, (P,).
         generator: decides everything.
         settings: how widely crops are drawn.
@@ -249,7 +248,6 @@ def weight_loss(dense: DenseReading, weights: Tensor, present: Tensor) -> Tensor
     too.
 
     Args:
-        dense: what was read.
         weights: the truth, (B,52).
         present: whether a face is there, (B,).
 

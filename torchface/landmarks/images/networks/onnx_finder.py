@@ -78,12 +78,7 @@ def onnx_finder(path: str | Path, limits: GraphLimits | None = None) -> CropFind
 
 
 def graph_finder(content: bytes, path: Path) -> CropFinder:
-    """The finder of a graph of this library's own making, run in this process; see :func:`onnx_finder`.
-
-    Args:
-        content: of an ONNX file.
-        path: what messages call it.
-    """
+    """The finder of a graph of this library's own making, run in this process; see :func:`onnx_finder`."""
     session = graph_session(content)
     return _finder(signature(session), _OwnGraph(session), path)
 

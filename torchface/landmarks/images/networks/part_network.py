@@ -35,7 +35,6 @@ class PartNetwork(PictureNetwork):
 
     Args:
         channels: at a half, a quarter, an eighth and a sixteenth of the resolution.
-        blocks: residual blocks there.
 
     :meth:`fit` takes pictures uint8 (B,3,H,W), the number of the part in :data:`PARTS` of each pixel uint8 (B,H,W), and
     the faces' boxes (B,4) pixels. It minimises cross entropy and lack of overlap (Milletari et al. 2016).

@@ -277,7 +277,6 @@ def with_blur(images: Tensor, generator: torch.Generator, share: float, widest: 
     Args:
         images: in [0,1]; changed in place.
         generator: decides everything.
-        share: of images out of focus.
         widest: standard deviation of their blur beyond 0.3, pixels, at most.
     """
     count = len(images)

@@ -34,7 +34,6 @@ class FollowedFace:
         look: its colours, upright and small, (1200,) of unit length.
         latest_look: the same in the last frame that showed it; not packed.
         missed: frames in a row without it.
-        frames: seen so far.
         unconfirmed: checks in a row in which the detector saw no face at its place.
         crowded: whether somebody else is about who might be taken for it.
     """

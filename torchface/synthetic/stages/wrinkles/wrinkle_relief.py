@@ -33,7 +33,6 @@ class WrinkleRelief:
         relief: from folding and its square at the gauges, (2G,), to displacement in the skin's frame, (3V,): along the
             normal, then along both tangents; millimetres.
         before: barycentric places of the gauges' ends on one side of their lines, (G,V).
-        behind: on the other side.
         along: averages along each line, (G,G).
         trace: share of folding at rest, (G,).
         line: which line each gauge belongs to, (G,) int64.
