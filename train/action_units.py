@@ -82,11 +82,7 @@ class Trained:
 
 @recipe
 def train(settings: Settings, run: Run) -> Trained:
-    """Reads, stabilises, aligns, labels, fits, evaluates and saves.
-
-    Raises:
-        TorchfaceError: there are not as many labels as videos, or a video or its labels cannot be used.
-    """
+    """Reads, stabilises, aligns, labels, fits, evaluates and saves."""
     progress = run.progress
     if settings.video or settings.labels:
         learned = _labelled(settings.video, settings.labels)
@@ -162,11 +158,7 @@ def save(
 
 
 def filmed(settings: Settings, progress: Progress) -> list[tuple[Path, ActionLabels]]:
-    """Films of embedded performers, written to ``settings.films``, and their labels; those held out come last.
-
-    Raises:
-        ValueRangeError: no performer to learn from.
-    """
+    """Films of embedded performers, written to ``settings.films``, and their labels; those held out come last."""
     count = settings.performers + settings.held_out
     if not settings.performers or not settings.repetitions:
         raise ValueRangeError("found --performers 0 or --repetitions 0, expected 1 or more")

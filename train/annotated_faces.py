@@ -57,11 +57,7 @@ NO_FACES = Faces([], torch.zeros(0, 4), torch.zeros(0, 68, 2), [])
 
 
 def annotated_landmarks(path: Path) -> list[tuple[Path, Tensor]]:
-    """Pictures and their 68 landmarks (68,2), of a folder of ``.pts`` files or of a dlib ``.xml``.
-
-    Raises:
-        FileFormatError: it is neither, a picture is missing, or there is no face with all 68.
-    """
+    """Pictures and their 68 landmarks (68,2), of a folder of ``.pts`` files or of a dlib ``.xml``."""
     found: list[tuple[Path, Tensor]] = []
     if path.suffix.lower() == ".xml":
         for face in load_dlib_faces(path):
@@ -84,7 +80,6 @@ def load_faces(path: Path, folders_are_people: bool = False) -> Faces:
     """The annotated faces of a folder of ``.pts`` files or of a dlib ``.xml``; those without all 68 are left out.
 
     Args:
-        path: of either.
         folders_are_people: pictures of a folder show one person; else each shows its own, a mirrored copy the same.
     """
     found = annotated_landmarks(path)

@@ -31,11 +31,6 @@ def annotated_pictures(path: Path, network: LandmarkNetwork) -> tuple[TensorData
 
     Args:
         path: a folder of pictures with ``.pts`` files of the same names, or a dlib ``.xml``.
-        network: that goes on learning.
-
-    Raises:
-        FileFormatError: there are no such files, or one cannot be read.
-        ValueRangeError: fewer than two faces.
     """
     rows = [_picture(image, landmarks, network) for image, landmarks in annotated_landmarks(path)]
     if len(rows) < 2:

@@ -57,11 +57,7 @@ class Trained:
 
 @recipe
 def train(settings: Settings, run: Run) -> Trained:
-    """Loads, splits, fits, evaluates on left-out frames, fits on all, saves.
-
-    Raises:
-        TorchfaceError: the folder holds no annotated frames, or too few.
-    """
+    """Loads, splits, fits, evaluates on left-out frames, fits on all, saves."""
     progress = run.progress
     frames = load_annotated_frames(settings.data)
     if settings.folds < 0 or settings.folds == 1:

@@ -52,7 +52,6 @@ class CapturedSequence:
 
     Args:
         name: of the file or folder.
-        count: of frames.
         read: vertices (t,V,3) of the frames from one number up to another, without it, millimetres.
         faces: (F,3) int64, of its own file.
         moved: what moves it where that is a rig: the rig and its weights.
@@ -139,12 +138,7 @@ def read_capture(folder: Path, neutral: Path | None) -> Capture:
 
 
 def read_pairs(folder: Path, capture: Capture) -> Capture:
-    """What a coarse animation shows of a capture: the same sequences in another folder, in the capture's order.
-
-    Raises:
-        ValueRangeError: a sequence is missing, or of another number of frames.
-        FileFormatError, TopologyError: as :func:`read_capture`.
-    """
+    """What a coarse animation shows of a capture: the same sequences in another folder, in the capture's order."""
     capture_read = read_capture(folder, capture.neutral_file)
     named = {_bare(sequence.name): sequence for sequence in capture_read.sequences}
     for sequence in capture.sequences:
@@ -187,8 +181,6 @@ def gather(capture: Capture, path: Path, progress: Progress, colors: bool = Fals
     """Writes all frames, or their colours, into one file; where an earlier run has stopped, it goes on.
 
     Args:
-        capture: what is gathered.
-        path: of the file.
         progress: called with each step and how far it is.
         colors: of the vertices, in place of their positions; all sequences have some.
 

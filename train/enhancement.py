@@ -68,12 +68,7 @@ class Settings(RecipeSettings):
 
 @recipe
 def train(settings: Settings, run: Run) -> EnhancementModel:
-    """Gathers, learns, tests, saves and draws.
-
-    Raises:
-        TorchfaceError: neither frames nor performer, or both; files that cannot be used.
-        ValueRangeError: no sequence is left to learn from.
-    """
+    """Gathers, learns, tests, saves and draws."""
     progress = run.progress
     capture = _capture(settings)
     learned = len(capture.sequences) - settings.held_out

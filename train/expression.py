@@ -73,11 +73,7 @@ class Trained:
 
 @recipe
 def train(settings: Settings, run: Run) -> Trained:
-    """Gathers on disk, aligned, leaves one out after the other, fits, saves.
-
-    Raises:
-        TorchfaceError: there is neither a folder nor a number of performers, or people do not fit each other.
-    """
+    """Gathers on disk, aligned, leaves one out after the other, fits, saves."""
     progress = run.progress
     people = gather(settings, run.work, progress)
     progress(f"{len(people.who)} people, {len(people.names)} expressions")

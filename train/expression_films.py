@@ -88,11 +88,7 @@ class Settings:
 
 
 def scenes(settings: Settings) -> dict[str, Scene]:
-    """What the settings ask for.
-
-    Raises:
-        NameMismatchError: there is no film of a name.
-    """
+    """What the settings ask for."""
     unknown = [name for name in settings.films if name not in FILMS]
     if unknown:
         raise NameMismatchError(f"films: found {', '.join(unknown)}, expected some of {', '.join(FILMS)}")

@@ -29,7 +29,6 @@ class Comparison:
 
     Args:
         squared: (M,N,3), summed over the vertices.
-        names: of the expressions.
         predicted: offsets (3,N,V,3) of those people who are kept for pictures, by their number.
         learned: how many people each was predicted from.
         distances: of each from those, (M,); see ``ExpressionRegression.distance``.

@@ -45,11 +45,7 @@ class Settings(RenderedSettings):
 
 @recipe
 def train(settings: Settings, run: Run) -> EyeNetwork:
-    """Renders, trains, evaluates and saves.
-
-    Raises:
-        ValueRangeError: fewer pictures than are held out and a part more.
-    """
+    """Renders, trains, evaluates and saves."""
     progress = run.progress
     settings.check_count(PART)
     files = eye_picture_files(

@@ -88,7 +88,6 @@ def eye_picture_files(
     Args:
         folder: for the files; pictures of another seed or other heads lie beside each other there.
         count: how many, rounded up to whole files.
-        seed: decides them.
         ict: ICT-FaceKit's ``FaceXModel``, whose heads are four in five; embedded performers alone without.
         workers: processes.
         progress: called with each step and how far it is.

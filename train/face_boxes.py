@@ -69,11 +69,7 @@ class Settings(RecipeSettings):
 
 @recipe
 def train(settings: Settings, run: Run) -> tuple[BoxNetwork, dict[str, float]]:
-    """Renders, learns, tests and saves; the network, and what was measured on people held out.
-
-    Raises:
-        TorchfaceError: too few people, or a file that cannot be used.
-    """
+    """Renders, learns, tests and saves; the network, and what was measured on people held out."""
     progress = run.progress
     if not (0 < settings.held_out < settings.people and settings.tested > 0):
         raise ValueRangeError(
@@ -136,10 +132,7 @@ def mined_pieces(
     """Squares (S,S,3) round what a network takes for faces in pictures without people.
 
     Args:
-        model: that errs.
-        count: of the pictures.
         size: pixels a side of the squares, S.
-        seed: of the pictures.
         progress: called with each step and how far it is.
     """
     progress, detector = progress or silent, NetworkDetector(model, _MISTAKEN)

@@ -44,11 +44,7 @@ class Settings(RenderedSettings):
 
 @recipe
 def train(settings: Settings, run: Run) -> PartNetwork:
-    """Renders, trains, evaluates and saves.
-
-    Raises:
-        ValueRangeError: fewer pictures than are held out and a part more.
-    """
+    """Renders, trains, evaluates and saves."""
     settings.check_count(PART)
     files = part_picture_files(
         settings.folder, settings.pictures, settings.seed, settings.ict, settings.workers, run.progress

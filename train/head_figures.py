@@ -39,9 +39,7 @@ def draw(
     """Writes the pictures into a folder.
 
     Args:
-        model: of heads.
         folder: made where it is missing.
-        seed: draws random heads.
         quality: its curves, if it was measured.
         learn, test: the heads that it has learned from and others, where there are any.
         progress: called with each step and how far it is.

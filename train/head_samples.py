@@ -37,7 +37,6 @@ class Source:
     """Meshes that are read one by one.
 
     Args:
-        names: of all of them.
         read: gives the mesh of a number.
         key: changes when anything about them does.
     """
@@ -89,9 +88,7 @@ def gather(source: Source, held_out: int, work: Path, template: Mesh | None, pro
     """Writes all meshes into two files; where an earlier run has stopped, it goes on.
 
     Args:
-        source: of the meshes.
         held_out: how many of them, the last, are kept for the test.
-        work: the folder of the files.
         template: of the same topology; says where the heads are to stand. The first mesh, upright, if absent.
         progress: called with each step and how far it is.
     """

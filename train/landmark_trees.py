@@ -53,11 +53,7 @@ class Settings(RecipeSettings):
 
 @recipe
 def train(settings: Settings, run: Run) -> tuple[LandmarkTrees, Tensor]:
-    """Loads or renders, splits, fits, evaluates and saves; the model, and its errors on the faces held out.
-
-    Raises:
-        TorchfaceError: neither data nor performers, too few faces, or a file that cannot be used.
-    """
+    """Loads or renders, splits, fits, evaluates and saves; the model, and its errors on the faces held out."""
     progress = run.progress
     learn, test = split(settings, progress)
     progress(f"{len(learn)} faces to learn from, {len(test)} to test on")

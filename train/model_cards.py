@@ -21,9 +21,7 @@ def model_card(
     """The card of a model: the command with paths as given, the effective settings with their names alone.
 
     Args:
-        settings: of the run.
         licence: under which the model may be used, where the settings do not say.
-        data: what it has learned from.
         metrics: what was measured on data held out.
         text: what the model is good for, measured how, its limits.
     """

@@ -106,12 +106,7 @@ class Trained:
 
 @recipe
 def train(settings: Settings, run: Run) -> Trained:
-    """Loads, aligns, splits, fits, evaluates, saves, draws.
-
-    Raises:
-        TopologyError: a mesh has another topology than the first.
-        TorchfaceError: neither scans nor performers, too few of them, all the same, or more components than they hold.
-    """
+    """Loads, aligns, splits, fits, evaluates, saves, draws."""
     progress = run.progress
     _check_one_source(settings)
     if settings.ict is not None:

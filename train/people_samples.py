@@ -131,10 +131,8 @@ def gather(
     """Writes all people, a file each; those that an earlier run has written are not read again.
 
     Args:
-        who: names of the people.
         read: gives the rig of a number.
         key: of what that rig is made of.
-        work: folder of the files.
         where: the people are from, for messages.
         progress: called with each step and how far it is.
     """

@@ -75,7 +75,6 @@ class Material:
     """What both kinds learn from.
 
     Args:
-        learn: takes to learn from.
         test: takes that are looked at once, for the card.
         rig: on which trial solves are made.
         silent: shapes that the takes say nothing of.

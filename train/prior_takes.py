@@ -183,11 +183,7 @@ def renamed(takes: PriorTakes, names: Sequence[str]) -> tuple[PriorTakes, tuple[
 
 
 def split(takes: PriorTakes, held_out: int | None) -> tuple[PriorTakes, PriorTakes]:
-    """Takes to learn from, and the last ones to test on, with all others of the same people: a third if not said.
-
-    Raises:
-        ShapeError: there are too few.
-    """
+    """Takes to learn from, and the last ones to test on, with all others of the same people: a third if not said."""
     count = len(takes.weights)
     learn, test = held_out_people(takes.people, max(count // 3, 1) if held_out is None else held_out)
     if not learn or not test:

@@ -90,11 +90,9 @@ def synthetic_video(
 
     Args:
         rig: whose landmarks are seen; its shapes need not have the takes' names.
-        names: of the takes' shapes.
         takes: weights, (T,N).
         pixel_noise: standard deviation of a landmark's coordinate.
         frames: how many of each take, evenly spread.
-        seed: of the noise.
 
     Returns:
         None where the rig has no landmarks, or fewer than half of the shapes.

@@ -35,10 +35,6 @@ def train(settings: Settings, run: Run) -> dict[str, dict[str, float]]:
 
     Returns:
         What was measured, by the folder's name.
-
-    Raises:
-        TorchfaceError: neither takes nor performances; too few takes, too short ones, ones with NaN or with different
-            shapes; marker takes without rig and attachment.
     """
     _check_one_source(settings)
     material = _material(settings, run.work, run.progress)

@@ -53,11 +53,7 @@ class RecipeSettings:
         shutil.rmtree(self.work, ignore_errors=True)
 
     def chosen_device(self) -> torch.device:
-        """The device to compute on.
-
-        Raises:
-            ValueRangeError: there is no such device, or the recipe cannot use it.
-        """
+        """The device to compute on."""
         if self.device is None:
             found = "cuda" in self.devices and torch.cuda.is_available()
             return torch.device("cuda" if found else "cpu")
@@ -98,11 +94,7 @@ class RenderedSettings(RecipeSettings):
     devices: ClassVar[tuple[str, ...]] = ANY_DEVICE
 
     def check_count(self, part: int) -> None:
-        """Refuses fewer pictures than are held out and a ``part`` more.
-
-        Raises:
-            ValueRangeError: so few.
-        """
+        """Refuses fewer pictures than are held out and a ``part`` more."""
         if self.pictures < self.held_out + part:
             raise ValueRangeError(
                 f"pictures: found {self.pictures}, expected {self.held_out} to hold out and {part} more at least"

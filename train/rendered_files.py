@@ -30,7 +30,6 @@ class Rendering:
     Args:
         render: the pictures of a file; a function of a module, so that processes can import it.
         method: name and version; files of another one are not taken up.
-        prefix: of the files' names.
         what: it shows, in a word, for the progress.
         part: pictures in a file.
     """
@@ -50,10 +49,8 @@ def rendered_files(
     A file that cannot be read, or has more or fewer pictures, is named in a warning and rendered again.
 
     Args:
-        rendering: what is rendered.
         folder: for the files; pictures of another seed or other heads lie beside each other there.
         count: of pictures, rounded up to whole files.
-        seed: decides them.
         ict: ICT-FaceKit's ``FaceXModel``, whose heads are four in five; embedded performers alone without.
         workers: processes.
         progress: called with each step and how far it is.

@@ -20,7 +20,6 @@ class Shown:
     """Captured frames, and what a coarse animation shows of each where that is known.
 
     Args:
-        truth: as captured.
         coarse: the same frames in the same places, coarse; their own smooth part if None.
     """
 
@@ -38,7 +37,6 @@ class Restored:
     Args:
         truth: as captured, (V,3), millimetres.
         smooth: what the model sees: its smooth part, or the coarse animation.
-        restored: that with the model's detail.
         outside: the share of the regions for which the frame lies outside the database.
     """
 

@@ -51,11 +51,7 @@ class RunLog:
         self._board: Any = None
 
     def __call__(self, step: int, name: str, value: float) -> None:
-        """See :class:`~torchface.progress.ValueLog`.
-
-        Raises:
-            FileFormatError: the table cannot be written.
-        """
+        """See :class:`~torchface.progress.ValueLog`."""
         row = Row(time.monotonic() - self._start, step, name, float(value))
         if self._begun:
             self.rows.append(row)

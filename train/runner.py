@@ -103,7 +103,6 @@ class Recipe(Generic[Settings, Trained]):
 
     Args:
         settings: its dataclass; ``out`` is held for this run.
-        train: learns, evaluates and saves.
         description: for ``--help``.
         lines: what is printed of the settings and the trained model.
     """
@@ -131,12 +130,7 @@ class Recipe(Generic[Settings, Trained]):
                 print(line)
 
     def chosen(self, words: Sequence[str]) -> Settings:
-        """The settings of flags and, behind ``--config``, of a file; flags win.
-
-        Raises:
-            FileFormatError: the file cannot be read, names what is no setting, or a value is of another kind.
-            ValueRangeError: ``--config`` without a file.
-        """
+        """The settings of flags and, behind ``--config``, of a file; flags win."""
         flags = list(words)
         default: Settings | None = None
         for place, word in enumerate(flags):

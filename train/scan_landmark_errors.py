@@ -22,7 +22,6 @@ class ScanErrors:
     """Errors on one scan.
 
     Args:
-        name: of the scan.
         pixels: of each landmark, (L,); NaN where the truth is not known.
         millimetres: the same in space, (L,).
         lines: by name, mean distance in pixels of the traced points that were kept to the true line.

@@ -17,21 +17,12 @@ Settings = TypeVar("Settings")
 
 
 def write_settings(path: Path, settings: Any) -> None:
-    """Writes the effective settings: :func:`read_settings` reads the same ones.
-
-    Raises:
-        FileFormatError: the file cannot be written.
-    """
+    """Writes the effective settings: :func:`read_settings` reads the same ones."""
     write_toml(path, _plain(settings))
 
 
 def read_settings(path: Path, kind: type[Settings]) -> Settings:
-    """Settings of a file; what it does not name is as by default, and as not given where there is no default.
-
-    Args:
-        path: of a TOML file.
-        kind: a dataclass.
-    """
+    """Settings of a file; what it does not name is as by default, and as not given where there is no default."""
     return _table(read_toml(path), kind)
 
 

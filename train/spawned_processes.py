@@ -24,9 +24,6 @@ def map_in_processes(work: Callable[[Part], Result], parts: Sequence[Part], work
         work: a function of a module, so that processes can import it.
         parts: what it is given, one at a time.
         workers: processes.
-
-    Raises:
-        TorchfaceError: a process was ended from outside.
     """
     if workers <= 1 or not parts:
         yield from map(work, parts)

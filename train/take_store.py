@@ -40,7 +40,6 @@ class TakesRead(Sequence[Tensor]):
 
     Args:
         takes: weights of each, (T,N).
-        rows: which of them.
         change: what is done with each; nothing if absent.
     """
 
@@ -63,11 +62,7 @@ class TakesRead(Sequence[Tensor]):
 
 
 class TakesOnDisk(Sequence[Tensor]):
-    """Takes of files, (T,N) float64 each; one that is asked for is read.
-
-    Args:
-        paths: of the files.
-    """
+    """Takes of files, (T,N) float64 each; one that is asked for is read."""
 
     def __init__(self, paths: Sequence[Path]) -> None:
         self._shards = Shards(paths, ["weights"])
@@ -95,7 +90,6 @@ class TakeStore:
 
     Args:
         folder: for the files.
-        count: of the takes.
     """
 
     def __init__(self, folder: Path, count: int) -> None:

@@ -60,11 +60,7 @@ class Shards:
         return int(self._ends[-1])
 
     def shard(self, number: int, begin: int = 0, end: int | None = None) -> dict[str, Tensor]:
-        """The rows of one file, or some of them, by name.
-
-        Raises:
-            FileFormatError: the file is gone or has changed.
-        """
+        """The rows of one file, or some of them, by name."""
         end = self.counts[number] if end is None else end
         path = self.paths[number]
         with _opened(path) as file:
@@ -78,11 +74,7 @@ class Shards:
         return tensors
 
     def read(self, begin: int, end: int) -> dict[str, Tensor]:
-        """Rows ``begin`` to ``end``, without the last, by name.
-
-        Raises:
-            ShapeError: there are no such rows.
-        """
+        """Rows ``begin`` to ``end``, without the last, by name."""
         if not 0 <= begin < end <= len(self):
             raise ShapeError(f"shards: found rows {begin} to {end}, expected some of {len(self)}")
         first, last = torch.searchsorted(self._ends, torch.tensor([begin, end - 1]), right=True).tolist()

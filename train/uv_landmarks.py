@@ -73,11 +73,7 @@ class Trained:
 
 @recipe
 def train(settings: Settings, run: Run) -> Trained:
-    """Loads, aligns, splits, fits, evaluates and saves.
-
-    Raises:
-        TorchfaceError: neither scans nor performers are asked for, no scan is annotated, or one cannot be used.
-    """
+    """Loads, aligns, splits, fits, evaluates and saves."""
     progress = run.progress
     learn, test = _split(settings, progress)
     progress(f"{len(learn)} scans to learn from, {len(test)} to test on")

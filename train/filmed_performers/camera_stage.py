@@ -43,8 +43,6 @@ class StageSettings:
     Args:
         width, height: of the video, pixels.
         markers: on the face, besides the two on its sides.
-        flaws: of the camera.
-        marker_flaws: of the marker system.
         unsteadiness: of the painter's hand, millimetres.
         performance: what is performed how often.
     """
@@ -63,13 +61,9 @@ class RecordedSession:
     """The files of a session, and the truth behind them.
 
     Args:
-        video: the file.
         take_path: the C3D with the markers, as many frames as the video.
         labels_path: what :func:`torchface.io.action_labels.load_action_labels` reads.
-        labels: the same.
-        rig: the performer.
         attachment: where the markers sit.
-        performance: weights and intensities.
         recording: the markers, and what their system did to them.
         rotation, translation: of the camera, world to camera, (T,3,3) and (T,3).
     """
@@ -98,8 +92,6 @@ def record_session(
     """Paints a performer, sets markers, records a session: ``name.avi``, ``name.c3d`` and ``name.toml``.
 
     Args:
-        folder: that exists.
-        name: of the files, without ending.
         identity: of the performer, (K,); the mean if absent.
         generator: where all randomness comes from.
         settings: how.
@@ -220,8 +212,6 @@ def render_video(
         weights: (T,N).
         camera: intrinsics and size.
         rotation, translation: world to camera in each frame, (T,3,3) and (T,3).
-        flaws: of the camera.
-        generator: of the noise.
     """
     _, ways = replace(camera, rotation=torch.eye(3), translation=torch.zeros(3)).rays()
     shape = ways.shape[:2]

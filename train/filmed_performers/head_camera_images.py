@@ -23,9 +23,7 @@ class HeadCameraRenderer:
     """Front of the head, helmet plates and marker balls as one mesh that moves.
 
     Args:
-        rig: a performer with skin.
         paint: share of paint on its skin texture, (size,size).
-        attachment: of the markers.
     """
 
     def __init__(self, rig: BlendshapeRig, paint: Tensor, attachment: Attachment) -> None:

@@ -49,7 +49,6 @@ class EyePicture:
         openness: the lids' distance on the head over that of the eye's corners, (2,).
         bare: how much of each eyeball is seen between the lids, (2,) square millimetres.
         gaze: of each eye, (2,2) radians: to the person's left, up.
-        person: its number.
     """
 
     rgba: Tensor
@@ -68,10 +67,8 @@ def draw_eye_pictures(
     """Pictures by number, each of a person's eyes with lids, a gaze, a pose and lights drawn for it.
 
     Args:
-        kinds: of heads.
         shares: how often each kind is drawn.
         first, count: numbers of the pictures; a picture depends on its number and the seed alone.
-        seed: decides them.
         each: pictures of one person.
     """
     parts = [_eye_kind(id(kind), kind) for kind in kinds]

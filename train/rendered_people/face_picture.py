@@ -41,7 +41,6 @@ class FacePicture:
         points: of the face's surface, (P,2) pixels; see ``dense_points``.
         point_visible: which of them nothing hides, (P,) bool.
         weights: the expression, (52,) by ARKit's names; a blink of 1 closes this person's lids.
-        person: its number.
     """
 
     rgba: Tensor
@@ -59,10 +58,8 @@ def draw_pictures(
     """Pictures by number, each of a person, an expression, a pose and lights drawn for it.
 
     Args:
-        kinds: of heads.
         shares: how often each kind is drawn.
         first, count: numbers of the pictures; a picture depends on its number and the seed alone.
-        seed: decides them.
         each: pictures of one person.
     """
     pictures: list[FacePicture] = []

@@ -141,9 +141,7 @@ def face_scene(
     bars and things. Then the picture is taken: light, colour, blur, noise, compression.
 
     Args:
-        people: to draw from.
         number: of the picture, from 0.
-        settings: what is in it.
         seed: decides everything, with the number.
     """
     settings = settings or SceneSettings()

@@ -30,11 +30,9 @@ def with_lashes(
     Args:
         image: colours with a fourth channel that is 1 on the person, (H,W,4).
         distance: of what each pixel shows, (H,W) millimetres.
-        camera: that sees it.
         marks: iBUG's 68 on the head, (68,3) millimetres.
         tone: of the lashes, sRGB (3,).
         dense: lashes that show, or hardly.
-        generator: of their length and place.
 
     Returns:
         (H,W,4).

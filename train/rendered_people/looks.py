@@ -25,18 +25,15 @@ class Looks:
 
     Args:
         skin, lips, hair, iris, clothes: colours.
-        redness, freckles, shadows, wrinkles: of the skin.
         gloss: how much light the skin mirrors.
         brow: share of hair in the brows, their thickness and their arch beside the usual, and millimetres that they
             lie higher.
         beard, moustache, stubble: shares of hair.
         liner, shadow: of make-up round the eyes; ``shadow_color`` its colour.
         lashes: dark lashes, or none that show.
-        hairdo: which hair.
         hat: the colour of a cap instead of hair; None without.
         glasses: half their width and height, millimetres, grey of the frame, its thickness in pixels of the picture,
             and how dark the lenses are; None for none.
-        seed: of the skin's noise.
     """
 
     skin: Tensor

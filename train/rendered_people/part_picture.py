@@ -53,10 +53,8 @@ def draw_part_pictures(
     """Pictures by number: of each person ``each`` are rendered, each is shown in ``scenes`` surroundings.
 
     Args:
-        kinds: of heads.
         shares: how often each kind is drawn.
         first, count: numbers of the pictures; a picture depends on its number and the seed alone.
-        seed: decides them.
         each, scenes: see above; ``first`` and ``count`` are multiples of ``scenes``.
     """
     pictures: list[PartPicture] = []

@@ -73,7 +73,6 @@ def annotated(kind: HeadKind, pixels: Tensor, looks: Looks) -> Tensor:
     """The 68 landmarks (68,2) as an annotator sees them: brows along their upper edge, the jaw where the face ends.
 
     Args:
-        kind: of the head.
         pixels: where a camera sees its vertices, (V,2).
         looks: of the person, whose brows lie higher or lower.
     """

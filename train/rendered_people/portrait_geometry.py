@@ -57,8 +57,6 @@ def portrait(rest: Tensor, moved: Tensor, faces: Tensor, hairdo: Hairdo, generat
     Args:
         rest, moved: the head at rest and with its expression, (V,3).
         faces: of the head, (F,3).
-        hairdo: which hair.
-        generator: of the lumps in it.
     """
     rest, moved = rest.double(), moved.double()
     share = hair_share(hairdo.hairline)

@@ -62,7 +62,6 @@ class FaceImage:
         image: grey, uint8 (H,W).
         landmarks: iBUG's 68, (68,2) pixels, as an annotator sees them: see ``annotated_landmarks``.
         box: x, y, width, height round the face as a detector draws it, (4,) pixels.
-        person: its number.
     """
 
     image: Tensor

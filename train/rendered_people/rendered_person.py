@@ -54,8 +54,6 @@ def render_person(
     """Shows someone to a camera.
 
     Args:
-        person: whose head it is.
-        scene: all that can be seen.
         camera: from where.
         generator: of the light sources and the exposure.
         rays: of the few rays a point that distinguish open places from hollow ones; ``generator`` if absent. With one
@@ -241,7 +239,6 @@ def visible_points(distance: Tensor, camera: Camera, points: Tensor, pixels: Ten
 
     Args:
         distance: of what each pixel shows, (H,W) millimetres.
-        camera: that sees it.
         points: (N,3) millimetres.
         pixels: where they are drawn, (N,2); it need not be where they are.
         behind: how far each may lie behind what is seen, (N,) millimetres.
@@ -263,7 +260,6 @@ def openness(
     Args:
         caster: of what may be in the way.
         starts, normals: of the points, a little above the surface, (R,3).
-        generator: of the rays' directions.
         count: rays a point.
         reach: millimetres.
     """

@@ -31,11 +31,7 @@ def random_color(rng: np.random.Generator, skin: float = 0.25) -> Color:
 
 
 def clutter(height: int, width: int, rng: np.random.Generator) -> np.ndarray:
-    """A background, uint8 (height,width,3), red first.
-
-    Raises:
-        ValueRangeError: no such size.
-    """
+    """A background, uint8 (height,width,3), red first."""
     if height < 1 or width < 1:
         raise ValueRangeError(f"clutter: found {height} x {width}, expected 1 x 1 at least")
     image = _clouds(height, width, rng)

@@ -24,7 +24,6 @@ def surface_color(points: Tensor, marks: Tensor, material: Tensor, looks: Looks,
         points: on the performer's mean head, (R,3), millimetres.
         marks: see ``skin_texture.vertex_marks``, (R,8).
         material: of the triangles that they lie on, (R,).
-        looks: of the person.
         brow_lift: see ``HeadKind``.
     """
     points = points.float()

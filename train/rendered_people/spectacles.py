@@ -24,7 +24,6 @@ def with_glasses(
 
     Args:
         image: colours with a fourth channel that is 1 on the person, (H,W,4).
-        camera: that sees it.
         marks: iBUG's 68 on the head, (68,3) millimetres.
         form: see ``Looks.glasses``.
         generator: of the frame's roundness and what the lenses mirror.

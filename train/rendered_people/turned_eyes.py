@@ -45,7 +45,6 @@ def with_turned_eyes(kind: HeadKind, rest: Tensor, posed: Tensor, gaze: Tensor) 
     Weights move lids along straight lines, which half-way cut through the eyeballs: they are put back on them.
 
     Args:
-        kind: of the head.
         rest, posed: the head, (V,3) millimetres.
         gaze: see :func:`gaze_weights`.
 

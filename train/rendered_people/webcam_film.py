@@ -49,13 +49,11 @@ class Scene:
     Args:
         people: ``ict`` or ``performer``.
         seed: of the person, the backdrop, the lights, the head's motion.
-        take: number of the take.
         start, length: seconds of it.
         sitting: where the person sits.
         speech: seconds between which the mouth talks; the take's own mouth if absent.
         away, hand: seconds at which the person turns away, and at which a hand rises to the mouth.
         blinks: seconds at which full blinks begin besides the take's own.
-        camera: takes the pictures.
         looks: ``plain``, ``glasses``, ``beard``, ``both``, or as they are drawn if absent.
     """
 
@@ -78,9 +76,7 @@ class Film:
     """A video on disk and the truth about it.
 
     Args:
-        path: of the video.
         person: who it shows.
-        performance: what they do.
         truth: of each frame; ``picture`` is empty.
     """
 
@@ -111,9 +107,6 @@ def webcam_film(scene: Scene, sources: FilmSources, kept: Path, progress: Progre
     """Renders a scene, or reads what was rendered before.
 
     Args:
-        scene: which.
-        sources: what of.
-        kept: folder of what was rendered.
         progress: called with each step and how far it is.
     """
     generator = torch.Generator().manual_seed(scene.seed)

@@ -80,7 +80,6 @@ def sitting(
     Args:
         weights: of ARKit's shapes, (T,52).
         fps: frames a second.
-        generator: of the head's motion.
         settings: where and how they sit.
         away: second at which they begin to turn away; they look back after that.
         hand: second at which a hand begins to rise to the mouth.
@@ -119,7 +118,6 @@ def with_speech(weights: Tensor, fps: float, generator: torch.Generator, start: 
     Args:
         weights: of a take whose mouth rests.
         fps: frames a second.
-        generator: of what the mouth does.
         start, end: seconds.
     """
     mouth = torch.tensor([name.startswith(_MOUTH) for name in ARKIT])

@@ -96,10 +96,7 @@ def webcam_frames(
     """Renders frame by frame; lights, background, hair and hand stay what they are.
 
     Args:
-        person: who sits there.
-        performance: what they do.
         seed: of the lights, the background and the noise.
-        settings: the camera.
         progress: called with each step and how far it is.
     """
     progress = progress or silent
