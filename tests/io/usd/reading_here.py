@@ -10,9 +10,9 @@ import pytest
 
 from torchface.errors import FileFormatError
 from torchface.io.scene_processes.scene_arrays import Scene
-from torchface.io.usd import stage_process, usd_reading
 
 pytest.importorskip("pxr")
+from torchface.io.usd import stage_process, usd_reading
 
 
 def read_here(command: Sequence[str], path: Path, reader: str, seconds: float) -> Scene:

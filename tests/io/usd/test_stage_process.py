@@ -21,7 +21,7 @@ from test_usd_reading import ANIMATION, QUAD, SHAPES, head, mesh_prim, usda
 
 from torchface.errors import FileFormatError, MissingExtraError, TorchfaceError
 from torchface.io import load_animation, load_mesh, load_rig, save_animation, save_rig
-from torchface.io.usd import stage_process
+from torchface.io.usd import process_limits, stage_layers, stage_process, usd_reading
 
 GOOD = head(mesh_prim(body=QUAD + SHAPES) + ANIMATION)
 CASES = int(os.environ.get("TORCHFACE_FUZZ_CASES", "0")) // 20 or 1  # each takes a process of its own
@@ -220,7 +220,7 @@ def test_a_process_that_crashes_or_fills_the_memory_is_an_error(
 ) -> None:
     script = tmp_path / "crash.py"
     script.write_text("import os\nos.kill(os.getpid(), 11)\n")
-    monkeypatch.setattr(stage_process, "__file__", str(script))
+    monkeypatch.setattr(usd_reading, "_PROCESS", script)
     with pytest.raises(FileFormatError, match="OpenUSD ended with SIGSEGV; expected a whole file"):
         load_rig(good)
     script.write_text("print('Killed')\nraise SystemExit(3)\n")
@@ -264,15 +264,16 @@ def test_a_full_disk_leaves_what_was_there(ending: str, tmp_path: Path, monkeypa
 def test_many_prims_are_refused_before_they_are_composed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     from pxr import Usd
 
-    monkeypatch.setattr(stage_process, "_MAX_PRIMS", 50)
+    monkeypatch.setattr(stage_layers, "MAX_PRIMS", 50)
     monkeypatch.setattr(Usd.Stage, "Open", None)
     usda(tmp_path / "many.usda", "".join(f'def Xform "p{i}" {{\ndef Xform "q" {{\n}}\n}}\n' for i in range(30)))
     with pytest.raises(stage_process.Refused, match="more than 50 prims"):
         stage_process.extract(tmp_path / "many.usda", lambda size: None)
 
 
-CHILD = (
-    "import sys; from torchface.io.usd.stage_process import end_in_time; end_in_time({}); print('ready', flush=True); "
+CHILD = (  # beside the file, which needs no more of the library
+    f"import sys; sys.path.insert(0, {str(Path(process_limits.__file__).parent)!r}); "
+    "from process_limits import end_in_time; end_in_time({}); print('ready', flush=True); "
 )
 WAITS = "import os; os.read(os.pipe()[0], 1)"
 

@@ -14,13 +14,13 @@ from torchface.geometry.meshes.normal_maps import DetailMaps, decode_normals
 from torchface.io.images.image_files import decode_image
 from torchface.io.scene_processes.reading_process import read_scene
 from torchface.io.scene_processes.scene_arrays import Scene, scene_mesh, scene_rig, scene_weights
-from torchface.io.usd import stage_process
 from torchface.io.usd.usd_library import require_usd
 from torchface.mesh import Mesh
 from torchface.rig import BlendshapeRig
 from torchface.take import Take
 
 _SECONDS_ALWAYS, _SECONDS_A_MEGABYTE = 120.0, 10.0
+_PROCESS = Path(__file__).resolve().with_name("stage_process.py")
 
 
 def read_usd_rig(path: str | Path, unit: str | None = None) -> BlendshapeRig:
@@ -56,9 +56,8 @@ def read_stage(path: str | Path, *options: str) -> Scene:
     require_usd()
     path = Path(path)
     size = checked_size(path)
-    script = str(Path(stage_process.__file__).resolve())
     seconds = _SECONDS_ALWAYS + _SECONDS_A_MEGABYTE * size / 2**20
-    return read_scene([sys.executable, "-P", script, *options], path, "OpenUSD", seconds)
+    return read_scene([sys.executable, "-P", str(_PROCESS), *options], path, "OpenUSD", seconds)
 
 
 def checked_size(path: Path) -> int:
