@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor
 
-from torchface.modeling.rigging.loose_parts import _tongue_of_gums, tongue_out
+from torchface.modeling.rigging.loose_parts import _Head, _in_the_mouth, _tongue_of_gums, tongue_out
 
 
 def gums(height: float) -> tuple[Tensor, Tensor, Tensor]:
@@ -38,3 +38,19 @@ def test_a_mouths_floor_is_no_tongue() -> None:
     points, faces, _ = gums(0.0)
     below = -points[:, 1] - 0.2 * points[:, 2]
     assert not bool(_tongue_of_gums(points, faces, torch.ones(len(points), dtype=torch.bool), below).any())
+
+
+def test_teeth_that_sit_low_behind_the_lips_belong_to_the_jaws_of_their_rows() -> None:
+    cube = torch.tensor([[x, y, z] for x in (-2, 2) for y in (-3, 3) for z in (-2, 2)]).double()
+    across = torch.linspace(-22, 22, 12).double()
+    teeth = [
+        cube + torch.stack([x, torch.tensor(height) + 0.02 * x.abs(), -8 - x.abs()])
+        for height in (-2.0, -10.0)  # the lips' line is at 0: the gap between the rows lies 6 mm under it
+        for x in across
+    ]
+    part = torch.arange(len(teeth)).repeat_interleave(8)
+    points = torch.cat(teeth)
+    whole = torch.ones(len(points), dtype=torch.bool)
+    head = _Head(points, part, whole, torch.zeros(1, len(points), 3))
+    _, share, _ = _in_the_mouth(head, torch.zeros(0, 3).long(), whole, torch.zeros(20, 3).double())
+    assert torch.equal(share, (part >= len(across)).double())

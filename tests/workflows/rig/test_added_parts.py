@@ -77,6 +77,7 @@ def test_old_vertices_and_bytes_stay(rigged: tuple[Path, Path, CharacterReport, 
     text = "\n".join(report.lines())
     for word in ("behind lips that were cut apart", "added: teeth", "added: the left eye", "added: the right eye"):
         assert word in text
+    assert "one piece" not in text
 
 
 @pytest.mark.bench

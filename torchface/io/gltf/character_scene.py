@@ -17,6 +17,7 @@ from torchface.color_space import to_srgb
 from torchface.errors import FileFormatError, TorchfaceError
 from torchface.io.gltf.accessors import read_floats
 from torchface.io.gltf.gltf_document import Document
+from torchface.io.gltf.gltf_reading import image_bytes
 from torchface.io.gltf.primitive_reading import (
     BYTES_A_CORNER,
     BYTES_A_VERTEX,
@@ -252,19 +253,13 @@ class _Shelf:
 
     def _image(self, index: object) -> Tensor | None:
         """The image of a texture; none where it is of a kind that is not read, such as KTX2."""
-        document = self.document
-        texture = document.item("textures", index, "textures")
-        source = texture.get("source")
-        if source is None:
+        found = image_bytes(self.document, index)
+        if found is None:
             return None
-        image, location = document.item("images", source, "textures"), f"images[{source}]"
+        data, source = found
         if source not in self._images:
             try:
-                if image.get("uri") is not None:
-                    data = document.bytes_at(image["uri"], f"{location}.uri")
-                else:
-                    data, _ = document.view(image.get("bufferView"), f"{location}.bufferView")
-                paint = decode_samples(bytes(data), f"{document.path}: {location}", planes=4).paint()
+                paint = decode_samples(bytes(data), f"{self.document.path}: images[{source}]", planes=4).paint()
             except TorchfaceError:
                 self._images[source] = None  # it is kept as it is; the face is looked for in clay
             else:

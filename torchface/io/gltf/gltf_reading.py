@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import accumulate
@@ -13,16 +12,25 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from torchface.color_space import to_srgb
 from torchface.errors import FileFormatError, NoShapesError
 from torchface.geometry.meshes.uv_seams import merge_equal_rows
 from torchface.io.gltf.corrective_extras import rig_of_targets, scene_correctives
 from torchface.io.gltf.gltf_document import Document, read_document
 from torchface.io.gltf.mesh_extras import read_annotations, read_mesh_count, read_order, read_polygons
-from torchface.io.gltf.primitive_reading import BYTES_A_CORNER, BYTES_A_VERTEX, Part, filled, read_part
+from torchface.io.gltf.primitive_reading import (
+    BYTES_A_CORNER,
+    BYTES_A_VERTEX,
+    MaterialLook,
+    Part,
+    filled,
+    read_part,
+)
 from torchface.io.gltf.scene import Instance, instances
 from torchface.io.images.image_files import decode_image
 from torchface.io.length_units import millimetres_per
 from torchface.io.scenes.scene_pieces import Piece, all_names, join_deltas, join_meshes, joined_size
+from torchface.io.scenes.texture_atlas import Look, with_looks
 from torchface.mesh import Mesh
 from torchface.rig import BlendshapeRig
 
@@ -70,19 +78,43 @@ def _read(document: Document, scale: float) -> tuple[Mesh, Tensor, tuple[str, ..
     if not instanced:
         raise FileFormatError(f"{document.path}: found no triangle in its scene, expected a mesh")
     whole = rejoined(document, instanced)
-    pieces = [_piece(document, instance, part, scale) for instance, part in ([whole] if whole else instanced)]
-    textures = list(dict.fromkeys(part.texture for _, part in instanced if part.texture is not None))
-    if len(textures) > 1:
-        what = f"{len(textures)} textures, of which a mesh has one: the first is taken"
-        warnings.warn(f"{document.path}: left out: {what}", stacklevel=3)
-    texture = textures[0] if textures else None
-    del parts, instanced, part, whole  # their shapes fit the memory once, not twice
-    image = None if texture is None else read_texture(document, texture)
+    kinds = list(dict.fromkeys(kind for _, part in instanced for kind, _ in part.looks))
+    made = [_piece(document, instance, part, scale, kinds) for instance, part in ([whole] if whole else instanced)]
+    pieces = [piece for piece, _ in made]
+    look = torch.cat([one for _, one in made])
+    ours = any("torchface" in part.extras for _, part in instanced)
+    del parts, instanced, part, whole, made  # their shapes fit the memory once, not twice
     document.reserve(joined_size(pieces), "the scene's morph targets")
-    return join_meshes(pieces, image), join_deltas(pieces), all_names(pieces)
+    mesh = join_meshes(pieces, None)
+    return _with_looks(document, mesh, look, kinds, ours), join_deltas(pieces), all_names(pieces)
 
 
-def _piece(document: Document, instance: Instance, part: Part, scale: float) -> Piece:
+def _with_looks(document: Document, mesh: Mesh, look: Tensor, kinds: list[MaterialLook], ours: bool) -> Mesh:
+    """The mesh with the images and colours of its materials as its one texture; ``look`` (F,) says whose each is.
+
+    Plain colours of files that torchface wrote are those of parts that regions name, and vertex colours are of meshes
+    without images: these stay without a place in the texture.
+    """
+    images: dict[int | None, Tensor | None] = {None: None}
+    for kind in kinds:
+        if kind.texture is not None and kind.texture not in images:
+            images[kind.texture] = image = read_texture(document, kind.texture)
+            document.reserve(0 if image is None else 12 * image[0].numel(), f"textures[{kind.texture}]")
+    painted = torch.tensor([images[kind.texture] is not None for kind in kinds])
+    if (ours or mesh.colors is not None) and not bool(painted.all()):
+        if not bool(painted.any()):
+            return mesh
+        most = int(torch.where(painted, look.bincount(minlength=len(kinds)), -1).argmax())
+        look = torch.where(painted[look], look, most)
+    used, look = look.unique(return_inverse=True)
+    looks = [Look(images[kinds[i].texture], to_srgb(torch.tensor(kinds[i].color).clamp(0, 1))) for i in used.tolist()]
+    return with_looks(mesh, look, looks)
+
+
+def _piece(
+    document: Document, instance: Instance, part: Part, scale: float, kinds: list[MaterialLook]
+) -> tuple[Piece, Tensor]:
+    """The mesh in its place, and which of the kinds of look each of its triangles has, (F,)."""
     location = f"meshes[{instance.mesh}].extras.torchface"
     joined = weld(part)
     linear, translation = instance.transform[:3, :3] * scale, instance.transform[:3, 3] * scale
@@ -94,15 +126,18 @@ def _piece(document: Document, instance: Instance, part: Part, scale: float) -> 
     if not np.isfinite(vertices).all() or not np.isfinite(deltas).all():
         raise document.error(f"meshes[{instance.mesh}]", "positions that overflow", "finite millimetres")
     extras, triangles = part.extras.get("torchface"), part.triangles
+    row = {kind: number for number, kind in enumerate(kinds)}
+    look = np.repeat([row[kind] for kind, _ in part.looks], [count for _, count in part.looks])
     rows = read_order(document, extras, location, len(triangles)) if joined.authored else None
     if rows is not None:
         triangles = np.empty_like(triangles)
         triangles[rows] = part.triangles
+        look[rows] = look.copy()
     faces = joined.vertex_of[triangles]
     uvs = uv_faces = None
     if part.uvs is not None:
         uvs, uv_faces = _texture_coordinates(part.uvs, joined.vertex_of, triangles)
-    return Piece(
+    piece = Piece(
         instance.name,
         torch.from_numpy(vertices),
         torch.from_numpy(np.ascontiguousarray(faces)),
@@ -114,6 +149,7 @@ def _piece(document: Document, instance: Instance, part: Part, scale: float) -> 
         torch.from_numpy(deltas),
         part.names,
     )
+    return piece, torch.from_numpy(look)
 
 
 def _texture_coordinates(
@@ -134,19 +170,28 @@ def _moved(
         return (points @ linear.T + translation).astype(np.float32)
 
 
-def read_texture(document: Document, index: int) -> Tensor | None:
-    """The image of a texture; none where only an extension has it."""
+def image_bytes(document: Document, index: object) -> tuple[memoryview, int] | None:
+    """The encoded image of a texture, a WebP of an extension too, and its number; none where only another one has it.
+
+    Raises:
+        FileFormatError: there is no such texture, or its image is not there.
+    """
     location = f"textures[{index}]"
     texture = document.item("textures", index, location)
-    if texture.get("source") is None:
+    webp = document.record(texture.get("extensions"), location).get("EXT_texture_webp")
+    source = texture.get("source", document.record(webp, location).get("source"))
+    if source is None:
         return None
-    image = document.item("images", texture["source"], f"{location}.source")
-    location = f"images[{texture['source']}]"
+    image, location = document.item("images", source, f"{location}.source"), f"images[{source}]"
     if image.get("uri") is not None:
-        data = document.bytes_at(image["uri"], f"{location}.uri")
-    else:
-        data, _ = document.view(image.get("bufferView"), f"{location}.bufferView")
-    return decode_image(bytes(data), f"{document.path}: {location}")
+        return document.bytes_at(image["uri"], f"{location}.uri"), source
+    return document.view(image.get("bufferView"), f"{location}.bufferView")[0], source
+
+
+def read_texture(document: Document, index: int) -> Tensor | None:
+    """The image of a texture; none where only an extension has it."""
+    found = image_bytes(document, index)
+    return None if found is None else decode_image(bytes(found[0]), f"{document.path}: images[{found[1]}]")
 
 
 def rejoined(document: Document, instanced: Sequence[tuple[Instance, Part]]) -> tuple[Instance, Part] | None:
@@ -179,7 +224,7 @@ def rejoined(document: Document, instanced: Sequence[tuple[Instance, Part]]) -> 
         filled([part.uvs for part in parts], count, 0.0),
         filled([part.colors for part in parts], count, 1.0),
         np.concatenate([part.vertex_ids for part in parts if part.vertex_ids is not None]),
-        next((part.texture for part in parts if part.texture is not None), None),
+        tuple(one for part in parts for one in part.looks),
         first[1].extras,
     )
     return replace(first[0], transform=np.eye(4)), whole

@@ -23,6 +23,14 @@ BYTES_A_VERTEX, BYTES_A_CORNER = 200, 40
 
 
 @dataclass(frozen=True)
+class MaterialLook:
+    """A base colour: index of its texture, and the linear colour that it is multiplied by."""
+
+    texture: int | None = None
+    color: tuple[float, float, float] = (1.0, 1.0, 1.0)
+
+
+@dataclass(frozen=True)
 class Part:
     """A mesh as the file has it: C vertices, split wherever texture coordinates differ.
 
@@ -33,7 +41,7 @@ class Part:
         uvs: (C,2), origin at the lower left.
         colors: (C,3) in [0,1], encoded as images are.
         vertex_ids: (C,), which vertex of the mesh as authored each was split from.
-        texture: index of the texture of most triangles.
+        looks: the texture and colour of the triangles, and of how many, in their order.
         extras: the mesh's ``extras``.
     """
 
@@ -44,7 +52,7 @@ class Part:
     uvs: NDArray[np.float32] | None
     colors: NDArray[np.float32] | None
     vertex_ids: NDArray[np.int64] | None
-    texture: int | None
+    looks: tuple[tuple[MaterialLook, int], ...]
     extras: dict[str, Any]
 
 
@@ -53,7 +61,7 @@ def read_part(document: Document, index: int) -> Part | None:
     location = f"meshes[{index}]"
     mesh = document.item("meshes", index, location)
     blocks: dict[str, _Block] = {}
-    triangles, textures, first = [], [], 0
+    triangles, looks, first = [], [], 0
     for i, row in enumerate(document.array(mesh, "primitives", location)):
         primitive = document.record(row, f"{location}.primitives[{i}]")
         if primitive.get("mode", _TRIANGLES) not in (_TRIANGLES, _STRIP, _FAN):
@@ -66,15 +74,15 @@ def read_part(document: Document, index: int) -> Part | None:
         corners = read_triangles(document, primitive, f"{location}.primitives[{i}]", len(blocks[key].positions))
         triangles.append(corners + blocks[key].first)
         painted = _painted(primitive)  # that texture is not of the mesh
-        texture = None if painted else _texture(document, primitive, f"{location}.primitives[{i}]")[0]
-        textures.append((len(corners), texture))
+        looks.append(
+            (MaterialLook() if painted else _look(document, primitive, f"{location}.primitives[{i}]")[0], len(corners))
+        )
     if not blocks:
         return None
     rows = list(blocks.values())
     if len({len(block.deltas) for block in rows}) > 1:
         counts = [len(block.deltas) for block in rows]
         raise document.error(location, f"primitives of {counts} morph targets", "the same number in each")
-    has = [count for count, texture in textures if texture is not None]
     return Part(
         np.concatenate([block.positions for block in rows]),
         rows[0].deltas if len(rows) == 1 else np.concatenate([block.deltas for block in rows], axis=1),
@@ -83,7 +91,7 @@ def read_part(document: Document, index: int) -> Part | None:
         filled([block.uvs for block in rows], [len(block.positions) for block in rows], 0.0),
         filled([block.colors for block in rows], [len(block.positions) for block in rows], 1.0),
         None if any(block.vertex_ids is None for block in rows) else np.concatenate([b.vertex_ids for b in rows]),
-        next((texture for count, texture in textures if has and count == max(has) and texture is not None), None),
+        tuple(looks),
         document.record(mesh.get("extras"), f"{location}.extras") if isinstance(mesh.get("extras"), dict) else {},
     )
 
@@ -120,7 +128,7 @@ def _read_block(document: Document, primitive: dict[str, Any], location: str, fi
         target = document.record(row, f"{location}.targets[{i}]")
         if "POSITION" in target:
             deltas[i] = read_floats(document, target["POSITION"], f"{location}.targets[{i}].POSITION", ("VEC3",), count)
-    uv_name = f"TEXCOORD_{_texture(document, primitive, location)[1]}"
+    uv_name = f"TEXCOORD_{_look(document, primitive, location)[1]}"
     uvs = colors = ids = None
     if uv_name in attributes:
         uvs = read_floats(document, attributes[uv_name], f"{location}.{uv_name}", ("VEC2",), count)
@@ -159,17 +167,19 @@ def read_triangles(document: Document, primitive: dict[str, Any], location: str,
     return np.stack([corners[steps], corners[steps + 1 + odd], corners[steps + 2 - odd]], axis=1)
 
 
-def _texture(document: Document, primitive: dict[str, Any], location: str) -> tuple[int | None, int]:
-    """The base colour's texture, and which set of texture coordinates it takes."""
+def _look(document: Document, primitive: dict[str, Any], location: str) -> tuple[MaterialLook, int]:
+    """The base colour, and which set of texture coordinates its texture takes."""
     if primitive.get("material") is None:
-        return None, 0
+        return MaterialLook(), 0
     material = document.item("materials", primitive["material"], f"{location}.material")
     surface = document.record(material.get("pbrMetallicRoughness"), f"{location}.material")
+    red, green, blue, _ = document.numbers(surface, "baseColorFactor", f"{location}.material", 4) or (1.0,) * 4
     texture = document.record(surface.get("baseColorTexture"), f"{location}.material.baseColorTexture")
     if "index" not in texture:
-        return None, 0
+        return MaterialLook(None, (red, green, blue)), 0
     index = document.integer(texture, "index", f"{location}.material.baseColorTexture")
-    return index, document.integer(texture, "texCoord", f"{location}.material.baseColorTexture", 0)
+    coordinates = document.integer(texture, "texCoord", f"{location}.material.baseColorTexture", 0)
+    return MaterialLook(index, (red, green, blue)), coordinates
 
 
 def _painted(primitive: dict[str, Any]) -> bool:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import torch
 from scipy import sparse
@@ -25,6 +26,7 @@ _BITE, _BITE_BLEND = 0.2, 3.0
 both jaws share, such as gums in one piece, passes from the one to the other."""
 _BOTH_JAWS, _ARCH = 0.15, 30.0
 _JAW = "jaw"
+_ROW, _OFF_THE_LIPS, _RISES = 4, 10.0, (0.0, 0.1, _BITE, 0.3)  # least teeth of a row; millimetres from the lips' line
 _TONGUE, _FILLED = 15.0, 0.2  # millimetres at least: teeth are smaller; and the share near the middle
 _BACK, _BEHIND_TEETH, _TEETH, _LEAST_BACK, _FALLS = (
     (0.3, 0.55),
@@ -191,16 +193,18 @@ def _in_the_mouth(head: _Head, faces: Tensor, left: Tensor, lips: Tensor) -> tup
     middle = lips.mean(0)
     inside = torch.zeros_like(left)
     share, tongue = torch.zeros(2, len(left), dtype=torch.float64)
-    widest, gums = _FILLED, []
+    widest, gums, found = _FILLED, [], []
     for one in head.part[left].unique().tolist():  # every tooth is a part
         rows = (head.part == one) & left
         away = head.vertices[rows] - middle
         at = away.mean(0)
         behind = float(at[2]) < 2.0 and abs(float(at[1])) < _MOUTH_HEIGHT
-        if not behind or float(at.norm()) > _IN_THE_MOUTH or float(away.norm(dim=-1).max()) > 2 * _IN_THE_MOUTH:
-            continue
+        if behind and float(at.norm()) < _IN_THE_MOUTH and float(away.norm(dim=-1).max()) < 2 * _IN_THE_MOUTH:
+            found.append((rows, away))
+    line, rise = _bite_plane([away for _, away in found])
+    for rows, away in found:
         inside |= rows
-        below = -(away[:, 1] + _BITE * away[:, 2])
+        below = line - (away[:, 1] + rise * away[:, 2])
         low = (0.5 + below / (2 * _BITE_BLEND)).clamp(0, 1)
         width, _, depth = (away.amax(0) - away.amin(0)).tolist()
         above = float((low < 0.5).double().mean())
@@ -215,6 +219,21 @@ def _in_the_mouth(head: _Head, faces: Tensor, left: Tensor, lips: Tensor) -> tup
         for rows, below in gums:
             tongue += _tongue_of_gums(head.vertices, faces, rows, below)
     return inside, share, tongue
+
+
+def _bite_plane(parts: list[Tensor]) -> tuple[float, float]:
+    """How far over the lips' line the gap between two rows of single teeth lies, and how much it rises to the back.
+
+    The widest gap counts, at any of the usual rises; without rows it is the lips' line.
+    """
+    small = [part.mean(0) for part in parts if float(part[:, 0].amax() - part[:, 0].amin()) < _TONGUE]
+    best = _BITE_BLEND, 0.0, _BITE
+    for rise in _RISES if len(small) >= 2 * _ROW else ():
+        heights = sorted(float(middle[1] + rise * middle[2]) for middle in small)
+        for lower, upper in list(pairwise(heights))[_ROW - 1 : len(heights) - _ROW]:
+            if abs(lower + upper) < 2 * _OFF_THE_LIPS:
+                best = max(best, (upper - lower, (lower + upper) / 2, rise))
+    return best[1:]
 
 
 def _tongue_of_gums(vertices: Tensor, faces: Tensor, rows: Tensor, below: Tensor) -> Tensor:

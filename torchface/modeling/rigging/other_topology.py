@@ -73,8 +73,8 @@ class CarriedShapes:
     tongue: Tensor
     open_lids: tuple[float | None, ...]
 
-    def notes(self) -> list[str]:
-        """Of eyes that may not shut and lips that do not part, for people to read."""
+    def notes(self, lips_cut: bool = False) -> list[str]:
+        """Of eyes that may not shut and lips that do not part, if nobody has cut them, for people to read."""
         named = list(zip(("right", "left"), self.open_lids, strict=True))
         unseen = [side for side, left in named if left is None]
         notes = [
@@ -87,7 +87,7 @@ class CarriedShapes:
                 f"warning: {' and '.join(unseen)} eye: the lids cannot be told from the eye (painted, shut or "
                 "one piece with the skin): look whether it shuts"
             )
-        if self._lips_in_one_piece():
+        if not lips_cut and self._lips_in_one_piece():
             notes.append(
                 "warning: the lips are one piece: jawOpen stretches the skin between them; cut the mesh along the lips"
             )

@@ -36,7 +36,7 @@ from torchface.shape_names import ARKIT
 from torchface.shape_names.recognised_names import arkit_name, recognised_shapes
 from torchface.synthetic import performer
 from torchface.viz.figures.character_views import SHOWN, character_sheet
-from torchface.workflows.rig.added_parts import added_parts
+from torchface.workflows.rig.added_parts import AddedParts, added_parts
 from torchface.workflows.rig.character_face import CharacterFace, find_character_face, textured
 
 CHARACTER_ENDINGS = (".glb", VRM_ENDING)
@@ -121,11 +121,10 @@ def rig_character(
         missing = [name for name in ARKIT if name not in present]
         template = performer(texture=False)
         registration = _registered(template, face, path, progress)
-        parts: tuple[str, ...] = ()
+        given: AddedParts | None = None
         if inner_mouth or eyes:
             progress("adding parts")
             given = added_parts(character, face, template, registration, (inner_mouth, eyes))
-            parts = given.notes
             if given.blocks:
                 document = document_with_parts(character, given.blocks, encode_png(given.page))
                 character = read_character(document)
@@ -135,7 +134,7 @@ def rig_character(
         )
         rig = _with_tongue(carried)
         made = tuple(name for name in missing if name in rig.names)
-        job = _Job(character, face, carried, rig, made, parts, empty)
+        job = _Job(character, face, carried, rig, made, given, empty)
         progress("writing the character")
         added = job.targets()
         root, data = (
@@ -247,7 +246,7 @@ class _Job:
     carried: CarriedShapes
     rig: BlendshapeRig
     made: tuple[str, ...]
-    parts: tuple[str, ...]
+    parts: AddedParts | None
     empty: tuple[str, ...]
 
     def targets(self) -> list[AddedTargets]:
@@ -334,9 +333,10 @@ class _Job:
             lines.append(f"    the others are at {', '.join(map(_place, found.others))}, in the file's unit")
         lines.append(f"template: {record.figures()}")
         lines += [f"  note: {note}" for note in record.notes if not note.startswith(_OF_SCANS)]
-        lines += [f"parts: {note}" for note in self.parts]
+        lines += [f"parts: {note}" for note in (() if self.parts is None else self.parts.notes)]
         if any(name in self.made for name in (*BLINKS, _JAW)):
-            lines += [f"  {note}" for note in self.carried.notes()]
+            cut = self.parts is not None and self.parts.lips_cut
+            lines += [f"  {note}" for note in self.carried.notes(lips_cut=cut)]
         own = {name: names for name, names in present.items() if names != (name,)}
         if present:
             lines.append(f"already there: {len(present)} of ARKit's 52, kept as they are")
