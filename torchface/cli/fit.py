@@ -67,9 +67,10 @@ def fit(
             shapes merged (browInnerUp, cheekPuff); shapes that ARKit lacks keep theirs. All keep theirs if absent.
         prior: Which weights faces have, by a shape prior's name or folder, or none.
         one_expression: All photographs show the same expression, as taken at once.
-        everything: Paint hair, clothes and what else hangs before the head on it; skin, eyes, brows and mouth alone if
-            absent.
-        insist: Write a rig also where the photographs do not seem to show one person.
+        everything: Paint hair, clothes and what else hangs before the head on it; if absent skin, eyes, brows and mouth
+            alone, with the template's hair, teeth, tongue and lashes.
+        insist: Fit also what is refused otherwise, with a warning: a face that is too small or hidden, several of
+            similar size, photographs that seem to show different people.
         quiet: Show no progress.
     """
     from torchface.files.job_lock import file_lock

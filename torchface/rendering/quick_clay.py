@@ -1,4 +1,4 @@
-"""A rig as clay with coloured eyes and mouth, drawn fast enough to play."""
+"""A rig with its skin, or as clay with coloured eyes and mouth, drawn fast enough to play."""
 
 from __future__ import annotations
 
@@ -32,6 +32,7 @@ _LEVELS, _TINT_LEVELS = 256, 4
 _AMBIENT, _HIGHLIGHT = 0.30, 0.16
 _LIGHTS = (((-0.55, 0.60, 0.60), 0.66), ((0.80, 0.05, 0.45), 0.24))  # right, up, toward the viewer; strength
 _LEAST_OPEN = 0.6
+_EXPOSURE = 1.35  # of skin in these lights
 _SMALLEST = 1.0  # millimetres before the lens
 _JUMP = 0.012  # of the nearness; neighbours that differ by more are an edge
 
@@ -45,16 +46,24 @@ class QuickClay:
         part: which colour each has, (F,).
         openness: how much light creases let in, (V,).
         colors: of each part, tint and light, (parts * tints * levels,3) uint8.
+        paint: the mesh's texture, (H,W,3) in [0,255], and where the triangles' corners lie in it, (F,3,2) pixels, for
+            all but the parts; clay if absent.
     """
 
     faces: Tensor
     part: Tensor
     openness: Tensor
     colors: np.ndarray
+    paint: tuple[Tensor, Tensor] | None = None
 
     @staticmethod
-    def of(mesh: Mesh) -> QuickClay:
-        """A mesh at rest, prepared; eyes look along z there."""
+    def of(mesh: Mesh, skin: bool = False) -> QuickClay:
+        """A mesh at rest, prepared; eyes look along z there.
+
+        Args:
+            mesh: at rest.
+            skin: draw its texture, where it has one, in place of clay.
+        """
         regions = {} if mesh.annotations is None else mesh.annotations.regions
         faces = mesh.faces.cpu()
 
@@ -78,7 +87,9 @@ class QuickClay:
         openness = vertex_openness(Mesh(mesh.vertices, mesh.faces[drawn.to(mesh.faces.device)]))
         lit = faces[drawn & (part > 0)].unique()  # a closed mouth at rest would leave its teeth dark when it opens
         openness[lit] = openness[lit].clamp(min=_LEAST_OPEN)
-        return QuickClay(faces[drawn], part[drawn], openness, _lit_colors(palette))
+        return QuickClay(
+            faces[drawn], part[drawn], openness, _lit_colors(palette), _paint(mesh, drawn) if skin else None
+        )
 
     def draw(self, vertices: Tensor, camera: Camera, tint: Tensor | None = None) -> np.ndarray:
         """The mesh before a dark ground, (H,W,3) uint8.
@@ -101,8 +112,22 @@ class QuickClay:
             level = (tint[self.faces].mean(1) * (_TINT_LEVELS - 1)).round().clamp(0, _TINT_LEVELS - 1).long()
             row = row + level[drawn.triangle]
         index = row * _LEVELS + (light * (_LEVELS - 1)).clamp(0, _LEVELS - 1).long()
-        image.reshape(-1, 3)[drawn.pixel.numpy()] = self.colors[index.numpy()]
+        colors = self.colors[index.numpy()]
+        if self.paint is not None:
+            self._paint_skin(colors, drawn, light)
+        image.reshape(-1, 3)[drawn.pixel.numpy()] = colors
         return _smooth_edges(image, drawn)
+
+    def _paint_skin(self, colors: np.ndarray, drawn: DrawnPixels, light: Tensor) -> None:
+        """Overwrites colours (S,3) of what is no part with the texture's in the light (S,)."""
+        assert self.paint is not None
+        texture, corners = self.paint
+        mine = self.part[drawn.triangle] == 0
+        share = torch.stack([one[mine] for one in drawn.barycentric], 1)
+        column, row = (corners[drawn.triangle[mine]] * share[..., None]).sum(1).round().long().unbind(1)
+        height, width = texture.shape[:2]
+        texels = texture[row.clamp(0, height - 1), column.clamp(0, width - 1)]
+        colors[mine.numpy()] = (_EXPOSURE * light[mine, None] * texels).clamp(0, 255).byte().numpy()
 
     def _light(self, points: Tensor) -> Tensor:
         """The light on vertices (V,3) in the camera's frame, (V,), 1 at most but in highlights."""
@@ -115,6 +140,17 @@ class QuickClay:
             half = torch.nn.functional.normalize(toward + points.new_tensor([0.0, 0.0, -1.0]), dim=0)
             light = light + _HIGHLIGHT * strength * (normals @ half).clamp(min=0) ** 24
         return light
+
+
+def _paint(mesh: Mesh, drawn: Tensor) -> tuple[Tensor, Tensor] | None:
+    """A mesh's texture and where the corners of triangles that are drawn (F,) lie in it; see ``QuickClay``."""
+    if mesh.texture is None or mesh.uvs is None or mesh.uv_faces is None:
+        return None
+    texture = 255 * mesh.texture[:3].permute(1, 2, 0).float().cpu()
+    size = torch.tensor([texture.shape[1], texture.shape[0]])
+    uvs = mesh.uvs.cpu().float()
+    places = torch.stack([uvs[:, 0], 1 - uvs[:, 1]], 1) * size - 0.5
+    return texture, places[mesh.uv_faces.cpu()[drawn]]
 
 
 def _off_axis(vertices: Tensor, faces: Tensor, eyeball: Tensor) -> Tensor:

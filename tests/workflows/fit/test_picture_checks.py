@@ -84,12 +84,12 @@ def test_hidden_and_small_faces() -> None:
 def test_two_faces_of_one_size() -> None:
     face = reading()
     pair = replace(found(face), boxes=torch.stack([face.box, face.box]))
-    assert "2 faces of similar size; the largest is taken, --face names another" in picture_lines(pair, skin())[0]
+    assert "the largest of 2 faces is taken, 1 more nearly as large (--face 1)" in picture_lines(pair, skin())[0]
     assert picture_lines(replace(pair, asked=True), skin()) == []
     few = found(reading(25.0))
     crowd = replace(few, boxes=few.boxes.expand(7, 4))
     with pytest.raises(
-        NoFaceError, match=r"found 7 of 7 faces of similar size, the largest 33 pixels .* --face .*6 at \("
+        NoFaceError, match=r"found 7 faces, 7 of them of similar size, the largest 33 pixels .* --face .*6 at \("
     ):
         picture_lines(crowd, skin())
     assert "25 pixels between" in picture_lines(replace(crowd, asked=True), skin())[0]

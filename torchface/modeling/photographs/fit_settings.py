@@ -77,6 +77,7 @@ class FitSettings:
         texture_size: of the skin, texels a side; 0 makes no texture.
         irises: centres of the irises in each photograph, (I,2,2) pixels, NaN where unknown: their colour is there.
         parts: what each photograph shows: skin and features alone are projected onto the head; all if absent.
+        paint_hair: paint the hair that photographs show on the head; else its colour is found alone.
 
     Raises:
         ValueRangeError: a setting is NaN, infinite or out of its range.
@@ -110,6 +111,7 @@ class FitSettings:
     texture_size: int = 1024
     irises: Tensor | None = None
     parts: Sequence[FaceParts] | None = None
+    paint_hair: bool = True
 
     def __post_init__(self) -> None:
         for name in ("inner_weight", "expression_mean", "expression_ridge", "asymmetry", "identity_bound"):

@@ -17,7 +17,7 @@ from torchface.rendering.camera_visibility import Shown
 _HAIRLINE, _FALL, _TEMPLE = 0.76, 0.28, 0.7
 _SIDES, _SIDEBURN, _OVER_EARS = (-0.25, -0.02), 0.2, 0.3
 _BEHIND, _NAPE = (0.52, 0.64), -0.75
-_EDGE, _FRINGE = 0.045, 0.07
+_EDGE, _FRINGE = 0.08, 0.07
 _ABOVE_BROWS, _SQUARE, _HAIR = 0.06, 0.3, 0.5
 _LEAST, _SHARE = 20, 0.3
 _COLUMNS, _COLUMN, _FEW = 17, 0.05, 6  # across the forehead, half the width of each, vertices
@@ -46,15 +46,21 @@ class HairCap:
         line = torch.lerp(line, torch.full_like(line, _SIDEBURN), _ramp(behind, *_SIDES))
         line = torch.where(behind > _SIDES[1], _OVER_EARS, line)
         line = torch.lerp(line, torch.full_like(line, _NAPE), _ramp(behind, *_BEHIND))
-        wave = 0.02 * (torch.sin(23 * place[:, 0]) + torch.sin(37 * place[:, 0] + 1.3))
+        # Single strands reach farther; locks of a few make the edge uneven.
+        wave = 0.01 * (torch.sin(23 * place[:, 0]) + torch.sin(37 * place[:, 0] + 1.3)) + 0.3 * _EDGE * self._strands(
+            place
+        )
         return _ramp(y - line + wave, -_EDGE, _EDGE)
 
     def painted(self, colors: Tensor, place: Tensor, share: Tensor) -> Tensor:
         """Colours (Q,3) with the hair over them, in strands that hang down."""
-        around = torch.atan2(place[:, 0], place[:, 2] - self.places.ears)
-        strand = torch.sin(_STRANDS * around + 3 * torch.sin(7 * place[:, 1])) + torch.sin(2.3 * _STRANDS * around)
-        hair = self.color.to(colors) * (1 + _STRAND / 2 * strand[:, None]).to(colors)
+        hair = self.color.to(colors) * (1 + _STRAND / 2 * self._strands(place)[:, None]).to(colors)
         return torch.lerp(colors, hair.clamp(0, 1), share[:, None].to(colors))
+
+    def _strands(self, place: Tensor) -> Tensor:
+        """Light and dark of single strands at places (Q,3), (Q,) in [-2,2]."""
+        around = torch.atan2(place[:, 0], place[:, 2] - self.places.ears)
+        return torch.sin(_STRANDS * around + 3 * torch.sin(7 * place[:, 1])) + torch.sin(2.3 * _STRANDS * around)
 
 
 def hair_cap(shown: Sequence[Shown], places: Sequence[FacePlaces], hair: Tensor) -> HairCap | None:
@@ -83,8 +89,8 @@ def hair_cap(shown: Sequence[Shown], places: Sequence[FacePlaces], hair: Tensor)
         _line(place[near, 1], covered[near], height)
         for height, near in zip(usual, (place[:, :1] - across).abs().T < _COLUMN, strict=True)
     ])  # fmt: skip
-    ends = torch.cat([line[:1], line, line[-1:]])
-    smooth = ends.unfold(0, 3, 1).mean(1)
+    around = lambda values: torch.cat([values[:1].expand(2), values, values[-1:].expand(2)]).unfold(0, 5, 1)  # noqa: E731
+    smooth = around(around(line).median(1).values).mean(1)
     return HairCap(color[covered & high].median(0).values.float(), smooth, places[0])
 
 

@@ -56,7 +56,7 @@ class ImageFit:
         covariance: of coefficients and weights of each expression, (K+EN,K+EN); rows of those that lie on their
             bound are zero.
         color: the colour model's fit to the photographs; None without one, or without photographs.
-        hair: its colour where the head has it as painted, (3,); None where photographs show a bald head.
+        hair: its colour, (3,); None where photographs show a bald head.
         iris: the irises' colour, (3,); None where no photograph shows it.
     """
 
@@ -174,8 +174,20 @@ def fit_images(
     if images is None:
         return fit
     progress("projecting the photographs onto the head")
+    return with_skin(fit, model, images, settings)
+
+
+def with_skin(fit: ImageFit, model: HeadModel, images: Sequence[Tensor], settings: FitSettings) -> ImageFit:
+    """A fit with the skin that its photographs show.
+
+    Args:
+        fit: of I photographs.
+        model: whose colours skin is completed with, where it has some.
+        images: the photographs, (3,H,W) each.
+        settings: the texture's size, parts and irises of the photographs.
+    """
     size, parts, irises = settings.texture_size, settings.parts, settings.irises
-    skin = photographed_skin(fit.posed, model.color, images, fit.cameras, size, parts, irises)
+    skin = photographed_skin(fit.posed, model.color, images, fit.cameras, size, parts, irises, settings.paint_hair)
     return replace(
         fit,
         mesh=skin.on(fit.mesh),

@@ -218,16 +218,24 @@ def _spreads(problem: Problem, state: State, picked: PickedPoints, factors: Whit
 
 
 def covariance(problem: Problem, state: State) -> Tensor:
-    """Of the coefficients, (D,D), cameras unknown; rows of those that lie on a bound are zero."""
+    r"""Of the coefficients' errors, (D,D), cameras unknown; rows of those that lie on a bound are zero.
+
+    .. math:: (H + P)^{-1} (s^2 H + P) (H + P)^{-1}
+
+    with the precision P of the prior, which true coefficients have, and errors of points s times as large along heads'
+    forms as the solve, of normal matrix H, takes them to be.
+    """
     picked = problem.points.picked(state.rows)
     factors = whitening(problem, state, picked)
     at = linearised(picked, state.coefficients[problem.rows], state.views, problem.targets, factors)
     precision, _ = problem.prior(state)
     H = normal_equations(problem, at, state.views).H
-    H = (H if problem.settings.surface is None else H / _ALONG_FORMS**2) + precision
+    along = 1.0 if problem.settings.surface is None else _ALONG_FORMS
     lower, upper = problem.bounds()
     x = state.coefficients
     inside = ((x > lower + 1e-9) & (x < upper - 1e-9)).nonzero()[:, 0]
-    result = torch.zeros_like(H)
-    result[inside[:, None], inside] = torch.linalg.inv(H[inside[:, None], inside])
+    H, precision = (one[inside[:, None], inside] for one in (H, precision))
+    back = torch.linalg.inv(H + precision)
+    result = torch.zeros(len(x), len(x), dtype=torch.float64)
+    result[inside[:, None], inside] = back @ (along**2 * H + precision) @ back
     return result

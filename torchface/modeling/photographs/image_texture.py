@@ -43,7 +43,7 @@ _IRIS_COSINE = 0.9  # of the angle between the eye's axis and the border of an i
 @dataclass(frozen=True, eq=False)
 class Skin:
     """Colours of the vertices (V,3), a texture (3,size,size) where there is a layout, the colour model's answer, the
-    hair's colour (3,) where it is painted, and the irises' (3,) where they are seen."""
+    hair's colour (3,) where it is seen, and the irises' (3,) where they are seen."""
 
     colors: Tensor | None
     texture: Tensor | None
@@ -65,6 +65,7 @@ def photographed_skin(
     size: int = 1024,
     parts: Sequence[FaceParts] | None = None,
     irises: Tensor | None = None,
+    paint_hair: bool = True,
 ) -> Skin:
     """A head's skin from photographs and a colour model.
 
@@ -76,6 +77,7 @@ def photographed_skin(
         size: of the texture, texels a side; 0 makes none.
         parts: what each shows: skin and the face's features alone are projected onto the head; all if absent.
         irises: centres of the eyes' irises in each photograph, (I,2,2) pixels, NaN where they are not known.
+        paint_hair: whether the hair is painted on the head, or its colour found alone.
 
     Returns:
         With texture coordinates: the photographs projected onto the head, their light divided out; where none shows it
@@ -116,7 +118,7 @@ def photographed_skin(
     if own:
         confidence = torch.where(others, 0.0, torch.ones(count, len(others)) if confidence is None else confidence)
     texture = photo_texture(posed, images, cameras, size, base, confidence, lights)
-    if cap is not None:
+    if cap is not None and paint_hair:
         texture = _capped(texture, cap, mesh, others)
     colors = texture.colors
     iris = iris_color(posed, images, cameras, irises)

@@ -17,6 +17,7 @@ _NOSE = -0.45
 _NEAR_FEATURES, _SURELY_SKIN = 0.10, 0.75
 _NECK, _BEHIND = (0.05, 0.35), (0.05, 0.30)
 _FOREHEAD = 0.15
+_BROW, _FRINGE = 0.11, (0.16, 0.30)
 """In distances between the eyes' outer corners, but for the second row: shares of the way to the face's outline."""
 
 
@@ -33,6 +34,7 @@ class FacePlaces:
         behind: length behind the ears' landmarks, (V,).
         chin: the chin's place, (3,).
         brows: how high the brows are.
+        brow: near a brow's landmarks, (V,) bool.
         ears: how far forward the ears' landmarks lie.
     """
 
@@ -42,6 +44,7 @@ class FacePlaces:
     features: Tensor
     behind: Tensor
     chin: Tensor
+    brow: Tensor
     brows: float
     ears: float
 
@@ -69,8 +72,9 @@ class FacePlaces:
         reach = _radius(outline - middle, torch.atan2(offsets[:, 1], offsets[:, 0]))
         length = offsets.norm(dim=1)
         features = torch.cdist(place, torch.cat([at[JAW:27], at[31:LANDMARKS]])).amin(1) < _NEAR_FEATURES
+        brow = torch.cdist(place, at[JAW:27]).amin(1) < _BROW
         ears, brows = float(at[[0, 16], 2].mean()), float(at[17:27, 1].mean())
-        return FacePlaces(length / reach, length - reach, place, features, ears - place[:, 2], at[8], brows, ears)
+        return FacePlaces(length / reach, length - reach, place, features, ears - place[:, 2], at[8], brow, brows, ears)
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,9 +105,13 @@ class ShownParts:
         bare, features, hair = (
             parts.at(pixels, *names).double().nan_to_num(0.0) for names in (("skin",), _FEATURES, ("hair",))
         )
-        beard = hair * _ramp(_NOSE - places.place[:, 1], 0.0, 0.1) * (places.out < 1)
-        own = graph.smoothed(((bare + features + beard) * falloff)[:, None], torch.ones_like(bare), 2)[:, 0]
-        return ShownParts(own, bare * falloff, hair - beard)
+        # Thick brows and beards look like hair; where hair hangs over the brows too there is a fringe.
+        above = places.place[:, 1] - places.brows
+        fringe = hair[(above > _FRINGE[0]) & (above < _FRINGE[1]) & (places.out < 1)].mean().nan_to_num(1.0)
+        grown = hair * _ramp(_NOSE - places.place[:, 1], 0.0, 0.1) * (places.out < 1)
+        grown = torch.maximum(grown, hair * places.brow * (1 - fringe))
+        own = graph.smoothed(((bare + features + grown) * falloff)[:, None], torch.ones_like(bare), 2)[:, 0]
+        return ShownParts(own, bare * falloff, hair - grown)
 
 
 def _radius(outline: Tensor, angle: Tensor) -> Tensor:

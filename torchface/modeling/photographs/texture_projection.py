@@ -21,6 +21,7 @@ from torchface.rendering.environment_light import EnvironmentLight
 _SQUARELY = 0.2
 _MIN_CONFIDENCE = 0.5
 _SHARP, _SLANT, _FADE = 3.0, 0.05, 0.5
+_BENDS = 8  # rounds by which the cosine is smoothed
 _FEATHER, _BROAD, _FILL = 6, 60, 400
 _TYPICAL, _SPARSE = 0.15, 0.05
 _HEAT_LOSS, _HEAT_LOSS_AT_MASK = 0.004, 0.01  # a ring of vertices, relative
@@ -106,7 +107,13 @@ def photo_texture(
     ]
     lights = [None] * len(images) if lights is None else lights
     at_vertices = [
-        replace(shown, colors=unlit(shown.colors, surface.normals, camera, light))
+        replace(
+            shown,
+            colors=unlit(shown.colors, surface.normals, camera, light),
+            # Under a brow and at a nose's wing skin is seen at a slant and yet is none's edge.
+            cosine=(shown.cosine > 0)
+            * graph.smoothed(shown.cosine[:, None].double(), (shown.cosine > 0).double(), _BENDS)[:, 0],
+        )
         for shown, surface, camera, light in zip(at_vertices, surfaces, cameras, lights, strict=True)
     ]
     outside = _outer_border(vertices, faces)
@@ -232,24 +239,26 @@ def _filled(mesh: Mesh, colors: Tensor, alpha: Tensor, base: Tensor | None, grap
         other = _toned(other, colors, alpha * there, graph, _BROAD, apart=False)
         guess = guess + ((1 - alpha) * there)[:, None] * other
         covered = covered + (1 - alpha) * there
-    if base is not None:
-        under = base.detach().cpu().double()
-        # The tone at the edge of what is covered counts, not that of the face as a whole.
-        edge = graph.smoothed(1 - covered[:, None], torch.ones_like(covered), _FEATHER)[:, 0]
-        seen_color = guess / covered.clamp(min=1e-9)[:, None]
-        return guess + (1 - covered)[:, None] * _toned(under, seen_color, covered * (edge + 1e-3), graph, _FILL)
     mean = (
         colors[alpha > 0.5].median(0).values
         if bool((alpha > 0.5).any())
         else (guess * alpha[:, None]).sum(0) / alpha.sum()
     )
+    if base is not None:
+        under = base.detach().cpu().double()
+        # The tone at the edge of what is covered counts, not that of the face as a whole, nor that of what the edge
+        # still shows of hair.
+        edge = graph.smoothed(1 - covered[:, None], torch.ones_like(covered), _FEATHER)[:, 0]
+        seen_color = guess / covered.clamp(min=1e-9)[:, None]
+        weight = covered * (edge + 1e-3) * _typical(seen_color, mean)
+        return guess + (1 - covered)[:, None] * _toned(under, seen_color, weight, graph, _FILL)
     label = components(mesh.faces.cpu(), len(alpha))
     shown = torch.zeros(int(label.max()) + 1, dtype=torch.float64).index_add_(0, label, covered)
     mean = torch.where((shown > 0)[label][:, None], mean, torch.tensor(_NEVER_SEEN, dtype=torch.float64))
     fixed = (covered > 0.5)[:, None]
     seen_color = guess / covered.clamp(min=0.5)[:, None]
     if masked:  # lips, brows and what the edge still shows of hair are not spread
-        typical = covered * torch.exp(-0.5 * ((seen_color - mean) / _TYPICAL).square().sum(-1))
+        typical = covered * _typical(seen_color, mean)
         weight = graph.smoothed(typical[:, None], torch.ones_like(covered), _BROAD)
         seen_color = torch.lerp(mean, graph.smoothed(seen_color, typical, _BROAD), weight / (weight + _SPARSE))
     under = torch.where(fixed, seen_color, mean)
@@ -257,6 +266,11 @@ def _filled(mesh: Mesh, colors: Tensor, alpha: Tensor, base: Tensor | None, grap
     for _ in range(0 if bool(fixed.all()) else _FILL):  # heat that flows from what is covered; behind a mask it is lost
         under = torch.where(fixed, under, torch.lerp(graph.sum(under) / graph.degree[:, None], mean, lost))
     return guess + (1 - covered)[:, None] * under
+
+
+def _typical(colors: Tensor, mean: Tensor) -> Tensor:
+    """How much colours (V,3) are like a mean, (V,) in [0,1]."""
+    return torch.exp(-0.5 * ((colors - mean) / _TYPICAL).square().sum(-1))
 
 
 def _toned(

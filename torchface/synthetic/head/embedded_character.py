@@ -43,13 +43,16 @@ class Character:
     surface: SurfaceMaps
 
 
-def character(rig: BlendshapeRig | None = None, look: Look | None = None, size: int = 2048) -> Character:
+def character(
+    rig: BlendshapeRig | None = None, look: Look | None = None, size: int = 2048, skin: Tensor | None = None
+) -> Character:
     """A head of the performer's topology with all that belongs to a face.
 
     Args:
         rig: ``performer()`` or another rig of its topology, whose shapes stay as they are.
         look: colours; a fair man's of 30 if absent.
         size: texels of a side of the images.
+        skin: see ``skin_maps``; its brows are the only ones then.
 
     Returns:
         The rig's shapes, in which the lower teeth go with the jaw and hair with the skin, and ``tongueOut`` where the
@@ -67,28 +70,24 @@ def character(rig: BlendshapeRig | None = None, look: Look | None = None, size: 
     """
     rig = performer(texture=False) if rig is None else rig
     count = topology().count
-    quads = rig.neutral.polygons
-    if len(rig.vertices) != count or quads is None or not torch.equal(quads, topology().quads):
+    if not is_performers(rig):
         raise TopologyError(f"character: found {rig.neutral}, expected the performer's topology of {count} vertices")
-    skin, moved = rig.vertices.double(), rig.deltas.double()
+    rest, moved = rig.vertices.double(), rig.deltas.double()
     mouth = _InTheMouth(rig)
-    pieces = {"skin": (skin, moved)}
+    pieces = {"skin": (rest, moved)}
     parts: dict[str, HeadPart] = {}
     for name, part in mouth_parts().items():
         parts[name] = part
         pieces[name] = mouth.placed(part.vertices, name in _WITH_THE_JAW)
     look = look or Look()
-    locks = hair_locks(look.haircut)
-    for name, grown in (
-        ("hair", scalp_hair(_CAP[look.haircut])),
-        ("hair_locks", locks),
-        ("brow_hair", brow_hairs()),
-        ("lash_hair", lashes()),
-    ):
-        parts[name] = grown.part
-        pieces[name] = _grown(grown, skin, moved)
+    grown = {"lash_hair": lashes()} | ({"brow_hair": brow_hairs()} if skin is None else {})
+    if look.haircut is not None:
+        grown = {"hair": scalp_hair(_CAP[look.haircut]), "hair_locks": hair_locks(look.haircut), **grown}
+    for name, piece in grown.items():
+        parts[name] = piece.part
+        pieces[name] = _grown(piece, rest, moved)
     parts["shirt"] = shirt()
-    pieces["shirt"] = about_neck(shirt().vertices, skin), torch.zeros(len(moved), len(shirt().vertices), 3).double()
+    pieces["shirt"] = about_neck(shirt().vertices, rest), torch.zeros(len(moved), len(shirt().vertices), 3).double()
     vertices = torch.cat([points for points, _ in pieces.values()])
     deltas = torch.cat([motion for _, motion in pieces.values()], 1)
     deltas[deltas.norm(dim=-1) < _STILL] = 0
@@ -99,17 +98,20 @@ def character(rig: BlendshapeRig | None = None, look: Look | None = None, size: 
         tongue = slice(start, start + len(pieces["tongue"][0]))
         out[tongue] = mouth.place(tongue_out()) - vertices[tongue]
         deltas, names = torch.cat([deltas, out[None]]), (*names, "tongueOut")
-    maps = skin_maps(look, size)
+    maps = skin_maps(look, size, skin)
     neutral = _mesh(rig.neutral, vertices, parts, maps.color)
     return Character(BlendshapeRig(neutral, deltas.float(), names), maps.surface)
 
 
 def shown_rig(rig: BlendshapeRig, size: int = 1024) -> BlendshapeRig:
     """The character of a performer's rig, with the rig's shapes alone; a rig of another topology as it is."""
+    return character(rig, size=size).rig.select(rig.names) if is_performers(rig) else rig
+
+
+def is_performers(rig: BlendshapeRig) -> bool:
+    """Whether a rig has the performer's topology, which ``character`` needs."""
     quads = rig.neutral.polygons
-    if quads is None or not torch.equal(quads, topology().quads):
-        return rig
-    return character(rig, size=size).rig.select(rig.names)
+    return len(rig.vertices) == topology().count and quads is not None and torch.equal(quads, topology().quads)
 
 
 def _mesh(skin: Mesh, vertices: Tensor, parts: dict[str, HeadPart], color: Tensor) -> Mesh:

@@ -42,7 +42,7 @@ class Look:
         hair, iris, shirt: sRGB in [0,1].
         lips: how much redder than the skin the lips are, 1 as usual.
         freckles: how strong they are, 1 as usual.
-        haircut: "short", "long" to the shoulders, or "tied" at the back.
+        haircut: "short", "long" to the shoulders, or "tied" at the back; bald if absent.
 
     Example:
         >>> Look(age=70.0, hair=(0.6, 0.6, 0.6)).melanin
@@ -55,7 +55,7 @@ class Look:
     iris: tuple[float, float, float] = (0.33, 0.24, 0.14)
     lips: float = 1.0
     freckles: float = 1.0
-    haircut: Style = "short"
+    haircut: Style | None = "short"
     shirt: tuple[float, float, float] = (0.23, 0.28, 0.34)
 
 
@@ -67,28 +67,42 @@ class SkinMaps:
     surface: SurfaceMaps
 
 
-@lru_cache(maxsize=4)
-def skin_maps(look: Look, size: int = 2048) -> SkinMaps:
+def skin_maps(look: Look, size: int = 2048, skin: Tensor | None = None) -> SkinMaps:
     """The images of a person.
 
     Args:
         size: texels of a side.
+        skin: colours of skin, lips and brows in the head's layout in place of the look's, (3,size,size), such as a fit
+            to photographs gives.
     """
+    return _look_maps(look, size) if skin is None else _maps(look, size, skin)
+
+
+@lru_cache(maxsize=4)
+def _look_maps(look: Look, size: int) -> SkinMaps:
+    return _maps(look, size, None)
+
+
+def _maps(look: Look, size: int, skin: Tensor | None) -> SkinMaps:
     texels, p, marks = _texels(size)
     lips, mouth, _, socket, lash, eyeball, nostril, ear = marks.unbind(1)
     hair = hair_share(p) * (1 - ear) * (1 - ramp(eyeball + socket + mouth, 0.2, 0.5))
+    hair = hair if look.haircut else torch.zeros_like(hair)
     ball = eyeball > 0.5
     old = max(0.0, (look.age - 32.0) / 40.0)
     creases = _creases(p) * old
-    color = _pigmented(skin_color(p, marks, look.freckles, 0.75 * look.lips), look.melanin)
-    color = color * (1 - 0.22 * creases.clamp(0, 1))[:, None]
-    color = mix(color, (0.42, 0.27, 0.19), 0.35 * min(old, 1.0) * ramp(noise(p, 3.2, 41), 0.62, 0.85))
+    if skin is None:
+        color = _pigmented(skin_color(p, marks, look.freckles, 0.75 * look.lips), look.melanin)
+        color = color * (1 - 0.22 * creases.clamp(0, 1))[:, None]
+        color = mix(color, (0.42, 0.27, 0.19), 0.35 * min(old, 1.0) * ramp(noise(p, 3.2, 41), 0.62, 0.85))
+        color = mix(color, look.hair, 0.42 * _brow_shade(p))
+    else:
+        color = skin.flatten(1)[:, texels.texels].T.float()
     strand = _strands(p)
     tone = torch.tensor(look.hair) * (0.92 + 0.42 * strand)[:, None]
     root = 0.62 + 0.38 * ramp(hair, 0.05, 0.5)
     shown = ramp(hair + 0.12 * strand * ramp(hair, 0.0, 0.15), 0.0, 0.30) * root
     color = color + (tone - color) * (0.94 * shown).clamp(0, 1)[:, None]
-    color = mix(color, look.hair, 0.42 * _brow_shade(p))
     color = inner_color(color, marks)
     color[ball] = eye_color(p[ball], look.iris)
     height = _height(p, lips, hair, strand, old) - 0.30 * creases

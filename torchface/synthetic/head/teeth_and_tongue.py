@@ -174,7 +174,8 @@ _TONGUE_OUT = np.array([
     (0.0, 24, -84.0, 15, 7.0), (0.25, 46, -76.5, 18, 7.0), (0.5, 70, -72.3, 14.0, 2.6), (0.64, 84, -71.8, 13.5, 2.2),
     (0.78, 96, -74.5, 13.5, 2.9), (0.92, 106, -83.0, 11.5, 2.7), (1.0, 110, -89.5, 7.5, 1.7),
 ])  # fmt: skip
-_TONGUE_STATIONS, _TONGUE_ROUND = 22, 20
+_TONGUE_STATIONS, _TONGUE_ROUND = 20, 20
+_TONGUE_TIP, _TONGUE_CAP = 4.5, 4  # length in millimetres, rows
 
 
 def _tongue(stations: np.ndarray) -> HeadPart:
@@ -190,7 +191,8 @@ def _tongue(stations: np.ndarray) -> HeadPart:
     points = np.stack([
         wide[:, None] * across, y[:, None] + rise * ahead[:, 1:], z[:, None] - rise * ahead[:, :1],
     ], -1)  # fmt: skip
-    tip = points[-1].mean(0) + 3.0 * np.array([0, *ahead[-1]])
-    points = np.concatenate([points, (0.55 * points[-1] + 0.45 * tip)[None], np.broadcast_to(tip, points[-1:].shape)])
-    points[-1] += 0.02 * (points[-2] - tip)
+    turn = np.linspace(0, np.pi / 2, _TONGUE_CAP + 1)[1:, None, None]
+    middle = points[-1].mean(0)
+    cap = middle + np.maximum(np.cos(turn), 0.02) * (points[-1] - middle)
+    points = np.concatenate([points, cap + _TONGUE_TIP * np.sin(turn) * np.array([0, *ahead[-1]])])
     return HeadPart.grid(torch.from_numpy(points), PAGE["tongue"], closed=True).turned()

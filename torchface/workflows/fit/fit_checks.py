@@ -87,7 +87,7 @@ def one_person_lines(photographs: Sequence[Path], marks: Tensor, bare: BareFit, 
     if float(sure[worst]) < OTHERS and not insist:
         raise AlignmentError(
             f"{photographs[worst].name}: shows another person than the rest, or its landmarks are wrong ({figures}); "
-            "leave it out, or say --insist if they are one person"
+            "leave it out, or --insist to fit them anyway"
         )
     return [f"WARNING: these photographs may show different people; their mean would be nobody ({figures})"]
 

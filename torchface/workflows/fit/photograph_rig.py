@@ -20,16 +20,14 @@ from torchface.io.mesh_files import MESH_ENDINGS
 from torchface.io.rig_files import SCENE_ENDINGS
 from torchface.io.video.video_file import VIDEO_ENDINGS
 from torchface.landmarks.images.face_crop import cut_crop
-from torchface.mesh import Mesh
 from torchface.modeling import FitSettings, ImageFit, fit_images, transfer_with_report
-from torchface.modeling.photographs.image_texture import with_iris
 from torchface.modeling.photographs.landmark_view import JAW
 from torchface.number_checks import checked_count
 from torchface.progress import Progress, silent
-from torchface.registration import hidden_parts, with_template_skin
 from torchface.rendering.clay_shading import Lighting, render
 from torchface.rendering.compositing import save_rendered_image
 from torchface.rig import BlendshapeRig
+from torchface.synthetic.head.embedded_character import is_performers
 from torchface.workflows.fit.fit_checks import (
     ALONE,
     eyes_distances,
@@ -46,6 +44,7 @@ from torchface.workflows.fit.fit_landmarks import (
     warn_if_stored_turned,
 )
 from torchface.workflows.fit.fit_readings import with_readings
+from torchface.workflows.fit.fitted_character import dressed_rig
 from torchface.workflows.fit.picture_checks import cover_lines, picture_lines, profile_lines
 from torchface.workflows.fit.video_pictures import video_pictures
 from torchface.workflows.named_finders import part_finder
@@ -134,9 +133,15 @@ class FittedHead:
             listed = [f"{self.rig.names[k]} {float(weights[k]):.2f}" for k in strongest if float(weights[k]) > 0.05]
             lines.append(f"{path.name}: expression {', '.join(listed) or 'at rest'}")
         if fit.color is not None:
-            lines.append(f"colour model: {float(fit.color.error.mean()):.3f} off, of 1 a channel")
+            off = float(fit.color.error.mean())
+            lines.append(
+                f"skin that no photograph shows: the head model's colours ({off / 3**0.5:.0%} of full brightness off "
+                "what photographs show elsewhere)"
+            )
+        regions = {} if self.rig.neutral.annotations is None else self.rig.neutral.annotations.regions
         if fit.hair is not None:
-            lines.append(f"hair: a cap of its colour {_code(fit.hair)}, painted on the head; it is no geometry")
+            what = "the template's haircut, not the person's" if "hair" in regions else "painted on the head as a cap"
+            lines.append(f"hair: {_code(fit.hair)}, its colour in the photographs; {what}")
         if fit.iris is not None:
             lines.append(f"irises: {_code(fit.iris)}, their colour in the photographs")
         elif fit.mesh.texture is not None:
@@ -198,6 +203,9 @@ def fit_photographs(
     parts = [part_finder()((255 * image[:3].clamp(0, 1)).byte(), one) for image, one in zip(images, marks, strict=True)]
     fitting = replace(settings.fit, expression_prior=prior, annotated=bool(found))
     fitting = fitting if settings.everything else replace(fitting, parts=parts)
+    # A template that the user names is written as it is.
+    worn = settings.template is None and not settings.everything and bool(fitting.texture_size) and is_performers(rig)
+    fitting = replace(fitting, paint_hair=not worn)
     if found:
         fitting = with_readings(fitting, found, rig)
     remarks = [line for one, image in zip(found, images, strict=False) for line in picture_lines(one, image, insist)]
@@ -211,26 +219,22 @@ def fit_photographs(
         remarks += strange_lines(photographs, fit)
     else:
         remarks += landmark_lines(photographs, images, marks, settings.landmark_model, bare)
-    # Photographs show little of eyeballs and teeth: parts of their own keep the template's skin.
-    unseen = hidden_parts(rig.neutral, torch.zeros(len(rig.vertices), dtype=torch.bool))
-    dressed = with_template_skin(fit.mesh, rig.neutral, unseen)
-    dressed = dressed if fit.iris is None else with_iris(dressed, fit.iris)
-    transferred = transfer_with_report(rig, dressed, progress=progress)
+    transferred = transfer_with_report(rig, fit.mesh, progress=progress)
+    dressed = dressed_rig(transferred.rig, rig, fit, images, parts, marks, worn)
+    made = dressed.rig
     progress("writing the rig and the overlays")
     overlays = tuple(out.with_name(f"{out.stem}_{i + 1}_{path.stem}.png") for i, path in enumerate(photographs))
     with all_or_none():
-        save_rig(renamed(transferred.rig, settings.names), out)
+        save_rig(renamed(made, settings.names), out, dressed.surface if out.suffix.lower() == ".glb" else None)
         for i, (path, image) in enumerate(zip(overlays, images, strict=True)):  # one photograph at a time
-            save_rendered_image(overlay(fit, i, image, marks[i], dressed), path)
+            save_rendered_image(overlay(fit, i, image, marks[i], made), path)
         for path, camera, (width, height), error in zip(overlays, fit.cameras, sizes, fit.errors.tolist(), strict=True):
             calibration = CameraCalibration(camera.intrinsics.double(), torch.zeros(5).double(), width, height, error)
             save_calibration(calibration, path.with_suffix(".toml"))
         for path, one in zip(overlays, found, strict=False):  # to be corrected and given as --landmarks
             save_pts(one.face.landmarks, path.with_suffix(".pts"))
     summary = transferred.report.summary()
-    return FittedHead(
-        transferred.rig, fit, overlays, summary, tuple(found), tuple(remarks), named.line, tuple(photographs)
-    )
+    return FittedHead(made, fit, overlays, summary, tuple(found), tuple(remarks), named.line, tuple(photographs))
 
 
 def _pictures(
@@ -250,17 +254,21 @@ def _pictures(
     return names, images, found
 
 
-def overlay(fit: ImageFit, view: int, image: Tensor, marks: Tensor, head: Mesh | None = None) -> Tensor:
+def overlay(fit: ImageFit, view: int, image: Tensor, marks: Tensor, rig: BlendshapeRig | None = None) -> Tensor:
     """A photograph, the head before it with its skin, and the landmarks: found green, fitted red; (3,H,W), cut to it.
 
     Args:
         fit: of I photographs.
         image: it, (3,H,W).
         marks: its landmarks, (68,2).
-        head: at rest, with the skin and the eyes that are shown; the fit's if absent.
+        rig: the person's, with the fit's shapes first; the fit's head if absent.
     """
     camera, corner = _cut(fit.cameras[view], marks)
-    posed = replace(head or fit.mesh, vertices=fit.posed[view].vertices)
+    posed = fit.posed[view]
+    if rig is not None:
+        weights = torch.zeros(1, len(rig.names))
+        weights[0, : fit.weights.shape[1]] = fit.weights[view]
+        posed = rig.neutral.with_vertices(rig(weights)[0].detach())
     shift = torch.cat([torch.eye(2, dtype=torch.float64), -corner[:2, None]], dim=1)
     piece = cut_crop((255 * image[:3].clamp(0, 1)).round().byte(), corner[2] * shift, _OVER)
     drawn, behind = (render(posed, camera, lighting=_LIGHT, background=color, samples=1) for color in (_WHITE, _BLACK))

@@ -55,11 +55,11 @@ def picture_lines(found: PhotographLandmarks, image: Tensor, insist: bool = Fals
     if rivals and eyes < _FEW_EYES:
         places = ", ".join(f"{k} at ({x:.0f}, {y:.0f})" for k, (x, y, *_) in enumerate(found.boxes[:20].tolist()))
         refusals.append(
-            f"{rivals + 1} of {len(found.boxes)} faces of similar size, the largest {float(face.box[2]):.0f} pixels "
-            f"wide, expected one, or --face with the number of one ({places})"
+            f"{len(found.boxes)} faces, {rivals + 1} of them of similar size, the largest {float(face.box[2]):.0f} "
+            f"pixels wide, expected one large face, or --face with the number of one of all ({places})"
         )
     if refusals and not insist:
-        raise NoFaceError(f"{name}: found {'; '.join(refusals)}; give another photograph, or say --insist")
+        raise NoFaceError(f"{name}: found {'; '.join(refusals)}; give another photograph, or --insist to fit it anyway")
     lines = [f"found {refusal}" for refusal in refusals]
     if _LEAST_EYES <= eyes < _FEW_EYES:
         lines.append(
@@ -70,7 +70,8 @@ def picture_lines(found: PhotographLandmarks, image: Tensor, insist: bool = Fals
         for part, share in hidden.items()
     ]
     if rivals and eyes >= _FEW_EYES:
-        lines.append(f"{rivals + 1} faces of similar size; the largest is taken, --face names another")
+        numbers = f"--face 1 to {rivals}" if rivals > 1 else "--face 1"
+        lines.append(f"the largest of {len(found.boxes)} faces is taken, {rivals} more nearly as large ({numbers})")
     return [f"WARNING: {name}: {line}" for line in [*lines, *_color_lines(image, face.box)]]
 
 

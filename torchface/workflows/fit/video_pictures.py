@@ -56,7 +56,7 @@ def video_pictures(
         with naming_the_frame(number):
             readings.append(tracker.step(frame))
         numbers.append(number)
-        sharpness.append(_sharpness(frame, readings[-1]))
+        sharpness.append(sharpness_of(frame, readings[-1].box) if bool(readings[-1].found) else torch.zeros(()))
         progress("finding the face in the video", number + 1, max(clip.count, number + 1))
     taken = FaceReading.stacked(readings)
     try:
@@ -77,13 +77,12 @@ def video_pictures(
     return pictures
 
 
-def _sharpness(frame: Tensor, reading: FaceReading) -> Tensor:
-    """How much of the face's detail a frame (3,H,W) keeps, (): the second differences beside the first."""
-    if not bool(reading.found):
-        return torch.zeros(())
+def sharpness_of(frame: Tensor, box: Tensor) -> Tensor:
+    """How much of the detail of a face in a box (x, y, width, height) a frame (3,H,W) keeps, (): the second differences
+    beside the first."""
     height, width = frame.shape[1:]
-    low = reading.box[:2].long().clamp(min=0)
-    high = (reading.box[:2] + reading.box[2:]).long().minimum(torch.tensor([width, height]))
+    low = box[:2].long().clamp(min=0)
+    high = (box[:2] + box[2:]).long().minimum(torch.tensor([width, height]))
     face = frame[:, low[1] : high[1], low[0] : high[0]].float().mean(0)
     if min(face.shape) < 4:
         return torch.zeros(())

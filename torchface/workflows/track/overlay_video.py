@@ -57,8 +57,8 @@ def side_by_side_drawer(tracked: Tracked) -> Callable[[int, Tensor], Tensor]:
     confidence is low; what of the rig lies there is tinted orange. A frame without a face shows no rig.
     """
     window = head_window(tracked)
-    rig, weights = tracked.rig, tracked.solution.weights.detach()
-    clay, near = QuickClay.of(rig.neutral), _near_landmarks(rig.neutral)
+    rig, weights = tracked.shown, tracked.solution.weights.detach()
+    clay, near = QuickClay.of(rig.neutral, skin=rig is not tracked.rig), _near_landmarks(rig.neutral)
     doubt = ((_SURE - tracked.reading.trust.nan_to_num()) / _SURE).clamp(0, 1)
     width = window.width
     view = (window.intrinsics @ torch.linalg.inv(tracked.calibration.intrinsics.double())).numpy()

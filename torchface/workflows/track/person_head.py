@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from torchface.errors import ValueRangeError
+from torchface.geometry.meshes.normal_maps import SurfaceMaps
 from torchface.landmarks.images.face_reading import FaceReading
 from torchface.modeling import FitSettings, HeadModel, ImageFit, fit_images, transfer_with_report
 from torchface.modeling.photographs.frame_choice import choose_frames
@@ -29,11 +30,15 @@ class PersonHead:
     Args:
         rig: the head found, with the shapes of the model's rig transferred to it.
         frames: their numbers, (F,).
+        shown: it with skin, hair and teeth, where pictures show them; the shapes are the rig's.
+        surface: how that shades.
     """
 
     rig: BlendshapeRig
     fit: ImageFit
     frames: Tensor
+    shown: BlendshapeRig | None = None
+    surface: SurfaceMaps | None = None
 
     def lines(self) -> list[str]:
         """For people to read."""

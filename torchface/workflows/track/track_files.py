@@ -71,7 +71,7 @@ def write_curves(tracked: Tracked, out: Path) -> dict[str, Path]:
     columns["presence"] = reading.presence
     track = Track(LANDMARK_NAMES, reading.landmarks, reading.confidence)
     save_landmarks_csv(Take(fps, landmarks=track, extras={"columns": columns}, seconds=when), products["landmarks"])
-    match = save_animation(tracked.rig, take, products["animation"], reduce=bound)
+    match = save_animation(tracked.shown, take, products["animation"], reduce=bound)
     if match.reduction is not None:
         tracked.reductions.append(f"{ANIMATION}: {match.reduction}")
     return products

@@ -88,6 +88,11 @@ class Tracked:
         return self.inputs.actor
 
     @property
+    def shown(self) -> BlendshapeRig:
+        """The actor's with the skin that the video shows, where the head was solved with the take."""
+        return self.rig if self.head is None or self.head.shown is None else self.head.shown
+
+    @property
     def calibration(self) -> CameraCalibration:
         """Of the camera."""
         return self.inputs.calibration

@@ -22,6 +22,7 @@ from torchface.rendering.point_light import PointLight
 from torchface.workflows.track.camera_views import OtherCamera, other_cameras
 from torchface.workflows.track.face_overlay import video_light
 from torchface.workflows.track.frame_readings import read_frames
+from torchface.workflows.track.head_skin import with_filmed_skin
 from torchface.workflows.track.overlay_video import write_overlay
 from torchface.workflows.track.person_head import person_head
 from torchface.workflows.track.take_measurements import measuring_solver, take_measurements
@@ -91,6 +92,9 @@ def _track(inputs: TrackInputs, others: list[OtherCamera], out: Path, filmed: bo
     if inputs.heads is not None:
         with _timed(seconds, "head"):
             head = person_head(inputs, inputs.heads, landmarks, reading, progress)
+        if filmed:
+            with _timed(seconds, "skin"):
+                head = with_filmed_skin(head, inputs, inputs.heads, reading, progress)
         inputs = replace(inputs, actor=head.rig)
     trust, solver = reading.trust, inputs.solver(inputs.clip.fps, MOTION if inputs.models.expects else None)
     offsets = known_offsets(inputs, out)
@@ -137,7 +141,7 @@ def _track(inputs: TrackInputs, others: list[OtherCamera], out: Path, filmed: bo
         tracked.products.update(write_curves(tracked, out))
         if head is not None:
             tracked.products["head"] = out / HEAD
-            save_rig(head.rig, out / HEAD)
+            save_rig(tracked.shown, out / HEAD, head.surface)
     if filmed and inputs.settings.overlay != "none":
         tracked = _with_overlay(tracked, out, state, key, progress)
     write_json(out / SUMMARY, summary(tracked))

@@ -1,0 +1,111 @@
+"""A fitted head as a character: the template's teeth, tongue, lashes, hair and collar in its photographs' colours."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torchface.geometry.meshes.normal_maps import SurfaceMaps
+from torchface.landmarks.images.face_crop import cut_crop
+from torchface.landmarks.images.networks.part_finder import FaceParts
+from torchface.modeling import ImageFit
+from torchface.modeling.photographs.image_texture import with_iris
+from torchface.registration import hidden_parts, with_template_skin
+from torchface.rig import BlendshapeRig
+from torchface.synthetic.head.embedded_character import character
+from torchface.synthetic.head.skin_maps import Look
+
+# In distances between the eyes' outer corners: how far from the face's middle hair hangs beside the neck, and how far
+# below the mouth.
+_BESIDE, _BELOW = (0.55, 1.15), (0.15, 0.75)
+_LONG = 0.3  # share of hair there on one side
+_SIZE = 1024
+_CLOTH, _LEAST = 0.7, 150  # share and crop's pixels
+
+
+@dataclass(frozen=True, eq=False)
+class DressedRig:
+    """A person's rig with skin, and how that shades: its normals and roughness where the template has some."""
+
+    rig: BlendshapeRig
+    surface: SurfaceMaps | None = None
+
+
+def dressed_rig(
+    rig: BlendshapeRig,
+    template: BlendshapeRig,
+    fit: ImageFit,
+    images: Sequence[Tensor],
+    parts: Sequence[FaceParts],
+    marks: Tensor,
+    whole: bool,
+) -> DressedRig:
+    """A fitted rig with the skin of its photographs.
+
+    Args:
+        rig: with the fit's head and shapes.
+        template: whose parts nobody sees in photographs.
+        fit: with its skin.
+        images: the photographs, (3,H,W) each.
+        parts: what each shows.
+        marks: the landmarks in each, (I,68,2) pixels.
+        whole: as a character with teeth, tongue, lashes, hair and collar, for rigs of the performer's topology; the
+            photographs' brows are its only ones.
+    """
+    # Photographs show little of eyeballs and teeth: parts of their own keep the template's skin.
+    unseen = hidden_parts(template.neutral, torch.zeros(len(template.vertices), dtype=torch.bool))
+    neutral = with_template_skin(fit.mesh, template.neutral, unseen)
+    if not whole:
+        neutral = neutral if fit.iris is None else with_iris(neutral, fit.iris)
+        return DressedRig(BlendshapeRig(neutral, rig.deltas, rig.names))
+    usual, shirt = Look(), _cloth(images, parts)
+    look = Look(
+        hair=usual.hair if fit.hair is None else _color(fit.hair),
+        iris=usual.iris if fit.iris is None else _color(fit.iris),
+        haircut=None if fit.hair is None else "long" if hangs_down(parts, marks) else "short",
+        shirt=usual.shirt if shirt is None else _color(shirt),
+    )
+    skin = neutral.texture
+    made = character(
+        BlendshapeRig(neutral, rig.deltas, rig.names), look, _SIZE if skin is None else skin.shape[-1], skin
+    )
+    return DressedRig(made.rig, made.surface)
+
+
+def hangs_down(parts: Sequence[FaceParts], marks: Tensor) -> bool:
+    """Whether photographs show hair beside the neck.
+
+    Args:
+        parts: what each shows.
+        marks: the landmarks in each, (I,68,2) pixels; NaN for missing.
+    """
+    found = []
+    for shown, points in zip(parts, marks.double(), strict=True):
+        across = points[42:48].nanmean(0) - points[36:42].nanmean(0)
+        unit = across * (points[45] - points[36]).norm().nan_to_num(float(1.45 * across.norm())) / across.norm()
+        down = torch.stack([-unit[1], unit[0]])
+        sides = torch.linspace(*_BESIDE, 9, dtype=torch.float64)
+        below = torch.linspace(*_BELOW, 9, dtype=torch.float64)
+        mouth = points[48:].nanmean(0)
+        for side in (-1, 1):
+            place = mouth + side * sides[:, None, None] * unit + below[:, None] * down
+            found.append(shown.at(place, "hair").nanmean().nan_to_num(0.0))
+    return float(torch.stack(found).view(-1, 2).amax(1).median()) > _LONG
+
+
+def _cloth(images: Sequence[Tensor], parts: Sequence[FaceParts]) -> Tensor | None:
+    """The colour of clothes, (3,); None where too little is seen."""
+    seen = []
+    for image, shown in zip(images, parts, strict=True):
+        crop = cut_crop((255 * image[:3].clamp(0, 1)).byte(), shown.transform, shown.shares.shape[-1])
+        seen.append(crop[:, shown.of("cloth") > _CLOTH].float() / 255)
+    colors = torch.cat(seen, 1)
+    return colors.median(1).values if colors.shape[1] >= _LEAST else None
+
+
+def _color(color: Tensor) -> tuple[float, float, float]:
+    red, green, blue = color.tolist()
+    return red, green, blue
