@@ -47,7 +47,12 @@ LONGEST = (
 
 
 TOGETHER = {
-    "browsers": ("export/web_app/test_app_in_chromium", "viz/browser", "viz/reports/test_player"),
+    "browsers": (
+        "export/web_app/test_app_in",
+        "export/web_app/test_app_controls",
+        "viz/browser",
+        "viz/reports/test_player",
+    ),
     "action units": ("capture/action_units",),
 }
 """Files for one process: two browsers take the time from one another, and a filmed session is costly to make twice."""

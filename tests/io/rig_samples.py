@@ -53,6 +53,13 @@ def sheet_rig() -> BlendshapeRig:
     return BlendshapeRig(mesh, deltas, ("jawOpen", "mouthSmileLeft", "eyeBlinkRight"))
 
 
+def named_sheet(names: tuple[str, ...]) -> BlendshapeRig:
+    """The sheet with a shape of each name, which moves all of it."""
+    mesh = quad_sheet()
+    deltas = torch.randn(len(names), len(mesh.vertices), 3, generator=torch.Generator().manual_seed(0))
+    return BlendshapeRig(mesh, deltas, names)
+
+
 def corrective_sheet() -> BlendshapeRig:
     """The sheet's rig with a product of two, one of three, and an in-between."""
     rig = sheet_rig()

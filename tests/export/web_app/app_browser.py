@@ -13,6 +13,7 @@ from typing import Any
 
 from headless_chromium import until
 
+WINDOW = (480, 360)
 _ISOLATED = {"Cross-Origin-Opener-Policy": "same-origin", "Cross-Origin-Embedder-Policy": "require-corp"}
 
 
@@ -143,3 +144,12 @@ class Page:
         """Stops the camera."""
         self.click("start")
         until(lambda: self.text("start") == "Start camera")
+
+
+@dataclass
+class Open:
+    """An open app, its host, and what it asks of the rest of the world."""
+
+    page: Page
+    host: Server
+    outside: Server

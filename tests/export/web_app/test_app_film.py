@@ -32,9 +32,10 @@ TOLERANCE = 0.02
 def app(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("app") / "app"
     try:
-        export_app(folder)
+        report = export_app(folder)
     except MissingExtraError as error:
         pytest.skip(f"the page cannot be built here: {error}")
+    assert sum(report.packed.values()) < 12 * 2**20
     return folder
 
 
