@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
+from collections.abc import Iterator
 from contextlib import closing
 from itertools import islice
 from pathlib import Path
@@ -15,7 +16,7 @@ import pytest
 import torch
 
 from torchface.errors import FileFormatError
-from torchface.io.video import write_video
+from torchface.io.video import VideoFile, write_video
 from torchface.workflows.live import camera as module
 from torchface.workflows.live import live_frames
 from torchface.workflows.live.camera import Camera
@@ -184,6 +185,25 @@ def test_frames_that_come_while_another_is_solved_are_dropped(tmp_path: Path, cl
         clock.sleep(0.07)  # three and a half frames long
     assert len(times) + played.dropped == 10
     assert times == pytest.approx([100.0, 100.06, 100.12])  # each given at most one frame late
+
+
+def test_a_video_that_is_decoded_slower_than_it_plays_is_shown_all_the_same(
+    tmp_path: Path, clock: Clock, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write_video([torch.zeros(200, 3, 32, 48, dtype=torch.uint8)], tmp_path / "film.avi", 50.0)
+    played = PlayedVideo(tmp_path / "film.avi")
+
+    def slow(self: VideoFile) -> Iterator[torch.Tensor]:
+        for _ in range(200):
+            clock.sleep(0.05)
+            yield torch.zeros(3, 32, 48, dtype=torch.uint8)
+
+    monkeypatch.setattr(VideoFile, "color_frames", slow)
+    gaps = [(came, clock.now - came) for came, _ in played.frames()]
+    times, late = np.array(gaps).T
+    assert len(times) >= 7
+    assert np.diff(times).max() < 1.5
+    assert late.max() < 0.021  # of the film's time, which goes on from there
 
 
 def test_a_video_that_is_recorded_loses_no_frame(tmp_path: Path, clock: Clock) -> None:

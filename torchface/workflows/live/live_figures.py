@@ -66,6 +66,6 @@ class LiveReport:
         return [
             f"{figures.frames} frames at {figures.fps:.1f} a second, a face in {figures.found}",
             f"{figures.latency(0.5):.1f} ms from frame to packet (99th percentile {figures.latency(0.99):.1f} ms), "
-            f"{self.dropped} frames came too early and were left out",
+            f"{self.dropped} frames came while another was solved and were left out",
             *(f"warning: {note}" for note in self.notes),
         ]

@@ -59,6 +59,7 @@ class SourceSettings:
 
 
 _DEFAULT = SourceSettings()
+_LONGEST_GAP = 0.5  # seconds of a film that are left out at once
 
 
 class PlayedVideo:
@@ -86,6 +87,7 @@ class PlayedVideo:
 
     def _once(self) -> Iterator[tuple[float, np.ndarray]]:
         started: float | None = None
+        skipped = 0
         for number, frame in enumerate(self.video.color_frames()):
             started = time.perf_counter() if started is None else started  # with the first frame: opening takes a while
             due = started + self._time(number)
@@ -95,8 +97,12 @@ class PlayedVideo:
             elif (
                 -early > 1 / self.video.fps and not self._settings.every
             ):  # a camera would have shown the next one by now
-                self.dropped += 1
-                continue
+                if skipped < _LONGEST_GAP * self.video.fps:
+                    self.dropped, skipped = self.dropped + 1, skipped + 1
+                    continue
+                # It cannot be decoded in its own time, and then it is played in a longer one.
+                started, due = started - early, due - early
+            skipped = 0
             yield due, cv2.merge(list(frame.numpy()))
 
     def _time(self, number: int) -> float:
