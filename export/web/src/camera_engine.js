@@ -37,6 +37,11 @@ export class CameraEngine {
     this.#reset = true;
   }
 
+  /** Loads the solver, so that the first picture finds it ready. */
+  prepare() {
+    this.#loaded().catch(() => {}); // said by the start, which tries again
+  }
+
   async start() {
     const { status } = this.#page;
     try {

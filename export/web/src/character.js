@@ -138,7 +138,10 @@ export class Character {
         if (moves[i]) face.expandByPoint(object.getVertexPosition(i, point).applyMatrix4(object.matrixWorld));
     }
     if (face.isEmpty()) return whole;
-    return face.expandByVector(face.getSize(new THREE.Vector3()).multiply(new THREE.Vector3(0.35, 0.45, 0.35))).intersect(whole);
+    const { x, y, z } = face.getSize(point); // more room above, where the forehead and the hair are
+    face.min.sub(new THREE.Vector3(0.35 * x, 0.15 * y, 0.35 * z));
+    face.max.add(new THREE.Vector3(0.35 * x, 0.45 * y, 0.35 * z));
+    return face.intersect(whole);
   }
 
   /** Without a bone the whole character turns about its neck. */

@@ -21,6 +21,7 @@ import { hideProblem, showNotes, showProblem, showStatus, speak } from "./words.
 const NEUTRAL = { ...shapeSettings({}), centre: null, frozen: false };
 const element = (id) => document.getElementById(id);
 const server = document.documentElement.dataset.engine === "server", stream = isStream();
+const INVITATION = server ? "" : "Start the camera: your face moves the character.";
 const rate = new FrameRate(), words = new StateWords();
 let character = null, stage = null, calibration = null;
 let newest = null; // as it was solved, before what the user set
@@ -62,7 +63,7 @@ const page = {
     takes.stop();
     rate.forget();
     drawFace(element("overlay"), null);
-    showStatus(said);
+    showStatus(said || INVITATION);
   },
   status: showStatus,
   problem: (what) => showProblem("camera", what),
@@ -138,7 +139,7 @@ function setMirror(on) {
 
 function showRate() {
   const now = rate.get(), threads = engine.threads > 1 ? `, ${engine.threads} threads` : "";
-  element("rate").value = now ? `${now.perSecond.toFixed(0)} frames a second, ${now.milliseconds.toFixed(0)} ms each${threads}` : "";
+  element("rate").value = now ? `${now.perSecond.toFixed(0)} frames a second, ${now.milliseconds.toFixed(0)} ms${threads}` : "";
 }
 
 element("start").addEventListener("click", async () => {
@@ -217,3 +218,7 @@ if (!stream) offerCharacters(use, (file) => takes.take(file));
 shippedCharacter(use).catch((error) => showProblem("character", `The character could not be loaded: ${error.message}.`));
 takes.refresh();
 if (server || stream) engine.start();
+else {
+  showStatus(INVITATION);
+  engine.prepare();
+}
