@@ -11,6 +11,7 @@ import pytest
 import torch
 
 from torchface.landmarks import BoxNetwork
+from torchface.landmarks.images.boxes import box_network
 from torchface.landmarks.images.networks.eye_network import EyeNetwork
 from torchface.onnx import export_model
 from torchface.onnx.network_graphs import FACE_VALUES
@@ -29,7 +30,10 @@ def network() -> BoxNetwork:
     return drawn.eval()
 
 
-def test_other_sizes_than_it_was_exported_with(network: BoxNetwork, tmp_path: Path) -> None:
+def test_other_sizes_than_it_was_exported_with(
+    network: BoxNetwork, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(box_network, "COPIES", 2)  # torch.export takes twenty seconds for each
     path = tmp_path / "boxes.onnx"
     export_model(network, path, {"licence": "MIT"})
     session = onnxruntime.InferenceSession(path.read_bytes(), providers=["CPUExecutionProvider"])

@@ -111,6 +111,7 @@ def test_steps_are_counted() -> None:
         GraphSteps(with_gaps=0)
 
 
+@pytest.mark.bench  # torch.export takes twenty seconds
 @pytest.mark.real
 @pytest.mark.parametrize(("markers", "worst"), [(100, 1e-5), (50, 5e-5)])
 def test_small_and_close_to_the_exact_solve(

@@ -94,13 +94,6 @@ def export_example_solver(
     Raises:
         ValueRangeError: there is no graph for such a solver, or it is too far from the exact solve; nothing is
             written.
-
-    Example:
-        >>> from torchface.capture.anybody import ExampleSolver, rig_examples
-        >>> from torchface.synthetic import performer
-        >>> examples = rig_examples(performer(texture=False), ["jawOpen", "browInnerUp"])
-        >>> export_example_solver(ExampleSolver(examples), "examples.onnx").size < 100_000
-        True
     """
     exact = copy.deepcopy(solver).cpu()
     content = example_model(exact, steps, facts).SerializeToString()

@@ -151,14 +151,6 @@ def export_solver(
     Raises:
         ValueRangeError: ONNX Runtime and PyTorch differ by more than 1e-5 and more than rounding explains; nothing is
             written.
-
-    Example:
-        >>> from torchface.synthetic import performer
-        >>> rig = performer(texture=False).select(["jawOpen", "browInnerUp", "mouthPucker"])
-        >>> sites = Attachment.from_vertices(rig.neutral, rig.neutral.landmarks)
-        >>> report = export_solver(rig, sites, "solver.onnx")
-        >>> max(gap.parity for gap in report.gaps) < 0.01  # weights of ONNX Runtime to those of PyTorch
-        True
     """
     solver = MarkerSolver(rig, attachment, alignment, sparsity, ridge)
     return export_marker_solver(solver, path, steps, markers)
@@ -199,7 +191,7 @@ def export_hybrid_solver(
     says, and ``gamma`` (B,N), how much that counts, mm² over all markers. Where gamma is zero in a whole batch it
     computes what the other graph does. It is checked with random predictions for a seventh of the weights.
 
-    Args, Raises, example: as :func:`export_solver`; a rig with correctives takes ``CorrectiveGraph``'s steps.
+    Args, Raises: as :func:`export_solver`; a rig with correctives takes ``CorrectiveGraph``'s steps.
     """
     solver = MarkerSolver(rig, attachment, alignment, sparsity, ridge).cpu().float()
     frames = _frames(solver, markers)

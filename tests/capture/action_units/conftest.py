@@ -24,8 +24,8 @@ def stage_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="session")
 def session(stage_folder: Path) -> RecordedSession:
-    """Three repetitions of each unit, two of a combination, 20 frames a second."""
-    performance = PerformanceSettings(3, 2, (("4", "9"),), fps=20.0, pace=1.3)
+    """Two repetitions of each unit, one of a combination, 20 frames a second."""
+    performance = PerformanceSettings(2, 1, (("4", "9"),), fps=20.0, pace=1.3)
     flaws = CameraFlaws(shake_rotation=0.6, shake_translation=1.2)
     settings = StageSettings(128, 170, markers=20, flaws=flaws, performance=performance)
     return record_session(stage_folder, "first", None, torch.Generator().manual_seed(3), settings)
