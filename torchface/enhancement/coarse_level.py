@@ -43,7 +43,6 @@ def coarse_level(vertices: Tensor, faces: Tensor, count: int) -> CoarseLevel:
 
     Args:
         vertices: (V,3), millimetres.
-        faces: (F,3) int64.
         count: of vertices to be left.
     """
     points, faces = vertices.detach().double().cpu(), faces.cpu()

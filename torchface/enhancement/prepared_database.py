@@ -48,7 +48,6 @@ class InputLids:
 
     Args:
         neutral: (V,3), millimetres.
-        faces: (F,3) int64.
         eyes: which triangles are each eye's region, (E,F) bool.
     """
 
@@ -98,7 +97,6 @@ class PreparedDatabase:
 
     Args:
         neutral: (V,3), millimetres.
-        faces: (F,3) int64.
         patches: the patch of each triangle, (F,) int64.
         sequences: the number of each frame's sequence, (K,) int64.
         features: of the frames' patches, (K,P,9).

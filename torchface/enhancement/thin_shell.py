@@ -42,7 +42,6 @@ class ThinShell:
 
     Args:
         neutral: the dense head at rest, (V,3), millimetres.
-        faces: (F,3) int64.
         points: where they sit on it: an attachment, or vertex ids (M,).
         stretching: :math:`k_s`; against ``bending`` it says over what length :math:`\sqrt{k_b / k_s}`, millimetres,
             motion fades into its surroundings' mean where no point holds it. Without any, motion goes on linearly.

@@ -106,7 +106,6 @@ def expression_score(found: Tensor, found_names: Sequence[str], true: Tensor, fp
             which the frame before stands.
         found_names: theirs, see :func:`torchface.shape_names.mapping`.
         true: of ARKit's shapes, (T,52).
-        fps: frames a second.
 
     Example:
         >>> true = torch.zeros(90, 52)

@@ -18,11 +18,7 @@ from torchface.files.whole_files import write_file
 
 @dataclass(frozen=True)
 class WrittenGraph:
-    """A graph's file.
-
-    Args:
-        size: in bytes.
-    """
+    """A graph's file."""
 
     path: Path
     size: int

@@ -28,7 +28,6 @@ def completed_form(rest: Tensor, current: Tensor, faces: Tensor, unseen: Tensor,
     Args:
         rest: the template, (V,3) float64.
         current: registered, (V,3) float64.
-        faces: (F,3) int64.
         unseen: whose positions the scan does not show, (V,) bool; the rest of the mesh stays.
         shown: whose positions it shows, (V,) bool: they align the template.
 
@@ -49,7 +48,6 @@ def completed_colors(colors: Tensor, base: Tensor, vertices: Tensor, faces: Tens
         colors: (V,3).
         base: what the skin looks like far from anything seen, (V,3).
         vertices: (V,3) float64, millimetres.
-        faces: (F,3) int64.
         unseen: (V,) bool.
     """
     if not unseen.any():

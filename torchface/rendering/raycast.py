@@ -29,7 +29,6 @@ class RayCaster:
 
     Args:
         vertices: (V,3), millimetres.
-        faces: (F,3) int64.
     """
 
     def __init__(self, vertices: Tensor, faces: Tensor) -> None:

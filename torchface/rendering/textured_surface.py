@@ -38,7 +38,6 @@ class TexturedSurface:
 
     Args:
         vertices: (V,3), any unit.
-        faces: (F,3) int64.
         uvs: (V,2), origin at the lower left.
         material: which of the materials each triangle has, (F,) int64.
 

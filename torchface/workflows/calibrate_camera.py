@@ -118,7 +118,6 @@ def calibrate(paths: Sequence[Path], board: Board, out: Path, progress: Progress
     Args:
         paths: image files of one size, or one video.
         out: the ``.toml`` to write; beside it an image of the corners found, and of views without distortion.
-        progress: called with each step and how far it is.
 
     Source: Zhang 2000; thesis 4.2.4.
     """
@@ -149,7 +148,6 @@ def calibrate_beside(
         films: of each camera, taken at once; those without timecodes began together.
         board: the checkerboard, seen by the first camera and each other one at once.
         out: the ``.toml`` to write; see :func:`~torchface.io.camera_files.save_cameras`.
-        progress: called with each step and how far it is.
 
     Returns:
         A report of each camera, the cameras, and lines about how they lie.

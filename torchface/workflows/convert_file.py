@@ -70,7 +70,6 @@ def convert_file(
         unit: of the source's numbers, where it is not the format's own.
         part: keep this annotated region only.
         names: how shapes are called in ``out``; see ``rig_names``.
-        progress: called with each step.
         pose: weights by name, to write the mesh in that pose instead of the rig.
         reduce: keep as few keys as stay within this of every frame's weights; all if absent.
     """

@@ -50,7 +50,6 @@ def sculpt_corrective(
         at: the pose, NAME=WEIGHT in words, or several in one.
         sculpt: the rig in that pose, as an artist changed it, in its topology.
         out: the rig's new file; see ``torchface convert``.
-        progress: called with each step.
 
     Returns:
         What was made, and lines for people to read.

@@ -264,7 +264,6 @@ def local_warps(images: Tensor, amplitude: float, generator: torch.Generator, al
 
     Args:
         amplitude: standard deviation of the control points' displacement, pixels.
-        generator: where the randomness comes from.
         alike: into how many parts the regions fall that get the same field, region by region.
 
     Source: thesis 4.1.14.

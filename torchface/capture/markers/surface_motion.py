@@ -17,7 +17,6 @@ class SurfaceMotion:
     r"""Vertices :math:`p_v(w) = A_v (1, w)` and, where asked for, their normals :math:`n_v(w) \approx N_v (1, w)`.
 
     Args:
-        faces: (F,3) int64.
         points: :math:`A`, (V,3,N+1), millimetres, float64.
         normals: :math:`N`, (V,3,N+1), float64; a shape's column is what the shape alone does to the unit normal.
         skin: the triangles that belong to the largest connected part, (F,) bool: where markers can sit.

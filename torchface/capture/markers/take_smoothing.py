@@ -245,7 +245,6 @@ def smooth_in_box(H: Tensor, slopes: Tensor, fps: float, smoothness: float) -> T
     Args:
         H: of the frames' energies, (N,N) float64.
         slopes: f of each, (T,N) float64.
-        fps: frames a second.
         smoothness: :math:`\lambda` at 60 frames a second, in the unit of the energies.
 
     Example:

@@ -95,7 +95,6 @@ def seen_skin(
     Args:
         frames: (T,3,H,W) sRGB in [0,1].
         vertices: in each frame, (T,V,3), millimetres.
-        faces: (F,3) int64.
         albedo: (V,3) sRGB.
         cameras: one a frame.
         weights: of the vertices, (V,); 0 leaves one out.

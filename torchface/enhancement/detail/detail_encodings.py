@@ -33,7 +33,6 @@ class DisplacementDetail:
 
     Args:
         neutral: (V,3), millimetres.
-        faces: (F,3) int64.
         frames: those of the mesh, where they are known.
     """
 
@@ -80,7 +79,6 @@ class GradientDetail:
 
     Args:
         neutral: (V,3), millimetres.
-        faces: (F,3) int64.
 
     Source: Facial Performance Enhancement Using Dynamic Shape Space Analysis, sections 4.2, 5.4 and 5.5.
     """
@@ -142,7 +140,6 @@ class SurfaceReconstruction:
 
     Args:
         neutral: (V,3), millimetres.
-        faces: (F,3) int64.
 
     Source: Facial Performance Enhancement Using Dynamic Shape Space Analysis, section 5.5; Botsch et al. 2006.
     """

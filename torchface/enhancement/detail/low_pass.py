@@ -38,7 +38,6 @@ class LowPass:
 
     Args:
         neutral: (V,3), millimetres.
-        faces: (F,3) int64.
         wavelength: :math:`\lambda`, millimetres.
 
     Source: Facial Performance Enhancement Using Dynamic Shape Space Analysis, section 4.2, equation 1 with its sign

@@ -48,7 +48,6 @@ class SurfaceFrames:
 
     Args:
         neutral: (V,3), millimetres.
-        faces: (F,3) int64.
     """
 
     def __init__(self, neutral: Tensor, faces: Tensor) -> None:

@@ -93,7 +93,6 @@ def regions_of_motion(
         motion: displacements (or shape features) of the patches in each frame, (K,P,C).
         patches: the patch of each triangle, (F,) int64.
         neutral: (V,3), millimetres, upright, looking along z.
-        faces: (F,3) int64.
         landmarks: vertex ids of the 68 iBUG landmarks.
 
     Returns:
@@ -183,7 +182,6 @@ def surface_distances(vertices: Tensor, faces: Tensor, sources: Tensor, limit: f
 
     Args:
         vertices: (V,3), millimetres.
-        faces: (F,3) int64.
         sources: ids (S,) int64.
         limit: what is further away gets infinity.
     """
@@ -203,7 +201,6 @@ def soft_weights(labels: Tensor, count: int, vertices: Tensor, faces: Tensor, si
         labels: the region of each triangle, (F,) int64.
         count: of regions, R.
         vertices: (V,3), millimetres.
-        faces: (F,3) int64.
         sigma: millimetres.
 
     Source: Facial Performance Enhancement Using Dynamic Shape Space Analysis, section 5.3.

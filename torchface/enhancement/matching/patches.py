@@ -25,7 +25,6 @@ def grow_patches(faces: Tensor, vertex_count: int, size: int = 100, seed: int = 
     which evens their sizes out.
 
     Args:
-        faces: (F,3) int64.
         size: vertices a patch, about.
 
     Returns:

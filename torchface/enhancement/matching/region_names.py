@@ -30,7 +30,6 @@ def named_regions(
         labels: the region of each triangle, (F,) int64.
         count: of regions, R.
         neutral: (V,3), millimetres.
-        faces: (F,3) int64.
         landmarks: vertex ids of the 68 iBUG landmarks; without them all are numbered, and none is voluntary.
     """
     numbered = [f"region_{number:02d}" for number in range(count - len(eyes))]

@@ -75,7 +75,6 @@ def taught_details(
 
     Args:
         read: frames (t,V,3) from one number up to another, without it, on the model's mesh, millimetres.
-        progress: called with each step and how far it is.
 
     Returns:
         Displacements (count,3V) along two tangents and the normal, as components and coefficients.

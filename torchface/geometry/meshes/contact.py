@@ -35,7 +35,6 @@ class ContactFinder:
     whichever lie opposite each other in the pose.
 
     Args:
-        faces: (F,3) int64.
         count: how many vertices there are.
         contacts: given pairs of vertices that touch, (K,2) int64.
     """

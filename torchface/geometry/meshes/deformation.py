@@ -17,7 +17,6 @@ def triangle_frames(vertices: Tensor, faces: Tensor) -> Tensor:
 
     Args:
         vertices: (...,V,3), millimetres.
-        faces: (F,3) int64.
 
     Returns:
         Frames (...,F,3,3), the three vectors as columns. The third is zero where a triangle has no area.
@@ -46,7 +45,6 @@ def deformation_gradients(rest: Tensor, deformed: Tensor, faces: Tensor) -> Tens
     Args:
         rest: (V,3), millimetres.
         deformed: (...,V,3), millimetres.
-        faces: (F,3) int64.
 
     Returns:
         Gradients (...,F,3,3). A triangle that has no area at rest has no gradient: it gets the identity.
@@ -74,7 +72,6 @@ def gradient_operator(vertices: Tensor, faces: Tensor) -> sparse.csr_array:
 
     Args:
         vertices: the mesh at rest, (V,3), millimetres.
-        faces: (F,3) int64.
 
     Returns:
         A matrix (3F,V); row 3t+i is the derivative along axis i on triangle t. A triangle without area has no rows.

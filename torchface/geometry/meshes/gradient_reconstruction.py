@@ -56,7 +56,6 @@ class GradientReconstruction:
 
     Args:
         rest: the mesh at rest, (V,3), millimetres.
-        faces: (F,3) int64.
         triangle_weights: :math:`a_t`, (F,); 1 if absent, as in equation 23.
 
     Source: thesis 3.3.1, equations 23 to 25, solved in float64 on the CPU.

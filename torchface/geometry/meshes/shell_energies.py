@@ -18,7 +18,6 @@ def stretching_energy(vertices: Tensor, faces: Tensor) -> sparse.csr_array:
 
     Args:
         vertices: the shell at rest, (V,3), millimetres.
-        faces: (F,3) int64.
     """
     gradients = gradient_operator(vertices, faces)
     areas = triangle_areas(vertices.double().cpu(), faces.cpu()).repeat_interleave(3).numpy()
@@ -42,7 +41,6 @@ def bending_energy(vertices: Tensor, faces: Tensor) -> sparse.csr_array:
 
     Args:
         vertices: the shell at rest, (V,3), millimetres.
-        faces: (F,3) int64.
 
     Source: Bergou, Wardetzky, Harmon, Zorin, Grinspun 2006, A Quadratic Bending Model for Inextensible Surfaces.
     """

@@ -53,7 +53,6 @@ def tangent_space(vertices: Tensor, faces: Tensor, uvs: Tensor, uv_faces: Tensor
 
     Args:
         vertices: (V,3), millimetres.
-        faces: (F,3) int64.
         uvs: origin at the lower left, (U,2).
         uv_faces: (F,3) int64.
         normals: unit vertex normals, (V,3).

@@ -47,7 +47,6 @@ def write_gltf_rig(
     shading show is left out.
 
     Args:
-        path: the file; it appears only when it is complete.
         detail: detail maps of its shapes, see ``torchface.io.gltf.detail_textures``, or of its regions, see
             ``torchface.io.gltf.wrinkle_textures``; or the surface's normals and roughness, with which images are JPEG.
         keys: an animation of its shapes, linear between keys.

@@ -97,7 +97,6 @@ def save_landmarks_csv(take: Take, path: str | Path) -> None:
 
     Args:
         take: landmarks (T,L,2), pixels.
-        path: the file; it appears only when it is complete.
 
     Source: OpenFace wiki, "Output Format".
     """

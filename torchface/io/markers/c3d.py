@@ -178,7 +178,6 @@ def save_c3d(take: Take, path: str | Path) -> None:
 
     Args:
         take: markers (T,M,3), millimetres, at most 65,535; labels of at most 255 bytes.
-        path: the file; it appears only when it is complete.
 
     Source: The C3D File Format User Guide, Motion Lab Systems.
     """

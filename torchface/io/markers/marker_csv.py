@@ -80,7 +80,6 @@ def save_markers_csv(take: Take, path: str | Path) -> None:
 
     Args:
         take: markers (T,M,3), millimetres. What else it holds is left out.
-        path: the file; it appears only when it is complete.
     """
     path = Path(path)
     labels, positions = values_to_write(take.markers, "marker positions", 3, path)

@@ -117,7 +117,6 @@ def save_trc(take: Take, path: str | Path) -> None:
 
     Args:
         take: markers (T,M,3), millimetres.
-        path: the file; it appears only when it is complete.
 
     Source: OpenSim documentation, "Marker (.trc) Files".
     """

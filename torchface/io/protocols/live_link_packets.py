@@ -55,7 +55,6 @@ class LiveLinkPackets:
 
     Args:
         names: of the weights that come, (N,); any rig's names that ARKit's can be had from.
-        fps: frames a second.
         subject: the name under which the receiver lists the face.
 
     Example:

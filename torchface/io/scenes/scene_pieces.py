@@ -19,7 +19,6 @@ class Piece:
     Args:
         name: of the node or prim; the region that it becomes.
         vertices: (V,3).
-        faces: (F,3).
         uvs: (U,2).
         uv_faces: (F,3).
         colors: (V,3).

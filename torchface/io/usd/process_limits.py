@@ -17,7 +17,6 @@ def limit_growth(start: int, size: int) -> None:
 
     Args:
         start: bytes of addresses before the first was opened.
-        size: bytes.
     """
     if sys.platform == "win32":  # no such limits there
         return

@@ -59,7 +59,6 @@ def save_weights_csv(take: Take, path: str | Path) -> None:
 
     Args:
         take: weights (T,N,1). What else it holds is left out.
-        path: the file; it appears only when it is complete.
     """
     path = Path(path)
     names, values = values_to_write(take.weights, "weights", 1, path)

@@ -50,7 +50,6 @@ def score_statistics(
         maps: centred maps of the M images, each (bins,h,w).
         filters: (L,M,bins,side,side).
         landmarks: pixels, (M,L,2); NaN where one is not known.
-        progress: called with each step and how far it is.
 
     Source: thesis 3.2.2.
     """

@@ -117,7 +117,6 @@ class FaceSearch:
         Args:
             surface: any unit, turned by any angle.
             framed: vertices (V,) bool that the pictures from around frame, such as those of a head's bone.
-            progress: called with each picture.
         """
         progress = progress or silent
         pictures: list[Tensor] = []

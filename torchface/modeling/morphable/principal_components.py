@@ -73,7 +73,6 @@ def principal_components(
         checkpoint: a folder for the rows of the Gram matrix, or the passes, that are finished. Killed and started
             again with the same samples in the same order and the same folder, the run continues; rows of other samples
             and damaged ones are computed again. In the end the files are removed.
-        progress: called with each step and how far it is.
 
     Source: thesis 3.2.4, equation 8; Turk, Pentland 1991.
     """

@@ -37,7 +37,6 @@ class SkinOfHead:
 
     Args:
         vertices: of the head, (J,3) float64.
-        faces: (F,3).
         loose: vertices that are no skin, (J,) bool.
         part: connected part of each vertex, (J,).
     """

@@ -77,7 +77,6 @@ def moved_parts(
         template: the template's rig on this head's face, with iBUG's 68 landmarks; without landmarks or eyeballs all
             parts go with the skin.
         vertices: of the head, (J,3) float64, in the template's place.
-        faces: (F,3).
         part: connected part of each vertex, (J,).
         loose: vertices of parts that are no skin, (J,) bool.
         deltas: of the skin, (N,J,3).

@@ -228,7 +228,6 @@ def joined_vertices(vertices: Tensor, faces: Tensor) -> JoinedMesh:
 
     Args:
         vertices: (V,3), millimetres.
-        faces: (F,3).
 
     Example:
         >>> square = torch.tensor([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
@@ -319,7 +318,6 @@ def nearest_alike(
 
     Args:
         surface: vertices (V,3), millimetres.
-        faces: (F,3).
         points: (Q,3).
         normals: unit, (Q,3).
 

@@ -21,7 +21,6 @@ class StageRecord:
         dropped: correspondences refused, by reason: ``distance``, ``border``, ``normal``, ``fold`` where a triangle
             would have turned over, and ``hidden`` under hair, cloth or where an ear came out in pieces.
         energies: cost before and after each linear step, its correspondences held.
-        seconds: wall-clock.
     """
 
     stage: str
@@ -47,7 +46,6 @@ class RegistrationRecord:
         notes: what was found in the input and what was done about it, for people to read.
         median_distance: of the exposed vertices that found the scan, to it, millimetres.
         matched: share of the template's vertices whose position the scan shows; the others follow their neighbours.
-        seconds: wall-clock.
         far_distance: as the median, but the 95th percentile.
         shown: share of what faces outward, whose position the scan shows.
         covered: share of what faces outward that lies under hair, cloth or on an ear in pieces: the template's.

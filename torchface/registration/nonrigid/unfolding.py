@@ -35,7 +35,6 @@ def unfolded(rest: Tensor, current: Tensor, faces: Tensor) -> Tensor:
     Args:
         rest: (V,3) float64.
         current: (V,3) float64.
-        faces: (F,3) int64.
     """
     best, min_count = current, int(turned_over(rest, current, faces).sum())
     for circle in range(_MAX_CIRCLES):

@@ -96,7 +96,6 @@ def compared_curves(
     Args:
         true, smooth, single: weights (T,N).
         names: of the shapes, N.
-        fps: frames a second.
     """
     lines = -(-len(names) // 2)
     figure = Figure(figsize=(12, 1.7 * lines), dpi=100, layout="constrained")

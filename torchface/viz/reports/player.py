@@ -76,7 +76,6 @@ class Player:
     Args:
         takes: rigs of one mesh, with weights of as many frames and shapes of the same names.
         panels: from left to right.
-        fps: frames a second.
         choices: rows of ``takes`` between which the viewer of the page chooses; the first to begin with.
         reference: row of ``takes`` whose curves lie under the others'.
         markers: over the panels that ask for them.

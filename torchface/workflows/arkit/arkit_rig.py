@@ -126,7 +126,6 @@ def make_arkit(
         template: a rig with ARKit's shapes; the embedded performer if absent.
         landmarks: of the source, see ``load_scan_landmarks``; its own if absent, else found by its shape.
         everything: make all of them, also those that it has.
-        progress: called with each step and how far it is.
     """
     progress = progress or silent
     rig = None if source.rig is None else source.rig.linear("torchface arkit")
@@ -346,7 +345,6 @@ def published_head(path: Path, components: int | None = None, progress: Progress
     Args:
         path: see ``load_head_model_file``.
         components: of its shape, of the largest deviations; all if absent.
-        progress: called with each step and how far it is.
     """
     model = load_head_model_file(path)
     made = make_arkit(Source(path, model.neutral, None, model), progress=progress)

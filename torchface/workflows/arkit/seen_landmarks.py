@@ -25,7 +25,6 @@ def seen_landmarks(head: Mesh, template: Mesh, progress: Progress) -> Landmarks 
         head: at rest.
         template: with 68 landmarks; of the embedded performer's topology the finder's other points count, of others the
             68 without their contour.
-        progress: called with each picture.
     """
     reference, search = character_search()
     points = search.reference

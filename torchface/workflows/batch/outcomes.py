@@ -58,7 +58,6 @@ class Outcome:
         error: why it was skipped; empty where it was not.
         lasting: the error lies in the item itself: another run would meet it again.
         fatal: the error meets every item, such as a full disk.
-        seconds: wall-clock.
         processor_seconds: of all threads.
         reused: it was finished by an earlier run.
     """

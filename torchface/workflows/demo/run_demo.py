@@ -60,7 +60,6 @@ class Scene:
         head: the new neutral.
         truth: the rig that really is the new head's.
         weights: (T,N), in the order of ``truth.names``.
-        fps: frames a second.
     """
 
     title: str
@@ -200,7 +199,6 @@ def run_demo(scene: Scene, out: Path, seed: int = 0, progress: Progress | None =
     Args:
         scene: see ``embedded_scene`` and ``scene_from``.
         out: the folder; made if absent.
-        progress: called with each step and how far it is.
 
     Returns:
         A ``DemoResult``; ``torchface.workflows.demo.demo_page.write_demo_page`` makes the report of it.

@@ -55,7 +55,6 @@ def animation_targets(
         sequence: the meshes, (T,V,3).
         neutral: what the targets add to, (V,3).
         megabytes: that the targets may take, not counting what glTF leaves out of them because it is still.
-        progress: called with each step and how far it is.
     """
     frames, vertices = sequence.shape[:2]
     most = int(megabytes * 1e6 // (_BYTES_A_VERTEX * vertices))

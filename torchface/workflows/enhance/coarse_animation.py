@@ -28,7 +28,6 @@ class CoarseAnimation:
     Args:
         path: where it came from.
         read: vertices (t,V,3) of the frames from one number up to another, without it, millimetres.
-        fps: frames a second.
         shown: what the file itself holds of these frames, in the same place: (t,N,3), NaN where a point was not seen.
         shown_faces: triangles of that, (G,3); None where it is points.
         residual: root mean square distance of its face at rest from the model's, aligned with it, millimetres; None

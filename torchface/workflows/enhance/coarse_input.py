@@ -68,7 +68,6 @@ def read_coarse(path: Path, model: Mesh, settings: InputSettings, state: Path, p
             meshes, or the folder of ``torchface track``.
         model: the model's neutral.
         state: a folder for what a later run may take up.
-        progress: called with each step and how far it is.
     """
     progress("reading the input")
     if is_markers(path):

@@ -73,7 +73,6 @@ def enhance_frames(
         out: the folder of results, held for this run.
         state: a folder for what a killed run leaves to the next.
         key: of everything that the frames come from; what another key left is made anew.
-        progress: called with each step and how far it is.
     """
     make_folder(out)
     make_folder(state)

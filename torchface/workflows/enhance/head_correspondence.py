@@ -122,7 +122,6 @@ def find_correspondence(
         pairs: places known by the user, for a head of another topology; by registration if absent.
         path: of the head, for messages.
         state: a file that keeps the correspondence for a later run of the same.
-        progress: called with each step and how far it is.
     """
     if has_topology_of(head, model):
         vertices, target = head.vertices.double(), model.vertices.double()

@@ -120,7 +120,6 @@ def retime_keyframes(
             region, exact), ``timing.csv`` and the page.
         fps: frames a second; the model's if absent.
         extend: time it as the whole captured motion of which the keyframes meet a part.
-        progress: called with each step.
 
     Source: Facial Performance Enhancement Using Dynamic Shape Space Analysis, section 6.2.
     """

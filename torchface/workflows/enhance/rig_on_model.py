@@ -72,7 +72,6 @@ def rig_on_model(
         model: the model's neutral.
         pairs: vertices of the rig and where they lie on the model; found by registration if absent.
         state: a file that keeps the correspondence for a later run of the same.
-        progress: called with each step and how far it is.
     """
     correspondence = find_correspondence(rig.neutral, model, pairs, path, state, progress)
     progress("setting up the thin shell")

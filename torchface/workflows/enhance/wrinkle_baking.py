@@ -36,7 +36,6 @@ def bake_region_maps(
         shares: of the regions in the rig's vertices, (R,N).
         scale: from the rig's millimetres to the model's.
         size: of the maps, texels a side.
-        progress: called with each step and how far it is.
     """
     still = Similarity(
         torch.ones(1, dtype=torch.float64),

@@ -100,7 +100,6 @@ def expression_benchmark(
             the method does not give the shape.
         films: a folder with the true weights of each film, ``FILM.csv``.
         out: folder for ``methods.csv``, ``shapes.csv`` and the report ``index.html``.
-        progress: called with each step and how far it is.
     """
     progress = progress or silent
     with within_job(out):

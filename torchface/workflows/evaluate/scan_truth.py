@@ -106,7 +106,6 @@ def scan_truth(
         out: the folder of registered meshes and their records.
         landmarks: a folder of landmark files named as the scans.
         unit: of the scans; each format's own if absent.
-        progress: called with each step and how far it is.
     """
     if result.rig is None:
         raise TopologyError(

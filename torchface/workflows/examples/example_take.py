@@ -140,7 +140,6 @@ def track_by_examples(
         out: the folder for ``weights.csv``, ``landmarks.csv``, ``methods.csv`` and ``overlay.mp4``.
         method: whose weights are written and drawn.
         landmarks: what finds them, or a ``.csv`` that holds them.
-        progress: called with each step and how far it is.
     """
     progress = progress or silent
     if not examples:

@@ -29,7 +29,6 @@ def picture_examples(
         pictures: files, or one folder of them. Where names say what they show (``neutral.png``, ``pucker.jpg``, ARKit's
             ``jawOpen.png``, digits before a name left out), any order and choice that has a neutral; otherwise the
             paper's 16 in its order.
-        progress: called with how far it is.
     """
     files = _files(pictures)
     names = _names(files)

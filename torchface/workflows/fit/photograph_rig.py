@@ -166,7 +166,6 @@ def fit_photographs(
         model: a head model by name or folder; see ``zoo.get_model``. The best at hand if absent.
         out: the ``.glb`` or folder to write, see ``save_rig``; overlays are written beside it.
         settings: whose shapes, which lens, which face of several.
-        progress: called with each step and how far it is.
     """
     progress, insist = progress or silent, settings.insist
     check_out(out)

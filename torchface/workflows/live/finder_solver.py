@@ -21,7 +21,6 @@ class FinderSolver:
 
     Args:
         landmarks: what finds landmarks; see :func:`~torchface.workflows.named_finders.load_finder`.
-        progress: called with each step.
     """
 
     names = ARKIT

@@ -132,7 +132,6 @@ def go_live(
         say: called with what the user should know while it runs, and without a page what a calibration asks for.
         opened: called with the page's address.
         make_solver: gives what solves the frames, by ARKit's names; called with the progress of its steps.
-        progress: called with the number of frames.
 
     Returns:
         The figures, and what was recorded.

@@ -215,7 +215,6 @@ class LiveSession:
 
         Args:
             seconds: after which it ends.
-            progress: called with the number of frames.
         """
         progress, before = progress or silent, None
         try:

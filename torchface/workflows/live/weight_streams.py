@@ -51,7 +51,6 @@ def mapped_sender(address: str, names: Sequence[str], fps: float) -> FrameSender
     Args:
         address: see :func:`torchface.io.open_sender`.
         names: of the weights that come, (N,).
-        fps: frames a second.
     """
     parts = parse_address(address)
     if "map" not in parts.options:
@@ -74,7 +73,6 @@ class WeightStreams:
     Args:
         addresses: see :func:`torchface.io.open_sender`.
         names: of the weights, (N,).
-        fps: frames a second.
         say: called once with a receiver that refuses packets, or that the network no longer reaches.
     """
 

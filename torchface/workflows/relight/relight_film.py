@@ -139,7 +139,6 @@ def relight_film(
     Args:
         track: the folder that ``torchface track`` wrote of it.
         settings: what it is to show.
-        progress: called with each step and how far it is.
 
     Returns:
         Lines for people to read.

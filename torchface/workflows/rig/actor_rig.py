@@ -186,7 +186,6 @@ def rig_actor(
         detail: a folder of high-resolution scans, named for the one shape that each shows at full strength, and
             ``neutral``.
         options: how the files are read and what is made of them.
-        progress: called with each step and how far it is.
     """
     check_out(out)
     if detail is not None and out.suffix.lower() == MAYA_ENDING:

@@ -93,7 +93,6 @@ def find_character_face(
     Args:
         character: in any unit and pose.
         surface: the same, to be looked at.
-        progress: called with each picture.
     """
     reference, search = character_search()
     framed = None if character.head is None else character.head > _HEAD_SHARE

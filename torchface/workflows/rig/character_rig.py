@@ -98,7 +98,6 @@ def rig_character(
     Args:
         path: a ``.glb`` or ``.vrm``.
         out: the file to write, of the same ending.
-        progress: called with each step.
         inner_mouth: give it a bag, teeth, gums and a tongue where it has none; lips in one piece are cut apart.
         eyes: give it eyeballs where it has none; eyes in one piece with the skin are cut out.
     """

@@ -53,7 +53,6 @@ class OpenedFace:
 
     Args:
         rest: vertices, (V,3) float64.
-        faces: (F,3).
         skin: which vertices are of the skin, (V,) bool.
     """
 

@@ -71,7 +71,6 @@ def predict_rig(
         expressions: the regression, by name or folder.
         template: a rig; the embedded performer if absent.
         options: ``part``, ``unit`` and ``names`` are used.
-        progress: called with each step and how far it is.
     """
     options, progress = options or RigOptions(), progress or silent
     check_out(out)

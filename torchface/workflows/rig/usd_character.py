@@ -31,7 +31,6 @@ def rig_usd_character(path: Path, out: Path, progress: Progress | None = None) -
 
     Args:
         path: ``.usd``, ``.usda``, ``.usdc`` or ``.usdz``.
-        progress: called with each step.
     """
     check_ending(out, path.suffix.lower())
     scene = read_stage(path)

@@ -74,9 +74,6 @@ def predicted_curves(
 
     Video and take begin together; a video of another rate is resampled to the take's, and where it ends before the
     take the markers are left alone.
-
-    Args:
-        progress: called with each step and how far it is.
     """
     classifier = zoo.get_model(camera.classifier, ActionUnitClassifier)
     labels = load_action_labels(camera.labels or camera.video.with_suffix(".toml"))

@@ -185,7 +185,6 @@ def solve_markers(
         attachment: where the markers sit; markers match by label.
         take: markers, in any space.
         predicted: what a head camera saw, for the hybrid solve.
-        progress: called with each step and how far it is.
     """
     progress = progress or silent
     whole = predicted is None and not settings.frame_by_frame

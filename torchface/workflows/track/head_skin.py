@@ -32,7 +32,6 @@ def with_filmed_skin(
         inputs: with the video.
         model: that the head is of.
         reading: of the frames, (T,...).
-        progress: called with each step.
     """
     progress("finding the head's skin")
     wanted = dict.fromkeys(head.frames.tolist())

@@ -28,11 +28,7 @@ _FOUND, _SUSPECT, _WORDS = (60, 230, 60), (236, 92, 40), (225, 225, 225)
 
 
 def write_overlay(tracked: Tracked, path: Path, progress: Progress) -> None:
-    """Writes the overlay of a whole video, as its settings ask for; it appears when it is complete.
-
-    Args:
-        progress: called with each step and how far it is.
-    """
+    """Writes the overlay of a whole video, as its settings ask for; it appears when it is complete."""
     settings = tracked.inputs.settings
     if settings.texture is not None:
         draw = paint_drawer(tracked, settings.texture)

@@ -60,7 +60,6 @@ def person_head(
         inputs: whose actor is the rig of the model's mean head.
         landmarks: smoothed, (T,68,2) pixels of a camera without distortion.
         reading: of the frames, (T,...): how far each landmark is trusted.
-        progress: called with each step.
     """
     progress("solving the head")
     rig, clip, trust = inputs.actor, inputs.clip, reading.trust

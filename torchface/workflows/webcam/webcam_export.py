@@ -37,7 +37,6 @@ class WebcamReport:
     """What was written.
 
     Args:
-        size: in bytes.
         landmarks: the largest mean distance of a frame's landmarks between ONNX Runtime and PyTorch, over that of the
             eyes' outer corners.
         weights: the largest difference of a weight.
@@ -69,7 +68,6 @@ def export_webcam(out: str | Path, progress: Progress | None = None) -> WebcamRe
 
     Args:
         out: the file to write; it appears only when it is complete and checked.
-        progress: called with each step.
     """
     out, progress = Path(out), progress or silent
     check_writable(out)

@@ -92,7 +92,6 @@ def best_sites(points: Tensor, faces: Tensor, candidates: Tensor, moments: PathM
 
     Args:
         points: affine maps of the vertices, (V,3,N+1), float64.
-        faces: (F,3) int64.
         candidates: rows of ``faces``, (M,Q) int64.
 
     Source: thesis 4.1.2, algorithm 4, steps 4 and 5.

@@ -41,7 +41,6 @@ def find_swaps(seen: Tensor, prediction: Prediction, fps: float) -> list[Swap]:
 
     Args:
         seen: markers in rig space, (T,M,3), NaN for not seen.
-        fps: frames a second.
     """
     outlier = prediction.outliers
     inlier = ~torch.isnan(prediction.distance) & ~outlier
@@ -69,7 +68,6 @@ def find_swaps_by_shape(markers: Tensor, fps: float) -> list[Swap]:
 
     Args:
         markers: (T,M,3), NaN for not seen.
-        fps: frames a second.
     """
     median = _centres(markers)
     seen = ~torch.isnan(markers).any(-1)

@@ -98,7 +98,6 @@ def augmented_eyes(
         labels: of the B pictures.
         eyes: which eye, (B,): 0 is the right one.
         width, height: of crops, pixels.
-        generator: decides everything.
         settings: how widely.
     """
     settings = settings or EyeAugmentation()

@@ -157,7 +157,6 @@ def cropped(
     Args:
         pictures: see :meth:`LandmarkNetwork.fit`.
         mirrored: a network's ``mirror``, (P,).
-        generator: decides everything.
         settings: how widely crops are drawn.
     """
     rgba, landmarks, visible, *more = pictures

@@ -78,7 +78,6 @@ def augmented(
         visible: which of them nothing hides, (B,68+P) bool.
         size: of a crop, pixels a side.
         margin: a crop's side, of the side of the face's box.
-        generator: decides everything.
         settings: how widely.
         mirror: which of the other points each becomes in a mirror, (P,) int64; without any if absent.
     """
@@ -253,7 +252,6 @@ def with_light(images: Tensor, generator: torch.Generator, grey_share: float = 0
 
     Args:
         images: in [0,1].
-        generator: decides everything.
         grey_share: of images without colour.
     """
     count = len(images)
@@ -276,7 +274,6 @@ def with_blur(images: Tensor, generator: torch.Generator, share: float, widest: 
 
     Args:
         images: in [0,1]; changed in place.
-        generator: decides everything.
         widest: standard deviation of their blur beyond 0.3, pixels, at most.
     """
     count = len(images)

@@ -35,7 +35,6 @@ class PictureNetwork(nn.Module):
                 ``DataLoader``'s workers. What they give, the class says.
             network: goes on from its weights; a new one if absent.
             settings: how; those of the class by default.
-            progress: called with each step and how far it is.
             checkpoint: a file that is kept while it runs, and taken up by the next run with the same settings; more
                 pictures may have come by then.
             device: where the network computes.

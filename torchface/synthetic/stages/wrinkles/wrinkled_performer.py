@@ -44,7 +44,6 @@ def with_lag(folding: Tensor, fps: float, fold_time: float, unfold_time: float) 
 
     Args:
         folding: what it would be held still; the first frame is taken to have been held.
-        fps: frames a second.
         fold_time: time constant of folding, seconds.
         unfold_time: time constant of unfolding, seconds.
     """
