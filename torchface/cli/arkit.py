@@ -42,8 +42,8 @@ def arkit(
             the parameters (.npz).
         animation: Expression parameters of the model (.npz or .safetensors: exp, jaw or pose, shape; as EMOCA, SMIRK
             and others write them), or meshes of SOURCE's topology: a folder of .obj or .ply, a frame each, a mesh
-            sequence (.safetensors), an array of vertices (.npz), face anchors with their vertices (.json), or an
-            animated .glb.
+            sequence (.safetensors), an array of vertices (.npz), face anchors with their vertices (.json), a
+            point cache in USD, as of Audio2Face, or an animated .glb.
         weights: ARKit weights (.csv, .json, .txt, .gesichter).
         template: The rig whose shapes are given; the embedded performer if absent. ICT-FaceKit's FaceXModel has shapes
             of scanned people.

@@ -18,6 +18,7 @@ _PREFIX = re.compile(
 _SUFFIX = re.compile(r"(_div\d+|_hd\d*|\.\d{3})$", re.IGNORECASE)
 _WORD = re.compile(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+|\d+")
 _SIDE = {"l": "left", "r": "right", "lt": "left", "rt": "right"}
+_ONE_SIDE = re.compile(r"[_.]([LR])$", re.IGNORECASE)
 _SPELLING = {"eyes": "eye", "brows": "brow", "eyebrow": "brow", "eyebrows": "brow", "lips": "lip"}
 
 _SIDED = {
@@ -135,6 +136,16 @@ def arkit_name(name: str) -> str | None:
     """
     words = _words(name)
     return _table().get(words) or _table().get(tuple(sorted(words)))
+
+
+def side_written_out(name: str) -> str:
+    """A name that ends in the side's first letter, as Blender wants it, with the side as ARKit writes it.
+
+    Example:
+        >>> side_written_out("browDown_L"), side_written_out("jawOpen"), side_written_out("Mouth_L")
+        ('browDownLeft', 'jawOpen', 'MouthLeft')
+    """
+    return _ONE_SIDE.sub(lambda found: _SIDE[found[1].lower()].capitalize(), name)
 
 
 def _words(name: str) -> tuple[str, ...]:

@@ -11,7 +11,7 @@ from torchface.errors import FileFormatError
 from torchface.io.gltf.animation_reading import read_gltf_weights
 from torchface.io.gltf.character_scene import read_character
 from torchface.io.gltf.gltf_document import read_document
-from torchface.io.gltf.morph_insertion import AddedTargets, document_with_targets, write_edited
+from torchface.io.gltf.morph_insertion import AddedTargets, document_with_targets, rename_targets, write_edited
 from torchface.mesh import Mesh
 
 HEAD = Mesh(torch.tensor([[0.0, 0, 0], [50, 0, 0], [0, 50, 0], [0, 0, 50]]), torch.tensor([[0, 1, 2], [0, 3, 1]]))
@@ -102,3 +102,12 @@ def test_an_empty_target_is_filled_in_its_place(tmp_path: Path) -> None:
     assert take is not None
     assert take.weights is not None
     assert take.weights.names == block.names
+
+
+def test_targets_get_other_names_where_those_are_free(tmp_path: Path) -> None:
+    path = tmp_path / "in.glb"
+    shapes = dict.fromkeys(("browDown_L", "jawOpen", "jaw_open", "fat"), torch.ones(4, 3))
+    write_character(path, HEAD, shapes)
+    root = unpacked(path)[0]
+    rename_targets(root, {"browDown_L": "browDownLeft", "jaw_open": "jawOpen"})
+    assert root["meshes"][0]["extras"]["targetNames"] == ["browDownLeft", "jawOpen", "jaw_open", "fat"]

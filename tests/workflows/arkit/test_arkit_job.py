@@ -93,20 +93,39 @@ def test_codes_become_the_planted_weights_and_go_back(
     assert np.sqrt((apart**2).mean()) < 0.1 * np.sqrt(((truth["exp"] @ basis) ** 2).mean())
 
 
-@pytest.mark.parametrize("kind", ["obj", "npy", "anchors"])
+def write_point_cache(meshes: torch.Tensor, path: Path) -> None:
+    """In centimetres, z up, 20 frames a second, without topology; a second prim of one point moves too."""
+    pytest.importorskip("pxr")
+    from pxr import Sdf, Usd, UsdGeom, Vt
+
+    stage = Usd.Stage.CreateNew(str(path))
+    stage.SetTimeCodesPerSecond(20)
+    UsdGeom.SetStageMetersPerUnit(stage, 0.01)
+    UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.z)
+    turned = meshes @ torch.tensor([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]]) / 10
+    for place, points in (("/World/eye", turned[:, :1]), ("/World/face", turned)):
+        attribute = stage.OverridePrim(place).CreateAttribute("points", Sdf.ValueTypeNames.Point3fArray)
+        for row, frame in enumerate(points):
+            attribute.Set(Vt.Vec3fArray.FromNumpy(frame.numpy()), row)
+    stage.Save()
+
+
+@pytest.mark.parametrize("kind", ["obj", "npy", "anchors", "cache"])
 def test_meshes_of_a_rigs_topology_become_the_planted_weights(
     kind: str, folder: Path, rig: BlendshapeRig, weights: torch.Tensor, tmp_path: Path
 ) -> None:
-    """In millimetres, metres, and metres with times; the head turned."""
+    """In millimetres, metres, metres with times, and a point cache of USD; the head turned."""
     few = 3
     meshes = rig(weights[:few]) @ torch.tensor([[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]]) + 20.0
-    path = tmp_path / {"obj": "meshes", "npy": "meshes.npy", "anchors": "meshes.json"}[kind]
+    path = tmp_path / {"obj": "meshes", "npy": "meshes.npy", "anchors": "meshes.json", "cache": "meshes.usd"}[kind]
     if kind == "obj":
         path.mkdir()
         for number, vertices in enumerate(meshes):
             save_mesh(Mesh(vertices, rig.neutral.faces), path / f"{number:03}.obj")
     elif kind == "npy":
         np.save(path, (meshes / 1000).flatten(1).numpy())
+    elif kind == "cache":
+        write_point_cache(meshes, path)
     else:
         frames = [{"timestamp": 0.05 * i, "vertices": (one / 1000).tolist()} for i, one in enumerate(meshes)]
         path.write_text(json.dumps({"frames": frames}))
@@ -115,8 +134,8 @@ def test_meshes_of_a_rigs_topology_become_the_planted_weights(
     save_rig(BlendshapeRig(mesh, rig.deltas, rig.names), tmp_path / "plain.glb")
     lines = animation_to_weights(tmp_path / "plain.glb", path, tmp_path / "w.csv", ALONE, silent)
     assert float((solved(tmp_path / "w.csv", rig) - weights[:few]).abs().mean()) < 0.01
-    assert any("taken to be in metres" in line for line in lines) is (kind != "obj")
-    assert load_take(tmp_path / "w.csv").fps == pytest.approx(20.0 if kind == "anchors" else 30.0, rel=1e-2)
+    assert any("taken to be in metres" in line for line in lines) is (kind in ("npy", "anchors"))
+    assert load_take(tmp_path / "w.csv").fps == pytest.approx(20.0 if kind in ("anchors", "cache") else 30.0, rel=1e-2)
 
 
 def test_shapes_that_a_rig_has_are_kept_and_only_the_others_made(rig: BlendshapeRig, tmp_path: Path) -> None:

@@ -136,7 +136,9 @@ def test_files_that_are_no_characters_are_refused(tmp_path: Path) -> None:
     empty.write_bytes(packed({"asset": {"version": "2.0"}, "nodes": [{}], "scenes": [{"nodes": [0]}], "scene": 0}, b""))
     with pytest.raises(FileFormatError, match="no triangle"):
         rig_character(empty, tmp_path / "out.glb")
-    with pytest.raises(FileFormatError, match="Blender"):
+    with pytest.raises(
+        FileFormatError, match=r"install Blender.*import_scene\.fbx\(filepath='.*hero\.fbx'\).*hero\.glb'"
+    ):
         check_character(tmp_path / "hero.fbx")
     with pytest.raises(FileFormatError, match=r"expected.*\.glb"):
         rig_character(empty, tmp_path / "out.obj")

@@ -26,12 +26,12 @@ _UNPACKED_ALWAYS = 2**28
 _UNPACKED_PER_BYTE = 32
 _SHORT = reprlib.Repr()
 _SHORT.maxstring = 60
-MESHOPT = "EXT_meshopt_compression"
+_MESHOPT = ("EXT_meshopt_compression", "KHR_meshopt_compression")
 _EXTENSIONS = (
-    *("KHR_mesh_quantization", MESHOPT, "KHR_texture_transform", "KHR_texture_basisu", "KHR_materials_"),
-    "KHR_lights_punctual",
+    *("KHR_mesh_quantization", *_MESHOPT, "KHR_texture_transform", "KHR_texture_basisu", "EXT_texture_webp"),
+    *("KHR_materials_", "KHR_lights_punctual"),
 )
-"""Extensions a file may require: the first two are read, the others change no vertex."""
+"""Extensions a file may require: the first three are read, the others change no vertex."""
 
 
 def shown(value: object) -> str:
@@ -107,9 +107,11 @@ class Document:
         """The bytes of a bufferView, and its stride."""
         view = self.item("bufferViews", index, where)
         location = f"bufferViews[{index}]"
-        packed = self.record(view.get("extensions"), f"{location}.extensions").get(MESHOPT)
-        if packed is not None:
-            return self._decompressed(self.record(packed, location), f"{location}.extensions.{MESHOPT}")
+        extensions = self.record(view.get("extensions"), f"{location}.extensions")
+        for name in _MESHOPT:
+            if name in extensions:
+                where = f"{location}.extensions.{name}"
+                return self._decompressed(self.record(extensions[name], where), where)
         start, length = self.integer(view, "byteOffset", location, 0), self.integer(view, "byteLength", location)
         buffer = self._buffer(self.integer(view, "buffer", location))
         if start + length > len(buffer):

@@ -217,6 +217,16 @@ def _extend_names(document: Document, mesh: dict[str, Any], location: str, names
         owner["extras"] = {**extras, "targetNames": list(names)}
 
 
+def rename_targets(root: dict[str, Any], names: Mapping[str, str]) -> None:
+    """Gives morph targets of a file other names, at meshes and their primitives; a name that is taken stays free."""
+    for mesh in root.get("meshes", ()):
+        for owner in (mesh, *mesh["primitives"]):
+            if _has_names(owner.get("extras")):
+                old = owner["extras"]["targetNames"]
+                new = [one if names.get(one) in old else names.get(one, one) for one in old]
+                owner["extras"] = {**owner["extras"], "targetNames": new}
+
+
 def _has_names(extras: object) -> bool:
     return isinstance(extras, dict) and "targetNames" in extras
 

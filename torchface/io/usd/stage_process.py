@@ -2,7 +2,8 @@
 
 ``python stage_process.py FILE FOLDER`` writes ``scene.json`` and ``arrays.npz`` (see
 ``torchface.io.scene_processes.scene_arrays``) into the folder, or ``refused.json``, a list of what was found and what
-was expected; with ``--maps`` before FILE those of its detail maps (see ``extract_maps``). OpenUSD is C++ that trusts
+was expected; with ``--maps`` before FILE those of its detail maps (see ``extract_maps``), with ``--points COUNT`` those
+of a point cache (see ``extract_points``). OpenUSD is C++ that trusts
 its files: here a crash, a count of gigabytes or an endless composition ends a process that has nothing to lose.
 """
 
@@ -14,6 +15,7 @@ import re
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -86,6 +88,45 @@ def extract_maps(path: Path, limit: Callable[[int], None]) -> tuple[dict[str, An
                 break
             found = MeshReader(stage, prim, layers).maps()
         return {"shapes": found[0], "bytes": layers.size, "left_out": layers.left_out}, found[1]
+
+
+def extract_points(path: Path, limit: Callable[[int], None], count: int) -> tuple[dict[str, Any], dict[str, Any]]:
+    """A point cache: the ``times``, seconds, and ``points`` (T,V,3) of the first prim of ``count`` points that move.
+
+    Arguments and errors as of :func:`extract`. The prim may be a mesh or, as in caches without topology, an ``over``.
+    """
+    with _refusals():
+        layers, stage = _opened(path, limit)
+        sizes = []
+        for prim in Usd.PrimRange(stage.GetPseudoRoot(), Usd.PrimAllPrimsPredicate):
+            attribute = prim.GetAttribute("points")
+            times = attribute.GetTimeSamples() if attribute else []
+            if prim.HasMetadata("clips"):
+                raise Refused(f"value clips at {shown(prim.GetPath())}", "a cache in the file itself: flatten it")
+            if len(times) < 2:
+                continue
+            sizes.append(len(attribute.Get(times[0]) or ()))
+            if sizes[-1] != count:
+                continue
+            points = np.empty((len(times), count, 3), np.float32)
+            for row, time in enumerate(times):  # USD gives one sample at a time
+                frame = np.array(attribute.Get(time), np.float32)
+                if frame.shape != (count, 3):
+                    raise Refused(f"{len(frame)} points at time code {time:g} of {shown(prim.GetPath())}", f"{count}")
+                points[row] = frame
+            transform = UsdGeom.XformCache(Usd.TimeCode(times[0])).GetLocalToWorldTransform(prim)
+            scene: dict[str, Any] = {
+                "metres_per_unit": float(UsdGeom.GetStageMetersPerUnit(stage)),
+                "up": str(UsdGeom.GetStageUpAxis(stage)),
+                "bytes": layers.size,
+                "left_out": layers.left_out,
+                "meshes": [{"name": shown(prim.GetName()), "place": shown(prim.GetPath())}],
+            }
+            scene["meshes"][0]["matrix"] = np.array(transform).ravel().tolist()
+            return scene, {"times": np.array(times) / stage.GetTimeCodesPerSecond(), "points": points}
+        if sizes:
+            raise Refused(f"prims of {sizes[:5]} points that move", f"one of {count}, as the head has")
+        return {"bytes": layers.size, "left_out": layers.left_out, "meshes": []}, {}
 
 
 def _opened(path: Path, limit: Callable[[int], None]) -> tuple[Layers, Any]:
@@ -163,4 +204,10 @@ def main(path: Path, folder: Path, what: Callable[..., tuple[dict[str, Any], dic
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[-2]), Path(sys.argv[-1]), extract_maps if "--maps" in sys.argv[1:-2] else extract)
+    kind, *given = sys.argv[1:-2] or ["--scene"]
+    what: Callable[..., tuple[dict[str, Any], dict[str, Any]]] = extract_maps if kind == "--maps" else extract
+    main(
+        Path(sys.argv[-2]),
+        Path(sys.argv[-1]),
+        partial(extract_points, count=int(given[0])) if kind == "--points" else what,
+    )

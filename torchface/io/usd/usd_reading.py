@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -13,7 +14,7 @@ from torchface.files.whole_files import LARGEST_FILE
 from torchface.geometry.meshes.normal_maps import DetailMaps, decode_normals
 from torchface.io.images.image_files import decode_image
 from torchface.io.scene_processes.reading_process import read_scene
-from torchface.io.scene_processes.scene_arrays import Scene, scene_mesh, scene_rig, scene_weights
+from torchface.io.scene_processes.scene_arrays import Scene, mesh_transform, scene_mesh, scene_rig, scene_weights
 from torchface.io.usd.usd_library import require_usd
 from torchface.mesh import Mesh
 from torchface.rig import BlendshapeRig
@@ -49,6 +50,29 @@ def read_usd_mesh(path: str | Path, unit: str | None = None) -> Mesh:
 def read_usd_weights(path: str | Path) -> Take | None:
     """The weights that a file's ``SkelAnimation`` gives its shapes; none where nothing moves them."""
     return scene_weights(read_stage(path))
+
+
+def read_usd_points(path: str | Path, count: int) -> tuple[Tensor, Tensor] | None:
+    """The frames of a point cache, as Audio2Face and other programs write it: points (T,V,3), millimetres, y up.
+
+    Args:
+        path: a USD file in which the points of a prim have time samples.
+        count: V, by which the prim is known.
+
+    Returns:
+        The points, and the times (T,), seconds; none where no points move.
+
+    Raises:
+        FileFormatError: points move, but no prim has so many.
+    """
+    scene = read_stage(path, "--points", str(count))
+    if not scene.record["meshes"]:
+        return None
+    linear, translation = mesh_transform(scene, scene.record["meshes"][0], None)
+    points = scene.arrays["points"] @ linear + translation
+    if not np.isfinite(points).all():
+        raise FileFormatError(f"{path}: found points that are NaN or infinite, expected finite numbers")
+    return torch.from_numpy(points.astype(np.float32)), torch.from_numpy(scene.arrays["times"])
 
 
 def read_stage(path: str | Path, *options: str) -> Scene:

@@ -17,6 +17,8 @@ from torchface.geometry.similarity import Similarity
 from torchface.io import load_take, save_rig
 from torchface.io.head_models.array_files import ONLY, ArrayFile
 from torchface.io.take_files import RECORDING_ENDINGS
+from torchface.io.usd.usd_reading import read_usd_points
+from torchface.io.usd.usd_writing import USD_ENDINGS
 from torchface.number_checks import check_rate
 from torchface.optim import BoxQP
 from torchface.progress import Progress
@@ -191,8 +193,8 @@ def load_moving_head(path: Path, head: Source) -> MovingHead:
     """An animation of a head as meshes.
 
     Args:
-        path: parameters or vertices of frames (``.npz``, ``.npy``, ``.safetensors``), face anchors (``.json``), or what
-            ``load_animated`` reads.
+        path: parameters or vertices of frames (``.npz``, ``.npy``, ``.safetensors``), face anchors (``.json``), a
+            point cache in USD, as Audio2Face exports it, or what ``load_animated`` reads.
     """
     if path.suffix.lower() == ".json":
         return _face_anchors(path, len(head.neutral.vertices))
@@ -203,8 +205,12 @@ def load_moving_head(path: Path, head: Source) -> MovingHead:
         key = arrays.first(_VERTICES)
         if key is not None and "faces" not in arrays:
             return _of_array(arrays, key, len(head.neutral.vertices))
-    animated = load_animated(path)
     own = head.neutral
+    if path.suffix.lower() in USD_ENDINGS and (cache := read_usd_points(path, len(own.vertices))) is not None:
+        points, times = cache
+        fps = (len(times) - 1) / float(times[-1] - times[0])
+        return MovingHead(len(points), lambda begin, end: points[begin:end], fps)
+    animated = load_animated(path)
     if len(animated.neutral.vertices) != len(own.vertices) or not torch.equal(animated.neutral.faces, own.faces):
         raise FileFormatError(
             f"{path}: found meshes of {len(animated.neutral.vertices)} vertices and {len(animated.neutral.faces)} "

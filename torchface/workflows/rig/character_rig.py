@@ -18,7 +18,7 @@ from torchface.files.whole_files import all_or_none, check_ending
 from torchface.geometry.meshes.operators import vertex_normals
 from torchface.io.gltf.character_scene import Block, Character, read_character
 from torchface.io.gltf.gltf_document import read_document
-from torchface.io.gltf.morph_insertion import AddedTargets, document_with_targets, write_edited
+from torchface.io.gltf.morph_insertion import AddedTargets, document_with_targets, rename_targets, write_edited
 from torchface.io.gltf.part_insertion import document_with_parts
 from torchface.io.images.image_files import encode_png
 from torchface.io.mesh_files import MESH_ENDINGS
@@ -33,7 +33,7 @@ from torchface.rendering.compositing import save_rendered_image, sheet
 from torchface.rendering.textured_surface import TexturedSurface
 from torchface.rig import BlendshapeRig
 from torchface.shape_names import ARKIT
-from torchface.shape_names.recognised_names import arkit_name, recognised_shapes
+from torchface.shape_names.recognised_names import arkit_name, recognised_shapes, side_written_out
 from torchface.synthetic import performer
 from torchface.viz.figures.character_views import SHOWN, character_sheet
 from torchface.workflows.rig.added_parts import AddedParts, added_parts
@@ -51,9 +51,12 @@ _FAR, _LEAST_MET = 4.0, 0.4  # millimetres of a head's size between face and tem
 _OF_SCANS = ("the scan has neither", "the scan's triangles")
 """Notes of a registration that say nothing of a character."""
 _TONGUE, _JAW, _CLOSE = "tongueOut", "jawOpen", "mouthClose"
+_MOST_TRIANGLES = 500_000  # of a head: its shapes take some 6 GB
 _CONVERT = {
-    ".fbx": "export it from Blender as .glb (File, Export, glTF 2.0, with Shape Keys and Skinning)",
-    ".gltf": "pack it: npx @gltf-transform/cli copy IN.gltf OUT.glb",
+    ".fbx": "install Blender, blender.org, and let it write one with skeleton and shape keys: "
+    'blender --background --python-expr "import bpy; bpy.ops.wm.read_factory_settings(use_empty=True); '
+    "bpy.ops.import_scene.fbx(filepath='{path}'); bpy.ops.export_scene.gltf(filepath='{stem}.glb')\"",
+    ".gltf": "pack it: npx @gltf-transform/cli copy {path} {stem}.glb",
 }
 
 
@@ -115,6 +118,11 @@ def rig_character(
         except NoFaceOnSurfaceError as error:
             save_rendered_image(sheet(list(error.views)[:24], min(8, len(error.views))), figure)
             raise AlignmentError(f"{path}: {error}; what was seen is in {figure}") from error
+        if len(face.head.faces) > _MOST_TRIANGLES:
+            raise ValueRangeError(
+                f"{path}: found {len(face.head.faces):,} triangles on the head, expected at most {_MOST_TRIANGLES:,}; "
+                f"make it coarser: npx @gltf-transform/cli simplify {path} coarse.glb --ratio 0.1 --error 0.001"
+            )
         found_after = time.perf_counter() - begin
         present, empty = _present(character)
         missing = [name for name in ARKIT if name not in present]
@@ -139,6 +147,7 @@ def rig_character(
         root, data = (
             document_with_targets(document, added, made, empty) if added else (copy.deepcopy(document.root), b"")
         )
+        rename_targets(root, job.spelled(present))
         expressions = add_expressions(document, root, job.binds(present, added))
         with all_or_none():
             write_edited(document, root, data, out)
@@ -155,7 +164,7 @@ def check_character(path: Path) -> None:
     ending = path.suffix.lower()
     if ending not in CHARACTER_ENDINGS:
         converted = f"torchface convert {path.name} {path.stem}.glb" if ending in MESH_ENDINGS else "export it as .glb"
-        how = _CONVERT.get(ending, converted)
+        how = _CONVERT.get(ending, converted).format(path=path, stem=path.with_suffix(""))
         raise FileFormatError(
             f"{path}: found {ending!r}, expected a character's .glb, .vrm or USD ({how}), or --template for a scan"
         )
@@ -275,6 +284,12 @@ class _Job:
             added.append(AddedTargets(block.mesh, block.primitives, positions, normal_rows))
         return added
 
+    @staticmethod
+    def spelled(present: dict[str, _Present]) -> dict[str, str]:
+        """Names of the character's shapes that are ARKit's with a letter for the side, and ARKit's."""
+        single = {shape.names[0]: name for name, shape in present.items() if len(shape.names) == 1}
+        return {own: name for own, name in single.items() if own != name and side_written_out(own) == name}
+
     def binds(self, present: dict[str, _Present], added: list[AddedTargets]) -> dict[str, tuple[MorphBind, ...]]:
         """What each of ARKit's expressions of a VRM drives: shapes that were there, and new ones."""
         bound = {name: shape.binds for name, shape in present.items()}
@@ -339,6 +354,11 @@ class _Job:
         own = {name: names for name, names in present.items() if names != (name,)}
         if present:
             lines.append(f"already there: {len(present)} of ARKit's 52, kept as they are")
+        if spelled := self.spelled(there):
+            lines.append(
+                f"  written with ARKit's names: {', '.join(f'{old} -> {new}' for old, new in spelled.items())}"
+            )
+            own = {name: names for name, names in own.items() if names[0] not in spelled}
         if own:
             lines.append("  by other names: " + ", ".join(f"{k} ({' + '.join(v)})" for k, v in own.items()))
         lines += self._doubts(there)
