@@ -21,7 +21,7 @@ PEOPLE, NOISE = 30, 1.5
 
 
 def test_covariance_is_that_of_planted_errors() -> None:
-    """Errors of neighbours go together, and along heads' forms errors are four times as large as the solve assumes."""
+    """Errors of neighbours go together, and along heads' forms errors are larger than the solve assumes."""
     model, rig = zoo.get_model("head"), performer(texture=False)
     mean, faces, marks = model.shape.mean, rig.neutral.faces, rig.neutral.landmarks
     generator = torch.Generator().manual_seed(2)

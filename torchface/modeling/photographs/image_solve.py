@@ -25,7 +25,7 @@ _MAX_CONTOUR_ERROR, _SETTLED, _TRIAL_ITERATIONS = 1.5, 0.02, 3
 _EXPECTED, _LEAST_UNKNOWN = 2.0, 1e-2  # of unknown differences: how many are expected to be as large as expected
 # Errors of a network's points along heads' forms, beside those that their spread about one head shows: a person's are
 # alike in all pictures (0.88), for networks draw points toward the mean head. Checked by test_likeness.
-_ALONG_FORMS = 4.0
+_ALONG_FORMS = 3.2
 
 
 @dataclass(frozen=True, eq=False)

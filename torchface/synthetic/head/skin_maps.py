@@ -30,6 +30,8 @@ from torchface.synthetic.head.teeth_and_tongue import PAGE
 
 _MELANIN = (1.9, 2.2, 2.4)
 _MARGIN = 6  # texels round a part's rectangle
+_WING = ((15.6, -28.6, 91.2), (17.6, -32.0, 87.8), (18.4, -38.5, 86.2), (16.8, -44.0, 87.0))
+"""Along the groove between the nose's wing and the cheek, on the left."""
 
 
 @dataclass(frozen=True)
@@ -90,12 +92,13 @@ def _maps(look: Look, size: int, skin: Tensor | None) -> SkinMaps:
     hair = hair if look.haircut else torch.zeros_like(hair)
     ball = eyeball > 0.5
     old = max(0.0, (look.age - 32.0) / 40.0)
-    creases = _creases(p) * old
+    creases, groove = _creases(p) * old, _wing_groove(p)
     if skin is None:
         color = _pigmented(skin_color(p, marks, look.freckles, 0.75 * look.lips), look.melanin)
         color = color * (1 - 0.22 * creases.clamp(0, 1))[:, None]
         color = mix(color, (0.42, 0.27, 0.19), 0.35 * min(old, 1.0) * ramp(noise(p, 3.2, 41), 0.62, 0.85))
         color = mix(color, look.hair, 0.42 * _brow_shade(p))
+        color = color * (1 - torch.tensor([0.10, 0.16, 0.17]) * groove[:, None])
     else:
         color = skin.flatten(1)[:, texels.texels].T.float()
     strand = _strands(p)
@@ -105,7 +108,7 @@ def _maps(look: Look, size: int, skin: Tensor | None) -> SkinMaps:
     color = color + (tone - color) * (0.94 * shown).clamp(0, 1)[:, None]
     color = inner_color(color, marks)
     color[ball] = eye_color(p[ball], look.iris)
-    height = _height(p, lips, hair, strand, old) - 0.30 * creases
+    height = _height(p, lips, hair, strand, old) - 0.30 * creases - 0.9 * groove
     height = height + _neck(p) * (1 - ramp(hair, 0.0, 0.3))
     height = height * (1 - ramp(eyeball + socket + mouth + nostril, 0.1, 0.4))
     rough = _roughness(p, lips, mouth, hair, lash, ball)
@@ -160,6 +163,16 @@ def _creases(p: Tensor) -> Tensor:
     return total + 0.7 * feet + 1.4 * fold * (p[:, 2] > 50) + 0.6 * under * (p[:, 2] > 50)
 
 
+def _wing_groove(p: Tensor) -> Tensor:
+    """How deep the grooves about the nose's wings are, (M,) in [0,1]."""
+    line = torch.tensor(_WING)
+    folded = torch.cat([p[:, :1].abs(), p[:, 1:]], 1)[:, None]
+    start, way = line[:-1], line.diff(dim=0)
+    along = (((folded - start) * way).sum(-1) / way.square().sum(-1)).clamp(0, 1)
+    apart = (folded - start - along[..., None] * way).norm(dim=-1).amin(1)
+    return torch.exp(-((apart / 2.2) ** 2))
+
+
 def _height(p: Tensor, lips: Tensor, hair: Tensor, strand: Tensor, old: float) -> Tensor:
     """Relief of the skin, millimetres."""
     oily = blob(p, (12, -34, 100), (18, 18, 26)) + 0.7 * blob(p, (30, -34, 72), (20, 18, 26))
@@ -189,7 +202,7 @@ def _roughness(p: Tensor, lips: Tensor, mouth: Tensor, hair: Tensor, lash: Tenso
     rough = 0.60 - 0.14 * blob(p, (4, -20, 100), (14, 26, 26)) - 0.08 * blob(p, (0, 40, 92), (34, 20, 40))
     rough = rough + 0.05 * noise(p, 2.0, 34)
     for share, value in ((ramp(lips, 0.3, 0.9), 0.42), (ramp(hair, 0.0, 0.3), 0.62), (ramp(mouth, 0.3, 0.9), 0.35),
-                         (ramp(lash, 0.2, 0.5), 0.3), (ball.float(), 0.12)):  # fmt: skip
+                         (ramp(lash, 0.15, 0.35), 0.12), (ball.float(), 0.12)):  # fmt: skip
         rough = rough + (value - rough) * share
     return rough.clamp(0.05, 1)
 

@@ -144,7 +144,9 @@ def _color_lines(image: Tensor, box: Tensor) -> list[str]:
     ratio = (middle[0].clamp(min=0.02) / middle[1].clamp(min=0.02)).log().flatten()
     low, high = ratio.quantile(ratio.new_tensor([0.1, 0.9])).tolist()
     if high - low < _ONE_HUE:
-        lines.append(f"one hue all over (red over green differs by {high - low:.1%}): a statue, a mask?")
+        lines.append(
+            f"one hue all over (red over green differs by {high - low:.1%}): a toned picture, a statue, a mask?"
+        )
     red, green, blue = middle.flatten(1).median(dim=1).values.clamp(min=0.02).log().tolist()
     if not (_RED[0] < red - green < _RED[1] and _BLUE[0] < blue - green < _BLUE[1]):
         lines.append(
