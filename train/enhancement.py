@@ -24,7 +24,7 @@ from .enhancement_figures import draw
 from .model_cards import model_card
 from .recipe_settings import RecipeSettings
 from .restored_frames import Shown, measured
-from .runner import Recipe, Run, metric_lines, recipe
+from .runner import Recipe, Run, recipe
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -158,9 +158,7 @@ def save(model: EnhancementModel, settings: Settings, metrics: dict[str, float],
     zoo.save_model(model, settings.out, card, half=("database_features", "region_weights"))
 
 
-RECIPE = Recipe(
-    Settings, train, __doc__, lambda settings, _: metric_lines(zoo.describe(settings.out.resolve()).metrics)
-)
+RECIPE = Recipe(Settings, train, __doc__)
 
 if __name__ == "__main__":
     RECIPE.main()

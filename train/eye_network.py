@@ -21,7 +21,7 @@ from torchface.landmarks.images.networks.eye_training import EyeSettings
 from .eye_pictures import EACH, PART, StoredEyePictures, eye_picture_files
 from .model_cards import model_card
 from .recipe_settings import RenderedSettings
-from .runner import Recipe, Run, metric_lines, recipe
+from .runner import Recipe, Run, recipe
 
 _TEST_BATCH = 100
 _SIZES = {"600": 1.0, "120": 0.5, "60": 0.25}
@@ -126,9 +126,7 @@ def save(model: EyeNetwork, settings: Settings, metrics: dict[str, float]) -> No
     )
 
 
-RECIPE = Recipe(
-    Settings, train, __doc__, lambda settings, _: metric_lines(zoo.describe(settings.out.resolve()).metrics)
-)
+RECIPE = Recipe(Settings, train, __doc__)
 
 if __name__ == "__main__":
     RECIPE.main()

@@ -83,18 +83,7 @@ class StoredEyePictures(Dataset[tuple[Tensor, ...]]):
 def eye_picture_files(
     folder: Path, count: int, seed: int, ict: Path | None = None, workers: int = 1, progress: Progress | None = None
 ) -> list[Path]:
-    """Renders what a folder does not hold yet; how many processes render does not change the pictures.
-
-    Args:
-        folder: for the files; pictures of another seed or other heads lie beside each other there.
-        count: how many, rounded up to whole files.
-        ict: ICT-FaceKit's ``FaceXModel``, whose heads are four in five; embedded performers alone without.
-        workers: processes.
-        progress: called with each step and how far it is.
-
-    Returns:
-        The files, in order, of :data:`PART` pictures each.
-    """
+    """Renders what a folder does not hold yet, :data:`PART` pictures a file; see ``rendered_files``."""
     rendering = Rendering(_render, "eye pictures/3", "eyes", "eyes", PART)
     return rendered_files(rendering, folder, count, seed, ict, workers, progress)
 

@@ -20,7 +20,7 @@ from torchface.landmarks.images.networks.part_training import PartSettings, part
 from .model_cards import model_card
 from .part_pictures import EACH, PART, SCENES, StoredPartPictures, part_picture_files
 from .recipe_settings import RenderedSettings
-from .runner import Recipe, Run, metric_lines, recipe
+from .runner import Recipe, Run, recipe
 
 _TEST_BATCH = 48
 
@@ -97,9 +97,7 @@ def save(model: PartNetwork, settings: Settings, metrics: dict[str, float]) -> N
     )
 
 
-RECIPE = Recipe(
-    Settings, train, __doc__, lambda settings, _: metric_lines(zoo.describe(settings.out.resolve()).metrics)
-)
+RECIPE = Recipe(Settings, train, __doc__)
 
 if __name__ == "__main__":
     RECIPE.main()

@@ -22,7 +22,7 @@ from .model_cards import model_card
 from .people_split import held_out_people
 from .recipe_settings import RecipeSettings
 from .rendered_people.portraits import FaceImageSettings
-from .runner import Recipe, Run, metric_lines, recipe
+from .runner import Recipe, Run, recipe
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -125,9 +125,7 @@ def _save(model: LandmarkTrees, settings: Settings, errors: Tensor, count: int) 
     zoo.save_model(model, settings.out, card, half=("offsets", "thresholds", "bases"))
 
 
-RECIPE = Recipe(
-    Settings, train, __doc__, lambda settings, _: metric_lines(zoo.describe(settings.out.resolve()).metrics)
-)
+RECIPE = Recipe(Settings, train, __doc__)
 
 if __name__ == "__main__":
     RECIPE.main()

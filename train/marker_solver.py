@@ -20,7 +20,7 @@ from torchface.synthetic.stages.weight_curves import perform
 
 from .model_cards import model_card
 from .recipe_settings import RecipeSettings
-from .runner import Recipe, Run, metric_lines, recipe
+from .runner import Recipe, Run, recipe
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -97,9 +97,7 @@ def measure(solver: MarkerSolver, rig: BlendshapeRig, settings: Settings) -> dic
     }
 
 
-RECIPE = Recipe(
-    Settings, train, __doc__, lambda settings, _: metric_lines(zoo.describe(settings.out.resolve()).metrics)
-)
+RECIPE = Recipe(Settings, train, __doc__)
 
 if __name__ == "__main__":
     RECIPE.main()

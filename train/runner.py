@@ -104,13 +104,15 @@ class Recipe(Generic[Settings, Trained]):
     Args:
         settings: its dataclass; ``out`` is held for this run.
         description: for ``--help``.
-        lines: what is printed of the settings and the trained model.
+        lines: what is printed of the settings and the trained model; what was measured, as its card has it, if absent.
     """
 
     settings: type[Settings]
     train: Train[Settings, Trained]
     description: str | None
-    lines: Callable[[Settings, Trained], Iterable[str]]
+    lines: Callable[[Settings, Trained], Iterable[str]] = lambda settings, _: metric_lines(
+        zoo.describe(settings.out.resolve()).metrics
+    )
 
     def __post_init__(self) -> None:
         plain_options(self.settings)

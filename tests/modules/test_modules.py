@@ -13,23 +13,18 @@ from typing import Any
 import pytest
 import torch
 from module_examples import (
-    CAMERA,
     EXAMPLES,
     NAMES,
     Example,
     corrected_rig,
     corrected_solver,
-    rig,
-    seen_landmarks,
     seen_markers,
 )
 from pretended_device import pretended
 from torch import Tensor, nn
 from torch.utils._pytree import tree_leaves
 
-from torchface.capture.own_rig import VideoSolver
 from torchface.errors import TraceError
-from torchface.onnx import VideoGraph
 from torchface.onnx.corrective_graph import CorrectiveGraph
 
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "concepts" / "modules.md"
@@ -38,6 +33,15 @@ COLUMNS = (
     "torch.export",
 )  # fmt: skip
 ROUNDING = 1e-9
+
+WRITTEN = (
+    "ProjectedGradient", "WebcamSolver", "SolverGraph", "SolverGraph with predictions", "DynamicsPrior", "HeadModel",
+    "ExpressionRegression", "WrinkleWeights", "ActionUnitClassifier", "LandmarkNetwork", "EyeNetwork",
+)  # fmt: skip
+"""Exported in the tests of their ONNX graphs, which is more."""
+
+LONG = ("WebcamSolver", "SolverGraph", "SolverGraph with predictions")
+"""Five to twelve seconds to compile."""
 
 IN_ONE_GRAPH = [name for name, example in EXAMPLES.items() if "torch.compile" not in example.cells]
 
@@ -245,9 +249,12 @@ def test_jacobians(name: str) -> None:
     outputs(example, module, first, *rest)  # nothing of the transform stays behind
 
 
-@every_class
+@pytest.mark.parametrize("name", [name for name in EXAMPLES if name not in LONG])
 def test_compiled_it_computes_the_same(name: str) -> None:
-    """In one graph, or with one gap in which it runs as ever; as far as the code that a backend makes of the graph."""
+    """In one graph, or with one gap in which it runs as ever; as far as the code that a backend makes of the graph.
+
+    The next test has those that take long.
+    """
     check_compiled(EXAMPLES[name], name in IN_ONE_GRAPH, "aot_eager")
 
 
@@ -267,7 +274,7 @@ def check_compiled(example: Example, whole: bool, backend: str) -> None:
             assert_same(list(compiled(*inputs)), wanted, 1e-4 if backend == "inductor" else 1e-5)
 
 
-@every_class
+@pytest.mark.parametrize("name", [name for name in EXAMPLES if name not in WRITTEN])
 def test_exported_it_computes_the_same(name: str) -> None:
     example = EXAMPLES[name]
     cell = example.cells.get("torch.export", "yes")
@@ -282,13 +289,9 @@ def test_exported_it_computes_the_same(name: str) -> None:
 
 
 def exported_graphs() -> dict[str, tuple[Callable[[], nn.Module], Callable[[], tuple[Tensor, ...]]]]:
-    """Those that stand in for solvers in the table and have no row of their own, of few steps."""
+    """Those that stand in for solvers in the table without a row and a quick test in ONNX, of few steps."""
     none = torch.zeros(4, len(NAMES))
     return {
-        "VideoGraph": (
-            lambda: VideoGraph(VideoSolver(rig(), None, CAMERA)),
-            lambda: (seen_landmarks()[0].float(), torch.ones(68), torch.zeros(6), torch.eye(3), torch.ones(3)),
-        ),
         "CorrectiveGraph": (
             lambda: CorrectiveGraph(corrected_solver(0), steps=1),
             lambda: (seen_markers(corrected_rig()).float(), none),
@@ -300,7 +303,7 @@ def exported_graphs() -> dict[str, tuple[Callable[[], nn.Module], Callable[[], t
     }
 
 
-@pytest.mark.parametrize("kind", ["VideoGraph", "CorrectiveGraph", "CorrectiveGraph with predictions"])
+@pytest.mark.parametrize("kind", ["CorrectiveGraph", "CorrectiveGraph with predictions"])
 def test_graphs_of_solvers_are_exported(kind: str) -> None:
     make, given = exported_graphs()[kind]
     graph, inputs = make(), given()
