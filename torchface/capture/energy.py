@@ -118,7 +118,7 @@ def sparsity_term(shapes: int, weight: float | Tensor, like: Tensor) -> Quadrati
 
     Source: thesis 4.1.4, equation 33.
     """
-    _check_weight("sparsity", weight)
+    check_weight("sparsity", weight)
     return Quadratic(like.new_zeros(shapes, shapes), weight * like.new_ones(1, shapes))
 
 
@@ -133,7 +133,7 @@ def ridge_term(shapes: int, weight: float | Tensor, like: Tensor, center: Tensor
 
     Source: thesis 4.1.4, equation 33.
     """
-    _check_weight("ridge", weight)
+    check_weight("ridge", weight)
     H = 2 * weight * torch.eye(shapes, dtype=like.dtype, device=like.device)
     if center is None:
         return Quadratic(H, like.new_zeros(1, shapes))
@@ -166,7 +166,8 @@ def gaussian_term(mean: Tensor, variance: Tensor) -> Quadratic:
     return Quadratic(torch.diag_embed(1 / variance), -mean / variance, 0.5 * (mean.square() / variance).sum(1))
 
 
-def _check_weight(name: str, weight: float | Tensor) -> None:
+def check_weight(name: str, weight: float | Tensor) -> None:
+    """Raises a ``ValueRangeError`` where the weight of a term is negative, not finite or too large."""
     # A compiled call checks nothing; a solver of meta tensors waits for its state.
     if torch.compiler.is_compiling() or (isinstance(weight, Tensor) and weight.is_meta):
         return

@@ -14,6 +14,8 @@ from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin
 
 from tyro.conf import arg
 
+from torchface.cli.terminal import console
+
 _WORDS = {Path: "PATH", str: "TEXT", int: "NUMBER", float: "NUMBER"}
 
 
@@ -49,6 +51,8 @@ def checked(command: Callable[..., None]) -> Callable[..., None]:
 
     @wraps(command)
     def run(*values: Any, **options: Any) -> None:
+        if options.get("quiet") is False:  # of commands that take long, whose libraries alone take seconds to load
+            console.print("starting")
         with inputs_kept(command, signature(command).bind(*values, **options).arguments):
             command(*values, **options)
 

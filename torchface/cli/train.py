@@ -15,7 +15,6 @@ from rich.text import Text
 
 from torchface.cli.terminal import PlainConsole
 from torchface.errors import FileFormatError, NameMismatchError
-from torchface.files.model_roots import is_checkout
 
 _PACKAGE = Path(__file__).resolve().parents[1]
 _INSTALLED, _IN_CHECKOUT = "torchface._train", "train"
@@ -52,6 +51,8 @@ def recipes_package() -> ModuleType:
     Raises:
         FileFormatError: there is none, or another package of that name was found first.
     """
+    from torchface.files.model_roots import is_checkout  # brings torch
+
     if find_spec(_INSTALLED) is not None:
         return import_module(_INSTALLED)
     checkout = _PACKAGE.parent

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from functools import cache
 from pathlib import Path
 
 from torchface.errors import FileFormatError, TorchfaceError
@@ -40,11 +41,18 @@ def is_checkout(folder: Path, package: str) -> bool:
     Its ``pyproject.toml`` must be the package's own, and no installer may have put the package there: what it installs
     it records beside.
     """
+    path = folder / "pyproject.toml"
     try:
-        project = read_toml(folder / "pyproject.toml")["project"]["name"].text()
-    except TorchfaceError:  # none, a stranger's without a name, no TOML
+        project = _project(path, path.stat().st_mtime_ns)
+    except (TorchfaceError, OSError, ValueError):  # none, a stranger's without a name, no TOML
         return False
     return project == package and not any(folder.glob(f"{package}-*.dist-info"))
+
+
+@cache
+def _project(path: Path, _changed: int) -> str:
+    """The name that a project's file gives it; each model that is looked up asks for it."""
+    return read_toml(path)["project"]["name"].text()
 
 
 def is_model(root: Path, name: str) -> bool:

@@ -4,15 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-import onnx
 import torch
 from torch import Tensor
 
 from torchface.attachment import Attachment
-from torchface.capture.anybody import ExampleShapes, ExampleSolver, landmark_observability
-from torchface.capture.anybody.examples.example_shapes import is_examples
-from torchface.capture.markers import MarkerSolver, observability
 from torchface.errors import FileFormatError
 from torchface.files.models import DESCRIPTION
 from torchface.files.whole_files import read_file
@@ -43,6 +40,11 @@ from torchface.take import Take
 from torchface.workflows.posed_mesh import load_neutral
 from torchface.workflows.weight_files import weight_faults
 
+if TYPE_CHECKING:  # solvers and onnx take seconds to load; few files need them
+    import onnx
+
+    from torchface.capture.anybody import ExampleShapes
+
 Rows = list[tuple[str, str]]
 
 _MAX_LENGTH = 240
@@ -71,6 +73,8 @@ def describe(path: Path, attachment: Path | None = None, part: str | None = None
         rig = rig or load_rig(path, part=part)  # whose error says what is missing
         rows = [*_rig_rows(rig), *_animation_rows(path)]
         if attachment is not None:
+            from torchface.capture.markers import MarkerSolver, observability
+
             where = Attachment.load(attachment)
             where.check(rig.neutral, attachment, path)
             visible = observability(MarkerSolver(rig, where))
@@ -86,9 +90,11 @@ def describe(path: Path, attachment: Path | None = None, part: str | None = None
         return _error_rows(path)
     if suffix in (*TAKE_ENDINGS, *RECORDING_ENDINGS) and (suffix != ".json" or is_weight_json(path)):
         return _take_rows(load_take(path))
-    if suffix == ".json" and is_examples(path):
-        return _example_rows(ExampleShapes.load(path))
     if suffix == ".json":
+        from torchface.capture.anybody.examples.example_shapes import ExampleShapes, is_examples
+
+        if is_examples(path):
+            return _example_rows(ExampleShapes.load(path))
         return _attachment_rows(Attachment.load(path))
     if suffix == ".onnx":
         return _graph_rows(path)
@@ -179,6 +185,8 @@ def _head_model_rows(model: HeadModelFile) -> Rows:
 
 
 def _example_rows(examples: ExampleShapes) -> Rows:
+    from torchface.capture.anybody import ExampleSolver, landmark_observability
+
     return [
         ("examples", f"{len(examples.names)}: {', '.join(examples.names)}"[:_MAX_LENGTH]),
         ("eyes' distance", f"{examples.eyes_distance:.1f} pixels"),
@@ -273,6 +281,8 @@ def _attachment_rows(attachment: Attachment) -> Rows:
 
 
 def _graph_rows(path: Path) -> Rows:
+    import onnx
+
     data = read_file(path, 2**28)
     try:
         model = onnx.load_model_from_string(data)

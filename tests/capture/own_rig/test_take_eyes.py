@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import fields
+from dataclasses import fields, replace
 
 import pytest
 import torch
@@ -13,8 +13,10 @@ from torchface.capture.own_rig import VideoSettings, VideoSolver
 from torchface.capture.own_rig.eye_geometry import CORNERS, Eyeballs
 from torchface.capture.own_rig.face_measurements import FaceMeasurements
 from torchface.capture.own_rig.take_eyes import TakeEyes, take_eyes
+from torchface.geometry.rotations import rotation_matrix
 from torchface.landmarks.images.face_reading import FaceReading
 from torchface.rig import BlendshapeRig
+from torchface.shape_names import ARKIT
 from torchface.synthetic import performer
 
 FRAMES, SHUT = 60, slice(20, 24)
@@ -100,3 +102,47 @@ def test_lids_landmarks_that_disagree_count_less(eyes: TakeEyes) -> None:
     assert torch.equal(trust[:, :36], torch.ones(FRAMES, 36))
     assert torch.equal(trust[:, 48:], torch.ones(FRAMES, 20))
     assert float(trust[SHUT, 36:48].max()) < 0.3
+
+
+def test_lids_whose_landmarks_are_doubted_shut_by_what_is_read(rig: BlendshapeRig, eyes: TakeEyes) -> None:
+    """As behind glasses: no landmark of an eye counts, and the eye network sees the blink."""
+    solver = VideoSolver(rig, None, K, settings=VideoSettings.of_found_landmarks())
+    marks = rig.vertices[rig.neutral.landmarks].double() @ ROTATION[0].T + TRANSLATION[0]
+    frames, trust = torch.arange(14, 26), torch.ones(12, 68)
+    trust[:, 36:48] = 0.0
+    read = eyes.readings(solver.rest[:68], solver.basis[:68], rig.names, Eyeballs.of(rig)).of_frames(frames)
+    found = ((marks @ K.T)[:, :2] / marks[:, 2:]).expand(len(frames), -1, -1)
+    solved = solver(found, confidence=trust, measured=FaceMeasurements(weights=read))
+    blinks = solved.weights[:, [rig.names.index(f"eyeBlink{side}") for side in ("Left", "Right")]]
+    shut = (frames >= SHUT.start) & (frames < SHUT.stop)
+    assert float(blinks[shut][1:].min()) > 0.8
+    assert float(blinks[~shut][:5].max()) < 0.1
+
+
+def test_a_lasting_gaze_is_the_persons_own_where_eyes_stay_on_the_lens(rig: BlendshapeRig) -> None:
+    """Eyes that lie otherwise seem to look up as the head nods before a lens; a network knows those that do look up."""
+    up, count = 0.2, 90
+    nod = torch.zeros(count, 3).double()
+    nod[:, 0] = 0.08 * torch.linspace(0, 9, count).double().sin()
+    turned, place = rotation_matrix(nod) @ ROTATION[:1], TRANSLATION[:1].expand(count, -1)
+    placed = rig.vertices[rig.neutral.landmarks].double() @ turned.transpose(1, 2) + place[:, None]
+    rays, depth = placed[..., :2] / placed[..., 2:], torch.stack([placed[:, a, 2] for a, _ in CORNERS], 1)
+    lens = -torch.nn.functional.normalize(placed[:, 36:48].mean(1), dim=1)[:, None] @ turned
+    lens = torch.stack([torch.zeros(count).double(), torch.asin(lens[:, 0, 1])], 1)
+    gaze = (lens + torch.tensor([0.0, up]))[:, None].expand(-1, 2, -1)
+    iris, ones = irises(rig, gaze, turned, place), torch.ones(count, 68)
+    seen = FaceReading(
+        (700 * rays + K[:2, 2]).float(), ones, ones, ones[:, 0], iris.float(), torch.full((count, 2), 0.3),
+        torch.zeros(count, 2), torch.ones(count, 2),
+    )  # fmt: skip
+    expression = torch.zeros(count, 52)
+    expression[:, [ARKIT.index("eyeLookUpLeft"), ARKIT.index("eyeLookUpRight")]] = float(gaze[..., 1].mean()) / 0.45
+    believed = replace(seen, expression=expression, expression_deviation=torch.full((count, 52), 0.02))
+    beside = [
+        float(
+            (take_eyes(one, rays, iris, turned, depth, torch.ones(count), Eyeballs.of(rig)).gaze - gaze)[..., 1].mean()
+        )
+        for one in (seen, believed)
+    ]
+    assert -0.2 < beside[0] < -0.1
+    assert abs(beside[1]) < 0.05

@@ -58,7 +58,7 @@ class GaborBank(nn.Module):
 
 def _kernel(wavelength: float, angle: float, reach: int) -> Tensor:
     """One filter (2*reach+1, 2*reach+1), complex128, of unit energy."""
-    step = torch.arange(-reach, reach + 1, dtype=torch.float64)
+    step = torch.arange(-reach, reach + 1, dtype=torch.float64, device="cpu")  # on "meta" it takes seconds to load
     y, x = torch.meshgrid(step, step, indexing="ij")
     along = x * math.cos(angle) + y * math.sin(angle)
     sigma = 0.42 * wavelength

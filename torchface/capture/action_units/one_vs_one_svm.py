@@ -33,7 +33,7 @@ class OneVsOne(nn.Module):
 
     def __init__(self, classes: int, features: int) -> None:
         super().__init__()
-        pairs = torch.tensor(list(combinations(range(classes), 2))).view(-1, 2)
+        pairs = torch.tensor(list(combinations(range(classes), 2)), device="cpu").view(-1, 2)
         self.register_buffer("weight", torch.zeros(len(pairs), features))
         self.register_buffer("bias", torch.zeros(len(pairs)))
         one_hot = torch.nn.functional.one_hot(pairs, classes).float()

@@ -40,6 +40,12 @@ class EyeSignals:
     straight: Tensor
     straight_seen: Tensor
 
+    @classmethod
+    def start(cls) -> EyeSignals:
+        """Before the first frame: open, straight ahead, nothing learned."""
+        one, none = torch.ones(2).double(), torch.zeros(2, 2).double()
+        return cls(one, 0 * one, none, 0 * one, none, none, none, none[0, 0])
+
 
 @dataclass(frozen=True, eq=False)
 class EyesRead:
@@ -59,7 +65,7 @@ def eye_signals(
     gaze: Tensor,
     usual: Tensor,
     looking: Tensor,
-    before: WebcamState,
+    before: WebcamState | EyeSignals,
     interval: Tensor,
     pose: Tensor,
     learns: Tensor,
@@ -70,7 +76,7 @@ def eye_signals(
         gaze: where the eyes seem to look, (2,2), NaN where nobody said.
         usual: openness of eyes at rest, (2,).
         looking: what looking up or down adds to the rig's openness at weights (8,) of ``LOOKS``, (2,8).
-        before: the state of the frame before.
+        before: the state of the frame before, or its signals.
         interval: seconds since then, ().
         pose: what the person has been asked to hold, () of ``POSES``.
         learns: 0 where nothing is to be learned, ().

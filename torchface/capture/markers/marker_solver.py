@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from torchface.attachment import Attachment
 from torchface.capture.antagonist_shapes import one_side, signed_quantities, weaker_sides
 from torchface.capture.corrective_energy import CorrectiveEnergy, least_in_box
-from torchface.capture.energy import Quadratic, chunks_of_frames, marker_term, ridge_term, sparsity_term
+from torchface.capture.energy import Quadratic, check_weight, chunks_of_frames, marker_term, ridge_term, sparsity_term
 from torchface.correctives.activation import CorrectiveActivation
 from torchface.correctives.corrective_shapes import Corrective, definitions_from_records
 from torchface.errors import NameMismatchError, ShapeError, ValueRangeError
@@ -139,7 +139,6 @@ class MarkerSolver(nn.Module):
         self.register_buffer("corrective_basis", None)
         self._prepared: dict[float, Prepared[BoxQP]] = {}
         self._prepared_rows: Prepared[tuple[Tensor, Tensor]] = Prepared()
-        self.regularization(self.rest)  # a negative weight is an error here, not at the first solve
 
     def _correct(self, definitions: Sequence[Corrective], basis: Tensor) -> None:
         """Takes up correctives and what a unit of each adds to the markers, (M,3,C)."""
@@ -149,10 +148,11 @@ class MarkerSolver(nn.Module):
 
     def _penalty(self, name: str, value: float | Tensor) -> float | Tensor:
         """A number as it is; a tensor of one as a scalar that moves and saves with the module."""
+        if isinstance(value, Tensor) and value.numel() != 1:
+            raise ShapeError(f"{name}: found {tuple(value.shape)}, expected one number")
+        check_weight(name, value)  # a negative weight is an error here, not at the first solve
         if not isinstance(value, Tensor):
             return float(value)
-        if value.numel() != 1:
-            raise ShapeError(f"{name}: found {tuple(value.shape)}, expected one number")
         if not isinstance(value, nn.Parameter):
             self.register_buffer(name, value)
         return value

@@ -24,6 +24,7 @@ from torchface.capture.own_rig.eye_geometry import (
 )
 from torchface.capture.weight_readings import WeightReadings
 from torchface.landmarks.images.face_reading import FaceReading
+from torchface.shape_names import ARKIT
 
 _USUAL_OPEN, _USUAL_SHUT = 0.3, 0.05  # openness where a take shows none
 _SHUT_FRAMES = 5.0  # that the usual shut level counts as
@@ -36,9 +37,13 @@ _NOISE, _PIXELS = 0.08, 0.5  # of openness beside the open eye's; and what lids 
 _BLINK_NOISE = 0.1  # of eyeBlink where the eye is surely shut
 _GAZE_NOISE = 0.03  # of eyeLook's weights
 _STRAYS = 0.35  # radians: what is further to the side or up is no looking straight ahead
-# Frames that eyes open, and looking straight, as people usually have them count as: people squint and look aside for
-# seconds.
-_OPEN_FRAMES, _STRAIGHT_FRAMES = 90.0, 240.0
+_OPEN_FRAMES = 90.0  # that eyes open as people usually have them count as: people squint for seconds
+# Radians: what eyes that look straight ahead are read apart by, of one person and another: the corners and the middle
+# of an eyeball lie a millimetre otherwise, the line of sight is turned, the head's pitch is found wrong.
+_PERSON = 0.15
+# Radians that people who look at the lens look beside it in the mean of a take; radians that a head turns at least for
+# it to show that they do; and how much more than it states the landmark network errs of looks in the mean of a take.
+_BESIDE, _TURNED, _UNDERSTATED = 0.1, 0.02, 3.0
 _ANY_FRAME = 0.1  # what a frame counts beside one in which the face surely rests
 # Radians from straight, of each eye: less is what eyes were read apart by mistake, more is none.
 _APART, _VERGENCE = 0.05, 0.12
@@ -59,6 +64,7 @@ class TakeEyes:
             shut, NaN where they were never seen.
         gaze_trust: (T,2) in [0,1].
         lid_trust: how far the landmarks of each eye agree with that, (T,2) in [0,1].
+        straight: what was taken for the person's own straight ahead beside the model's, (2,2) radians; zero if absent.
     """
 
     open: Tensor
@@ -67,6 +73,7 @@ class TakeEyes:
     gaze: Tensor
     gaze_trust: Tensor
     lid_trust: Tensor
+    straight: Tensor | None = None
 
     def readings(self, rest: Tensor, basis: Tensor, names: Sequence[str], eyeballs: Eyeballs) -> WeightReadings:
         """As readings of the weights of a rig.
@@ -137,7 +144,9 @@ def take_eyes(
     raw = seen_gaze(rays.double(), iris.double(), rotation.double(), depth.double(), eyeballs)
     looks = torch.isfinite(raw).all(-1)
     trust = torch.where(looks, seen * (1 - shut), 0.0)
-    gaze, trust = _one_gaze(torch.where(looks[..., None], raw, 0.0), trust)
+    raw = torch.where(looks[..., None], raw, 0.0)
+    straight = _straight(raw, trust, _toward_lens(rays.double(), rotation.double()), reading, eyeballs)
+    gaze = _one_gaze(raw - straight, trust)
 
     openness = reading.openness.double()
     known = torch.isfinite(openness)
@@ -161,6 +170,7 @@ def take_eyes(
         _held(gaze, trust.amax(1) > _LEAST_GAZE),
         trust.amax(1, keepdim=True).expand(-1, 2),
         torch.where(known, agree.nan_to_num(1.0), 1.0),
+        straight,
     )
 
 
@@ -190,15 +200,61 @@ def _weighted_median(values: Tensor, weight: Tensor) -> Tensor:
     return values[order[int((total < 0.5 * total[-1]).sum())]]
 
 
-def _one_gaze(raw: Tensor, trust: Tensor) -> tuple[Tensor, Tensor]:
-    """Both eyes' gaze at one thing beside straight ahead, (T,2,2), and how much it counts, (T,2)."""
+def _toward_lens(rays: Tensor, rotation: Tensor) -> Tensor:
+    """Where the lens is beside the head, (T,2) radians to the person's left and up, of landmarks' rays (T,68,2)."""
+    eyes = torch.stack([rays[:, number] for pair in CORNERS for number in pair]).nanmean(0)
+    way = -torch.nn.functional.normalize(torch.nn.functional.pad(eyes, (0, 1), value=1.0), dim=1)
+    left, up, ahead = (way[:, None] @ rotation)[:, 0].unbind(1)
+    return torch.stack([torch.atan2(left, ahead), torch.asin(up.clamp(-1, 1))], 1)
+
+
+def _straight(raw: Tensor, trust: Tensor, lens: Tensor, reading: FaceReading, eyeballs: Eyeballs | None) -> Tensor:
+    r"""What a person's eyes are read apart from straight ahead by, (2,2) radians: a Gaussian's mean beside what says
+    where eyes look in the mean of a take without knowing their geometry.
+
+    .. math:: b = (\bar r - m) \frac{s_b^2}{s_b^2 + s_m^2}, \quad \bar r = m + b
+
+    with :math:`\bar r` what was read in the mean; m, known to :math:`s_m`, is from what the landmark network expects of
+    the looks, whose errors are alike in all frames, and of the lens, where eyes turn against the head to stay on it.
+
+    Args:
+        raw, trust: gaze (T,2,2) and how much it counts, (T,2).
+        lens: where it is, (T,2).
+        reading: of the frames.
+        eyeballs: of the rig.
+    """
+    turns = (eyeballs or Eyeballs.usual()).turns.to(raw)
+    rows = [ARKIT.index(name) for name in LOOKS]
+    expected = gaze_of_looks(reading.expression[:, rows].double(), turns)
+    # Both shapes of an axis, of each eye: in and out, then down and up.
+    variance = (reading.expression_deviation[:, rows].double() * turns).square().unflatten(1, (2, 2, 2)).sum(-1)
+    variance = variance.transpose(1, 2)
     straight = torch.zeros_like(raw[0])
     for eye in range(2):
-        frames = trust[:, eye] > _LEAST_GAZE
-        if bool(frames.any()):
-            lasting = raw[frames, eye].clamp(-_STRAYS, _STRAYS).median(0).values
-            straight[eye] = lasting * frames.sum() / (frames.sum() + _STRAIGHT_FRAMES)
-    ahead = raw - straight
+        frames = (trust[:, eye] > _LEAST_GAZE) & torch.isfinite(lens).all(1)
+        if not bool(frames.any()):
+            continue
+        lasting = raw[frames, eye].clamp(-_STRAYS, _STRAYS).median(0).values
+        known = (1 / variance[frames, eye].nan_to_num(torch.inf)).mean(0) / _UNDERSTATED**2  # 0 where nobody read it
+        read = expected[frames, eye].nan_to_num(0.0).mean(0)
+        looked_at = _follows(raw[frames, eye], lens[frames]) / _BESIDE**2
+        mean = (lens[frames].median(0).values * looked_at + read * known) / (looked_at + known).clamp(min=1e-9)
+        sure = looked_at + known + 1 / _STRAYS**2
+        straight[eye] = (lasting - mean) * _PERSON**2 / (_PERSON**2 + 1 / sure)
+    return straight.clamp(-2 * _PERSON, 2 * _PERSON)
+
+
+def _follows(gaze: Tensor, lens: Tensor) -> Tensor:
+    """How far gaze (F,2) turns against the head, so that it stays on the lens (F,2) or near it, (2,) in [0,1]."""
+    gaze, lens = (one - one.median(0).values for one in (gaze, lens))
+    gaze, lens = (one.clamp(-reach, reach) for one in (gaze, lens) for reach in [3 * one.abs().median(0).values])
+    moved, turned = gaze.square().mean(0), lens.square().mean(0)
+    alike = (gaze * lens).mean(0) / (moved * turned).sqrt().clamp(min=1e-9)
+    return alike.clamp(0, 1).square() * turned / (turned + _TURNED**2)
+
+
+def _one_gaze(ahead: Tensor, trust: Tensor) -> Tensor:
+    """Both eyes' gaze at one thing, (T,2,2), of each eye's beside straight ahead that counts (T,2)."""
     share = (trust + 1e-3)[..., None]
     both = (share * ahead).sum(1) / share.sum(1)
     cross = 0.5 * (ahead[:, 0, 0] - ahead[:, 1, 0]) * (trust.amin(1) > _LEAST_GAZE)
@@ -206,7 +262,7 @@ def _one_gaze(raw: Tensor, trust: Tensor) -> tuple[Tensor, Tensor]:
     made = both[:, None].expand(-1, 2, 2).clone()
     made[:, 0, 0] += cross
     made[:, 1, 0] -= cross
-    return made, trust
+    return made
 
 
 def _held(gaze: Tensor, seen: Tensor) -> Tensor:

@@ -16,7 +16,7 @@ from torchface.capture.own_rig.frame_states import FrameTerms, VideoSolution, Vi
 from torchface.capture.own_rig.gauss_newton import HeadState
 from torchface.capture.own_rig.solver_components import DEFAULT_WEIGHT_STEP, check_not_negative
 from torchface.capture.own_rig.state_estimate import Expectation, StateEstimate
-from torchface.capture.own_rig.weight_walk import faded, frame_intervals, unseen_time, walk_information
+from torchface.capture.own_rig.weight_walk import faded, frame_intervals, read_evidence, unseen_time, walk_information
 from torchface.errors import ShapeError, ValueRangeError
 from torchface.geometry.cameras.pnp import solve_pnp
 from torchface.optim.data_dependent import data_dependent
@@ -225,6 +225,10 @@ class VideoSolver(FrameSolver):
             rotation, translation = self._pose_of(state, pixels, confidence, enough, measured.views)
         interval = self.settings.interval if interval is None else interval
         evidence = self.shape_confidence(trust * enough)
+        read = measured.weights.energy() if enough and measured.weights is not None else None
+        if read is not None:
+            before = torch.zeros_like(evidence) if state.head is None else state.head.weights.detach()
+            evidence = evidence.maximum(read_evidence(read, before))
         hidden = unseen_time(state.hidden, evidence, interval)
         expected = self._expected(state, rotation, translation, evidence, hidden, interval)
         tracked = HeadState(expected.mean.weights, rotation, translation)
@@ -233,7 +237,6 @@ class VideoSolver(FrameSolver):
         if measured.deviation is not None:
             noise = (noise.square() + measured.deviation.double().square()).sqrt()
         precision = self.precision(torch.isfinite(pixels).all(-1) & enough, confidence, noise)
-        read = measured.weights.energy() if enough and measured.weights is not None else None
         views = tuple(self._whitened(view, last) for view in measured.views) if enough else ()
         terms = FrameTerms(pixels.nan_to_num(0.0), precision, rotation, translation, expected, read, views)
         if enough:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from torchface.capture.energy import Quadratic
 from torchface.errors import ShapeError, ValueRangeError
 
 HOLD, RELAXATION = 0.3, 0.3
@@ -14,12 +15,25 @@ HIDDEN = 0.25
 # Of the random walk's variance: a shape without evidence is not led off by what others do.
 _LEAST_SHARE = 0.02
 _LEAST_TRUST = 0.05
+_SURE = 0.15  # standard deviation of a reading of a weight that counts as half of the evidence
+_JUMP = 0.15  # of a weight, from which a reading that differs says that it moved
 
 
 def relative_trust(trust: Tensor) -> Tensor:
     """How much landmarks count, (B,68) in [0,1], beside their frame's surest: a blurred face hides nothing."""
     trust = trust.clamp(0, 1)
     return trust / trust.amax(1, keepdim=True).clamp(min=_LEAST_TRUST)
+
+
+def read_evidence(read: Quadratic, weights: Tensor) -> Tensor:
+    """The share of evidence, (B,N) in [0,1], that readings of weights are beside those of the frame before (B,N).
+
+    Of an eye whose lids' landmarks are doubted, as behind glasses, networks still say that it blinks. Small differences
+    are their noise.
+    """
+    information = read.H.diagonal(dim1=1, dim2=2)
+    jump = ((read.H @ weights[..., None])[..., 0] + read.f).abs() / information.clamp(min=1e-9)
+    return information / (information + 1 / _SURE**2) * ((jump - _JUMP) / _JUMP).clamp(0, 1)
 
 
 def unseen_time(before: Tensor | None, evidence: Tensor, interval: float | Tensor) -> Tensor:

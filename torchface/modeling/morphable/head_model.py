@@ -251,10 +251,7 @@ class HeadModel(nn.Module):
         if "faces" not in tensors:
             raise FileFormatError("head model: found no size of the faces in the config, expected one")
         count = values["shape"]["vertices"].whole(1)
-        masks = torch.zeros(count, dtype=torch.bool)
-        annotations = Annotations(
-            tensors.get("landmarks"), dict.fromkeys(names, masks), tensors.get("mirror"), tensors.get("contacts")
-        )
+        annotations = Annotations(tensors.get("landmarks"), {}, tensors.get("mirror"), tensors.get("contacts"))
         model = cls(
             MorphableModel.from_config(shape),
             None if color is None else MorphableModel.from_config(color),
@@ -264,6 +261,9 @@ class HeadModel(nn.Module):
             uv_faces=tensors.get("uv_faces"),
             annotations=annotations,
         )
+        if names:
+            model.region_names = sorted(names)
+            model.regions = torch.zeros(len(names), count, dtype=torch.bool)
         if "rig" in config:
             shapes, colored = _rig_of(values["rig"], count)
             rest = torch.zeros(count, 3)

@@ -96,6 +96,7 @@ class LandmarkPull:
             return []
         let_go = "; those along the jaw were let go" if (self.contour & (off > _DISAGREES)).any() else ""
         return [
-            f"landmarks disagree with the surface: {' and '.join(remarks)}{let_go}. Look at them in the report's "
-            "pictures, correct them in their file or leave those out"
+            f"landmarks disagree with the surface, on which the registered mesh lies beside them: "
+            f"{' and '.join(remarks)}{let_go}. They are likely picked or found at wrong places: look at them in the "
+            "report's pictures, correct them in their file or leave those out"
         ]

@@ -11,13 +11,17 @@ import numpy as np
 import torch
 
 from torchface.capture.anybody import WebcamControls
+from torchface.capture.anybody.eye_signals import EyeSignals, EyesRead, eye_signals
 from torchface.capture.own_rig import VideoState
+from torchface.capture.own_rig.eye_geometry import Eyeballs, seen_gaze
 from torchface.capture.own_rig.landmark_offsets import LandmarkOffsets
 from torchface.capture.own_rig.outlier_landmarks import landmark_reach, outlier_landmarks
+from torchface.capture.own_rig.take_eyes import TakeEyes
 from torchface.errors import FileFormatError, ValueRangeError
 from torchface.files.whole_files import all_or_none, make_folder
 from torchface.geometry.cameras.distortion import undistort
 from torchface.io.protocols.weight_sender import find_receiver
+from torchface.landmarks.images.face_reading import FaceReading
 from torchface.landmarks.images.tracking.landmark_tracker import LandmarkTracker
 from torchface.number_checks import checked_number
 from torchface.progress import Progress, silent
@@ -27,11 +31,13 @@ from torchface.workflows.live.live_frames import LiveFrame, open_source, planes,
 from torchface.workflows.live.recordings import FrameLog
 from torchface.workflows.live.weight_streams import WeightStreams
 from torchface.workflows.named_finders import graph_detector
-from torchface.workflows.track.take_solution import OFFSETS, offsets_of
+from torchface.workflows.track.take_measurements import measured_trust, measuring_solver, take_measurements
+from torchface.workflows.track.take_solution import OFFSETS, eye_depth, eye_rays, lid_looks, offsets_of, with_eyes
 from torchface.workflows.track.track_files import save_curves
 from torchface.workflows.track.track_inputs import TrackInputs, TrackSettings, inputs_of, load_actor
 
 _MIN_LANDMARKS = 6
+_OPENNESS_NOISE = 0.1  # beside the open eye's
 
 
 class ActorSolver:
@@ -47,9 +53,13 @@ class ActorSolver:
             raise ValueRangeError("--landmarks: found a table, expected what finds landmarks as the face moves")
         self._tracker = LandmarkTracker(models.finder, models.appearance, graph_detector(), inputs.settings.face)
         self._calibration, self._filter = inputs.calibration, AdaptiveFilter(68, 2, LANDMARK_SETTINGS)
+        self._inputs, self._eyeballs = inputs, Eyeballs.of(inputs.actor)
         solver = inputs.solver()
-        self._solver = solver if offsets is None else solver.shifted(offsets)
+        solver = solver if offsets is None else solver.shifted(offsets)
+        self._solver, self._measuring = solver, measuring_solver(solver)
+        self._looking, self._usual = lid_looks(solver)
         self._state: VideoState | None = None
+        self._eyes = EyeSignals.start()
         self._reach = landmark_reach(inputs.actor)
 
     def step(self, picture: np.ndarray, interval: float | None, controls: WebcamControls) -> LiveFrame:
@@ -62,10 +72,35 @@ class ActorSolver:
         enough = int((torch.isfinite(landmarks).all(1) & (trust > 0)).sum()) >= _MIN_LANDMARKS
         if self._state is None and not enough:
             return LiveFrame(torch.zeros(len(self.names)), torch.full((3, 3), torch.nan), reading.landmarks)
-        before = self._state or self._solver.start()
-        self._state = self._solver.step(before, landmarks, confidence=trust, interval=interval)
+        before, solver = self._state or self._solver.start(), self._solver
+        take = FaceReading.stacked([reading])
+        measured = take_measurements(self._inputs, solver, take)
+        if measured is not None:
+            solver, trust = self._measuring, measured_trust(landmarks[None], take)[0]
+        if enough and bool(torch.isfinite(take.openness).any()):
+            # Where the head was a frame ago; of a face that has just come, where its landmarks alone put it.
+            head = before if before.solved else solver.step(before, landmarks, None, None, trust, interval, measured)
+            seen = self._seen_eyes(take, head, interval or 1 / self._inputs.clip.fps)
+            measured = with_eyes(self._inputs, solver, measured, seen)
+        self._state = solver.step(before, landmarks, None, None, trust, interval, measured)
         weights, rotation = self._state.weights.detach().float(), self._state.rotation.detach().float()
         return LiveFrame(weights, rotation, reading.landmarks)
+
+    def _seen_eyes(self, take: FaceReading, head: VideoState, interval: float) -> TakeEyes:
+        """The eyes of a take of one frame, (1,...), beside what was learned of them until then, as ``live`` does."""
+        rotation, translation = head.rotation[None].double(), head.translation[None].double()
+        depth = eye_depth(self._solver, rotation, translation)
+        rays, iris = eye_rays(take, self._calibration)
+        gaze = seen_gaze(rays, iris, rotation, depth, self._eyeballs)[0]
+        read = EyesRead(*(one[0].double() for one in (take.openness, take.closed, take.eye_visibility)))
+        asked, learns = torch.zeros(()).double(), torch.ones(()).double()
+        since = torch.tensor(interval).double()
+        eyes = eye_signals(read, gaze, self._usual, self._looking, self._eyes, since, asked, learns)
+        self._eyes = eyes
+        off = _OPENNESS_NOISE / eyes.open_trust.sqrt()
+        return TakeEyes(
+            eyes.open[None], off[None], take.closed, eyes.gaze[None], eyes.gaze_trust[None], torch.ones(1, 2)
+        )
 
 
 _DEFAULT = TrackSettings()

@@ -28,6 +28,7 @@ from torchface.errors import AlignmentError, FileFormatError, ValueRangeError
 from torchface.files.checkpoints import read_checkpoint, write_checkpoint
 from torchface.files.content_keys import content_key
 from torchface.files.whole_files import make_folder
+from torchface.geometry.cameras.calibration import CameraCalibration
 from torchface.geometry.cameras.distortion import undistort
 from torchface.landmarks.images.face_reading import FaceReading
 from torchface.progress import Progress
@@ -153,18 +154,36 @@ def seen_eyes(inputs: TrackInputs, solver: VideoSolver, landmarks: Tensor, readi
         poses = measure_poses(rest, landmarks, K, reading.trust)
     except AlignmentError:
         return None
+    depth = eye_depth(solver, poses.rotation, poses.translation)
+    seen, iris = eye_rays(reading, inputs.calibration)
+    resting, (looking, _) = known_rest(reading), lid_looks(solver)
+    even = torch.ones(len(landmarks)) if resting is None else resting
+    return take_eyes(reading, seen, iris, poses.rotation, depth, even, Eyeballs.of(inputs.actor), looking)
+
+
+def eye_depth(solver: VideoSolver, rotation: Tensor, translation: Tensor) -> Tensor:
+    """How far the middles of both eyes' corners lie from the camera, (T,2) millimetres, of poses (T,3,3) and (T,3)."""
+    rest = solver.rest[:LANDMARKS].double()
     middles = torch.stack([0.5 * (rest[a] + rest[b]) for a, b in CORNERS])
-    depth = torch.einsum("ti,ei->te", poses.rotation[:, 2], middles) + poses.translation[:, 2:]
+    return torch.einsum("ti,ei->te", rotation[:, 2], middles) + translation[:, 2:]
+
+
+def eye_rays(reading: FaceReading, calibration: CameraCalibration) -> tuple[Tensor, Tensor]:
+    """Trusted landmarks (T,68,2) and irises (T,2,2) at depth 1, as a camera without distortion has them."""
+    K = calibration.intrinsics.double()
     seen, iris = (
-        (undistort(one.double(), inputs.calibration) - K[:2, 2]) / K.diagonal()[:2]
+        (undistort(one.double(), calibration) - K[:2, 2]) / K.diagonal()[:2]
         for one in (reading.trusted_landmarks, reading.iris)
     )
-    resting = known_rest(reading)
+    return seen, iris
+
+
+def lid_looks(solver: VideoSolver) -> tuple[Tensor, Tensor]:
+    """What looking about adds to openness at weights of ``LOOKS``, (2,8), and the rig's openness at rest, (2,)."""
     called = arkit_names(solver.names)
     onto = torch.tensor([[float(name == look) for look in LOOKS] for name in called]).double()
-    rows, _ = openness_rows(rest, solver.basis[:LANDMARKS].double(), called)
-    even = torch.ones(len(landmarks)) if resting is None else resting
-    return take_eyes(reading, seen, iris, poses.rotation, depth, even, Eyeballs.of(inputs.actor), rows @ onto)
+    rows, usual = openness_rows(solver.rest[:LANDMARKS].double(), solver.basis[:LANDMARKS].double(), called)
+    return rows @ onto, usual
 
 
 def with_eyes(

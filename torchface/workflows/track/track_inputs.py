@@ -31,7 +31,7 @@ from torchface.workflows.track.track_models import (
     load_track_models,
 )
 
-METHOD = "track/8"
+METHOD = "track/9"
 """Of the keys; another number where the same inputs, or pieces of another length, come to give other results."""
 
 Overlay = Literal["side", "over", "none"]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import torch
@@ -28,6 +28,10 @@ def write_track_page(tracked: Tracked, out: Path) -> Path:
     """Writes the report's page and figures into a folder, and returns the page's path."""
     fps, solution, texture = tracked.video.fps, tracked.solution, tracked.inputs.settings.texture
     files = ", ".join(f"{name}: {path.name}" for name, path in tracked.products.items())
+    drawers = [(side_by_side_drawer(tracked), False), (mesh_drawer(tracked), True)]
+    if texture is not None:
+        drawers.append((paint_drawer(tracked, texture), True))
+    beside, over, *painted = frames_sheets(tracked, drawers)
     sections = [
         Section("What was done", "\n".join([*tracked.lines(), f"files: {files}"])),
         Section("Figures", tables=[Table(("figure", "value"), figures(tracked))]),
@@ -36,13 +40,13 @@ def write_track_page(tracked: Tracked, out: Path) -> Path:
             "The picture and, beside it, the solved rig in the same pose; landmarks are green, those of low confidence "
             "and what of the rig lies there orange.",
             [_suspect(tracked)],
-            [("frames.png", frames_sheet(tracked, side_by_side_drawer(tracked), cut=False))],
+            [("frames.png", beside)],
             _player(tracked),
         ),
         Section(
             "Landmarks over the picture",
             "The solved face half through over the video; found landmarks are green, those of the solved rig red.",
-            figures=[("landmarks.png", frames_sheet(tracked, mesh_drawer(tracked)))],
+            figures=[("landmarks.png", over)],
         ),
         Section(
             "Reprojection error",
@@ -52,9 +56,8 @@ def write_track_page(tracked: Tracked, out: Path) -> Path:
         ),
     ]
     if texture is not None:
-        painted = ("painted.png", frames_sheet(tracked, paint_drawer(tracked, texture)))
         text = f"{texture.name} on the face, in the light of the video."
-        sections.insert(4, Section("Texture", text, figures=[painted]))
+        sections.insert(4, Section("Texture", text, figures=[("painted.png", painted[0])]))
     angles = torch.rad2deg(head_angles(solution.rotation.detach().double()))
     moved = solution.translation.detach().double()
     still = moved - moved.mean(0)
@@ -97,21 +100,23 @@ def figures(tracked: Tracked) -> list[tuple[str, str]]:
         ("focal length", f"{float(camera.intrinsics[0, 0]):.0f} px"),
         ("faces in the first frame", str(tracked.faces)),
     ]
-    rows += [(f"{name}, frames a second", f"{count / took:.0f}") for name, took in tracked.seconds.items() if took > 0]
+    rows += [(f"{name}, time with its start", f"{took:.1f} s") for name, took in tracked.seconds.items()]
     return rows
 
 
-def frames_sheet(tracked: Tracked, draw: Callable[[int, Tensor], Tensor], cut: bool = True) -> Tensor:
-    """Frames spread over the video as ``draw`` makes frame number t, (3,H,W), cut to the face unless they are."""
+def frames_sheets(tracked: Tracked, drawers: Sequence[tuple[Callable[[int, Tensor], Tensor], bool]]) -> list[Tensor]:
+    """Sheets of frames spread over the video, read once, as each of ``drawers`` makes frame number t, (3,H,W); cut to
+    the face where it says so."""
     count = len(tracked)
     wanted = torch.linspace(0, count - 1, min(SHOWN, count)).round().long().unique().tolist()
-    cells, at = [], 0
-    box = _face_box(tracked, wanted) if cut else None
-    for chunk in tracked.video.color_chunks():
-        for t in [t for t in wanted if at <= t < at + len(chunk)]:
-            cells.append(caption(_cut(draw(t, chunk[t - at]).float() / 255, box), f"frame {t}", 12))
-        at += len(chunk)
-    return sheet(cells, min(_COLUMNS, len(cells)))
+    cells: list[list[Tensor]] = [[] for _ in drawers]
+    face = _face_box(tracked, wanted)
+    for t, frame in enumerate(tracked.video.color_frames()):
+        if t not in wanted:
+            continue
+        for made, (draw, cut) in zip(cells, drawers, strict=True):
+            made.append(caption(_cut(draw(t, frame), face if cut else None), f"frame {t}", 12))
+    return [sheet(made, min(_COLUMNS, len(made))) for made in cells]
 
 
 def _face_box(tracked: Tracked, frames: list[int]) -> tuple[int, int, int, int]:
@@ -129,8 +134,9 @@ def _face_box(tracked: Tracked, frames: list[int]) -> tuple[int, int, int, int]:
 
 
 def _cut(image: Tensor, box: tuple[int, int, int, int] | None) -> Tensor:
+    """A part of a picture, uint8 (3,H,W), as wide as a cell, in [0,1]."""
     x0, y0, x1, y1 = box or (0, 0, image.shape[2], image.shape[1])
-    part = image[:, y0:y1, x0:x1]
+    part = image[:, y0:y1, x0:x1].float() / 255
     scale = _WIDTH / part.shape[2]
     size = (max(1, round(part.shape[1] * scale)), _WIDTH)
     return torch.nn.functional.interpolate(part[None], size, mode="bilinear", antialias=True)[0].clamp(0, 1)

@@ -24,6 +24,7 @@ from torchface.landmarks.images.tracking.video_landmarks import landmark_jitter
 from torchface.rendering.point_light import PointLight
 from torchface.rig import BlendshapeRig
 from torchface.workflows.track.person_head import PersonHead
+from torchface.workflows.track.take_solution import OFFSETS
 from torchface.workflows.track.track_inputs import TrackInputs
 
 MIN_STABLE = 6
@@ -32,6 +33,7 @@ _POOR = 0.04  # of the distance of the eyes' outer corners; landmarks of a rig's
 _SURE = 0.5
 _AT_BOUND, _OFTEN, _MAX_NAMED = 1e-3, 0.2, 5
 _LEAST_MOTION = 1e-2  # mm²
+_OWN_EYES = 2.0  # degrees
 
 
 @dataclass(frozen=True, eq=False)
@@ -180,8 +182,9 @@ class Tracked:
         errors = torch.where(self.seen, self.solution.errors, torch.nan)
         lines = [
             f"{count} frames at {self.video.fps:g} a second, the face found in {seen} ({100 * seen / count:.1f} %)",
-            f"landmarks: jitter {self.jitter:.2f} px; to the solved rig's: median {float(errors.nanmedian()):.2f} px, "
-            f"95th percentile {float(errors.nanquantile(0.95)):.2f} px",
+            f"landmarks: they tremble by {self.jitter:.2f} px from frame to frame; the solved rig's lie "
+            f"{float(errors.nanmedian()):.2f} px from them in the middle frame (median), and less than "
+            f"{float(errors.nanquantile(0.95)):.2f} px in 95 % of the frames",
         ]
         if self.head is not None:
             lines += [line for line in (self.inputs.about, *self.head.lines()) if line]
@@ -230,15 +233,30 @@ class Tracked:
         if rarely:
             named = ", ".join(f"{self.rig.names[i]} {100 * float(dark[i]):.0f} %" for i in rarely[:_MAX_NAMED])
             lines.append(
-                f"often hidden, so kept and then brought to rest: {named} of the frames (confidence.csv says when)"
+                f"often hidden: {named} of the frames; there they keep their weight for a third of a second, and "
+                "then go to rest: do not take that for acting (confidence.csv says where)"
             )
         if self.offsets is not None:
             size = float(self.offsets.millimetres.norm(dim=1).mean())
-            lines.append(f"landmarks lie {size:.1f} mm off the rig's in the mean, which was taken out (--offsets)")
+            lines.append(
+                f"the person's landmarks lie {size:.1f} mm from the rig's in the mean while the face rests; that was "
+                f"taken for the shape of the face, not for acting (--offsets {OFFSETS} uses the same for other takes)"
+            )
+        if self.eyes is not None and self.eyes.straight is not None:
+            side, up = self.eyes.straight.mean(0).rad2deg().tolist()
+            if max(abs(side), abs(up)) >= _OWN_EYES:
+                lines.append(
+                    f"eyes: of a gaze that lasts, {abs(up):.0f} degrees {'up' if up > 0 else 'down'} and "
+                    f"{abs(side):.0f} to the {'left' if side > 0 else 'right'} were taken for how this person's eyes "
+                    "lie, not for acting"
+                )
         often = [i for i in bounds.argsort(descending=True).tolist() if bounds[i] > _OFTEN]
         if often:
             named = ", ".join(f"{self.rig.names[i]} {100 * float(bounds[i]):.0f} %" for i in often[:_MAX_NAMED])
-            lines.append(f"often at their bound of 1: {named}")
+            lines.append(
+                f"often at 1, their most: {named} of the frames; the face goes further than these shapes of the rig, "
+                "or the rig is not this person's"
+            )
         span = (self.landmarks[:, 36] - self.landmarks[:, 45]).norm(dim=1).nanmedian()
         if float(errors.nanmedian()) > _POOR * float(span):
             share = f"{100 * float(errors.nanmedian() / span):.0f} % of the distance of the eyes"
@@ -254,7 +272,7 @@ class Tracked:
             )
         if self.reused:
             lines.append(f"landmarks of {self.reused} frames were known from an earlier run")
-        lines.extend(
-            f"{name}: {took:.1f} s, {count / took:.0f} frames a second" for name, took in self.seconds.items() if took
-        )
+        if self.seconds:
+            took = ", ".join(f"{name} {seconds:.1f} s" for name, seconds in self.seconds.items())
+            lines.append(f"time, start included: {took}; the film lasts {count / self.video.fps:.1f} s")
         return lines

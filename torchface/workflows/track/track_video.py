@@ -25,7 +25,12 @@ from torchface.workflows.track.frame_readings import read_frames
 from torchface.workflows.track.head_skin import with_filmed_skin
 from torchface.workflows.track.overlay_video import write_overlay
 from torchface.workflows.track.person_head import person_head
-from torchface.workflows.track.take_measurements import measuring_solver, take_measurements
+from torchface.workflows.track.take_measurements import (
+    measured_trust,
+    measuring_solver,
+    take_measurements,
+    with_own_brows,
+)
 from torchface.workflows.track.take_solution import (
     MOTION,
     frame_times,
@@ -86,7 +91,7 @@ def _track(inputs: TrackInputs, others: list[OtherCamera], out: Path, filmed: bo
     times = frame_times(inputs, len(reading.landmarks))
     with _timed(seconds, "smoothing"):
         judged = judged_reading(inputs, reading, None if inputs.models.finder is None else state.looks())
-        reading = judged.reading
+        reading = with_own_brows(judged.reading)
         landmarks = smoothed_landmarks(inputs, reading, times)
     head = None
     if inputs.heads is not None:
@@ -112,7 +117,7 @@ def _track(inputs: TrackInputs, others: list[OtherCamera], out: Path, filmed: bo
         with _timed(seconds, "weights"):
             measured, sure = take_measurements(inputs, solver, reading), trust
             if measured is not None:
-                solver, sure = measuring_solver(solver, landmarks, reading)
+                solver, sure = measuring_solver(solver), measured_trust(landmarks, reading)
             if eyes is not None:
                 measured, sure = with_eyes(inputs, solver, measured, eyes), eyes.agreed(sure)
             if others:

@@ -63,15 +63,15 @@ class DenseHead(nn.Module):
     def __init__(self, points: int, hidden: int, channels: int, deep: int) -> None:
         super().__init__()
         self.register_buffer("places", torch.zeros(points, 3))
-        self.register_buffer("mirror", torch.arange(points))
+        self.register_buffer("mirror", torch.arange(points, device="cpu"))
         self.register_buffer("spread", torch.ones(WEIGHTS))  # errors of weights in stated deviations, of held-out faces
-        cells = _EXTENT * torch.linspace(-1, 1, _CELLS)
+        cells = _EXTENT * torch.linspace(-1, 1, _CELLS, device="cpu")
         self.register_buffer("cells", torch.cartesian_prod(cells, cells).flip(1))
         rank = min(_FORM, 2 * points)
         self.form = nn.Sequential(nn.Linear(2 * COUNT, rank, bias=False), nn.Linear(rank, 2 * points))
-        self.local = nn.Parameter(0.05 * torch.randn(points, channels, _OWN + _SHARED))
-        self.under = nn.Parameter(0.1 * torch.randn(COUNT, channels, _UNDER))
-        self.deep = nn.Parameter(0.1 * torch.randn(_CELLS**2, deep, _DEEP))
+        self.local = _normal(0.05, points, channels, _OWN + _SHARED)
+        self.under = _normal(0.1, COUNT, channels, _UNDER)
+        self.deep = _normal(0.1, _CELLS**2, deep, _DEEP)
         self.mix = nn.Linear(2 * COUNT + COUNT * _UNDER + points * _SHARED + deep + _CELLS**2 * _DEEP, hidden)
         self.again = nn.Linear(hidden, hidden)
         self.move = nn.Sequential(nn.Linear(hidden, _MOVE, bias=False), nn.Linear(_MOVE, 2 * points, bias=False))
@@ -151,6 +151,12 @@ def in_face_frame(points: Tensor, landmarks: Tensor) -> Tensor:
     """Points (B,L,2) of faces with landmarks (B,68,2), in the faces' own frames."""
     middle, axes = face_frame(landmarks)
     return (points - middle) @ axes.transpose(1, 2) / axes.square().sum(2)[:, None]
+
+
+def _normal(deviation: float, *shape: int) -> nn.Parameter:
+    """Normally distributed numbers; on "meta" none: what computes there loads torch's compiler, two seconds."""
+    empty = torch.empty(shape)
+    return nn.Parameter(empty if empty.is_meta else empty.normal_(std=deviation))
 
 
 def _sampled(features: Tensor, pixels: Tensor, size: int) -> Tensor:

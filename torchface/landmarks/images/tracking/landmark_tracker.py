@@ -154,8 +154,10 @@ class LandmarkTracker:
     def _same_person(self, frame: Tensor, face: FaceReading) -> FaceReading | None:
         """What was followed, if it still looks as it did or nobody else is about; else another face near that does;
         None where none does: it is hidden behind somebody."""
+        if not self._followed.crowded:
+            return face
         alike = self._likeness(frame, face)
-        if alike >= self.settings.least_likeness or not self._followed.crowded:
+        if alike >= self.settings.least_likeness:
             return face
         best = self._most_alike(frame, find_faces(frame, self.detector))
         return best if best is not None and self._likeness(frame, best) >= alike + self.settings.likeness_gain else None
