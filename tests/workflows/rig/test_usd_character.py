@@ -4,6 +4,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from reading_here import same_process  # noqa: F401
 
 from planted.characters import box_mesh
 from torchface.io.usd.usd_reading import read_usd_rig
@@ -11,8 +12,6 @@ from torchface.synthetic import performer
 from torchface.workflows.rig import usd_character
 from torchface.workflows.rig.character_rig import CharacterReport
 from torchface.workflows.rig.usd_character import rig_usd_character
-
-pytest.importorskip("pxr")
 
 
 def write_stage(path: Path) -> None:
@@ -46,6 +45,7 @@ def write_stage(path: Path) -> None:
     stage.GetRootLayer().Save()
 
 
+@pytest.mark.usefixtures("same_process")
 @pytest.mark.parametrize("ending", [".usda", ".usdc", ".usdz"])
 def test_shapes_are_added_in_the_files_axes_and_the_rest_stays(
     ending: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
