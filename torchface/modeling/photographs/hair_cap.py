@@ -8,6 +8,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from torchface.landmarks.images.face_crop import cut_crop
+from torchface.landmarks.images.networks.part_finder import FaceParts
 from torchface.modeling.photographs.skin_mask import FacePlaces
 from torchface.rendering.camera_visibility import Shown
 
@@ -20,6 +22,7 @@ _BEHIND, _NAPE = (0.52, 0.64), -0.75
 _EDGE, _FRINGE = 0.08, 0.07
 _ABOVE_BROWS, _SQUARE, _HAIR = 0.06, 0.3, 0.5
 _LEAST, _SHARE = 20, 0.3
+_BEYOND = 0.08  # share of hair in a picture above the brows
 _COLUMNS, _COLUMN, _FEW = 17, 0.05, 6  # across the forehead, half the width of each, vertices
 _STRANDS, _STRAND = 150.0, 0.10
 
@@ -83,8 +86,7 @@ def hair_cap(shown: Sequence[Shown], places: Sequence[FacePlaces], hair: Tensor)
     high = place[:, 1] > _HAIRLINE - _FALL
     if int((covered & high).sum()) < max(_LEAST, _SHARE * int(high.sum())):
         return None
-    across = torch.linspace(-1, 1, _COLUMNS, dtype=torch.float64) * _TEMPLE
-    usual = _HAIRLINE - _FALL * (across / _TEMPLE).square()
+    across, usual = _usual_line()
     line = torch.stack([
         _line(place[near, 1], covered[near], height)
         for height, near in zip(usual, (place[:, :1] - across).abs().T < _COLUMN, strict=True)
@@ -92,6 +94,36 @@ def hair_cap(shown: Sequence[Shown], places: Sequence[FacePlaces], hair: Tensor)
     around = lambda values: torch.cat([values[:1].expand(2), values, values[-1:].expand(2)]).unfold(0, 5, 1)  # noqa: E731
     smooth = around(around(line).median(1).values).mean(1)
     return HairCap(color[covered & high].median(0).values.float(), smooth, places[0])
+
+
+def hair_beyond(
+    images: Sequence[Tensor], parts: Sequence[FaceParts], marks: Sequence[Tensor], places: FacePlaces
+) -> HairCap | None:
+    """Hair that photographs show above the brows and off the head that was found, such as a shock of it; None without.
+
+    Args:
+        images: photographs, (3,H,W) each.
+        parts: what each shows.
+        marks: the landmarks in each, (68,2) pixels.
+        places: of the vertices.
+    """
+    colors = []
+    for image, shown, points in zip(images, parts, marks, strict=True):
+        size, transform = shown.shares.shape[-1], shown.transform
+        crop = cut_crop((255 * image[:3].clamp(0, 1)).byte(), transform, size).float() / 255
+        top = int((points[17:27].double() @ transform[:, :2].T + transform[:, 2])[:, 1].amin().clamp(0, size))
+        hair = shown.of("hair")[:top] > _HAIR
+        if hair.numel() and float(hair.double().mean()) > _BEYOND:
+            colors.append(crop[:, :top][:, hair])
+    if not colors:
+        return None
+    return HairCap(torch.cat(colors, 1).median(1).values, _usual_line()[1], places)
+
+
+def _usual_line() -> tuple[Tensor, Tensor]:
+    """Places across the forehead and how high hair usually begins there, (17,) each."""
+    across = torch.linspace(-1, 1, _COLUMNS, dtype=torch.float64) * _TEMPLE
+    return across, _HAIRLINE - _FALL * (across / _TEMPLE).square()
 
 
 def _line(heights: Tensor, hair: Tensor, usual: Tensor) -> Tensor:

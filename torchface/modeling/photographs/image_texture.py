@@ -17,7 +17,7 @@ from torchface.io.gltf.region_materials import EYEBALL, IRIS, part_material
 from torchface.landmarks.images.networks.part_finder import FaceParts
 from torchface.mesh import Mesh
 from torchface.modeling.morphable.morphable_model import MorphableModel
-from torchface.modeling.photographs.hair_cap import HairCap, hair_cap
+from torchface.modeling.photographs.hair_cap import HairCap, hair_beyond, hair_cap
 from torchface.modeling.photographs.landmark_view import LANDMARKS
 from torchface.modeling.photographs.skin_light import skin_light, unlit
 from torchface.modeling.photographs.skin_mask import FacePlaces, ShownParts
@@ -114,6 +114,12 @@ def photographed_skin(
         if parts is not None:
             confidence = torch.stack([one.own for one in known])
             cap = hair_cap(shown, places, torch.where(others, 0.0, torch.stack([one.hair for one in known])))
+            if cap is None:
+                marks = [
+                    camera.project(surface.vertices[mesh.landmarks.cpu()])
+                    for surface, camera in zip(surfaces, cameras, strict=True)
+                ]
+                cap = hair_beyond(images, parts, marks, places[0])
     own = base is None and bool(others.any()) and not bool(others.all())
     if own:
         confidence = torch.where(others, 0.0, torch.ones(count, len(others)) if confidence is None else confidence)

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
+from torch.nn.functional import max_pool2d
 
 from torchface.geometry.meshes.vertex_graph import VertexGraph
 from torchface.landmarks.images.networks.part_finder import FaceParts
@@ -19,6 +20,8 @@ _NECK, _BEHIND = (0.05, 0.35), (0.05, 0.30)
 _FOREHEAD = 0.15
 _BROW, _FRINGE = 0.11, (0.16, 0.30)
 """In distances between the eyes' outer corners, but for the second row: shares of the way to the face's outline."""
+
+_SHADOW = 5  # pixels of the network's crop across which hair darkens skin
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,7 +113,11 @@ class ShownParts:
         fringe = hair[(above > _FRINGE[0]) & (above < _FRINGE[1]) & (places.out < 1)].mean().nan_to_num(1.0)
         grown = hair * _ramp(_NOSE - places.place[:, 1], 0.0, 0.1) * (places.out < 1)
         grown = torch.maximum(grown, hair * places.brow * (1 - fringe))
-        own = graph.smoothed(((bare + features + grown) * falloff)[:, None], torch.ones_like(bare), 2)[:, 0]
+        # What lies beside hair is in its shadow, and between strands of a fringe is no skin to be painted.
+        wide = replace(parts, shares=max_pool2d(parts.shares[None], _SHADOW, 1, _SHADOW // 2)[0])
+        shaded = wide.at(pixels, "hair").double().nan_to_num(0.0) * (places.place[:, 1] > _NOSE) * ~places.brow
+        seen = (bare * (1 - shaded) + features + grown) * falloff
+        own = graph.smoothed(seen[:, None], torch.ones_like(bare), 2)[:, 0]
         return ShownParts(own, bare * falloff, hair - grown)
 
 
