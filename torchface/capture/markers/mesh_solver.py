@@ -89,8 +89,11 @@ class MeshSolver:
         self._at_rest = self._share @ self.rest
         self._arms = (self.rest - self._at_rest) * self._share[:, None]
         # One product for all that a frame is asked: the slopes, its part along the rigid motions, and along the rest.
-        self._around = (self.rest - self.rest.mean(0)).flatten()[:, None]
-        self._columns = torch.cat([self._rows, self._rigid, self._around], 1)
+        # In the order of coordinates, then vertices: so a frame is turned in one product with a wide matrix.
+        around = (self.rest - self.rest.mean(0)).flatten()[:, None]
+        columns = torch.cat([self._rows, self._rigid, around], 1)
+        self._columns = columns.unflatten(0, (-1, 3)).transpose(0, 1).flatten(0, 1).contiguous()
+        self._at_zero = self._columns[:, -1] @ self._columns
 
     def aligned(self, meshes: Tensor) -> Tensor:
         """Meshes (t,V,3) aligned with the rig at rest by their steady vertices, (t,V,3) float64.
@@ -103,18 +106,21 @@ class MeshSolver:
         meshes = meshes.double()
         if not bool(torch.isfinite(meshes).all()):
             raise ValueRangeError(_NUMBERS)
-        rotation, middle = self._poses(meshes)
+        rotation, middle = self._poses(meshes.transpose(1, 2))
         return (meshes - middle[:, None]) @ rotation.transpose(1, 2) + self._at_rest
 
-    def _poses(self, meshes: Tensor) -> tuple[Tensor, Tensor]:
-        """Rotations (t,3,3) onto the rig at rest, and the middles (t,3) of the steady vertices, that go to its own."""
-        share = self._share
-        middle = share @ meshes
-        covariance = (meshes.transpose(1, 2) @ self._arms).transpose(1, 2)
+    def _poses(self, coordinates: Tensor) -> tuple[Tensor, Tensor]:
+        """Rotations (t,3,3) onto the rig at rest, and the middles (t,3) of the steady vertices, that go to its own.
+
+        Args:
+            coordinates: of the meshes, (t,3,V).
+        """
+        middle = coordinates @ self._share
+        covariance = (coordinates @ self._arms).transpose(1, 2)
         if not bool(torch.isfinite(covariance).all()):
             raise ValueRangeError(_NUMBERS)
         u, _, vh = torch.linalg.svd(covariance)
-        sign = torch.ones(len(meshes), 3, dtype=torch.float64)
+        sign = torch.ones(len(coordinates), 3, dtype=torch.float64)
         sign[:, 2] = torch.det(u @ vh)
         return (u * sign[:, None]) @ vh, middle
 
@@ -176,16 +182,15 @@ class MeshSolver:
     def equations(self, meshes: Tensor) -> tuple[Tensor, Tensor]:
         """The energy's slope at rest (t,N), and its value there (t,), mm² a vertex, of meshes (t,V,3)."""
         self._check(meshes)
-        meshes = meshes.double()
-        rotation, _ = self._poses(meshes)
-        middle = meshes.mean(1)
-        turned = (meshes - middle[:, None]) @ rotation.transpose(1, 2)
-        flat = turned.flatten(1)
+        places = torch.empty(len(meshes), 3, len(self.rest), dtype=torch.float64).copy_(meshes.transpose(1, 2))
+        rotation, _ = self._poses(places)
+        places -= places.mean(2, keepdim=True)
+        flat = (rotation @ places).flatten(1)
         shapes, count = len(self.names), len(self.rest)
-        products = flat @ self._columns - self._around[:, 0] @ self._columns
+        products = flat @ self._columns - self._at_zero
         along, beside = products[:, shapes:-1], products[:, -1]
         # |y - b|² = |y|² - |b|² - 2 b (y - b); what lies along the rigid motions does not count.
-        size = flat.square().sum(1) - self._around.square().sum() - 2 * beside
+        size = torch.linalg.vecdot(flat, flat) - self._at_zero[-1] - 2 * beside
         return (-2.0 / count) * products[:, :shapes], (size - along.square().sum(1)) / count
 
     def error(self, slopes: Tensor, constant: Tensor, weights: Tensor) -> Tensor:
