@@ -8,8 +8,14 @@ from torch import Tensor
 
 from planted.characters import box_mesh
 from torchface.geometry.rotations import rotation_matrix
+from torchface.geometry.similarity import Similarity
 from torchface.landmarks.images.checked_detector import shipped_detector
-from torchface.landmarks.surfaces.face_on_surface import FaceSearch, NoFaceOnSurfaceError, ReferencePoints
+from torchface.landmarks.surfaces.face_on_surface import (
+    FaceOnSurface,
+    FaceSearch,
+    NoFaceOnSurfaceError,
+    ReferencePoints,
+)
 from torchface.rendering.textured_surface import Material, TexturedSurface
 from torchface.synthetic import draw_identities, neutral_head
 from torchface.workflows.named_finders import load_finder
@@ -56,3 +62,21 @@ def test_a_ball_a_box_and_the_back_of_a_head_are_no_faces(search: FaceSearch) ->
         with pytest.raises(NoFaceOnSurfaceError, match=r"found no face|not from near") as refused:
             replace(search, rings=((0.0, 3),)).find(surface(vertices, faces))
         assert len(refused.value.views) > 0
+
+
+@pytest.mark.parametrize(("clear", "chosen"), [(True, 2), (False, 1)])
+def test_a_doubtful_face_is_taken_only_where_all_directions_show_no_better_one(
+    clear: bool, chosen: int, search: FaceSearch, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """ICT-FaceKit's head with hair, z up: its crown was taken for a face, and its face was not looked at."""
+    one = torch.ones(1, dtype=torch.float64)
+    pose = Similarity(one, torch.eye(3, dtype=torch.float64)[None], torch.zeros(1, 3, dtype=torch.float64))
+    read = {0: (0.70, 0.27), 1: (0.72, 0.26), 2: (1.0, 0.07)}
+    found = {
+        key: FaceOnSurface(torch.zeros(68, 3), pose, *values, (), torch.zeros(0, 3)) for key, values in read.items()
+    }
+    rounds = iter([[(0, None), (1, None)], [(2, None), (0, None)] if clear else [(0, None)]])
+    monkeypatch.setattr(FaceSearch, "_candidates", lambda *_: next(rounds))
+    monkeypatch.setattr(FaceSearch, "_from_near", lambda self, surface, group, *_: found[group])
+    head = neutral_head(texture=False)
+    assert search.find(surface(head.vertices, head.faces)) is found[chosen]

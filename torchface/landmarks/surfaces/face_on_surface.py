@@ -31,6 +31,7 @@ _ASTRAY = 0.5  # of the eyes' distance: a view's hit that is further from the me
 _TRIED = 3  # places that are looked at from near
 _LOST = 0.07  # of the eyes' distance: what is off by more on the reference is no habit of the finder
 _PRESENCE, _MISFIT = 0.7, 0.35
+_DOUBT = 0.45  # above it other places are looked at too; faces, caricatures too, are below
 _FACE_OF_HEAD = 0.5  # side of the box round a face, in sides of a picture that frames the head
 
 
@@ -73,6 +74,11 @@ class FaceOnSurface:
     misfit: float
     views: tuple[Tensor, ...]
     others: Tensor
+
+    @property
+    def doubt(self) -> float:
+        """How far the face is from one beyond doubt, at 0."""
+        return 1 - self.presence + self.misfit
 
     @property
     def middle(self) -> Tensor:
@@ -120,16 +126,22 @@ class FaceSearch:
         """
         progress = progress or silent
         pictures: list[Tensor] = []
-        refused = None
-        # What is taken for a face for sure may be none from near; then all directions are looked at.
+        refused, doubtful = None, []
+        # What is taken for a face for sure may be none from near, or hardly one; then all directions are looked at.
         for sure in (_SURE, torch.inf):
             for group, others in self._candidates(surface, framed, sure, pictures, progress):
                 try:
-                    return self._from_near(surface, group, others, progress)
+                    found = self._from_near(surface, group, others, progress)
                 except NoFaceOnSurfaceError as error:
                     refused = refused or error
-            if refused is None:
+                else:
+                    if found.doubt < _DOUBT:
+                        return found
+                    doubtful.append(found)
+            if refused is None and not doubtful:
                 break
+        if doubtful:
+            return min(doubtful, key=lambda one: one.doubt)
         raise refused or NoFaceOnSurfaceError(
             f"found no face in {len(pictures)} pictures from around, expected a head", pictures
         )
