@@ -18,7 +18,7 @@ def samples(mask: Mesh) -> Samples:
     return Samples.of(mask.vertices, mask.faces, torch.arange(len(mask.vertices)))
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", range(2))
 def test_any_pose_is_found_by_shape_alone(mask, samples, moved, make_mask, seed: int) -> None:
     finer = make_mask(50, 70)
     found = find_pose(samples, ScanPoints(moved(finer.vertices, seed), finer.faces)).pose
