@@ -24,7 +24,7 @@ from torch import Tensor, nn
 from torchface.io.video import open_video
 from torchface.landmarks.images.face_landmarker.mediapipe_finder import MediaPipeTracker
 from torchface.onnx.network_graphs import network_model
-from torchface.onnx.webcam.webcam_model import WebcamAnswer, WebcamGraph, webcam_model
+from torchface.onnx.webcam.webcam_model import WebcamAnswer, reading_model, solving_model, webcam_model
 from torchface.onnx.webcam.webcam_session import WebcamSession
 from torchface.shape_names import ARKIT
 from torchface.workflows.webcam.webcam_graph import webcam_graph, webcam_module
@@ -89,7 +89,9 @@ def test_the_whole_way_is_quick_and_small(data: Path, tmp_path: Path) -> None:
     size, empty = (640, 480), [np.full((480, 640, 3), 90, np.uint8)] * 30
     network = module.reader.landmarks
     crops = {"image": np.random.default_rng(0).random((1, 3, network.size, network.size), np.float32)}
-    reading = webcam_model(WebcamGraph(module.reader, Reading())).SerializeToString()
+    solver = Reading()
+    parts = reading_model(module.reader, solver.state_size), solving_model(solver)
+    reading = webcam_model(*parts).SerializeToString()
 
     print("\nmilliseconds of processor time, one thread (quietest tenth of frames)")
     rows = {"landmark network": milliseconds(network_model(network).SerializeToString(), crops)}

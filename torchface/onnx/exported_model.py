@@ -97,9 +97,7 @@ def exported_model(
     for value in (*model.graph.input, *model.graph.output):
         del value.metadata_props[:]
     model.producer_name, model.producer_version, model.ir_version = "torchface", "", IR_VERSION
-    helper.set_model_props(
-        model, {key: value if isinstance(value, str) else json.dumps(value) for key, value in metadata.items()}
-    )
+    _set_metadata(model, metadata)
     _check(model)
     return model
 
@@ -132,6 +130,54 @@ def half_stored(model: onnx.ModelProto, names: Collection[str]) -> onnx.ModelPro
     model.graph.node.extend(nodes)
     _check(model)
     return model
+
+
+def chained_models(
+    first: onnx.ModelProto, second: onnx.ModelProto, outputs: Sequence[str], metadata: Mapping[str, object]
+) -> onnx.ModelProto:
+    """One model of two of ``exported_model``, of which the second takes outputs of the first by their names.
+
+    Args:
+        first: with the inputs of the whole.
+        second: without inputs that the first does not give.
+        outputs: names of those of the whole, of either.
+        metadata: as for :func:`exported_model`.
+    """
+    model, rest = onnx.ModelProto(), onnx.GraphProto()
+    model.CopyFrom(first)
+    rest.CopyFrom(second.graph)
+    _prefix_names(rest, {one.name for one in (*rest.input, *rest.output)})
+    given = {one.name: one for one in (*first.graph.output, *rest.output)}
+    del model.graph.output[:]
+    model.graph.output.extend(given[name] for name in outputs)
+    model.graph.node.extend(rest.node)
+    model.graph.initializer.extend(rest.initializer)
+    _set_metadata(model, metadata)
+    _check(model)
+    return model
+
+
+def _prefix_names(graph: onnx.GraphProto, kept: Collection[str]) -> None:
+    """Gives values of a graph, and of those inside its nodes, names that no other graph has."""
+
+    def renamed(name: str) -> str:
+        return name if not name or name in kept else f"second.{name}"
+
+    for value in (*graph.initializer, *graph.input, *graph.output):
+        value.name = renamed(value.name)
+    for node in graph.node:
+        for names in (node.input, node.output):
+            names[:] = [renamed(name) for name in names]
+        for attribute in node.attribute:
+            if attribute.HasField("g"):
+                _prefix_names(attribute.g, kept)
+
+
+def _set_metadata(model: onnx.ModelProto, metadata: Mapping[str, object]) -> None:
+    """Gives a model its metadata; values that are not text become JSON."""
+    helper.set_model_props(
+        model, {key: value if isinstance(value, str) else json.dumps(value) for key, value in metadata.items()}
+    )
 
 
 def _check(model: onnx.ModelProto) -> None:

@@ -9,7 +9,7 @@ from torch import Tensor, nn
 from torchface.landmarks import FaceReading
 from torchface.landmarks.images.frame_reader.face_reader import STATE
 from torchface.landmarks.images.frame_reader.picture_pieces import picture_size
-from torchface.onnx.webcam.webcam_model import WebcamAnswer, WebcamGraph, webcam_model
+from torchface.onnx.webcam.webcam_model import WebcamAnswer, reading_model, solving_model, webcam_model
 from torchface.shape_names import ARKIT
 
 
@@ -44,4 +44,5 @@ def solver() -> PlantedSolver:
 @pytest.fixture(scope="session")
 def webcam_file(solver: PlantedSolver) -> bytes:
     """The graph."""
-    return webcam_model(WebcamGraph(PlantedReader(), solver), {"licence": "MIT"}).SerializeToString()
+    reading = reading_model(PlantedReader(), solver.state_size)  # type: ignore[arg-type]
+    return webcam_model(reading, solving_model(solver), {"licence": "MIT"}).SerializeToString()

@@ -21,7 +21,14 @@ from torchface.landmarks.images.frame_reader.face_reader import (
 from torchface.landmarks.images.frame_reader.picture_pieces import cut_square, whole_picture
 from torchface.landmarks.images.networks.eye_network import EyeNetwork
 from torchface.onnx.exported_model import exported_model
-from torchface.onnx.webcam.webcam_model import OUTPUTS, AnswerSolver, WebcamGraph, webcam_model
+from torchface.onnx.webcam.webcam_model import (
+    OUTPUTS,
+    AnswerSolver,
+    WebcamGraph,
+    reading_model,
+    solving_model,
+    webcam_model,
+)
 
 USUAL = (0.0, 1.0, 0.5, 0.0, 0.0)
 FRAME = np.full((90, 120, 3), 200, np.uint8)
@@ -112,7 +119,7 @@ def reader() -> FaceReader:
 def test_the_graph_is_the_module(reader: FaceReader, solver: AnswerSolver) -> None:
     """Where a face is searched, followed, looked at once more and lost; networks that run twice are stored once."""
     graph = WebcamGraph(reader, solver)
-    model = webcam_model(graph)
+    model = webcam_model(reading_model(reader, solver.state_size), solving_model(solver))
     webcam, followed, generator = Webcam(model.SerializeToString()), 0, torch.Generator().manual_seed(3)
     for size in ((90, 120), (90, 120), (90, 120), (200, 150), (200, 150), (64, 64), (64, 64)):
         coarse = torch.rand(1, 4, 9, 12, generator=generator)

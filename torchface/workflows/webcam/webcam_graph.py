@@ -13,7 +13,13 @@ from torchface.landmarks import BoxNetwork, LandmarkNetwork
 from torchface.landmarks.images.frame_reader.face_reader import FaceReader, WebcamNetworks
 from torchface.landmarks.images.networks.eye_network import EyeNetwork
 from torchface.modeling import HeadModel
-from torchface.onnx.webcam.webcam_model import WebcamGraph, WebcamSolverGraph, webcam_model
+from torchface.onnx.webcam.webcam_model import (
+    WebcamGraph,
+    WebcamSolverGraph,
+    reading_model,
+    solving_model,
+    webcam_model,
+)
 from torchface.progress import Progress, silent
 from torchface.synthetic.head.performer import performer
 from torchface.workflows.cached_graph import cached_graph
@@ -28,6 +34,8 @@ NETWORKS = ("face_boxes", "landmark_network", "eye_network")
 MODELS = (*NETWORKS, HEADS, DEFAULT_PRIOR)
 """Of the zoo: what the graph is made of."""
 
+_STEP = "making the webcam's graph, once, a minute or two: parts"
+_READING = ("onnx", "landmarks/images")
 _CODE = ("onnx", "capture", "landmarks/images", "synthetic/head")  # whose code says what becomes of the models
 
 
@@ -45,19 +53,33 @@ def webcam_module() -> WebcamGraph:
 
 
 def webcam_graph(progress: Progress | None = None) -> bytes:
-    """The graph's file: from the cache where it is there and whole, else made, which takes a minute.
+    """The graph's file: from the cache where it is there and whole, else made, which takes a minute or two. Parts that
+    an interrupted start has made are taken.
 
     Raises:
         NameMismatchError: a model of the zoo is of another kind.
         FileFormatError: a model is damaged.
     """
 
-    def make() -> onnx.ModelProto:
-        (progress or silent)("making the webcam's graph, once: about a minute")
-        licences = {name: zoo.describe(name).licence for name in MODELS}
-        return webcam_model(webcam_module(), {"licence": "MIT", "licences": licences})
+    progress = progress or silent
+    models = {name: zoo.find(name) for name in MODELS}
 
-    return cached_graph("webcam", make, _CODE, models={name: zoo.find(name) for name in MODELS})
+    def make() -> onnx.ModelProto:
+        progress(_STEP, 0, 2)
+        solver = WebcamSolverGraph(default_webcam_solver())
+        solving = cached_graph("webcam_solving", lambda: solving_model(solver), _CODE, models=models)
+        progress(_STEP, 1, 2)  # the longer part follows
+        networks, size = {name: models[name] for name in NETWORKS}, solver.state_size
+
+        def read() -> onnx.ModelProto:
+            return reading_model(FaceReader(webcam_networks()), size)
+
+        reading = cached_graph("webcam_reading", read, _READING, models=networks, state=size)
+        licences = {name: zoo.describe(name).licence for name in MODELS}
+        parts = (onnx.ModelProto.FromString(part) for part in (reading, solving))
+        return webcam_model(*parts, {"licence": "MIT", "licences": licences})
+
+    return cached_graph("webcam", make, _CODE, models=models)
 
 
 def default_webcam_solver(settings: WebcamSettings | None = None) -> WebcamSolver:
