@@ -1,9 +1,9 @@
 """From a flash in the camera's picture to the packet and to the character's pixel: median and 95th percentile, printed.
 
-A film is the camera: a mark in its corner lights up and, in the same picture, the jaw of a rendered face opens. The end
+A film is the camera: marks in its corner light up and, in the same picture, the jaw of a rendered face opens. The end
 is the first packet, answer or drawn pixel in which the jaw is past half of its way. For ``live``, for the app, and for
-MediaPipe's Face Landmarker in the same browser, which draws nothing. Pages find the flash in the camera's element,
-``live`` in the pictures of its source.
+MediaPipe's Face Landmarker in the same browser, which draws nothing. The marks are the picture's number in bits: pages
+that see a later picture than the flash, as they were busy, know when it was.
 """
 
 from __future__ import annotations
@@ -42,21 +42,24 @@ from train.rendered_people.webcam_video import WebcamSettings, draw_subject, web
 
 pytestmark = [pytest.mark.bench, pytest.mark.browser]
 SIZE, FPS, SHUT, OPEN = (640, 480), 30.0, 40, 40
-MARK = 24  # pixels a side
+MARK, BITS = 16, 7  # pixels a side; of a picture's number
 FLASHES = 12
 PEER = "@mediapipe/tasks-vision@1.1.0"
 
 _WATCH = """
 const milliseconds = (time) => performance.timeOrigin + time;
 window.flashes = []; window.drawn = []; window.answered = [];
-{ const canvas = new OffscreenCanvas(1, 1), context = canvas.getContext("2d", { willReadFrequently: true });
-  let lit = true;
+{ const canvas = new OffscreenCanvas(BITS, 1), context = canvas.getContext("2d", { willReadFrequently: true });
+  let before = SHUT;
   const look = (video) => video.requestVideoFrameCallback((now, facts) => {
     look(video);
-    context.drawImage(video, 4, 4, 8, 8, 0, 0, 1, 1);
-    const before = lit;
-    lit = context.getImageData(0, 0, 1, 1).data[1] > 128;
-    if (lit && !before) flashes.push(milliseconds(facts.captureTime ?? now));
+    context.drawImage(video, 0, 0, BITS * MARK, MARK, 0, 0, BITS, 1);
+    const { data } = context.getImageData(0, 0, BITS, 1);
+    let number = 0;
+    for (let bit = 0; bit < BITS; bit++) number += (data[4 * bit + 1] > 128) << bit;
+    if (number >= SHUT && before < SHUT)
+      flashes.push(milliseconds((facts.captureTime ?? now) - (1000 * (number - SHUT)) / FPS));
+    before = number;
   });
   document.addEventListener("DOMContentLoaded", () => document.querySelectorAll("video").forEach(look));
   const P = WebGL2RenderingContext.prototype, { fenceSync } = P; // follows each drawing
@@ -78,7 +81,9 @@ window.flashes = []; window.drawn = []; window.answered = [];
     }
   };
 }
-""".replace("JAW", str(JAW))
+"""
+for name, value in {"BITS": BITS, "MARK": MARK, "SHUT": SHUT, "FPS": FPS, "JAW": JAW}.items():
+    _WATCH = _WATCH.replace(name, str(value))
 _PEER = """<!doctype html><video id="video" muted playsinline></video><script type="module">
 import { FaceLandmarker, FilesetResolver } from "./peer/vision_bundle.mjs";
 const files = await FilesetResolver.forVisionTasks("./peer/wasm");
@@ -103,7 +108,7 @@ video.requestVideoFrameCallback(look);
 
 @pytest.fixture(scope="module")
 def faces() -> np.ndarray:
-    """Pictures (T,480,640,3) of a face whose jaw opens at once, and a mark in the corner that lights up with it."""
+    """Pictures (T,480,640,3) of a face whose jaw opens at once, and their numbers as marks."""
     weights = torch.zeros(2, len(ARKIT))
     weights[1, JAW] = 0.7
     generator = torch.Generator().manual_seed(7)
@@ -113,9 +118,10 @@ def faces() -> np.ndarray:
     rest, opened = (
         cv2.resize(one.picture.permute(1, 2, 0).numpy(), SIZE, interpolation=cv2.INTER_CUBIC) for one in frames
     )
-    rest[:MARK, :MARK], opened[:MARK, :MARK] = 0, 255
     noise = np.random.default_rng(0)
     film = np.stack([rest] * SHUT + [opened] * OPEN).astype(np.int16)
+    for number, bit in np.ndindex(len(film), BITS):
+        film[number, :MARK, bit * MARK : (bit + 1) * MARK] = 255 * (number >> bit & 1)
     return np.clip(film + noise.integers(-3, 4, film.shape, np.int16), 0, 255).astype(np.uint8)
 
 
@@ -123,6 +129,13 @@ def told(what: str, milliseconds: Any) -> float:
     times = np.asarray(milliseconds, float)
     print(f"\n{what}: {np.median(times):.0f} ms, 95th percentile {np.quantile(times, 0.95):.0f} ({len(times)})")
     return float(np.median(times))
+
+
+def checked_pace(networks: float) -> float:
+    """The networks' time, if pictures come often enough to see each flash."""
+    if networks > 1000 * SHUT / FPS / 4:
+        pytest.skip(f"this machine is busy: the networks alone take {networks:.0f} ms")
+    return networks
 
 
 def after_flashes(flashes: Any, times: Any, values: Any) -> np.ndarray:
@@ -222,7 +235,7 @@ def test_live(faces: np.ndarray, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
             thread.start()
         try:
             until(lambda: len(film.flashes) > FLASHES)
-            networks = told("live, networks and solver alone", solver.took[len(solver.took) // 5 :])
+            networks = checked_pace(told("live, networks and solver alone", solver.took[len(solver.took) // 5 :]))
             count = len(jaws)
             packets = after_flashes(film.flashes, arrived[:count], jaws[:count])
             packet = told("live, flash to packet", 1000 * packets)
@@ -238,7 +251,24 @@ def test_live(faces: np.ndarray, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
             film.open = False
             for thread in threads:
                 thread.join(30)
-    assert packet < networks + 1000 / FPS
+    assert_soon(packet, networks)
+
+
+def assert_soon(flash: float, networks: float) -> None:
+    """At most a picture's time after the networks' own; pictures wait for networks that do not keep the camera's pace."""
+    assert flash < networks + max(networks, 1000 / FPS)
+
+
+def test_the_jaw_is_past_half_in_the_flashs_own_picture(faces: np.ndarray) -> None:
+    """So smoothing delays nothing: what is above the networks' time is waiting, for the picture and for the drawing."""
+    solver = person_solver(silent)
+    jaw = np.array(
+        [float(solver.step(one, 1 / FPS, WebcamControls()).weights[JAW]) for one in np.tile(faces, (2, 1, 1, 1))]
+    )
+    half = (jaw[len(faces) :].min() + jaw[len(faces) :].max()) / 2
+    for flash in (SHUT, len(faces) + SHUT):
+        assert jaw[flash - 1] < half < jaw[flash]
+    assert jaw[len(faces)] < half
 
 
 def test_the_app_and_its_peer(faces: np.ndarray, data: Path, tmp_path: Path) -> None:
@@ -263,8 +293,7 @@ def test_the_app_and_its_peer(faces: np.ndarray, data: Path, tmp_path: Path) -> 
         before = len(seen(driver, "flashes"))
         until(lambda: len(seen(driver, "flashes")) > before + FLASHES)
         told_answers(driver, "MediaPipe")
-    networks, flash = app
-    assert flash < networks + 1000 / FPS
+    assert_soon(app[1], app[0])
 
 
 @contextmanager
@@ -284,7 +313,7 @@ def told_answers(driver: Any, what: str) -> tuple[float, float]:
     """The networks' own time and that from flash to answer, medians."""
     flashes, answers = seen(driver, "flashes"), np.array(seen(driver, "answered"), float)
     steady = answers[len(answers) // 5 :]
-    networks = told(f"{what}, networks and solver alone", steady[:, 2])
+    networks = checked_pace(told(f"{what}, networks and solver alone", steady[:, 2]))
     flash = told(f"{what}, flash to weights", after_flashes(flashes, answers[:, 0], answers[:, 1]))
     print(f"{what}: {1 / steady[:, 3].mean():.0f} pictures a second")
     return networks, flash

@@ -1,12 +1,41 @@
-"""The webcam's graph as a file."""
+"""The webcam's graph as a file, and what of it an interrupted start keeps."""
 
 from __future__ import annotations
 
 from pathlib import Path
+from types import SimpleNamespace
 
+import onnx
 import pytest
+from onnx import helper
 
+from torchface.workflows.webcam import webcam_graph as module
 from torchface.workflows.webcam.webcam_export import export_webcam
+
+
+def test_a_start_that_is_interrupted_keeps_the_part_that_is_ready(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made, said, empty = list[str](), list[tuple[int, int]](), helper.make_model(helper.make_graph([], "g", [], []))
+
+    def part(name: str) -> onnx.ModelProto:
+        made.append(name)
+        if made.count("reading") == 1 and name == "reading":
+            raise KeyboardInterrupt
+        return empty
+
+    monkeypatch.setenv("TORCHFACE_CACHE", str(tmp_path))
+    monkeypatch.setattr(module, "default_webcam_solver", lambda: None)
+    monkeypatch.setattr(module, "WebcamSolverGraph", lambda solver: SimpleNamespace(state_size=2))
+    monkeypatch.setattr(module, "FaceReader", lambda networks: networks)
+    monkeypatch.setattr(module, "solving_model", lambda solver: part("solving"))
+    monkeypatch.setattr(module, "reading_model", lambda reader, size: part("reading"))
+    monkeypatch.setattr(module, "webcam_model", lambda reading, solving, facts: part("whole"))
+    with pytest.raises(KeyboardInterrupt):
+        module.webcam_graph(lambda step, done=0, total=0: said.append((done, total)))
+    assert module.webcam_graph() == module.webcam_graph() == empty.SerializeToString()
+    assert made == ["solving", "reading", "reading", "whole"]
+    assert said == [(0, 2), (1, 2)]
 
 
 @pytest.mark.bench

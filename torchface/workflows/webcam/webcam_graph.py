@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 
 import onnx
@@ -34,7 +37,8 @@ NETWORKS = ("face_boxes", "landmark_network", "eye_network")
 MODELS = (*NETWORKS, HEADS, DEFAULT_PRIOR)
 """Of the zoo: what the graph is made of."""
 
-_STEP = "making the webcam's graph, once, a minute or two: parts"
+_STEP = "making the webcam's graph in two parts, once; a minute or two on a quiet machine"
+_INTERVAL = 5.0  # seconds
 _READING = ("onnx", "landmarks/images")
 _CODE = ("onnx", "capture", "landmarks/images", "synthetic/head")  # whose code says what becomes of the models
 
@@ -65,21 +69,40 @@ def webcam_graph(progress: Progress | None = None) -> bytes:
     models = {name: zoo.find(name) for name in MODELS}
 
     def make() -> onnx.ModelProto:
-        progress(_STEP, 0, 2)
-        solver = WebcamSolverGraph(default_webcam_solver())
-        solving = cached_graph("webcam_solving", lambda: solving_model(solver), _CODE, models=models)
-        progress(_STEP, 1, 2)  # the longer part follows
+        with _told(progress, 0):
+            solver = WebcamSolverGraph(default_webcam_solver())
+            solving = cached_graph("webcam_solving", lambda: solving_model(solver), _CODE, models=models)
         networks, size = {name: models[name] for name in NETWORKS}, solver.state_size
 
-        def read() -> onnx.ModelProto:
+        def make_reading() -> onnx.ModelProto:
             return reading_model(FaceReader(webcam_networks()), size)
 
-        reading = cached_graph("webcam_reading", read, _READING, models=networks, state=size)
+        with _told(progress, 1):  # the longer part
+            reading = cached_graph("webcam_reading", make_reading, _READING, models=networks, state=size)
         licences = {name: zoo.describe(name).licence for name in MODELS}
-        parts = (onnx.ModelProto.FromString(part) for part in (reading, solving))
-        return webcam_model(*parts, {"licence": "MIT", "licences": licences})
+        read, solved = onnx.ModelProto.FromString(reading), onnx.ModelProto.FromString(solving)
+        return webcam_model(read, solved, {"licence": "MIT", "licences": licences})
 
     return cached_graph("webcam", make, _CODE, models=models)
+
+
+@contextmanager
+def _told(progress: Progress, done: int) -> Iterator[None]:
+    """Says again and again that a part is being made: nothing tells how far it is."""
+    ended = threading.Event()
+
+    def tell() -> None:
+        progress(_STEP, done, 2)
+        while not ended.wait(_INTERVAL):
+            progress(_STEP, done, 2)
+
+    thread = threading.Thread(target=tell, daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        ended.set()
+        thread.join()
 
 
 def default_webcam_solver(settings: WebcamSettings | None = None) -> WebcamSolver:
