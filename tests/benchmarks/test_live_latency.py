@@ -255,7 +255,7 @@ def test_live(faces: np.ndarray, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 
 
 def assert_soon(flash: float, networks: float) -> None:
-    """At most a picture's time after the networks' own; pictures wait for networks that do not keep the camera's pace."""
+    """At most a picture's time after the networks' own; networks slower than the camera are waited for."""
     assert flash < networks + max(networks, 1000 / FPS)
 
 
