@@ -21,7 +21,7 @@ import { hideProblem, showNotes, showProblem, showStatus, speak } from "./words.
 const NEUTRAL = { ...shapeSettings({}), centre: null, frozen: false };
 const element = (id) => document.getElementById(id);
 const server = document.documentElement.dataset.engine === "server", stream = isStream();
-const INVITATION = server ? "" : "Start the camera: your face moves the character.";
+const INVITATION = server ? "" : "Start the camera to begin.";
 const rate = new FrameRate(), words = new StateWords();
 let character = null, stage = null, calibration = null;
 let newest = null; // as it was solved, before what the user set
