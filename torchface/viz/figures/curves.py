@@ -75,12 +75,13 @@ def weight_curves(solved: Tensor, true: Tensor | None, names: Sequence[str], fps
     for row, (label, values, truth) in enumerate(curves):
         most = 1.0 if row else max(float(x.max()) for x in (values, truth) if x is not None) or 1.0
         base = -_APART * row
-        axes.axhline(base, color="grey", linewidth=0.5)
-        axes.axhline(base + 1, color="grey", linewidth=0.5, linestyle=":")
         if truth is not None:
             axes.plot(seconds, base + truth / most, color=TRUE, linewidth=1.6, alpha=0.8, label="" if row else "true")
         axes.plot(seconds, base + values / most, color=SOLVED, linewidth=0.8, label="" if row else "solved")
         labels.append(f"{label}\n0 to {most:.3g}")
+    bases = -_APART * torch.arange(len(curves))
+    axes.hlines(bases, 0, float(seconds[-1]), color="grey", linewidth=0.5)
+    axes.hlines(bases + 1, 0, float(seconds[-1]), color="grey", linewidth=0.5, linestyle=":")
     axes.set_yticks([0.5 - _APART * row for row in range(len(curves))], labels, fontsize=8)
     axes.tick_params(axis="y", length=0)
     axes.set(xlabel="seconds", xlim=(0, float(seconds[-1])), ylim=(0.95 - _APART * len(curves), 1.1))

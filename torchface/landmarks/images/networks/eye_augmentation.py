@@ -6,7 +6,6 @@ import math
 from dataclasses import dataclass
 
 import cv2
-import kornia
 import numpy as np
 import torch
 from torch import Tensor
@@ -100,6 +99,8 @@ def augmented_eyes(
         width, height: of crops, pixels.
         settings: how widely.
     """
+    from kornia.geometry.transform import warp_affine  # loaded here: it takes half a second
+
     settings = settings or EyeAugmentation()
     count, each = len(rgba), torch.arange(len(rgba))
 
@@ -114,7 +115,7 @@ def augmented_eyes(
     transforms = eye_transforms(labels.landmarks, width, height)[each, eyes]
     transforms = _jittered(transforms, present, width, height, generator, settings)
     points = moved(truth, transforms)
-    cut = kornia.geometry.transform.warp_affine(
+    cut = warp_affine(
         rgba.float(), transforms, (height, width), padding_mode="border", align_corners=True
     )
     images, alpha = cut[:, :3] / 255, cut[:, 3:] / 255

@@ -7,7 +7,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import cv2
-import kornia
 import numpy as np
 import torch
 from torch import Tensor
@@ -254,6 +253,9 @@ def with_light(images: Tensor, generator: torch.Generator, grey_share: float = 0
         images: in [0,1].
         grey_share: of images without colour.
     """
+    # Loaded here, as below: kornia takes half a second, and what finds faces never blurs.
+    from kornia.color import rgb_to_grayscale
+
     count = len(images)
 
     def rand(*shape: int) -> Tensor:
@@ -264,7 +266,7 @@ def with_light(images: Tensor, generator: torch.Generator, grey_share: float = 0
     images = (images * gain * dark).clamp(1e-4, 1) ** (0.45 * (2 * rand(count, 1, 1, 1) - 1)).exp()
     mean = images.mean((1, 2, 3), keepdim=True)
     images = mean + (images - mean) * (0.6 + 0.7 * rand(count, 1, 1, 1))
-    grey = kornia.color.rgb_to_grayscale(images.clamp(0, 1))
+    grey = rgb_to_grayscale(images.clamp(0, 1))
     saturation = torch.where(rand(count, 1, 1, 1) < grey_share, 0.0, 0.5 + 0.8 * rand(count, 1, 1, 1))
     return (grey + saturation * (images - grey)).clamp(0, 1)
 
@@ -276,15 +278,17 @@ def with_blur(images: Tensor, generator: torch.Generator, share: float, widest: 
         images: in [0,1]; changed in place.
         widest: standard deviation of their blur beyond 0.3, pixels, at most.
     """
+    from kornia.filters import gaussian_blur2d, motion_blur
+
     count = len(images)
     soft = (torch.rand(count, generator=generator) < share).nonzero()[:, 0]
     if len(soft):
         sigma = (0.3 + widest * torch.rand(len(soft), 1, generator=generator) ** 2).expand(-1, 2)
-        images[soft] = kornia.filters.gaussian_blur2d(images[soft], (9, 9), sigma)
+        images[soft] = gaussian_blur2d(images[soft], (9, 9), sigma)
     moving = (torch.rand(count, generator=generator) < 0.12).nonzero()[:, 0]
     if len(moving):
         angle = 360 * torch.rand(len(moving), generator=generator)
-        images[moving] = kornia.filters.motion_blur(images[moving], 7, angle, torch.zeros(len(moving)))
+        images[moving] = motion_blur(images[moving], 7, angle, torch.zeros(len(moving)))
     return images
 
 
