@@ -14,6 +14,7 @@ from torchface.capture.anybody import WebcamControls
 from torchface.capture.anybody.eye_signals import EyeSignals, EyesRead, eye_signals
 from torchface.capture.own_rig import VideoState
 from torchface.capture.own_rig.eye_geometry import Eyeballs, seen_gaze
+from torchface.capture.own_rig.face_points import LANDMARKS
 from torchface.capture.own_rig.landmark_offsets import LandmarkOffsets
 from torchface.capture.own_rig.outlier_landmarks import landmark_reach, outlier_landmarks
 from torchface.capture.own_rig.take_eyes import TakeEyes
@@ -60,6 +61,11 @@ class ActorSolver:
         self._looking, self._usual = lid_looks(solver)
         self._state: VideoState | None = None
         self._eyes = EyeSignals.start()
+        # What runs for the first time takes a quarter of a second, in which a camera's frames would be lost.
+        head = solver.rest[:LANDMARKS].double() * torch.tensor([1.0, -1.0, -1.0]) + torch.tensor([0.0, 0.0, 600.0])
+        pixels = head @ inputs.calibration.intrinsics.double().T
+        self._measuring.step(solver.start(), (pixels[:, :2] / pixels[:, 2:]).float())
+        self._tracker.detector(torch.zeros(3, 128, 128, dtype=torch.uint8))
         self._reach = landmark_reach(inputs.actor)
 
     def step(self, picture: np.ndarray, interval: float | None, controls: WebcamControls) -> LiveFrame:

@@ -115,9 +115,7 @@ def augmented_eyes(
     transforms = eye_transforms(labels.landmarks, width, height)[each, eyes]
     transforms = _jittered(transforms, present, width, height, generator, settings)
     points = moved(truth, transforms)
-    cut = warp_affine(
-        rgba.float(), transforms, (height, width), padding_mode="border", align_corners=True
-    )
+    cut = warp_affine(rgba.float(), transforms, (height, width), padding_mode="border", align_corners=True)
     images, alpha = cut[:, :3] / 255, cut[:, 3:] / 255
     images = images + _behind(count, height, width, generator) * (1 - alpha)
     images = with_light(images, generator)
