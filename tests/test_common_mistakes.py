@@ -10,18 +10,34 @@ import pytest
 import torch
 
 import torchface
-from torchface import Attachment, BlendshapeRig, Mesh, Take, Track
-from torchface.capture import MarkerSolver, align_take, fit_attachment
+from torchface import Annotations, Attachment, BlendshapeRig, Mesh, Take, Track
+from torchface.capture import (
+    DynamicsPrior,
+    ExampleSolver,
+    HybridSolver,
+    MarkerSolver,
+    ShapePrior,
+    WebcamSolver,
+    WholeTakeSolver,
+    align_take,
+    fit_attachment,
+)
 from torchface.capture.own_rig import VideoSolver
 from torchface.correctives import Corrective, Correctives
+from torchface.enhancement import CapturedPerformance, EnhancementModel
 from torchface.errors import ArgumentTypeError, TorchfaceError
+from torchface.landmarks import find_faces
 from torchface.modeling import (
     ExpressionRegression,
     HeadModel,
     MorphableModel,
+    align_scan,
+    bake_normal_map,
+    corrective_from_sculpt,
     rig_from_neutral,
     transfer_deformation,
 )
+from torchface.onnx import export_module
 from torchface.optim import BoxQP, ProjectedGradient, box_qp, simplex_qp
 from torchface.registration import register
 
@@ -115,6 +131,38 @@ MISTAKES: dict[str, tuple[Callable[[Given], Any], str]] = {
     "a path before the rig": (lambda g: torchface.save_rig("a.glb", g.rig), "rig: found the text 'a.glb', expected"),
     "vertices to save": (lambda g: torchface.save_mesh(g.v, "a.obj"), "mesh: found a tensor .* expected a Mesh"),
     "weights to save": (lambda g: torchface.save_animation(g.rig, g.q, "a.glb"), "take: found a tensor .* a Take"),
+    "a slope as a start": (lambda g: BoxQP(g.H)(g.q, "0"), r"start: found the text '0', expected a tensor \(B,N\)"),
+    "a bound as a text": (lambda g: box_qp(g.H, g.q, "0"), r"lower: found the text '0', expected a tensor \(N,\)"),
+    "a name for a program": (lambda g: MarkerSolver(g.rig, g.sites, program="gradient"), "program: .*a ProjectedGrad"),
+    "a class for a program": (
+        lambda g: MarkerSolver(g.rig, g.sites, program=ProjectedGradient),
+        "program: found the class ProjectedGradient, expected a ProjectedGradient",
+    ),
+    "a rig for a hybrid solver": (lambda g: HybridSolver(g.rig), "markers: found a BlendshapeRig, expected a MarkerS"),
+    "a mesh for a take's solver": (lambda g: WholeTakeSolver(g.mesh), "markers: found a Mesh, expected a MarkerSolv"),
+    "a path for a webcam": (lambda g: WebcamSolver("a.glb"), "rig: found the text 'a.glb', .*torchface.load_rig reads"),
+    "markers for examples": (lambda g: ExampleSolver(g.markers), "examples: found a tensor .* an ExampleShapes"),
+    "a focal length alone": (lambda g: VideoSolver(g.rig, g.f[:68, 0], 500.0), "intrinsics: found a float, expected"),
+    "weights as a tensor": (lambda g: g.rig.weights_from(g.q), r"track: found a tensor \(4, 3\), expected a Track"),
+    "a mesh for vertices": (lambda g: g.mesh.with_vertices(g.mesh), "vertices: found a Mesh, expected a tensor"),
+    "landmarks as a text": (lambda g: Annotations("ibug"), r"landmarks: found the text 'ibug', expected a tensor"),
+    "names before takes": (
+        lambda g: ShapePrior.fit(g.rig.names, torch.zeros(9, 4)),
+        "names: a name: found a tensor .* expected a str",
+    ),
+    "motion by names": (lambda g: DynamicsPrior.fit(g.rig.names, [g.q]), "names: a name: found a tensor"),
+    "frames for a performance": (lambda g: EnhancementModel.fit(g.heads), "performance: found a tensor .* a Captured"),
+    "meshes for frames": (lambda g: CapturedPerformance([g.mesh], g.f, [0], g.v), "frames: found a list of Mesh"),
+    "vertices for a scan": (lambda g: align_scan(g.mesh, g.v), "scan: found a tensor .* expected a Mesh"),
+    "vertices to bake": (lambda g: bake_normal_map(g.v, g.mesh), "mesh: found a tensor .* expected a Mesh"),
+    "a sculpt by name": (
+        lambda g: corrective_from_sculpt(g.rig, {"jawOpen": 1.0}, g.v),
+        r"weights: found a dict, expected a tensor \(N,\)",
+    ),
+    "a path for a picture": (lambda g: find_faces("a.png"), "image: found the text 'a.png', expected a tensor"),
+    "inputs without names": (lambda g: export_module(g.solver, [g.markers], "a.onnx"), "inputs: found a list of Tens"),
+    "a path for a module": (lambda g: export_module("a", {"x": g.q}, "a.onnx"), "module: found the text 'a', expected"),
+    "a class before its kind": (lambda g: torchface.zoo.register(MarkerSolver, "x"), "kind: found the class MarkerSo"),
     "a track to save": (lambda g: torchface.save_take(g.take.markers, "a.csv"), "take: found a Track, expected a Take"),
 }
 
@@ -144,10 +192,12 @@ def test_arrays_and_lists_give_what_tensors_give(given: Given) -> None:
     assert torch.equal(sites.on(g.f, g.v), g.sites.on(g.f, g.v))
     assert torch.equal(Track(("a",), np.ones((2, 1, 3))).values, torch.ones(2, 1, 3))  # type: ignore[arg-type]
     solved = g.solver(g.markers)
+    assert torch.equal(mesh.with_vertices(g.heads[0].numpy()).vertices, g.heads[0])  # type: ignore[arg-type]
     for other in (g.markers.numpy(), g.markers.tolist()):
         torch.testing.assert_close(g.solver(other), solved, rtol=0, atol=1e-6)
     expected = box_qp(g.H, g.q)
     H, q = g.H.numpy(), g.q.numpy()
+    assert torch.equal(box_qp(g.H, g.q, [0, 0, 0], np.ones(3), start=q), expected)  # type: ignore[arg-type]
     for found in (box_qp(H, q), BoxQP(H)(q), ProjectedGradient(H)(q)):  # type: ignore[arg-type]
         assert found.dtype == torch.float64
         torch.testing.assert_close(found, expected, rtol=0, atol=1e-6)

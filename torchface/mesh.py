@@ -44,6 +44,11 @@ class Annotations:
     mirror: Tensor | None = None
     contacts: Tensor | None = None
 
+    def __post_init__(self) -> None:
+        for name, expected in (("landmarks", "(68,)"), ("mirror", "(V,)"), ("contacts", "(K,2)")):
+            if getattr(self, name) is not None:
+                object.__setattr__(self, name, as_tensor(name, getattr(self, name), expected, torch.int64))
+
     def to(self, device: torch.device | str) -> Annotations:
         """The same annotations on another device."""
         return Annotations(
@@ -162,6 +167,7 @@ class Mesh:
 
     def with_vertices(self, vertices: Tensor) -> Mesh:
         """The same topology, texture, colours and annotations at other positions (V,3)."""
+        vertices = as_tensor("vertices", vertices, "(V,3)")
         if vertices.shape != self.vertices.shape:
             raise ShapeError(f"vertices: found {tuple(vertices.shape)}, expected {tuple(self.vertices.shape)}")
         return replace(self, vertices=vertices)

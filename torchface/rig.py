@@ -198,6 +198,7 @@ class BlendshapeRig(nn.Module):
         Raises:
             NameMismatchError: no name of the track means a shape of the rig.
         """
+        checked_type("track", track, Track)
         matrix = mapping(track.names, self.names).to(track.values)
         if not matrix.any():
             raise NameMismatchError(

@@ -173,13 +173,13 @@ def test_all_frames_at_once(
 ) -> None:
     H, f = frames.H, frames.f
     single, singles = H.float(), f.float()
-    ours = {"float32": BoxQP(single), "float64": BoxQP(H), "coarse": BoxQP(single, tolerance=6e-5)}
+    ours = {"float32": BoxQP(single), "float64": BoxQP(H), "coarse": BoxQP(single, tolerance=1.5e-4)}
     rows = []
     with torch.inference_mode():
         batched: dict[str, Callable[[], Tensor]] = {
             "torchface, float32": lambda: ours["float32"](singles),
             "torchface, float64": lambda: ours["float64"](f),
-            "torchface, float32, to 6e-5": lambda: ours["coarse"](singles),
+            "torchface, float32, to 1.5e-4": lambda: ours["coarse"](singles),
             "ADMM on torch, 50 iterations": lambda: batched_admm(single, singles, 50),
             "ADMM on torch, 100 iterations": lambda: batched_admm(single, singles, 100),
             "FISTA on torch, 400 iterations": lambda: fista(single, singles),
@@ -212,9 +212,9 @@ def test_all_frames_at_once(
         if f"{name}, one by one" in found:
             assert found[f"{name}, one by one"].milliseconds >= 5 * rows[0].milliseconds
     assert found["DAQP, one by one"].milliseconds >= 1.6 * rows[0].milliseconds
-    coarse = found["torchface, float32, to 6e-5"]
+    coarse = found["torchface, float32, to 1.5e-4"]
     assert coarse.gap <= 1e-5
-    assert found["DAQP, one by one"].milliseconds >= 2.5 * coarse.milliseconds
+    assert found["DAQP, one by one"].milliseconds >= 3 * coarse.milliseconds
 
 
 def session_of(capture: Capture, path: Path) -> onnxruntime.InferenceSession:

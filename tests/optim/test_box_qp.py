@@ -11,7 +11,7 @@ from scipy.optimize import lsq_linear
 from torch import Tensor
 
 from torchface.errors import ShapeError, ValueRangeError
-from torchface.optim import BoxQP, box_qp
+from torchface.optim import BoxQP, ProjectedGradient, box_qp
 from torchface.optim.prepared_program import PreparedProgram
 
 INF = math.inf
@@ -120,13 +120,16 @@ def test_a_singular_h_still_reaches_the_least_energy(rank: int) -> None:
     assert ((energy - least) / least.abs()).max() <= 1e-8
 
 
-def test_a_shape_that_nothing_sees_goes_where_its_price_sends_it() -> None:
+@pytest.mark.parametrize("problems", [1, 300])
+def test_a_shape_that_nothing_sees_goes_where_its_price_sends_it(problems: int) -> None:
     H = torch.zeros(3, 3, dtype=torch.float64)
     H[0, 0] = 2.0
-    f = torch.tensor([[-1.0, 0.3, -0.3]], dtype=torch.float64)
+    f = torch.tensor([[-1.0, 0.3, -0.3]], dtype=torch.float64).expand(problems, 3)
     x = box_qp(H, f)
-    assert x[0, 1:].tolist() == [0.0, 1.0]
-    assert abs(float(x[0, 0]) - 0.5) <= 1e-9
+    assert torch.equal(x[:, 1:], torch.tensor([0.0, 1.0]).double().expand(problems, 2))
+    assert (x[:, 0] - 0.5).abs().max() <= 1e-9
+    with pytest.raises(ValueRangeError, match=r"rows \[1, 2\] of H that are zero"):
+        ProjectedGradient(H)
 
 
 def test_a_start_does_not_change_the_answer() -> None:

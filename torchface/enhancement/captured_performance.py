@@ -10,6 +10,7 @@ from torch import Tensor
 
 from torchface.errors import ShapeError, TopologyError, ValueRangeError
 from torchface.io.meshes.mesh_sequence import MeshSequence
+from torchface.number_checks import as_tensor
 from torchface.take import Track
 
 
@@ -55,6 +56,10 @@ class CapturedPerformance:
     weights: Track | None = None
 
     def __post_init__(self) -> None:
+        for name, expected in (("faces", "(F,3)"), ("neutral", "(V,3)"), ("sequences", "(K,)")):
+            object.__setattr__(self, name, as_tensor(name, getattr(self, name), expected))
+        if not isinstance(self.frames, MeshSequence):
+            object.__setattr__(self, "frames", as_tensor("frames", self.frames, "(K,V,3)"))
         count = len(self.frames)
         _check_topology(self.frames, self.faces, self.neutral)
         if self.coarse is not None:

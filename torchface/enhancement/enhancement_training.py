@@ -24,7 +24,7 @@ from torchface.errors import ValueRangeError
 from torchface.files.checkpoints import read_checkpoint, write_checkpoint
 from torchface.files.content_keys import content_key
 from torchface.io.meshes.mesh_sequence import MeshSequence
-from torchface.number_checks import checked_count
+from torchface.number_checks import checked_count, checked_type
 from torchface.progress import Progress, silent
 
 _COLOR_RANK = 32
@@ -48,6 +48,7 @@ def fit_enhancement(
     """The model of :meth:`EnhancementModel.fit`, which says what the arguments are."""
     progress = progress or silent
     checked_count("rank", rank, 1)
+    checked_type("performance", performance, CapturedPerformance)
     faces, sequences = performance.faces, performance.sequences
     neutral = performance.neutral.detach().float()
     progress("preparing the mesh")

@@ -12,6 +12,7 @@ from torchface import __version__
 from torchface.capture.priors import ShapePrior
 from torchface.capture.priors.student_t import StudentDensity
 from torchface.errors import ShapeError, TraceError
+from torchface.number_checks import checked_type
 from torchface.onnx.checked_export import ExportReport, write_checked
 from torchface.onnx.exported_model import exported_model
 
@@ -53,6 +54,8 @@ def export_module(
         >>> export_module(Solve(), {"x": torch.rand(2, 4)}, "solve.onnx").path.name
         'solve.onnx'
     """
+    checked_type("module", module, nn.Module)
+    checked_type("inputs", inputs, Mapping)
     rows = {len(value) if value.ndim else 0 for value in inputs.values()}
     if len(rows) != 1 or min(rows) < 2:
         shapes = {name: tuple(value.shape) for name, value in inputs.items()}

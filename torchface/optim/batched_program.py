@@ -25,7 +25,7 @@ from torchface.optim.operator_splitting import (
 # Few variables and a coarse tolerance: splitting alone ends nearly always, sooner than a factorisation. So many steps
 # for a tolerance of 1e-4, for each decade below it, and for what these leave.
 _COARSE, _FEW_VARIABLES = 1e-7, 64
-_STEPS, _STEPS_A_DECADE, _MORE_STEPS = 60, 18, 40
+_STEPS, _STEPS_A_DECADE, _MORE_STEPS = 55, 18, 40
 # Otherwise so many steps, times the root of N, before active sets are tried; twice as many each time that both are.
 _STEPS_A_ROOT, _MOST_STEPS, _SETTLING_ROUNDS = 4, 75, 5
 # Steps of splitting and of Newton. The last ones make sure.

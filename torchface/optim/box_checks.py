@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from numbers import Real
+
 import torch
 from torch import Tensor
 
 from torchface.errors import ShapeError, ValueRangeError
-from torchface.number_checks import checked_number
+from torchface.number_checks import as_tensor, checked_number
 from torchface.optim.box_problem import BoxProblem, check_box, metric
 
 _TOLERANCE = {torch.float32: 3e-6, torch.float64: 1e-11}
@@ -56,6 +58,8 @@ def checked_bounds(
     variables = H.shape[-1]
     bounds = []
     for which, bound in (("lower", lower), ("upper", upper)):
+        if not isinstance(bound, Real):
+            bound = as_tensor(which, bound, "(N,), or a number")
         bound = torch.as_tensor(bound, dtype=torch.float64, device=H.device).detach()
         if bound.ndim and bound.shape != (variables,):
             raise ShapeError(f"{name}: found {which} {tuple(bound.shape)}, expected a number or ({variables},)")

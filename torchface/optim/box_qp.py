@@ -33,7 +33,8 @@ def box_qp(
 
     Args:
         H: symmetric up to rounding, which is taken off, and positive semidefinite, (N,N) or (B,N,N), float32 or
-            float64.
+            float64. A variable whose row is zero, as of a shape that nothing sees, goes to the bound where f sends it;
+            ``ProjectedGradient``, whose metric is the diagonal, refuses it.
         f: (B,N), of the same dtype and device.
         lower: a number or (N,); ``-inf`` for none. Bounds are constants: no gradient flows to them.
         upper: a number or (N,); ``inf`` for none.
@@ -59,6 +60,7 @@ def box_qp(
     """
     H = as_tensor("H", H, "(N,N) or (B,N,N)")
     f = as_tensor("f", f, "(B,N)", H.dtype)
+    start = None if start is None else as_tensor("start", start, "(B,N)", H.dtype)
     if is_transformed():
         return _transformed_minimiser(H, f, lower, upper, tolerance)
     return _box_qp(H, f, lower, upper, start, tolerance)
@@ -125,6 +127,7 @@ class BoxQP(nn.Module):
     def forward(self, f: Tensor, start: Tensor | None = None) -> Tensor:
         """The minimisers (B,N) for f (B,N), of H's dtype; ``start`` is an initial guess (B,N)."""
         f = as_tensor("f", f, "(B,N)", self.H.dtype)
+        start = None if start is None else as_tensor("start", start, "(B,N)", self.H.dtype)
         if is_transformed():
             return _transformed_minimiser(self.H, f, self.lower, self.upper, self.tolerance)
         return self._solved(f, start)

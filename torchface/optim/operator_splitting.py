@@ -16,13 +16,15 @@ The constant is formed from the gradient g at any point w as
 :math:`c = -\alpha (H + \rho D)^{-1} g + w ((\alpha - 1) I - G)`. With g and w in float64 and w near the solution the
 steps themselves may run in float32: what they round away is a share of what is left to go, not of f.
 
-Source: Boyd et al. 2011, sections 3.4.3 and 5.2; the diagonal metric takes the place of a scaled H.
+A small :math:`\rho` shrinks first what a large one shrinks last; where it changes, u is divided by the ratio.
+
+Source: Boyd et al. 2011, sections 3.4.1, 3.4.3 and 5.2; the diagonal metric takes the place of a scaled H.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
@@ -35,6 +37,9 @@ from torchface.optim.box_problem import BoxProblem, metric
 RHO = 0.12
 RELAXATION = 1.9
 _RHO_SHARE = 1.4
+# Shares of the suited rho, of the first steps from zero and of all others, and how many the first ones are: on the same
+# rig the worst distance to the least energy comes to 1e-5 after 54 steps so, and after 64 with one rho.
+_FIRST_RHO, _OTHER_RHO, _FIRST_STEPS = 0.5, 1.3, 20
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,11 +50,13 @@ class SplittingFactors:
         step: :math:`G`, (N,N) or (B,N,N).
         offset: :math:`-\\alpha (H + \\rho D)^{-1}`, (N,N) or (B,N,N).
         relaxation: :math:`\\alpha`.
+        first: of another rho, for the first steps in float32 from zero.
     """
 
     step: Tensor
     offset: Tensor
     relaxation: float = RELAXATION
+    first: SplittingFactors | None = None
 
     def rows(self, keep: Tensor) -> SplittingFactors:
         """The factors of some problems; one H serves all."""
@@ -98,6 +105,12 @@ def prepare_splitting(H: Tensor, rho: float | Tensor = RHO, relaxation: float = 
     return SplittingFactors(step, offset, relaxation)
 
 
+def prepare_two_stages(H: Tensor) -> SplittingFactors:
+    """The factors of H (N,N), float64, for many problems: a step takes no longer, and fewer are needed."""
+    rho = suited_rho(H)
+    return replace(prepare_splitting(H, _OTHER_RHO * rho), first=prepare_splitting(H, _FIRST_RHO * rho))
+
+
 def start_splitting(problem: BoxProblem, start: Tensor | None) -> SplittingState:
     """The state at ``start`` (B,N), at zero if absent, clipped; its dual is zero.
 
@@ -124,25 +137,41 @@ def splitting_steps(
         dtype: in which the steps run; what goes in and comes out is float64.
     """
     checked_count("splitting_steps: steps", steps)
-    # From zero, where the gradient is f, there is less to form.
-    cold = not bool(state.z.any())
-    constant = _times(problem.f, factors.offset) if cold else factors.constant(state.z, problem.gradient(state.z))
-    matrix, (lower, upper) = factors.step.to(dtype), _bounds(problem, dtype)
-    product: Callable[..., Tensor] = torch.addmm if matrix.ndim == 2 else torch.baddbmm
-    if matrix.ndim == 3:
-        matrix = matrix.transpose(1, 2)
-        constant, z, t = (x.to(dtype, copy=True)[..., None] for x in (constant, state.z, state.t))
-    else:  # a problem a column: products are a fifth quicker so
-        matrix = matrix.T.contiguous()
-        constant, z, t = (x.new_empty(x.T.shape, dtype=dtype).copy_(x.T) for x in (constant, state.z, state.t))
-    v, share = torch.empty_like(z), 2 - factors.relaxation
-    for _ in range(steps):  # each needs the one before
-        product(constant, matrix, t, out=v)
-        v.add_(z, alpha=share)
-        torch.clamp(v, lower, upper, out=z)
-        torch.lerp(v, z, 2.0, out=t)  # 2 z - v
+    shared, first = factors.step.ndim == 2, factors.first if dtype == torch.float32 else None
+    stages: list[tuple[SplittingFactors, Tensor, int]] = []
+    if bool(state.z.any()):
+        constant = factors.constant(state.z, problem.gradient(state.z))
+        z, t = (_columns(x, shared, dtype) for x in (state.z, state.t))
+    else:  # where the gradient is f, and there is less to form
+        constant = _times(problem.f, factors.offset)
+        z = torch.zeros_like(
+            constant.T if shared else constant[..., None], dtype=dtype, memory_format=torch.contiguous_format
+        )
+        t = torch.zeros_like(z)
+        if first is not None:
+            early = min(steps, _FIRST_STEPS)
+            slope = _columns(problem.f, shared, dtype)
+            stages, steps = [(first, first.offset.to(dtype) @ slope, early)], steps - early
+    stages.append((factors, _columns(constant, shared, dtype), steps))
+    lower, upper = _bounds(problem, dtype)
+    v = torch.empty_like(z)
+    product: Callable[..., Tensor] = torch.addmm if shared else torch.baddbmm
+    for number, (part, constant, count) in enumerate(stages):
+        if number:
+            t = torch.lerp(z, t, _FIRST_RHO / _OTHER_RHO)  # u of the new rho
+        matrix = part.step.to(dtype).mT.contiguous()
+        for _ in range(count):  # each needs the one before
+            product(constant, matrix, t, out=v)
+            v.add_(z, alpha=2 - part.relaxation)
+            torch.clamp(v, lower, upper, out=z)
+            torch.lerp(v, z, 2.0, out=t)  # 2 z - v
     z, t = (torch.empty_like(problem.f).copy_(x.T if x.ndim == 2 else x[..., 0]) for x in (z, t))
     return SplittingState(problem.clip(z), t)  # in float32 a bound may have been rounded to the wrong side of itself
+
+
+def _columns(x: Tensor, shared: bool, dtype: torch.dtype) -> Tensor:
+    """x (B,N) as a copy (N,B), by which products with one matrix are a fifth quicker, or as (B,N,1)."""
+    return x.new_empty(x.T.shape, dtype=dtype).copy_(x.T) if shared else x.to(dtype, copy=True)[..., None]
 
 
 def _bounds(problem: BoxProblem, dtype: torch.dtype) -> tuple[Any, Any]:

@@ -127,6 +127,7 @@ class ProjectedGradient(nn.Module):
             raise ShapeError("ProjectedGradient: found no H, expected one here or where the module is made")
         H = as_tensor("H", H, "(N,N) or (B,N,N)")
         f = as_tensor("f", f, "(B,N)", H.dtype)
+        start = None if start is None else as_tensor("start", start, "(B,N)", H.dtype)
         if not (_recorded() or is_transformed()):
             check_vectors(H, f, start, _NAME)
             check_finite(f, start, _NAME)
@@ -179,13 +180,14 @@ class ProjectedGradient(nn.Module):
         def step(number: Tensor, x: Tensor, y: Tensor, age: Tensor, *_: Tensor) -> _State:
             found = torch.minimum(torch.maximum(product(y, matrix) + constant, lower), upper)
             back, moved = y - found, found - x
-            age = torch.where(product(back * moved, weighed) > 0, 0.0, age)
-            after = number + 1, found, found + age / (age + 3) * moved, age + 1
+            age = torch.where(product(back * moved, weighed)[:, 0] > 0, 0.0, age)
+            after = number + 1, found, found + (age / (age + 3))[:, None] * moved, age + 1
             return after if self.tolerance is None else (*after, (back.abs() * eigenvalue[..., None]).max())
 
         x = torch.minimum(torch.maximum(torch.zeros_like(f) if start is None else start, lower), upper)
         counted = torch.zeros((), dtype=torch.int64, device=f.device)
-        state: _State = (counted, x, x.clone(), torch.zeros_like(f[:, :1]))
+        # Of a column (B,1) torch.export may take the 1 for a size that varies, after a loop of other sizes.
+        state: _State = (counted, x, x.clone(), torch.zeros_like(f[:, 0]))
         state = state if self.tolerance is None else (*state, f.new_full((), torch.inf))
         return _looped(step, state, self.steps, self.tolerance)[1]
 

@@ -23,6 +23,7 @@ from torchface.landmarks.scans.uv_detector import UVLandmarkDetector
 from torchface.modeling.morphable.head_model import HeadModel
 from torchface.modeling.morphable.morphable_model import MorphableModel
 from torchface.modeling.rigging.expression_regression import ExpressionRegression
+from torchface.number_checks import checked_type
 
 KINDS: dict[str, type[nn.Module]] = {
     "action_units": ActionUnitClassifier,
@@ -78,7 +79,7 @@ def register(kind: str, model_class: type[nn.Module]) -> None:
         >>> zoo.get_model("./my_gain", Gain).gain.shape
         torch.Size([3])
     """
-    if not _KIND.fullmatch(kind):
+    if not _KIND.fullmatch(checked_type("kind", kind, str)):
         raise NameMismatchError(f"kind: found {kind[:80]!r}, expected up to 64 lower-case letters, digits and _")
     known = KINDS.get(kind, model_class)
     if known is not model_class and (known.__module__, known.__qualname__) != (

@@ -14,6 +14,7 @@ from torchface.capture.own_rig.eye_geometry import LOOKS, arkit_names, openness_
 from torchface.capture.own_rig.face_points import JAW, LANDMARKS
 from torchface.capture.priors import ShapePrior
 from torchface.errors import NameMismatchError
+from torchface.number_checks import checked_type
 from torchface.rig import BlendshapeRig
 from torchface.shape_names import ARKIT, mapping
 
@@ -55,6 +56,7 @@ class WebcamSolverParts(nn.Module):
         settings: WebcamSettings | None = None,
     ) -> None:
         super().__init__()
+        checked_type("rig", rig, BlendshapeRig)
         self.settings = settings or WebcamSettings()
         self.names: tuple[str, ...] = tuple(rig.names)
         self.person = PersonLandmarks(rig, identity_modes, self.settings.coefficients)

@@ -86,7 +86,7 @@ class HybridSolver(nn.Module):
 
     def __init__(self, markers: MarkerSolver) -> None:
         super().__init__()
-        self.markers = markers
+        self.markers = checked_type("markers", markers, MarkerSolver)
 
     @property
     def names(self) -> tuple[str, ...]:

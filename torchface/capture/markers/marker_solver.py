@@ -97,6 +97,8 @@ class MarkerSolver(nn.Module):
         super().__init__()
         checked_type("rig", rig, BlendshapeRig)
         checked_type("attachment", attachment, Attachment).check(rig.neutral)
+        if program is not None:
+            checked_type("program", program, ProjectedGradient)
         own = program is not None and (
             program.H is not None or bool((program.lower != 0).any() | (program.upper != 1).any())
         )

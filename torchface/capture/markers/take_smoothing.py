@@ -78,7 +78,7 @@ class WholeTakeSolver(nn.Module):
         sparsity: float | None = None,
     ) -> None:
         super().__init__()
-        self.markers = markers
+        self.markers = checked_type("markers", markers, MarkerSolver)
         self.smoothness = checked_number("smoothness", smoothness, 0.0, LARGEST_WEIGHT)
         endless = huber_threshold == math.inf
         self.huber_threshold = (

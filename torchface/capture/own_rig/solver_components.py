@@ -21,6 +21,7 @@ from torchface.correctives.activation import CorrectiveActivation
 from torchface.correctives.corrective_shapes import definitions_from_records
 from torchface.errors import FileFormatError, NameMismatchError, ShapeError, ValueRangeError
 from torchface.files.documents import Value
+from torchface.number_checks import as_tensor, checked_type
 from torchface.rig import BlendshapeRig
 
 CONTOUR_WEIGHT = 0.5
@@ -76,6 +77,8 @@ class VideoSolverParts(nn.Module):
     ) -> None:
         super().__init__()
         settings = settings or VideoSettings()
+        checked_type("rig", rig, BlendshapeRig)
+        intrinsics = as_tensor("intrinsics", intrinsics, "(3,3)", torch.get_default_dtype())
         marks = rig.neutral.landmarks if landmark_vertices is None else landmark_vertices
         if intrinsics.shape != (3, 3):
             raise ShapeError(f"intrinsics: found {tuple(intrinsics.shape)}, expected (3,3)")

@@ -17,6 +17,7 @@ from torchface.capture.priors.process_training import LeftOutProcess, fitted_ker
 from torchface.capture.priors.take_frames import MOST_FRAMES, drawn_rows
 from torchface.capture.priors.take_windows import FOLDS, Autoregression, Part, RunningMoments, TakeWindows
 from torchface.errors import ShapeError, ValueRangeError
+from torchface.number_checks import checked_type
 from torchface.progress import Progress, silent
 
 _MIN_SCALE = 1e-3  # a standard deviation below which a shape counts as one that never moves
@@ -71,7 +72,8 @@ def fit_dynamics_prior(
     progress: Progress | None = None,
 ) -> DynamicsPrior:
     """See ``DynamicsPrior.fit``."""
-    names, settings = tuple(names), settings or DynamicsSettings()
+    names = tuple(checked_type("names: a name", name, str) for name in names)
+    settings = settings or DynamicsSettings()
     regions = tuple(tuple(group) for group in (face_regions(names) if groups is None else groups))
     progress = progress or silent
     _check(takes, names, window, fps, input_noise)

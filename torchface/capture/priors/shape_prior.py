@@ -17,7 +17,7 @@ from torchface.capture.priors.parzen_window import ParzenDensity
 from torchface.capture.priors.student_t import PARTING_VARIANCE, StudentDensity, StudentGroups
 from torchface.capture.priors.take_frames import TakeFrames
 from torchface.errors import FileFormatError, ShapeError, ValueRangeError
-from torchface.number_checks import LARGEST_WEIGHT, as_real, checked_number
+from torchface.number_checks import LARGEST_WEIGHT, as_real, checked_number, checked_type
 
 _UPPER = re.compile(r"(eye|brow|pupil)", re.IGNORECASE)
 LearnedDensity = ParzenDensity | GaussianMixture | StudentDensity
@@ -120,6 +120,7 @@ class ShapePrior(nn.Module):
             ShapeError: no takes, or of another number of shapes.
             ValueRangeError: fewer than two frames with all weights.
         """
+        names = tuple(checked_type("names: a name", name, str) for name in names)
         TakeFrames(takes, len(names)).count()
         groups = (tuple(range(len(names))),) if groups is None else groups
         seen = [TakeFrames(takes, len(names), tuple(group)) for group in groups]

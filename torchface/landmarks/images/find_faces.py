@@ -6,6 +6,7 @@ from torch import Tensor
 
 from torchface.landmarks.images.boxes.face_box import FaceBoxes, FaceDetector, NoFaceError, check_image
 from torchface.landmarks.images.checked_detector import shipped_detector
+from torchface.number_checks import as_tensor
 
 
 def find_faces(image: Tensor, detector: FaceDetector | None = None) -> FaceBoxes:
@@ -23,6 +24,7 @@ def find_faces(image: Tensor, detector: FaceDetector | None = None) -> FaceBoxes
         >>> len(find_faces(torch.full((120, 160), 128, dtype=torch.uint8)).boxes)
         0
     """
+    image = as_tensor("image", image, "(H,W) or (3,H,W) of uint8")
     check_image(image)
     return (detector or shipped_detector())(image)
 

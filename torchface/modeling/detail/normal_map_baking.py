@@ -17,7 +17,7 @@ from torchface.geometry.meshes.tangent_space import TangentSpace, tangent_space,
 from torchface.geometry.similarity import Similarity
 from torchface.mesh import Mesh
 from torchface.modeling.detail.scan_alignment import Correspondences, ScanAlignment, align_scan
-from torchface.number_checks import checked_count, checked_number
+from torchface.number_checks import checked_count, checked_number, checked_type
 from torchface.rendering.raycast import RayCaster
 
 MAX_SIDE = 8192
@@ -325,6 +325,8 @@ def _checked_size(size: int | tuple[int, int]) -> tuple[int, int]:
 
 
 def _checked_meshes(mesh: Mesh, scan: Mesh) -> tuple[Tensor, Tensor]:
+    checked_type("mesh", mesh, Mesh)
+    checked_type("scan", scan, Mesh)
     if mesh.uvs is None or mesh.uv_faces is None:
         raise TopologyError("mesh: found no texture coordinates, expected uvs and uv_faces to bake into")
     for name, one in (("mesh", mesh), ("scan", scan)):

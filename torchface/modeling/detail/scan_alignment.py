@@ -14,6 +14,7 @@ from torchface.geometry.meshes.operators import border_vertices, triangle_areas,
 from torchface.geometry.meshes.unit_check import check_unit, extent
 from torchface.geometry.similarity import Similarity, similarity_transform
 from torchface.mesh import Mesh
+from torchface.number_checks import checked_type
 from torchface.registration.scan_preparation import check_same_hand
 
 Correspondences = tuple[Tensor, Tensor]
@@ -72,6 +73,8 @@ def align_scan(
         >>> aligned.similarity.translation.round().tolist()
         [[-30.0, -30.0, -30.0]]
     """
+    for name, one in (("mesh", mesh), ("scan", scan)):
+        checked_type(name, one, Mesh)
     check_unit(
         "scan",
         scan.vertices[scan.faces.flatten()],

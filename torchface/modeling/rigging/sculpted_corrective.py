@@ -12,6 +12,7 @@ from torchface.errors import AlignmentError, NameMismatchError, TopologyError, V
 from torchface.geometry.meshes.unit_check import check_unit, extent
 from torchface.geometry.similarity import Similarity, similarity_transform
 from torchface.mesh import Mesh
+from torchface.number_checks import as_tensor, checked_type
 from torchface.rig import BlendshapeRig
 
 # Millimetres: less is what files round; a shift of less moves nothing that is seen.
@@ -111,7 +112,9 @@ def corrective_from_sculpt(
         >>> made.definition.name, made.rig(torch.tensor([[1.0, 0.5]]))[0, 0].tolist()
         ('smile_jaw', [3.5, 2.5, 2.5])
     """
-    weights, sculpt = weights.detach().cpu().double(), sculpt.detach().cpu().double()
+    checked_type("rig", rig, BlendshapeRig)
+    weights = as_tensor("weights", weights, "(N,)").detach().cpu().double()
+    sculpt = as_tensor("sculpt", sculpt, "(V,3)").detach().cpu().double()
     rows = weights.nonzero()[:, 0].tolist()
     pose = " ".join(f"{rig.names[row]}={float(weights[row]):.4g}" for row in rows)
     if not rows or not bool(((weights >= 0) & (weights <= 1)).all()):

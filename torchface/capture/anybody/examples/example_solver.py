@@ -23,6 +23,7 @@ from torchface.capture.anybody.examples.landmark_placement import (
 )
 from torchface.capture.weight_observability import Observability, weight_observability
 from torchface.errors import NameMismatchError, ShapeError, ValueRangeError
+from torchface.number_checks import checked_type
 from torchface.optim.data_dependent import data_dependent
 
 _OBJECTIVES = {"squared_distances": SquaredDistances, "distances": Distances}
@@ -92,6 +93,7 @@ class ExampleSolver(nn.Module):
         self, examples: ExampleShapes, method: ExampleMethod | None = None, placement: PlacementModel | None = None
     ) -> None:
         super().__init__()
+        checked_type("examples", examples, ExampleShapes)
         if not bool(examples.basis.any()):
             raise ValueRangeError("examples: found expressions that are all the neutral, expected some that differ")
         self._register(examples.names, examples.neutral, examples.basis, method, placement)
