@@ -214,7 +214,7 @@ def test_all_frames_at_once(
     assert found["DAQP, one by one"].milliseconds >= 1.6 * rows[0].milliseconds
     coarse = found["torchface, float32, to 1.5e-4"]
     assert coarse.gap <= 1e-5
-    assert found["DAQP, one by one"].milliseconds >= 3 * coarse.milliseconds
+    assert found["DAQP, one by one"].milliseconds >= 2.5 * coarse.milliseconds
 
 
 def session_of(capture: Capture, path: Path) -> onnxruntime.InferenceSession:

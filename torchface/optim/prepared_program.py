@@ -18,8 +18,9 @@ from torchface.optim.operator_splitting import SplittingFactors, prepare_two_sta
 # Measured on 16 to 600 variables: DAQP is the faster one for up to so many problems of one H, each of which takes it a
 # time that grows as variables cubed and a constant; with an H each for up to so many variables, however many problems.
 _FEW, _CONSTANT, _FEW_VARIABLES = 230**3, 40**3, 80
-# Numbers in one chunk of frames: its buffers stay in a CPU's second-level cache; an accelerator wants more.
-_CHUNK_NUMBERS = {"cpu": 2**17, "other": 2**23}
+# Numbers in one chunk of problems with an H each, twice those of one H, but so many frames at least: more take a fifth
+# longer where other work fills the third-level cache; an accelerator wants more.
+_CHUNK_NUMBERS, _LEAST_FRAMES = {"cpu": 2**17, "other": 2**23}, 256
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,7 +93,7 @@ class PreparedProgram:
         count, size = f.shape
         solution = torch.empty_like(f)
         numbers = _CHUNK_NUMBERS.get(f.device.type, _CHUNK_NUMBERS["other"])
-        most = max(1, numbers // (size if self.H.ndim == 2 else size**2))
+        most = max(_LEAST_FRAMES, numbers // (2 * size)) if self.H.ndim == 2 else max(1, numbers // size**2)
         chunk = max(1, -(-count // max(1, -(-count // most))))  # all of about one size: a short one costs as many calls
         chunk += -chunk % 16  # products are quicker where each row of a variable begins on a cache line
         for first in range(0, count, chunk):
