@@ -67,7 +67,9 @@ def annotated_landmarks(path: Path) -> list[tuple[Path, Tensor]]:
         for file in sorted(path.rglob("*.pts")):
             pictures = [file.with_suffix(ending) for ending in IMAGE_ENDINGS if file.with_suffix(ending).is_file()]
             if not pictures:
-                raise FileFormatError(f"{file}: found no image of the same name, expected one beside it")
+                raise FileFormatError(
+                    f"{file}: found no image of the same name, expected one beside it, of {', '.join(IMAGE_ENDINGS)}"
+                )
             found.append((pictures[0], load_landmark_points(file).ibug()))
     else:
         raise FileFormatError(f"{path}: found no folder and no .xml, expected iBUG's .pts files or dlib's XML")

@@ -55,7 +55,7 @@ def export_module(
         'solve.onnx'
     """
     checked_type("module", module, nn.Module)
-    checked_type("inputs", inputs, Mapping)
+    checked_type("inputs", inputs, Mapping)  # type: ignore[type-abstract]
     rows = {len(value) if value.ndim else 0 for value in inputs.values()}
     if len(rows) != 1 or min(rows) < 2:
         shapes = {name: tuple(value.shape) for name, value in inputs.items()}

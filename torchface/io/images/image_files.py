@@ -15,7 +15,7 @@ from torchface.files.whole_files import read_file, write_file
 from torchface.geometry.meshes.normal_maps import encode_normals
 from torchface.io.images.image_samples import decode_samples
 
-IMAGE_ENDINGS = (".png", ".jpg", ".jpeg", ".bmp", ".webp", ".tif", ".tiff")
+IMAGE_ENDINGS = (".png", ".jpg", ".jpeg", ".bmp", ".webp", ".tif", ".tiff", ".ppm", ".pgm")
 """What photographs are called; :func:`load_image` goes by their content."""
 
 
