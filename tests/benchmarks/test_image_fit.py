@@ -47,7 +47,7 @@ from torchface.rig import BlendshapeRig
 from torchface.shape_names import mapping
 from torchface.synthetic import performer
 from torchface.workflows.fit.photograph_rig import overlay
-from torchface.workflows.track.track_models import DEFAULT_PRIOR, load_priors
+from torchface.workflows.named_priors import DEFAULT_PRIOR, load_priors
 
 pytestmark = pytest.mark.real
 

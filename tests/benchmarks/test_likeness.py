@@ -23,8 +23,8 @@ from torchface.io.rigs.ict_facekit import region
 from torchface.modeling import FitSettings, ImageFit, fit_images
 from torchface.workflows.fit.fit_landmarks import find_in_photographs
 from torchface.workflows.fit.fit_readings import with_readings
+from torchface.workflows.named_priors import DEFAULT_PRIOR, load_priors
 from torchface.workflows.surface_sites import sites_on_rig
-from torchface.workflows.track.track_models import DEFAULT_PRIOR, load_priors
 from train.face_pictures import head_kinds
 from train.morphable import ict_head_model
 from train.rendered_people.backdrops import uniform

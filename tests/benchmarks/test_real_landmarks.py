@@ -26,7 +26,7 @@ from torchface.io.rigs.ict_facekit import load_identity_modes
 from torchface.modeling import FitSettings, HeadModel, MorphableModel, fit_images
 from torchface.rig import BlendshapeRig
 from torchface.temporal.adaptive_kalman import LANDMARK_SETTINGS, adaptive_filter
-from torchface.workflows.track.track_models import load_priors
+from torchface.workflows.named_priors import load_priors
 
 pytestmark = [pytest.mark.real, pytest.mark.bench]
 

@@ -159,7 +159,7 @@ def video_solver(
     from torchface.io.camera_files import load_calibration
     from torchface.number_checks import check_rate
     from torchface.onnx import export_video_solver
-    from torchface.workflows.track.track_models import load_priors
+    from torchface.workflows.named_priors import load_priors
 
     with file_lock(out, ".onnx"), progress_bars(quiet) as progress:
         if fps is not None:

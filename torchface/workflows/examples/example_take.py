@@ -32,8 +32,8 @@ from torchface.landmarks.images.ibug_68 import COUNT
 from torchface.landmarks.images.tracking.video_landmarks import track_landmarks
 from torchface.progress import Progress, silent
 from torchface.take import Take, Track
+from torchface.viz.figures.landmark_dots import with_dots
 from torchface.workflows.named_finders import DEFAULT_LANDMARKS, load_finder
-from torchface.workflows.track.face_overlay import with_dots
 
 Method = Literal["all", "regional", "linear"]
 METHODS: tuple[Method, ...] = ("all", "regional", "linear")

@@ -28,6 +28,7 @@ from torchface.rendering.clay_shading import Lighting, render
 from torchface.rendering.compositing import save_rendered_image
 from torchface.rig import BlendshapeRig
 from torchface.synthetic.head.embedded_character import is_performers
+from torchface.viz.figures.landmark_dots import with_dots
 from torchface.workflows.fit.fit_checks import (
     ALONE,
     eyes_distances,
@@ -49,10 +50,9 @@ from torchface.workflows.fit.picture_checks import cover_lines, picture_lines, p
 from torchface.workflows.fit.video_pictures import video_pictures
 from torchface.workflows.named_finders import part_finder
 from torchface.workflows.named_heads import NamedHeads, load_head_model, matching
+from torchface.workflows.named_priors import DEFAULT_PRIOR, load_priors
 from torchface.workflows.rig.actor_rig import check_out
 from torchface.workflows.rig_names import Naming, renamed
-from torchface.workflows.track.face_overlay import with_dots
-from torchface.workflows.track.track_models import DEFAULT_PRIOR, load_priors
 
 _OVER, _MARGIN = 480, 0.45
 _LIGHT = Lighting(occlusion_rays=0)

@@ -21,6 +21,7 @@ from torchface.mesh import Mesh
 from torchface.rendering.point_light import vertex_albedo
 from torchface.rendering.raycast import RayCaster
 from torchface.rendering.texture_overlay import FacePaint, overlay, skin_faces
+from torchface.viz.figures.landmark_dots import with_dots
 from torchface.workflows.track.track_result import Tracked
 
 _CHUNK = 8
@@ -28,9 +29,7 @@ _STRENGTH = 0.6
 _LIGHT_FRAMES = 2
 _EVEN_SKIN = (0.80, 0.62, 0.53)
 _SKIN = (0.62, 0.74, 0.90)
-_FOUND, _SOLVED = (60, 230, 60), (250, 70, 60)
 _MAX_SIDE = 480
-_SUBPIXEL = 4  # binary digits of OpenCV's drawing coordinates
 
 
 def mesh_drawer(tracked: Tracked) -> Callable[[int, Tensor], Tensor]:
@@ -168,15 +167,3 @@ def _part_of(camera: Camera, x0: int, y0: int, x1: int, y1: int, step: int) -> C
     shrunk[:2, 2] += (scale[:2] - 1) / 2  # the corner, not the centre of the first pixel, stays where it is
     size = (-(-(x1 - x0) // step), -(-(y1 - y0) // step))
     return Camera(shrunk, camera.rotation, camera.translation, *size)
-
-
-def with_dots(frame: Tensor, landmarks: Tensor, solved: Tensor) -> Tensor:
-    """Landmarks on a frame, uint8 (3,H,W): those given (L,2) green, the solved rig's (L,2) red."""
-    canvas = np.array(frame.permute(1, 2, 0).numpy(), order="C")  # a copy: the frame stays as it is
-    radius = max(1.0, 0.004 * max(frame.shape[1:]))
-    scale = 2**_SUBPIXEL
-    for points, color, size in ((solved, _SOLVED, 0.7 * radius), (landmarks, _FOUND, radius)):
-        for x, y in (points[torch.isfinite(points).all(1)].double() * scale).round().long().tolist():
-            if abs(x) < 2**30 and abs(y) < 2**30:
-                cv2.circle(canvas, (x, y), round(size * scale), color, -1, cv2.LINE_AA, _SUBPIXEL)
-    return torch.from_numpy(canvas).permute(2, 0, 1)

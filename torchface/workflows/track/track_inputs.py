@@ -23,13 +23,8 @@ from torchface.modeling import HeadModel
 from torchface.number_checks import check_rate
 from torchface.rig import BlendshapeRig
 from torchface.workflows.named_heads import NamedHeads, load_head_model, matching
-from torchface.workflows.track.track_models import (
-    DEFAULT_LANDMARKS,
-    DEFAULT_PRIOR,
-    TrackModels,
-    is_table,
-    load_track_models,
-)
+from torchface.workflows.named_priors import DEFAULT_PRIOR
+from torchface.workflows.track.track_models import DEFAULT_LANDMARKS, TrackModels, is_table, load_track_models
 
 METHOD = "track/9"
 """Of the keys; another number where the same inputs, or pieces of another length, come to give other results."""

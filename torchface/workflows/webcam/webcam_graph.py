@@ -26,7 +26,7 @@ from torchface.onnx.webcam.webcam_model import (
 from torchface.progress import Progress, silent
 from torchface.synthetic.head.performer import performer
 from torchface.workflows.cached_graph import cached_graph
-from torchface.workflows.track.track_models import DEFAULT_PRIOR, load_priors
+from torchface.workflows.named_priors import DEFAULT_PRIOR, load_priors
 
 __all__ = ["default_webcam_solver"]
 
