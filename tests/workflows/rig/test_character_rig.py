@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from planted.characters import Planted, box_mesh, caricature, packed, unpacked, write_character
-from torchface.errors import AlignmentError, FileFormatError
+from torchface.errors import AlignmentError, FileFormatError, ValueRangeError
 from torchface.geometry.similarity import Similarity
 from torchface.io.gltf.character_scene import Character, read_character
 from torchface.io.gltf.gltf_document import read_document
@@ -19,7 +19,7 @@ from torchface.mesh import Mesh
 from torchface.rig import BlendshapeRig
 from torchface.shape_names import ARKIT
 from torchface.synthetic import draw_identities, performer
-from torchface.workflows.rig import character_face
+from torchface.workflows.rig import character_face, character_rig
 from torchface.workflows.rig.character_rig import CharacterReport, check_character, rig_character
 
 FEW = ((0.0, 4),)
@@ -129,6 +129,21 @@ def test_a_face_on_a_flat_card_is_refused_by_the_files_name(tmp_path: Path, monk
     with pytest.raises(AlignmentError, match=r"card\.glb: found no face: .*of 2 triangles.*out_face\.png"):
         rig_character(tmp_path / "card.glb", tmp_path / "out.glb")
     assert (tmp_path / "out_face.png").is_file()
+
+
+def test_a_head_of_too_many_triangles_is_refused_with_the_command_that_makes_it_coarser(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    head = performer(texture=False).neutral
+    write_character(tmp_path / "fine.glb", head, how=Planted(body=False))
+    _, search = character_face.character_search()
+    here = Similarity(torch.full((1,), 1e-3).double(), torch.eye(3).double()[None], torch.zeros(1, 3).double())
+    found = FaceOnSurface(here.apply(search.reference.all)[0], here, 1.0, 0.0, (), torch.zeros(0, 3))
+    monkeypatch.setattr(FaceSearch, "find", lambda *_: found)
+    monkeypatch.setattr(character_rig, "_MOST_TRIANGLES", 1000)
+    with pytest.raises(ValueRangeError, match=r"fine\.glb: found [\d,]+ triangles on the head.*1,000.*simplify"):
+        rig_character(tmp_path / "fine.glb", tmp_path / "out.glb")
+    assert not (tmp_path / "out.glb").exists()
 
 
 def test_files_that_are_no_characters_are_refused(tmp_path: Path) -> None:
