@@ -188,3 +188,19 @@ def test_a_program_of_ones_own_finds_the_same_weights(small_rig: BlendshapeRig, 
     assert again.program.steps == 3000
     with pytest.raises(ValueRangeError, match="program: found"):
         MarkerSolver(small_rig, small_attachment, program=ProjectedGradient(upper=2.0))
+
+
+def test_a_shape_that_moves_no_marker_stays_at_rest_and_leaves_the_others_alone(
+    small_rig: BlendshapeRig, small_attachment: Attachment
+) -> None:
+    weights, markers = performed(small_rig, small_attachment, 5)
+    unseen = BlendshapeRig(
+        small_rig.neutral, torch.cat([small_rig.deltas, torch.zeros_like(small_rig.deltas[:1])]),
+        (*small_rig.names, "unseen"),
+    )  # fmt: skip
+    found = MarkerSolver(unseen, small_attachment, sparsity=0, ridge=0)(markers)
+    torch.testing.assert_close(found[:, :-1], weights, rtol=0, atol=1e-4)
+    assert not found[:, -1].any()
+    layer = MarkerSolver(unseen, small_attachment, sparsity=0, ridge=0, program=ProjectedGradient())
+    with pytest.raises(ValueRangeError, match=rf"found rows \[{len(weights[0])}\] of H that are zero.*add a ridge"):
+        layer(markers)
