@@ -24,7 +24,7 @@ def import_extra(module: str, package: str, extra: str, job: str) -> Any:
         return importlib.import_module(module)
     except ImportError as error:
         raise MissingExtraError(
-            f"{job} needs {package}, which is not installed ({error}); expected it beside torchface: "
+            f"{job} needs {package}, which is not installed ({error}); this installs it: "
             f"{sys.executable} -m pip install '{_requirement(package, extra)}'"
         ) from error
 

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from torchface.cli import main
-from torchface.errors import TopologyError, ValueRangeError
+from torchface.errors import FileFormatError, TopologyError, ValueRangeError
 from torchface.io import MeshSequence, load_animation, load_rig, save_mesh
 from torchface.mesh import Mesh
 from torchface.workflows.enhance.retime_keyframes import Keyframe, retime_keyframes
@@ -63,6 +63,9 @@ def test_keyframes_that_do_not_fit_are_named(actor, tmp_path: Path) -> None:
         first = Keyframe(weights, 0, rig) if last.path == rig else fine
         with pytest.raises(kind, match=said):
             retime_keyframes(first, last, 8, actor.model, out)
+    missing = tmp_path / "missing.obj"
+    with pytest.raises(FileFormatError, match=r"missing\.obj: "):
+        retime_keyframes(Keyframe(missing), fine, 8, actor.model, out)
     with pytest.raises(ValueRangeError, match="found the same file for both keyframes"):
         retime_keyframes(Keyframe(cut), Keyframe(cut), 8, actor.model, out)
     with pytest.raises(ValueRangeError, match="--frames: found 1, expected a whole number of at least 2"):

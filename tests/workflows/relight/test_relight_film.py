@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import pytest
@@ -31,7 +31,7 @@ from torchface.workflows.relight.relight_film import (
     _reaching,
     relight_film,
 )
-from torchface.workflows.relight.tracked_film import read_tracked_film
+from torchface.workflows.relight.tracked_film import bare, read_tracked_film
 from torchface.workflows.track.head_rotations import rotation_columns
 from torchface.workflows.track.track_files import ANIMATION, LANDMARKS, SUMMARY, SUMMARY_FORMAT
 
@@ -105,6 +105,18 @@ def test_the_face_is_relit_and_the_hand_before_it_is_not(filmed: Filmed, tmp_pat
         assert float((hand <= 3).float().mean()) > 0.9
         beside = (new[t].float() - old[t].float()).abs().amax(0)[60:110, 95:110]
         assert float(beside.mean()) > 4  # the cheek behind it is relit
+
+
+def test_hair_and_clothes_of_a_head_of_track_are_left_out() -> None:
+    rig = performer(texture=False)
+    notes = rig.neutral.annotations
+    assert notes is not None
+    assert bare(rig) is rig
+    grown = rig.neutral.vertices[:, 1] > rig.neutral.vertices[:, 1].quantile(0.8)
+    named = replace(notes, regions=notes.regions | {"hair_left": grown, "shirt": torch.zeros_like(grown)})
+    left = bare(BlendshapeRig(replace(rig.neutral, annotations=named), rig.deltas, rig.names))
+    assert torch.equal(left.neutral.vertices, rig.neutral.vertices[~grown])
+    assert torch.equal(left.deltas, rig.deltas[:, ~grown])
 
 
 def test_a_light_from_behind_the_head_is_doubted() -> None:

@@ -20,6 +20,7 @@ from torchface.rig import BlendshapeRig
 from torchface.workflows.track.head_rotations import head_rotations
 from torchface.workflows.track.track_files import ANIMATION, LANDMARKS, SUMMARY, SUMMARY_FORMAT
 
+_GROWN = ("hair", "lash_hair", "brow_hair", "shirt")
 _POSE = (*(f"pose_T{axis}" for axis in "xyz"), *(f"pose_{name.removeprefix('Head').lower()}" for name in ROTATIONS[:3]))
 
 
@@ -85,7 +86,7 @@ def read_tracked_film(film: Path, track: Path, camera: Path | None = None) -> Tr
     if not bool(seen.any()):
         raise ValueRangeError(f"{track}: found no frame with a face, expected some")
     pose = pose.nan_to_num(0.0)
-    rig = load_rig(track / ANIMATION)
+    rig = bare(load_rig(track / ANIMATION))
     if camera is not None:
         calibration = load_calibration(camera).resized(video.width, video.height)
     elif not record["camera_assumed"].found:
@@ -98,3 +99,10 @@ def read_tracked_film(film: Path, track: Path, camera: Path | None = None) -> Tr
     weights = rig.weights_from(animation.weights)
     marks_found = marks.landmarks.values
     return TrackedFilm(video, rig, weights, head_rotations(pose[:, 3:]), pose[:, :3], marks_found, seen, calibration)
+
+
+def bare(rig: BlendshapeRig) -> BlendshapeRig:
+    """A rig without hair and clothes, which the film has its own of."""
+    regions = {} if rig.neutral.annotations is None else rig.neutral.annotations.regions
+    grown = [mask for name, mask in regions.items() if name.startswith(_GROWN)]
+    return rig.part(~torch.stack(grown).any(0)) if grown else rig

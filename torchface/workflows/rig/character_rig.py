@@ -355,9 +355,8 @@ class _Job:
         if present:
             lines.append(f"already there: {len(present)} of ARKit's 52, kept as they are")
         if spelled := self.spelled(there):
-            lines.append(
-                f"  written with ARKit's names: {', '.join(f'{old} -> {new}' for old, new in spelled.items())}"
-            )
+            some = ", ".join(f"{old} -> {new}" for old, new in list(spelled.items())[:3])
+            lines.append(f"  written with ARKit's names: {len(spelled)} shapes, such as {some}")
             own = {name: names for name, names in own.items() if names[0] not in spelled}
         if own:
             lines.append("  by other names: " + ", ".join(f"{k} ({' + '.join(v)})" for k, v in own.items()))
@@ -365,7 +364,7 @@ class _Job:
         missing = [name for name in ARKIT if name not in self.made and name not in present]
         lines.append(f"made: {len(self.made)} shapes" + (f"; not made: {', '.join(missing)}" if missing else ""))
         if self.empty:
-            lines.append(f"  note: {', '.join(self.empty)}: there, but nothing moved by it, so it counts as missing")
+            lines.append(f"  note: {', '.join(self.empty)}: the file's own moves nothing and counts as missing")
         if expressions:
             lines.append(f"expressions added to the VRM: {len(expressions)}")
         return [*lines, f"in all {seconds[1]:.1f} s"]
