@@ -127,7 +127,8 @@ class FittedHead:
                 f"{inner / eyes:.1%} without the contour), focal length {float(camera.intrinsics[0, 0]):.0f}"
             )
         lines += self.remarks
-        lines.append(f"identity: largest coefficient {float(fit.coefficients.abs().max()):.2f} standard deviations")
+        most = float(fit.coefficients.abs().max())
+        lines.append(f"identity: at most {most:.2f} standard deviations from the mean head in a mode; 3 are rare")
         for path, weights in zip(photographs, fit.weights, strict=True):
             strongest = weights.argsort(descending=True)[:5].tolist()
             listed = [f"{self.rig.names[k]} {float(weights[k]):.2f}" for k in strongest if float(weights[k]) > 0.05]
@@ -135,8 +136,8 @@ class FittedHead:
         if fit.color is not None:
             off = float(fit.color.error.mean())
             lines.append(
-                f"skin that no photograph shows: the head model's colours ({off / 3**0.5:.0%} of full brightness off "
-                "what photographs show elsewhere)"
+                "skin that no photograph shows: the head model's colours, which differ from the skin that photographs "
+                f"show by {off / 3**0.5:.0%} of full brightness"
             )
         regions = {} if self.rig.neutral.annotations is None else self.rig.neutral.annotations.regions
         if fit.hair is not None:

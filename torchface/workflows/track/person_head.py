@@ -47,7 +47,8 @@ class PersonHead:
         listed = ", ".join(str(frame) for frame in self.frames.tolist())
         return [
             f"head: solved from {len(self.frames)} frames ({listed}); inner landmarks {float(inner):.1%} of the eyes' "
-            f"distance off; largest coefficient {float(self.fit.coefficients.abs().max()):.2f} standard deviations"
+            f"distance off in them; at most {float(self.fit.coefficients.abs().max()):.2f} standard deviations from "
+            "the mean head in a mode; 3 are rare"
         ]
 
 
