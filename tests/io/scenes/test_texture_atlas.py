@@ -49,6 +49,20 @@ def test_images_of_other_sizes_and_tiles_and_a_plain_colour_are_shown_as_they_we
     assert torch.equal(with_looks(mesh, torch.zeros(4).long(), looks[:1]).uvs, moved)  # type: ignore[arg-type]
 
 
+def test_a_strip_longer_than_an_image_may_be_is_made_shorter() -> None:
+    """Four texels high: a strip that has hardly anything to give up."""
+    strip = torch.linspace(0, 1, 9000).expand(3, 4, -1)
+    corners = torch.tensor([[0.0, 0.5], [1.0, 0.5], [0.5, 0.5]])
+    mesh = Mesh(torch.eye(3), torch.tensor([[0, 1, 2], [0, 2, 1]]), uvs=corners, uv_faces=torch.tensor([[0, 1, 2]] * 2))
+    made = with_looks(mesh, torch.tensor([0, 1]), [Look(strip), Look(None, torch.tensor([1.0, 0.0, 0.0]))])
+    assert made.texture is not None
+    assert max(made.texture.shape[1:]) <= 8192
+    for share in (0.1, 0.5, 0.9):
+        found = shown(made, 0, torch.tensor([[1 - share, share, 0.0]]))[0]
+        torch.testing.assert_close(found, torch.full((3,), share), atol=2e-3, rtol=0)
+    torch.testing.assert_close(shown(made, 1, torch.full((1, 3), 1 / 3))[0], torch.tensor([1.0, 0.0, 0.0]))
+
+
 def test_a_file_of_two_images_and_a_plain_colour_keeps_all_three(tmp_path: Path) -> None:
     build = Builder()
     uvs = np.array([[0, 1], [1, 1], [1, 0], [0, 0]], np.float32)

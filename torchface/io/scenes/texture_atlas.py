@@ -79,11 +79,11 @@ def _packed(images: list[Tensor]) -> tuple[list[tuple[int, int]], Tensor]:
         if max(width, height) <= _LARGEST:
             break
         share = 0.95 * _LARGEST / max(width, height)
+        # Plain colours and thin strips keep their few texels; what is wide shrinks until all fits.
+        small = [[max(min(side, _SWATCH), int(share * side)) for side in image.shape[1:]] for image in images]
         images[:] = [
-            torch.nn.functional.interpolate(image[None], scale_factor=share, mode="area")[0]
-            if min(image.shape[1:]) > _SWATCH / share
-            else image
-            for image in images
+            torch.nn.functional.interpolate(image[None], size=size, mode="area")[0]
+            for image, size in zip(images, small, strict=True)
         ]
     atlas = torch.zeros(3, height, width)
     for image, (x, y) in zip(images, places, strict=True):

@@ -88,7 +88,7 @@ def webcam_graph(progress: Progress | None = None) -> bytes:
 
 @contextmanager
 def _told(progress: Progress, done: int) -> Iterator[None]:
-    """Says again and again that a part is being made: nothing tells how far it is."""
+    """Says again and again that a part is being made: its share cannot be known."""
     ended = threading.Event()
 
     def tell() -> None:
