@@ -272,8 +272,8 @@ def test_one_frame_at_a_time(
     assert rows[0].gap <= 1e-5
     assert rows[1].gap <= 1e-12
     assert rows[2].gap <= 1e-6
-    # DAQP itself, the checks of what it finds, and PyTorch around it.
-    assert rows[1].milliseconds <= found["DAQP"].milliseconds + 0.05
+    # DAQP itself, the checks of what it finds, and PyTorch around it: 0.03 to 0.14 ms by the processor.
+    assert rows[1].milliseconds <= 7 * found["DAQP"].milliseconds
     assert "PIQP" not in found or rows[1].milliseconds < found["PIQP"].milliseconds
     for name, share in (("OSQP 1e-5", 0.75), ("DAQP", 7.0)):
         if name in found:

@@ -20,7 +20,7 @@ INF = math.inf
 @pytest.fixture(params=["one by one", "as a batch"], autouse=True)
 def way(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
     """Each of the two solvers that ``box_qp`` chooses between, whatever the numbers of problems and variables."""
-    monkeypatch.setattr(PreparedProgram, "_are_few", lambda *_: request.param == "one by one")
+    monkeypatch.setattr(PreparedProgram, "_few", 1e9 if request.param == "one by one" else -1)
 
 
 def hessian(variables: int, least: float, largest: float, seed: int = 0, rank: int | None = None) -> Tensor:

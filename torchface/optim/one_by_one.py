@@ -21,6 +21,7 @@ _NO_BOUND, _STEEPEST = 1e30, 1e30
 # How far a variable may leave its bounds, in the scale in which the diagonal of H is one.
 _PRIMAL_TOLERANCE = 1e-9
 _ROUNDING = 1e-12
+_NONE = np.zeros(0, np.int64)
 
 
 class OneByOne:
@@ -51,7 +52,7 @@ class OneByOne:
         return OneByOne, self._given
 
     def solve(self, f: Array, tolerance: float) -> tuple[Array, Array]:
-        """The minimisers (B,N), in the bounds, and which are solved to the tolerance of ``box_qp``, (B,) bool.
+        """The minimisers (B,N), in the bounds, and rows of those not solved to the tolerance of ``box_qp``.
 
         Args:
             f: (B,N), float64; a problem where it is not finite is not solved.
@@ -72,8 +73,11 @@ class OneByOne:
         np.minimum(aim, self._high, out=aim)
         aim -= y
         aim *= self._scale
-        # Nothing holds for NaN, where the solver found nothing.
-        return x, (np.abs(aim) <= tolerance * (1 + np.abs(x))).all(1)
+        np.abs(aim, out=aim)
+        # Most end here: of one frame each call of NumPy counts. Nothing holds for NaN, where the solver found nothing.
+        if aim.max(initial=0.0) <= tolerance:
+            return x, _NONE
+        return x, (~(aim <= tolerance * (1 + np.abs(x))).all(1)).nonzero()[0]
 
     def _minimiser(self, row: int, slope: Array, cold: bool) -> Array | float:
         """Of a problem, scaled; NaN where there is none to be found."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -51,7 +52,7 @@ class PreparedProgram:
             start: (B,N), or none.
             tolerance: on the residual of ``box_qp``.
         """
-        if self._are_few(len(f)):
+        if len(f) <= self._few:
             x = self._solve_few(f.detach().numpy(), tolerance)
         else:
             check_finite(f, start)
@@ -63,18 +64,21 @@ class PreparedProgram:
 
     def _solve_few(self, f: Array, tolerance: float) -> Tensor:
         f = f.astype(np.float64, copy=False)
-        x, solved = self._one_by_one.solve(f, tolerance)
+        x, open_ = self._one_by_one.solve(f, tolerance)
         found = torch.from_numpy(x)
-        if not solved.all():
-            rows, slopes = torch.from_numpy((~solved).nonzero()[0]), torch.from_numpy(f[~solved])
+        if len(open_):
+            rows, slopes = torch.from_numpy(open_), torch.from_numpy(f[open_])
             check_finite(torch.from_numpy(f), None)
             found[rows] = self._rows(rows)._in_chunks(slopes, found[rows].nan_to_num(0.0), tolerance)
         return found
 
-    def _are_few(self, problems: int) -> bool:
+    @cached_property
+    def _few(self) -> float:
+        """So many problems at most are solved one by one."""
         size = len(self.lower)
-        few = problems * (size**3 + _CONSTANT) <= _FEW if self.H.ndim == 2 else size <= _FEW_VARIABLES
-        return few and self.H.device.type == "cpu"
+        if self.H.device.type != "cpu" or (self.H.ndim == 3 and size > _FEW_VARIABLES):
+            return -1
+        return _FEW / (size**3 + _CONSTANT) if self.H.ndim == 2 else math.inf
 
     @cached_property
     def _one_by_one(self) -> OneByOne:
