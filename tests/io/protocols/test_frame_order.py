@@ -30,6 +30,27 @@ def test_a_clock_that_jumps_goes_on_from_there() -> None:
     assert (order.counts.jumps, order.counts.lost, order.counts.late) == (2, 0, 0)
 
 
+def test_a_clock_that_is_set_back_a_little_stops_nothing_for_longer_than_a_network_does() -> None:
+    order = FrameOrder()
+    assert all(order.takes("phone", number, number / 60) for number in range(120, 300))
+    back = [order.takes("phone", number, 5 + (number - 150) / 60) for number in range(150, 240)]
+    assert back == [False] * 11 + [True] * 79
+    assert (order.counts.jumps, order.counts.late) == (1, 11)
+
+
+def test_a_frame_of_the_clock_before_a_jump_is_late() -> None:
+    order = FrameOrder()
+    assert took(order, [100_000, 100_002, 5, 100_001, 6, 7]) == [True, True, True, False, True, True]
+    assert (order.counts.jumps, order.counts.late) == (1, 1)
+
+
+def test_a_sender_whose_number_never_changes_is_taken_as_it_comes() -> None:
+    order = FrameOrder()
+    taken = [order.takes("phone", 0, frame / 60) for frame in range(120)]
+    assert all(taken[12:])
+    assert order.counts.jumps == 0
+
+
 def test_a_second_sender_waits_until_the_first_is_gone() -> None:
     order = FrameOrder()
     assert took(order, [1, 2], now=0.0) == [True, True]
