@@ -98,7 +98,7 @@ def exported_model(
         del value.metadata_props[:]
     model.producer_name, model.producer_version, model.ir_version = "torchface", "", IR_VERSION
     _set_metadata(model, metadata)
-    _check(model)
+    check_model(model)
     return model
 
 
@@ -128,7 +128,7 @@ def half_stored(model: onnx.ModelProto, names: Collection[str]) -> onnx.ModelPro
     nodes = [*casts, *model.graph.node]
     del model.graph.node[:]
     model.graph.node.extend(nodes)
-    _check(model)
+    check_model(model)
     return model
 
 
@@ -146,31 +146,28 @@ def chained_models(
     model, rest = onnx.ModelProto(), onnx.GraphProto()
     model.CopyFrom(first)
     rest.CopyFrom(second.graph)
-    _prefix_names(rest, {one.name for one in (*rest.input, *rest.output)})
+    kept = {one.name for one in (*rest.input, *rest.output)}
+    rename_values(rest, lambda name: name if name in kept else f"second.{name}")
     given = {one.name: one for one in (*first.graph.output, *rest.output)}
     del model.graph.output[:]
     model.graph.output.extend(given[name] for name in outputs)
     model.graph.node.extend(rest.node)
     model.graph.initializer.extend(rest.initializer)
     _set_metadata(model, metadata)
-    _check(model)
+    check_model(model)
     return model
 
 
-def _prefix_names(graph: onnx.GraphProto, kept: Collection[str]) -> None:
-    """Gives values of a graph, and of those inside its nodes, names that no other graph has."""
-
-    def renamed(name: str) -> str:
-        return name if not name or name in kept else f"second.{name}"
-
+def rename_values(graph: onnx.GraphProto, renamed: Callable[[str], str]) -> None:
+    """Gives values of a graph, and of those inside its nodes, other names."""
     for value in (*graph.initializer, *graph.input, *graph.output):
         value.name = renamed(value.name)
     for node in graph.node:
         for names in (node.input, node.output):
-            names[:] = [renamed(name) for name in names]
+            names[:] = [name and renamed(name) for name in names]
         for attribute in node.attribute:
             if attribute.HasField("g"):
-                _prefix_names(attribute.g, kept)
+                rename_values(attribute.g, renamed)
 
 
 def _set_metadata(model: onnx.ModelProto, metadata: Mapping[str, object]) -> None:
@@ -180,7 +177,8 @@ def _set_metadata(model: onnx.ModelProto, metadata: Mapping[str, object]) -> Non
     )
 
 
-def _check(model: onnx.ModelProto) -> None:
+def check_model(model: onnx.ModelProto) -> None:
+    """Has ONNX check a model, with the types of its values where that can be done."""
     # Inference of shapes does not see the constants around a branch, which sizes in it are made of.
     onnx.checker.check_model(model, full_check=all(node.op_type != "If" for node in model.graph.node))
 

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import copy
+from collections.abc import Callable, Mapping
 from typing import NamedTuple, Protocol
 
 import onnx
@@ -14,8 +15,10 @@ from torchface.capture.anybody import WebcamControls, WebcamSolver
 from torchface.capture.anybody.webcam_state import CONTROLS, POSES
 from torchface.landmarks.images.face_reading import READ_FOR_SOLVER, FaceReading
 from torchface.landmarks.images.frame_reader.face_reader import STATE, FaceReader
+from torchface.landmarks.images.frame_reader.face_search import FOUND
 from torchface.landmarks.images.frame_reader.picture_pieces import picture_size
 from torchface.onnx.exported_model import chained_models, exported_model, half_stored
+from torchface.onnx.graph_parts import PART, graph_part, with_parts
 from torchface.onnx.network_graphs import halves
 from torchface.onnx.unrolled_operators import TRANSLATIONS
 from torchface.shape_names import ARKIT
@@ -33,6 +36,7 @@ OUTPUTS = (
 )  # fmt: skip
 
 _SHORTEST, _LONGEST, _USUAL = 1e-3, 1.0, 1 / 30  # seconds
+_PICTURE = torch.zeros(96, 128, 4, dtype=torch.uint8)
 _HIGHEST = (5.0, 10.0, 1.0, 1.0, 1.0)
 
 
@@ -137,18 +141,83 @@ class WebcamGraph(nn.Module):
         return tuple(given[name] for name in OUTPUTS)
 
 
-def reading_model(reader: FaceReader, state_size: int) -> onnx.ModelProto:
-    """The model of :class:`WebcamReading`, with networks stored as halves, for a solver of so many state numbers."""
+class _Part(nn.Module):
+    """A part of a reader as a module."""
+
+    def __init__(self, reader: FaceReader) -> None:
+        super().__init__()
+        self.reader = reader
+
+
+class _Cells(_Part):
+    def forward(self, images: Tensor) -> Tensor:
+        return self.reader.boxes.cells(images)
+
+
+class _Search(_Part):
+    def forward(self, image: Tensor, place: Tensor, waiting: Tensor, attempt: Tensor) -> Tensor:
+        return self.reader.search(image, place, waiting, attempt)
+
+
+class _Look(_Part):
+    def forward(self, image: Tensor, place: Tensor) -> Tensor:
+        return self.reader.look(image, place)
+
+
+def _cell_part(images: Tensor) -> Tensor:
+    rows, columns = ((side // 4 + 1) // 2 for side in images.shape[2:])
+    return graph_part([images], "cells", [1, rows * columns, 6])
+
+
+def reading_parts(reader: FaceReader) -> dict[str, Callable[[], onnx.ModelProto]]:
+    """What makes the models of the parts of :class:`WebcamReading` that take long."""
+    place = torch.tensor([64.0, 48.0, 64.0, 1.0, 0.0])
+    picture, sizes = {"image": _PICTURE, "place": place}, {"image": ("height", "width", "channels")}
+    sought = {**picture, "waiting": torch.tensor(False), "attempt": torch.tensor(0.0)}
+
+    def cells() -> onnx.ModelProto:
+        given = {"images": torch.zeros(1, 3, 96, 128)}
+        return exported_model(_Cells(reader), given, ["out"], {}, {"images": (None, None, "height", "width")})
+
+    def search() -> onnx.ModelProto:
+        apart = copy.copy(reader)
+        apart._modules = {**reader._modules, "boxes": copy.copy(reader.boxes)}
+        apart.boxes.cells = _cell_part  # type: ignore[method-assign]
+        model = exported_model(_Search(apart), sought, ["out"], {}, sizes, PART, optimize=False)
+        return with_parts(model, {"cells": cells()}, "reader.")
+
+    def look() -> onnx.ModelProto:
+        return exported_model(_Look(reader), picture, ["out"], {}, sizes, optimize=False)
+
+    return {"look": look, "search": search}
+
+
+def reading_model(
+    reader: FaceReader, state_size: int, parts: Mapping[str, onnx.ModelProto] | None = None
+) -> onnx.ModelProto:
+    """The model of :class:`WebcamReading`, with networks stored as halves, for a solver of so many state numbers.
+
+    Args:
+        parts: what ``reading_parts`` makes; made if absent, and none of a reader of another kind.
+    """
     examples = {
-        "image": torch.zeros(96, 128, 4, dtype=torch.uint8),
+        "image": _PICTURE,
         "interval": torch.tensor(_USUAL),
         "controls": WebcamControls().tensor(),
         "state": torch.zeros(STATE + state_size),
     }
     sizes = {"image": ("height", "width", "channels")}
-    model = exported_model(WebcamReading(reader), examples, READ, {}, sizes, TRANSLATIONS, optimize=False)
+    apart, parts = reader, dict(parts or {})
+    if isinstance(reader, FaceReader):
+        apart, parts = copy.copy(reader), parts or {name: make() for name, make in reading_parts(reader).items()}
+        length = len(reader.look(_PICTURE, torch.tensor([64.0, 48.0, 64.0, 1.0, 0.0])))
+        apart.look = lambda *given: graph_part(list(given), "look", [length])  # type: ignore[method-assign]
+        apart.search = lambda *given: graph_part(list(given), "search", [FOUND])  # type: ignore[method-assign]
+    model = exported_model(WebcamReading(apart), examples, READ, {}, sizes, {**TRANSLATIONS, **PART}, optimize=False)
     names = halves(reader, "reader.")
-    return half_stored(model, {name for name in names if not name.startswith("reader.boxes.")})
+    return half_stored(
+        with_parts(model, parts, "reader."), {name for name in names if not name.startswith("reader.boxes.")}
+    )
 
 
 def solving_model(solver: AnswerSolver) -> onnx.ModelProto:

@@ -20,6 +20,7 @@ from torchface.onnx.webcam.webcam_model import (
     WebcamGraph,
     WebcamSolverGraph,
     reading_model,
+    reading_parts,
     solving_model,
     webcam_model,
 )
@@ -37,7 +38,7 @@ NETWORKS = ("face_boxes", "landmark_network", "eye_network")
 MODELS = (*NETWORKS, HEADS, DEFAULT_PRIOR)
 """Of the zoo: what the graph is made of."""
 
-_STEP = "making the webcam's graph in two parts, once; a minute or two on a quiet machine"
+_STEP, _PARTS = "making the webcam's graph, once; a minute on a quiet machine", 4
 _INTERVAL = 5.0  # seconds
 _READING = ("onnx", "landmarks/images")
 _CODE = ("onnx", "capture", "landmarks/images", "synthetic/head")  # whose code says what becomes of the models
@@ -57,7 +58,7 @@ def webcam_module() -> WebcamGraph:
 
 
 def webcam_graph(progress: Progress | None = None) -> bytes:
-    """The graph's file: from the cache where it is there and whole, else made, which takes a minute or two. Parts that
+    """The graph's file: from the cache where it is there and whole, else made, which takes about a minute. Parts that
     an interrupted start has made are taken.
 
     Raises:
@@ -68,20 +69,22 @@ def webcam_graph(progress: Progress | None = None) -> bytes:
     progress = progress or silent
     models = {name: zoo.find(name) for name in MODELS}
 
+    networks = {name: models[name] for name in NETWORKS}
+
     def make() -> onnx.ModelProto:
         with _told(progress, 0):
             solver = WebcamSolverGraph(default_webcam_solver())
             solving = cached_graph("webcam_solving", lambda: solving_model(solver), _CODE, models=models)
-        networks, size = {name: models[name] for name in NETWORKS}, solver.state_size
-
-        def make_reading() -> onnx.ModelProto:
-            return reading_model(FaceReader(webcam_networks()), size)
-
-        with _told(progress, 1):  # the longer part
-            reading = cached_graph("webcam_reading", make_reading, _READING, models=networks, state=size)
+        reader, parts = FaceReader(webcam_networks()), dict[str, onnx.ModelProto]()
+        for name, make_part in reading_parts(reader).items():
+            with _told(progress, 1 + len(parts)):
+                part = cached_graph(f"webcam_{name}", make_part, _READING, models=networks)
+            parts[name] = onnx.ModelProto.FromString(part)
+        with _told(progress, 1 + len(parts)):
+            reading = reading_model(reader, solver.state_size, parts)
         licences = {name: zoo.describe(name).licence for name in MODELS}
-        read, solved = onnx.ModelProto.FromString(reading), onnx.ModelProto.FromString(solving)
-        return webcam_model(read, solved, {"licence": "MIT", "licences": licences})
+        solved = onnx.ModelProto.FromString(solving)
+        return webcam_model(reading, solved, {"licence": "MIT", "licences": licences})
 
     return cached_graph("webcam", make, _CODE, models=models)
 
@@ -92,9 +95,9 @@ def _told(progress: Progress, done: int) -> Iterator[None]:
     ended = threading.Event()
 
     def tell() -> None:
-        progress(_STEP, done, 2)
+        progress(_STEP, done, _PARTS)
         while not ended.wait(_INTERVAL):
-            progress(_STEP, done, 2)
+            progress(_STEP, done, _PARTS)
 
     thread = threading.Thread(target=tell, daemon=True)
     thread.start()

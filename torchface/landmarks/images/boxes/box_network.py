@@ -166,6 +166,10 @@ class BoxNetwork(nn.Module):
         said = self.said(self.mixed_8(fine))
         return FaceMaps(said[:, :1], said[:, 1:])
 
+    def cells(self, images: Tensor) -> Tensor:
+        """The face of every cell (B,h*w,6), in pixels of the images, as :meth:`forward` gives faces."""
+        return _said_faces(self.maps(images))
+
     def forward(self, images: Tensor) -> Tensor:
         """The likeliest faces, (B,K,6): x and y of the centre, side, score in [0,1], cosine and sine of the roll angle.
 
@@ -182,7 +186,7 @@ class BoxNetwork(nn.Module):
         copies = [as_real(images)]
         for _ in range(COPIES - 1):
             copies.append(avg_pool2d(copies[-1], 2))
-        cells = torch.cat([_said_faces(self.maps(copy), 2**half) for half, copy in enumerate(copies)], 1)
+        cells = torch.cat([_enlarged(self.cells(copy), 2**half) for half, copy in enumerate(copies)], 1)
         rows = cells[..., 3].topk(self.faces, dim=1).indices
         faces = cells.gather(1, rows[..., None].expand(-1, -1, 6))
         apart = (faces[:, :, None, :2] - faces[:, None, :, :2]).square().sum(-1).sqrt()
@@ -194,19 +198,19 @@ class BoxNetwork(nn.Module):
         return torch.cat([faces[..., :3], scores[..., None], faces[..., 4:]], -1)
 
 
-def _said_faces(maps: FaceMaps, scale: int) -> Tensor:
-    """The face of every cell (B,h*w,6), as :meth:`BoxNetwork.forward` gives faces.
+def _enlarged(faces: Tensor, scale: int) -> Tensor:
+    """Faces (...,6) in pixels of a picture that is larger by a scale."""
+    return faces * faces.new_tensor([scale] * 3 + [1] * 3) + faces.new_tensor([(scale - 1) / 2] * 2 + [0] * 4)
 
-    Args:
-        scale: pixels a pixel of the images.
-    """
+
+def _said_faces(maps: FaceMaps) -> Tensor:
     likely, geometry = maps.centre.sigmoid(), maps.geometry
     # Cells beside a peak keep a thousandth: among equal ones the order would be anybody's.
     peaks = likely * torch.where(max_pool2d(likely, 3, 1, 1) == likely, 1.0, BESIDE_A_PEAK)
     column = geometry[:, :1] + torch.arange(peaks.shape[3]).to(peaks)
     row = geometry[:, 1:2] + torch.arange(peaks.shape[2]).to(peaks)[:, None]
-    middle = scale * STRIDE * (torch.cat([column, row], 1) + 0.5) - 0.5
-    side = scale * TYPICAL_SIDE * geometry[:, 2:3].clamp(-LOG_SIDES, LOG_SIDES).exp()
+    middle = STRIDE * (torch.cat([column, row], 1) + 0.5) - 0.5
+    side = TYPICAL_SIDE * geometry[:, 2:3].clamp(-LOG_SIDES, LOG_SIDES).exp()
     angle = geometry[:, 3:] / geometry[:, 3:].square().sum(1, keepdim=True).clamp(min=1e-12).sqrt()
     return torch.cat([middle, side, peaks, angle], 1).flatten(2).transpose(1, 2)
 

@@ -121,7 +121,7 @@ class FaceReader(nn.Module):
         searched = asked | lost_now
         found = _either(
             searched,
-            lambda image, place, waiting, attempt: search(image, self.boxes, settings.search, place, waiting, attempt),
+            self.search,
             lambda image, place, waiting, attempt: torch.zeros(FOUND),
             (image, place, missing < settings.patience, attempt),
         )
@@ -130,7 +130,7 @@ class FaceReader(nn.Module):
         ready = plausible(begin, size, settings.smallest) & (followed | there)
         first = torch.where(ready, begin, torch.tensor(_ANYWHERE))
         # The network runs on every picture, as ONNX Runtime makes it half as fast inside of a branch.
-        seen = self._look(image, first)
+        seen = self.look(image, first)
         moved = place_around(seen[: 2 * COUNT].view(COUNT, 2))
         before = torch.where(followed, place, first)
         shared = overlap(before[:2], before[2], moved)
@@ -140,7 +140,7 @@ class FaceReader(nn.Module):
         shown = torch.where(again, torch.where(followed, sought(moved, anchor), moved), first)
         seen = _either(
             again,
-            lambda image, shown, seen: self._look(image, shown),
+            lambda image, shown, seen: self.look(image, shown),
             lambda image, shown, seen: seen.clone(),
             (image, shown, seen),
         )
@@ -172,7 +172,11 @@ class FaceReader(nn.Module):
         parts = {name: torch.where(good, getattr(face, name), value) for name, value in nothing.items()}
         return FaceReading(deviation=face.deviation, **parts), after
 
-    def _look(self, image: Tensor, place: Tensor) -> Tensor:
+    def search(self, image: Tensor, place: Tensor, waiting: Tensor, attempt: Tensor) -> Tensor:
+        """See :func:`~torchface.landmarks.images.frame_reader.face_search.search`."""
+        return search(image, self.boxes, self.settings.search, place, waiting, attempt)
+
+    def look(self, image: Tensor, place: Tensor) -> Tensor:
         """What the network finds in the square round a place, one after the other; see :meth:`_unpacked`."""
         network = self.landmarks
         found = network(cut_square(image, place, network.size, network.margin))
