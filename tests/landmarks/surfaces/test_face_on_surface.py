@@ -19,11 +19,12 @@ from torchface.landmarks.surfaces.face_on_surface import (
 from torchface.rendering.textured_surface import Material, TexturedSurface
 from torchface.synthetic import draw_identities, neutral_head
 from torchface.workflows.named_finders import load_finder
+from torchface.workflows.rig.character_face import mesh_surface
 
 RINGS = ((0.0, 6), (55.0, 4), (-55.0, 4))
 
 
-def surface(vertices: Tensor, faces: Tensor) -> TexturedSurface:
+def clay(vertices: Tensor, faces: Tensor) -> TexturedSurface:
     skin = Material(torch.tensor([0.8, 0.65, 0.56, 1.0]))
     material = torch.zeros(len(faces), dtype=torch.int64)
     return TexturedSurface(vertices.double(), faces, torch.zeros(len(vertices), 2), material, (skin,))
@@ -32,20 +33,27 @@ def surface(vertices: Tensor, faces: Tensor) -> TexturedSurface:
 @pytest.fixture(scope="module")
 def search() -> FaceSearch:
     mean, finder = neutral_head(texture=False), load_finder()
-    points = ReferencePoints(mean.vertices[mean.landmarks], finder.places, surface(mean.vertices, mean.faces))
+    points = ReferencePoints(
+        mean.vertices[mean.landmarks], finder.places, lambda painted: mesh_surface(neutral_head(texture=painted))
+    )
     return FaceSearch(shipped_detector(), finder.finder, points, RINGS)
 
 
-@pytest.mark.parametrize("turn", [(-1.4, 0.4, 0.2), (0.3, 2.5, 1.0)])  # on its back, anyhow
-def test_points_lie_where_the_head_has_them(search: FaceSearch, turn: tuple[float, ...]) -> None:
-    head = neutral_head(draw_identities(1, torch.Generator().manual_seed(7))[0], texture=False)
+@pytest.mark.parametrize(
+    ("turn", "painted", "limit"), [((-1.4, 0.4, 0.2), False, 0.02), ((0.3, 2.5, 1.0), True, 0.015)]
+)
+def test_points_lie_where_the_head_has_them(
+    search: FaceSearch, turn: tuple[float, ...], painted: bool, limit: float
+) -> None:
+    """On its back in clay; turned anyhow, painted: by what the finder has off on clay it would be 0.021."""
+    head = neutral_head(draw_identities(1, torch.Generator().manual_seed(7))[0], texture=painted)
     mean = neutral_head(texture=False).vertices.double()
     rotation = rotation_matrix(torch.tensor(turn, dtype=torch.float64))
     placed = 0.01 * head.vertices.double() @ rotation.T + 5.0  # in another unit, elsewhere
-    found = search.find(surface(placed, head.faces))
+    found = search.find(mesh_surface(head.with_vertices(placed)))
     ids = torch.cdist(search.reference.points.double(), mean).argmin(1)
     error = (found.points[68:] - placed[ids]).norm(dim=-1) / (found.points[36] - found.points[45]).norm()
-    assert float(error.nanmedian()) < 0.02
+    assert float(error.nanmedian()) < limit
     assert float(torch.isfinite(error).double().mean()) > 0.9
     forward = found.pose.rotation[0] @ torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
     assert float(forward @ (rotation @ torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64))) > 0.99
@@ -60,7 +68,7 @@ def test_a_ball_a_box_and_the_back_of_a_head_are_no_faces(search: FaceSearch) ->
     ball = 100 * torch.nn.functional.normalize(round_box, dim=-1)
     for vertices, faces in ((box, triangles), (ball, fine), (head.vertices, behind)):
         with pytest.raises(NoFaceOnSurfaceError, match=r"found no face|not from near") as refused:
-            replace(search, rings=((0.0, 3),)).find(surface(vertices, faces))
+            replace(search, rings=((0.0, 3),)).find(clay(vertices, faces))
         assert len(refused.value.views) > 0
 
 
@@ -79,4 +87,4 @@ def test_a_doubtful_face_is_taken_only_where_all_directions_show_no_better_one(
     monkeypatch.setattr(FaceSearch, "_candidates", lambda *_: next(rounds))
     monkeypatch.setattr(FaceSearch, "_from_near", lambda self, surface, group, *_: found[group])
     head = neutral_head(texture=False)
-    assert search.find(surface(head.vertices, head.faces)) is found[chosen]
+    assert search.find(clay(head.vertices, head.faces)) is found[chosen]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -42,12 +42,13 @@ class ReferencePoints:
     Args:
         landmarks: iBUG's 68, (68,3).
         points: the other points of the finder, (P,3).
-        surface: the head; where it is given, what the finder always has off on it is taken out of what it finds.
+        surface: the head, painted (True) or in clay; where it is given, what the finder always has off on it is taken
+            out of what it finds on surfaces that are painted or not.
     """
 
     landmarks: Tensor
     points: Tensor
-    surface: TexturedSurface | None = None
+    surface: Callable[[bool], TexturedSurface] | None = None
 
     @property
     def all(self) -> Tensor:
@@ -223,7 +224,8 @@ class FaceSearch:
             cameras = _close_cameras(self.reference.landmarks)[: None if attempt else _FEWER]
             found, views, read = self._look(near, cameras, first.plain, progress)
             if attempt and self.reference.surface is not None:
-                bias = self._look(self.reference.surface, cameras, False, progress)[0] - reference
+                painted = not first.plain and _is_painted(near, cameras[0], self.reference.landmarks)
+                bias = self._look(self.reference.surface(painted), cameras, False, progress)[0] - reference
                 bias[bias.norm(dim=-1) > _LOST * eyes] = 0.0
                 bias[:COUNT] = 0.0  # the 68 follow annotators' habits, not the reference's vertices
             found = found - torch.nan_to_num(bias)
@@ -316,12 +318,23 @@ def _placed(
     return hits, torch.where(torch.isfinite(hits).all(-1), weight, 0.0)
 
 
-def _hits(surface: TexturedSurface, camera: Camera, pixels: Tensor, plain: bool) -> Tensor:
-    """Where rays through pixels (N,2) meet a surface, (N,3) float64; NaN for those that miss or graze it."""
+def _is_painted(surface: TexturedSurface, camera: Camera, landmarks: Tensor) -> bool:
+    """Whether most of a face that is seen from the front has a texture."""
+    hits, _ = surface.first_opaque(*_rays(camera, camera.project(landmarks.double()[INNER])))
+    textured = torch.tensor([one.texture is not None for one in surface.materials])
+    return bool(textured[surface.material[hits.triangle[hits.triangle >= 0]]].double().mean() > 0.5)
+
+
+def _rays(camera: Camera, pixels: Tensor) -> tuple[Tensor, Tensor]:
     ones = torch.ones(len(pixels), 1, dtype=torch.float64)
     ways = torch.cat([pixels.double(), ones], 1) @ torch.linalg.inv(camera.intrinsics).T @ camera.rotation
     ways = torch.nn.functional.normalize(ways, dim=-1)
-    origins = camera.centre.expand_as(ways)
+    return camera.centre.expand_as(ways), ways
+
+
+def _hits(surface: TexturedSurface, camera: Camera, pixels: Tensor, plain: bool) -> Tensor:
+    """Where rays through pixels (N,2) meet a surface, (N,3) float64; NaN for those that miss or graze it."""
+    origins, ways = _rays(camera, pixels)
     hits, _ = surface.first_opaque(origins, ways, plain)
     points = origins + hits.distance[:, None] * ways
     missed = (hits.triangle < 0) | (surface.facing(hits, ways) < _SLANTED)

@@ -12,7 +12,7 @@ from torchface.modeling.rigging.blinks_that_shut import SkinOfHead
 from torchface.modeling.rigging.other_topology import joined_vertices
 from torchface.progress import Progress
 from torchface.registration.scan_preparation import Landmarks
-from torchface.workflows.rig.character_face import SKIN, character_search, find_skin, plain_surface, with_lids
+from torchface.workflows.rig.character_face import character_search, find_skin, mesh_surface, with_lids
 
 _ASTRAY, _LEAST_ASTRAY, _LEAST = 4.0, 15.0, 12
 _FLAT, _TOP = 0.4, 0.18  # of its height: how deep a body is at most, and how much of it the head is
@@ -28,9 +28,9 @@ def seen_landmarks(head: Mesh, template: Mesh, progress: Progress) -> Landmarks 
     """
     reference, search = character_search()
     points = search.reference
-    surface = plain_surface(head.vertices.double(), head.faces, SKIN)
+    surface = mesh_surface(head)
     try:
-        found = search.find(surface, uppermost(head), progress)
+        found = search.find(surface, uppermost(surface.vertices), progress)
     except NoFaceOnSurfaceError:
         return None
     placed = found.pose.inverse().apply(found.points)[0]
@@ -55,9 +55,9 @@ def seen_landmarks(head: Mesh, template: Mesh, progress: Progress) -> Landmarks 
     return ids, found.pose.apply(places)[0]
 
 
-def uppermost(mesh: Mesh) -> Tensor | None:
+def uppermost(vertices: Tensor) -> Tensor | None:
     """The vertices (V,) bool where a whole body that stands upright has its head; None of a mesh that is no body."""
-    size = mesh.vertices.amax(0) - mesh.vertices.amin(0)
+    size = vertices.amax(0) - vertices.amin(0)
     if float(size[[0, 2]].min()) > _FLAT * float(size[1]):
         return None
-    return mesh.vertices[:, 1] > mesh.vertices[:, 1].max() - _TOP * size[1]
+    return vertices[:, 1] > vertices[:, 1].max() - _TOP * size[1]

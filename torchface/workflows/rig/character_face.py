@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import torch
 from scipy.spatial import cKDTree
@@ -12,6 +13,7 @@ from torch import Tensor
 
 from torchface.geometry.meshes.operators import triangle_normals
 from torchface.geometry.meshes.surface_index import SurfaceIndex
+from torchface.geometry.meshes.uv_seams import split_at_seams
 from torchface.io.gltf.character_scene import Block, Character
 from torchface.landmarks.images.checked_detector import shipped_detector
 from torchface.landmarks.images.ibug_68 import COUNT
@@ -103,9 +105,28 @@ def find_character_face(
 def character_search() -> tuple[Mesh, FaceSearch]:
     """The embedded performer's mean head, and what finds faces on surfaces by it."""
     reference, finder = neutral_head(texture=False), load_finder()
-    clay = plain_surface(reference.vertices.double(), reference.faces, SKIN)
-    points = ReferencePoints(reference.vertices[reference.landmarks], finder.places, clay)
+    points = ReferencePoints(reference.vertices[reference.landmarks], finder.places, _reference_surface)
     return reference, FaceSearch(shipped_detector(), finder.finder, points)
+
+
+@lru_cache(2)
+def _reference_surface(painted: bool) -> TexturedSurface:
+    return mesh_surface(neutral_head(texture=painted))
+
+
+def mesh_surface(mesh: Mesh) -> TexturedSurface:
+    """A mesh's surface with its texture, or of plain skin; its vertices are split at the texture's seams."""
+    if mesh.texture is None or mesh.uvs is None:
+        return plain_surface(mesh.vertices.double(), mesh.faces, SKIN)
+    corners = None if mesh.uv_faces is None else mesh.uv_faces.numpy()
+    split = split_at_seams(len(mesh.vertices), mesh.faces.numpy(), corners)
+    uvs = mesh.uvs if split.uv_of is None else mesh.uvs[torch.from_numpy(split.uv_of)]
+    opaque = torch.cat([mesh.texture[:3].float(), torch.ones_like(mesh.texture[:1], dtype=torch.float32)])
+    return replace(
+        plain_surface(mesh.vertices.double()[torch.from_numpy(split.vertex_of)], torch.from_numpy(split.triangles)),
+        uvs=uvs,
+        materials=(Material(torch.ones(4), opaque),),
+    )
 
 
 def face_pieces(character: Character, found: FaceOnSurface, reference: Mesh, points: ReferencePoints) -> CharacterFace:
