@@ -1,5 +1,7 @@
 """Blinks that leave eyes half open are made to shut them, before what lies in the eye; the rest of the face stays."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 from torch import Tensor
@@ -45,6 +47,24 @@ def test_half_a_blink_is_made_whole(actor: BlendshapeRig, eyes: bool) -> None:
     moved = (shut - half).norm(dim=-1).amax(0) > 0
     assert not bool(moved[actor.neutral.annotations.regions["chin"]].any())
     assert not bool(moved[head.loose].any())
+
+
+def test_a_fold_of_the_open_lid_is_flatter_when_the_eye_is_shut(actor: BlendshapeRig) -> None:
+    head, marks = head_of(actor)
+    openings = eyes_seen(head, marks)
+    blinks = actor.deltas.double()
+    for row, opening in enumerate(openings):
+        assert opening is not None
+        line = opening.upper + torch.tensor([0.0, 4.0, 0.0], dtype=torch.float64)
+        apart = torch.cdist(head.vertices[:, :2], line[:, :2]).amin(1)
+        fold = 0.8 * torch.exp(-((apart / 1.1) ** 2)) * ~head.loose * (head.vertices[:, 2] > opening.upper[:, 2].min())
+        folded = replace(head, vertices=head.vertices + fold[:, None] * torch.tensor([0.0, 0.0, 1.0]))
+        plain = (head.vertices + shut_blinks(head, blinks, actor.names, openings)[0][row])[:, 2]
+        shut = (folded.vertices + shut_blinks(folded, blinks, actor.names, openings)[0][row])[:, 2]
+        middle = opening.upper.mean(0)
+        there = (fold > 0.4) & ((head.vertices - middle)[:, 0].abs() < 10)
+        assert int(there.sum()) > 10
+        assert float((shut - plain)[there].abs().mean()) < 0.85 * float(fold[there].mean())
 
 
 def test_painted_eyes_have_no_opening(actor: BlendshapeRig) -> None:

@@ -10,7 +10,7 @@ from scipy import sparse
 from torch import Tensor
 
 from torchface.geometry.meshes.operators import vertex_areas
-from torchface.geometry.meshes.shell_energies import stretching_energy
+from torchface.geometry.meshes.shell_energies import bending_energy, stretching_energy
 from torchface.geometry.meshes.surface_index import SurfaceIndex, SurfacePoints
 from torchface.landmarks.surfaces.eye_openings import EyeOpening, eye_opening
 from torchface.optim.sparse import SparseCholesky
@@ -29,6 +29,8 @@ _FIRM, _TOUCH = 100.0, 0.3
 _SPAN, _ASIDE = 76.0, 1.6
 _AROUND = 1.5  # of the opening's half width, round its middle: the lids
 _BEHIND, _BEFORE, _LIFT, _MOST = 1.5, 0.5, 0.25, 12.0
+_LID = 0.8  # of the opening's height, from the upper lid's edge up: what unfolds
+_FINEST, _HELD = 1.3, 0.005  # millimetres: narrower folds go; how much each place of the lid keeps to where it is
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,7 +75,8 @@ def shut_blinks(
     .. math:: \min_c \sum_k \lVert c(p_k) - c(q_k) + g_k \rVert^2 + \lambda \int \lVert c \rVert^2 / \ell^2 + \lVert
         \nabla c \rVert^2,
 
-    nine tenths of it by the upper lid; then the lids go before what lies in the eye, be it a ball or a plate.
+    nine tenths of it by the upper lid. The upper lid unfolds: narrow folds that it keeps from rest are smoothed by
+    least bending. Then the lids go before what lies in the eye, be it a ball or a plate.
 
     Args:
         head: at rest.
@@ -129,7 +132,7 @@ class _Lids:
         return float(-self.gap(delta)[1:-1, 1].clamp(max=0).min() / self.height)
 
     def shut(self, delta: Tensor) -> Tensor:
-        """The blink (J,3), shut."""
+        """The blink (J,3), shut and unfolded."""
         moving = torch.zeros(len(delta), dtype=torch.bool)
         moving[self.skin[self.near[self.skin].any(1)].flatten()] = True
         rows = moving.nonzero()[:, 0]
@@ -153,7 +156,20 @@ class _Lids:
             right += _FIRM * torch.from_numpy(matrix.T @ values.numpy())
         moved = delta.clone()
         moved[rows] += SparseCholesky(system).solve(right)
+        moved[rows] += self._unfolding(moved[rows], rest, faces, sum(one.T @ one for one in matrices))
         return self._before_the_eye(moved, rows)
+
+    def _unfolding(self, delta: Tensor, rest: Tensor, faces: Tensor, edges: sparse.csr_array) -> Tensor:
+        """The change (n,3) of a pose that bends the upper lid least; its edge stays."""
+        posed = rest + delta
+        bending, mass = bending_energy(posed, faces), vertex_areas(posed, faces).clamp(min=1e-6) / _FINEST**4
+        above, below = self._at(self.head.vertices, self.upper), self._at(self.head.vertices, self.lower)
+        distance, nearest = torch.cdist(rest, above).min(1)
+        lid = torch.exp(-((distance / (_LID * self.height)) ** 4)) * (rest[:, 1] > below[nearest, 1])
+        lid = lid * (delta.norm(dim=-1) / delta.norm(dim=-1).max().clamp(min=1e-9)).sqrt()
+        held = (1 / lid.clamp(min=1e-3) - 1 + _HELD) * mass
+        system = bending + sparse.diags_array(held.numpy()) + _FIRM * edges
+        return SparseCholesky(system).solve(-torch.from_numpy(bending @ posed.numpy()))
 
     def _before_the_eye(self, delta: Tensor, rows: Tensor) -> Tensor:
         """Lifts what was before the eye at rest, or beside it, before it in the pose."""
