@@ -189,7 +189,7 @@ def test_a_relit_face_looks_as_under_the_other_source(rig: BlendshapeRig, camera
     mesh = rig.neutral
     for camera in cameras[::2]:
         old, wanted = film(mesh, camera, LIGHT), film(mesh, camera, other)
-        found = relight(old, mesh.vertices, mesh, LIGHT, other, camera)
+        found = relight(old, mesh, LIGHT, other, camera)
         on_face = first_hits(mesh, camera) >= 0
         before, after = ((x - wanted).abs().amax(0)[on_face] for x in (old, found))
         assert float(after.mean()) < 0.15 * float(before.mean())
@@ -200,11 +200,22 @@ def test_a_relit_face_looks_as_under_the_other_source(rig: BlendshapeRig, camera
 def test_the_same_light_changes_nothing_but_old_shadows_edges(rig: BlendshapeRig, cameras: tuple[Camera, ...]) -> None:
     mesh, camera = rig.neutral, cameras[0]
     frame = film(mesh, camera, LIGHT)
-    same = relight(frame, mesh.vertices, mesh, LIGHT, LIGHT, camera)
+    same = relight(frame, mesh, LIGHT, LIGHT, camera)
     assert float((same - frame).abs().amax(0).quantile(0.9)) < 2e-3
     share = torch.zeros(len(mesh.vertices))
-    kept = relight(frame, mesh.vertices, mesh, LIGHT, EVEN, camera, share=share)
+    kept = relight(frame, mesh, LIGHT, EVEN, camera, share=share)
     torch.testing.assert_close(kept, frame, atol=1e-4, rtol=0)
+
+
+def test_light_reaches_beyond_the_mesh_where_asked(rig: BlendshapeRig, cameras: tuple[Camera, ...]) -> None:
+    """A grey picture in half the light is half as bright on both sides of the outline, and as before far off."""
+    mesh, camera, grey = rig.neutral, cameras[0], torch.full((3, 240, 240), 0.5)
+    half = PointLight(EVEN.ambient / 2, EVEN.intensity, EVEN.position)
+    found = relight(grey, mesh, EVEN, half, camera, beyond=True)
+    on_face = first_hits(mesh, camera) >= 0
+    dark = to_srgb(to_linear(grey) / 2)
+    assert float((found - dark).abs().amax(0)[grown(on_face)].max()) < 0.01
+    assert torch.equal(found[:, :3, :3], grey[:, :3, :3])
 
 
 def test_what_is_no_paint_or_no_face_is_refused(rig: BlendshapeRig, cameras: tuple[Camera, ...]) -> None:
@@ -227,7 +238,7 @@ def test_what_is_no_paint_or_no_face_is_refused(rig: BlendshapeRig, cameras: tup
     with pytest.raises(ValueRangeError, match="NaN"):
         overlay(frame, broken, paint, LIGHT, camera)
     with pytest.raises(ShapeError, match="share"):
-        relight(frame, mesh.vertices, mesh, LIGHT, EVEN, camera, share=torch.ones(3))
+        relight(frame, mesh, LIGHT, EVEN, camera, share=torch.ones(3))
 
 
 def test_no_region_no_hole(rig: BlendshapeRig) -> None:

@@ -14,6 +14,7 @@ from torchface.geometry.cameras.calibration import CameraCalibration
 from torchface.geometry.cameras.pinhole import Camera
 from torchface.mesh import Mesh
 from torchface.rendering.environment_light import EnvironmentLight
+from torchface.rendering.gaussian_blur import gaussian_blur
 from torchface.rendering.pixel_coverage import Footprint, footprint
 from torchface.rendering.point_light import PointLight, irradiance, lit_by
 
@@ -23,7 +24,9 @@ _NOT_SKIN = (
 )  # fmt: skip
 _MAX_GAIN = 10.0
 _FLOOR = 1e-3  # linear; light that lenses scatter, so that black has a quotient
-_BESIDE = 3.0  # pixels, standard deviation of a blur
+_BESIDE = 0.025  # of the root of the pixels that a head covers, standard deviation of a blur
+_FAINT = 0.05  # of a blurred cover, where light beyond the head ends
+_RIM = 0.75  # cosine between the normals of a point and of those beside it, on the rims of lids and lips
 _MAX_SIDE = 8192
 
 
@@ -139,13 +142,13 @@ def overlay(
 
 def relight(
     frame: Tensor,
-    vertices: Tensor,
     mesh: Mesh,
     light: PointLight,
     new_light: PointLight | EnvironmentLight,
     camera: Camera,
     calibration: CameraCalibration | None = None,
     share: Tensor | None = None,
+    beyond: bool = False,
 ) -> Tensor:
     r"""A frame with the face under another light: each pixel times the quotient of new and old light there.
 
@@ -156,50 +159,81 @@ def relight(
 
     Args:
         frame: (3,H,W) sRGB, uint8 or in [0,1].
-        vertices: of the face in it, (V,3), millimetres.
+        mesh: of the face as it stands in it, millimetres.
         light: of the frame, as ``estimate_light`` finds it.
         calibration: of a lens that bends the frame.
         share: how far each vertex is relit, (V,) in [0,1]; fade it out where hair or collar begins. All of it if
             absent.
+        beyond: relight what lies beside the outline too, as what is within: a filmed face never ends exactly where
+            its mesh does. Mask what is no skin afterwards.
 
     Returns:
         A frame of the same kind.
 
     Source: thesis 4.2.11 and figure 80.
     """
-    image = _checked(frame, vertices, mesh, camera)
+    image = _checked(frame, mesh.vertices, mesh, camera)
     if share is not None and share.shape != (len(mesh.vertices),):
         raise ShapeError(f"share: found {tuple(share.shape)}, expected ({len(mesh.vertices)},)")
     faces = mesh.faces.cpu()
-    covered = footprint(vertices, faces, torch.ones(len(faces), dtype=torch.bool), camera, calibration)
+    covered = footprint(mesh.vertices, faces, torch.ones(len(faces), dtype=torch.bool), camera, calibration)
     if len(covered.pixel) == 0:
         return frame
-    linear = to_linear(image)
+    linear, sigma = to_linear(image), _beside(covered)
     old, lit = linear.reshape(3, -1).T[covered.pixel], _soft_shadow(covered, light)
-    reflected = (old + _FLOOR) / (_light_on(covered, light, lit) + _FLOOR)
-    # Where the old shadow ends, a pixel's lag between mesh and face would draw a line, and where the face ends, pixels
-    # hold some of what is behind: the skin beside it goes there.
-    clear = (1 - 4 * lit * (1 - lit)).clamp(min=0) ** 2 * (covered.share == 1)
-    reflected = torch.lerp(covered.softened(reflected, clear + 1e-3, _BESIDE), reflected, clear[:, None])
-    new = reflected * (_light_on(covered, new_light) + _FLOOR) - _FLOOR
-    new = torch.minimum(new.clamp(min=0), _MAX_GAIN * old)
-    alpha = torch.ones(len(old)) if share is None else covered.of_vertices(share.double()[:, None], faces)[:, 0].float()
-    return _as(frame, image, covered.blended(linear, new * alpha[:, None], alpha), covered.pixel)
+    shaded, lights = old + _FLOOR, (lit, torch.zeros_like(lit), torch.ones_like(lit))
+    on_skin, most, least = (shaded / (_light_on(covered, light, seen) + _FLOOR) for seen in lights)
+    # Where the old shadow ends, a pixel's lag between mesh and face would draw a line: the skin beside it goes there,
+    # as far as a shadow can tell.
+    clear = (1 - 4 * lit * (1 - lit)).clamp(min=0) ** 2
+    reflected = torch.lerp(covered.softened(on_skin, clear + 1e-3, sigma), on_skin, clear[:, None])
+    new = (reflected.clamp(least, most) * (_light_on(covered, new_light) + _FLOOR) - _FLOOR).clamp(min=0)
+    gain = ((new + _FLOOR) / (old + _FLOOR)).clamp(max=_MAX_GAIN)
+    if share is not None:
+        kept = covered.of_vertices(share.double()[:, None], faces).float()
+        gain = torch.lerp(torch.ones_like(gain), gain, covered.softened(kept, sigma=sigma))
+    drawn = torch.zeros(linear[0].numel(), 4)
+    weight = covered.share.float()[:, None]
+    drawn.index_add_(0, covered.pixel, weight * torch.cat([gain, torch.ones_like(gain[:, :1])], 1))
+    reach, spread = drawn[:, 3:], torch.ones(1)
+    if beyond:
+        near = gaussian_blur(drawn.T.reshape(1, 4, *linear.shape[1:]), sigma)[0].flatten(1).T
+        reach = (near[:, 3:] / _FAINT).clamp(max=1)
+        spread = torch.lerp(torch.ones(1), near[:, :3] / near[:, 3:].clamp(min=1e-6), reach)
+    result = linear.reshape(3, -1) * (drawn[:, :3] + (1 - drawn[:, 3:]) * spread).T
+    return _as(frame, image, result, reach[:, 0].nonzero()[:, 0])
+
+
+def _beside(covered: Footprint) -> float:
+    """The standard deviation of a blur over the neighbourhood of a face's point, pixels."""
+    return max(1.0, _BESIDE * math.sqrt(float(covered.share.sum())))
 
 
 def _soft_shadow(covered: Footprint, light: PointLight) -> Tensor:
-    """The share of the source that samples see, (S,); edges are soft, as those of sources with a size and lenses."""
+    """The share of the source that samples see, (S,), with soft edges, as those of sources with a size and lenses.
+
+    Lines of shadow, as between lips, are none: those of the film lie elsewhere.
+    """
     lit = lit_by(light.position, covered.caster, covered.points, covered.normals)
-    return covered.softened(lit[:, None])[:, 0]
+    wide = covered.softened(lit[:, None], sigma=max(1.0, 0.5 * _beside(covered)))[:, 0]
+    return (2 * wide - 0.5).clamp(0, 1)
 
 
 def _light_on(covered: Footprint, light: PointLight | EnvironmentLight, lit: Tensor | None = None) -> Tensor:
-    """Red, green and blue light at the samples, (S,3); ``lit`` is the share of the source that each sees, if known."""
+    """Red, green and blue light at the samples, (S,3); ``lit`` is the share of the source that each sees, if known.
+
+    The rims of lids and lips would shine, or be black, and never lie where the filmed ones do: they have the light of
+    the skin beside them.
+    """
+    sigma = _beside(covered)
     if isinstance(light, EnvironmentLight):
-        # Without shadows the rims of lids and lips would shine.
-        return covered.softened(light.irradiance(covered.normals).float(), sigma=_BESIDE)
-    lit = _soft_shadow(covered, light) if lit is None else lit
-    return irradiance(covered.points, covered.normals, light, lit.double()).float()
+        found = covered.softened(light.irradiance(covered.normals).float(), sigma=sigma)  # it knows no shadows
+    else:
+        lit = _soft_shadow(covered, light) if lit is None else lit
+        found = irradiance(covered.points, covered.normals, light, lit.double()).float()
+    mean = torch.nn.functional.normalize(covered.softened(covered.normals, sigma=sigma), dim=1)
+    smooth = (((mean * covered.normals.float()).sum(1) - _RIM) / (1 - _RIM)).clamp(1e-3, 0.5) * 2
+    return torch.lerp(covered.softened(found, smooth, sigma), found, smooth[:, None])
 
 
 def _coarseness(covered: Footprint, paint: FacePaint) -> float:

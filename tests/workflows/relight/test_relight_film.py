@@ -26,7 +26,6 @@ from torchface.workflows.relight.relight_film import (
     RelightSettings,
     WantedLight,
     _doubts,
-    _facing,
     _near_face,
     _reaching,
     relight_film,
@@ -129,17 +128,14 @@ def test_a_light_from_behind_the_head_is_doubted() -> None:
     assert torch.equal(_reaching(behind).ambient, behind.ambient)
 
 
-def test_the_new_light_fades_out_beside_the_face_and_at_its_outline(filmed: Filmed) -> None:
-    mesh, camera = filmed.rig.neutral, filmed.cameras[0]
+def test_the_new_light_fades_out_beside_the_face(filmed: Filmed) -> None:
+    mesh = filmed.rig.neutral
     assert mesh.annotations is not None
     regions = mesh.annotations.regions
     near = _near_face(mesh)
     assert bool((near[regions["face"]] == 1).all())
     assert bool((near[regions["eyeball_left"]] == 1).all())
     assert float(near[mesh.vertices[:, 2] < -60].max()) == 0  # the back of the head
-    facing = _facing(filmed.rig.vertices, mesh, camera)
-    assert float(facing[mesh.landmarks[30]]) > 0.9  # the tip of the nose
-    assert float(facing[mesh.vertices[:, 2] < -60].median()) == 0
 
 
 @pytest.mark.bench  # a light is searched for again, seconds

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import astuple, dataclass, replace
 from pathlib import Path
 from typing import Literal
 
@@ -13,8 +13,6 @@ from torch import Tensor
 
 from torchface.errors import AlignmentError, ValueRangeError
 from torchface.files.whole_files import check_ending, check_writable
-from torchface.geometry.cameras.pinhole import Camera
-from torchface.geometry.meshes.operators import vertex_normals
 from torchface.geometry.similarity import similarity_transform
 from torchface.io import load_rig
 from torchface.io.images.image_files import load_paint
@@ -37,7 +35,7 @@ from torchface.workflows.track.face_overlay import light_of
 FilmLight = Literal["once", "each"]
 Draw = Callable[[int, Tensor, PointLight | EnvironmentLight], Tensor]
 _CHUNK = 8
-_LIT = 2  # frames from which the film's light is estimated
+_LIT, _AGAIN = 5, 3  # frames from which the film's light is estimated, and those of a chunk
 _BEFORE_SKIN = ("glasses", "hand", "cloth", "hair", "background")
 _BEFORE_HEAD, _NAMED, _LEAST_HIDDEN = ("hand",), ("hand", "glasses"), 0.005
 _HIDDEN, _EDGE, _SOFT = 0.5, 0.3, 0.7  # the share of what is before a face, and pixels of the network's crop
@@ -48,7 +46,6 @@ _BESIDE = 110.0  # degrees of azimuth beyond which a light reaches no front of a
 _LEAST_SOURCE = 0.05  # share of the light below which its direction says nothing
 _BEYOND = 25.0  # millimetres beyond the face, over neck, ears and scalp, in which the new light fades out
 _INNER = ("eye", "lids", "brow", "nose", "upper_lip", "lower_lip")
-_GRAZING = 0.12  # cosine to the view below which it fades out: there a tracked head and the filmed one part
 
 
 @dataclass(frozen=True)
@@ -115,7 +112,7 @@ class RelightSettings:
         exposure: how many times as bright as the film's light the panorama is.
         texture: paint in the rig's texture coordinates.
         rig: another head, which moves as the actor does.
-        film_light: whether the film's light is estimated once, or in each frame.
+        film_light: whether the film's light is estimated once, or in each eight frames.
         occluders: leave what is before the face as it is.
         camera: the calibration with which the film was tracked.
     """
@@ -182,20 +179,22 @@ def relight_film(
         return around.scaled(settings.exposure * mean / max(float(around.mean.mean()), 1e-9))
 
     def drawn() -> Iterator[Tensor]:
-        old, at = whole, 0
+        latest, at = whole, 0
         changed = light is not None or panorama is not None
         for chunk in tracked.video.color_chunks(_CHUNK):
-            for frame in chunk:
+            earlier = latest
+            if settings.film_light == "each":
+                here = _spread(tracked.seen[at : at + len(chunk)], _AGAIN)
+                latest = _reaching(_light(tracked, {at + k: chunk[k] for k in here}, earlier)) if here else earlier
+            for k, frame in enumerate(chunk):
                 if bool(tracked.seen[at]):
-                    if settings.film_light == "each":
-                        old = _reaching(_light(tracked, {at: frame}, old))
+                    old = _between(earlier, latest, (k + 1) / len(chunk))
                     new = new_light(old)
-                    vertices, camera = tracked.vertices(at), tracked.camera(at)
                     result = frame
-                    mesh, lens = tracked.rig.neutral, tracked.calibration
                     if changed:
-                        share = near * _facing(vertices, mesh, camera)
-                        result = relight(frame, vertices, mesh, old, new, camera, lens, share)
+                        posed = tracked.rig.neutral.with_vertices(tracked.vertices(at))
+                        lens = tracked.calibration
+                        result = relight(frame, posed, old, new, tracked.camera(at), lens, near, finder is not None)
                     if draw is not None:
                         result = draw(at, result, new)
                     if finder is not None:
@@ -339,11 +338,8 @@ def _inner(mesh: Mesh) -> Tensor:
     return inner
 
 
-def _facing(vertices: Tensor, mesh: Mesh, camera: Camera) -> Tensor:
-    """1 where the surface looks toward the camera and in the middle of the face, 0 at the outline, (V,)."""
-    ways = camera.rotation.T @ -camera.translation - vertices.double()
-    cosine = (vertex_normals(vertices.double(), mesh.faces) * torch.nn.functional.normalize(ways, dim=1)).sum(1)
-    return torch.where(_inner(mesh), 1.0, (cosine / _GRAZING).clamp(0, 1).float())
+def _between(before: PointLight, after: PointLight, share: float) -> PointLight:
+    return PointLight(*(torch.lerp(a, b, share) for a, b in zip(astuple(before), astuple(after), strict=True)))
 
 
 def _words(light: PointLight, what: str) -> str:
