@@ -1,6 +1,7 @@
 """The pages as a user meets them: Chromium renders them, a slider is dragged, the head is clicked on."""
 
 import io
+import math
 import threading
 import time
 from collections.abc import Iterator
@@ -15,6 +16,7 @@ from headless_chromium import until
 from PIL import Image
 from torch import Tensor
 
+from torchface.geometry.meshes.normal_maps import DetailMaps
 from torchface.geometry.meshes.operators import vertex_normals
 from torchface.mesh import Mesh
 from torchface.rig import BlendshapeRig
@@ -193,6 +195,58 @@ def test_the_texture_is_hidden_in_motion_and_shown_at_rest(chromium: Any, ball_r
     finally:
         chromium.get("about:blank")
         opened.stop()
+
+
+_IN_VIEW = """
+const view = window.__viserMutable;
+for (const name of ['/head/textured', '/head/next']) {
+    const node = view && view.nodeRefFromName[name];
+    let found = null;
+    if (node && node.visible) node.traverse(x => { const map = x.isMesh && x.material.normalMap;
+        if (map && map.image && map.image.width) {
+            const canvas = new OffscreenCanvas(1, 1), pen = canvas.getContext('2d');
+            pen.drawImage(map.image, 0, 0, 1, 1, 0, 0, 1, 1);
+            found = [pen.getImageData(0, 0, 1, 1).data[0], Math.min(...x.geometry.attributes.position.array)];
+        } });
+    if (found) return found;
+}
+return null;
+"""
+
+
+@pytest.mark.bench  # a page that draws in software reads one head a second
+def test_wrinkles_follow_the_weights_in_motion(
+    chromium: Any, ball_rig: BlendshapeRig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The head in view leans and has the normals of one weight, which changes while a shape moves."""
+    monkeypatch.setattr("torchface.viz.browser.rig_viewer._TEXTURE_INTERVAL", 2.0)
+    mesh, slope = ball_rig.neutral, 0.8
+    uvs = mesh.vertices[:, :2] / 200 + 0.5
+    move = torch.zeros_like(ball_rig.deltas[:1])
+    move[:, :, 0] = -300.0  # the least coordinate of all says the weight
+    rig = BlendshapeRig(replace(mesh, uvs=uvs, uv_faces=mesh.faces), move, ("jawOpen",))
+    tilted = torch.nn.functional.normalize(torch.tensor([slope, 0.0, 1.0]), dim=0)[None, :, None, None]
+    flat = torch.tensor([0.0, 0.0, 1.0])[:, None, None].expand(3, 16, 16)
+    opened = RigViewer(rig, detail=DetailMaps(("jawOpen",), tilted.expand(1, 3, 16, 16), flat), port=0)
+    seen = []
+    try:
+        chromium.get(opened.url)
+        until(lambda: chromium.execute_script(_IN_VIEW))
+        with dragged(opened):
+            until(lambda: seen.append(chromium.execute_script(_IN_VIEW)) or len(set(map(str, filter(None, seen)))) > 2)
+        opened.set_weight("jawOpen", 0.5)
+        until(lambda: abs(weight_of(chromium.execute_script(_IN_VIEW), mesh) - 0.5) < 0.01)
+    finally:
+        chromium.get("about:blank")
+        opened.stop()
+    for found in filter(None, seen):
+        steep = slope * weight_of(found, mesh)
+        expected = 255 * (0.5 + 0.5 * steep / math.hypot(1, steep))
+        assert abs(found[0] - expected) < 4
+
+
+def weight_of(found: list[float] | None, mesh: Mesh) -> float:
+    return math.nan if found is None else (float(mesh.vertices[:, 0].min()) - OVER - 1000 * found[1]) / 300
 
 
 @contextmanager

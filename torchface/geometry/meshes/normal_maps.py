@@ -70,6 +70,14 @@ class DetailMaps:
             raise NameMismatchError(f"detail maps: the rig has no shape {', '.join(map(repr, missing[:5]))}")
         return blend_normal_maps(self.maps, weights[[row[name] for name in self.names]], self.neutral)
 
+    def reduced(self, side: int) -> DetailMaps:
+        """The maps with at most so many texels a side."""
+        step = -(-max(self.maps.shape[-2:]) // side)
+        if step <= 1:
+            return self
+        neutral = None if self.neutral is None else _pooled(self.neutral, step)
+        return DetailMaps(self.names, _pooled(self.maps, step), neutral)
+
     def merged(self, sources: Mapping[str, Sequence[str]]) -> DetailMaps:
         """The maps of shapes that are sums of these.
 
@@ -81,6 +89,10 @@ class DetailMaps:
         rows = {name: found for name, found in rows.items() if found}
         maps = [blend_normal_maps(self.maps[found], torch.ones(len(found)), self.neutral) for found in rows.values()]
         return DetailMaps(tuple(rows), torch.stack(maps) if maps else self.maps[:0], self.neutral)
+
+
+def _pooled(normals: Tensor, step: int) -> Tensor:
+    return torch.nn.functional.normalize(torch.nn.functional.avg_pool2d(normals, step, ceil_mode=True), dim=-3)
 
 
 def blend_normal_maps(maps: Tensor, weights: Tensor, neutral: Tensor | None = None) -> Tensor:

@@ -40,12 +40,13 @@ class HeadOnPage:
     """The pieces of one mesh as nodes of the page's scene, and the textured mesh over them while it rests.
 
     The page shades pieces smoothly and takes new positions in place; a texture it reads only from a whole file, so
-    the textured mesh follows when the head has come to rest.
+    the textured mesh follows when the head has come to rest. Wrinkles are seen in motion too, at the rate at which
+    files can be made: pieces move with them then, and the page reads the next file hidden beside the one in view.
 
     Args:
         mesh: what to show, millimetres.
         offset: where to, millimetres.
-        normal_map: gives the normal map (3,H,W) of the pose, or nothing; called when the head has come to rest.
+        normal_map: gives the normal map (3,H,W) of the pose, or nothing; called at each :meth:`settle`.
     """
 
     def __init__(
@@ -62,8 +63,9 @@ class HeadOnPage:
         self._normal_map = normal_map if mesh.uvs is not None else None
         has_colors = (mesh.texture is not None and mesh.uvs is not None) or mesh.colors is not None
         self._textured = TexturedHead(mesh) if has_colors or self._normal_map is not None else None
-        self._texture_shown = False
-        self._texture_enabled = True
+        self._texture_enabled, self._wrinkled = True, True
+        self._stale = False
+        self._next: tuple[Any, Tensor] | None = None  # has been sent, and is not in view yet
         origin = SCALE * np.array(offset)
         self._nodes = [
             server.scene.add_mesh_simple(
@@ -79,17 +81,18 @@ class HeadOnPage:
             )
             for number, part in enumerate(self._parts)
         ]
-        self._textured_node = None
-        if self._textured is not None:
-            self._textured_node = server.scene.add_glb(
-                f"/{name}/textured",
-                self._glb(self._textured),
+        self._textured_nodes: list[Any] = []
+        for spare in ("textured", "next") if self._normal_map else ("textured",) if self._textured else ():
+            node = server.scene.add_glb(
+                f"/{name}/{spare}",
+                self._glb(),
                 scale=SCALE * millimetres_per("m"),
                 position=origin,
+                visible=spare == "textured",
                 cast_shadow=False,
                 receive_shadow=False,
             )
-            self._texture_shown = True
+            self._textured_nodes.append(node)
 
     @property
     def vertices(self) -> Tensor:
@@ -104,7 +107,12 @@ class HeadOnPage:
     @property
     def settled(self) -> bool:
         """Whether nothing is left for :meth:`settle` to do."""
-        return self._textured is None or self._texture_shown or not self._texture_enabled
+        return not self._texture_enabled or not (self._stale or self._next)
+
+    @property
+    def follows(self) -> bool:
+        """Whether the textured mesh is shown in motion, for its wrinkles."""
+        return self._normal_map is not None and self._texture_enabled and self._wrinkled
 
     def show(self, vertices: Tensor) -> int:
         """Moves the vertices (V,3), millimetres; returns how many pieces were sent, the others having stayed."""
@@ -112,44 +120,69 @@ class HeadOnPage:
             raise ShapeError(f"vertices: found {tuple(vertices.shape)}, expected {tuple(self._vertices.shape)}")
         new = vertices.detach().cpu().float()
         moved = (new - self._vertices).abs().amax(1) > _MIN_MOVE
-        sent = 0
-        with self._server.atomic():
-            for part, node in zip(self._parts, self._nodes, strict=True):
-                if moved[part.vertex_ids].any():
-                    node.vertices = new[part.vertex_ids].numpy()
-                    sent += 1
-            if sent and self._texture_shown and self._textured_node is not None:
-                self._textured_node.visible = False
-                self._texture_shown = False
         # What stays below the threshold adds up: only what was sent counts as shown.
         self._vertices = torch.where(moved[:, None], new, self._vertices)
+        with self._server.atomic():
+            sent = self._move(self._vertices) if not self.follows else int(moved.any())
+            if sent and self._textured_nodes:
+                self._stale = True
+                if not self.follows:
+                    self._hide()
+        return sent
+
+    def _move(self, vertices: Tensor) -> int:
+        """Sends the pieces that the page has elsewhere; how many."""
+        sent = 0
+        for part, node in zip(self._parts, self._nodes, strict=True):
+            here = vertices[part.vertex_ids].numpy()
+            if not np.array_equal(here, node.vertices):
+                node.vertices = here
+                sent += 1
         return sent
 
     def settle(self) -> None:
-        """Shows the texture, where the head has one that is not shown."""
-        if self.settled or self._textured_node is None or self._textured is None:
+        """Shows the texture, where the head has one that is not shown; one with wrinkles at the call after."""
+        if self.settled:
             return
         with self._server.atomic():
-            self._textured_node.glb_data = self._glb(self._textured)
-            self._textured_node.visible = True
-        self._texture_shown = True
+            if self._next is not None:
+                self._hide()
+                self._next[0].visible = True
+                self._move(self._next[1])
+                self._next = None
+            if self._stale:
+                node = next((node for node in self._textured_nodes if not node.visible), self._textured_nodes[0])
+                node.glb_data = self._glb()
+                self._stale = False
+                if len(self._textured_nodes) == 1:
+                    node.visible = True
+                else:
+                    self._next = node, self._vertices
 
-    def _glb(self, textured: TexturedHead) -> bytes:
+    def _glb(self) -> bytes:
+        assert self._textured is not None
         over = self._vertices + OVER * vertex_normals(self._vertices, self._faces)
-        return textured.glb(over, None if self._normal_map is None else self._normal_map())
+        return self._textured.glb(over, None if self._normal_map is None else self._normal_map())
 
-    def refresh_texture(self) -> None:
-        """Marks the texture as out of date, so that the next :meth:`settle` makes it anew."""
-        self._texture_shown = False
+    def _hide(self) -> None:
+        for node in self._textured_nodes:
+            node.visible = False
+
+    def refresh_texture(self, wrinkled: bool | None = None) -> None:
+        """Marks the texture as out of date, so that the next :meth:`settle` makes it anew, with wrinkles or without."""
+        self._stale = bool(self._textured_nodes)
+        if wrinkled is not None:
+            self._wrinkled = wrinkled
 
     def enable_texture(self, enabled: bool) -> None:
-        """Shows the texture at rest, or never."""
+        """Shows the texture, or never."""
         self._texture_enabled = enabled
+        self._move(self._vertices)
         if enabled:
             self.settle()
-        elif self._textured_node is not None:
-            self._textured_node.visible = False
-            self._texture_shown = False
+        else:
+            self._hide()
+            self._stale, self._next = bool(self._textured_nodes), None
 
 
 _MAX_SIDE = 2048

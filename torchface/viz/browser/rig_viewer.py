@@ -28,6 +28,7 @@ from torchface.viz.browser.weight_editor import WeightEditor
 _TICK = 1 / 120
 _REST = 0.25
 _PANEL_INTERVAL = 0.12
+_TEXTURE_INTERVAL, _ROUGH_SIDE = 0.2, 512  # seconds in which a page reads a head; texels of its wrinkles in motion
 _SPEEDS = ("0.1", "0.25", "0.5", "1", "2")
 _OPEN_GROUPS = ("brows", "eyes", "jaw", "mouth")
 _SPREAD = 6
@@ -39,7 +40,7 @@ class RigViewer(BrowserPage):
     Args:
         take: weights to play and edit, mapped to the rig's names; one neutral pose if absent.
         out: where *Save* writes; a path that the page shows and cannot change.
-        detail: wrinkle maps of the rig's shapes, shown while the head rests.
+        detail: wrinkle maps of the rig's shapes, which follow the weights: in motion with few texels, at rest with all.
         port: the first to try, 0 for any.
     """
 
@@ -62,7 +63,8 @@ class RigViewer(BrowserPage):
         self._moved_at = self._panel_at = float("-inf")
         self._panel_due = False
         super().__init__(label, port)
-        self._detail, self._wrinkled = detail, detail is not None
+        self._detail, self._wrinkled, self._rough, self._settled_at = detail, detail is not None, False, 0.0
+        self._few_texels = None if detail is None else detail.reduced(_ROUGH_SIDE)
         self.head = HeadOnPage(self.server, self._posed(), "head", normal_map=self._normal_map if detail else None)
         frame_camera(self.server, rig.neutral)
         if self.take is not None:
@@ -102,13 +104,12 @@ class RigViewer(BrowserPage):
         return self.rig(self.editor.pose[None].to(self.rig.deltas))[0].detach()
 
     def _normal_map(self) -> Tensor | None:
-        if self._detail is None or not self._wrinkled:
-            return None
-        return self._detail.blend(self.rig.names, self.editor.pose)
+        detail = self._few_texels if self._rough else self._detail
+        return detail.blend(self.rig.names, self.editor.pose) if detail is not None and self._wrinkled else None
 
     def _show_wrinkles(self, enabled: bool) -> None:
         self._wrinkled = bool(enabled)
-        self.head.refresh_texture()
+        self.head.refresh_texture(self._wrinkled)
 
     def _show(self) -> int:
         sent = self.head.show(self._vertices())
@@ -131,8 +132,16 @@ class RigViewer(BrowserPage):
                 if self._panel_due and now - self._panel_at > _PANEL_INTERVAL:
                     self._refresh_panel()
                     self._panel_at, self._panel_due = now, False
-                if not self.head.settled and now - self._moved_at > _REST:
-                    self.head.settle()
+                self._draw_texture(now, now - self._moved_at <= _REST)
+
+    def _draw_texture(self, now: float, moving: bool) -> None:
+        if self._rough and not moving:
+            self._rough = False
+            self.head.refresh_texture()
+        if not self.head.settled and (self.head.follows or not moving) and now - self._settled_at > _TEXTURE_INTERVAL:
+            self._rough = moving
+            self.head.settle()
+            self._settled_at = time.monotonic()
 
     def _refresh_panel(self) -> None:
         pose = self.editor.pose.tolist()
@@ -166,7 +175,9 @@ class RigViewer(BrowserPage):
                 spread = gui.add_slider("Spread", 0, 60, 1, _SPREAD, hint="Frames beside that an edit takes along")
                 self._shared(spread, lambda value: setattr(self.editor, "spread", int(value)))
             if self.head.has_texture:
-                texture = gui.add_checkbox("Texture at rest", True, hint="In motion the head shows in plain colours")
+                texture = gui.add_checkbox(
+                    "Texture", True, hint="In motion the head shows in plain colours, unless it has wrinkles"
+                )
                 self._shared(texture, self.head.enable_texture)
             if self._detail is not None:
                 self._shared(gui.add_checkbox("Wrinkles", True), self._show_wrinkles)
