@@ -31,7 +31,9 @@ def progress_bars(quiet: bool = False) -> Iterator[Progress]:
         yield _Log()
     else:
         spinner = SpinnerColumn(finished_text="[green]✓")
-        with Bars(spinner, _Name(), _Bar(), _Count(), TimeElapsedColumn(), _Remaining(), console=console) as bars:
+        columns = (spinner, _Name(), _Bar(), _Count(), TimeElapsedColumn(), _Remaining())
+        # Lines are drawn in Python, beside a live session's frames.
+        with Bars(*columns, console=console, refresh_per_second=4) as bars:
             steps = _Lines(bars)
             try:
                 yield steps

@@ -2,7 +2,16 @@
 
 const FIRST_INTERVAL = 1 / 30; // seconds, of a frame that none came before
 const LONGEST_INTERVAL = 10; // seconds: after a longer pause all that time smooths is forgotten anyway
+/** A graph that does nothing: with it the runtime is loaded and compiled while the graph is still on its way. */
+const IDENTITY = Uint8Array.from(atob("CAc6LwoQCgFhEgFiIghJZGVudGl0eRIBZ1oLCgFhEgYKBAgBEgBiCwoBYhIGCgQIARIAQgQKABAN"), (one) => one.charCodeAt(0));
+const BLANK = 128; // pixels a side of the first picture
 const POSE = 0, GAIN = 1, SMOOTHING = 2, RESET = 3;
+
+async function fetched(graph) {
+  const answer = await fetch(graph);
+  if (!answer.ok) throw new Error(`${new URL(graph).pathname} was not found (status ${answer.status})`);
+  return new Uint8Array(await answer.arrayBuffer());
+}
 
 /**
  * Answers the page's messages.
@@ -24,15 +33,13 @@ export function answerFrames(ort, engine) {
     ort.env.wasm.wasmPaths = { mjs, wasm };
     ort.env.wasm.numThreads = threads;
     ort.env.logLevel = "error";
-    const answer = await fetch(graph);
-    if (!answer.ok) throw new Error(`${new URL(graph).pathname} was not found (status ${answer.status})`);
-    session = await ort.InferenceSession.create(new Uint8Array(await answer.arrayBuffer()), {
-      executionProviders: [engine],
-      graphOptimizationLevel: "all",
-      logSeverityLevel: 3, // errors alone
-    });
+    const options = { executionProviders: [engine], graphOptimizationLevel: "all", logSeverityLevel: 3 }; // errors alone
+    const [content] = await Promise.all([fetched(graph), ort.InferenceSession.create(IDENTITY, options)]);
+    session = await ort.InferenceSession.create(content, options);
     const size = session.inputMetadata.find((input) => input.name === "state").shape[0];
     state = new ort.Tensor("float32", new Float32Array(size), [size]);
+    const blank = new Uint8Array(4 * BLANK * BLANK);
+    await run(blank, BLANK, BLANK, FIRST_INTERVAL, new Float32Array(5)); // the first run compiles and allocates
     return { ready: { engine, threads: ort.env.wasm.numThreads } };
   }
 
@@ -46,12 +53,7 @@ export function answerFrames(ort, engine) {
     controls[GAIN] = gain;
     controls[SMOOTHING] = smoothing;
     controls[RESET] = reset ? 1 : 0;
-    const found = await session.run({
-      image: new ort.Tensor("uint8", pixels, [height, width, 4]),
-      interval: new ort.Tensor("float32", new Float32Array([interval]), []),
-      controls: new ort.Tensor("float32", controls, [5]),
-      state,
-    });
+    const found = await run(pixels, width, height, interval, controls);
     state = found.next_state;
     const numbers = (name) => Float32Array.from(found[name].data);
     return {
@@ -64,6 +66,14 @@ export function answerFrames(ort, engine) {
       },
     };
   }
+
+  const run = (pixels, width, height, interval, controls) =>
+    session.run({
+      image: new ort.Tensor("uint8", pixels, [height, width, 4]),
+      interval: new ort.Tensor("float32", new Float32Array([interval]), []),
+      controls: new ort.Tensor("float32", controls, [5]),
+      state,
+    });
 
   function read(picture) {
     const width = picture.displayWidth ?? picture.width, height = picture.displayHeight ?? picture.height;

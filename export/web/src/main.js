@@ -78,6 +78,7 @@ const page = {
 };
 
 const engine = server ? new ServerEngine(page, element("picture")) : new CameraEngine(page, element("video"));
+if (!server && !stream) engine.prepare(); // first: drawing takes a while to begin
 const playing = new WeightControls();
 const takes = new TakeList(engine.takes, () => character, (frame) => stage?.pose(playing.apply(frame, NEUTRAL)));
 
@@ -218,7 +219,4 @@ if (!stream) offerCharacters(use, (file) => takes.take(file));
 shippedCharacter(use).catch((error) => showProblem("character", `The character could not be loaded: ${error.message}.`));
 takes.refresh();
 if (server || stream) engine.start();
-else {
-  showStatus(INVITATION);
-  engine.prepare();
-}
+else showStatus(INVITATION);

@@ -26,7 +26,6 @@ from torchface.shape_names import ARKIT
 from torchface.workflows.browser_app.app_folder import CHARACTER, TABLE
 from torchface.workflows.browser_app.built_page import built_page
 from torchface.workflows.browser_app.character import load_character
-from torchface.workflows.enhance.enhance_animation import EnhanceSettings, enhance_animation, load_model
 from torchface.workflows.live.camera import DEFAULT_SIZE
 from torchface.workflows.live.kept_takes import (
     ANIMATION,
@@ -144,6 +143,8 @@ def go_live(
     if settings.seconds is not None:
         checked_number("seconds", settings.seconds, above=True)
     if settings.enhance is not None:
+        from torchface.workflows.enhance.enhance_animation import load_model  # a tenth of all that is imported
+
         load_model(settings.enhance)  # which is wrong should not be said after the take
     notes = Notes(say)
     with ExitStack() as stack:
@@ -226,6 +227,8 @@ ENHANCED = "enhanced"
 
 def _enhance(takes: list[SavedTake], model: str, say: Say, progress: Progress) -> None:
     """Writes each take with an actor's wrinkles beside its files."""
+    from torchface.workflows.enhance.enhance_animation import EnhanceSettings, enhance_animation
+
     for take in takes:
         if take.error or not take.frames:
             continue
