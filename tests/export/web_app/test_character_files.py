@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 import torch
 from browser import posted
+from osc_receiver import values_by_address
 from rig_samples import corrective_sheet, named_sheet, quad_sheet
 from scipy.spatial.transform import Rotation
 from test_vrm_in_browser import browser as vrm_browser  # noqa: F401  (three-vrm's packages)
@@ -23,9 +24,11 @@ from torchface.io.gltf.accessors import read_floats
 from torchface.io.gltf.gltf_document import read_document
 from torchface.io.gltf.performance_animation import Performance, performed_glb
 from torchface.io.gltf.primitive_reading import read_target_names
+from torchface.io.protocols.vmc_packets import VmcPackets
 from torchface.io.weights.weight_csv import save_weights_csv
 from torchface.shape_names import ARKIT, VRM1, mapping
 from torchface.workflows.browser_app.character import load_character
+from torchface.workflows.track.head_rotations import head_angles
 
 pytestmark = pytest.mark.browser
 VRM_WEB = Path(__file__).parents[2] / "io" / "vrm" / "web"
@@ -251,14 +254,30 @@ def test_three_vrm_plays_a_saved_vrm_animation(run: Run, tmp_path: Path, vrm_bro
     assert pygltflib.GLTF2.load_binary(str(tmp_path / "take.vrma")).animations[0].name == "performance"
     files = {"/avatar.vrm": avatar.read_bytes(), "/animation.vrma": (tmp_path / "take.vrma").read_bytes()}
     found = posted(vrm_browser, VRM_WEB, "avatar.html?animation=1", tmp_path, files)
-    head = np.diag([1.0, -1.0, -1.0]) @ rows[0, 53:62].reshape(3, 3)
-    angle = Rotation.from_matrix(head).magnitude()
-    assert found["turned"]["head"] == pytest.approx(0.7 * angle, abs=1e-3)
-    assert found["turned"]["neck"] == pytest.approx(0.3 * angle, abs=1e-3)
+    head = Rotation.from_matrix(np.diag([1.0, -1.0, -1.0]) @ rows[0, 53:62].reshape(3, 3))
     weights = torch.tensor(rows[:1, 1:53], dtype=torch.float32)
     clips = dict(zip(VRM1.names, VRM1.from_arkit(weights)[0].tolist(), strict=True))
     expected = {"JawOpen": float(weights[0, ARKIT.index("jawOpen")])} if own else {n: clips[n] for n in expressions}
-    for name, value in expected.items():
+    assert_posed(found, head, expected)
+    if own:
+        return
+    # The same by VMC, as python-osc decodes it and UniVRM takes it over from Unity, whose x axis is turned round.
+    angles = torch.tensor(rows[0, 53:62], dtype=torch.float64).reshape(3, 3)
+    rotations = torch.cat([head_angles(angles), torch.zeros(6, dtype=torch.float64)])
+    sent = values_by_address(VmcPackets(ARKIT)(weights[0], rotations))
+    turns = {name[0].lower() + name[1:]: turn for name, _, _, _, *turn in sent["/VMC/Ext/Bone/Pos"]}
+    bones = {name: [x, -y, -z, w] for name, (x, y, z, w) in turns.items() if "Eye" not in name}
+    pose = json.dumps({"bones": bones, "clips": dict(sent["/VMC/Ext/Blend/Val"])}).encode()
+    files = {"/avatar.vrm": avatar.read_bytes(), "/pose.json": pose}
+    assert_posed(posted(vrm_browser, VRM_WEB, "avatar.html?pose=1", tmp_path, files), head, expected)
+
+
+def assert_posed(found: dict[str, Any], head: Rotation, expressions: dict[str, float]) -> None:
+    """Neck and head together are turned as the head is, the neck by 0.3 of it."""
+    neck = Rotation.from_quat(found["turned"]["neck"])
+    assert (head.inv() * neck * Rotation.from_quat(found["turned"]["head"])).magnitude() < 1e-3
+    assert (Rotation.from_rotvec(0.3 * head.as_rotvec()).inv() * neck).magnitude() < 1e-3
+    for name, value in expressions.items():
         assert found["shown"][name] == pytest.approx(value, abs=1e-3), name
 
 
