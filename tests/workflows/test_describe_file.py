@@ -6,11 +6,13 @@ import numpy as np
 import pytest
 import torch
 
+from planted.characters import Planted, packed, unpacked, write_character
 from torchface import Take, Track, save_take
 from torchface.errors import FileFormatError
 from torchface.geometry.cameras.calibration import CameraCalibration
-from torchface.io import save_calibration
+from torchface.io import save_calibration, save_mesh
 from torchface.io.landmarks.landmark_points import save_pts
+from torchface.synthetic import neutral_head
 from torchface.workflows.describe_file import describe
 
 
@@ -55,3 +57,18 @@ def test_folders_that_are_no_rigs_say_what_they_are(tmp_path: Path) -> None:
     (tmp_path / "model.toml").touch()
     with pytest.raises(FileFormatError, match=r"found a learned model, .*zoo describe"):
         describe(tmp_path)
+
+
+def test_a_head_of_two_metres_and_a_texture_that_is_not_read_are_said(tmp_path: Path) -> None:
+    head = neutral_head(texture=False)
+    save_mesh(head.with_vertices(8 * head.vertices), tmp_path / "large.obj")
+    ((_, said),) = [row for row in describe(tmp_path / "large.obj") if row[0] == "warning"]
+    assert "mm, expected 80 to 700 of a head" in said
+    whole = tmp_path / "whole.glb"
+    write_character(whole, head, how=Planted())  # a head with a body
+    assert not [row for row in describe(whole) if row[0] == "warning"]
+    root, binary = unpacked(whole)
+    root["textures"][0] = {"extensions": {"KHR_texture_basisu": {"source": root["textures"][0]["source"]}}}
+    whole.write_bytes(packed(root, binary))
+    ((_, said),) = [row for row in describe(whole) if row[0] == "warning"]
+    assert "1 of its textures cannot be read (KHR_texture_basisu)" in said

@@ -23,6 +23,7 @@ from torchface.io import (
     load_rig,
     load_take,
 )
+from torchface.io.gltf.gltf_reading import unread_textures
 from torchface.io.head_models.head_model_files import is_head_model_file
 from torchface.io.images.image_files import IMAGE_ENDINGS, load_image
 from torchface.io.landmarks.landmark_points import load_landmark_points
@@ -50,6 +51,9 @@ Rows = list[tuple[str, str]]
 _MAX_LENGTH = 240
 _LENGTH, _LONGEST_HEADER = "_mm", 4096  # ends the names of columns that are no weights
 _MAX_NAMED, _MAX_LISTED = 8, 10
+_HEADS, _BODY, _TALLEST = (80, 700), 0.45, 2500.0
+"""Millimetres: the largest extent of a face or head; a body's least width of its height, and its height."""
+_GLTF_ENDINGS = (".glb", ".gltf", ".vrm")
 
 
 def describe(path: Path, attachment: Path | None = None, part: str | None = None) -> Rows:
@@ -69,9 +73,9 @@ def describe(path: Path, attachment: Path | None = None, part: str | None = None
     if path.is_dir() or suffix in SCENE_ENDINGS:
         mesh, rig = load_neutral(path, part=part)
         if rig is None and attachment is None:
-            return _mesh_rows(mesh)
+            return [*_mesh_rows(mesh), *_texture_rows(path)]
         rig = rig or load_rig(path, part=part)  # whose error says what is missing
-        rows = [*_rig_rows(rig), *_animation_rows(path)]
+        rows = [*_rig_rows(rig), *_texture_rows(path), *_animation_rows(path)]
         if attachment is not None:
             from torchface.capture.markers import MarkerSolver, observability
 
@@ -203,6 +207,12 @@ def _mesh_rows(mesh: Mesh) -> Rows:
         ("texture coordinates", "none" if mesh.uvs is None else f"{len(mesh.uvs):,}"),
         ("texture", "none" if mesh.texture is None else "x".join(str(n) for n in mesh.texture.shape[:0:-1])),
     ]
+    width, height, depth = (mesh.vertices.amax(0) - mesh.vertices.amin(0)).tolist()
+    largest, body = max(width, height, depth), min(width, depth) < _BODY * height
+    if not _HEADS[0] <= largest <= _HEADS[1] and not (body and largest < _TALLEST):
+        rows.append(
+            ("warning", f"{largest:,.4g} mm, expected {_HEADS[0]} to {_HEADS[1]} of a head: --unit says another unit")
+        )
     if mesh.annotations is not None:
         notes = mesh.annotations
         rows += [
@@ -212,6 +222,13 @@ def _mesh_rows(mesh: Mesh) -> Rows:
             ("contact pairs", "none" if notes.contacts is None else str(len(notes.contacts))),
         ]
     return rows
+
+
+def _texture_rows(path: Path) -> Rows:
+    unread = unread_textures(path) if path.is_file() and path.suffix.lower() in _GLTF_ENDINGS else []
+    if not unread:
+        return []
+    return [("warning", f"{len(unread)} of its textures cannot be read ({unread[0]}): export it with PNG or JPEG")]
 
 
 def _extent(points: Tensor) -> str:

@@ -188,6 +188,16 @@ def image_bytes(document: Document, index: object) -> tuple[memoryview, int] | N
     return document.view(image.get("bufferView"), f"{location}.bufferView")[0], source
 
 
+def unread_textures(path: str | Path) -> list[str]:
+    """The kinds of the textures of a file that cannot be read, such as ``KHR_texture_basisu`` (KTX2)."""
+    document = read_document(path)
+    return [
+        ", ".join(document.record(texture.get("extensions"), f"textures[{row}]")) or "no image"
+        for row, texture in enumerate(document.objects("textures"))
+        if image_bytes(document, row) is None
+    ]
+
+
 def read_texture(document: Document, index: int) -> Tensor | None:
     """The image of a texture; none where only an extension has it."""
     found = image_bytes(document, index)

@@ -48,8 +48,9 @@ FACE_SPAN = 260.0
 
 _STILL_MM = 2e-3  # at a head's size; what moves less does not move
 _FAR, _LEAST_MET = 4.0, 0.4  # millimetres of a head's size between face and template, and the face's share that is met
-_OF_SCANS = ("the scan has neither", "the scan's triangles")
+_OF_SCANS = ("the scan has neither", "the scan's triangles", "landmarks disagree")
 """Notes of a registration that say nothing of a character."""
+_COARSE, _WIDE = 1500, 500.0  # triangles of a skin, millimetres of a shape's motion: what is warned of
 _TONGUE, _JAW, _CLOSE = "tongueOut", "jawOpen", "mouthClose"
 _MOST_TRIANGLES = 500_000  # of a head: its shapes take some 6 GB
 _CONVERT = {
@@ -345,6 +346,8 @@ class _Job:
                 f"  note: {1 + len(found.others)} faces were seen; the one at {_place(found.middle)} was taken"
             )
             lines.append(f"    the others are at {', '.join(map(_place, found.others))}, in the file's unit")
+        if (count := len(self.face.skin.faces)) < _COARSE:
+            lines.append(f"  warning: its skin has {count:,} triangles, expected {_COARSE:,} for lids and lips to shut")
         lines.append(f"template: {record.figures()}")
         lines += [f"  note: {note}" for note in record.notes if not note.startswith(_OF_SCANS)]
         lines += [f"parts: {note}" for note in (() if self.parts is None else self.parts.notes)]
@@ -374,6 +377,12 @@ class _Job:
         motion = {name: self._present_motion(shape) for name, shape in there.items()}
         still = [name for name, moved in motion.items() if not bool((moved.norm(dim=-1) > _STILL_MM).any())]
         lines = [f"  note: {', '.join(still)}: there, but nothing moves by it"] if still else []
+        far = {name: float(moved.norm(dim=-1).max()) for name, moved in motion.items()}
+        lines += [
+            f"  warning: its {name} moves by {size:.3g} mm at a head's size"
+            for name, size in far.items()
+            if size > _WIDE
+        ]
         if _JAW in motion and _CLOSE in motion and not {_JAW, _CLOSE} & set(still):
             deltas = torch.stack([motion[_JAW], motion[_CLOSE]]).float()
             own = BlendshapeRig.from_tensors(self.face.vertices.float(), self.character.faces, deltas, (_JAW, _CLOSE))
