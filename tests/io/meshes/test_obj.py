@@ -143,6 +143,26 @@ def test_materials_lead_nowhere_outside_the_folder(tmp_path: Path) -> None:
         load_mesh(tmp_path / "inside" / "a.obj")
 
 
+def test_faces_have_the_images_and_colours_of_their_own_materials(tmp_path: Path) -> None:
+    """Also a material that no library has, which looks like the first image, and a face before any material."""
+    for name, color in (("red", (1.0, 0.0, 0.0)), ("blue", (0.0, 0.0, 1.0))):
+        save_image(torch.tensor(color).view(3, 1, 1).expand(3, 8, 8), tmp_path / f"{name}.png")
+    (tmp_path / "a.mtl").write_text(
+        "newmtl r\nKd 0 0 0\nmap_Kd red.png\nnewmtl b\nmap_Kd blue.png\nnewmtl g\nKd 0 1 0\n"
+    )
+    square, face = "v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\nvt 0 0\nvt 1 0\nvt 1 1\nvt 0 1\n", "f 1/1 2/2 3/3 4/4\n"
+    used = (
+        "usemtl r\n" + face + "usemtl b\n" + 2 * face + "usemtl g\nf 1 2 3\nusemtl lost\n" + face + "usemtl b\n" + face
+    )
+    mesh = load_mesh(write(tmp_path / "a.obj", "mtllib a.mtl\n" + square + face + used))
+    middle = mesh.uvs[mesh.uv_faces].mean(1)
+    height, width = mesh.texture.shape[1:]
+    column, row = (middle[:, 0] * width).long(), ((1 - middle[:, 1]) * height).long()
+    seen = mesh.texture[:, row, column].T
+    expected = "rr rr bb bb g rr bb".replace(" ", "")
+    assert seen.tolist() == [{"r": [1, 0, 0], "b": [0, 0, 1], "g": [0, 1, 0]}[one] for one in expected]
+
+
 def test_a_mutated_obj_is_read_or_refused(tmp_path: Path) -> None:
     mesh = quad_sheet()
     save_mesh(mesh, tmp_path / "sheet.obj")

@@ -16,9 +16,11 @@ from torchface.io.images.image_files import encode_png, load_image
 from torchface.io.length_units import finite_vertices, millimetres_per
 from torchface.io.meshes.obj_statements import Statements, read_statements, read_vertices, texture_coordinates
 from torchface.io.meshes.polygons import corners_of_polygons, pad_polygons
+from torchface.io.scenes.texture_atlas import Look, with_looks
 from torchface.mesh import Mesh
 
 _MAX_MATERIALS = 2**20  # bytes, of all material files of a mesh
+_MAX_TEXELS = 2**27  # of all its images
 
 
 def read_obj(path: str | Path, unit: str = "mm") -> Mesh:
@@ -33,11 +35,11 @@ def read_obj(path: str | Path, unit: str = "mm") -> Mesh:
     vertices = finite_vertices(path, statements.vertices[:, :3] * scale)
     polygons = pad_polygons(str(path), statements.sizes, statements.corners)
     uvs, uv_polygons = _texture_coordinates(path, statements)
-    rest = {"colors": _colors(path, statements.vertices), "texture": _texture(path, statements)}
+    colors, (looks, look) = _colors(path, statements.vertices), _looks(path, statements)
+    look = look.repeat_interleave(torch.from_numpy(statements.sizes) - 2)
     del statements  # a large mesh fits the memory once, not twice
-    if polygons.shape[1] == 3:
-        return Mesh(vertices, polygons, uvs, uv_polygons, **rest)  # type: ignore[arg-type]
-    return Mesh.from_polygons(vertices, polygons, uvs, uv_polygons, **rest)  # type: ignore[arg-type]
+    make = Mesh if polygons.shape[1] == 3 else Mesh.from_polygons
+    return with_looks(make(vertices, polygons, uvs, uv_polygons, colors=colors), look, looks)
 
 
 def read_obj_vertices(path: str | Path, neutral: Mesh, topology: bytes | None, unit: str = "mm") -> Tensor:
@@ -140,12 +142,40 @@ def _colors(path: Path, table: NDArray[np.float64]) -> Tensor | None:
     return torch.from_numpy((colors / scale).clip(0, 1).astype(np.float32))
 
 
-def _texture(path: Path, statements: Statements) -> Tensor | None:
-    """The image of the first material in use that has one."""
-    images: dict[str, str] = {}
+def _looks(path: Path, statements: Statements) -> tuple[list[Look], Tensor]:
+    """The images and plain colours of the materials in use, and which of them each face has, (P,).
+
+    Without any image there is one look; materials that no library has look like the first one with an image.
+    """
+    kinds = _materials(path, statements.libraries)
+    used = [(name.decode("utf-8", "replace").strip(), first) for name, first in statements.materials]
+    used = [(name, 0 if not row else first) for row, (name, first) in enumerate(used or [(n, 0) for n in kinds][:1])]
+    images = {name: _image_beside(path, kinds[name][0]) for name, _ in used if name in kinds}
+    first_image = next((file for file in images.values() if file is not None), None)
+    if first_image is None:
+        return [Look(None)], torch.zeros(len(statements.sizes), dtype=torch.int64)
+    keys: dict[tuple[Path | None, tuple[float, ...]], int] = {}
+    rows = []
+    for name, _ in used:
+        file = images.get(name, first_image)
+        rows.append(keys.setdefault((file, kinds[name][1] if file is None else ()), len(keys)))
+    looks, texels = [], 0
+    for file, color in keys:
+        looks.append(Look(None, torch.tensor(color)) if file is None else Look(load_image(file)))
+        image = looks[-1].image
+        texels += 0 if image is None else image[0].numel()
+        if texels > _MAX_TEXELS:
+            raise FileFormatError(f"{path}: found images of more than {_MAX_TEXELS:,} texels, expected fewer")
+    begin = torch.tensor([first for _, first in used] + [len(statements.sizes)])
+    return looks, torch.tensor(rows).repeat_interleave(begin.diff())
+
+
+def _materials(path: Path, libraries: Iterable[bytes]) -> dict[str, tuple[str, tuple[float, ...]]]:
+    """The name of the image, "" for none, and the colour of each material."""
+    found: dict[str, tuple[str, tuple[float, ...]]] = {}
     opened: set[Path] = set()
     left = _MAX_MATERIALS
-    for library in statements.libraries:
+    for library in libraries:
         file = _beside(path, library)
         if file is None or file in opened or not file.is_file():
             continue  # exporters name libraries that nobody passes on; the mesh is whole without
@@ -157,14 +187,25 @@ def _texture(path: Path, statements: Statements) -> Tensor | None:
             words = line.split()
             if len(words) >= 2 and words[0] == "newmtl":
                 material = " ".join(words[1:])
+                found.setdefault(material, ("", (1.0, 1.0, 1.0)))
             elif len(words) >= 2 and words[0] == "map_Kd":
-                images.setdefault(material, words[-1])
-    used = [name.decode("utf-8", "replace").strip() for name in statements.materials]
-    for name in used or list(images):
-        image = _beside(path, images[name].encode()) if name in images else None
-        if image is not None and image.is_file():
-            return load_image(image)
-    return None
+                image, color = found.get(material, ("", (1.0, 1.0, 1.0)))
+                found[material] = image or words[-1], color
+            elif len(words) == 4 and words[0] == "Kd" and material in found:
+                found[material] = found[material][0], _color(words[1:], found[material][1])
+    return found
+
+
+def _color(words: list[str], otherwise: tuple[float, ...]) -> tuple[float, ...]:
+    try:
+        return tuple(min(max(float(word), 0.0), 1.0) for word in words)
+    except ValueError:
+        return otherwise
+
+
+def _image_beside(path: Path, name: str) -> Path | None:
+    file = _beside(path, name.encode()) if name else None
+    return file if file is not None and file.is_file() else None
 
 
 def _beside(path: Path, name: bytes) -> Path | None:

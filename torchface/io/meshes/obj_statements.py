@@ -28,7 +28,7 @@ class Statements:
         corners: vertex ids, (C,).
         uv_corners: which texture coordinate, (C,), -1 for none; absent where no corner has one.
         libraries: material files in their order, each once.
-        materials: in use, in their order, each once.
+        materials: in use, and how many faces come before each, in their order.
     """
 
     vertices: NDArray[np.float64]
@@ -37,7 +37,7 @@ class Statements:
     corners: NDArray[np.int64]
     uv_corners: NDArray[np.int64] | None
     libraries: list[bytes]
-    materials: list[bytes]
+    materials: list[tuple[bytes, int]]
 
 
 def read_statements(path: Path, data: bytes) -> Statements:
@@ -46,14 +46,19 @@ def read_statements(path: Path, data: bytes) -> Statements:
     coordinates: list[bytes] = []
     coordinate_count = 0
     libraries: dict[bytes, None] = {}
-    materials: dict[bytes, None] = {}
+    materials: list[tuple[bytes, int]] = []
+    face_count = 0
     for lines in _lines_by_keyword(path, data):
         vertices.append(_number_rows(path, "v", lines[b"v"], _VERTEX_WIDTHS))
         faces.append(_face_corners(path, lines[b"f"]))
         coordinates.append(b"\n".join(lines[b"vt"]))
         coordinate_count += len(lines[b"vt"])
         libraries.update(dict.fromkeys(lines[b"mtllib"]))
-        materials.update(dict.fromkeys(lines[b"usemtl"]))
+        for line in lines[b"usemtl"]:
+            above, name = line.split(b" ", 1)
+            if not materials or materials[-1][0] != name:
+                materials.append((name, face_count + int(above)))
+        face_count += len(lines[b"f"])
         if len(libraries) > _MAX_LIBRARIES:
             raise FileFormatError(f"{path}: found more than {_MAX_LIBRARIES} material files, expected fewer")
     table = _joined(path, vertices)
@@ -77,7 +82,7 @@ def read_statements(path: Path, data: bytes) -> Statements:
             uv_corners = None
         else:
             _check_range(path, "texture coordinate", uv_corners, coordinate_count, first=-1)
-    return Statements(table, coordinates, sizes, corners, uv_corners, list(libraries), list(materials))
+    return Statements(table, coordinates, sizes, corners, uv_corners, list(libraries), materials)
 
 
 def read_vertices(path: Path, data: bytes) -> NDArray[np.float64]:
@@ -130,7 +135,10 @@ def _floats(path: Path, keyword: str, words: Iterable[bytes]) -> NDArray[np.floa
 
 
 def _lines_by_keyword(path: Path, data: bytes) -> Iterator[dict[bytes, list[bytes]]]:
-    """What follows the keyword, for the keywords that are read, piece by piece; text comes by the line."""
+    """What follows the keyword, for the keywords that are read, piece by piece; text comes by the line.
+
+    Before the name of a material stands how many of the piece's faces come before it.
+    """
     if b"\0" in data[:4096]:
         raise FileFormatError(f"{path}: found binary data, expected the text of an OBJ")
     vertex_count = coordinate_count = 0
@@ -141,7 +149,8 @@ def _lines_by_keyword(path: Path, data: bytes) -> Iterator[dict[bytes, list[byte
         for line in piece.splitlines():
             words = line.split(None, 1)
             if len(words) == 2 and (rows := known.get(words[0])) is not None:
-                rows.append(words[1])
+                is_material = words[0] == b"usemtl"
+                rows.append(b"%d %b" % (len(faces), words[1]) if is_material else words[1])
                 if rows is faces and b"-" in words[1]:  # a relative index counts back from the last vertex above it
                     above = vertex_count + len(vertices), coordinate_count + len(coordinates)
                     faces[-1] = _absolute(path, words[1], *above)
