@@ -209,6 +209,17 @@ def test_mistakes_end_with_a_message_and_status_2(
     assert message in told.replace("\n", " ")
 
 
+def test_a_demo_that_was_killed_is_said_to_begin_anew(
+    shoot: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ["demo", "--template", str(shoot / "rig.glb"), "--out", str(tmp_path), "--quiet"]
+    for name, said in (("nothing", False), ("template.glb", True), ("index.html", False)):
+        (tmp_path / name).touch()
+        with pytest.raises(SystemExit):
+            main(words)
+        assert ("begins anew" in " ".join(capsys.readouterr().err.split())) == said
+
+
 def test_every_command_explains_itself_and_its_arguments(capsys: pytest.CaptureFixture[str]) -> None:
     for words in WORDS:
         with pytest.raises(SystemExit) as ended:

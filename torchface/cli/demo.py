@@ -45,8 +45,10 @@ def demo(
 
     checked_count("--seed", seed, 0, LARGEST_SEED)
     with job_lock(out), progress_bars(quiet) as progress:
+        if (out / _FILES[0]).exists() and not (out / "index.html").exists():
+            console.print(f"{out}: an earlier run did not come to its end; this one begins anew", highlight=False)
         progress("preparing head and take")
-        scene = scene_from(template, take, target, seed)
+        scene = scene_from(template, take, target, seed, progress)
         result = run_demo(scene, out, seed, progress=progress)
         page = write_demo_page(result, out, progress)
     console.print(_table(scene.title, scene_rows(result)))

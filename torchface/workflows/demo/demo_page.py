@@ -104,8 +104,8 @@ def write_demo_page(result: DemoResult, out: Path, progress: Progress | None = N
     active = distinct[active]
     progress("writing the performance for the page")
     markup = _player(result, out, shown, [names[i] for i in active.tolist()])
-    progress("rendering the rig")
-    rig_figure = _rig_figure(result)
+    rig_figure = _rig_figure(result, progress)
+    progress("drawing one frame")
     frame_figure = _frame_figure(result, shown)
     progress("drawing curves and markers")
     solved, single = result.solved, result.frame_by_frame
@@ -263,9 +263,10 @@ def _posed(result: DemoResult, weights: dict[str, float]) -> tuple[Mesh, Mesh]:
     return pair[0], pair[1]
 
 
-def _rig_figure(result: DemoResult) -> Tensor:
-    upper, lower = [], []
+def _rig_figure(result: DemoResult, progress: Progress) -> Tensor:
+    upper, lower = list[Tensor](), list[Tensor]()
     for title, weights in _POSES.items():
+        progress("rendering the rig", len(upper), len(_POSES))
         template, actor = _posed(result, weights)
         upper.append(
             face_views(

@@ -126,10 +126,12 @@ class DemoResult:
     files: dict[str, Path]
 
 
-def embedded_scene(seed: int, frames: int = 1800) -> Scene:
+def embedded_scene(seed: int, frames: int = 1800, progress: Progress = silent) -> Scene:
     """The mean performer's rig, a performer drawn at random, and a synthetic performance."""
     generator = torch.Generator().manual_seed(seed)
+    progress("preparing head and take", 0, 2)
     truth = shown_rig(performer(draw_identities(1, generator)[0], texture=False))
+    progress("preparing head and take", 1, 2)
     weights = perform(frames, generator)
     assert weights.weights is not None
     return Scene(
@@ -142,7 +144,9 @@ def embedded_scene(seed: int, frames: int = 1800) -> Scene:
     )
 
 
-def scene_from(template: Path | None, take: Path | None, target: Path | None, seed: int) -> Scene:
+def scene_from(
+    template: Path | None, take: Path | None, target: Path | None, seed: int, progress: Progress = silent
+) -> Scene:
     """A scene of the user's own parts; what is not given, the embedded performer gives.
 
     Args:
@@ -154,7 +158,7 @@ def scene_from(template: Path | None, take: Path | None, target: Path | None, se
     played = None if take is None else _weight_take(take)
     generator = torch.Generator().manual_seed(seed)
     if template is None:
-        scene = embedded_scene(seed)
+        scene = embedded_scene(seed, progress=progress)
     else:
         rig = load_rig(template)
         if target is not None:
@@ -230,17 +234,19 @@ def _run_demo(scene: Scene, out: Path, seed: int, flaws: StageFlaws, progress: P
     generator = torch.Generator().manual_seed(seed)
     recording = record(scene.truth, attachment, scene.weights, generator, flaws, scene.fps)
     save_take(recording.take, files["marker take"])
-    progress("solving the take")
+    progress("solving the take", 0, 2)
     marker_solver = MarkerSolver(rig, attachment)
     captured = load_take(files["marker take"])
     started = time.perf_counter()
     solved = WholeTakeSolver(marker_solver).solve_take(captured)
     seconds = time.perf_counter() - started
+    progress("solving the take", 1, 2)
     single = marker_solver.solve_take(captured)
-    progress("writing weights, animation and solver")
+    progress("writing weights and animation")
     live = bool(mapping(rig.names, ARKIT).any())
     (save_live_link if live else save_weights_csv)(solved, files["solved weights"])
     save_animation(rig, solved, files["animated rig"])
+    progress("exporting and checking the solver")
     some = recording.markers[:: max(1, len(recording.markers) // 300)]
     seen = some + flaws.noise * torch.randn(some.shape, generator=generator)
     solver = export_solver(rig, attachment, files["solver for applications"], markers=seen)
