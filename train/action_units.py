@@ -7,7 +7,7 @@ six minutes of one core.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import torch
@@ -169,7 +169,9 @@ def filmed(settings: Settings, progress: Progress) -> list[tuple[Path, ActionLab
         generator = torch.Generator().manual_seed(settings.seed + 1 + number)
         one = record_session(folder, f"p{number}", identity, generator, stage, progress)
         save_rig(one.rig, folder / f"p{number}.glb")
-        one.attachment.save(folder / f"p{number}.json")
+        first = one.attachment.on(one.rig.neutral.faces, one.rig(one.performance.weights[:1]))[0]
+        stood_off = one.recording.markers[0] - first  # markers are balls, whose centres lie off the skin
+        replace(one.attachment, residual=stood_off).save(folder / f"p{number}.json")
         weights = Track(one.rig.names, one.performance.weights[..., None])
         save_take(Take(_FPS, weights=weights), folder / f"p{number}.csv")
         films.append((one.video.path, one.labels))

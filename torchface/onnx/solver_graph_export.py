@@ -32,7 +32,7 @@ from torchface.optim.projected_gradient import ProjectedGradient
 from torchface.rig import BlendshapeRig
 
 _RHOS = (0.03, 0.045, 0.06, 0.075, 0.09, 0.12, 0.16, 0.22, 0.3, 0.4)
-GRADIENT_STEPS = 300
+GRADIENT_STEPS, GRADIENT_STEPS_WITH_GAPS = 300, 500
 _PARITY = 1e-5
 # Two runs that round differently may lie a few times as far from each other as one does from the exact sum; a graph
 # that computes something else lies much farther.
@@ -103,7 +103,7 @@ class GraphSteps:
 
     Args:
         seen: for batches in which every marker is seen; 66, or 300 of projected gradient, if absent.
-        with_gaps: for batches with missing markers; 96, or 300 of projected gradient, if absent.
+        with_gaps: for batches with missing markers; 96, or 500 of projected gradient, if absent.
         method: operator splitting, written out, or ``ProjectedGradient``, a ``Loop``.
 
     Raises:
@@ -213,7 +213,7 @@ def solver_graph(
         return CorrectiveGraph(solver)
     H = solver.complete_hessian()
     if steps.method == "projected-gradient":
-        seen, gaps = steps.seen or GRADIENT_STEPS, steps.with_gaps or GRADIENT_STEPS
+        seen, gaps = steps.seen or GRADIENT_STEPS, steps.with_gaps or GRADIENT_STEPS_WITH_GAPS
         return SolverGraph(solver, ProjectedGradient(H, steps=seen), ProjectedGradient(steps=gaps))
     seen, gaps = steps.seen or STEPS, steps.with_gaps or STEPS_WITH_GAPS
     rho = choose_rho(solver, seen, frames)
