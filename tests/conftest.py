@@ -14,6 +14,7 @@ from typing import Any
 
 import pytest
 import torch
+from headless_chromium import headless_chromium
 from hypothesis import settings
 
 from torchface.attachment import Attachment
@@ -208,3 +209,10 @@ def receiver() -> Iterator[Any]:
     opened = OscReceiver()
     yield opened
     opened.server.server_close()
+
+
+@pytest.fixture(scope="session")
+def chromium(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
+    """The driver of a Chromium that draws pages, one after the other."""
+    with headless_chromium(tmp_path_factory.mktemp("chromium"), size=(600, 600)) as driver:
+        yield driver

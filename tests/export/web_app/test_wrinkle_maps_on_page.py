@@ -6,10 +6,11 @@ import base64
 import json
 import shutil
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
-from browser import WEB, chromium, posted
+from browser import WEB, posted
 from test_gltf_viewers import node  # noqa: F401  (its packages)
 from torch import Tensor
 
@@ -53,10 +54,7 @@ def waves(side: int, across: float, up: float) -> Tensor:
     return torch.nn.functional.normalize(torch.stack([slope, 0.5 * slope, torch.ones(side, side)]), dim=0)
 
 
-def test_the_page_mixes_as_the_library_does(node: str, tmp_path: Path) -> None:  # noqa: F811
-    browser = chromium()
-    if browser is None:
-        pytest.skip("no Chromium is installed (apt-get install chromium)")
+def test_the_page_mixes_as_the_library_does(node: str, chromium: Any, tmp_path: Path) -> None:  # noqa: F811
     rig = performer(texture=False).select(["jawOpen", "browInnerUp"])
     maps = DetailMaps(rig.names, torch.stack([waves(256, 160, 0), waves(256, 0, 200)]), waves(256, 90, 90))
     weights = torch.tensor([0.4, 0.7])
@@ -75,7 +73,7 @@ def test_the_page_mixes_as_the_library_does(node: str, tmp_path: Path) -> None: 
     files = [("wrinkled", row), ("expected", row), ("at_rest", row), ("wrinkled", [0.0] * 52), ("at_rest", [0.0] * 52)]
     shots = json.dumps([[f"/{name}.glb", values] for name, values in files])
     (tmp_path / "page.html").write_text(PAGE.replace("SHOTS", shots))
-    found = posted(browser, tmp_path, "page.html", tmp_path, {})["pictures"]
+    found = posted(chromium, tmp_path, "page.html", {})["pictures"]
     pictures = [decode_image(base64.b64decode(url.partition(",")[2]), "the page's picture") for url in found]
     moved, expected, still, rest, rest_expected = pictures
     off = lambda a, b: float((a - b).abs().mean() * 255)  # noqa: E731

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import base64
 import json
-import shutil
-import subprocess
 import threading
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from functools import partial
 from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -41,21 +40,13 @@ class Shot:
     turns: dict[str, tuple[float, float]] = field(default_factory=dict)
 
 
-def chromium() -> str | None:
-    """The path of a Chromium, or none."""
-    return next(
-        (found for name in ("chromium", "chromium-browser", "google-chrome") if (found := shutil.which(name))), None
-    )
-
-
-def posted(browser: str, web: Path, page: str, folder: Path, files: dict[str, bytes]) -> dict:
+def posted(browser: Any, web: Path, page: str, files: dict[str, bytes]) -> dict:
     """What a page of a folder posts, drawn without a GPU.
 
     Args:
-        browser: see ``chromium``.
+        browser: the driver of ``chromium``.
         web: the folder that is served.
         page: of it, with its query.
-        folder: for the browser's profile.
         files: what is served beside, by path.
     """
     results: list[dict] = []
@@ -83,28 +74,22 @@ def posted(browser: str, web: Path, page: str, folder: Path, files: dict[str, by
 
     server = ThreadingHTTPServer(("127.0.0.1", 0), partial(Handler, directory=str(web)))
     threading.Thread(target=server.serve_forever, daemon=True).start()
-    flags = ["--headless", "--no-sandbox", "--disable-gpu", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
-    flags += ["--no-first-run", "--disable-dev-shm-usage", f"--user-data-dir={folder / 'profile'}"]
-    address = f"http://127.0.0.1:{server.server_port}/{page}"
-    process = subprocess.Popen([browser, *flags, address], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     try:
+        browser.get(f"http://127.0.0.1:{server.server_port}/{page}")
         assert done.wait(_SECONDS), "the page posted nothing"
     finally:
-        process.terminate()
-        process.wait(30)
+        browser.get("about:blank")
         server.shutdown()
         server.server_close()
     assert "error" not in results[0], results[0]["error"]
     return results[0]
 
 
-def pictures(browser: str, shots: Sequence[tuple[Path, Shot]], folder: Path, side: int = 512) -> list[Tensor]:
+def pictures(browser: Any, shots: Sequence[tuple[Path, Shot]], side: int = 512) -> list[Tensor]:
     """What three.js draws of ``.glb`` files, a picture (3,side,side) a shot.
 
     Args:
-        browser: see ``chromium``.
         shots: the file, and what is seen of it.
-        folder: for the browser's profile.
         side: pixels.
     """
     files = {f"/{i}.glb": file for i, file in enumerate(dict.fromkeys(file for file, _ in shots))}
@@ -116,7 +101,6 @@ def pictures(browser: str, shots: Sequence[tuple[Path, Shot]], folder: Path, sid
         browser,
         WEB,
         "look.html",
-        folder,
         {"/shots.json": order, **{name: file.read_bytes() for name, file in files.items()}},
     )
     rows = [base64.b64decode(url.partition(",")[2]) for url in found["pictures"]]

@@ -5,10 +5,11 @@ from __future__ import annotations
 import json
 import struct
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
-from browser import Shot, chromium, pictures
+from browser import Shot, pictures
 from test_gltf_viewers import node  # noqa: F401  (its packages)
 from torch import Tensor
 
@@ -18,14 +19,6 @@ from torchface.synthetic import performer
 
 pytestmark = pytest.mark.browser
 SIDE = 240
-
-
-@pytest.fixture(scope="module")
-def browser(node: str) -> str:  # noqa: F811
-    found = chromium()
-    if found is None:
-        pytest.skip("no Chromium is installed (apt-get install chromium)")
-    return found
 
 
 def frame(rig: BlendshapeRig, region: Tensor, margin: float = 1.2) -> tuple[tuple[float, float, float], float]:
@@ -79,16 +72,18 @@ def assert_shaded_alike(morphed: Tensor, expected: Tensor, stiff: Tensor) -> Non
     assert shaded_apart(morphed, expected) < 0.1 * shaded_apart(stiff, expected)
 
 
-def test_a_smile_of_the_performer_is_shaded_as_it_is_shaped(browser: str, tmp_path: Path) -> None:
+@pytest.mark.usefixtures("node")
+def test_a_smile_of_the_performer_is_shaded_as_it_is_shaped(chromium: Any, tmp_path: Path) -> None:
     rig = performer().select(["mouthSmileLeft"])
     shot = Shot({"mouthSmileLeft": 1.0}, 25, *frame(rig, rig.neutral.annotations.regions["face"]))
     files = as_shaped(rig, "mouthSmileLeft", tmp_path)
-    assert_shaded_alike(*pictures(browser, [(file, shot) for file in files], tmp_path, SIDE))
+    assert_shaded_alike(*pictures(chromium, [(file, shot) for file in files], SIDE))
 
 
 @pytest.mark.real
+@pytest.mark.usefixtures("node")
 def test_a_real_head_has_eyes_and_skin_in_their_own_colours_and_shaded_shapes(
-    browser: str, tmp_path: Path, ict_folder: Path
+    chromium: Any, tmp_path: Path, ict_folder: Path
 ) -> None:
     rig = load_rig(ict_folder, shapes=["eyeBlink_L", "eyeBlink_R", "jawOpen"])
     regions = rig.neutral.annotations.regions
@@ -100,7 +95,7 @@ def test_a_real_head_has_eyes_and_skin_in_their_own_colours_and_shaded_shapes(
     )
     files = as_shaped(rig, "jawOpen", tmp_path)
     wanted = [(files[0], front), (files[0], closed), *((file, jaw) for file in files)]
-    eyes_open, eyes_closed, *jaws = pictures(browser, wanted, tmp_path, SIDE)
+    eyes_open, eyes_closed, *jaws = pictures(chromium, wanted, SIDE)
     assert_shaded_alike(*jaws)
     ball = rig.vertices[regions["eyeball_left"]]
     pupil = ball[ball[:, 2].argmax()]

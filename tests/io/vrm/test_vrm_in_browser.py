@@ -5,11 +5,12 @@ from __future__ import annotations
 import shutil
 import subprocess
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
-from browser import chromium, posted
+from browser import posted
 from scipy.spatial.transform import Rotation
 
 from planted.characters import Planted, write_character
@@ -25,30 +26,29 @@ pytestmark = pytest.mark.browser
 
 
 @pytest.fixture(scope="module")
-def browser() -> str:
+def browser(chromium: Any) -> Any:
     """A Chromium, with three-vrm installed in ``web``; kept there for the next run."""
-    found = chromium()
     npm = shutil.which("npm")
-    if found is None or npm is None:
-        pytest.skip("Chromium and npm are not installed; three-vrm comes from npm")
+    if npm is None:
+        pytest.skip("npm is not installed; three-vrm comes from it")
     if not (WEB / "node_modules" / "@pixiv").is_dir():
         command = [npm, "ci", "--no-audit", "--no-fund"]
         done = subprocess.run(command, cwd=WEB, capture_output=True, text=True, timeout=300, check=False)
         if done.returncode != 0:
             pytest.skip(f"npm could not install three-vrm: {done.stderr[-300:]}")
-    return found
+    return chromium
 
 
-def seen(browser: str, avatar: Path, folder: Path, animation: Path | None = None) -> dict:
+def seen(browser: Any, avatar: Path, animation: Path | None = None) -> dict:
     """What the page posts of an avatar."""
     files = {"/avatar.vrm": avatar.read_bytes()}
     if animation is None:
-        return posted(browser, WEB, "avatar.html", folder, files)
-    return posted(browser, WEB, "avatar.html?animation=1", folder, files | {"/animation.vrma": animation.read_bytes()})
+        return posted(browser, WEB, "avatar.html", files)
+    return posted(browser, WEB, "avatar.html?animation=1", files | {"/animation.vrma": animation.read_bytes()})
 
 
 @pytest.mark.parametrize(("version", "preset", "meta"), [("VRMC_vrm", "blinkLeft", "1"), ("VRM", "blink_l", "0")])
-def test_added_expressions_move_the_mesh(browser: str, tmp_path: Path, version: str, preset: str, meta: str) -> None:
+def test_added_expressions_move_the_mesh(browser: Any, tmp_path: Path, version: str, preset: str, meta: str) -> None:
     before, after = tmp_path / "before.vrm", tmp_path / "after.vrm"
     lift = torch.tensor([[0.0, 0, 0], [0, 0, 0], [0, 10, 0], [0, 0, 0]])
     count = write_character(before, HEAD, {"lid": lift}, Planted(vrm=version, expressions={preset: "lid"}))
@@ -58,7 +58,7 @@ def test_added_expressions_move_the_mesh(browser: str, tmp_path: Path, version: 
     root, data = document_with_targets(document, [AddedTargets(0, (0,), moved)], NAMES)
     add_expressions(document, root, {name: [MorphBind(0, 0, 1 + row)] for row, name in enumerate(NAMES)})
     write_edited(document, root, data, after)
-    found = seen(browser, after, tmp_path)
+    found = seen(browser, after)
     assert found["version"] == meta
     assert found["moved"]["blinkLeft"] == pytest.approx(0.01, abs=1e-5)  # as before; three-vrm has VRM 1's names
     assert found["moved"]["jawOpen"] == pytest.approx(0.02, abs=1e-5)
@@ -66,13 +66,13 @@ def test_added_expressions_move_the_mesh(browser: str, tmp_path: Path, version: 
 
 
 @pytest.mark.real
-def test_an_animation_still_plays(browser: str, tmp_path: Path, data: Path) -> None:
+def test_an_animation_still_plays(browser: Any, tmp_path: Path, data: Path) -> None:
     avatar = tmp_path / "avatar.vrm"
     write_character(avatar, HEAD, how=Planted(vrm="VRMC_vrm"))
     document = read_document(avatar)
     moved = np.zeros((1, 44, 3), np.float32)
     root, added = document_with_targets(document, [AddedTargets(0, (0,), moved)], ["jawOpen"])
     write_edited(document, root, added, avatar)
-    found = seen(browser, avatar, tmp_path, data / "characters" / "test.vrma")
+    found = seen(browser, avatar, data / "characters" / "test.vrma")
     turned = Rotation.from_quat(list(found["turned"].values()))
     assert turned.magnitude().max() > 0.01  # radians

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import onnxruntime
 import pytest
@@ -110,8 +108,7 @@ def reader() -> FaceReader:
             landmarks.heat.weight.normal_(0, 3)
             for part in (boxes.said, landmarks.presence):
                 part.weight.normal_()
-    search = replace(ReaderSettings().search, score=0.0, again=0.0)
-    settings = ReaderSettings(new=0.0, vague=0.0, sure=0.0, likely=0.0, least=0.0, smallest=1.0, search=search)
+    settings = ReaderSettings(new=0.0, vague=0.0, sure=0.0, likely=0.0, least=0.0, smallest=1.0, score=0.0, again=0.0)
     return FaceReader(WebcamNetworks(boxes, landmarks, eyes), settings).eval()
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor, nn
@@ -12,7 +12,7 @@ from torchface.landmarks.images.boxes.box_network import BoxNetwork
 from torchface.landmarks.images.face_reading import FaceReading, confidence_of
 from torchface.landmarks.images.folded_normalisation import without_normalisation
 from torchface.landmarks.images.frame_reader.face_place import overlap, place_around, plausible, relation, sought
-from torchface.landmarks.images.frame_reader.face_search import FOUND, SearchSettings, search
+from torchface.landmarks.images.frame_reader.face_search import FOUND, search
 from torchface.landmarks.images.frame_reader.picture_pieces import (
     AROUND,
     cut_square,
@@ -35,6 +35,9 @@ _LONGEST = 0.5  # seconds: after a longer break the face may be anywhere
 _ANYWHERE = (32.0, 32.0, 64.0, 1.0, 0.0)  # a place, where there is none to look at
 _SHRUNK, _GROWN = 0.6, 1.6  # of a face from one picture to the next
 _LONG = 1e3  # seconds
+_DOUBT = 0.25  # seconds of presence below ``sure`` and the like after which the box network is asked, again and again
+_PATIENCE = 0.3  # seconds for which a lost face is waited for at its place before another of several is taken
+_EAGER, _PAUSE = 0.5, 0.1  # seconds after a face was lost in which every frame is searched; between searches afterwards
 
 
 @dataclass(frozen=True)
@@ -47,12 +50,9 @@ class ReaderSettings:
         sure: presence from which nothing is asked about a face that is followed.
         likely: presence from which it is kept though the box network sees none.
         least: presence under which it is lost at once.
-        doubt: seconds of presence below ``sure`` and the like after which the box network is asked, again and again.
-        patience: seconds for which a lost face is waited for at its place before another of several is taken.
-        eager: seconds after a face was lost in which every frame is searched.
-        pause: seconds between searches afterwards.
         smallest: pixels a side of the box round a face, at least.
-        search: where faces are looked for.
+        score: of the box network that a face has at least.
+        again: score that confirms a face which is followed.
     """
 
     new: float = 0.6
@@ -60,12 +60,9 @@ class ReaderSettings:
     sure: float = 0.9
     likely: float = 0.5
     least: float = 0.1
-    doubt: float = 0.25
-    patience: float = 0.3
-    eager: float = 0.5
-    pause: float = 0.1
     smallest: float = 12.0
-    search: SearchSettings = field(default_factory=SearchSettings)
+    score: float = 0.3
+    again: float = 0.25
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,14 +113,14 @@ class FaceReader(nn.Module):
         # Another picture size is another camera: its face may be anywhere.
         place = place * same
         followed = (following > 0.5) & same & (interval <= _LONGEST)
-        asked = followed & (doubt >= settings.doubt) & (since >= settings.doubt)
-        lost_now = ~followed & ((missing <= settings.eager) | (since >= settings.pause))
+        asked = followed & (doubt >= _DOUBT) & (since >= _DOUBT)
+        lost_now = ~followed & ((missing <= _EAGER) | (since >= _PAUSE))
         searched = asked | lost_now
         found = _either(
             searched,
             self.search,
             lambda image, place, waiting, attempt: torch.zeros(FOUND),
-            (image, place, missing < settings.patience, attempt),
+            (image, place, missing < _PATIENCE, attempt),
         )
         there = found[5] > 0.5
         begin = torch.where(followed, sought(place, anchor), found[:5])
@@ -174,7 +171,7 @@ class FaceReader(nn.Module):
 
     def search(self, image: Tensor, place: Tensor, waiting: Tensor, attempt: Tensor) -> Tensor:
         """See :func:`~torchface.landmarks.images.frame_reader.face_search.search`."""
-        return search(image, self.boxes, self.settings.search, place, waiting, attempt)
+        return search(image, self.boxes, (self.settings.score, self.settings.again), place, waiting, attempt)
 
     def look(self, image: Tensor, place: Tensor) -> Tensor:
         """What the network finds in the square round a place, one after the other; see :meth:`_unpacked`."""

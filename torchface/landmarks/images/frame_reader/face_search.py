@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import torch
 from torch import Tensor
 
@@ -12,6 +10,8 @@ from torchface.landmarks.images.frame_reader.face_place import overlap
 from torchface.landmarks.images.frame_reader.picture_pieces import whole_picture
 
 _NEAR, _SMALLER, _LARGER = 0.75, 0.6, 1.6
+_OVERLAP = 0.25  # at least, of a face that is followed and what confirms it
+_CANDIDATES = 4  # that are tried in turn, a frame each, where the landmark network refuses one
 _FIRST = 1e6  # more than any side: a face that is near goes before all others
 # Where what the network says shows no face, one is looked for upright, then 50 degrees either way.
 _TRIES, _LEANING = 4, (0.643, 0.766)
@@ -19,33 +19,14 @@ FOUND = 7
 """Numbers that a search gives."""
 
 
-@dataclass(frozen=True)
-class SearchSettings:
-    """Where faces are looked for.
-
-    Args:
-        longest: pixels of the longer side of the picture that the box network is shown.
-        score: that a face has at least.
-        again: score that confirms a face which is followed.
-        overlap: of the two, at least.
-        candidates: faces that are tried in turn, a frame each, where the landmark network refuses one.
-    """
-
-    longest: int = INPUT_SIZE
-    score: float = 0.3
-    again: float = 0.25
-    overlap: float = 0.25
-    candidates: int = 4
-
-
 def search(
-    image: Tensor, network: BoxNetwork, settings: SearchSettings, place: Tensor, waiting: Tensor, attempt: Tensor
+    image: Tensor, network: BoxNetwork, scores: tuple[float, float], place: Tensor, waiting: Tensor, attempt: Tensor
 ) -> Tensor:
     """The face that is meant.
 
     Args:
         image: uint8 (H,W,C).
-        settings: where faces are looked for.
+        scores: that a face has at least, and that one has which confirms a face that is followed.
         place: where the face was last (5,); side 0 where there was none.
         waiting: whether another face than one near there is refused where several are about, () bool.
         attempt: how many were refused since the last was lost, ().
@@ -53,16 +34,16 @@ def search(
     Returns:
         Its place; whether there is one; whether a face is seen at the last place: (7,).
     """
-    picture, ratio = whole_picture(image, settings.longest)
+    picture, ratio = whole_picture(image, INPUT_SIZE)
     faces = network(picture)[0]
-    middles, sides, scores = (faces[:, :2] + 0.5) * ratio - 0.5, faces[:, 2] * ratio.mean(), faces[:, 3]
+    middles, sides, said = (faces[:, :2] + 0.5) * ratio - 0.5, faces[:, 2] * ratio.mean(), faces[:, 3]
     last = place[2].clamp(min=1)
     distance, growth = ((middles - place[:2]) / last).square().sum(1).sqrt(), sides / last
     near = (distance < _NEAR) & (growth > _SMALLER) & (growth < _LARGER) & (place[2] > 0)
-    likely = scores >= settings.score
+    likely = said >= scores[0]
     meant = likely & (near | (place[2] <= 0) | ~waiting | (likely.sum() <= 1))
-    preference = torch.where(near, (2 - distance) * _FIRST, sides * scores) * meant
-    order, rows = preference.topk(settings.candidates)
+    preference = torch.where(near, (2 - distance) * _FIRST, sides * said) * meant
+    order, rows = preference.topk(_CANDIDATES)
     count = (order > 0).sum()
     rounds = (attempt / count.clamp(min=1)).floor()
     row = rows[(attempt - rounds * count.clamp(min=1)).long()[None]]
@@ -72,5 +53,5 @@ def search(
     leaning = (other >= 2).float()
     turned = torch.stack([1 - leaning * (1 - _LEANING[0]), leaning * _LEANING[1] * (5 - 2 * other)])
     angle = torch.where(other > 0, turned, angle)
-    there = (overlap(middles, sides, place) > settings.overlap) & (scores >= settings.again)
+    there = (overlap(middles, sides, place) > _OVERLAP) & (said >= scores[1])
     return torch.cat([middle, side, angle, torch.stack([count > 0, there.any()]).float()])
