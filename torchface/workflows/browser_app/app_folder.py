@@ -84,7 +84,7 @@ def export_app(
     check_writable(folder=out)
     _check_folder(out)
     progress("reading the character")
-    shown = load_character(character)
+    shown = load_character(character, progress=progress)
     graph = webcam_graph(progress) if webcam is None else read_file(webcam)
     check_webcam_graph(graph, webcam or "the webcam's graph")
     files = {GRAPH: graph, CHARACTER: shown.data, TABLE: shown.page_table()}

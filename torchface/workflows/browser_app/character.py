@@ -23,6 +23,7 @@ from torchface.io.gltf.corrective_extras import scene_correctives
 from torchface.io.gltf.gltf_document import Document, document_of
 from torchface.io.gltf.primitive_reading import read_target_names
 from torchface.io.tables.csv_table import quoted
+from torchface.progress import Progress, silent
 from torchface.rig import BlendshapeRig
 from torchface.shape_names import ARKIT, mapping, recognised_shapes
 from torchface.synthetic import character
@@ -120,7 +121,7 @@ class Character:
         return {"sum": used, "product": list(shapes.products[row]), "gain": gain, "lower": lower, "upper": upper}
 
 
-def load_character(path: str | Path | None = None, table: Path | None = None) -> Character:
+def load_character(path: str | Path | None = None, table: Path | None = None, progress: Progress = silent) -> Character:
     """Reads a character.
 
     Args:
@@ -130,7 +131,7 @@ def load_character(path: str | Path | None = None, table: Path | None = None) ->
     """
     whole = path is not None and Path(path).suffix.lower() in _GLB
     name = "the embedded performer" if path is None else Path(path).name if whole else f"{Path(path).stem}.glb"
-    data = _taken(Path(path)) if whole and path is not None else _written(path)
+    data = _taken(Path(path)) if whole and path is not None else _written(path, progress)
     document = document_of(Path(path or name), data)
     definitions = scene_correctives(document)
     names = _shapes(document, {definition.name for definition in definitions})
@@ -176,15 +177,15 @@ def _taken(path: Path) -> bytes:
     return read_file(path)
 
 
-def _written(path: str | Path | None) -> bytes:
+def _written(path: str | Path | None, progress: Progress) -> bytes:
+    def embedded() -> bytes:
+        progress("making the character, once; half a minute on a quiet machine")
+        shown = character()
+        return _saved(shown.rig, shown.surface)
+
     if path is None:
-        return cached_file("character", ".glb", _embedded, ("synthetic/head", "io/gltf"))
+        return cached_file("character", ".glb", embedded, ("synthetic/head", "io/gltf"))
     return _saved(load_rig(path))
-
-
-def _embedded() -> bytes:
-    shown = character()
-    return _saved(shown.rig, shown.surface)
 
 
 def _saved(rig: BlendshapeRig, surface: SurfaceMaps | None = None) -> bytes:

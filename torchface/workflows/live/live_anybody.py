@@ -160,7 +160,7 @@ def go_live(
             source = open_source(settings.camera, notes, SourceSettings(settings.size, every, settings.loop))
         stack.enter_context(closing(source))
         progress("reading the character")
-        character = load_character(settings.character, settings.mapping)
+        character = load_character(settings.character, settings.mapping, progress)
         for note in character.notes():
             notes(note)
         page = built_page(progress) if settings.page else None
