@@ -59,8 +59,9 @@ def test_a_fold_of_the_open_lid_is_flatter_when_the_eye_is_shut(actor: Blendshap
         apart = torch.cdist(head.vertices[:, :2], line[:, :2]).amin(1)
         fold = 0.8 * torch.exp(-((apart / 1.1) ** 2)) * ~head.loose * (head.vertices[:, 2] > opening.upper[:, 2].min())
         folded = replace(head, vertices=head.vertices + fold[:, None] * torch.tensor([0.0, 0.0, 1.0]))
-        plain = (head.vertices + shut_blinks(head, blinks, actor.names, openings)[0][row])[:, 2]
-        shut = (folded.vertices + shut_blinks(folded, blinks, actor.names, openings)[0][row])[:, 2]
+        apart = torch.full_like(fold, 1.5)  # as of a stranger's lids
+        plain = (head.vertices + shut_blinks(head, blinks, actor.names, openings, apart)[0][row])[:, 2]
+        shut = (folded.vertices + shut_blinks(folded, blinks, actor.names, openings, apart)[0][row])[:, 2]
         middle = opening.upper.mean(0)
         there = (fold > 0.4) & ((head.vertices - middle)[:, 0].abs() < 10)
         assert int(there.sum()) > 10

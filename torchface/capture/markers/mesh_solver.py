@@ -171,7 +171,8 @@ class MeshSolver:
         progress("solving")
         if temporal and count > 2:
             smoothness = CALM * float(self.H.diagonal().mean())
-            weights = smooth_in_box(self.H, slopes, fps, smoothness)
+            # In single precision it takes less than half the time and comes as near to the least.
+            weights = smooth_in_box(self.H.float(), slopes.float(), fps, smoothness).double()
         else:
             weights = BoxQP(self.H, 0.0, 1.0)(slopes)
         free = -torch.linalg.solve(self.H, slopes.T).T

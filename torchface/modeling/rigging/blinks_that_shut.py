@@ -30,6 +30,7 @@ _SPAN, _ASIDE = 76.0, 1.6
 _AROUND = 1.5  # of the opening's half width, round its middle: the lids
 _BEHIND, _BEFORE, _LIFT, _MOST = 1.5, 0.5, 0.25, 12.0
 _LID = 0.8  # of the opening's height, from the upper lid's edge up: what unfolds
+_OTHER = 0.4, 0.6  # millimetres of a lid from the template's, mean: where it begins to unfold, and does wholly
 _FINEST, _HELD = 1.3, 0.005  # millimetres: narrower folds go; how much each place of the lid keeps to where it is
 
 
@@ -66,7 +67,11 @@ def eyes_seen(head: SkinOfHead, marks: Tensor) -> list[EyeOpening | None]:
 
 
 def shut_blinks(
-    head: SkinOfHead, deltas: Tensor, names: Sequence[str], openings: Sequence[EyeOpening | None]
+    head: SkinOfHead,
+    deltas: Tensor,
+    names: Sequence[str],
+    openings: Sequence[EyeOpening | None],
+    apart: Tensor | None = None,
 ) -> tuple[Tensor, tuple[float | None, ...]]:
     r"""Deltas (N,J,3) in which each blink shuts its eye, and what it leaves open, as a share of the opening.
 
@@ -75,8 +80,9 @@ def shut_blinks(
     .. math:: \min_c \sum_k \lVert c(p_k) - c(q_k) + g_k \rVert^2 + \lambda \int \lVert c \rVert^2 / \ell^2 + \lVert
         \nabla c \rVert^2,
 
-    nine tenths of it by the upper lid. The upper lid unfolds: narrow folds that it keeps from rest are smoothed by
-    least bending. Then the lids go before what lies in the eye, be it a ball or a plate.
+    nine tenths of it by the upper lid. An upper lid that is not of the form from which the blink came unfolds: narrow
+    folds that it keeps from rest are smoothed by least bending. Then the lids go before what lies in the eye, be it a
+    ball or a plate.
 
     Args:
         head: at rest.
@@ -84,6 +90,7 @@ def shut_blinks(
         names: of the shapes; those that mean ARKit's blinks are changed.
         openings: of the right and left eye; of one that is not seen the blink stays, and what it leaves is None; where
             no shape means its blink, 0.
+        apart: how far each vertex lies from the surface from which the blinks came, (J,) millimetres; 0 if absent.
     """
     shapes, left = mapping(names, BLINKS) > 0.5, []
     if any(one is not None for one in openings):
@@ -95,7 +102,7 @@ def shut_blinks(
             continue
         lids = _Lids.of(head, opening, index)
         for shape in own:
-            deltas[shape] = lids.shut(deltas[shape])
+            deltas[shape] = lids.shut(deltas[shape], apart)
         left.append(lids.left(deltas[own[0]]))
     return deltas, tuple(left)
 
@@ -131,7 +138,7 @@ class _Lids:
         """The widest gap that a blink leaves, as a share of the opening's height."""
         return float(-self.gap(delta)[1:-1, 1].clamp(max=0).min() / self.height)
 
-    def shut(self, delta: Tensor) -> Tensor:
+    def shut(self, delta: Tensor, apart: Tensor | None) -> Tensor:
         """The blink (J,3), shut and unfolded."""
         moving = torch.zeros(len(delta), dtype=torch.bool)
         moving[self.skin[self.near[self.skin].any(1)].flatten()] = True
@@ -156,20 +163,23 @@ class _Lids:
             right += _FIRM * torch.from_numpy(matrix.T @ values.numpy())
         moved = delta.clone()
         moved[rows] += SparseCholesky(system).solve(right)
-        moved[rows] += self._unfolding(moved[rows], rest, faces, sum(one.T @ one for one in matrices))
+        if apart is not None:
+            moved[rows] += self._unfolding(moved[rows], rest, faces, apart[rows], sum(one.T @ one for one in matrices))
         return self._before_the_eye(moved, rows)
 
-    def _unfolding(self, delta: Tensor, rest: Tensor, faces: Tensor, edges: sparse.csr_array) -> Tensor:
-        """The change (n,3) of a pose that bends the upper lid least; its edge stays."""
+    def _unfolding(self, delta: Tensor, rest: Tensor, faces: Tensor, apart: Tensor, edges: sparse.csr_array) -> Tensor:
+        """The change (n,3) of a pose that bends an upper lid of another form least; its edge stays."""
         posed = rest + delta
         bending, mass = bending_energy(posed, faces), vertex_areas(posed, faces).clamp(min=1e-6) / _FINEST**4
         above, below = self._at(self.head.vertices, self.upper), self._at(self.head.vertices, self.lower)
         distance, nearest = torch.cdist(rest, above).min(1)
         lid = torch.exp(-((distance / (_LID * self.height)) ** 4)) * (rest[:, 1] > below[nearest, 1])
+        other = (lid * apart).sum() / lid.sum().clamp(min=1e-9)
+        share = ((other - _OTHER[0]) / (_OTHER[1] - _OTHER[0])).clamp(0, 1)
         lid = lid * (delta.norm(dim=-1) / delta.norm(dim=-1).max().clamp(min=1e-9)).sqrt()
         held = (1 / lid.clamp(min=1e-3) - 1 + _HELD) * mass
         system = bending + sparse.diags_array(held.numpy()) + _FIRM * edges
-        return SparseCholesky(system).solve(-torch.from_numpy(bending @ posed.numpy()))
+        return share * SparseCholesky(system).solve(-torch.from_numpy(bending @ posed.numpy()))
 
     def _before_the_eye(self, delta: Tensor, rows: Tensor) -> Tensor:
         """Lifts what was before the eye at rest, or beside it, before it in the pose."""

@@ -166,7 +166,7 @@ def shapes_on(
     skin = _Skin.of(moved, registration, joined)
     deltas = skin.carried(moved.deltas.double())
     head = SkinOfHead(joined.vertices, joined.faces, skin.loose, joined.part)
-    deltas, left = shut_blinks(head, deltas, moved.names, eyes_seen(head, _marks(moved)))
+    deltas, left = shut_blinks(head, deltas, moved.names, eyes_seen(head, _marks(moved)), skin.distance)
     parts = moved_parts(moved, joined.vertices, joined.faces, joined.part, skin.loose, deltas)
     deltas = parts.deltas
     still = torch.zeros(len(joined.vertices), dtype=torch.bool)
