@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import torch
 from torch import Tensor
 
@@ -24,35 +22,16 @@ _SAME_PLACE, _UNMOVED, _CONFIRMED, _APART = 0.5, 0.75, 0.4, 0.3  # overlaps of b
 _MOST_OTHERS = 4
 _MOST_TRIED = 4  # boxes of a search beside those of the larger faces
 
-
-@dataclass(frozen=True)
-class TrackingSettings:
-    """When a face counts as lost, and where it is looked for.
-
-    Args:
-        new_presence: from which a box of the detector elsewhere than where a face was shows one.
-        sure_presence: from which a face is one without asking the detector.
-        least_presence: from which it is one where the detector sees a face too.
-        least_confidence: the mean under which a face that the detector misses ``checks`` times in a row is lost.
-        check_every: frames after which the detector is asked anyway.
-        checks: how often in a row it must see none.
-        frames_waited: for which a lost face is waited for at its place before another is taken.
-        least_side: of a box, pixels, under which a face is lost.
-        least_likeness: correlation of a face's look with how it looked before, under which it is another's where there
-            are several.
-        likeness_gain: how much more another face must look as this one did to be taken for it.
-    """
-
-    new_presence: float = 0.5
-    sure_presence: float = 0.9
-    least_presence: float = 0.1
-    least_confidence: float = 0.44
-    check_every: int = 16
-    checks: int = 3
-    frames_waited: int = 10
-    least_side: float = 12.0
-    least_likeness: float = 0.6
-    likeness_gain: float = 0.15
+# The detector's, from which a box elsewhere than where a face was shows one; the network's, from which a face is one
+# without asking the detector, and where the detector sees one too.
+_NEW_PRESENCE, _SURE_PRESENCE, _LEAST_PRESENCE = 0.5, 0.9, 0.1
+# The mean under which a face that the detector misses so many times in a row is lost; frames after which it is asked.
+_LEAST_CONFIDENCE, _CHECKS, _CHECK_EVERY = 0.44, 3, 16
+_FRAMES_WAITED = 10  # for a lost face at its place before another is taken
+_LEAST_SIDE = 12.0  # of a box, pixels, under which a face is lost
+# Correlation of a face's look with how it looked before, under which it is another's where there are several, and how
+# much more another must look as this one did to be taken for it.
+_LEAST_LIKENESS, _LIKENESS_GAIN = 0.6, 0.15
 
 
 class LandmarkTracker:
@@ -68,7 +47,6 @@ class LandmarkTracker:
         detector: finds boxes; see ``find_faces``.
         face: which one, from 0, the largest first, where the first frame that shows one shows several. It stays with
             that face while others come and go.
-        settings: when a face counts as lost.
 
     Raises:
         ValueRangeError: trees find other landmarks than the 68, or ``face`` is negative.
@@ -86,14 +64,12 @@ class LandmarkTracker:
         appearance: AppearanceModel | None = None,
         detector: FaceDetector | None = None,
         face: int = 0,
-        settings: TrackingSettings | None = None,
     ) -> None:
         if face < 0:
             raise ValueRangeError(f"face: found {face}, expected a number from 0")
         self.finder: LandmarkFinder = TreeFinder(finder) if isinstance(finder, LandmarkTrees) else finder
         self.appearance, self.face = appearance, face
         self.detector = detector or shipped_detector()
-        self.settings = settings or TrackingSettings()
         self.reset()
 
     def reset(self) -> None:
@@ -145,7 +121,7 @@ class LandmarkTracker:
         followed.place = face_place(refined.landmarks)
         if face is not before:
             followed.set_anchor(face.search_box)
-        followed.learn_look(frame, refined.landmarks, self.settings.least_likeness)
+        followed.learn_look(frame, refined.landmarks, _LEAST_LIKENESS)
         return refined
 
     def _likeness(self, frame: Tensor, face: FaceReading) -> float:
@@ -157,22 +133,22 @@ class LandmarkTracker:
         if not self._followed.crowded:
             return face
         alike = self._likeness(frame, face)
-        if alike >= self.settings.least_likeness:
+        if alike >= _LEAST_LIKENESS:
             return face
         best = self._most_alike(frame, find_faces(frame, self.detector))
-        return best if best is not None and self._likeness(frame, best) >= alike + self.settings.likeness_gain else None
+        return best if best is not None and self._likeness(frame, best) >= alike + _LIKENESS_GAIN else None
 
     def _most_alike(self, frame: Tensor, faces: FaceBoxes) -> FaceReading | None:
         """Of the faces about where the person was the one that looks most like it, if any looks like it at all."""
         read = [self._face_in(frame, faces, number) for number in self._followed.near(faces.boxes)]
         alike = [(self._likeness(frame, one), one) for one in read if one is not None]
         best = max(alike, key=lambda pair: pair[0], default=(-1.0, None))
-        return best[1] if best[0] >= self.settings.least_likeness else None
+        return best[1] if best[0] >= _LEAST_LIKENESS else None
 
     def _face_in(self, frame: Tensor, faces: FaceBoxes, number: int) -> FaceReading | None:
         """One of the detector's faces with its landmarks, if it is one."""
         face = settled_face(self.finder, frame, faces.boxes[number], float(faces.tilts[number]))
-        return face if self._plausible(face.box, frame) and face.presence >= self.settings.least_presence else None
+        return face if self._plausible(face.box, frame) and face.presence >= _LEAST_PRESENCE else None
 
     def _note_others(self, frame: Tensor, faces: FaceBoxes, box: Tensor) -> None:
         """Notes whether somebody else than the face in a box (4,) is about, who might be taken for it."""
@@ -180,11 +156,11 @@ class LandmarkTracker:
             return
         apart = (overlaps(faces.boxes, box[None])[:, 0] < _APART).nonzero()[:_MOST_OTHERS, 0].tolist()
         others = [find_in_box(self.finder, frame, faces.boxes[i], float(faces.tilts[i])) for i in apart]
-        self._followed.crowded = any(float(one.presence) >= self.settings.sure_presence for one in others)
+        self._followed.crowded = any(float(one.presence) >= _SURE_PRESENCE for one in others)
 
     def _follow(self, frame: Tensor) -> FaceReading | None:
         """The face from where it was a frame ago; None where it is not there."""
-        followed, settings = self._followed, self.settings
+        followed = self._followed
         if followed.place is None:
             return None
         before, tilt = followed.place[:4], followed.place[4]
@@ -197,15 +173,15 @@ class LandmarkTracker:
             return None
         if float(overlaps(before[None], moved[None])) < _UNMOVED:  # it moved far: once more from where it is now
             face = find_in_box(self.finder, frame, followed.anchored_box(moved, tilt), float(tilt))
-        sure = float(face.presence) >= settings.sure_presence
-        if sure and followed.frames % settings.check_every:
+        sure = float(face.presence) >= _SURE_PRESENCE
+        if sure and followed.frames % _CHECK_EVERY:
             return face
         if self._confirmed(frame, face.box):
             followed.unconfirmed = 0
-            return face if float(face.presence) >= settings.least_presence else None
+            return face if float(face.presence) >= _LEAST_PRESENCE else None
         followed.unconfirmed += 1
-        vague = float(face.confidence.mean()) < settings.least_confidence
-        lost = not sure or (followed.unconfirmed >= settings.checks and vague)
+        vague = float(face.confidence.mean()) < _LEAST_CONFIDENCE
+        lost = not sure or (followed.unconfirmed >= _CHECKS and vague)
         return None if lost else face  # turned faces are none to the detector
 
     def _confirmed(self, frame: Tensor, box: Tensor) -> bool:
@@ -223,16 +199,16 @@ class LandmarkTracker:
 
     def _search(self, frame: Tensor) -> FaceReading | None:
         """The face wherever it is now; None where it is nowhere."""
-        followed, settings = self._followed, self.settings
+        followed = self._followed
         face = self._chosen(frame, find_faces(frame, self.detector))
-        if face is None and followed.place is not None and 0 < followed.missed < settings.frames_waited:
+        if face is None and followed.place is not None and 0 < followed.missed < _FRAMES_WAITED:
             face = self._still_there(frame, followed.place)
         if face is not None:
             followed.unconfirmed = 0
         return face
 
     def _is_sure(self, face: FaceReading) -> bool:
-        return float(face.presence) >= self.settings.sure_presence
+        return float(face.presence) >= _SURE_PRESENCE
 
     def _chosen(self, frame: Tensor, faces: FaceBoxes) -> FaceReading | None:
         """The one of these faces that is meant, if it is one."""
@@ -240,13 +216,13 @@ class LandmarkTracker:
         near = followed.near(faces.boxes)
         if near and followed.crowded:
             return self._most_alike(frame, faces)
-        waits = followed.place is not None and followed.missed < self.settings.frames_waited
+        waits = followed.place is not None and followed.missed < _FRAMES_WAITED
         if not near and (waits or self.face >= len(faces)):
             return None
         skipped = 0 if near else self.face
         for number in near[:1] or range(min(len(faces), self.face + _MOST_TRIED)):  # a box may show no face
             face = self._face_in(frame, faces, number)
-            if face is None or not (near or float(face.presence) >= self.settings.new_presence):
+            if face is None or not (near or float(face.presence) >= _NEW_PRESENCE):
                 continue
             if skipped == 0:
                 followed.look = followed.look if near else None  # a face elsewhere may be anybody's
@@ -262,7 +238,7 @@ class LandmarkTracker:
         if not self._is_sure(face) or not self._plausible(moved, frame):
             return None
         near = float(overlaps(place[None, :4], moved[None])) > _SAME_PLACE
-        return face if near and self._likeness(frame, face) >= self.settings.least_likeness else None
+        return face if near and self._likeness(frame, face) >= _LEAST_LIKENESS else None
 
     def _plausible(self, box: Tensor, frame: Tensor) -> bool:
         """Whether a box is a size that a face can have, and its middle in the image."""
@@ -271,4 +247,4 @@ class LandmarkTracker:
         x, y = (box[:2] + box[2:] / 2).tolist()
         height, width = frame.shape[-2:]
         inside = 0 <= x < width and 0 <= y < height
-        return inside and self.settings.least_side <= float(box[2]) <= 1.5 * max(height, width)
+        return inside and _LEAST_SIDE <= float(box[2]) <= 1.5 * max(height, width)
