@@ -407,6 +407,19 @@ def test_of_several_faces_the_one_asked_for_is_followed(filmed: Filmed, tmp_path
     assert "camera: none given; assumed a field of view of 60 degrees" in told
 
 
+def test_the_verdict_comes_first(done: Done) -> None:
+    tracked = done.tracked
+    assert tracked.lines()[0] == tracked.verdict()
+    assert tracked.verdict().startswith(f"result: good, the face was found in {FRAMES} of {FRAMES} frames (100.0 %)")
+    eyes = (tracked.landmarks[:, 36] - tracked.landmarks[:, 45]).norm(dim=1).median()
+    shifted = replace(tracked.solution, errors=tracked.solution.errors + 0.05 * eyes)
+    assert replace(tracked, solution=shifted).verdict().startswith("result: poor, the solved face lies ")
+    marks = tracked.reading.landmarks.clone()
+    marks[: FRAMES // 2] = torch.nan
+    half = replace(tracked, reading=replace(tracked.reading, landmarks=marks))
+    assert half.verdict().startswith(f"result: in part, the face was found in {FRAMES - FRAMES // 2} of {FRAMES}")
+
+
 def test_offsets_of_another_person_are_said(done: Done, filmed: Filmed, tmp_path: Path) -> None:
     inputs, own = done.tracked.inputs, done.tracked.offsets
     assert own is not None

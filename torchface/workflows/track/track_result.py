@@ -30,7 +30,7 @@ from torchface.workflows.track.track_inputs import TrackInputs
 MIN_STABLE = 6
 """Stable landmarks that a pose needs."""
 _POOR = 0.04  # of the distance of the eyes' outer corners; landmarks of a rig's own face are off by 2 to 3 %
-_SURE = 0.5
+_SURE, _MOST = 0.5, 0.9
 _AT_BOUND, _OFTEN, _MAX_NAMED = 1e-3, 0.2, 5
 _LEAST_MOTION = 1e-2  # mm²
 _OWN_EYES = 2.0  # degrees
@@ -176,15 +176,35 @@ class Tracked:
         confidence = self.solution.confidence[self.seen.to(self.solution.confidence.device)]
         return (confidence < HIDDEN).float().mean(0)
 
+    @property
+    def misfit(self) -> float:
+        """How far the solved face lies from the landmarks in the median frame, of the eyes' distance; NaN unseen."""
+        off = torch.where(self.seen, self.solution.errors, torch.nan).nanmedian()
+        return float(off / (self.landmarks[:, 36] - self.landmarks[:, 45]).norm(dim=1).nanmedian())
+
+    def verdict(self) -> str:
+        """Whether the result is to be used, in a line."""
+        count, seen, misfit = len(self), int(self.seen.sum()), self.misfit
+        found = f"the face was found in {seen} of {count} frames ({100 * seen / count:.1f} %)"
+        if not seen:
+            return f"result: none, {found}"
+        fit = f"the solved face lies {100 * misfit:.1f} % of the eyes' distance from the landmarks"
+        if misfit > _POOR:
+            whose = "is the rig this person's own" if self.head is None else "would --rig with this person's own do better"
+            return f"result: poor, {fit} (at most {100 * _POOR:.0f} % is usual; {whose}?); {found}"
+        if seen < _MOST * count:
+            return f"result: in part, {found}; there {fit} (at most {100 * _POOR:.0f} % is usual)"
+        return f"result: good, {found}, and {fit} (at most {100 * _POOR:.0f} % is usual)"
+
     def lines(self) -> list[str]:
         """For people to read."""
         count, seen = len(self), int(self.seen.sum())
         errors = torch.where(self.seen, self.solution.errors, torch.nan)
         lines = [
-            f"{count} frames at {self.video.fps:g} a second, the face found in {seen} ({100 * seen / count:.1f} %)",
-            f"landmarks: they tremble by {self.jitter:.2f} px from frame to frame; the solved rig's lie "
-            f"{float(errors.nanmedian()):.2f} px from them in the middle frame (median), and less than "
-            f"{float(errors.nanquantile(0.95)):.2f} px in 95 % of the frames",
+            self.verdict(),
+            f"{count} frames at {self.video.fps:g} a second; the landmarks tremble by {self.jitter:.2f} px from frame to "
+            f"frame; the solved face lies {float(errors.nanmedian()):.2f} px from them in the median frame, and less "
+            f"than {float(errors.nanquantile(0.95)):.2f} px in 95 % of the frames",
         ]
         if self.head is not None:
             lines += [line for line in (self.inputs.about, *self.head.lines()) if line]
@@ -256,14 +276,6 @@ class Tracked:
             lines.append(
                 f"often at 1, their most: {named} of the frames; the face goes further than these shapes of the rig, "
                 "or the rig is not this person's"
-            )
-        span = (self.landmarks[:, 36] - self.landmarks[:, 45]).norm(dim=1).nanmedian()
-        if float(errors.nanmedian()) > _POOR * float(span):
-            share = f"{100 * float(errors.nanmedian() / span):.0f} % of the distance of the eyes"
-            lines.append(
-                f"the rig fits the landmarks poorly ({share}): is it this person's own?"
-                if self.head is None
-                else f"the head solved with the take fits the landmarks poorly ({share}); --rig takes this person's own"
             )
         if unlearned := self.inputs.models.unlearned:
             more = f" and {len(unlearned) - _MAX_NAMED} more" if len(unlearned) > _MAX_NAMED else ""
