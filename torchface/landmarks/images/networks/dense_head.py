@@ -88,7 +88,7 @@ class DenseHead(nn.Module):
         middle, axes = face_frame(landmarks)
         own = in_face_frame(landmarks, landmarks).flatten(1)
         base = self.form(own).unflatten(1, (-1, 2))
-        local = each_row(sampled_at(maps[0], base @ axes + middle, size).transpose(1, 2), self.local)
+        local = each_row(sampled_at(maps[0], base @ axes + middle, size), self.local)
         grid = self.grid(maps, middle, axes, size)
         read = [own, each_row(under, self.under).flatten(1), maps[2].mean((2, 3)), grid]
         hidden = torch.relu(self.mix(torch.cat(read, 1)))

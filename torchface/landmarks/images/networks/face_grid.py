@@ -6,7 +6,6 @@ from collections.abc import Sequence
 
 import torch
 from torch import Tensor, nn
-from torch.nn.functional import grid_sample
 
 from torchface.landmarks.images.networks.heat_maps import ResidualBlock, convolution
 
@@ -57,8 +56,8 @@ class FaceGrid(nn.Module):
             size: pixels a side of the crop.
         """
         places = self.cells @ axes + middle
-        sampled = torch.cat([sampled_at(one, places, size) for one in maps], 1).unflatten(2, (_SIDE, _SIDE))
-        read = self.read(self.narrow(sampled)).flatten(2).transpose(1, 2)
+        sampled = torch.cat([sampled_at(one, places, size) for one in maps], 2).transpose(1, 2)
+        read = self.read(self.narrow(sampled.unflatten(2, (_SIDE, _SIDE)))).flatten(2).transpose(1, 2)
         return each_row(read, self.each).flatten(1)
 
 
@@ -69,9 +68,19 @@ def normal(deviation: float, *shape: int) -> nn.Parameter:
 
 
 def sampled_at(features: Tensor, pixels: Tensor, size: int) -> Tensor:
-    """Features (B,C,h,w) of crops of ``size`` pixels a side at places (B,L,2), (B,C,L)."""
-    grid = (pixels[:, None] + 0.5) * (2 / size) - 1
-    return grid_sample(features, grid, padding_mode="border", align_corners=False)[:, :, 0]
+    """Features (B,C,h,w) of crops of ``size`` pixels a side at places (B,L,2), (B,L,C); at the edge beyond it.
+
+    The same as ``grid_sample``, of which ONNX Runtime's takes three times as long as four rows that are taken whole.
+    """
+    batch, channels, high, wide = features.shape
+    x, y = ((pixels + 0.5) * (wide / size) - 0.5).unbind(-1)
+    x, y = x.clamp(0, wide - 1), y.clamp(0, high - 1)
+    left, top = x.floor().clamp(max=wide - 2), y.floor().clamp(max=high - 2)
+    across, down = (x - left)[..., None], (y - top)[..., None]
+    rows = features.flatten(2).transpose(1, 2).reshape(-1, channels)
+    first = (top * wide + left).long() + high * wide * torch.arange(batch, device=features.device)[:, None]
+    above = torch.lerp(rows[first], rows[first + 1], across)
+    return torch.lerp(above, torch.lerp(rows[first + wide], rows[first + wide + 1], across), down)
 
 
 def each_row(features: Tensor, rows: Tensor) -> Tensor:
