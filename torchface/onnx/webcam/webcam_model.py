@@ -195,7 +195,7 @@ def reading_parts(reader: FaceReader) -> dict[str, Callable[[], onnx.ModelProto]
 def reading_model(
     reader: FaceReader, state_size: int, parts: Mapping[str, onnx.ModelProto] | None = None
 ) -> onnx.ModelProto:
-    """The model of :class:`WebcamReading`, with networks stored as halves or bytes, for a solver of so many state numbers.
+    """The model of :class:`WebcamReading`, whose networks are small in the file, for a solver of so many state numbers.
 
     Args:
         parts: what ``reading_parts`` makes; made if absent, and none of a reader of another kind.

@@ -190,7 +190,7 @@ class Tracked:
             return f"result: none, {found}"
         fit = f"the solved face lies {100 * misfit:.1f} % of the eyes' distance from the landmarks"
         if misfit > _POOR:
-            whose = "is the rig this person's own" if self.head is None else "would --rig with this person's own do better"
+            whose = "is the rig this person's own" if self.head is None else "does --rig with their own do better"
             return f"result: poor, {fit} (at most {100 * _POOR:.0f} % is usual; {whose}?); {found}"
         if seen < _MOST * count:
             return f"result: in part, {found}; there {fit} (at most {100 * _POOR:.0f} % is usual)"
@@ -202,8 +202,8 @@ class Tracked:
         errors = torch.where(self.seen, self.solution.errors, torch.nan)
         lines = [
             self.verdict(),
-            f"{count} frames at {self.video.fps:g} a second; the landmarks tremble by {self.jitter:.2f} px from frame to "
-            f"frame; the solved face lies {float(errors.nanmedian()):.2f} px from them in the median frame, and less "
+            f"{count} frames at {self.video.fps:g} a second; the landmarks tremble by {self.jitter:.2f} px from frame "
+            f"to frame; the solved face lies {float(errors.nanmedian()):.2f} px from them in the median frame, and less "
             f"than {float(errors.nanquantile(0.95)):.2f} px in 95 % of the frames",
         ]
         if self.head is not None:

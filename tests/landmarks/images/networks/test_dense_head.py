@@ -65,7 +65,7 @@ def test_calibration_makes_deviations_as_large_as_errors() -> None:
     truth = torch.rand(4000, 52, generator=generator)
     noise = torch.linspace(0.05, 0.4, 52)
     read = truth + noise * torch.randn(4000, 52, generator=generator)
-    head = DenseHead(1, 4, 4, 4)
+    head = DenseHead(1, 4, (4, 4, 4))
     for stated in (0.1, 0.1 * noise / 0.1):  # calibrated anew it stays
         head.calibrate(read, (head.spread * stated).expand(4000, 52), truth)
         torch.testing.assert_close(head.spread * stated, noise, rtol=0.05, atol=0)
