@@ -203,8 +203,8 @@ class Tracked:
         lines = [
             self.verdict(),
             f"{count} frames at {self.video.fps:g} a second; the landmarks tremble by {self.jitter:.2f} px from frame "
-            f"to frame; the solved face lies {float(errors.nanmedian()):.2f} px from them in the median frame, and less "
-            f"than {float(errors.nanquantile(0.95)):.2f} px in 95 % of the frames",
+            f"to frame; the solved face lies {float(errors.nanmedian()):.2f} px from them in the median frame, and "
+            f"less than {float(errors.nanquantile(0.95)):.2f} px in 95 % of the frames",
         ]
         if self.head is not None:
             lines += [line for line in (self.inputs.about, *self.head.lines()) if line]
