@@ -28,9 +28,9 @@ from torchface.io.gltf.primitive_reading import (
 )
 from torchface.io.gltf.scene import Instance, instances
 from torchface.io.images.image_files import decode_image
+from torchface.io.images.texture_atlas import Look, with_looks
 from torchface.io.length_units import millimetres_per
 from torchface.io.scenes.scene_pieces import Piece, all_names, join_deltas, join_meshes, joined_size
-from torchface.io.scenes.texture_atlas import Look, with_looks
 from torchface.mesh import Mesh
 from torchface.rig import BlendshapeRig
 

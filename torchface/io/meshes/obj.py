@@ -13,10 +13,10 @@ from torch import Tensor
 from torchface.errors import FileFormatError, TopologyError
 from torchface.files.whole_files import all_or_none, read_file, write_file
 from torchface.io.images.image_files import encode_png, load_image
+from torchface.io.images.texture_atlas import Look, with_looks
 from torchface.io.length_units import finite_vertices, millimetres_per
 from torchface.io.meshes.obj_statements import Statements, read_statements, read_vertices, texture_coordinates
 from torchface.io.meshes.polygons import corners_of_polygons, pad_polygons
-from torchface.io.scenes.texture_atlas import Look, with_looks
 from torchface.mesh import Mesh
 
 _MAX_MATERIALS = 2**20  # bytes, of all material files of a mesh

@@ -9,7 +9,7 @@ from tests.io.gltf.gltf_samples import SQUARE, SQUARE_TRIANGLES, Builder
 from torchface.color_space import to_srgb
 from torchface.io.gltf.gltf_reading import read_gltf_mesh
 from torchface.io.images.image_files import encode_png
-from torchface.io.scenes.texture_atlas import Look, with_looks
+from torchface.io.images.texture_atlas import Look, with_looks
 from torchface.mesh import Mesh
 from torchface.rendering.clay_shading import sample_texture
 
