@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -20,7 +21,7 @@ def test_a_start_that_is_interrupted_keeps_the_part_that_is_ready(
 
     def part(name: str) -> onnx.ModelProto:
         made.append(name)
-        if made.count("reading") == 1 and name == "reading":
+        if made.count("search") == 1 and name == "search":
             raise KeyboardInterrupt
         return empty
 
@@ -29,13 +30,15 @@ def test_a_start_that_is_interrupted_keeps_the_part_that_is_ready(
     monkeypatch.setattr(module, "WebcamSolverGraph", lambda solver: SimpleNamespace(state_size=2))
     monkeypatch.setattr(module, "FaceReader", lambda networks: networks)
     monkeypatch.setattr(module, "solving_model", lambda solver: part("solving"))
-    monkeypatch.setattr(module, "reading_model", lambda reader, size: part("reading"))
+    parts = {name: partial(part, name) for name in ("look", "search")}
+    monkeypatch.setattr(module, "reading_parts", lambda reader: parts)
+    monkeypatch.setattr(module, "reading_model", lambda reader, size, parts: part("reading"))
     monkeypatch.setattr(module, "webcam_model", lambda reading, solving, facts: part("whole"))
     with pytest.raises(KeyboardInterrupt):
         module.webcam_graph(lambda step, done=0, total=0: said.append((done, total)))
     assert module.webcam_graph() == module.webcam_graph() == empty.SerializeToString()
-    assert made == ["solving", "reading", "reading", "whole"]
-    assert sorted(set(said)) == [(0, 2), (1, 2)]
+    assert made == ["solving", "look", "search", "search", "reading", "whole"]
+    assert sorted(set(said)) == [(0, 4), (1, 4), (2, 4)]
 
 
 @pytest.mark.bench
