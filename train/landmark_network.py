@@ -80,7 +80,6 @@ def train(settings: Settings, run: Run) -> LandmarkNetwork:
     model = LandmarkNetwork.fit(
         learned, first_network(settings), settings.network, progress, run.checkpoint, run.device, run.log
     )
-    rounded(model)
     middle = EACH * ((count + len(pictures)) // (2 * EACH))
     calibrate(model, held_out(model, pictures, count, middle))
     save(model, settings, measures(held_out(model, pictures, middle, len(pictures))))
@@ -158,16 +157,6 @@ def held_out(model: LandmarkNetwork, pictures: StoredExpressions, first: int, la
         weights.append(posed)
     crops = Crops(*(torch.cat([getattr(one, part.name) for one in shown]) for part in fields(Crops)))
     return HeldOut(crops, torch.cat(weights), NetworkLandmarks(*(torch.cat(part) for part in zip(*found, strict=True))))
-
-
-@torch.no_grad()
-def rounded(model: LandmarkNetwork) -> None:
-    """Has each row of the weights that read features take 255 values evenly apart, which a graph stores as bytes."""
-    exact = ("dense.form", "dense.move", "dense.sure")  # points are read to a part of a pixel
-    for name, weight in model.named_parameters():
-        if weight.ndim in (2, 4) and not name.startswith(exact):
-            scale = weight.abs().flatten(1).amax(1).clamp(min=1e-12).view(-1, *[1] * (weight.ndim - 1)) / 127
-            weight.copy_((weight / scale).round() * scale)
 
 
 def calibrate(model: LandmarkNetwork, seen: HeldOut) -> None:

@@ -117,42 +117,19 @@ def _held_apart(module: nn.Module) -> nn.Module:
     return _Held(module).eval() if own & (set(dir(torch.fx.GraphModule)) - set(dir(nn.Module))) else module
 
 
-def small_stored(model: onnx.ModelProto, names: Collection[str]) -> onnx.ModelProto:
-    """A graph whose named constants are small in the file; ONNX Runtime widens them when it loads.
-
-    They are halves; or bytes and a scale a row where they are such in half precision, see :func:`byte_rows`.
-    """
-    nodes = []
+def half_stored(model: onnx.ModelProto, names: Collection[str]) -> onnx.ModelProto:
+    """A graph whose named constants are halves in the file; ONNX Runtime widens them when it loads."""
+    casts = []
     for value in model.graph.initializer:
-        if value.name not in names:
-            continue
-        name, whole = value.name, numpy_helper.to_array(value)
-        if (rows := byte_rows(whole)) is None:
-            value.CopyFrom(numpy_helper.from_array(whole.astype(np.float16), f"{name} half"))
-            nodes.append(helper.make_node("Cast", [value.name], [name], to=TensorProto.FLOAT))
-            continue
-        value.CopyFrom(numpy_helper.from_array(rows[0], f"{name} byte"))
-        model.graph.initializer.append(numpy_helper.from_array(rows[1], f"{name} scale"))
-        # Not DequantizeLinear, which ONNX Runtime would compute in each run.
-        nodes.append(helper.make_node("Cast", [value.name], [f"{name} whole"], to=TensorProto.FLOAT))
-        nodes.append(helper.make_node("Mul", [f"{name} whole", f"{name} scale"], [name]))
-    nodes.extend(model.graph.node)
+        if value.name in names:
+            name, half = value.name, numpy_helper.to_array(value).astype(np.float16)
+            value.CopyFrom(numpy_helper.from_array(half, f"{name} half"))
+            casts.append(helper.make_node("Cast", [value.name], [name], to=TensorProto.FLOAT))
+    nodes = [*casts, *model.graph.node]
     del model.graph.node[:]
     model.graph.node.extend(nodes)
     check_model(model)
     return model
-
-
-def byte_rows(weights: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
-    """Bytes (R,...) and a scale of each row, (R,1,...), whose products the weights are; None where there are none.
-
-    A product may be off by as much as it is in half precision.
-    """
-    largest = np.abs(weights).max(axis=tuple(range(1, weights.ndim)), keepdims=True)
-    scale = (np.maximum(largest, np.finfo(np.float32).tiny) / 127).astype(np.float32)
-    rounded = np.rint(weights / scale)
-    even = np.abs(weights - scale * rounded) <= 1.5e-3 * np.abs(weights) + 2e-3 * scale
-    return (rounded.astype(np.int8), scale) if bool(even.all()) else None
 
 
 def chained_models(

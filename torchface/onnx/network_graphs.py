@@ -17,7 +17,7 @@ from torchface.landmarks.images.networks.eye_network import EyeFindings, EyeNetw
 from torchface.landmarks.images.networks.landmark_network import LandmarkNetwork, NetworkLandmarks
 from torchface.landmarks.images.networks.part_network import PART_MARGIN, PART_SIZE, PARTS, PartNetwork
 from torchface.onnx.checked_export import ExportReport, write_checked
-from torchface.onnx.exported_model import exported_model, small_stored
+from torchface.onnx.exported_model import exported_model, half_stored
 
 ImageNetwork = LandmarkNetwork | EyeNetwork | PartNetwork | BoxNetwork
 
@@ -84,8 +84,7 @@ def export_network(network: ImageNetwork, path: str | Path, facts: Mapping[str, 
     ``faces`` (B,K,6), the likeliest first: x and y of the centre and side of the box, pixels, score in [0,1], cosine
     and sine of the roll angle, clockwise as the image is seen. What is no face has a score near 0.
 
-    Images are red, green, blue in [0,1]. Weights of the first three are stored in half precision, or as bytes
-    where they are such.
+    Images are red, green, blue in [0,1]. Weights of the first three are stored in half precision.
 
     Args:
         facts: further metadata, such as licence and data.
@@ -118,7 +117,7 @@ def network_model(network: ImageNetwork, facts: Mapping[str, object] | None = No
         {"task": task, **form.metadata, "version": __version__, **(facts or {})},
         {form.images: form.sizes},
     )
-    return model if isinstance(network, BoxNetwork) else small_stored(model, halves(module))
+    return model if isinstance(network, BoxNetwork) else half_stored(model, halves(module))
 
 
 def _given(network: LandmarkNetwork) -> tuple[str, ...]:
@@ -139,7 +138,7 @@ class _Given(nn.Module):
 
 
 def halves(network: nn.Module, prefix: str = "") -> set[str]:
-    """Names of the weights that are stored in half precision or as bytes: all but biases."""
+    """Names of the weights that are stored in half precision: all but biases."""
     return {prefix + name for name, value in network.named_parameters() if value.ndim > 1 and not name.endswith("bias")}
 
 

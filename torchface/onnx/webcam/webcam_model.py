@@ -17,7 +17,7 @@ from torchface.landmarks.images.face_reading import READ_FOR_SOLVER, FaceReading
 from torchface.landmarks.images.frame_reader.face_reader import STATE, FaceReader
 from torchface.landmarks.images.frame_reader.face_search import FOUND
 from torchface.landmarks.images.frame_reader.picture_pieces import picture_size
-from torchface.onnx.exported_model import chained_models, exported_model, small_stored
+from torchface.onnx.exported_model import chained_models, exported_model, half_stored
 from torchface.onnx.graph_parts import PART, graph_part, with_parts
 from torchface.onnx.network_graphs import halves
 from torchface.onnx.unrolled_operators import TRANSLATIONS
@@ -195,7 +195,7 @@ def reading_parts(reader: FaceReader) -> dict[str, Callable[[], onnx.ModelProto]
 def reading_model(
     reader: FaceReader, state_size: int, parts: Mapping[str, onnx.ModelProto] | None = None
 ) -> onnx.ModelProto:
-    """The model of :class:`WebcamReading`, whose networks are small in the file, for a solver of so many state numbers.
+    """The model of :class:`WebcamReading`, with networks stored as halves, for a solver of so many state numbers.
 
     Args:
         parts: what ``reading_parts`` makes; made if absent, and none of a reader of another kind.
@@ -215,7 +215,7 @@ def reading_model(
         apart.search = lambda *given: graph_part(list(given), "search", [FOUND])  # type: ignore[method-assign]
     model = exported_model(WebcamReading(apart), examples, READ, {}, sizes, {**TRANSLATIONS, **PART}, optimize=False)
     names = halves(reader, "reader.")
-    return small_stored(
+    return half_stored(
         with_parts(model, parts, "reader."), {name for name in names if not name.startswith("reader.boxes.")}
     )
 

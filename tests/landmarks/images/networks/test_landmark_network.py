@@ -16,7 +16,6 @@ from torchface.landmarks import LandmarkNetwork, NetworkSettings
 from torchface.landmarks.images.face_crop import crop_transform, cut_crop, from_crop
 from torchface.landmarks.images.ibug_68 import INNER, MIRROR_68, box_around
 from torchface.landmarks.images.networks.crop_finder import BothSides
-from torchface.landmarks.images.networks.landmark_network import FeatureMaps
 from torchface.landmarks.images.networks.picture_augmentation import AugmentationSettings, augmented
 from torchface.onnx import export_model
 from torchface.workflows.named_finders import load_finder
@@ -43,8 +42,7 @@ def test_a_heat_map_with_one_hot_cell_is_read_at_its_place(network: LandmarkNetw
     heat = torch.full((1, 68, 16, 16), -60.0)
     rows, columns = torch.arange(68) // 16 + 3, torch.arange(68) % 16
     heat[0, torch.arange(68), rows, columns] = 60.0
-    quarter, eighth, sixteenth = (torch.zeros(1, count, side, side) for count, side in ((16, 16), (16, 8), (24, 4)))
-    found = network.read(FeatureMaps(heat, quarter, eighth, sixteenth)).landmarks[0]
+    found = network.read(heat, torch.zeros(1, 16, 16, 16), torch.zeros(1, 24, 4, 4)).landmarks[0]
     # Four pixels a cell, pixel centres at integers: the first cell's middle is at 1.5.
     torch.testing.assert_close(found, torch.stack([4.0 * columns + 1.5, 4.0 * rows + 1.5], dim=1))
 

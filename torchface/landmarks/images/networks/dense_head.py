@@ -8,12 +8,16 @@ import torch
 from torch import Tensor, nn
 
 from torchface.landmarks.images.ibug_68 import COUNT, tilt_around
-from torchface.landmarks.images.networks.face_grid import FaceGrid, each_row, normal, sampled_at
 from torchface.shape_names import ARKIT
 
 WEIGHTS = len(ARKIT)
 
-_OWN, _UNDER = 3, 8  # numbers read off the features of a point, and of one of the 68
+_OWN, _SHARED, _UNDER = 3, 2, 8  # numbers read off the features of a point: its own, and those that all others see
+_CELLS, _DEEP, _EXTENT = (
+    6,
+    4,
+    1.8,
+)  # deep features: cells a side, numbers of a cell, and half the side, of a face's size
 _FORM, _MOVE, _SURE, _SEEN = 56, 88, 16, 64  # ranks of maps to all points, and units that see where points were found
 _OFFSET = 0.1  # of the face's size, a unit of what features move a point by
 
@@ -40,32 +44,34 @@ class DenseHead(nn.Module):
     .. math:: x_p = \bar x_p + F_p g + A_p f(\bar x_p + F_p g) + B_p h
 
     with g the 68 landmarks in the face's own frame, f the features under a place, and h hidden units that see g, the
-    features under all landmarks, those on a grid in the face's frame, and the mean of the deepest. Weights are read off
-    h and off where points were found.
+    features under all landmarks and points, the deepest features on a grid in the face's frame, and their mean. Weights
+    are read off h and off where points were found.
 
     Args:
         points: P.
         hidden: units of h.
-        channels: of features at a quarter, an eighth and a sixteenth of the crop's resolution.
 
     Source: Wood et al. 2022 (many points with a deviation each, from rendered pictures).
     """
 
     places: Tensor
     mirror: Tensor
+    cells: Tensor
     spread: Tensor
 
-    def __init__(self, points: int, hidden: int, channels: tuple[int, int, int]) -> None:
+    def __init__(self, points: int, hidden: int, channels: int, deep: int) -> None:
         super().__init__()
         self.register_buffer("places", torch.zeros(points, 3))
         self.register_buffer("mirror", torch.arange(points, device="cpu"))
         self.register_buffer("spread", torch.ones(WEIGHTS))  # errors of weights in stated deviations, of held-out faces
+        cells = _EXTENT * torch.linspace(-1, 1, _CELLS, device="cpu")
+        self.register_buffer("cells", torch.cartesian_prod(cells, cells).flip(1))
         rank = min(_FORM, 2 * points)
         self.form = nn.Sequential(nn.Linear(2 * COUNT, rank, bias=False), nn.Linear(rank, 2 * points))
-        self.local = normal(0.05, points, channels[0], _OWN)
-        self.under = normal(0.1, COUNT, channels[0], _UNDER)
-        self.grid = FaceGrid(channels)
-        self.mix = nn.Linear(2 * COUNT + COUNT * _UNDER + channels[2] + self.grid.numbers, hidden)
+        self.local = _normal(0.05, points, channels, _OWN + _SHARED)
+        self.under = _normal(0.1, COUNT, channels, _UNDER)
+        self.deep = _normal(0.1, _CELLS**2, deep, _DEEP)
+        self.mix = nn.Linear(2 * COUNT + COUNT * _UNDER + points * _SHARED + deep + _CELLS**2 * _DEEP, hidden)
         self.again = nn.Linear(hidden, hidden)
         self.move = nn.Sequential(nn.Linear(hidden, _MOVE, bias=False), nn.Linear(_MOVE, 2 * points, bias=False))
         self.sure = nn.Sequential(nn.Linear(hidden, _SURE, bias=False), nn.Linear(_SURE, points))
@@ -76,21 +82,23 @@ class DenseHead(nn.Module):
         nn.init.zeros_(self.more.weight)
         nn.init.constant_(cast(nn.Linear, self.sure[1]).bias, -2.0)  # a seventh of the face's size
 
-    def forward(self, landmarks: Tensor, under: Tensor, maps: tuple[Tensor, Tensor, Tensor], size: int) -> DenseReading:
+    def forward(self, landmarks: Tensor, under: Tensor, features: Tensor, deep: Tensor, size: int) -> DenseReading:
         """What is read.
 
         Args:
             landmarks: iBUG's 68, (B,68,2) pixels of the crop.
             under: features under each, (B,68,C).
-            maps: features at a quarter, an eighth and a sixteenth of the crop's resolution, (B,C,h,w) each.
+            features: (B,C,h,w).
+            deep: the deepest features, (B,D,h',w').
             size: pixels a side of the crop.
         """
         middle, axes = face_frame(landmarks)
         own = in_face_frame(landmarks, landmarks).flatten(1)
         base = self.form(own).unflatten(1, (-1, 2))
-        local = each_row(sampled_at(maps[0], base @ axes + middle, size), self.local)
-        grid = self.grid(maps, middle, axes, size)
-        read = [own, each_row(under, self.under).flatten(1), maps[2].mean((2, 3)), grid]
+        local = _each(sampled_at(features, base @ axes + middle, size), self.local)
+        cells = _each(sampled_at(deep, self.cells @ axes + middle, size), self.deep)
+        shared = [_each(under, self.under), local[..., _OWN:]]
+        read = [own, *(one.flatten(1) for one in shared), deep.mean((2, 3)), cells.flatten(1)]
         hidden = torch.relu(self.mix(torch.cat(read, 1)))
         hidden = hidden + torch.relu(self.again(hidden))
         apart = local[..., :2] + self.move(hidden).unflatten(1, (-1, 2))
@@ -142,3 +150,30 @@ def in_face_frame(points: Tensor, landmarks: Tensor) -> Tensor:
     """Points (B,L,2) of faces with landmarks (B,68,2), in the faces' own frames."""
     middle, axes = face_frame(landmarks)
     return (points - middle) @ axes.transpose(1, 2) / axes.square().sum(2)[:, None]
+
+
+def _normal(deviation: float, *shape: int) -> nn.Parameter:
+    """Normally distributed numbers; on "meta" none: what computes there loads torch's compiler, two seconds."""
+    empty = torch.empty(shape)
+    return nn.Parameter(empty if empty.is_meta else empty.normal_(std=deviation))
+
+
+def sampled_at(features: Tensor, pixels: Tensor, size: int) -> Tensor:
+    """Features (B,C,h,w) of crops of ``size`` pixels a side at places (B,L,2), (B,L,C); at the edge beyond it.
+
+    The same as ``grid_sample``, of which ONNX Runtime's takes three times as long as four rows that are taken whole.
+    """
+    batch, channels, high, wide = features.shape
+    x, y = ((pixels + 0.5) * (wide / size) - 0.5).unbind(-1)
+    x, y = x.clamp(0, wide - 1), y.clamp(0, high - 1)
+    left, top = x.floor().clamp(max=wide - 2), y.floor().clamp(max=high - 2)
+    across, down = (x - left)[..., None], (y - top)[..., None]
+    rows = features.flatten(2).transpose(1, 2).reshape(-1, channels)
+    first = (top * wide + left).long() + high * wide * torch.arange(batch, device=features.device)[:, None]
+    above = torch.lerp(rows[first], rows[first + 1], across)
+    return torch.lerp(above, torch.lerp(rows[first + wide], rows[first + wide + 1], across), down)
+
+
+def _each(features: Tensor, rows: Tensor) -> Tensor:
+    """Products (B,L,K) of features (B,L,C) with rows (L,C,K) of their own."""
+    return torch.bmm(features.transpose(0, 1), rows).transpose(0, 1)

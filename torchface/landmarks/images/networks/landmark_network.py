@@ -56,20 +56,6 @@ class NetworkLandmarks(NamedTuple):
         return cls(landmarks, deviation, visibility, presence, *points, *unseen)
 
 
-class FeatureMaps(NamedTuple):
-    """What the convolutions make of B crops of S pixels a side.
-
-    Args:
-        heat: maps of iBUG's 68, (B,68,S/4,S/4).
-        quarter, eighth, sixteenth: features at these shares of the resolution, (B,C,h,w) each.
-    """
-
-    heat: Tensor
-    quarter: Tensor
-    eighth: Tensor
-    sixteenth: Tensor
-
-
 class LandmarkNetwork(PictureNetwork):
     r"""Landmarks by a convolutional encoder and decoder whose heat maps are read by their means.
 
@@ -113,7 +99,7 @@ class LandmarkNetwork(PictureNetwork):
         size: int = 112,
         margin: float = 1.25,
         channels: tuple[int, ...] = (16, 24, 48, 96),
-        blocks: tuple[int, ...] = (2, 4, 5),
+        blocks: tuple[int, ...] = (1, 2, 2),
         decoder: int = 32,
         points: int = 0,
         hidden: int = 176,
@@ -151,7 +137,7 @@ class LandmarkNetwork(PictureNetwork):
         self.local_bias = nn.Parameter(torch.zeros(COUNT, 2))
         self.presence = nn.Linear(sixteenth, 1)
         self.points, self.hidden = points, hidden
-        self.dense = DenseHead(points, hidden, (decoder, eighth, sixteenth)) if points else None
+        self.dense = DenseHead(points, hidden, decoder, sixteenth) if points else None
 
     @classmethod
     def _usual_settings(cls) -> DescentSettings:
@@ -224,32 +210,32 @@ class LandmarkNetwork(PictureNetwork):
         """
         if crops.ndim != 4 or crops.shape[1:] != (3, self.size, self.size):
             raise ShapeError(f"crops: found {tuple(crops.shape)}, expected (B,3,{self.size},{self.size})")
-        return self.read(self.maps(crops))
+        return self.read(*self.maps(crops))
 
-    def maps(self, crops: Tensor) -> FeatureMaps:
-        """Heat maps and features."""
+    def maps(self, crops: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Heat maps (B,68,S/4,S/4), decoder features (B,C,S/4,S/4) and the deepest features (B,D,S/16,S/16)."""
         quarter = self.quarter(self.stem(2 * crops - 1))
         eighth = self.eighth(quarter)
         deep = self.sixteenth(eighth)
         whole = deep + self.context(deep.mean((2, 3)))[:, :, None, None]
         eighth = self.mix_eighth(doubled(self.up_eighth(whole)) + eighth)
         features = self.mix_quarter(doubled(self.up_quarter(eighth)) + self.skip_quarter(quarter))
-        return FeatureMaps(self.heat(features), features, eighth, deep)
+        return self.heat(features), features, deep
 
-    def read(self, maps: FeatureMaps) -> NetworkLandmarks:
+    def read(self, heat: Tensor, features: Tensor, deep: Tensor) -> NetworkLandmarks:
         """Landmarks from what ``maps`` gives."""
-        found, dense = self.readings(maps)
+        found, dense = self.readings(heat, features, deep)
         return found if dense is None else NetworkLandmarks(*found[:4], *dense)
 
-    def readings(self, maps: FeatureMaps) -> tuple[NetworkLandmarks, DenseReading | None]:
+    def readings(self, heat: Tensor, features: Tensor, deep: Tensor) -> tuple[NetworkLandmarks, DenseReading | None]:
         """The 68 alone, and what the head for points reads; None without one."""
-        points, under, widening = read_heat(maps.heat, maps.quarter, STRIDE)
+        points, under, widening = read_heat(heat, features, STRIDE)
         local = (under[..., None] * self.local).sum(2) + self.local_bias
         deviation = (local[..., 0] + widening).exp().clamp(*DEVIATION_RANGE)
-        presence = self.presence(maps.sixteenth.mean((2, 3)))[:, 0].sigmoid()
+        presence = self.presence(deep.mean((2, 3)))[:, 0].sigmoid()
         found = NetworkLandmarks.of_68(points, deviation, local[..., 1].sigmoid(), presence)
         if self.dense is None:
             return found, None
         # The head describes where the 68 are; it does not move them.
-        dense = self.dense(points.detach(), under, maps[1:], self.size)
+        dense = self.dense(points.detach(), under, features, deep, self.size)
         return found, dense._replace(point_deviation=dense.point_deviation.clamp(*DEVIATION_RANGE))

@@ -22,12 +22,12 @@ from torchface.landmarks.images.networks.heat_map_training import (
     heat_loss,
     point_loss,
 )
-from torchface.landmarks.images.networks.landmark_network import STRIDE, FeatureMaps, LandmarkNetwork
+from torchface.landmarks.images.networks.landmark_network import STRIDE, LandmarkNetwork
 from torchface.landmarks.images.networks.picture_augmentation import AugmentationSettings, Crops, augmented
 from torchface.optim import DescentSettings, DescentTask
 from torchface.shape_names import ARKIT, mirror
 
-_METHOD = "landmark network/5"
+_METHOD = "landmark network/4"
 # Pairs of landmarks whose distance is what is read off a face: how far lids and lips are open, how high brows are.
 _PAIRS = torch.tensor([[37, 41], [38, 40], [43, 47], [44, 46], [61, 67], [62, 66], [63, 65], [51, 57], [48, 54],
                        [19, 37], [24, 44]])  # fmt: skip
@@ -184,8 +184,8 @@ def _loss(
     truth, visible, weight = marks[:, :COUNT], seen[:, :COUNT], trusted[:, :COUNT]
     with torch.autocast(images.device.type, torch.bfloat16, enabled=share < settings.bfloat16):
         maps = network.maps(images)
-    maps = FeatureMaps(*(one.float() for one in maps))  # places are read to a part of a pixel
-    reading, dense = network.readings(maps)
+    heat, features, deep = (one.float() for one in maps)  # places are read to a part of a pixel
+    reading, dense = network.readings(heat, features, deep)
     places, distance = point_loss(reading.landmarks, truth, reading.deviation, weight)
     pairs = gap_loss(reading.landmarks, truth, weight, _PAIRS, 2)
     hidden = binary_cross_entropy(reading.visibility.clamp(1e-5, 1 - 1e-5), visible, reduction="none")
@@ -194,7 +194,7 @@ def _loss(
     loss = places + settings.pair * pairs + hidden + absent
     if settings.heat > 0:
         fading = settings.heat * max(0.0, 1 - 2 * share) + 0.05
-        loss = loss + fading * heat_loss(maps.heat, truth, weight, STRIDE, _HEAT)
+        loss = loss + fading * heat_loss(heat, truth, weight, STRIDE, _HEAT)
     # Of faces that are not found yet openings say nothing.
     loss = loss + settings.opening * min(1.0, 4 * share) * opening_loss(reading.landmarks, truth, weight)
     if dense is not None:
