@@ -45,7 +45,7 @@ def relight(
         texture: An image in the rig's texture coordinates to put on the skin, lit as the face is; where it is
             transparent the film shows.
         rig: A head with a texture to show in the face's place; it moves as the actor does.
-        film_light: Estimate the film's light once, or in each eight frames, for lights that change or move.
+        film_light: Estimate the film's light once, or every eight frames, for lights that change or move.
         occluders: Leave what is before the face as it is. --no-occluders relights all of it.
         camera: The calibration with which the film was tracked, if there was one.
         quiet: Show no progress.

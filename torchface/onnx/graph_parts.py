@@ -12,6 +12,7 @@ import onnx
 import torch
 from torch import Tensor
 
+from torchface.errors import TorchfaceError
 from torchface.onnx.exported_model import check_model, rename_values
 
 _DOMAIN = "torchface"
@@ -20,7 +21,7 @@ _DOMAIN = "torchface"
 @torch.library.custom_op("torchface::graph_part", mutates_args=())
 def graph_part(inputs: Sequence[Tensor], name: str, shape: Sequence[int]) -> Tensor:
     """Stands in an exported program for a part of that name that gives a tensor of that shape, float32."""
-    raise NotImplementedError(name)
+    raise TorchfaceError(f"{name}: found a part of a graph that is computed, expected one that is exported")
 
 
 @graph_part.register_fake

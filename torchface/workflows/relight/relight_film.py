@@ -112,7 +112,7 @@ class RelightSettings:
         exposure: how many times as bright as the film's light the panorama is.
         texture: paint in the rig's texture coordinates.
         rig: another head, which moves as the actor does.
-        film_light: whether the film's light is estimated once, or in each eight frames.
+        film_light: whether the film's light is estimated once, or every eight frames.
         occluders: leave what is before the face as it is.
         camera: the calibration with which the film was tracked.
     """

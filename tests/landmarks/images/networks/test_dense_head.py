@@ -7,14 +7,13 @@ import copy
 import onnxruntime
 import pytest
 import torch
-from torch.nn.functional import grid_sample
 from torch.utils.data import TensorDataset
 
 from torchface import zoo
 from torchface.landmarks import FaceReading, LandmarkNetwork, NetworkSettings
 from torchface.landmarks.images.ibug_68 import COUNT
 from torchface.landmarks.images.networks.crop_finder import BothSides, CropFinder
-from torchface.landmarks.images.networks.dense_head import DenseHead, in_face_frame, sampled_at
+from torchface.landmarks.images.networks.dense_head import DenseHead, in_face_frame
 from torchface.landmarks.images.networks.landmark_training import cropped, opening_loss, openings
 from torchface.landmarks.images.networks.picture_augmentation import AugmentationSettings
 from torchface.onnx import export_model
@@ -70,18 +69,6 @@ def test_calibration_makes_deviations_as_large_as_errors() -> None:
     for stated in (0.1, 0.1 * noise / 0.1):  # calibrated anew it stays
         head.calibrate(read, (head.spread * stated).expand(4000, 52), truth)
         torch.testing.assert_close(head.spread * stated, noise, rtol=0.05, atol=0)
-
-
-def test_features_are_sampled_as_torch_does() -> None:
-    generator = torch.Generator().manual_seed(0)
-    features = torch.randn(3, 5, 22, 22, dtype=torch.float64, generator=generator)
-    places = 220 * torch.rand(3, 40, 2, dtype=torch.float64, generator=generator) - 22  # some beyond the crop
-    expected = grid_sample(features, (places[:, None] + 0.5) / 88 - 1, padding_mode="border", align_corners=False)
-    torch.testing.assert_close(sampled_at(features, places, 176), expected[:, :, 0].transpose(1, 2))
-    inner, some = 4 + 120 * places[:1, :6] / 220, features[:1, :2].clone()
-    assert torch.autograd.gradcheck(
-        lambda one, other: sampled_at(one, other, 176), (some.requires_grad_(), inner.requires_grad_())
-    )
 
 
 def test_a_face_in_its_own_frame_is_the_same_however_it_lies(faces: torch.Tensor) -> None:
