@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
 from pathlib import Path
 
+import numpy as np
 import onnx
 import onnxruntime
 import pytest
@@ -22,6 +25,10 @@ from torchface.onnx.solver_graph_export import (
     solver_graph,
 )
 from torchface.synthetic.stages.marker_stage import place_markers
+
+EXAMPLE = Path(__file__).resolve().parents[2] / "examples" / "solve_onnx.py"
+# Importing torch would defeat the example's point, so it is made impossible.
+WITHOUT_TORCH = "import sys, runpy; sys.modules['torch'] = None; sys.argv = sys.argv[1:]; runpy.run_path(sys.argv[0])"
 
 
 def run(path: Path, *inputs: Tensor) -> Tensor:
@@ -73,6 +80,21 @@ def test_the_metadata_says_what_goes_in_and_out(written: SolverReport, turned_bu
     assert {opset.domain for opset in onnx.load(written.path).opset_import} == {""}
 
 
+def test_the_example_solves_with_onnxruntime_and_numpy_alone(
+    written: SolverReport, turned_bumps: MarkerSolver, tmp_path: Path
+) -> None:
+    markers = random_frames(turned_bumps, 30)
+    markers[4, 2] = torch.nan
+    np.save(tmp_path / "markers.npy", markers.numpy())
+    given = [EXAMPLE, written.path, tmp_path / "markers.npy", tmp_path / "weights.npy"]
+    command = [sys.executable, "-c", WITHOUT_TORCH, *map(str, given)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
+    assert done.returncode == 0, done.stderr
+    assert "30 frames" in done.stdout
+    solved = torch.from_numpy(np.load(tmp_path / "weights.npy"))
+    torch.testing.assert_close(solved, turned_bumps(markers), rtol=0, atol=5e-3)
+
+
 def test_a_graph_that_disagrees_is_not_written(
     written: SolverReport,
     bump_rig: BlendshapeRig,
@@ -87,6 +109,7 @@ def test_a_graph_that_disagrees_is_not_written(
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.bench  # torch.export takes twenty seconds; test_solver_graph.py tries the module that is exported
 def test_the_hybrid_file_computes_it_and_says_what_it_takes(dome_rig: BlendshapeRig, tmp_path: Path) -> None:
     path = tmp_path / "hybrid.onnx"
     report = export_hybrid_solver(dome_rig, place_markers(dome_rig, 30), path)

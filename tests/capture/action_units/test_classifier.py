@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+import onnx
 import pytest
 import torch
 
@@ -28,7 +29,7 @@ from torchface.capture.action_units.one_vs_one_svm import OneVsOne
 from torchface.capture.action_units.weight_targets import smooth_intensities
 from torchface.errors import FileFormatError, NameMismatchError, ShapeError, ValueRangeError
 from torchface.io.action_labels import ActionLabels
-from torchface.onnx import export_action_units
+from torchface.onnx import action_unit_graph, export_action_units
 from train.classifier_evaluation import cross_validation, level_agreement
 from train.filmed_performers.action_performance import MOVES
 from train.filmed_performers.camera_stage import RecordedSession
@@ -180,7 +181,7 @@ def test_two_performers_can_be_learned_from(
         assert level_agreement(classify(found, video), planted(truth, found.units))["within_one"] > 0.95
 
 
-def test_from_disk_and_from_onnx(both: Learned, tmp_path: Path) -> None:
+def test_from_disk_and_from_onnx(both: Learned, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     classifier, video = both.classifier, both.arguments[0][0]
     zoo.save_model(classifier, tmp_path / "units", zoo.ModelCard("MIT", "made", {}, "none"))
     again = zoo.get_model(tmp_path / "units")
@@ -198,6 +199,13 @@ def test_from_disk_and_from_onnx(both: Learned, tmp_path: Path) -> None:
     assert classifier(frames, rest).unique(dim=0).shape[0] > 1
     meta = session.get_modelmeta().custom_metadata_map
     assert '"18L"' in meta["units"]
+
+    # The graph of a classifier with other intensities is not written.
+    monkeypatch.setattr(action_unit_graph, "action_unit_model", lambda *_: onnx.load(tmp_path / "units.onnx"))
+    again.group_classifiers()[0].intensities.add_(0.1)
+    with pytest.raises(ValueRangeError, match="agrees with PyTorch in 0"):
+        export_action_units(again, tmp_path / "wrong.onnx", frames)
+    assert not (tmp_path / "wrong.onnx").exists()
 
 
 def test_a_config_that_cannot_be_is_refused(classifier: ActionUnitClassifier) -> None:

@@ -1,135 +1,38 @@
-"""A filmed performer comes back as weights, whatever happens on the way; what cannot be tracked is told."""
+"""A filmed performer comes back as weights; what cannot be tracked is told."""
 
 from __future__ import annotations
 
 import json
-import math
 import shutil
-import socket
 import warnings
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import pytest
 import torch
-from forked_runs import held, killed
-from received_frames import decode_frame
-from safetensors.torch import load_file
 
-from planted.light_stage import LightStageSettings, render_lit_video
-from torchface import BlendshapeRig, load_rig, load_take, save_rig, zoo
-from torchface.capture.priors import ShapePrior
+from tests.workflows.track.conftest import FRAMES, QUICK, Done, Filmed
+from torchface import BlendshapeRig, load_rig, load_take, save_rig
 from torchface.cli import main
-from torchface.errors import FileFormatError, NameMismatchError, ValueRangeError
-from torchface.geometry.cameras.calibration import CameraCalibration, assumed_calibration
+from torchface.errors import FileFormatError, ValueRangeError
+from torchface.geometry.cameras.calibration import assumed_calibration
 from torchface.geometry.rotations import rotation_matrix
-from torchface.io.camera_files import save_calibration
 from torchface.io.gltf.animation_reading import read_gltf_weights
 from torchface.io.video import VideoFile, open_video, write_video
-from torchface.landmarks import FaceReading
-from torchface.landmarks.images.tracking.landmark_tracker import LandmarkTracker
 from torchface.rendering.point_light import PointLight
-from torchface.shape_names import ARKIT, mapping
+from torchface.shape_names import ARKIT
 from torchface.synthetic.head.performer import performer
-from torchface.workflows.live.live_actor import track_live
-from torchface.workflows.live.recordings import FrameLog
-from torchface.workflows.named_finders import graph_detector, load_finder
-from torchface.workflows.track import frame_readings
 from torchface.workflows.track.face_overlay import mesh_drawer, paint_drawer, undistorted
 from torchface.workflows.track.head_rotations import head_angles
 from torchface.workflows.track.overlay_video import head_window
 from torchface.workflows.track.take_solution import known_offsets
 from torchface.workflows.track.track_inputs import TrackInputs, TrackSettings
-from torchface.workflows.track.track_models import TrackModels, load_track_models
+from torchface.workflows.track.track_models import TrackModels
 from torchface.workflows.track.track_page import write_track_page
 from torchface.workflows.track.track_result import Tracked
-from torchface.workflows.track.track_state import FOLDER, TrackState
 from torchface.workflows.track.track_video import track_video
 
 pytestmark = pytest.mark.usefixtures("coarse_figures")
-
-FRAMES = 11
-PIECE = 4
-QUICK = TrackSettings(overlay="none")
-
-
-@dataclass(frozen=True)
-class Filmed:
-    """A film, its rig's file, and what was performed."""
-
-    video: Path
-    rig: Path
-    camera: Path
-    actor: BlendshapeRig
-    weights: torch.Tensor
-    landmarks: torch.Tensor
-    rotation: torch.Tensor
-
-
-@dataclass(frozen=True)
-class Done:
-    """What tracking gave; what lay in its folder when it was killed, and how many frames were tracked after that."""
-
-    tracked: Tracked
-    out: Path
-    left: tuple[str, ...]
-    steps: int
-
-
-@pytest.fixture(scope="module")
-def filmed(tmp_path_factory: pytest.TempPathFactory) -> Filmed:
-    """The mean performer opens the jaw, smiles and raises the brows while the head turns."""
-    folder = tmp_path_factory.mktemp("film")
-    actor = performer(texture=True)
-    weights = torch.zeros(FRAMES, len(actor.names))
-    ramp = torch.linspace(0, 1, FRAMES)
-    for name, size in {"jawOpen": 0.8, "browInnerUp": 0.9, "mouthSmileLeft": 0.7, "mouthSmileRight": 0.7}.items():
-        weights[:, actor.names.index(name)] = size * (ramp if name == "jawOpen" else (math.pi * ramp).sin())
-    light = PointLight(torch.full((3,), 0.35), torch.full((3,), 0.7), torch.tensor([-500.0, -700.0, 100.0]))
-    settings = LightStageSettings(width=160, height=120, samples=1, turn=12.0)
-    film = render_lit_video(
-        folder / "film.avi", actor, weights, light, 30.0, torch.Generator().manual_seed(0), settings
-    )
-    save_rig(actor, folder / "rig.glb")
-    intrinsics = film.cameras[0].intrinsics
-    save_calibration(CameraCalibration(intrinsics, torch.zeros(5), 160, 120, 0.1), folder / "camera.toml")
-    marks = actor.neutral.landmarks
-    landmarks = torch.stack([
-        camera.project(actor(weights[t : t + 1])[0, marks].double()) for t, camera in enumerate(film.cameras)
-    ])  # fmt: skip
-    rotation = torch.stack([camera.rotation for camera in film.cameras])
-    return Filmed(
-        folder / "film.avi", folder / "rig.glb", folder / "camera.toml", actor, weights, landmarks.float(), rotation
-    )
-
-
-@pytest.fixture(scope="module")
-def done(filmed: Filmed, tmp_path_factory: pytest.TempPathFactory) -> Done:
-    """The film tracked with everything, in pieces of a few frames; killed in the third piece and started again."""
-    out = tmp_path_factory.mktemp("tracked") / "out"
-    settings = TrackSettings(camera=filmed.camera)
-
-    def killed(what: str, frames: int = 0, total: int = 0) -> None:
-        if what == "tracking landmarks" and frames == 2 * PIECE + 2:
-            raise KeyboardInterrupt
-
-    steps = 0
-    step = LandmarkTracker.step
-
-    def counted(self: LandmarkTracker, frame: torch.Tensor) -> FaceReading:
-        nonlocal steps
-        steps += 1
-        return step(self, frame)
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(frame_readings, "PIECE", PIECE)
-        with pytest.raises(KeyboardInterrupt):
-            track_video(filmed.video, filmed.rig, out, settings, killed)
-        left = tuple(path.name for path in out.iterdir())
-        patch.setattr(LandmarkTracker, "step", counted)
-        tracked = track_video(filmed.video, filmed.rig, out, settings)
-    return Done(tracked, out, left, steps)
 
 
 def test_a_filmed_performer_comes_back(done: Done, filmed: Filmed) -> None:
@@ -191,113 +94,6 @@ def test_the_report_shows_frames_and_curves(done: Done, tmp_path: Path) -> None:
     assert "landmark_network" in page
 
 
-def test_a_killed_run_goes_on_where_it_was_and_gives_the_same(done: Done, filmed: Filmed) -> None:
-    assert done.left == (FOLDER,)
-    assert done.steps == FRAMES - 2 * PIECE
-    assert done.tracked.reused == 2 * PIECE
-    tracker = LandmarkTracker(load_finder().finder, detector=graph_detector())
-    whole: list[torch.Tensor] = []
-    whole.extend(tracker.step(frame).landmarks for frame in open_video(filmed.video).color_frames())
-    assert torch.equal(done.tracked.reading.landmarks, torch.stack(whole))
-
-
-def test_what_is_up_to_date_is_kept(done: Done, filmed: Filmed, tmp_path: Path) -> None:
-    out = tmp_path / "out"
-    shutil.copytree(done.out, out)
-    made = {path: path.stat().st_mtime_ns for path in (out / "overlay.mp4", out / FOLDER / "solution.safetensors")}
-    again = track_video(filmed.video, filmed.rig, out, TrackSettings(camera=filmed.camera))
-    assert {path: path.stat().st_mtime_ns for path in made} == made
-    assert set(again.seconds) == {"smoothing"}
-    torch.testing.assert_close(again.solution.weights, done.tracked.solution.weights)
-    smooth = track_video(
-        filmed.video, filmed.rig, out, TrackSettings(camera=filmed.camera, overlay="none", whole_take=True)
-    )
-    assert set(smooth.seconds) == {"smoothing", "weights"}  # landmarks stay
-    assert not torch.equal(smooth.solution.weights, again.solution.weights)
-
-
-def assert_same_file(path: Path, other: Path) -> None:
-    """Bit for bit, but that numbers of tables may differ by rounding: products of matrices depend on where they lie."""
-    if path.read_bytes() == other.read_bytes():
-        return
-    if path.suffix == ".glb":
-        played, wanted_take = read_gltf_weights(path), read_gltf_weights(other)
-        assert played is not None
-        assert wanted_take is not None
-        assert played.weights is not None
-        assert wanted_take.weights is not None
-        torch.testing.assert_close(played.weights.values, wanted_take.weights.values, atol=1e-5, rtol=0)
-        return
-    assert path.suffix == ".csv", path
-    ours, theirs = (table.read_text().splitlines() for table in (path, other))
-    assert len(ours) == len(theirs)
-    for row, wanted in zip(ours, theirs, strict=True):
-        for one, two in zip(row.split(","), wanted.split(","), strict=True):
-            assert one == two or float(one) == pytest.approx(float(two), abs=1e-5), (path.name, row[:20])
-
-
-def test_damaged_files_are_told_and_made_anew(
-    done: Done, filmed: Filmed, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(frame_readings, "PIECE", PIECE)
-    out = tmp_path / "out"
-    shutil.copytree(done.out, out)
-    names = {path.relative_to(done.out) for path in done.out.rglob("*") if path.is_file()}
-    pieces = sorted((out / FOLDER).glob("landmarks_*"))
-    pieces[1].write_bytes(b"")
-    (out / "overlay.mp4").write_bytes((out / "overlay.mp4").read_bytes()[:1000])
-    for name in ("weights.csv", "animation.glb", "summary.json"):
-        (out / name).write_bytes(b"")
-    settings = TrackSettings(camera=filmed.camera)
-    killed(lambda told: track_video(filmed.video, filmed.rig, out, settings, told), "drawing the overlay", 5)
-    left = out / FOLDER / f".{pieces[1].name}.999999.part"
-    left.write_bytes(b"of a run that was killed")
-    with pytest.warns(UserWarning, match="overlay.mp4: found other content than was written"):
-        again = track_video(filmed.video, filmed.rig, out, settings)
-    assert again.reused == FRAMES
-    assert set(again.seconds) == {"smoothing", "overlay"}
-    assert {path.relative_to(out) for path in out.rglob("*") if path.is_file()} == names
-    for name in names - {Path("summary.json"), Path(FOLDER) / "track.json"}:  # these hold times and hashes of files
-        if name.suffix == ".safetensors":  # whose header names things in any order
-            ours, theirs = load_file(out / name), load_file(done.out / name)
-            torch.testing.assert_close(ours, theirs, rtol=0, atol=0, equal_nan=True)
-        else:
-            assert_same_file(out / name, done.out / name)
-
-
-def test_another_run_into_the_folder_is_refused(done: Done, filmed: Filmed, tmp_path: Path) -> None:
-    with (
-        held(tmp_path / "out") as process,
-        pytest.raises(ValueRangeError, match=rf"another run writing into .*out \(process {process} on "),
-    ):
-        track_video(filmed.video, filmed.rig, tmp_path / "out", QUICK)
-
-
-def test_pieces_of_other_runs_and_damaged_ones_are_thrown_away(tmp_path: Path) -> None:
-    piece = FaceReading(torch.rand(4, 68, 2), torch.rand(4, 68), torch.ones(4, 68), torch.ones(4))
-    state = TrackState(tmp_path, "a")
-    for _ in range(3):
-        state.append(piece, torch.rand(4, 1200), torch.zeros(3))
-    assert TrackState(tmp_path, "a").done == 12
-    files = sorted((tmp_path / FOLDER).glob("*.safetensors"))
-    files[1].write_bytes(files[1].read_bytes()[:-1000] + bytes(1000))
-    with pytest.warns(UserWarning, match=r"landmarks_000001\.safetensors: found a damaged checkpoint"):
-        assert TrackState(tmp_path, "a").done == 4
-    assert [path.exists() for path in files] == [True, False, False]
-    assert TrackState(tmp_path, "b").done == 0
-    product = tmp_path / "x.csv"
-    product.write_text("x")
-    state.made(product, "k")
-    assert state.is_current(product, "k")
-    assert not state.is_current(product, "l")
-    product.write_text("y")
-    with pytest.warns(UserWarning, match=r"x\.csv: found other content than was written"):
-        assert not state.is_current(product, "k")
-    product.write_text("x")
-    (tmp_path / FOLDER / "track.json").write_text("[[[")
-    assert not state.is_current(product, "k")
-
-
 def test_paint_stays_on_the_skin_and_landmarks_are_drawn_where_they_are(
     done: Done, filmed: Filmed, tmp_path: Path
 ) -> None:
@@ -352,32 +148,6 @@ def test_what_cannot_be_tracked_is_told_and_leaves_nothing(
     with pytest.raises(ValueRangeError, match=r"camera.toml.*made for 300 x 100 pixels"):
         track_video(filmed.video, filmed.rig, out, TrackSettings(camera=tmp_path / "camera.toml"))
     assert not out.exists()
-
-
-def test_models_that_do_not_fit_are_told(dome_rig: BlendshapeRig, tmp_path: Path) -> None:
-    with pytest.raises(
-        NameMismatchError, match="--landmarks: found head, a HeadModel, expected a LandmarkTrees or LandmarkNetwork"
-    ):
-        load_track_models(dome_rig, "head")
-    with pytest.raises(NameMismatchError, match="--dynamics: found face_landmarks, a LandmarkTrees"):
-        load_track_models(dome_rig, dynamics="face_landmarks")
-    takes = [torch.rand(60, 3, generator=torch.Generator().manual_seed(seed)) for seed in range(2)]
-    prior = ShapePrior.fit(takes, ("jawLeft", "mouthLeft", "browDownLeft"))
-    zoo.save_model(prior, tmp_path / "other", zoo.ModelCard("MIT", "none", {}, "none"))
-    with pytest.raises(NameMismatchError, match=r"other: .*jawLeft"):
-        load_track_models(dome_rig, prior=tmp_path / "other")
-
-
-def test_priors_of_arkits_names_serve_other_spellings_and_rates(dome_rig: BlendshapeRig) -> None:
-    names = [f"{name.removesuffix('Left')}_L" if name.endswith("Left") else name for name in dome_rig.names]
-    rig = BlendshapeRig(dome_rig.neutral, dome_rig.deltas, names)
-    models = load_track_models(rig, prior="shape_prior", dynamics="dynamics_prior", fps=30.0)
-    assert models.prior is not None
-    assert models.dynamics is not None
-    assert models.prior.names == models.dynamics.names == tuple(names)
-    assert models.dynamics.fps == 30.0
-    with pytest.raises(ValueRangeError, match=r"dynamics_prior: .*found 2 frames a second, expected from 7.5 to 480"):
-        load_track_models(rig, dynamics="dynamics_prior", fps=2.0)
 
 
 def test_a_take_shorter_than_the_window_is_told() -> None:
@@ -461,45 +231,6 @@ def test_a_cut_to_another_face_is_said_and_not_solved(filmed: Filmed, tmp_path: 
     assert not insisted.others
     assert insisted.reused == 2 * FRAMES
     assert insisted.solution.confidence[FRAMES:].mean() > 0.5
-
-
-def test_a_played_video_is_sent_frame_by_frame(filmed: Filmed, tmp_path: Path) -> None:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as receiver:
-        receiver.bind(("127.0.0.1", 0))
-        receiver.settimeout(5)
-        address = f"udp://127.0.0.1:{receiver.getsockname()[1]}"
-        report = track_live(str(filmed.video), filmed.rig, [address], tmp_path)
-        frames = [decode_frame(receiver.recv(2048)) for _ in range(report.figures.frames)]
-    assert report.figures.frames + report.dropped == FRAMES
-    assert report.figures.found == report.figures.frames
-    sent = torch.stack([frame.weights for frame in frames])
-    kept = load_take(tmp_path / "weights.csv").weights
-    assert kept is not None
-    torch.testing.assert_close(kept.select(["jawOpen"]).values[:, 0, 0], sent[:, ARKIT.index("jawOpen")])
-    torch.testing.assert_close(kept.values[..., 0] @ mapping(kept.names, ARKIT).T, sent)
-    assert sent.any()
-    assert frames[-1].rotations[:3].abs().max() > 0
-    with pytest.raises(ValueRangeError, match="expected an address"):
-        track_live(str(filmed.video), filmed.rig, ["tcp://x"])
-    with pytest.raises(FileFormatError, match="camera 97: cannot be opened"):
-        track_live("97", filmed.rig, [address])
-
-
-def test_a_disk_that_fills_ends_the_curves_and_not_the_stream(
-    filmed: Filmed, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    append = FrameLog.append
-
-    def full(log: FrameLog, *given: Any) -> None:
-        if log.count == 2:
-            raise FileFormatError("the disk is full")
-        append(log, *given)
-
-    monkeypatch.setattr(FrameLog, "append", full)
-    report = track_live(str(filmed.video), filmed.rig, ["udp://127.0.0.1:9"], tmp_path)
-    assert report.figures.frames + report.dropped == FRAMES > 2
-    assert "the curves end at frame 2: the disk is full" in report.notes
-    assert len(load_take(tmp_path / "weights.csv")) == 2
 
 
 def test_the_command_says_what_is_missing(filmed: Filmed, capsys: pytest.CaptureFixture[str]) -> None:
