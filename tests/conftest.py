@@ -173,6 +173,8 @@ def coarse_figures() -> Iterator[None]:
     """Figures of reports with one ray a pixel and no shadow in creases, for tests that do not look at them."""
     figures = ("face_views", "marker_maps", "registration_views")
     pages = (
+        "workflows.fit.photograph_rig",
+        "workflows.rig.predicted_rig",
         "workflows.solve.solve_page",
         "workflows.register.scan_job",
         "workflows.batch.contact_sheet",

@@ -50,7 +50,10 @@ def pairs(dome_rig: BlendshapeRig, tmp_path_factory: pytest.TempPathFactory) -> 
 def trained(pairs: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Trained, Path]:
     out = tmp_path_factory.mktemp("models") / "domes"
     asked = ("jawOpen", "mouthSmileLeft+mouthSmileRight")
-    return train(Settings(pairs=pairs, expressions=asked, out=out, pictured=1)), out
+    frame = expression_table.frame_face
+    with pytest.MonkeyPatch.context() as patch:  # small pictures are drawn sooner
+        patch.setattr(expression_table, "frame_face", lambda mesh, yaw, **_: frame(mesh, yaw, width=60, height=72))
+        return train(Settings(pairs=pairs, expressions=asked, out=out, pictured=1)), out
 
 
 def test_the_law_is_found(trained: tuple[Trained, Path]) -> None:

@@ -247,7 +247,9 @@ def test_a_model_of_registered_faces_carries_the_templates_rig(
     assert len(rig.names) == 53
 
 
-def test_meshes_in_centimetres_are_refused_and_read_with_their_unit(heads: list[Mesh], tmp_path: Path) -> None:
+def test_meshes_in_centimetres_are_refused_and_read_with_their_unit(
+    heads: list[Mesh], tmp_path: Path, without_pictures: None
+) -> None:
     folder = tmp_path / "scans"
     folder.mkdir()
     for number, mesh in enumerate(heads[:3]):

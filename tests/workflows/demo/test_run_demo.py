@@ -18,8 +18,6 @@ from torchface.rig import BlendshapeRig
 from torchface.workflows.demo.demo_page import result_rows, scene_rows, write_demo_page
 from torchface.workflows.demo.run_demo import FLAWS, embedded_scene, run_demo, scene_from
 
-pytestmark = pytest.mark.usefixtures("coarse_figures")
-
 
 def test_the_embedded_performer_comes_back_and_every_file_says_the_same(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch

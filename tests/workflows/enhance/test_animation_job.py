@@ -12,8 +12,6 @@ from torchface.cli import main
 from torchface.io import MeshSequence, save_animation
 from torchface.take import Take, Track
 
-pytestmark = pytest.mark.usefixtures("coarse_figures")
-
 
 @pytest.fixture
 def takes(actor: Actor, tmp_path: Path) -> Path:

@@ -66,7 +66,7 @@ def shuffled(actor: Actor) -> tuple[torch.Tensor, torch.Tensor]:
 
 
 def test_weights_become_meshes_an_animation_a_video_and_a_report(
-    actor: Actor, expected: torch.Tensor, tmp_path: Path, coarse_figures: None, monkeypatch: pytest.MonkeyPatch
+    actor: Actor, expected: torch.Tensor, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(enhance_views, "_VIDEO_HEIGHT", 80)
     settings = EnhanceSettings(InputSettings(rig=actor.folder / "rig.glb"), meshes="ply")

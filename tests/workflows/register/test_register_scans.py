@@ -31,7 +31,6 @@ from torchface.workflows.batch.run_batch import BatchOptions, BatchReport
 from torchface.workflows.register.register_scans import SCANS, ScanSettings, register_scans
 from torchface.workflows.register.scan_job import ScanJob
 
-pytestmark = pytest.mark.usefixtures("coarse_figures")
 SHORT = Schedule((Stage(Level.GRAPH, 8.0, 8.0, 20.0, samples=300), Stage(Level.GRAPH, 0.5, 1.0, 8.0)), nodes=30)
 COUNT = 5
 
@@ -174,6 +173,7 @@ def test_a_run_killed_at_random_moments_leaves_whole_files_and_goes_on(
         )
 
 
+@pytest.mark.bench  # two processes load the library; tests/workflows/batch tries what becomes of one that dies
 def test_processes_give_the_same_and_one_that_dies_takes_only_its_scan(
     template: Mesh, scans: Path, done: BatchReport, tmp_path: Path
 ) -> None:

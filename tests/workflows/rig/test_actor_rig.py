@@ -24,8 +24,6 @@ from torchface.rig import BlendshapeRig
 from torchface.synthetic.head.neutral_head import neutral_head
 from torchface.workflows.rig.actor_rig import RigOptions, rig_actor
 
-pytestmark = pytest.mark.usefixtures("coarse_figures")
-
 PICKS = torch.arange(26, 600, 41)
 
 

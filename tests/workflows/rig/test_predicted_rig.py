@@ -33,7 +33,6 @@ def folder(dome_rig: BlendshapeRig, tmp_path_factory: pytest.TempPathFactory) ->
     return folder
 
 
-@pytest.mark.usefixtures("coarse_figures")
 def test_a_head_gets_predicted_and_transferred_shapes(
     folder: Path, dome_rig: BlendshapeRig, capsys: pytest.CaptureFixture[str]
 ) -> None:

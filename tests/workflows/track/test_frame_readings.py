@@ -25,8 +25,6 @@ from torchface.workflows.track.frame_readings import given_reading
 from torchface.workflows.track.track_inputs import TrackSettings
 from torchface.workflows.track.track_video import track_video
 
-pytestmark = pytest.mark.usefixtures("coarse_figures")
-
 COUNT, WIDTH, HEIGHT = 6, 320, 240
 
 

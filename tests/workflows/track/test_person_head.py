@@ -20,8 +20,6 @@ from torchface.take import Take, Track
 from torchface.workflows.track.track_inputs import TrackSettings
 from torchface.workflows.track.track_video import track_video
 
-pytestmark = pytest.mark.usefixtures("coarse_figures")
-
 COUNT, WIDTH, HEIGHT = 12, 640, 480
 SHAPES = ["jawOpen", "mouthSmileLeft", "mouthSmileRight", "browInnerUp"]
 

@@ -17,8 +17,6 @@ from torchface.shape_names import ARKIT, mapping
 from torchface.workflows.live.live_actor import track_live
 from torchface.workflows.live.recordings import FrameLog
 
-pytestmark = pytest.mark.usefixtures("coarse_figures")
-
 
 def test_a_played_video_is_sent_frame_by_frame(filmed: Filmed, tmp_path: Path) -> None:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as receiver:

@@ -24,8 +24,6 @@ from torchface.take import Take, Track
 from torchface.workflows.track.track_inputs import TrackSettings
 from torchface.workflows.track.track_video import track_video
 
-pytestmark = pytest.mark.usefixtures("coarse_figures")
-
 WIDTH, HEIGHT = 160, 120
 TIMES = np.concatenate([np.arange(10) / 30, 10 / 30 + np.arange(8) / 12])
 

@@ -22,8 +22,6 @@ from torchface.workflows.track.track_inputs import TrackSettings
 from torchface.workflows.track.track_state import FOLDER, TrackState
 from torchface.workflows.track.track_video import track_video
 
-pytestmark = pytest.mark.usefixtures("coarse_figures")
-
 
 def test_a_killed_run_goes_on_where_it_was_and_gives_the_same(done: Done, filmed: Filmed) -> None:
     assert done.left == (FOLDER,)

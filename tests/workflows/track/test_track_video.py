@@ -32,8 +32,6 @@ from torchface.workflows.track.track_page import write_track_page
 from torchface.workflows.track.track_result import Tracked
 from torchface.workflows.track.track_video import track_video
 
-pytestmark = pytest.mark.usefixtures("coarse_figures")
-
 
 def test_a_filmed_performer_comes_back(done: Done, filmed: Filmed) -> None:
     tracked = done.tracked
