@@ -51,6 +51,7 @@ def test_new_targets_are_read_and_an_animation_of_weights_still_fits(tmp_path: P
     character = read_character(read_document(out))
     assert character.blocks[0].names == ("smile", "jawOpen", "tongueOut")
     torch.testing.assert_close(character.targets(character.blocks[0])[1:], torch.from_numpy(moved))
+    assert character.targets(character.blocks[0]) is character.targets(character.blocks[0])  # the budget counts once
     take = read_gltf_weights(out)
     assert take is not None
     assert take.weights is not None

@@ -191,15 +191,30 @@ def test_a_tiled_texture_is_told_and_the_mesh_read(tmp_path: Path) -> None:
     assert mesh.texture is None
 
 
-def test_of_two_textures_the_first_is_taken_and_the_other_told(tmp_path: Path) -> None:
-    for number, name in enumerate(("skin.png", "teeth.png")):
-        save_image(torch.full((3, 2, 2), float(number)), tmp_path / name)
-    parts = painted("face", "skin") + painted("mouth", "teeth")
-    path = usda(tmp_path / "two.usda", parts + material("skin", "skin.png") + material("teeth", "teeth.png"))
-    with pytest.warns(UserWarning, match=r"left out: 2 textures \(skin\.png, teeth\.png\), of which a mesh has one"):
-        mesh = load_mesh(path)
-    assert mesh.texture.max() == 0
-    assert mesh.polygons.tolist() == [[0, 1, 2, 3], [4, 5, 6, 7]]  # quads stay quads where meshes are joined
+def test_each_face_shows_its_own_material(tmp_path: Path) -> None:
+    for name, value in (("skin.png", 0.2), ("teeth.png", 0.8)):
+        save_image(torch.full((3, 2, 2), value), tmp_path / name)
+    subset = """def GeomSubset "gums" (prepend apiSchemas = ["MaterialBindingAPI"])
+{
+uniform token elementType = "face"
+uniform token familyName = "materialBind"
+int[] indices = [1]
+rel material:binding = </gums>
+}
+"""
+    pair = QUAD.replace("[4]", "[3, 3]").replace("[0, 1, 2, 3]", "[0, 1, 2, 0, 2, 3]")
+    mouth = mesh_prim("mouth", pair + "rel material:binding = </teeth>\n" + subset, '"MaterialBindingAPI"')
+    gums = material("gums", "skin.png").replace(".connect = </gums/texture.outputs:rgb>", " = (1, 0, 0)")
+    body = painted("face", "skin") + mouth + material("skin", "skin.png") + material("teeth", "teeth.png") + gums
+    mesh = load_mesh(usda(tmp_path / "three.usda", body))
+    assert mesh.texture is not None
+    middle = mesh.uvs[mesh.uv_faces].mean(1)
+    size = torch.tensor([mesh.texture.shape[2], mesh.texture.shape[1]])
+    at = (torch.stack([middle[:, 0], 1 - middle[:, 1]], 1) * size).long()
+    seen = mesh.texture[:, at[:, 1], at[:, 0]].T
+    grey = [[0.2] * 3, [0.2] * 3, [0.8] * 3, [1.0, 0.0, 0.0]]
+    torch.testing.assert_close(seen, torch.tensor(grey), atol=1 / 255, rtol=0)
+    assert mesh.polygons.tolist() == [[0, 1, 2, 3], [4, 5, 6, -1], [4, 6, 7, -1]]  # quads stay where meshes are joined
 
 
 @pytest.mark.real

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -86,6 +86,7 @@ class Character:
     blocks: tuple[Block, ...]
     head: Tensor | None
     head_bone: str
+    _read: dict[Block, Tensor] = field(default_factory=dict, repr=False)  # targets, which count once in the budget
 
     @property
     def first_triangles(self) -> list[int]:
@@ -94,6 +95,8 @@ class Character:
 
     def targets(self, block: Block) -> Tensor:
         """The morph targets (N,C,3) of a block's own array."""
+        if block in self._read:
+            return self._read[block]
         document, location = self.document, f"meshes[{block.mesh}].primitives[{block.primitives[0]}]"
         mesh = document.item("meshes", block.mesh, location)
         primitive = document.record(document.array(mesh, "primitives", location)[block.primitives[0]], location)
@@ -104,6 +107,7 @@ class Character:
             if "POSITION" in target:
                 rows = read_floats(document, target["POSITION"], f"{location}.targets[{i}]", ("VEC3",), count)
                 deltas[i] = torch.from_numpy(rows)
+        self._read[block] = deltas
         return deltas
 
 

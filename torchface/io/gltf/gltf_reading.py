@@ -28,7 +28,7 @@ from torchface.io.gltf.primitive_reading import (
 )
 from torchface.io.gltf.scene import Instance, instances
 from torchface.io.images.image_files import decode_image
-from torchface.io.images.texture_atlas import Look, with_looks
+from torchface.io.images.texture_atlas import Look, with_used_looks
 from torchface.io.length_units import millimetres_per
 from torchface.io.scenes.scene_pieces import Piece, all_names, join_deltas, join_meshes, joined_size
 from torchface.mesh import Mesh
@@ -100,15 +100,8 @@ def _with_looks(document: Document, mesh: Mesh, look: Tensor, kinds: list[Materi
         if kind.texture is not None and kind.texture not in images:
             images[kind.texture] = image = read_texture(document, kind.texture)
             document.reserve(0 if image is None else 12 * image[0].numel(), f"textures[{kind.texture}]")
-    painted = torch.tensor([images[kind.texture] is not None for kind in kinds])
-    if (ours or mesh.colors is not None) and not bool(painted.all()):
-        if not bool(painted.any()):
-            return mesh
-        most = int(torch.where(painted, look.bincount(minlength=len(kinds)), -1).argmax())
-        look = torch.where(painted[look], look, most)
-    used, look = look.unique(return_inverse=True)
-    looks = [Look(images[kinds[i].texture], to_srgb(torch.tensor(kinds[i].color).clamp(0, 1))) for i in used.tolist()]
-    return with_looks(mesh, look, looks)
+    looks = [Look(images[kind.texture], to_srgb(torch.tensor(kind.color).clamp(0, 1))) for kind in kinds]
+    return with_used_looks(mesh, look, looks, images_only=ours or mesh.colors is not None)
 
 
 def _piece(

@@ -35,6 +35,27 @@ class Look:
         return plain if bool((self.color == 1).all()) else plain * self.color[:, None, None]
 
 
+MAX_TEXELS = 2**27
+"""Of all images of a scene."""
+
+
+def with_used_looks(mesh: Mesh, look: Tensor, looks: Sequence[Look], images_only: bool) -> Mesh:
+    """:func:`with_looks` of those that occur.
+
+    Args:
+        images_only: triangles of plain colours get no place of their own, and nothing changes where no look has an
+            image.
+    """
+    painted = torch.tensor([one.image is not None for one in looks])
+    if images_only and not bool(painted.all()):
+        if not bool(painted.any()):
+            return mesh
+        most = int(torch.where(painted, look.bincount(minlength=len(looks)), -1).argmax())
+        look = torch.where(painted[look], look, most)
+    used, look = look.unique(return_inverse=True)
+    return with_looks(mesh, look, [looks[i] for i in used.tolist()])
+
+
 def with_looks(mesh: Mesh, look: Tensor, looks: Sequence[Look]) -> Mesh:
     """The mesh with one image of all looks, and texture coordinates there; with one look as it is, without an image.
 

@@ -13,14 +13,13 @@ from torch import Tensor
 from torchface.errors import FileFormatError, TopologyError
 from torchface.files.whole_files import all_or_none, read_file, write_file
 from torchface.io.images.image_files import encode_png, load_image
-from torchface.io.images.texture_atlas import Look, with_looks
+from torchface.io.images.texture_atlas import MAX_TEXELS, Look, with_looks
 from torchface.io.length_units import finite_vertices, millimetres_per
 from torchface.io.meshes.obj_statements import Statements, read_statements, read_vertices, texture_coordinates
 from torchface.io.meshes.polygons import corners_of_polygons, pad_polygons
 from torchface.mesh import Mesh
 
 _MAX_MATERIALS = 2**20  # bytes, of all material files of a mesh
-_MAX_TEXELS = 2**27  # of all its images
 
 
 def read_obj(path: str | Path, unit: str = "mm") -> Mesh:
@@ -164,8 +163,8 @@ def _looks(path: Path, statements: Statements) -> tuple[list[Look], Tensor]:
         looks.append(Look(None, torch.tensor(color)) if file is None else Look(load_image(file)))
         image = looks[-1].image
         texels += 0 if image is None else image[0].numel()
-        if texels > _MAX_TEXELS:
-            raise FileFormatError(f"{path}: found images of more than {_MAX_TEXELS:,} texels, expected fewer")
+        if texels > MAX_TEXELS:
+            raise FileFormatError(f"{path}: found images of more than {MAX_TEXELS:,} texels, expected fewer")
     begin = torch.tensor([first for _, first in used] + [len(statements.sizes)])
     return looks, torch.tensor(rows).repeat_interleave(begin.diff())
 

@@ -5,8 +5,9 @@ of the file no rig can hold, in words, ``meshes`` and ``animation``. A mesh has 
 the ``matrix`` of 16 numbers from its points to the scene (for rows), ``notes`` (JSON of
 ``torchface.io.gltf.mesh_extras`` and ``corrective_extras``) and ``shapes``, with a ``name`` each and ``between``, its
 in-betweens, with a ``name`` and a ``weight``. Mesh 0's arrays are ``0/points`` (V,3), ``0/counts`` (P,), ``0/corners``
-(C,), and where it has them ``0/uvs``, ``0/uv_corners``, ``0/colors``, in light, ``0/texture``, an encoded image, and
-for each shape ``0/shape/0/offsets``, with ``0/shape/0/rows``, the points that they belong to, if these are not all, and
+(C,), and where it has them ``0/uvs``, ``0/uv_corners``, ``0/colors``, in light, ``0/texture``, an encoded image, or ``0/looks``,
+which of the mesh's ``looks`` each face has (a look's ``image`` is the number of an array ``image/0``, or none, its
+``color`` in light), and for each shape ``0/shape/0/offsets``, with ``0/shape/0/rows``, the points that they belong to, if these are not all, and
 ``0/shape/0/between/0``, offsets of the same points. ``animation`` has ``names``, and the arrays ``animation/times``
 (T,), seconds, and ``animation/weights`` (T,N).
 """
@@ -24,6 +25,7 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from torchface.color_space import to_srgb
 from torchface.correctives.corrective_shapes import Corrective
@@ -34,6 +36,7 @@ from torchface.io.gltf.corrective_extras import read_correctives, rig_of_targets
 from torchface.io.gltf.gltf_document import Document
 from torchface.io.gltf.mesh_extras import read_annotations
 from torchface.io.images.image_files import decode_image
+from torchface.io.images.texture_atlas import MAX_TEXELS, Look, with_used_looks
 from torchface.io.length_units import millimetres_per
 from torchface.io.meshes.polygons import pad_polygons
 from torchface.io.scenes.scene_pieces import Piece, all_names, join_deltas, join_meshes, joined_size
@@ -109,9 +112,30 @@ def pieces_of(scene: Scene, unit: str | None = None) -> list[Piece]:
 
 
 def _mesh(scene: Scene, pieces: list[Piece]) -> Mesh:
-    images = [scene.arrays[name] for i in range(len(pieces)) if (name := f"{i}/texture") in scene.arrays]
-    texture = decode_image(images[0].tobytes(), f"{scene.path}: its texture") if images else None
-    return join_meshes(pieces, texture)
+    """All meshes as one, with the images and colours of their materials as its texture."""
+    mesh, records = join_meshes(pieces, None), scene.record["meshes"]
+    kinds: dict[tuple[str | None, tuple[float, ...]], int] = {}
+    rows = []
+    for number, (record, piece) in enumerate(zip(records, pieces, strict=True)):
+        own = f"{number}/texture" if f"{number}/texture" in scene.arrays else None
+        listed: list[tuple[str | None, tuple[float, ...]]] = [(own, (1.0,) * 3)]
+        of = torch.zeros(len(piece.faces), dtype=torch.int64)
+        if "looks" in record:
+            named = [(look["image"], look["color"] or (1.0,) * 3) for look in record["looks"]]
+            listed = [(None if image is None else f"image/{image}", tuple(color)) for image, color in named]
+            counts = torch.from_numpy(scene.arrays[f"{number}/counts"])
+            of = torch.from_numpy(scene.arrays[f"{number}/looks"]).repeat_interleave(counts - 2)
+        rows.append(torch.tensor([kinds.setdefault(kind, len(kinds)) for kind in listed])[of])
+    images: dict[str, Tensor] = {}
+    for name in dict.fromkeys(name for name, _ in kinds if name is not None):
+        images[name] = decode_image(scene.arrays[name].tobytes(), f"{scene.path}: its texture")
+        if sum(image[0].numel() for image in images.values()) > MAX_TEXELS:
+            raise FileFormatError(f"{scene.path}: found images of more than {MAX_TEXELS:,} texels, expected fewer")
+    looks = [
+        Look(None if name is None else images[name], to_srgb(torch.tensor(color).clamp(0, 1))) for name, color in kinds
+    ]
+    ours = any(record["notes"] is not None for record in records)
+    return with_used_looks(mesh, torch.cat(rows), looks, images_only=ours or mesh.colors is not None)
 
 
 def _definitions(scene: Scene, names: Sequence[str]) -> tuple[list[Corrective], dict[str, str]]:

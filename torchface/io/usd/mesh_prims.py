@@ -62,16 +62,14 @@ class MeshReader:
         left = self.mesh.GetOrientationAttr().Get() == UsdGeom.Tokens.leftHanded
         if left != bool(np.linalg.det(matrix[:3, :3]) < 0):
             order = _reversed(counts)
-        look = self._look()
-        self._coordinates(look[1], len(points), corners)
+        looks, covered, named = self._looks(len(counts))
+        self._coordinates(named, len(points), corners)
         self._colors(len(points))
         kept, held = self._without_holes(counts)
         order = order[held]
-        self.arrays |= {"points": points, "counts": counts[kept], "corners": corners[order]}
+        self.arrays |= {"points": points, "counts": counts[kept], "corners": corners[order], "looks": covered[kept]}
         if "uv_corners" in self.arrays:
             self.arrays["uv_corners"] = self.arrays["uv_corners"][order]
-        if look[0] is not None:
-            self.arrays["texture"] = np.frombuffer(look[0], np.uint8)
         notes = self.prim.GetCustomDataByKey(_NOTES)
         return {
             "name": str(self.prim.GetName()),
@@ -80,6 +78,7 @@ class MeshReader:
             "matrix": matrix.ravel().tolist(),
             "notes": notes if isinstance(notes, str) else None,
             "shapes": self._shapes(),
+            "looks": looks,
         }
 
     def animation(self) -> Any:
@@ -169,27 +168,37 @@ class MeshReader:
         if value is not None and str(primvar.GetInterpolation()) in ("vertex", "varying") and len(value) == points:
             self.arrays["colors"] = _rows(value, 3)
 
-    def _look(self) -> tuple[bytes | None, str | None]:
-        """The image of most faces, encoded, and the name of the coordinates that it is laid out in."""
+    def _looks(self, faces: int) -> tuple[list[dict[str, Any]], Any, str | None]:
+        """What covers the faces, which of that each has, (P,), and in which coordinates the image of most is laid out.
+
+        A look is the number of an ``image`` or none, and a ``color`` in light, or none for what torchface painted.
+        """
+        looks, of = [], np.zeros(faces, np.int64)
         subsets = UsdShade.MaterialBindingAPI(self.prim).GetMaterialBindSubsets()
-        parts = [(len(subset.GetIndicesAttr().Get() or ()), subset.GetPrim()) for subset in subsets]
-        parts.sort(key=lambda part: -part[0])
-        found: tuple[bytes | None, str | None] = None, None
-        for _, prim in [*parts, (0, self.prim)]:
-            material = UsdShade.MaterialBindingAPI(prim).ComputeBoundMaterial()[0]
-            if material and material.GetPrim().GetCustomDataByKey(_PAINTED):
-                continue
-            surface = material.ComputeSurfaceSource()[0] if material else None
-            texture = _source(surface, "diffuseColor")
-            if texture is None or texture.GetIdAttr().Get() != "UsdUVTexture":
-                continue
-            coordinates = _source(texture, "st")
-            named = coordinates is not None and coordinates.GetIdAttr().Get() == _COORDINATES
-            primvar = _value(coordinates, "varname") if named else None
-            image = self._image(texture, read=found[0] is None)
-            if image is not None:
-                found = image, str(primvar) if primvar else None
-        return found
+        for number, prim in enumerate([self.prim, *(subset.GetPrim() for subset in subsets)]):
+            looks.append(self._look(prim))
+            if number:
+                rows = np.array(subsets[number - 1].GetIndicesAttr().Get() or (), np.int64)
+                of[rows[(rows >= 0) & (rows < faces)]] = number
+        count = np.bincount(of, minlength=len(looks))
+        shown_most = max(range(len(looks)), key=lambda one: (looks[one][0]["image"] is not None, count[one]))
+        return [look for look, _ in looks], of, looks[shown_most][1]
+
+    def _look(self, prim: Any) -> tuple[dict[str, Any], str | None]:
+        """What a prim's material shows, and the name of the coordinates of its image."""
+        material = UsdShade.MaterialBindingAPI(prim).ComputeBoundMaterial()[0]
+        if material and material.GetPrim().GetCustomDataByKey(_PAINTED):
+            return {"image": None, "color": None}, None
+        surface = material.ComputeSurfaceSource()[0] if material else None
+        texture = _source(surface, "diffuseColor")
+        if texture is None or texture.GetIdAttr().Get() != "UsdUVTexture":
+            color = np.array(_value(surface, "diffuseColor") if surface else None, object)
+            plain = color.shape == (3,) and np.isfinite(color.astype(np.float64)).all()
+            return {"image": None, "color": [float(value) for value in color] if plain else None}, None
+        coordinates = _source(texture, "st")
+        named = coordinates is not None and coordinates.GetIdAttr().Get() == _COORDINATES
+        primvar = _value(coordinates, "varname") if named else None
+        return {"image": self._image_number(texture), "color": None}, str(primvar) if primvar else None
 
     def maps(self) -> tuple[list[str], dict[str, Any]]:
         """The shapes that have detail maps, and the images, encoded, by their numbers and ``neutral``."""
@@ -202,8 +211,8 @@ class MeshReader:
             for number, (_, name) in enumerate(listed):
                 if surface and Sdf.Path.IsValidIdentifier(name):
                     named[f"{number}"] = UsdShade.Shader.Get(self.stage, material.GetPath().AppendChild(name))
-            images = {key: self._image(texture, read=True) for key, texture in named.items() if texture}
-            found = {key: np.frombuffer(image, np.uint8) for key, image in images.items() if image is not None}
+            files = {key: self._image(texture) for key, texture in named.items() if texture}
+            found = {key: self.layers.images[file] for key, file in files.items() if file is not None}
             if found:
                 missing = [name for number, (_, name) in enumerate(listed) if f"{number}" not in found]
                 if missing:
@@ -221,8 +230,13 @@ class MeshReader:
             return []
         return found if all(isinstance(name, str) for one in found for name in one) else []
 
-    def _image(self, texture: Any, read: bool) -> bytes | None:
-        """The image of a texture, encoded; none where there is none, or it is not to be read."""
+    def _image_number(self, texture: Any) -> int | None:
+        """The place of a texture's image among those of the scene; none where there is none."""
+        found = self._image(texture)
+        return None if found is None else list(self.layers.images).index(found)
+
+    def _image(self, texture: Any) -> str | None:
+        """The file of a texture's image, encoded among those of the scene; none where there is none."""
         found = texture.GetInput("file")
         attributes = found.GetValueProducingAttributes() if found else []
         value = attributes[0].Get() if attributes else None
@@ -234,17 +248,17 @@ class MeshReader:
             return None
         stack = attributes[0].GetPropertyStack()
         file = self.layers.inside(stack[0].layer, name)
-        if file not in self.layers.images:
-            self.layers.images.append(file)
-        if not read:
-            return None
+        if file in self.layers.images:
+            return file
         asset = Ar.GetResolver().OpenAsset(Ar.ResolvedPath(file))
         if not asset:
             raise Refused(f"an image that cannot be read, {shown(name)}", "an existing file")
-        if asset.GetSize() > LARGEST_FILE // 8:
-            raise Refused(f"an image of {asset.GetSize()} bytes, {shown(name)}", f"at most {LARGEST_FILE // 8}")
+        total = asset.GetSize() + sum(len(image) for image in self.layers.images.values())
+        if total > LARGEST_FILE // 8:
+            raise Refused(f"images of {total} bytes up to {shown(name)}", f"at most {LARGEST_FILE // 8}")
         with asset:
-            return bytes(asset.GetBuffer())
+            self.layers.images[file] = np.frombuffer(bytes(asset.GetBuffer()), np.uint8)
+        return file
 
     def _shapes(self) -> list[dict[str, Any]]:
         targets = self.binding.GetBlendShapeTargetsRel().GetForwardedTargets()

@@ -30,7 +30,7 @@ class Layers:
         self.root, self.folder, self.limit = root, os.path.realpath(root.parent), limit
         self.size = self.prims = 0
         self.known: set[str] = set()
-        self.images: list[str] = []
+        self.images: dict[str, Any] = {}  # encoded, by file
         self.left_out: list[str] = []
 
     def leave(self, what: str) -> None:

@@ -10,7 +10,6 @@ its files: here a crash, a count of gigabytes or an endless composition ends a p
 from __future__ import annotations
 
 import json
-import posixpath
 import re
 import sys
 from collections.abc import Callable, Iterator
@@ -67,9 +66,7 @@ def extract(path: Path, limit: Callable[[int], None]) -> tuple[dict[str, Any], d
         if not scene["meshes"]:
             raise Refused("no mesh in its scene", "at least one with faces")
         scene["animation"] = _weights(stage, animations, arrays)
-        if len(layers.images) > 1:
-            some = ", ".join(shown(posixpath.basename(name).rstrip("]"), 40) for name in layers.images[:5])
-            layers.leave(f"{len(layers.images)} textures ({some}), of which a mesh has one: the first is taken")
+        arrays |= {f"image/{number}": image for number, image in enumerate(layers.images.values())}
         scene["left_out"] = layers.left_out
         return scene, arrays
 

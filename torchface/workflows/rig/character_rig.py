@@ -365,7 +365,8 @@ class _Job:
             lines.append("  by other names: " + ", ".join(f"{k} ({' + '.join(v)})" for k, v in own.items()))
         lines += self._doubts(there)
         missing = [name for name in ARKIT if name not in self.made and name not in present]
-        lines.append(f"made: {len(self.made)} shapes" + (f"; not made: {', '.join(missing)}" if missing else ""))
+        why = " (it has no tongue of its own; --inner-mouth gives it one)" if missing == [_TONGUE] else ""
+        lines.append(f"made: {len(self.made)} shapes" + (f"; not made: {', '.join(missing)}{why}" if missing else ""))
         if self.empty:
             lines.append(f"  note: {', '.join(self.empty)}: the file's own moves nothing and counts as missing")
         if expressions:
