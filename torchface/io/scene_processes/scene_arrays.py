@@ -5,11 +5,11 @@ of the file no rig can hold, in words, ``meshes`` and ``animation``. A mesh has 
 the ``matrix`` of 16 numbers from its points to the scene (for rows), ``notes`` (JSON of
 ``torchface.io.gltf.mesh_extras`` and ``corrective_extras``) and ``shapes``, with a ``name`` each and ``between``, its
 in-betweens, with a ``name`` and a ``weight``. Mesh 0's arrays are ``0/points`` (V,3), ``0/counts`` (P,), ``0/corners``
-(C,), and where it has them ``0/uvs``, ``0/uv_corners``, ``0/colors``, in light, ``0/texture``, an encoded image, or ``0/looks``,
-which of the mesh's ``looks`` each face has (a look's ``image`` is the number of an array ``image/0``, or none, its
-``color`` in light), and for each shape ``0/shape/0/offsets``, with ``0/shape/0/rows``, the points that they belong to, if these are not all, and
-``0/shape/0/between/0``, offsets of the same points. ``animation`` has ``names``, and the arrays ``animation/times``
-(T,), seconds, and ``animation/weights`` (T,N).
+(C,), and where it has them ``0/uvs``, ``0/uv_corners``, ``0/colors``, in light, ``0/texture``, an encoded image, or
+``0/looks``, which of the mesh's ``looks`` each face has (a look's ``image`` is the number of an array ``image/0``, or
+none, its ``color`` in light), and for each shape ``0/shape/0/offsets``, with ``0/shape/0/rows``, the points that they
+belong to, if these are not all, and ``0/shape/0/between/0``, offsets of the same points. ``animation`` has ``names``,
+and the arrays ``animation/times`` (T,), seconds, and ``animation/weights`` (T,N).
 """
 
 from __future__ import annotations
