@@ -87,7 +87,7 @@ export class CameraEngine {
 
   /** The solver, which is loaded once; after a failure once more. */
   async #loaded() {
-    this.#loading ??= (this.#solver = new Solver()).load("./webcam.onnx");
+    this.#loading ??= (this.#solver = new Solver()).load("./webcam.ort");
     try {
       await this.#loading;
     } catch (error) {

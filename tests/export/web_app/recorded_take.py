@@ -88,7 +88,7 @@ def record(page: Page, folder: Path, frames: int) -> Recorded:
     return Recorded(sent, solved, folder / "take.csv", folder / "take.glb")
 
 
-def assert_same_weights(graph: Path, recorded: Recorded, tolerance: float) -> None:
+def assert_same_weights(graph: Path | bytes, recorded: Recorded, tolerance: float) -> None:
     """Runs the graph over the pixels that the page gave its worker, and compares the page's answers."""
     session = onnxruntime.InferenceSession(graph)
     size = next(one.shape[0] for one in session.get_inputs() if one.name == "state")

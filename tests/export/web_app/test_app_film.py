@@ -22,6 +22,7 @@ from torchface.errors import MissingExtraError
 from torchface.io.gltf.animation_reading import read_gltf_weights
 from torchface.io.video import open_video
 from torchface.workflows.browser_app import export_app
+from torchface.workflows.webcam.webcam_graph import webcam_graph
 from train.rendered_people.webcam_video import talking_subject
 
 pytestmark = [pytest.mark.browser, pytest.mark.bench]
@@ -63,7 +64,7 @@ def test_weights_are_pythons_the_character_is_drawn_and_the_rate_is_told(
 ) -> None:
     with opened(app, faces, tmp_path, isolated) as page:
         recorded = record(page, tmp_path, 40)
-        assert_same_weights(app / "webcam.onnx", recorded, TOLERANCE)
+        assert_same_weights(webcam_graph(), recorded, TOLERANCE)
         assert np.array([one["weights"] for one in recorded.solved]).std(0).max() > 0.02
         canvas = page.driver.find_element("id", "character").screenshot_as_png
         assert np.asarray(Image.open(io.BytesIO(canvas)).convert("L"), float).std() > 15

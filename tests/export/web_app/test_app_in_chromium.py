@@ -28,7 +28,7 @@ BROWSERS_OWN = ("google.com", "googleapis.com", "gstatic.com", "gvt1.com", "duck
 
 def test_recorded_weights_are_those_of_onnx_runtime_in_python(app: Path, recorded: Recorded) -> None:
     """On the very pixels and intervals that the page gave its worker."""
-    assert_same_weights(app / "webcam.onnx", recorded, 1e-5)
+    assert_same_weights(app.parent / "planted.onnx", recorded, 1e-5)
     rows = load_take(recorded.csv).weights
     assert rows is not None
     answers = np.array([one["weights"] for one in recorded.recorded])
@@ -81,7 +81,7 @@ def test_khronos_validator_finds_nothing_in_the_glb(recorded: Recorded, node: st
 def test_only_files_of_the_page_were_asked_for(opened: Open, recorded: Recorded) -> None:
     assert {method for method, _ in opened.host.requests} == {"GET"}
     paths = {path for _, path in opened.host.requests}
-    known = ("/index.html", "/webcam.onnx", "/character.glb", "/character.json")
+    known = ("/index.html", "/webcam.ort", "/character.glb", "/character.json")
     assert set(known) <= paths
     assert all(path.startswith((*known, "/assets/")) for path in paths)
     strangers = [path for _, path in opened.outside.requests if not any(own in path for own in BROWSERS_OWN)]

@@ -6,6 +6,7 @@ import gzip
 import json
 from dataclasses import dataclass
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import onnxruntime
 
@@ -18,8 +19,8 @@ from torchface.workflows.browser_app.built_page import built_page
 from torchface.workflows.browser_app.character import load_character
 from torchface.workflows.webcam.webcam_graph import webcam_graph
 
-CHARACTER, TABLE, GRAPH, PAGE = "character.glb", "character.json", "webcam.onnx", "index.html"
-_ASSETS = (".js", ".css", ".wasm")
+CHARACTER, TABLE, GRAPH, PAGE = "character.glb", "character.json", "webcam.ort", "index.html"
+_ASSETS, _FORMER_GRAPH = (".js", ".css", ".wasm"), "webcam.onnx"
 
 
 @dataclass(frozen=True)
@@ -43,7 +44,7 @@ class AppReport:
         kinds = {
             "page (HTML, JavaScript, CSS)": (".html", ".js", ".css", ".txt", ".json", ""),
             "ONNX Runtime (WebAssembly)": (".wasm",),
-            "solver": (".onnx",),
+            "solver": (".ort",),
             "character": (".glb",),
         }
         rows = [
@@ -85,8 +86,7 @@ def export_app(
     _check_folder(out)
     progress("reading the character")
     shown = load_character(character, progress=progress)
-    graph = webcam_graph(progress) if webcam is None else read_file(webcam)
-    check_webcam_graph(graph, webcam or "the webcam's graph")
+    graph = page_graph(webcam_graph(progress) if webcam is None else read_file(webcam), webcam or "the webcam's graph")
     files = {GRAPH: graph, CHARACTER: shown.data, TABLE: shown.page_table()}
     page = built_page(progress)
     files |= {path.relative_to(page).as_posix(): read_file(path) for path in sorted(page.rglob("*")) if path.is_file()}
@@ -98,6 +98,8 @@ def export_app(
         for old in (out / "assets").iterdir():  # their names change with their content
             if old.suffix in _ASSETS and f"assets/{old.name}" not in files:
                 delete_file(old)
+        if (out / _FORMER_GRAPH).is_file():
+            delete_file(out / _FORMER_GRAPH)
     packed = {name: len(gzip.compress(data, 6)) for name, data in files.items()}
     still = shown.shapes.undriven
     driven = tuple(name for name in shown.names if name not in still)
@@ -105,7 +107,8 @@ def export_app(
 
 
 def _check_folder(out: Path) -> None:
-    if out.is_dir() and any(out.iterdir()) and not ((out / PAGE).is_file() and (out / GRAPH).is_file()):
+    graph = any((out / name).is_file() for name in (GRAPH, _FORMER_GRAPH))
+    if out.is_dir() and any(out.iterdir()) and not ((out / PAGE).is_file() and graph):
         raise FileFormatError(f"{out}: found a folder with other files, expected none, an empty one or an earlier app")
 
 
@@ -116,15 +119,26 @@ _OUTPUTS = (
 )
 
 
-def check_webcam_graph(data: bytes, path: str | Path) -> None:
-    """Looks at inputs, outputs and names of shapes; runs nothing."""
+def page_graph(data: bytes, path: str | Path) -> bytes:
+    """The webcam's graph in ONNX Runtime's own format, with its operators joined and its constants computed: the page
+    begins with it in a third of the time that the ONNX file takes.
+
+    Raises:
+        FileFormatError: inputs, outputs or names of shapes are others.
+    """
     wanted = f"expected the graph of torchface export webcam ({', '.join(_INPUTS)} to {', '.join(_OUTPUTS)})"
     options = onnxruntime.SessionOptions()
-    options.log_severity_level = 3  # errors alone
-    try:
-        session = onnxruntime.InferenceSession(data, options, providers=["CPUExecutionProvider"])
-    except Exception as error:  # ONNX Runtime has no common class for what it raises
-        raise FileFormatError(f"{path}: not an ONNX file that runs ({str(error)[:160]}), {wanted}") from error
+    options.log_severity_level, options.intra_op_num_threads = 3, 1  # errors alone
+    # What goes further is for this machine's processor alone.
+    options.graph_optimization_level = onnxruntime.GraphOptimizationLevel.ORT_ENABLE_EXTENDED
+    options.add_session_config_entry("session.save_model_format", "ORT")
+    with TemporaryDirectory() as folder:
+        options.optimized_model_filepath = str(Path(folder) / GRAPH)
+        try:
+            session = onnxruntime.InferenceSession(data, options, providers=["CPUExecutionProvider"])
+        except Exception as error:  # ONNX Runtime has no common class for what it raises
+            raise FileFormatError(f"{path}: not an ONNX file that runs ({str(error)[:160]}), {wanted}") from error
+        saved = read_file(Path(folder) / GRAPH)
     inputs = {value.name: value.type for value in session.get_inputs()}
     missing = sorted(set(_OUTPUTS) - {value.name for value in session.get_outputs()})
     if inputs != _INPUTS or missing:
@@ -133,3 +147,4 @@ def check_webcam_graph(data: bytes, path: str | Path) -> None:
     names = session.get_modelmeta().custom_metadata_map.get("names", "[]")
     if tuple(json.loads(names)) != ARKIT:
         raise FileFormatError(f"{path}: found the shapes {names:.80}, expected ARKit's 52 in their order")
+    return saved
