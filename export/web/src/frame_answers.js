@@ -19,6 +19,8 @@ async function fetched(graph) {
  * - `{load: {graph, mjs, wasm, threads}}` with addresses, is answered by `{ready: {engine, threads}}`;
  * - `{frame: {number, time, picture, pose, gain, smoothing, reset}}`, a picture of any size that is given away, its time
  *   in milliseconds, by `{solved: {number, time, interval, ..., milliseconds, width, height}}`;
+ * - `{follow: pictures}`, a stream of a camera's pictures, by such answers to them, and by `{left: true}` when it ends;
+ * - `{controls: {pose, gain, smoothing, reset} | null}` says how those are solved; without them they are let go;
  * - whatever fails by `{failed: words}`.
  *
  * @param {object} ort of onnxruntime-web.
@@ -27,7 +29,7 @@ async function fetched(graph) {
 export function answerFrames(ort, engine) {
   const canvas = new OffscreenCanvas(1, 1);
   const context = canvas.getContext("2d", { willReadFrequently: true, alpha: false });
-  let session = null, state = null, before = null;
+  let session = null, state = null, before = null, wanted = null;
 
   async function load({ graph, mjs, wasm, threads }) {
     ort.env.wasm.wasmPaths = { mjs, wasm };
@@ -45,7 +47,7 @@ export function answerFrames(ort, engine) {
 
   async function solve({ number, time, picture, pose, gain, smoothing, reset }) {
     const started = performance.now();
-    const { width, height, pixels } = read(picture);
+    const { width, height, pixels } = await read(picture);
     const interval = before === null ? FIRST_INTERVAL : Math.min((time - before) / 1000, LONGEST_INTERVAL);
     before = time;
     const controls = new Float32Array(5);
@@ -75,7 +77,28 @@ export function answerFrames(ort, engine) {
       state,
     });
 
-  function read(picture) {
+  async function follow(pictures) {
+    const reader = pictures.getReader();
+    for (;;) {
+      const { value: picture, done } = await reader.read();
+      if (done) return { left: true };
+      if (wanted === null) {
+        picture.close();
+        continue;
+      }
+      const controls = wanted;
+      wanted = { ...controls, reset: false };
+      self.postMessage(await solve({ number: 0, time: picture.timestamp / 1000, picture, ...controls }));
+    }
+  }
+
+  async function read(picture) {
+    if (picture instanceof VideoFrame && !picture.rotation && !picture.flip) {
+      const { width, height } = picture.visibleRect, pixels = new Uint8Array(4 * width * height);
+      await picture.copyTo(pixels, { format: "RGBA" });
+      picture.close();
+      return { width, height, pixels };
+    }
     const width = picture.displayWidth ?? picture.width, height = picture.displayHeight ?? picture.height;
     if (canvas.width !== width || canvas.height !== height) [canvas.width, canvas.height] = [width, height];
     context.drawImage(picture, 0, 0);
@@ -85,7 +108,8 @@ export function answerFrames(ort, engine) {
 
   self.onmessage = async ({ data }) => {
     try {
-      self.postMessage(data.load ? await load(data.load) : await solve(data.frame));
+      if ("controls" in data) wanted = data.controls;
+      else self.postMessage(data.load ? await load(data.load) : data.follow ? await follow(data.follow) : await solve(data.frame));
     } catch (error) {
       self.postMessage({ failed: String(error?.message ?? error) });
     }

@@ -12,6 +12,7 @@ export class Solver {
   #worker = startedWorker(absolute(worker));
   #waiting = [];
   #number = 0;
+  #show = null;
   facts = null;
 
   constructor() {
@@ -40,6 +41,22 @@ export class Solver {
     return (await this.#ask({ frame: { number: this.#number, time, picture, ...controls } }, [picture])).solved;
   }
 
+  /**
+   * Has the worker take pictures from a stream by itself, whatever this page is busy with.
+   *
+   * @param {ReadableStream} pictures of the camera; it is given away.
+   * @param {(solved: object) => void} show takes each answer; the promise fails with the reason why there are no more.
+   */
+  async follow(pictures, show) {
+    this.#show = show;
+    await this.#ask({ follow: pictures }, [pictures]);
+  }
+
+  /** Says how pictures of that stream are solved from now on; null lets them go. */
+  setControls(controls) {
+    this.#worker.postMessage({ controls });
+  }
+
   #ask(message, given = []) {
     return new Promise((resolve, reject) => {
       this.#waiting.push({ resolve, reject });
@@ -48,6 +65,7 @@ export class Solver {
   }
 
   #settle(answer) {
+    if (answer.solved?.number === 0) return this.#show(answer.solved);
     const waiting = this.#waiting.shift(); // answers come in the order of what was asked
     if ("failed" in answer) waiting?.reject(new Error(answer.failed));
     else waiting?.resolve(answer);

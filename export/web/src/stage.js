@@ -4,9 +4,11 @@ import * as THREE from "three";
 
 import { DrawingPace, drawn, pause } from "./drawing_pace.js";
 import { ProcessorMorphing } from "./processor_morphing.js";
+import { shrinkTextures } from "./smaller_textures.js";
 
 const FIELD = 24; // degrees; a portrait lens
 const MOST_PIXELS = 2; // for one of the page's: more is work that nobody sees
+const SOFTWARE_PIXELS = 125_000; // of a whole drawing without a graphics card, each of several samples: without these, hairs are specks
 const SOFTWARE = /swiftshader|llvmpipe|softpipe|software|basic render/i; // WebGL without a graphics card
 
 export class Stage {
@@ -27,7 +29,7 @@ export class Stage {
    */
   constructor(canvas, film = null) {
     this.#film = film;
-    this.#renderer = new THREE.WebGLRenderer({ canvas, antialias: film !== null || !this.#software, alpha: true });
+    this.#renderer = new THREE.WebGLRenderer({ canvas, antialias: true, alpha: true });
     if (film !== null) this.#scene.background = new THREE.Color(film.background);
     this.#renderer.toneMapping = THREE.NeutralToneMapping;
     const key = new THREE.DirectionalLight(0xfff4e8, 2.2), rim = new THREE.DirectionalLight(0xdce8ff, 0.8);
@@ -42,6 +44,7 @@ export class Stage {
     this.#character?.dispose();
     this.#character = character;
     this.#morphing = this.#software ? new ProcessorMorphing(character.root) : null;
+    if (this.#software && this.#film === null) shrinkTextures(character.root);
     this.#scene.add(character.root);
     this.#fit();
   }
@@ -94,7 +97,8 @@ export class Stage {
   #fit() {
     const { clientWidth, clientHeight } = this.#renderer.domElement, { width, height } = this.#film ?? { width: clientWidth, height: clientHeight };
     if (width === 0 || height === 0) return;
-    this.#pace = new DrawingPace(this.#film ? 1 : Math.min(this.#software ? 1 : MOST_PIXELS, window.devicePixelRatio));
+    const most = this.#software ? Math.min(1, Math.sqrt(SOFTWARE_PIXELS / (width * height))) : MOST_PIXELS;
+    this.#pace = new DrawingPace(this.#film ? 1 : Math.min(most, window.devicePixelRatio));
     this.#renderer.setPixelRatio(this.#pace.ratio);
     this.#renderer.setSize(width, height, false);
     this.#camera.aspect = width / height;

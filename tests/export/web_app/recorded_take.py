@@ -19,9 +19,14 @@ _TYPES = ("text/csv", "model/gltf-binary", "model/vnd.usdz+zip", "video/mp4")
 _WATCH = (Path(__file__).parent / "watched_worker.js").read_text()
 
 
-def watch(driver: Any) -> None:
-    """Has the pages that are opened from now on keep what ``watched`` reads."""
-    driver.execute_cdp_cmd("Page.addScriptToEvaluateOnNewDocument", {"source": _WATCH})
+def watch(driver: Any, streamed: bool = False) -> None:
+    """Has the pages that are opened from now on keep what ``watched`` reads.
+
+    Args:
+        streamed: whether the worker may take the camera's pictures itself, which are not kept then.
+    """
+    source = _WATCH.replace("delete window.MediaStreamTrackProcessor", "") if streamed else _WATCH
+    driver.execute_cdp_cmd("Page.addScriptToEvaluateOnNewDocument", {"source": source})
 
 
 def allow_camera(driver: Any, setting: str) -> None:

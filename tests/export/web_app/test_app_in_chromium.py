@@ -10,9 +10,11 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from app_browser import WINDOW, Open, Page, elsewhere, static_host
+from app_browser import WINDOW, Open, Page, elsewhere, film_camera, static_host
+from film import planted_film, write_y4m
 from headless_chromium import headless_chromium, until
-from recorded_take import Recorded, allow_camera, assert_same_weights, watched
+from planted_graph import BLOCK, COLUMNS
+from recorded_take import Recorded, allow_camera, assert_same_weights, watch, watched
 from test_gltf_viewers import assert_valid, node  # noqa: F401  (its packages)
 
 from torchface.io import load_rig, load_take
@@ -210,6 +212,40 @@ def test_an_answer_that_comes_when_the_tab_is_hidden_does_not_end_the_pause(open
             page.let_pictures_go()
             until(lambda: driver.execute_script("return watched.solved.length") > before)
             assert page.text("status").startswith("Paused")
+
+
+def test_the_worker_takes_the_cameras_pictures_itself_and_rests_while_the_tab_is_hidden(
+    app: Path, tmp_path: Path
+) -> None:
+    """Where the browser gives a stream of them; in the other tests pictures pass through the page."""
+    film, count = planted_film(24), "return watched.solved.length"
+    write_y4m(tmp_path / "film.y4m", film, 15)
+    switches = (*film_camera(tmp_path / "film.y4m"), "--disable-3d-apis")
+    with static_host(app) as host, headless_chromium(tmp_path / "profile", *switches, size=WINDOW) as driver:
+        watch(driver, streamed=True)
+        allow_camera(driver, "granted")
+        driver.get(f"{host.url}/index.html")
+        page = Page(driver)
+        slide = "const e = document.getElementById('smoothing'); e.value = 0; e.dispatchEvent(new Event('input'))"
+        driver.execute_script(slide)
+        page.start()
+        before = driver.execute_script(count)
+        until(lambda: driver.execute_script(count) > before + 12)
+        found = np.array(driver.execute_script("return watched.solved.slice(-10).map(s => [...s.weights])"))
+        blocks = film[:, :, : BLOCK * COLUMNS].reshape(24, COLUMNS, BLOCK, COLUMNS, BLOCK).mean((2, 4))
+        # A film's luma goes from 16 to 235.
+        expected = ((blocks.reshape(24, -1)[:, : len(ARKIT)] - 16) / 219).clip(0, 1)
+        assert abs(found[:, None] - expected).max(2).min(1).max() < 0.02
+        with minimized(driver):
+            until(lambda: page.text("status").startswith("Paused"))
+            driver.execute_async_script("setTimeout(arguments[0], 200)")
+            before = driver.execute_script(count)
+            driver.execute_async_script("setTimeout(arguments[0], 600)")
+            assert driver.execute_script(count) == before
+        until(lambda: driver.execute_script(count) > before + 3)
+        page.stop()
+        page.start()
+        assert driver.execute_script("return watched.sent.length") == 0
 
 
 @contextmanager

@@ -1,5 +1,6 @@
 // Runs in the page before its own scripts: keeps what goes to the worker and what comes back, what is downloaded, and what
 // the page says of itself. While `held` is a list, pictures for the worker wait there.
+delete window.MediaStreamTrackProcessor; // so pictures pass through the page, where they can be kept and held
 window.watched = { sent: [], solved: [], workers: [], blobs: [], said: [], held: null };
 {
   const post = Worker.prototype.postMessage, made = URL.createObjectURL, Original = window.Worker;
