@@ -170,7 +170,7 @@ def real_capture(ict_folder: Path, performances: list[Path]) -> tuple[Blendshape
 
 @pytest.fixture(scope="module")
 def coarse_figures() -> Iterator[None]:
-    """Figures of reports with one ray a pixel and no shadow in creases, for tests that do not look at them."""
+    """Figures of reports with one ray for 4 × 4 pixels and no shadow in creases, for tests that do not look at them."""
     figures = ("face_views", "marker_maps", "registration_views")
     pages = (
         "workflows.fit.photograph_rig",
@@ -184,11 +184,16 @@ def coarse_figures() -> Iterator[None]:
     def coarse(mesh: Mesh, camera: Camera, *rest: Any, **more: Any) -> torch.Tensor:
         given = inspect.signature(render).bind(mesh, camera, *rest, **more)
         lighting = replace(given.arguments.pop("lighting", DEFAULT_LIGHTING), occlusion_rays=0)
-        return render(**{**given.arguments, "lighting": lighting, "samples": 1})
+        middle = torch.tensor([[0.0, 0, 0.375], [0, 0, 0.375], [0, 0, 0]], dtype=torch.float64)  # of 4 pixels
+        scaled = camera.intrinsics.double() * torch.tensor([[0.25], [0.25], [1.0]], dtype=torch.float64) - middle
+        few = replace(camera, intrinsics=scaled, width=-(-camera.width // 4), height=-(-camera.height // 4))
+        drawn = render(**{**given.arguments, "camera": few, "lighting": lighting, "samples": 1})
+        return drawn.repeat_interleave(4, 1).repeat_interleave(4, 2)[:, : camera.height, : camera.width]
 
     with pytest.MonkeyPatch.context() as patch:
         for module in (*(f"viz.figures.{name}" for name in figures), *pages):
             patch.setattr(f"torchface.{module}.render", coarse)
+        patch.setattr("torchface.viz.figures.registration_views._SAMPLES", 1)
         yield
 
 
