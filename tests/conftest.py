@@ -6,7 +6,7 @@ import inspect
 import os
 import sys
 from collections.abc import Iterator
-from copy import copy
+from copy import copy, deepcopy
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -20,7 +20,7 @@ from PIL import Image
 
 from torchface.attachment import Attachment
 from torchface.geometry.cameras.pinhole import Camera
-from torchface.io import load_rig, load_take
+from torchface.io import load_rig, load_take, rig_files
 from torchface.mesh import Mesh
 from torchface.rendering.clay_shading import DEFAULT_LIGHTING, render
 from torchface.rig import BlendshapeRig
@@ -30,8 +30,8 @@ from torchface.synthetic.stages.marker_stage import place_markers
 REPOSITORY = Path(__file__).resolve().parent.parent
 DATA = Path(os.environ.get("TORCHFACE_DATA", REPOSITORY.parent / "shared" / "data"))
 
-settings.register_profile("ci", derandomize=True, deadline=None, print_blob=True)
-settings.register_profile("dev", deadline=None)
+settings.register_profile("ci", derandomize=True, deadline=None, print_blob=True, max_examples=25)
+settings.register_profile("dev", deadline=None, max_examples=25)
 settings.load_profile("ci" if os.environ.get("CI") else "dev")
 
 
@@ -100,6 +100,25 @@ def quick_files() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(os, "fsync", lambda handle: None)
         patch.setattr(Image.Image, "save", packed_quickly)
+        yield
+
+
+@pytest.fixture(scope="session", autouse=True)
+def head_read_once() -> Iterator[None]:
+    """A process reads the real head once, which takes seconds; each test has a copy of its own."""
+    read = rig_files.load_ict_facekit
+    known: dict[Any, BlendshapeRig] = {}
+
+    def copied(folder: Path, shapes: Any = None, part: str | None = None, unit: str | None = None) -> BlendshapeRig:
+        if Path(folder) != DATA / "ict_facekit" / "FaceXModel":
+            return read(folder, shapes, part, unit)
+        key = (None if shapes is None else tuple(shapes), part, unit)
+        if key not in known:
+            known[key] = read(folder, shapes, part, unit)
+        return deepcopy(known[key])
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(rig_files, "load_ict_facekit", copied)
         yield
 
 

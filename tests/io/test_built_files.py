@@ -29,7 +29,7 @@ from torchface.io.gltf.gltf_reading import read_gltf_rig
 from torchface.io.landmarks.dlib_xml import load_dlib_faces
 from torchface.landmarks.scans.scan_annotations import load_annotations
 
-CASES = int(os.environ.get("TORCHFACE_FUZZ_CASES", "24"))
+CASES = int(os.environ.get("TORCHFACE_FUZZ_CASES", "12"))
 
 
 def load_attachment(path: Path) -> Attachment:

@@ -13,7 +13,7 @@ from built_files import check_built
 from torchface.io.images.image_files import load_paint
 from torchface.io.video import open_video
 
-CASES = int(os.environ.get("TORCHFACE_FUZZ_CASES", "60"))
+CASES = int(os.environ.get("TORCHFACE_FUZZ_CASES", "20"))
 
 
 def read_image(path: Path) -> None:

@@ -22,6 +22,8 @@ OPTIONS = {
     "libsvtav1": {"preset": "12"},
     "libx265": {"x265-params": "log-level=none"},
     "mpeg4": {"qmax": "4"},
+    "libvpx": {"deadline": "realtime", "cpu-used": "8"},
+    "libvpx-vp9": {"deadline": "realtime", "cpu-used": "8"},
 }
 
 

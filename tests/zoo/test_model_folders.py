@@ -393,7 +393,7 @@ def test_a_mutated_model_is_loaded_or_refused(solver: MarkerSolver, dome_rig: Bl
         )
     report = check_reader(read_bundle, bundles, ".bundle")
     assert report.refused > report.cases * 2 / 3
-    assert report.read > 10
+    assert report.read > 0
 
 
 _VALUES = st.recursive(

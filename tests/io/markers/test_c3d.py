@@ -40,7 +40,7 @@ def _opinion(data: bytes) -> tuple[c3d.Reader, np.ndarray, np.ndarray]:
 
 
 @given(marker_takes())
-@settings(max_examples=60)
+@settings(max_examples=25)
 def test_a_take_comes_back_to_the_bit(take: Take) -> None:
     assert round_trip(save_c3d, load_c3d, take).fps == take.fps
 

@@ -25,7 +25,7 @@ _GOOD = """frame,time,nose_x,nose_y,nose_z,chin_x,chin_y,chin_z
 
 
 @given(marker_takes())
-@settings(max_examples=40)
+@settings(max_examples=25)
 def test_a_take_comes_back_to_the_bit(take: Take) -> None:
     assert round_trip(save_markers_csv, load_markers_csv, take).fps == take.fps
 

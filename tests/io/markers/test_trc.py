@@ -27,7 +27,7 @@ Frame#\tTime\tnose\t\t\tchin\t\t
 
 
 @given(marker_takes())
-@settings(max_examples=40)
+@settings(max_examples=25)
 def test_a_take_comes_back_to_the_bit(take: Take) -> None:
     assert round_trip(save_trc, load_trc, take).fps == take.fps
 

@@ -22,7 +22,7 @@ def write(path: Path, text: str) -> Path:
     return path
 
 
-@settings(max_examples=60)
+@settings(max_examples=25)
 @given(rig=rigs())
 def test_any_mesh_comes_back_exactly(rig: BlendshapeRig, tmp_path_factory: pytest.TempPathFactory) -> None:
     path = tmp_path_factory.getbasetemp() / "any.obj"

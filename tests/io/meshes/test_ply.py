@@ -57,7 +57,7 @@ endsolid a
 """
 
 
-@settings(max_examples=40)
+@settings(max_examples=25)
 @given(rig=rigs())
 def test_any_mesh_comes_back_from_ply(rig: BlendshapeRig, tmp_path_factory: pytest.TempPathFactory) -> None:
     path = tmp_path_factory.getbasetemp() / "any.ply"

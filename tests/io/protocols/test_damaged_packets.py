@@ -24,7 +24,7 @@ from torchface.io.protocols.vrchat_packets import VrchatPackets
 from torchface.io.protocols.vtube_studio import _Calls, _RefusedError
 from torchface.shape_names import ARKIT
 
-CASES = int(os.environ.get("TORCHFACE_FUZZ_CASES", "300"))
+CASES = int(os.environ.get("TORCHFACE_FUZZ_CASES", "100"))
 WEIGHTS, ROTATIONS = torch.arange(52) / 64, torch.arange(9) / 16
 Read = Callable[[bytes], list[ReceivedFace]]
 

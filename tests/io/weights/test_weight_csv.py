@@ -19,7 +19,7 @@ _GOOD = "frame,time,jawOpen,smile_L\n10,1.0,0.25,\n11,1.1,1,-0.5\n13,1.3,0,1e-3\
 
 
 @given(weight_takes())
-@settings(max_examples=40)
+@settings(max_examples=25)
 def test_a_take_comes_back_to_the_bit(take: Take) -> None:
     assert take.weights is not None
     header = ("frame", "time", *take.weights.names)

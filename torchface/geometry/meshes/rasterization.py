@@ -59,17 +59,24 @@ class TexelMap:
             rings: how many texels wide the margin is.
         """
         channels = values.shape[1]
-        image = torch.zeros(channels, self.height * self.width, dtype=torch.float32)
-        image[:, self.texels] = values.T.float()
-        image = image.reshape(1, channels, self.height, self.width)
-        filled = self.mask()[None, None].float()
-        background = values.float().mean(0) if len(values) else torch.zeros(channels, dtype=torch.float32)
+        texture = torch.zeros(self.height * self.width, channels, dtype=torch.float32)
+        texture[self.texels] = values.detach().float()
+        image = texture.view(self.height, self.width, channels).numpy()
+        filled = self.mask().numpy()
+        background = values.detach().float().mean(0) if len(values) else torch.zeros(channels, dtype=torch.float32)
         for _ in range(rings):  # a ring of texels at a time
-            count = torch.nn.functional.avg_pool2d(filled, 3, 1, 1, count_include_pad=True)
-            mean = torch.nn.functional.avg_pool2d(image * filled, 3, 1, 1) / count.clamp(min=1e-6)
-            image = torch.where(filled > 0, image, torch.where(count > 0, mean, image))
-            filled = (count > 1e-6).float()
-        return torch.where(filled > 0, image, background.reshape(1, channels, 1, 1))[0].contiguous()
+            count = _sum_around(filled.astype(np.float32))
+            ring = ~filled & (count > 0)
+            image[ring] = _sum_around(image).reshape(image.shape)[ring] / count[ring][:, None]
+            filled = filled | ring
+        image[~filled] = background.numpy()
+        return texture.view(self.height, self.width, channels).permute(2, 0, 1).contiguous()
+
+
+def _sum_around(image: np.ndarray) -> np.ndarray:
+    import cv2  # loads in 0.1 s
+
+    return cv2.boxFilter(image, -1, (3, 3), normalize=False, borderType=cv2.BORDER_CONSTANT)
 
 
 def interpolate(values: Tensor, corners: Tensor, barycentric: Tensor) -> Tensor:
