@@ -2,6 +2,7 @@
 
 import { BrowserTakes } from "./browser_takes.js";
 import { closeCamera, openCamera } from "./camera.js";
+import { PARTS } from "./frame_answers.js";
 import { pumpFrames } from "./frame_pump.js";
 import { Solver } from "./solver.js";
 import { WeightControls } from "./weight_controls.js";
@@ -15,6 +16,7 @@ export class CameraEngine {
   #stream = null;
   #pump = null;
   #reset = false;
+  #parts = 0;
 
   /**
    * @param {object} page `{controls(), show(solved), running(on), status(words), problem(words), takesChanged()}`.
@@ -43,14 +45,13 @@ export class CameraEngine {
   }
 
   async start() {
-    const { status } = this.#page;
     try {
-      status("Asking for the camera…");
+      this.#page.status("Asking for the camera…");
       const loaded = this.#loaded(); // while the user is asked
       loaded.catch(() => {}); // said once the camera is there
       this.takes.stream = this.#stream = await openCamera(this.#video, () => this.stop("The camera was unplugged, or may no longer be used."));
       this.#page.running(true);
-      status("Loading the solver…");
+      this.#tell(this.#parts);
       await loaded;
       if (this.#stream !== null) this.#run(); // else it was taken away meanwhile
     } catch (error) {
@@ -85,9 +86,14 @@ export class CameraEngine {
     });
   }
 
+  #tell(parts) {
+    this.#parts = parts;
+    if (this.running) this.#page.status(`Loading the face reader: ${parts} of ${PARTS}…`);
+  }
+
   /** The solver, which is loaded once; after a failure once more. */
   async #loaded() {
-    this.#loading ??= (this.#solver = new Solver()).load("./webcam.ort");
+    this.#loading ??= (this.#solver = new Solver((parts) => this.#tell(parts))).load("./webcam.ort");
     try {
       await this.#loading;
     } catch (error) {
@@ -99,5 +105,6 @@ export class CameraEngine {
   #forget() {
     this.#solver?.close();
     this.#solver = this.#loading = null;
+    this.#parts = 0;
   }
 }

@@ -4,6 +4,8 @@ const FIRST_INTERVAL = 1 / 30; // seconds, of a frame that none came before
 const LONGEST_INTERVAL = 10; // seconds: after a longer pause all that time smooths is forgotten anyway
 /** A graph that does nothing: with it the runtime is loaded and compiled while the graph is still on its way. */
 const IDENTITY = Uint8Array.from(atob("CAc6LwoQCgFhEgFiIghJZGVudGl0eRIBZ1oLCgFhEgYKBAgBEgBiCwoBYhIGCgQIARIAQgQKABAN"), (one) => one.charCodeAt(0));
+/** Steps of loading: the graph and the runtime are here, the session is made, a first picture has been through. */
+export const PARTS = 4;
 const BLANK = 128; // pixels a side of the first picture
 const POSE = 0, GAIN = 1, SMOOTHING = 2, RESET = 3;
 
@@ -16,7 +18,8 @@ async function fetched(graph) {
 /**
  * Answers the page's messages.
  *
- * - `{load: {graph, mjs, wasm, threads}}` with addresses, is answered by `{ready: {engine, threads}}`;
+ * - `{load: {graph, mjs, wasm, threads}}` with addresses, is answered by `{ready: {engine, threads}}`, and before by
+ *   `{loaded: parts}` for each of `PARTS`;
  * - `{frame: {number, time, picture, pose, gain, smoothing, reset}}`, a picture of any size that is given away, its time
  *   in milliseconds, by `{solved: {number, time, interval, ..., milliseconds, width, height}}`;
  * - `{follow: pictures}`, a stream of a camera's pictures, by such answers to them, and by `{left: true}` when it ends;
@@ -36,8 +39,10 @@ export function answerFrames(ort, engine) {
     ort.env.wasm.numThreads = threads;
     ort.env.logLevel = "error";
     const options = { executionProviders: [engine], graphOptimizationLevel: "all", logSeverityLevel: 3 }; // errors alone
-    const [content] = await Promise.all([fetched(graph), ort.InferenceSession.create(IDENTITY, options)]);
-    session = await ort.InferenceSession.create(content, options);
+    let parts = 0;
+    const done = (value) => (self.postMessage({ loaded: ++parts }), value);
+    const [content] = await Promise.all([fetched(graph).then(done), ort.InferenceSession.create(IDENTITY, options).then(done)]);
+    session = done(await ort.InferenceSession.create(content, options));
     const size = session.inputMetadata.find((input) => input.name === "state").shape[0];
     state = new ort.Tensor("float32", new Float32Array(size), [size]);
     const blank = new Uint8Array(4 * BLANK * BLANK);

@@ -42,7 +42,7 @@ const page = {
   }),
   show(wanted, solved) {
     newest = solved;
-    rate.add(solved.milliseconds);
+    rate.add(solved);
     if (!takes.playing) stage?.pose(wanted);
     if (stream) return;
     const seen = isSeen(solved);

@@ -13,9 +13,12 @@ export class Solver {
   #waiting = [];
   #number = 0;
   #show = null;
+  #loaded;
   facts = null;
 
-  constructor() {
+  /** @param {(parts: number) => void} loaded called when parts of the engine are there. */
+  constructor(loaded) {
+    this.#loaded = loaded;
     this.#worker.onmessage = ({ data }) => this.#settle(data);
     this.#worker.onerror = (event) => this.#failAll(event.message || "the worker could not be started");
   }
@@ -65,6 +68,7 @@ export class Solver {
   }
 
   #settle(answer) {
+    if ("loaded" in answer) return this.#loaded(answer.loaded);
     if (answer.solved?.number === 0) return this.#show(answer.solved);
     const waiting = this.#waiting.shift(); // answers come in the order of what was asked
     if ("failed" in answer) waiting?.reject(new Error(answer.failed));
