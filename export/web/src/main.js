@@ -71,7 +71,7 @@ const page = {
   /** What torchface says of itself, beside the frames. */
   state({ words: told = "", notes = [], ended = "", calibrate = false }) {
     said = ended || told;
-    if (ended) showStatus(ended);
+    if (ended || !engine.running) showStatus(said || INVITATION);
     showNotes(notes);
     if (calibrate && calibration === null && !stream) startCalibration();
   },

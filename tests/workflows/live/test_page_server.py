@@ -34,7 +34,7 @@ from torchface.workflows.live import live_anybody
 from torchface.workflows.live.live_anybody import LiveSettings, go_live
 from torchface.workflows.live.live_frames import LiveFrame
 from torchface.workflows.live.live_view import FRAME, PICTURE, LiveView
-from torchface.workflows.live.page_server import PageServer
+from torchface.workflows.live.page_server import PageServer, Preparing
 
 
 class Desk:
@@ -142,6 +142,26 @@ def test_the_pages_socket_gives_frames_pictures_and_state_and_takes_wishes(serve
     shown = cv2.imdecode(np.frombuffer(small, np.uint8, offset=8), cv2.IMREAD_COLOR)
     assert shown.shape == (48, 64, 3)
     assert np.abs(shown[24, 32].astype(int) - (50, 100, 200)).max() < 8
+
+
+def test_a_page_says_what_is_made_and_its_settings_reach_the_session_then(desk: Desk, tmp_path: Path) -> None:
+    (tmp_path / "index.html").write_text("page")
+    told: list[tuple[str, int, int]] = []
+    preparing = Preparing(lambda step, done=0, total=0: told.append((step, done, total)))
+    server = PageServer(tmp_path, {}, lambda name: b"", preparing, 0)
+    try:
+        preparing("making the graph", 1, 4)
+        assert told == [("making the graph", 1, 4)]
+        with connect(server.url.replace("http", "ws") + "socket") as page:
+            assert json.loads(page.recv(5)) == {"words": "Making the graph: 1 of 4 parts are ready."}
+            page.send(json.dumps({"controls": {"mirror": True}}))
+            page.send(json.dumps({"record": True}))
+            until(lambda: preparing.wishes)
+            server.attend(desk)
+            until(lambda: isinstance(page.recv(5), bytes))
+        assert desk.messages == [{"controls": {"mirror": True}}]
+    finally:
+        server.stop()
 
 
 def test_the_page_hands_takes_over(server: PageServer, desk: Desk) -> None:

@@ -39,7 +39,7 @@ from torchface.workflows.live.kept_takes import (
 from torchface.workflows.live.live_figures import LiveReport
 from torchface.workflows.live.live_frames import FaceSolver, FrameSource, LiveFrame, Say, SourceSettings, open_source
 from torchface.workflows.live.live_session import LiveSession, Notes
-from torchface.workflows.live.page_server import PageServer
+from torchface.workflows.live.page_server import PageServer, Preparing
 from torchface.workflows.live.received_source import ReceivedSolver, ReceivedSource, ReceivedWatch
 from torchface.workflows.live.recordings import Recordings, SavedTake
 from torchface.workflows.live.session_prompts import FaceWatch, Watch
@@ -164,17 +164,24 @@ def go_live(
         for note in character.notes():
             notes(note)
         page = built_page(progress) if settings.page else None
+        folder = settings.record or settings.takes or RECORDINGS
+        recordings = Recordings(folder, character, source.video.path.name, source.video.fps)
+        preparing, server = Preparing(progress), None
+        if page is not None:  # before the solver, which may take a minute the first time
+            files = {CHARACTER: character.data, TABLE: character.page_table()}
+            server = PageServer(page, files, partial(take_file, recordings.folder), preparing, settings.port)
+            stack.callback(server.stop)
+            opened(server.url)
+            say(f"For OBS, the character alone: {server.stream_url}")
         solver: FaceSolver
         watch: Watch
         if received is not None:
             solver, watch = ReceivedSolver(received, notes), ReceivedWatch(received, notes)
         else:
-            progress("loading the solver")
-            solver = make_solver(progress)
+            preparing("loading the face reader")
+            solver = make_solver(preparing)
             watch = FaceWatch(lambda picture: shipped_detector()(picture).boxes.tolist())
         streams = stack.enter_context(WeightStreams(settings.addresses, ARKIT, source.video.fps, notes))
-        folder = settings.record or settings.takes or RECORDINGS
-        recordings = Recordings(folder, character, source.video.path.name, source.video.fps)
         if settings.takes is not None:
             import_recordings(settings.takes, recordings, notes)
         session = LiveSession(source, solver, streams, recordings, notes, say, watch)
@@ -183,15 +190,10 @@ def go_live(
         session.guided = settings.calibrate
         if settings.calibrate and page is None:
             session.calibrate()
-        server = None
         try:
-            if page is not None:
-                files = {CHARACTER: character.data, TABLE: character.page_table()}
-                takes = partial(take_file, recordings.folder)
-                server = PageServer(page, files, takes, session, settings.port)
-                stack.callback(server.stop)
-                opened(server.url)
-                say(f"For OBS, the character alone: {server.stream_url}")
+            if server is not None:
+                server.attend(session)
+                stack.callback(server.stop)  # before the streams end
             session.run(settings.seconds, progress)
         finally:
             if recordings.running:

@@ -13,6 +13,7 @@ import secrets
 import threading
 import time
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from http import HTTPStatus
 from pathlib import Path
 from typing import Any, Protocol
@@ -26,6 +27,7 @@ from websockets.sync.server import ServerConnection, serve
 
 from torchface.errors import TorchfaceError
 from torchface.files.whole_files import read_file
+from torchface.progress import Progress
 from torchface.viz.browser.browser_page import HOST, free_port
 from torchface.viz.browser.origin_check import is_allowed, without_token
 from torchface.workflows.live.live_view import LiveView, TakeUpload
@@ -62,6 +64,41 @@ class LiveDesk(Protocol):
 
     def left(self) -> None:
         """A page was closed, which may have asked for a pose."""
+
+
+class Preparing:
+    """A session's desk before there is a session: the page says what is being made.
+
+    Args:
+        progress: of the program, which is told the same.
+    """
+
+    def __init__(self, progress: Progress) -> None:
+        self.wishes: dict[str, Any] = {}
+        self._progress, self._words = progress, ""
+
+    def __call__(self, step: str, done: int = 0, total: int = 0) -> None:
+        """Says a step, as ``Progress`` does."""
+        self._words = f"{step[:1].upper()}{step[1:]}" + (f": {done} of {total} parts are ready." if total else "…")
+        self._progress(step, done, total)
+
+    def next_view(self, before: LiveView | None, seconds: float) -> None:
+        """There is none yet."""
+        time.sleep(seconds)
+
+    def state(self) -> dict[str, Any]:
+        """What the page shows."""
+        return {"words": self._words}
+
+    def asked(self, message: Mapping[str, Any]) -> None:
+        """Keeps what the user set for the session, and nothing else."""
+        self.wishes |= {key: message[key] for key in ("controls", "names") if key in message}
+
+    def keep(self, name: str, rows: np.ndarray) -> None:
+        """Nothing is kept yet."""
+
+    def left(self) -> None:
+        """A page was closed."""
 
 
 class PageServer:
@@ -105,8 +142,17 @@ class PageServer:
         """The address of the stream view."""
         return f"http://{HOST}:{self.port}/stream"
 
+    def attend(self, desk: LiveDesk) -> None:
+        """Shows another desk from now on, which is asked for what was wished while it was prepared."""
+        before, self._desk = self._desk, desk
+        if isinstance(before, Preparing):
+            with suppress(TorchfaceError):  # which stands in the notes
+                desk.asked(before.wishes)
+
     def stop(self) -> None:
-        """Says to open pages that it has ended, and ends."""
+        """Says to open pages that it has ended, and ends, once."""
+        if self._stopped.is_set():
+            return
         self._stopped.set()
         self._server.shutdown()
         self._thread.join(2)
