@@ -8,8 +8,9 @@ import torch
 from torchface import Mesh
 from torchface.errors import ValueRangeError
 from torchface.geometry.rotations import rotation_matrix
+from torchface.geometry.similarity import Similarity
 from torchface.mesh import Annotations
-from torchface.modeling.rigging.other_topology import CarriedShapes, joined_vertices, shapes_on
+from torchface.modeling.rigging.other_topology import CarriedShapes, TemplatePlaces, joined_vertices, shapes_on
 from torchface.rig import BlendshapeRig
 from torchface.synthetic import performer
 
@@ -61,6 +62,24 @@ def test_every_shape_is_the_true_one(carried: CarriedShapes, head: tuple[Mesh, t
     cosine = (found * truth).sum(1) / (found.norm(dim=1) * truth.norm(dim=1))
     assert float(cosine.min()) > 0.985, dict(zip(SHAPES, cosine.tolist(), strict=True))
     assert float(relative.max()) < 0.18, dict(zip(SHAPES, relative.tolist(), strict=True))
+
+
+def test_a_lip_that_lies_where_the_other_is_goes_with_its_own_jaw(
+    carried: CarriedShapes, template: BlendshapeRig
+) -> None:
+    rig, one = template.select(["jawOpen"]), torch.ones(1, dtype=torch.float64)
+    still = Similarity(one, torch.eye(3, dtype=torch.float64)[None], torch.zeros(1, 3, dtype=torch.float64))
+    registration = replace(carried.registration, mesh=rig.neutral, pose=still)
+    regions, line = rig.neutral.annotations.regions, rig.vertices[rig.neutral.landmarks[[62, 66]]].mean(0)
+    middle = (rig.vertices[:, 0].abs() < 12) & (rig.vertices[:, 1] < line[1] + 0.5)
+    rows = (regions["lower_lip"] & middle & ((rig.vertices - line)[:, 1] > -2)).nonzero()[:, 0]
+    raised = rig.vertices.clone()
+    raised[rows, 1] += 3.0  # among the upper lip's vertices
+    target, truth = Mesh(raised, rig.neutral.faces), rig.deltas[0, rows].norm(dim=-1)
+    guessed = shapes_on(rig, target, registration=registration).rig.deltas[0, rows].norm(dim=-1)
+    told = shapes_on(rig, target, registration=registration, followed=TemplatePlaces.at(rows, rows))
+    assert float((guessed / truth).min()) < 0.5
+    assert float((told.rig.deltas[0, rows].norm(dim=-1) / truth - 1).abs().max()) < 0.1
 
 
 def test_an_eyeball_turns_rigidly(

@@ -47,6 +47,7 @@ _SKIN_SHARE, _BODY_SHARE = 0.3, 0.15
 _OPEN = 0.1  # of an eye: what a blink that shuts it leaves at most
 _JAW, _LIP, _DRAWN, _LEAST_DRAWN = "jawOpen", 10.0, 4.0, 3  # millimetres round the lips' line, times their length
 _SAME_PLACE = 1e-4
+_AT_LIPS = 1.5  # millimetres from the edge of lips that were cut
 _ALIKE = 0.2
 
 
@@ -109,6 +110,26 @@ class CarriedShapes:
         return int(((after > _DRAWN * before) & (after - before > _LIP)).sum()) >= _LEAST_DRAWN
 
 
+@dataclass(frozen=True, eq=False)
+class TemplatePlaces:
+    """Vertices of a head that follow known places of the template.
+
+    Args:
+        rows: of the head, (n,).
+        corner: two vertices of the template for each, (n,2).
+        share: how much of each, (n,2).
+    """
+
+    rows: Tensor
+    corner: Tensor
+    share: Tensor
+
+    @staticmethod
+    def at(rows: Tensor, ids: Tensor) -> TemplatePlaces:
+        """At vertices ids (n,) of the template."""
+        return TemplatePlaces(rows, ids[:, None].expand(-1, 2), torch.tensor([1.0, 0.0]).double().repeat(len(ids), 1))
+
+
 def shapes_on(
     template: BlendshapeRig,
     target: Mesh,
@@ -116,6 +137,7 @@ def shapes_on(
     *,
     registration: Registration | None = None,
     movable: Tensor | None = None,
+    followed: TemplatePlaces | None = None,
     progress: Progress | None = None,
 ) -> CarriedShapes:
     r"""Gives a head of any topology a template's shapes on its own vertices.
@@ -135,6 +157,7 @@ def shapes_on(
         landmarks: template vertex ids (L,) and points in the target's space (L,3), as ``register`` takes them.
         registration: of the template's neutral with the target, where it is there already.
         movable: which of the target's vertices may move, (V,) bool; all if absent.
+        followed: places of the template that are known; the others are found by distance and normal.
         progress: called with each step and how far it is.
 
     Raises:
@@ -163,7 +186,7 @@ def shapes_on(
     moved = transfer_with_report(template, fitted, progress=progress).rig
     progress("carrying the shapes over")
     joined = joined_vertices(goal, target.faces.cpu())
-    skin = _Skin.of(moved, registration, joined)
+    skin = _Skin.of(moved, registration, joined, followed)
     deltas = skin.carried(moved.deltas.double())
     head = SkinOfHead(joined.vertices, joined.faces, skin.loose, joined.part)
     deltas, left = shut_blinks(head, deltas, moved.names, eyes_seen(head, _marks(moved)), skin.distance)
@@ -276,7 +299,9 @@ class _Skin:
     loose: Tensor
 
     @staticmethod
-    def of(rig: BlendshapeRig, registration: Registration, joined: JoinedMesh) -> _Skin:
+    def of(
+        rig: BlendshapeRig, registration: Registration, joined: JoinedMesh, followed: TemplatePlaces | None = None
+    ) -> _Skin:
         faces = rig.neutral.faces.cpu()
         label = torch.from_numpy(_labels(torch.cat([faces[:, [0, 1]], faces[:, [1, 2]]]).T, len(rig.vertices)))
         faces = faces[(label == label.bincount().argmax())[faces[:, 0]]]
@@ -288,6 +313,12 @@ class _Skin:
         confidence = torch.exp(-((distance / _NEAR) ** 2)) * cosine.clamp(min=0) ** 2 * (seen * share).sum(1)
         confidence[beyond] *= _BLIND
         known = (confidence > 0.1) & ~beyond
+        if followed is not None:
+            rows = joined.of[followed.rows]
+            near = cKDTree(joined.vertices[rows].numpy()).query(joined.vertices.numpy())[0] < _AT_LIPS
+            confidence[torch.from_numpy(near)] *= _BLIND  # which of lips that touch it is, its place does not tell
+            corner[rows, :2], share[rows, :2], share[rows, 2] = followed.corner, followed.share, 0.0
+            confidence[rows], distance[rows], known[rows] = 1.0, 0.0, True
         part, area = joined.part, vertex_areas(joined.vertices, joined.faces)
         size = torch.zeros(int(part.max()) + 1, dtype=torch.float64).index_add_(0, part, area)
         near = torch.zeros_like(size).index_add_(0, part, area * known)

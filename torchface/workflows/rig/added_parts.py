@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -12,7 +12,7 @@ from torchface.geometry.meshes.cutting import strip
 from torchface.geometry.meshes.operators import vertex_normals
 from torchface.io.gltf.character_scene import Character
 from torchface.io.gltf.part_insertion import ExtendedBlock
-from torchface.modeling.rigging.other_topology import fitted_template
+from torchface.modeling.rigging.other_topology import TemplatePlaces, fitted_template
 from torchface.registration import Registration
 from torchface.rig import BlendshapeRig
 from torchface.synthetic import character as shown_character
@@ -35,12 +35,24 @@ class AddedParts:
         page: image of the parts, (3,H,W) in [0,1].
         notes: for people to read.
         lips_cut: lips that were one piece are two.
+        followed: which places of the template the vertices of the mouth's edge and bag follow, by the file's blocks:
+            its number, and their rows there.
     """
 
     blocks: tuple[ExtendedBlock, ...]
     page: Tensor
     notes: tuple[str, ...]
     lips_cut: bool
+    followed: tuple[tuple[int, TemplatePlaces], ...] = ()
+
+    def followed_on(self, character: Character, face: CharacterFace) -> TemplatePlaces:
+        """The same by vertices of the head, once the parts are in the file."""
+        place = torch.full((len(character.vertices),), -1)
+        place[face.rows] = torch.arange(len(face.rows))
+        rows = torch.cat([place[character.blocks[block].rows][one.rows] for block, one in self.followed])
+        known = rows >= 0
+        corner, share = (torch.cat([getattr(one, key) for _, one in self.followed]) for key in ("corner", "share"))
+        return TemplatePlaces(rows[known], corner[known], share[known])
 
 
 def added_parts(
@@ -96,6 +108,7 @@ class _Fitting:
         self._faces: list[Tensor] = []
         self._notes: list[str] = []
         self._lips_cut = False
+        self._followed: list[TemplatePlaces] = []  # rows as in the faces
 
     def add_mouth(self) -> None:
         """Bag, gums, teeth and tongue where the mouth has none; lips that are one piece are cut apart."""
@@ -105,7 +118,10 @@ class _Fitting:
             self._notes.append("the mouth has a bag: none was added")
         else:
             self._lips_cut = hole is None
-            self._weld(self._opened.cut_lips(edge) if hole is None else hole, "mouth", MOUTH_CONTACT + 1, True)
+            loop = self._opened.cut_lips(edge) if hole is None else hole
+            self._weld(loop, "mouth", MOUTH_CONTACT + 1, True)
+            ring = Loop.of(_ring("mouth", MOUTH_CONTACT, True), self._template)
+            self._followed.append(TemplatePlaces(loop.vertices, *ring.between(loop.share)))
             self._notes.append("added: the mouth's bag" + ", behind lips that were cut apart" * self._lips_cut)
         if self._has_loose(edge.mean(0), 26.0):
             self._notes.append("teeth or a tongue are there: none were added")
@@ -148,6 +164,8 @@ class _Fitting:
         inner = Loop.of(_ring(name, number, left), self._template)
         host = torch.stack([loop.vertices[(loop.share - one).abs().argmin()] for one in inner.share])
         rows = self._append(self._template[inner.vertices], None, host)
+        if name == "mouth":
+            self._followed.append(TemplatePlaces.at(rows, inner.vertices))
         triangles = strip(loop.vertices, rows, loop.share, inner.share)
         following = loop.vertices.roll(-1)
         faces = self._opened.cut.faces
@@ -182,6 +200,8 @@ class _Fitting:
             mesh.uvs[own[:, 1]].double(),
             torch.full((len(own),), self._host),
         )
+        if behind:
+            self._followed.append(TemplatePlaces.at(rows, own[:, 0]))
         self._faces.append(rows[of].reshape(-1, 3))
 
     def _behind_skin(self, places: Tensor) -> Tensor:
@@ -230,7 +250,8 @@ class _Fitting:
             ]
         )
         faces = torch.cat([self._opened.cut.faces, *strips])
-        blocks = []
+        blocks, followed = [], []
+        known = [replace(one, rows=positive(one.rows)) for one in self._followed]
         for number, block in enumerate(self._character.blocks):
             cut = (of[old:] == number).nonzero()[:, 0] + old
             mine = number == main
@@ -240,6 +261,9 @@ class _Fitting:
             local = torch.full((len(places),), -1)
             local[block.rows] = torch.arange(block.rows.stop - block.rows.start)
             local[rows] = block.rows.stop - block.rows.start + torch.arange(len(rows))
+            for one in known:
+                here = local[one.rows] >= 0
+                followed.append((number, TemplatePlaces(local[one.rows][here], one.corner[here], one.share[here])))
             by = torch.cat([cut, host]) if mine else cut
             own, start = {}, self._character.first_triangles[number]
             for primitive, count in zip(block.primitives, block.triangles, strict=True):
@@ -257,4 +281,4 @@ class _Fitting:
                     local[parts].numpy() if mine else None,
                 )
             )
-        return AddedParts(tuple(blocks), page, tuple(self._notes), self._lips_cut)
+        return AddedParts(tuple(blocks), page, tuple(self._notes), self._lips_cut, tuple(followed))

@@ -138,7 +138,13 @@ def rig_character(
                 character = read_character(document)
                 surface, face = textured(character), face.on(character)
         carried = shapes_on(
-            template, face.head, face.landmarks, registration=registration, movable=face.movable, progress=progress
+            template,
+            face.head,
+            face.landmarks,
+            registration=registration,
+            movable=face.movable,
+            followed=given.followed_on(character, face) if given is not None and given.followed else None,
+            progress=progress,
         )
         rig = _with_tongue(carried)
         made = tuple(name for name in missing if name in rig.names)

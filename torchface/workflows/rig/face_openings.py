@@ -47,6 +47,14 @@ class Loop:
         around = torch.cat([upper, lower[1:-1].flip(0)])
         return Loop(around, torch.cat([halves[0], (1 - halves[1][1:-1]).flip(0)]))
 
+    def between(self, share: Tensor) -> tuple[Tensor, Tensor]:
+        """The two vertices between which each share (n,) of the way lies, (n,2), and how much it is of each, (n,2)."""
+        ends = torch.cat([self.share, torch.ones(1).double()])
+        before = (torch.searchsorted(ends, share.clamp(0, 1 - 1e-9), right=True) - 1).clamp(0, len(self.share) - 1)
+        far = ((share - ends[before]) / (ends[before + 1] - ends[before]).clamp(min=1e-9)).clamp(0, 1)
+        pair = torch.stack([before, (before + 1) % len(self.vertices)], 1)
+        return self.vertices[pair], torch.stack([1 - far, far], 1)
+
 
 class OpenedFace:
     """A face's mesh, opened where that is asked for; places are in the template's space.
