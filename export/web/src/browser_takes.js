@@ -1,7 +1,10 @@
 // Takes that the browser records and keeps.
 
 import { forgetFile, keepFile, keptFile, keptFiles } from "./kept_files.js";
+import { liveLinkCsv } from "./live_link_csv.js";
 import { Take } from "./take.js";
+import { give } from "./take_files.js";
+import { showProblem } from "./words.js";
 
 const PREFIX = "take ";
 const FILMS = { "video/mp4": ".mp4", "video/webm": ".webm" }; // by what the browser records
@@ -28,10 +31,18 @@ export class BrowserTakes {
     this.#film = filmed && this.stream !== null ? recorded(this.stream) : null;
   }
 
+  /** Keeps the take; one that this browser has no room for is given as a file, so that it is not lost. */
   async stop() {
-    const take = this.#take, film = this.#film?.();
+    const take = this.#take, filmed = this.#film?.();
     this.#take = this.#film = null;
-    if (take?.frames.length) await this.keep(new Date().toLocaleString([], { dateStyle: "short", timeStyle: "medium" }), take, await film);
+    if (!take?.frames.length) return;
+    const film = await filmed, name = new Date().toLocaleString([], { dateStyle: "short", timeStyle: "medium" });
+    try {
+      await this.keep(name, take, film);
+    } catch (error) {
+      give(name, ".csv", liveLinkCsv(take));
+      throw new Error(`The take could not be kept (${error.name ?? error}); it was downloaded as a .csv${film ? ", without its film" : ""}. Delete other takes, then drop it on the page.`);
+    }
   }
 
   /** Keeps a take, with the camera's film where there is one. */
@@ -43,7 +54,7 @@ export class BrowserTakes {
 
   add(solved) {
     this.#take?.add(solved.time, solved);
-    if (this.#take?.full) this.stop();
+    if (this.#take?.full) this.stop().catch(({ message }) => showProblem("takes", message));
   }
 
   /** Newest first, each `{id, name, seconds, frames, film}`, the last a suffix. */

@@ -174,6 +174,24 @@ def test_a_permission_that_is_withdrawn_is_explained_and_ends_the_take(opened: O
     page.start()
 
 
+def test_a_take_that_the_browser_has_no_room_for_is_downloaded(opened: Open, recorded: Recorded) -> None:
+    page, driver = opened.page, opened.page.driver
+    page.start()
+    count = "return document.querySelectorAll('#takes li').length"
+    before = driver.execute_script(count)
+    full = """const store = IDBObjectStore.prototype, put = store.put;
+    store.put = () => { store.put = put; throw new DOMException("full", "QuotaExceededError"); };"""
+    driver.execute_script(full)
+    page.click("record")
+    until(lambda: page.recorded_frames >= 3)
+    page.click("record")
+    assert "could not be kept (QuotaExceededError); it was downloaded as a .csv" in until(lambda: page.problem)
+    assert driver.execute_script(count) == before
+    script = "const done = arguments[0]; watched.blobs.at(-1).text().then(done)"
+    assert len(driver.execute_async_script(script).split("\n")) > 3
+    driver.execute_script("document.querySelector('#problem button').click()")
+
+
 def test_a_face_is_lost_and_found(opened: Open, recorded: Recorded) -> None:
     page = opened.page
     page.start()

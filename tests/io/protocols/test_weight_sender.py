@@ -84,6 +84,19 @@ def test_broadcast_is_allowed_and_what_cannot_be_sent_is_reported(monkeypatch: p
             sender.send(torch.zeros(52))
 
 
+def test_a_receiver_at_ipv6_gets_the_weights() -> None:
+    try:
+        receiver = socket.socket(socket.AF_INET6, socket.SOCK_DGRAM)
+        receiver.bind(("::1", 0))
+    except OSError:
+        pytest.skip("this machine has no IPv6")
+    with receiver:
+        receiver.settimeout(5)
+        with closing(open_sender(f"livelink://[::1]:{receiver.getsockname()[1]}", ARKIT, 60.0)) as sender:
+            assert sender.send(torch.full((52,), 0.5))
+        assert decode_frame(receiver.recv(2048)).weights == pytest.approx([0.5] * 52)
+
+
 def test_nobody_listening_is_reported_and_the_next_listener_gets_the_frames() -> None:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as empty:
         empty.bind(("127.0.0.1", 0))

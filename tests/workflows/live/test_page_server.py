@@ -224,6 +224,7 @@ class Opened:
         self._thread.start()
         self.url: str = until(lambda: self.urls and self.urls[0])
         self.stream = until(lambda: [one.split()[-1] for one in self.said if "OBS" in one])[0]
+        (folder / "dome.glb").unlink()  # a character that is deleted while it plays is shown and recorded all the same
 
     def close(self) -> None:
         self.source.open = False
