@@ -6,6 +6,7 @@ import subprocess
 import sys
 import warnings
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -85,8 +86,13 @@ def test_a_result_of_another_ending_is_refused_before_anything_is_read(
     "words", ["render rig.glb --out", "export solver --rig rig.glb --attachment attachment.json --out"]
 )
 def test_a_missing_folder_of_a_result_is_made(
-    stage: Path, words: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    stage: Path, words: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, coarse_figures: None
 ) -> None:
+    def exported(rig: object, attachment: object, path: Path, **_: object) -> SimpleNamespace:
+        path.write_bytes(b"an export takes twenty seconds")
+        return SimpleNamespace(rows=list)
+
+    monkeypatch.setattr("torchface.onnx.export_solver", exported)
     monkeypatch.chdir(stage)
     out = tmp_path / "new" / ("a.png" if words.startswith("render") else "a.onnx")
     main([*words.split(), str(out), "--quiet"])
