@@ -20,7 +20,8 @@ from PIL import Image
 
 from torchface.attachment import Attachment
 from torchface.geometry.cameras.pinhole import Camera
-from torchface.io import load_rig, load_take, rig_files
+from torchface.io import load_rig, load_take
+from torchface.io.rigs import ict_facekit
 from torchface.mesh import Mesh
 from torchface.rendering.clay_shading import DEFAULT_LIGHTING, render
 from torchface.rig import BlendshapeRig
@@ -105,20 +106,24 @@ def quick_files() -> Iterator[None]:
 
 @pytest.fixture(scope="session", autouse=True)
 def head_read_once() -> Iterator[None]:
-    """A process reads the real head once, which takes seconds; each test has a copy of its own."""
-    read = rig_files.load_ict_facekit
-    known: dict[Any, BlendshapeRig] = {}
+    """A process reads the real head's files once, which takes seconds; each test has a copy of its own."""
+    known: dict[Any, Any] = {}
 
-    def copied(folder: Path, shapes: Any = None, part: str | None = None, unit: str | None = None) -> BlendshapeRig:
-        if Path(folder) != DATA / "ict_facekit" / "FaceXModel":
-            return read(folder, shapes, part, unit)
-        key = (None if shapes is None else tuple(shapes), part, unit)
-        if key not in known:
-            known[key] = read(folder, shapes, part, unit)
-        return deepcopy(known[key])
+    def once(read: Any) -> Any:
+        def copied(folder: Path, given: Any, *more: Any) -> Any:
+            if Path(folder) != DATA / "ict_facekit" / "FaceXModel":
+                return read(folder, given, *more)
+            key = (read, more[-1], None if read is neutral else tuple(given))
+            if key not in known:
+                known[key] = read(folder, given, *more)
+            return deepcopy(known[key])
 
+        return copied
+
+    neutral, deltas = ict_facekit._read_neutral, ict_facekit._read_deltas
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(rig_files, "load_ict_facekit", copied)
+        patch.setattr(ict_facekit, "_read_neutral", once(neutral))
+        patch.setattr(ict_facekit, "_read_deltas", once(deltas))
         yield
 
 

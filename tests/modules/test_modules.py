@@ -38,7 +38,7 @@ WRITTEN = (
     "ProjectedGradient", "WebcamSolver", "SolverGraph", "SolverGraph with predictions", "DynamicsPrior", "HeadModel",
     "ExpressionRegression", "WrinkleWeights", "ActionUnitClassifier", "LandmarkNetwork", "EyeNetwork",
 )  # fmt: skip
-"""Exported in the tests of their ONNX graphs, which is more."""
+"""Exported in the tests and benches of their ONNX graphs, which is more."""
 
 LONG = ("WebcamSolver", "SolverGraph", "SolverGraph with predictions")
 """Five to twelve seconds to compile."""
@@ -251,11 +251,11 @@ def test_jacobians(name: str) -> None:
 
 @pytest.mark.parametrize("name", [name for name in EXAMPLES if name not in LONG])
 def test_compiled_it_computes_the_same(name: str) -> None:
-    """In one graph, or with one gap in which it runs as ever; as far as the code that a backend makes of the graph.
+    """In one graph, or with one gap in which it runs as ever; the graph is run as it is.
 
-    The next test has those that take long.
+    The next test has those that take long, and what backends make of the graph.
     """
-    check_compiled(EXAMPLES[name], name in IN_ONE_GRAPH, "aot_eager")
+    check_compiled(EXAMPLES[name], name in IN_ONE_GRAPH, "eager")
 
 
 @pytest.mark.bench
@@ -303,7 +303,9 @@ def exported_graphs() -> dict[str, tuple[Callable[[], nn.Module], Callable[[], t
     }
 
 
-@pytest.mark.parametrize("kind", ["CorrectiveGraph", "CorrectiveGraph with predictions"])
+@pytest.mark.parametrize(
+    "kind", ["CorrectiveGraph", pytest.param("CorrectiveGraph with predictions", marks=pytest.mark.bench)]
+)
 def test_graphs_of_solvers_are_exported(kind: str) -> None:
     make, given = exported_graphs()[kind]
     graph, inputs = make(), given()

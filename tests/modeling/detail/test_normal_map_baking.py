@@ -144,6 +144,7 @@ def test_a_scan_in_another_pose_is_laid_on_the_mesh_by_picked_points(face: Mesh,
     assert torch.equal(by_points.similarity.rotation, found.similarity.rotation)
 
 
+@pytest.mark.bench  # test_scan_alignment.py finds the pose without picks, and other tests here bake
 def test_wrinkles_come_back_from_a_scan_in_another_pose_without_picks(face: Mesh) -> None:
     scan = moved(patch((-60, 60), (-30, 60), 480, 440, DEPTH), 100, (30.0, 200, -100))
     baked = bake_normal_map(face, scan, (768, 1536))

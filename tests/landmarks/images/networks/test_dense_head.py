@@ -111,15 +111,18 @@ def test_both_sides_of_a_crop_give_mirrored_points_and_weights(network: Landmark
 
 def test_the_graph_gives_points_and_weights(network: LandmarkNetwork, tmp_path) -> None:
     path = tmp_path / "network.onnx"
-    report = export_model(network, path)
-    names = ["points", "point_deviation", "expression", "expression_deviation"]
-    assert set(names) < set(report.parity)
+    report = export_model(network, path, {"licence": "MIT"})
+    names = ["landmarks", "deviation", "visibility", "presence"]
+    names += ["points", "point_deviation", "expression", "expression_deviation"]
+    assert set(names) == set(report.parity)
     session = onnxruntime.InferenceSession(path.read_bytes(), providers=["CPUExecutionProvider"])
     crops = torch.rand(3, 3, 64, 64, generator=torch.Generator().manual_seed(8))
     with torch.no_grad():
         expected = network(crops)
     for name, value in zip(names, session.run(names, {"image": crops.numpy()}), strict=True):
         torch.testing.assert_close(torch.from_numpy(value), getattr(expected, name), rtol=5e-3, atol=0.05)
+    assert report.size < 2_000_000
+    assert session.get_modelmeta().custom_metadata_map["crop"] == "1.25"
 
 
 def test_a_finder_gives_points_in_pixels_of_the_picture(network: LandmarkNetwork) -> None:

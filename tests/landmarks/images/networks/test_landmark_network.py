@@ -3,7 +3,6 @@
 from dataclasses import replace
 from pathlib import Path
 
-import onnxruntime
 import pytest
 import torch
 from torch.utils.data import TensorDataset
@@ -17,7 +16,6 @@ from torchface.landmarks.images.face_crop import crop_transform, cut_crop, from_
 from torchface.landmarks.images.ibug_68 import INNER, MIRROR_68, box_around
 from torchface.landmarks.images.networks.crop_finder import BothSides
 from torchface.landmarks.images.networks.picture_augmentation import AugmentationSettings, augmented
-from torchface.onnx import export_model
 from torchface.workflows.named_finders import load_finder
 from train.rendered_people.face_picture import draw_pictures
 from train.rendered_people.head_kind import performer_kind
@@ -116,20 +114,6 @@ def test_what_is_covered_is_not_visible(pictures: tuple[torch.Tensor, ...]) -> N
     free = augmented(*pictures, 112, 1.25, next(generators), replace(settings, hidden=0.0))
     hidden = augmented(*pictures, 112, 1.25, next(generators), settings)
     assert 0.05 < float(free.visible.mean() - hidden.visible.mean()) < 0.8
-
-
-def test_the_graph_gives_what_the_network_gives(network: LandmarkNetwork, tmp_path) -> None:
-    path = tmp_path / "network.onnx"
-    report = export_model(network, path, {"licence": "MIT"})
-    session = onnxruntime.InferenceSession(path.read_bytes(), providers=["CPUExecutionProvider"])
-    crops = torch.rand(5, 3, 64, 64, generator=torch.Generator().manual_seed(8))
-    outputs = session.run(["landmarks", "deviation", "visibility", "presence"], {"image": crops.numpy()})
-    with torch.no_grad():
-        for told, value in zip(network(crops)[:4], outputs, strict=True):
-            # Weights are halves in the file.
-            torch.testing.assert_close(torch.from_numpy(value), told, rtol=5e-3, atol=0.05)
-    assert report.size < 2_000_000
-    assert session.get_modelmeta().custom_metadata_map["crop"] == "1.25"
 
 
 def test_a_saved_network_comes_back(network: LandmarkNetwork, tmp_path) -> None:
