@@ -87,13 +87,14 @@ def _live():
     return person_solver(silent)
 
 
-def track(rig: Callable[[Film | Clip], BlendshapeRig], **options: object) -> Method:
-    """``torchface track`` on a rig."""
+def track(rig: Callable[[Film | Clip], BlendshapeRig] | None, **options: object) -> Method:
+    """``torchface track`` on a rig, or on the head that it solves with the film."""
 
     def run(film: Film | Clip) -> tuple[Tensor, Tensor]:
         with TemporaryDirectory() as folder:
-            path = Path(folder) / "rig.glb"
-            save_rig(rig(film), path)
+            path = None if rig is None else Path(folder) / "rig.glb"
+            if rig is not None and path is not None:
+                save_rig(rig(film), path)
             settings = TrackSettings(overlay="none", **options)  # type: ignore[arg-type]
             tracked = track_video(film.path, path, Path(folder) / "out", settings)
             weights = load_take(Path(folder) / "out" / "live_link.csv").weights

@@ -20,6 +20,7 @@ from torchface.geometry.cameras.pinhole import look_at
 from torchface.geometry.similarity import similarity_transform
 from torchface.io import load_identity_modes
 from torchface.io.rigs.ict_facekit import region
+from torchface.landmarks import FaceReading
 from torchface.modeling import FitSettings, ImageFit, fit_images
 from torchface.workflows.fit.fit_landmarks import find_in_photographs
 from torchface.workflows.fit.fit_readings import with_readings
@@ -120,7 +121,8 @@ def test_likeness_of_rendered_people(ict_folder: Path) -> None:
             some = [found[row] for row in rows]
             settings = FitSettings(transfers=0, expression_prior=prior, annotated=True)
             marks = torch.stack([one.confident for one in some])
-            fit = fit_images(model, rig, marks, (SIZE, SIZE), settings=with_readings(settings, some, rig))
+            read = with_readings(settings, FaceReading.stacked([one.face for one in some]), some[0].places, rig)
+            fit = fit_images(model, rig, marks, (SIZE, SIZE), settings=read)
             errors[name].append(error(fit.mesh.vertices))
             stated[name].append(normalised(fit, known @ who.coefficients.double()))
             if len(rows) == 1:

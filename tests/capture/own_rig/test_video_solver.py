@@ -93,6 +93,19 @@ def test_exact_landmarks_give_exact_weights_and_poses(small: BlendshapeRig) -> N
     assert bool(solution.solved.all())
 
 
+def test_errors_along_the_contour_count_as_in_the_solve(small: BlendshapeRig) -> None:
+    """An annotator's place along the contour says nothing of a face: 0.3 of it counts, of what lies across all."""
+    rotation, translation = poses(2)
+    weights = acted(2)
+    seen, solver = film(small, weights, rotation, translation), exact(small)
+    along = torch.nn.functional.normalize(seen[:, 6] - seen[:, 4], dim=-1)
+    for way, counted in ((along, 0.3), (along.flip(-1) * along.new_tensor([-1.0, 1.0]), 1.0)):
+        moved = seen.clone()
+        moved[:, 5] += 10 * way
+        errors = solver.reprojection_errors(moved, weights, rotation, translation)
+        torch.testing.assert_close(errors, torch.full_like(errors, counted * 10 / 68**0.5), atol=1e-3, rtol=0)
+
+
 def test_landmarks_that_are_not_seen_are_skipped(small: BlendshapeRig) -> None:
     rotation, translation = poses(3)
     weights = acted(3)

@@ -20,6 +20,7 @@ from torchface.capture.own_rig.gauss_newton import (
     box_step,
     energy_of_step,
     linearise,
+    sliding,
 )
 from torchface.capture.own_rig.solver_components import VideoSolverParts
 from torchface.optim.implicit import attach_gradients
@@ -137,11 +138,17 @@ class FrameSolver(VideoSolverParts):
         return head.moved(x[:, :-6], x[:, -6:])
 
     def reprojection_errors(self, landmarks: Tensor, weights: Tensor, rotation: Tensor, translation: Tensor) -> Tensor:
-        """Root mean square distance of seen landmarks (T,68,2) to the rig's, (T,), pixels; NaN where none is seen."""
+        """Root mean square distance of seen landmarks (T,68,2) to the rig's, (T,), pixels; NaN where none is seen.
+
+        Landmarks of the contour count along it as they do in the solve, see ``sliding``: where between ear and chin an
+        annotator sets them says nothing of a face.
+        """
         weights, rotation, translation = (x.detach().double() for x in (weights, rotation, translation))
         points, K = self.points, self.intrinsics.double()
         rows = points.chosen(weights, rotation, translation, K)
         placed = points.at(weights)[torch.arange(len(rows), device=rows.device)[:, None], rows]
         image = (placed @ rotation.transpose(-1, -2) + translation[:, None]) @ K.T
-        squared = (image[..., :2] / image[..., 2:] - landmarks.detach().double()).square().sum(-1)
+        pixels = image[..., :2] / image[..., 2:]
+        off = sliding((pixels - landmarks.detach().double())[..., None], pixels, self.settings.contour_slide)
+        squared = off.square().sum((-2, -1))
         return squared.nanmean(1).sqrt().to(landmarks.dtype)

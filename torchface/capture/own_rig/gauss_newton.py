@@ -131,17 +131,29 @@ def linearise(
     pixels, by_place = pixel_jacobian(turned + head.translation[:, None], intrinsics)
     # Residuals and their derivatives by the points' places go through the same products.
     lines = torch.cat([(pixels - landmarks)[..., None], by_place], dim=-1) * precision[..., None, None]
-    if along < 1:
-        contour, jaw = lines[:, :JAW], pixels[:, :JAW]
-        beyond = torch.cat([jaw[:, :1], jaw, jaw[:, -1:]], dim=1)
-        tangent = normalize(beyond[:, 2:] - beyond[:, :-2], dim=-1)
-        squeeze = (1 - along) * tangent[..., :, None] * tangent[..., None, :]
-        lines = torch.cat([contour - squeeze @ contour, lines[:, JAW:]], dim=1)
+    lines = sliding(lines, pixels, along)
     residual, by_place = lines[..., 0], lines[..., 1:]
     by_world = (by_place.reshape(count, -1, 3) @ head.rotation).view(by_place.shape)
     by_weights = (by_world @ basis).view(count, -1, 2, shapes)
     by_turn = torch.linalg.cross(turned[:, :, None].expand_as(by_place), by_place)
     return Linearised(residual, torch.cat([by_weights, by_turn, by_place], dim=-1))
+
+
+def sliding(lines: Tensor, pixels: Tensor, along: float) -> Tensor:
+    """Offsets of landmarks, or their derivatives, in which those of the contour count less along it than across it.
+
+    Args:
+        lines: (B,68,2,K), along x and y.
+        pixels: where a rig's landmarks are seen, (B,68,2).
+        along: how much an offset along the contour counts beside one across it, 0 to 1.
+    """
+    if along >= 1:
+        return lines
+    contour, jaw = lines[:, :JAW], pixels[:, :JAW]
+    beyond = torch.cat([jaw[:, :1], jaw, jaw[:, -1:]], dim=1)
+    tangent = normalize(beyond[:, 2:] - beyond[:, :-2], dim=-1)
+    squeeze = (1 - along) * tangent[..., :, None] * tangent[..., None, :]
+    return torch.cat([contour - squeeze @ contour, lines[:, JAW:]], dim=1)
 
 
 def energy_of_step(energy: Quadratic, weights: Tensor) -> Quadratic:

@@ -130,6 +130,10 @@ class FaceReading:
         )
         return replace(self, points=points, point_deviation=deviation)
 
+    def of_frames(self, frames: Tensor) -> FaceReading:
+        """Of a take's reading (T,...) that of some frames, (F,) int64."""
+        return FaceReading(*(getattr(self, part.name)[frames] for part in fields(self)))
+
     def doubted(self, landmarks: Tensor) -> FaceReading:
         """The same with no confidence in some of the landmarks, (...,68) bool."""
         return replace(self, deviation=torch.where(landmarks, torch.inf, self.deviation))

@@ -1,8 +1,7 @@
-"""What a landmark network reads of photographs beside the 68 landmarks, as a fit of a head counts it."""
+"""What a landmark network reads of photographs and frames beside the 68 landmarks, as a fit of a head counts it."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -14,7 +13,6 @@ from torchface.landmarks import FaceReading
 from torchface.modeling import FitSettings
 from torchface.modeling.photographs.fit_settings import ExpressionPrior, SurfacePoints, WeightQuadratic
 from torchface.rig import BlendshapeRig
-from torchface.workflows.fit.fit_landmarks import PhotographLandmarks
 from torchface.workflows.surface_sites import sites_on_rig
 
 
@@ -40,16 +38,16 @@ class ReadExpressions:
         return Quadratic(own.H + read.H, own.f + read.f)
 
 
-def with_readings(settings: FitSettings, found: Sequence[PhotographLandmarks], rig: BlendshapeRig) -> FitSettings:
+def with_readings(settings: FitSettings, readings: FaceReading, places: Tensor, rig: BlendshapeRig) -> FitSettings:
     """Settings with each landmark's deviation, and the points of the surface and the expressions that were read.
 
     Args:
         settings: with the prior on expressions.
-        found: one a photograph, all by one model.
+        readings: of I photographs by one model, (I,...).
+        places: of the points that the model finds beside the 68, on the embedded performer's mean head, (P,3) mm.
         rig: whose weights are solved for, with the 68 landmarks annotated.
     """
-    readings = FaceReading.stacked([one.face for one in found])
-    settings, places = replace(settings, deviations=readings.deviation, irises=readings.iris), found[0].places
+    settings = replace(settings, deviations=readings.deviation, irises=readings.iris)
     if len(places) and len(places) == readings.points.shape[1]:
         surface = SurfacePoints(readings.points, readings.point_deviation, sites_on_rig(rig, places))
         settings = replace(settings, surface=surface)

@@ -20,6 +20,7 @@ from torchface.io.mesh_files import MESH_ENDINGS
 from torchface.io.rig_files import SCENE_ENDINGS
 from torchface.io.video.video_file import VIDEO_ENDINGS
 from torchface.landmarks.images.face_crop import cut_crop
+from torchface.landmarks.images.face_reading import FaceReading
 from torchface.modeling import FitSettings, ImageFit, fit_images, transfer_with_report
 from torchface.modeling.photographs.landmark_view import JAW
 from torchface.number_checks import checked_count
@@ -207,7 +208,8 @@ def fit_photographs(
     worn = settings.template is None and not settings.everything and bool(fitting.texture_size) and is_performers(rig)
     fitting = replace(fitting, paint_hair=not worn)
     if found:
-        fitting = with_readings(fitting, found, rig)
+        readings = FaceReading.stacked([one.face for one in found])
+        fitting = with_readings(fitting, readings, found[0].places, rig)
     remarks = [line for one, image in zip(found, images, strict=False) for line in picture_lines(one, image, insist)]
     for photograph, shown, points in zip(photographs, parts, marks, strict=True):
         remarks += cover_lines(photograph, shown, points)

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
 from torchface.errors import ValueRangeError
+from torchface.geometry.cameras.distortion import undistort
 from torchface.geometry.meshes.normal_maps import SurfaceMaps
 from torchface.landmarks.images.face_reading import FaceReading
 from torchface.modeling import FitSettings, HeadModel, ImageFit, fit_images, transfer_with_report
@@ -15,6 +16,7 @@ from torchface.modeling.photographs.frame_choice import choose_frames
 from torchface.modeling.photographs.landmark_view import JAW
 from torchface.progress import Progress
 from torchface.rig import BlendshapeRig
+from torchface.workflows.fit.fit_readings import with_readings
 from torchface.workflows.track.track_inputs import TrackInputs
 
 FRAMES = 10
@@ -72,11 +74,14 @@ def person_head(
     marks = torch.where((trust > _DOUBTED)[..., None], landmarks, torch.nan)[frames]
     few = (torch.isfinite(marks[:, JAW:]).all(-1).sum(1) < FRAMES)[:, None, None]
     found = inputs.models.finder is not None
-    settings = FitSettings(
-        expression_prior=inputs.models.prior,
-        annotated=found,
-        deviations=reading.deviation[frames] if found else None,
-    )
+    settings = FitSettings(expression_prior=inputs.models.prior, annotated=found)
+    if found:
+        shown = replace(
+            reading.of_frames(frames),
+            iris=undistort(reading.iris[frames].double(), inputs.calibration),
+            points=undistort(reading.points[frames].double(), inputs.calibration),
+        )
+        settings = with_readings(settings, shown, inputs.models.places, rig)
     fit = fit_images(
         heads,
         rig,

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import functools
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import torch
+from torch import Tensor
 
 from torchface import zoo
 from torchface.capture.priors import AdaptedDynamicsPrior, DynamicsPrior, ShapePrior
@@ -37,6 +38,7 @@ class TrackModels:
         solving: changes when what solves does.
         expects: whether the finder reads which weights of the rig's shapes are to be expected: then solves have no
             other prior.
+        places: of the points that the finder finds beside the 68, on the embedded performer's mean head, (P,3) mm.
     """
 
     finder: LandmarkFinder | None
@@ -47,6 +49,7 @@ class TrackModels:
     seeing: str = ""
     solving: str = ""
     expects: bool = False
+    places: Tensor = field(default_factory=lambda: torch.zeros(0, 3))
 
 
 def is_table(landmarks: str | Path | None) -> bool:
@@ -84,6 +87,7 @@ def load_track_models(
         ),
         content_key("solving", prior=learned, dynamics=model_folder(dynamics), fps=fps),
         named is not None and named.expects and prior == DEFAULT_PRIOR and knows_half(ARKIT, rig),
+        torch.zeros(0, 3) if named is None else named.places,
     )
 
 
