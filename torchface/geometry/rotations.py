@@ -1,4 +1,4 @@
-"""Rotations from their axis and angle, and the way back."""
+"""Rotations from their axis and angle, and the way back, or from quaternions."""
 
 from __future__ import annotations
 
@@ -28,6 +28,17 @@ def rotation_matrix(vectors: Tensor) -> Tensor:
     cross = cross_matrix(vectors)
     turned = torch.sinc(angle) * cross + 0.5 * torch.sinc(0.5 * angle).square() * (cross @ cross)
     return torch.eye(3, dtype=vectors.dtype, device=vectors.device) + turned
+
+
+def quaternion_matrix(quaternions: Tensor) -> Tensor:
+    """The rotations (...,3,3) of unit quaternions (...,4), x, y, z, w."""
+    x, y, z, w = quaternions.unbind(-1)
+    rows = [
+        1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w),
+        2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w),
+        2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y),
+    ]  # fmt: skip
+    return torch.stack(rows, dim=-1).unflatten(-1, (3, 3))
 
 
 def rotation_vector(rotations: Tensor) -> Tensor:

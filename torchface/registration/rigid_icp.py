@@ -11,6 +11,7 @@ from torch import Tensor
 
 from torchface.errors import AlignmentError
 from torchface.geometry.meshes.operators import border_vertices, vertex_normals
+from torchface.geometry.rotations import quaternion_matrix
 from torchface.geometry.similarity import MAX_HEAD_SCALE, MIN_HEAD_SCALE, Similarity
 
 _SEED = 0
@@ -178,10 +179,5 @@ def _rotations(count: int) -> Tensor:
     r, rest = t.sqrt(), (1 - t).sqrt()
     a, b = d / math.sqrt(2), d / 1.533751168755204288118041
     x, y, z, w = r * a.sin(), r * a.cos(), rest * b.sin(), rest * b.cos()
-    rows = [
-        1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w),
-        2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w),
-        2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y),
-    ]  # fmt: skip
-    rotations = torch.stack(rows, dim=-1).reshape(-1, 3, 3)
+    rotations = quaternion_matrix(torch.stack([x, y, z, w], dim=-1))
     return torch.cat([torch.eye(3, dtype=torch.float64)[None], rotations])

@@ -12,6 +12,7 @@ from torchface.errors import NameMismatchError, ValueRangeError
 from torchface.geometry.cameras.pinhole import Camera, look_at
 from torchface.geometry.meshes.operators import components, corners, triangle_normals
 from torchface.geometry.meshes.surface_index import SurfaceIndex
+from torchface.geometry.rotations import quaternion_matrix
 from torchface.landmarks.scans.contours import evenly_spaced
 from torchface.landmarks.scans.landmark_pairs import template_features
 from torchface.landmarks.scans.scan_annotations import ScanAnnotation
@@ -53,7 +54,6 @@ class ScannerSettings:
         dress: hair and collar.
         tone: by which factor one standard deviation brightens the skin from scan to scan.
         photography: of the texture; None makes a scan without one.
-        any_pose: turned any way; otherwise upright to within some 20 degrees.
     """
 
     voxel: float = 1.4
@@ -67,7 +67,6 @@ class ScannerSettings:
     dress: Dress = field(default_factory=Dress)
     tone: float = 1.15
     photography: Photography | None = field(default_factory=Photography)
-    any_pose: bool = True
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,7 +135,7 @@ def scan_head(head: Mesh, seed: int, settings: ScannerSettings | None = None) ->
     fused = _torn(fused, landmarks, settings, generator)
     if settings.photography is not None:
         fused = _photographed(fused, subject, centre, settings.photography)
-    rotation, translation = _pose(settings.any_pose, generator)
+    rotation, translation = _pose(generator)
 
     def moved(points: Tensor) -> Tensor:
         return (points.double() - centre) @ rotation.T + translation
@@ -235,18 +234,8 @@ def _ragged(points: Tensor, generator: torch.Generator) -> Tensor:
     return 2.0 * (points @ heading.T + phase).sin().sum(1)
 
 
-def _pose(any_pose: bool, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+def _pose(generator: torch.Generator) -> tuple[Tensor, Tensor]:
     """A random rotation (3,3) and translation (3,)."""
-    quaternion = torch.randn(4, generator=generator, dtype=torch.float64)
-    if not any_pose:
-        quaternion = quaternion * 0.1 + torch.tensor([1.0, 0.0, 0.0, 0.0], dtype=torch.float64)
-    w, x, y, z = (quaternion / quaternion.norm()).tolist()
-    rotation = torch.tensor(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ],
-        dtype=torch.float64,
-    )
+    w, *rest = torch.nn.functional.normalize(torch.randn(4, generator=generator, dtype=torch.float64), dim=0)
+    rotation = quaternion_matrix(torch.stack([*rest, w]))
     return rotation, 60.0 * torch.randn(3, generator=generator, dtype=torch.float64)
