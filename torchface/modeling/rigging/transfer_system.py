@@ -35,6 +35,7 @@ STILL = 0.01
 _LINK_WEIGHT = 100.0
 _LINK_TOLERANCE = 0.02
 _CONTACT_DECAY = 4.0
+_NEAREST = 16  # vertices
 
 
 class ShapeTransfer:
@@ -313,8 +314,14 @@ def part_links(mesh: Mesh) -> PartLinks:
     body = np.flatnonzero(labels == sizes.argmax())
     rest = np.flatnonzero(labels != sizes.argmax())
     pairs = [np.stack([rest, body[cKDTree(points[body]).query(points[rest])[1]]], axis=1)]
-    for label in np.unique(labels[rest]):  # a head has tens of parts, each with a tree of its own to leave out
-        own, others = np.flatnonzero(labels == label), rest[labels[rest] != label]
+    # Lashes and hair are hundreds of small parts, whose vertices have others among the nearest few.
+    near = rest[cKDTree(points[rest]).query(points[rest], range(1, min(_NEAREST, len(rest)) + 1))[1]]
+    other = labels[near] != labels[rest, None]
+    found = other.any(1)
+    pairs.append(np.stack([rest[found], near[found, other[found].argmax(1)]], axis=1))
+    left = rest[~found]
+    for label in np.unique(labels[left]):  # a large part, with a tree of its own to leave out
+        own, others = left[labels[left] == label], rest[labels[rest] != label]
         if len(others) == 0:
             continue
         distance, nearest = cKDTree(points[others]).query(points[own])
