@@ -14,10 +14,14 @@ export class DrawingPace {
   #slow = [];
   #before = null;
   #settled = false;
+  #coarsest;
 
-  /** @param {number} ratio pixels to be drawn for one of the page's, to begin with. */
-  constructor(ratio) {
-    this.ratio = ratio;
+  /**
+   * @param {number} ratio pixels to be drawn for one of the page's, to begin with.
+   * @param {number} coarsest the least of them.
+   */
+  constructor(ratio, coarsest = COARSEST) {
+    [this.ratio, this.#coarsest] = [ratio, coarsest];
   }
 
   /**
@@ -43,9 +47,9 @@ export class DrawingPace {
     if (this.#before !== null && took > WORTH * this.#before.took) {
       this.#settled = true; // it is not the pixels
       this.ratio = this.#before.ratio;
-    } else if (this.ratio > COARSEST) {
+    } else if (this.ratio > this.#coarsest) {
       this.#before = { ratio: this.ratio, took };
-      this.ratio = Math.max(COARSEST, COARSER * this.ratio);
+      this.ratio = Math.max(this.#coarsest, COARSER * this.ratio);
     }
   }
 }

@@ -98,7 +98,8 @@ export class Stage {
     const { clientWidth, clientHeight } = this.#renderer.domElement, { width, height } = this.#film ?? { width: clientWidth, height: clientHeight };
     if (width === 0 || height === 0) return;
     const most = this.#software ? Math.min(1, Math.sqrt(SOFTWARE_PIXELS / (width * height))) : MOST_PIXELS;
-    this.#pace = new DrawingPace(this.#film ? 1 : Math.min(most, window.devicePixelRatio));
+    const ratio = this.#film ? 1 : Math.min(most, window.devicePixelRatio);
+    this.#pace = new DrawingPace(ratio, this.#software ? ratio : undefined);
     this.#renderer.setPixelRatio(this.#pace.ratio);
     this.#renderer.setSize(width, height, false);
     this.#camera.aspect = width / height;
