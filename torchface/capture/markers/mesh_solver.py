@@ -88,12 +88,12 @@ class MeshSolver:
         self._share = self._steady / self._steady.sum()
         self._at_rest = self._share @ self.rest
         self._arms = (self.rest - self._at_rest) * self._share[:, None]
-        # One product for all that a frame is asked: the slopes, its part along the rigid motions, and along the rest.
-        # In the order of coordinates, then vertices: so a frame is turned in one product with a wide matrix.
-        around = (self.rest - self.rest.mean(0)).flatten()[:, None]
-        columns = torch.cat([self._rows, self._rigid, around], 1)
-        self._columns = columns.unflatten(0, (-1, 3)).transpose(0, 1).flatten(0, 1).contiguous()
-        self._at_zero = self._columns[:, -1] @ self._columns
+        # One product for all that a frame is asked: the slopes, and its part along the rigid motions. In the order of
+        # coordinates, then vertices: so a frame is turned in one product with a wide matrix.
+        columns = torch.cat([self._rows, self._rigid], 1)
+        columns = columns.unflatten(0, (-1, 3)).transpose(0, 1).flatten(0, 1).contiguous()
+        self._columns = {dtype: columns.to(dtype) for dtype in (torch.float32, torch.float64)}
+        self._around = (self.rest - self.rest.mean(0)).T.contiguous()
 
     def aligned(self, meshes: Tensor) -> Tensor:
         """Meshes (t,V,3) aligned with the rig at rest by their steady vertices, (t,V,3) float64.
@@ -115,8 +115,8 @@ class MeshSolver:
         Args:
             coordinates: of the meshes, (t,3,V).
         """
-        middle = coordinates @ self._share
-        covariance = (coordinates @ self._arms).transpose(1, 2)
+        middle = (coordinates @ self._share.to(coordinates)).double()
+        covariance = (coordinates @ self._arms.to(coordinates)).transpose(1, 2).double()
         if not bool(torch.isfinite(covariance).all()):
             raise ValueRangeError(_NUMBERS)
         u, _, vh = torch.linalg.svd(covariance)
@@ -183,16 +183,16 @@ class MeshSolver:
     def equations(self, meshes: Tensor) -> tuple[Tensor, Tensor]:
         """The energy's slope at rest (t,N), and its value there (t,), mm² a vertex, of meshes (t,V,3)."""
         self._check(meshes)
-        places = torch.empty(len(meshes), 3, len(self.rest), dtype=torch.float64).copy_(meshes.transpose(1, 2))
-        rotation, _ = self._poses(places)
+        # Meshes of single precision stay so: beside their own rounding that of the products is little.
+        dtype = torch.float32 if meshes.dtype == torch.float32 else torch.float64
+        places = torch.empty(len(meshes), 3, len(self.rest), dtype=dtype).copy_(meshes.transpose(1, 2))
         places -= places.mean(2, keepdim=True)
-        flat = (rotation @ places).flatten(1)
+        rotation, _ = self._poses(places)
+        flat = torch.baddbmm(self._around.to(dtype).expand_as(places), rotation.to(dtype), places, beta=-1).flatten(1)
         shapes, count = len(self.names), len(self.rest)
-        products = flat @ self._columns - self._at_zero
-        along, beside = products[:, shapes:-1], products[:, -1]
-        # |y - b|² = |y|² - |b|² - 2 b (y - b); what lies along the rigid motions does not count.
-        size = torch.linalg.vecdot(flat, flat) - self._at_zero[-1] - 2 * beside
-        return (-2.0 / count) * products[:, :shapes], (size - along.square().sum(1)) / count
+        products = (flat @ self._columns[dtype]).double()
+        size = flat.square().sum(1, dtype=torch.float64)
+        return (-2.0 / count) * products[:, :shapes], (size - products[:, shapes:].square().sum(1)) / count
 
     def error(self, slopes: Tensor, constant: Tensor, weights: Tensor) -> Tensor:
         """Root mean square distance of the vertices at weights (T,N), (T,), millimetres."""
