@@ -264,7 +264,7 @@ def smooth_in_box(H: Tensor, slopes: Tensor, fps: float, smoothness: float) -> T
 
 @dataclass(frozen=True, eq=False)
 class _SmoothProblem:
-    r"""The smooth part of the problem in the basis that makes it diagonal: eigenvectors of H with the steps, cosines over time."""
+    r"""The smooth part of the problem in the basis that makes it diagonal: eigenvectors of H and the steps, cosines."""
 
     vectors: Tensor
     divisor: Tensor
