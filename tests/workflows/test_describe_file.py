@@ -72,3 +72,8 @@ def test_a_head_of_two_metres_and_a_texture_that_is_not_read_are_said(tmp_path: 
     whole.write_bytes(packed(root, binary))
     ((_, said),) = [row for row in describe(whole) if row[0] == "warning"]
     assert "1 of its textures cannot be read (KHR_texture_basisu)" in said
+
+
+def test_what_is_not_there_is_told_before_its_ending(tmp_path: Path) -> None:
+    with pytest.raises(FileFormatError, match="found no such file"):
+        describe(tmp_path / "nothing")

@@ -24,6 +24,12 @@ _writes: dict[Path, int] = {}
 _waiting: ContextVar[list[tuple[Path | None, Path]] | None] = ContextVar("waiting", default=None)
 
 
+def check_there(path: Path) -> None:
+    """Raises ``FileFormatError`` where there is no file or folder, before its ending is judged."""
+    if not path.exists():
+        raise FileFormatError(f"{path}: found no such file, expected an existing one")
+
+
 def read_file(path: str | Path, largest: int = LARGEST_FILE) -> bytes:
     """The bytes of a file."""
     path = Path(path)

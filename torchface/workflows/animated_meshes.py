@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from torchface.errors import FileFormatError, NameMismatchError, TopologyError, ValueRangeError
+from torchface.files.whole_files import check_there
 from torchface.io import MeshSequence, load_animation, load_mesh, load_rig, load_take
 from torchface.io.markers.marker_csv import is_marker_header
 from torchface.io.mesh_files import MESH_ENDINGS
@@ -93,6 +94,7 @@ def load_animated(path: Path, rig: Path | None = None, part: str | None = None) 
     elif ending in MESH_ENDINGS:
         animated = meshes_over_time(path, [path], loaded)
     else:
+        check_there(path)
         raise FileFormatError(f"{path}: found the ending {ending!r}, expected {_FORMS}")
     return animated if part is None else _kept(animated, region(animated.neutral, part))
 

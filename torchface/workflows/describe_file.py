@@ -12,7 +12,7 @@ from torch import Tensor
 from torchface.attachment import Attachment
 from torchface.errors import FileFormatError
 from torchface.files.models import DESCRIPTION
-from torchface.files.whole_files import read_file
+from torchface.files.whole_files import check_there, read_file
 from torchface.geometry.cameras.calibration import CameraCalibration
 from torchface.io import (
     HeadModelFile,
@@ -127,6 +127,8 @@ def describe(path: Path, attachment: Path | None = None, part: str | None = None
         ".pts",
         ".toml",
     )
+    if not suffix:
+        check_there(path)
     raise FileFormatError(
         f"{path}: found the ending {suffix!r}, expected a folder or one of {' '.join(sorted(endings))}"
     )

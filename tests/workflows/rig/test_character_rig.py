@@ -3,12 +3,13 @@
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
 
-from planted.characters import Planted, box_mesh, caricature, packed, unpacked, write_character
+from planted.characters import Planted, box_mesh, caricature, decimated, packed, unpacked, write_character
 from torchface.errors import AlignmentError, FileFormatError, ValueRangeError
 from torchface.geometry.similarity import Similarity
 from torchface.io.gltf.character_scene import Character, read_character
@@ -157,6 +158,33 @@ def test_files_that_are_no_characters_are_refused(tmp_path: Path) -> None:
         check_character(tmp_path / "hero.fbx")
     with pytest.raises(FileFormatError, match=r"expected.*\.glb"):
         rig_character(empty, tmp_path / "out.obj")
+    with pytest.raises(FileFormatError, match="found a folder"):
+        check_character(tmp_path)
+    with pytest.raises(FileFormatError, match="no such file"):
+        check_character(tmp_path / "hero.obj")
+
+
+def test_few_triangles_and_shapes_that_move_far_are_warned_of(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    person = performer(texture=False).select(["jawOpen", "mouthPucker"])
+    coarse = decimated(person, 1400)
+    shapes = dict(zip(coarse.names, (40 * coarse.deltas[0], coarse.deltas[1]), strict=True))
+    write_character(tmp_path / "a.glb", coarse.neutral, shapes, Planted(body=False))
+    _, search = character_face.character_search()
+    one = torch.ones(1, dtype=torch.float64)
+    pose = Similarity(1e-3 * one, torch.eye(3, dtype=torch.float64)[None], torch.zeros(1, 3, dtype=torch.float64))
+    found = FaceOnSurface(pose.apply(search.reference.all)[0], pose, 1.0, 0.0, (), torch.zeros(0, 3))
+    monkeypatch.setattr(FaceSearch, "find", lambda *_: found)
+    character = read_character(read_document(tmp_path / "a.glb"))
+    face = character_face.find_character_face(character, character_face.textured(character))
+    there, empty = character_rig._present(character)
+    record = SimpleNamespace(figures=str, notes=())
+    carried = SimpleNamespace(registration=SimpleNamespace(record=record))
+    lines = character_rig._Job(character, face, carried, coarse, (), None, empty).notes(there, (), (0.0, 0.0))
+    warnings = [line for line in lines if "warning" in line]
+    assert len(warnings) == 2
+    assert f"its skin has {len(face.skin.faces):,} triangles, expected 1,500" in warnings[0]
+    moved = 40 * float(coarse.deltas[0].norm(dim=-1).max())
+    assert f"its jawOpen moves by {moved:.3g} mm at a head's size" in warnings[1]
 
 
 def test_draco_is_refused_with_the_command_that_decompresses(tmp_path: Path) -> None:

@@ -14,7 +14,7 @@ from torch import Tensor
 from torchface.capture.mouth_close_conventions import mouth_close_of
 from torchface.errors import AlignmentError, FileFormatError, ValueRangeError
 from torchface.files.job_lock import file_lock
-from torchface.files.whole_files import all_or_none, check_ending
+from torchface.files.whole_files import all_or_none, check_ending, check_there
 from torchface.geometry.meshes.operators import vertex_normals
 from torchface.io.gltf.character_scene import Block, Character, read_character
 from torchface.io.gltf.gltf_document import read_document
@@ -169,7 +169,11 @@ def rig_character(
 def check_character(path: Path) -> None:
     """Raises ``FileFormatError`` for files that are no ``.glb`` or ``.vrm``, with the way to make one."""
     ending = path.suffix.lower()
+    if path.is_dir():
+        raise FileFormatError(f"{path}: found a folder, expected a character's .glb, .vrm or USD")
     if ending not in CHARACTER_ENDINGS:
+        if ending not in _CONVERT:
+            check_there(path)
         converted = f"torchface convert {path.name} {path.stem}.glb" if ending in MESH_ENDINGS else "export it as .glb"
         how = _CONVERT.get(ending, converted).format(path=path, stem=path.with_suffix(""))
         raise FileFormatError(
