@@ -46,13 +46,15 @@ def faces() -> np.ndarray:
 
 
 @contextmanager
-def opened(app: Path, frames: np.ndarray, folder: Path, isolated: bool = False) -> Iterator[Page]:
+def opened(
+    app: Path, frames: np.ndarray, folder: Path, isolated: bool = False, streamed: bool = False
+) -> Iterator[Page]:
     write_y4m(folder / "film.y4m", frames)
     with (
         static_host(app, isolated) as host,
         headless_chromium(folder / "profile", *film_camera(folder / "film.y4m"), size=(800, 700)) as driver,
     ):
-        watch(driver)
+        watch(driver, streamed)
         allow_camera(driver, "granted")
         driver.get(f"{host.url}/index.html")
         yield Page(driver)
@@ -68,9 +70,9 @@ def test_weights_are_pythons_the_character_is_drawn_and_the_rate_is_told(
         assert np.array([one["weights"] for one in recorded.solved]).std(0).max() > 0.02
         canvas = page.driver.find_element("id", "character").screenshot_as_png
         assert np.asarray(Image.open(io.BytesIO(canvas)).convert("L"), float).std() > 15
+    with opened(app, faces, tmp_path, isolated, streamed=True) as page:
         page.start()
-        count = len(recorded.solved) + 150
-        until(lambda: page.driver.execute_script("return watched.solved.length") >= count)
+        until(lambda: page.driver.execute_script("return watched.solved.length") >= 150)
         told = page.driver.execute_script("return watched.solved.slice(-100).map(s => [s.interval, s.milliseconds])")
         times, solving = np.array(told).T  # without what is slow at first, and without pictures that are kept
         print(
