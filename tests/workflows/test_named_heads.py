@@ -8,9 +8,11 @@ import pytest
 import torch
 
 from torchface import zoo
+from torchface.geometry.meshes.rasterization import rasterise_uvs
+from torchface.io import load_ict_facekit
 from torchface.modeling import HeadModel, MorphableModel
 from torchface.synthetic import performer
-from torchface.workflows.named_heads import NamedHeads
+from torchface.workflows.named_heads import NamedHeads, matching
 from train.morphable import Settings
 
 
@@ -42,3 +44,19 @@ def test_heads_of_ict_are_put_where_they_are_found(tmp_path: Path, monkeypatch: 
     assert Settings(ict=tmp_path / "FaceXModel").out == tmp_path / "people"
     assert Settings(ict=tmp_path / "FaceXModel", out=Path("a")).out == Path("a")
     assert Settings(performers=3).out == Path("models/head")
+
+
+@pytest.mark.real
+def test_charts_of_an_ict_head_do_not_cover_each_other(data: Path) -> None:
+    """Eyeballs lie over the face in ICT-FaceKit's own texture coordinates, and the neck in a further tile."""
+    rig = load_ict_facekit(data / "ict_facekit" / "FaceXModel", shapes=["jawOpen"])
+    shape = MorphableModel(rig.vertices, torch.zeros(1, *rig.vertices.shape), torch.ones(1))
+    mesh = matching(HeadModel.on(rig.neutral, shape, rig=rig))[1].neutral
+    assert mesh.annotations is not None
+    assert mesh.uvs is not None
+    assert mesh.uv_faces is not None
+    assert 0 <= float(mesh.uvs.min()) <= float(mesh.uvs.max()) <= 1
+    names = ("face", "head_and_neck", "eyeball_left", "eyeball_right", "teeth", "gums_and_tongue")
+    inside = [mesh.annotations.regions[name][mesh.faces].all(1) for name in names]
+    shown = torch.stack([rasterise_uvs(mesh.uvs, mesh.uv_faces[one], 512, 512).mask() for one in inside])
+    assert int(shown.sum(0).max()) == 1

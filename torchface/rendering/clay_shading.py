@@ -13,6 +13,7 @@ from torchface.geometry.cameras.pinhole import Camera
 from torchface.geometry.meshes.operators import vertex_normals
 from torchface.geometry.meshes.tangent_space import from_tangent_space, tangent_space
 from torchface.mesh import Mesh
+from torchface.rendering.clear_shells import without_clear_shells
 from torchface.rendering.raycast import RayCaster
 
 __all__ = ["Lighting", "render"]
@@ -64,7 +65,8 @@ def render(
     """An image of a mesh.
 
     Args:
-        mesh: its texture is used where it has one, else its vertex colours, else clay.
+        mesh: its texture is used where it has one, else its vertex colours, else clay; clear shells over eyes are left
+            out.
         camera: see ``torchface.geometry.cameras.pinhole.look_at``.
         colors: vertex colours (V,3) in [0,1] to use instead, for example a heat map.
         lighting: which lights.
@@ -91,6 +93,7 @@ def render(
     origins, directions = camera.rays(samples)
     height, width = directions.shape[:2]
     origins, directions = origins.reshape(-1, 3), directions.reshape(-1, 3)
+    mesh = without_clear_shells(mesh)
     caster = RayCaster(mesh.vertices, mesh.faces)
     hits = caster.cast(origins, directions)
     seen = hits.triangle >= 0

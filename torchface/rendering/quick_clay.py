@@ -14,6 +14,7 @@ from torchface.geometry.meshes.operators import vertex_normals
 from torchface.geometry.meshes.rasterization import DrawnPixels, rasterise
 from torchface.mesh import Mesh
 from torchface.rendering.clay_shading import vertex_openness
+from torchface.rendering.clear_shells import CLEAR, triangles_of
 
 BACKGROUND = (38, 40, 44)
 _CLAY, _TINT = (205, 180, 163), (236, 92, 40)
@@ -27,7 +28,6 @@ _PARTS: dict[tuple[str, ...], tuple[int, int, int]] = {
 }
 _IRIS, _PUPIL = (92, 66, 44), (16, 14, 12)
 _IRIS_ANGLE, _PUPIL_ANGLE = 27.0, 11.0  # degrees from the way the eye looks
-_CLEAR = ("lacrimal", "eye_blend", "eye_occlusion", "eyelash")  # shells that are to be seen through
 _LEVELS, _TINT_LEVELS = 256, 4
 _AMBIENT, _HIGHLIGHT = 0.30, 0.16
 _LIGHTS = (((-0.55, 0.60, 0.60), 0.66), ((0.80, 0.05, 0.45), 0.24))  # right, up, toward the viewer; strength
@@ -67,22 +67,15 @@ class QuickClay:
         regions = {} if mesh.annotations is None else mesh.annotations.regions
         faces = mesh.faces.cpu()
 
-        def those(prefixes: tuple[str, ...]) -> Tensor:
-            inside = torch.zeros(len(mesh.vertices), dtype=torch.bool)
-            for name, mask in regions.items():
-                if name.startswith(prefixes):
-                    inside |= mask.cpu()
-            return inside[faces].all(1)
-
         part = torch.zeros(len(faces), dtype=torch.int64)
         for number, prefixes in enumerate(_PARTS, 1):
-            part[those(prefixes)] = number
+            part[triangles_of(mesh, prefixes)] = number
         for name, mask in regions.items():
             if name.startswith("eyeball") and bool(mask.any()):
                 angle = _off_axis(mesh.vertices.cpu(), faces, mask.cpu())
                 part[angle < _IRIS_ANGLE] = len(_PARTS) + 1
                 part[angle < _PUPIL_ANGLE] = len(_PARTS) + 2
-        drawn = ~those(_CLEAR)
+        drawn = ~triangles_of(mesh, CLEAR)
         palette = np.array([_CLAY, *_PARTS.values(), _IRIS, _PUPIL], np.float64)
         openness = vertex_openness(Mesh(mesh.vertices, mesh.faces[drawn.to(mesh.faces.device)]))
         lit = faces[drawn & (part > 0)].unique()  # a closed mouth at rest would leave its teeth dark when it opens

@@ -9,7 +9,9 @@ import torch
 
 from torchface import zoo
 from torchface.errors import TopologyError
+from torchface.geometry.meshes.uv_tiles import in_one_tile
 from torchface.io import load_rig
+from torchface.io.gltf.region_materials import part_material
 from torchface.io.head_models.head_model_files import is_head_model_file
 from torchface.io.rigs.ict_facekit import region
 from torchface.modeling import HeadModel
@@ -82,7 +84,7 @@ def matching(
             model = model.part(keep)
         rig = rig.part(keep)
     if _same_topology(model, rig):
-        return model, rig
+        return model, _with_one_image(rig)
     count = len(model.shape.mean)
     fitting = [name for name, mask in parts.items() if part is None and int(mask.sum()) == count]
     hint = "; name a rig with --template whose topology is the model's" if template is None else ""
@@ -90,6 +92,21 @@ def matching(
         f"{source}: found {len(rig.vertices)} vertices and {len(rig.neutral.faces)} triangles, expected the model's "
         f"{count} and {len(model.faces)}" + (f"; try --part {fitting[0]}" if fitting else hint)
     )
+
+
+def _with_one_image(rig: BlendshapeRig) -> BlendshapeRig:
+    """A rig whose charts all have a place in the one image that is painted, each part that is no skin its own."""
+    mesh = rig.neutral
+    if mesh.texture is not None or mesh.uvs is None:
+        return rig
+    kind = torch.zeros(len(mesh.faces), dtype=torch.int64)
+    regions = {} if mesh.annotations is None else mesh.annotations.regions
+    for number, (name, mask) in enumerate(regions.items(), 2):  # each eyeball has its own, and clear shells have one
+        material = part_material(name)
+        if material is not None:
+            kind[mask.cpu()[mesh.faces.cpu()].all(1)] = 1 if material.alpha == "BLEND" else number
+    packed = in_one_tile(mesh, kind)
+    return rig if packed is mesh else BlendshapeRig(packed, rig.deltas, rig.names, rig.correctives)
 
 
 def _same_topology(model: HeadModel, rig: BlendshapeRig) -> bool:

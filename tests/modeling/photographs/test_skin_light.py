@@ -12,6 +12,7 @@ from tests.planted.planted_parts import planted_parts
 from torchface.geometry.cameras.pinhole import Camera, look_at
 from torchface.geometry.meshes.operators import vertex_normals
 from torchface.mesh import Mesh
+from torchface.modeling.photographs.fit_settings import FitSettings
 from torchface.modeling.photographs.image_texture import part_vertices, photographed_skin
 from torchface.modeling.photographs.skin_light import skin_light, unlit
 from torchface.modeling.photographs.skin_mask import FacePlaces
@@ -63,7 +64,7 @@ def test_hair_is_a_cap_of_its_colour_and_a_bald_head_stays_bald(head: Mesh, came
     for name, mesh in (("bald", head), ("hair", haired)):
         picture = render(mesh, camera, lighting=EVEN, samples=1)
         parts = planted_parts(picture, {"hair": HAIR, "background": torch.zeros(3)}, 0.05)
-        found[name] = photographed_skin([head], None, [picture], [camera], 128, [parts])
+        found[name] = photographed_skin([head], None, [picture], [camera], FitSettings(texture_size=128, parts=[parts]))
     assert found["bald"].hair is None
     color, cap = found["hair"].hair, found["hair"].colors
     assert color is not None

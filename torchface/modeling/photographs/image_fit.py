@@ -186,8 +186,7 @@ def with_skin(fit: ImageFit, model: HeadModel, images: Sequence[Tensor], setting
         images: the photographs, (3,H,W) each.
         settings: the texture's size, parts and irises of the photographs.
     """
-    size, parts, irises = settings.texture_size, settings.parts, settings.irises
-    skin = photographed_skin(fit.posed, model.color, images, fit.cameras, size, parts, irises, settings.paint_hair)
+    skin = photographed_skin(fit.posed, model.color, images, fit.cameras, settings, fit.mesh)
     return replace(
         fit,
         mesh=skin.on(fit.mesh),

@@ -17,6 +17,7 @@ from torchface.io.gltf.region_materials import EYEBALL, IRIS, part_material
 from torchface.landmarks.images.networks.part_finder import FaceParts
 from torchface.mesh import Mesh
 from torchface.modeling.morphable.morphable_model import MorphableModel
+from torchface.modeling.photographs.fit_settings import FitSettings
 from torchface.modeling.photographs.hair_cap import HairCap, hair_beyond, hair_cap
 from torchface.modeling.photographs.landmark_view import LANDMARKS
 from torchface.modeling.photographs.skin_light import skin_light, unlit
@@ -37,6 +38,7 @@ _MIN_PIXELS = 40
 _IRIS_WIDTH, _MIN_RADIUS, _MIN_RING, _RING = 11.7, 2.5, 6, (0.45, 0.8)  # millimetres, pixels, pixels, radii
 _DARKEST, _LARGE = 0.07, 0.4  # of the largest iris' radius: in which photographs colours count
 _WHITE = 0.72  # mean of the channels from which an eyeball's texel is no iris
+_PUPIL = 0.38  # of the iris
 _IRIS_COSINE = 0.9  # of the angle between the eye's axis and the border of an iris 11 mm wide
 
 
@@ -62,10 +64,8 @@ def photographed_skin(
     color: MorphableModel | None,
     images: Sequence[Tensor],
     cameras: Sequence[Camera],
-    size: int = 1024,
-    parts: Sequence[FaceParts] | None = None,
-    irises: Tensor | None = None,
-    paint_hair: bool = True,
+    settings: FitSettings,
+    rest: Mesh | None = None,
 ) -> Skin:
     """A head's skin from photographs and a colour model.
 
@@ -74,15 +74,16 @@ def photographed_skin(
         color: model of vertex colours, if there is one.
         images: photographs, (3,H,W) each.
         cameras: one each.
-        size: of the texture, texels a side; 0 makes none.
-        parts: what each shows: skin and the face's features alone are projected onto the head; all if absent.
-        irises: centres of the eyes' irises in each photograph, (I,2,2) pixels, NaN where they are not known.
-        paint_hair: whether the hair is painted on the head, or its colour found alone.
+        settings: the texture's size, parts and irises of the photographs, and whether hair is painted on the head.
+        rest: the head whose eyes look ahead, along z; the first of those posed if absent.
 
     Returns:
         With texture coordinates: the photographs projected onto the head, their light divided out; where none shows it
         the colour model, else the template's skin; hair as a cap. Without: the colour model's colours.
     """
+    size, parts, irises, paint_hair = (
+        settings.texture_size, settings.parts, settings.irises, settings.paint_hair
+    )  # fmt: skip
     fit = None if color is None else fit_colors(color, posed, images, cameras)
     mesh = posed[0]
     base = _own_colors(mesh) if fit is None else fit.colors
@@ -129,8 +130,10 @@ def photographed_skin(
     colors = texture.colors
     iris = iris_color(posed, images, cameras, irises)
     if own or iris is not None:
-        colored = with_part_colors(replace(mesh, colors=colors), torch.tensor(IRIS.color) if iris is None else iris)
+        rest, color = rest or mesh, torch.tensor(IRIS.color) if iris is None else iris
+        colored = with_part_colors(replace(rest, colors=colors), color)
         colors = colors if colored.colors is None else colored.colors
+        texture = _with_parts(texture, colors, rest, others, color) if own else texture
     return Skin(colors, texture.image, fit, None if cap is None else cap.color, iris)
 
 
@@ -142,6 +145,29 @@ def _capped(texture: PhotoTexture, cap: HairCap, mesh: Mesh, parts: Tensor) -> P
     painted = cap.painted(image, at[:, :3], at[:, 3] * cap.share(at[:, :3]))
     colors = cap.painted(texture.colors.double(), place, ~parts * cap.share(place))
     return replace(texture, image=texture.texels.image(painted), colors=colors.float())
+
+
+def _with_parts(texture: PhotoTexture, colors: Tensor, mesh: Mesh, parts: Tensor, iris: Tensor) -> PhotoTexture:
+    """A texture that shows parts (V,) that are no skin in their colours (V,3), and eyeballs with an iris and a pupil.
+
+    Args:
+        mesh: at rest.
+        iris: its colour, sRGB (3,).
+    """
+    texels, faces = texture.texels, mesh.faces.cpu()
+    corners = faces[texels.triangles]
+    painted = texels.interpolate(colors.double(), faces)
+    for name, mask in ({} if mesh.annotations is None else mesh.annotations.regions).items():
+        if part_material(name) is EYEBALL and bool(mask.any()):
+            ball = mesh.vertices[mask].detach().cpu().double()
+            at = texels.interpolate(mesh.vertices.detach().cpu().double() - (ball.amin(0) + ball.amax(0)) / 2, faces)
+            aside = torch.where(at[:, 2] > 0, at[:, :2].norm(dim=1) / (0.5 * _IRIS_WIDTH), torch.inf)[:, None]
+            ringed = iris.double() * (1.1 - 0.5 * (aside.clamp(max=1) - 0.75).clamp(min=0) / 0.25)  # a dark rim
+            eye = torch.where(aside < _PUPIL, 0.04, torch.where(aside < 1, ringed, painted.new_tensor(EYEBALL.color)))
+            painted = torch.where(mask.cpu()[corners].all(1)[:, None], eye, painted)
+    shown = texture.image.flatten(1)[:, texels.texels].T.double()
+    part = parts[corners].all(1)[:, None]
+    return replace(texture, image=texels.image(torch.where(part, painted, shown).clamp(0, 1)))
 
 
 def _has_landmarks(mesh: Mesh) -> bool:

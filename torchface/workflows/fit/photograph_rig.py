@@ -93,6 +93,9 @@ class PhotographSettings:
             checked_count("face", self.face)
 
 
+_POOR = 0.04  # of the distance of the eyes' outer corners
+
+
 @dataclass(frozen=True, eq=False)
 class FittedHead:
     """What was made, and how near it comes to the photographs.
@@ -115,10 +118,18 @@ class FittedHead:
     heads: str = ""
     shown: tuple[Path, ...] = ()
 
+    def verdict(self) -> str:
+        """Whether the head is to be used, in a line; no landmark says whether skin and likeness are right."""
+        residuals = self.fit.residuals[:, JAW:].square().sum(-1).nanmean(1).sqrt()
+        off = float((residuals / eyes_distances(self.fit.landmarks)).max())
+        fit = f"eyes, nose and mouth lie {off:.1%} of the eyes' distance from the landmarks"
+        look = f"look at {self.overlays[0].name} first" if self.overlays else "look at the rig first"
+        return f"result: {'poor' if off > _POOR else 'good'}, {fit} (at most {_POOR:.0%} is usual); {look}"
+
     def lines(self) -> list[str]:
         """For people to read."""
         fit, photographs = self.fit, self.shown
-        lines = [self.heads] if self.heads else []
+        lines = [self.verdict(), *([self.heads] if self.heads else [])]
         lines += [line for one in self.found for line in one.lines()]
         for i, (path, camera, error) in enumerate(zip(photographs, fit.cameras, fit.errors.tolist(), strict=True)):
             eyes = float(eyes_distances(fit.landmarks)[i])

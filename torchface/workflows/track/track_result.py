@@ -190,7 +190,11 @@ class Tracked:
             return f"result: none, {found}"
         fit = f"the solved face lies {100 * misfit:.1f} % of the eyes' distance from the landmarks"
         if misfit > _POOR:
-            whose = "is the rig this person's own" if self.head is None else "does --rig with their own do better"
+            whose = (
+                "is the rig this person's own"
+                if self.head is None
+                else "does --rig with their own, or a model of people, do better"
+            )
             return f"result: poor, {fit} (at most {100 * _POOR:.0f} % is usual; {whose}?); {found}"
         if seen < _MOST * count:
             return f"result: in part, {found}; there {fit} (at most {100 * _POOR:.0f} % is usual)"
