@@ -247,7 +247,15 @@ def load_template(path: Path, part: str | None = None, unit: str | None = None) 
     return mesh if part is None else submesh(mesh, region(mesh, part)).mesh, None
 
 
-RECIPE = Recipe(Settings, train, __doc__, lambda _, trained: metric_lines(trained.metrics))
+def _told(settings: Settings, trained: Trained) -> list[str]:
+    """What was measured, and who takes the model up."""
+    lines = metric_lines(trained.metrics)
+    if settings.out.parent == own_models():
+        lines.append("`torchface fit` and `track` take this model where none is named")
+    return lines
+
+
+RECIPE = Recipe(Settings, train, __doc__, _told)
 
 if __name__ == "__main__":
     RECIPE.main()

@@ -130,6 +130,7 @@ class Recipe(Generic[Settings, Trained]):
                 trained = self.train(chosen, progress)
             for line in self.lines(chosen, trained):
                 print(line)
+            print(f"written to {chosen.out}")
 
     def chosen(self, words: Sequence[str]) -> Settings:
         """The settings of flags and, behind ``--config``, of a file; flags win."""

@@ -274,6 +274,7 @@ def export_app(
     print_table(report.rows())
     if report.still:
         console.print(f"no face moves {', '.join(report.still)}", soft_wrap=True)
+    console.print(f"to try it: python -m http.server --directory {out}, then http://localhost:8000", soft_wrap=True)
     print_path(out)
 
 

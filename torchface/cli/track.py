@@ -102,8 +102,8 @@ def track(
             $TORCHFACE_HOME or the checkout, else `head`, of performers made by code.
         whole_take: Smooth landmarks over all frames, those after each too; with --dynamics the weights as well.
         part: Keep this region of the rig only, such as face.
-        overlay: overlay.mp4: the rig as opaque clay beside the picture, parts of low confidence tinted; half through
-            over it; or none.
+        overlay: overlay.mp4: the rig, in its texture or clay, beside the picture, parts of low confidence tinted; half
+            through over it; or none.
         fps: Frames a second of a .csv of landmarks without VIDEO; by its times if absent.
         size: WIDTHxHEIGHT of the pictures that such landmarks were found in; the camera's if absent.
         solver: By the rig, or by example expressions: weights.csv then has theirs, methods.csv the error and time of

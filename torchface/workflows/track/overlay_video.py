@@ -54,7 +54,7 @@ def side_by_side_drawer(tracked: Tracked) -> Callable[[int, Tensor], Tensor]:
     """
     window = head_window(tracked)
     rig, weights = tracked.shown, tracked.solution.weights.detach()
-    clay, near = QuickClay.of(rig.neutral, skin=rig is not tracked.rig), _near_landmarks(rig.neutral)
+    clay, near = QuickClay.of(rig.neutral, skin=True), _near_landmarks(rig.neutral)
     doubt = ((_SURE - tracked.reading.trust.nan_to_num()) / _SURE).clamp(0, 1)
     width = window.width
     view = (window.intrinsics @ torch.linalg.inv(tracked.calibration.intrinsics.double())).numpy()
