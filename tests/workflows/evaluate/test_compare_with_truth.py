@@ -150,6 +150,7 @@ def test_what_does_not_fit_is_told(folder: Path, rig: BlendshapeRig, weights: to
     write_sequence(folder / "nan.safetensors", torch.full((FRAMES, 625, 3), torch.nan), rig.neutral.faces)
     with pytest.raises(ValueRangeError, match="NaN in every frame"):
         evaluate(folder / "nan.safetensors", [true], out)
+    (folder / "a.doc").write_bytes(b"words")
     with pytest.raises(FileFormatError, match=r"ending '\.doc'"):
         evaluate(folder / "a.doc", [true], out)
     with pytest.raises(ValueRangeError, match="found 2 files"):
