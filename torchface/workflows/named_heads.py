@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
@@ -97,7 +97,7 @@ def matching(
 def _with_one_image(rig: BlendshapeRig) -> BlendshapeRig:
     """A rig whose charts all have a place in the one image that is painted, each part that is no skin its own."""
     mesh = rig.neutral
-    if mesh.texture is not None or mesh.uvs is None:
+    if mesh.texture is not None or mesh.uvs is None or mesh.uv_faces is None:
         return rig
     kind = torch.zeros(len(mesh.faces), dtype=torch.int64)
     regions = {} if mesh.annotations is None else mesh.annotations.regions
@@ -105,8 +105,12 @@ def _with_one_image(rig: BlendshapeRig) -> BlendshapeRig:
         material = part_material(name)
         if material is not None:
             kind[mask.cpu()[mesh.faces.cpu()].all(1)] = 1 if material.alpha == "BLEND" else number
-    packed = in_one_tile(mesh, kind)
-    return rig if packed is mesh else BlendshapeRig(packed, rig.deltas, rig.names, rig.correctives)
+    own = mesh.uvs.cpu()
+    uvs, rows = in_one_tile(own, mesh.uv_faces.cpu(), kind)
+    if uvs is own:
+        return rig
+    packed = replace(mesh, uvs=uvs.to(mesh.uvs), uv_faces=rows.to(mesh.uv_faces))
+    return BlendshapeRig(packed, rig.deltas, rig.names, rig.correctives)
 
 
 def _same_topology(model: HeadModel, rig: BlendshapeRig) -> bool:

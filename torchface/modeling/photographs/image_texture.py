@@ -130,10 +130,10 @@ def photographed_skin(
     colors = texture.colors
     iris = iris_color(posed, images, cameras, irises)
     if own or iris is not None:
-        rest, color = rest or mesh, torch.tensor(IRIS.color) if iris is None else iris
-        colored = with_part_colors(replace(rest, colors=colors), color)
+        rest, painted = rest or mesh, torch.tensor(IRIS.color) if iris is None else iris
+        colored = with_part_colors(replace(rest, colors=colors), painted)
         colors = colors if colored.colors is None else colored.colors
-        texture = _with_parts(texture, colors, rest, others, color) if own else texture
+        texture = _with_parts(texture, colors, rest, others, painted) if own else texture
     return Skin(colors, texture.image, fit, None if cap is None else cap.color, iris)
 
 
