@@ -49,7 +49,7 @@ def test_a_file_is_a_recipe_too(tmp_path: Path, capsys: pytest.CaptureFixture[st
     own = tmp_path / "own_recipe.py"
     own.write_text(OWN)
     main(["train", str(own), "--out", str(tmp_path / "model")])
-    assert capsys.readouterr().out == "model done\n"
+    assert capsys.readouterr().out == f"model done\nwritten to {tmp_path / 'model'}\n"
 
 
 def test_the_recipe_of_the_documentation_learns(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -60,8 +60,9 @@ def test_the_recipe_of_the_documentation_learns(tmp_path: Path, capsys: pytest.C
         save_take(perform(60, torch.Generator().manual_seed(seed), 60.0), tmp_path / f"{seed}.csv")
     words = ["--network.steps", "60", "--network.rate", "0.02", "--out", str(tmp_path / "steady")]
     main(["train", str(own), "--takes", str(tmp_path), *words])
-    printed = dict(line.split() for line in capsys.readouterr().out.splitlines())
-    assert set(printed) == {"noisy", "filtered"}
+    *printed, written = capsys.readouterr().out.splitlines()
+    assert set(dict(line.split() for line in printed)) == {"noisy", "filtered"}
+    assert written == f"written to {tmp_path / 'steady'}"
     assert {"steady.safetensors", "settings.toml", "log.csv"} <= {path.name for path in (tmp_path / "steady").iterdir()}
 
 
