@@ -29,7 +29,7 @@ from torchface.workflows.track.track_inputs import TrackInputs
 
 MIN_STABLE = 6
 """Stable landmarks that a pose needs."""
-_POOR = 0.04  # of the distance of the eyes' outer corners; landmarks of a rig's own face are off by 2 to 3 %
+_POOR = 0.025  # of the distance of the eyes' outer corners; solved heads of rendered people are off by 1 to 2.3 %
 _SURE, _MOST = 0.5, 0.9
 _AT_BOUND, _OFTEN, _MAX_NAMED = 1e-3, 0.2, 5
 _LEAST_MOTION = 1e-2  # mm²
@@ -195,10 +195,10 @@ class Tracked:
                 if self.head is None
                 else "does --rig with their own, or a model of people, do better"
             )
-            return f"result: poor, {fit} (at most {100 * _POOR:.0f} % is usual; {whose}?); {found}"
+            return f"result: poor, {fit} (at most {100 * _POOR:.3g} % is usual; {whose}?); {found}"
         if seen < _MOST * count:
-            return f"result: in part, {found}; there {fit} (at most {100 * _POOR:.0f} % is usual)"
-        return f"result: good, {found}, and {fit} (at most {100 * _POOR:.0f} % is usual)"
+            return f"result: in part, {found}; there {fit} (at most {100 * _POOR:.3g} % is usual)"
+        return f"result: good, {found}, and {fit} (at most {100 * _POOR:.3g} % is usual)"
 
     def lines(self) -> list[str]:
         """For people to read."""
