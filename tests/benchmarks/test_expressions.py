@@ -35,7 +35,7 @@ def benchmark(data: Path, tmp_path_factory: pytest.TempPathFactory) -> Expressio
         "mediapipe": seen,
         "live": live,
         "track": track(mean_head),
-        "track, no rig": track(None),
+        "track no rig": track(None),
         "track, own rig": track(own_head(ict)),
         "dissertation": examples(lambda film: seen(film)[1]),
     }
@@ -53,7 +53,7 @@ def test_expressions(benchmark: ExpressionBenchmark) -> None:
     for line in benchmark.lines():
         print(line)
     nothing = benchmark.methods[NOTHING].error()
-    for name in ("live", "track", "track, no rig", "track, own rig"):
+    for name in ("live", "track", "track no rig", "track, own rig"):
         if name in benchmark.methods:
             assert benchmark.methods[name].error() < nothing
 
