@@ -66,6 +66,14 @@ def test_the_head_is_solved_with_the_take(actor: BlendshapeRig, take: tuple[Path
     skin = actor.neutral.annotations.regions["face"]
     true = actor.vertices[skin]
     assert from_the_truth(made.vertices[skin], true) < 0.6 * from_the_truth(mean.vertices[skin], true)
+    ahead = similarity_transform(*(one.vertices[mean.neutral.landmarks][None].double() for one in (made, mean)))
+    assert float(ahead.rotation[0].diagonal().sum()) > 3 - 1e-6  # it stands as the mean head, else gaze is off
+    assert tracked.head is not None
+    for camera, posed, seen in zip(
+        tracked.head.fit.cameras, tracked.head.fit.posed, tracked.head.fit.landmarks, strict=True
+    ):
+        inner = posed.vertices[mean.neutral.landmarks[36:48]].double()
+        assert float((camera.project(inner) - seen[36:48]).norm(dim=1).max()) < 3  # pixels: cameras went along
     assert tracked.products["head"] == tmp_path / "out" / "head.glb"
     assert any(line.startswith("head: solved from") for line in tracked.lines())
     save_rig(mean, tmp_path / "mean.glb")
