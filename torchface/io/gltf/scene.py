@@ -7,8 +7,10 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
+from torchface.geometry.rotations import quaternion_matrix
 from torchface.io.gltf.gltf_document import Document
 
 _MAX_INSTANCES = 4096
@@ -107,13 +109,8 @@ def _local(document: Document, node: dict[str, Any], location: str) -> NDArray[n
     length = np.sqrt(x * x + y * y + z * z + w * w)
     if not 0.5 < length < 2:
         raise document.error(f"{location}.rotation", [x, y, z, w], "a unit quaternion")
-    x, y, z, w = x / length, y / length, z / length, w / length
     transform = np.eye(4)
-    transform[:3, :3] = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-    ]
+    transform[:3, :3] = quaternion_matrix(torch.tensor([x, y, z, w], dtype=torch.float64) / length).numpy()
     transform[:3, :3] *= document.numbers(node, "scale", location, 3) or (1.0, 1.0, 1.0)
     transform[:3, 3] = document.numbers(node, "translation", location, 3) or (0.0, 0.0, 0.0)
     return transform

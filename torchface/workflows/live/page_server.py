@@ -70,7 +70,7 @@ class Preparing:
     """A session's desk before there is a session: the page says what is being made.
 
     Args:
-        progress: of the program, which is told the same.
+        progress: of the program; it gets the same steps.
     """
 
     def __init__(self, progress: Progress) -> None:
