@@ -144,7 +144,7 @@ def test_the_pages_socket_gives_frames_pictures_and_state_and_takes_wishes(serve
     assert np.abs(shown[24, 32].astype(int) - (50, 100, 200)).max() < 8
 
 
-def test_a_page_says_what_is_made_and_its_settings_reach_the_session_then(desk: Desk, tmp_path: Path) -> None:
+def test_a_page_says_what_is_made_and_its_settings_and_takes_reach_the_session_then(desk: Desk, tmp_path: Path) -> None:
     (tmp_path / "index.html").write_text("page")
     told: list[tuple[str, int, int]] = []
     preparing = Preparing(lambda step, done=0, total=0: told.append((step, done, total)))
@@ -156,10 +156,16 @@ def test_a_page_says_what_is_made_and_its_settings_reach_the_session_then(desk: 
             assert json.loads(page.recv(5)) == {"words": "Making the graph: 1 of 4 parts are ready."}
             page.send(json.dumps({"controls": {"mirror": True}}))
             page.send(json.dumps({"record": True}))
-            until(lambda: preparing.wishes)
+            rows = np.random.default_rng(0).random((3, 66), np.float32)
+            page.send(json.dumps({"keep": "mine", "bytes": rows.nbytes}))
+            page.send(rows.tobytes())
+            until(lambda: preparing.wishes and preparing.takes)
+            assert "mine: kept as soon as torchface is ready." in json.loads(page.recv(5))["words"]
             server.attend(desk)
             until(lambda: isinstance(page.recv(5), bytes))
         assert desk.messages == [{"controls": {"mirror": True}}]
+        assert [name for name, _ in desk.kept] == ["mine"]
+        np.testing.assert_array_equal(desk.kept[0][1], rows)
     finally:
         server.stop()
 

@@ -75,6 +75,7 @@ class Preparing:
 
     def __init__(self, progress: Progress) -> None:
         self.wishes: dict[str, Any] = {}
+        self.takes: list[tuple[str, np.ndarray]] = []
         self._progress, self._words = progress, ""
 
     def __call__(self, step: str, done: int = 0, total: int = 0) -> None:
@@ -88,14 +89,16 @@ class Preparing:
 
     def state(self) -> dict[str, Any]:
         """What the page shows."""
-        return {"words": self._words}
+        waiting = "".join(f" {name}: kept as soon as torchface is ready." for name, _ in self.takes)
+        return {"words": self._words + waiting}
 
     def asked(self, message: Mapping[str, Any]) -> None:
         """Keeps what the user set for the session, and nothing else."""
         self.wishes |= {key: message[key] for key in ("controls", "names") if key in message}
 
     def keep(self, name: str, rows: np.ndarray) -> None:
-        """Nothing is kept yet."""
+        """Holds a take for the session."""
+        self.takes.append((name, rows))
 
     def left(self) -> None:
         """A page was closed."""
@@ -114,6 +117,7 @@ class PageServer:
         self._folder, self._character, self._takes, self._desk = folder, character, takes, desk
         self._files = {path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file()}
         self._token = secrets.token_urlsafe(12)
+        self._keeping = threading.Lock()  # no take comes to a desk that has just been left
         self._stopped = threading.Event()
         logger = logging.getLogger(__name__)
         logger.setLevel(logging.CRITICAL + 1)  # browsers that hang up are no news
@@ -143,11 +147,15 @@ class PageServer:
         return f"http://{HOST}:{self.port}/stream"
 
     def attend(self, desk: LiveDesk) -> None:
-        """Shows another desk from now on, which is asked for what was wished while it was prepared."""
-        before, self._desk = self._desk, desk
-        if isinstance(before, Preparing):
-            with suppress(TorchfaceError):  # which stands in the notes
-                desk.asked(before.wishes)
+        """Shows another desk from now on, which gets what was wished and dropped while it was prepared."""
+        with self._keeping:
+            before, self._desk = self._desk, desk
+            if isinstance(before, Preparing):
+                with suppress(TorchfaceError):  # which stands in the notes
+                    desk.asked(before.wishes)
+                for name, rows in before.takes:
+                    with suppress(TorchfaceError):
+                        desk.keep(name, rows)
 
     def stop(self) -> None:
         """Says to open pages that it has ended, and ends, once."""
@@ -205,7 +213,8 @@ class PageServer:
         try:
             if isinstance(message, bytes):
                 if upload is not None and upload.is_whole_with(message):
-                    self._desk.keep(upload.name, upload.rows())
+                    with self._keeping:
+                        self._desk.keep(upload.name, upload.rows())
                     return None
                 return upload
             asked = json.loads(message)
