@@ -59,7 +59,7 @@ TOGETHER = {
         "viz/browser",
         "viz/reports/test_player",
     ),
-    "action units": ("capture/action_units",),
+    "action units": ("capture/action_units", "train/test_action_units"),
 }
 """Files for one process: two browsers take the time from one another, and a filmed session is costly to make twice."""
 
@@ -237,6 +237,20 @@ def dome_rig() -> BlendshapeRig:
         bulge[..., None] * direction[:, None],
         ["jawOpen", "browInnerUp", "mouthSmileLeft", "mouthSmileRight"],
     )
+
+
+@pytest.fixture(scope="session")
+def filmed_session(tmp_path_factory: pytest.TempPathFactory) -> Any:
+    """A performer before the camera stage: two repetitions of each unit, one of a combination, 20 frames a second."""
+    from train.filmed_performers.action_performance import PerformanceSettings
+    from train.filmed_performers.camera_stage import StageSettings, record_session
+    from train.filmed_performers.helmet_camera import CameraFlaws
+
+    performance = PerformanceSettings(2, 1, (("4", "9"),), fps=20.0, pace=1.3)
+    flaws = CameraFlaws(shake_rotation=0.6, shake_translation=1.2)
+    settings = StageSettings(128, 170, markers=20, flaws=flaws, performance=performance)
+    folder = tmp_path_factory.mktemp("camera_stage")
+    return record_session(folder, "first", None, torch.Generator().manual_seed(3), settings)
 
 
 @pytest.fixture

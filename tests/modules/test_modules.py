@@ -40,8 +40,11 @@ WRITTEN = (
 )  # fmt: skip
 """Exported in the tests and benches of their ONNX graphs, which is more."""
 
-LONG = ("WebcamSolver", "SolverGraph", "SolverGraph with predictions")
-"""Five to twelve seconds to compile."""
+LONG = (
+    "WebcamSolver", "SolverGraph", "SolverGraph with predictions", "BoxNetwork", "PartNetwork", "LandmarkNetwork",
+    "EnhancementModel",
+)  # fmt: skip
+"""Two to twelve seconds to compile; the bench compiles them to machine code."""
 
 IN_ONE_GRAPH = [name for name, example in EXAMPLES.items() if "torch.compile" not in example.cells]
 
@@ -70,7 +73,7 @@ def assert_same(found: list[Tensor], wanted: list[Tensor], tolerance: float = RO
         )
 
 
-@pytest.mark.parametrize("name", ["VideoSolver", "WebcamSolver", "EnhancementModel"])
+@pytest.mark.parametrize("name", ["WebcamSolver", pytest.param("VideoSolver", marks=pytest.mark.bench)])
 def test_calls_leave_no_tensors_behind(name: str) -> None:
     example = EXAMPLES[name]
     module, inputs = fresh(example), example.inputs()
@@ -303,9 +306,8 @@ def exported_graphs() -> dict[str, tuple[Callable[[], nn.Module], Callable[[], t
     }
 
 
-@pytest.mark.parametrize(
-    "kind", ["CorrectiveGraph", pytest.param("CorrectiveGraph with predictions", marks=pytest.mark.bench)]
-)
+@pytest.mark.bench  # ten seconds each
+@pytest.mark.parametrize("kind", ["CorrectiveGraph", "CorrectiveGraph with predictions"])
 def test_graphs_of_solvers_are_exported(kind: str) -> None:
     make, given = exported_graphs()[kind]
     graph, inputs = make(), given()

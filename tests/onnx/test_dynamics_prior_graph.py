@@ -18,7 +18,7 @@ from torchface.onnx import dynamics_prior_graph as exporting
 from torchface.synthetic.stages.weight_curves import perform
 
 
-@pytest.fixture(scope="module", params=[1, 4])
+@pytest.fixture(scope="module", params=[4, pytest.param(1, marks=pytest.mark.bench)])
 def prior(request: pytest.FixtureRequest) -> DynamicsPrior:
     takes = []
     for seed in range(2):

@@ -66,6 +66,7 @@ def test_the_graph_of_vertices_is_the_module(
     assert json.loads(told["maps"]) == ["a", "b"]
 
 
+@pytest.mark.bench
 def test_the_graph_of_blendshape_weights_gives_what_the_posed_rig_does(
     rig: BlendshapeRig, learned: WrinkleWeights, poses: Tensor, tmp_path: Path
 ) -> None:

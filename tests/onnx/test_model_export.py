@@ -104,6 +104,7 @@ def test_offsets_come_with_any_pose(regression: ExpressionRegression, tmp_path: 
     assert json.loads(metadata["metrics"]) == {"error": 1.5}
 
 
+@pytest.mark.bench  # torch.export takes seven seconds
 def test_the_bank_finds_what_the_detector_finds(detector: UVLandmarkDetector, tmp_path: Path) -> None:
     images, places = pictures(5, 9)
     export_landmark_bank(detector, tmp_path / "uv.onnx", FACTS, images[:2])

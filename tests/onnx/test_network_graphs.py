@@ -30,6 +30,7 @@ def network() -> BoxNetwork:
     return drawn.eval()
 
 
+@pytest.mark.bench  # torch.export takes ten seconds
 def test_other_sizes_than_it_was_exported_with(
     network: BoxNetwork, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

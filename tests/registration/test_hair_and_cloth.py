@@ -84,7 +84,7 @@ def bare(head: Mesh, truth: Tensor) -> Registration:
     return quickly(head, without_colors(Mesh(truth, head.faces, colors=rainbow(truth[:, 0]))))
 
 
-@pytest.mark.parametrize("axis", [0, 1])
+@pytest.mark.parametrize("axis", [0, pytest.param(1, marks=pytest.mark.bench)])
 def test_colours_that_no_skin_has_say_nothing_of_hair(head: Mesh, truth: Tensor, bare: Registration, axis: int) -> None:
     painted = quickly(head, Mesh(truth, head.faces, colors=rainbow(truth[:, axis])))
     assert painted.record.covered < 0.01

@@ -171,6 +171,7 @@ def both(regions: RegionVideo, session: RecordedSession, other: RecordedSession)
     return Learned(arguments, ActionUnitClassifier.fit(*arguments))
 
 
+@pytest.mark.bench
 def test_two_performers_can_be_learned_from(
     both: Learned, regions: RegionVideo, session: RecordedSession, other: RecordedSession
 ) -> None:
@@ -181,8 +182,10 @@ def test_two_performers_can_be_learned_from(
         assert level_agreement(classify(found, video), planted(truth, found.units))["within_one"] > 0.95
 
 
-def test_from_disk_and_from_onnx(both: Learned, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    classifier, video = both.classifier, both.arguments[0][0]
+def test_from_disk_and_from_onnx(
+    classifier: ActionUnitClassifier, regions: RegionVideo, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    video = regions
     zoo.save_model(classifier, tmp_path / "units", zoo.ModelCard("MIT", "made", {}, "none"))
     again = zoo.get_model(tmp_path / "units")
     assert isinstance(again, ActionUnitClassifier)

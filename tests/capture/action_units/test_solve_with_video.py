@@ -13,32 +13,32 @@ from train.filmed_performers.camera_stage import RecordedSession
 
 
 def test_the_video_leads_what_markers_hardly_see(
-    other: RecordedSession, classifier: ActionUnitClassifier, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    session: RecordedSession, classifier: ActionUnitClassifier, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     zoo.save_model(classifier, tmp_path / "units", zoo.ModelCard("MIT", "filmed", {}, "none"))
-    save_rig(other.rig, tmp_path / "rig.glb")
-    other.attachment.save(tmp_path / "attachment.json")
+    save_rig(session.rig, tmp_path / "rig.glb")
+    session.attachment.save(tmp_path / "attachment.json")
     words = [
         "solve",
         str(tmp_path / "rig.glb"),
-        str(other.take_path),
+        str(session.take_path),
         "--attachment",
         str(tmp_path / "attachment.json"),
     ]
     errors = []
     for name, more in (
         ("alone", []),
-        ("hybrid", ["--video", str(other.video.path), "--action-units", str(tmp_path / "units")]),
+        ("hybrid", ["--video", str(session.video.path), "--action-units", str(tmp_path / "units")]),
     ):
         main([*words, *more, "--out", str(tmp_path / f"{name}.csv"), "--quiet"])
         solved = load_take(tmp_path / f"{name}.csv").weights
         assert solved is not None
-        errors.append((other.rig.weights_from(solved) - other.performance.weights).abs().mean(0))
+        errors.append((session.rig.weights_from(solved) - session.performance.weights).abs().mean(0))
     told = capsys.readouterr().err
     assert "video: predicts" in told
-    led = other.rig.index(["noseSneerLeft", "noseSneerRight", "cheekSquintLeft", "cheekSquintRight"])
+    led = session.rig.index(["noseSneerLeft", "noseSneerRight", "cheekSquintLeft", "cheekSquintRight"])
     alone, hybrid = errors
     assert float(hybrid[led].mean()) < 0.7 * float(alone[led].mean())
     with pytest.raises(SystemExit):
-        main([*words, "--video", str(other.video.path), "--out", str(tmp_path / "w.csv"), "--quiet"])
+        main([*words, "--video", str(session.video.path), "--out", str(tmp_path / "w.csv"), "--quiet"])
     assert "expected both or neither" in " ".join(capsys.readouterr().err.split())

@@ -150,6 +150,7 @@ def test_landmarks_of_a_lens_that_bends(seen: tuple[Tensor, Tensor], device: str
     check(lambda pixels: undistort(pixels, bent), device, seen[1])
 
 
+@pytest.mark.bench  # tests/modules moves the solver of videos too
 def test_the_solver_and_all_it_holds(device: str) -> None:
     """Moved as a whole, also after it was used, with a prior and a memory; frame by frame and the whole take."""
     names = ("jawOpen", "mouthSmileLeft", "browInnerUp")

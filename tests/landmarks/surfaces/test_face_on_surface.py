@@ -40,7 +40,8 @@ def search() -> FaceSearch:
 
 
 @pytest.mark.parametrize(
-    ("turn", "painted", "limit"), [((-1.4, 0.4, 0.2), False, 0.02), ((0.3, 2.5, 1.0), True, 0.015)]
+    ("turn", "painted", "limit"),
+    [pytest.param((-1.4, 0.4, 0.2), False, 0.02, marks=pytest.mark.bench), ((0.3, 2.5, 1.0), True, 0.015)],
 )
 def test_points_lie_where_the_head_has_them(
     search: FaceSearch, turn: tuple[float, ...], painted: bool, limit: float

@@ -125,7 +125,7 @@ def error_degrees(mesh: Mesh, baked: NormalMap) -> tuple[Tensor, Tensor]:
 
 
 def test_planted_wrinkles_come_back(face: Mesh, forehead: Mesh) -> None:
-    baked = bake_normal_map(face, forehead, (1024, 2048), alignment=still())
+    baked = bake_normal_map(face, forehead, (768, 1536), alignment=still())
     error, relief = error_degrees(face, baked)
     assert len(error) > 1000
     assert relief.median() > 12
@@ -197,10 +197,11 @@ def test_a_turned_texture_turns_the_map_but_not_the_normals_it_stands_for(forehe
     assert face.uvs is not None
     for uvs in (face.uvs.flip(1), torch.stack([1 - face.uvs[:, 0], face.uvs[:, 1]], 1)):  # mirrored, both
         turned = replace(face, uvs=uvs)
-        baked = bake_normal_map(turned, forehead, 1024, alignment=still())
+        baked = bake_normal_map(turned, forehead, 512, alignment=still())
         assert error_degrees(turned, baked)[0].median() < 3
 
 
+@pytest.mark.bench
 @pytest.mark.real
 def test_wrinkles_planted_on_a_real_head_come_back_across_its_texture(ict_folder: Path) -> None:
     neutral = load_rig(ict_folder, part="face").neutral

@@ -20,7 +20,7 @@ from torchface.rig import BlendshapeRig
 from torchface.synthetic import draw_identities, performer
 from torchface.synthetic.stages.subdivision import catmull_clark, finely_coloured
 
-DEPTH, WIDTH, SIZE = 0.3, 2.0, 1024
+DEPTH, WIDTH, SIZE = 0.3, 2.0, 768
 SHAPE = "browInnerUp"
 
 

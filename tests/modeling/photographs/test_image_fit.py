@@ -240,12 +240,12 @@ def test_pictures_of_different_expressions_give_one_head(rig: BlendshapeRig, mod
 def test_more_pictures_give_a_better_head(rig: BlendshapeRig, model: HeadModel) -> None:
     skin, errors = model.annotations.regions["face"], torch.zeros(4)
     poses = [(0.0, LAUGH), (35.0, POUT), (-40.0, {}), (10.0, EXPRESSION)]
-    for seed in range(4):
+    for seed in range(2):
         rest = model.shape(torch.randn(1, 15, generator=torch.Generator().manual_seed(20 + seed)))[0]
         marks = snapshots(rig, rest, poses, seed)
         for count in range(4):
             fit = fit_images(model, rig, marks[: count + 1], SIZE, settings=POINTS)
-            errors[count] += aligned_error(fit.mesh.vertices[skin], rest[skin]) / 4
+            errors[count] += aligned_error(fit.mesh.vertices[skin], rest[skin]) / 2
     assert bool((errors[1:] < 1.05 * errors[:-1]).all())
     assert float(errors[3]) < 0.7 * float(errors[0])
 
@@ -258,14 +258,14 @@ def test_a_difference_that_the_model_does_not_know_is_found(rig: BlendshapeRig, 
     poses, held = [(0.0, {}), (35.0, {}), (-35.0, {})], replace(POINTS, unknown_deviation=0.0)
     for change, known in ((wider, False), (0 * wider, True)):
         ours, theirs = 0.0, 0.0
-        for seed in range(3):
+        for seed in range(2):
             rest = model.shape(torch.randn(1, 15, generator=torch.Generator().manual_seed(30 + seed)))[0] + change
             marks = snapshots(rig, rest, poses, seed)
             free, model_alone = (fit_images(model, rig, marks, SIZE, settings=some) for some in (POINTS, held))
             assert free.coefficients.shape == model_alone.coefficients.shape == (15,)
             ours += aligned_error(free.mesh.vertices[skin], rest[skin])
             theirs += aligned_error(model_alone.mesh.vertices[skin], rest[skin])
-        assert (ours - theirs) / 3 < 0.1 if known else ours < 0.7 * theirs
+        assert (ours - theirs) / 2 < 0.1 if known else ours < 0.7 * theirs
 
 
 def test_landmarks_as_annotators_put_them_are_no_other_face(rig: BlendshapeRig, model: HeadModel) -> None:
@@ -406,6 +406,7 @@ def test_a_real_portrait(
     assert float((fit.posed[0].vertices[upper] - fit.posed[0].vertices[lower]).norm(dim=-1).mean()) < 2.0
 
 
+@pytest.mark.bench  # eighteen fits
 @pytest.mark.real
 def test_smiles_of_turned_heads_are_as_strong_on_both_sides(
     data: Path, ict_folder: Path, real_capture: tuple[BlendshapeRig, Attachment, list[torch.Tensor]]

@@ -144,6 +144,7 @@ def test_parts_that_registration_left_before_the_lips_go_behind_them(ict_folder:
     assert float(moved.norm(dim=-1).mean()) < 3.0
 
 
+@pytest.mark.bench
 @pytest.mark.real
 def test_lids_that_are_a_millimetre_off_do_not_turn_eyes_inward(ict_folder: Path) -> None:
     """Eyeballs of people's heads, against their true places, where the skin is a registration's."""

@@ -80,6 +80,7 @@ class Pieces(nn.Module):
         return cut_square(image, place, 32, 1.25), *whole_picture(image, 100)
 
 
+@pytest.mark.bench
 def test_pieces_of_pictures_of_any_size_are_cut_in_a_graph() -> None:
     """Their sizes are known when it runs."""
     given = {"image": torch.zeros(96, 128, 4, dtype=torch.uint8), "place": torch.tensor([40.0, 30.0, 50.0, 1.0, 0.0])}

@@ -62,6 +62,7 @@ def parity(settings: WebcamSettings, frames: int) -> float:
     return worst
 
 
+@pytest.mark.bench  # torch.export takes fifteen seconds
 def test_the_graph_is_the_module() -> None:
     assert parity(WebcamSettings(steps=1, coefficients=6), 4) < 1e-4
 

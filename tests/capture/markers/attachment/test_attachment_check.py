@@ -57,6 +57,7 @@ def test_a_calm_take_gives_the_sites_and_names_the_shapes_that_it_leaves_open(
     assert len(known.shapes) + len(known.unseen) <= len(rig.names) / 2
 
 
+@pytest.mark.bench
 def test_a_guess_that_is_far_off_still_ends_at_the_sites(performance: Performance) -> None:
     rig, attachment, _ = performance
     take = filmed(performance, take=1, every=6)
@@ -64,6 +65,7 @@ def test_a_guess_that_is_far_off_still_ends_at_the_sites(performance: Performanc
     assert (site_distances(rig, fit.attachment, attachment) < 1.0).float().mean() >= 0.98
 
 
+@pytest.mark.bench
 def test_a_slipping_helmet_moves_no_site(performance: Performance) -> None:
     rig, attachment, takes = performance
     recording = record(rig, attachment, takes[0][::8], torch.Generator().manual_seed(0), SLIP, fps=7.5)

@@ -65,6 +65,7 @@ def test_sites_on_the_performer_come_back(performance: Performance, stage_space:
     check_fit(performance, stage_space)
 
 
+@pytest.mark.bench
 @pytest.mark.real
 def test_sites_on_a_real_rig_come_back(real_capture: Performance, stage_space: Similarity) -> None:
     check_fit(real_capture, stage_space)
@@ -105,6 +106,7 @@ def test_the_best_site_is_the_best_of_all_points_tried(performance: Performance)
             assert (error(candidates[:, column], corners) >= found.error - 2e-3).all()
 
 
+@pytest.mark.bench
 def test_gaps_do_not_matter_much(performance: Performance, stage_space: Similarity) -> None:
     rig, attachment, takes = performance
     short = (rig, attachment, [takes[0][::6]])

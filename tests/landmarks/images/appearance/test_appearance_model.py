@@ -387,6 +387,7 @@ def test_sizes_of_training_images_may_differ(film: PortraitVideo) -> None:
     assert mean_error(fit.landmarks, film.landmarks[:6]).max() < 0.02
 
 
+@pytest.mark.bench
 @pytest.mark.real
 def test_a_dozen_photographs_help_with_faces_that_are_not_among_them(data: Path) -> None:
     """Other people, poses and cameras than learned from: no job for such a model, and yet it must help, not harm.

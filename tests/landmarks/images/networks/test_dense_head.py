@@ -109,6 +109,7 @@ def test_both_sides_of_a_crop_give_mirrored_points_and_weights(network: Landmark
     torch.testing.assert_close(mirrored.expression[:, mirror(ARKIT)], found.expression)
 
 
+@pytest.mark.bench
 def test_the_graph_gives_points_and_weights(network: LandmarkNetwork, tmp_path) -> None:
     path = tmp_path / "network.onnx"
     report = export_model(network, path, {"licence": "MIT"})

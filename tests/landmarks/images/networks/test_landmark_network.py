@@ -45,6 +45,7 @@ def test_a_heat_map_with_one_hot_cell_is_read_at_its_place(network: LandmarkNetw
     torch.testing.assert_close(found, torch.stack([4.0 * columns + 1.5, 4.0 * rows + 1.5], dim=1))
 
 
+@pytest.mark.bench  # test_dense_head.py trains a network with more outputs
 def test_training_finds_what_is_there_to_be_seen(pictures: tuple[torch.Tensor, ...]) -> None:
     torch.manual_seed(0)
     untrained = LandmarkNetwork(**SMALL)

@@ -197,6 +197,7 @@ def test_a_killed_training_goes_on_to_the_same_result(learned: LandmarkTrees, tm
         LandmarkTrees.fit(*data, FEW, kill_at_once, checkpoint=path)
 
 
+@pytest.mark.bench
 def test_mirrored_pictures_teach_the_other_side() -> None:
     images, boxes, points = blobs(60, 0)
     twins = (1, 0, 2, 4, 3)  # of the places; their greys differ, so that the pictures are no mirror images
@@ -301,6 +302,7 @@ def test_the_box_goes_with_the_landmarks() -> None:
         box_around(points[:, :5])
 
 
+@pytest.mark.bench
 def test_the_shipped_model_finds_made_up_faces() -> None:
     model, found, truth = zoo.get_model("face_landmarks"), [], []
     for picture in face_images(18, 987):
