@@ -13,6 +13,24 @@ import torch
 from torchface.errors import FileFormatError, ShapeError, ValueRangeError
 from torchface.io.images.radiance_hdr import load_panorama
 from torchface.rendering.environment_light import EnvironmentLight
+from torchface.rendering.point_light import PointLight, irradiance
+
+
+def normals_of_a_ball() -> torch.Tensor:
+    """Of a ball before the camera, one a pixel of its disc, (P,3)."""
+    y, x = torch.meshgrid(*[torch.linspace(-1, 1, 201).double()] * 2, indexing="ij")
+    inside = x * x + y * y < 1
+    x, y = x[inside], y[inside]
+    return torch.stack([x, y, -(1 - x * x - y * y).sqrt()], 1)
+
+
+@pytest.mark.parametrize("toward", [(0.0, 0.0, -1.0), (0.7, -0.3, -0.5), (1.0, 0.0, 0.0), (-0.5, 0.1, 0.8)])
+def test_light_on_what_the_camera_sees_of_a_ball_is_its_mean(toward: tuple[float, float, float]) -> None:
+    ambient, intensity = torch.tensor([0.1, 0.2, 0.3]), torch.tensor([1.0, 0.5, 0.25])
+    light, ball = PointLight.directional(ambient, intensity, torch.tensor(toward)), normals_of_a_ball()
+    expected = irradiance(torch.zeros_like(ball), ball, light).mean(0)
+    torch.testing.assert_close(light.on_front(), expected.float(), atol=2e-3, rtol=0)
+    assert torch.equal(light.on_front(least=0.0) > light.on_front(), torch.full((3,), toward[2] > 0))
 
 
 def test_a_panorama_lights_as_the_integral_of_the_clamped_cosine() -> None:
@@ -30,6 +48,8 @@ def test_a_panorama_lights_as_the_integral_of_the_clamped_cosine() -> None:
     expected = 4 * (seen @ (toward @ normals.T).clamp(min=0)).T / len(toward)
     found = light.irradiance(normals)
     assert float((found - expected).abs().mean() / expected.mean()) < 0.04
+    ball = normals_of_a_ball()
+    torch.testing.assert_close(light.on_front, light.irradiance(ball).mean(0), atol=0.01, rtol=0.01)
     brightest = torch.nn.functional.normalize(torch.tensor([-0.5, -0.7, -0.5]).double(), dim=0)
     assert light.irradiance(brightest)[0] > 3 * light.irradiance(-brightest)[0]
 

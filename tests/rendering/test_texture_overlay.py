@@ -21,7 +21,7 @@ from torchface.mesh import Mesh
 from torchface.rendering.pixel_coverage import footprint
 from torchface.rendering.point_light import PointLight
 from torchface.rendering.raycast import RayCaster
-from torchface.rendering.texture_overlay import FacePaint, overlay, relight, skin_faces
+from torchface.rendering.texture_overlay import FacePaint, _soft_shadow, overlay, relight, skin_faces
 from torchface.rig import BlendshapeRig
 from torchface.synthetic import performer
 
@@ -205,6 +205,28 @@ def test_the_same_light_changes_nothing_but_old_shadows_edges(rig: BlendshapeRig
     share = torch.zeros(len(mesh.vertices))
     kept = relight(frame, mesh, LIGHT, EVEN, camera, share=share)
     torch.testing.assert_close(kept, frame, atol=1e-4, rtol=0)
+
+
+def test_a_shadow_ends_softly() -> None:
+    """A wall of 40 mm on a plane, light at 45 degrees: the shadow fades over the penumbra of a source of 20 degrees.
+
+    Seen from a point at distance x behind the wall, its edge is at the angle atan(40 / x); the source is hidden where
+    that is above 65 degrees and whole where it is below 25.
+    """
+    wide, high = 400.0, 40.0
+    plane = torch.tensor([[-wide, -wide, 0], [wide, -wide, 0], [wide, wide, 0], [-wide, wide, 0]])
+    wall = torch.tensor([[0, -wide, 0], [0, wide, 0], [0, wide, high], [0, -wide, high]])
+    mesh = Mesh(torch.cat([plane, wall]), torch.tensor([[0, 1, 2], [0, 2, 3], [4, 5, 6], [4, 6, 7]]))
+    K = torch.tensor([[500.0, 0, 99.5], [0, 500.0, 99.5], [0, 0, 1]])
+    camera = Camera(K, torch.diag(torch.tensor([1.0, -1.0, -1.0])), torch.tensor([0.0, 0, 500]), 200, 200)
+    light = PointLight.directional(torch.zeros(3), torch.ones(3), torch.tensor([-1.0, 0.0, -1.0]))
+    covered = footprint(mesh.vertices, mesh.faces, torch.ones(4, dtype=torch.bool), camera)
+    seen, x = _soft_shadow(covered, light), covered.points[:, 0]
+    flat = (covered.normals[:, 2] < -0.9) & (covered.share == 1)
+    assert float(seen[flat & (x > 4) & (x < 12)].max()) < 0.05
+    assert float(seen[flat & (x > 95)].min()) > 0.95
+    fading = x[flat & (seen > 0.1) & (seen < 0.9)]
+    assert 25 < float(fading.max() - fading.min()) < 75
 
 
 def test_light_reaches_beyond_the_mesh_where_asked(rig: BlendshapeRig, cameras: tuple[Camera, ...]) -> None:

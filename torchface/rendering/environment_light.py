@@ -67,6 +67,13 @@ class EnvironmentLight:
         """Light in the mean of all directions, (3,)."""
         return self.coefficients[0] * harmonics(torch.eye(3, dtype=torch.float64))[0, 0]
 
+    @property
+    def on_front(self) -> Tensor:
+        """Light on a ball that the camera sees, in the mean over its disc in the picture, (3,)."""
+        toward_camera = torch.tensor([[0.0, 0.0, -1.0]], dtype=torch.float64)
+        kept = harmonics(toward_camera)[0] * torch.tensor(_KEPT, dtype=torch.float64)
+        return kept @ self.coefficients.double()
+
     def scaled(self, factor: float) -> EnvironmentLight:
         """The same, so many times as bright."""
         return EnvironmentLight(self.coefficients * factor)

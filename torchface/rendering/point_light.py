@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import torch
@@ -69,6 +70,24 @@ class PointLight:
         """Unit vectors L from points (...,3) in the camera's frame to the source."""
         return torch.nn.functional.normalize(self.position.to(points) - points, dim=-1)
 
+    def from_afar(self, point: Tensor) -> PointLight:
+        """A directional light that comes to a point (3,) of the camera's frame from where this one does."""
+        return PointLight.directional(self.ambient, self.intensity, self.toward(point.to(self.position)))
+
+    def on_front(self, least: float = -1.0) -> Tensor:
+        r"""A far light on a ball that the camera sees, in the mean over its disc in the picture, (3,).
+
+        .. math:: I_a + I_p\, \frac{2}{3 \pi} (\sin\theta + (\pi - \theta) \cos\theta)
+
+        Args:
+            least: of the cosine of :math:`\theta`, between the source and the camera; 0 takes one behind the ball as
+                one beside it.
+        """
+        toward = torch.nn.functional.normalize(self.position.double(), dim=0)
+        angle = math.acos(min(max(-float(toward[2]), least), 1.0))
+        share = (math.sin(angle) + (math.pi - angle) * math.cos(angle)) * 2 / (3 * math.pi)
+        return self.ambient + self.intensity * share
+
 
 def irradiance(points: Tensor, normals: Tensor, light: PointLight, lit: Tensor | None = None) -> Tensor:
     r"""What a light brings to points of a surface, by which the albedo is multiplied; linear, differentiable.
@@ -96,7 +115,7 @@ def lit_by(position: Tensor, caster: RayCaster, points: Tensor, normals: Tensor)
     """Whether each point (Q,3) faces a source at ``position`` (3,) with nothing of the mesh between, (Q,) bool.
 
     Args:
-        position: in the frame of the points, millimetres.
+        position: in the frame of the points, millimetres; or one for each point, (Q,3).
         normals: unit.
     """
     toward = torch.nn.functional.normalize(position.double() - points.double(), dim=-1)

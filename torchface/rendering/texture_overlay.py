@@ -26,6 +26,8 @@ _MAX_GAIN = 10.0
 _FLOOR = 1e-3  # linear; light that lenses scatter, so that black has a quotient
 _BESIDE = 0.025  # of the root of the pixels that a head covers, standard deviation of a blur
 _FAINT = 0.05  # of a blurred cover, where light beyond the head ends
+_SOURCE = 20.0  # degrees, from the middle to the rim of a source, a window or a lamp in a room
+_PLACES = 4  # by as many of them on the source's disc, each seen from one pixel of a square
 _RIM = 0.75  # cosine between the normals of a point and of those beside it, on the rims of lids and lips
 _MAX_SIDE = 8192
 
@@ -210,13 +212,23 @@ def _beside(covered: Footprint) -> float:
 
 
 def _soft_shadow(covered: Footprint, light: PointLight) -> Tensor:
-    """The share of the source that samples see, (S,), with soft edges, as those of sources with a size and lenses.
+    """The share of the source that samples see, (S,), where the source is a disc and so has soft shadows.
 
-    Lines of shadow, as between lips, are none: those of the film lie elsewhere.
+    Each pixel of a square looks at another place on the disc, and a blur takes their mean. Lines of shadow, as between
+    lips, are none: those of the film lie elsewhere.
     """
-    lit = lit_by(light.position, covered.caster, covered.points, covered.normals)
-    wide = covered.softened(lit[:, None], sigma=max(1.0, 0.5 * _beside(covered)))[:, 0]
-    return (2 * wide - 0.5).clamp(0, 1)
+    count = _PLACES * _PLACES
+    turn = torch.arange(count).double() * math.pi * (3 - math.sqrt(5))
+    disc = (torch.arange(count) + 0.5).div(count).sqrt().double() * math.tan(math.radians(_SOURCE))
+    middle = covered.points.mean(0)
+    toward = light.position.double() - middle
+    _, _, across = torch.linalg.svd(toward[None])  # rows: the direction, and two across it
+    disc = (disc * turn.cos())[:, None] * across[1] + (disc * turn.sin())[:, None] * across[2]
+    place = covered.pixel % covered.width % _PLACES + covered.pixel // covered.width % _PLACES * _PLACES
+    positions = light.position.double() + toward.norm() * disc[place]
+    lit = lit_by(positions, covered.caster, covered.points, covered.normals)
+    wide = covered.softened(lit[:, None], sigma=max(_PLACES / 2, 0.5 * _beside(covered)))[:, 0]
+    return (1.5 * wide - 0.25).clamp(0, 1)
 
 
 def _light_on(covered: Footprint, light: PointLight | EnvironmentLight, lit: Tensor | None = None) -> Tensor:

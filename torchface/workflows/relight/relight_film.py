@@ -8,6 +8,8 @@ from dataclasses import astuple, dataclass, replace
 from pathlib import Path
 from typing import Literal
 
+import cv2
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -27,9 +29,12 @@ from torchface.rendering.gaussian_blur import gaussian_blur
 from torchface.rendering.point_light import PointLight
 from torchface.rendering.texture_overlay import FacePaint, overlay, relight, skin_faces
 from torchface.rig import BlendshapeRig
+from torchface.synthetic import Look, character
+from torchface.synthetic.head.embedded_character import is_performers
 from torchface.take import Track
 from torchface.workflows.named_finders import part_finder
-from torchface.workflows.relight.tracked_film import TrackedFilm, read_tracked_film
+from torchface.workflows.relight.tracked_film import TrackedFilm, bare, read_tracked_film
+from torchface.workflows.relight.wanted_light import WantedLight
 from torchface.workflows.track.face_overlay import light_of
 
 FilmLight = Literal["once", "each"]
@@ -37,64 +42,14 @@ Draw = Callable[[int, Tensor, PointLight | EnvironmentLight], Tensor]
 _CHUNK = 8
 _LIT, _AGAIN = 5, 3  # frames from which the film's light is estimated, and those of a chunk
 _BEFORE_SKIN = ("glasses", "hand", "cloth", "hair", "background")
-_BEFORE_HEAD, _NAMED, _LEAST_HIDDEN = ("hand",), ("hand", "glasses"), 0.005
+_BEHIND = ("background",)  # the head of the track is wider than the filmed one here and there
+_BEFORE_HEAD, _NAMED, _LEAST_HIDDEN = ("hand", "hair", "cloth"), ("hand", "glasses"), 0.005
 _HIDDEN, _EDGE, _SOFT = 0.5, 0.3, 0.7  # the share of what is before a face, and pixels of the network's crop
-_AMBIENT = 0.3  # of the wanted light, unless said
-_SPHERE = 0.25  # the mean of the clamped cosine over all directions
-_MOST = 100.0
+_BACKLIT = 0.5  # of a panorama's mean; a face that gets less of it stays darker than in the film
 _BESIDE = 110.0  # degrees of azimuth beyond which a light reaches no front of a face
 _LEAST_SOURCE = 0.05  # share of the light below which its direction says nothing
-_BEYOND = 25.0  # millimetres beyond the face, over neck, ears and scalp, in which the new light fades out
+_BEYOND = 60.0  # millimetres beyond the face, over neck, ears and scalp, in which the new light fades out
 _INNER = ("eye", "lids", "brow", "nose", "upper_lip", "lower_lip")
-
-
-@dataclass(frozen=True)
-class WantedLight:
-    """A light from one direction and from everywhere, relative to the film's.
-
-    Args:
-        azimuth: degrees from the camera to the viewer's right.
-        elevation: degrees upwards.
-        strength: of both together, 1 as bright as the film's.
-        ambient: the share from everywhere.
-        red, green, blue: its colour beside the film's.
-    """
-
-    azimuth: float = 0.0
-    elevation: float = 0.0
-    strength: float = 1.0
-    ambient: float = _AMBIENT
-    red: float = 1.0
-    green: float = 1.0
-    blue: float = 1.0
-
-    @staticmethod
-    def parse(words: Sequence[str]) -> WantedLight:
-        """Of words such as ``azimuth=60``."""
-        bounds = {"azimuth": (-360, 360), "elevation": (-90, 90), "ambient": (0, 1)}
-        names = tuple(WantedLight.__dataclass_fields__)
-        found: dict[str, float] = {}
-        for word in words:
-            name, _, number = word.partition("=")
-            try:
-                value = float(number)
-            except ValueError:
-                value = math.nan
-            low, high = bounds.get(name, (0, _MOST))
-            if name not in names or not low <= value <= high:
-                raise ValueRangeError(
-                    f"--light: found {word!r:.60}, expected NAME=NUMBER with {', '.join(names)}; azimuth and elevation "
-                    f"in degrees, ambient of 0 to 1, the others of 0 to {_MOST:g}"
-                )
-            found[name] = value
-        return WantedLight(**found)
-
-    def beside(self, film: PointLight) -> PointLight:
-        """The light, in the film's brightness and colour."""
-        whole = (film.ambient + film.intensity) * self.strength * torch.tensor([self.red, self.green, self.blue])
-        around, up = math.radians(self.azimuth), math.radians(self.elevation)
-        toward = torch.tensor([math.sin(around) * math.cos(up), -math.sin(up), -math.cos(around) * math.cos(up)])
-        return PointLight.directional(self.ambient * whole, (1 - self.ambient) * whole, toward)
 
 
 _FROM_ABOVE = WantedLight(azimuth=20.0, elevation=40.0, strength=1.1, ambient=0.45)
@@ -109,11 +64,11 @@ class RelightSettings:
         light: another light, as words; see :class:`WantedLight`.
         environment: a panorama of light (``.hdr``), of the film's mean brightness.
         turn: of the panorama, degrees; its middle to the viewer's right.
-        exposure: how many times as bright as the film's light the panorama is.
+        exposure: how many times as bright as in the film the panorama makes the face.
         texture: paint in the rig's texture coordinates.
         rig: another head, which moves as the actor does.
         film_light: whether the film's light is estimated once, or every eight frames.
-        occluders: leave what is before the face as it is.
+        occluders: leave what is before the face as it is; without, only what lies behind it stays.
         camera: the calibration with which the film was tracked.
     """
 
@@ -160,23 +115,27 @@ def relight_film(
     draw = _painter(tracked, settings)
     lit = _spread(tracked.seen, _LIT)
     found = _light(tracked, dict(zip(lit, _frames(tracked, lit, progress), strict=True)))
-    whole, near = _reaching(found), _near_face(tracked.rig.neutral)
-    finder = part_finder() if settings.occluders else None
-    before = _BEFORE_HEAD if settings.rig is not None else _BEFORE_SKIN
+    middle = tracked.middle
+    whole, near = _reaching(found, middle), _near_face(tracked.rig.neutral)
+    before: tuple[str, ...] = _BEFORE_HEAD if settings.rig is not None else _BEFORE_SKIN
+    if not settings.occluders:
+        before = () if settings.rig is not None else _BEHIND
+    finder = part_finder() if before else None
+    far = found.from_afar(middle)
     lines = [
-        f"{tracked.video.count} frames, the face in {int(tracked.seen.sum())}; {_words(found, 'the film')}",
-        *_doubts(found),
+        f"{tracked.video.count} frames, the face in {int(tracked.seen.sum())}; {_words(far, 'the film')}",
+        *_doubts(far),
     ]
     hidden: list[float] = []
 
     def new_light(old: PointLight) -> PointLight | EnvironmentLight:
         if light is not None:
-            return light.beside(old)
+            return light.beside(old.from_afar(middle))
         if panorama is None:
             return old
         around = EnvironmentLight.of(panorama, settings.turn)
-        mean = float((old.ambient + _SPHERE * old.intensity).mean())
-        return around.scaled(settings.exposure * mean / max(float(around.mean.mean()), 1e-9))
+        reaching = max(float(around.on_front.mean()), _BACKLIT * float(around.mean.mean()), 1e-9)
+        return around.scaled(settings.exposure * float(old.from_afar(middle).on_front().mean()) / reaching)
 
     def drawn() -> Iterator[Tensor]:
         latest, at = whole, 0
@@ -185,7 +144,8 @@ def relight_film(
             earlier = latest
             if settings.film_light == "each":
                 here = _spread(tracked.seen[at : at + len(chunk)], _AGAIN)
-                latest = _reaching(_light(tracked, {at + k: chunk[k] for k in here}, earlier)) if here else earlier
+                pictures = {at + k: chunk[k] for k in here}
+                latest = _reaching(_light(tracked, pictures, earlier), middle) if here else earlier
             for k, frame in enumerate(chunk):
                 if bool(tracked.seen[at]):
                     old = _between(earlier, latest, (k + 1) / len(chunk))
@@ -199,8 +159,9 @@ def relight_film(
                         result = draw(at, result, new)
                     if finder is not None:
                         parts = finder(frame, tracked.landmarks[at])
-                        mask = _shown(frame, parts, before)
-                        hidden.append(float((parts.of(*_NAMED) > 0.5).float().mean()))
+                        mask = _shown(frame, parts, before, tracked.landmarks[at])
+                        if settings.occluders:
+                            hidden.append(float((parts.of(*_NAMED) > 0.5).float().mean()))
                         result = torch.lerp(frame.float(), result.float(), mask).round().to(torch.uint8)
                     yield result[None]
                 else:
@@ -223,8 +184,8 @@ def _painter(tracked: TrackedFilm, settings: RelightSettings) -> Draw | None:
     if settings.texture is not None:
         paint = FacePaint.of(tracked.rig.neutral, load_paint(settings.texture))
     elif settings.rig is not None:
-        other = load_rig(settings.rig)
-        paint, moved = _head(other, settings.rig), _placed(other, tracked, settings.rig)
+        other = _other_head(settings.rig)
+        paint, moved = _head(other.neutral), _placed(other, tracked, settings.rig)
         height = other.vertices[:, 1] - other.vertices[other.neutral.landmarks[_CHIN], 1]
         share = ((height + _NECK[1]) / (_NECK[1] - _NECK[0])).clamp(0, 1)
     else:
@@ -238,11 +199,20 @@ def _painter(tracked: TrackedFilm, settings: RelightSettings) -> Draw | None:
     return draw
 
 
-def _head(other: BlendshapeRig, path: Path) -> FacePaint:
-    """All of another head as paint, eyes and teeth too."""
-    mesh = other.neutral
-    if mesh.texture is None or mesh.uvs is None:
+def _other_head(path: Path) -> BlendshapeRig:
+    """A head for the actor's place, with teeth where the template has some; hair and clothes are the film's."""
+    other = load_rig(path)
+    texture = other.neutral.texture
+    if texture is None or other.neutral.uvs is None:
         raise ValueRangeError(f"{path}: found a rig without a texture, expected one, which the film is to show")
+    if is_performers(other):
+        other = character(other, Look(haircut=None), texture.shape[-1], texture.float()).rig
+    return bare(other)
+
+
+def _head(mesh: Mesh) -> FacePaint:
+    """All of another head as paint, eyes and teeth too."""
+    assert mesh.texture is not None
     texture = torch.cat([mesh.texture.float(), torch.ones_like(mesh.texture[:1]).float()])
     paint = FacePaint.of(mesh, texture)
     return replace(paint, skin=torch.ones_like(paint.skin))
@@ -264,10 +234,19 @@ def _placed(other: BlendshapeRig, tracked: TrackedFilm, path: Path) -> Callable[
     return vertices
 
 
-def _shown(frame: Tensor, parts: FaceParts, before: Sequence[str]) -> Tensor:
-    """How far each pixel of a frame (3,H,W) shows what some parts do not hide, (H,W) in [0,1]; 1 beyond their crop."""
+def _shown(frame: Tensor, parts: FaceParts, before: Sequence[str], marks: Tensor) -> Tensor:
+    """How far each pixel of a frame (3,H,W) shows what some parts do not hide, (H,W) in [0,1]; 1 beyond their crop.
+
+    Hair within the hull of the landmarks (68,2) is a beard or brows, which belong to the face.
+    """
     y, x = torch.meshgrid(torch.arange(frame.shape[1]), torch.arange(frame.shape[2]), indexing="ij")
-    hidden = parts.at(torch.stack([x, y], -1), *before).nan_to_num(0.0)
+    pixels = torch.stack([x, y], -1)
+    hidden = parts.at(pixels, *before).nan_to_num(0.0)
+    if "hair" in before:
+        hull = cv2.convexHull(marks[torch.isfinite(marks).all(1)].float().numpy()).round().astype(np.int32)
+        inside = torch.from_numpy(cv2.fillConvexPoly(np.zeros(frame.shape[1:], np.uint8), hull, 1)).bool()
+        others = parts.at(pixels, *(name for name in before if name != "hair")).nan_to_num(0.0)
+        hidden = torch.where(inside, others, hidden)
     sigma = max(1.0, _SOFT / float(parts.transform[:, :2].det().abs().sqrt()))
     smooth = gaussian_blur(hidden[None, None], sigma)[0, 0]
     return ((_HIDDEN - smooth) / _EDGE + 0.5).clamp(0, 1)
@@ -312,9 +291,9 @@ def _doubts(light: PointLight) -> list[str]:
     ]
 
 
-def _reaching(light: PointLight) -> PointLight:
-    """The light without a source behind the head, of which a face that looks at the camera gets nothing."""
-    return replace(light, intensity=torch.zeros_like(light.intensity)) if _doubts(light) else light
+def _reaching(light: PointLight, middle: Tensor) -> PointLight:
+    """The light without a source behind a head at ``middle`` (3,), of which a face gets nothing."""
+    return replace(light, intensity=torch.zeros_like(light.intensity)) if _doubts(light.from_afar(middle)) else light
 
 
 def _near_face(mesh: Mesh) -> Tensor:

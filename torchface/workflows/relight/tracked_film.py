@@ -49,6 +49,12 @@ class TrackedFilm:
         pose = self.rotation[frame], self.translation[frame]
         return Camera(self.calibration.intrinsics.double(), *pose, self.video.width, self.video.height)
 
+    @property
+    def middle(self) -> Tensor:
+        """Of the head in the camera's frame, in the mean of the film, (3,) millimetres."""
+        points = self.rotation[self.seen] @ self.rig.vertices.double().mean(0) + self.translation[self.seen]
+        return points.mean(0)
+
     def vertices(self, frame: int) -> Tensor:
         """The face of a frame in the rig's space, (V,3)."""
         return self.rig(self.weights[frame : frame + 1].to(self.rig.deltas))[0]
