@@ -44,7 +44,7 @@ class ImageFit:
     """A person's head, found in I photographs with 68 landmarks each.
 
     Args:
-        mesh: the head at rest, in the model's place, with the rig's topology and skin.
+        mesh: the head at rest, with the rig's topology and skin; it stands as the rig's head, in the model's size.
         posed: the same with the expression of each photograph.
         coefficients: of the model's modes of identity, (K,), standard deviations; of what the model does not know the
             head has more.
@@ -96,7 +96,8 @@ def fit_images(
               + \lVert a \rVert^2 + \lVert u \rVert^2_{GP} + \sum_i \rho(w_i), \quad |a| \le 3, \; 0 \le w \le 1
 
     u are smooth differences of heads that the model does not know. PnP gives initial poses; then all moves at once,
-    each step a quadratic program in a box. At the end the shapes that show are transferred to the head found.
+    each step a quadratic program in a box. At the end the shapes that show are transferred to the head found, which
+    then stands as the rig's does.
 
     Args:
         model: heads at rest.
@@ -170,7 +171,7 @@ def fit_images(
         points = LinearPoints.of(mean, torch.cat([modes, deltas]), sites)
         problem = replace(problem, points=points)
         state = solve(problem, state)
-    fit = _result(problem, state, rig.neutral, mean, modes, deltas, sizes)
+    fit = _standing_as(rig.neutral, vertices, _result(problem, state, rig.neutral, mean, modes, deltas, sizes))
     if images is None:
         return fit
     progress("projecting the photographs onto the head")
@@ -227,6 +228,25 @@ def _result(
         state.noise,
         covariance(problem, state)[kept][:, kept],
     )
+
+
+def _standing_as(template: Mesh, landmarks: Tensor, fit: ImageFit) -> ImageFit:
+    """A fit whose head stands as a template does, and its cameras as before to it.
+
+    A face that is turned in its own coordinates, and cameras that are turned back, show the same. The mean head of a
+    model may be turned beside the template, and heads found beside it; the gaze and pose of who is tracked were, too.
+    """
+    own, there = (one.vertices[landmarks][None].detach().cpu().double() for one in (fit.mesh, template))
+    motion = similarity_transform(own, there, scale=False)
+    turn, shift = motion.rotation[0], motion.translation[0]
+    mesh, *posed = (
+        one.with_vertices(motion.apply(one.vertices.double())[0].to(one.vertices)) for one in (fit.mesh, *fit.posed)
+    )
+    cameras = []
+    for camera in fit.cameras:
+        rotation = camera.rotation.double() @ turn.T
+        cameras.append(replace(camera, rotation=rotation, translation=camera.translation.double() - rotation @ shift))
+    return replace(fit, mesh=mesh, posed=tuple(posed), cameras=tuple(cameras))
 
 
 def _in_place(rig: BlendshapeRig, mean: Tensor) -> Tensor:

@@ -10,7 +10,6 @@ from torch import Tensor
 from torchface.errors import ValueRangeError
 from torchface.geometry.cameras.distortion import undistort
 from torchface.geometry.meshes.normal_maps import SurfaceMaps
-from torchface.geometry.similarity import similarity_transform
 from torchface.landmarks.images.face_reading import FaceReading
 from torchface.modeling import FitSettings, HeadModel, ImageFit, fit_images, transfer_with_report
 from torchface.modeling.photographs.frame_choice import choose_frames
@@ -92,25 +91,4 @@ def person_head(
         settings=settings,
         progress=progress,
     )
-    fit = _looking_ahead(fit, rig)
     return PersonHead(transfer_with_report(rig, fit.mesh, progress=progress).rig, fit, frames)
-
-
-def _looking_ahead(fit: ImageFit, rig: BlendshapeRig) -> ImageFit:
-    """A fit whose head stands as the mean head does, and its cameras as before to it.
-
-    A face that is turned in its own coordinates, and cameras that are turned back, show the same. Heads found were
-    turned by 7 to 9 degrees about x; poses and gaze then were, too.
-    """
-    marks = rig.neutral.landmarks
-    own, mean = (one[marks].detach().cpu().double()[None] for one in (fit.mesh.vertices, rig.vertices))
-    motion = similarity_transform(own, mean, scale=False)
-    turn, shift = motion.rotation[0], motion.translation[0]
-    mesh, *posed = (
-        one.with_vertices(motion.apply(one.vertices.double())[0].to(one.vertices)) for one in (fit.mesh, *fit.posed)
-    )
-    cameras = []
-    for camera in fit.cameras:
-        rotation = camera.rotation.double() @ turn.T
-        cameras.append(replace(camera, rotation=rotation, translation=camera.translation.double() - rotation @ shift))
-    return replace(fit, mesh=mesh, posed=tuple(posed), cameras=tuple(cameras))
