@@ -78,6 +78,7 @@ def test_the_command_runs(python: Path, tmp_path: Path) -> None:
     assert "transfer" in shown
 
 
+@pytest.mark.bench  # the wheel holds the recipe, as the first test says
 def test_a_recipe_of_the_wheel_learns(python: Path, tmp_path: Path) -> None:
     words = ["train", "marker_solver", "--markers", "20", "--frames", "30", "--out", "models/own"]
     code = f"import sys, torchface.cli; torchface.cli.main({words}); print('train' in sys.modules)"

@@ -70,6 +70,7 @@ def test_the_graph_is_the_exact_solve(examples: ExampleShapes, method: object, t
     assert [one.name for one in session.get_outputs()] == ["weights", "carried"]
 
 
+@pytest.mark.bench  # torch.export takes ten seconds
 def test_it_is_written_with_its_names_or_not_at_all(
     examples: ExampleShapes, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

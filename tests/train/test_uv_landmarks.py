@@ -133,7 +133,11 @@ def test_a_detector_of_textures_refuses_a_scan_without(trained: tuple[Trained, P
         scan_landmarks(UVLandmarkDetector(2), scan)
 
 
-def test_annotations_that_cannot_be_used_are_named(folder: Path, tmp_path: Path) -> None:
+def test_annotations_that_cannot_be_used_are_named(tmp_path: Path) -> None:
+    folder = tmp_path / "scans"
+    people = draw_identities(2, torch.Generator().manual_seed(2))
+    coarse = ScannerSettings(voxel=8.0, detail=8.0, photography=Photography(height=120))
+    write_scans((neutral_head(identity) for identity in people), folder, coarse)
     document = json.loads((folder / "annotations.json").read_text())
     one = dict(document, scans={"scan_000.obj": document["scans"]["scan_000.obj"]})
     (tmp_path / "one.json").write_text(json.dumps(one))

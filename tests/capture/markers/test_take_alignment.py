@@ -114,8 +114,18 @@ def swapped(take: Take, pair: tuple[int, int], share: float) -> Take:
     return replace(take, markers=Track(take.markers.names, values))
 
 
-@pytest.mark.parametrize("pair", [(0, 60), (3, 41), (7, 90)])
-@pytest.mark.parametrize(("share", "neutral_frame"), [(0.09, None), (0.4, None), (0.4, 60)])
+@pytest.mark.parametrize(
+    ("pair", "share", "neutral_frame"),
+    [
+        ((0, 60), 0.09, None),
+        ((3, 41), 0.4, None),
+        *(
+            pytest.param(pair, share, frame, marks=pytest.mark.bench)
+            for pair, share, frame in (((7, 90), 0.09, None), ((7, 90), 0.4, None), ((0, 60), 0.4, None))
+        ),
+        *((pair, 0.4, 60) for pair in ((0, 60), (3, 41), (7, 90))),
+    ],
+)
 def test_exchanged_labels_do_not_move_the_alignment(
     performance: Performance, stage_space: Similarity, pair: tuple[int, int], share: float, neutral_frame: int | None
 ) -> None:

@@ -38,6 +38,7 @@ def test_errors_on_the_performer_are_smaller(performance: Performance) -> None:
     check_errors(performance, 0.8, 0)  # made-up curves have corners
 
 
+@pytest.mark.bench
 @pytest.mark.real
 def test_errors_on_a_real_take_are_smaller(real_capture: Performance) -> None:
     check_errors(real_capture, 0.65, 2)

@@ -80,6 +80,7 @@ def test_a_smile_of_the_performer_is_shaded_as_it_is_shaped(chromium: Any, tmp_p
     assert_shaded_alike(*pictures(chromium, [(file, shot) for file in files], SIDE))
 
 
+@pytest.mark.bench
 @pytest.mark.real
 @pytest.mark.usefixtures("node")
 def test_a_real_head_has_eyes_and_skin_in_their_own_colours_and_shaded_shapes(

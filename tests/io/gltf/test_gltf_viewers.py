@@ -114,6 +114,7 @@ def test_a_head_of_parts_is_valid_and_moves_alike_in_three(node: str, tmp_path: 
     )
 
 
+@pytest.mark.bench
 @pytest.mark.real
 def test_a_real_head_of_parts_is_valid_and_moves_alike_in_three(node: str, tmp_path: Path, ict_folder: Path) -> None:
     rig = load_rig(ict_folder, shapes=["jawOpen", "eyeBlink_L"])

@@ -348,6 +348,7 @@ def test_lashes_are_hairs_on_a_clear_ground() -> None:
     assert float(faded[-4, 3]) < 0.1
 
 
+@pytest.mark.bench
 @pytest.mark.real
 def test_a_real_head_of_parts_comes_back_as_the_same_rig(ict_folder: Path, tmp_path: Path) -> None:
     rig = load_rig(ict_folder, shapes=["jawOpen", "eyeBlink_L"])

@@ -320,6 +320,7 @@ def test_a_header_that_is_no_python_is_refused(tmp_path: Path) -> None:
         load_head_model_file(tmp_path / "v.npy")
 
 
+@pytest.mark.bench
 def test_eos_itself_reads_the_planted_file_and_its_own_is_read(rig: BlendshapeRig, tmp_path: Path) -> None:
     models = pytest.importorskip("eos").morphablemodel
     write_eos(rig, tmp_path / "planted.bin")

@@ -60,6 +60,7 @@ def test_the_real_head_has_its_parts_shapes_landmarks_and_mirror(ict_folder: Pat
     assert sum(held) > 0.999 * len(held)
 
 
+@pytest.mark.bench
 @pytest.mark.real
 def test_a_real_shape_moves_as_another_reader_says(ict_folder: Path) -> None:
     rig = load_rig(ict_folder, shapes=["cheekRaiser_L", "jawOpen"])

@@ -28,6 +28,7 @@ def test_the_templates_own_closed_face_opens_to_its_neutral(template: Blendshape
     assert float((opened.vertices - template.vertices).norm(dim=-1).max()) < 1e-3
 
 
+@pytest.mark.bench
 def test_other_performers_eyes_open_as_their_own(template: BlendshapeRig) -> None:
     for identity in draw_identities(2, torch.Generator().manual_seed(1)):
         actor = performer(identity, texture=False)

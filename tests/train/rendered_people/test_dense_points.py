@@ -59,6 +59,7 @@ def test_pictures_have_the_weights_that_they_show(performers: HeadKind) -> None:
         assert float((picture.rgba[3, spots[:, 1], spots[:, 0]] == 255).float().mean()) > 0.95
 
 
+@pytest.mark.bench
 @pytest.mark.real
 def test_points_of_peoples_heads_lie_where_the_performers_do(performers: HeadKind, ict_folder: Path) -> None:
     people = people_kind(load_ict_facekit(ict_folder), load_identity_modes(ict_folder))

@@ -106,6 +106,7 @@ def seen_as_they_are(rig: BlendshapeRig, size: float, patch: pytest.MonkeyPatch)
     patch.setattr(arkit_rig, "seen_landmarks", lambda head, template, progress: (marks, places))
 
 
+@pytest.mark.bench
 def test_the_unit_does_not_matter(monkeypatch: pytest.MonkeyPatch) -> None:
     actor = performer(texture=False)
     seen_as_they_are(actor, 10.0, monkeypatch)

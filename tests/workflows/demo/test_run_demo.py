@@ -3,6 +3,7 @@
 import html
 import re
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -15,10 +16,12 @@ from torchface.io import load_rig, load_take, save_mesh, save_rig
 from torchface.mesh import Mesh
 from torchface.onnx import SolverReport
 from torchface.rig import BlendshapeRig
+from torchface.synthetic.head.embedded_character import shown_rig
 from torchface.workflows.demo.demo_page import result_rows, scene_rows, write_demo_page
 from torchface.workflows.demo.run_demo import FLAWS, embedded_scene, run_demo, scene_from
 
 
+@pytest.mark.usefixtures("coarse_figures")
 def test_the_embedded_performer_comes_back_and_every_file_says_the_same(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -30,7 +33,8 @@ def test_the_embedded_performer_comes_back_and_every_file_says_the_same(
         return SolverReport(path, path.write_bytes(bytes(9)), None, 1, 1, (), 0.0, 0.0)
 
     monkeypatch.setattr("torchface.workflows.demo.run_demo.export_solver", exported)
-    result = run_demo(embedded_scene(seed=4, frames=150), tmp_path, seed=4)
+    monkeypatch.setattr("torchface.workflows.demo.run_demo.shown_rig", partial(shown_rig, size=256))
+    result = run_demo(embedded_scene(seed=4, frames=80), tmp_path, seed=4)
     noise = 3**0.5 * FLAWS.noise
     solved, single = result.solved, result.frame_by_frame
     for one in (solved, single):
@@ -96,6 +100,7 @@ def test_parts_that_do_not_fit_are_named(tmp_path: Path) -> None:
         scene_from(tmp_path / "template.glb", None, tmp_path / "square.obj", 1)
 
 
+@pytest.mark.bench
 @pytest.mark.real
 def test_a_real_take_moves_a_random_real_head(ict_folder: Path, performances: list[Path]) -> None:
     scene = scene_from(ict_folder, performances[0], None, seed=3)

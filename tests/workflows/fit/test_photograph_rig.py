@@ -182,17 +182,24 @@ def test_a_rig_that_travels_with_the_model_needs_no_template(studio: Path, tmp_p
     )
     assert own.rig.names == tuple(SHAPES)
     torch.testing.assert_close(own.rig.deltas, plain.rig.deltas, rtol=0, atol=0.02)
+
+
+@pytest.mark.bench
+def test_a_face_alone_is_fitted_as_the_head_is(studio: Path, tmp_path: Path) -> None:
     skin = performer(texture=False).neutral.annotations
     assert skin is not None
-    face = fit_photographs(
-        photographs,
-        marks,
-        studio / "heads_with_rig",
-        tmp_path / "c.glb",
-        PhotographSettings(fit=FitSettings(texture_size=0), part="face"),
+    whole, face = (
+        fit_photographs(
+            [studio / "p1.png"],
+            [studio / "p1.pts"],
+            studio / "heads_with_rig",
+            tmp_path / f"{part}.glb",
+            PhotographSettings(fit=FitSettings(texture_size=0), part=part),
+        ).rig
+        for part in (None, "face")
     )
-    assert len(face.rig.vertices) == int(skin.regions["face"].sum())
-    assert aligned_error(face.rig.vertices, own.rig.vertices[skin.regions["face"]]) < 0.5
+    assert len(face.vertices) == int(skin.regions["face"].sum())
+    assert aligned_error(face.vertices, whole.vertices[skin.regions["face"]]) < 0.5
 
 
 def test_a_model_of_a_part_says_which_part_of_the_template_it_meets(studio: Path) -> None:
@@ -248,6 +255,7 @@ def test_files_that_do_not_belong_together_are_named(studio: Path, tmp_path: Pat
         matching(dome)
 
 
+@pytest.mark.bench
 @pytest.mark.real
 def test_a_face_has_one_number_with_and_without_a_file(data: Path) -> None:
     folder = data / "images" / "dlib_faces"
@@ -315,6 +323,7 @@ def test_two_people_do_not_merge_without_a_word(people: People, tmp_path: Path) 
         people.remarks(0, 1, 2)
 
 
+@pytest.mark.bench
 @pytest.mark.real
 def test_given_landmarks_that_do_not_fit_are_said(people: People, tmp_path: Path) -> None:
     photograph = people.photographs[3]

@@ -89,6 +89,7 @@ def test_a_dirty_take_of_the_performer(performance: Performance) -> None:
     check_dirty_take(performance, 0, 1200)
 
 
+@pytest.mark.bench
 @pytest.mark.real
 def test_a_dirty_real_take(real_capture: Performance) -> None:
     check_dirty_take(real_capture, 2, 1200)

@@ -286,6 +286,7 @@ def test_what_cannot_be_tracked_is_said(trees: LandmarkTrees, tmp_path: Path) ->
     assert track.values.isnan().all()
 
 
+@pytest.mark.bench  # the shipped network tracks one in tests/workflows/track
 @pytest.mark.real
 def test_a_real_face_is_tracked_and_no_face_is_none(trees: LandmarkTrees, data: Path) -> None:
     track = track_landmarks(list(open_video(data / "video" / "single_face.mp4").frames())[:36], LandmarkTracker(trees))
