@@ -69,9 +69,14 @@ class FitCheck:
         return not self.distance <= self.limit
 
     @property
+    def usual(self) -> float:
+        """The largest ``distance`` that a stage's noise makes, millimetres."""
+        return TRIED_SHARE * self._size
+
+    @property
     def noisy(self) -> bool:
         """The distance is more than a stage's noise makes: worth looking for a cause."""
-        return not self.distance <= TRIED_SHARE * self._size
+        return not self.distance <= self.usual
 
     @property
     def doubtful(self) -> bool:

@@ -19,7 +19,7 @@ from torchface.capture import (
     clean_take,
     rest_residual,
 )
-from torchface.capture.markers import Cleanup, HelmetMotion
+from torchface.capture.markers import Cleanup, FitCheck, HelmetMotion
 from torchface.capture.markers.marker_solver import RIDGE, SPARSITY
 from torchface.evaluation.mesh_errors import marker_offsets
 from torchface.geometry.similarity import Similarity
@@ -40,6 +40,7 @@ from torchface.workflows.solve.weight_stream import StreamReport
 
 # A take is cleaned again where its alignment moves a site farther after the first cleaning, mm.
 _REALIGNED = 0.1
+_MOST = 0.8  # of the samples, below which a take shows too little
 _SHOWN_SPANS = 6
 _SHOWN_DEFECTS = 12
 
@@ -110,6 +111,13 @@ class Solution:
         markers = self.markers if residual is None else self.markers - residual.to(self.markers)
         return marker_offsets(self.rig, self.attachment, self.weights, markers)
 
+    @cached_property
+    def fit(self) -> FitCheck:
+        """How far the markers lie from the solved face, beside the size of the sites."""
+        sites = self.attachment.on(self.rig.neutral.faces, self.rig.vertices.detach())
+        radius = float((sites - sites.mean(0)).norm(dim=-1).mean())
+        return FitCheck(float(self.offsets.norm(dim=-1).nanmedian()), radius)
+
     @property
     def rmse(self) -> Tensor:
         """Marker RMSE a frame, (T,), millimetres."""
@@ -136,14 +144,29 @@ class SolveReport:
     warnings: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
 
+    def verdict(self) -> str:
+        """Whether the weights are to be used, in a line."""
+        fit = self.solution.fit
+        lie = (
+            f"the markers lie {fit.distance:.2g} mm from the solved face (median; at most {fit.usual:.2g} mm is usual "
+            f"for these sites"
+        )
+        seen = f"{100 * self.seen:.1f} % of the markers' samples were seen"
+        if fit.doubtful:
+            return f"result: poor, {lie}; are rig and sites this person's own, and the labels right?); {seen}"
+        if fit.noisy:
+            why = "more noise than a stage's, another head's rig, or a take that needs --clean or --slip?"
+            return f"result: in part, {lie}; {why}); {seen}"
+        if self.seen < _MOST:
+            return f"result: in part, {seen}, and where they are missing weights are guessed; {lie})"
+        return f"result: good, {lie}); {seen}"
+
     def lines(self) -> list[str]:
         """For people to read."""
         solution, rmse = self.solution, self.solution.rmse
         frames, worst = len(rmse), float(rmse.nan_to_num().max())
-        lines = [*(f"warning: {warning}" for warning in self.warnings), *self.notes]
-        lines.append(
-            f"{frames} frames at {solution.take.rate}, {100 * self.seen:.1f} % of the attachment's marker samples seen"
-        )
+        lines = [self.verdict(), *(f"warning: {warning}" for warning in self.warnings), *self.notes]
+        lines.append(f"{frames} frames at {solution.take.rate}")
         if solution.alignment is not None:
             x, y, z = solution.alignment.translation[0].tolist()
             scale = float(solution.alignment.scale[0])
