@@ -1,4 +1,4 @@
-"""The examples in docstrings run as they are written, in either float format."""
+"""The examples in docstrings run as they are written, in either float format (float64 in the bench)."""
 
 from __future__ import annotations
 
@@ -30,7 +30,9 @@ FLOAT32 = (
 )
 
 
-@pytest.fixture(params=[torch.float32, torch.float64], ids=["float32", "float64"])
+@pytest.fixture(
+    params=[torch.float32, pytest.param(torch.float64, marks=pytest.mark.bench)], ids=["float32", "float64"]
+)
 def float_format(request: pytest.FixtureRequest) -> Iterator[torch.dtype]:
     """What numbers become tensors of: examples show facts, which hold in both."""
     for name in MODULES:  # constants of a module have the format of its first import

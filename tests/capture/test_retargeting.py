@@ -117,6 +117,7 @@ def test_any_text_is_a_table_or_refused(tmp_path_factory: pytest.TempPathFactory
     assert all(isinstance(rule, ShapeRule) for rule in rules.values())
 
 
+@pytest.mark.bench
 @pytest.mark.real
 def test_a_real_performance_reaches_every_shape_that_both_rigs_have(ict_folder: Path, performances: list[Path]) -> None:
     rig = load_rig(ict_folder, part="face")

@@ -112,6 +112,7 @@ def test_transforms_are_loops() -> None:
         torch.testing.assert_close(jacobian(lambda f: layer(f, H))(f), wanted, rtol=0, atol=1e-9)
 
 
+@pytest.mark.bench  # tests/modules compiles the layer
 def test_a_compiled_network_learns_as_it_does_uncompiled() -> None:
     """In one graph, its backward pass too."""
     layer = ProjectedGradient(nn.Parameter(hessians(size=5)))
@@ -139,7 +140,7 @@ class WithHessian(nn.Module):
         return found
 
 
-@pytest.mark.parametrize("own", [False, True], ids=["shared", "each"])
+@pytest.mark.parametrize("own", [pytest.param(False, marks=pytest.mark.bench), True], ids=["shared", "each"])
 def test_onnx_runtime_computes_the_same_in_a_loop(tmp_path: Path, own: bool) -> None:
     """An H that the graph holds, and one that it computes of its inputs, with a tolerance."""
     H = hessians(*((6,) if own else ())).float()

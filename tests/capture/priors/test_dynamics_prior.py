@@ -194,6 +194,7 @@ def test_the_zoo_keeps_it(prior: DynamicsPrior, tmp_path: Path) -> None:
         assert torch.equal(found, expected)
 
 
+@pytest.mark.bench
 @pytest.mark.real
 def test_real_takes_are_predicted_better_than_by_a_line(performances: list[Path]) -> None:
     tracks = [load_take(path).weights for path in performances]

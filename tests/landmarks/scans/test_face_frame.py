@@ -31,7 +31,7 @@ def posed(identity: Tensor, seed: int) -> Example:
 
 @pytest.fixture(scope="module")
 def examples() -> list[Example]:
-    identities = draw_identities(8, torch.Generator().manual_seed(5))
+    identities = draw_identities(7, torch.Generator().manual_seed(5))
     return [posed(identity, seed) for seed, identity in enumerate(identities)]
 
 
@@ -42,7 +42,7 @@ def frame(examples: list[Example]) -> FaceFrame:
 
 @pytest.fixture(scope="module")
 def poses(frame: FaceFrame, examples: list[Example]) -> list[Similarity]:
-    """The poses found of the three heads that the frame was not learned from."""
+    """The poses found of the two heads that the frame was not learned from."""
     return [frame.locate(mesh) for mesh, _ in examples[5:]]
 
 
@@ -65,24 +65,20 @@ def test_new_heads_are_found_in_any_pose(frame: FaceFrame, examples: list[Exampl
     assert sum(errors) / len(errors) < 5.0
 
 
-def test_turning_a_scan_turns_its_pose(frame: FaceFrame, examples: list[Example], poses: list[Similarity]) -> None:
+def test_a_scan_turned_and_smaller_has_the_pose_turned_and_larger(
+    frame: FaceFrame, examples: list[Example], poses: list[Similarity]
+) -> None:
     mesh, points = examples[6]
-    turn = torch.tensor([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
-    turned = mesh.with_vertices(mesh.vertices @ turn.T + 50)
-    first, second = poses[1], frame.locate(turned)
+    turn = 0.92 * torch.tensor([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    first, second = poses[1], frame.locate(mesh.with_vertices(mesh.vertices @ turn.T + 50))
     here = first.apply(points[None])[0]
     there = second.apply((points @ turn.T.double() + 50)[None])[0]
-    assert (here - there).norm(dim=-1).max() < 0.5
-
-
-def test_size_comes_out(frame: FaceFrame, examples: list[Example], poses: list[Similarity]) -> None:
-    mesh, _ = examples[7]
-    ratio = frame.locate(mesh.with_vertices(0.92 * mesh.vertices)).scale / poses[2].scale
-    assert float(ratio) == pytest.approx(1 / 0.92, rel=0.01)
+    assert (here - there).norm(dim=-1).max() < 1.0
+    assert float(second.scale / first.scale) == pytest.approx(1 / 0.92, rel=0.01)
 
 
 def test_a_scan_inside_out_and_with_crumbs_is_found(frame: FaceFrame, examples: list[Example]) -> None:
-    mesh, points = examples[7]
+    mesh, points = examples[5]
     crumb = trimesh.creation.icosphere(subdivisions=2, radius=6.0)
     extra = torch.tensor(crumb.vertices).float() + mesh.vertices.mean(0) + 200
     vertices = torch.cat([mesh.vertices, extra])
