@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -50,8 +51,11 @@ def test_the_file_is_the_graph(written: SolverReport, turned_bumps: MarkerSolver
     assert [gap.missing for gap in written.gaps] == [0.0, 0.1, 0.3]
     assert max(gap.parity for gap in written.gaps) <= 1e-5
     assert max(gap.worst for gap in written.gaps) <= 1e-5
+    assert written.verdict().startswith("result: good, the graph's error is at most 0.00")
+    few = replace(written, gaps=(replace(written.gaps[0], worst=2e-3), *written.gaps[1:]))
+    assert few.verdict().startswith("result: poor, the graph's error is at most 0.2 % above")
     assert written.size == path.stat().st_size
-    assert "30% missing" in str(written)
+    assert "30% of the markers missing" in str(written)
     assert list(path.parent.iterdir()) == [path]
 
     graph = solver_graph(turned_bumps, random_frames(turned_bumps, 512))

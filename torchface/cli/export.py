@@ -4,15 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import Annotated, Literal
 
 from torchface.cli.command_options import Output, OutputPath
 from torchface.cli.progress_bars import progress_bars
 from torchface.cli.terminal import Quiet, console, print_lines, print_path, print_table
-
-if TYPE_CHECKING:
-    from torchface.onnx import SolverReport
-
 
 Method = Literal["splitting", "projected-gradient"]
 
@@ -41,9 +37,7 @@ def solver(
         part: Keep this region of the rig only, such as face.
         quiet: Show no progress.
     """
-    from torchface.onnx import export_solver
-
-    _write_solver(export_solver, rig, attachment, out, method, part, quiet)
+    _write_solver(False, rig, attachment, out, method, part, quiet)
 
 
 def hybrid_solver(
@@ -68,13 +62,11 @@ def hybrid_solver(
         part: Keep this region of the rig only, such as face.
         quiet: Show no progress.
     """
-    from torchface.onnx import export_hybrid_solver
-
-    _write_solver(export_hybrid_solver, rig, attachment, out, method, part, quiet)
+    _write_solver(True, rig, attachment, out, method, part, quiet)
 
 
 def _write_solver(
-    export: Callable[..., SolverReport],
+    hybrid: bool,
     rig: Path,
     attachment: Path,
     out: Path,
@@ -83,16 +75,19 @@ def _write_solver(
     quiet: bool,
 ) -> None:
     from torchface.attachment import Attachment
+    from torchface.capture import MarkerSolver
     from torchface.files.job_lock import file_lock
     from torchface.io import load_rig
     from torchface.onnx import GraphSteps
+    from torchface.onnx.solver_graph_export import export_marker_solver
 
     with file_lock(out, ".onnx"), progress_bars(quiet) as progress:
         progress("reading the rig")
         loaded, where = load_rig(rig, part=part), Attachment.load(attachment)
         where.check(loaded.neutral, attachment, rig)
-        progress("exporting and checking")
-        report = export(loaded, where, out, steps=GraphSteps(method=method))
+        solver = MarkerSolver(loaded, where)
+        report = export_marker_solver(solver, out, GraphSteps(method=method), hybrid=hybrid, progress=progress)
+    print_lines([report.verdict()])
     print_table(report.rows())
     print_path(out)
 
