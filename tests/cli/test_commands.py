@@ -11,7 +11,6 @@ import torch
 from displaced_sites import misplaced, site_distances
 
 import torchface
-from torchface.attachment import Attachment
 from torchface.capture import MarkerSolver, WholeTakeSolver
 from torchface.cli import COMMANDS, GROUPS, main
 from torchface.evaluation import weight_jitter
@@ -132,18 +131,19 @@ def test_render_and_info_and_export(
         assert fact in told
     out = shoot / "solver.onnx"
 
-    def exported(rig: BlendshapeRig, sites: Attachment, path: Path, steps: GraphSteps) -> Any:
+    def exported(solver: MarkerSolver, path: Path, steps: GraphSteps, **_: object) -> Any:
         """In place of twenty seconds of ``torch.export``."""
         values = [
-            onnx.helper.make_tensor_value_info(name, 1, [len(sites.labels or ()), 3]) for name in ("markers", "weights")
+            onnx.helper.make_tensor_value_info(name, 1, [len(solver.labels), 3]) for name in ("markers", "weights")
         ]
         node = onnx.helper.make_node("Identity", ["markers"], ["weights"])
         opset = [onnx.helper.make_opsetid("", 18)]
         graph = onnx.helper.make_graph([node], "g", values[:1], values[1:])
         onnx.save(onnx.helper.make_model(graph, opset_imports=opset, ir_version=9), path)
-        return SimpleNamespace(rows=lambda: [(", ".join(rig.names), steps.method)])
+        rows = [(", ".join(solver.names), steps.method)]
+        return SimpleNamespace(rows=lambda: rows, verdict=lambda: "result: good")
 
-    monkeypatch.setattr("torchface.onnx.export_solver", exported)
+    monkeypatch.setattr("torchface.onnx.solver_graph_export.export_marker_solver", exported)
     run("export", "solver", "--rig", shoot / "rig.glb", "--attachment", shoot / "attachment.json", "--out", out)
     said = capsys.readouterr()
     assert "jawOpen, browInnerUp, mouthSmileLeft, mouthSmileRight" in said.out + said.err
