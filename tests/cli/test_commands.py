@@ -11,6 +11,7 @@ import torch
 from displaced_sites import misplaced, site_distances
 
 import torchface
+from torchface.attachment import Attachment
 from torchface.capture import MarkerSolver, WholeTakeSolver
 from torchface.cli import COMMANDS, GROUPS, main
 from torchface.evaluation import weight_jitter
