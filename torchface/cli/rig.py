@@ -167,7 +167,7 @@ def rig(
 
 def _rig_character(scan: tuple[Path, ...], out: Path, parts: tuple[bool, bool], given: list[str], quiet: bool) -> None:
     from torchface.errors import ValueRangeError
-    from torchface.workflows.rig.character_rig import PICTURE_ENDING, check_character, rig_character
+    from torchface.workflows.rig.character_rig import check_character, rig_character
     from torchface.workflows.rig.usd_character import USD_ENDINGS, rig_usd_character
 
     if given or len(scan) > 1:
@@ -188,5 +188,6 @@ def _rig_character(scan: tuple[Path, ...], out: Path, parts: tuple[bool, bool], 
         )
     for line in report.lines():
         console.print(line, highlight=False)
-    print_path(out.with_name(f"{out.stem}{PICTURE_ENDING}"))
+    if report.figure is not None:
+        print_path(report.figure)
     print_path(out)

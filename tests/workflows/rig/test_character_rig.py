@@ -164,6 +164,25 @@ def test_files_that_are_no_characters_are_refused(tmp_path: Path) -> None:
         check_character(tmp_path / "hero.obj")
 
 
+def test_a_character_that_has_all_shapes_is_copied_at_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(character_rig, "find_character_face", lambda *_: pytest.fail("looks for a face"))
+    head = Mesh(torch.eye(3), torch.tensor([[0, 1, 2]]))
+    names = [name.replace("Left", "_L").replace("Right", "_R") for name in ARKIT]
+    how = Planted(vrm="VRMC_vrm", expressions={"blinkLeft": names[0]})
+    write_character(tmp_path / "a.vrm", head, {name: torch.eye(3) for name in names}, how)
+    report = rig_character(tmp_path / "a.vrm", tmp_path / "b.vrm")
+    before, after = (read_character(read_document(tmp_path / name)) for name in ("a.vrm", "b.vrm"))
+    assert after.blocks[0].names == ARKIT
+    assert torch.equal(
+        torch.as_tensor(after.targets(after.blocks[0])), torch.as_tensor(before.targets(before.blocks[0]))
+    )
+    assert set(vrm_expressions(read_document(tmp_path / "b.vrm"))) == {*ARKIT, "blinkLeft"}
+    assert report.made == ()
+    assert report.figure is None
+    assert "already there: 52" in report.lines()[0]
+    assert "nothing to make" in " ".join(report.lines())
+
+
 def test_few_triangles_and_shapes_that_move_far_are_warned_of(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     person = performer(texture=False).select(["jawOpen", "mouthPucker"])
     coarse = decimated(person, 1400)

@@ -17,7 +17,7 @@ from torchface.files.job_lock import file_lock
 from torchface.files.whole_files import all_or_none, check_ending, check_there
 from torchface.geometry.meshes.operators import vertex_normals
 from torchface.io.gltf.character_scene import Block, Character, read_character
-from torchface.io.gltf.gltf_document import read_document
+from torchface.io.gltf.gltf_document import Document, read_document
 from torchface.io.gltf.morph_insertion import AddedTargets, document_with_targets, rename_targets, write_edited
 from torchface.io.gltf.part_insertion import document_with_parts
 from torchface.io.images.image_files import encode_png
@@ -71,7 +71,7 @@ class CharacterReport:
         expressions: of a VRM, those that were added.
         median_mm: between face and template, at a head's size.
         seconds: that finding the face took, and all.
-        figure: pictures of the face before and after.
+        figure: pictures of the face before and after; None where there was nothing to make.
     """
 
     made: tuple[str, ...]
@@ -112,6 +112,10 @@ def rig_character(
         progress("reading the character")
         document = read_document(path)
         character = read_character(document)
+        present, empty = _present(character)
+        missing = [name for name in ARKIT if name not in present]
+        if not (missing or inner_mouth or eyes):
+            return _copied(document, present, out, begin)
         surface = textured(character)
         figure = out.with_name(f"{out.stem}{PICTURE_ENDING}")
         try:
@@ -125,8 +129,6 @@ def rig_character(
                 f"make it coarser: npx @gltf-transform/cli simplify {path} coarse.glb --ratio 0.1 --error 0.001"
             )
         found_after = time.perf_counter() - begin
-        present, empty = _present(character)
-        missing = [name for name in ARKIT if name not in present]
         template = performer(texture=False)
         registration = _registered(template, face, path, progress)
         given: AddedParts | None = None
@@ -154,7 +156,7 @@ def rig_character(
         root, data = (
             document_with_targets(document, added, made, empty) if added else (copy.deepcopy(document.root), b"")
         )
-        rename_targets(root, job.spelled(present))
+        rename_targets(root, _spelled(present))
         expressions = add_expressions(document, root, job.binds(present, added))
         with all_or_none():
             write_edited(document, root, data, out)
@@ -231,6 +233,39 @@ def _present(character: Character) -> tuple[dict[str, _Present], tuple[str, ...]
     return {name: found[name] for name in ARKIT if name in found}, empty
 
 
+def _spelled(present: dict[str, _Present]) -> dict[str, str]:
+    """Names of the character's shapes that are ARKit's with a letter for the side, and ARKit's."""
+    single = {shape.names[0]: name for name, shape in present.items() if len(shape.names) == 1}
+    return {own: name for own, name in single.items() if own != name and side_written_out(own) == name}
+
+
+def _copied(document: Document, present: dict[str, _Present], out: Path, begin: float) -> CharacterReport:
+    """Writes a character that has all of ARKit's shapes, with their names and a VRM's expressions alone changed."""
+    root = copy.deepcopy(document.root)
+    rename_targets(root, _spelled(present))
+    expressions = add_expressions(document, root, {name: shape.binds for name, shape in present.items()})
+    write_edited(document, root, b"", out)
+    notes = [*_present_lines(present), "nothing to make: the file was copied, and no face was looked for"]
+    if expressions:
+        notes.append(f"expressions added to the VRM: {len(expressions)}")
+    names = {name: shape.names for name, shape in present.items()}
+    seconds = time.perf_counter() - begin
+    return CharacterReport((), names, expressions, 0.0, (0.0, seconds), None, tuple(notes))
+
+
+def _present_lines(there: dict[str, _Present]) -> list[str]:
+    """The shapes that a character has, for people to read."""
+    own = {name: shape.names for name, shape in there.items() if shape.names != (name,)}
+    lines = [f"already there: {len(there)} of ARKit's 52, kept as they are"] if there else []
+    if spelled := _spelled(there):
+        some = ", ".join(f"{old} -> {new}" for old, new in list(spelled.items())[:3])
+        lines.append(f"  written with ARKit's names: {len(spelled)} shapes, such as {some}")
+        own = {name: names for name, names in own.items() if names[0] not in spelled}
+    if own:
+        lines.append("  by other names: " + ", ".join(f"{k} ({' + '.join(v)})" for k, v in own.items()))
+    return lines
+
+
 def _registered(template: BlendshapeRig, face: CharacterFace, path: Path, progress: Progress) -> Registration:
     """The template on the head; refused where its face does not come to lie on it."""
     registration = register(template.neutral, face.skin, face.landmarks, texture_size=0, progress=progress)
@@ -295,12 +330,6 @@ class _Job:
             added.append(AddedTargets(block.mesh, block.primitives, positions, normal_rows))
         return added
 
-    @staticmethod
-    def spelled(present: dict[str, _Present]) -> dict[str, str]:
-        """Names of the character's shapes that are ARKit's with a letter for the side, and ARKit's."""
-        single = {shape.names[0]: name for name, shape in present.items() if len(shape.names) == 1}
-        return {own: name for own, name in single.items() if own != name and side_written_out(own) == name}
-
     def binds(self, present: dict[str, _Present], added: list[AddedTargets]) -> dict[str, tuple[MorphBind, ...]]:
         """What each of ARKit's expressions of a VRM drives: shapes that were there, and new ones."""
         bound = {name: shape.binds for name, shape in present.items()}
@@ -344,7 +373,6 @@ class _Job:
         self, there: dict[str, _Present], expressions: tuple[str, ...], seconds: tuple[float, float]
     ) -> list[str]:
         """For people to read."""
-        present = {name: shape.names for name, shape in there.items()}
         found, record, character = self.face.found, self.carried.registration.record, self.character
         where = f"bone {character.head_bone!r} and " if character.head is not None else ""
         lines = [
@@ -364,17 +392,9 @@ class _Job:
         if any(name in self.made for name in (*BLINKS, _JAW)):
             cut = self.parts is not None and self.parts.lips_cut
             lines += [f"  {note}" for note in self.carried.notes(lips_cut=cut)]
-        own = {name: names for name, names in present.items() if names != (name,)}
-        if present:
-            lines.append(f"already there: {len(present)} of ARKit's 52, kept as they are")
-        if spelled := self.spelled(there):
-            some = ", ".join(f"{old} -> {new}" for old, new in list(spelled.items())[:3])
-            lines.append(f"  written with ARKit's names: {len(spelled)} shapes, such as {some}")
-            own = {name: names for name, names in own.items() if names[0] not in spelled}
-        if own:
-            lines.append("  by other names: " + ", ".join(f"{k} ({' + '.join(v)})" for k, v in own.items()))
+        lines += _present_lines(there)
         lines += self._doubts(there)
-        missing = [name for name in ARKIT if name not in self.made and name not in present]
+        missing = [name for name in ARKIT if name not in self.made and name not in there]
         why = " (it has no tongue of its own; --inner-mouth gives it one)" if missing == [_TONGUE] else ""
         lines.append(f"made: {len(self.made)} shapes" + (f"; not made: {', '.join(missing)}{why}" if missing else ""))
         if self.empty:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import sys
 import tempfile
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -57,8 +58,7 @@ def rig_usd_character(path: Path, out: Path, progress: Progress | None = None) -
             finally:
                 if target != temporary:
                     target.unlink(missing_ok=True)
-    names = (report.made, report.present, report.expressions, report.median_mm, report.seconds)
-    return CharacterReport(*names, figure, report.notes)
+    return replace(report, figure=report.figure and figure)
 
 
 def _write_glb(scene: Scene, path: Path) -> None:
