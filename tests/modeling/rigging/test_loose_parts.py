@@ -34,6 +34,29 @@ def test_a_tongue_in_one_piece_with_gums_comes_out_and_the_arch_stays() -> None:
     assert float(tip[hill, 1].max()) < float(points[hill, 1].max()) + 1e-6
 
 
+def test_what_is_near_teeth_is_gums_and_stays() -> None:
+    points, faces, hill = gums(18.0)
+    below = -points[:, 1] - 0.2 * points[:, 2]
+    near = (points - torch.tensor([0.0, 0.0, -16.0])).norm(dim=-1) < 2.5  # of the hill's front edge
+    whole = torch.ones(len(points), dtype=torch.bool)
+    assert float(_tongue_of_gums(points, faces, whole, below)[near].min()) > 0.8
+    tongue = _tongue_of_gums(points, faces, whole, below, [near])
+    assert float(tongue[near].max()) < 0.01
+    assert float(tongue[hill & (points[:, 2] < -24)].min()) > 0.8
+
+
+def test_tufts_of_a_beard_are_not_in_the_mouth_though_their_roots_are_under_the_skin() -> None:
+    cube = torch.tensor([[x, y, z] for x in (-2, 2) for y in (-3, 3) for z in (-2, 2)]).double()
+    skin = torch.tensor([[-60, -60, 0], [60, -60, 0], [60, 60, 0], [-60, 60, 0]]).double()
+    tuft = torch.tensor([[0, 0, -1], [1, 0, -1], [0, -8, 5]]).double() + torch.tensor([9.0, 12.0, 0.0])
+    points = torch.cat([skin, cube - torch.tensor([0.0, 6.0, 8.0]), tuft - torch.tensor([0.0, 0.0, 1.0])])
+    part = torch.tensor([0] * 4 + [1] * 8 + [2] * 3)
+    faces = torch.tensor([[0, 1, 2], [0, 2, 3]])
+    head = _Head(points, part, part > 0, torch.zeros(1, len(points), 3))
+    inside, _, _ = _in_the_mouth(head, faces, part > 0, torch.zeros(20, 3).double())
+    assert torch.equal(inside, part == 1)
+
+
 def test_a_mouths_floor_is_no_tongue() -> None:
     points, faces, _ = gums(0.0)
     below = -points[:, 1] - 0.2 * points[:, 2]

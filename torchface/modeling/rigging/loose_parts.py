@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
 import torch
 from scipy import sparse
+from scipy.spatial import cKDTree
 from torch import Tensor
 
 from torchface.geometry.meshes.operators import vertex_normals
@@ -15,12 +17,14 @@ from torchface.geometry.meshes.surface_index import SurfaceIndex
 from torchface.geometry.similarity import Similarity, similarity_transform
 from torchface.geometry.spheres import nearest_sphere
 from torchface.optim.sparse import SparseCholesky
+from torchface.rendering.raycast import RayCaster
 from torchface.rig import BlendshapeRig
 
 _ROUND, _LEAST_BALL, _SMALLEST_BALL, _LARGEST_BALL = 0.12, 12, 0.4, 2.4
 """How far from a sphere an eyeball may be, in radii, its fewest vertices, and its size in the template's."""
 _EYEBALL_REACH, _CORNEA = 1.35, 0.8  # radii; the cosine of how far it reaches from its middle
 _IN_THE_MOUTH, _MOUTH_HEIGHT = 75.0, 25.0  # millimetres
+_DEEP, _ENCLOSED = 3.0, 0.25  # millimetres behind the skin; the share of a part that lies so
 _BITE, _BITE_BLEND = 0.2, 3.0
 """How much the line between upper and lower teeth rises toward the back, and the millimetres over which a part that
 both jaws share, such as gums in one piece, passes from the one to the other."""
@@ -35,6 +39,7 @@ _BACK, _BEHIND_TEETH, _TEETH, _LEAST_BACK, _FALLS = (
     8,
     4.0,
 )  # of half the arch's width; millimetres
+_STANDS, _GUM = 1.0, (3.0, 6.0)  # millimetres from teeth: a part they stand in; gums at most, tongue at least
 _TONGUE_OUT, _TONGUE_DOWN = 12.0, 8.0
 _OPEN, _TONGUE_RISE, _TONGUE_DROP = 0.33, 2.0, 15.0  # of jawOpen; millimetres over the lower teeth, and at the tip
 _ROOT, _LYING, _STIFF = 0.3, 2.0, 0.01
@@ -192,14 +197,16 @@ def _in_the_mouth(head: _Head, faces: Tensor, left: Tensor, lips: Tensor) -> tup
     middle = lips.mean(0)
     inside = torch.zeros_like(left)
     share, tongue = torch.zeros(2, len(left), dtype=torch.float64)
-    widest, gums, found = _FILLED, [], []
+    widest, gums, found, deep = _FILLED, [], [], _deep(head, faces, left)
     for one in head.part[left].unique().tolist():  # every tooth is a part
         rows = (head.part == one) & left
         away = head.vertices[rows] - middle
         at = away.mean(0)
         behind = float(at[2]) < 2.0 and abs(float(at[1])) < _MOUTH_HEIGHT
-        if behind and float(at.norm()) < _IN_THE_MOUTH and float(away.norm(dim=-1).max()) < 2 * _IN_THE_MOUTH:
+        near = float(at.norm()) < _IN_THE_MOUTH and float(away.norm(dim=-1).max()) < 2 * _IN_THE_MOUTH
+        if behind and near and float(deep[rows].double().mean()) > _ENCLOSED:
             found.append((rows, away))
+    teeth = [rows for rows, away in found if float(away[:, 0].amax() - away[:, 0].amin()) < _TONGUE]
     line, rise = _bite_plane([away for _, away in found])
     for rows, away in found:
         inside |= rows
@@ -208,16 +215,37 @@ def _in_the_mouth(head: _Head, faces: Tensor, left: Tensor, lips: Tensor) -> tup
         width, _, depth = (away.amax(0) - away.amin(0)).tolist()
         above = float((low < 0.5).double().mean())
         both = width > _ARCH and _BOTH_JAWS < above < 1 - _BOTH_JAWS
-        if both:
+        lower = float(below.mean()) > 0
+        if both or (lower and width > _ARCH and _holds(head.vertices[rows], [head.vertices[one] for one in teeth])):
             gums.append((rows, below))
+            lower = False
         share[rows] = low * low * (3 - 2 * low) if both else float(below.mean() > 0)
         filled = float((away[:, 0].abs() < 5.0).double().mean())  # gums are an arch, hollow in the middle
-        if float(below.mean()) > 0 and not both and width > _TONGUE and depth > _TONGUE and filled > widest:
+        if lower and width > _TONGUE and depth > _TONGUE and filled > widest:
             widest, tongue = filled, rows.double()
     if not tongue.any():
         for rows, below in gums:
-            tongue += _tongue_of_gums(head.vertices, faces, rows, below)
+            tongue += _tongue_of_gums(head.vertices, faces, rows, below, teeth)
     return inside, share, tongue
+
+
+def _deep(head: _Head, faces: Tensor, rows: Tensor) -> Tensor:
+    """Vertices (J,) of some that lie behind skin or between it, as much of a tooth does; roots of beards do not."""
+    skin, points = faces[~head.loose[faces].any(1)], head.vertices[rows]
+    found = rows.clone()
+    if len(skin):
+        caster = RayCaster(head.vertices, skin)
+        ways = torch.tensor([[0.0, 0, 1], [1, 0, 0], [-1, 0, 0]], dtype=torch.float64)
+        far = torch.stack([caster.distances(points, way.expand_as(points), 2 * _IN_THE_MOUTH) for way in ways])
+        before, left, right = (far > _DEEP) & (far < 2 * _IN_THE_MOUTH)
+        found[rows] = before | (left & right)
+    return found
+
+
+def _holds(points: Tensor, teeth: list[Tensor]) -> bool:
+    """Whether teeth stand in a part (n,3), as in gums."""
+    tree = cKDTree(points.numpy())
+    return sum(float(tree.query(one.numpy())[0].min()) < _STANDS for one in teeth) >= _ROW
 
 
 def _bite_plane(parts: list[Tensor]) -> tuple[float, float]:
@@ -235,8 +263,13 @@ def _bite_plane(parts: list[Tensor]) -> tuple[float, float]:
     return best[1:]
 
 
-def _tongue_of_gums(vertices: Tensor, faces: Tensor, rows: Tensor, below: Tensor) -> Tensor:
-    """How much each vertex (J,) is of a tongue in one piece with gums: harmonic from its back to the arch around it."""
+def _tongue_of_gums(
+    vertices: Tensor, faces: Tensor, rows: Tensor, below: Tensor, teeth: Sequence[Tensor] = ()
+) -> Tensor:
+    """How much each vertex (J,) is of a tongue in one piece with gums: harmonic from its back to the arch around it.
+
+    What is near teeth that are parts of their own is of the arch.
+    """
     none = torch.zeros(len(vertices), dtype=torch.float64)
     ids = rows.nonzero()[:, 0]
     place = torch.full((len(vertices),), -1)
@@ -256,6 +289,14 @@ def _tongue_of_gums(vertices: Tensor, faces: Tensor, rows: Tensor, below: Tensor
     if float(points[back, 1].quantile(0.9)) < gum:  # the mouth's floor
         return none
     back &= points[:, 1] > gum - _FALLS
+    if teeth:
+        nearby = cKDTree(vertices[torch.stack(list(teeth)).any(0)].numpy()).query(points.numpy())[0]
+        arch |= torch.from_numpy(nearby < _GUM[0])
+        back &= torch.from_numpy(nearby > _GUM[1])
+    up = torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64).expand_as(points)
+    under = RayCaster(points, own[low[own].all(1)]).occluded(points + 0.1 * up, up) & low & (facing[:, 1] > 0.5)
+    arch |= under  # the floor under a tongue
+    back &= ~under
     weight = torch.where(back | arch, 1e3, 1e-6)
     system = sparse.diags_array(weight.double().numpy()) + stretching_energy(points, own)
     none[ids] = SparseCholesky(system).solve((weight * back).double()[:, None])[:, 0].clamp(0, 1)

@@ -36,7 +36,8 @@ _HEAD_SHARE = 0.5  # of a vertex's weights on the head's bone, from which pictur
 _REACH, _BELOW, _NECK = 280.0, -210.0, 60.0  # millimetres of the reference: from its middle, below its eyes
 _EYE_REACH, _MOUTH_REACH, _SKIN_REACH = 48.0, 115.0, 8.0
 _BEFORE_LIPS, _MOUTH_HEIGHT = 4.0, 38.0
-_FACE_REACH = 95.0
+_FACE_REACH, _BEARD_REACH = 95.0, 130.0
+_TUFT, _ROOTED = 40.0, 3.0  # millimetres: the size of a tuft of a beard, and how near to the skin it begins
 _STILL = re.compile(
     r"(?<!brow)(?<!brow[_ .])hair|(?<![a-z])(hat|cap)(?![a-z])|helmet|glass|cloth|outfit|shirt|collar|scarf|hood"
     r"|(?<![a-z])mask|earring|(?<![a-z])horns?(?![a-z])",
@@ -197,7 +198,7 @@ def find_skin(vertices: Tensor, faces: Tensor, part: Tensor, placed: Tensor) -> 
 
 
 def _moves(own: Tensor, placed: Tensor, skin: cKDTree) -> bool:
-    """Whether a loose part (n,3) belongs to eyes or mouth, or lies on the face as brows and lashes do."""
+    """Whether a loose part (n,3) belongs to eyes or mouth, or is on the face as brows, lashes and beards are."""
     for eye in EYES:
         lids = placed[eye]
         centre = lids[torch.isfinite(lids).all(-1)].mean(0)
@@ -209,10 +210,12 @@ def _moves(own: Tensor, placed: Tensor, skin: cKDTree) -> bool:
     inside = bool(((own - lips).norm(dim=-1) < _MOUTH_REACH).all())
     if inside and float(at[2]) < _BEFORE_LIPS and abs(float(at[1])) < _MOUTH_HEIGHT:
         return True
-    face = placed[torch.isfinite(placed).all(-1)].mean(0)
-    if not bool(((own - face).norm(dim=-1) < _FACE_REACH).all()):
+    away = float((own - placed[torch.isfinite(placed).all(-1)].mean(0)).norm(dim=-1).max())
+    if away > _BEARD_REACH:
         return False
-    return bool((skin.query(own.numpy())[0] < _SKIN_REACH).all())
+    height = skin.query(own.numpy())[0]
+    tuft = float((own.amax(0) - own.amin(0)).max()) < _TUFT and height.min() < _ROOTED
+    return bool(tuft or (away < _FACE_REACH and (height < _SKIN_REACH).all()))
 
 
 def _landmarks(reference: Mesh, points: ReferencePoints, placed: Tensor, on_skin: Tensor) -> Landmarks:
