@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from torchface.modeling.rigging.blinks_that_shut import BLINKS, SkinOfHead, eyes_seen, shut_blinks
+from torchface.modeling.rigging.blinks_that_shut import BLINKS, SkinOfHead, _Lids, eyes_seen, shut_blinks
 from torchface.rig import BlendshapeRig
 from torchface.synthetic import performer
 
@@ -77,3 +77,20 @@ def test_painted_eyes_have_no_opening(actor: BlendshapeRig) -> None:
     assert torch.equal(same, half)
     assert left == (None, None)
     assert eyes_seen(head, torch.full_like(marks, torch.nan)) == [None, None]
+
+
+def test_a_large_triangle_of_a_lid_goes_before_a_round_eye(actor: BlendshapeRig) -> None:
+    head, _ = head_of(actor)
+    ball = actor.neutral.annotations.regions["eyeball_left"]
+    points, eye = head.vertices[ball], head.faces[ball[head.faces].all(1)]
+    middle, front = points.mean(0), float(points[:, 2].max())
+    corners = torch.tensor([[-16, -13, 0], [16, -13, 0], [0, 16, 0]]).double() + middle
+    corners[:, 2] = front - 1.0  # before the eye at its corners, which lie beside it, and 1 mm behind its front
+    first = len(head.vertices)
+    lid = SkinOfHead(torch.cat([head.vertices, corners]), torch.arange(first, first + 3)[None], head.loose, head.part)
+    rows = torch.arange(first, first + 3)
+    near = torch.zeros(first + 3, dtype=torch.bool)
+    lids = _Lids(replace(lid, faces=torch.cat([lid.faces, eye])), lid.faces, None, None, 8.0, near, eye)  # type: ignore[arg-type]
+    moved = lids._before_the_eye(torch.zeros(first + 3, 3).double(), rows)
+    assert bool((corners[:, 2] + moved[rows, 2] > front - 0.6).all())  # one of the places looked at is near the front
+    assert float(moved[rows, 2].max()) < 1.5

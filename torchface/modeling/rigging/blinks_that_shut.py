@@ -29,6 +29,12 @@ _FIRM, _TOUCH = 100.0, 0.3
 _SPAN, _ASIDE = 76.0, 1.6
 _AROUND = 1.5  # of the opening's half width, round its middle: the lids
 _BEHIND, _BEFORE, _LIFT, _MOST = 1.5, 0.5, 0.25, 12.0
+_PLACES = (
+    torch.tensor(
+        [[a, b, 4 - a - b] for a in range(5) for b in range(5 - a) if 4 not in (a, b, 4 - a - b)], dtype=torch.float64
+    )
+    / 4
+)  # of a triangle beside its corners: one of a coarse head stands through a round eye
 _LID = 0.8  # of the opening's height, from the upper lid's edge up: what unfolds
 _OTHER = 0.4, 0.6  # millimetres of a lid from the template's, mean: where it begins to unfold, and does wholly
 _FINEST, _HELD = 1.3, 0.005  # millimetres: narrower folds go; how much each place of the lid keeps to where it is
@@ -182,16 +188,23 @@ class _Lids:
         return share * SparseCholesky(system).solve(-torch.from_numpy(bending @ posed.numpy()))
 
     def _before_the_eye(self, delta: Tensor, rows: Tensor) -> Tensor:
-        """Lifts what was before the eye at rest, or beside it, before it in the pose."""
+        """Lifts what was before the eye at rest, or beside it, before it in the pose, triangles as a whole."""
         if not len(self.eye):
             return delta
         caster = RayCaster(self.head.vertices, self.eye)
-        free = _over(caster, self.head.vertices[rows]) < _BEFORE
-        posed = self.head.vertices[rows] + delta[rows]
-        lift = (_over(caster, posed) + _LIFT).clamp(0, _MOST)
-        moved = delta.clone()
-        moved[rows, 2] += torch.where(free & torch.isfinite(lift), lift, 0.0)
-        return moved
+        free = torch.zeros(len(delta), dtype=torch.bool)
+        free[rows] = _over(caster, self.head.vertices[rows]) < _BEFORE
+        faces = self.skin[free[self.skin].all(1)]
+        posed = self.head.vertices + delta
+        lift = torch.zeros(len(delta), dtype=torch.float64)
+        lift[free] = (_over(caster, posed[free]) + _LIFT).clamp(0, _MOST)
+        places = torch.einsum("pk,fkc->fpc", _PLACES, posed[faces])
+        lacking = _over(caster, places.flatten(0, 1)).view(len(faces), -1) - lift[faces] @ _PLACES.T
+        lift.scatter_reduce_(
+            0, faces.flatten(), (lift[faces] + lacking.amax(1).clamp(0, _MOST)[:, None]).flatten(), "amax"
+        )
+        posed[:, 2] += lift
+        return posed - self.head.vertices
 
     def _at(self, vertices: Tensor, points: SurfacePoints) -> Tensor:
         return (vertices[self.skin[points.triangle]] * points.barycentric[..., None]).sum(1)
