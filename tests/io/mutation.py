@@ -114,7 +114,7 @@ def check_reader(
         reader: a function of a path, at the top level of its module.
         seed_files: good files; the reader must accept them.
         suffix: how a case's file name ends, with the dot.
-        cases: how many; ``$TORCHFACE_FUZZ_CASES`` or 200 if absent.
+        cases: how many; ``$TORCHFACE_FUZZ_CASES`` or 100 if absent.
         name: how a case's file name begins.
 
     Raises:
@@ -126,7 +126,7 @@ def check_reader(
             **place_of(reader),
             "seeds": [str(path) for path in seed_files],
             "case": str(case),
-            "cases": cases or int(os.environ.get("TORCHFACE_FUZZ_CASES", "200")),
+            "cases": cases or int(os.environ.get("TORCHFACE_FUZZ_CASES", "100")),
         }
         try:
             # A child whose every case takes the allowed time is still ended some day.

@@ -117,6 +117,7 @@ def test_broken_times_are_refused_or_repaired_and_said(change: str, name: str, t
     torch.testing.assert_close(found.times, seconds - seconds[0], atol=1e-9, rtol=0)
 
 
+@pytest.mark.bench
 @pytest.mark.real
 def test_the_real_takes_are_even_and_keep_the_times_of_what_is_left(performances: list[Path], tmp_path: Path) -> None:
     for number, path in enumerate(performances):

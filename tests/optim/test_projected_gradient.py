@@ -140,7 +140,8 @@ class WithHessian(nn.Module):
         return found
 
 
-@pytest.mark.parametrize("own", [pytest.param(False, marks=pytest.mark.bench), True], ids=["shared", "each"])
+@pytest.mark.bench  # tests/onnx/test_module_graph.py exports a network with the layer in it
+@pytest.mark.parametrize("own", [False, True], ids=["shared", "each"])
 def test_onnx_runtime_computes_the_same_in_a_loop(tmp_path: Path, own: bool) -> None:
     """An H that the graph holds, and one that it computes of its inputs, with a tolerance."""
     H = hessians(*((6,) if own else ())).float()

@@ -186,6 +186,7 @@ def test_a_drag_takes_neighbours_along_and_is_one_step(video: Path, tracker: Tra
         AnnotationSession([], tmp_path)
 
 
+@pytest.mark.bench
 def test_the_recipe_learns_from_the_folder_and_tells_left_out_errors(
     film: PortraitVideo, video: Path, tmp_path: Path
 ) -> None:

@@ -143,6 +143,7 @@ def test_a_video_will_do(pictures: list[Tensor], tmp_path: Path, capsys: pytest.
     torch.testing.assert_close(load_calibration(out).intrinsics.diagonal(), K.diagonal(), rtol=0.01, atol=0)
 
 
+@pytest.mark.bench
 def test_two_cameras_are_put_where_they_are(
     rays: Tensor, pictures: list[Tensor], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -26,6 +26,7 @@ def test_the_built_in_tables_know_every_unit() -> None:
     assert matrix[UNITS.index("18L"), SHAPES.index("mouthLeft")] == pytest.approx(0.8)
 
 
+@pytest.mark.bench
 @pytest.mark.real
 def test_the_table_of_a_real_rig_names_its_shapes(ict_folder: Path) -> None:
     names = load_rig(ict_folder, part="face").names

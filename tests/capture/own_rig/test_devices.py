@@ -97,6 +97,7 @@ def test_the_pretended_device_is_one() -> None:
         assert bool((away > 6).any())
 
 
+@pytest.mark.bench  # the robust one begins with it
 def test_pnp(seen: tuple[Tensor, Tensor], device: str) -> None:
     points, pixels = seen
     pixels = pixels[:2]

@@ -140,6 +140,7 @@ def test_bad_input_is_named() -> None:
         PoseSettings(min_landmarks=3)
 
 
+@pytest.mark.bench
 @pytest.mark.real
 def test_expression_hardly_moves_the_stable_landmarks(
     real_capture: tuple[BlendshapeRig, object, list[Tensor]], performances: list[Path]

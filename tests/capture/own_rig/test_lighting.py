@@ -159,6 +159,7 @@ def test_paint_and_foreign_shadow_are_outliers(lit: tuple[Mesh, Camera, PointLig
     assert float(fit.inliers[0, fit.visible[0] & (rows < 66)].float().mean()) < 0.05
 
 
+@pytest.mark.bench
 def test_only_products_of_light_and_reflectance_are_told(
     lit: tuple[Mesh, Camera, PointLight, Tensor], found: LightFit
 ) -> None:

@@ -175,6 +175,7 @@ def test_tangents_are_the_ones_that_viewers_compute(node: str, tmp_path: Path) -
     assert_tangents_are_mikktspaces(node, tmp_path, replace(bent, uvs=(mesh.uvs - 0.5).abs() + 0.1 * mesh.uvs))
 
 
+@pytest.mark.bench
 @pytest.mark.real
 def test_tangents_of_a_real_face_are_the_ones_that_viewers_compute(node: str, tmp_path: Path, ict_folder: Path) -> None:
     assert_tangents_are_mikktspaces(node, tmp_path, load_rig(ict_folder, part="face").neutral)

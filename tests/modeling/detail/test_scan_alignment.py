@@ -118,6 +118,7 @@ def test_they_come_back_by_picked_points(planted: Planted, by_picks: NormalMap) 
     assert float(error.median()) <= 5
 
 
+@pytest.mark.bench  # test_normal_map_baking.py lays a scan without picks
 def test_they_come_back_with_no_point_picked(planted: Planted) -> None:
     error, _ = planted.errors(bake_normal_map(planted.raised, planted.scan, SIZE))
     assert len(error) > 500

@@ -197,6 +197,7 @@ def real_rig(ict_folder: Path) -> BlendshapeRig:
     return load_ict_facekit(ict_folder, shapes)
 
 
+@pytest.mark.bench
 @pytest.mark.real
 def test_a_real_head_onto_itself_and_onto_a_turned_copy(real_rig: BlendshapeRig) -> None:
     with pytest.warns(UserWarning, match="2 in mouthStretch_R"):

@@ -129,6 +129,7 @@ def test_shells_stay_behind_the_closed_lids_of_random_heads(ict_folder: Path) ->
         assert float(shape_depths(after, parts).max()) <= TOLERANCE
 
 
+@pytest.mark.bench
 @pytest.mark.real
 def test_parts_that_registration_left_before_the_lips_go_behind_them(ict_folder: Path) -> None:
     template = load_ict_facekit(ict_folder, ["jawOpen", "eyeBlink_L"])

@@ -153,6 +153,7 @@ def test_reset_and_save_are_buttons_of_the_page(chromium: Any, viewer: RigViewer
     until(lambda: (shown(chromium, "/head/part0")[1] - viewer.rig.vertices[:2562]).abs().max() < 1e-4)
 
 
+@pytest.mark.bench
 def test_play_moves_the_mesh_along_the_take(chromium: Any, viewer: RigViewer) -> None:
     play = until(lambda: chromium.find_elements("xpath", "//button[contains(., 'Play')]"))[0]
     chromium.execute_script("arguments[0].click()", play)
@@ -174,6 +175,7 @@ def test_play_moves_the_mesh_along_the_take(chromium: Any, viewer: RigViewer) ->
     until(lambda: thumb(chromium, "Frame").get_attribute("aria-valuenow") == str(viewer.editor.frame))
 
 
+@pytest.mark.bench
 def test_the_texture_is_hidden_in_motion_and_shown_at_rest(chromium: Any, ball_rig: BlendshapeRig) -> None:
     mesh = ball_rig.neutral
     colors = (mesh.vertices - mesh.vertices.amin(0)) / (mesh.vertices.amax(0) - mesh.vertices.amin(0))
@@ -317,6 +319,7 @@ def test_a_click_picks_the_vertex_under_the_cursor(chromium: Any, picker: Picker
     until(lambda: picker.session.picks.landmarks == (first, None, None))
 
 
+@pytest.mark.bench
 def test_clicks_on_head_and_scan_make_a_pair(chromium: Any, picker: Picker, two_balls: Mesh) -> None:
     settle(chromium)
     picker._mode.value = "correspondences"

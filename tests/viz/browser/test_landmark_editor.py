@@ -86,6 +86,7 @@ def drag(chromium: Any, begin: list[float], end: list[float]) -> None:
     moves.pause(0.2).release().move_by_offset(-points[-1][0], -points[-1][1]).perform()
 
 
+@pytest.mark.bench
 def test_a_frame_is_upright_and_its_dots_are_dragged_and_saved(chromium: Any, editor: LandmarkEditor) -> None:
     session = editor.session
     until(lambda: colour(chromium, editor, (25.0, 60.0))[0] > 150)  # red, above

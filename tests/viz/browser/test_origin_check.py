@@ -175,6 +175,7 @@ socket.onerror = () => done("refused");
 """
 
 
+@pytest.mark.bench
 @pytest.mark.browser
 def test_in_the_browser_only_the_page_itself_gets_through(chromium: Any, viewer: RigViewer) -> None:
     import viser

@@ -21,6 +21,11 @@ from torchface.workflows.demo.demo_page import result_rows, scene_rows, write_de
 from torchface.workflows.demo.run_demo import FLAWS, embedded_scene, run_demo, scene_from
 
 
+@pytest.fixture(autouse=True)
+def small_maps(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("torchface.workflows.demo.run_demo.shown_rig", partial(shown_rig, size=256))
+
+
 @pytest.mark.usefixtures("coarse_figures")
 def test_the_embedded_performer_comes_back_and_every_file_says_the_same(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -33,7 +38,6 @@ def test_the_embedded_performer_comes_back_and_every_file_says_the_same(
         return SolverReport(path, path.write_bytes(bytes(9)), None, 1, 1, (), 0.0, 0.0)
 
     monkeypatch.setattr("torchface.workflows.demo.run_demo.export_solver", exported)
-    monkeypatch.setattr("torchface.workflows.demo.run_demo.shown_rig", partial(shown_rig, size=256))
     result = run_demo(embedded_scene(seed=4, frames=80), tmp_path, seed=4)
     noise = 3**0.5 * FLAWS.noise
     solved, single = result.solved, result.frame_by_frame

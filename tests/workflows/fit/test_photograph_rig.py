@@ -307,6 +307,7 @@ def people(data: Path, ict_folder: Path, tmp_path_factory: pytest.TempPathFactor
     return People(model, [data / "images" / "people" / name for name in PEOPLE], heads, rig)
 
 
+@pytest.mark.bench
 @pytest.mark.real
 def test_two_people_do_not_merge_without_a_word(people: People, tmp_path: Path) -> None:
     photographs, out = [people.photographs[0], people.photographs[3]], tmp_path / "rig.glb"

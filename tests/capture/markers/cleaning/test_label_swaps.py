@@ -36,7 +36,7 @@ def neighbour(markers: Tensor, a: int, rank: int) -> int:
 
 @pytest.mark.parametrize("rank", [1, 3, 60])
 @pytest.mark.parametrize("marker", [0, 23, 71])
-@pytest.mark.parametrize(("first", "last"), [(120, 121), (40, 67), (20, 155)])
+@pytest.mark.parametrize(("first", "last"), [(120, 121), (40, 67), pytest.param(20, 155, marks=pytest.mark.bench)])
 def test_labels_exchanged_in_less_than_half_are_found_by_shape(
     markers: Tensor, marker: int, rank: int, first: int, last: int
 ) -> None:
@@ -60,6 +60,7 @@ def test_labels_in_order_are_left(performance: Performance, markers: Tensor) -> 
     assert find_swaps_by_shape(torch.full_like(markers, torch.nan), 60.0) == []
 
 
+@pytest.mark.bench
 @pytest.mark.real
 def test_labels_in_order_are_left_in_real_takes(real_capture: Performance) -> None:
     rig, attachment, takes = real_capture

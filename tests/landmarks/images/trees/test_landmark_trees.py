@@ -311,6 +311,7 @@ def test_the_shipped_model_finds_made_up_faces() -> None:
     assert relative_errors(torch.stack(found), torch.stack(truth)).median() < 0.05
 
 
+@pytest.mark.bench
 @pytest.mark.real
 def test_the_shipped_model_finds_real_faces(data: Path) -> None:
     """18 faces that dlib's predictor has landmarks for, a reference and no truth, and one annotated by hand.
