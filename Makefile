@@ -21,8 +21,9 @@ $(VENV)/.installed-%: $(STAMP)
 	touch $@
 
 # Two processes of one thread each, the longest files first; what is costly to make once (a synthetic video, a browser) stays in one.
+# Bytecode is written, whatever the shell says: many tests start a process.
 test: $(VENV)/.installed-test
-	OMP_NUM_THREADS=1 $(RUN) -m pytest --numprocesses 2 --dist loadfile --no-loadscope-reorder
+	PYTHONDONTWRITEBYTECODE= OMP_NUM_THREADS=1 $(RUN) -m pytest --numprocesses 2 --dist loadfile --no-loadscope-reorder
 
 # Blender's package has a Python of its own: it wants 3.11 and numpy below 2.
 BLENDER_PYTHON ?= python3.11

@@ -32,6 +32,8 @@ from torchface.synthetic.stages.marker_stage import place_markers
 REPOSITORY = Path(__file__).resolve().parent.parent
 DATA = Path(os.environ.get("TORCHFACE_DATA", REPOSITORY.parent / "shared" / "data"))
 
+gc.disable()  # until all tests are imported
+
 settings.register_profile("ci", derandomize=True, deadline=None, print_blob=True, max_examples=25)
 settings.register_profile("dev", deadline=None, max_examples=25)
 settings.load_profile("ci" if os.environ.get("CI") else "dev")
@@ -135,6 +137,7 @@ def pytest_collection_finish() -> None:
     """
     gc.collect()
     gc.freeze()
+    gc.enable()
     if "torchface.onnx.exported_model" not in sys.modules:  # no test exports
         return
     from torch.onnx._internal.exporter._registration import ONNXRegistry
