@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import os
+import re
 import shutil
 import stat
 import sys
@@ -28,6 +29,12 @@ def check_there(path: Path) -> None:
     """Raises ``FileFormatError`` where there is no file or folder, before its ending is judged."""
     if not path.exists():
         raise FileFormatError(f"{path}: found no such file, expected an existing one")
+
+
+def numbered_order(path: Path) -> list[tuple[int, int, str]]:
+    """Key that sorts files by name, ``frame2`` before ``frame10``."""
+    parts = re.split(r"(\d+)", path.name.lower())
+    return [(0, int(part[:18]), "") if part.isdecimal() else (1, 0, part) for part in parts]
 
 
 def read_file(path: str | Path, largest: int = LARGEST_FILE) -> bytes:

@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterable
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from itertools import pairwise
 from pathlib import Path
 
 import torch
 from torch import Tensor
 
 from torchface.errors import FileFormatError, NameMismatchError, TopologyError, ValueRangeError
-from torchface.files.whole_files import check_there
+from torchface.files.whole_files import check_there, numbered_order
 from torchface.io import MeshSequence, load_animation, load_mesh, load_rig, load_take
 from torchface.io.markers.marker_csv import is_marker_header
 from torchface.io.mesh_files import MESH_ENDINGS
@@ -45,6 +47,7 @@ class AnimatedMesh:
         rig: of its topology, where one came with it.
         take: of the weights, where there is one, with the times of its frames.
         numbered: whether its frames are numbered from a beginning that others may share.
+        missing: which frames of a folder are not there, for people to read; empty where none is known to be.
         colors: of the vertices, (t,V,3) in [0,1], read as ``read`` does, where meshes have them.
     """
 
@@ -57,6 +60,7 @@ class AnimatedMesh:
     rig: BlendshapeRig | None = None
     take: Take | None = None
     numbered: bool = False
+    missing: str = ""
     colors: Callable[[int, int], Tensor] | None = None
 
     def require_topology_of(self, other: AnimatedMesh, hint: str = "") -> None:
@@ -183,10 +187,24 @@ def _of_sequence(path: Path, rig: BlendshapeRig | None) -> AnimatedMesh:
 
 
 def _of_folder(folder: Path, rig: BlendshapeRig | None) -> AnimatedMesh:
-    files = sorted(file for file in folder.iterdir() if file.suffix.lower() in (*MESH_ENDINGS, *SCENE_ENDINGS))
+    meshes = (file for file in folder.iterdir() if file.suffix.lower() in (*MESH_ENDINGS, *SCENE_ENDINGS))
+    files = sorted(meshes, key=numbered_order)
     if not files:
         raise FileFormatError(f"{folder}: found no mesh, expected files ending in {', '.join(MESH_ENDINGS)} or .glb")
-    return meshes_over_time(folder, files, rig)
+    return replace(meshes_over_time(folder, files, rig), missing=_missing(files))
+
+
+def _missing(files: list[Path]) -> str:
+    """Where the numbers that end names leap further than they mostly do; empty where they do not."""
+    ends = [re.search(r"(\d{1,18})$", file.stem) for file in files]
+    numbers = [int(end[1]) for end in ends if end is not None]
+    steps = [after - before for before, after in pairwise(numbers)]
+    if len(numbers) < len(files) or len(steps) < 2 or min(steps) < 1:
+        return ""
+    usual = sorted(steps)[(len(steps) - 1) // 2]
+    leaps = [(files[row].name, files[row + 1].name) for row, step in enumerate(steps) if step > usual]
+    lost = sum(step // usual - 1 for step in steps if step > usual)
+    return f"{lost} of {len(files) + lost} frames are missing, first from {' to '.join(leaps[0])}" if leaps else ""
 
 
 def meshes_over_time(path: Path, files: list[Path], rig: BlendshapeRig | None) -> AnimatedMesh:

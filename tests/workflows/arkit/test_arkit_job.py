@@ -9,7 +9,7 @@ import torch
 
 from planted.published_heads import codes, expression_basis, flame_arrays, gnm_arrays, gnm_landmarks, head
 from torchface import Mesh, load_mesh, load_rig, load_take, save_mesh, save_rig
-from torchface.errors import FileFormatError, NameMismatchError
+from torchface.errors import FileFormatError, NameMismatchError, ValueRangeError
 from torchface.modeling import HeadModel
 from torchface.progress import silent
 from torchface.rig import BlendshapeRig
@@ -136,6 +136,57 @@ def test_meshes_of_a_rigs_topology_become_the_planted_weights(
     assert float((solved(tmp_path / "w.csv", rig) - weights[:few]).abs().mean()) < 0.01
     assert any("taken to be in metres" in line for line in lines) is (kind in ("npy", "anchors"))
     assert load_take(tmp_path / "w.csv").fps == pytest.approx(20.0 if kind in ("anchors", "cache") else 30.0, rel=1e-2)
+
+
+def test_frames_that_are_no_faces_of_the_head_are_named(
+    folder: Path, rig: BlendshapeRig, weights: torch.Tensor, tmp_path: Path
+) -> None:
+    source, out, meshes = folder / "rig.glb", tmp_path / "w.csv", rig(weights[:4])
+
+    def solved_lines(frames: torch.Tensor) -> list[str]:
+        np.save(tmp_path / "m.npy", frames.numpy())
+        return animation_to_weights(source, tmp_path / "m.npy", out, ALONE, silent)
+
+    with pytest.raises(ValueRangeError, match=r"4 of 4 frames lie more than 10 mm .* order of vertices"):
+        solved_lines(meshes.roll(1, 1))
+    nan = meshes.clone()
+    nan[2, 7, 1] = torch.nan
+    with pytest.raises(FileFormatError, match=r"in 1 of 4 rows, first at \[2, 7, 1\]"):
+        solved_lines(nan)
+    assert not out.exists()
+    meshes[3] *= 10
+    lines = solved_lines(meshes)
+    assert "1 of 4 frames lie more than 10 mm" in lines[0]
+    assert "frame 3 by" in lines[0]
+    assert not any("warning" in line for line in solved_lines(rig(weights[:4])))
+
+
+def test_missing_frames_are_counted_and_times_that_fall_refused(
+    folder: Path, rig: BlendshapeRig, weights: torch.Tensor, tmp_path: Path
+) -> None:
+    out, meshes = tmp_path / "w.csv", rig(weights[:5])
+    (tmp_path / "meshes").mkdir()
+    mesh = load_rig(folder / "rig.glb").neutral
+    for number in (8, 9, 10, 12):  # by number, not by letter
+        save_mesh(mesh.with_vertices(meshes[number - 8]), tmp_path / "meshes" / f"f{number}.glb")
+    lines = animation_to_weights(folder / "rig.glb", tmp_path / "meshes", out, ALONE, silent)
+    assert "1 of 5 frames are missing, first from f10.glb to f12.glb" in lines[0]
+    assert float((solved(out, rig) - weights[[0, 1, 2, 4]]).abs().mean()) < 0.01
+
+    def anchors(*times: object) -> list[str]:
+        frames = [{"timestamp": t, "vertices": (one / 1000).tolist()} for t, one in zip(times, meshes, strict=False)]
+        (tmp_path / "a.json").write_text(json.dumps(frames))
+        return animation_to_weights(folder / "rig.glb", tmp_path / "a.json", out, ALONE, silent)
+
+    assert "2 of 5 frames are missing" in anchors(0.0, 0.02, 0.08)[0]
+    assert load_take(out).fps == pytest.approx(50)
+    with pytest.raises(FileFormatError, match=r"\[2\].timestamp = 0.01, expected more than the 0.02 s"):
+        anchors(0.0, 0.02, 0.01)
+    with pytest.raises(FileFormatError, match="expected seconds"):
+        anchors("a", 0.02)
+    (tmp_path / "a.json").write_text(json.dumps([{"vertices": [[0, 0, 0]] * 1220}]))
+    with pytest.raises(FileFormatError, match=f"vertices of 1220, expected the head's {len(rig.vertices)} vertices"):
+        animation_to_weights(folder / "rig.glb", tmp_path / "a.json", out, ALONE, silent)
 
 
 def test_shapes_that_a_rig_has_are_kept_and_only_the_others_made(rig: BlendshapeRig, tmp_path: Path) -> None:

@@ -48,6 +48,7 @@ _MAX_JSON, _MOST_FRAMES = 2**30, 2**18
 _UNITS = (1.0, 10.0, 1000.0)
 _UNIT_NAMES = {1.0: "millimetres", 10.0: "centimetres", 1000.0: "metres"}
 _SHOWN_FRAMES = 200
+_NO_FACE_MM = 10.0  # faces that ARKit's shapes do not show are 0.2 to 3 mm away
 _LEFT_MM, _LEFT_SHARE, _SHOWN = 0.2, 0.1, 6
 
 
@@ -139,11 +140,19 @@ def animation_to_weights(
     read = (lambda begin, end: moving.read(begin, end) * scale) if scale != 1 else moving.read
     fps = settings.fps or moving.fps or _FPS
     solution = solver.solve(read, moving.count, fps, settings.temporal, progress)
+    broken = _broken_frames(solution, animation)
     take = Take(fps, weights=Track(rig.names, solution.weights.float()[..., None]))
     warnings, _ = write_weights(_all_of_arkit(take), files, rig)
     error_file = out.with_name(f"{out.stem}_error.csv")
     _write_errors(solution, fps, error_file)
-    lines = [*notes, *moving.notes, *note, *solution_lines(solution), *unsaid_lines(solver, solution, read, rig)]
+    lines = [
+        *notes,
+        *moving.notes,
+        *note,
+        *broken,
+        *solution_lines(solution),
+        *unsaid_lines(solver, solution, read, rig),
+    ]
     if moving.parameters is not None and head.model is not None:
         lines += parameter_lines(solver, head, moving.parameters)
     return [*lines, *warnings, f"error of each frame: {error_file}"]
@@ -216,7 +225,8 @@ def load_moving_head(path: Path, head: Source) -> MovingHead:
             f"{path}: found meshes of {len(animated.neutral.vertices)} vertices and {len(animated.neutral.faces)} "
             f"triangles, expected those of {head.path}, {len(own.vertices)} and {len(own.faces)}"
         )
-    return MovingHead(animated.count, animated.read, animated.fps)
+    notes = (f"warning: {path.name}: {animated.missing}",) if animated.missing else ()
+    return MovingHead(animated.count, animated.read, animated.fps, notes=notes)
 
 
 def _by_parameters(path: Path, arrays: ArrayFile, head: Source) -> MovingHead:
@@ -253,14 +263,26 @@ def _face_anchors(path: Path, vertices: int) -> MovingHead:
     frames = document["frames"] if isinstance(document.found, dict) else document
     rows = frames.rows(1, _MOST_FRAMES, "frames of face anchors with vertices, or Audio2Face's weights")
     meshes = torch.stack([_anchor_vertices(row, vertices) for row in rows])
-    times = [float(row["timestamp"].found or row["time"].found or 0.0) for row in rows]
-    span = times[-1] - times[0]
-    fps = (len(rows) - 1) / span if len(rows) > 1 and span > 0 else None
-    return MovingHead(len(meshes), lambda begin, end: meshes[begin:end], fps)
+    named = [row["timestamp"] if row["timestamp"] else row["time"] for row in rows]
+    if not all(named):
+        return MovingHead(len(meshes), lambda begin, end: meshes[begin:end])
+    times = torch.tensor([one.number("seconds") for one in named], dtype=torch.float64)
+    steps = times.diff()
+    if len(steps) and not float(steps.min()) > 0:
+        row = int(steps.argmin())
+        raise named[row + 1].error(f"more than the {times[row]:g} s of the frame before")
+    usual = float(steps.median()) if len(steps) else 0.0
+    lost = int((steps / usual).round().sum()) - len(steps) if len(steps) else 0
+    note = f"warning: {path.name}: {lost} of {len(rows) + lost} frames are missing, by the times" if lost else ""
+    fps = (len(steps) + lost) / float(times[-1] - times[0]) if len(steps) else None
+    return MovingHead(len(meshes), lambda begin, end: meshes[begin:end], fps, notes=(note,) if note else ())
 
 
 def _anchor_vertices(row: Value, count: int) -> Tensor:
     found = row["geometry"]["vertices"] if row["geometry"] else row["vertices"]
+    if isinstance(found.found, list) and len(found.found) not in (count, 3 * count):
+        few = f"found {found.key} of {len(found.found)}, expected the head's {count} vertices"
+        raise FileFormatError(f"{found.source}: {few}")
     nested = isinstance(found.found, list) and bool(found.found) and isinstance(found.found[0], list)
     values = found.tensor(count, 3) if nested else found.tensor(3 * count, expected=f"{count} vertices of 3 numbers")
     return values.reshape(count, 3).float()
@@ -318,6 +340,19 @@ def _unit_factor(solver: MeshSolver, first: Tensor, path: Path) -> tuple[float, 
             return factor, [] if factor == 1 else [note]
     solver.check_unit(first)
     return 1.0, []
+
+
+def _broken_frames(solution: MeshSolution, path: Path) -> list[str]:
+    """A warning of frames that no expression comes near; refused where these are half of them or more."""
+    error, worst = solution.error, int(solution.error.argmax())
+    count = int((error > _NO_FACE_MM).sum())
+    found = (
+        f"{path.name}: {count} of {len(error)} frames lie more than {_NO_FACE_MM:g} mm from all that ARKit's shapes "
+        f"show, frame {worst} by {float(error[worst]):.1f} mm (root mean square over the vertices)"
+    )
+    if 2 * count >= len(error):
+        raise ValueRangeError(f"{found}, expected expressions of this head: its order of vertices, its unit, radians")
+    return [f"warning: {found}"] if count else []
 
 
 def _write_errors(solution: MeshSolution, fps: float, path: Path) -> None:

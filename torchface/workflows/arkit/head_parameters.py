@@ -18,6 +18,7 @@ from torchface.geometry.similarity import similarity_transform
 from torchface.geometry.skinning import joint_transforms, unskinned
 from torchface.io.head_models.array_files import ArrayFile
 from torchface.io.head_models.head_model_file import HeadJoints, HeadModelFile
+from torchface.number_checks import check_rate
 from torchface.rig import BlendshapeRig
 
 EXPRESSIONS = ("exp", "expr", "expression", "expressions", "expcode", "expression_params", "expression_coeffs")
@@ -82,6 +83,7 @@ def read_parameters(arrays: ArrayFile, model: HeadModelFile) -> HeadParameters:
     if (key := arrays.first(_RATES)) is not None:
         used.add(key)
         fps = float(arrays.numbers(key, *arrays.shape(key)).flatten()[0])
+        check_rate(fps, f"{arrays.path}: {key}")
     unread = tuple(name for name in arrays.names if name not in used)
     return HeadParameters(values, rotations, person, fps, unread)
 

@@ -11,6 +11,7 @@ import torch
 from torchface.capture.anybody import ExampleShapes, paper_expressions, shown_examples
 from torchface.capture.anybody.examples.example_expressions import NEUTRAL
 from torchface.errors import FileFormatError, NameMismatchError
+from torchface.files.whole_files import numbered_order
 from torchface.io.images.image_files import IMAGE_ENDINGS, load_image
 from torchface.landmarks import NoFaceError, find_landmarks
 from torchface.progress import Progress, silent
@@ -52,7 +53,7 @@ def picture_examples(
 def _files(pictures: Sequence[Path]) -> list[Path]:
     if len(pictures) == 1 and pictures[0].is_dir():
         folder = pictures[0]
-        files = sorted((p for p in folder.iterdir() if p.suffix.lower() in IMAGE_ENDINGS), key=_natural)
+        files = sorted((p for p in folder.iterdir() if p.suffix.lower() in IMAGE_ENDINGS), key=numbered_order)
         if not files:
             raise FileFormatError(f"{folder}: found no picture, expected files ending in {', '.join(IMAGE_ENDINGS)}")
     else:
@@ -60,12 +61,6 @@ def _files(pictures: Sequence[Path]) -> list[Path]:
     if len(files) > _MOST:
         raise FileFormatError(f"examples: found {len(files)} pictures, expected at most {_MOST}")
     return files
-
-
-def _natural(path: Path) -> list[tuple[int, int, str]]:
-    """Sorts 2 before 10."""
-    parts = re.split(r"(\d+)", path.name.lower())
-    return [(0, int(part[:18]), "") if part.isdecimal() else (1, 0, part) for part in parts]
 
 
 def _names(files: Sequence[Path]) -> list[str]:
