@@ -2,6 +2,8 @@
 
 import os
 import re
+import subprocess
+import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
 from inspect import Parameter, getdoc, signature
@@ -156,6 +158,14 @@ def test_another_name_of_the_same_file_is_the_same(
         main(["retarget", str(take), "--to", str(rig), "--out", str(other)])
     assert "is the input" in " ".join(capsys.readouterr().err.split())
     assert take.read_text().startswith("frame")
+
+
+def test_a_missing_input_is_said_before_torch_is_loaded() -> None:
+    for words in (["fit", "none.png", "--out", "x.glb"], ["track", "none.mp4", "--out", "out"], ["info", "none.glb"]):
+        code = f"import sys; from torchface.cli import main\ntry: main({words})\nfinally: print('torch' in sys.modules)"
+        done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+        assert done.stdout == "False\n"
+        assert f"{words[1]}: found no such file or folder, expected an existing one" in " ".join(done.stderr.split())
 
 
 def test_two_outputs_of_one_name_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -35,10 +35,14 @@ Lock = Callable[[Path], AbstractContextManager[Path]]
     ],
 )
 def test_a_second_run_of_a_command_is_refused(
-    lock: Lock, words: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    lock: Lock, words: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     given, _, name = words.partition(" --out ")
     out = tmp_path / (name or "out")
+    monkeypatch.chdir(tmp_path)
+    for word in given.split():
+        if "." in word or word == "scans":
+            Path(word).touch()
     with lock(out):
         there = sorted(tmp_path.rglob("*"))
         with pytest.raises(SystemExit) as ended:

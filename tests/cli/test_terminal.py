@@ -73,13 +73,16 @@ def test_a_place_that_cannot_be_written_to_is_named_before_the_solve(
 def test_a_result_of_another_ending_is_refused_before_anything_is_read(
     words: str, ending: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.chdir(tmp_path)  # where none of the inputs is
+    monkeypatch.chdir(tmp_path)
+    inputs = {Path(word) for word in words.split() if "." in word and not word.startswith("w.")}
+    for path in inputs:
+        path.touch()  # which nothing could be read from
     with pytest.raises(SystemExit) as ended:
         main(words.split())
     assert ended.value.code == 2
     told = " ".join(capsys.readouterr().err.split())
     assert f"w.xlsx: found the ending '.xlsx', expected {ending}" in told
-    assert not list(tmp_path.iterdir())
+    assert {path.relative_to(tmp_path) for path in tmp_path.iterdir()} == inputs
 
 
 @pytest.mark.parametrize(
@@ -88,11 +91,11 @@ def test_a_result_of_another_ending_is_refused_before_anything_is_read(
 def test_a_missing_folder_of_a_result_is_made(
     stage: Path, words: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, coarse_figures: None
 ) -> None:
-    def exported(rig: object, attachment: object, path: Path, **_: object) -> SimpleNamespace:
+    def exported(_: object, path: Path, *__: object, **___: object) -> SimpleNamespace:
         path.write_bytes(b"an export takes twenty seconds")
-        return SimpleNamespace(rows=list)
+        return SimpleNamespace(rows=list, verdict=str)
 
-    monkeypatch.setattr("torchface.onnx.export_solver", exported)
+    monkeypatch.setattr("torchface.onnx.solver_graph_export.export_marker_solver", exported)
     monkeypatch.chdir(stage)
     out = tmp_path / "new" / ("a.png" if words.startswith("render") else "a.onnx")
     main([*words.split(), str(out), "--quiet"])

@@ -15,7 +15,9 @@ from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin
 from tyro.conf import arg
 
 from torchface.cli.terminal import console
+from torchface.errors import FileFormatError
 
+_PATTERN = re.compile(r"[{}*?%\[\]]|:/")  # of a placeholder, of several files, or of an address
 _WORDS = {Path: "PATH", str: "TEXT", int: "NUMBER", float: "NUMBER"}
 
 
@@ -46,17 +48,34 @@ Command = TypeVar("Command", bound=Callable[..., Any])
 
 
 def checked(command: Callable[..., None]) -> Callable[..., None]:
-    """The command with plain options, refused before any work where an output is one of its inputs."""
+    """The command with plain options, refused before any work where an input is missing or is an output too."""
     plain_options(command)
 
     @wraps(command)
     def run(*values: Any, **options: Any) -> None:
-        if options.get("quiet") is False:  # of commands that take long, whose libraries alone take seconds to load
-            console.print("starting")
-        with inputs_kept(command, signature(command).bind(*values, **options).arguments):
+        given = signature(command).bind(*values, **options).arguments
+        with inputs_kept(command, given):
+            _check_inputs(command, given)
+            if options.get("quiet") is False:  # of commands that take long, whose libraries alone take seconds to load
+                console.print("starting")
             command(*values, **options)
 
     return run
+
+
+def _check_inputs(command: Callable[..., Any], values: Mapping[str, Any]) -> None:
+    """Raises ``FileFormatError`` where an input does not exist, before libraries are loaded, which takes seconds.
+
+    One of many inputs, which a batch reports and skips, and names with placeholders are left to the command.
+    """
+    hints = get_type_hints(command, include_extras=True)
+    for name, value in values.items():
+        paths = [value] if isinstance(value, Path) else value if isinstance(value, tuple) and len(value) == 1 else []
+        if _output(name, hints[name]) is not None:
+            continue
+        for path in paths:
+            if isinstance(path, Path) and not path.exists() and not _PATTERN.search(str(path)):
+                raise FileFormatError(f"{path}: found no such file or folder, expected an existing one")
 
 
 def inputs_kept(command: Callable[..., Any], values: Mapping[str, Any]) -> AbstractContextManager[None]:

@@ -6,18 +6,18 @@ import warnings
 from collections.abc import Sequence
 from io import BytesIO
 from pathlib import Path
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 import torch
-from matplotlib import colormaps
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
-from matplotlib.text import Text
 from PIL import Image, ImageDraw, ImageFont
 from torch import Tensor
 
 from torchface.escaped_text import visible
 from torchface.files.whole_files import check_ending, make_folder, write_file
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 __all__ = ["caption", "heat_colors", "save_rendered_image", "sheet"]
 
@@ -34,6 +34,8 @@ def heat_colors(values: Tensor, maximum: float, colormap: str = "turbo") -> Tens
         >>> torch.equal(colors[1], colors[2])  # beyond the maximum
         True
     """
+    from matplotlib import colormaps
+
     table = torch.tensor(np.asarray(colormaps[colormap].resampled(256)(np.arange(256)))[:, :3], dtype=torch.float32)
     return table[(values / maximum * 255).clamp(0, 255).long()]
 
@@ -99,8 +101,18 @@ def from_pillow(image: Image.Image) -> Tensor:
     return torch.from_numpy(np.asarray(image.convert("RGB")).copy()).permute(2, 0, 1).float() / 255
 
 
+def new_figure(width: float, height: float, layout: Literal["constrained"] | None = None) -> Figure:
+    """An empty figure, in hundreds of pixels. matplotlib is loaded here, so that other commands do not wait for it."""
+    from matplotlib.figure import Figure
+
+    return Figure(figsize=(width, height), dpi=100, layout=layout)
+
+
 def from_figure(figure: Figure) -> Tensor:
     """(3,H,W) in [0,1] of a matplotlib figure; its texts are taken for what they say, names with dollar signs too."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.text import Text
+
     for text in figure.findobj(Text):
         if text.get_text():  # those of ticks that have none yet are matplotlib's own
             text.set_text(visible(text.get_text()))

@@ -7,8 +7,8 @@ import hashlib
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-import onnx
 import torch
 
 import torchface
@@ -16,6 +16,9 @@ from torchface.errors import FileFormatError
 from torchface.files.cache_folder import cache_folder
 from torchface.files.content_keys import content_key
 from torchface.files.whole_files import all_or_none, read_file, write_file
+
+if TYPE_CHECKING:
+    import onnx
 
 
 def cached_graph(kind: str, make: Callable[[], onnx.ModelProto], code: Sequence[str], **models: object) -> bytes:

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 from functools import cache
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-import onnx
 import torch
 from torch import Tensor
 
@@ -26,6 +26,9 @@ from torchface.landmarks.images.networks.part_network import PartNetwork
 from torchface.landmarks.images.trees.landmark_consensus import ConsensusSettings
 from torchface.landmarks.images.trees.tree_finder import PHOTOGRAPH, TreeFinder
 from torchface.workflows.cached_graph import cached_graph
+
+if TYPE_CHECKING:
+    import onnx
 
 __all__ = ["NamedFinder", "load_finder"]
 

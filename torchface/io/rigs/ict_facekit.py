@@ -12,7 +12,6 @@ from pathlib import Path
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.optimize import linear_sum_assignment
 from scipy.spatial import cKDTree
 from scipy.spatial.distance import cdist
 from torch import Tensor
@@ -249,6 +248,8 @@ def _images(flipped: NDArray[np.float64], points: NDArray[np.float64]) -> NDArra
     left, right = np.flatnonzero(~mutual), np.setdiff1d(np.arange(len(points)), forward[mutual])
     if len(left) > _MAX_UNMATCHED:
         return None
+    from scipy.optimize import linear_sum_assignment  # takes its time
+
     rows, columns = linear_sum_assignment(cdist(flipped[left], points[right]))
     forward[left[rows]] = right[columns]
     return forward

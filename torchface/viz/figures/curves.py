@@ -5,10 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import torch
-from matplotlib.figure import Figure
 from torch import Tensor
 
-from torchface.rendering.compositing import from_figure
+from torchface.rendering.compositing import from_figure, new_figure
 
 __all__ = ["error_curve", "named_bars", "weight_curves"]
 
@@ -24,7 +23,7 @@ def error_curve(error: Tensor, fps: float, label: str = "marker RMSE (mm)") -> T
         >>> bool(picture.min() < 0.5 and picture.max() == 1)  # drawn on white
         True
     """
-    figure = Figure(figsize=(10, 2.6), dpi=100)
+    figure = new_figure(10, 2.6)
     axes = figure.add_axes((0.08, 0.19, 0.91, 0.78))
     seconds = torch.arange(len(error)) / fps
     axes.plot(seconds, error, color=SOLVED, linewidth=0.8)
@@ -43,7 +42,7 @@ def timing_curves(values: Tensor, names: Sequence[str], fps: float, label: str) 
         >>> bool(picture.min() < 0.5 and picture.max() == 1)  # drawn on white
         True
     """
-    figure = Figure(figsize=(10, 4), dpi=100, layout="constrained")
+    figure = new_figure(10, 4, layout="constrained")
     axes = figure.subplots()
     seconds = torch.arange(values.shape[1]) / fps
     for row, name in zip(values, names, strict=True):
@@ -67,7 +66,7 @@ def weight_curves(solved: Tensor, true: Tensor | None, names: Sequence[str], fps
     curves = [("sum of weights", solved.sum(1), None if true is None else true.sum(1))]
     curves += [(names[i], solved[:, i], None if true is None else true[:, i]) for i in order]
     height = 0.55 + 1.1 * len(curves)
-    figure = Figure(figsize=(10, height), dpi=100)
+    figure = new_figure(10, height)
     # Axes of each curve's own, or a layout that is solved for, would take ten times as long.
     axes = figure.add_axes((0.16, 0.45 / height, 0.83, 1 - 0.55 / height))
     seconds = torch.arange(len(solved)) / fps
@@ -105,7 +104,7 @@ def compared_curves(
         names: of the shapes, N.
     """
     lines = -(-len(names) // 2)
-    figure = Figure(figsize=(12, 1.7 * lines), dpi=100, layout="constrained")
+    figure = new_figure(12, 1.7 * lines, layout="constrained")
     grid = figure.subplots(lines, 2, sharex=True, squeeze=False).flatten()
     stretch = slice(first, last)
     seconds = torch.arange(len(true))[stretch] / fps
@@ -132,7 +131,7 @@ def named_bars(values: Tensor, names: Sequence[str], label: str) -> Tensor:
         True
     """
     order = values.argsort().tolist()
-    figure = Figure(figsize=(6, 0.5 + 0.17 * len(order)), dpi=100, layout="constrained")
+    figure = new_figure(6, 0.5 + 0.17 * len(order), layout="constrained")
     axes = figure.subplots()
     axes.barh([names[i] for i in order], values[order].tolist(), color=SOLVED)
     axes.tick_params(axis="y", labelsize=7)
@@ -145,7 +144,7 @@ def motion_curves(
     translation: Tensor, degrees: Tensor, fps: float, true: tuple[Tensor, Tensor] | None = None
 ) -> Tensor:
     """Translations (T,3), millimetres, and rotations (T,3), degrees, over time, with the true ones if any; (3,H,W)."""
-    figure = Figure(figsize=(10, 6), dpi=100)
+    figure = new_figure(10, 6)
     margins = {"left": 0.08, "right": 0.99, "bottom": 0.08, "top": 0.985, "hspace": 0.1, "wspace": 0.2}
     rows = figure.subplots(3, 2, sharex=True, gridspec_kw=margins)
     seconds = torch.arange(len(translation)) / fps

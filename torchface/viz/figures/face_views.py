@@ -5,15 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import torch
-from matplotlib.cm import ScalarMappable
-from matplotlib.colors import Normalize
-from matplotlib.figure import Figure
 from torch import Tensor
 
 from torchface.geometry.cameras.pinhole import Camera, look_at
 from torchface.mesh import Mesh
 from torchface.rendering.clay_shading import CLAY, DEFAULT_LIGHTING, Lighting, render
-from torchface.rendering.compositing import caption, from_figure, heat_colors, sheet
+from torchface.rendering.compositing import caption, from_figure, heat_colors, new_figure, sheet
 from torchface.rig import BlendshapeRig
 from torchface.viz.figures.region_colors import as_seen
 
@@ -102,7 +99,10 @@ def color_bar(
     extend: str = "neither",
 ) -> Tensor:
     """The scale of a heat map from 0 to ``maximum``, (3,H,110); ``bar`` is left, bottom, width, height in [0,1]."""
-    figure = Figure(figsize=(1.1, height / 100), dpi=100)
+    figure = new_figure(1.1, height / 100)
+    from matplotlib.cm import ScalarMappable
+    from matplotlib.colors import Normalize
+
     mappable = ScalarMappable(Normalize(0, maximum), colormap)
     figure.colorbar(mappable, cax=figure.add_axes(bar), label=label, extend=extend)
     return from_figure(figure)

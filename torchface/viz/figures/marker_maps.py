@@ -8,17 +8,13 @@ from dataclasses import replace
 
 import numpy as np
 import torch
-from matplotlib import colormaps
-from matplotlib.axes import Axes
-from matplotlib.collections import LineCollection
-from matplotlib.figure import Figure
 from torch import Tensor
 
 from torchface.geometry.meshes.operators import corners
 from torchface.geometry.meshes.surface_index import SurfaceIndex
 from torchface.mesh import Mesh
 from torchface.rendering.clay_shading import DEFAULT_LIGHTING, render
-from torchface.rendering.compositing import from_figure, heat_colors, sheet
+from torchface.rendering.compositing import from_figure, heat_colors, new_figure, sheet
 from torchface.rendering.raycast import RayCaster
 from torchface.viz.figures.curves import SOLVED, TRUE
 from torchface.viz.figures.face_views import FRONT, THREE_QUARTER, clay_colors, color_bar, frame_face
@@ -59,10 +55,12 @@ def marker_map(mesh: Mesh, points: Tensor, errors: Tensor, maximum: float, label
 def marker_regions(mesh: Mesh, points: Tensor, regions: Sequence[str]) -> Tensor:
     """Markers at points (M,3) of a mesh, a colour a region, with a legend; (3,H,W)."""
     names = list(dict.fromkeys(regions))
+    from matplotlib import colormaps
+
     table = np.asarray(colormaps["tab20"](np.arange(20)))[:, :3]
     colors = np.stack([table[names.index(region) % 20] for region in regions])
     views = _views(mesh, points, colors, [""] * len(regions))
-    figure = Figure(figsize=(1.7, _HEIGHT / 100), dpi=100)
+    figure = new_figure(1.7, _HEIGHT / 100)
     for i, name in enumerate(names):
         figure.text(0.12, 0.78 - 0.05 * i, "●", color=table[i % 20], fontsize=14, va="center")
         figure.text(0.26, 0.78 - 0.05 * i, f"{name}, {regions.count(name)}", fontsize=10, va="center")
@@ -81,8 +79,8 @@ def _views(mesh: Mesh, points: Tensor, colors: np.ndarray, labels: Sequence[str]
 def _view(mesh: Mesh, points: Tensor, colors: np.ndarray, labels: Sequence[str], yaw: float) -> Tensor:
     camera = frame_face(mesh, yaw, width=_WIDTH, height=_HEIGHT)
     image = render(as_seen(mesh), camera, _paint(mesh), replace(DEFAULT_LIGHTING, occlusion_rays=0))
-    figure = Figure(figsize=(_WIDTH / 100, _HEIGHT / 100), dpi=100)
-    axes: Axes = figure.add_axes((0, 0, 1, 1))
+    figure = new_figure(_WIDTH / 100, _HEIGHT / 100)
+    axes = figure.add_axes((0, 0, 1, 1))
     axes.imshow(image.permute(1, 2, 0).numpy())
     front = facing(mesh, points, yaw)
     at = camera.project(points.double())
@@ -107,7 +105,9 @@ def _view(mesh: Mesh, points: Tensor, colors: np.ndarray, labels: Sequence[str],
 
 def marker_views(markers: Tensor, on_mesh: Tensor, title: str = "") -> Tensor:
     """One frame: seen markers (M,3), NaN where not seen, joined to their points on the mesh (M,3); (3,H,W)."""
-    figure = Figure(figsize=(10, 5), dpi=100, layout="constrained")
+    from matplotlib.collections import LineCollection
+
+    figure = new_figure(10, 5, layout="constrained")
     known = markers.isfinite().all(-1)
     error = (markers - on_mesh)[known].norm(dim=-1)
     for axes, (name, across) in zip(figure.subplots(1, 2), (("front", 0), ("side", 2)), strict=True):
@@ -126,13 +126,15 @@ def marker_views(markers: Tensor, on_mesh: Tensor, title: str = "") -> Tensor:
 
 def site_views(mesh: Mesh, before: Tensor, after: Tensor) -> Tensor:
     """Sites before and after (M,3) on views of a face, joined by lines, those that face the viewer; (3,H,W)."""
+    from matplotlib.collections import LineCollection
+
     images = []
     for yaw in (FRONT, THREE_QUARTER):
         camera = frame_face(mesh, yaw, width=560, height=700)
         front = facing(mesh, after, yaw)
         old, new = camera.project(before[front].double()), camera.project(after[front].double())
         image = render(mesh, camera, clay_colors(mesh), samples=2)
-        figure = Figure(figsize=(image.shape[2] / 100, image.shape[1] / 100), dpi=100)
+        figure = new_figure(image.shape[2] / 100, image.shape[1] / 100)
         axes = figure.add_axes((0, 0, 1, 1))
         axes.imshow(image.permute(1, 2, 0).numpy())
         pairs = torch.stack([old, new], 1).tolist()
@@ -160,7 +162,7 @@ def facing(mesh: Mesh, points: Tensor, yaw: float) -> Tensor:
 
 def errors_by_iteration(errors: Tensor) -> Tensor:
     """Each marker's error after each iteration (R,M), millimetres, with mean and worst; (3,H,W)."""
-    figure = Figure(figsize=(10, 3), dpi=100, layout="constrained")
+    figure = new_figure(10, 3, layout="constrained")
     axes = figure.subplots()
     iterations = range(1, len(errors) + 1)
     axes.plot(iterations, errors, color="grey", linewidth=0.4, alpha=0.5)

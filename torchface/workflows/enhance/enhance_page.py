@@ -5,11 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 
 import torch
-from matplotlib.figure import Figure
 from torch import Tensor
 
 from torchface.escaped_text import as_markup
-from torchface.rendering.compositing import from_figure
+from torchface.rendering.compositing import from_figure, new_figure
 from torchface.viz.figures.curves import timing_curves
 from torchface.viz.reports.report_page import Section, Table, write_page
 from torchface.workflows.enhance.enhance_animation import Enhanced, spread_frames
@@ -68,7 +67,7 @@ def write_enhance_page(done: Enhanced, out: Path, height: int = _HEIGHT) -> Path
 
 def distance_curves(done: Enhanced) -> Tensor:
     """The distance of every region over time, those outside of the database marked; an image (3,H,W)."""
-    figure = Figure(figsize=(10, 3.4), dpi=100, layout="constrained")
+    figure = new_figure(10, 3.4, layout="constrained")
     axes = figure.subplots()
     seconds = torch.arange(done.animation.count) / done.animation.fps
     distances, outside = done.frames.distances, done.frames.outside
