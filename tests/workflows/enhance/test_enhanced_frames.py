@@ -7,14 +7,15 @@ from pathlib import Path
 import pytest
 import torch
 
-from tests.workflows.enhance.conftest import Actor
+from tests.workflows.enhance.conftest import Actor, folded
 from torchface import zoo
-from torchface.enhancement import EnhancementModel
+from torchface.enhancement import CapturedPerformance, EnhancementModel, EnhancementSettings
 from torchface.enhancement.animation_retiming import at_moments, retimed_moments
 from torchface.io.meshes.mesh_sequence import MeshSequenceWriter
 from torchface.progress import silent
 from torchface.workflows.enhance import enhanced_frames
 from torchface.workflows.enhance.coarse_input import InputSettings, read_coarse
+from torchface.workflows.enhance.enhance_views import framed_model
 
 
 def test_pieces_are_those_of_the_whole(actor: Actor, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -35,6 +36,18 @@ def test_pieces_are_those_of_the_whole(actor: Actor, tmp_path: Path, monkeypatch
     torch.testing.assert_close(pieces[[0, -1]], frames[[0, -1]], atol=2e-3, rtol=0)
     assert float((pieces - frames).abs().max()) > 0.01
     assert "retimed" in found.notes[-1]
+
+
+def test_a_model_of_gradients_is_framed_where_one_of_displacements_is(actor: Actor) -> None:
+    frames = folded(actor.frames, actor.mesh.vertices)
+    captured = CapturedPerformance(frames, actor.mesh.faces, torch.arange(len(frames)) // 4, actor.mesh.vertices)
+    seen = [
+        framed_model(EnhancementModel.fit(captured, EnhancementSettings(detail=kind), rank=4)).annotations
+        for kind in ("displacements", "gradients")
+    ]
+    one, other = (notes.regions["face"] for notes in seen)  # type: ignore[union-attr]
+    assert float((one & other).sum() / (one | other).sum()) > 0.5
+    assert float((one | other).double().mean()) < 0.9
 
 
 def test_the_report_says_which_region_moved_in_time_and_how_far() -> None:

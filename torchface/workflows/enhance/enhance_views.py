@@ -75,9 +75,10 @@ def head_motion(vertices: Tensor, neutral: Tensor) -> Similarity:
 
 def framed_model(model: EnhancementModel) -> Mesh:
     """The model's neutral, with where its detail is as its face, for cameras to look at."""
-    sites = model.components.shape[1] // 3
+    channels = 9 if model.settings.detail == "gradients" else 3
+    sites = model.components.shape[1] // channels
     spread = model.coefficients.std(0)[:, None]
-    detail = (model.components.float().view(-1, 3, sites).square().sum(1) * spread.square()).sum(0).sqrt()
+    detail = (model.components.float().view(-1, channels, sites).square().sum(1) * spread.square()).sum(0).sqrt()
     detailed = detail > _DETAILED * float(detail[:: max(1, sites // 100_000)].quantile(0.98))
     if sites == len(model.faces):  # of the detail's kinds some sit on triangles
         corners = model.faces[detailed].flatten()
