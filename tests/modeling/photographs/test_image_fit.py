@@ -3,26 +3,19 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
-from pathlib import Path
+from dataclasses import replace
 
 import pytest
 import torch
 from torch import Tensor
 
+from planted.photographed_heads import EXPRESSION, SIZE, Person, aligned_error, person, portraits
 from torchface import zoo
 from torchface.attachment import Attachment
-from torchface.errors import AlignmentError, ShapeError, TopologyError, ValueRangeError
-from torchface.geometry.cameras.pinhole import Camera, look_at
-from torchface.geometry.similarity import similarity_transform
-from torchface.io.images.image_files import load_image
-from torchface.io.landmarks.dlib_xml import load_dlib_faces
-from torchface.io.landmarks.landmark_points import load_landmark_points
-from torchface.io.rigs.ict_facekit import load_identity_modes
+from torchface.errors import ShapeError
+from torchface.geometry.cameras.pinhole import look_at
 from torchface.landmarks.images.ibug_68 import as_annotated
-from torchface.mesh import Mesh
 from torchface.modeling.morphable.head_model import HeadModel
-from torchface.modeling.morphable.morphable_model import MorphableModel
 from torchface.modeling.photographs.fit_problem import Problem
 from torchface.modeling.photographs.fit_settings import FitSettings, SurfacePoints
 from torchface.modeling.photographs.image_fit import ImageFit, contour_curves, fit_images
@@ -30,70 +23,8 @@ from torchface.modeling.photographs.image_input import annotated_vertices
 from torchface.modeling.photographs.landmark_view import LandmarkSites, LinearPoints
 from torchface.modeling.rigging.deformation_transfer import transfer_deformation
 from torchface.rig import BlendshapeRig
-from torchface.synthetic import draw_identities, performer
-from torchface.synthetic.head.identity import anatomy
-
-SIZE = (1280, 1024)
-
 
 FIXED = FitSettings(sliding=False, contour_slide=1.0, one_expression=True)
-
-
-EXPRESSION = {"jawOpen": 0.3, "mouthSmileLeft": 0.7, "mouthSmileRight": 0.6, "browInnerUp": 0.5}
-
-
-@dataclass(frozen=True, eq=False)
-class Person:
-    """A planted head and what cameras see of it."""
-
-    coefficients: Tensor
-    weights: Tensor
-    rest: Tensor
-    face: Tensor
-    cameras: list[Camera]
-    landmarks: Tensor
-
-    @property
-    def focal(self) -> float:
-        return float(self.cameras[0].intrinsics[0, 0])
-
-
-@pytest.fixture(scope="module")
-def rig() -> BlendshapeRig:
-    return performer(texture=False)
-
-
-@pytest.fixture(scope="module")
-def model(rig: BlendshapeRig) -> HeadModel:
-    heads = torch.stack([anatomy(who).vertices for who in draw_identities(60, torch.Generator().manual_seed(0))])
-    return HeadModel.on(rig.neutral, MorphableModel.fit(heads.float(), 15))
-
-
-def portraits(face: Tensor, rig: BlendshapeRig) -> list[Camera]:
-    centre = face[rig.neutral.landmarks].mean(0)
-    return [look_at(centre, yaw, 3.0, span=300.0, width=SIZE[0], height=SIZE[1]) for yaw in (-40.0, 0.0, 40.0)]
-
-
-def person(
-    rig: BlendshapeRig, model: HeadModel, seed: int, noise: float = 0.5, weights: Tensor | None = None
-) -> Person:
-    """Three portraits of a head of the model, as landmarks."""
-    generator = torch.Generator().manual_seed(seed)
-    coefficients = torch.randn(model.shape.count, generator=generator)
-    if weights is None:
-        weights = torch.zeros(len(rig.names))
-        weights[rig.index(list(EXPRESSION))] = torch.tensor(list(EXPRESSION.values()))
-    rest = model.shape(coefficients[None])[0]
-    face = rest + rig(weights[None])[0] - rig.vertices
-    cameras = portraits(face, rig)
-    seen = torch.stack([camera.project(face[rig.neutral.landmarks].double()) for camera in cameras])
-    seen = seen + noise * torch.randn(seen.shape, generator=generator).double()
-    return Person(coefficients, weights, rest, face, cameras, seen)
-
-
-def aligned_error(found: Tensor, true: Tensor) -> float:
-    moved = similarity_transform(found[None].double(), true[None].double()).apply(found[None].double())[0]
-    return float((moved - true.double()).norm(dim=-1).mean())
 
 
 @pytest.fixture(scope="module")
@@ -323,107 +254,6 @@ def test_a_laugh_goes_to_a_smile_by_the_prior(rig: BlendshapeRig, model: HeadMod
             strays[name] += float(fit.weights[0, rig.index(others)].max()) / 4
     assert off["prior"] < off["none"]
     assert strays["prior"] < 0.2
-
-
-@pytest.fixture(scope="module")
-def seen(rig: BlendshapeRig, model: HeadModel) -> Tensor:
-    return person(rig, model, 8).landmarks
-
-
-def test_too_few_or_none(rig: BlendshapeRig, model: HeadModel, seen: Tensor) -> None:
-    none = seen.clone()
-    none[1] = torch.nan
-    with pytest.raises(ValueRangeError, match="found none in view 1"):
-        fit_images(model, rig, none, SIZE)
-    few = seen.clone()
-    few[2, 22:] = torch.nan
-    with pytest.raises(ValueRangeError, match="found 5 on brows, eyes, nose and mouth in view 2, expected at least 6"):
-        fit_images(model, rig, few, SIZE)
-
-
-def test_pixels_of_another_picture(rig: BlendshapeRig, model: HeadModel, seen: Tensor) -> None:
-    with pytest.raises(ValueRangeError, match="most of them outside an image of 320 x 256"):
-        fit_images(model, rig, seen, (320, 256))
-    with pytest.raises(ValueRangeError, match="expected pixels in an image of 1280 x 1024"):
-        fit_images(model, rig, seen / 1280, SIZE)
-
-
-def test_another_order(rig: BlendshapeRig, model: HeadModel, seen: Tensor) -> None:
-    with pytest.raises(AlignmentError, match="iBUG's order"):
-        fit_images(model, rig, seen.flip(1), SIZE)
-    with pytest.raises(AlignmentError, match="iBUG's order"):
-        fit_images(model, rig, seen[:, torch.randperm(68, generator=torch.Generator().manual_seed(0))], SIZE)
-
-
-def test_seen_from_behind(rig: BlendshapeRig, model: HeadModel) -> None:
-    marks = rig.vertices[rig.neutral.landmarks].double()
-    camera = look_at(marks.mean(0), 170.0, span=300.0, width=SIZE[0], height=SIZE[1])
-    with pytest.raises(AlignmentError, match=r"rotated by 1\d\d° in view 0, as if seen from behind"):
-        fit_images(model, rig, camera.project(marks)[None], SIZE)
-
-
-def test_wrong_shapes_and_other_topology(
-    rig: BlendshapeRig, model: HeadModel, seen: Tensor, dome_rig: BlendshapeRig
-) -> None:
-    with pytest.raises(ShapeError, match=r"landmarks: found \(3, 51, 2\), expected \(I,68,2\)"):
-        fit_images(model, rig, seen[:, 17:], SIZE)
-    with pytest.raises(ShapeError, match="for each of 3 views"):
-        fit_images(model, rig, seen, [SIZE, SIZE])
-    with pytest.raises(TopologyError, match="expected the same triangles"):
-        fit_images(model, dome_rig, seen, SIZE)
-    with pytest.raises(ValueRangeError, match="focal length of -1"):
-        fit_images(model, rig, seen, SIZE, camera=-1.0)
-    bare = Mesh(rig.vertices, rig.neutral.faces)
-    plain, plain_rig = HeadModel.on(bare, model.shape), BlendshapeRig(bare, rig.deltas, rig.names)
-    with pytest.raises(ValueRangeError, match="landmarks: found none"):
-        fit_images(plain, plain_rig, seen, SIZE)
-
-
-def people(rig: BlendshapeRig, ict_folder: Path) -> HeadModel:
-    """Real people's shapes on the rig's neutral."""
-    modes = load_identity_modes(ict_folder, part="face").deltas
-    sizes = modes.flatten(1).norm(dim=1)
-    return HeadModel.on(rig.neutral, MorphableModel(rig.vertices, modes / sizes[:, None, None], sizes))
-
-
-@pytest.mark.real
-def test_a_real_portrait(
-    data: Path, ict_folder: Path, real_capture: tuple[BlendshapeRig, Attachment, list[torch.Tensor]]
-) -> None:
-    rig = real_capture[0]
-    model = people(rig, ict_folder)
-    path = data / "images" / "ibug" / "image_0010.png"
-    image = load_image(path)
-    marks = load_landmark_points(path.with_suffix(".pts")).ibug()
-    fit = fit_images(model, rig, marks[None], (image.shape[2], image.shape[1]), settings=FitSettings(transfers=0))
-    eyes = float((marks[36] - marks[45]).norm())
-    assert float(fit.errors[0]) < 0.07 * eyes
-    assert float(fit.residuals[0, 17:].norm(dim=-1).mean()) < 0.04 * eyes
-    yaw = math.degrees(math.atan2(-float(fit.cameras[0].rotation[2, 0]), -float(fit.cameras[0].rotation[2, 2])))
-    assert 15 < yaw < 45  # the face is turned toward the viewer's left
-    assert float(fit.coefficients.abs().max()) < 2.5
-    upper, lower = rig.neutral.landmarks[61:64], rig.neutral.landmarks[[67, 66, 65]]
-    assert float((fit.posed[0].vertices[upper] - fit.posed[0].vertices[lower]).norm(dim=-1).mean()) < 2.0
-
-
-@pytest.mark.bench  # eighteen fits
-@pytest.mark.real
-def test_smiles_of_turned_heads_are_as_strong_on_both_sides(
-    data: Path, ict_folder: Path, real_capture: tuple[BlendshapeRig, Attachment, list[torch.Tensor]]
-) -> None:
-    """Taken alone, 68 landmarks of a head turned by 36 degrees gave 0.63 and 0.24 to the halves of one smile."""
-    rig = real_capture[0]
-    model = people(rig, ict_folder)
-    left, right = rig.index(["mouthSmile_L", "mouthSmile_R"])
-    folder, apart = data / "images" / "dlib_faces", []
-    for face in load_dlib_faces(folder / "training_with_face_landmarks.xml"):
-        image = load_image(folder / face.image)
-        fit = fit_images(
-            model, rig, face.points[None], (image.shape[2], image.shape[1]), settings=FitSettings(transfers=0)
-        )
-        apart.append(float((fit.weights[0, left] - fit.weights[0, right]).abs()))
-    assert max(apart) < 0.1
-    assert sum(apart) / len(apart) < 0.06
 
 
 def test_points_of_the_surface_tell_a_head_better(rig: BlendshapeRig, model: HeadModel) -> None:

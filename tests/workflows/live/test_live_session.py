@@ -24,17 +24,14 @@ from torchface.io.video import open_video
 from torchface.io.video.video_packets import pyav
 from torchface.landmarks.images.boxes.face_box import FaceBoxes
 from torchface.shape_names import ARKIT
-from torchface.workflows.browser_app import character as characters
 from torchface.workflows.browser_app.character import load_character
 from torchface.workflows.live import live_anybody
 from torchface.workflows.live import recordings as recordings_module
 from torchface.workflows.live.kept_takes import film_of, kept_takes, remove_take, take_file
 from torchface.workflows.live.live_anybody import LiveSettings, go_live, import_recordings
-from torchface.workflows.live.live_figures import LiveFigures
-from torchface.workflows.live.live_frames import LiveFrame
 from torchface.workflows.live.live_session import LiveSession, Notes
 from torchface.workflows.live.recordings import FrameLog, Recordings
-from torchface.workflows.live.session_prompts import STEPS, FaceWatch, GuidedCalibration
+from torchface.workflows.live.session_prompts import STEPS
 from torchface.workflows.live.weight_streams import WeightStreams
 from torchface.workflows.track.head_rotations import head_rotations
 
@@ -326,103 +323,6 @@ def test_a_guided_calibration_asks_for_five_faces_in_ten_seconds(dome: Path, tmp
     assert held.tolist() == pytest.approx([1.3] * 5, abs=0.07)
     assert (poses[:20] == 0).all()  # time to get into the first
     assert (poses[302:] == 0).all()
-
-
-def test_the_calibrations_clock_stands_while_no_face_is_seen() -> None:
-    calibration: GuidedCalibration | None = GuidedCalibration(3.0)
-    for _ in range(100):
-        assert calibration is not None
-        calibration = calibration.after(0.1, seen_at(float("nan")))
-    assert calibration == GuidedCalibration(3.0)
-    assert calibration.pose == 2
-    assert GuidedCalibration(9.95).after(0.1, seen_at(1.0)) is None
-
-
-def seen_at(x: float) -> LiveFrame:
-    """A face whose landmarks lie at one place; none at NaN."""
-    return LiveFrame(torch.zeros(52), torch.eye(3), torch.tensor([[x, 20.0]]).expand(68, 2))
-
-
-def test_no_face_darkness_and_which_of_several_faces_are_said() -> None:
-    counted: list[tuple[int, ...]] = []
-
-    def find(picture: torch.Tensor) -> list[list[float]]:
-        counted.append(tuple(picture.shape))
-        return [[40.0, 10.0, 20.0, 20.0], [0.0, 10.0, 20.0, 20.0]]
-
-    watch = FaceWatch(find)
-    bright, dark = np.full((48, 64, 3), 120, np.uint8), np.full((48, 64, 3), 9, np.uint8)
-    nobody, left = seen_at(float("nan")), seen_at(11.0)
-    watch.look(bright, nobody, 0.0)
-    assert watch.words == "No face yet: sit before the camera and look into it"
-    watch.look(dark, nobody, 0.1)
-    assert watch.words.startswith("Too dark")
-    watch.look(bright, left, 0.2)
-    assert watch._looking is not None
-    watch._looking.join(5)
-    watch.look(bright, left, 0.3)
-    assert watch.words == "Two people: following the right one"  # as in a mirror
-    watch.mirrored = False
-    watch.look(bright, left, 0.3)
-    assert watch.words == "Two people: following the left one"
-    assert counted == [(3, 48, 64)]  # not at every frame
-    watch.look(bright, nobody, 0.4)
-    assert watch.words == "Your face is hidden: the last expression is held, then relaxes"
-
-
-def test_latency_is_told_within_a_hundredth() -> None:
-    figures = LiveFigures()
-    for i in range(1, 1001):
-        figures.add(i / 30, i / 30 + i / 1000, i % 2 == 0)
-    assert figures.latency(0.5) == pytest.approx(500, rel=0.01)
-    assert figures.latency(0.99) == pytest.approx(990, rel=0.01)
-    assert (figures.frames, figures.found) == (1000, 500)
-
-
-def test_a_mapping_drives_a_character_of_other_names(dome_rig: BlendshapeRig, tmp_path: Path) -> None:
-    names = ["Mund_auf", "Brauen", "Laecheln_L", "Laecheln_R"]
-    save_rig(BlendshapeRig(dome_rig.neutral, dome_rig.deltas, names), tmp_path / "strange.glb")
-    with pytest.raises(Exception, match=r"found the shapes 'Mund_auf'.*--mapping FILE.*\n\[\"Mund_auf\"\]") as told:
-        load_character(tmp_path / "strange.glb")
-    assert type(told.value).__name__ == "NameMismatchError"
-    table = tmp_path / "mapping.toml"
-    table.write_text(str(told.value).split("such as\n")[1] + "\ngain = 0.5\n")  # what the message shows is a table
-    moved = load_character(tmp_path / "strange.glb", table)
-    weights = torch.zeros(5000, 52)
-    weights[:, JAW] = torch.linspace(0, 1, 5000)
-    assert torch.equal(moved.weights(weights)[:, 0], weights[:, JAW] * 0.5)
-    assert "1 of its 4 shapes move" in moved.notes()[0]
-    table.write_text("[Nase]\nsum = {jawOpen = 1.0}\n")
-    with pytest.raises(Exception, match=r"mapping.toml: retarget: found rules for Nase, expected shapes"):
-        load_character(tmp_path / "strange.glb", table)
-    table.write_text("[Mund_auf]\nsum = {jawOpne = 1.0}\n")
-    with pytest.raises(Exception, match=r"mapping.toml: .*names jawOpne, expected shapes of the source"):
-        load_character(tmp_path / "strange.glb", table)
-
-
-def test_shapes_by_other_programs_names_move(dome_rig: BlendshapeRig, tmp_path: Path) -> None:
-    names = ["A25_Jaw_Open", "Fcl_EYE_Close_L", "mouthSmile_L", "Nase"]
-    save_rig(BlendshapeRig(dome_rig.neutral, dome_rig.deltas, names), tmp_path / "other.glb")
-    moved = load_character(tmp_path / "other.glb")
-    weights = torch.rand(3, 52)
-    expected = weights[:, [JAW, ARKIT.index("eyeBlinkLeft"), SMILE]]
-    torch.testing.assert_close(moved.weights(weights), torch.cat([expected, torch.zeros(3, 1)], 1))
-
-
-def test_characters_that_cannot_move(dome_rig: BlendshapeRig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from torchface import save_mesh
-
-    save_mesh(dome_rig.neutral, tmp_path / "statue.glb")
-    with pytest.raises(FileFormatError, match=r"statue.glb: found no morph target"):
-        load_character(tmp_path / "statue.glb")
-    save_rig(dome_rig, tmp_path / "dome.glb")
-    whole = (tmp_path / "dome.glb").read_bytes()
-    (tmp_path / "broken.glb").write_bytes(whole[: len(whole) // 2])
-    with pytest.raises(FileFormatError, match=r"broken.glb"):
-        load_character(tmp_path / "broken.glb")
-    monkeypatch.setattr(characters, "LARGEST_CHARACTER", 1000)
-    with pytest.raises(FileFormatError, match=r"dome.glb: found 0 MB, expected at most 0 MB for a character"):
-        load_character(tmp_path / "dome.glb")
 
 
 def test_a_receiver_that_is_not_there_is_told_once_with_the_figure() -> None:

@@ -1,0 +1,61 @@
+"""Planted heads, and the landmarks that cameras see of them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torchface.geometry.cameras.pinhole import Camera, look_at
+from torchface.geometry.similarity import similarity_transform
+from torchface.modeling.morphable.head_model import HeadModel
+from torchface.rig import BlendshapeRig
+
+SIZE = (1280, 1024)
+
+
+EXPRESSION = {"jawOpen": 0.3, "mouthSmileLeft": 0.7, "mouthSmileRight": 0.6, "browInnerUp": 0.5}
+
+
+@dataclass(frozen=True, eq=False)
+class Person:
+    """A planted head and what cameras see of it."""
+
+    coefficients: Tensor
+    weights: Tensor
+    rest: Tensor
+    face: Tensor
+    cameras: list[Camera]
+    landmarks: Tensor
+
+    @property
+    def focal(self) -> float:
+        return float(self.cameras[0].intrinsics[0, 0])
+
+
+def portraits(face: Tensor, rig: BlendshapeRig) -> list[Camera]:
+    centre = face[rig.neutral.landmarks].mean(0)
+    return [look_at(centre, yaw, 3.0, span=300.0, width=SIZE[0], height=SIZE[1]) for yaw in (-40.0, 0.0, 40.0)]
+
+
+def person(
+    rig: BlendshapeRig, model: HeadModel, seed: int, noise: float = 0.5, weights: Tensor | None = None
+) -> Person:
+    """Three portraits of a head of the model, as landmarks."""
+    generator = torch.Generator().manual_seed(seed)
+    coefficients = torch.randn(model.shape.count, generator=generator)
+    if weights is None:
+        weights = torch.zeros(len(rig.names))
+        weights[rig.index(list(EXPRESSION))] = torch.tensor(list(EXPRESSION.values()))
+    rest = model.shape(coefficients[None])[0]
+    face = rest + rig(weights[None])[0] - rig.vertices
+    cameras = portraits(face, rig)
+    seen = torch.stack([camera.project(face[rig.neutral.landmarks].double()) for camera in cameras])
+    seen = seen + noise * torch.randn(seen.shape, generator=generator).double()
+    return Person(coefficients, weights, rest, face, cameras, seen)
+
+
+def aligned_error(found: Tensor, true: Tensor) -> float:
+    moved = similarity_transform(found[None].double(), true[None].double()).apply(found[None].double())[0]
+    return float((moved - true.double()).norm(dim=-1).mean())

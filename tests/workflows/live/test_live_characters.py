@@ -1,0 +1,61 @@
+"""Characters of other names are driven; those that cannot move are refused."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import torch
+from planted_faces import JAW, SMILE
+
+from torchface import BlendshapeRig, save_rig
+from torchface.errors import FileFormatError
+from torchface.shape_names import ARKIT
+from torchface.workflows.browser_app import character as characters
+from torchface.workflows.browser_app.character import load_character
+
+
+def test_a_mapping_drives_a_character_of_other_names(dome_rig: BlendshapeRig, tmp_path: Path) -> None:
+    names = ["Mund_auf", "Brauen", "Laecheln_L", "Laecheln_R"]
+    save_rig(BlendshapeRig(dome_rig.neutral, dome_rig.deltas, names), tmp_path / "strange.glb")
+    with pytest.raises(Exception, match=r"found the shapes 'Mund_auf'.*--mapping FILE.*\n\[\"Mund_auf\"\]") as told:
+        load_character(tmp_path / "strange.glb")
+    assert type(told.value).__name__ == "NameMismatchError"
+    table = tmp_path / "mapping.toml"
+    table.write_text(str(told.value).split("such as\n")[1] + "\ngain = 0.5\n")  # what the message shows is a table
+    moved = load_character(tmp_path / "strange.glb", table)
+    weights = torch.zeros(5000, 52)
+    weights[:, JAW] = torch.linspace(0, 1, 5000)
+    assert torch.equal(moved.weights(weights)[:, 0], weights[:, JAW] * 0.5)
+    assert "1 of its 4 shapes move" in moved.notes()[0]
+    table.write_text("[Nase]\nsum = {jawOpen = 1.0}\n")
+    with pytest.raises(Exception, match=r"mapping.toml: retarget: found rules for Nase, expected shapes"):
+        load_character(tmp_path / "strange.glb", table)
+    table.write_text("[Mund_auf]\nsum = {jawOpne = 1.0}\n")
+    with pytest.raises(Exception, match=r"mapping.toml: .*names jawOpne, expected shapes of the source"):
+        load_character(tmp_path / "strange.glb", table)
+
+
+def test_shapes_by_other_programs_names_move(dome_rig: BlendshapeRig, tmp_path: Path) -> None:
+    names = ["A25_Jaw_Open", "Fcl_EYE_Close_L", "mouthSmile_L", "Nase"]
+    save_rig(BlendshapeRig(dome_rig.neutral, dome_rig.deltas, names), tmp_path / "other.glb")
+    moved = load_character(tmp_path / "other.glb")
+    weights = torch.rand(3, 52)
+    expected = weights[:, [JAW, ARKIT.index("eyeBlinkLeft"), SMILE]]
+    torch.testing.assert_close(moved.weights(weights), torch.cat([expected, torch.zeros(3, 1)], 1))
+
+
+def test_characters_that_cannot_move(dome_rig: BlendshapeRig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from torchface import save_mesh
+
+    save_mesh(dome_rig.neutral, tmp_path / "statue.glb")
+    with pytest.raises(FileFormatError, match=r"statue.glb: found no morph target"):
+        load_character(tmp_path / "statue.glb")
+    save_rig(dome_rig, tmp_path / "dome.glb")
+    whole = (tmp_path / "dome.glb").read_bytes()
+    (tmp_path / "broken.glb").write_bytes(whole[: len(whole) // 2])
+    with pytest.raises(FileFormatError, match=r"broken.glb"):
+        load_character(tmp_path / "broken.glb")
+    monkeypatch.setattr(characters, "LARGEST_CHARACTER", 1000)
+    with pytest.raises(FileFormatError, match=r"dome.glb: found 0 MB, expected at most 0 MB for a character"):
+        load_character(tmp_path / "dome.glb")
