@@ -18,7 +18,7 @@ from torchface.onnx import dynamics_prior_graph as exporting
 from torchface.synthetic.stages.weight_curves import perform
 
 
-@pytest.fixture(scope="module", params=[4, pytest.param(1, marks=pytest.mark.bench)])
+@pytest.fixture(scope="module", params=[1, 4])
 def prior(request: pytest.FixtureRequest) -> DynamicsPrior:
     takes = []
     for seed in range(2):
@@ -36,6 +36,7 @@ def report(prior: DynamicsPrior, tmp_path_factory: pytest.TempPathFactory) -> Ex
     return report
 
 
+@pytest.mark.bench
 def test_the_graph_predicts_as_the_module(prior: DynamicsPrior, report: ExportReport) -> None:
     assert "ONNX Runtime against PyTorch" in str(report)
     session = onnxruntime.InferenceSession(report.path, providers=["CPUExecutionProvider"])
@@ -53,6 +54,7 @@ def test_the_graph_predicts_as_the_module(prior: DynamicsPrior, report: ExportRe
     assert json.loads(facts["input_noise"]) == prior.input_noise
 
 
+@pytest.mark.bench
 def test_a_graph_that_differs_is_not_written(
     prior: DynamicsPrior, report: ExportReport, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -136,6 +136,7 @@ def test_without_a_dynamics_prior_it_walks_as_the_exact_solve_does(rig: Blendsha
     assert float(states[-1].weights.max()) < float(states[9].weights.max())
 
 
+@pytest.mark.bench  # torch.export takes twenty seconds; the module is tried above
 def test_the_file_is_the_graph(written: VideoReport) -> None:
     assert written.frames == 40
     assert written.parity <= 1e-4
@@ -165,6 +166,7 @@ def test_a_file_with_correctives_is_the_graph(rig: BlendshapeRig, tmp_path: Path
     assert export_video_solver(corrective_rig(rig), CAMERA, tmp_path / "video_solver.onnx").parity < 1e-5
 
 
+@pytest.mark.bench
 def test_the_metadata_says_what_goes_in_and_out(written: VideoReport, rig: BlendshapeRig) -> None:
     session = onnxruntime.InferenceSession(written.path, providers=["CPUExecutionProvider"])
     count = len(SEEN)
@@ -190,6 +192,7 @@ def test_the_metadata_says_what_goes_in_and_out(written: VideoReport, rig: Blend
     assert {opset.domain for opset in onnx.load(written.path).opset_import} == {""}
 
 
+@pytest.mark.bench
 def test_without_a_face_nothing_begins(written: VideoReport, rig: BlendshapeRig) -> None:
     """Frames before the first face hand on no state; the file then begins as if they had not been."""
     session = onnxruntime.InferenceSession(written.path, providers=["CPUExecutionProvider"])
@@ -208,6 +211,7 @@ def test_without_a_face_nothing_begins(written: VideoReport, rig: BlendshapeRig)
         np.testing.assert_array_equal(one, other)
 
 
+@pytest.mark.bench
 def test_a_graph_that_differs_is_not_written(
     written: VideoReport,
     rig: BlendshapeRig,
