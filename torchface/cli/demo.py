@@ -54,6 +54,7 @@ def demo(
     console.print(_table(scene.title, scene_rows(result)))
     console.print(_table("against the truth", result_rows(result), ("", "whole take", "frame by frame")))
     console.print(_table("solver.onnx", result.solver.rows()))
+    console.print(result.solver.verdict())
     print_path(page)
 
 

@@ -83,10 +83,10 @@ class SolverReport(WrittenGraph):
 
     def verdict(self) -> str:
         """Whether the graph is to be used, in a line; what ONNX Runtime computes otherwise than PyTorch is an error."""
-        worst = max(gap.worst for gap in self.gaps)
+        worst = max((gap.worst for gap in self.gaps), default=0.0)
         found = (
-            f"the graph's error is at most {max(100 * worst, 0.001):.2g} % above the exact solve's, the least possible "
-            f"(up to {100 * _USUAL:.2g} % is usual)"
+            f"the graph's error (squared distances and penalties) is at most {max(100 * worst, 0.001):.2g} % above the "
+            f"exact solve's, the least possible (up to {100 * _USUAL:.2g} % is usual)"
         )
         if worst > _USUAL:
             return f"result: poor, {found}; more steps bring it nearer (GraphSteps in Python), or the other --method"
@@ -104,9 +104,9 @@ class SolverReport(WrittenGraph):
             rows.append(
                 (
                     f"{gap.missing:.0%} of the markers missing",
-                    f"error (energy: squared distances and penalties) above the exact solve's: {100 * gap.worst:.1e} % "
-                    f"in the worst frame, {100 * gap.median:.1e} % in the median; weights of ONNX Runtime and PyTorch "
-                    f"{gap.parity:.1e} apart, by rounding alone {gap.rounding:.1e}",
+                    f"error above the exact solve's: {100 * gap.worst:.1e} % in the worst frame, "
+                    f"{100 * gap.median:.1e} % in the median; ONNX Runtime's weights lie {gap.parity:.1e} from "
+                    f"PyTorch's (rounding alone: {gap.rounding:.1e})",
                 )
             )
         return rows
@@ -284,7 +284,7 @@ def _export(
     progress: Progress,
 ) -> SolverReport:
     """Checks and writes a graph; ``more`` are its inputs after the markers and the weights before."""
-    progress("writing the graph")
+    progress("writing the graph, half a minute")
     content = solver_model(graph, bool(more), facts).SerializeToString()
     session, gaps = one_thread_session(content), []
     for count, missing in enumerate(_MISSING):

@@ -9,7 +9,6 @@ from pathlib import Path
 import pytest
 import torch
 
-from torchface.attachment import Attachment
 from torchface.capture import MarkerSolver
 from torchface.errors import TopologyError, ValueRangeError
 from torchface.io import load_rig, load_take, save_mesh, save_rig
@@ -30,14 +29,14 @@ def small_maps(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_the_embedded_performer_comes_back_and_every_file_says_the_same(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    asked: list[tuple[BlendshapeRig, Attachment]] = []
+    asked: list[MarkerSolver] = []
 
-    def exported(rig: BlendshapeRig, sites: Attachment, path: Path, markers: torch.Tensor) -> SolverReport:
+    def exported(solver: MarkerSolver, path: Path, markers: torch.Tensor, progress: object) -> SolverReport:
         """In place of twenty seconds of ``torch.export``."""
-        asked.append((rig, sites))
+        asked.append(solver)
         return SolverReport(path, path.write_bytes(bytes(9)), None, 1, 1, (), 0.0, 0.0)
 
-    monkeypatch.setattr("torchface.workflows.demo.run_demo.export_solver", exported)
+    monkeypatch.setattr("torchface.workflows.demo.run_demo.export_marker_solver", exported)
     result = run_demo(embedded_scene(seed=4, frames=80), tmp_path, seed=4)
     noise = 3**0.5 * FLAWS.noise
     solved, single = result.solved, result.frame_by_frame
@@ -60,9 +59,9 @@ def test_the_embedded_performer_comes_back_and_every_file_says_the_same(
     assert written is not None
     torch.testing.assert_close(rig.weights_from(written).float(), solved.weights, atol=1e-5, rtol=0)
 
-    ((rig, sites),) = asked
-    assert rig is result.rig
-    assert sites is result.attachment
+    (solver,) = asked
+    assert solver.names == result.rig.names
+    assert solver.labels == result.attachment.labels
     assert result.solver.path == result.files["solver for applications"]
 
     page = write_demo_page(result, tmp_path)

@@ -35,7 +35,8 @@ from torchface.io.weights.live_link_csv import save_live_link
 from torchface.io.weights.weight_csv import save_weights_csv
 from torchface.mesh import Mesh
 from torchface.modeling.rigging.deformation_transfer import TransferReport, transfer_with_report
-from torchface.onnx import SolverReport, export_solver
+from torchface.onnx import SolverReport
+from torchface.onnx.solver_graph_export import export_marker_solver
 from torchface.progress import Progress, silent
 from torchface.rig import BlendshapeRig
 from torchface.shape_names import ARKIT, mapping
@@ -246,10 +247,9 @@ def _run_demo(scene: Scene, out: Path, seed: int, flaws: StageFlaws, progress: P
     live = bool(mapping(rig.names, ARKIT).any())
     (save_live_link if live else save_weights_csv)(solved, files["solved weights"])
     save_animation(rig, solved, files["animated rig"])
-    progress("exporting and checking the solver")
     some = recording.markers[:: max(1, len(recording.markers) // 300)]
     seen = some + flaws.noise * torch.randn(some.shape, generator=generator)
-    solver = export_solver(rig, attachment, files["solver for applications"], markers=seen)
+    solver = export_marker_solver(marker_solver, files["solver for applications"], markers=seen, progress=progress)
     progress("comparing with the truth")
     face = face_mask(scene.head)
 
