@@ -17,7 +17,7 @@ from torchface.landmarks.images.tracking.video_landmarks import landmark_jitter,
 from torchface.landmarks.images.trees.landmark_trees import LandmarkTrees
 from torchface.landmarks.images.trees.tree_finder import TreeFinder
 from torchface.landmarks.images.trees.tree_training import TreeSettings
-from torchface.landmarks.scans.contours import Contour, TraceSettings, trace_contour
+from torchface.landmarks.scans.contours import Contour, trace_contour
 from torchface.landmarks.scans.cylinder import CylinderLayout, UnwrappedHead, unwrap
 from torchface.landmarks.scans.detector_settings import DetectorSettings
 from torchface.landmarks.scans.face_frame import FaceFrame
@@ -62,7 +62,6 @@ __all__ = [
     "NoFaceError",
     "ScanAnnotation",
     "ScanLandmarks",
-    "TraceSettings",
     "TreeFinder",
     "TreeSettings",
     "UVLandmarkDetector",

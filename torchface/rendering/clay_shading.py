@@ -20,6 +20,7 @@ __all__ = ["Lighting", "render"]
 
 CLAY = (0.80, 0.72, 0.66)
 """The colour of a mesh that brings none."""
+_OCCLUSION_REACH = 60.0  # millimetres beyond which a surface no longer dims
 
 
 @dataclass(frozen=True)
@@ -30,7 +31,6 @@ class Lighting:
         lights: direction toward the light in the camera's frame (right, up, toward the viewer) and its strength.
         ambient: light from everywhere, dimmed where other parts of the mesh stand close.
         occlusion_rays: rays a pixel that measure how close; 0 leaves the dimming out.
-        occlusion_reach: millimetres beyond which a surface no longer dims.
         gloss: strength of the highlight.
 
     Example:
@@ -46,7 +46,6 @@ class Lighting:
     )
     ambient: float = 0.38
     occlusion_rays: int = 8
-    occlusion_reach: float = 60.0
     gloss: float = 0.10
 
 
@@ -198,5 +197,5 @@ def _openness(caster: RayCaster, points: Tensor, normals: Tensor, lighting: Ligh
         height = math.sqrt((i + 0.5) / count)
         angle = turn + i * 2.399963
         way = height * normals + math.sqrt(1 - height**2) * (angle.cos() * side + angle.sin() * other)
-        free += caster.distances(starts, way, lighting.occlusion_reach)
-    return free.double() / (count * lighting.occlusion_reach)
+        free += caster.distances(starts, way, _OCCLUSION_REACH)
+    return free.double() / (count * _OCCLUSION_REACH)

@@ -9,7 +9,8 @@ import pytest
 import torch
 
 from torchface.errors import ValueRangeError
-from torchface.landmarks.scans.contours import TraceSettings, evenly_spaced, trace_contour
+from torchface.landmarks.scans import contours
+from torchface.landmarks.scans.contours import evenly_spaced, trace_contour
 from torchface.landmarks.scans.line_shape import LineShape
 from torchface.rendering.gaussian_blur import gaussian_blur
 
@@ -45,25 +46,27 @@ def test_a_brighter_second_line_does_not_distract() -> None:
     assert (found.points[:, 1] - rows)[found.kept].abs().mean() < 1.0
 
 
-def test_no_single_column_can_do_better() -> None:
+def test_no_single_column_can_do_better(monkeypatch: pytest.MonkeyPatch) -> None:
     image, _ = planted(9.0, seed=3)
-    settings = TraceSettings(sags=(0.08,), iterations=100)
+    monkeypatch.setattr(contours, "_SAGS", (0.08,))
+    monkeypatch.setattr(contours, "_ITERATIONS", 100)
     left, right = torch.tensor([60.0, 110.0]), torch.tensor([160.0, 104.0])
-    found = trace_contour(image, left, right, settings)
-    top = 104 - settings.border
-    box = gaussian_blur(image[:, top : 110 + settings.border + 1, 60:161][None], settings.blurs[-1])[0, 0].double()
-    rows, width = np.arange(len(box)), settings.line_width
+    found = trace_contour(image, left, right)
+    top = 104 - contours._BORDER
+    box = gaussian_blur(image[:, top : 110 + contours._BORDER + 1, 60:161][None], contours._BLUR)[0, 0].double()
+    rows, width = np.arange(len(box)), contours._LINE_WIDTH
     grey = box.numpy()
     grey = grey - np.minimum(grey[np.maximum(rows - width, 0)], grey[np.minimum(rows + width, len(rows) - 1)])
     grey = (grey - grey.min()) / grey.std()
     path = (found.points[:, 1] - top).long().numpy()
-    course, deviation = LineShape.arc(0.08, settings.deviation).rows(left, right, COLUMNS)
+    course, deviation = LineShape.arc(0.08, contours._DEVIATION).rows(left, right, COLUMNS)
     limit = grey[path, np.arange(101)].mean() + grey[path, np.arange(101)].std()
     for c in range(1, 100):
-        cost = settings.dark * grey[:, c] + settings.near * ((rows - float(course[c]) + top) / float(deviation[c])) ** 2
+        away = (rows - float(course[c]) + top) / float(deviation[c])
+        cost = contours._DARK * grey[:, c] + contours._NEAR * away**2
         for n in (c - 1, c + 1):
-            cost = cost + settings.similar * (grey[:, c] - grey[path[n], n]) ** 2
-            cost = cost + settings.smooth * (rows - path[n]) ** 2
+            cost = cost + contours._SIMILAR * (grey[:, c] - grey[path[n], n]) ** 2
+            cost = cost + contours._SMOOTH * (rows - path[n]) ** 2
         cost = cost + 4.0 * (grey[:, c] > limit)
         assert cost[path[c]] <= cost.min() + 1e-9
 

@@ -20,6 +20,7 @@ from torchface.landmarks.scans.uv_landmark_names import LINES, UV_LANDMARK_NAMES
 from torchface.mesh import Mesh
 from torchface.rendering.clay_shading import sample_texture
 from torchface.synthetic import performer
+from torchface.synthetic.stages import scanner
 from torchface.synthetic.stages.depth_fusion import DepthNoise, fuse, surface_net
 from torchface.synthetic.stages.hair_and_collar import Dress
 from torchface.synthetic.stages.scanner import Photography, RawScan, ScannerSettings, eyes_closed, scan_head
@@ -53,9 +54,9 @@ def test_the_scan_has_a_topology_of_its_own_and_is_torn(closed: Mesh, scan: RawS
     mesh = scan.mesh
     assert len(mesh.vertices) != len(closed.vertices)
     assert border_vertices(mesh.faces, len(mesh.vertices)).sum() > 100
-    assert int(components(mesh.faces, len(mesh.vertices)).max()) <= COARSE.crumbs + 1
+    assert int(components(mesh.faces, len(mesh.vertices)).max()) <= scanner._CRUMBS + 1
     back = (mesh.vertices.double() - scan.translation) @ scan.rotation
-    lowest = float(closed.vertices[closed.landmarks[8], 1]) - COARSE.below_chin
+    lowest = float(closed.vertices[closed.landmarks[8], 1]) - scanner._BELOW_CHIN
     assert back[:, 1].min() > lowest - 25
     hair = back[:, 1] > float(closed.vertices[:, 1].max()) + 2
     assert hair.any()

@@ -14,51 +14,19 @@ from torchface.errors import ShapeError, ValueRangeError
 from torchface.landmarks.scans.line_shape import LineShape, unit_profiles
 from torchface.rendering.gaussian_blur import gaussian_blur
 
+_BORDER = 50  # pixels: the line stays this near to the box round the two corners, above and below
+_SIMILAR = 1.0  # weight of neighbours having the same intensity, or being as like
+_DARK = 2.0  # weight of being dark, or like the learned profile
+_SMOOTH = 0.1  # weight of neighbours lying level, a squared pixel
+_NEAR = 1.0  # weight of staying near the course that the line begins with, a squared standard deviation
+_LINE_WIDTH = 5  # intensity is measured against that so many pixels above and below
+_BLUR = 1.0  # pixels
+_SAGS = (-0.06, 0.0, 0.06, 0.12)  # shares of its length by which an arc sags where no usual course is known
+_DEVIATION = 0.07  # about such an arc, a share of its length
+_DISPLACEMENTS = (-2.0, -1.0, 0.0, 1.0, 2.0)  # of uncertain corners, standard deviations; every column pays for them
+_ITERATIONS = 15  # at most; fewer when nothing moves any more
+_END_TOLERANCE = 8  # pixels up or down to within which a corner is known
 _BRIGHT = 4.0  # standard deviations; were such rows forbidden, a column without others would jump to any dark spot
-
-
-@dataclass(frozen=True)
-class TraceSettings:
-    """How a line is traced; lengths in pixels.
-
-    Args:
-        border: the line stays this near to the box round the two corners, above and below.
-        similar: weight of neighbours having the same intensity, or being as like.
-        dark: weight of being dark, or like the learned profile.
-        smooth: weight of neighbours lying level, a squared pixel.
-        near: weight of staying near the course that the line initial with, a squared standard deviation.
-        line_width: intensity is measured against that so many pixels above and below.
-        blurs: standard deviations of the blur under which the line is found first, and then finer.
-        sags: where no usual course is known, the line initial as an arc that sags by these shares of its length; the
-            best end wins.
-        deviation: the standard deviation about such an arc, a share of its length.
-        displacements: where corners are uncertain, either end of the usual course is tried moved by so many
-            standard deviations; the best line wins, and every column pays for its displacement as for leaving the
-            course.
-        iterations: at most so many a blur; fewer when nothing moves any more.
-        end_tolerance: a corner is only known to within so many pixels up or down.
-
-    Example:
-        >>> image = torch.ones(1, 100, 100)
-        >>> image[0, 60] = 0.0  # a dark line, ten pixels below the corners
-        >>> corners = torch.tensor([20.0, 50.0]), torch.tensor([80.0, 50.0])
-        >>> wide, narrow = (trace_contour(image, *corners, TraceSettings(border=rows)) for rows in (50, 2))
-        >>> wide.points[30, 1].item() > 55, narrow.points[30, 1].item() > 55  # the line is out of reach
-        (True, False)
-    """
-
-    border: int = 50
-    similar: float = 1.0
-    dark: float = 2.0
-    smooth: float = 0.1
-    near: float = 1.0
-    line_width: int = 5
-    blurs: tuple[float, ...] = (1.0,)
-    sags: tuple[float, ...] = (-0.06, 0.0, 0.06, 0.12)
-    deviation: float = 0.07
-    displacements: tuple[float, ...] = (-2.0, -1.0, 0.0, 1.0, 2.0)
-    iterations: int = 15
-    end_tolerance: int = 8
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,9 +63,7 @@ def evenly_spaced(points: Tensor, count: int) -> Tensor:
     return points[after - 1] + share[:, None] * (points[after] - points[after - 1])
 
 
-def trace_contour(
-    image: Tensor, left: Tensor, right: Tensor, settings: TraceSettings | None = None, shape: LineShape | None = None
-) -> Contour:
+def trace_contour(image: Tensor, left: Tensor, right: Tensor, shape: LineShape | None = None) -> Contour:
     r"""Traces the line between two corners: a dark one, or one with the profile that was learned.
 
     A line has one row :math:`y_c` a column c; with I how little a pixel is like the line, over its standard deviation
@@ -106,10 +72,10 @@ def trace_contour(
     .. math:: E = \sum_{c=1}^{N} a\,(I_c - I_{c+1})^2 + b\, I_c + s\,(y_c - y_{c+1})^2
         + d\,(y_c - y^0_c)^2 / \sigma_c^2 ,
 
-    with :math:`y^0` the course that it initial with. In the thesis I is the intensity; here it is how much brighter a
+    with :math:`y^0` the course that it begins with. In the thesis I is the intensity; here it is how much brighter a
     pixel is than the darker of what lies above and below, or, where its profile was learned from annotated lines,
     1 less the correlation of what lies round the pixel with that profile: the line between two lids need not be the
-    darkest of the furrows there. The thesis initial from the straight line and has no last term; here the start is the
+    darkest of the furrows there. The thesis begins with the straight line and has no last term; here the start is the
     mean of annotated lines where there were any, else the straight line and an arc. Learned lines are tried with
     their ends moved up and down as far as corners usually err; the least energy wins.
 
@@ -120,7 +86,6 @@ def trace_contour(
     Args:
         image: grey (1,S,S) or colours (3,S,S) in [0,1].
         left, right: corners, (2,) pixels; the left one further left by two pixels at least.
-        settings: weights and limits.
         shape: how the line usually runs, and its profile.
 
     Raises:
@@ -136,19 +101,16 @@ def trace_contour(
         >>> line.points[:, 1].unique().tolist()
         [50.0]
     """
-    settings = settings or TraceSettings()
-    box, rows, columns = _box(image, left, right, settings.border)
-    shapes = [LineShape.arc(sag, settings.deviation) for sag in settings.sags] if shape is None else [shape]
-    initial, pulls, displaced = _initial_lines(shapes, left, right, torch.from_numpy(columns), settings)
+    box, rows, columns = _box(image, left, right)
+    shapes = [LineShape.arc(sag, _DEVIATION) for sag in _SAGS] if shape is None else [shape]
+    initial, pulls, displaced = _initial_lines(shapes, left, right, torch.from_numpy(columns))
     initial -= rows[0]
     profile = None if shape is None or shape.profile is None else shape.profiles(left, right, torch.from_numpy(columns))
     path = initial.round().clip(0, len(rows) - 1).astype(np.int64)
-    grey = np.zeros(0)
-    for blur in settings.blurs:  # each goes on from where the coarser one ended
-        smooth = gaussian_blur(box[None, None], blur)[0, 0].double()
-        grey = _valleys(smooth.numpy(), settings.line_width) if profile is None else _unlike(smooth, profile)
-        path = _conditional_modes(grey, path, initial, pulls, settings)
-    energies = _energy(grey, path, initial, pulls, settings) + displaced
+    smooth = gaussian_blur(box[None, None], _BLUR)[0, 0].double()
+    grey = _valleys(smooth.numpy()) if profile is None else _unlike(smooth, profile)
+    path = _conditional_modes(grey, path, initial, pulls)
+    energies = _energy(grey, path, initial, pulls) + displaced
     best = int(energies.argmin())
     line = path[best]
     shade = grey[line, np.arange(len(line))]
@@ -158,7 +120,7 @@ def trace_contour(
 
 
 def _initial_lines(
-    shapes: list[LineShape], left: Tensor, right: Tensor, columns: Tensor, settings: TraceSettings
+    shapes: list[LineShape], left: Tensor, right: Tensor, columns: Tensor
 ) -> tuple[NDArray, NDArray, NDArray]:
     """Courses (S,N) in image rows, the pulls toward them (S,N), and what the displacement of each costs, (S,).
 
@@ -168,16 +130,16 @@ def _initial_lines(
     initial, pulls, costs = [], [], []
     for shape in shapes:
         rows, deviation = shape.rows(left, right, columns)
-        tried = settings.displacements if shape.corner_deviation > 0 else (0.0,)
+        tried = _DISPLACEMENTS if shape.corner_deviation > 0 else (0.0,)
         for at_left, at_right in product(tried, tried):
             displaced = at_left * (1 - share) + at_right * share
             initial.append(rows + shape.corner_deviation * displaced)
-            pulls.append(settings.near / deviation**2)
-            costs.append(settings.near * float(displaced.square().mean()))
+            pulls.append(_NEAR / deviation**2)
+            costs.append(_NEAR * float(displaced.square().mean()))
     return torch.stack(initial).numpy(), torch.stack(pulls).numpy(), np.array(costs)
 
 
-def _box(image: Tensor, left: Tensor, right: Tensor, border: int) -> tuple[Tensor, NDArray, NDArray]:
+def _box(image: Tensor, left: Tensor, right: Tensor) -> tuple[Tensor, NDArray, NDArray]:
     """Grey values round the corners, and the image rows and columns they come from."""
     if image.ndim != 3:
         raise ShapeError(f"image: found {tuple(image.shape)}, expected (C,S,S)")
@@ -193,17 +155,17 @@ def _box(image: Tensor, left: Tensor, right: Tensor, border: int) -> tuple[Tenso
     first, last = int(ends[0, 0].round()), int(ends[1, 0].round())
     if last - first < 2:
         raise ValueRangeError(f"corners: found columns {first} and {last}, expected the left one left of the right one")
-    top = max(0, int(ends[:, 1].min()) - border)
-    bottom = min(height - 1, int(ends[:, 1].max()) + border)
+    top = max(0, int(ends[:, 1].min()) - _BORDER)
+    bottom = min(height - 1, int(ends[:, 1].max()) + _BORDER)
     box = image[:, top : bottom + 1, first : last + 1].mean(0).float()
     return box, np.arange(top, bottom + 1), np.arange(first, last + 1)
 
 
-def _valleys(grey: NDArray, width: int) -> NDArray:
-    """How much brighter a pixel is than the darker of those ``width`` above and below it, in standard deviations: low
-    on dark lines, not on dark patches, shadows and their edges."""
+def _valleys(grey: NDArray) -> NDArray:
+    """How much brighter a pixel is than the darker of those above and below it, in standard deviations: low on dark
+    lines, not on dark patches, shadows and their edges."""
     rows = np.arange(len(grey))
-    above, below = grey[np.maximum(rows - width, 0)], grey[np.minimum(rows + width, len(grey) - 1)]
+    above, below = grey[np.maximum(rows - _LINE_WIDTH, 0)], grey[np.minimum(rows + _LINE_WIDTH, len(grey) - 1)]
     valley = grey - np.minimum(above, below)
     return (valley - valley.min()) / max(float(valley.std()), 1e-6)
 
@@ -217,29 +179,27 @@ def _unlike(grey: Tensor, profile: Tensor) -> NDArray:
     return unlike / max(float(unlike.std()), 1e-6)
 
 
-def _conditional_modes(
-    grey: NDArray, path: NDArray, initial: NDArray, pulls: NDArray, settings: TraceSettings
-) -> NDArray:
+def _conditional_modes(grey: NDArray, path: NDArray, initial: NDArray, pulls: NDArray) -> NDArray:
     """Passes over the columns of S lines (S,N) at once, from left to right, until nothing moves."""
     path = path.copy()
     lines = np.arange(len(path))
     count = path.shape[1]
     row = np.arange(len(grey), dtype=np.float64)
-    outside = np.abs(row[:, None] - initial[:, None, [0, -1]]) > settings.end_tolerance
-    # The order is the method: a column's choice is what the next column initial from. Hence a loop, and NumPy, whose
+    outside = np.abs(row[:, None] - initial[:, None, [0, -1]]) > _END_TOLERANCE
+    # The order is the method: a column's choice is what the next column begins with. Hence a loop, and NumPy, whose
     # small operations take a fifth of torch's time.
-    for _ in range(settings.iterations):
+    for _ in range(_ITERATIONS):
         before = path.copy()
         shades = grey[path, np.arange(count)]
         limit = shades.mean(1) + shades.std(1)
         for c in range(count):
             here = grey[:, c]
-            cost = settings.dark * here + pulls[:, c, None] * (row - initial[:, c, None]) ** 2
+            cost = _DARK * here + pulls[:, c, None] * (row - initial[:, c, None]) ** 2
             for n in (c - 1, c + 1):
                 if 0 <= n < count:
                     there = grey[path[:, n], n]
-                    cost += settings.similar * (here - there[:, None]) ** 2
-                    cost += settings.smooth * (row - path[:, n, None]) ** 2
+                    cost += _SIMILAR * (here - there[:, None]) ** 2
+                    cost += _SMOOTH * (row - path[:, n, None]) ** 2
             cost[here > limit[:, None]] += _BRIGHT
             if c in (0, count - 1):
                 cost[outside[:, :, 0 if c == 0 else 1]] += 1e9
@@ -249,9 +209,9 @@ def _conditional_modes(
     return path
 
 
-def _energy(grey: NDArray, path: NDArray, initial: NDArray, pulls: NDArray, settings: TraceSettings) -> NDArray:
+def _energy(grey: NDArray, path: NDArray, initial: NDArray, pulls: NDArray) -> NDArray:
     """Mean energy a column of lines (S,N)."""
     shades = grey[path, np.arange(path.shape[1])]
-    total = settings.dark * shades.sum(1) + settings.similar * (np.diff(shades, axis=1) ** 2).sum(1)
+    total = _DARK * shades.sum(1) + _SIMILAR * (np.diff(shades, axis=1) ** 2).sum(1)
     total = total + (pulls * (path - initial) ** 2).sum(1)
-    return (total + settings.smooth * (np.diff(path, axis=1) ** 2).sum(1)) / path.shape[1]
+    return (total + _SMOOTH * (np.diff(path, axis=1) ** 2).sum(1)) / path.shape[1]

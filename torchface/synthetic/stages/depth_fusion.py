@@ -17,15 +17,15 @@ from torchface.rendering.raycast import RayCaster
 _LAYERS = 3  # voxels in front of and behind the surface
 _GRAZING = 0.25  # cosine below which a view sees nothing
 _WAVES = 5
+_SHORTEST = 4.0  # of a wave of noise, millimetres
 
 
 @dataclass(frozen=True)
 class DepthNoise:
-    """Errors of one view's depth: waves of ``amplitude`` millimetres with lengths between ``shortest`` and
-    ``longest``, and ``grain`` from point to point."""
+    """Errors of one view's depth: waves of ``amplitude`` millimetres with lengths of 4 mm to ``longest``,
+    and ``grain`` from point to point."""
 
     amplitude: float = 0.12
-    shortest: float = 4.0
     longest: float = 25.0
     grain: float = 0.05
 
@@ -143,7 +143,7 @@ def _depth(
     for _ in range(_WAVES):
         heading = torch.nn.functional.normalize(torch.randn(3, generator=generator, dtype=torch.float64), dim=0)
         draw = torch.rand(2, generator=generator, dtype=torch.float64)
-        length = noise.shortest * (noise.longest / noise.shortest) ** float(draw[0])
+        length = _SHORTEST * (noise.longest / _SHORTEST) ** float(draw[0])
         phase = place @ heading * (2 * math.pi / length) + 2 * math.pi * draw[1]
         error = error + noise.amplitude * math.sqrt(2 / _WAVES) * phase.sin()
     return hits.distance + error, cosine

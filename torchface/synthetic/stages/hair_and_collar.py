@@ -12,6 +12,8 @@ from torchface.geometry.meshes.operators import vertex_normals
 from torchface.mesh import Mesh
 
 _WAVES = 14
+_HAIRLINE = 62.0  # millimetres above the eyes, on the forehead
+_HAIR_COLOR, _COLLAR_COLOR = (0.12, 0.09, 0.07), (0.75, 0.78, 0.80)
 
 
 @dataclass(frozen=True)
@@ -20,16 +22,11 @@ class Dress:
 
     Args:
         hair: thickness of the lumps, millimetres; 0 is a shaved head.
-        hairline: how far above the eyes it begins on the forehead, millimetres.
         collar: thickness of the collar's lumps, millimetres; 0 is none.
-        hair_color, collar_color: in [0,1].
     """
 
     hair: float = 9.0
-    hairline: float = 62.0
     collar: float = 10.0
-    hair_color: tuple[float, float, float] = (0.12, 0.09, 0.07)
-    collar_color: tuple[float, float, float] = (0.75, 0.78, 0.80)
 
 
 def dressed(head: Mesh, landmarks: Tensor, dress: Dress, generator: torch.Generator) -> Mesh:
@@ -43,25 +40,25 @@ def dressed(head: Mesh, landmarks: Tensor, dress: Dress, generator: torch.Genera
     vertices = head.vertices.double()
     colors = torch.full_like(vertices, 0.7) if head.colors is None else head.colors.double()
     eyes, chin, ears = landmarks[36:48].mean(0), landmarks[8], landmarks[[0, 16]].mean(0)
-    share = _hair_share(vertices, eyes, ears, dress.hairline)
+    share = _hair_share(vertices, eyes, ears)
     lumps = _lumps(vertices, generator, 22.0, 70.0)
     thickness = dress.hair * share * (1.0 + 0.45 * lumps)
     vertices = vertices + thickness[:, None] * vertex_normals(vertices, head.faces)
-    colors = torch.lerp(colors, torch.tensor(dress.hair_color, dtype=torch.float64), share[:, None] ** 0.5)
+    colors = torch.lerp(colors, torch.tensor(_HAIR_COLOR, dtype=torch.float64), share[:, None] ** 0.5)
     faces = head.faces
     if dress.collar > 0:
         ring, ring_faces = _collar(vertices, ears, chin, dress.collar, generator)
         faces = torch.cat([faces, ring_faces + len(vertices)])
         vertices = torch.cat([vertices, ring])
-        colors = torch.cat([colors, torch.tensor(dress.collar_color, dtype=torch.float64).expand(len(ring), 3)])
+        colors = torch.cat([colors, torch.tensor(_COLLAR_COLOR, dtype=torch.float64).expand(len(ring), 3)])
     return Mesh(vertices.float(), faces, colors=colors.clamp(0, 1).float())
 
 
-def _hair_share(vertices: Tensor, eyes: Tensor, ears: Tensor, hairline: float) -> Tensor:
+def _hair_share(vertices: Tensor, eyes: Tensor, ears: Tensor) -> Tensor:
     """0 on the face, 1 on the scalp, (V,); the line falls from forehead to behind the ears."""
     depth = ((eyes[2] - vertices[:, 2]) / (eyes[2] - ears[2]).clamp(min=20)).clamp(-1, 2)
-    # On the forehead the line lies ``hairline`` above the eyes, at the ears a little above them, behind them far below.
-    line = eyes[1] + hairline - 45.0 * depth.clamp(min=0) - 75.0 * (depth - 1.15).clamp(min=0) / 0.5
+    # On the forehead the line lies far above the eyes, at the ears a little above them, behind them far below.
+    line = eyes[1] + _HAIRLINE - 45.0 * depth.clamp(min=0) - 75.0 * (depth - 1.15).clamp(min=0) / 0.5
     return ((vertices[:, 1] - line) / 9.0).clamp(0, 1) * (vertices[:, 1] > ears[1] - 90)
 
 

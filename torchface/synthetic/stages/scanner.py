@@ -28,6 +28,10 @@ from torchface.synthetic.stages.subdivision import finely_coloured
 _DISTANCE = 520.0
 _VIEWS = tuple((yaw, pitch) for pitch in (-14.0, 22.0) for yaw in (-100.0, -65.0, -32.0, 0.0, 32.0, 65.0, 100.0))
 _LINE_POINTS = 60
+_HOLES, _HOLE_RADIUS = 5, 5.0  # how many are torn, and their radii at most, millimetres
+_CRUMBS = 4  # loose bits floating about
+_BELOW_CHIN, _BEHIND_EARS = 75.0, 60.0  # millimetres: where the scan is cut off, roughly; the cut is ragged
+_TONE = 1.15  # by which factor one standard deviation brightens the skin from scan to scan
 _YAWS = (0.0, -55.0, 55.0)
 _FLASH = Lighting(lights=(((0.3, 0.3, 0.9), 0.35), ((-0.4, 0.1, 0.8), 0.2)), ambient=0.5, occlusion_rays=0, gloss=0.03)
 
@@ -48,24 +52,18 @@ class ScannerSettings:
         voxel: resolution of the fused surface; a scan has about 120,000 / voxel² vertices.
         detail: the head is subdivided until its edges are about this long.
         noise: of depth.
-        holes: how many are torn, with radii up to ``hole_radius``.
-        crumbs: loose bits floating about.
-        below_chin, behind_ears: where the scan is cut off, roughly; the cut is ragged.
         dress: hair and collar.
-        tone: by which factor one standard deviation brightens the skin from scan to scan.
         photography: of the texture; None makes a scan without one.
+
+    Example:
+        >>> ScannerSettings(voxel=3.0, photography=None).detail
+        1.2
     """
 
     voxel: float = 1.4
     detail: float = 1.2
     noise: DepthNoise = field(default_factory=DepthNoise)
-    holes: int = 5
-    hole_radius: float = 5.0
-    crumbs: int = 4
-    below_chin: float = 75.0
-    behind_ears: float = 60.0
     dress: Dress = field(default_factory=Dress)
-    tone: float = 1.15
     photography: Photography | None = field(default_factory=Photography)
 
 
@@ -127,12 +125,12 @@ def scan_head(head: Mesh, seed: int, settings: ScannerSettings | None = None) ->
     head = head.with_vertices(smooth.vertices[: len(head.vertices)])
     landmarks = head.vertices[head.landmarks].double()
     annotation = _truth(head, landmarks)
-    tone = settings.tone ** float(torch.randn(1, generator=generator))
+    tone = _TONE ** float(torch.randn(1, generator=generator))
     smooth = replace(smooth, colors=None if smooth.colors is None else (smooth.colors * tone).clamp(0, 1))
     subject = dressed(smooth, landmarks, settings.dress, generator)
     centre = landmarks[[36, 45, 48, 54]].mean(0)
     fused = Mesh(*fuse(subject, _eyes(centre), settings.voxel, settings.noise, generator))
-    fused = _torn(fused, landmarks, settings, generator)
+    fused = _torn(fused, landmarks, generator)
     if settings.photography is not None:
         fused = _photographed(fused, subject, centre, settings.photography)
     rotation, translation = _pose(generator)
@@ -208,20 +206,20 @@ def _eyes(centre: Tensor) -> Tensor:
     return centre + torch.tensor([0.0, 0.0, -70.0], dtype=torch.float64) + _DISTANCE * way
 
 
-def _torn(mesh: Mesh, landmarks: Tensor, settings: ScannerSettings, generator: torch.Generator) -> Mesh:
+def _torn(mesh: Mesh, landmarks: Tensor, generator: torch.Generator) -> Mesh:
     """Cut off raggedly at the neck and behind the ears, with holes, without most crumbs."""
     middle = torch.stack(corners(mesh.vertices, mesh.faces)).mean(0)
     ragged = _ragged(middle, generator)
-    keep = middle[:, 1] > landmarks[8, 1] - settings.below_chin + ragged
-    keep &= middle[:, 2] > landmarks[[0, 16], 2].mean() - settings.behind_ears + ragged
+    keep = middle[:, 1] > landmarks[8, 1] - _BELOW_CHIN + ragged
+    keep &= middle[:, 2] > landmarks[[0, 16], 2].mean() - _BEHIND_EARS + ragged
     inside = middle[keep]
-    for _ in range(settings.holes):
+    for _ in range(_HOLES):
         at = inside[int(torch.randint(len(inside), (1,), generator=generator))]
-        radius = settings.hole_radius * float(torch.rand(1, generator=generator)) ** 0.5
+        radius = _HOLE_RADIUS * float(torch.rand(1, generator=generator)) ** 0.5
         keep &= (middle - at).norm(dim=-1) > radius * (1 + 0.3 * ragged / 6.0)
     faces = mesh.faces[keep]
     part = components(faces, len(mesh.vertices))[faces[:, 0]]
-    order = part.bincount().argsort(descending=True)[: 1 + settings.crumbs]
+    order = part.bincount().argsort(descending=True)[: 1 + _CRUMBS]
     faces = faces[torch.isin(part, order)]
     used, faces = faces.unique(return_inverse=True)
     return Mesh(mesh.vertices[used], faces)
