@@ -19,4 +19,4 @@ for frame in markers:
     (previous,) = session.run(["weights"], {"markers": frame[None], "previous": previous})
     solved.append(previous[0])
 np.save(sys.argv[3], np.array(solved))
-print(f"{len(markers)} frames; {names[int(np.argmax(np.mean(solved, 0)))]} is most active")
+print(f"{len(markers)} frames, {len(names)} weights each ({names[0]}, {names[1]}, ...): {sys.argv[3]}")

@@ -152,6 +152,8 @@ class Recipe(Generic[Settings, Trained]):
 
 
 def metric_lines(metrics: Mapping[str, float], number: str = "8.3f") -> list[str]:
-    """A line for each measured number, in the given format."""
+    """A line for each measured number, in the given format; counts without decimals."""
     width = max(map(len, metrics), default=0)
-    return [f"{name:{width}} {value:{number}}" for name, value in metrics.items()]
+    counts = [value >= 1 and value == int(value) and "%" not in number for value in metrics.values()]
+    formats = [number.split(".")[0] + ".0f" if count else number for count in counts]
+    return [f"{name:{width}} {value:{form}}" for (name, value), form in zip(metrics.items(), formats, strict=True)]

@@ -20,13 +20,14 @@ FRONT, THREE_QUARTER, PROFILE = 0.0, 35.0, 90.0
 PICTURE_HEIGHTS = (16, 4096)
 """Least and largest height that a command draws a view in, pixels."""
 
+_OVER_HAIR = 0.02  # of the picture, free above hair
 _COLUMNS, _MOST, _WIDTH, _HEIGHT = 6, 24, 200, 250
 
 
 def framing(mesh: Mesh, aspect: float = 0.8) -> tuple[Tensor, float]:
     """What to look at, (3,), and how many millimetres an image of ``aspect`` (width over height) is to be high.
 
-    Round the landmarks or the ``face`` region where annotated, else the whole mesh.
+    Round the landmarks or the ``face`` region where annotated, with the hair above it, else the whole mesh.
     """
     points, margin, offset = mesh.vertices, 1.15, (0.0, 0.0, 0.0)
     if mesh.annotations is not None and mesh.annotations.landmarks is not None:
@@ -36,7 +37,14 @@ def framing(mesh: Mesh, aspect: float = 0.8) -> tuple[Tensor, float]:
         points, margin = mesh.vertices[mesh.annotations.regions["face"]], 1.2
     low, high = points.amin(0), points.amax(0)
     centre = (low + high) / 2 + torch.tensor(offset).to(low) * float(high[1] - low[1])
-    return centre, margin * float(torch.maximum(high[1] - low[1], (high[0] - low[0]) / aspect))
+    span = margin * float(torch.maximum(high[1] - low[1], (high[0] - low[0]) / aspect))
+    regions = {} if mesh.annotations is None else mesh.annotations.regions
+    hair = [mask for name, mask in regions.items() if name.startswith("hair") and bool(mask.any())]
+    if hair and len(points) < len(mesh.vertices):
+        above = float(mesh.vertices[torch.stack(hair).any(0), 1].max() - centre[1]) + _OVER_HAIR * span - span / 2
+        if above > 0:
+            centre, span = centre + torch.tensor([0.0, above / 2, 0.0]).to(centre), span + above
+    return centre, span
 
 
 def frame_face(mesh: Mesh, yaw: float = FRONT, width: int = 400, height: int = 500) -> Camera:
