@@ -175,6 +175,7 @@ def test_a_solver_is_rebuilt_from_its_state(rig: BlendshapeRig, attachment: Atta
         MarkerSolver.from_config(solver.config | {"correctives": [7]})
 
 
+@pytest.mark.bench
 @pytest.mark.real
 def test_a_real_take_on_a_real_rig_with_correctives(ict_folder: Path, performances: list[Path]) -> None:
     rig = load_rig(ict_folder, part="face")
