@@ -59,7 +59,7 @@ def test_heads_and_models_that_do_not_fit_are_named(
     save_rig(dome_rig.select(dome_rig.names[1:]), tmp_path / "jawless.glb")
     with pytest.raises(NameMismatchError, match=r"expressions: found .* of jawOpen, expected some of the shapes"):
         predict_rig(folder / "tall.obj", out, folder / "jaws", tmp_path / "jawless.glb")
-    for words in ([], ["--neutral", "head.obj", "--pose", "eyeBlinkLeft=1"], ["scan.obj"]):
+    for words in ([], ["--neutral", str(folder / "tall.obj"), "--pose", "eyeBlinkLeft=1"], ["scan.obj"]):
         with pytest.raises(SystemExit):
             main(["rig", *words, "--out", str(out)])
     told = " ".join(capsys.readouterr().err.split())
