@@ -74,3 +74,20 @@ def test_hair_is_a_cap_of_its_colour_and_a_bald_head_stays_bald(head: Mesh, came
     assert float((cap[behind] - HAIR).norm(dim=1).median()) < 0.1  # no picture shows it
     forehead = places.cheeks & (places.place[:, 1] < 0.3) & ~part_vertices(head)
     assert float((cap[forehead] - SKIN).norm(dim=1).median()) < 0.1
+
+
+def test_shadow_beside_hair_is_not_painted_and_a_mole_is(head: Mesh, camera: Camera) -> None:
+    places = FacePlaces.of(head)
+    assert head.colors is not None
+    border = (places.out > 0.8) & (places.out < 1.0) & (places.place[:, 1] < 0) & (places.place[:, 0] > 0)
+    mole = places.cheeks & ((places.place - places.place.new_tensor([-0.4, -0.5, 0.0]))[:, :2].norm(dim=1) < 0.08)
+    dark = SKIN * 0.5
+    picture = render(
+        replace(head, colors=torch.where((border | mole)[:, None], dark, head.colors)), camera, lighting=EVEN, samples=1
+    )
+    parts = planted_parts(picture, {"background": torch.zeros(3)}, 0.05)
+    found = photographed_skin([head], None, [picture], [camera], FitSettings(texture_size=128, parts=[parts])).colors
+    assert found is not None
+    seen = PosedSurface.each(head, 1)[0].shown_in(picture, camera).cosine > 0.3
+    assert float((found[border & seen] - SKIN).norm(dim=1).median()) < 0.1
+    assert float((found[mole] - dark).norm(dim=1).min()) < 0.1

@@ -24,12 +24,21 @@ from torchface.modeling.photographs.skin_light import skin_light, unlit
 from torchface.modeling.photographs.skin_mask import FacePlaces, ShownParts
 from torchface.modeling.photographs.texture_fit import ColorFit, fit_colors
 from torchface.modeling.photographs.texture_projection import PhotoTexture, photo_texture
-from torchface.rendering.camera_visibility import PosedSurface, shown_in
+from torchface.rendering.camera_visibility import PosedSurface, Shown, shown_in
 from torchface.rendering.clay_shading import sample_texture
 from torchface.rendering.environment_light import EnvironmentLight
 from torchface.rendering.raycast import RayCaster
 
+GREY = 0.015
+"""Mean difference of the channels below which a photograph has no colours."""
+
 _BARE = 0.7  # share of skin from which a vertex counts for the light
+_SQUARE, _UNLIKE, _AROUND, _WITHIN = (
+    0.2,
+    0.16,
+    0.14,
+    0.85,
+)  # cosine, of full white, of the eyes' distance, share of skin
 _MIN_DIAMETER = 14.0  # across an eyeball; of smaller ones a photograph shows no iris
 _SHARE = (0.15, 0.40)
 """Of the eyeball between the lids, the darkest first: lashes and pupil, then the iris, then white and highlights."""
@@ -39,6 +48,7 @@ _IRIS_WIDTH, _MIN_RADIUS, _MIN_RING, _RING = 11.7, 2.5, 6, (0.45, 0.8)  # millim
 _DARKEST, _LARGE = 0.07, 0.4  # of the largest iris' radius: in which photographs colours count
 _WHITE = 0.72  # mean of the channels from which an eyeball's texel is no iris
 _PUPIL = 0.38  # of the iris
+_LID_SHADOW = 0.5  # of the eye's opening
 _IRIS_COSINE = 0.9  # of the angle between the eye's axis and the border of an iris 11 mm wide
 
 
@@ -87,6 +97,8 @@ def photographed_skin(
     fit = None if color is None else fit_colors(color, posed, images, cameras)
     mesh = posed[0]
     base = _own_colors(mesh) if fit is None else fit.colors
+    if base is not None and all(float((one.amax(0) - one.amin(0)).mean()) < GREY for one in images):
+        base = base.mean(1, keepdim=True).expand_as(base)  # else a grey face has a coloured neck
     if mesh.uvs is None or size == 0:
         return Skin(base, None, fit)
     others, count = part_vertices(mesh), len(images)
@@ -113,7 +125,12 @@ def photographed_skin(
             for at, surface, camera, light in zip(shown, surfaces, cameras, lights, strict=True)
         ]
         if parts is not None:
-            confidence = torch.stack([one.own for one in known])
+            confidence = torch.stack(
+                [
+                    one.own * _like_skin(at, one, where, graph)
+                    for at, one, where in zip(shown, known, places, strict=True)
+                ]
+            )
             cap = hair_cap(shown, places, torch.where(others, 0.0, torch.stack([one.hair for one in known])))
             if cap is None:
                 marks = [
@@ -135,6 +152,19 @@ def photographed_skin(
         colors = colors if colored.colors is None else colored.colors
         texture = _with_parts(texture, colors, rest, others, painted) if own else texture
     return Skin(colors, texture.image, fit, None if cap is None else cap.color, iris)
+
+
+def _like_skin(shown: Shown, parts: ShownParts, places: FacePlaces, graph: VertexGraph) -> Tensor:
+    """0 where what is taken for skin ends in other colours than skin, as beside hair and in its shadow, (V,)."""
+    bare = parts.bare * (shown.cosine > _SQUARE) * ~places.features
+    if float(bare.max()) < _BARE:
+        return torch.ones_like(bare)
+    skin = shown.colors[bare > _BARE].double().median(0).values
+    unlike = (skin - shown.colors.double()).clamp(min=0).norm(dim=1) / _UNLIKE  # highlights are skin
+    edge = (places.place[graph.first] - places.place[graph.second]).norm(dim=1).median()
+    rings = round(4 * float(_AROUND / edge) ** 2)
+    around = graph.smoothed((parts.own * (shown.cosine > _SQUARE))[:, None], torch.ones_like(bare), rings)[:, 0]
+    return (places.features | (around > _WITHIN) | (unlike < 1) | (parts.own - parts.bare > 0.3)).double()
 
 
 def _capped(texture: PhotoTexture, cap: HairCap, mesh: Mesh, parts: Tensor) -> PhotoTexture:
@@ -164,10 +194,24 @@ def _with_parts(texture: PhotoTexture, colors: Tensor, mesh: Mesh, parts: Tensor
             aside = torch.where(at[:, 2] > 0, at[:, :2].norm(dim=1) / (0.5 * _IRIS_WIDTH), torch.inf)[:, None]
             ringed = iris.double() * (1.1 - 0.5 * (aside.clamp(max=1) - 0.75).clamp(min=0) / 0.25)  # a dark rim
             eye = torch.where(aside < _PUPIL, 0.04, torch.where(aside < 1, ringed, painted.new_tensor(EYEBALL.color)))
+            if _has_landmarks(mesh):
+                eye = eye * _under_lids(mesh, ball, at)[:, None]
             painted = torch.where(mask.cpu()[corners].all(1)[:, None], eye, painted)
     shown = texture.image.flatten(1)[:, texels.texels].T.double()
     part = parts[corners].all(1)[:, None]
     return replace(texture, image=texels.image(torch.where(part, painted, shown).clamp(0, 1)))
+
+
+def _under_lids(mesh: Mesh, ball: Tensor, at: Tensor) -> Tensor:
+    """How much light lids at rest let through to texels (P,3) about the middle of an eyeball (W,3), (P,) in [0,1]."""
+    middle = (ball.amin(0) + ball.amax(0)) / 2
+    lids = mesh.vertices[mesh.landmarks[36:48]].detach().cpu().double().view(2, 6, 3) - middle
+    eye = lids[int(lids.mean(1).norm(dim=1).argmin())]
+    high, low = eye[[1, 2], 1].mean(), eye[[4, 5], 1].mean()
+    reach = _LID_SHADOW * (high - low).clamp(min=1e-6)
+    return (1 - 0.5 * (1 - (high - at[:, 1]) / reach).clamp(0, 1)) * (
+        1 - 0.2 * (1 - (at[:, 1] - low) / reach).clamp(0, 1)
+    )
 
 
 def _has_landmarks(mesh: Mesh) -> bool:

@@ -12,6 +12,7 @@ from torch import Tensor
 from torchface.landmarks import NoFaceError
 from torchface.landmarks.images.networks.part_finder import FaceParts
 from torchface.modeling import ImageFit
+from torchface.modeling.photographs.image_texture import GREY
 from torchface.workflows.fit.fit_landmarks import PhotographLandmarks
 
 # Pixels between the outer corners of the eyes: a face 40 pixels wide has 20.
@@ -19,7 +20,6 @@ _LEAST_EYES, _FEW_EYES = 10.0, 30.0
 _PRESENT = 0.5
 _HIDDEN, _EYE_HIDDEN = 0.4, 0.3  # visibilities; those of 9 faces that nothing hides were above 0.87 and 0.91
 _RIVAL = 0.5  # of the chosen face's area: another that large may be the one that is meant
-_GREY = 0.015  # mean difference of the channels, of 1
 _RED, _BLUE = (
     (0.03, 1.0),
     (-1.1, 0.1),
@@ -131,7 +131,7 @@ def _color_lines(image: Tensor, box: Tensor) -> list[str]:
     middle = _middle(image, box)
     if min(middle.shape[1:]) < 4:
         return []
-    grey = float((middle.amax(0) - middle.amin(0)).mean()) < _GREY
+    grey = float((middle.amax(0) - middle.amin(0)).mean()) < GREY
     light = middle.mean(0)
     alike = [(light.diff(dim=axis).abs() < 1 / 255) for axis in (0, 1)]
     flat = float((alike[0][:, 1:] & alike[1][1:]).float().mean())
