@@ -198,6 +198,7 @@ def _in_the_mouth(head: _Head, faces: Tensor, left: Tensor, lips: Tensor) -> tup
     inside = torch.zeros_like(left)
     share, tongue = torch.zeros(2, len(left), dtype=torch.float64)
     widest, gums, found, deep = _FILLED, [], [], _deep(head, faces, left)
+    among_teeth = False
     for one in head.part[left].unique().tolist():  # every tooth is a part
         rows = (head.part == one) & left
         away = head.vertices[rows] - middle
@@ -215,17 +216,19 @@ def _in_the_mouth(head: _Head, faces: Tensor, left: Tensor, lips: Tensor) -> tup
         width, _, depth = (away.amax(0) - away.amin(0)).tolist()
         above = float((low < 0.5).double().mean())
         both = width > _ARCH and _BOTH_JAWS < above < 1 - _BOTH_JAWS
-        lower = float(below.mean()) > 0
-        if both or (lower and width > _ARCH and _holds(head.vertices[rows], [head.vertices[one] for one in teeth])):
+        lower = float(below.mean()) > 0 and not both
+        held = lower and width > _ARCH and _holds(head.vertices[rows], [head.vertices[one] for one in teeth])
+        if both or held:
             gums.append((rows, below))
-            lower = False
         share[rows] = low * low * (3 - 2 * low) if both else float(below.mean() > 0)
         filled = float((away[:, 0].abs() < 5.0).double().mean())  # gums are an arch, hollow in the middle
         if lower and width > _TONGUE and depth > _TONGUE and filled > widest:
-            widest, tongue = filled, rows.double()
-    if not tongue.any():
+            widest, tongue, among_teeth = filled, rows.double(), held
+    if among_teeth or not tongue.any():  # gums with a tongue, or a tongue that touches teeth
+        of_gums = torch.zeros_like(tongue)
         for rows, below in gums:
-            tongue += _tongue_of_gums(head.vertices, faces, rows, below, teeth)
+            of_gums += _tongue_of_gums(head.vertices, faces, rows, below, teeth)
+        tongue = of_gums if of_gums.any() else tongue
     return inside, share, tongue
 
 
