@@ -16,6 +16,7 @@ from torchface.io.video.blank_video import BlankVideo
 from torchface.landmarks.images.face_reading import FaceReading
 from torchface.landmarks.images.tracking.landmark_tracker import LandmarkTracker
 from torchface.synthetic import performer
+from torchface.workflows.live import live_actor
 from torchface.workflows.live.live_actor import ActorSolver
 from torchface.workflows.track.track_inputs import TrackSettings, inputs_of
 
@@ -43,6 +44,7 @@ def test_eyes_look_where_irises_are_and_shut(monkeypatch: pytest.MonkeyPatch) ->
 
     shown = [reading(0.0, 0.0)] * 20 + [reading(0.3, 0.0)] * 10 + [reading(0.0, 0.99)] * 5
     pictures = iter(shown)
+    monkeypatch.setattr(live_actor, "graph_detector", lambda: None)
     monkeypatch.setattr(LandmarkTracker, "step", lambda tracker, frame: next(pictures))
     solver = ActorSolver(inputs)
     solved = torch.stack([torch.as_tensor(solver.step(picture, 1 / 30, WebcamControls()).weights) for _ in shown])
