@@ -91,3 +91,17 @@ def test_shadow_beside_hair_is_not_painted_and_a_mole_is(head: Mesh, camera: Cam
     seen = PosedSurface.each(head, 1)[0].shown_in(picture, camera).cosine > 0.3
     assert float((found[border & seen] - SKIN).norm(dim=1).median()) < 0.1
     assert float((found[mole] - dark).norm(dim=1).min()) < 0.1
+
+
+def test_a_photographs_brows_are_the_only_ones(head: Mesh, camera: Camera) -> None:
+    places = FacePlaces.of(head)
+    assert head.colors is not None
+    fringe = places.place[:, 1] > places.brows + 0.12
+    template = replace(head, colors=torch.where(places.brow[:, None], HAIR, head.colors))
+    shown = replace(head, colors=torch.where(fringe[:, None], HAIR, head.colors))  # the person's brows are fair
+    picture = render(shown, camera, lighting=EVEN, samples=1)
+    parts = planted_parts(picture, {"hair": HAIR, "background": torch.zeros(3)}, 0.05)
+    settings = FitSettings(texture_size=128, parts=[parts], paint_hair=False)
+    found = photographed_skin([template], None, [picture], [camera], settings).colors
+    assert found is not None
+    assert float((found[places.brow & ~fringe] - SKIN).norm(dim=1).mean()) < 0.1

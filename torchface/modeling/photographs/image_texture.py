@@ -39,6 +39,7 @@ _SQUARE, _UNLIKE, _AROUND, _WITHIN = (
     0.14,
     0.85,
 )  # cosine, of full white, of the eyes' distance, share of skin
+_BROWS, _REPAINTED = 0.5, 12  # share of a brow that photographs show, rings of vertices
 _MIN_DIAMETER = 14.0  # across an eyeball; of smaller ones a photograph shows no iris
 _SHARE = (0.15, 0.40)
 """Of the eyeball between the lids, the darkest first: lashes and pupil, then the iris, then white and highlights."""
@@ -131,6 +132,8 @@ def photographed_skin(
                     for at, one, where in zip(shown, known, places, strict=True)
                 ]
             )
+            if base is not None and float(confidence[:, places[0].brow].amax(0).mean()) > _BROWS:
+                base = _without_brows(base, places[0], graph)
             cap = hair_cap(shown, places, torch.where(others, 0.0, torch.stack([one.hair for one in known])))
             if cap is None:
                 marks = [
@@ -152,6 +155,12 @@ def photographed_skin(
         colors = colors if colored.colors is None else colored.colors
         texture = _with_parts(texture, colors, rest, others, painted) if own else texture
     return Skin(colors, texture.image, fit, None if cap is None else cap.color, iris)
+
+
+def _without_brows(colors: Tensor, places: FacePlaces, graph: VertexGraph) -> Tensor:
+    """Vertex colours (V,3) with skin for brows: beside those of photographs a template's would be a second pair."""
+    beside = graph.smoothed(colors.double(), (~places.brow).double(), _REPAINTED)
+    return torch.where(places.brow[:, None], beside, colors.double()).to(colors)
 
 
 def _like_skin(shown: Shown, parts: ShownParts, places: FacePlaces, graph: VertexGraph) -> Tensor:
