@@ -121,7 +121,7 @@ def fit_picture() -> torch.Tensor:
             points = path.with_suffix(".pts")
             rows = "\n".join(f"{x:.3f} {y:.3f}" for x, y in (marks[-1] + 1).tolist())
             points.write_text(f"version: 1\nn_points: {len(ids)}\n{{\n{rows}\n}}\n")
-            cells.append(caption(_half(load_image(path)), "photograph"))
+            cells.append(caption(_half(load_image(path)), "rendered photograph"))
         files = [path.with_suffix(".pts") for path in photographs]
         fit_photographs(photographs, files, "head", Path(folder) / "rig.glb")
         rig = load_rig(Path(folder) / "rig.glb")
@@ -153,7 +153,7 @@ def relight_picture() -> torch.Tensor:
     vertices, camera, mesh = film.vertices[0], film.cameras[0], rig.neutral
     light = estimate_light(frame, vertices, mesh.faces, vertex_albedo(mesh), camera).light
     other = PointLight(light.ambient, light.intensity.flip(0), torch.tensor([480.0, -260, 250]))
-    relit = relight(frame, vertices, mesh, light, other, camera)
+    relit = relight(frame, mesh.with_vertices(vertices), light, other, camera)
     painted = overlay(frame, vertices, FacePaint.of(mesh, face_paint()), light, camera)
     titles = ("film", "relit", "painted, in the film's light")
     middle = round(float(camera.project(vertices.double())[:, 0].mean()))
