@@ -204,9 +204,10 @@ def _pucker(m: Mouth, mid: Tensor) -> Tensor:
 
 
 def _press(m: Mouth) -> Tensor:
+    """The left half of the lower lip pressed up against the upper one; the skin below follows and bulges."""
     share = m.left * (1 - m.across.abs() ** 4) * _gaussian(m.across, 0.45, 0.7)
-    upper = {4: (-0.3, -0.1), 5: (-1.6, -0.5), 6: (-1.3, -1.2), 7: (-0.8, -1.4), 8: (-0.3, -1.1), 9: (0.0, -0.6)}
-    lower = {k: (-up, forward) for k, (up, forward) in upper.items()}
-    return m.profile(upper, lower, share) + m.skin_motion(
-        m.slide(0.06 * m.half_width * m.corner * m.left, 0.6 * m.corner * m.left, -0.4 * share)
-    )
+    upper = {4: (-0.2, 0.0), 5: (-1.0, -0.1), 6: (-0.8, -0.4), 7: (-0.5, -0.6), 8: (-0.2, -0.5), 9: (0.0, -0.3)}
+    lower = {4: (1.4, 0.9), 5: (2.6, 1.1), 6: (2.0, 0.5), 7: (1.1, -0.2), 8: (0.4, -0.5), 9: (0.0, -0.3)}
+    chin = m.push((14, -86, 86), (12, 9, 14), torch.tensor((0.0, 1.6, 0.7), dtype=torch.float64))
+    up = (0.9 * m.is_lower + 0.5 * m.is_upper) * share * m.size
+    return m.profile(upper, lower, share) + chin + m.skin_motion(m.slide(0.0, up, 0.6 * m.is_lower * share))
