@@ -10,6 +10,8 @@ from torchface.geometry.meshes.operators import components
 from torchface.geometry.similarity import similarity_transform
 from torchface.io import load_rig, save_rig
 from torchface.modeling import inner_parts
+from torchface.rendering.raycast import RayCaster
+from torchface.rig import BlendshapeRig
 from torchface.shape_names import ARKIT
 from torchface.synthetic import IDENTITY, Look, character, draw_identities, performer
 from torchface.synthetic.head.hair_locks import hair_locks
@@ -167,3 +169,18 @@ def test_file_has_images_as_jpeg_and_comes_back(shown, tmp_path) -> None:
 def test_other_topologies_are_refused(shown) -> None:
     with pytest.raises(TopologyError, match="performer's topology"):
         character(shown.rig)
+
+
+def test_gums_stay_behind_a_chin_that_lies_further_back() -> None:
+    actor = performer(texture=False)
+    assert actor.neutral.annotations is not None
+    vertices = actor.vertices.clone()
+    vertices[actor.neutral.annotations.regions["chin"], 2] -= 9.0
+    shown = character(BlendshapeRig(actor.neutral.with_vertices(vertices), actor.deltas, actor.names), size=64).rig
+    regions = shown.neutral.annotations.regions
+    face = torch.arange(len(shown.vertices)) < len(vertices)
+    outer = face & ~regions["mouth_interior"]
+    skin = RayCaster(shown.vertices, shown.neutral.faces[outer[shown.neutral.faces].all(1)])
+    gums = shown.vertices[regions["gums_lower"]].double()
+    gums = gums[gums[:, 0].abs() < 15]
+    assert bool(skin.occluded(gums, gums.new_tensor([0.0, 0.0, 1.0]).expand_as(gums)).all())

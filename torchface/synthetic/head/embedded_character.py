@@ -16,6 +16,7 @@ from torchface.rig import BlendshapeRig
 from torchface.synthetic.head.hair import GrownPart, brow_hairs, lashes, scalp_hair
 from torchface.synthetic.head.hair_locks import hair_locks
 from torchface.synthetic.head.handle_weights import handle_weights
+from torchface.synthetic.head.head_annotations import head_annotations
 from torchface.synthetic.head.identity import mean_vertices
 from torchface.synthetic.head.performer import performer
 from torchface.synthetic.head.shirt import about_neck, shirt
@@ -27,6 +28,7 @@ from torchface.synthetic.head.uv_layout import unwrapping
 _OPEN_FOR_TONGUE = 0.33  # of jawOpen, without which the tongue would go through the teeth
 _WITH_THE_JAW = ("teeth_lower", "gums_lower", "tongue")
 _STILL = 0.01  # millimetres
+_FRONT, _BESIDE, _COVER = 15.0, 6, 2.0  # millimetres to a side, vertices, millimetres of flesh before gums
 _CAP = {"short": 0.6, "long": 0.18, "tied": 0.2}
 
 
@@ -152,6 +154,7 @@ class _InTheMouth:
         self._from, self._to = mean[line[[0, 26]]].mean(0), skin[line[[0, 26]]].mean(0)
         wide = float(skin[line[13], 0] / mean[line[13], 0])
         self._scale = torch.tensor([wide, 1.0, 1.0], dtype=torch.float64)
+        self._to = self._to - torch.tensor([0.0, 0.0, self._in_front_of(skin)], dtype=torch.float64)
         weights = handle_weights()
         bone = (weights.jaw > 0.9999) & (weights.lip_ring < 0)
         rest, count = skin[bone], len(rig.names)
@@ -162,6 +165,16 @@ class _InTheMouth:
     def place(self, points: Tensor) -> Tensor:
         """Points (P,3) of the mean head in this one."""
         return self._to + (points - self._from) * self._scale
+
+    def _in_front_of(self, skin: Tensor) -> float:
+        """Millimetres by which gums lie too far forward: they would come through lips or chin of skin (V,3)."""
+        regions = head_annotations().regions
+        outside = skin[torch.stack([regions[name] for name in ("chin", "upper_lip", "lower_lip")]).any(0)]
+        gums = torch.cat([self.place(mouth_parts()[name].vertices) for name in ("gums_upper", "gums_lower")])
+        gums = gums[gums[:, 0].abs() < _FRONT]
+        beside = torch.from_numpy(cKDTree(outside[:, :2].numpy()).query(gums[:, :2].numpy(), _BESIDE)[1])
+        cover = outside[beside][..., 2].amax(1) - gums[:, 2]  # of the vertices beside, inner ones lie further back
+        return max(0.0, _COVER - float(cover.min()))
 
     def placed(self, points: Tensor, with_jaw: bool) -> tuple[Tensor, Tensor]:
         """A part (P,3) in this head and its motion in each shape, (N,P,3)."""
