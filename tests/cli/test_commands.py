@@ -187,7 +187,7 @@ def test_the_version_is_told(capsys: pytest.CaptureFixture[str]) -> None:
     ("words", "message"),
     [
         (("info", "nothing.glb"), "nothing.glb"),
-        (("info", "nothing.xyz"), "found the ending '.xyz'"),
+        (("info", "nothing.xyz"), "nothing.xyz: found no such file"),
         (("render", "rig.glb", "--weights", "jawOpen"), "expected NAME=NUMBER"),
         (("solve", "rig.glb", "rig.glb", "--attachment", "attachment.json"), "rig.glb"),
         (("demo", "--template", "rig.glb", "--quiet"), "expected a target"),

@@ -144,5 +144,5 @@ def test_a_rig_in_place_of_a_person(tmp_path: Path, capsys: pytest.CaptureFixtur
     main(["info", str(tmp_path / "rig.json")])
     assert "jawOpen" in capsys.readouterr().err
     with pytest.raises(SystemExit):
-        main(["examples", "--rig", "rig.glb", "--camera", "0", "--out", "x.json"])
+        main(["examples", "--rig", str(tmp_path / "rig.glb"), "--camera", "0", "--out", "x.json"])
     assert "found --camera and --rig, expected PICTURES, --camera or --rig" in " ".join(capsys.readouterr().err.split())

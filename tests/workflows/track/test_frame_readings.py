@@ -105,6 +105,7 @@ def test_a_wild_landmark_is_left_out_and_named(take: tuple[Path, Path, Tensor], 
 
 
 def test_tables_that_do_not_fit_are_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "rig.glb").touch()
     table = tmp_path / "take.csv"
     points = 100 + 100 * torch.rand(COUNT, 68, 2, generator=torch.Generator().manual_seed(0))
     header = ",".join(f"{axis}_{i}" for axis in "xy" for i in range(68))

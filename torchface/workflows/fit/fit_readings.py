@@ -15,6 +15,8 @@ from torchface.modeling.photographs.fit_settings import ExpressionPrior, Surface
 from torchface.rig import BlendshapeRig
 from torchface.workflows.surface_sites import sites_on_rig
 
+__all__ = ["with_readings"]
+
 
 @dataclass(frozen=True, eq=False)
 class ReadExpressions:
@@ -46,6 +48,13 @@ def with_readings(settings: FitSettings, readings: FaceReading, places: Tensor, 
         readings: of I photographs by one model, (I,...).
         places: of the points that the model finds beside the 68, on the embedded performer's mean head, (P,3) mm.
         rig: whose weights are solved for, with the 68 landmarks annotated.
+
+    Example:
+        >>> from torchface.synthetic import performer
+        >>> sure = torch.ones(1, 68)
+        >>> face = FaceReading(60 * torch.rand(1, 68, 2), sure, sure, sure[:, 0])
+        >>> with_readings(FitSettings(), face, torch.zeros(0, 3), performer(texture=False)).deviations.shape
+        torch.Size([1, 68])
     """
     settings = replace(settings, deviations=readings.deviation, irises=readings.iris)
     if len(places) and len(places) == readings.points.shape[1]:
