@@ -11,7 +11,8 @@ from torch import Tensor
 from torchface.geometry.cameras.pinhole import look_at
 from torchface.io.gltf.part_textures.iris_texture import painted_eye
 from torchface.mesh import Mesh
-from torchface.modeling.photographs.image_texture import iris_color, part_vertices, with_iris, with_part_colors
+from torchface.modeling.photographs.eye_color import iris_color, with_iris
+from torchface.modeling.photographs.image_texture import part_vertices, with_part_colors
 from torchface.rendering.clay_shading import Lighting, render
 from torchface.synthetic import neutral_head, performer
 

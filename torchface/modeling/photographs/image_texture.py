@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -10,13 +9,12 @@ import torch
 from torch import Tensor
 
 from torchface.geometry.cameras.pinhole import Camera
-from torchface.geometry.meshes.operators import vertex_normals
-from torchface.geometry.meshes.rasterization import rasterise_uvs
 from torchface.geometry.meshes.vertex_graph import VertexGraph
 from torchface.io.gltf.region_materials import EYEBALL, IRIS, part_material
 from torchface.landmarks.images.networks.part_finder import FaceParts
 from torchface.mesh import Mesh
 from torchface.modeling.morphable.morphable_model import MorphableModel
+from torchface.modeling.photographs.eye_color import IRIS_WIDTH, iris_color
 from torchface.modeling.photographs.fit_settings import FitSettings
 from torchface.modeling.photographs.hair_cap import HairCap, hair_beyond, hair_cap
 from torchface.modeling.photographs.landmark_view import LANDMARKS
@@ -24,30 +22,17 @@ from torchface.modeling.photographs.skin_light import skin_light, unlit
 from torchface.modeling.photographs.skin_mask import FacePlaces, ShownParts
 from torchface.modeling.photographs.texture_fit import ColorFit, fit_colors
 from torchface.modeling.photographs.texture_projection import PhotoTexture, photo_texture
-from torchface.rendering.camera_visibility import PosedSurface, Shown, shown_in
+from torchface.rendering.camera_visibility import PosedSurface, Shown
 from torchface.rendering.clay_shading import sample_texture
 from torchface.rendering.environment_light import EnvironmentLight
-from torchface.rendering.raycast import RayCaster
 
 GREY = 0.015
 """Mean difference of the channels below which a photograph has no colours."""
 
 _BARE = 0.7  # share of skin from which a vertex counts for the light
-_SQUARE, _UNLIKE, _AROUND, _WITHIN = (
-    0.2,
-    0.16,
-    0.14,
-    0.85,
-)  # cosine, of full white, of the eyes' distance, share of skin
+# Cosine, of full white, of the distance of the eyes' outer corners, share of skin.
+_SQUARE, _UNLIKE, _AROUND, _WITHIN = 0.2, 0.16, 0.14, 0.85
 _BROWS, _REPAINTED = 0.5, 12  # share of a brow that photographs show, rings of vertices
-_MIN_DIAMETER = 14.0  # across an eyeball; of smaller ones a photograph shows no iris
-_SHARE = (0.15, 0.40)
-"""Of the eyeball between the lids, the darkest first: lashes and pupil, then the iris, then white and highlights."""
-
-_MIN_PIXELS = 40
-_IRIS_WIDTH, _MIN_RADIUS, _MIN_RING, _RING = 11.7, 2.5, 6, (0.45, 0.8)  # millimetres, pixels, pixels, radii
-_DARKEST, _LARGE = 0.07, 0.4  # of the largest iris' radius: in which photographs colours count
-_WHITE = 0.72  # mean of the channels from which an eyeball's texel is no iris
 _PUPIL = 0.38  # of the iris
 _LID_SHADOW = 0.5  # of the eye's opening
 _IRIS_COSINE = 0.9  # of the angle between the eye's axis and the border of an iris 11 mm wide
@@ -126,12 +111,8 @@ def photographed_skin(
             for at, surface, camera, light in zip(shown, surfaces, cameras, lights, strict=True)
         ]
         if parts is not None:
-            confidence = torch.stack(
-                [
-                    one.own * _like_skin(at, one, where, graph)
-                    for at, one, where in zip(shown, known, places, strict=True)
-                ]
-            )
+            skin = [_like_skin(at, one, where, graph) for at, one, where in zip(shown, known, places, strict=True)]
+            confidence = torch.stack([one.own for one in known]) * torch.stack(skin)
             if base is not None and float(confidence[:, places[0].brow].amax(0).mean()) > _BROWS:
                 base = _without_brows(base, places[0], graph)
             cap = hair_cap(shown, places, torch.where(others, 0.0, torch.stack([one.hair for one in known])))
@@ -200,7 +181,7 @@ def _with_parts(texture: PhotoTexture, colors: Tensor, mesh: Mesh, parts: Tensor
         if part_material(name) is EYEBALL and bool(mask.any()):
             ball = mesh.vertices[mask].detach().cpu().double()
             at = texels.interpolate(mesh.vertices.detach().cpu().double() - (ball.amin(0) + ball.amax(0)) / 2, faces)
-            aside = torch.where(at[:, 2] > 0, at[:, :2].norm(dim=1) / (0.5 * _IRIS_WIDTH), torch.inf)[:, None]
+            aside = torch.where(at[:, 2] > 0, at[:, :2].norm(dim=1) / (0.5 * IRIS_WIDTH), torch.inf)[:, None]
             ringed = iris.double() * (1.1 - 0.5 * (aside.clamp(max=1) - 0.75).clamp(min=0) / 0.25)  # a dark rim
             eye = torch.where(aside < _PUPIL, 0.04, torch.where(aside < 1, ringed, painted.new_tensor(EYEBALL.color)))
             if _has_landmarks(mesh):
@@ -218,9 +199,8 @@ def _under_lids(mesh: Mesh, ball: Tensor, at: Tensor) -> Tensor:
     eye = lids[int(lids.mean(1).norm(dim=1).argmin())]
     high, low = eye[[1, 2], 1].mean(), eye[[4, 5], 1].mean()
     reach = _LID_SHADOW * (high - low).clamp(min=1e-6)
-    return (1 - 0.5 * (1 - (high - at[:, 1]) / reach).clamp(0, 1)) * (
-        1 - 0.2 * (1 - (at[:, 1] - low) / reach).clamp(0, 1)
-    )
+    upper, lower = (1 - (high - at[:, 1]) / reach).clamp(0, 1), (1 - (at[:, 1] - low) / reach).clamp(0, 1)
+    return (1 - 0.5 * upper) * (1 - 0.2 * lower)
 
 
 def _has_landmarks(mesh: Mesh) -> bool:
@@ -246,117 +226,6 @@ def part_vertices(mesh: Mesh) -> Tensor:
         if part_material(name) is not None:
             result |= mask.cpu()
     return result
-
-
-def iris_color(
-    posed: Mesh | Sequence[Mesh], images: Sequence[Tensor], cameras: Sequence[Camera], irises: Tensor | None = None
-) -> Tensor | None:
-    """The irises' colour (3,), sRGB, or None where no photograph is large enough to show it.
-
-    Where the irises are known, rings about their centres count, without lids, lashes and highlights. Else what is seen
-    of the eyeballs between the lids: the dark share that is neither lash and pupil nor white.
-
-    Args:
-        posed: the head as the photographs show it, or as each of them does, its eyeballs annotated.
-        images: photographs, (3,H,W) each.
-        cameras: one each.
-        irises: centres in each photograph, (I,2,2) pixels.
-    """
-    ringed = None if irises is None else _ring_color(irises, images, cameras, posed)
-    if ringed is not None:
-        return ringed
-    meshes = [posed] * len(images) if isinstance(posed, Mesh) else posed
-    regions = {} if meshes[0].annotations is None else meshes[0].annotations.regions
-    balls = [mask.cpu() for name, mask in regions.items() if part_material(name) is EYEBALL and bool(mask.any())]
-    if not balls:
-        return None
-    clear = torch.zeros(len(meshes[0].vertices), dtype=torch.bool)
-    for name, mask in regions.items():
-        material = part_material(name)
-        clear |= mask.cpu() if material is not None and material.alpha == "BLEND" else torch.zeros_like(clear)
-    seen = []
-    for mesh, image, camera in zip(meshes, images, cameras, strict=True):  # photographs
-        vertices, faces = mesh.vertices.detach().cpu().double(), mesh.faces.cpu()
-        caster = RayCaster(vertices, faces[~clear[faces].all(1)])
-        shown = shown_in(image.cpu(), camera, caster, vertices, vertex_normals(vertices, faces))
-        for ball in balls:
-            pixels = camera.project(vertices[ball])
-            if float((pixels.amax(0) - pixels.amin(0)).amin()) >= _MIN_DIAMETER:
-                seen.append(shown.colors[ball & (shown.cosine > 0.3)].double())
-    colors = torch.cat(seen) if seen else torch.zeros(0, 3, dtype=torch.float64)
-    if len(colors) < _MIN_PIXELS:
-        return None
-    order = colors.mean(1).argsort()
-    first, last = (round(share * len(order)) for share in _SHARE)
-    return colors[order[first : max(last, first + 1)]].median(0).values.clamp(0.03, 0.9).float()
-
-
-def _ring_color(
-    irises: Tensor, images: Sequence[Tensor], cameras: Sequence[Camera], posed: Mesh | Sequence[Mesh]
-) -> Tensor | None:
-    """The colour (3,) of rings about the irises' centres (I,2,2), each channel's median of photographs that are large
-    enough, so that one in coloured light does not decide; None without any."""
-    found, radii = list[Tensor](), list[float]()
-    meshes = [posed] * len(images) if isinstance(posed, Mesh) else posed
-    for mesh, image, camera, centres in zip(meshes, images, cameras, irises.double(), strict=True):
-        marks = mesh.vertices[mesh.landmarks][36:48].detach().cpu().double()
-        depth = float((marks @ camera.rotation.double()[2] + camera.translation.double()[2]).mean())
-        radius = 0.5 * _IRIS_WIDTH * float(camera.intrinsics[0, 0]) / depth
-        if radius < _MIN_RADIUS:
-            continue
-        seen = camera.project(marks)
-        eyes = zip(centres, (seen[:6], seen[6:]), strict=True)
-        rings = [_ring(image, centre, lids, radius) for centre, lids in eyes if bool(torch.isfinite(centre).all())]
-        colors = torch.cat(rings) if rings else torch.zeros(0, 3)
-        if len(colors) < _MIN_RING:
-            continue
-        light = colors.mean(1)
-        kept = (light >= light.quantile(0.35)) & (light <= light.quantile(0.75))
-        color = colors[kept].median(0).values.float()
-        if float(color.max()) > _DARKEST:  # else nothing but pupil and shadow is seen
-            found.append(color.clamp(0.03, 0.9))
-            radii.append(radius)
-    large = [color for color, radius in zip(found, radii, strict=True) if radius >= _LARGE * max(radii)]
-    return torch.stack(large).quantile(0.5, dim=0) if large else None
-
-
-def _ring(image: Tensor, centre: Tensor, lids: Tensor, radius: float) -> Tensor:
-    """The colours (Q,3) of an image (3,H,W) round an iris' centre (2,), between lids of six landmarks (6,2)."""
-    side = torch.arange(-math.ceil(radius), math.ceil(radius) + 1, dtype=torch.float64)
-    dy, dx = torch.meshgrid(side, side, indexing="ij")
-    y, x = (centre[1] + dy).round().long(), (centre[0] + dx).round().long()
-    from_middle = ((x - centre[0]).square() + (y - centre[1]).square()).sqrt() / radius
-    # The upper lid's shadow and lashes lie within a fifth of the iris' width.
-    top = max(float(lids[[1, 2], 1].mean() - centre[1]) + 0.35 * radius, -0.6 * radius)
-    bottom = float(lids[[4, 5], 1].mean() - centre[1]) - 0.1 * radius
-    ring = (from_middle > _RING[0]) & (from_middle < _RING[1]) & (dy > top) & (dy < bottom)
-    ring &= (x >= 0) & (y >= 0) & (x < image.shape[2]) & (y < image.shape[1])
-    return image[:3, y[ring], x[ring]].T.double()
-
-
-def with_iris(mesh: Mesh, iris: Tensor) -> Mesh:
-    """A mesh at rest whose texture has painted eyeballs, with their irises in another colour (3,), fibres and all."""
-    if mesh.texture is None or mesh.uvs is None or mesh.uv_faces is None or mesh.annotations is None:
-        return mesh
-    height, width = mesh.texture.shape[1:]
-    texture, vertices = mesh.texture.cpu().flatten(1).clone(), mesh.vertices.detach().cpu().double()
-    for name, mask in mesh.annotations.regions.items():
-        if part_material(name) is not EYEBALL or not bool(mask.any()):
-            continue
-        inside = mask.cpu()[mesh.faces.cpu()].all(1)
-        texels = rasterise_uvs(mesh.uvs, mesh.uv_faces[inside], height, width)
-        ball = vertices[mask.cpu()]
-        at = texels.interpolate(vertices - (ball.amin(0) + ball.amax(0)) / 2, mesh.faces.cpu()[inside])
-        from_axis = at[:, :2].norm(dim=1) / (0.5 * _IRIS_WIDTH)
-        front = (from_axis < 1.05) & (at[:, 2] > 0)
-        rows, from_axis = texels.texels[front], from_axis[front]
-        ring = texture[:, rows[(from_axis > _RING[0]) & (from_axis < _RING[1])]]
-        if ring.numel():
-            colors = texture[:, rows]
-            colored = colors * (iris.to(colors) / ring.median(1).values.clamp(min=0.02))[:, None]
-            dark = ((_WHITE - colors.mean(0)) / 0.1).clamp(0, 1)  # what is left of the white beside it stays
-            texture[:, rows] = torch.lerp(colors, colored.clamp(0, 1), dark)
-    return replace(mesh, texture=texture.view_as(mesh.texture).to(mesh.texture))
 
 
 def with_part_colors(mesh: Mesh, iris: Tensor | None) -> Mesh:

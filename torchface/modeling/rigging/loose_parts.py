@@ -298,7 +298,7 @@ def _tongue_of_gums(
         back &= torch.from_numpy(nearby > _GUM[1])
     up = torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64).expand_as(points)
     under = RayCaster(points, own[low[own].all(1)]).occluded(points + 0.1 * up, up) & low & (facing[:, 1] > 0.5)
-    arch |= under  # the floor under a tongue
+    arch |= under  # what a tongue lies on
     back &= ~under
     weight = torch.where(back | arch, 1e3, 1e-6)
     system = sparse.diags_array(weight.double().numpy()) + stretching_energy(points, own)

@@ -12,7 +12,7 @@ from torchface.geometry.meshes.normal_maps import SurfaceMaps
 from torchface.landmarks.images.face_crop import cut_crop
 from torchface.landmarks.images.networks.part_finder import FaceParts
 from torchface.modeling import ImageFit
-from torchface.modeling.photographs.image_texture import with_iris
+from torchface.modeling.photographs.eye_color import with_iris
 from torchface.registration import hidden_parts, with_template_skin
 from torchface.rig import BlendshapeRig
 from torchface.synthetic.head.embedded_character import character

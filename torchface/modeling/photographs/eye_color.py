@@ -1,0 +1,141 @@
+"""Colour of the eyes: found in photographs, and given to painted eyeballs."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from torchface.geometry.cameras.pinhole import Camera
+from torchface.geometry.meshes.operators import vertex_normals
+from torchface.geometry.meshes.rasterization import rasterise_uvs
+from torchface.io.gltf.region_materials import EYEBALL, part_material
+from torchface.mesh import Mesh
+from torchface.rendering.camera_visibility import shown_in
+from torchface.rendering.raycast import RayCaster
+
+IRIS_WIDTH = 11.7
+"""Of people's irises, millimetres."""
+
+_MIN_DIAMETER = 14.0  # across an eyeball; of smaller ones a photograph shows no iris
+_SHARE = (0.15, 0.40)
+"""Of the eyeball between the lids, the darkest first: lashes and pupil, then the iris, then white and highlights."""
+
+_MIN_PIXELS = 40
+_MIN_RADIUS, _MIN_RING, _RING = 2.5, 6, (0.45, 0.8)  # pixels, pixels, radii
+_DARKEST, _LARGE = 0.07, 0.4  # of the largest iris' radius: in which photographs colours count
+_WHITE = 0.72  # mean of the channels from which an eyeball's texel is no iris
+
+
+def iris_color(
+    posed: Mesh | Sequence[Mesh], images: Sequence[Tensor], cameras: Sequence[Camera], irises: Tensor | None = None
+) -> Tensor | None:
+    """The irises' colour (3,), sRGB, or None where no photograph is large enough to show it.
+
+    Where the irises are known, rings about their centres count, without lids, lashes and highlights. Else what is seen
+    of the eyeballs between the lids: the dark share that is neither lash and pupil nor white.
+
+    Args:
+        posed: the head as the photographs show it, or as each of them does, its eyeballs annotated.
+        images: photographs, (3,H,W) each.
+        cameras: one each.
+        irises: centres in each photograph, (I,2,2) pixels.
+    """
+    ringed = None if irises is None else _ring_color(irises, images, cameras, posed)
+    if ringed is not None:
+        return ringed
+    meshes = [posed] * len(images) if isinstance(posed, Mesh) else posed
+    regions = {} if meshes[0].annotations is None else meshes[0].annotations.regions
+    balls = [mask.cpu() for name, mask in regions.items() if part_material(name) is EYEBALL and bool(mask.any())]
+    if not balls:
+        return None
+    clear = torch.zeros(len(meshes[0].vertices), dtype=torch.bool)
+    for name, mask in regions.items():
+        material = part_material(name)
+        clear |= mask.cpu() if material is not None and material.alpha == "BLEND" else torch.zeros_like(clear)
+    seen = []
+    for mesh, image, camera in zip(meshes, images, cameras, strict=True):  # photographs
+        vertices, faces = mesh.vertices.detach().cpu().double(), mesh.faces.cpu()
+        caster = RayCaster(vertices, faces[~clear[faces].all(1)])
+        shown = shown_in(image.cpu(), camera, caster, vertices, vertex_normals(vertices, faces))
+        for ball in balls:
+            pixels = camera.project(vertices[ball])
+            if float((pixels.amax(0) - pixels.amin(0)).amin()) >= _MIN_DIAMETER:
+                seen.append(shown.colors[ball & (shown.cosine > 0.3)].double())
+    colors = torch.cat(seen) if seen else torch.zeros(0, 3, dtype=torch.float64)
+    if len(colors) < _MIN_PIXELS:
+        return None
+    order = colors.mean(1).argsort()
+    first, last = (round(share * len(order)) for share in _SHARE)
+    return colors[order[first : max(last, first + 1)]].median(0).values.clamp(0.03, 0.9).float()
+
+
+def _ring_color(
+    irises: Tensor, images: Sequence[Tensor], cameras: Sequence[Camera], posed: Mesh | Sequence[Mesh]
+) -> Tensor | None:
+    """The colour (3,) of rings about the irises' centres (I,2,2), each channel's median of photographs that are large
+    enough, so that one in coloured light does not decide; None without any."""
+    found, radii = list[Tensor](), list[float]()
+    meshes = [posed] * len(images) if isinstance(posed, Mesh) else posed
+    for mesh, image, camera, centres in zip(meshes, images, cameras, irises.double(), strict=True):
+        marks = mesh.vertices[mesh.landmarks][36:48].detach().cpu().double()
+        depth = float((marks @ camera.rotation.double()[2] + camera.translation.double()[2]).mean())
+        radius = 0.5 * IRIS_WIDTH * float(camera.intrinsics[0, 0]) / depth
+        if radius < _MIN_RADIUS:
+            continue
+        seen = camera.project(marks)
+        eyes = zip(centres, (seen[:6], seen[6:]), strict=True)
+        rings = [_ring(image, centre, lids, radius) for centre, lids in eyes if bool(torch.isfinite(centre).all())]
+        colors = torch.cat(rings) if rings else torch.zeros(0, 3)
+        if len(colors) < _MIN_RING:
+            continue
+        light = colors.mean(1)
+        kept = (light >= light.quantile(0.35)) & (light <= light.quantile(0.75))
+        color = colors[kept].median(0).values.float()
+        if float(color.max()) > _DARKEST:  # else nothing but pupil and shadow is seen
+            found.append(color.clamp(0.03, 0.9))
+            radii.append(radius)
+    large = [color for color, radius in zip(found, radii, strict=True) if radius >= _LARGE * max(radii)]
+    return torch.stack(large).quantile(0.5, dim=0) if large else None
+
+
+def _ring(image: Tensor, centre: Tensor, lids: Tensor, radius: float) -> Tensor:
+    """The colours (Q,3) of an image (3,H,W) round an iris' centre (2,), between lids of six landmarks (6,2)."""
+    side = torch.arange(-math.ceil(radius), math.ceil(radius) + 1, dtype=torch.float64)
+    dy, dx = torch.meshgrid(side, side, indexing="ij")
+    y, x = (centre[1] + dy).round().long(), (centre[0] + dx).round().long()
+    from_middle = ((x - centre[0]).square() + (y - centre[1]).square()).sqrt() / radius
+    # The upper lid's shadow and lashes lie within a fifth of the iris' width.
+    top = max(float(lids[[1, 2], 1].mean() - centre[1]) + 0.35 * radius, -0.6 * radius)
+    bottom = float(lids[[4, 5], 1].mean() - centre[1]) - 0.1 * radius
+    ring = (from_middle > _RING[0]) & (from_middle < _RING[1]) & (dy > top) & (dy < bottom)
+    ring &= (x >= 0) & (y >= 0) & (x < image.shape[2]) & (y < image.shape[1])
+    return image[:3, y[ring], x[ring]].T.double()
+
+
+def with_iris(mesh: Mesh, iris: Tensor) -> Mesh:
+    """A mesh at rest whose texture has painted eyeballs, with their irises in another colour (3,), fibres and all."""
+    if mesh.texture is None or mesh.uvs is None or mesh.uv_faces is None or mesh.annotations is None:
+        return mesh
+    height, width = mesh.texture.shape[1:]
+    texture, vertices = mesh.texture.cpu().flatten(1).clone(), mesh.vertices.detach().cpu().double()
+    for name, mask in mesh.annotations.regions.items():
+        if part_material(name) is not EYEBALL or not bool(mask.any()):
+            continue
+        inside = mask.cpu()[mesh.faces.cpu()].all(1)
+        texels = rasterise_uvs(mesh.uvs, mesh.uv_faces[inside], height, width)
+        ball = vertices[mask.cpu()]
+        at = texels.interpolate(vertices - (ball.amin(0) + ball.amax(0)) / 2, mesh.faces.cpu()[inside])
+        from_axis = at[:, :2].norm(dim=1) / (0.5 * IRIS_WIDTH)
+        front = (from_axis < 1.05) & (at[:, 2] > 0)
+        rows, from_axis = texels.texels[front], from_axis[front]
+        ring = texture[:, rows[(from_axis > _RING[0]) & (from_axis < _RING[1])]]
+        if ring.numel():
+            colors = texture[:, rows]
+            colored = colors * (iris.to(colors) / ring.median(1).values.clamp(min=0.02))[:, None]
+            dark = ((_WHITE - colors.mean(0)) / 0.1).clamp(0, 1)  # what is left of the white beside it stays
+            texture[:, rows] = torch.lerp(colors, colored.clamp(0, 1), dark)
+    return replace(mesh, texture=texture.view_as(mesh.texture).to(mesh.texture))
