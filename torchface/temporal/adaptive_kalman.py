@@ -117,9 +117,9 @@ class AdaptiveFilter:
         self.scores = self.scores.to(measured.device)
         running = self._filter.to(measured.device)
         running.predict(interval)
-        variance = running.covariance[:, 0, 0] + running.variance
+        variance, group = running.covariance[:, 0, 0] + running.variance, running.group
         residual = every - running.state[:, 0]
-        certainty = -0.5 * (residual.square() / variance + variance.log())
+        certainty = -0.5 * (residual.square() / variance[group] + variance.log()[group])
         known = ~residual.isnan()
         gained = torch.where(known, certainty, 0.0).reshape(self._models, *self.shape).sum(-1)
         fade = torch.where(known.reshape(self._models, *self.shape).any(-1), 1 - 1 / self.settings.memory, 1.0)

@@ -79,32 +79,31 @@ class KalmanFilter:
         each = [settings] if isinstance(settings, KalmanSettings) else list(settings)
         if len(each) != channels and not isinstance(settings, KalmanSettings):
             raise ShapeError(f"Kalman filter: found {len(each)} settings, expected one or {channels}")
-        self.variance = torch.tensor([one.measurement**2 for one in each], dtype=torch.float64)
-        """Of the measurements, (1,) or (C,)."""
-        self._longest_gap = torch.tensor([one.longest_gap for one in each])
         self.state = torch.full((channels, 3), torch.nan, dtype=torch.float64)
-        self.covariance = torch.zeros(channels, 3, 3, dtype=torch.float64)
-        self._unseen = torch.zeros(channels, dtype=torch.int64)
         if len({one.damping for one in each}) > 1:
             raise ValueRangeError("Kalman filter: found settings of different damping, expected one for all channels")
         self._damping = each[0].damping
-        self._jerk = torch.tensor([one.jerk**2 for one in each], dtype=torch.float64)[:, None, None]
+        # Channels of the same settings that were seen in the same frames have the same covariance: it is kept once.
+        kinds = list(dict.fromkeys(each))
+        row = {kind: number for number, kind in enumerate(kinds)}
+        self.group = torch.tensor([row[one] for one in each]).expand(channels)
+        """Which row of what is kept by group each channel has, (C,)."""
+        self._first = torch.tensor([each.index(kind) for kind in kinds])
+        self.variance = torch.tensor([kind.measurement**2 for kind in kinds], dtype=torch.float64)
+        """Of the measurements, (G,)."""
+        self.covariance = torch.zeros(len(kinds), 3, 3, dtype=torch.float64)
+        """Of the states, (G,3,3)."""
+        self._longest_gap = torch.tensor([kind.longest_gap for kind in kinds])
+        self._unseen = torch.zeros(len(kinds), dtype=torch.int64)
+        self._jerk = torch.tensor([kind.jerk**2 for kind in kinds], dtype=torch.float64)[:, None, None]
         self._go_on(1.0)
 
     def to(self, device: torch.device) -> KalmanFilter:
         """The filter itself, with all that it holds on a device; ``step`` follows its measurements there."""
         if self.state.device != device:
-            for name in (
-                "variance",
-                "state",
-                "covariance",
-                "_longest_gap",
-                "_unseen",
-                "_jerk",
-                "_transition",
-                "_noise",
-            ):
-                setattr(self, name, getattr(self, name).to(device))
+            for name, value in vars(self).items():
+                if isinstance(value, Tensor):
+                    setattr(self, name, value.to(device))
         return self
 
     def predict(self, interval: float = 1.0) -> None:
@@ -124,23 +123,37 @@ class KalmanFilter:
         self._transition = transition.to(self.state.device)
         self._noise = noise.to(self.state.device) * self._jerk
 
+    def _split(self, seen: Tensor) -> None:
+        """Parts groups of which some channels are seen (C,) and others are not."""
+        parts, self.group = (2 * self.group + seen).unique(return_inverse=True)
+        channels = torch.arange(len(seen), device=seen.device)
+        self._first = channels.new_empty(len(parts)).scatter_(0, self.group, channels)
+        for name in ("variance", "covariance", "_longest_gap", "_unseen", "_jerk", "_noise"):
+            setattr(self, name, getattr(self, name)[parts // 2])
+
     def correct(self, measured: Tensor) -> None:
         """Takes in a frame's measurements (C,); NaN means not seen."""
-        seen = ~measured.isnan()
-        fresh = seen & self.state[:, 0].isnan()
+        known = ~measured.isnan()
+        if not torch.equal(known[self._first][self.group], known):
+            self._split(known)
+        seen = known[self._first]
+        fresh = seen & self.state[self._first, 0].isnan()
         self._unseen = torch.where(seen, 0, self._unseen + 1)
-        innovation = torch.where(seen & ~fresh, measured.double() - self.state[:, 0], 0.0)
         gain = self.covariance[:, :, 0] / (self.covariance[:, 0, 0] + self.variance)[:, None]
         gain = torch.where((seen & ~fresh)[:, None], gain, 0.0)
-        self.state = self.state + gain * innovation[:, None]
+        each = gain[self.group]
+        innovation = torch.where(each[:, 0] > 0, measured.double() - self.state[:, 0], 0.0)
+        self.state = self.state + each * innovation[:, None]
         # Joseph's form stays symmetric and positive, whatever is rounded.
         keep = torch.eye(3, dtype=gain.dtype, device=gain.device) - gain[:, :, None] * gain.new_tensor([1.0, 0, 0])
         noise = self.variance[:, None, None] * gain[:, :, None] * gain[:, None]
         self.covariance = keep @ self.covariance @ keep.transpose(1, 2) + noise
-        first, first_covariance = _first(measured.double(), self.variance)
         lost = self._unseen > self._longest_gap
-        self.state = torch.where(fresh[:, None], first, torch.where(lost[:, None], torch.nan, self.state))
-        self.covariance = torch.where(fresh[:, None, None], first_covariance, self.covariance)
+        if bool(lost.any()) or bool(fresh.any()):
+            first = torch.nn.functional.pad(measured.double()[:, None], (0, 2))
+            kept = torch.where(lost[self.group, None], torch.nan, self.state)
+            self.state = torch.where(fresh[self.group, None], first, kept)
+            self.covariance = torch.where(fresh[:, None, None], _first_covariance(self.variance), self.covariance)
 
     def step(self, measured: Tensor) -> Tensor:
         """Filtered positions (C,) float64 after a frame's measurements (C,); NaN before the first and in long gaps.
@@ -191,9 +204,9 @@ def kalman_smoother(
     predicted, filtered = [], []
     for frame, interval in zip(curves, intervals or [1.0] * frames, strict=True):
         running.predict(interval)
-        predicted.append((running.state, running.covariance, running._transition))
+        predicted.append((running.state, running.covariance[running.group], running._transition))
         running.correct(frame)
-        filtered.append((running.state, running.covariance))
+        filtered.append((running.state, running.covariance[running.group]))
     state = filtered[-1][0]
     smoothed = [state[:, 0]]
     for (ahead, ahead_covariance, transition), (here, covariance) in zip(
@@ -215,11 +228,10 @@ def _model(damping: float, interval: float) -> tuple[Tensor, Tensor]:
     return transition, torch.tensor(noise, dtype=torch.float64)
 
 
-def _first(measured: Tensor, variance: Tensor) -> tuple[Tensor, Tensor]:
-    """State and covariance of channels (C,) at their first measurement."""
-    state = torch.nn.functional.pad(measured[:, None], (0, 2))
+def _first_covariance(variance: Tensor) -> Tensor:
+    """Covariances (G,3,3) at the first measurement, of these variances (G,)."""
     share = variance.new_tensor([1.0, _FIRST_VELOCITY**2, _FIRST_ACCELERATION**2])
-    return state, torch.diag_embed(variance[:, None] * share).expand(len(measured), 3, 3)
+    return torch.diag_embed(variance[:, None] * share)
 
 
 def _regular(covariance: Tensor) -> Tensor:

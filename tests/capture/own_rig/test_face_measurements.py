@@ -102,3 +102,21 @@ def test_the_second_camera_shows_what_the_first_does_not() -> None:
     assert depth[0] < 0.5 * depth[1]
     with pytest.raises(ShapeError, match=r"landmarks \(4, 5, 2\), expected \(4, 68, 2\)"):
         replace(views[0], landmarks=views[0].landmarks[:, :5])
+
+
+def test_single_frames_are_solved_as_batches_are(monkeypatch: pytest.MonkeyPatch) -> None:
+    """NumPy's steps of one frame against PyTorch's: sliding contour, motion, readings, an antagonist, a hidden part."""
+    rig = performer(texture=False).select([*NAMES, "mouthRight"])
+    solver = VideoSolver(rig, None, K, settings=VideoSettings.of_found_landmarks())
+    generator = torch.Generator().manual_seed(2)
+    weights = 0.6 * torch.rand(FRAMES, 8, generator=generator).double()
+    image = (solver.points.at(weights)[:, :68] @ poses().mT + torch.tensor([5.0, -3.0, 500.0]).double()) @ K.T
+    landmarks = image[..., :2] / image[..., 2:] + torch.randn(FRAMES, 68, 2, generator=generator)
+    landmarks[2, 20:30] = torch.nan
+    read = WeightReadings(torch.eye(8), weights, torch.full((FRAMES, 8), 0.2))
+    measured = FaceMeasurements(torch.ones(FRAMES, 68), read)
+    one = solver(landmarks, measured=measured)
+    monkeypatch.setattr(VideoSolver, "_simple", lambda *_: False)
+    other = solver(landmarks, measured=measured)
+    for name in ("weights", "rotation", "translation"):
+        torch.testing.assert_close(getattr(one, name), getattr(other, name), atol=1e-8, rtol=1e-8)

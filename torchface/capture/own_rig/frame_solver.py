@@ -22,6 +22,7 @@ from torchface.capture.own_rig.gauss_newton import (
     linearise,
     sliding,
 )
+from torchface.capture.own_rig.single_frame import SingleFrame
 from torchface.capture.own_rig.solver_components import VideoSolverParts
 from torchface.optim.implicit import attach_gradients
 
@@ -66,6 +67,25 @@ class FrameSolver(VideoSolverParts):
         """
         exactness = min(max(0.1 * self.settings.tolerance, _FINEST), _COARSEST)
         box = self.lower.double(), self.upper.double()
+        if len(start.weights) == 1 and self._simple(terms):
+            parts = self.l1_penalty.double(), self.ridge.double(), self.signed.double()
+            one = SingleFrame(self.settings, terms, self.points, self.intrinsics.double(), *box, *parts)
+            head, rows = one.solve(start.mapped(torch.detach), exactness)
+        else:
+            head, rows = self._stepped(terms, start, box, exactness)
+        if torch.is_grad_enabled() and any(x.requires_grad for x in terms.tensors()):
+            head = self._attached(terms, head, rows)
+        return head, rows
+
+    def _simple(self, terms: FrameTerms) -> bool:
+        """Whether frames' energies are what ``SingleFrame`` knows."""
+        more = self.prior is not None or self.activation is not None or self.settings.pose_trust > 0
+        return not (more or terms.views) and self.rest.device.type == "cpu"
+
+    def _stepped(
+        self, terms: FrameTerms, start: HeadState, box: tuple[Tensor, Tensor], exactness: float
+    ) -> tuple[HeadState, Tensor]:
+        """The states (B,...) and rows after all steps."""
         # Steps are many and small; what tensors keep for derivatives is a fifth of their cost.
         with torch.inference_mode():
             head, rows = start, self.chosen(start, terms.views)
@@ -80,10 +100,7 @@ class FrameSolver(VideoSolverParts):
                 if iteration > 0 and float((head.weights - before.weights).abs().max()) < self.settings.tolerance:
                     break
         # Copies, as autograd refuses tensors that were made without it.
-        head, rows = head.mapped(torch.clone), rows.clone()
-        if torch.is_grad_enabled() and any(x.requires_grad for x in terms.tensors()):
-            head = self._attached(terms, head, rows)
-        return head, rows
+        return head.mapped(torch.clone), rows.clone()
 
     def chosen(self, head: HeadState, views: Sequence[CameraView] = ()) -> Tensor:
         """Which of the rig's points each landmark is in B states, (B,68), then in views; see ``FacePoints.chosen``."""

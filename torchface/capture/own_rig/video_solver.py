@@ -237,7 +237,8 @@ class VideoSolver(FrameSolver):
         if measured.deviation is not None:
             noise = (noise.square() + measured.deviation.double().square()).sqrt()
         precision = self.precision(torch.isfinite(pixels).all(-1) & enough, confidence, noise)
-        views = tuple(self._whitened(view, last) for view in measured.views) if enough else ()
+        sighted = [view for view in measured.views if enough and bool(view.seen.any())]
+        views = tuple(self._whitened(view, last) for view in sighted)
         terms = FrameTerms(pixels.nan_to_num(0.0), precision, rotation, translation, expected, read, views)
         if enough:
             # After a gap the tracked pose is nearer than where the head was left.
