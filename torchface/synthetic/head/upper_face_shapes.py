@@ -166,7 +166,7 @@ def upper_face(head: Anatomy) -> dict[str, Tensor]:
         "eyeWideLeft": lids(-0.33, -0.12, lean=0.8) + push((30, 20, 82), (17, 8, 20), (0, 1.2, 0)),
         "eyeSquintLeft": lids(0.26, 0.85) + push((34, -17, 70), (15, 9, 22), (0.3, 2.2, 0.8)),
         "eyeLookDownLeft": _rotated_eye(head, -GAZE, 0) + lids(0.52, -0.35),
-        "eyeLookUpLeft": _rotated_eye(head, GAZE, 0) + lids(-0.30, 0.35, lean=0.6),
+        "eyeLookUpLeft": _rotated_eye(head, GAZE, 0) + lids(-0.45, 0.35, lean=0.8),
         "eyeLookInLeft": _rotated_eye(head, 0, -1.15 * GAZE) + _sideways(head, -0.55),
         "eyeLookOutLeft": _rotated_eye(head, 0, 1.15 * GAZE) + _sideways(head, 0.55),
         "browDownLeft": push(brow_inner, (11, 11, 20), (-2.2, -6.5, 0.6))
