@@ -6,7 +6,14 @@ import pytest
 import torch
 from torch import Tensor
 
-from torchface.modeling.rigging.blinks_that_shut import BLINKS, SkinOfHead, _Lids, eyes_seen, shut_blinks
+from torchface.modeling.rigging.blinks_that_shut import (
+    BLINKS,
+    SkinOfHead,
+    _before_the_eye,
+    eyes_seen,
+    lids_looking_down,
+    shut_blinks,
+)
 from torchface.rig import BlendshapeRig
 from torchface.synthetic import performer
 
@@ -49,6 +56,25 @@ def test_half_a_blink_is_made_whole(actor: BlendshapeRig, eyes: bool) -> None:
     assert not bool(moved[head.loose].any())
 
 
+def test_lids_of_other_shapes_follow_as_far_as_the_template_s() -> None:
+    names = ["eyeLookDownLeft", "eyeLookUpLeft", "eyeWideLeft"]
+    actor = performer(texture=False).select([*BLINKS, *names])
+    head, marks = head_of(actor)
+    openings, shares = eyes_seen(head, marks), lids_looking_down(actor)
+    assert shares[0] is None
+    assert shares[1] == pytest.approx(0.52, abs=0.01)
+    assert openings[1] is not None
+    edge = torch.cat([openings[1].upper, openings[1].lower])
+    lids = (torch.cdist(head.vertices, edge).amin(1) < 2) & ~head.loose
+    whole = actor.deltas.double()
+    less = torch.cat([whole[:2], 0.6 * whole[2:]])
+    made = shut_blinks(head, less, actor.names, openings, looking_down=shares)[0]
+    for row in (2, 3, 4):
+        assert float((made[row] - whole[row])[lids].norm()) < 0.4 * float((less[row] - whole[row])[lids].norm())
+    same = shut_blinks(head, whole, actor.names, openings, looking_down=shares)[0]
+    assert float((same[2:] - whole[2:])[:, lids].norm(dim=-1).max()) < 0.4
+
+
 def test_a_fold_of_the_open_lid_is_flatter_when_the_eye_is_shut(actor: BlendshapeRig) -> None:
     head, marks = head_of(actor)
     openings = eyes_seen(head, marks)
@@ -89,8 +115,7 @@ def test_a_large_triangle_of_a_lid_goes_before_a_round_eye(actor: BlendshapeRig)
     first = len(head.vertices)
     lid = SkinOfHead(torch.cat([head.vertices, corners]), torch.arange(first, first + 3)[None], head.loose, head.part)
     rows = torch.arange(first, first + 3)
-    near = torch.zeros(first + 3, dtype=torch.bool)
-    lids = _Lids(replace(lid, faces=torch.cat([lid.faces, eye])), lid.faces, None, None, 8.0, near, eye)  # type: ignore[arg-type]
-    moved = lids._before_the_eye(torch.zeros(first + 3, 3).double(), rows)
+    whole = replace(lid, faces=torch.cat([lid.faces, eye]), loose=torch.cat([ball, torch.zeros(3, dtype=torch.bool)]))
+    moved = _before_the_eye(whole, eye, torch.zeros(first + 3, 3).double(), rows)
     assert bool((corners[:, 2] + moved[rows, 2] > front - 0.6).all())  # one of the places looked at is near the front
     assert float(moved[rows, 2].max()) < 1.5

@@ -15,10 +15,17 @@ from torchface.geometry.meshes.surface_index import SurfaceIndex, SurfacePoints
 from torchface.landmarks.surfaces.eye_openings import EyeOpening, eye_opening
 from torchface.optim.sparse import SparseCholesky
 from torchface.rendering.raycast import RayCaster
+from torchface.rig import BlendshapeRig
 from torchface.shape_names import mapping
 
 BLINKS = ("eyeBlinkRight", "eyeBlinkLeft")
 """In the order of iBUG's eyes."""
+_OTHER_LIDS = tuple(
+    tuple(f"eye{way}{side}" for way in ("LookUp", "LookDown", "LookIn", "LookOut", "Wide", "Squint"))
+    for side in ("Right", "Left")
+)
+_DOWN = ("eyeLookDownRight", "eyeLookDownLeft")
+_MOST_GROWN = 2.0  # times
 EYES = (slice(36, 42), slice(42, 48))
 """Of iBUG's 68."""
 
@@ -78,6 +85,7 @@ def shut_blinks(
     names: Sequence[str],
     openings: Sequence[EyeOpening | None],
     apart: Tensor | None = None,
+    looking_down: Sequence[float | None] = (None, None),
 ) -> tuple[Tensor, tuple[float | None, ...]]:
     r"""Deltas (N,J,3) in which each blink shuts its eye, and what it leaves open, as a share of the opening.
 
@@ -90,13 +98,17 @@ def shut_blinks(
     folds that it keeps from rest are smoothed by least bending. Then the lids go before what lies in the eye, be it a
     ball or a plate.
 
+    Blinks are fitted to openings, an eye's other shapes are not: where lids that look down go a smaller share of a
+    blink's way than the template's, lids of all these shapes move as many times as far as that takes.
+
     Args:
         head: at rest.
         deltas: (N,J,3) float64.
-        names: of the shapes; those that mean ARKit's blinks are changed.
+        names: of the shapes; those that mean ARKit's shapes of the eyes are changed.
         openings: of the right and left eye; of one that is not seen the blink stays, and what it leaves is None; where
             no shape means its blink, 0.
         apart: how far each vertex lies from the surface from which the blinks came, (J,) millimetres; 0 if absent.
+        looking_down: the template's shares, see ``lids_looking_down``; what is None or absent changes nothing.
     """
     shapes, left = mapping(names, BLINKS) > 0.5, []
     if any(one is not None for one in openings):
@@ -109,111 +121,163 @@ def shut_blinks(
         lids = _Lids.of(head, opening, index)
         for shape in own:
             deltas[shape] = lids.shut(deltas[shape], apart)
+        upper = [lids.upper_lid(one) for one in (_shape(deltas, names, _DOWN[row]), deltas[own[0]]) if one is not None]
+        share, wanted = _share(*upper) if len(upper) == 2 else None, looking_down[row]
+        if share is not None and wanted is not None and wanted > share:
+            times = min(wanted / share, _MOST_GROWN)
+            for shape in (mapping(names, _OTHER_LIDS[row]) > 0.5).any(0).nonzero()[:, 0].tolist():
+                deltas[shape] = lids.moved_by(times, deltas[shape])
         left.append(lids.left(deltas[own[0]]))
     return deltas, tuple(left)
 
 
+def lids_looking_down(rig: BlendshapeRig) -> tuple[float | None, float | None]:
+    """How far the right and left upper lid go where the eye looks down, as a share of a blink; None if unknown."""
+    marks = None if rig.neutral.annotations is None else rig.neutral.annotations.landmarks
+    if marks is None or len(marks) != 68:
+        return None, None
+    deltas = rig.deltas.detach().cpu().double()
+    shares = []
+    for row, eye in enumerate(EYES):
+        both = [_shape(deltas, rig.names, name) for name in (_DOWN[row], BLINKS[row])]
+        middle = marks[eye][1:3].cpu()
+        upper = [one[middle] for one in both if one is not None]
+        shares.append(_share(*upper) if len(upper) == 2 else None)
+    return shares[0], shares[1]
+
+
+def _shape(deltas: Tensor, names: Sequence[str], name: str) -> Tensor | None:
+    meant = (mapping(names, [name])[0] > 0.5).nonzero()[:, 0]
+    return deltas[int(meant[0])] if len(meant) else None
+
+
+def _share(down: Tensor, blink: Tensor) -> float | None:
+    """Of points' mean ways (k,3), vertical."""
+    way, whole = float(down[:, 1].mean()), float(blink[:, 1].mean())
+    return way / whole if way < 0 and whole < 0 else None
+
+
 @dataclass(frozen=True, eq=False)
 class _Lids:
-    """The lids of one eye: places of the upper and lower edge on the skin, skin around (n,), the eye's triangles."""
+    """The lids of one eye.
+
+    Args:
+        skin: triangles (S,3).
+        edges: places of the upper and of the lower edge on the skin.
+        height: of the opening, millimetres.
+        rows: vertices of the skin around, (n,).
+        faces: triangles among them, (m,3) of 0 to n-1.
+        matrices: (k,n) each, points of the upper and of the lower edge from the vertices.
+        system: of the change of the vertices that moves the edges.
+        eye: the triangles of what lies in it.
+    """
 
     head: SkinOfHead
     skin: Tensor
-    upper: SurfacePoints
-    lower: SurfacePoints
+    edges: tuple[SurfacePoints, SurfacePoints]
     height: float
-    near: Tensor
+    rows: Tensor
+    faces: Tensor
+    matrices: tuple[sparse.csr_array, sparse.csr_array]
+    system: SparseCholesky
     eye: Tensor
 
     @staticmethod
     def of(head: SkinOfHead, opening: EyeOpening, index: SurfaceIndex) -> _Lids:
         above, below = opening.at(_SHARES)
-        edge = torch.cat([above, below])
+        edge, skin = torch.cat([above, below]), head.skin
         middle, height = edge.mean(0), float((above - below)[:, 1].max())
         half = float(edge[:, 0].max() - edge[:, 0].min()) / 2
         near = (head.vertices - middle).norm(dim=-1) < _AROUND * half + height
-        eye = _eye(head, near, edge)
-        return _Lids(head, head.skin, index.nearest(above), index.nearest(below), height, near, eye)
+        rows = skin[near[skin].any(1)].unique()
+        place = torch.full((len(head.vertices),), -1)
+        place[rows] = torch.arange(len(rows))
+        faces = place[skin]
+        faces = faces[(faces >= 0).all(1)]
+        rest, edges = head.vertices[rows], (index.nearest(above), index.nearest(below))
+        upper, lower = (_matrix(points, place[skin[points.triangle]], len(rows)) for points in edges)
+        mass = vertex_areas(rest, faces) / max(_REACH * height, _LEAST_REACH) ** 2
+        held = _FIRM * (upper.T @ upper) + _FIRM * (lower.T @ lower)
+        system = SparseCholesky(stretching_energy(rest, faces) + sparse.diags_array(mass.numpy()) + held)
+        return _Lids(head, skin, edges, height, rows, faces, (upper, lower), system, _eye(head, near, edge))
 
     def gap(self, delta: Tensor) -> Tensor:
         """From the upper to the lower edge in a pose, (k,3)."""
-        posed = self.head.vertices + delta
-        return self._at(posed, self.lower) - self._at(posed, self.upper)
+        upper, lower = (self._at(self.head.vertices + delta, points) for points in self.edges)
+        return lower - upper
 
     def left(self, delta: Tensor) -> float:
         """The widest gap that a blink leaves, as a share of the opening's height."""
         return float(-self.gap(delta)[1:-1, 1].clamp(max=0).min() / self.height)
 
+    def upper_lid(self, delta: Tensor) -> Tensor:
+        """The ways of the middle of the upper lid's edge, (k,3)."""
+        return self._at(delta, self.edges[0])[len(_SHARES) // 3 : -(len(_SHARES) // 3)]
+
+    def moved_by(self, times: float, delta: Tensor) -> Tensor:
+        """A pose (J,3) whose lids move so many times as far."""
+        change = self._change([(times - 1) * self._at(delta, points) for points in self.edges])
+        return _before_the_eye(self.head, self.eye, delta.index_add(0, self.rows, change), self.rows)
+
     def shut(self, delta: Tensor, apart: Tensor | None) -> Tensor:
         """The blink (J,3), shut and unfolded."""
-        moving = torch.zeros(len(delta), dtype=torch.bool)
-        moving[self.skin[self.near[self.skin].any(1)].flatten()] = True
-        rows = moving.nonzero()[:, 0]
-        place = torch.full((len(delta),), -1)
-        place[rows] = torch.arange(len(rows))
-        faces = place[self.skin[moving[self.skin].all(1)]]
-        reach = max(_REACH * self.height, _LEAST_REACH)
-        rest = self.head.vertices[rows]
-        stiff = stretching_energy(rest, faces)
-        mass = vertex_areas(rest, faces) / reach**2
         gap = self.gap(delta)
         gap = (
             gap * (gap[:, 1:2] < _TOUCH) * torch.tensor([0.0, 1.0, 1.0])
         )  # lids that overlap have shut; they may slide
-        matrices = [self._matrix(points, place, len(rows)) for points in (self.upper, self.lower)]
-        wanted = [_UPPER * gap, (_UPPER - 1) * gap]
-        system = stiff + sparse.diags_array(mass.numpy())
-        right = torch.zeros(len(rows), 3, dtype=torch.float64)
-        for matrix, values in zip(matrices, wanted, strict=True):
-            system = system + _FIRM * (matrix.T @ matrix)
-            right += _FIRM * torch.from_numpy(matrix.T @ values.numpy())
-        moved = delta.clone()
-        moved[rows] += SparseCholesky(system).solve(right)
+        moved = delta.index_add(0, self.rows, self._change([_UPPER * gap, (_UPPER - 1) * gap]))
         if apart is not None:
-            moved[rows] += self._unfolding(moved[rows], rest, faces, apart[rows], sum(one.T @ one for one in matrices))
-        return self._before_the_eye(moved, rows)
+            moved[self.rows] += self._unfolding(moved[self.rows], apart[self.rows])
+        return _before_the_eye(self.head, self.eye, moved, self.rows)
 
-    def _unfolding(self, delta: Tensor, rest: Tensor, faces: Tensor, apart: Tensor, edges: sparse.csr_array) -> Tensor:
+    def _change(self, edges: Sequence[Tensor]) -> Tensor:
+        """The change (n,3) of the vertices around that moves the edges' points, (k,3) each."""
+        right = sum(_FIRM * (matrix.T @ way.numpy()) for matrix, way in zip(self.matrices, edges, strict=True))
+        return self.system.solve(torch.from_numpy(right))
+
+    def _unfolding(self, delta: Tensor, apart: Tensor) -> Tensor:
         """The change (n,3) of a pose that bends an upper lid of another form least; its edge stays."""
+        rest = self.head.vertices[self.rows]
         posed = rest + delta
-        bending, mass = bending_energy(posed, faces), vertex_areas(posed, faces).clamp(min=1e-6) / _FINEST**4
-        above, below = self._at(self.head.vertices, self.upper), self._at(self.head.vertices, self.lower)
+        bending, mass = bending_energy(posed, self.faces), vertex_areas(posed, self.faces).clamp(min=1e-6) / _FINEST**4
+        above, below = (self._at(self.head.vertices, points) for points in self.edges)
         distance, nearest = torch.cdist(rest, above).min(1)
         lid = torch.exp(-((distance / (_LID * self.height)) ** 4)) * (rest[:, 1] > below[nearest, 1])
         other = (lid * apart).sum() / lid.sum().clamp(min=1e-9)
         share = ((other - _OTHER[0]) / (_OTHER[1] - _OTHER[0])).clamp(0, 1)
         lid = lid * (delta.norm(dim=-1) / delta.norm(dim=-1).max().clamp(min=1e-9)).sqrt()
         held = (1 / lid.clamp(min=1e-3) - 1 + _HELD) * mass
+        edges = sum(matrix.T @ matrix for matrix in self.matrices)
         system = bending + sparse.diags_array(held.numpy()) + _FIRM * edges
         return share * SparseCholesky(system).solve(-torch.from_numpy(bending @ posed.numpy()))
-
-    def _before_the_eye(self, delta: Tensor, rows: Tensor) -> Tensor:
-        """Lifts what was before the eye at rest, or beside it, before it in the pose, triangles as a whole."""
-        if not len(self.eye):
-            return delta
-        caster = RayCaster(self.head.vertices, self.eye)
-        free = torch.zeros(len(delta), dtype=torch.bool)
-        free[rows] = _over(caster, self.head.vertices[rows]) < _BEFORE
-        faces = self.skin[free[self.skin].all(1)]
-        posed = self.head.vertices + delta
-        lift = torch.zeros(len(delta), dtype=torch.float64)
-        lift[free] = (_over(caster, posed[free]) + _LIFT).clamp(0, _MOST)
-        places = torch.einsum("pk,fkc->fpc", _PLACES, posed[faces])
-        lacking = _over(caster, places.flatten(0, 1)).view(len(faces), -1) - lift[faces] @ _PLACES.T
-        lift.scatter_reduce_(
-            0, faces.flatten(), (lift[faces] + lacking.amax(1).clamp(0, _MOST)[:, None]).flatten(), "amax"
-        )
-        posed[:, 2] += lift
-        return posed - self.head.vertices
 
     def _at(self, vertices: Tensor, points: SurfacePoints) -> Tensor:
         return (vertices[self.skin[points.triangle]] * points.barycentric[..., None]).sum(1)
 
-    def _matrix(self, points: SurfacePoints, place: Tensor, count: int) -> sparse.csr_array:
-        columns = place[self.skin[points.triangle]]
-        row = torch.arange(len(columns)).repeat_interleave(3)
-        data = (points.barycentric.flatten().numpy(), (row.numpy(), columns.flatten().numpy()))
-        return sparse.csr_array(data, shape=(len(columns), count))
+
+def _before_the_eye(head: SkinOfHead, eye: Tensor, delta: Tensor, rows: Tensor) -> Tensor:
+    """Lifts what of the skin's rows (n,) was before the eye or beside it at rest before it in the pose."""
+    if not len(eye):
+        return delta
+    caster = RayCaster(head.vertices, eye)
+    skin, free = head.skin, torch.zeros(len(delta), dtype=torch.bool)
+    free[rows] = _over(caster, head.vertices[rows]) < _BEFORE
+    faces = skin[free[skin].all(1)]
+    posed = head.vertices + delta
+    lift = torch.zeros(len(delta), dtype=torch.float64)
+    lift[free] = (_over(caster, posed[free]) + _LIFT).clamp(0, _MOST)
+    places = torch.einsum("pk,fkc->fpc", _PLACES, posed[faces])
+    lacking = _over(caster, places.flatten(0, 1)).view(len(faces), -1) - lift[faces] @ _PLACES.T
+    lift.scatter_reduce_(0, faces.flatten(), (lift[faces] + lacking.amax(1).clamp(0, _MOST)[:, None]).flatten(), "amax")
+    posed[:, 2] += lift
+    return posed - head.vertices
+
+
+def _matrix(points: SurfacePoints, columns: Tensor, count: int) -> sparse.csr_array:
+    """Points (k,n) from vertices, of which those of each point's triangle are ``columns`` (k,3)."""
+    row = torch.arange(len(columns)).repeat_interleave(3)
+    data = (points.barycentric.flatten().numpy(), (row.numpy(), columns.flatten().numpy()))
+    return sparse.csr_array(data, shape=(len(columns), count))
 
 
 def _eye(head: SkinOfHead, near: Tensor, edge: Tensor) -> Tensor:

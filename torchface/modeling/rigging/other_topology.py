@@ -23,7 +23,7 @@ from torchface.geometry.meshes.operators import (
 from torchface.geometry.meshes.shell_energies import stretching_energy
 from torchface.geometry.meshes.surface_index import triangle_coordinates
 from torchface.mesh import Mesh
-from torchface.modeling.rigging.blinks_that_shut import SkinOfHead, eyes_seen, shut_blinks
+from torchface.modeling.rigging.blinks_that_shut import SkinOfHead, eyes_seen, lids_looking_down, shut_blinks
 from torchface.modeling.rigging.deformation_transfer import transfer_with_report
 from torchface.modeling.rigging.loose_parts import moved_parts
 from torchface.modeling.rigging.part_clearance import clear_parts
@@ -189,7 +189,8 @@ def shapes_on(
     skin = _Skin.of(moved, registration, joined, followed)
     deltas = skin.carried(moved.deltas.double())
     head = SkinOfHead(joined.vertices, joined.faces, skin.loose, joined.part)
-    deltas, left = shut_blinks(head, deltas, moved.names, eyes_seen(head, _marks(moved)), skin.distance)
+    openings, down = eyes_seen(head, _marks(moved)), lids_looking_down(template)
+    deltas, left = shut_blinks(head, deltas, moved.names, openings, skin.distance, down)
     parts = moved_parts(moved, joined.vertices, joined.faces, joined.part, skin.loose, deltas)
     deltas = parts.deltas
     still = torch.zeros(len(joined.vertices), dtype=torch.bool)
