@@ -128,9 +128,8 @@ class VideoFile:
             yield from chunk
 
     def color_frames(self) -> Iterator[Tensor]:
-        """The frames in colour one by one, uint8 (3,H,W), red first."""
-        for chunk in self.color_chunks(8):
-            yield from chunk
+        """The frames in colour one by one, uint8 (3,H,W), red first; a pixel's colours lie side by side in memory."""
+        return (torch.from_numpy(frame).permute(2, 0, 1) for frame in self._decoded())
 
     def frame(self, number: int) -> Tensor:
         """One frame, uint8 (H,W).

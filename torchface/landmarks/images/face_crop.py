@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from torchface.errors import ShapeError, ValueRangeError
-from torchface.landmarks.images.boxes.face_box import check_image
+from torchface.landmarks.images.boxes.face_box import check_image, interleaved
 
 CROP_MARGIN = 1.25
 """A crop's side in sides of the face's box, where nothing else is said."""
@@ -86,13 +86,14 @@ def cut_crops(image: Tensor, transforms: Tensor, width: int, height: int) -> Ten
     (a, b, _), (c, d, _) = ways[0].tolist()
     step = max(1, round(1 / math.sqrt(abs(a * d - b * c))))
     high, wide = max(1, (bottom - top) // step) * step, max(1, (right - left) // step) * step
-    piece = image[..., top : top + high, left : left + wide].cpu()
-    small = (max(1, piece.shape[-1] // step), max(1, piece.shape[-2] // step))
-    planes = [plane.numpy() for plane in (piece if image.ndim == 3 else piece[None])]
+    pixels = interleaved(image[..., top : top + high, left : left + wide])
+    high, wide = pixels.shape[:2]
+    small = (max(1, wide // step), max(1, high // step))
     if step > 1:
-        planes = [cv2.resize(plane, small, interpolation=cv2.INTER_AREA) for plane in planes]
-    pixels = cv2.merge(planes if len(planes) == 3 else planes * 3)
-    ratio = (small[0] / piece.shape[-1], small[1] / piece.shape[-2])
+        pixels = cv2.resize(pixels, small, interpolation=cv2.INTER_AREA)
+    if image.ndim == 2:
+        pixels = cv2.merge([pixels] * 3)
+    ratio = (small[0] / wide, small[1] / high)
     # From the pixels of the piece, that may be a smaller copy, to the image's, and from there to the crop's.
     back = np.array([[1 / ratio[0], 0, left - 0.5 + 0.5 / ratio[0]], [0, 1 / ratio[1], top - 0.5 + 0.5 / ratio[1]]])
     back = np.concatenate([back, [[0.0, 0.0, 1.0]]])

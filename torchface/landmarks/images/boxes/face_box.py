@@ -75,7 +75,27 @@ def grey_pixels(image: Tensor) -> np.ndarray:
     check_image(image)
     if image.ndim == 2:
         return image.cpu().numpy()
-    return cv2.cvtColor(np.ascontiguousarray(image.permute(1, 2, 0).cpu().numpy()), cv2.COLOR_RGB2GRAY)
+    return cv2.cvtColor(interleaved(image), cv2.COLOR_RGB2GRAY)
+
+
+def interleaved(image: Tensor) -> np.ndarray:
+    """An image's values, uint8 (H,W) or (H,W,3), a pixel's side by side; a view where they lie so, as videos' do."""
+    pixels = image.cpu()
+    if image.ndim == 2:
+        return pixels.numpy()
+    beside = pixels.stride()[0::2] == (1, 3)
+    return pixels.permute(1, 2, 0).numpy() if beside else cv2.merge([plane.numpy() for plane in pixels])
+
+
+def at_most(image: Tensor, longest: int) -> tuple[Tensor, float]:
+    """An image, uint8 (H,W) or (3,H,W), made smaller until its longer side has so many pixels; and its pixels a pixel
+    of that."""
+    ratio = max(image.shape[-2:]) / longest
+    if ratio <= 1:
+        return image, 1.0
+    height, width = (max(1, round(side / ratio)) for side in image.shape[-2:])
+    small = torch.from_numpy(cv2.resize(interleaved(image), (width, height), interpolation=cv2.INTER_AREA))
+    return small if image.ndim == 2 else small.permute(2, 0, 1), ratio
 
 
 def sorted_boxes(boxes: Tensor, scores: Tensor, tilts: Tensor | None = None) -> FaceBoxes:

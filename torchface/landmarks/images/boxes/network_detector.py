@@ -11,7 +11,7 @@ from torch import Tensor
 
 from torchface.errors import ValueRangeError
 from torchface.landmarks.images.boxes.box_network import INPUT_SIZE, BoxNetwork
-from torchface.landmarks.images.boxes.face_box import FaceBoxes, check_image, sorted_boxes
+from torchface.landmarks.images.boxes.face_box import FaceBoxes, check_image, interleaved, sorted_boxes
 from torchface.landmarks.images.folded_normalisation import without_normalisation
 from torchface.landmarks.images.graph_session import graph_session
 
@@ -81,17 +81,13 @@ def graph_boxes(content: bytes) -> Callable[[Tensor], Tensor]:
 def _network_picture(image: Tensor, longest: int) -> tuple[Tensor, Tensor]:
     """What the network is shown of an image: (1,3,h,w) in [0,1], its last rows and columns repeated until they are as
     many as it asks for; and pixels of the image a pixel of it, (2,), x and y."""
-    planes = (image if image.ndim == 3 else image[None]).cpu()
-    height, width = planes.shape[1:]
+    height, width = image.shape[-2:]
     scale = min(1.0, longest / max(height, width))
     size = (max(1, round(width * scale)), max(1, round(height * scale)))
     # Between two pixels OpenCV interpolates four times as fast as it averages; below half the size it would skip some.
     how = cv2.INTER_AREA if scale < 0.5 else cv2.INTER_LINEAR
     beyond = [max(2, -(-side // _MULTIPLE)) * _MULTIPLE - side for side in size]
-    shown = [
-        cv2.copyMakeBorder(cv2.resize(plane.numpy(), size, interpolation=how), 0, beyond[1], 0, beyond[0],
-                           cv2.BORDER_REPLICATE)
-        for plane in planes
-    ]  # fmt: skip
-    picture = torch.from_numpy(np.stack(shown)).float() / 255
+    shown = cv2.resize(interleaved(image), size, interpolation=how)
+    shown = cv2.copyMakeBorder(shown, 0, beyond[1], 0, beyond[0], cv2.BORDER_REPLICATE)
+    picture = torch.from_numpy(np.atleast_3d(shown)).permute(2, 0, 1).float() / 255
     return picture.expand(3, -1, -1)[None], torch.tensor([width / size[0], height / size[1]])

@@ -93,11 +93,11 @@ class FollowedFace:
 
     def likeness(self, image: Tensor, landmarks: Tensor) -> float:
         """How much a face looks like this one, the correlation of their colours; 1 where its look is not known."""
-        return 1.0 if self.look is None else float(self.look @ face_look(image, landmarks))
+        return 1.0 if self.look is None else float(self.look @ face_look(image, face_place(landmarks)))
 
-    def learn_look(self, image: Tensor, landmarks: Tensor, least: float) -> None:
+    def learn_look(self, image: Tensor, place: Tensor, least: float) -> None:
         """Takes up a share of how the face looks now, unless others are about and it looks less like itself."""
-        look = self.latest_look = face_look(image, landmarks)
+        look = self.latest_look = face_look(image, place)
         if self.look is None:
             self.look = look
         elif not self.crowded or float(self.look @ look) >= least:
@@ -105,18 +105,17 @@ class FollowedFace:
             self.look = mixed / mixed.norm().clamp(min=1e-6)
 
 
-def face_look(image: Tensor, landmarks: Tensor) -> Tensor:
+def face_look(image: Tensor, place: Tensor) -> Tensor:
     """A face's colours, upright and small, about their mean: enough to distinguish two people of one video.
 
     Args:
         image: uint8 (H,W), or (3,H,W) red first.
-        landmarks: of the face, (68,2) pixels.
+        place: its upright box and its tilt, (5,).
 
     Returns:
         (1200,) float32 of unit length; the product of two is their correlation.
     """
-    box, tilt = turned_box(landmarks)
-    crop = cut_crop(image, crop_transform(box, float(tilt), _SIZE, _MARGIN), _SIZE).float()
+    crop = cut_crop(image, crop_transform(place[:4], float(place[4]), _SIZE, _MARGIN), _SIZE).float()
     # The mean of all colours goes, not that of each: how red a face is beside how blue differs between people.
     flat = (crop - crop.mean()).flatten()
     return flat / flat.norm().clamp(min=1e-6)

@@ -8,7 +8,7 @@ from torch import Tensor
 from torchface.errors import ValueRangeError
 from torchface.landmarks.images.appearance.appearance_model import AppearanceModel
 from torchface.landmarks.images.box_landmarks import refined_face, settled_face
-from torchface.landmarks.images.boxes.face_box import FaceBoxes, FaceDetector, check_image, overlaps
+from torchface.landmarks.images.boxes.face_box import FaceBoxes, FaceDetector, at_most, check_image, overlaps
 from torchface.landmarks.images.checked_detector import shipped_detector
 from torchface.landmarks.images.face_reading import FaceReading
 from torchface.landmarks.images.find_faces import find_faces
@@ -28,6 +28,7 @@ _NEW_PRESENCE, _SURE_PRESENCE, _LEAST_PRESENCE = 0.5, 0.9, 0.1
 # The mean under which a face that the detector misses so many times in a row is lost; frames after which it is asked.
 _LEAST_CONFIDENCE, _CHECKS, _CHECK_EVERY = 0.44, 3, 16
 _FRAMES_WAITED = 10  # for a lost face at its place before another is taken
+_CHECKED = 320  # pixels of the longer side of a copy that the detector is asked about, about twice the face's
 _LEAST_SIDE = 12.0  # of a box, pixels, under which a face is lost
 # Correlation of a face's look with how it looked before, under which it is another's where there are several, and how
 # much more another must look as this one did to be taken for it.
@@ -121,7 +122,7 @@ class LandmarkTracker:
         followed.place = face_place(refined.landmarks)
         if face is not before:
             followed.set_anchor(face.search_box)
-        followed.learn_look(frame, refined.landmarks, _LEAST_LIKENESS)
+        followed.learn_look(frame, followed.place, _LEAST_LIKENESS)
         return refined
 
     def _likeness(self, frame: Tensor, face: FaceReading) -> float:
@@ -190,10 +191,10 @@ class LandmarkTracker:
             return False
         x, y, side = (float(value) for value in (box[0], box[1], box[2]))
         left, top = max(0, int(x - side / 2)), max(0, int(y - side / 2))
-        piece = frame[..., top : int(y + 1.5 * side) + 1, left : int(x + 1.5 * side) + 1]
+        piece, ratio = at_most(frame[..., top : int(y + 1.5 * side) + 1, left : int(x + 1.5 * side) + 1], _CHECKED)
         faces = find_faces(piece, self.detector)
         corner = box.new_tensor([left, top, 0, 0])
-        faces = FaceBoxes(faces.boxes + corner, faces.scores, faces.tilts)
+        faces = FaceBoxes(ratio * faces.boxes + corner, faces.scores, faces.tilts)
         self._note_others(frame, faces, box)
         return len(faces) > 0 and bool((overlaps(faces.boxes, box[None]) > _CONFIRMED).any())
 
