@@ -137,6 +137,7 @@ def pytest_collection_finish() -> None:
     """
     gc.collect()
     gc.freeze()
+    gc.set_threshold(50_000, 20, 20)  # Python's 700 takes one part in twenty of a run
     gc.enable()
     if "torchface.onnx.exported_model" not in sys.modules:  # no test exports
         return

@@ -27,8 +27,8 @@ FRAMES, RATE = 48, 15
 
 
 @pytest.fixture(scope="package")
-def run(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str, object], Any]:
-    """Runs a job of ``modules.mjs``; skips visibly where node or the page's packages are missing."""
+def run(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Callable[[str, object], Any]]:
+    """Runs a job of ``modules.mjs``, all in one process; skips visibly where node or the page's packages are missing."""
     node, npm = shutil.which("node"), shutil.which("npm")
     if node is None or npm is None:
         pytest.skip("node and npm are not installed")
@@ -45,12 +45,15 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str, object], Any
         path = data if isinstance(data, Path) else folder / "input.json"
         if path is not data:
             path.write_text(json.dumps(data))
-        command = [node, "modules.mjs", str(folder), job, str(path)]
-        done = subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=120, check=False)
-        assert done.returncode == 0, done.stderr[-3000:]
-        return json.loads(done.stdout)
+        print(json.dumps([job, str(path)]), file=process.stdin, flush=True)
+        answer = json.loads(process.stdout.readline() or '{"error": "it ended"}')
+        assert "error" not in answer, answer["error"]
+        return answer["found"]
 
-    return run
+    with subprocess.Popen(
+        [node, "modules.mjs", str(folder)], cwd=folder, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    ) as process:
+        yield run
 
 
 @pytest.fixture(scope="package")

@@ -1,11 +1,12 @@
-// Runs the page's modules under Node: node modules.mjs FOLDER JOB FILE, where FOLDER has src/; prints the answer as JSON.
+// Runs the page's modules under Node: node modules.mjs FOLDER, where FOLDER has src/. Each line of input is a job as
+// JSON, [name, file]; its answer is a line of JSON, of what failed {"error": text}.
 import { readFileSync } from "node:fs";
+import { createInterface } from "node:readline";
 import { pathToFileURL } from "node:url";
 
-const [folder, job, file] = process.argv.slice(2);
+const folder = process.argv[2];
 const load = (name) => import(pathToFileURL(`${folder}/src/${name}.js`).href);
-const input = readFileSync(file);
-const bytes = input.buffer.slice(input.byteOffset, input.byteOffset + input.length);
+let input, bytes;
 
 const jobs = {
   /** What each of a list of names takes of ARKit's weights. */
@@ -191,4 +192,10 @@ const jobs = {
     return { influences, ways, places, box: [character.box.min.toArray(), character.box.max.toArray()] };
   },
 };
-console.log(JSON.stringify(await jobs[job]()));
+for await (const line of createInterface({ input: process.stdin })) {
+  const [job, file] = JSON.parse(line);
+  input = readFileSync(file);
+  bytes = input.buffer.slice(input.byteOffset, input.byteOffset + input.length);
+  const answer = await jobs[job]().then((found) => ({ found }), (error) => ({ error: `${error.stack}` }));
+  console.log(JSON.stringify(answer));
+}
