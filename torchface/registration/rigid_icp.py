@@ -22,6 +22,18 @@ _LEAST_FIT = 0.35
 _SCAN_POINTS = 20_000
 
 
+def _falling(first: float, last: float, steps: int) -> tuple[float, ...]:
+    return tuple(first * (last / first) ** (i / (steps - 1)) for i in range(steps))
+
+
+# Of each round: points, reaches, poses that are kept after a third of the steps and at the end, slack of the matches.
+_SEARCH = (
+    (120, _falling(80, 40, 8), 80, 40, 1.0),
+    (400, _falling(40, 15, 12), 12, 8, 0.5),
+    (1500, _falling(20, 8, 20), 2, 1, 0.0),
+)
+
+
 @dataclass(frozen=True, eq=False)
 class Samples:
     """Points (N,3) and unit normals (N,3) of a template, float64, in an order whose beginnings are spread too."""
@@ -53,9 +65,9 @@ class ScanPoints:
         self.points, self.normals, self.border = points[keep], normals[keep], border[keep]
         self._tree = cKDTree(self.points.numpy())
 
-    def nearest(self, queries: Tensor) -> tuple[Tensor, Tensor]:
-        """Distance and row of the nearest point to each query (...,3)."""
-        distance, row = self._tree.query(queries.reshape(-1, 3).numpy())
+    def nearest(self, queries: Tensor, slack: float = 0.0) -> tuple[Tensor, Tensor]:
+        """Distance and row of a point at most ``1 + slack`` times as far as the nearest from each query (...,3)."""
+        distance, row = self._tree.query(queries.reshape(-1, 3).numpy(), eps=slack)
         shape = queries.shape[:-1]
         return torch.from_numpy(distance).reshape(shape), torch.from_numpy(row).reshape(shape)
 
@@ -80,6 +92,7 @@ def rigid_icp(
     reaches: tuple[float, ...],
     scale: bool = False,
     landmarks: tuple[Tensor, Tensor] | None = None,
+    slack: float = 0.0,
 ) -> Fit:
     r"""Iterated closest points from many starts at once, across the surface and with falling reach.
 
@@ -93,13 +106,14 @@ def rigid_icp(
         reaches: c of each step, millimetres.
         scale: estimate s, within 0.8 to 1.25 of where it started.
         landmarks: x and u, (L,3) each.
+        slack: of the nearest points, which then are found sooner.
 
     Source: Chen, Medioni 1992 (across the surface); Rusinkiewicz, Levoy 2001; thesis 3.2.3, figure 16.
     """
     pose = Similarity(start.scale.double(), start.rotation.double(), start.translation.double())
     lowest, highest = pose.scale * MIN_HEAD_SCALE, pose.scale * MAX_HEAD_SCALE
     for reach in reaches:
-        moved, targets, normals, weights = _planes(samples, scan, pose, reach)
+        moved, targets, normals, weights = _planes(samples, scan, pose, reach, slack)
         if landmarks is not None:
             extra = _landmark_planes(landmarks, pose, len(samples.points))
             pairs = zip((moved, targets, normals, weights), extra, strict=True)
@@ -117,7 +131,7 @@ def rigid_icp(
         growth = (1 + step[:, 6]).clamp(0.9, 1.1) if scale else torch.ones_like(pose.scale)
         growth = (pose.scale * growth).clamp(lowest, highest) / pose.scale
         pose = pose.moved(step[:, :3], growth, step[:, 3:6], centre[:, 0])
-    return Fit(pose, _planes(samples, scan, pose, reaches[-1])[3].mean(1))
+    return Fit(pose, _planes(samples, scan, pose, reaches[-1], slack)[3].mean(1))
 
 
 def find_pose(samples: Samples, scan: ScanPoints) -> Fit:
@@ -130,9 +144,11 @@ def find_pose(samples: Samples, scan: ScanPoints) -> Fit:
     middle = (scan.points.amax(0) + scan.points.amin(0)) / 2
     own = (samples.points.amax(0) + samples.points.amin(0)) / 2
     start = Similarity(one, all_rotations, middle - all_rotations @ own)
-    few = rigid_icp(samples.first(120), scan, start, _falling(80, 40, 8)).best(40)
-    more = rigid_icp(samples.first(400), scan, few.pose, _falling(40, 15, 12)).best(8)
-    most = rigid_icp(samples.first(1500), scan, more.pose, _falling(20, 8, 20), scale=True).best(1)
+    for first, reaches, half, kept, slack in _SEARCH:
+        some, scale, early = samples.first(first), slack == 0, len(reaches) // 3 + 1
+        left = rigid_icp(some, scan, start, reaches[:early], scale, slack=slack).best(half)
+        most = rigid_icp(some, scan, left.pose, reaches[early:], scale, slack=slack).best(kept)
+        start = most.pose
     if float(most.fit[0]) < _LEAST_FIT:
         raise AlignmentError(
             f"register: found no pose in which the template fits the scan by shape (best fit {float(most.fit[0]):.2f} "
@@ -141,17 +157,13 @@ def find_pose(samples: Samples, scan: ScanPoints) -> Fit:
     return most
 
 
-def _falling(first: float, last: float, steps: int) -> tuple[float, ...]:
-    return tuple(first * (last / first) ** (i / (steps - 1)) for i in range(steps))
-
-
 def _planes(
-    samples: Samples, scan: ScanPoints, pose: Similarity, reach: float
+    samples: Samples, scan: ScanPoints, pose: Similarity, reach: float, slack: float
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Moved samples, their scan points, normals, each (B,N,3), and weights (B,N)."""
     moved = pose.apply(samples.points)
     own = samples.normals @ pose.rotation.transpose(1, 2)
-    distance, row = scan.nearest(moved)
+    distance, row = scan.nearest(moved, slack)
     normals = scan.normals[row]
     agree = (own * normals).sum(-1).clamp(min=0)
     weights = agree * (1 + (distance / reach).square()).pow(-2) * ~scan.border[row]

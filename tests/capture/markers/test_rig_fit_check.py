@@ -30,7 +30,7 @@ GAPS = StageFlaws(missing=0.02)
 
 def filmed(performance: Performance, flaws: StageFlaws = GAPS) -> Tensor:
     rig, attachment, takes = performance
-    take = record(rig, attachment, takes[0][::24], torch.Generator().manual_seed(0), flaws, fps=2.5).take
+    take = record(rig, attachment, takes[0][::40], torch.Generator().manual_seed(0), flaws, fps=1.5).take
     assert take.markers is not None
     return take.markers.values
 
@@ -55,7 +55,7 @@ def test_another_performers_transferred_rig_passes(performance: Performance) -> 
     rig, attachment, takes = performance
     truth = performer(draw_identities(1, torch.Generator().manual_seed(3))[0], texture=False)
     solved_with = transfer_deformation(rig, truth.neutral)
-    weights = takes[0][::24]
+    weights = takes[0][::40]
     take = record(truth, attachment, weights, torch.Generator().manual_seed(0)).take
     assert take.markers is not None
     assert check_fit(sites(solved_with, attachment), take.markers.values).cause == ""
@@ -75,7 +75,7 @@ def test_few_markers_close_together_may_stand_off_the_skin(performance: Performa
     points = attachment.on(rig.neutral.faces, rig.vertices)
     near = (points - points[points[:, 1].argmax()]).norm(dim=1).argsort()[:8]
     brow = attachment.select([(attachment.labels or ())[i] for i in near.tolist()])
-    take = record(rig, brow, takes[0][::24], torch.Generator().manual_seed(0), StageFlaws(standoff=3)).take
+    take = record(rig, brow, takes[0][::40], torch.Generator().manual_seed(0), StageFlaws(standoff=3)).take
     assert take.markers is not None
     found = check_fit(sites(rig, brow), take.markers.values)
     assert found.radius < 30

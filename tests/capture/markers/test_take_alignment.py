@@ -41,7 +41,7 @@ def test_a_neutral_frame_gives_the_similarity_exactly(performance: Performance, 
 
 def test_a_take_without_a_neutral_frame(performance: Performance, stage_space: Similarity) -> None:
     rig, attachment, takes = performance
-    weights = takes[0].clone()
+    weights = takes[0][::5].clone()
     weights[:, rig.index(["browInnerUp", "mouthSmileLeft", "mouthSmileRight"])] += 0.3
     weights = weights.clamp(0, 1)
     take = record(rig, attachment, weights, torch.Generator().manual_seed(0), StageFlaws(missing=0.05)).take

@@ -28,7 +28,7 @@ FRAMES, RATE = 48, 15
 
 @pytest.fixture(scope="package")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Callable[[str, object], Any]]:
-    """Runs a job of ``modules.mjs``, all in one process; skips visibly where node or the page's packages are missing."""
+    """Runs a job of ``modules.mjs``, all in one process; skips where node or the page's packages are missing."""
     node, npm = shutil.which("node"), shutil.which("npm")
     if node is None or npm is None:
         pytest.skip("node and npm are not installed")

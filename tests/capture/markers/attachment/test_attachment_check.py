@@ -24,7 +24,7 @@ Performance = tuple[BlendshapeRig, Attachment, list[Tensor]]
 SLIP = StageFlaws(slip_translation=8, slip_rotation=3)
 
 
-def filmed(performance: Performance, flaws: StageFlaws | None = None, take: int = 0, every: int = 16) -> Take:
+def filmed(performance: Performance, flaws: StageFlaws | None = None, take: int = 0, every: int = 24) -> Take:
     rig, attachment, takes = performance
     generator = torch.Generator().manual_seed(0)
     return record(rig, attachment, takes[take][::every], generator, flaws or StageFlaws(), fps=60.0 / every).take
