@@ -21,8 +21,7 @@ from torchface.shape_names import mapping
 BLINKS = ("eyeBlinkRight", "eyeBlinkLeft")
 """In the order of iBUG's eyes."""
 _OTHER_LIDS = tuple(
-    tuple(f"eye{way}{side}" for way in ("LookUp", "LookDown", "LookIn", "LookOut", "Wide", "Squint"))
-    for side in ("Right", "Left")
+    tuple(f"eye{way}{side}" for way in ("LookUp", "LookDown", "Wide", "Squint")) for side in ("Right", "Left")
 )
 _DOWN = ("eyeLookDownRight", "eyeLookDownLeft")
 _MOST_GROWN = 2.0  # times
@@ -217,7 +216,7 @@ class _Lids:
     def moved_by(self, times: float, delta: Tensor) -> Tensor:
         """A pose (J,3) whose lids move so many times as far."""
         change = self._change([(times - 1) * self._at(delta, points) for points in self.edges])
-        return _before_the_eye(self.head, self.eye, delta.index_add(0, self.rows, change), self.rows)
+        return delta.index_add(0, self.rows, change)
 
     def shut(self, delta: Tensor, apart: Tensor | None) -> Tensor:
         """The blink (J,3), shut and unfolded."""
