@@ -140,5 +140,5 @@ def save_rendered_image(image: Tensor, path: str | Path) -> None:
     check_ending(path, *_KINDS)
     make_folder(path.parent)
     content = BytesIO()
-    to_pillow(image).save(content, _KINDS[path.suffix.lower()])
+    to_pillow(image).save(content, _KINDS[path.suffix.lower()], compress_level=3)  # a PNG of 6 takes twice the time
     write_file(path, content.getvalue())

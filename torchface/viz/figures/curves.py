@@ -8,11 +8,12 @@ import torch
 from torch import Tensor
 
 from torchface.rendering.compositing import from_figure, new_figure
+from torchface.viz.figures.line_chart import LineChart
 
 __all__ = ["error_curve", "named_bars", "weight_curves"]
 
 SOLVED, TRUE, SINGLE = "#1f5fa8", "#d9822b", "#8e9aa8"
-_APART = 1.15  # from one curve of weights to the next
+_APART, _ROW = 1.15, 108  # from one curve of weights to the next, and pixels of that
 
 
 def error_curve(error: Tensor, fps: float, label: str = "marker RMSE (mm)") -> Tensor:
@@ -23,15 +24,15 @@ def error_curve(error: Tensor, fps: float, label: str = "marker RMSE (mm)") -> T
         >>> bool(picture.min() < 0.5 and picture.max() == 1)  # drawn on white
         True
     """
-    figure = new_figure(10, 2.6)
-    axes = figure.add_axes((0.08, 0.19, 0.91, 0.78))
-    seconds = torch.arange(len(error)) / fps
-    axes.plot(seconds, error, color=SOLVED, linewidth=0.8)
-    median = float(error.nanmedian())
-    axes.axhline(median, color="grey", linewidth=0.8, linestyle="--", label=f"median {median:.3f}")
-    axes.set(xlabel="seconds", ylabel=label, ylim=(0, None), xlim=(0, float(seconds[-1])))
-    axes.legend(loc="lower right", frameon=False)
-    return from_figure(figure)
+    seconds, median = torch.arange(len(error)) / fps, float(error.nanmedian())
+    most = float(error.nan_to_num(0.0).max()) or 1.0
+    chart = LineChart(1000, 260)
+    panel = chart.panel((80, 8, 990, 210), (0.0, float(seconds[-1])), (0.0, 1.05 * most))
+    panel.level(median, dashed=True)
+    panel.line(seconds, error, SOLVED)
+    panel.numbers("seconds", label)
+    panel.legend([(f"median {median:.3f}", "grey")], 200)
+    return chart.picture()
 
 
 def timing_curves(values: Tensor, names: Sequence[str], fps: float, label: str) -> Tensor:
@@ -65,27 +66,23 @@ def weight_curves(solved: Tensor, true: Tensor | None, names: Sequence[str], fps
     order = (solved if true is None else true).std(0).argsort(descending=True)[:max_shapes].tolist()
     curves = [("sum of weights", solved.sum(1), None if true is None else true.sum(1))]
     curves += [(names[i], solved[:, i], None if true is None else true[:, i]) for i in order]
-    height = 0.55 + 1.1 * len(curves)
-    figure = new_figure(10, height)
-    # Axes of each curve's own, or a layout that is solved for, would take ten times as long.
-    axes = figure.add_axes((0.16, 0.45 / height, 0.83, 1 - 0.55 / height))
-    seconds = torch.arange(len(solved)) / fps
-    labels = []
+    bottom = 10 + _ROW * len(curves)
+    chart, seconds = LineChart(1000, bottom + 45), torch.arange(len(solved)) / fps
+    panel = chart.panel((160, 10, 990, bottom), (0.0, float(seconds[-1])), (0.95 - _APART * len(curves), 1.1))
     for row, (label, values, truth) in enumerate(curves):
         most = 1.0 if row else max(float(x.max()) for x in (values, truth) if x is not None) or 1.0
         base = -_APART * row
+        panel.level(base)
+        panel.level(base + 1, dashed=True)
         if truth is not None:
-            axes.plot(seconds, base + truth / most, color=TRUE, linewidth=1.6, alpha=0.8, label="" if row else "true")
-        axes.plot(seconds, base + values / most, color=SOLVED, linewidth=0.8, label="" if row else "solved")
-        labels.append(f"{label}\n0 to {most:.3g}")
-    bases = -_APART * torch.arange(len(curves))
-    axes.hlines(bases, 0, float(seconds[-1]), color="grey", linewidth=0.5)
-    axes.hlines(bases + 1, 0, float(seconds[-1]), color="grey", linewidth=0.5, linestyle=":")
-    axes.set_yticks([0.5 - _APART * row for row in range(len(curves))], labels, fontsize=8)
-    axes.tick_params(axis="y", length=0)
-    axes.set(xlabel="seconds", xlim=(0, float(seconds[-1])), ylim=(0.95 - _APART * len(curves), 1.1))
-    axes.legend(loc="upper right", frameon=False, ncols=2, fontsize=8)
-    return from_figure(figure)
+            panel.line(seconds, base + truth / most, TRUE, 2)
+        panel.line(seconds, base + values / most, SOLVED)
+        middle = 10 + (0.6 - base) / (0.15 + _APART * len(curves)) * (bottom - 10)
+        chart.text((152, middle - 7), label, "rm", 12)
+        chart.text((152, middle + 8), f"0 to {most:.3g}", "rm", 12)
+    panel.numbers("seconds")
+    panel.legend([("true", TRUE)] * (true is not None) + [("solved", SOLVED)], 18)
+    return chart.picture()
 
 
 def compared_curves(
@@ -144,21 +141,18 @@ def motion_curves(
     translation: Tensor, degrees: Tensor, fps: float, true: tuple[Tensor, Tensor] | None = None
 ) -> Tensor:
     """Translations (T,3), millimetres, and rotations (T,3), degrees, over time, with the true ones if any; (3,H,W)."""
-    figure = new_figure(10, 6)
-    margins = {"left": 0.08, "right": 0.99, "bottom": 0.08, "top": 0.985, "hspace": 0.1, "wspace": 0.2}
-    rows = figure.subplots(3, 2, sharex=True, gridspec_kw=margins)
-    seconds = torch.arange(len(translation)) / fps
+    chart, seconds = LineChart(1000, 600), torch.arange(len(translation)) / fps
     for column, (values, unit) in enumerate(((translation, "mm along"), (degrees, "° about"))):
         reach = 1.1 * max(float(values.abs().max()), 0.5 if column else 1.0)
+        left = 80 + 497 * column
         for axis, name in enumerate("xyz"):
-            axes = rows[axis][column]
+            top = 10 + 186 * axis
+            panel = chart.panel((left, top, left + 414, top + 168), (0.0, float(seconds[-1])), (-reach, reach))
+            panel.level(0.0)
             if true is not None:
-                axes.plot(seconds, true[column][:, axis], color=TRUE, linewidth=1.8, alpha=0.8, label="true")
-            axes.plot(seconds, values[:, axis], color=SOLVED, linewidth=0.8, label="solved")
-            axes.set(ylabel=f"{unit} {name}", ylim=(-reach, reach), xlim=(0, float(seconds[-1])))
-            axes.axhline(0, color="grey", linewidth=0.5)
-    for axes in rows[-1]:
-        axes.set_xlabel("seconds")
-    if true is not None:
-        rows[0][0].legend(loc="upper right", frameon=False, ncols=2, fontsize=8)
-    return from_figure(figure)
+                panel.line(seconds, true[column][:, axis], TRUE, 2)
+            panel.line(seconds, values[:, axis], SOLVED)
+            panel.numbers("seconds" if axis == 2 else None, f"{unit} {name}")
+            if true is not None and not axis and not column:
+                panel.legend([("true", TRUE), ("solved", SOLVED)])
+    return chart.picture()

@@ -150,12 +150,13 @@ def shade_over(frame: Tensor, vertices: Tensor, faces: Tensor, camera: Camera) -
     if step > 1:
         layer = torch.nn.functional.interpolate(layer, scale_factor=step, mode="bilinear", align_corners=False)
     layer = layer[0, :, : y1 - y0, : x1 - x0]
-    image = frame.float() / 255
+    image = frame.clone()
     under = image[:, y0 : y0 + layer.shape[1], x0 : x0 + layer.shape[2]]
     strength = layer[3:]
     colors = layer[:3] / (strength / _STRENGTH).clamp(min=1e-6)
-    under.copy_(under * (1 - strength) + colors * strength)
-    return (255 * image.clamp(0, 1)).round().to(torch.uint8)
+    mixed = under / 255 * (1 - strength) + colors * strength
+    under.copy_((255 * mixed.clamp(0, 1)).round())
+    return image
 
 
 def _part_of(camera: Camera, x0: int, y0: int, x1: int, y1: int, step: int) -> Camera:

@@ -29,16 +29,30 @@ from torchface.workflows.track.track_state import TrackState
 PIECE = 64
 """Frames whose readings are kept at a time: what a killed run loses at most."""
 
+SHOWN = 12
+"""Frames of a take that its report shows."""
+_MOST_KEPT = 100 * 2**20  # bytes of their pictures that stay in memory until then
+
 _COMPARED, _STEP = 5, 10  # frames of a table that are compared with pictures, and frames from one to the next
 
 
-def read_frames(inputs: TrackInputs, state: TrackState, progress: Progress) -> tuple[FaceReading, int]:
-    """The face in all frames, (T,...), and how many faces the first frame shows; 0 where a table gives landmarks."""
+def shown_frames(count: int) -> list[int]:
+    """Which of a take's frames its report shows."""
+    return torch.linspace(0, count - 1, min(SHOWN, count)).round().long().unique().tolist()
+
+
+def read_frames(
+    inputs: TrackInputs, state: TrackState, progress: Progress, pictures: dict[int, Tensor] | None = None
+) -> tuple[FaceReading, int]:
+    """The face in all frames, (T,...), and how many faces the first frame shows; 0 where a table gives landmarks.
+
+    Pictures that the report will show go into ``pictures`` by their numbers, if they are few enough to be kept.
+    """
     clip, finder, faces = inputs.clip, inputs.models.finder, 0
     if finder is None:
         reading = given_reading(Path(inputs.settings.landmarks), clip)
     else:
-        faces = _track(inputs, finder, state, progress)
+        faces = _track(inputs, finder, state, progress, {} if pictures is None else pictures)
         reading = state.reading()
     inputs.check_length(len(reading.landmarks))
     if not reading.found.any():
@@ -47,14 +61,18 @@ def read_frames(inputs: TrackInputs, state: TrackState, progress: Progress) -> t
     return reading, faces
 
 
-def _track(inputs: TrackInputs, finder: LandmarkFinder, state: TrackState, progress: Progress) -> int:
+def _track(
+    inputs: TrackInputs, finder: LandmarkFinder, state: TrackState, progress: Progress, pictures: dict[int, Tensor]
+) -> int:
     """Readings of all frames into the state; how many faces the first frame shows."""
     clip = inputs.clip
     tracker = LandmarkTracker(finder, inputs.models.appearance, graph_detector(), inputs.settings.face)
     done, at, faces = state.done, 0, 0
     if done:  # a run that was killed goes on with all that it knew, and so gives the same landmarks
         tracker.resume(state.memory)
-    frames = clip.color_frames()
+    frames, kept = clip.color_frames(), set(shown_frames(clip.count))
+    if 3 * clip.width * clip.height * len(kept) > _MOST_KEPT:
+        kept.clear()
     for first in frames:
         if at == 0:
             faces = len(find_faces(first, tracker.detector))
@@ -68,6 +86,8 @@ def _track(inputs: TrackInputs, finder: LandmarkFinder, state: TrackState, progr
             with naming_the_frame(at):
                 readings.append(tracker.step(frame))
             looks.append(tracker.look)
+            if at in kept:
+                pictures[at] = frame
             at += 1
             progress("tracking landmarks", at, max(clip.count, at))
         state.append(FaceReading.stacked(readings), torch.stack(looks), tracker.memory)

@@ -14,11 +14,11 @@ from torchface.rendering.compositing import caption, sheet
 from torchface.viz.figures.curves import error_curve, motion_curves, weight_curves
 from torchface.viz.reports.report_page import Section, Table, write_page
 from torchface.workflows.track.face_overlay import camera_at, mesh_drawer, paint_drawer
+from torchface.workflows.track.frame_readings import shown_frames
 from torchface.workflows.track.head_rotations import head_angles
 from torchface.workflows.track.overlay_video import side_by_side_drawer
 from torchface.workflows.track.track_result import MIN_STABLE, Tracked
 
-SHOWN = 12
 _COLUMNS, _WIDTH = 4, 300
 _CURVES_A_PICTURE = 13
 _MARGIN = 0.6
@@ -107,11 +107,11 @@ def figures(tracked: Tracked) -> list[tuple[str, str]]:
 def frames_sheets(tracked: Tracked, drawers: Sequence[tuple[Callable[[int, Tensor], Tensor], bool]]) -> list[Tensor]:
     """Sheets of frames spread over the video, read once, as each of ``drawers`` makes frame number t, (3,H,W); cut to
     the face where it says so."""
-    count = len(tracked)
-    wanted = torch.linspace(0, count - 1, min(SHOWN, count)).round().long().unique().tolist()
+    wanted = shown_frames(len(tracked))
     cells: list[list[Tensor]] = [[] for _ in drawers]
     face = _face_box(tracked, wanted)
-    for t, frame in enumerate(tracked.video.color_frames()):
+    known = all(t in tracked.pictures for t in wanted)
+    for t, frame in sorted(tracked.pictures.items()) if known else enumerate(tracked.video.color_frames()):
         if t not in wanted:
             continue
         for made, (draw, cut) in zip(cells, drawers, strict=True):
@@ -136,10 +136,11 @@ def _face_box(tracked: Tracked, frames: list[int]) -> tuple[int, int, int, int]:
 def _cut(image: Tensor, box: tuple[int, int, int, int] | None) -> Tensor:
     """A part of a picture, uint8 (3,H,W), as wide as a cell, in [0,1]."""
     x0, y0, x1, y1 = box or (0, 0, image.shape[2], image.shape[1])
-    part = image[:, y0:y1, x0:x1].float() / 255
+    part = image[:, y0:y1, x0:x1]
     scale = _WIDTH / part.shape[2]
     size = (max(1, round(part.shape[1] * scale)), _WIDTH)
-    return torch.nn.functional.interpolate(part[None], size, mode="bilinear", antialias=True)[0].clamp(0, 1)
+    small = torch.nn.functional.interpolate(part[None].contiguous(), size, mode="bilinear", antialias=True)
+    return small[0].float() / 255
 
 
 def _player(tracked: Tracked) -> str:

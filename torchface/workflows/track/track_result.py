@@ -56,6 +56,7 @@ class Tracked:
         head: the person's, where it was solved with the take.
         cameras: the others that saw the take, a line each.
         eyes: what the frames show of the eyes; None where nobody looked at them.
+        pictures: some frames by their numbers, uint8 (3,H,W), for the report; it reads others from the video.
     """
 
     inputs: TrackInputs
@@ -75,6 +76,7 @@ class Tracked:
     head: PersonHead | None = None
     eyes: TakeEyes | None = None
     cameras: Sequence[str] = ()
+    pictures: dict[int, Tensor] = field(default_factory=dict)
 
     def __len__(self) -> int:
         return len(self.landmarks)

@@ -9,6 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import torch
+from torch import Tensor
 
 from torchface.capture.own_rig import FaceMeasurements
 from torchface.files.checkpoints import read_checkpoint, write_checkpoint
@@ -83,9 +84,10 @@ def track_video(
 def _track(inputs: TrackInputs, others: list[OtherCamera], out: Path, filmed: bool, progress: Progress) -> Tracked:
     state = TrackState(out, inputs.reading_key)
     seconds: dict[str, float] = {}
+    pictures: dict[int, Tensor] = {}
     reused = state.done
     with _timed(seconds, "landmarks"):
-        reading, faces = read_frames(inputs, state, progress)
+        reading, faces = read_frames(inputs, state, progress, pictures)
     if state.done == reused:
         seconds.clear()
     times = frame_times(inputs, len(reading.landmarks))
@@ -141,6 +143,7 @@ def _track(inputs: TrackInputs, others: list[OtherCamera], out: Path, filmed: bo
         head=head,
         eyes=eyes,
         cameras=[other.line for other in others],
+        pictures=pictures,
     )
     with all_or_none():
         tracked.products.update(write_curves(tracked, out))
