@@ -62,7 +62,7 @@ TOGETHER = {
         "viz/browser",
         "viz/reports/test_player",
     ),
-    "action units": ("capture/action_units", "train/test_action_units"),
+    "action units": ("capture/action_units", "train/test_action_units", "train/filmed_performers/test_camera_stage"),
 }
 """Files for one process: two browsers take the time from one another, and a filmed session is costly to make twice."""
 

@@ -43,7 +43,12 @@ def float_format(request: pytest.FixtureRequest) -> Iterator[torch.dtype]:
     torch.set_default_dtype(usual)
 
 
-@pytest.mark.parametrize("name", MODULES)
+LONG = "torchface.onnx.module_graph"  # as tests/onnx/test_module_graph.py
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=pytest.mark.bench) if name == LONG else name for name in MODULES]
+)
 def test_examples_give_what_they_say(
     name: str, float_format: torch.dtype, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -46,7 +46,13 @@ def jitter(values: Tensor) -> float:
 
 
 @pytest.mark.parametrize(
-    ("size", "noise", "most"), [(40.0, 1.5, 0.4), (4.0, 1.5, 0.25), (0.0, 1.5, 0.18), (40.0, 3.5, 0.35)]
+    ("size", "noise", "most"),
+    [
+        (40.0, 1.5, 0.4),
+        (0.0, 1.5, 0.18),
+        pytest.param(4.0, 1.5, 0.25, marks=pytest.mark.bench),
+        pytest.param(40.0, 3.5, 0.35, marks=pytest.mark.bench),
+    ],
 )
 def test_as_good_as_the_best_settings_whatever_moves(size: float, noise: float, most: float) -> None:
     truth = motion(size)

@@ -153,21 +153,24 @@ class Learned:
     classifier: ActionUnitClassifier
 
 
+TWO_GROUPS = [
+    RegionGroup("mouth", ("mouth",), ("18L",)),
+    RegionGroup("between_brows", ("between_brows",), ("9",), ("4",)),
+]
+
+
+def of_two_groups(labels: ActionLabels) -> ActionLabels:
+    return replace(labels, performed=tuple(s for s in labels.performed if set(s.units) <= {"18L", "9", "4"}))
+
+
 @pytest.fixture(scope="module")
 def both(regions: RegionVideo, session: RecordedSession, other: RecordedSession) -> Learned:
-    groups = [
-        RegionGroup("mouth", ("mouth",), ("18L",)),
-        RegionGroup("between_brows", ("between_brows",), ("9",), ("4",)),
-    ]
     videos = [
         regions,
         read_regions(other.video, other.labels, regions.names, regions.neutral, regions.patterns.shape[-1]),
     ]
-    labels = [
-        replace(one.labels, performed=tuple(s for s in one.labels.performed if set(s.units) <= {"18L", "9", "4"}))
-        for one in (session, other)
-    ]
-    arguments = (videos, labels, groups, TrainingSettings(warps=1))
+    labels = [of_two_groups(one.labels) for one in (session, other)]
+    arguments = (videos, labels, TWO_GROUPS, TrainingSettings(warps=1))
     return Learned(arguments, ActionUnitClassifier.fit(*arguments))
 
 
@@ -183,9 +186,10 @@ def test_two_performers_can_be_learned_from(
 
 
 def test_from_disk_and_from_onnx(
-    classifier: ActionUnitClassifier, regions: RegionVideo, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    session: RecordedSession, regions: RegionVideo, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    video = regions
+    video, labels = regions, of_two_groups(session.labels)
+    classifier = ActionUnitClassifier.fit([video], [labels], TWO_GROUPS, TrainingSettings(warps=1))
     zoo.save_model(classifier, tmp_path / "units", zoo.ModelCard("MIT", "made", {}, "none"))
     again = zoo.get_model(tmp_path / "units")
     assert isinstance(again, ActionUnitClassifier)
@@ -196,11 +200,11 @@ def test_from_disk_and_from_onnx(
     assert report.agreement == 1.0
     import onnxruntime
 
-    session = onnxruntime.InferenceSession(tmp_path / "units.onnx")
-    (found,) = session.run(None, {"regions": frames.numpy(), "rest": rest.numpy()})
+    runtime = onnxruntime.InferenceSession(tmp_path / "units.onnx")
+    (found,) = runtime.run(None, {"regions": frames.numpy(), "rest": rest.numpy()})
     assert np.abs(found - classifier(frames, rest).numpy()).max() < 1e-6
     assert classifier(frames, rest).unique(dim=0).shape[0] > 1
-    meta = session.get_modelmeta().custom_metadata_map
+    meta = runtime.get_modelmeta().custom_metadata_map
     assert '"18L"' in meta["units"]
 
     # The graph of a classifier with other intensities is not written.

@@ -10,13 +10,11 @@ import torch
 from torchface.io import load_take
 from torchface.io.action_labels import load_action_labels
 from torchface.io.video import open_video
-from torchface.synthetic import draw_identities, performer
-from train.filmed_performers.action_performance import ACTION_UNITS, MOVES, PerformanceSettings
+from torchface.synthetic import performer
+from train.filmed_performers.action_performance import ACTION_UNITS, MOVES
 from train.filmed_performers.camera_stage import (
     SIDE_MARKERS,
     RecordedSession,
-    StageSettings,
-    record_session,
     render_video,
     stage_markers,
 )
@@ -24,20 +22,17 @@ from train.filmed_performers.head_camera_images import HeadCameraRenderer
 from train.filmed_performers.helmet_camera import HELMET_POINT, CameraFlaws, helmet_camera, shaken_cameras
 from train.filmed_performers.reflective_paint import reflective_paint
 
-QUICK = PerformanceSettings(repetitions=1, combination_repetitions=1, combinations=(("4", "9"),), fps=8.0, pace=1.5)
 STILL = CameraFlaws(noise=0.0, blur=0.0, shake_rotation=0.0, shake_translation=0.0)
 
 
 @pytest.fixture(scope="module")
-def session(tmp_path_factory: pytest.TempPathFactory) -> RecordedSession:
-    settings = StageSettings(96, 128, performance=QUICK)
-    identity = draw_identities(1, torch.Generator().manual_seed(3))[0]
-    return record_session(tmp_path_factory.mktemp("stage"), "one", identity, torch.Generator().manual_seed(1), settings)
+def session(filmed_session: RecordedSession) -> RecordedSession:
+    return filmed_session
 
 
 def test_video_markers_and_labels_lie_beside_each_other(session: RecordedSession) -> None:
     video, take, labels = open_video(session.video.path), load_take(session.take_path), session.labels
-    assert (video.width, video.height, video.fps) == (96, 128, 8.0)
+    assert (video.width, video.height, video.fps) == (128, 170, 20.0)
     assert take.markers is not None
     assert video.count == len(take) == labels.frames == len(session.performance.weights)
     assert abs(take.fps - video.fps) < 1e-6
@@ -64,7 +59,7 @@ def test_intensities_are_what_moves_the_face(session: RecordedSession) -> None:
     performance = session.performance
     for a, unit in enumerate(ACTION_UNITS):
         alone = [s for s in performance.performed if s.units == (unit,)]
-        assert len(alone) == 1
+        assert len(alone) == 2
         rows = slice(alone[0].first, alone[0].last)
         curve = performance.intensities[rows, a]
         assert 0.8 < curve.max() <= 1.0
