@@ -214,12 +214,7 @@ class Mesh:
 
 
 def fan_triangulation(polygons: Tensor) -> Tensor:
-    """Triangles (F,3) of polygons (P,K) padded with -1: corner 0 with each following edge, polygon by polygon.
-
-    Example:
-        >>> fan_triangulation(torch.tensor([[0, 1, 2, 3], [4, 5, 6, -1]])).tolist()
-        [[0, 1, 2], [0, 2, 3], [4, 5, 6]]
-    """
+    """Triangles (F,3) of polygons (P,K) padded with -1: corner 0 with each following edge, polygon by polygon."""
     if polygons.ndim != 2 or polygons.shape[1] < 3:
         raise ShapeError(f"polygons: found {tuple(polygons.shape)}, expected (P,K) with K at least 3")
     blocks = list(_fans(polygons))
@@ -257,12 +252,6 @@ def submesh(mesh: Mesh, keep: Tensor) -> Submesh:
 
     Args:
         keep: a boolean mask (V,) or vertex ids (K,) int64; order of the whole is kept.
-
-    Example:
-        >>> square = torch.tensor([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
-        >>> piece = submesh(Mesh(square, torch.tensor([[0, 1, 2], [0, 2, 3]])), torch.tensor([0, 2, 3]))
-        >>> piece.vertex_ids.tolist(), piece.mesh.faces.tolist()
-        ([0, 2, 3], [[0, 1, 2]])
     """
     count, device = len(mesh.vertices), mesh.vertices.device
     if keep.dtype == torch.bool:

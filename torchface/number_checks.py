@@ -38,13 +38,6 @@ def checked_number(
         name: of the argument, setting or field; begins the message.
         value: an ``int``, a ``float``, one of numpy's, or a tensor of one number.
         above: the range is open at ``least``.
-
-    Example:
-        >>> checked_number("ridge", 0.5)
-        0.5
-        >>> checked_number("ridge", float("nan"))
-        Traceback (most recent call last):
-        torchface.errors.ValueRangeError: ridge: found nan, expected a finite number of at least 0
     """
     number = _real(value)
     if not math.isfinite(number) or not least <= number <= most or (above and number == least):
@@ -58,11 +51,6 @@ def checked_count(
     """The whole number itself, where it is in its range.
 
     Args, Raises: as :func:`checked_number`; 3.0 is no whole number.
-
-    Example:
-        >>> checked_count("--port", 99999, 0, 65535)
-        Traceback (most recent call last):
-        torchface.errors.ValueRangeError: --port: found 99999, expected a whole number from 0 to 65535
     """
     fraction = isinstance(value, float) or (isinstance(value, torch.Tensor) and value.is_floating_point())
     if fraction or not least <= _real(value) <= most:
@@ -77,13 +65,6 @@ def as_tensor(name: str, value: object, expected: str, dtype: torch.dtype | None
         name: of the argument; begins the message.
         expected: the shape, such as ``(B,N)``.
         dtype: of what is converted; NumPy's own, and torch's default of lists, if absent.
-
-    Example:
-        >>> as_tensor("faces", np.array([[0, 1, 2]], dtype=np.int32), "(F,3)", torch.int64).dtype
-        torch.int64
-        >>> as_tensor("f", "0, 1", "(B,N)")
-        Traceback (most recent call last):
-        torchface.errors.ArgumentTypeError: f: found the text '0, 1', expected a tensor (B,N)
     """
     if isinstance(value, torch.Tensor):
         return value

@@ -311,14 +311,7 @@ def _cut_extras(extras: dict[str, Any], rows: slice | Tensor, count: int) -> dic
 
 
 def empty_frames(take: Take) -> Tensor:
-    """The frames in which no marker was seen, (K,) int64, rising.
-
-    Example:
-        >>> markers = torch.zeros(3, 1, 3)
-        >>> markers[1] = torch.nan
-        >>> empty_frames(Take(fps=60.0, markers=Track(("chin",), markers))).tolist()
-        [1]
-    """
+    """The frames in which no marker was seen, (K,) int64, rising."""
     if take.markers is None:
         raise ValueRangeError("take: found no markers, expected some")
     return take.markers.values.isnan().any(2).all(1).nonzero()[:, 0]

@@ -13,12 +13,7 @@ _NOTHING = 1e-6  # a side that a solve leaves so far up has come to rest
 
 
 def signed_quantities(names: Sequence[str]) -> Tensor:
-    """The matrix (K,N) of +1 and -1 that makes of weights (N,) the K quantities whose sides are two shapes each.
-
-    Example:
-        >>> signed_quantities(["jawLeft", "jawOpen", "jawRight"]).tolist()
-        [[1.0, 0.0, -1.0]]
-    """
+    """The matrix (K,N) of +1 and -1 that makes of weights (N,) the K quantities whose sides are two shapes each."""
     pairs = antagonists(names)
     sides = torch.nn.functional.one_hot(pairs, len(names)).double()
     return sides[:, 0] - sides[:, 1]

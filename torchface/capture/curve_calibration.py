@@ -46,15 +46,7 @@ class CurveCorrection:
 
 
 class CurveCalibration:
-    """Learns a correction while frames come: rest in the first ten seconds or when asked for, gains of guided poses.
-
-    Example:
-        >>> calibration = CurveCalibration()
-        >>> for _ in range(60):
-        ...     calibration.add(torch.full((52,), 0.25), pose=1, interval=1 / 60)
-        >>> calibration.correction.rest[ARKIT.index("jawOpen")].item()
-        0.25
-    """
+    """Learns a correction while frames come: rest in the first ten seconds or when asked for, gains of guided poses."""
 
     def __init__(self) -> None:
         self.correction = CurveCorrection(torch.zeros(len(ARKIT)), torch.ones(len(ARKIT)))

@@ -28,11 +28,6 @@ class CorrectiveActivation(nn.Module):
     Args:
         definitions: C correctives.
         names: of the N shapes.
-
-    Example:
-        >>> both = CorrectiveActivation([Corrective("ab", ("a", "b")), Corrective("a50", ("a",), 0.5)], ["a", "b"])
-        >>> both(torch.tensor([[0.5, 1.0], [0.75, 0.0]])).tolist()
-        [[0.5, 1.0], [0.0, 0.5]]
     """
 
     drivers: Tensor
@@ -157,12 +152,7 @@ class CorrectiveActivation(nn.Module):
         return [definition.record() for definition in self.definitions]
 
     def expressions(self) -> list[str]:
-        """The activations in words that Blender's drivers, Maya and Python know, of drivers' weights w0, w1 and so on.
-
-        Example:
-            >>> CorrectiveActivation([Corrective("ab", ("a", "b")), Corrective("a4", ("a",), 0.4)], "ab").expressions()
-            ['w0*w1', 'max(0,min(w0/0.4,(1-w0)/0.6))']
-        """
+        """The activations in words that Blender's drivers, Maya and Python know, of drivers' weights w0, w1 …"""
         formulas = [
             "*".join(f"w{place}" for place in range(len(definition.drivers))) for definition in self.definitions
         ]

@@ -106,14 +106,6 @@ def expression_score(found: Tensor, found_names: Sequence[str], true: Tensor, fp
             which the frame before stands.
         found_names: theirs, see :func:`torchface.shape_names.mapping`.
         true: of ARKit's shapes, (T,52).
-
-    Example:
-        >>> true = torch.zeros(90, 52)
-        >>> true[:, ARKIT.index("jawOpen")] = torch.linspace(0, 9, 90).sin().square()
-        >>> score = expression_score(0.5 * true, ARKIT, true, 30.0)
-        >>> jaw = ARKIT.index("jawOpen")
-        >>> round(score.correlation[jaw].item(), 3), round(score.slope[jaw].item(), 3)
-        (1.0, 0.5)
     """
     if found.ndim != 2 or true.shape != (len(found), len(ARKIT)) or len(found) < 3:
         raise ShapeError(

@@ -45,12 +45,6 @@ def skinned(vertices: Tensor, weights: Tensor, turns: Tensor, shifts: Tensor) ->
 
     Returns:
         (B,V,3).
-
-    Example:
-        >>> turned = torch.tensor([[[0.0, 0.0, torch.pi / 2]]])
-        >>> turns, shifts = joint_transforms(torch.zeros(1, 3), [-1], turned)
-        >>> [round(x, 3) + 0.0 for x in skinned(torch.eye(3)[:1], torch.ones(1, 1), turns, shifts)[0, 0].tolist()]
-        [0.0, 1.0, 0.0]
     """
     turn, shift = blended(weights, turns, shifts)
     return (turn @ vertices[..., None])[..., 0] + shift

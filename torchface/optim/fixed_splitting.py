@@ -148,10 +148,6 @@ def fixed_loop(step: Callable[..., tuple[Tensor, ...]], count: int, carried: tup
 
     Args:
         step: takes tensors and gives as many of the same shapes.
-
-    Example:
-        >>> fixed_loop(lambda x, y: (y, x + y), 5, (torch.tensor(0), torch.tensor(1)))
-        (tensor(5), tensor(8))
     """
     if count == 0 or not torch.compiler.is_exporting():
         for _ in range(count):  # each needs the one before

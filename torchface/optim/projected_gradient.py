@@ -206,10 +206,6 @@ def largest_eigenvalue(H: Tensor) -> Tensor:
 
     Args:
         H: (N,N) or (B,N,N), symmetric, positive semidefinite.
-
-    Example:
-        >>> round(largest_eigenvalue(torch.ones(3, 3)).item(), 3)
-        3.0
     """
     spread = metric(H)
     # Without a pattern that the eigenvector could be orthogonal to.

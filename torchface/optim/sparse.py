@@ -24,11 +24,6 @@ class SparseCholesky:
         matrix: :math:`A`, (n,n), any scipy sparse format, symmetric positive definite. Only its lower triangle is read.
 
     Source: QDLDL (Stellato, Banjac, Goulart, Bemporad, Boyd 2020), in the order of AMD (Amestoy, Davis, Duff 1996).
-
-    Example:
-        >>> solver = SparseCholesky(sparse.diags_array([4.0, 16.0]))
-        >>> solver.solve(np.array([4.0, 8.0])).tolist()
-        [1.0, 0.5]
     """
 
     def __init__(self, matrix: sparse.sparray | sparse.spmatrix) -> None:

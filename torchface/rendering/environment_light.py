@@ -25,11 +25,6 @@ class EnvironmentLight:
             (9,3); light of 1 from everywhere shows the albedo as it is.
 
     Source: Ramamoorthi and Hanrahan 2001, An Efficient Representation for Irradiance Environment Maps.
-
-    Example:
-        >>> even = EnvironmentLight.of(torch.ones(3, 32, 64))
-        >>> even.irradiance(torch.eye(3)).round(decimals=2).unique().tolist()
-        [1.0]
     """
 
     coefficients: Tensor

@@ -40,16 +40,6 @@ class TexturedSurface:
         vertices: (V,3), any unit.
         uvs: (V,2), origin at the lower left.
         material: which of the materials each triangle has, (F,) int64.
-
-    Example:
-        >>> from torchface.geometry.cameras.pinhole import look_at
-        >>> skin = Material(torch.tensor([0.8, 0.6, 0.5, 1.0]))
-        >>> triangle = torch.tensor([[-1.0, -1.0, 0.0], [1.0, -1.0, 0.0], [0.0, 1.0, 0.0]])
-        >>> faces, material = torch.tensor([[0, 1, 2]]), torch.zeros(1, dtype=torch.int64)
-        >>> surface = TexturedSurface(triangle, faces, torch.zeros(3, 2), material, (skin,))
-        >>> picture = surface.draw(look_at(torch.zeros(3), 0.0, span=3.0, width=8, height=8)).picture
-        >>> bool(picture[0, 4, 4] > picture[2, 4, 4])  # more red than blue
-        True
     """
 
     vertices: Tensor

@@ -26,10 +26,6 @@ def frame_grid(seconds: Tensor, fps: float) -> tuple[float, Tensor]:
 
     Returns:
         Places a second, a multiple of ``fps``, and the place of each frame, (T,) int64, rising from 0.
-
-    Example:
-        >>> frame_grid(torch.tensor([0.0, 0.1, 0.3, 0.4]), fps=10.0)
-        (10.0, tensor([0, 1, 3, 4]))
     """
     since = seconds.double() - seconds[0]
     check_gaps(since, fps)

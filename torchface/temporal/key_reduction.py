@@ -50,11 +50,6 @@ def kept_keys(times: Tensor, values: Tensor, bound: float) -> Tensor:
         (T,) bool; the first and the last sample are keys.
 
     Source: Gritzali and Papakonstantinou 1983; Imai and Iri 1988.
-
-    Example:
-        >>> bend = torch.tensor([0.0, 0.1, 0.2, 0.3, 0.2, 0.1])
-        >>> kept_keys(torch.arange(6), bend[:, None], 0.01).tolist()
-        [True, False, False, True, False, True]
     """
     bound = checked_number("bound of keys", bound, 0.0, above=True) * (1 - _ROUNDING)
     if values.ndim != 2 or times.shape != values.shape[:1]:

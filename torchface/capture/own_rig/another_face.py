@@ -63,13 +63,6 @@ def other_faces(looks: Tensor, relative: Tensor, trust: Tensor, boxes: Tensor) -
             :func:`~torchface.capture.own_rig.outlier_landmarks.landmark_residuals`.
         trust: of the landmarks, (T,68).
         boxes: x, y, width, height of the faces, (T,4) pixels.
-
-    Example:
-        >>> looks = torch.nn.functional.normalize(torch.randn(2, 50, generator=torch.Generator().manual_seed(0)), dim=1)
-        >>> film = looks.repeat_interleave(20, dim=0)
-        >>> spans = other_faces(film, torch.zeros(40, 68, 2), torch.ones(40, 68), torch.ones(40, 4))
-        >>> [(span.first, span.last) for span in spans]
-        [(20, 39)]
     """
     others: list[AnotherFace] = []
     known: list[_Span] = []

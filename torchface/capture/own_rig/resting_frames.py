@@ -21,10 +21,6 @@ def resting_share(activity: Tensor) -> Tensor:
 
     Args:
         activity: sums of weights; NaN for unknown, which counts as no rest.
-
-    Example:
-        >>> resting_share(torch.tensor([0.1] * 20 + [2.0] * 80)).round().sum().item()
-        20.0
     """
     known = torch.isfinite(activity)
     if not bool(known.any()):

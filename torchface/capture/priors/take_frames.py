@@ -23,9 +23,6 @@ class TakeFrames:
         takes: weights of each, (T,N); a list, or what reads them from a disk.
         shapes: N.
         group: columns that are wanted; all if absent.
-
-    Raises (where the takes are read):
-        ShapeError: no takes, or of another number of shapes.
     """
 
     takes: Sequence[Tensor]

@@ -20,12 +20,6 @@ class CutMesh:
         shares: what each vertex is of those there were, (W,V), sparse; the first V are themselves.
         faces: (G,3).
         source: the triangle that each is a part of, (G,).
-
-    Example:
-        >>> square = CutMesh.of(4, torch.tensor([[0, 1, 2], [0, 2, 3]]))
-        >>> cut = square.split(torch.tensor([[0, 2]]), torch.tensor([0.25]))
-        >>> cut.at(torch.tensor([[0.0], [1.0], [2.0], [1.0]]).double())[4].item(), len(cut.faces)
-        (0.5, 4)
     """
 
     shares: sparse.csr_array

@@ -164,11 +164,7 @@ def _moved(
 
 
 def image_bytes(document: Document, index: object) -> tuple[memoryview, int] | None:
-    """The encoded image of a texture, a WebP of an extension too, and its number; none where only another one has it.
-
-    Raises:
-        FileFormatError: there is no such texture, or its image is not there.
-    """
+    """The encoded image of a texture, a WebP of an extension too, and its number; None where another one has it."""
     location = f"textures[{index}]"
     texture = document.item("textures", index, location)
     webp = document.record(texture.get("extensions"), location).get("EXT_texture_webp")

@@ -32,25 +32,14 @@ class PacketCounts:
     fault: str = ""
 
     def words(self) -> str:
-        """What went wrong, for people; empty if nothing did.
-
-        Example:
-            >>> PacketCounts(taken=90, lost=2, late=1).words()
-            '2 lost, 1 late'
-        """
+        """What went wrong, for people; empty if nothing did."""
         names = {"lost": "lost", "late": "late", "others": "of another sender", "jumps": "jumps of its clock"}
         found = [f"{getattr(self, name)} {words}" for name, words in names.items() if getattr(self, name)]
         return ", ".join([*found, *([f"{self.malformed} not understood ({self.fault})"] if self.malformed else [])])
 
 
 class FrameOrder:
-    """Says of each frame whether it is the next one to show.
-
-    Example:
-        >>> order = FrameOrder()
-        >>> [order.takes("phone", number, now=0.0) for number in (1, 2, 5, 3)], order.counts.lost
-        ([True, True, True, False], 2)
-    """
+    """Says of each frame whether it is the next one to show."""
 
     def __init__(self) -> None:
         self.counts = PacketCounts()

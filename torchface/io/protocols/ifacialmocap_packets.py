@@ -40,11 +40,6 @@ class IFacialMocapPackets:
         names: of the weights that come, (N,); any rig's names that ARKit's can be had from.
 
     Source: iFacialMocap, communication specifications, ifacialmocap.com/for-developer.
-
-    Example:
-        >>> (packet,) = IFacialMocapPackets(["jawOpen"])(torch.tensor([0.5]), None)
-        >>> b"jawOpen-50|" in packet, packet[-42:]
-        (True, b'|rightEye#0.0,0.0,0.0|leftEye#0.0,0.0,0.0|')
     """
 
     def __init__(self, names: Sequence[str]) -> None:

@@ -56,11 +56,6 @@ class LiveLinkPackets:
     Args:
         names: of the weights that come, (N,); any rig's names that ARKit's can be had from.
         subject: the name under which the receiver lists the face.
-
-    Example:
-        >>> (packet,) = LiveLinkPackets(["jawOpen"], fps=60.0)(torch.tensor([0.5]), None)
-        >>> len(packet), packet[45:54]
-        (315, b'torchface')
     """
 
     def __init__(self, names: Sequence[str], fps: float, subject: str = "torchface") -> None:
@@ -78,13 +73,7 @@ class LiveLinkPackets:
 
 
 def read_live_link(packet: bytes) -> list[ReceivedFace]:
-    """The face of a packet of the app; one without values is of a face that the app does not see.
-
-    Example:
-        >>> (face,) = read_live_link(LiveLinkPackets(["jawOpen"], fps=60.0)(torch.tensor([0.5]), None)[0])
-        >>> face.weights[ARKIT.index("jawOpen")].item(), face.number, face.subject
-        (0.5, 0, 'torchface')
-    """
+    """The face of a packet of the app; one without values is of a face that the app does not see."""
     if packet[:1] != bytes([_VERSION]):
         found = f"version {packet[0]}" if packet else "no byte"
         raise FileFormatError(f"packet: found {found}, expected Live Link Face's version {_VERSION}")

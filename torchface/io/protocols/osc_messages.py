@@ -21,12 +21,7 @@ _WITHOUT_BYTES = {"T": True, "F": False, "N": None, "I": None}
 
 
 def osc_message(address: str, *values: Value) -> bytes:
-    """A message; floats have 32 bits.
-
-    Example:
-        >>> osc_message("/a", 1, "b")
-        b'/a\\x00\\x00,is\\x00\\x00\\x00\\x00\\x01b\\x00\\x00\\x00'
-    """
+    """A message; floats have 32 bits."""
     kinds, data = ",", b""
     for value in values:
         if isinstance(value, bool):
@@ -51,12 +46,7 @@ def osc_bundles(messages: Iterable[bytes], largest: int = LARGEST) -> list[bytes
 
 
 def read_osc(packet: bytes) -> list[Message]:
-    """The messages of a packet, those of bundles in their order.
-
-    Example:
-        >>> read_osc(osc_bundles([osc_message("/a", 1.5), osc_message("/b", True)])[0])
-        [('/a', (1.5,)), ('/b', (True,))]
-    """
+    """The messages of a packet, those of bundles in their order."""
     messages = []
     try:
         for message in _messages(packet, 0):

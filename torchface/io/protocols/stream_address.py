@@ -80,12 +80,6 @@ def parse_address(address: str) -> StreamAddress:
     Options stand behind ``?``, divided by ``&``: ``rate`` (frames a second at most), ``map`` (a mapping table),
     ``names`` (for ``vmc`` and ``vrchat``, several divided by ``+``), ``subject`` (Live Link Face), ``token`` (a file,
     VTube Studio).
-
-    Example:
-        >>> parse_address("udp://127.0.0.1:11111")
-        StreamAddress(scheme='udp', host='127.0.0.1', port=11111, path='', options={})
-        >>> parse_address("vmc://localhost?rate=30&names=vrm0").namings()
-        ('vrm0',)
     """
     parts = _parts(address, SENT, _EXPECTED, 1)
     if not parts.host or (parts.path and parts.scheme != "osc"):
@@ -115,10 +109,6 @@ def parse_source(address: str) -> StreamAddress:
     """The parts of an address that is received at; without a host all of this machine's addresses are listened at.
 
     Port 0 is any that is free.
-
-    Example:
-        >>> parse_source("livelink://:11111").port, parse_source("vmc://[::1]").host
-        (11111, '::1')
     """
     parts = _parts(address, RECEIVED, _EXPECTED_SOURCE, 0)
     if parts.options or (parts.path and parts.scheme != "osc"):

@@ -34,11 +34,6 @@ class WeightReceiver:
     Args:
         address: ``livelink://:11111``, ``ifacialmocap://PHONE`` (which is asked to send), ``vmc://:39539``,
             ``osc://:9000/PREFIX``. A host is one of this machine's addresses, for ``ifacialmocap`` the phone's.
-
-    Example:
-        >>> with WeightReceiver("livelink://127.0.0.1:0") as receiver:
-        ...     receiver.faces(seconds=0.0)
-        []
     """
 
     def __init__(self, address: str) -> None:

@@ -61,9 +61,6 @@ def read_usd_points(path: str | Path, count: int) -> tuple[Tensor, Tensor] | Non
 
     Returns:
         The points, and the times (T,), seconds; none where no points move.
-
-    Raises:
-        FileFormatError: points move, but no prim has so many.
     """
     scene = read_stage(path, "--points", str(count))
     if not scene.record["meshes"]:

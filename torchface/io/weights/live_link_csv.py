@@ -35,12 +35,7 @@ def are_live_link_shapes(names: Sequence[str]) -> bool:
 
 
 def not_in_live_link(names: Sequence[str]) -> tuple[str, ...]:
-    """The names of shapes that Live Link Face's file would not give back: halves that it merges, and those it lacks.
-
-    Example:
-        >>> not_in_live_link(["jawOpen", "eyeBlink_L", "browInnerUp_L", "cheekRaiser_L"])
-        ('browInnerUp_L', 'cheekRaiser_L')
-    """
+    """The names of shapes that Live Link Face's file would not give back: halves that it merges, and those it lacks."""
     matrix = mapping(names, ARKIT)
     return tuple(name for name, comes_back in zip(names, (matrix == 1).any(0).tolist(), strict=True) if not comes_back)
 

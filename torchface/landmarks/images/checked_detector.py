@@ -38,13 +38,6 @@ class CheckedDetector:
 
     Args:
         network: says whether they are faces; or a finder that runs its graph.
-
-    Example:
-        >>> from torchface import zoo
-        >>> proposed = NetworkDetector(zoo.get_model("face_boxes"), 0.2)
-        >>> detector = CheckedDetector(proposed, zoo.get_model("landmark_network"))
-        >>> len(detector(torch.full((3, 120, 160), 128, dtype=torch.uint8)))
-        0
     """
 
     def __init__(self, detector: FaceDetector, network: LandmarkNetwork | CropFinder) -> None:

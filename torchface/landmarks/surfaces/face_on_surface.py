@@ -89,12 +89,7 @@ class FaceOnSurface:
 
 
 class NoFaceOnSurfaceError(AlignmentError):
-    """A surface shows no face; ``views`` are pictures of what was seen.
-
-    Example:
-        >>> NoFaceOnSurfaceError("ball.glb: found no face", ()).views
-        ()
-    """
+    """A surface shows no face; ``views`` are pictures of what was seen."""
 
     def __init__(self, message: str, views: Sequence[Tensor]) -> None:
         super().__init__(message)

@@ -252,12 +252,6 @@ def joined_vertices(vertices: Tensor, faces: Tensor) -> JoinedMesh:
 
     Args:
         vertices: (V,3), millimetres.
-
-    Example:
-        >>> square = torch.tensor([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
-        >>> joined = joined_vertices(square.double(), torch.tensor([[0, 1, 2], [3, 4, 5]]))
-        >>> len(joined.vertices), joined.part.unique().tolist()
-        (4, [0])
     """
     normals, seam = vertex_normals(vertices, faces), border_vertices(faces, len(vertices)).nonzero()[:, 0]
     near = cKDTree(vertices[seam].numpy()).query_pairs(_SAME_PLACE, output_type="ndarray")

@@ -23,14 +23,7 @@ _INK, _GREY = "black", "grey"
 
 
 class LineChart:
-    """A white picture that panels of lines and texts are drawn into.
-
-    Example:
-        >>> chart = LineChart(200, 100)
-        >>> chart.panel((40, 10, 190, 70), (0.0, 5.0), (0.0, 1.0)).line(torch.arange(6), torch.rand(6), "#1f5fa8")
-        >>> chart.picture().shape
-        torch.Size([3, 100, 200])
-    """
+    """A white picture that panels of lines and texts are drawn into."""
 
     def __init__(self, width: int, height: int) -> None:
         self.pixels: Array = np.full((height, width, 3), 255, np.uint8)

@@ -122,9 +122,6 @@ _OUTPUTS = (
 def page_graph(data: bytes, path: str | Path) -> bytes:
     """The webcam's graph in ONNX Runtime's own format, with its operators joined and its constants computed: the page
     begins with it in a third of the time that the ONNX file takes.
-
-    Raises:
-        FileFormatError: inputs, outputs or names of shapes are others.
     """
     wanted = f"expected the graph of torchface export webcam ({', '.join(_INPUTS)} to {', '.join(_OUTPUTS)})"
     options = onnxruntime.SessionOptions()

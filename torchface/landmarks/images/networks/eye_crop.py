@@ -39,15 +39,6 @@ def eye_transforms(landmarks: Tensor, width: int = CROP_WIDTH, height: int = CRO
 
     Returns:
         (...,2,2,3), the person's right eye first; pixel centres at integers in both. NaN where landmarks are.
-
-    Example:
-        >>> from torchface.synthetic import performer
-        >>> rig = performer(texture=False)
-        >>> pixels = rig.vertices[rig.neutral.landmarks][:, :2] * torch.tensor([1.0, -1.0])
-        >>> right = eye_transforms(pixels)[0]
-        >>> inside = pixels[36:42].to(right) @ right[:, :2].T + right[:, 2]
-        >>> bool((inside > 0).all() and (inside < torch.tensor([48.0, 32.0])).all())
-        True
     """
     if landmarks.shape[-2:] != (68, 2):
         raise ShapeError(f"landmarks: found {tuple(landmarks.shape)}, expected (...,68,2)")
