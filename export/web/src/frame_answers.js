@@ -38,7 +38,12 @@ export function answerFrames(ort, engine) {
     ort.env.wasm.wasmPaths = { mjs, wasm };
     ort.env.wasm.numThreads = threads;
     ort.env.logLevel = "error";
-    const options = { executionProviders: [engine], graphOptimizationLevel: "all", logSeverityLevel: 3 }; // errors alone
+    const options = {
+      executionProviders: [engine],
+      graphOptimizationLevel: "disabled", // what is loaded is optimised
+      executionMode: "parallel", // else the making of the session looks for memory to be used again, in a time that grows with the square
+      logSeverityLevel: 3, // errors alone
+    };
     let parts = 0;
     const done = (value) => (self.postMessage({ loaded: ++parts }), value);
     const [content] = await Promise.all([fetched(graph).then(done), ort.InferenceSession.create(IDENTITY, options).then(done)]);

@@ -3,8 +3,8 @@
 import * as THREE from "three";
 
 import { DrawingPace, drawn, pause } from "./drawing_pace.js";
+import { lighten } from "./lighter_drawing.js";
 import { ProcessorMorphing } from "./processor_morphing.js";
-import { shrinkTextures } from "./smaller_textures.js";
 
 const FIELD = 24; // degrees; a portrait lens
 const MOST_PIXELS = 2; // for one of the page's: more is work that nobody sees
@@ -44,7 +44,7 @@ export class Stage {
     this.#character?.dispose();
     this.#character = character;
     this.#morphing = this.#software ? new ProcessorMorphing(character.root) : null;
-    if (this.#software && this.#film === null) shrinkTextures(character.root);
+    if (this.#software && this.#film === null) lighten(character.root);
     this.#scene.add(character.root);
     this.#fit();
   }

@@ -6,13 +6,11 @@ import gzip
 import json
 from dataclasses import dataclass
 from pathlib import Path
-from tempfile import TemporaryDirectory
-
-import onnxruntime
 
 from torchface.errors import FileFormatError
 from torchface.files.job_lock import job_lock
 from torchface.files.whole_files import all_or_none, check_writable, delete_file, make_folder, read_file, write_file
+from torchface.onnx.runtime_format import in_runtime_format
 from torchface.progress import Progress, silent
 from torchface.shape_names import ARKIT
 from torchface.workflows.browser_app.built_page import built_page
@@ -124,18 +122,10 @@ def page_graph(data: bytes, path: str | Path) -> bytes:
     begins with it in a third of the time that the ONNX file takes.
     """
     wanted = f"expected the graph of torchface export webcam ({', '.join(_INPUTS)} to {', '.join(_OUTPUTS)})"
-    options = onnxruntime.SessionOptions()
-    options.log_severity_level, options.intra_op_num_threads = 3, 1  # errors alone
-    # What goes further is for this machine's processor alone.
-    options.graph_optimization_level = onnxruntime.GraphOptimizationLevel.ORT_ENABLE_EXTENDED
-    options.add_session_config_entry("session.save_model_format", "ORT")
-    with TemporaryDirectory() as folder:
-        options.optimized_model_filepath = str(Path(folder) / GRAPH)
-        try:
-            session = onnxruntime.InferenceSession(data, options, providers=["CPUExecutionProvider"])
-        except Exception as error:  # ONNX Runtime has no common class for what it raises
-            raise FileFormatError(f"{path}: not an ONNX file that runs ({str(error)[:160]}), {wanted}") from error
-        saved = read_file(Path(folder) / GRAPH)
+    try:
+        saved, session = in_runtime_format(data)
+    except Exception as error:  # ONNX Runtime has no common class for what it raises
+        raise FileFormatError(f"{path}: not an ONNX file that runs ({str(error)[:160]}), {wanted}") from error
     inputs = {value.name: value.type for value in session.get_inputs()}
     missing = sorted(set(_OUTPUTS) - {value.name for value in session.get_outputs()})
     if inputs != _INPUTS or missing:

@@ -44,7 +44,7 @@ from torchface.workflows.live.received_source import ReceivedSolver, ReceivedSou
 from torchface.workflows.live.recordings import Recordings, SavedTake
 from torchface.workflows.live.session_prompts import FaceWatch, Watch
 from torchface.workflows.live.weight_streams import WeightStreams
-from torchface.workflows.webcam.webcam_graph import webcam_graph
+from torchface.workflows.webcam.webcam_graph import prepared_webcam_graph
 
 _USUAL = 1 / 30  # seconds
 
@@ -75,7 +75,7 @@ class PersonSolver:
 
 def person_solver(progress: Progress) -> PersonSolver:
     """A solver for whoever sits before a camera; the first time it is made, which takes a minute."""
-    return PersonSolver(WebcamSession(webcam_graph(progress)))
+    return PersonSolver(WebcamSession(prepared_webcam_graph(progress)))
 
 
 RECORDINGS = Path("recordings")

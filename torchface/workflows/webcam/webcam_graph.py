@@ -8,6 +8,7 @@ from contextlib import contextmanager
 from dataclasses import replace
 
 import onnx
+import onnxruntime
 
 from torchface import zoo
 from torchface.capture.anybody import WebcamSettings, WebcamSolver
@@ -16,6 +17,7 @@ from torchface.landmarks import BoxNetwork, LandmarkNetwork
 from torchface.landmarks.images.frame_reader.face_reader import FaceReader, WebcamNetworks
 from torchface.landmarks.images.networks.eye_network import EyeNetwork
 from torchface.modeling import HeadModel
+from torchface.onnx.runtime_format import in_runtime_format
 from torchface.onnx.webcam.webcam_model import (
     WebcamGraph,
     WebcamSolverGraph,
@@ -26,7 +28,7 @@ from torchface.onnx.webcam.webcam_model import (
 )
 from torchface.progress import Progress, silent
 from torchface.synthetic.head.performer import performer
-from torchface.workflows.cached_graph import cached_graph
+from torchface.workflows.cached_graph import cached_file, cached_graph
 from torchface.workflows.named_priors import DEFAULT_PRIOR, load_priors
 
 __all__ = ["default_webcam_solver"]
@@ -87,6 +89,16 @@ def webcam_graph(progress: Progress | None = None) -> bytes:
         return webcam_model(reading, solved, {"licence": "MIT", "licences": licences})
 
     return cached_graph("webcam", make, _CODE, models=models)
+
+
+def prepared_webcam_graph(progress: Progress | None = None) -> bytes:
+    """The graph as :class:`~torchface.onnx.webcam.webcam_session.WebcamSession` begins with it soonest; see
+    :func:`webcam_graph`."""
+    models = {name: zoo.find(name) for name in MODELS}
+    made_by = {"models": models, "runtime": onnxruntime.__version__}
+    return cached_file(
+        "webcam_prepared", ".ort", lambda: in_runtime_format(webcam_graph(progress))[0], _CODE, **made_by
+    )
 
 
 @contextmanager

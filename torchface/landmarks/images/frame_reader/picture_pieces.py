@@ -41,11 +41,12 @@ def sampled(image: Tensor, points: Tensor, spacing: Tensor, beyond: Tensor) -> T
     for start, length, axis in ((top, rows * by, 0), (left, columns * by, 1)):
         torch._check(start + length >= 0)
         torch._check(start + length <= image.shape[axis])
-    piece = image.narrow(0, top, rows * by).narrow(1, left, columns * by)[..., :3]
-    planes = piece.permute(2, 0, 1).float()
+    piece = image.narrow(0, top, rows * by).narrow(1, left, columns * by)
+    planes = piece.permute(2, 0, 1)[:3].float()  # to cut the last axis takes long
     # Rows first: most pixels are gone when the columns' turn comes.
     planes = planes.reshape(3, rows, by, columns * by).mean(2).reshape(3, rows, columns, by).mean(3)
-    places = (points - low + 0.5) * 2 / (count * step) - 1
+    scale = 2 / (count * step)
+    places = torch.addmm((0.5 - low) * scale - 1, points, scale.diag())  # one product in place of five steps
     found = grid_sample(planes[None], places[None, None], padding_mode="border", align_corners=False)
     return found[0, :, 0] / 255
 
@@ -73,7 +74,7 @@ def cut_square(image: Tensor, place: Tensor, size: int, margin: float) -> Tensor
         (1,3,S,S) in [0,1].
     """
     spacing = place[2] * (margin / size)
-    points = crop_grid(size, size) * spacing @ axes(place) + place[:2]
+    points = torch.addmm(place[:2], crop_grid(size, size), spacing * axes(place))
     beyond = spacing * place[3:].abs().sum() / 2 + AROUND
     return sampled(image, points, spacing, beyond).view(1, 3, size, size)
 
@@ -103,7 +104,7 @@ def whole_picture(image: Tensor, longest: int) -> tuple[Tensor, Tensor]:
     """
     size = picture_size(image)
     target = (size * (longest / size.amax(0)).clamp(max=1)).round().clamp(min=1)
-    planes = image[..., :3].permute(2, 0, 1)[None]
+    planes = image.permute(2, 0, 1)[None, :3]
     for wanted in (size.minimum(2 * target), target):
         width, height = whole_numbers(wanted)
         planes = interpolate(planes, size=(height, width), mode="bilinear")
