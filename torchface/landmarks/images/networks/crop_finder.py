@@ -87,11 +87,12 @@ class CropFinder:
                 f"{self.name}: found {shapes}, expected landmarks (1,{COUNT},2), deviation (1,{COUNT}), visibility "
                 f"(1,{COUNT}) and presence (1,)"
             )
-        one = NetworkLandmarks(*(value[0].detach().float().cpu() for value in found))
+        one = NetworkLandmarks(*(value[0].float().cpu() for value in found))
         scale = box_side(box) * (self.margin / self.size)  # pixels of the image a pixel of the crop
+        places = from_crop(torch.cat([one.landmarks, one.points]), transform)
         return FaceReading(
-            from_crop(one.landmarks, transform), scale * one.deviation, one.visibility, one.presence,
-            points=from_crop(one.points, transform), point_deviation=scale * one.point_deviation,
+            places[:COUNT], scale * one.deviation, one.visibility, one.presence,
+            points=places[COUNT:], point_deviation=scale * one.point_deviation,
             expression=one.expression, expression_deviation=one.expression_deviation,
             search_box=box.to(one.landmarks),
         )  # fmt: skip

@@ -76,6 +76,8 @@ class LandmarkTracker:
     def reset(self) -> None:
         """Forgets the face, as before the first frame."""
         self._followed = FollowedFace()
+        self._moved = torch.zeros(0), torch.zeros(0)
+        """Landmarks of the latest frame's face, and its place."""
 
     @property
     def memory(self) -> Tensor:
@@ -119,10 +121,11 @@ class LandmarkTracker:
             return FaceReading.lost()
         followed.missed = 0
         refined = refined_face(face, frame, self.appearance)
-        followed.place = face_place(refined.landmarks)
+        known = refined.landmarks is self._moved[0]
+        place = followed.place = self._moved[1] if known else face_place(refined.landmarks)
         if face is not before:
             followed.set_anchor(face.search_box)
-        followed.learn_look(frame, followed.place, _LEAST_LIKENESS)
+        followed.learn_look(frame, place, _LEAST_LIKENESS)
         return refined
 
     def _likeness(self, frame: Tensor, face: FaceReading) -> float:
@@ -169,11 +172,12 @@ class LandmarkTracker:
         if not self._plausible(box, frame):
             return None
         face = find_in_box(self.finder, frame, box, float(tilt))
-        moved, tilt = turned_box(face.landmarks)
+        place = face_place(face.landmarks)
+        moved, self._moved = place[:4], (face.landmarks, place)
         if not self._plausible(moved, frame) or not 0.6 < float(moved[2] / before[2]) < 1.6:
             return None
         if float(overlaps(before[None], moved[None])) < _UNMOVED:  # it moved far: once more from where it is now
-            face = find_in_box(self.finder, frame, followed.anchored_box(moved, tilt), float(tilt))
+            face = find_in_box(self.finder, frame, followed.anchored_box(moved, place[4]), float(place[4]))
         sure = float(face.presence) >= _SURE_PRESENCE
         if sure and followed.frames % _CHECK_EVERY:
             return face
