@@ -22,6 +22,7 @@ _BEHIND, _NAPE = (0.52, 0.64), -0.75
 _EDGE, _FRINGE = 0.08, 0.07
 _ABOVE_BROWS, _SQUARE, _HAIR = 0.06, 0.3, 0.5
 _LEAST, _SHARE = 20, 0.3
+_DARKEST, _BLACK = 0.005, 0.07  # the share of a head's pixels that is black, and its usual value in photographs
 _BEYOND = 0.08  # share of hair in a picture above the brows
 _COLUMNS, _COLUMN, _FEW = 17, 0.05, 6  # across the forehead, half the width of each, vertices
 _STRANDS, _STRAND = 150.0, 0.10
@@ -118,6 +119,28 @@ def hair_beyond(
     if not colors:
         return None
     return HairCap(torch.cat(colors, 1).median(1).values, _usual_line()[1], places)
+
+
+def without_veil(color: Tensor, skin: Tensor, images: Sequence[Tensor], heads: Sequence[Tensor]) -> Tensor:
+    """Hair's colour (3,), as dark beside skin's (3,) as in pictures that have black; films of webcams are washed out.
+
+    Args:
+        images: photographs, (3,H,W) each.
+        heads: vertices of the head in each, (V,2) pixels.
+    """
+    darkest = []
+    for image, head in zip(images, heads, strict=True):
+        size = torch.tensor(image.shape[:0:-1], dtype=head.dtype)
+        (left, top), (right, bottom) = (head.amin(0).floor().clamp(min=0).minimum(size - 3).long().tolist(),
+            head.amax(0).ceil().minimum(size).clamp(min=3).long().tolist())  # fmt: skip
+        shown = image[:3, top : max(bottom, top + 3), left : max(right, left + 3)]
+        smooth = torch.nn.functional.avg_pool2d(shown[None], 3, 1).mean(1).flatten()
+        darkest.append(smooth.kthvalue(1 + int(_DARKEST * (len(smooth) - 1))).values)
+    bright, dark = float(skin.mean()), float(color.mean())
+    veil = min(float(torch.stack(darkest).mean()) - _BLACK, 0.7 * dark)
+    if veil <= 0 or dark >= bright:
+        return color
+    return color * max(0.2, (bright - (bright - dark) * bright / (bright - veil)) / dark)
 
 
 def _usual_line() -> tuple[Tensor, Tensor]:

@@ -16,7 +16,7 @@ from torchface.mesh import Mesh
 from torchface.modeling.morphable.morphable_model import MorphableModel
 from torchface.modeling.photographs.eye_color import IRIS_WIDTH, iris_color
 from torchface.modeling.photographs.fit_settings import FitSettings
-from torchface.modeling.photographs.hair_cap import HairCap, hair_beyond, hair_cap
+from torchface.modeling.photographs.hair_cap import HairCap, hair_beyond, hair_cap, without_veil
 from torchface.modeling.photographs.landmark_view import LANDMARKS
 from torchface.modeling.photographs.skin_light import skin_light, unlit
 from torchface.modeling.photographs.skin_mask import FacePlaces, ShownParts
@@ -122,6 +122,10 @@ def photographed_skin(
                     for surface, camera in zip(surfaces, cameras, strict=True)
                 ]
                 cap = hair_beyond(images, parts, marks, places[0])
+            bare = torch.cat([at.colors[one.bare > _BARE] for at, one in zip(shown, known, strict=True)])
+            if cap is not None and len(bare):
+                heads = [camera.project(one.vertices) for one, camera in zip(surfaces, cameras, strict=True)]
+                cap = replace(cap, color=without_veil(cap.color, bare.median(0).values, images, heads))
     own = base is None and bool(others.any()) and not bool(others.all())
     if own:
         confidence = torch.where(others, 0.0, torch.ones(count, len(others)) if confidence is None else confidence)
