@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from functools import cache
+
 import torch
 from torch import Tensor
 
 from torchface.rig import BlendshapeRig
 from torchface.shape_names import ARKIT
-from torchface.synthetic.head.identity import anatomy, mirrored
+from torchface.synthetic.head.identity import Anatomy, anatomy, mirrored
 from torchface.synthetic.head.lower_face_shapes import lower_face
 from torchface.synthetic.head.neutral_head import dress
 from torchface.synthetic.head.upper_face_shapes import upper_face
@@ -40,9 +42,19 @@ def performer(identity: Tensor | None = None, texture: bool = True) -> Blendshap
         True
     """
     person = anatomy(identity)
+    deltas = _mean_deltas().clone() if identity is None else _deltas(person)
+    return BlendshapeRig(dress(person, texture), deltas, SHAPES)
+
+
+@cache
+def _mean_deltas() -> Tensor:
+    """Those of the mean performer, who is asked for most."""
+    return _deltas(anatomy())
+
+
+def _deltas(person: Anatomy) -> Tensor:
     made = upper_face(person) | lower_face(person)
     for name in list(made):
         if name.endswith("Left"):
             made[name.removesuffix("Left") + "Right"] = mirrored(made[name])
-    deltas = torch.stack([made[name] for name in SHAPES])
-    return BlendshapeRig(dress(person, texture), deltas.float(), SHAPES)
+    return torch.stack([made[name] for name in SHAPES]).float()
