@@ -43,11 +43,17 @@ def float_format(request: pytest.FixtureRequest) -> Iterator[torch.dtype]:
     torch.set_default_dtype(usual)
 
 
-LONG = "torchface.onnx.module_graph"  # as tests/onnx/test_module_graph.py
+# One to four seconds each; tests of their own do as much.
+LONG = (
+    "torchface.capture.action_units.classifier",
+    "torchface.modeling.rigging.other_topology",
+    "torchface.onnx.module_graph",
+    "torchface.synthetic.stages.wrinkles.wrinkled_performer",
+)
 
 
 @pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=pytest.mark.bench) if name == LONG else name for name in MODULES]
+    "name", [pytest.param(name, marks=pytest.mark.bench) if name in LONG else name for name in MODULES]
 )
 def test_examples_give_what_they_say(
     name: str, float_format: torch.dtype, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
