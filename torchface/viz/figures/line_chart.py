@@ -29,14 +29,10 @@ class LineChart:
         self.pixels: Array = np.full((height, width, 3), 255, np.uint8)
         self._texts: list[tuple[tuple[float, float], str, str, int, bool]] = []
 
-    def panel(
-        self, box: tuple[int, int, int, int], x: tuple[float, float], y: tuple[float, float], frame: bool = True
-    ) -> Panel:
+    def panel(self, box: tuple[int, int, int, int], x: tuple[float, float], y: tuple[float, float]) -> Panel:
         """A panel whose first and last columns and rows are in ``box``, for numbers from the first to the second."""
-        panel = Panel(self, *box, x, y)
-        if frame:
-            cv2.rectangle(self.pixels, box[:2], box[2:], ImageColor.getrgb(_INK))
-        return panel
+        cv2.rectangle(self.pixels, box[:2], box[2:], ImageColor.getrgb(_INK))
+        return Panel(self, *box, x, y)
 
     def text(self, place: tuple[float, float], text: str, anchor: str = "mm", size: int = 13, up: bool = False) -> None:
         """A text at a place, by Pillow's anchor; ``up`` reads from below and is centred."""
