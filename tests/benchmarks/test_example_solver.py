@@ -21,8 +21,9 @@ import onnxruntime
 import pytest
 import torch
 from scipy.optimize import lsq_linear
-from test_video_solver import Faces, faces, head, wander
+from test_video_solver import faces
 from torch import Tensor
+from video_solver_cases import Faces, head, wander
 
 from torchface.capture import ExampleSolver
 from torchface.capture.anybody import (

@@ -21,8 +21,8 @@ from torchface.errors import ValueRangeError
 from torchface.onnx.exported_model import exported_model
 from torchface.optim.fixed_splitting import FixedSplitting, newton_inverse
 
-STEPS = 96
-"""Of splitting; every frame has a matrix of its own."""
+STEPS, REGIONAL_STEPS = 96, 168
+"""Of splitting; every frame has a matrix of its own, and a region's few landmarks make a worse one."""
 
 _RHO, _DOUBLINGS = 1e-7, 28  # of the inverse for a landmark model's coefficients, of a matrix with a unit diagonal
 
@@ -47,10 +47,11 @@ class ExampleGraph(nn.Module):
     rows: Tensor
     own: Tensor
 
-    def __init__(self, solver: ExampleSolver, steps: int = STEPS) -> None:
+    def __init__(self, solver: ExampleSolver, steps: int | None = None) -> None:
         super().__init__()
         method = solver.method
         _check(solver)
+        steps = steps_of(solver) if steps is None else steps
         self.placement, self.program = solver.placement, FixedSplitting(steps=steps)
         self.register_buffer("neutral", solver.neutral.detach().double().cpu())
         self.register_buffer("basis", solver.basis.detach().double().cpu())
@@ -152,8 +153,12 @@ def _check(solver: ExampleSolver) -> None:
         )
 
 
+def steps_of(solver: ExampleSolver) -> int:
+    return REGIONAL_STEPS if isinstance(solver.method, Regional) else STEPS
+
+
 def example_model(
-    solver: ExampleSolver, steps: int = STEPS, facts: Mapping[str, object] | None = None
+    solver: ExampleSolver, steps: int | None = None, facts: Mapping[str, object] | None = None
 ) -> onnx.ModelProto:
     """The solver as ONNX: ``landmarks`` (B,68,2) and ``previous`` (B,N) to ``weights`` and ``carried`` (B,N)."""
     metadata = {
@@ -163,7 +168,7 @@ def example_model(
         "version": __version__,
         "method": type(solver.method).__name__,
         "placement": type(solver.placement).__name__,
-        "steps": steps,
+        "steps": steps_of(solver) if steps is None else steps,
         **(facts or {}),
     }
     inputs = {

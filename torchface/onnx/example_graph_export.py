@@ -17,7 +17,7 @@ from torchface.capture.anybody import ExampleSolver
 from torchface.errors import ValueRangeError
 from torchface.files.whole_files import write_file
 from torchface.onnx.checked_export import WrittenGraph, one_thread_session
-from torchface.onnx.example_graph import STEPS, example_model
+from torchface.onnx.example_graph import example_model
 
 _FRAMES, _FRAMES_A_POSE = 200, 10
 _NOISE = 0.005  # of the eyes' distance
@@ -74,7 +74,7 @@ class ExampleReport(WrittenGraph):
 def export_example_solver(
     solver: ExampleSolver,
     path: str | Path,
-    steps: int = STEPS,
+    steps: int | None = None,
     landmarks: Tensor | None = None,
     facts: Mapping[str, object] | None = None,
 ) -> ExampleReport:
@@ -87,7 +87,7 @@ def export_example_solver(
         solver: of squared distances, or of a landmark model; with landmark boxes, or all at once with the similarity
             solved for.
         path: the file to write; it appears only when it is complete and checked.
-        steps: of splitting.
+        steps: of splitting; 168 of a regional solver and 96 of others if absent.
         landmarks: frames to check with, (T,68,2), none missing; random sparse weights with noise if absent.
         facts: further metadata.
 
