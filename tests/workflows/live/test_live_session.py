@@ -30,6 +30,7 @@ from torchface.workflows.live import recordings as recordings_module
 from torchface.workflows.live.kept_takes import film_of, kept_takes, remove_take, take_file
 from torchface.workflows.live.live_anybody import LiveSettings, go_live, import_recordings
 from torchface.workflows.live.live_session import LiveSession, Notes
+from torchface.workflows.live.page_server import Preparing
 from torchface.workflows.live.recordings import FrameLog, Recordings
 from torchface.workflows.live.session_prompts import STEPS
 from torchface.workflows.live.weight_streams import WeightStreams
@@ -362,3 +363,22 @@ def test_the_command_plays_records_and_says_what_is_wrong(
         assert ended.value.code == 2
         assert told in " ".join(capsys.readouterr().err.split())
     main(["live", "--list"])
+
+
+def test_a_take_that_was_dropped_outlives_a_solver_that_cannot_be_made(
+    dome: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(live_anybody, "built_page", lambda progress: tmp_path)
+    rows, said = torch.arange(3.0)[:, None] + torch.zeros(3, 66), list[str]()
+    rows[:, 1:53] = 0.5
+
+    def unmade(preparing: Preparing) -> ShadeSolver:
+        preparing.keep("mine", rows.numpy())
+        raise ValueRangeError("no solver")
+
+    settings = LiveSettings(str(film(tmp_path / "film.avi", [0.0])), dome, takes=tmp_path / "out", port=0)
+    with pytest.raises(ValueRangeError, match="no solver"):
+        go_live(settings, said.append, said.append, unmade)  # type: ignore[arg-type]
+    (kept,) = kept_takes(tmp_path / "out")
+    assert (kept.name, kept.frames) == ("mine", 3)
+    assert said[-1] == f"what was dropped on the page is kept in {tmp_path / 'out'}"

@@ -170,6 +170,7 @@ def go_live(
         if page is not None:  # before the solver, which may take a minute the first time
             files = {CHARACTER: character.data, TABLE: character.page_table()}
             server = PageServer(page, files, partial(take_file, recordings.folder), preparing, settings.port)
+            stack.callback(_keep_dropped, preparing, recordings, notes)
             stack.callback(server.stop)
             opened(server.url)
             say(f"For OBS, the character alone: {server.stream_url}")
@@ -206,6 +207,13 @@ def go_live(
         wrong = received.receiver.counts.words() if received is not None else ""
         more = (wrong, *(take.note for take in saved), *streams.notes())
         return LiveReport(session.figures, source.dropped, tuple(note for note in more if note)), saved
+
+
+def _keep_dropped(preparing: Preparing, recordings: Recordings, say: Say) -> None:
+    """Keeps the takes that a page gave to a session that never began."""
+    if preparing.takes:
+        preparing.hand_over(lambda name, rows: recordings.keep(name, torch.from_numpy(rows.copy())))
+        say(f"what was dropped on the page is kept in {recordings.folder}")
 
 
 def import_recordings(folder: Path, recordings: Recordings, say: Say) -> None:

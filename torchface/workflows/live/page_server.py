@@ -100,6 +100,12 @@ class Preparing:
         """Holds a take for the session."""
         self.takes.append((name, rows))
 
+    def hand_over(self, keep: Callable[[str, np.ndarray], None]) -> None:
+        """Gives away the takes that it holds."""
+        while self.takes:
+            with suppress(TorchfaceError):  # which stands in the notes
+                keep(*self.takes.pop(0))
+
     def left(self) -> None:
         """A page was closed."""
 
@@ -153,9 +159,7 @@ class PageServer:
             if isinstance(before, Preparing):
                 with suppress(TorchfaceError):  # which stands in the notes
                     desk.asked(before.wishes)
-                for name, rows in before.takes:
-                    with suppress(TorchfaceError):
-                        desk.keep(name, rows)
+                before.hand_over(desk.keep)
 
     def stop(self) -> None:
         """Says to open pages that it has ended, and ends, once."""
