@@ -11,7 +11,7 @@ import torch
 from rig_samples import corrective_sheet
 
 from torchface.errors import FileFormatError, NameMismatchError, ValueRangeError
-from torchface.io import save_mesh, save_rig, save_take
+from torchface.io import save_animation, save_mesh, save_rig, save_take
 from torchface.rig import BlendshapeRig
 from torchface.take import Take, Track
 from torchface.workflows.convert_file import convert_file
@@ -27,8 +27,12 @@ def test_pose_by_words_and_by_take_is_the_rig_at_those_weights(dome_rig: Blendsh
     torch.testing.assert_close(by_words.neutral.vertices, dome_rig.vertices, atol=1e-3, rtol=0)
     weights = torch.rand(5, 4, 1, generator=torch.Generator().manual_seed(0))
     save_take(Take(60.0, weights=Track(dome_rig.names, weights)), tmp_path / "take.csv")
-    by_take = load_posed(tmp_path / "rig.glb", {}, tmp_path / "take.csv", 3)
-    torch.testing.assert_close(by_take.mesh.vertices, dome_rig(weights[3:4, :, 0])[0], atol=1e-3, rtol=0)
+    save_animation(dome_rig, Take(60.0, weights=Track(dome_rig.names, weights)), tmp_path / "take.glb")
+    for take in ("take.csv", "take.glb"):
+        by_take = load_posed(tmp_path / "rig.glb", {}, tmp_path / take, 3)
+        torch.testing.assert_close(by_take.mesh.vertices, dome_rig(weights[3:4, :, 0])[0], atol=1e-3, rtol=0)
+    with pytest.raises(ValueRangeError, match="found no weights, expected a weight take"):
+        load_posed(tmp_path / "rig.glb", {}, tmp_path / "rig.glb", 0)
 
 
 def test_what_cannot_be_posed_is_said(dome_rig: BlendshapeRig, tmp_path: Path) -> None:

@@ -31,7 +31,7 @@ def render(
             folder.
         out: The .png or .jpg to write.
         weights: Pose of a rig, such as jawOpen=0.5 mouthSmileLeft=1.
-        take: Pose of a rig from a weight take instead.
+        take: Pose of a rig from a weight take, or from an animated .glb, instead.
         frame: Which frame of the take.
         yaw: Directions to look from, degrees; 0 is the front, 90 the viewer's right.
         height: Of the image, pixels.

@@ -10,12 +10,13 @@ import torch
 from torch import Tensor
 
 from torchface.errors import NameMismatchError, NoShapesError, ValueRangeError
-from torchface.io import load_mesh, load_rig, load_take
+from torchface.io import load_mesh, load_rig
 from torchface.io.mesh_files import MESH_ENDINGS
 from torchface.io.rigs.ict_facekit import region
 from torchface.mesh import Mesh, submesh
 from torchface.rig import BlendshapeRig
 from torchface.shape_names import mapping, near_names
+from torchface.workflows.weight_files import load_weight_take
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,7 +49,7 @@ def load_posed(
     Args:
         path: a mesh file, a rig file or a rig's folder.
         weights: the pose, by shape name in any of the spellings that ``torchface.shape_names`` reads.
-        take: the pose from a frame of a weight take instead.
+        take: the pose from a frame of a weight take, or of an animated rig's file, instead.
         part: keep this annotated region only.
     """
     if weights or take is not None:
@@ -61,9 +62,8 @@ def load_posed(
         return Posed(neutral, neutral)
     if take is None:
         return Posed(posed_mesh(rig, weights), rig.neutral)
-    track = load_take(take).weights
-    if track is None:
-        raise ValueRangeError(f"{take}: found no weights, expected a weight take such as Live Link Face's")
+    track = load_weight_take(take).weights
+    assert track is not None
     if not 0 <= frame < len(track):
         raise ValueRangeError(f"{take}: found {len(track)} frames, expected frame {frame} among them")
     row = rig.weights_from(track.frames(slice(frame, frame + 1)))[0]

@@ -20,14 +20,20 @@ from torchface.capture.mouth_close_conventions import (
 from torchface.capture.retargeting import ShapeMap, load_shape_rules, retarget_take, save_shape_rules, shape_map
 from torchface.errors import NameMismatchError, ValueRangeError
 from torchface.files.whole_files import make_folder
-from torchface.io import load_rig, load_take
+from torchface.io import load_rig
 from torchface.progress import Progress, silent
 from torchface.rendering.compositing import save_rendered_image
 from torchface.rig import BlendshapeRig
 from torchface.shape_names import arkit_sources, mapping
 from torchface.take import Take, Track
 from torchface.viz.figures.face_views import pose_pairs
-from torchface.workflows.weight_files import WeightFiles, check_live_link, weight_faults, write_weights
+from torchface.workflows.weight_files import (
+    WeightFiles,
+    check_live_link,
+    load_weight_take,
+    weight_faults,
+    write_weights,
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,9 +66,8 @@ def retarget_weights(
     progress = progress or silent
     files.check()
     progress("reading")
-    played = load_take(weights)
-    if played.weights is None:
-        raise ValueRangeError(f"{weights}: found no weights, expected a CSV of them")
+    played = load_weight_take(weights)
+    assert played.weights is not None
     faults = [f"{weights}: {fault}" for fault in weight_faults(played.weights)]
     if files.animation is not None and not bool(torch.isfinite(played.weights.values).all()):
         raise ValueRangeError(

@@ -8,9 +8,10 @@ from pathlib import Path
 
 import torch
 
-from torchface.errors import NameMismatchError
+from torchface.errors import NameMismatchError, ValueRangeError
 from torchface.files.whole_files import all_or_none, check_ending, check_writable, make_folder
-from torchface.io.rig_files import ANIMATION_ENDINGS, save_animation
+from torchface.io.rig_files import ANIMATION_ENDINGS, SCENE_ENDINGS, load_animation, save_animation
+from torchface.io.take_files import load_take
 from torchface.io.weights.live_link_csv import not_in_live_link, save_live_link
 from torchface.io.weights.weight_csv import save_weights_csv
 from torchface.number_checks import checked_number
@@ -48,6 +49,16 @@ class WeightFiles:
         check_writable(self.out, self.live_link, self.animation, folder=folder)
         if self.animation is not None:
             check_ending(self.animation, *ANIMATION_ENDINGS)
+
+
+def load_weight_take(path: Path) -> Take:
+    """A take that has weights, or an animated rig's file as one."""
+    take = load_animation(path) if path.suffix.lower() in SCENE_ENDINGS else load_take(path)
+    if take is None or take.weights is None:
+        raise ValueRangeError(
+            f"{path}: found no weights, expected a weight take such as Live Link Face's, or an animated rig"
+        )
+    return take
 
 
 def checked_reduction(bound: float | None) -> float | None:

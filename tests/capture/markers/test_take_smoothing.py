@@ -20,7 +20,7 @@ from torchface.temporal.interpolation import values_at
 Performance = tuple[BlendshapeRig, Attachment, list[Tensor]]
 
 
-def check_errors(performance: Performance, most: float, take: int, frames: int = 500) -> None:
+def check_errors(performance: Performance, most: float, take: int, frames: int = 700) -> None:
     rig, attachment, takes = performance
     true = takes[take][:frames]
     solver = MarkerSolver(rig, attachment)

@@ -154,6 +154,17 @@ def test_shirt_stands_round_the_neck_and_stays(shown) -> None:
     assert rig.deltas[:, regions["shirt"]].abs().max() == 0
 
 
+def test_closed_parts_and_the_shirt_face_outward(shown) -> None:
+    mesh, vertices = shown.rig.neutral, shown.rig.vertices.double()
+    part = components(mesh.faces, len(vertices))
+    for name in ("teeth_upper", "teeth_lower", "tongue", "hair_locks", "eyeball_left", "eyeball_right", "shirt"):
+        faces = mesh.faces[mesh.annotations.regions[name][mesh.faces].all(1)]
+        for one in part[faces[:, 0]].unique():
+            corners = vertices[faces[part[faces[:, 0]] == one]]
+            volume = torch.linalg.det(corners - corners.mean((0, 1))).sum()
+            assert float(volume) > 0, name
+
+
 def test_file_has_images_as_jpeg_and_comes_back(shown, tmp_path) -> None:
     path = tmp_path / "character.glb"
     save_rig(shown.rig, path, shown.surface)

@@ -83,7 +83,7 @@ def test_every_file_tells_the_same(done: Done) -> None:
 
 def test_the_report_shows_frames_and_curves(done: Done, tmp_path: Path) -> None:
     page = write_track_page(done.tracked, tmp_path).read_text()
-    for picture in ("frames.png", "landmarks.png", "error.png", "head.png", "weights1.png"):
+    for picture in ("frames.png", "landmarks.png", "error.png", "pose.png", "weights1.png"):
         assert picture in page
         assert (tmp_path / picture).is_file()
     assert "as given, 0.10 px from what it was fitted to" in page

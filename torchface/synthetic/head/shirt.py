@@ -36,7 +36,7 @@ def shirt() -> HeadPart:
     across, ahead = np.cos(angle), np.sin(angle)
     y = side + np.where(ahead > 0, front - side, back - side) * np.abs(ahead) ** 1.6
     points = np.stack([wide * across, y, middle + deep * ahead], -1)
-    return HeadPart.grid(torch.from_numpy(points), SHIRT_PATCH, closed=True).turned()
+    return HeadPart.grid(torch.from_numpy(points), SHIRT_PATCH, closed=True)
 
 
 def about_neck(points: Tensor, skin: Tensor) -> Tensor:

@@ -108,7 +108,7 @@ def _jaw(jaw: str, crowns: np.ndarray) -> tuple[HeadPart, HeadPart]:
     teeth = []
     for crown, start in zip(crowns, borders, strict=False):  # fourteen of a jaw, each of its own form
         tooth = _tooth(crown, start + crown[0] / 2, front, edge, way)
-        tooth = tooth if way > 0 else tooth.turned()
+        tooth = tooth.turned() if way > 0 else tooth
         teeth += [tooth, tooth.mirrored()]
     return HeadPart.joined(teeth), _gums(crowns, borders, front, edge, way)
 
@@ -195,4 +195,4 @@ def _tongue(stations: np.ndarray) -> HeadPart:
     middle = points[-1].mean(0)
     cap = middle + np.maximum(np.cos(turn), 0.02) * (points[-1] - middle)
     points = np.concatenate([points, cap + _TONGUE_TIP * np.sin(turn) * np.array([0, *ahead[-1]])])
-    return HeadPart.grid(torch.from_numpy(points), PAGE["tongue"], closed=True).turned()
+    return HeadPart.grid(torch.from_numpy(points), PAGE["tongue"], closed=True)

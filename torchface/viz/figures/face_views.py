@@ -37,7 +37,10 @@ def framing(mesh: Mesh, aspect: float = 0.8) -> tuple[Tensor, float]:
         points, margin = mesh.vertices[mesh.annotations.regions["face"]], 1.2
     low, high = points.amin(0), points.amax(0)
     centre = (low + high) / 2 + torch.tensor(offset).to(low) * float(high[1] - low[1])
-    span = margin * float(torch.maximum(high[1] - low[1], (high[0] - low[0]) / aspect))
+    across = high[0] - low[0]
+    if len(points) == len(mesh.vertices):  # seen from any side
+        across = 2 * (points - centre)[:, [0, 2]].norm(dim=1).max()
+    span = margin * float(torch.maximum(high[1] - low[1], across / aspect))
     regions = {} if mesh.annotations is None else mesh.annotations.regions
     hair = [mask for name, mask in regions.items() if name.startswith("hair") and bool(mask.any())]
     if hair and len(points) < len(mesh.vertices):

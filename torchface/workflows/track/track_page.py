@@ -67,7 +67,7 @@ def write_track_page(tracked: Tracked, out: Path) -> Path:
         "Where the head is before the camera, about its mean place (x right, y down, z away from the camera), and how "
         "it is rotated: pitch about x, yaw about y, roll about z."
     )
-    sections.append(Section("Head", text, figures=[("head.png", head)]))
+    sections.append(Section("Head", text, figures=[("pose.png", head)]))
     weights, names = solution.weights.detach(), tracked.rig.names
     order = weights.amax(0).argsort(descending=True).tolist()
     curves = []
