@@ -13,9 +13,9 @@ from torchface.landmarks.images.face_reading import FaceReading, trust_of
 from torchface.shape_names import ARKIT
 from torchface.workflows.track.track_inputs import TrackInputs
 
-# What landmarks are off by beside what networks expect of the 68, in rendered films of people; the floor is what they
-# are off by alike, a share of the eyes' distance.
-_UNDERSTATED, _FLOOR = 2.0, 0.01
+# What landmarks are off by beside what networks expect of the 68, in rendered films of people, and what they are
+# all off by at least, a share of the eyes' distance.
+_UNDERSTATED, _LEAST = 2.0, 0.01
 # Weights of brows in the mean of a take, of six real ones, and their standard deviation from one to another: what a
 # network reads beyond is how the person's brows lie.
 _BROWS = {"browInnerUp": 0.15, "browOuterUpLeft": 0.07, "browOuterUpRight": 0.07, "browDownLeft": 0.13,
@@ -61,7 +61,7 @@ def take_measurements(inputs: TrackInputs, solver: VideoSolver, reading: FaceRea
 
 def measuring_solver(solver: VideoSolver) -> VideoSolver:
     """The solver for measurements: what landmarks are off by is in their deviations."""
-    settings = replace(solver.settings, relative_noise=min(solver.settings.relative_noise, _FLOOR))
+    settings = replace(solver.settings, relative_noise=min(solver.settings.relative_noise, _LEAST))
     return solver.with_settings(settings)
 
 
