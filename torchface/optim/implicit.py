@@ -180,21 +180,15 @@ class SimplexSolution(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
         H, x = ctx.saved_tensors
-        exact = H.detach().double()
-        exact = 0.5 * (exact + exact.transpose(-1, -2))
+        exact = _symmetric(H.detach().double())
         wide, taken = x.double(), x > 0
         v = gradients[0].double().masked_fill(~taken, 0.0)
         spread = metric(exact)
         tangent = solve_free(exact, spread, taken, taken.to(wide))
         s = solve_free(exact, spread, taken, v)
         s = s - tangent * (s.sum(1) / tangent.sum(1))[:, None]
-        to_H = to_f = None
-        if ctx.needs_input_grad[0]:
-            outer = s.T @ wide if H.ndim == 2 else s[:, :, None] * wide[:, None, :]
-            to_H = (-0.5 * (outer + outer.transpose(-1, -2))).to(H.dtype)
-        if ctx.needs_input_grad[1]:
-            to_f = (-s).to(x.dtype)
-        return to_H, to_f, None
+        to_H = -_by_matrix(s, wide, H).to(H.dtype) if ctx.needs_input_grad[0] else None
+        return to_H, -s.to(x.dtype), None
 
 
 def attach_gradients(gradient: Callable[[Tensor], Tensor], solution: Tensor, free: Tensor) -> Tensor:

@@ -10,11 +10,10 @@ from torch import Tensor, nn
 from torchface.attachment import Attachment
 from torchface.capture.corrective_energy import CorrectiveEnergy, least_in_box
 from torchface.capture.energy import Quadratic, chunks_of_frames, marker_term
-from torchface.capture.markers.marker_solver import RIDGE, SPARSITY, MarkerSolver, frames_seen
-from torchface.errors import NameMismatchError, ShapeError
+from torchface.capture.markers.marker_solver import RIDGE, SPARSITY, MarkerSolver, frames_seen, markers_of
+from torchface.errors import ShapeError
 from torchface.geometry.rotations import rotation_matrix, rotation_vector
 from torchface.geometry.similarity import Similarity
-from torchface.number_checks import checked_type
 from torchface.optim import BoxQP, box_qp
 from torchface.optim.box_checks import default_tolerance
 from torchface.optim.data_dependent import data_dependent
@@ -136,8 +135,7 @@ class HelmetSolver(nn.Module):
         """
         if markers.ndim != 3 or markers.shape[1:] != self.markers.rest.shape:
             raise ShapeError(f"markers: found {tuple(markers.shape)}, expected (B,{len(self.markers.rest)},3)")
-        alignment = self.markers.alignment
-        seen = markers.double() if alignment is None else alignment.apply(markers.double())
+        seen = self.markers.in_rig_space(markers.double())
         tolerance = default_tolerance(markers.dtype)
         gaps = torch.isnan(seen).any(-1).any(-1)
         if bool(torch.isnan(seen).any(-1).all(-1).any()):
@@ -161,10 +159,7 @@ class HelmetSolver(nn.Module):
             NameMismatchError: the take has no markers, labels that the attachment does not know, or none that it knows.
             ValueRangeError: no frame shows any marker.
         """
-        checked_type("take", take, Take)
-        if take.markers is None:
-            raise NameMismatchError("take: has no markers, expected a track of them")
-        markers = self.markers.arrange(take.markers)
+        markers = self.markers.arrange(markers_of(take))
         rows = frames_seen(markers)
         seen, steps = self(markers[rows])
         weights = interpolated(seen, rows, len(markers))

@@ -32,7 +32,7 @@ class LabelMatch:
 
     def notes(self) -> list[str]:
         """For people to read: what was left out."""
-        return [f"left out {_listed(self.unmatched)}: not among the attachment's markers"] if self.unmatched else []
+        return [f"left out {listed(self.unmatched)}: not among the attachment's markers"] if self.unmatched else []
 
 
 def match_labels(found: Sequence[str], known: Sequence[str], renamed: Mapping[str, str] | None = None) -> LabelMatch:
@@ -56,7 +56,7 @@ def match_labels(found: Sequence[str], known: Sequence[str], renamed: Mapping[st
         absent = [name for name in names if name and name not in there]
         if absent:
             raise NameMismatchError(
-                f"labels: found {_listed(absent)} in the map, expected labels of {side}: {_listed(there)}"
+                f"labels: found {listed(absent)} in the map, expected labels of {side}: {listed(there)}"
             )
     assigned: dict[str, str] = {}  # channel by known label
     for channel, own in renamed.items():
@@ -79,7 +79,7 @@ def match_labels(found: Sequence[str], known: Sequence[str], renamed: Mapping[st
     channels = tuple(channel for channel in found if channel in by_channel)
     if not channels:
         raise NameMismatchError(
-            f"labels: found {_listed(found)}, expected some of the attachment's: {_listed(known)}; a table with a row "
+            f"labels: found {listed(found)}, expected some of the attachment's: {listed(known)}; a table with a row "
             "'label of the take,label of the attachment' for each marker maps them (--labels map.csv)"
         )
     return LabelMatch(
@@ -107,11 +107,11 @@ def own_labels(found: Sequence[str], renamed: Mapping[str, str] | None = None) -
     absent = [name for name in renamed if name not in found]
     if absent:
         raise NameMismatchError(
-            f"labels: found {_listed(absent)} in the map, expected labels of the take: {_listed(found)}"
+            f"labels: found {listed(absent)} in the map, expected labels of the take: {listed(found)}"
         )
     channels = [name for name in found if renamed.get(name, name) and not _UNLABELLED.fullmatch(_bare(name).strip())]
     if not channels:
-        raise NameMismatchError(f"labels: found {_listed(found)}, expected labelled markers")
+        raise NameMismatchError(f"labels: found {listed(found)}, expected labelled markers")
     bare = [renamed.get(name, _bare(name)) for name in channels]
     labels = bare if len(set(bare)) == len(bare) else [renamed.get(name, name) for name in channels]
     assigned: dict[str, str] = {}
@@ -163,6 +163,7 @@ def _assign(assigned: dict[str, str], label: str, channel: str) -> None:
     assigned[label] = channel
 
 
-def _listed(names: Iterable[str], max_names: int = 6) -> str:
+def listed(names: Iterable[str]) -> str:
+    """The first six names, for messages."""
     names = list(names)
-    return ", ".join(names[:max_names]) + (f" and {len(names) - max_names} more" if len(names) > max_names else "")
+    return ", ".join(names[:6]) + (f" and {len(names) - 6} more" if len(names) > 6 else "")

@@ -227,12 +227,12 @@ class MarkerSolver(nn.Module):
         """What the solve minimises for markers (B,M,3), float64."""
         if self.activation is None or self.corrective_basis is None:
             return self._linear_energy(markers)
-        rest, targets = self.rest.double(), self._in_rig_space(markers.double())
+        rest, targets = self.rest.double(), self.in_rig_space(markers.double())
         basis = torch.cat([self.basis, self.corrective_basis], 2).double()
         return CorrectiveEnergy(marker_term(basis, rest, targets), self.activation) + self.regularization(rest)
 
     def _linear_energy(self, markers: Tensor) -> Quadratic:
-        term = marker_term(self.basis.double(), self.rest.double(), self._in_rig_space(markers.double()))
+        term = marker_term(self.basis.double(), self.rest.double(), self.in_rig_space(markers.double()))
         return term + self.regularization(term.H)
 
     def points(self, weights: Tensor) -> Tensor:
@@ -253,7 +253,7 @@ class MarkerSolver(nn.Module):
 
     def squared_distance(self, markers: Tensor, weights: Tensor) -> Tensor:
         """Mean squared distance of the seen markers (B,M,3) to the rig at weights (B,N): (B,), mm² in rig space."""
-        squared = (self.points(weights) - self._in_rig_space(markers.double())).square().sum(-1)
+        squared = (self.points(weights) - self.in_rig_space(markers.double())).square().sum(-1)
         return squared.nanmean(-1)
 
     @data_dependent("torchface.onnx.SolverGraph, which `torchface export solver` writes")
@@ -334,10 +334,7 @@ class MarkerSolver(nn.Module):
             >>> solved.weights.names == solver.names, bool(solved.weights.values.max() < 1e-3)
             (True, True)
         """
-        checked_type("take", take, Take)
-        if take.markers is None:
-            raise NameMismatchError("take: has no markers, expected a track of them")
-        markers = self.arrange(take.markers)
+        markers = self.arrange(markers_of(take))
         rows = frames_seen(markers)
         weights = interpolated(self(markers[rows]), rows, len(markers))
         return replace(take, weights=Track(self.names, weights[..., None]))
@@ -359,7 +356,7 @@ class MarkerSolver(nn.Module):
 
     def complete_slope(self, markers: Tensor) -> Tensor:
         """The energy's slope at rest, (B,N), float64, for markers without gaps."""
-        offset = self.rest.double() - self._in_rig_space(markers.double())
+        offset = self.rest.double() - self.in_rig_space(markers.double())
         return (2.0 / len(self.rest)) * (offset.flatten(1) @ self.basis.double().flatten(0, 1)) + self.sparsity
 
     def _corrected(self, markers: Tensor, gaps: Tensor, initial: Tensor | None, tolerance: float) -> Tensor:
@@ -388,7 +385,7 @@ class MarkerSolver(nn.Module):
         assert self.corrective_basis is not None
         assert self.activation is not None
         H, rows = self._prepared_rows.get((self.basis, self.corrective_basis), self._extended_rows)
-        offset = (self.rest.double() - self._in_rig_space(markers.double())).flatten(1)
+        offset = (self.rest.double() - self.in_rig_space(markers.double())).flatten(1)
         share = 2.0 / len(self.rest)
         term = Quadratic(H, share * (offset @ rows), 0.5 * share * offset.square().sum(1))
         return CorrectiveEnergy(term, self.activation) + self.regularization(H)
@@ -423,7 +420,8 @@ class MarkerSolver(nn.Module):
         H = marker_term(self.basis.double(), rest, rest[None]).H
         return H + self.regularization(H).H
 
-    def _in_rig_space(self, markers: Tensor) -> Tensor:
+    def in_rig_space(self, markers: Tensor) -> Tensor:
+        """Markers (B,M,3) moved by the alignment, where there is one."""
         alignment = self.alignment
         return markers if alignment is None else alignment.apply(markers)
 
@@ -446,6 +444,13 @@ def check_labels(found: Sequence[str], known: Sequence[str]) -> None:
             f"markers: found {shown}{' and others' if len(unknown) > 5 else ''}, expected labels of the attachment: "
             f"{', '.join(known[:5])}, ...; drop markers that are not of the face with Track.select"
         )
+
+
+def markers_of(take: Take) -> Track:
+    """The markers of a take, which it must have."""
+    if checked_type("take", take, Take).markers is None:
+        raise NameMismatchError("take: has no markers, expected a track of them")
+    return take.markers  # type: ignore[return-value]
 
 
 def frames_seen(markers: Tensor) -> Tensor:

@@ -12,8 +12,8 @@ from scipy.fft import dct, idct
 from torch import Tensor, nn
 
 from torchface.capture.corrective_energy import CorrectiveEnergy
-from torchface.capture.markers.marker_solver import MarkerSolver, frames_seen, penalty_value
-from torchface.errors import NameMismatchError, ShapeError, TraceError, ValueRangeError
+from torchface.capture.markers.marker_solver import MarkerSolver, frames_seen, markers_of, penalty_value
+from torchface.errors import ShapeError, TraceError, ValueRangeError
 from torchface.number_checks import LARGEST_WEIGHT, check_rate, checked_number, checked_type
 from torchface.optim.data_dependent import data_dependent
 from torchface.take import Take, Track
@@ -100,10 +100,7 @@ class WholeTakeSolver(nn.Module):
             NameMismatchError: the take has no markers, labels that the attachment does not know, or none that it knows.
             ValueRangeError: no frame shows any marker, or a coordinate is infinite.
         """
-        checked_type("take", take, Take)
-        if take.markers is None:
-            raise NameMismatchError("take: has no markers, expected a track of them")
-        weights = self(self.markers.arrange(take.markers), take.fps, take.seconds)
+        weights = self(self.markers.arrange(markers_of(take)), take.fps, take.seconds)
         return replace(take, weights=Track(self.markers.names, weights[..., None]))
 
     @data_dependent("torchface.onnx.SolverGraph for frame by frame, which `torchface export solver` writes")
@@ -149,7 +146,7 @@ class WholeTakeSolver(nn.Module):
         """What the solve minimises, over all frames."""
         smoothness, huber_threshold = self._scaled(fps)
         solver = self.markers
-        seen = markers.double() if solver.alignment is None else solver.alignment.apply(markers.double())
+        seen = solver.in_rig_space(markers.double())
         w = weights.double()
         points = solver.points(w)
         data = (points - seen).square().sum(-1).nan_to_num(0.0).sum() / points.shape[1]
@@ -174,7 +171,7 @@ class WholeTakeSolver(nn.Module):
         Source: Boyd et al. 2011, section 5.2; Geman and Yang 1995 for b.
         """
         solver = self.markers
-        seen = markers if solver.alignment is None else solver.alignment.apply(markers)
+        seen = solver.in_rig_space(markers)
         rest, rows = solver.rest.double(), solver.basis.double().flatten(0, 1)
         count, shapes = len(rest), rows.shape[1]
         H = (2.0 / count) * (rows.T @ rows)
@@ -322,10 +319,9 @@ class _TakeData:
 
     @staticmethod
     def of(solver: MarkerSolver, markers: Tensor) -> _TakeData:
-        alignment = solver.alignment
         whole = None if bool(torch.isnan(markers).any()) else solver.complete_energy(markers)
-        seen = markers if alignment is None else alignment.apply(markers)
-        return _TakeData(solver, whole if isinstance(whole, CorrectiveEnergy) else None, seen)
+        energy = whole if isinstance(whole, CorrectiveEnergy) else None
+        return _TakeData(solver, energy, solver.in_rig_space(markers))
 
     def value(self, weights: Tensor) -> float:
         if self.energy is not None:

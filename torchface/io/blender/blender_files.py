@@ -8,7 +8,7 @@ import os
 import shutil
 import sys
 import tempfile
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +20,7 @@ from torchface.io.blender import reading_in_blender, writing_in_blender
 from torchface.io.gltf.corrective_extras import all_targets
 from torchface.io.scene_processes.reading_process import read_scene, run_process
 from torchface.io.scene_processes.scene_arrays import scene_mesh, scene_rig, scene_weights
-from torchface.io.scenes.weight_keys import WeightKeys
+from torchface.io.scenes.weight_keys import WeightKeys, with_correctives
 from torchface.io.usd.usd_reading import checked_size
 from torchface.io.usd.usd_writing import write_usd_rig
 from torchface.mesh import Mesh
@@ -118,9 +118,8 @@ def write_blender_file(rig: BlendshapeRig, path: str | Path, keys: WeightKeys | 
     command = blender_command(Path(writing_in_blender.__file__).resolve())
     deltas, names = all_targets(rig)
     plain = BlendshapeRig(rig.neutral, deltas, [f"shape_{row}" for row in range(len(names))])
-    if keys is not None and rig.activation is not None:
-        followed = rig.activation(keys.weights.to(rig.vertices)).to(keys.weights)
-        keys = replace(keys, weights=torch.cat([keys.weights, followed], 1))
+    if keys is not None:
+        keys = with_correctives(rig, keys)
     with tempfile.TemporaryDirectory(prefix="torchface-blender-") as folder:
         source, made, notes = (Path(folder, name) for name in ("rig.usdc", f"made{path.suffix.lower()}", "notes.json"))
         write_usd_rig(plain, source, keys)

@@ -35,7 +35,7 @@ def character_nodes(document: Document) -> dict[str, int]:
     """
     nodes = document.objects("nodes")
     joints = {joint for skin in document.objects("skins") for joint in document.array(skin, "joints", "skins")}
-    table = _vrm_bones(document)
+    table = vrm_bones(document)
     found: dict[str, int] = {}
     for part, pattern in _NAMES.items():
         named = (
@@ -55,7 +55,8 @@ def looks_back(document: Document) -> bool:
     return "VRM" in extensions and "VRMC_vrm" not in extensions
 
 
-def _vrm_bones(document: Document) -> dict[str, Any]:
+def vrm_bones(document: Document) -> dict[str, Any]:
+    """The nodes that a VRM calls its bones, by part; none of other files."""
     extensions = document.record(document.root.get("extensions"), "extensions")
     for name in ("VRMC_vrm", "VRM"):
         if name in extensions:

@@ -16,6 +16,7 @@ from torch import Tensor
 from torchface.color_space import to_srgb
 from torchface.errors import FileFormatError, TorchfaceError
 from torchface.io.gltf.accessors import read_floats
+from torchface.io.gltf.character_nodes import vrm_bones
 from torchface.io.gltf.gltf_document import Document
 from torchface.io.gltf.gltf_reading import image_bytes
 from torchface.io.gltf.primitive_reading import (
@@ -314,16 +315,9 @@ def _skinned(
 
 def _head_bone(document: Document, transforms: dict[int, NDArray[np.float64]]) -> int | None:
     """The node of the head: what VRM says, else the joint or node of such a name that is nearest to the root."""
-    extensions = document.record(document.root.get("extensions"), "extensions")
-    for name in ("VRMC_vrm", "VRM"):
-        humanoid = document.record(extensions.get(name), name).get("humanoid")
-        bones = humanoid.get("humanBones") if isinstance(humanoid, dict) else None
-        if isinstance(bones, dict):
-            bones = [{**bone, "bone": key} for key, bone in bones.items() if isinstance(bone, dict)]
-        for bone in bones if isinstance(bones, list) else []:
-            node = bone.get("node") if isinstance(bone, dict) and bone.get("bone") == _HEAD else None
-            if isinstance(node, int) and node in transforms:
-                return node
+    bone = vrm_bones(document).get("head")
+    if isinstance(bone, int) and bone in transforms:
+        return bone
     nodes = document.objects("nodes")
     lists = [document.array(skin, "joints", "skins") for skin in document.objects("skins")]
     joints = {joint for row in lists for joint in row if isinstance(joint, int)}
@@ -333,9 +327,6 @@ def _head_bone(document: Document, transforms: dict[int, NDArray[np.float64]]) -
             if _HEAD_BONE.search(name) and not _NO_HEAD_BONE.search(name) and nodes[node].get("mesh") is None:
                 return node
     return None
-
-
-_HEAD = "head"
 
 
 def _descendants(document: Document, root: int) -> set[int]:

@@ -28,12 +28,8 @@ def write_correctives(definitions: Sequence[Corrective]) -> dict[str, Any]:
 
 def scene_correctives(document: Document) -> tuple[Corrective, ...]:
     """The definitions of the first mesh that has any."""
-    for i, mesh in enumerate(document.objects("meshes")):
-        extras = mesh.get("extras")
-        ours = extras.get("torchface") if isinstance(extras, dict) else None
-        if isinstance(ours, dict) and ours.get(_FIELD):
-            return read_correctives(document, ours, f"meshes[{i}].extras.torchface")
-    return ()
+    found = document.first_extras(_FIELD)
+    return () if found is None else read_correctives(document, found[0]["extras"]["torchface"], found[1])
 
 
 def read_correctives(document: Document, extras: Mapping[str, Any], location: str) -> tuple[Corrective, ...]:

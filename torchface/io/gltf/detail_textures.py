@@ -107,23 +107,13 @@ def read_gltf_detail(path: str | Path) -> DetailMaps | None:
 
 def _listed(document: Document) -> tuple[list[dict[str, Any]], dict[str, Any]]:
     """The list of the first mesh that has one, and that mesh; else the first mesh."""
-    listed_mesh = list_of_first_mesh(document, _LIST)
-    if listed_mesh is None:
+    found = document.first_extras(_LIST)
+    if found is None:
         meshes = document.objects("meshes")
         return [], meshes[0] if meshes else {}
-    mesh, location = listed_mesh
-    rows = document.array(mesh["extras"]["torchface"], _LIST, location.removesuffix(f".{_LIST}"))
-    return [document.record(row, f"{location}[{k}]") for k, row in enumerate(rows)], mesh
-
-
-def list_of_first_mesh(document: Document, key: str) -> tuple[dict[str, Any], str] | None:
-    """The first mesh whose ``extras.torchface`` holds something under a key, and that place in words."""
-    for i, mesh in enumerate(document.objects("meshes")):
-        extras = mesh.get("extras")
-        ours = extras.get("torchface") if isinstance(extras, dict) else None
-        if isinstance(ours, dict) and ours.get(key):
-            return mesh, f"meshes[{i}].extras.torchface.{key}"
-    return None
+    mesh, location = found
+    rows = document.array(mesh["extras"]["torchface"], _LIST, location)
+    return [document.record(row, f"{location}.{_LIST}[{k}]") for k, row in enumerate(rows)], mesh
 
 
 def _name(document: Document, entry: dict[str, Any], index: int) -> str:

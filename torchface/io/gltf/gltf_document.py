@@ -103,6 +103,15 @@ class Document:
             raise self.error(f"{where}.{key}", shown(value), f"{count} finite numbers")
         return [float(x) for x in value]
 
+    def first_extras(self, key: str) -> tuple[dict[str, Any], str] | None:
+        """The first mesh whose ``extras.torchface`` holds something under a key, and the place of that in words."""
+        for i, mesh in enumerate(self.objects("meshes")):
+            extras = mesh.get("extras")
+            ours = extras.get("torchface") if isinstance(extras, dict) else None
+            if isinstance(ours, dict) and ours.get(key):
+                return mesh, f"meshes[{i}].extras.torchface"
+        return None
+
     def view(self, index: object, where: str) -> tuple[memoryview, int | None]:
         """The bytes of a bufferView, and its stride."""
         view = self.item("bufferViews", index, where)

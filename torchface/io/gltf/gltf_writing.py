@@ -26,7 +26,7 @@ from torchface.io.gltf.part_textures.iris_texture import eye_centre
 from torchface.io.gltf.primitive_writing import MaterialWriter, PrimitiveWriter, metres
 from torchface.io.gltf.wrinkle_textures import write_region_maps
 from torchface.io.length_units import millimetres_per
-from torchface.io.scenes.weight_keys import WeightKeys
+from torchface.io.scenes.weight_keys import WeightKeys, with_correctives
 from torchface.mesh import Mesh
 from torchface.rig import BlendshapeRig
 
@@ -51,7 +51,8 @@ def write_gltf_rig(
             ``torchface.io.gltf.wrinkle_textures``; or the surface's normals and roughness, with which images are JPEG.
         keys: an animation of its shapes, linear between keys.
     """
-    _write(path, rig.neutral, *all_targets(rig), keys and _with_correctives(rig, keys), detail, _definitions(rig))
+    definitions = () if rig.correctives is None else rig.correctives.definitions
+    _write(path, rig.neutral, *all_targets(rig), keys and with_correctives(rig, keys), detail, definitions)
 
 
 def save_gltf_mesh(mesh: Mesh, path: str | Path) -> None:
@@ -120,18 +121,6 @@ def _write(
         root["animations"] = [_animation(keys, len(nodes), buffers)]
     with replaced_file(path) as temporary, temporary.open("wb") as file:
         file.writelines(glb_pieces(root, buffers, path))
-
-
-def _definitions(rig: BlendshapeRig) -> tuple[Corrective, ...]:
-    return () if rig.correctives is None else rig.correctives.definitions
-
-
-def _with_correctives(rig: BlendshapeRig, keys: WeightKeys) -> WeightKeys:
-    """Keys of the morph targets: correctives get the weights that the shapes' call for, so that it plays everywhere."""
-    if rig.activation is None:
-        return keys
-    followed = rig.activation(keys.weights.to(rig.vertices.device)).cpu()
-    return replace(keys, weights=torch.cat([keys.weights, followed], 1))
 
 
 def _animation(keys: WeightKeys, nodes: int, buffers: BufferWriter) -> dict[str, Any]:

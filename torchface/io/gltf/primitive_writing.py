@@ -19,10 +19,8 @@ from torchface.io.images.image_files import encode_jpeg, encode_png
 from torchface.io.length_units import millimetres_per
 from torchface.mesh import Mesh
 
-MIN_MOVE = 1e-4
-"""Millimetres; a vertex that a shape moves less than this is written as not moved."""
-MIN_ROTATION = 1 / 256
-"""Radians; a normal that a shape rotates less than this is written as unchanged, since 8 bits do not show it."""
+MIN_MOVE = 1e-4  # millimetres; a vertex that a shape moves less than this is written as not moved
+_MIN_ROTATION = 1 / 256  # radians; a normal that a shape rotates less than this is written as unchanged
 _MAX_EXACT_ID = 2**24
 
 
@@ -71,12 +69,8 @@ class PrimitiveWriter:
 
     def add_targets(self, deltas: Tensor) -> None:
         """Morph targets (N,V,3), millimetres, for all primitives: positions and normals."""
-        rest = self.mesh.vertices.detach().double()
         for delta in deltas.detach().cpu().double():  # one shape at a time: all normals at once would fill the memory
-            rotated = (shading_normals(rest + delta, self.mesh.faces) - self.normals).float().numpy()
-            rotated *= np.einsum("ij,ij->i", rotated, rotated)[:, None] >= MIN_ROTATION * MIN_ROTATION
-            moved = delta.float().numpy()
-            moved = moved * (np.einsum("ij,ij->i", moved, moved)[:, None] >= MIN_MOVE * MIN_MOVE)
+            moved, rotated = shown_motion(self.mesh, self.normals, delta)
             for primitive, vertices in self._written:
                 target = {
                     "POSITION": self.buffers.deltas(metres(moved[vertices])),
@@ -119,6 +113,16 @@ def shading_normals(vertices: Tensor, faces: Tensor) -> Tensor:
     normals = vertex_normals(vertices, faces)
     normals[normals.norm(dim=1) < 0.5] = torch.tensor([0.0, 0.0, 1.0], dtype=normals.dtype)  # loose, or without area
     return normals
+
+
+def shown_motion(mesh: Mesh, normals: Tensor, delta: Tensor) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """How far a shape (V,3) float64 moves positions and normals (V,3); 0 where that is too little to show."""
+    moved = delta.float().numpy()
+    rotated = (shading_normals(mesh.vertices.detach().double() + delta, mesh.faces) - normals).float().numpy()
+    return (
+        moved * (np.einsum("ij,ij->i", moved, moved)[:, None] >= MIN_MOVE * MIN_MOVE),
+        rotated * (np.einsum("ij,ij->i", rotated, rotated)[:, None] >= _MIN_ROTATION * _MIN_ROTATION),
+    )
 
 
 class MaterialWriter:

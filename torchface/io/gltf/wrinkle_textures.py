@@ -21,7 +21,7 @@ from torch import Tensor
 from torchface.geometry.meshes.normal_maps import decode_normals, encode_normals
 from torchface.geometry.meshes.region_maps import RegionMaps
 from torchface.io.gltf.buffers import BufferWriter
-from torchface.io.gltf.detail_textures import TextureReader, list_of_first_mesh, normal_texture
+from torchface.io.gltf.detail_textures import TextureReader, normal_texture
 from torchface.io.gltf.gltf_document import Document, read_document
 from torchface.io.images.image_files import encode_png
 
@@ -63,10 +63,10 @@ def load_region_maps(path: str | Path) -> RegionMaps | None:
         True
     """
     document = read_document(path)
-    listed_mesh = list_of_first_mesh(document, _KEY)
-    if listed_mesh is None:
+    found = document.first_extras(_KEY)
+    if found is None:
         return None
-    mesh, location = listed_mesh
+    mesh, location = found[0], f"{found[1]}.{_KEY}"
     listed = document.record(mesh["extras"]["torchface"][_KEY], location)
     regions = document.array(listed, "regions", location)
     if not regions or not all(isinstance(name, str) and name for name in regions) or len(set(regions)) < len(regions):

@@ -24,6 +24,7 @@ LARGEST_ARRAYS = 2**31
 _LARGEST_FILE, _MOST_ENTRIES, _MOST_VERTICES, _HEADER = 2**32, 1000, 2**20, 2**16
 _LARGEST_NUMBER = 1e6  # of a model's lengths in its own unit, far above any
 _PICKLES = (".pkl", ".pickle", ".pt", ".pth", ".ckpt")
+_BROKEN = (zipfile.BadZipFile, zlib.error, SafetensorError, OSError, ValueError, EOFError)
 ONLY = "array"
 """The name of what a ``.npy`` holds."""
 _HOW = (
@@ -56,30 +57,21 @@ class ArrayFile:
         self._archive: dict[str, zipfile.ZipInfo] | None = None
         if not self.path.is_file():
             raise FileFormatError(f"{self.path}: found no such file, expected .npz or .safetensors")
-        with self.path.open("rb") as file:
-            begin = file.read(8)
         if self.path.stat().st_size > _LARGEST_FILE:
             raise FileFormatError(
                 f"{self.path}: found {self.path.stat().st_size} bytes, expected at most {_LARGEST_FILE}"
             )
-        ending = self.path.suffix.lower()
-        if ending in _PICKLES or begin[:1] == b"\x80":
+        if is_pickle(self.path):
             raise FileFormatError(f"{self.path}: found a pickle or a file that may hold one, expected .npz. {_HOW}")
         note_read(self.path)
+        with self.path.open("rb") as file:
+            begin = file.read(8)
         try:
             if begin[:6] == _NPY:
                 self._stored = self._npy_header()
             else:
                 self._stored = self._npz_headers() if begin[:2] == b"PK" else self._safetensors_headers()
-        except (
-            zipfile.BadZipFile,
-            zlib.error,
-            SafetensorError,
-            OSError,
-            ValueError,
-            EOFError,
-            NotImplementedError,
-        ) as e:
+        except (*_BROKEN, NotImplementedError) as e:
             raise FileFormatError(f"{self.path}: found no readable arrays ({e}), expected .npz or .safetensors") from e
 
     def __contains__(self, name: str) -> bool:
@@ -165,7 +157,7 @@ class ArrayFile:
         self._left -= stored.size
         try:
             return self._loaded(name)
-        except (zipfile.BadZipFile, zlib.error, SafetensorError, OSError, ValueError, EOFError, MemoryError) as error:
+        except (*_BROKEN, MemoryError) as error:
             raise FileFormatError(f"{self.path}: {name} cannot be read ({error})") from error
 
     def _loaded(self, name: str) -> NDArray[Any]:

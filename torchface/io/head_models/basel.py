@@ -156,6 +156,5 @@ def _landmarks(path: Path, text: str, vertices: Tensor) -> SurfacePlaces | None:
         raise FileFormatError(f"{path}: found landmarks that are no names with places ({error})") from error
     if len(places) < 3 or not bool(torch.isfinite(places).all()):
         return None
-    nearest = torch.from_numpy(cKDTree(vertices.double().numpy()).query(places.numpy())[1])
-    ids = nearest[:, None].expand(-1, 3).contiguous()
-    return SurfacePlaces(torch.tensor(list(named)), ids, torch.tensor([1.0, 0.0, 0.0]).repeat(len(ids), 1))
+    nearest = cKDTree(vertices.double().numpy()).query(places.numpy())[1]
+    return SurfacePlaces.at_vertices(dict(zip(named, nearest.tolist(), strict=True)))

@@ -76,8 +76,7 @@ def _places(landmarks: dict[str, int], count: int) -> SurfacePlaces | None:
     ibug = {int(name) - 1: row for name, row in landmarks.items() if name.isdecimal() and 1 <= int(name) <= 68}
     if len(ibug) < 3 or not all(0 <= row < count for row in ibug.values()):
         return None
-    ids = torch.tensor(list(ibug.values()))[:, None].expand(-1, 3).contiguous()
-    return SurfacePlaces(torch.tensor(list(ibug)), ids, torch.tensor([1.0, 0.0, 0.0]).repeat(len(ids), 1))
+    return SurfacePlaces.at_vertices(ibug)
 
 
 class _Archive:

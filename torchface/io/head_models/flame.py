@@ -51,8 +51,7 @@ def read_flame(path: Path, arrays: ArrayFile) -> HeadModelFile:
     regions = eyeballs(joints)
     annotations = Annotations(regions=regions)
     if landmarks is not None and len(landmarks.rows) == 68:
-        nearest = landmarks.vertices.gather(1, landmarks.shares.argmax(1, keepdim=True))[:, 0]
-        annotations = Annotations(nearest, regions)
+        annotations = Annotations(landmarks.nearest(), regions)
     names = tuple(f"exp_{i:03}" for i in range(len(expressions)))
     mesh = Mesh(vertices, faces, annotations=annotations)
     licence = "as its authors say: CC-BY-4.0 for FLAME 2023 Open, research alone for others"

@@ -48,7 +48,7 @@ def read_gnm(path: Path, arrays: ArrayFile) -> HeadModelFile:
         corners = arrays.numbers("triangle_uvs", len(faces), 3, 2)
         uvs, rows = corners.flatten(0, 1).unique(dim=0, return_inverse=True)
         uv_faces = rows.reshape(-1, 3)
-    annotations = Annotations(None if landmarks is None else _nearest(landmarks), regions, mirror)
+    annotations = Annotations(None if landmarks is None else landmarks.nearest(), regions, mirror)
     mesh = Mesh(vertices, faces, uvs, uv_faces, annotations=annotations)
     own = names or tuple(f"expression_{i:03}" for i in range(size))
     return HeadModelFile(NAME, mesh, identity, expressions, own, _joints(arrays, count), landmarks, "Apache-2.0")
@@ -71,17 +71,8 @@ def _joints(arrays: ArrayFile, count: int) -> HeadJoints | None:
 
 def _landmarks(path: Path, vertices: Tensor) -> SurfacePlaces | None:
     """From the text beside the model, or where the model's repository has it; its contour in iBUG's order."""
-    found = next(
-        (
-            p
-            for p in (
-                path.with_name(_LANDMARKS),
-                path.parents[min(2, len(path.parents) - 1)] / "landmarks" / _LANDMARKS,
-            )
-            if p.is_file()
-        ),
-        None,
-    )
+    beside = path.with_name(_LANDMARKS), path.parents[min(2, len(path.parents) - 1)] / "landmarks" / _LANDMARKS
+    found = next((file for file in beside if file.is_file()), None)
     if found is None:
         return None
     try:
@@ -98,7 +89,3 @@ def _landmarks(path: Path, vertices: Tensor) -> SurfacePlaces | None:
     across = places.on(vertices)[:17, 0].argsort()
     order = torch.cat([across, torch.arange(17, 68)])
     return SurfacePlaces(torch.arange(68), ids[order], shares[order])
-
-
-def _nearest(places: SurfacePlaces) -> Tensor:
-    return places.vertices.gather(1, places.shares.argmax(1, keepdim=True))[:, 0]

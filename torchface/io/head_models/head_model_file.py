@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import torch
 from torch import Tensor
 
 from torchface.errors import FileFormatError
+from torchface.geometry.rotations import rotation_matrix
 from torchface.geometry.skinning import joint_transforms, skinned
 from torchface.mesh import Mesh
 
@@ -70,6 +72,16 @@ class SurfacePlaces:
     vertices: Tensor
     shares: Tensor
 
+    @classmethod
+    def at_vertices(cls, places: Mapping[int, int]) -> SurfacePlaces:
+        """Each landmark of iBUG's, by row, on one vertex."""
+        ids = torch.tensor(list(places.values()))[:, None].expand(-1, 3).contiguous()
+        return cls(torch.tensor(list(places)), ids, torch.tensor([1.0, 0.0, 0.0]).repeat(len(ids), 1))
+
+    def nearest(self) -> Tensor:
+        """The vertex that each lies closest to, (L,)."""
+        return self.vertices.gather(1, self.shares.argmax(1, keepdim=True))[:, 0]
+
     def on(self, vertices: Tensor) -> Tensor:
         """Where they lie on a head (V,3), (L,3)."""
         return (vertices[self.vertices] * self.shares[..., None].to(vertices)).sum(1)
@@ -131,8 +143,6 @@ class HeadModelFile:
         correctives = self.joints.correctives
         if correctives is None:
             return self.neutral.vertices.new_zeros(len(rotations), *self.neutral.vertices.shape)
-        from torchface.geometry.rotations import rotation_matrix
-
         inner = rotation_matrix(rotations[:, 1:].reshape(-1, 3)) - torch.eye(3, dtype=rotations.dtype)
         feature = inner.reshape(len(rotations), -1).to(correctives)
         return (feature @ correctives.flatten(1)).unflatten(1, correctives.shape[1:])

@@ -81,6 +81,14 @@ def weight_keys(rig: BlendshapeRig, take: Take) -> tuple[WeightKeys, ShapeMatch]
     )
 
 
+def with_correctives(rig: BlendshapeRig, keys: WeightKeys) -> WeightKeys:
+    """Keys of shapes and correctives, which get the weights that the shapes' call for, so that they play everywhere."""
+    if rig.activation is None:
+        return keys
+    followed = rig.activation(keys.weights.to(rig.vertices.device)).cpu()
+    return replace(keys, weights=torch.cat([keys.weights, followed], 1))
+
+
 def common_keys(rig: BlendshapeRig, keys: WeightKeys, bound: float) -> tuple[WeightKeys, KeyReduction]:
     """Few keys that all shapes share, for files that have one time for all; correctives, which such files hold as
     weights, stay within the bound too.
@@ -90,9 +98,7 @@ def common_keys(rig: BlendshapeRig, keys: WeightKeys, bound: float) -> tuple[Wei
         keys: one a frame.
         bound: of the distance between a frame's weights and the lines between keys.
     """
-    values = keys.weights
-    if rig.activation is not None:
-        values = torch.cat([values, rig.activation(values.to(rig.vertices.device)).cpu()], 1)
+    values = with_correctives(rig, keys).weights
     kept = kept_keys(keys.seconds, values, bound)
     reduction = KeyReduction(len(kept), int(kept.sum()), reduction_error(keys.seconds, values, kept))
     return replace(keys, seconds=keys.seconds[kept], weights=keys.weights[kept]), reduction

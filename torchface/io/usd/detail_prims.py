@@ -13,7 +13,7 @@ from torch import Tensor
 
 from torchface.geometry.meshes.normal_maps import DetailMaps, encode_normals
 from torchface.io.images.image_files import encode_png
-from torchface.io.usd.material_prims import coordinate_reader
+from torchface.io.usd.material_prims import image_texture
 
 WRINKLE_MAPS = "wrinkleMaps"
 
@@ -51,13 +51,7 @@ def write_wrinkles(
 
 def _texture(usd: Any, stage: Any, material: str, name: str, file: str) -> Any:
     types = usd.Sdf.ValueTypeNames
-    texture = usd.UsdShade.Shader.Define(stage, f"{material}/{name}")
-    texture.CreateIdAttr("UsdUVTexture")
-    texture.CreateInput("file", types.Asset).Set(f"./{file}")
-    texture.CreateInput("sourceColorSpace", types.Token).Set("raw")
-    for side in ("wrapS", "wrapT"):
-        texture.CreateInput(side, types.Token).Set("repeat")
+    texture = image_texture(usd, stage, material, name, file, "raw")
     texture.CreateInput("scale", types.Float4).Set(usd.Gf.Vec4f(2, 2, 2, 1))  # from [0,1] to [-1,1]
     texture.CreateInput("bias", types.Float4).Set(usd.Gf.Vec4f(-1, -1, -1, 0))
-    texture.CreateInput("st", types.Float2).ConnectToSource(coordinate_reader(usd, stage, material))
     return texture

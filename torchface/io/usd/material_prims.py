@@ -116,7 +116,7 @@ def _material(usd: Any, stage: Any, path: str, look: _Look) -> Any:
     material.CreateSurfaceOutput().ConnectToSource(surface.ConnectableAPI(), "surface")
     color, opacity = surface.CreateInput("diffuseColor", types.Color3f), look.material.opacity
     if look.image is not None:
-        texture = _texture(usd, stage, path, look.image[0])
+        texture = image_texture(usd, stage, path, "texture", look.image[0], "sRGB")
         color.ConnectToSource(texture.CreateOutput("rgb", types.Float3))
         if look.material.alpha != "OPAQUE" and len(look.image[1]) == 4:
             surface.CreateInput("opacity", types.Float).ConnectToSource(texture.CreateOutput("a", types.Float))
@@ -134,22 +134,18 @@ def _material(usd: Any, stage: Any, path: str, look: _Look) -> Any:
     return material
 
 
-def _texture(usd: Any, stage: Any, path: str, image: str) -> Any:
+def image_texture(usd: Any, stage: Any, path: str, name: str, image: str, space: str) -> Any:
+    """A texture of an image file beside the layer, in the material at a path, by the mesh's texture coordinates."""
     types = usd.Sdf.ValueTypeNames
-    texture = usd.UsdShade.Shader.Define(stage, f"{path}/texture")
+    texture = usd.UsdShade.Shader.Define(stage, f"{path}/{name}")
     texture.CreateIdAttr("UsdUVTexture")
     texture.CreateInput("file", types.Asset).Set(f"./{image}")
-    texture.CreateInput("sourceColorSpace", types.Token).Set("sRGB")
+    texture.CreateInput("sourceColorSpace", types.Token).Set(space)
     for side in ("wrapS", "wrapT"):
         texture.CreateInput(side, types.Token).Set("repeat")
-    texture.CreateInput("st", types.Float2).ConnectToSource(coordinate_reader(usd, stage, path))
+    reader = _reader(usd, stage, f"{path}/coordinates", "UsdPrimvarReader_float2", "st")  # one a material
+    texture.CreateInput("st", types.Float2).ConnectToSource(reader.CreateOutput("result", types.Float2))
     return texture
-
-
-def coordinate_reader(usd: Any, stage: Any, material: str) -> Any:
-    """What gives the textures of the material at a path the mesh's texture coordinates; one a material."""
-    reader = _reader(usd, stage, f"{material}/coordinates", "UsdPrimvarReader_float2", "st")
-    return reader.CreateOutput("result", usd.Sdf.ValueTypeNames.Float2)
 
 
 def _reader(usd: Any, stage: Any, path: str, kind: str, primvar: str) -> Any:

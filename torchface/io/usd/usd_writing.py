@@ -25,9 +25,9 @@ from torchface.geometry.meshes.normal_maps import DetailMaps
 from torchface.io.gltf.corrective_extras import write_correctives
 from torchface.io.gltf.detail_textures import check_detail
 from torchface.io.gltf.mesh_extras import write_extras
-from torchface.io.gltf.primitive_writing import MIN_MOVE, MIN_ROTATION, metres, shading_normals
+from torchface.io.gltf.primitive_writing import metres, shading_normals, shown_motion
 from torchface.io.meshes.polygons import corners_of_polygons
-from torchface.io.scenes.weight_keys import WeightKeys
+from torchface.io.scenes.weight_keys import WeightKeys, with_correctives
 from torchface.io.usd.detail_prims import write_wrinkles
 from torchface.io.usd.material_prims import write_materials
 from torchface.io.usd.usd_library import usd_library
@@ -210,11 +210,11 @@ def _targets(rig: BlendshapeRig) -> list[_Target]:
 
 def _with_combinations(rig: BlendshapeRig, keys: WeightKeys) -> WeightKeys:
     """Keys of all blend shapes: USD blends in-betweens itself, combinations get what the shapes' weights call for."""
-    if rig.activation is None or rig.correctives is None:
+    if rig.correctives is None:
         return keys
-    columns = [row for row, corrective in enumerate(rig.correctives.definitions) if not corrective.is_in_between]
-    followed = rig.activation(keys.weights.to(rig.vertices.device)).cpu()[:, columns]
-    return replace(keys, weights=torch.cat([keys.weights, followed], 1))
+    shapes = range(len(rig.names))
+    combined = [row for row, one in enumerate(rig.correctives.definitions, len(shapes)) if not one.is_in_between]
+    return replace(keys, weights=with_correctives(rig, keys).weights[:, [*shapes, *combined]])
 
 
 def _reach(mesh: Mesh, rig: BlendshapeRig) -> Tensor:
@@ -226,20 +226,12 @@ def _reach(mesh: Mesh, rig: BlendshapeRig) -> Tensor:
 
 
 def _shapes(usd: Any, stage: Any, mesh: Mesh, targets: Sequence[_Target], tokens: Sequence[str]) -> list[Any]:
-    rest = mesh.vertices.detach().double()
-    normals = shading_normals(rest, mesh.faces)
-
-    def moves(delta: Tensor) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """How far positions and normals move, (V,3) each; 0 where that is too little to show."""
-        rotated = (shading_normals(rest + delta, mesh.faces) - normals).float().numpy()
-        moved = delta.float().numpy()
-        moved = moved * (np.einsum("ij,ij->i", moved, moved)[:, None] >= MIN_MOVE * MIN_MOVE)
-        return moved, rotated * (np.einsum("ij,ij->i", rotated, rotated)[:, None] >= MIN_ROTATION * MIN_ROTATION)
-
+    normals = shading_normals(mesh.vertices.detach().double(), mesh.faces)
     used: set[str] = set()
     paths = []
     for token, target in zip(tokens, targets, strict=True):  # all normals at once would fill the memory
-        poses = [moves(target.delta), *(moves(reached) for _, _, reached in target.between)]
+        reached = [target.delta, *(place for _, _, place in target.between)]
+        poses = [shown_motion(mesh, normals, delta) for delta in reached]
         rows = np.flatnonzero(np.any([(moved != 0) | (rotated != 0) for moved, rotated in poses], axis=(0, 2)))
         rows = rows if len(rows) else np.zeros(1, np.int64)  # Blender leaves a shape without any offset out
         shape = usd.UsdSkel.BlendShape.Define(stage, f"{_MESH}/{free_name(usd.Tf.MakeValidIdentifier(token), used)}")

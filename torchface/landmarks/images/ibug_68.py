@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-
 import torch
 from torch import Tensor
 
@@ -74,7 +72,7 @@ def tilt_around(landmarks: Tensor) -> Tensor:
     return torch.atan2(across[..., 1] - down[..., 0], across[..., 0] + down[..., 1])
 
 
-def box_around(landmarks: Tensor, tilt: float = 0.0) -> Tensor:
+def box_around(landmarks: Tensor) -> Tensor:
     r"""The box that a face detector of OpenCV's kind would draw round landmarks.
 
     A square of :math:`1.6\sqrt{(w^2 + h^2)/2}`, w and h the extent of brows, nose, eyes and mouth; their mean lies in
@@ -82,8 +80,6 @@ def box_around(landmarks: Tensor, tilt: float = 0.0) -> Tensor:
 
     Args:
         landmarks: iBUG's 68, (...,68,2), pixels; NaN rows are left out.
-        tilt: of the face, radians, clockwise as the image is seen: the box has the middle and the size that it would
-            have were the face upright.
 
     Returns:
         x, y, width, height, (...,4) pixels; NaN where brows, nose, eyes and mouth are all missing.
@@ -92,16 +88,11 @@ def box_around(landmarks: Tensor, tilt: float = 0.0) -> Tensor:
         raise ShapeError(f"landmarks: found {tuple(landmarks.shape)}, expected (...,68,2)")
     inner = landmarks[..., INNER, :]
     seen = torch.isfinite(inner).all(-1, keepdim=True)
-    upright = inner.new_tensor([[math.cos(tilt), math.sin(tilt)], [-math.sin(tilt), math.cos(tilt)]])
-    if tilt:
-        inner = inner @ upright.T
     low = torch.where(seen, inner, torch.inf).amin(-2)
     high = torch.where(seen, inner, -torch.inf).amax(-2)
     middle = torch.where(seen, inner, 0).sum(-2) / seen.sum(-2)
     side = SIDE_OF_EXTENT * ((high - low).square().sum(-1, keepdim=True) / 2).sqrt()
     centre = middle + side * middle.new_tensor([0.0, -MIDDLE_ABOVE])
-    if tilt:
-        centre = centre @ upright
     box = torch.cat([centre - side / 2, side, side], dim=-1)
     return torch.where(torch.isfinite(box).all(-1, keepdim=True), box, torch.nan)
 

@@ -16,24 +16,12 @@ from torchface.errors import ValueRangeError
 from torchface.geometry.meshes.operators import components, corners
 from torchface.geometry.meshes.surface_index import SurfaceIndex
 from torchface.geometry.similarity import similarity_transform
+from torchface.landmarks.images.ibug_68 import COUNT, MIRROR_68
 from torchface.mesh import Mesh
 from torchface.rendering.raycast import RayCaster
 from torchface.rig import BlendshapeRig
 from torchface.shape_names import ARKIT, mapping
 from torchface.synthetic.head.performer import performer
-
-LANDMARKS = 68
-
-# iBUG's points in the order of their mirror images.
-_MIRROR = (
-    *range(16, -1, -1),
-    *range(26, 16, -1),
-    *range(27, 31),
-    *range(35, 30, -1),
-    *(45, 44, 43, 42, 47, 46, 39, 38, 37, 36, 41, 40),
-    *(54, 53, 52, 51, 50, 49, 48, 59, 58, 57, 56, 55),
-    *(64, 63, 62, 61, 60, 67, 66, 65),
-)
 
 _Site = dict[int, float]
 _SIDE: dict[str, dict[str, _Site]] = {
@@ -171,14 +159,14 @@ def makeup_layout(rig: BlendshapeRig) -> MakeupLayout:
             names += [f"{name}R", f"{name}L"]
             partner += [f"{name}L", f"{name}R"]
             regions += [region, region]
-            sites += [_row(weights), _row({_MIRROR[index]: weight for index, weight in weights.items()})]
+            sites += [_row(weights), _row({MIRROR_68[index]: weight for index, weight in weights.items()})]
     attachment = _on_skin(rig.neutral, torch.stack(sites) @ points, names)
     return MakeupLayout(attachment, tuple(regions), torch.tensor([names.index(name) for name in partner]))
 
 
 def _landmarks(rig: BlendshapeRig) -> Tensor:
     annotations = rig.neutral.annotations
-    if annotations is not None and annotations.landmarks is not None and len(annotations.landmarks) == LANDMARKS:
+    if annotations is not None and annotations.landmarks is not None and len(annotations.landmarks) == COUNT:
         return rig.vertices.detach().cpu().double()[annotations.landmarks.cpu()]
     return landmarks_by_shape(rig)
 
@@ -221,7 +209,7 @@ def _centres(rig: BlendshapeRig) -> dict[str, Tensor]:
 
 
 def _row(weights: _Site) -> Tensor:
-    row = torch.zeros(LANDMARKS, dtype=torch.float64)
+    row = torch.zeros(COUNT, dtype=torch.float64)
     row[list(weights)] = torch.tensor(list(weights.values()), dtype=torch.float64)
     if abs(float(row.sum()) - 1) > 1e-9:
         raise ValueRangeError(f"layout: found weights {weights} of sum {float(row.sum()):g}, expected 1")

@@ -25,7 +25,7 @@ from torchface.landmarks import (
     landmark_jitter,
     track_landmarks,
 )
-from torchface.landmarks.images.ibug_68 import MIRROR_68, box_around
+from torchface.landmarks.images.ibug_68 import MIRROR_68, box_around, turned_box
 from torchface.landmarks.images.trees.landmark_consensus import ConsensusSettings, consensus
 from torchface.landmarks.images.trees.tree_finder import TreeFinder
 from torchface.rendering.clay_shading import Lighting, render
@@ -234,7 +234,7 @@ def test_trees_find_a_face_that_is_turned_as_they_are_told(
     upright = consensus(trees, image, box_around(truth))
     last = torch.tensor([image.shape[1] - 1.0, image.shape[0] - 1.0])
     turned = [torch.stack([last[1] - truth[:, 1], truth[:, 0]], 1), last - truth][quarters - 1]
-    found = consensus(trees, image.rot90(-quarters).contiguous(), box_around(turned, angle), angle)
+    found = consensus(trees, image.rot90(-quarters).contiguous(), turned_box(turned)[0], angle)
     off, before = (
         (one - two).norm(dim=1).mean() for one, two in ((found.landmarks, turned), (upright.landmarks, truth))
     )

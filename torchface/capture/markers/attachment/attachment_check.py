@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from torchface.capture.markers.attachment.site_uncertainty import SiteUncertainty
+from torchface.capture.markers.marker_labels import listed
 from torchface.capture.markers.rest_pose import inlier_markers
 from torchface.capture.markers.rig_fit_check import DOUBTFUL_SHARE
 from torchface.errors import AlignmentError, ValueRangeError
@@ -16,7 +17,6 @@ from torchface.errors import AlignmentError, ValueRangeError
 # whose shapes are a fifth wrong 0.09 or 0.16; with markers 2 mm off the skin 0.13, since the scale takes most of that
 # up; with the rig of a similar head 0.3 to 0.4, of any other 0.7 to 0.9.
 MAX_OFF_SKIN = 0.3
-_SHOWN = 6
 
 
 def check_sites(
@@ -47,7 +47,7 @@ def check_sites(
     far = (~inlier_markers(error)).nonzero()[:, 0]
     if len(far):
         worst = far[error[far].argsort(descending=True)].tolist()
-        named = _listed([f"{labels[i]} ({float(error[i]):.0f} mm)" for i in worst])
+        named = listed([f"{labels[i]} ({float(error[i]):.0f} mm)" for i in worst])
         raise AlignmentError(
             f"markers: {named} stay far from the skin while most stay within {typical:.2g} mm: they sit on the "
             "helmet, fell off, or carry another marker's label; leave them out of the take or correct their label"
@@ -57,13 +57,8 @@ def check_sites(
         raise ValueRangeError(
             f"range of motion: leaves {len(sites)} of {len(labels)} sites uncertain by more than a millimetre and "
             f"{len(shapes)} of {len(uncertainty.names) - len(uncertainty.unseen)} shapes that the markers see "
-            f"({_listed(shapes)}), expected at most half: play every expression strongly, each by itself"
+            f"({listed(shapes)}), expected at most half: play every expression strongly, each by itself"
         )
-
-
-def _listed(names: Sequence[str]) -> str:
-    more = f" and {len(names) - _SHOWN} more" if len(names) > _SHOWN else ""
-    return ", ".join(names[:_SHOWN]) + more
 
 
 def mean_radius(points: Tensor) -> float:

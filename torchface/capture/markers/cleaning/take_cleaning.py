@@ -16,9 +16,8 @@ from torchface.capture.markers.cleaning.label_swaps import (
     whole_take_exchanges,
 )
 from torchface.capture.markers.cleaning.robust_prediction import Prediction, predict_markers
-from torchface.capture.markers.marker_solver import MarkerSolver
+from torchface.capture.markers.marker_solver import MarkerSolver, markers_of
 from torchface.capture.markers.take_smoothing import WholeTakeSolver
-from torchface.errors import NameMismatchError
 from torchface.take import Take, Track
 
 _SPIKE_SECONDS, _GAP_SECONDS = 0.1, 0.25
@@ -123,13 +122,11 @@ def clean_take(solver: MarkerSolver, take: Take, slip: bool = False) -> Cleanup:
         >>> [(defect.kind, defect.labels, defect.first) for defect in cleanup.defects]
         [('spike', ('M008',), 30)]
     """
-    track = take.markers
-    if track is None:
-        raise NameMismatchError("take: has no markers, expected a track of them")
+    track = markers_of(take)
     raw = solver.arrange(track).double()
     raw[torch.isnan(raw).any(-1)] = torch.nan
     alignment = solver.alignment
-    seen = raw if alignment is None else alignment.apply(raw)
+    seen = solver.in_rig_space(raw)
     first = predict_markers(solver, seen, slip)
     labels = solver.labels
     cycles = whole_take_exchanges(seen, first)

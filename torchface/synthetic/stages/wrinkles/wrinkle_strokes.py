@@ -10,6 +10,8 @@ from itertools import pairwise
 import torch
 from torch import Tensor
 
+from torchface.landmarks.images.ibug_68 import MIRROR_68
+
 _INTEROCULAR = 62.0  # millimetres between the eyes' middles that sizes are given for
 
 
@@ -41,7 +43,7 @@ def wrinkle_strokes(marks: Tensor, seed: int) -> list[Stroke]:
         *_chin(marks, scale, draw),
         *_lips(marks, scale, draw),
     ]
-    mirrored = marks[_MIRRORED] * torch.tensor([-1.0, 1.0])
+    mirrored = marks[list(MIRROR_68)] * torch.tensor([-1.0, 1.0])
     for side, seen, sign in (("left", marks, 1.0), ("right", mirrored, -1.0)):
         # Drawn as if each side were the left one, from its own random numbers: no face is quite symmetric.
         for stroke in (*_eye(seen, scale, draw), *_nasolabial(seen, scale, draw), *_nose_side(seen, scale, draw)):
@@ -49,13 +51,6 @@ def wrinkle_strokes(marks: Tensor, seed: int) -> list[Stroke]:
             control = flipped if sign > 0 else flipped.flip(0)
             strokes.append(replace(stroke, place=f"{stroke.place}_{side}", control=control))
     return strokes
-
-
-_MIRRORED = torch.tensor([
-    *range(16, -1, -1), *range(26, 16, -1), *range(27, 31), *range(35, 30, -1), 45, 44, 43, 42, 47, 46,
-    39, 38, 37, 36, 41, 40, *range(54, 47, -1), *range(59, 54, -1), *range(64, 59, -1), *range(67, 64, -1),
-])  # fmt: skip
-"""The 68 landmarks' mirror images."""
 
 
 class _Draw:
