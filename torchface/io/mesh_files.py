@@ -22,8 +22,7 @@ _WRITERS = {
     **dict.fromkeys(USD_ENDINGS, write_usd_mesh),
 }
 _GLTF = (".glb", ".gltf", ".vrm")
-MESH_ENDINGS = tuple(_READERS)
-"""What :func:`load_mesh` reads beside glTF and USD, which may hold a rig."""
+MESH_ENDINGS = tuple(_READERS)  # what load_mesh reads beside glTF and USD, which may hold a rig
 
 
 def load_mesh(path: str | Path, unit: str | None = None) -> Mesh:

@@ -27,10 +27,8 @@ from torchface.take import Take
 from torchface.temporal.key_reduction import KeyReduction
 
 GLTF_ENDINGS = (".glb", ".gltf", ".vrm")
-SCENE_ENDINGS = (*GLTF_ENDINGS, *USD_ENDINGS)
-"""Files that may hold a rig, or a mesh without shapes."""
-ANIMATION_ENDINGS = (".glb", *USD_ENDINGS, MAYA_ENDING)
-"""Files that a rig is written to with an animation."""
+SCENE_ENDINGS = (*GLTF_ENDINGS, *USD_ENDINGS)  # files that may hold a rig, or a mesh without shapes
+ANIMATION_ENDINGS = (".glb", *USD_ENDINGS, MAYA_ENDING)  # files that a rig is written to with an animation
 
 
 def load_rig(

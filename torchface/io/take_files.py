@@ -32,11 +32,8 @@ TAKE_ENDINGS = (*MARKER_ENDINGS, ".csv")
 RECORDING_ENDINGS = (".txt", ".json", ".gesichter")
 """Of weights as phones and other programs record them, which are read alone."""
 
-LARGEST_WEIGHT = 5.0
-"""Nobody drives a shape so far; where a tenth of the frames do, weights are in percent."""
-
-LARGEST_ANGLE = math.pi
-"""No rotation in radians is larger; where it is in a tenth of the frames, it is in degrees."""
+LARGEST_WEIGHT = 5.0  # nobody drives a shape so far; where a tenth of the frames do, weights are in percent
+LARGEST_ANGLE = math.pi  # no rotation in radians is larger; where it is in a tenth of the frames, it is in degrees
 
 _SHARE, _MOST_PERCENT, _MOST_DEGREES = 0.1, 200.0, 360.0
 

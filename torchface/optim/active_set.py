@@ -98,21 +98,13 @@ def projected_newton(problem: BoxProblem, start: Tensor, tolerance: float, itera
 
 @dataclass(frozen=True, eq=False)
 class _NewtonStep:
-    """A full step and what it was made from.
+    """A full step and what it was made from."""
 
-    Args:
-        full: where it leads, in the box, (B,N).
-        descends: whether the objective falls enough there, (B,).
-        held: variables at a bound whose gradient pushes outward, (B,N).
-        near: how close to a bound counts as at it, (B,1).
-        damping: added to the scaled diagonal, (B,).
-    """
-
-    full: Tensor
-    descends: Tensor
-    held: Tensor
-    near: Tensor
-    damping: Tensor
+    full: Tensor  # where it leads, in the box, (B,N)
+    descends: Tensor  # whether the objective falls enough there, (B,)
+    held: Tensor  # variables at a bound whose gradient pushes outward, (B,N)
+    near: Tensor  # how close to a bound counts as at it, (B,1)
+    damping: Tensor  # added to the scaled diagonal, (B,)
 
     @staticmethod
     def at(problem: BoxProblem, x: Tensor, gradient: Tensor) -> _NewtonStep:

@@ -15,20 +15,14 @@ _SMALLEST_DIAGONAL = 1e-12
 
 @dataclass(frozen=True, eq=False)
 class BoxProblem:
-    r"""B problems :math:`\min \tfrac12 x^\top H x + f^\top x,\ l \le x \le u`, in float64.
+    r"""B problems :math:`\min \tfrac12 x^\top H x + f^\top x,\ l \le x \le u`, in float64."""
 
-    Args:
-        H: symmetric, positive semidefinite, (N,N) for all problems or (B,N,N).
-        f: (B,N).
-        lower, upper: (N,), infinite where there is no bound.
-        diagonal: the metric, diag H kept from zero, (N,) or (B,N).
-    """
-
-    H: Tensor
-    f: Tensor
+    H: Tensor  # symmetric, positive semidefinite, (N,N) for all problems or (B,N,N)
+    f: Tensor  # (B,N)
+    # lower, upper: (N,), infinite where there is no bound
     lower: Tensor
     upper: Tensor
-    diagonal: Tensor
+    diagonal: Tensor  # the metric, diag H kept from zero, (N,) or (B,N)
 
     @staticmethod
     def of(H: Tensor, f: Tensor, lower: Tensor, upper: Tensor) -> BoxProblem:

@@ -13,8 +13,7 @@ from torchface.errors import TraceError
 from torchface.optim.box_problem import metric
 from torchface.optim.free_variables import RIDGE, solve_free
 
-Solve = Callable[[Tensor, Tensor, Tensor, Tensor], Tensor]
-"""Of H, f and the bounds, tensors that no transform wraps."""
+Solve = Callable[[Tensor, Tensor, Tensor, Tensor], Tensor]  # of H, f and the bounds, tensors that no transform wraps
 
 
 class BoxSolution(torch.autograd.Function):

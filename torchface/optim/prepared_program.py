@@ -26,14 +26,10 @@ _CHUNK_NUMBERS, _LEAST_FRAMES = {"cpu": 2**17, "other": 2**23}, 256
 
 @dataclass(frozen=True, eq=False)
 class PreparedProgram:
-    """The symmetric part of H in float64, and bounds in float64.
+    """The symmetric part of H in float64, and bounds in float64."""
 
-    Args:
-        H: (N,N) for all problems or (B,N,N).
-        lower, upper: (N,), infinite where there is no bound.
-    """
-
-    H: Tensor
+    H: Tensor  # (N,N) for all problems or (B,N,N)
+    # lower, upper: (N,), infinite where there is no bound
     lower: Tensor
     upper: Tensor
 

@@ -24,19 +24,12 @@ _CHUNK_NUMBERS = 2**24  # of the widest array, in all problems of a chunk
 
 @dataclass(frozen=True, eq=False)
 class SimplexProblems:
-    """Problems of which several may share a matrix.
+    """Problems of which several may share a matrix."""
 
-    Args:
-        rows: of all matrices, one below the other, (G·N,N) float64.
-        first: each problem's first row, (B,) int64.
-        f: (B,N).
-        limit: on the residual of each, (B,).
-    """
-
-    rows: Tensor
-    first: Tensor
-    f: Tensor
-    limit: Tensor
+    rows: Tensor  # of all matrices, one below the other, (G·N,N) float64
+    first: Tensor  # each problem's first row, (B,) int64
+    f: Tensor  # (B,N)
+    limit: Tensor  # on the residual of each, (B,)
 
     def __getitem__(self, some: Tensor) -> SimplexProblems:
         return SimplexProblems(self.rows, self.first[some], self.f[some], self.limit[some])
@@ -49,15 +42,10 @@ class SimplexProblems:
 
 @dataclass(frozen=True, eq=False)
 class Mixture:
-    """Points of the simplex by their positive variables, K places each.
+    """Points of the simplex by their positive variables, K places each."""
 
-    Args:
-        index: of variables, (B,K); a place that is free repeats another.
-        value: of theirs, (B,K), of sum 1; 0 in free places.
-    """
-
-    index: Tensor
-    value: Tensor
+    index: Tensor  # of variables, (B,K); a place that is free repeats another
+    value: Tensor  # of theirs, (B,K), of sum 1; 0 in free places
 
     def __getitem__(self, some: Tensor) -> Mixture:
         return Mixture(self.index[some], self.value[some])
@@ -136,19 +124,12 @@ def _lowered(problems: SimplexProblems, x: Mixture, entering: Tensor, enters: Te
 
 @dataclass
 class _Candidates:
-    """Variables that may take part, K places a problem.
+    """Variables that may take part, K places a problem."""
 
-    Args:
-        H: between them, (B,K,K).
-        f: of them, (B,K).
-        taken: which take part, (B,K) bool.
-        value: (B,K), 0 where not taken.
-    """
-
-    H: Tensor
-    f: Tensor
-    taken: Tensor
-    value: Tensor
+    H: Tensor  # between them, (B,K,K)
+    f: Tensor  # of them, (B,K)
+    taken: Tensor  # which take part, (B,K) bool
+    value: Tensor  # (B,K), 0 where not taken
 
     def __getitem__(self, some: Tensor) -> _Candidates:
         return _Candidates(self.H[some], self.f[some], self.taken[some], self.value[some])

@@ -18,8 +18,7 @@ from torchface.optim.data_dependent import data_dependent
 from torchface.take import Take, Track
 from torchface.temporal import interpolated, savitzky_golay
 
-GAMMA = 4.0
-"""Largest weight of a prediction, mm² over all markers for a squared weight of 1."""
+GAMMA = 4.0  # largest weight of a prediction, mm² over all markers for a squared weight of 1
 
 
 def gamma_curves(active: Tensor, maximum: float = GAMMA, window: int = 15, order: int = 2) -> Tensor:

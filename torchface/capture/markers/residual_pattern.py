@@ -16,15 +16,10 @@ _MIN_MARKERS, _NEIGHBOURS, _REACH = 20, 4, 1.5
 
 @dataclass(frozen=True)
 class ResidualPattern:
-    """The pattern of a residual.
+    """The pattern of a residual."""
 
-    Args:
-        smooth: root mean square of what neighbouring markers share, millimetres.
-        correlation: of each marker's residual with the mean of its neighbours'.
-    """
-
-    smooth: float
-    correlation: float
+    smooth: float  # root mean square of what neighbouring markers share, millimetres
+    correlation: float  # of each marker's residual with the mean of its neighbours'
 
     @property
     def other_head(self) -> bool:

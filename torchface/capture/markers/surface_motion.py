@@ -14,18 +14,12 @@ from torchface.rig import BlendshapeRig
 
 @dataclass(frozen=True, eq=False)
 class SurfaceMotion:
-    r"""Vertices :math:`p_v(w) = A_v (1, w)` and, where asked for, their normals :math:`n_v(w) \approx N_v (1, w)`.
-
-    Args:
-        points: :math:`A`, (V,3,N+1), millimetres, float64.
-        normals: :math:`N`, (V,3,N+1), float64; a shape's column is what the shape alone does to the unit normal.
-        skin: the triangles that belong to the largest connected part, (F,) bool: where markers can sit.
-    """
+    r"""Vertices :math:`p_v(w) = A_v (1, w)` and, where asked for, their normals :math:`n_v(w) \approx N_v (1, w)`."""
 
     faces: Tensor
-    points: Tensor
-    normals: Tensor | None
-    skin: Tensor
+    points: Tensor  # A, (V,3,N+1), millimetres, float64
+    normals: Tensor | None  # N, (V,3,N+1), float64; a shape's column is what the shape alone does to the unit normal
+    skin: Tensor  # the triangles that belong to the largest connected part, (F,) bool: where markers can sit
 
     @staticmethod
     def of(rig: BlendshapeRig, normals: bool = False) -> SurfaceMotion:

@@ -306,16 +306,12 @@ class _SmoothProblem:
 
 @dataclass(frozen=True, eq=False)
 class _TakeData:
-    """What markers ask of each frame of a rig with correctives, over all M markers, seen or not.
-
-    Args:
-        energy: of frames that show all; None where a frame has gaps, whose residuals are then formed anew.
-        seen: in rig space, (T,M,3).
-    """
+    """What markers ask of each frame of a rig with correctives, over all M markers, seen or not."""
 
     solver: MarkerSolver
+    # Of frames that show all; None where a frame has gaps, whose residuals are then formed anew.
     energy: CorrectiveEnergy | None
-    seen: Tensor
+    seen: Tensor  # in rig space, (T,M,3)
 
     @staticmethod
     def of(solver: MarkerSolver, markers: Tensor) -> _TakeData:

@@ -28,8 +28,7 @@ from torchface.rig import BlendshapeRig
 from torchface.take import Take
 
 BLENDER_ENDINGS = (".fbx", ".blend")
-PROGRAM = "TORCHFACE_BLENDER"
-"""The environment variable that names the Blender to run, or a Python that has ``bpy``."""
+PROGRAM = "TORCHFACE_BLENDER"  # the environment variable that names the Blender to run, or a Python that has bpy
 
 _SECONDS_ALWAYS, _SECONDS_A_MEGABYTE = 600.0, 10.0
 _INSTALL = (

@@ -37,23 +37,16 @@ _MAX_TEXTURE = 2**24  # texels; larger ones are drawn plain
 
 @dataclass(frozen=True, eq=False)
 class Block:
-    """Vertices that some primitives of one mesh share.
-
-    Args:
-        primitives: of the mesh, which share the vertices.
-        name: the node's and the mesh's, for people and for rules by name.
-        rows: where the vertices lie among the character's.
-        triangles: how many each primitive has.
-    """
+    """Vertices that some primitives of one mesh share."""
 
     node: int
     mesh: int
-    primitives: tuple[int, ...]
-    name: str
+    primitives: tuple[int, ...]  # of the mesh, which share the vertices
+    name: str  # the node's and the mesh's, for people and for rules by name
     materials: tuple[str, ...]
-    rows: slice
+    rows: slice  # where the vertices lie among the character's
     names: tuple[str, ...]
-    triangles: tuple[int, ...]
+    triangles: tuple[int, ...]  # how many each primitive has
 
 
 @dataclass(frozen=True, eq=False)

@@ -28,8 +28,7 @@ from torchface.mesh import Mesh
 
 _LIST = "wrinkleMaps"
 _UNPACKED_ALWAYS = 2**28
-_UNPACKED_PER_BYTE = 1024
-"""Wrinkles on a flat ground pack well, but not a thousand times."""
+_UNPACKED_PER_BYTE = 1024  # wrinkles on a flat ground pack well, but not a thousand times
 
 
 def write_detail(

@@ -41,15 +41,11 @@ def shown(value: object) -> str:
 
 @dataclass
 class Document:
-    """A glTF document whose every access is checked; errors name the file and the place in it.
-
-    Args:
-        binary: the binary chunk of a ``.glb``.
-    """
+    """A glTF document whose every access is checked; errors name the file and the place in it."""
 
     path: Path
     root: dict[str, Any]
-    binary: memoryview | None = None
+    binary: memoryview | None = None  # the binary chunk of a .glb
     _sources: dict[str, memoryview] = field(default_factory=dict)
     _unpacked_views: dict[str, memoryview] = field(default_factory=dict)
     _unpacked: int = 0

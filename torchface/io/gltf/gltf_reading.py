@@ -231,17 +231,11 @@ def rejoined(document: Document, instanced: Sequence[tuple[Instance, Part]]) -> 
 
 @dataclass(frozen=True)
 class Weld:
-    """Which split vertices are one.
+    """Which split vertices are one."""
 
-    Args:
-        vertex_of: for each split vertex the vertex it belongs to, (C,).
-        row_of: for each vertex the first split one, (V,).
-        authored: the numbering is the one the mesh was written with, so annotations hold.
-    """
-
-    vertex_of: NDArray[np.int64]
-    row_of: NDArray[np.int64]
-    authored: bool
+    vertex_of: NDArray[np.int64]  # for each split vertex the vertex it belongs to, (C,)
+    row_of: NDArray[np.int64]  # for each vertex the first split one, (V,)
+    authored: bool  # the numbering is the one the mesh was written with, so annotations hold
 
 
 def weld(part: Part) -> Weld:

@@ -26,18 +26,12 @@ _JSON, _BINARY = 0x4E4F534A, 0x004E4942
 
 @dataclass(frozen=True, eq=False)
 class AddedTargets:
-    """What new morph targets move of vertices that some primitives of a mesh share.
-
-    Args:
-        primitives: those that share the vertices.
-        positions: (N,C,3) in the mesh's own axes and unit, one for each new name.
-        normals: the same of the normals, or none.
-    """
+    """What new morph targets move of vertices that some primitives of a mesh share."""
 
     mesh: int
-    primitives: tuple[int, ...]
-    positions: NDArray[np.float32]
-    normals: NDArray[np.float32] | None = None
+    primitives: tuple[int, ...]  # those that share the vertices
+    positions: NDArray[np.float32]  # (N,C,3) in the mesh's own axes and unit, one for each new name
+    normals: NDArray[np.float32] | None = None  # the same of the normals, or none
 
 
 def document_with_targets(

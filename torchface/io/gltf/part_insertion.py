@@ -22,24 +22,16 @@ _MATERIAL = "eyes and inside of the mouth"
 
 @dataclass(frozen=True, eq=False)
 class ExtendedBlock:
-    """A block of a character with n vertices more, behind the C that it has.
-
-    Args:
-        shares: of the block's own vertices, by which the new ones take what they are not given, (n,C), sparse.
-        places: in the scene, (n,3).
-        normals: in the scene, (n,3).
-        faces: all triangles of each of its primitives.
-        uvs: texture coordinates, origin at the lower left, (n,2); NaN where they are taken by share.
-        parts: triangles in the material of the parts, (P,3), or none.
-    """
+    """A block of a character with n vertices more, behind the C that it has."""
 
     block: int
+    # Of the block's own vertices, by which the new ones take what they are not given, (n,C), sparse.
     shares: sparse.csr_array
-    places: NDArray[np.float64]
-    normals: NDArray[np.float64]
-    faces: Mapping[int, NDArray[np.int64]]
-    uvs: NDArray[np.float64]
-    parts: NDArray[np.int64] | None
+    places: NDArray[np.float64]  # in the scene, (n,3)
+    normals: NDArray[np.float64]  # in the scene, (n,3)
+    faces: Mapping[int, NDArray[np.int64]]  # all triangles of each of its primitives
+    uvs: NDArray[np.float64]  # texture coordinates, origin at the lower left, (n,2); NaN where they are taken by share
+    parts: NDArray[np.int64] | None  # triangles in the material of the parts, (P,3), or none
 
 
 def document_with_parts(character: Character, blocks: Sequence[ExtendedBlock], page: bytes) -> Document:

@@ -17,26 +17,19 @@ from torchface.io.gltf.gltf_document import Document, glb_pieces
 from torchface.io.gltf.primitive_reading import read_target_names
 from torchface.io.gltf.scene import instances, local_transform, node_transforms
 
-NECKS_SHARE = 0.3
-"""Of the head's rotation, where there is a neck."""
+NECKS_SHARE = 0.3  # of the head's rotation, where there is a neck
 
 _PIVOT = (0.0, -0.25, -0.1)  # of the shapes' box from its middle: where a head without bones turns
 
 
 @dataclass(frozen=True, eq=False)
 class Performance:
-    """Weights and rotations of a take.
+    """Weights and rotations of a take."""
 
-    Args:
-        seconds: of each frame, (T,).
-        weights: (T,N).
-        rotations: Live Link Face's yaw, pitch and roll of head, left and right eye, (T,9) radians.
-    """
-
-    seconds: NDArray[np.float64]
+    seconds: NDArray[np.float64]  # of each frame, (T,)
     names: Sequence[str]
-    weights: NDArray[np.float32]
-    rotations: NDArray[np.float64]
+    weights: NDArray[np.float32]  # (T,N)
+    rotations: NDArray[np.float64]  # Live Link Face's yaw, pitch and roll of head, left and right eye, (T,9) radians
 
 
 def performed_glb(document: Document, performance: Performance) -> bytes:

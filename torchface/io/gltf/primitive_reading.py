@@ -32,28 +32,18 @@ class MaterialLook:
 
 @dataclass(frozen=True)
 class Part:
-    """A mesh as the file has it: C vertices, split wherever texture coordinates differ.
+    """A mesh as the file has it: C vertices, split wherever texture coordinates differ."""
 
-    Args:
-        positions: (C,3), the file's unit and the mesh's own axes.
-        deltas: (N,C,3), one a name.
-        triangles: (F,3) into the C vertices.
-        uvs: (C,2), origin at the lower left.
-        colors: (C,3) in [0,1], encoded as images are.
-        vertex_ids: (C,), which vertex of the mesh as authored each was split from.
-        looks: the texture and colour of the triangles, and of how many, in their order.
-        extras: the mesh's ``extras``.
-    """
-
-    positions: NDArray[np.float32]
-    deltas: NDArray[np.float32]
+    positions: NDArray[np.float32]  # (C,3), the file's unit and the mesh's own axes
+    deltas: NDArray[np.float32]  # (N,C,3), one a name
     names: tuple[str, ...]
-    triangles: NDArray[np.int64]
-    uvs: NDArray[np.float32] | None
-    colors: NDArray[np.float32] | None
-    vertex_ids: NDArray[np.int64] | None
+    triangles: NDArray[np.int64]  # (F,3) into the C vertices
+    uvs: NDArray[np.float32] | None  # (C,2), origin at the lower left
+    colors: NDArray[np.float32] | None  # (C,3) in [0,1], encoded as images are
+    vertex_ids: NDArray[np.int64] | None  # (C,), which vertex of the mesh as authored each was split from
+    # The texture and colour of the triangles, and of how many, in their order.
     looks: tuple[tuple[MaterialLook, int], ...]
-    extras: dict[str, Any]
+    extras: dict[str, Any]  # the mesh's extras
 
 
 def read_part(document: Document, index: int) -> Part | None:

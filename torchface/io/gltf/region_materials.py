@@ -8,21 +8,14 @@ from typing import Literal
 
 @dataclass(frozen=True)
 class PartMaterial:
-    """The look of a part that nobody has painted.
-
-    Args:
-        words: a region whose name holds one of them is made of it.
-        color: sRGB in [0,1].
-        roughness: 0 a mirror, 1 chalk.
-        opacity: of the whole part, in [0,1].
-        alpha: glTF's mode: "OPAQUE"; "MASK", with holes where its image has no opacity; "BLEND", clear.
-    """
+    """The look of a part that nobody has painted."""
 
     name: str
-    words: tuple[str, ...]
-    color: tuple[float, float, float]
-    roughness: float
-    opacity: float = 1.0
+    words: tuple[str, ...]  # a region whose name holds one of them is made of it
+    color: tuple[float, float, float]  # sRGB in [0,1]
+    roughness: float  # 0 a mirror, 1 chalk
+    opacity: float = 1.0  # of the whole part, in [0,1]
+    # GlTF's mode: "OPAQUE"; "MASK", with holes where its image has no opacity; "BLEND", clear.
     alpha: Literal["OPAQUE", "MASK", "BLEND"] = "OPAQUE"
 
 

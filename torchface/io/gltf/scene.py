@@ -18,17 +18,11 @@ _MAX_INSTANCES = 4096
 
 @dataclass(frozen=True)
 class Instance:
-    """A mesh in the scene.
+    """A mesh in the scene."""
 
-    Args:
-        mesh: its index among the document's meshes.
-        name: the node's name, else the mesh's, else ``mesh_0`` and so on.
-        transform: from mesh to scene, (4,4).
-    """
-
-    mesh: int
-    name: str
-    transform: NDArray[np.float64]
+    mesh: int  # its index among the document's meshes
+    name: str  # the node's name, else the mesh's, else mesh_0 and so on
+    transform: NDArray[np.float64]  # from mesh to scene, (4,4)
 
 
 def instances(document: Document) -> list[Instance]:

@@ -19,14 +19,12 @@ from torch import Tensor
 from torchface.errors import FileFormatError
 from torchface.files.input_files import note_read
 
-LARGEST_ARRAYS = 2**31
-"""Bytes of all arrays that are read of a file."""
+LARGEST_ARRAYS = 2**31  # bytes of all arrays that are read of a file
 _LARGEST_FILE, _MOST_ENTRIES, _MOST_VERTICES, _HEADER = 2**32, 1000, 2**20, 2**16
 _LARGEST_NUMBER = 1e6  # of a model's lengths in its own unit, far above any
 _PICKLES = (".pkl", ".pickle", ".pt", ".pth", ".ckpt")
 _BROKEN = (zipfile.BadZipFile, zlib.error, SafetensorError, OSError, ValueError, EOFError)
-ONLY = "array"
-"""The name of what a ``.npy`` holds."""
+ONLY = "array"  # the name of what a .npy holds
 _HOW = (
     "A pickle runs what its author wrote, so torchface opens none. Convert it once, in a process of its own, with the "
     "script of the page Head models of others (docs/how_to/head_models.md): it lets numpy's and scipy's arrays through "

@@ -35,30 +35,20 @@ _UNSIGNED, _UNTOLD = 1, 4
 
 @dataclass(frozen=True, eq=False)
 class ImageHeader:
-    """An image as its file describes it.
-
-    Args:
-        width, height: pixels, as they are stored.
-        samples: of a pixel, such as 3.
-        bits: of a sample.
-        number: what a sample is: 1 an unsigned whole number, 2 a signed one, 3 floating point (TIFF's numbering).
-        orientation: EXIF's, 1 (upright) to 8.
-        data: the file for a decoder: without what is no pixel, where such parts may claim gigabytes.
-        least_pixels: that a decoder unpacks at a time, such as those of a tile.
-        inverted: 0 is white.
-        transparent: a PNG's one colour that is, in the samples that are decoded; empty where there is none.
-    """
+    """An image as its file describes it."""
 
     kind: str
+    # width, height: pixels, as they are stored
     width: int
     height: int
-    samples: int
-    bits: int
-    number: int
-    orientation: int
-    data: bytes
-    least_pixels: int = 0
-    inverted: bool = False
+    samples: int  # of a pixel, such as 3
+    bits: int  # of a sample
+    number: int  # what a sample is: 1 an unsigned whole number, 2 a signed one, 3 floating point (TIFF's numbering)
+    orientation: int  # EXIF's, 1 (upright) to 8
+    data: bytes  # the file for a decoder: without what is no pixel, where such parts may claim gigabytes
+    least_pixels: int = 0  # that a decoder unpacks at a time, such as those of a tile
+    inverted: bool = False  # 0 is white
+    # A PNG's one colour that is, in the samples that are decoded; empty where there is none.
     transparent: tuple[int, ...] = ()
 
 

@@ -24,13 +24,9 @@ _HIGHEST = {np.dtype(np.uint8): 255, np.dtype(np.uint16): 65535, np.dtype(np.flo
 
 @dataclass(frozen=True, eq=False)
 class Samples:
-    """An upright image as its file stores it.
+    """An upright image as its file stores it."""
 
-    Args:
-        array: (H,W,C) of uint8, uint16 or float32: grey, grey and alpha, red green blue, or those and alpha.
-    """
-
-    array: np.ndarray
+    array: np.ndarray  # (H,W,C) of uint8, uint16 or float32: grey, grey and alpha, red green blue, or those and alpha
 
     def colors(self) -> Tensor:
         """Red, green and blue in [0,1], (3,H,W) float32."""

@@ -35,8 +35,7 @@ class Look:
         return plain if bool((self.color == 1).all()) else plain * self.color[:, None, None]
 
 
-MAX_TEXELS = 2**27
-"""Of all images of a scene."""
+MAX_TEXELS = 2**27  # of all images of a scene
 
 
 def with_used_looks(mesh: Mesh, look: Tensor, looks: Sequence[Look], images_only: bool) -> Mesh:

@@ -22,17 +22,12 @@ _MAX_DEPTH = 32
 
 @dataclass(frozen=True, eq=False)
 class LabelledFace:
-    """One face in a photograph.
+    """One face in a photograph."""
 
-    Args:
-        image: the photograph's file as the XML names it, relative to the XML.
-        box: left, top, width, height, (4,) pixels.
-        points: landmarks by their number, (L,2), pixels, x right, y down, pixel centres at integers from 0; NaN for
-            numbers that are left out.
-    """
-
-    image: str
-    box: Tensor
+    image: str  # the photograph's file as the XML names it, relative to the XML
+    box: Tensor  # left, top, width, height, (4,) pixels
+    # Landmarks by their number, (L,2), pixels, x right, y down, pixel centres at integers from 0; NaN for numbers that
+    # are left out.
     points: Tensor
 
 

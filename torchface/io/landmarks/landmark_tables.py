@@ -16,8 +16,7 @@ from torchface.io.landmarks.openface_csv import openface_times
 from torchface.io.tables.csv_table import Table, TableReader, quoted
 from torchface.io.tables.frame_rates import numbering_extras
 
-COUNTS = (68, 468, 478)
-"""Points a frame: iBUG's landmarks; MediaPipe's mesh without and with irises."""
+COUNTS = (68, 468, 478)  # points a frame: iBUG's landmarks; MediaPipe's mesh without and with irises
 
 _POINT = re.compile(r"([xy])_?([0-9]{1,3})")
 _LEVELS = ("confidence", "FaceScore")
@@ -29,26 +28,16 @@ _MAX_FRAMES_A_ROW = 100
 
 @dataclass(frozen=True, eq=False)
 class LandmarkTable:
-    """Landmarks of one face in all frames.
+    """Landmarks of one face in all frames."""
 
-    Args:
-        points: (T,N,2) float32, NaN where not seen; pixels with centres at integers, or shares of the image's width and
-            height.
-        confidence: (T,N) in [0,1].
-        visibility: (T,N) in [0,1]; 1 where the table does not say.
-        presence: (T,) in [0,1]; 1 where the table does not say, 0 where nothing is seen.
-        fps: frames a second by the table's times, if it has any.
-        seconds: when each frame is shown, (T,) from 0, where they come unevenly.
-        shares: whether points are shares of the image.
-    """
-
+    # (T,N,2) float32, NaN where not seen; pixels with centres at integers, or shares of the image's width and height.
     points: Tensor
-    confidence: Tensor
-    visibility: Tensor
-    presence: Tensor
-    fps: float | None
-    seconds: Tensor | None
-    shares: bool
+    confidence: Tensor  # (T,N) in [0,1]
+    visibility: Tensor  # (T,N) in [0,1]; 1 where the table does not say
+    presence: Tensor  # (T,) in [0,1]; 1 where the table does not say, 0 where nothing is seen
+    fps: float | None  # frames a second by the table's times, if it has any
+    seconds: Tensor | None  # when each frame is shown, (T,) from 0, where they come unevenly
+    shares: bool  # whether points are shares of the image
 
     def pixels(self, width: int, height: int) -> Tensor:
         """The points in an image's pixels (T,N,2)."""

@@ -18,8 +18,7 @@ from torchface.io.tables.track_checks import kept_columns, values_to_write
 from torchface.number_checks import check_rate
 from torchface.take import Take, Track
 
-UNKNOWN_RATE = 30.0
-"""Frames a second of landmarks whose video's rate was not known to what found them."""
+UNKNOWN_RATE = 30.0  # frames a second of landmarks whose video's rate was not known to what found them
 
 _OPENCV_RATE = 1000.0
 _FRAME, _TIME, _CONFIDENCE, _SUCCESS = "frame", "timestamp", "confidence", "success"

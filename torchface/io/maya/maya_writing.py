@@ -48,19 +48,13 @@ _ATTRIBUTES = re.findall(
 
 @dataclass(frozen=True)
 class MayaTargets:
-    """The targets of a rig's blendShape node.
+    """The targets of a rig's blendShape node."""
 
-    Args:
-        aliases: Maya's names of the shapes and then of the combinations.
-        combinations: names of the combinations among the correctives.
-        items: of each target, where it leads by the number of the item, (V,3), millimetres.
-        drivers: of each combination, the targets whose weights are multiplied.
-    """
-
-    aliases: tuple[str, ...]
-    combinations: tuple[str, ...]
+    aliases: tuple[str, ...]  # Maya's names of the shapes and then of the combinations
+    combinations: tuple[str, ...]  # names of the combinations among the correctives
+    # Of each target, where it leads by the number of the item, (V,3), millimetres.
     items: tuple[dict[int, NDArray[np.float64]], ...]
-    drivers: tuple[tuple[int, ...], ...]
+    drivers: tuple[tuple[int, ...], ...]  # of each combination, the targets whose weights are multiplied
 
 
 def write_maya_rig(rig: BlendshapeRig, path: str | Path, keys: WeightKeys | None = None) -> None:

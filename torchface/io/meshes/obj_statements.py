@@ -19,25 +19,15 @@ _MAX_LIBRARIES = 64
 
 @dataclass
 class Statements:
-    """What an OBJ says.
+    """What an OBJ says."""
 
-    Args:
-        vertices: numbers of each vertex, (V,3) and more.
-        coordinates: lines of texture coordinates, which stay text until a face needs them, in pieces.
-        sizes: corners of each face, (P,).
-        corners: vertex ids, (C,).
-        uv_corners: which texture coordinate, (C,), -1 for none; absent where no corner has one.
-        libraries: material files in their order, each once.
-        materials: in use, and how many faces come before each, in their order.
-    """
-
-    vertices: NDArray[np.float64]
-    coordinates: list[bytes]
-    sizes: NDArray[np.int64]
-    corners: NDArray[np.int64]
-    uv_corners: NDArray[np.int64] | None
-    libraries: list[bytes]
-    materials: list[tuple[bytes, int]]
+    vertices: NDArray[np.float64]  # numbers of each vertex, (V,3) and more
+    coordinates: list[bytes]  # lines of texture coordinates, which stay text until a face needs them, in pieces
+    sizes: NDArray[np.int64]  # corners of each face, (P,)
+    corners: NDArray[np.int64]  # vertex ids, (C,)
+    uv_corners: NDArray[np.int64] | None  # which texture coordinate, (C,), -1 for none; absent where no corner has one
+    libraries: list[bytes]  # material files in their order, each once
+    materials: list[tuple[bytes, int]]  # in use, and how many faces come before each, in their order
 
 
 def read_statements(path: Path, data: bytes) -> Statements:

@@ -13,23 +13,15 @@ _FREE = 2.0  # seconds after which another sender may take over
 
 @dataclass
 class PacketCounts:
-    """What came.
-
-    Args:
-        late: those that came after a newer one.
-        others: of a second sender while the first was there.
-        jumps: how often the sender's count was set.
-        malformed: packets that are none of the protocol.
-        fault: what is wrong with the last of these.
-    """
+    """What came."""
 
     taken: int = 0
     lost: int = 0
-    late: int = 0
-    others: int = 0
-    jumps: int = 0
-    malformed: int = 0
-    fault: str = ""
+    late: int = 0  # those that came after a newer one
+    others: int = 0  # of a second sender while the first was there
+    jumps: int = 0  # how often the sender's count was set
+    malformed: int = 0  # packets that are none of the protocol
+    fault: str = ""  # what is wrong with the last of these
 
     def words(self) -> str:
         """What went wrong, for people; empty if nothing did."""

@@ -8,8 +8,7 @@ from collections.abc import Iterable, Iterator
 from torchface.errors import FileFormatError
 
 Value = str | int | float | bool
-Message = tuple[str, tuple[Value | bytes | None, ...]]
-"""An address and its values."""
+Message = tuple[str, tuple[Value | bytes | None, ...]]  # an address and its values
 
 LARGEST_IN_ETHERNET = 1400  # bytes of a packet, which one Ethernet frame must hold
 LARGEST = 60_000  # what UDP carries

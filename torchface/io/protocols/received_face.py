@@ -11,27 +11,19 @@ from torch import Tensor
 from torchface.errors import FileFormatError
 from torchface.io.weights.weight_csv import ROTATIONS
 
-_MOST, _MOST_ANGLE = 5.0, 2 * math.pi
-"""No program sends larger weights, 1 being all, or angles in radians."""
+_MOST, _MOST_ANGLE = 5.0, 2 * math.pi  # no program sends larger weights, 1 being all, or angles in radians
 
 
 @dataclass(frozen=True, eq=False)
 class ReceivedFace:
-    """What a packet says of a face.
+    """What a packet says of a face."""
 
-    Args:
-        weights: by ARKit's names, (52,).
-        rotations: Live Link Face's nine of head and eyes, radians, (9,).
-        subject: how the sender calls the face or itself.
-        number: of the frame as the sender counts; None where it does not.
-        found: whether the sender sees a face.
-    """
-
-    weights: Tensor
+    weights: Tensor  # by ARKit's names, (52,)
+    # Live Link Face's nine of head and eyes, radians, (9,).
     rotations: Tensor = field(default_factory=lambda: torch.zeros(len(ROTATIONS)))
-    subject: str = ""
-    number: int | None = None
-    found: bool = True
+    subject: str = ""  # how the sender calls the face or itself
+    number: int | None = None  # of the frame as the sender counts; None where it does not
+    found: bool = True  # whether the sender sees a face
 
     def __post_init__(self) -> None:
         for what, values, most in (("weight", self.weights, _MOST), ("rotation", self.rotations, _MOST_ANGLE)):

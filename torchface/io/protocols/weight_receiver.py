@@ -19,8 +19,7 @@ from torchface.io.protocols.received_face import ReceivedFace
 from torchface.io.protocols.stream_address import StreamAddress, parse_source, resolved
 from torchface.io.protocols.vmc_packets import VmcReader
 
-Read = Callable[[bytes], list[ReceivedFace]]
-"""Faces of a packet; raises ``TorchfaceError`` where it is malformed."""
+Read = Callable[[bytes], list[ReceivedFace]]  # faces of a packet; raises TorchfaceError where it is malformed
 
 _LARGEST_PACKET = 65536
 _ASK_AGAIN = 2.0  # seconds without a packet after which the app is asked to send

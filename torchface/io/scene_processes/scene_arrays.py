@@ -54,17 +54,11 @@ _KEY, _SAME_PEAK = "\0", 1e-6
 
 @dataclass(frozen=True)
 class Scene:
-    """What a process found in a file; nothing of it is trusted.
+    """What a process found in a file; nothing of it is trusted."""
 
-    Args:
-        path: the file, for errors.
-        record: of ``scene.json``.
-        arrays: of ``arrays.npz``.
-    """
-
-    path: Path
-    record: dict[str, Any]
-    arrays: Mapping[str, NDArray[Any]]
+    path: Path  # the file, for errors
+    record: dict[str, Any]  # of scene.json
+    arrays: Mapping[str, NDArray[Any]]  # of arrays.npz
 
     def warn_of_left_out(self) -> None:
         """Reports by ``UserWarning`` what the process left out."""

@@ -14,29 +14,18 @@ from torchface.mesh import Annotations, Mesh
 
 @dataclass(frozen=True)
 class Piece:
-    """A mesh of a scene, in millimetres and the scene's place.
+    """A mesh of a scene, in millimetres and the scene's place."""
 
-    Args:
-        name: of the node or prim; the region that it becomes.
-        vertices: (V,3).
-        uvs: (U,2).
-        uv_faces: (F,3).
-        colors: (V,3).
-        polygons: (P,K), padded with -1.
-        deltas: (N,V,3).
-        names: of its N shapes.
-    """
-
-    name: str
-    vertices: Tensor
+    name: str  # of the node or prim; the region that it becomes
+    vertices: Tensor  # (V,3)
     faces: Tensor
-    uvs: Tensor | None
-    uv_faces: Tensor | None
-    colors: Tensor | None
-    polygons: Tensor | None
+    uvs: Tensor | None  # (U,2)
+    uv_faces: Tensor | None  # (F,3)
+    colors: Tensor | None  # (V,3)
+    polygons: Tensor | None  # (P,K), padded with -1
     annotations: Annotations | None
-    deltas: Tensor
-    names: tuple[str, ...]
+    deltas: Tensor  # (N,V,3)
+    names: tuple[str, ...]  # of its N shapes
 
 
 def all_names(pieces: Sequence[Piece]) -> tuple[str, ...]:

@@ -16,19 +16,13 @@ from torchface.temporal.key_reduction import KeyReduction, kept_keys, reduction_
 
 @dataclass(frozen=True)
 class WeightKeys:
-    """Keys of an animation, linear between them.
+    """Keys of an animation, linear between them."""
 
-    Args:
-        seconds: of each key, (T,) float64, rising from 0.
-        weights: of a rig's shapes, (T,N) float32.
-        fps: frames a second of the film that they are for.
-        kept: which of the keys each shape's curve has, (T,N) bool, in a file whose curves have keys of their own; all
-            if absent.
-    """
-
-    seconds: Tensor
-    weights: Tensor
-    fps: float
+    seconds: Tensor  # of each key, (T,) float64, rising from 0
+    weights: Tensor  # of a rig's shapes, (T,N) float32
+    fps: float  # frames a second of the film that they are for
+    # Which of the keys each shape's curve has, (T,N) bool, in a file whose curves have keys of their own; all if
+    # absent.
     kept: Tensor | None = None
 
 

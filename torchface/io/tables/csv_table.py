@@ -17,8 +17,7 @@ import numpy as np
 from torchface.errors import FileFormatError, NameMismatchError
 from torchface.files.whole_files import read_file, replaced_file
 
-MAX_TABLE_BYTES = 2**29
-"""Bytes of text; two hours of 60 fps Live Link Face stay below."""
+MAX_TABLE_BYTES = 2**29  # bytes of text; two hours of 60 fps Live Link Face stay below
 
 _MAX_ROW = 2**22
 _MAX_NUMBER = float(np.finfo(np.float32).max)

@@ -22,8 +22,7 @@ COMMON_RATES = (
 )
 """Rates that cameras run at."""
 
-DEFAULT_RATE = 60.0
-"""Frames a second of a file of one frame at time 0, from which none follows."""
+DEFAULT_RATE = 60.0  # frames a second of a file of one frame at time 0, from which none follows
 
 _MAX_FRAME_NUMBER = 2**32 - 1
 _UNEVEN, _LIKE = 0.02, 0.2  # of a frame: so far from an even rate, and from the length of one
@@ -59,21 +58,13 @@ class FrameTimes:
 
 @dataclass(frozen=True)
 class TimeSource:
-    """What is known of times before they are looked at.
+    """What is known of times before they are looked at."""
 
-    Args:
-        error: makes an error of what was found and what was expected.
-        numbers: of the frames, (T,), rising, where the file has them.
-        rate: frames a second that the file states.
-        resolution: seconds by which times are rounded; seen in them if absent.
-        seconds: whether the format itself says that times are seconds.
-    """
-
-    error: Callable[[str, str], FileFormatError]
-    numbers: np.ndarray | None = None
-    rate: float | None = None
-    resolution: float | None = None
-    seconds: bool = False
+    error: Callable[[str, str], FileFormatError]  # makes an error of what was found and what was expected
+    numbers: np.ndarray | None = None  # of the frames, (T,), rising, where the file has them
+    rate: float | None = None  # frames a second that the file states
+    resolution: float | None = None  # seconds by which times are rounded; seen in them if absent
+    seconds: bool = False  # whether the format itself says that times are seconds
 
 
 def file_error(where: object) -> Callable[[str, str], FileFormatError]:

@@ -25,16 +25,11 @@ _TOLERANCE = 0.002  # 60 and 60000/1001 differ by 0.001
 
 @dataclass(frozen=True)
 class Timing:
-    """What the timecodes of a take say.
+    """What the timecodes of a take say."""
 
-    Args:
-        fps: frames a second, a usual rate where the clock runs within 0.2 % of one.
-        seconds: when each frame is shown, (T,) from 0, where they come unevenly.
-    """
-
-    fps: float
+    fps: float  # frames a second, a usual rate where the clock runs within 0.2 % of one
     measured: float
-    seconds: Tensor | None
+    seconds: Tensor | None  # when each frame is shown, (T,) from 0, where they come unevenly
 
 
 def read_timecodes(texts: Sequence[str], path: Path) -> Timing:

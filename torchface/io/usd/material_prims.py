@@ -22,21 +22,13 @@ PAINTED = "torchface_painted"
 
 @dataclass(frozen=True, eq=False)
 class _Look:
-    """What some polygons are made of.
+    """What some polygons are made of."""
 
-    Args:
-        name: of the subset and the material.
-        material: roughness, opacity and the plain colour.
-        image: file name and pixels, (3,H,W) or (4,H,W), in the mesh's layout.
-        colored: by the vertices' colours.
-        painted: the image is none of the mesh's own.
-    """
-
-    name: str
-    material: PartMaterial
-    image: tuple[str, Tensor] | None = None
-    colored: bool = False
-    painted: bool = False
+    name: str  # of the subset and the material
+    material: PartMaterial  # roughness, opacity and the plain colour
+    image: tuple[str, Tensor] | None = None  # file name and pixels, (3,H,W) or (4,H,W), in the mesh's layout
+    colored: bool = False  # by the vertices' colours
+    painted: bool = False  # the image is none of the mesh's own
 
 
 def write_materials(usd: Any, stage: Any, prim: Any, mesh: Mesh, root: str, stem: str) -> tuple[dict[str, bytes], str]:

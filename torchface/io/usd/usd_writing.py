@@ -35,8 +35,7 @@ from torchface.mesh import Mesh
 from torchface.rig import BlendshapeRig
 
 USD_ENDINGS = (".usd", ".usda", ".usdc", ".usdz")
-NOTES = "torchface"
-"""The key of a mesh prim's ``customData`` under which annotations and the like are kept, as JSON."""
+NOTES = "torchface"  # the key of a mesh prim's customData under which annotations and the like are kept, as JSON
 
 _ROOT, _MESH, _SKELETON, _ANIMATION = "/rig", "/rig/face", "/rig/skeleton", "/rig/performance"
 

@@ -15,13 +15,9 @@ _GREY = 96
 
 @dataclass(frozen=True)
 class BlankVideo(VideoFile):
-    """Plain grey frames; the path names what they stand for, such as a table of landmarks.
+    """Plain grey frames; the path names what they stand for, such as a table of landmarks."""
 
-    Args:
-        seconds: when each is shown, (count,) from 0, where they come unevenly.
-    """
-
-    seconds: Tensor | None = None
+    seconds: Tensor | None = None  # when each is shown, (count,) from 0, where they come unevenly
 
     def check(self) -> None:
         """There is nothing to refuse."""

@@ -30,15 +30,11 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class Packets:
-    """The packets of a video.
+    """The packets of a video."""
 
-    Args:
-        seconds: when the frame of each is shown, (P,) float64, rising; NaN where the file does not say, at the end.
-        hidden: how many more there are that an edit list leaves out.
-    """
-
+    # When the frame of each is shown, (P,) float64, rising; NaN where the file does not say, at the end.
     seconds: np.ndarray
-    hidden: int
+    hidden: int  # how many more there are that an edit list leaves out
 
 
 def packets_of(container: InputContainer, stream: VideoStream, errors: list[str]) -> Iterator[Packet | None]:

@@ -24,8 +24,7 @@ if TYPE_CHECKING:
     from av.video.stream import VideoStream
 
 _FORMATS = {".avi": "avi", ".mkv": "matroska", ".mp4": "mp4"}
-WRITTEN_ENDINGS = tuple(_FORMATS)
-"""Of videos that are written."""
+WRITTEN_ENDINGS = tuple(_FORMATS)  # of videos that are written
 _BT709, _LIMITED = 1, 1  # H.273's numbers of matrix, primaries and transfer; FFmpeg's of the range
 _LOSSY = ("yuv420p", "yuv444p")
 _MAX_MPEG4_TICKS, _MAX_BIT_RATE = 65535, 2**30

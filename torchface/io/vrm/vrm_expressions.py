@@ -15,18 +15,12 @@ _FULL_V0 = 100.0  # VRM 0 counts weights to 100
 
 @dataclass(frozen=True)
 class MorphBind:
-    """A morph target that an expression drives.
+    """A morph target that an expression drives."""
 
-    Args:
-        node: that shows the mesh.
-        target: index among the mesh's morph targets.
-        weight: at the expression's full strength, 1 for the whole target.
-    """
-
-    node: int
+    node: int  # that shows the mesh
     mesh: int
-    target: int
-    weight: float = 1.0
+    target: int  # index among the mesh's morph targets
+    weight: float = 1.0  # at the expression's full strength, 1 for the whole target
 
 
 def vrm_version(document: Document) -> str | None:

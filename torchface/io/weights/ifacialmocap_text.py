@@ -17,8 +17,7 @@ from torchface.io.weights.weight_csv import ROTATIONS
 from torchface.shape_names import ARKIT
 from torchface.take import Take, Track
 
-RATE = 60.0
-"""Frames a second that the app sends; its text has no times."""
+RATE = 60.0  # frames a second that the app sends; its text has no times
 
 _MOST_FIELDS, _MOST_LINE = 400, 2**14
 _SHAPE = re.compile(r"([A-Za-z]\w{1,39})[-&](-?[0-9.eE+-]+)")

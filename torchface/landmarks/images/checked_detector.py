@@ -20,8 +20,7 @@ from torchface.landmarks.images.ibug_68 import turned_box
 from torchface.landmarks.images.networks.crop_finder import CropFinder, CropNetwork
 from torchface.landmarks.images.networks.landmark_network import LandmarkNetwork
 
-PROPOSED = 0.3
-"""Score from which the shipped box network's faces are looked at."""
+PROPOSED = 0.3  # score from which the shipped box network's faces are looked at
 
 _MOST, _TURNED = 16, 3  # faces of a detector that are looked at, the likeliest; and of them in other turns
 _TURNS = ((0.0,), (math.pi / 3, -math.pi / 3, math.pi))  # beside the detector's tilt; the latter where no face is found

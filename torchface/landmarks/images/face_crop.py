@@ -12,8 +12,7 @@ from torch import Tensor
 from torchface.errors import ShapeError, ValueRangeError
 from torchface.landmarks.images.boxes.face_box import check_image, interleaved
 
-CROP_MARGIN = 1.25
-"""A crop's side in sides of the face's box, where nothing else is said."""
+CROP_MARGIN = 1.25  # a crop's side in sides of the face's box, where nothing else is said
 
 _MAX_SIDE = 1e5
 

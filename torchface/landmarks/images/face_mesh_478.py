@@ -7,14 +7,9 @@ from torch import Tensor
 
 from torchface.errors import ShapeError
 
-MESH_POINTS = 478
-"""Points of the mesh: 468 of the face, and five on each iris behind them."""
-
-FACE_POINTS = 468
-"""Points of the mesh without the irises."""
-
-IRISES = (468, 473)
-"""The irises' middles, the person's right eye first."""
+MESH_POINTS = 478  # points of the mesh: 468 of the face, and five on each iris behind them
+FACE_POINTS = 468  # points of the mesh without the irises
+IRISES = (468, 473)  # the irises' middles, the person's right eye first
 
 BLENDSHAPE_POINTS = (
     0, 1, 4, 5, 6, 7, 8, 10, 13, 14, 17, 21, 33, 37, 39, 40, 46, 52, 53, 54, 55, 58, 61, 63, 65, 66, 67, 70, 78, 80,

@@ -17,13 +17,11 @@ READ_FOR_SOLVER = (
 )  # fmt: skip
 """The parts of a reading that a webcam's solver takes, in its order."""
 
-HALF_CONFIDENCE = 0.02
-"""The deviation, in sides of the face's box, of a confidence of one half."""
+HALF_CONFIDENCE = 0.02  # the deviation, in sides of the face's box, of a confidence of one half
 
 _HIDDEN, _VISIBLE = 0.7, 0.95
 _LIPS, _CHIN, _CONTOUR = slice(48, 68), slice(4, 13), 17
-_GROUPS = (slice(17, 22), slice(22, 27), slice(27, 36), slice(36, 42), slice(42, 48), _LIPS)
-"""Brows, nose, eyes, lips."""
+_GROUPS = (slice(17, 22), slice(22, 27), slice(27, 36), slice(36, 42), slice(42, 48), _LIPS)  # brows, nose, eyes, lips
 
 _UNREAD: dict[str, tuple[tuple[int, ...], float]] = {
     "iris": ((2, 2), torch.nan), "openness": ((2,), torch.nan), "closed": ((2,), torch.nan),

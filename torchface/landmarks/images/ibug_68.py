@@ -8,17 +8,13 @@ from torch import Tensor
 from torchface.errors import ShapeError
 
 COUNT = 68
-"""How many."""
 
 _RUNS = ((0, 16), (17, 26), (27, 27), (28, 28), (29, 29), (30, 30), (31, 35))
 _PAIRS = ((36, 45), (37, 44), (38, 43), (39, 42), (40, 47), (41, 46))
 _LIPS = ((48, 54), (55, 59), (60, 64), (65, 67))
 _RIGHT_EYE, _LEFT_EYE, _MOUTH = slice(36, 42), slice(42, 48), slice(48, 68)
-SIDE_OF_EXTENT = 1.6
-"""A box's side, of the extent of brows, nose, eyes and mouth."""
-
-MIDDLE_ABOVE = 0.037
-"""How far the box's middle lies above their mean, in sides of the box."""
+SIDE_OF_EXTENT = 1.6  # a box's side, of the extent of brows, nose, eyes and mouth
+MIDDLE_ABOVE = 0.037  # how far the box's middle lies above their mean, in sides of the box
 
 
 def _mirror() -> tuple[int, ...]:
@@ -27,11 +23,8 @@ def _mirror() -> tuple[int, ...]:
     return tuple(twins[row] for row in range(COUNT))
 
 
-MIRROR_68 = _mirror()
-"""Which of the 68 each becomes when the image is mirrored."""
-
-INNER = slice(17, 68)
-"""Brows, nose, eyes and mouth: all but the jaw's contour."""
+MIRROR_68 = _mirror()  # which of the 68 each becomes when the image is mirrored
+INNER = slice(17, 68)  # brows, nose, eyes and mouth: all but the jaw's contour
 
 
 # Landmarks, and by which share of the way to another annotators put them further (away from it, if negative).

@@ -20,27 +20,20 @@ from torchface.synthetic.head.teeth_and_tongue import HeadPart
 from torchface.synthetic.head.topology import EYE_RIM, topology
 from torchface.synthetic.head.uv_layout import unwrapping
 
-WHORL = (8.0, 88.0, -52.0)
-"""Where the hair of the head starts from."""
-HAIR_PATCH = (0.62, 0.955, 0.70, 0.985)
-"""Place on the page that brows and lashes are coloured from."""
+WHORL = (8.0, 88.0, -52.0)  # where the hair of the head starts from
+HAIR_PATCH = (0.62, 0.955, 0.70, 0.985)  # place on the page that brows and lashes are coloured from
 _BROW_HAIRS, _LASHES = 260, 3
 
 
 @dataclass(frozen=True, eq=False)
 class GrownPart:
-    """A part that skin carries: its own form, and for each vertex (V,) three skin vertices (V,3) with weights (V,3).
+    """A part that skin carries: its own form, and for each vertex (V,) three skin vertices (V,3) with weights (V,3)."""
 
-    Args:
-        part: its form on the mean head.
-        hosts, weights: of the skin at each vertex's root.
-        turns: whether it turns with the skin about the nearer eye, as lashes do.
-    """
-
-    part: HeadPart
+    part: HeadPart  # its form on the mean head
+    # hosts, weights: of the skin at each vertex's root
     hosts: Tensor
     weights: Tensor
-    turns: bool = False
+    turns: bool = False  # whether it turns with the skin about the nearer eye, as lashes do
 
 
 def hair_share(points: Tensor) -> Tensor:

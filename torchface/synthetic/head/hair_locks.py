@@ -23,8 +23,7 @@ Style = Literal["short", "long", "tied"]
 
 LOCK_PATCH = (0.577, 0.785, 0.612, 0.985)
 """Place on the page that locks are coloured from: across them, and from root to tip."""
-KNOT = (0.0, 46.0, -104.0)
-"""Where tied hair is held together."""
+KNOT = (0.0, 46.0, -104.0)  # where tied hair is held together
 _KNOT_RADIUS = 21.0
 _PARTING = {"short": 24.0, "long": 7.0, "tied": 0.0}
 _ROWS = {"short": 7, "long": 12, "tied": 9}

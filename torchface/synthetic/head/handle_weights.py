@@ -21,17 +21,11 @@ LIP_HANDLES = 52
 
 @dataclass(frozen=True, eq=False)
 class HandleWeights:
-    """Weights over the mean head's vertices.
+    """Weights over the mean head's vertices."""
 
-    Args:
-        lips: how much each vertex follows each lip handle, (V,52); rows of the red of the lips sum to 1.
-        jaw: how much each vertex rotates with the jaw, (V,).
-        lip_position: each lip vertex's handle, (V,) int64, -1 elsewhere; ``lip_ring`` its ring, -1 elsewhere.
-    """
-
-    lips: Tensor
-    jaw: Tensor
-    lip_position: Tensor
+    lips: Tensor  # how much each vertex follows each lip handle, (V,52); rows of the red of the lips sum to 1
+    jaw: Tensor  # how much each vertex rotates with the jaw, (V,)
+    lip_position: Tensor  # each lip vertex's handle, (V,) int64, -1 elsewhere; lip_ring its ring, -1 elsewhere
     lip_ring: Tensor
 
 

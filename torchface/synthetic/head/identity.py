@@ -14,8 +14,7 @@ from torchface.synthetic.head.mean_head import sculpture
 from torchface.synthetic.head.signed_distance import EYE_CENTRE, EYE_RADIUS
 from torchface.synthetic.head.topology import EYE_RIM, MOUTH_BORDER, topology
 
-HINGE = (57.0, -14.0, 8.0)
-"""The left jaw joint of the mean head."""
+HINGE = (57.0, -14.0, 8.0)  # the left jaw joint of the mean head
 
 Field = Callable[[Tensor, "_Parts"], Tensor]
 

@@ -14,8 +14,7 @@ from torchface.synthetic.head.skin_texture import noise
 from torchface.synthetic.head.teeth_and_tongue import HeadPart
 from torchface.synthetic.head.topology import topology
 
-SHIRT_PATCH = (0.392, 0.785, 0.426, 0.985)
-"""Place on the page that cloth is coloured from."""
+SHIRT_PATCH = (0.392, 0.785, 0.426, 0.985)  # place on the page that cloth is coloured from
 # From inside the collar to the chest: height in front, at the side, at the back; half width, half depth, depth of the
 # middle; millimetres.
 _LOOPS = np.array([

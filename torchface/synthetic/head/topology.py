@@ -46,33 +46,21 @@ EYE_RIM, MOUTH_BORDER, MOUTH_CONTACT, NOSTRIL_RIM, EAR_RIM = 8, 5, 9, 2, 4
 
 @dataclass(frozen=True, eq=False)
 class Topology:
-    """Which vertices form what; ids are into the half head (x ≥ 0), then the whole.
+    """Which vertices form what; ids are into the half head (x ≥ 0), then the whole."""
 
-    Args:
-        grid: the head's grid, (ROWS+1, COLUMNS+1), -1 inside blocks.
-        crown: the crown's grid, (CAP_SIDE+1, COLUMNS-2*CAP_SIDE+1); its first row is the midline.
-        rings: loops (rings+1, L) by name, from the block's border inwards; the mouth's run from midline to midline.
-        caps: grids (h+1, w+1) that close each inmost loop.
-        eyeball: the left eyeball's loops (K, EYEBALL_SEGMENTS), front to back, and its two closing grids.
-        half_count: vertices of the half; ``midline`` marks those on x = 0.
-        half_quads: (P,4).
-        mirror: over the whole, (V,); ``count`` V.
-        quads: of the whole, (2P,4).
-        other_half: for each vertex of the half its twin in the whole, (half_count,).
-    """
-
-    grid: Tensor
-    crown: Tensor
+    grid: Tensor  # the head's grid, (ROWS+1, COLUMNS+1), -1 inside blocks
+    crown: Tensor  # the crown's grid, (CAP_SIDE+1, COLUMNS-2*CAP_SIDE+1); its first row is the midline
+    # Loops (rings+1, L) by name, from the block's border inwards; the mouth's run from midline to midline.
     rings: dict[str, Tensor]
-    caps: dict[str, Tensor]
-    eyeball: Tensor
-    half_count: int
+    caps: dict[str, Tensor]  # grids (h+1, w+1) that close each inmost loop
+    eyeball: Tensor  # the left eyeball's loops (K, EYEBALL_SEGMENTS), front to back, and its two closing grids
+    half_count: int  # vertices of the half; midline marks those on x = 0
     midline: Tensor
-    half_quads: Tensor
-    mirror: Tensor
+    half_quads: Tensor  # (P,4)
+    mirror: Tensor  # over the whole, (V,); count V
     count: int
-    quads: Tensor
-    other_half: Tensor
+    quads: Tensor  # of the whole, (2P,4)
+    other_half: Tensor  # for each vertex of the half its twin in the whole, (half_count,)
 
 
 @dataclass

@@ -12,11 +12,8 @@ from torchface.synthetic.head.identity import Anatomy, both_sides, bump, mean_ve
 from torchface.synthetic.head.signed_distance import LID_THICKNESS
 from torchface.synthetic.head.topology import EYE_RIM, topology
 
-CLOSING_HEIGHT = 0.28
-"""Where the lids meet, as a share of the way from the lower to the upper edge."""
-
-GAZE = math.radians(26.0)
-"""Rotation of an eye at weight 1."""
+CLOSING_HEIGHT = 0.28  # where the lids meet, as a share of the way from the lower to the upper edge
+GAZE = math.radians(26.0)  # rotation of an eye at weight 1
 
 # How much of the lid edge's way each ring goes: skin from the orbit to the edge (8), then the inner lid and socket.
 _FOLLOW = torch.tensor(

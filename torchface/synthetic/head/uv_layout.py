@@ -12,8 +12,7 @@ from torchface.synthetic.head.mean_head import sculpture
 from torchface.synthetic.head.signed_distance import EYE_CENTRE, EYE_RADIUS
 from torchface.synthetic.head.topology import COLUMNS, ROWS, topology
 
-SKIN_TOP = 0.78
-"""Below it lies the unrolled skin, above it the islands."""
+SKIN_TOP = 0.78  # below it lies the unrolled skin, above it the islands
 
 CROWN_ISLAND = (0.5, 0.89, 0.095)
 EYE_ISLANDS = ((0.88, 0.89, 0.095), (0.12, 0.89, 0.095))

@@ -18,15 +18,10 @@ _HAIR_COLOR, _COLLAR_COLOR = (0.12, 0.09, 0.07), (0.75, 0.78, 0.80)
 
 @dataclass(frozen=True)
 class Dress:
-    """How much of it there is.
+    """How much of it there is."""
 
-    Args:
-        hair: thickness of the lumps, millimetres; 0 is a shaved head.
-        collar: thickness of the collar's lumps, millimetres; 0 is none.
-    """
-
-    hair: float = 9.0
-    collar: float = 10.0
+    hair: float = 9.0  # thickness of the lumps, millimetres; 0 is a shaved head
+    collar: float = 10.0  # thickness of the collar's lumps, millimetres; 0 is none
 
 
 def dressed(head: Mesh, landmarks: Tensor, dress: Dress, generator: torch.Generator) -> Mesh:

@@ -74,17 +74,11 @@ class PathMoments:
 
 @dataclass(frozen=True, eq=False)
 class Sites:
-    """The best sites.
+    """The best sites."""
 
-    Args:
-        triangles: rows of the faces, (M,) int64.
-        barycentric: (M,3), float64.
-        error: root mean square distance to the marker's path, (M,), millimetres.
-    """
-
-    triangles: Tensor
-    barycentric: Tensor
-    error: Tensor
+    triangles: Tensor  # rows of the faces, (M,) int64
+    barycentric: Tensor  # (M,3), float64
+    error: Tensor  # root mean square distance to the marker's path, (M,), millimetres
 
 
 def best_sites(points: Tensor, faces: Tensor, candidates: Tensor, moments: PathMoments) -> Sites:

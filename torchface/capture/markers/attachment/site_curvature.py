@@ -29,42 +29,25 @@ ARM = 50.0
 
 @dataclass(frozen=True, eq=False)
 class SitesOnTake:
-    """Sites, pose and weights of a take's frames, and how the markers move with them.
+    """Sites, pose and weights of a take's frames, and how the markers move with them."""
 
-    Args:
-        affine: affine maps of the sites, (M,3,N+1), millimetres.
-        tangents: affine maps of two unit tangents of the skin at each site, (M,2,3,N+1).
-        moved: markers in rig space, (T,M,3), NaN where not seen.
-        weights: (T,N).
-        pose_columns: how a unit of each pose parameter moves each marker, (T,M,3,G).
-        slips: six columns of rigid motion a frame follow the weights.
-    """
-
-    affine: Tensor
-    tangents: Tensor
-    moved: Tensor
-    weights: Tensor
-    pose_columns: Tensor
-    slips: bool = False
+    affine: Tensor  # affine maps of the sites, (M,3,N+1), millimetres
+    tangents: Tensor  # affine maps of two unit tangents of the skin at each site, (M,2,3,N+1)
+    moved: Tensor  # markers in rig space, (T,M,3), NaN where not seen
+    weights: Tensor  # (T,N)
+    pose_columns: Tensor  # how a unit of each pose parameter moves each marker, (T,M,3,G)
+    slips: bool = False  # six columns of rigid motion a frame follow the weights
 
 
 @dataclass(frozen=True, eq=False)
 class TakeCurvature:
-    """Second order of half the squared distance over the given frames, in mm².
+    """Second order of half the squared distance over the given frames, in mm²."""
 
-    Args:
-        information: :math:`S`, (2M+G,2M+G): two tangents of each site, then G columns of the pose.
-        gradient: of them, (2M+G,).
-        factor: Cholesky factors of :math:`G_t`, (T,N,N); rows of weights in the active set are those of the identity.
-        cross: :math:`C_t`, (T,N,2M+G).
-        weight_gradient: (T,N).
-    """
-
-    information: Tensor
-    gradient: Tensor
-    factor: Tensor
-    cross: Tensor
-    weight_gradient: Tensor
+    information: Tensor  # S, (2M+G,2M+G): two tangents of each site, then G columns of the pose
+    gradient: Tensor  # of them, (2M+G,)
+    factor: Tensor  # Cholesky factors of G_t, (T,N,N); rows of weights in the active set are those of the identity
+    cross: Tensor  # C_t, (T,N,2M+G)
+    weight_gradient: Tensor  # (T,N)
 
     @staticmethod
     def of(fit: SitesOnTake, ridge: float, bounded: bool = True) -> TakeCurvature:

@@ -62,18 +62,12 @@ class FitState:
 
 @dataclass(frozen=True, eq=False)
 class SiteSolver:
-    """Solves for sites, weights and pose; holds what is the same in all iterations.
-
-    Args:
-        search: for candidate triangles.
-        initial: the initial guess of the sites at rest, (M,3), millimetres.
-        standoff: estimate the markers' distance from the skin.
-    """
+    """Solves for sites, weights and pose; holds what is the same in all iterations."""
 
     motion: SurfaceMotion
-    search: SiteSearch
-    initial: Tensor
-    standoff: bool
+    search: SiteSearch  # for candidate triangles
+    initial: Tensor  # the initial guess of the sites at rest, (M,3), millimetres
+    standoff: bool  # estimate the markers' distance from the skin
     scale: bool = True
 
     def at(self, state: FitState) -> Tensor:

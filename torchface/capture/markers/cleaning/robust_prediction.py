@@ -22,17 +22,11 @@ _RIDGE, _MOTION_RIDGE = 1e-2, 1e-4
 
 @dataclass(frozen=True, eq=False)
 class Prediction:
-    """The markers as the rig predicts them.
+    """The markers as the rig predicts them."""
 
-    Args:
-        expected: where each marker should be, in rig space, (T,M,3), millimetres.
-        distance: between seen and expected, (T,M), NaN where not seen.
-        limit: the distance beyond which a sample of the marker is an outlier, (M,).
-    """
-
-    expected: Tensor
-    distance: Tensor
-    limit: Tensor
+    expected: Tensor  # where each marker should be, in rig space, (T,M,3), millimetres
+    distance: Tensor  # between seen and expected, (T,M), NaN where not seen
+    limit: Tensor  # the distance beyond which a sample of the marker is an outlier, (M,)
 
     @property
     def outliers(self) -> Tensor:

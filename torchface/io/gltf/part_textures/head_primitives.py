@@ -84,21 +84,13 @@ ColorSource = Literal["texture", "colors", "material"]
 
 @dataclass(frozen=True, eq=False)
 class Surface:
-    """The triangles of one primitive.
+    """The triangles of one primitive."""
 
-    Args:
-        triangles: rows of the mesh's faces, ascending, (K,).
-        material: what they are made of.
-        color_source: where their colour is: in the mesh's texture, in its vertex colours, or in the material.
-        part: the region of an eyeball that rotates about a node of its own.
-        paint: of an eyeball or lashes whose colour is in the material.
-    """
-
-    triangles: Tensor
-    material: PartMaterial
-    color_source: ColorSource
-    part: str | None = None
-    paint: Paint | None = None
+    triangles: Tensor  # rows of the mesh's faces, ascending, (K,)
+    material: PartMaterial  # what they are made of
+    color_source: ColorSource  # where their colour is: in the mesh's texture, in its vertex colours, or in the material
+    part: str | None = None  # the region of an eyeball that rotates about a node of its own
+    paint: Paint | None = None  # of an eyeball or lashes whose colour is in the material
 
 
 def surfaces(mesh: Mesh, has_image: bool) -> list[Surface]:

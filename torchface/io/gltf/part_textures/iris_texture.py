@@ -174,15 +174,10 @@ def _ramp(value: Tensor, low: float, high: float) -> Tensor:
 
 @dataclass(frozen=True, eq=False)
 class Paint:
-    """Colours of a part, sRGB and opacity.
+    """Colours of a part, sRGB and opacity."""
 
-    Args:
-        image: in the mesh's own layout, (4,S,S); or
-        colors: of its vertices, (V,4), where it has none.
-    """
-
-    image: Tensor | None
-    colors: Tensor | None
+    image: Tensor | None  # in the mesh's own layout, (4,S,S); or
+    colors: Tensor | None  # of its vertices, (V,4), where it has none
 
 
 def painted(mesh: Mesh, rows: Tensor, values: Tensor, color: Callable[[Tensor], Tensor], side: int = _SIDE) -> Paint:

@@ -17,16 +17,11 @@ from torchface.landmarks.images.appearance.shape_modes import procrustes_mean
 
 @dataclass(frozen=True, eq=False)
 class AnnotatedFrame:
-    """An image with landmarks.
-
-    Args:
-        image: (3,H,W), uint8 or in [0,1].
-        landmarks: iBUG's 68, (68,2) pixels.
-    """
+    """An image with landmarks."""
 
     name: str
-    image: Tensor
-    landmarks: Tensor
+    image: Tensor  # (3,H,W), uint8 or in [0,1]
+    landmarks: Tensor  # iBUG's 68, (68,2) pixels
 
 
 def load_annotated_frames(folder: str | Path) -> list[AnnotatedFrame]:

@@ -59,19 +59,12 @@ def _open(shape: Tensor, pairs: Sequence[tuple[Sequence[int], Sequence[int]]], l
 
 @dataclass(frozen=True, eq=False)
 class FaceGrid:
-    """The pixels inside a reference shape.
+    """The pixels inside a reference shape."""
 
-    Args:
-        pixels: their places (N,2).
-        triangle: which holds each, (N,).
-        gradient: what its triangle's barycentric coordinates gain a pixel along x and y, (N,3,2).
-        barycentric: (N,3).
-    """
-
-    pixels: Tensor
-    triangle: Tensor
-    barycentric: Tensor
-    gradient: Tensor
+    pixels: Tensor  # their places (N,2)
+    triangle: Tensor  # which holds each, (N,)
+    barycentric: Tensor  # (N,3)
+    gradient: Tensor  # what its triangle's barycentric coordinates gain a pixel along x and y, (N,3,2)
 
 
 def face_grid(points: Tensor, triangles: Tensor) -> FaceGrid:

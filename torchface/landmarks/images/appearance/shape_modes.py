@@ -31,17 +31,11 @@ class PlanarPose(NamedTuple):
 
 
 class ShapeModes(NamedTuple):
-    """A linear Gaussian model of shapes, similarities removed.
+    """A linear Gaussian model of shapes, similarities removed."""
 
-    Args:
-        mean: (L,2), centred, its root mean square distance from the centre is 1.
-        modes: orthonormal (K,L,2), orthogonal to what similarities do to the mean.
-        deviations: standard deviations along them, (K,), the largest first.
-    """
-
-    mean: Tensor
-    modes: Tensor
-    deviations: Tensor
+    mean: Tensor  # (L,2), centred, its root mean square distance from the centre is 1
+    modes: Tensor  # orthonormal (K,L,2), orthogonal to what similarities do to the mean
+    deviations: Tensor  # standard deviations along them, (K,), the largest first
 
 
 def planar_pose(mean: Tensor, shapes: Tensor) -> PlanarPose:

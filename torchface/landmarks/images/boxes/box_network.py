@@ -20,36 +20,24 @@ if TYPE_CHECKING:
 INPUT_SIZE = 896
 """Pixels of the longer side of the copy of an image that the network is given; a face of 32 pixels in 1280 has 22."""
 
-COPIES = 5
-"""Copies of an image that the network sees: each half as large as the one before, for faces twice as large."""
-
-STRIDE = 8
-"""Pixels a cell of the maps."""
-
-TYPICAL_SIDE = 24.0
-"""Pixels: what a network that has learned nothing takes a face for."""
+COPIES = 5  # copies of an image that the network sees: each half as large as the one before, for faces twice as large
+STRIDE = 8  # pixels a cell of the maps
+TYPICAL_SIDE = 24.0  # pixels: what a network that has learned nothing takes a face for
 
 _SMALLEST = 64  # pixels a side of an image
 _FEWEST_CELLS = (_SMALLEST // STRIDE) ** 2
-LOG_SIDES = 5.0
-"""How far the logarithm of a side may lie from the typical one's."""
-
-BESIDE_A_PEAK = 1e-3
-"""What a score counts beside a likelier one of the same face."""
+LOG_SIDES = 5.0  # how far the logarithm of a side may lie from the typical one's
+BESIDE_A_PEAK = 1e-3  # what a score counts beside a likelier one of the same face
 
 _SAME_FACE = 0.45  # of the larger side: two faces whose centres are nearer are one
 
 
 class FaceMaps(NamedTuple):
-    """What the network says of every cell.
+    """What the network says of every cell."""
 
-    Args:
-        centre: logit that a face has its centre in the cell, (B,1,h,w).
-        geometry: of that face (B,5,h,w): its centre against the cell's, x and y in cells; the logarithm of its side
-            over 24 pixels; cosine and sine of its roll angle, of any length.
-    """
-
-    centre: Tensor
+    centre: Tensor  # logit that a face has its centre in the cell, (B,1,h,w)
+    # Of that face (B,5,h,w): its centre against the cell's, x and y in cells; the logarithm of its side over 24 pixels;
+    # cosine and sine of its roll angle, of any length.
     geometry: Tensor
 
 

@@ -71,17 +71,12 @@ class LiteNetwork:
 
 @dataclass(frozen=True, eq=False)
 class LandmarkerBundle:
-    """The three networks of a bundle.
+    """The three networks of a bundle."""
 
-    Args:
-        boxes: from a picture (1,128,128,3) in [-1,1] to 896 boxes with six points each, and their scores.
-        landmarks: from a crop (1,256,256,3) in [0,1] to 478 points of three numbers in its pixels, and a score.
-        blendshapes: from 146 of them, (1,146,2), to weights (52,).
-    """
-
-    boxes: LiteNetwork
+    boxes: LiteNetwork  # from a picture (1,128,128,3) in [-1,1] to 896 boxes with six points each, and their scores
+    # From a crop (1,256,256,3) in [0,1] to 478 points of three numbers in its pixels, and a score.
     landmarks: LiteNetwork
-    blendshapes: LiteNetwork
+    blendshapes: LiteNetwork  # from 146 of them, (1,146,2), to weights (52,)
 
 
 def load_bundle(path: str | Path) -> LandmarkerBundle:

@@ -69,15 +69,10 @@ class FaceSquare:
 
 @dataclass(frozen=True, eq=False)
 class MeshFace:
-    """A face's mesh.
+    """A face's mesh."""
 
-    Args:
-        points: (478,2) pixels of the picture.
-        presence: how likely there is a face, in [0,1].
-    """
-
-    points: Tensor
-    presence: float
+    points: Tensor  # (478,2) pixels of the picture
+    presence: float  # how likely there is a face, in [0,1]
 
     @property
     def square(self) -> FaceSquare:

@@ -11,8 +11,7 @@ from torch import Tensor
 
 from torchface.landmarks.images.boxes.face_box import overlaps
 
-SIDE = 128
-"""Pixels a side of the picture that the network is shown."""
+SIDE = 128  # pixels a side of the picture that the network is shown
 
 _GRIDS = ((16, 2), (8, 6))  # cells a side, and anchors in the middle of each cell
 _SHARED = 0.3  # overlap from which two boxes are of one face

@@ -67,15 +67,11 @@ class ReaderSettings:
 
 @dataclass(frozen=True, eq=False)
 class WebcamNetworks:
-    """What read faces.
-
-    Args:
-        eyes: finds lids and irises in an eye.
-    """
+    """What read faces."""
 
     boxes: BoxNetwork
     landmarks: LandmarkNetwork
-    eyes: EyeNetwork
+    eyes: EyeNetwork  # finds lids and irises in an eye
 
 
 class FaceReader(nn.Module):

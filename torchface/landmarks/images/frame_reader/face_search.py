@@ -15,8 +15,7 @@ _CANDIDATES = 4  # that are tried in turn, a frame each, where the landmark netw
 _FIRST = 1e6  # more than any side: a face that is near goes before all others
 # Where what the network says shows no face, one is looked for upright, then 50 degrees either way.
 _TRIES, _LEANING = 4, (0.643, 0.766)
-FOUND = 7
-"""Numbers that a search gives."""
+FOUND = 7  # numbers that a search gives
 
 
 def search(

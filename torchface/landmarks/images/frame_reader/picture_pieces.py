@@ -9,8 +9,7 @@ from torch.nn.functional import grid_sample, interpolate, pad
 from torchface.landmarks.images.frame_reader.face_place import axes
 
 _MULTIPLE = 32  # what a network's coarsest level asks for
-AROUND = 2.0
-"""Pixels that interpolation needs beyond points."""
+AROUND = 2.0  # pixels that interpolation needs beyond points
 
 
 def picture_size(image: Tensor) -> Tensor:

@@ -15,23 +15,17 @@ from torchface.landmarks.images.ibug_68 import COUNT, MIRROR_68
 from torchface.landmarks.images.networks.landmark_network import NetworkLandmarks
 from torchface.shape_names import ARKIT, mirror
 
-CropNetwork = Callable[[Tensor], NetworkLandmarks]
-"""Crops (B,3,S,S) float32 in [0,1], red first, to what they show."""
+CropNetwork = Callable[[Tensor], NetworkLandmarks]  # crops (B,3,S,S) float32 in [0,1], red first, to what they show
 
 _NO_POINTS = torch.zeros(0, dtype=torch.int64)
 
 
 @dataclass(frozen=True, eq=False)
 class BothSides:
-    """A network that is shown each crop and its mirror image, and the mean of what it finds in the two.
-
-    Args:
-        network: see ``CropNetwork``.
-        mirror: which of the network's points each becomes when the picture is mirrored, (P,) int64.
-    """
+    """A network that is shown each crop and its mirror image, and the mean of what it finds in the two."""
 
     network: CropNetwork
-    mirror: Tensor = _NO_POINTS
+    mirror: Tensor = _NO_POINTS  # which of the network's points each becomes when the picture is mirrored, (P,) int64
 
     def __call__(self, crops: Tensor) -> NetworkLandmarks:
         last = crops.shape[-1] - 1
@@ -63,16 +57,11 @@ def _merged(upright: tuple[Tensor, ...], mirrored: tuple[Tensor, ...], last: int
 
 @dataclass(frozen=True, eq=False)
 class CropFinder:
-    """Finds landmarks by showing a network the face's box, turned upright.
-
-    Args:
-        size: pixels a side of a crop, S.
-        margin: a crop's side in sides of the face's box.
-    """
+    """Finds landmarks by showing a network the face's box, turned upright."""
 
     network: CropNetwork
-    size: int
-    margin: float = CROP_MARGIN
+    size: int  # pixels a side of a crop, S
+    margin: float = CROP_MARGIN  # a crop's side in sides of the face's box
     name: str = "landmark network"
 
     @torch.no_grad()

@@ -23,19 +23,12 @@ _OFFSET = 0.1  # of the face's size, a unit of what features move a point by
 
 
 class DenseReading(NamedTuple):
-    """What the head reads of B faces.
+    """What the head reads of B faces."""
 
-    Args:
-        points: (B,P,2) pixels of the crop.
-        point_deviation: standard deviation of a coordinate, (B,P) pixels.
-        expression: weights by ARKit's names as they are to be expected, (B,52).
-        expression_deviation: standard deviation of the truth about them, (B,52).
-    """
-
-    points: Tensor
-    point_deviation: Tensor
-    expression: Tensor
-    expression_deviation: Tensor
+    points: Tensor  # (B,P,2) pixels of the crop
+    point_deviation: Tensor  # standard deviation of a coordinate, (B,P) pixels
+    expression: Tensor  # weights by ARKit's names as they are to be expected, (B,52)
+    expression_deviation: Tensor  # standard deviation of the truth about them, (B,52)
 
 
 class DenseHead(nn.Module):

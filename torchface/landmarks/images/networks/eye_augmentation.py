@@ -18,67 +18,40 @@ _SHUT, _OPEN = 10.0, 28.0  # square millimetres of eyeball up to which an eye is
 
 @dataclass(frozen=True)
 class EyeAugmentation:
-    """How widely crops are drawn; shares lie in [0,1].
+    """How widely crops are drawn; shares lie in [0,1]."""
 
-    Args:
-        turn: largest roll angle that landmarks leave, degrees.
-        scale: how much larger or smaller than its crop an eye may be, as a logarithm.
-        shift: how far it may lie aside, of the crop.
-        hidden: share of crops with something before the eye.
-        absent: share of crops that show no eye.
-        far: share of crops of faces that are small in their picture.
-        sizes: pixels of their pictures in one of the crop, for the smallest and the largest of them.
-    """
-
-    turn: float = 12.0
-    scale: float = 0.2
-    shift: float = 0.12
-    hidden: float = 0.22
-    absent: float = 0.06
-    far: float = 0.55
+    turn: float = 12.0  # largest roll angle that landmarks leave, degrees
+    scale: float = 0.2  # how much larger or smaller than its crop an eye may be, as a logarithm
+    shift: float = 0.12  # how far it may lie aside, of the crop
+    hidden: float = 0.22  # share of crops with something before the eye
+    absent: float = 0.06  # share of crops that show no eye
+    far: float = 0.55  # share of crops of faces that are small in their picture
+    # Pixels of their pictures in one of the crop, for the smallest and the largest of them.
     sizes: tuple[float, float] = (0.2, 1.0)
 
 
 @dataclass(frozen=True, eq=False)
 class EyeCrops:
-    """What a network is shown, and what it should answer.
+    """What a network is shown, and what it should answer."""
 
-    Args:
-        images: (B,3,h,w) in [0,1].
-        points: six of the lids and the iris's centre, (B,7,2) pixels.
-        seen: which of them can be seen, (B,7) in [0,1]; the iris's centre of a shut eye cannot.
-        openness: of the lids, (B,).
-        closed: whether the eye is shut, (B,) in [0,1].
-        visibility: whether nothing hides it, (B,) in [0,1].
-        present: whether an eye is there, (B,) in [0,1].
-    """
-
-    images: Tensor
-    points: Tensor
-    seen: Tensor
-    openness: Tensor
-    closed: Tensor
-    visibility: Tensor
-    present: Tensor
+    images: Tensor  # (B,3,h,w) in [0,1]
+    points: Tensor  # six of the lids and the iris's centre, (B,7,2) pixels
+    seen: Tensor  # which of them can be seen, (B,7) in [0,1]; the iris's centre of a shut eye cannot
+    openness: Tensor  # of the lids, (B,)
+    closed: Tensor  # whether the eye is shut, (B,) in [0,1]
+    visibility: Tensor  # whether nothing hides it, (B,) in [0,1]
+    present: Tensor  # whether an eye is there, (B,) in [0,1]
 
 
 @dataclass(frozen=True, eq=False)
 class EyeLabels:
-    """What is known of pictures of both eyes, the person's right one first.
+    """What is known of pictures of both eyes, the person's right one first."""
 
-    Args:
-        landmarks: iBUG's 68, (M,68,2) pixels.
-        visible: which of 36 to 47 nothing hides, (M,12) bool.
-        iris: centres of the irises, (M,2,2) pixels.
-        openness: the lids' distance over that of the corners, on the head, (M,2).
-        bare: how much of each eyeball is seen, (M,2) square millimetres.
-    """
-
-    landmarks: Tensor
-    visible: Tensor
-    iris: Tensor
-    openness: Tensor
-    bare: Tensor
+    landmarks: Tensor  # iBUG's 68, (M,68,2) pixels
+    visible: Tensor  # which of 36 to 47 nothing hides, (M,12) bool
+    iris: Tensor  # centres of the irises, (M,2,2) pixels
+    openness: Tensor  # the lids' distance over that of the corners, on the head, (M,2)
+    bare: Tensor  # how much of each eyeball is seen, (M,2) square millimetres
 
 
 def augmented_eyes(

@@ -7,21 +7,15 @@ from torch import Tensor
 
 from torchface.errors import ShapeError
 
-CROP_WIDTH, CROP_HEIGHT = 48, 32
-"""Pixels of an eye's crop."""
+CROP_WIDTH, CROP_HEIGHT = 48, 32  # pixels of an eye's crop
 
 EYE_LANDMARKS = ((36, 37, 38, 39, 40, 41), (45, 44, 43, 42, 47, 46))
 """iBUG's landmarks of the right eye, and of the left in the order that the right one's have in a mirror: the outer
 corner, two of the upper lid, the inner corner, two of the lower lid."""
 
-SHARE = 0.83
-"""How wide a crop is, of the distance of the eyes."""
-
-DOWN = 1.4
-"""The distance of the eyes over that of their middle from the nose's base, on heads seen from the front."""
-
-NOSE_BASE = 33
-"""iBUG's landmark."""
+SHARE = 0.83  # how wide a crop is, of the distance of the eyes
+DOWN = 1.4  # the distance of the eyes over that of their middle from the nose's base, on heads seen from the front
+NOSE_BASE = 33  # iBUG's landmark
 
 
 def eye_transforms(landmarks: Tensor, width: int = CROP_WIDTH, height: int = CROP_HEIGHT) -> Tensor:

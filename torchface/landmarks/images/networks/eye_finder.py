@@ -23,11 +23,8 @@ from torchface.landmarks.images.networks.eye_crop import (
 )
 from torchface.landmarks.images.networks.eye_network import EyeFindings
 
-LEAST = 6.0
-"""Pixels of the image that a crop must be wide."""
-
-HIDDEN, SEEN = 0.3, 0.8
-"""Visibility up to which an eye does not count, and from which it counts fully."""
+LEAST = 6.0  # pixels of the image that a crop must be wide
+HIDDEN, SEEN = 0.3, 0.8  # visibility up to which an eye does not count, and from which it counts fully
 
 PLACES = tuple(sum(EYE_LANDMARKS, ()).index(number) for number in range(36, 48))
 """Rows of both eyes' lids, in the order of ``EYE_LANDMARKS``, that landmarks 36 to 47 are."""
@@ -35,15 +32,10 @@ PLACES = tuple(sum(EYE_LANDMARKS, ()).index(number) for number in range(36, 48))
 
 @dataclass(frozen=True, eq=False)
 class EyedFinder:
-    """Finds landmarks, then looks at the eyes among them.
+    """Finds landmarks, then looks at the eyes among them."""
 
-    Args:
-        finder: finds all 68.
-        eyes: refines those of the lids, and reads irises.
-    """
-
-    finder: LandmarkFinder
-    eyes: EyeFinder
+    finder: LandmarkFinder  # finds all 68
+    eyes: EyeFinder  # refines those of the lids, and reads irises
 
     @property
     def name(self) -> str:
@@ -57,14 +49,10 @@ class EyedFinder:
 
 @dataclass(frozen=True, eq=False)
 class EyeFinder:
-    """Reads the eyes of a face in an image.
+    """Reads the eyes of a face in an image."""
 
-    Args:
-        network: from crops (2,3,h,w) float32 in [0,1], red first, to what they show.
-        width, height: pixels of the crops.
-    """
-
-    network: Callable[[Tensor], EyeFindings]
+    network: Callable[[Tensor], EyeFindings]  # from crops (2,3,h,w) float32 in [0,1], red first, to what they show
+    # width, height: pixels of the crops
     width: int
     height: int
 

@@ -15,14 +15,10 @@ from torchface.landmarks.images.networks.heat_maps import ResidualBlock, convolu
 from torchface.landmarks.images.networks.picture_network import PictureNetwork
 from torchface.optim import DescentSettings, DescentTask
 
-POINTS = 7
-"""Six landmarks of the lids, then the iris's centre."""
-STRIDE = 2
-"""Pixels of the crop a side of a heat map's cell."""
-DEVIATION_RANGE = (0.05, 40.0)
-"""Pixels of the crop, of the deviations that the network states."""
-LEAST_SPREAD = 0.03
-"""Of a crop's brightness, so that what shows nothing is not made to show something."""
+POINTS = 7  # six landmarks of the lids, then the iris's centre
+STRIDE = 2  # pixels of the crop a side of a heat map's cell
+DEVIATION_RANGE = (0.05, 40.0)  # pixels of the crop, of the deviations that the network states
+LEAST_SPREAD = 0.03  # of a crop's brightness, so that what shows nothing is not made to show something
 _MOST_CHANNELS, _MOST_BLOCKS, _MOST_SIDE = 256, 8, 256
 
 

@@ -20,8 +20,7 @@ from typing import Any, BinaryIO
 
 import numpy as np
 
-MOST_BYTES, MOST_NUMBERS, MOST_AXES = 2**28, 2**24, 4
-"""Of a request, and of an array."""
+MOST_BYTES, MOST_NUMBERS, MOST_AXES = 2**28, 2**24, 4  # of a request, and of an array
 
 OUTPUTS = ("landmarks", "deviation", "visibility", "presence")
 

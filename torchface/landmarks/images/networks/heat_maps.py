@@ -43,17 +43,11 @@ def cell_places(heat: Tensor, stride: int) -> Tensor:
 
 
 class HeatReading(NamedTuple):
-    """What heat maps give.
+    """What heat maps give."""
 
-    Args:
-        points: their means, (B,L,2) pixels of the crop.
-        under: features under each, (B,L,C).
-        widening: a quarter of the logarithm of the maps' variances and 1, (B,L): wide maps are uncertain ones.
-    """
-
-    points: Tensor
-    under: Tensor
-    widening: Tensor
+    points: Tensor  # their means, (B,L,2) pixels of the crop
+    under: Tensor  # features under each, (B,L,C)
+    widening: Tensor  # a quarter of the logarithm of the maps' variances and 1, (B,L): wide maps are uncertain ones
 
 
 def read_heat(heat: Tensor, features: Tensor, stride: int) -> HeatReading:

@@ -16,11 +16,9 @@ from torchface.landmarks.images.networks.heat_maps import ResidualBlock, convolu
 from torchface.landmarks.images.networks.picture_network import PictureNetwork
 from torchface.optim import DescentSettings, DescentTask
 
-STRIDE = 4
-"""Pixels of the crop a side of a heat map's cell."""
+STRIDE = 4  # pixels of the crop a side of a heat map's cell
 _MOST_CHANNELS, _MOST_BLOCKS, _MOST_SIZE, _MOST_POINTS = 512, 16, 512, 4096
-DEVIATION_RANGE = (0.05, 60.0)
-"""Pixels of the crop, of the deviations that the network states."""
+DEVIATION_RANGE = (0.05, 60.0)  # pixels of the crop, of the deviations that the network states
 
 
 class NetworkLandmarks(NamedTuple):

@@ -44,17 +44,11 @@ _EXPECTED = (
 
 @dataclass(frozen=True)
 class GraphLimits:
-    """What a foreign graph may take.
+    """What a foreign graph may take."""
 
-    Args:
-        load_seconds: until it is read, optimised and has answered one crop.
-        answer_seconds: for each crop after that.
-        megabytes: of memory, beside ONNX Runtime's own; not enforced on macOS and Windows.
-    """
-
-    load_seconds: float = 60.0
-    answer_seconds: float = 20.0
-    megabytes: int = 2048
+    load_seconds: float = 60.0  # until it is read, optimised and has answered one crop
+    answer_seconds: float = 20.0  # for each crop after that
+    megabytes: int = 2048  # of memory, beside ONNX Runtime's own; not enforced on macOS and Windows
 
 
 def onnx_finder(path: str | Path, limits: GraphLimits | None = None) -> CropFinder:

@@ -19,15 +19,10 @@ _ROW = {name: number for number, name in enumerate(PARTS)}
 
 @dataclass(frozen=True, eq=False)
 class FaceParts:
-    """What a crop of a picture shows.
+    """What a crop of a picture shows."""
 
-    Args:
-        shares: of each of :data:`PARTS` in the crop's pixels, (10,S,S).
-        transform: from the picture's pixels to the crop's, (2,3) float64.
-    """
-
-    shares: Tensor
-    transform: Tensor
+    shares: Tensor  # of each of PARTS in the crop's pixels, (10,S,S)
+    transform: Tensor  # from the picture's pixels to the crop's, (2,3) float64
 
     def of(self, *names: str) -> Tensor:
         """The share of some of :data:`PARTS` together in the crop's pixels, (S,S)."""
@@ -46,12 +41,9 @@ class FaceParts:
 
 @dataclass(frozen=True, eq=False)
 class PartFinder:
-    """Shows a network the upright crop of a face, and its mirror image.
+    """Shows a network the upright crop of a face, and its mirror image."""
 
-    Args:
-        network: from crops (B,3,S,S) float32 in [0,1], red first, to shares (B,10,S,S) of :data:`PARTS`.
-    """
-
+    # From crops (B,3,S,S) float32 in [0,1], red first, to shares (B,10,S,S) of PARTS.
     network: Callable[[Tensor], Tensor]
 
     @torch.no_grad()

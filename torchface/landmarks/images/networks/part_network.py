@@ -19,10 +19,8 @@ from torchface.optim import DescentSettings, DescentTask
 PARTS = ("background", "skin", "hair", "brows", "eyes", "lips", "teeth", "glasses", "hand", "cloth")
 """In the order of the network's channels. Beards are hair, hats are cloth, all that is between the lips is teeth, and
 what a clear lens shows is what lies behind it."""
-PART_SIZE = 128
-"""Pixels a side of a crop."""
-PART_MARGIN = 1.7
-"""A crop's side in sides of the face's box."""
+PART_SIZE = 128  # pixels a side of a crop
+PART_MARGIN = 1.7  # a crop's side in sides of the face's box
 _MOST_CHANNELS, _MOST_BLOCKS = 256, 8
 
 

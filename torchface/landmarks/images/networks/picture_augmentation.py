@@ -13,8 +13,7 @@ from torch import Tensor
 
 from torchface.landmarks.images.ibug_68 import COUNT, MIRROR_68, box_around
 
-Uniform = Callable[[float, float], float]
-"""A number drawn between two others."""
+Uniform = Callable[[float, float], float]  # a number drawn between two others
 
 _EYES, _MOUTH = slice(36, 48), slice(48, 68)
 
@@ -42,21 +41,13 @@ class AugmentationSettings:
 
 @dataclass(frozen=True, eq=False)
 class Crops:
-    """What a network is shown, and what it should answer.
+    """What a network is shown, and what it should answer."""
 
-    Args:
-        images: (B,3,S,S) in [0,1].
-        landmarks: (B,68+P,2) pixels.
-        visible: (B,68+P) in [0,1].
-        present: whether a face is there, (B,) in [0,1].
-        mirrored: whether left and right are exchanged, (B,) bool.
-    """
-
-    images: Tensor
-    landmarks: Tensor
-    visible: Tensor
-    present: Tensor
-    mirrored: Tensor
+    images: Tensor  # (B,3,S,S) in [0,1]
+    landmarks: Tensor  # (B,68+P,2) pixels
+    visible: Tensor  # (B,68+P) in [0,1]
+    present: Tensor  # whether a face is there, (B,) in [0,1]
+    mirrored: Tensor  # whether left and right are exchanged, (B,) bool
 
 
 def augmented(

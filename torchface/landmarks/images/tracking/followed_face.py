@@ -16,36 +16,24 @@ _LOOK = 3 * _SIZE * _SIZE
 _LEARNED = 0.1  # of how a face looks now that is taken up by what is known of its look
 _NEAR, _SMALLER, _LARGER = 0.75, 0.6, 1.6  # sides of the box, and factors of its size
 
-LOOK = _LOOK
-"""Numbers of a look."""
-
-MEMORY = 5 + 3 + _LOOK + 4
-"""Numbers that a followed face is packed into."""
+LOOK = _LOOK  # numbers of a look
+MEMORY = 5 + 3 + _LOOK + 4  # numbers that a followed face is packed into
 
 
 @dataclass(eq=False)
 class FollowedFace:
-    """What is known of one face; absent for unknown.
+    """What is known of one face; absent for unknown."""
 
-    Args:
-        place: its upright box and its tilt, (5,).
-        anchor: where the finder's box lies as the face sees it: its middle from the upright box's (2,) in sides of
-            that, and its size by that's; (3,).
-        look: its colours, upright and small, (1200,) of unit length.
-        latest_look: the same in the last frame that showed it; not packed.
-        missed: frames in a row without it.
-        unconfirmed: checks in a row in which the detector saw no face at its place.
-        crowded: whether somebody else is about who might be taken for it.
-    """
-
-    place: Tensor | None = None
+    place: Tensor | None = None  # its upright box and its tilt, (5,)
+    # Where the finder's box lies as the face sees it: its middle from the upright box's (2,) in sides of that, and its
+    # size by that's; (3,).
     anchor: Tensor | None = None
-    look: Tensor | None = None
-    missed: int = 0
+    look: Tensor | None = None  # its colours, upright and small, (1200,) of unit length
+    missed: int = 0  # frames in a row without it
     frames: int = 0
-    unconfirmed: int = 0
-    crowded: bool = False
-    latest_look: Tensor | None = None
+    unconfirmed: int = 0  # checks in a row in which the detector saw no face at its place
+    crowded: bool = False  # whether somebody else is about who might be taken for it
+    latest_look: Tensor | None = None  # the same in the last frame that showed it; not packed
 
     def pack(self) -> Tensor:
         """All of it as a tensor (1212,) float64; NaN for unknown."""

@@ -16,8 +16,7 @@ from torchface.landmarks.images.face_reading import confidence_of
 from torchface.landmarks.images.ibug_68 import MIRROR_68
 from torchface.landmarks.images.trees.landmark_trees import LandmarkTrees, initial_shapes
 
-REACH = 1.1
-"""How far the image that trees are shown reaches from the middle of a box, in its sides."""
+REACH = 1.1  # how far the image that trees are shown reaches from the middle of a box, in its sides
 
 _OUTLYING = 0.02  # of the box's side: starts that end so far from the others count half
 _MAX_SIDE = 4096
@@ -54,15 +53,10 @@ class ConsensusSettings:
 
 
 class Consensus(NamedTuple):
-    """Landmarks, and how much the starts disagree about each.
+    """Landmarks, and how much the starts disagree about each."""
 
-    Args:
-        landmarks: (L,2), pixels.
-        dispersion: (L,), root mean square distance of the starts' landmarks, of the box's side.
-    """
-
-    landmarks: Tensor
-    dispersion: Tensor
+    landmarks: Tensor  # (L,2), pixels
+    dispersion: Tensor  # (L,), root mean square distance of the starts' landmarks, of the box's side
 
     @property
     def confidence(self) -> Tensor:

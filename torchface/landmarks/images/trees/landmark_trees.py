@@ -16,8 +16,7 @@ from torchface.progress import Progress
 if TYPE_CHECKING:
     from torchface.landmarks.images.trees.tree_training import TreeSettings
 
-FAINTEST = 0.02
-"""Spread of the grey values under which a face counts as having none, in [0,1]."""
+FAINTEST = 0.02  # spread of the grey values under which a face counts as having none, in [0,1]
 
 _MAX_SIZES = {"landmarks": 10_000, "cascades": 1000, "trees": 100_000, "depth": 12, "features": 32_000}
 

@@ -16,8 +16,7 @@ from torchface.landmarks.images.ibug_68 import COUNT
 from torchface.landmarks.images.trees.landmark_consensus import REACH, Consensus, ConsensusSettings, consensus
 from torchface.landmarks.images.trees.landmark_trees import LandmarkTrees
 
-PHOTOGRAPH = ConsensusSettings(starts=48)
-"""Starts for a single picture, where time matters less than in a video."""
+PHOTOGRAPH = ConsensusSettings(starts=48)  # starts for a single picture, where time matters less than in a video
 
 _EVEN, _STEEPNESS = 0.054, 12.0
 _AROUND = 0.06  # of the box's side: the patch round a landmark that must show something

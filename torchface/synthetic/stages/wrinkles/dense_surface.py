@@ -19,17 +19,12 @@ _BLUNT = 1e-3  # of a ring's spread: keeps the gradient finite where a ring is a
 
 @dataclass(frozen=True, eq=False)
 class DenseSurface:
-    """A smooth surface over a coarse mesh.
+    """A smooth surface over a coarse mesh."""
 
-    Args:
-        neutral: the dense mesh without wrinkles or pores; the coarse vertices come first, in their order.
-        operator: from coarse vertices to dense ones, (V,V0), float32.
-        tangents: from coarse vertices to two tangents a dense vertex, (2V,V0), float32: how two fixed directions in
-            the skin have been moved and stretched; the first V rows are the first direction's.
-    """
-
-    neutral: Mesh
-    operator: sparse.csr_array
+    neutral: Mesh  # the dense mesh without wrinkles or pores; the coarse vertices come first, in their order
+    operator: sparse.csr_array  # from coarse vertices to dense ones, (V,V0), float32
+    # From coarse vertices to two tangents a dense vertex, (2V,V0), float32: how two fixed directions in the skin have
+    # been moved and stretched; the first V rows are the first direction's.
     tangents: sparse.csr_array
 
 

@@ -16,27 +16,16 @@ _STEP = 0.25  # millimetres between points of a line
 
 @dataclass(frozen=True, eq=False)
 class WrinkleLine:
-    """A line in which skin folds.
+    """A line in which skin folds."""
 
-    Args:
-        place: which wrinkle it is, such as ``forehead`` or ``crows_feet_left``.
-        points: along it on the neutral face, (S,3), a quarter of a millimetre apart.
-        triangle: rows of the neutral's faces, (S,) int64, that the points lie on.
-        barycentric: weights of the corners of those triangles, (S,3).
-        depth: of the valley below the ridges at full compression, millimetres.
-        width: from the valley's bottom to where its sides end, millimetres.
-        trace: share of the depth that is there at rest.
-        overhang: how much the upper or outer ridge hangs over the valley; 0 for a symmetric fold.
-    """
-
-    place: str
-    points: Tensor
-    triangle: Tensor
-    barycentric: Tensor
-    depth: float
-    width: float
-    trace: float
-    overhang: float = 0.0
+    place: str  # which wrinkle it is, such as forehead or crows_feet_left
+    points: Tensor  # along it on the neutral face, (S,3), a quarter of a millimetre apart
+    triangle: Tensor  # rows of the neutral's faces, (S,) int64, that the points lie on
+    barycentric: Tensor  # weights of the corners of those triangles, (S,3)
+    depth: float  # of the valley below the ridges at full compression, millimetres
+    width: float  # from the valley's bottom to where its sides end, millimetres
+    trace: float  # share of the depth that is there at rest
+    overhang: float = 0.0  # how much the upper or outer ridge hangs over the valley; 0 for a symmetric fold
 
 
 def wrinkle_lines(neutral: Mesh, seed: int) -> list[WrinkleLine]:

@@ -27,23 +27,16 @@ _SAME_WAY = 0.2  # cosine to the line's normal below which a vertex belongs to a
 
 @dataclass(frozen=True, eq=False)
 class WrinkleRelief:
-    """What the lines do to a dense face, linear in how far each has folded and in the square of it.
+    """What the lines do to a dense face, linear in how far each has folded and in the square of it."""
 
-    Args:
-        relief: from folding and its square at the gauges, (2G,), to displacement in the skin's frame, (3V,): along the
-            normal, then along both tangents; millimetres.
-        before: barycentric places of the gauges' ends on one side of their lines, (G,V).
-        along: averages along each line, (G,G).
-        trace: share of folding at rest, (G,).
-        line: which line each gauge belongs to, (G,) int64.
-    """
-
+    # From folding and its square at the gauges, (2G,), to displacement in the skin's frame, (3V,): along the normal,
+    # then along both tangents; millimetres.
     relief: sparse.csr_array
-    before: sparse.csr_array
+    before: sparse.csr_array  # barycentric places of the gauges' ends on one side of their lines, (G,V)
     behind: sparse.csr_array
-    along: sparse.csr_array
-    trace: Tensor
-    line: Tensor
+    along: sparse.csr_array  # averages along each line, (G,G)
+    trace: Tensor  # share of folding at rest, (G,)
+    line: Tensor  # which line each gauge belongs to, (G,) int64
 
 
 def wrinkle_relief(neutral: Mesh, lines: list[WrinkleLine]) -> WrinkleRelief:

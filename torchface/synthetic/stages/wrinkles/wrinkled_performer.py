@@ -22,8 +22,7 @@ from torchface.synthetic.stages.wrinkles.skin_texture_relief import pore_heights
 from torchface.synthetic.stages.wrinkles.wrinkle_lines import wrinkle_lines
 from torchface.synthetic.stages.wrinkles.wrinkle_relief import wrinkle_relief
 
-_LEAST_COMPRESSION = 0.04
-"""Below it a rig's largest compression is taken to be this: no wrinkle comes from noise."""
+_LEAST_COMPRESSION = 0.04  # below it a rig's largest compression is taken to be this: no wrinkle comes from noise
 
 
 def steady_folding(compression: Tensor, scale: Tensor, trace: Tensor) -> Tensor:
