@@ -17,8 +17,7 @@ Kind = TypeVar("Kind")
 LARGEST_WEIGHT = 1e12
 """The largest weight that a term of an energy may have: beyond it rounding leaves nothing of the other terms."""
 
-LARGEST_SEED = 2**32 - 1
-"""What every generator of random numbers takes."""
+LARGEST_SEED = 2**32 - 1  # what every generator of random numbers takes
 MIN_FPS, MAX_FPS = 0.01, 10_000.0
 """Frames a second: from a picture every hundred seconds to what no marker camera reaches."""
 

@@ -30,14 +30,10 @@ class CorrectiveEnergy:
     .. math:: E(y) = \tfrac12 x^\top H x + f^\top x + c, \qquad x = (y, a(w)),
 
     where y are L variables: the N weights w, and what else a solve finds, such as a helmet's motion.
-
-    Args:
-        extended: the quadratic of x, of L + C variables.
-        activation: :math:`a`, of N shapes and C correctives.
     """
 
-    extended: Quadratic
-    activation: CorrectiveActivation
+    extended: Quadratic  # the quadratic of x, of L + C variables
+    activation: CorrectiveActivation  # a, of N shapes and C correctives
 
     def __add__(self, other: Quadratic) -> CorrectiveEnergy:
         """With an energy of the L variables added."""

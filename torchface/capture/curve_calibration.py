@@ -27,18 +27,14 @@ class CurveCorrection:
 
     .. math:: w' = g\,\frac{\max(0, w - r)}{1 - r}, \quad w' = g\,w \text{ of lids}
 
-    Args:
-        rest: r, the person's weights at rest, (52,); 0 of lids and gaze.
-        gain: g, (52,).
-
     Example:
         >>> correction = CurveCorrection(torch.full((52,), 0.2), torch.full((52,), 1.25))
         >>> [round(value, 3) for value in correction(torch.tensor([0.1, 0.6, 0.84] + [0.0] * 49))[:3].tolist()]
         [0.0, 0.625, 1.0]
     """
 
-    rest: Tensor
-    gain: Tensor
+    rest: Tensor  # r, the person's weights at rest, (52,); 0 of lids and gaze
+    gain: Tensor  # g, (52,)
 
     def __call__(self, weights: Tensor) -> Tensor:
         """Corrected weights (...,52), from 0 to 1."""

@@ -22,16 +22,11 @@ class Quadratic:
 
     Energies add: ``marker_term(...) + sparsity_term(...)`` is the energy of both. Terms of
     markers are in mm² a marker, terms of video and its priors are negative log likelihoods.
-
-    Args:
-        H: (N,N) for all frames, or (B,N,N).
-        f: (B,N), or (1,N) for all frames.
-        constant: :math:`c`, (B,) or (1,); it moves no minimum, it makes energies comparable.
     """
 
-    H: Tensor
-    f: Tensor
-    constant: Tensor | None = None
+    H: Tensor  # (N,N) for all frames, or (B,N,N)
+    f: Tensor  # (B,N), or (1,N) for all frames
+    constant: Tensor | None = None  # c, (B,) or (1,); it moves no minimum, it makes energies comparable
 
     def __post_init__(self) -> None:
         shapes = self.f.ndim == 2 and self.H.ndim in (2, 3) and self.H.shape[-2:] == (self.f.shape[1],) * 2

@@ -33,8 +33,7 @@ __all__ = [
 
 JAW, CLOSE = "jawOpen", "mouthClose"
 
-_FAR = 0.5
-"""Vertices that the jaw moves at least this share of the farthest decide."""
+_FAR = 0.5  # vertices that the jaw moves at least this share of the farthest decide
 _CHIN = 0.9
 """Of them the chin and the teeth follow the jaw, which no closing of lips does; they are the upper tenth at least."""
 _UNCLEAR = (0.3, 0.7)

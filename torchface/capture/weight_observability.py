@@ -14,21 +14,13 @@ _SHOWN_SHAPES, _SHOWN_CONFUSIONS, _SHOWN_NAMES = 4, 8, 12
 
 @dataclass(frozen=True)
 class Confusion:
-    """A change of several weights that the points do not see.
+    """A change of several weights that the points do not see."""
 
-    Args:
-        names: the shapes that take part most, with their signed weights in ``direction``.
-        direction: a unit change of the weights, the entries that belong to ``names``.
-        moves: how far that change moves the points, root mean square, in ``unit``.
-        points: what they are called.
-        unit: of ``moves``.
-    """
-
-    names: tuple[str, ...]
-    direction: tuple[float, ...]
-    moves: float
-    points: str = "markers"
-    unit: str = "mm"
+    names: tuple[str, ...]  # the shapes that take part most, with their signed weights in direction
+    direction: tuple[float, ...]  # a unit change of the weights, the entries that belong to names
+    moves: float  # how far that change moves the points, root mean square, in unit
+    points: str = "markers"  # what they are called
+    unit: str = "mm"  # of moves
 
     def __str__(self) -> str:
         pairs = list(zip(self.direction, self.names, strict=True))

@@ -13,8 +13,7 @@ from torch import Tensor
 from torchface.errors import ArgumentTypeError, NameMismatchError, ShapeError, ValueRangeError
 from torchface.number_checks import as_tensor, checked_number, checked_type
 
-MOST_DRIVERS = 8
-"""A combination shape is driven by two to eight shapes."""
+MOST_DRIVERS = 8  # a combination shape is driven by two to eight shapes
 
 
 @dataclass(frozen=True)

@@ -20,17 +20,12 @@ _BEYOND = 0.6  # how far past a triangle's side its slope is followed, as a part
 
 @dataclass(frozen=True, eq=False)
 class CoarseLevel:
-    """A coarse mesh among the vertices of a dense one.
+    """A coarse mesh among the vertices of a dense one."""
 
-    Args:
-        vertex_ids: rows of the dense mesh's vertices that are left, (C,) int64.
-        faces: triangles between them, rows of ``vertex_ids``, (G,3) int64.
-        prolongation: the matrix (V,C) that carries values from the coarse vertices to the dense ones; rows sum to 1,
-            and on a flat mesh affine fields are carried exactly.
-    """
-
-    vertex_ids: Tensor
-    faces: Tensor
+    vertex_ids: Tensor  # rows of the dense mesh's vertices that are left, (C,) int64
+    faces: Tensor  # triangles between them, rows of vertex_ids, (G,3) int64
+    # The matrix (V,C) that carries values from the coarse vertices to the dense ones; rows sum to 1, and on a flat mesh
+    # affine fields are carried exactly.
     prolongation: sparse.csr_array
 
 

@@ -119,15 +119,10 @@ def _learn_colors(model: EnhancementModel, colors: Tensor | MeshSequence) -> Non
 
 @dataclass(frozen=True, eq=False)
 class LearnedFrames:
-    """The features, motion and details of a database.
+    """The features, motion and details of a database."""
 
-    Args:
-        features: of every frame, (K,P,9).
-        motion: mean displacements of the patches' smooth part, (K,P,3), millimetres.
-    """
-
-    features: Tensor
-    motion: Tensor
+    features: Tensor  # of every frame, (K,P,9)
+    motion: Tensor  # mean displacements of the patches' smooth part, (K,P,3), millimetres
     basis: LearnedBasis
 
 

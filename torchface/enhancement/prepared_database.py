@@ -93,29 +93,18 @@ def _eye(neutral: Tensor, faces: Tensor, inside: Tensor) -> _Eye:
 
 @dataclass(frozen=True, eq=False)
 class PreparedDatabase:
-    """An actor's database with what is computed of it; each part is made when it is first asked for.
+    """An actor's database with what is computed of it; each part is made when it is first asked for."""
 
-    Args:
-        neutral: (V,3), millimetres.
-        patches: the patch of each triangle, (F,) int64.
-        sequences: the number of each frame's sequence, (K,) int64.
-        features: of the frames' patches, (K,P,9).
-        coefficients: of the frames' details, (K,r).
-        settings: how frames are split and detail is found.
-        weights: of the actor's rig in the frames, (K,N), where they are known.
-        weight_terms: of the map from them, (R,3), see ``WeightMap``.
-    """
-
-    neutral: Tensor
+    neutral: Tensor  # (V,3), millimetres
     faces: Tensor
-    patches: Tensor
-    sequences: Tensor
-    features: Tensor
-    coefficients: Tensor
+    patches: Tensor  # the patch of each triangle, (F,) int64
+    sequences: Tensor  # the number of each frame's sequence, (K,) int64
+    features: Tensor  # of the frames' patches, (K,P,9)
+    coefficients: Tensor  # of the frames' details, (K,r)
     regions: Regions
-    settings: EnhancementSettings
-    weights: Tensor | None = None
-    weight_terms: Tensor | None = None
+    settings: EnhancementSettings  # how frames are split and detail is found
+    weights: Tensor | None = None  # of the actor's rig in the frames, (K,N), where they are known
+    weight_terms: Tensor | None = None  # of the map from them, (R,3), see WeightMap
 
     @property
     def inputs(self) -> tuple[Tensor | float, ...]:

@@ -67,30 +67,19 @@ class BlinkCount:
 
 @dataclass(frozen=True, eq=False)
 class ExpressionScore:
-    """How a film's weights compare with the truth; shapes are ARKit's 52.
+    """How a film's weights compare with the truth; shapes are ARKit's 52."""
 
-    Args:
-        moved: shapes that the truth moves by more than 0.05, (52,) bool.
-        supported: shapes that the method gives, (52,) bool.
-        correlation: of each shape that moves, (52,): 0 where the method gives none or a constant; NaN where it rests.
-        slope: of the found weight over the true one, (52,); likewise.
-        error: root mean square, (52,); a shape that is not given counts as 0 in every frame.
-        restless: shapes that are never below 0.05 though the truth rests, (52,) bool.
-        lag: milliseconds by which weights come late.
-        jitter: of weights where the truth rests, as :func:`~torchface.evaluation.weight_jitter` has it.
-        both: share of frames with antagonists both above 0.1, which the truth does not have.
-    """
-
-    moved: Tensor
-    supported: Tensor
+    moved: Tensor  # shapes that the truth moves by more than 0.05, (52,) bool
+    supported: Tensor  # shapes that the method gives, (52,) bool
+    # Of each shape that moves, (52,): 0 where the method gives none or a constant; NaN where it rests.
     correlation: Tensor
-    slope: Tensor
-    error: Tensor
-    restless: Tensor
-    lag: float
-    jitter: float
+    slope: Tensor  # of the found weight over the true one, (52,); likewise
+    error: Tensor  # root mean square, (52,); a shape that is not given counts as 0 in every frame
+    restless: Tensor  # shapes that are never below 0.05 though the truth rests, (52,) bool
+    lag: float  # milliseconds by which weights come late
+    jitter: float  # of weights where the truth rests, as weight_jitter has it
     blinks: BlinkCount
-    both: float
+    both: float  # share of frames with antagonists both above 0.1, which the truth does not have
 
     def region_error(self, region: str = "all") -> float:
         """Root mean square over the shapes of one of ``REGIONS`` that move; NaN where none does."""

@@ -41,17 +41,11 @@ _SHORT.maxlist = _SHORT.maxdict = 40
 
 @dataclass(frozen=True)
 class Value:
-    """A value of a document, and where it is from: what is read of it is of the type asked for, or an error says where.
+    """A value of a document, and where it is from: read as the type asked for, or an error says where it is."""
 
-    Args:
-        source: the file's name, or what else the document is.
-        key: the path of keys that leads to it; empty for the document itself.
-        found: the value; None where there is none.
-    """
-
-    source: str | Path
-    key: str
-    found: Any = None
+    source: str | Path  # the file's name, or what else the document is
+    key: str  # the path of keys that leads to it; empty for the document itself
+    found: Any = None  # the value; None where there is none
 
     def error(self, expected: str) -> FileFormatError:
         """The error that names source, key, what was found and what was expected."""

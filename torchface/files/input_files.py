@@ -11,8 +11,7 @@ from pathlib import Path
 
 from torchface.errors import FileFormatError
 
-Identity = tuple[int, int]
-"""Of a file on this machine: its device and number, which links and spellings share."""
+Identity = tuple[int, int]  # of a file on this machine: its device and number, which links and spellings share
 
 
 @dataclass(frozen=True)

@@ -7,8 +7,7 @@ from pathlib import Path
 
 from torchface.errors import FileFormatError
 
-_PIECE = 2**20
-"""Bytes."""
+_PIECE = 2**20  # bytes
 
 
 def line_pieces(

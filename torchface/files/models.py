@@ -26,28 +26,18 @@ _TEXTS = ("kind", "sha256", "licence", "data", "recipe", "url")
 
 @dataclass(frozen=True)
 class ModelRecord:
-    """What is known of a saved model without loading it.
-
-    Args:
-        licence: under which it may be used, such as ``MIT``.
-        metrics: what was measured on data held out.
-        recipe: the command that makes it again.
-        url: where it comes from.
-        settings: of the recipe, the effective ones.
-        size: of the state, bytes.
-        config: what its class is built from.
-    """
+    """What is known of a saved model without loading it."""
 
     kind: str
-    licence: str
+    licence: str  # under which it may be used, such as MIT
     data: str
-    metrics: dict[str, float] = field(default_factory=dict)
-    recipe: str = ""
-    url: str = ""
-    settings: dict[str, Any] = field(default_factory=dict)
+    metrics: dict[str, float] = field(default_factory=dict)  # what was measured on data held out
+    recipe: str = ""  # the command that makes it again
+    url: str = ""  # where it comes from
+    settings: dict[str, Any] = field(default_factory=dict)  # of the recipe, the effective ones
     sha256: str = ""
-    size: int = 0
-    config: dict[str, Any] = field(default_factory=dict)
+    size: int = 0  # of the state, bytes
+    config: dict[str, Any] = field(default_factory=dict)  # what its class is built from
 
 
 def write_model(

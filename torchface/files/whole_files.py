@@ -18,8 +18,7 @@ from torchface.files.input_files import check_no_input, note_read
 from torchface.files.temporary_files import new_temporary, remove_left_over, temporary_name
 from torchface.files.write_errors import unmade, unsettled, unwritten
 
-LARGEST_FILE = 2**31
-"""Bytes; what a head rig with hundreds of shapes stays well below."""
+LARGEST_FILE = 2**31  # bytes; what a head rig with hundreds of shapes stays well below
 
 _writes: dict[Path, int] = {}
 _waiting: ContextVar[list[tuple[Path | None, Path]] | None] = ContextVar("waiting", default=None)

@@ -18,17 +18,11 @@ _LEAST_SHARE = 0.05  # of the points' mean distance from their centre: below it 
 
 @dataclass(frozen=True)
 class MirrorCheck:
-    """How well two fits lay corresponding points on one another.
+    """How well two fits lay corresponding points on one another."""
 
-    Args:
-        distance: that the best similarity leaves, root mean square, in the target's unit.
-        mirrored_distance: that is left where the points are mirrored first.
-        radius: of the target, mean distance from its centre.
-    """
-
-    distance: float
-    mirrored_distance: float
-    radius: float
+    distance: float  # that the best similarity leaves, root mean square, in the target's unit
+    mirrored_distance: float  # that is left where the points are mirrored first
+    radius: float  # of the target, mean distance from its centre
 
     @property
     def mirrored(self) -> bool:

@@ -58,19 +58,12 @@ class HasShape(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class ModelFit:
-    """A model aligned with a scan.
+    """A model aligned with a scan."""
 
-    Args:
-        vertices: (V,3) float64, in the scan's space.
-        coefficients: (K,), standard deviations.
-        pose: from the model's space to the scan's, a batch of one.
-        noise: what the model leaves of the distance to the scan, millimetres, a robust standard deviation.
-    """
-
-    vertices: Tensor
-    coefficients: Tensor
-    pose: Similarity
-    noise: float
+    vertices: Tensor  # (V,3) float64, in the scan's space
+    coefficients: Tensor  # (K,), standard deviations
+    pose: Similarity  # from the model's space to the scan's, a batch of one
+    noise: float  # what the model leaves of the distance to the scan, millimetres, a robust standard deviation
 
 
 def shape_model(model: object, template: Mesh) -> ShapeModel:

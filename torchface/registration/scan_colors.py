@@ -24,19 +24,12 @@ _MAX_ANGLE = 75.0
 
 @dataclass(frozen=True, eq=False)
 class ScanColors:
-    """Where a scan's colours are looked up.
+    """Where a scan's colours are looked up."""
 
-    Args:
-        scan: the scan as it came, with a texture or vertex colours.
-        faces: triangles of ``vertices`` that are registered to, (F',3), the right side out.
-        vertices: (V',3).
-        face_ids: the scan's own row of each, (F',).
-    """
-
-    scan: Mesh
-    vertices: Tensor
-    faces: Tensor
-    face_ids: Tensor
+    scan: Mesh  # the scan as it came, with a texture or vertex colours
+    vertices: Tensor  # (V',3)
+    faces: Tensor  # triangles of vertices that are registered to, (F',3), the right side out
+    face_ids: Tensor  # the scan's own row of each, (F',)
 
     def at(self, triangle: Tensor, barycentric: Tensor) -> Tensor:
         """Colours (Q,3) at barycentric coordinates (Q,3) of rows (Q,) of ``faces``."""

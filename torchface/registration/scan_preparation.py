@@ -15,8 +15,7 @@ from torchface.geometry.mirrored_points import check_mirrored
 from torchface.geometry.similarity import Similarity, similarity_transform
 from torchface.mesh import Mesh
 
-LEAST_TRIANGLES = 50
-"""Of a surface that a template is registered to."""
+LEAST_TRIANGLES = 50  # of a surface that a template is registered to
 _CRUMB = 0.02
 _OFF_SURFACE = 15.0
 _WORST_LANDMARK_FIT = 0.1
@@ -29,19 +28,12 @@ Landmarks = tuple[Tensor, Tensor]
 
 @dataclass(frozen=True, eq=False)
 class PreparedScan:
-    """The surface of a scan that is registered to.
+    """The surface of a scan that is registered to."""
 
-    Args:
-        vertices: (V',3) float64, those at the same place made one.
-        faces: (F',3), without crumbs, the right side out.
-        face_ids: the scan's own row of each, (F',).
-        notes: what was done.
-    """
-
-    vertices: Tensor
-    faces: Tensor
-    face_ids: Tensor
-    notes: tuple[str, ...]
+    vertices: Tensor  # (V',3) float64, those at the same place made one
+    faces: Tensor  # (F',3), without crumbs, the right side out
+    face_ids: Tensor  # the scan's own row of each, (F',)
+    notes: tuple[str, ...]  # what was done
 
     def turned(self) -> PreparedScan:
         """The other side out."""

@@ -22,15 +22,11 @@ _OFF_THE_SKIN = 0.2  # millimetres; a ray that starts on the skin would hit it
 
 @dataclass(frozen=True, eq=False)
 class Shown:
-    """Points (Q,) in one photograph.
+    """Points (Q,) in one photograph."""
 
-    Args:
-        cosine: between the normal and the way to the camera, (Q,); 0 where the point is hidden or outside the image.
-        colors: of the image there, (Q,3), bilinear.
-    """
-
+    # Between the normal and the way to the camera, (Q,); 0 where the point is hidden or outside the image.
     cosine: Tensor
-    colors: Tensor
+    colors: Tensor  # of the image there, (Q,3), bilinear
 
 
 @dataclass(frozen=True, eq=False)

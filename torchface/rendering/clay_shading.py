@@ -18,8 +18,7 @@ from torchface.rendering.raycast import RayCaster
 
 __all__ = ["Lighting", "render"]
 
-CLAY = (0.80, 0.72, 0.66)
-"""The colour of a mesh that brings none."""
+CLAY = (0.80, 0.72, 0.66)  # the colour of a mesh that brings none
 _OCCLUSION_REACH = 60.0  # millimetres beyond which a surface no longer dims
 
 

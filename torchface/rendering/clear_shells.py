@@ -9,8 +9,7 @@ from torch import Tensor
 
 from torchface.mesh import Mesh
 
-CLEAR = ("lacrimal", "eye_blend", "eye_occlusion", "eyelash")
-"""How names of their regions begin."""
+CLEAR = ("lacrimal", "eye_blend", "eye_occlusion", "eyelash")  # how names of their regions begin
 
 
 def triangles_of(mesh: Mesh, prefixes: tuple[str, ...]) -> Tensor:

@@ -22,8 +22,7 @@ if TYPE_CHECKING:
 __all__ = ["caption", "heat_colors", "save_rendered_image", "sheet"]
 
 _KINDS = {".png": "PNG", ".jpg": "JPEG", ".jpeg": "JPEG"}
-PICTURE_ENDINGS = tuple(_KINDS)
-"""Of the files that :func:`save_rendered_image` writes."""
+PICTURE_ENDINGS = tuple(_KINDS)  # of the files that save_rendered_image writes
 
 
 def heat_colors(values: Tensor, maximum: float, colormap: str = "turbo") -> Tensor:

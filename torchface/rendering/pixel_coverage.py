@@ -23,25 +23,15 @@ _NEAR = 1.0  # millimetres before the lens
 
 @dataclass(frozen=True, eq=False)
 class Footprint:
-    """S samples of a mesh in an image: one at the centre of a pixel inside, several where the surface ends.
+    """S samples of a mesh in an image: one at the centre of a pixel inside, several where the surface ends."""
 
-    Args:
-        pixel: row-major index of the pixel, (S,) int64.
-        share: of its pixel that a sample stands for, (S,).
-        triangle: (S,) int64.
-        barycentric: in it, (S,3).
-        points: in the camera's frame, (S,3), millimetres.
-        normals: there, unit, smooth, (S,3).
-        caster: the mesh in the camera's frame.
-    """
-
-    pixel: Tensor
-    share: Tensor
-    triangle: Tensor
-    barycentric: Tensor
-    points: Tensor
-    normals: Tensor
-    caster: RayCaster
+    pixel: Tensor  # row-major index of the pixel, (S,) int64
+    share: Tensor  # of its pixel that a sample stands for, (S,)
+    triangle: Tensor  # (S,) int64
+    barycentric: Tensor  # in it, (S,3)
+    points: Tensor  # in the camera's frame, (S,3), millimetres
+    normals: Tensor  # there, unit, smooth, (S,3)
+    caster: RayCaster  # the mesh in the camera's frame
     height: int
     width: int
 

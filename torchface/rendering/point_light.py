@@ -16,8 +16,7 @@ from torchface.rendering.raycast import RayCaster
 
 __all__ = ["PointLight", "vertex_albedo"]
 
-MAX_DISTANCE = 100_000.0
-"""Millimetres; a light 100 m away shines from one direction: the directional limit."""
+MAX_DISTANCE = 100_000.0  # millimetres; a light 100 m away shines from one direction: the directional limit
 
 _OFF_THE_SKIN = 0.4  # millimetres; a ray that starts on the skin would hit it
 

@@ -39,21 +39,14 @@ _JUMP = 0.012  # of the nearness; neighbours that differ by more are an edge
 
 @dataclass(frozen=True, eq=False)
 class QuickClay:
-    """What of a mesh stays while it moves.
+    """What of a mesh stays while it moves."""
 
-    Args:
-        faces: triangles that are drawn, (F,3).
-        part: which colour each has, (F,).
-        openness: how much light creases let in, (V,).
-        colors: of each part, tint and light, (parts * tints * levels,3) uint8.
-        paint: the mesh's texture, (H,W,3) in [0,255], and where the triangles' corners lie in it, (F,3,2) pixels, for
-            all but the parts; clay if absent.
-    """
-
-    faces: Tensor
-    part: Tensor
-    openness: Tensor
-    colors: np.ndarray
+    faces: Tensor  # triangles that are drawn, (F,3)
+    part: Tensor  # which colour each has, (F,)
+    openness: Tensor  # how much light creases let in, (V,)
+    colors: np.ndarray  # of each part, tint and light, (parts * tints * levels,3) uint8
+    # The mesh's texture, (H,W,3) in [0,255], and where the triangles' corners lie in it, (F,3,2) pixels, for all but
+    # the parts; clay if absent.
     paint: tuple[Tensor, Tensor] | None = None
 
     @staticmethod

@@ -47,17 +47,12 @@ def skin_faces(mesh: Mesh) -> Tensor:
 
 @dataclass(frozen=True, eq=False)
 class FacePaint:
-    """Paint for the skin of a mesh, prepared once for many frames.
+    """Paint for the skin of a mesh, prepared once for many frames."""
 
-    Args:
-        mesh: topology, texture coordinates and regions; where its vertices are does not matter.
-        levels: the paint, linear, colour times alpha and alpha, (4,h,w), each half as large as the one before.
-        skin: triangles that take paint, (F,).
-    """
-
-    mesh: Mesh
+    mesh: Mesh  # topology, texture coordinates and regions; where its vertices are does not matter
+    # The paint, linear, colour times alpha and alpha, (4,h,w), each half as large as the one before.
     levels: tuple[Tensor, ...]
-    skin: Tensor
+    skin: Tensor  # triangles that take paint, (F,)
 
     @staticmethod
     def of(mesh: Mesh, texture: Tensor) -> FacePaint:

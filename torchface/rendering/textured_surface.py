@@ -21,31 +21,20 @@ _AMBIENT, _FALL = 0.45, 0.55
 
 @dataclass(frozen=True, eq=False)
 class Material:
-    """What covers some triangles.
+    """What covers some triangles."""
 
-    Args:
-        color: red, green, blue and opacity, (4,), encoded as images are.
-        texture: (4,H,W) in [0,1], first row on top; none for the plain colour.
-    """
-
-    color: Tensor
-    texture: Tensor | None = None
+    color: Tensor  # red, green, blue and opacity, (4,), encoded as images are
+    texture: Tensor | None = None  # (4,H,W) in [0,1], first row on top; none for the plain colour
 
 
 @dataclass(frozen=True, eq=False)
 class TexturedSurface:
-    """Triangles of several materials.
+    """Triangles of several materials."""
 
-    Args:
-        vertices: (V,3), any unit.
-        uvs: (V,2), origin at the lower left.
-        material: which of the materials each triangle has, (F,) int64.
-    """
-
-    vertices: Tensor
+    vertices: Tensor  # (V,3), any unit
     faces: Tensor
-    uvs: Tensor
-    material: Tensor
+    uvs: Tensor  # (V,2), origin at the lower left
+    material: Tensor  # which of the materials each triangle has, (F,) int64
     materials: tuple[Material, ...]
     _made: dict[str, object] = field(default_factory=dict, init=False, repr=False)
 

@@ -7,8 +7,7 @@ from torch import Tensor
 
 from torchface.errors import ValueRangeError
 
-FINEST = 8
-"""Places a frame at most: then no frame is further from its place than a sixteenth of one."""
+FINEST = 8  # places a frame at most: then no frame is further from its place than a sixteenth of one
 
 _NEAR = 0.05  # of a frame
 _LONGEST = 20  # places a frame of the take, and

@@ -18,16 +18,12 @@ _ROUNDING = 1e-6  # of the bound, which numbers in files may add
 
 @dataclass(frozen=True)
 class KeyReduction:
-    """How many keys were left, and how far curves are from the samples they had.
+    """How many keys were left, and how far curves are from the samples they had."""
 
-    Args:
-        before, after: keys of all curves; curves that share their times count once.
-        largest: distance between a sample and its curve.
-    """
-
+    # before, after: keys of all curves; curves that share their times count once
     before: int
     after: int
-    largest: float
+    largest: float  # distance between a sample and its curve
 
     def __str__(self) -> str:
         return f"{self.after:,} of {self.before:,} keys, largest error {self.largest:.2g}"

@@ -24,17 +24,11 @@ _LAYOUT = f"expected a model's folder as zoo.save_model writes it, {DESCRIPTION}
 
 @dataclass(frozen=True)
 class HubReference:
-    """A model's folder in a repository of the Hugging Face Hub.
+    """A model's folder in a repository of the Hugging Face Hub."""
 
-    Args:
-        repository: ``owner/name``.
-        revision: a branch, tag or commit.
-        folder: of the model in the repository; empty for the repository's own.
-    """
-
-    repository: str
-    revision: str
-    folder: str
+    repository: str  # owner/name
+    revision: str  # a branch, tag or commit
+    folder: str  # of the model in the repository; empty for the repository's own
 
     def __str__(self) -> str:
         return f"hf://{self.repository}@{self.revision}{'/' if self.folder else ''}{self.folder}"

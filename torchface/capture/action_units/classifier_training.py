@@ -30,15 +30,10 @@ _REST_FRAMES = 2  # at either end of a repetition
 
 @dataclass(frozen=True, eq=False)
 class GroupClasses:
-    """The labels of a group's frames.
+    """The labels of a group's frames."""
 
-    Args:
-        table: intensities of the group's units in each class, (C,A); the first class is rest.
-        classes: of every frame, (T,) int64.
-    """
-
-    table: Tensor
-    classes: Tensor
+    table: Tensor  # intensities of the group's units in each class, (C,A); the first class is rest
+    classes: Tensor  # of every frame, (T,) int64
 
 
 def fit_classifier(

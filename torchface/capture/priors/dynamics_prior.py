@@ -58,23 +58,14 @@ class DynamicsSettings:
 
 @dataclass(frozen=True, eq=False)
 class UsualMotion:
-    """How N shapes move each on its own, and the sizes that a dynamics prior's G processes work in.
+    """How N shapes move each on its own, and the sizes that a dynamics prior's G processes work in."""
 
-    Args:
-        center: the takes' mean, against which places count, (N,).
-        coefficients: A, the autoregression over the window, (J,N).
-        feature_scale: usual sizes of place, slope and curvature, (O,N).
-        target_scale: s, (N,).
-        gain: by what the mean of each process is multiplied, (G,).
-        limits: smallest and largest weight, (2,).
-    """
-
-    center: Tensor
-    coefficients: Tensor
-    feature_scale: Tensor
-    target_scale: Tensor
-    gain: Tensor
-    limits: Tensor
+    center: Tensor  # the takes' mean, against which places count, (N,)
+    coefficients: Tensor  # A, the autoregression over the window, (J,N)
+    feature_scale: Tensor  # usual sizes of place, slope and curvature, (O,N)
+    target_scale: Tensor  # s, (N,)
+    gain: Tensor  # by what the mean of each process is multiplied, (G,)
+    limits: Tensor  # smallest and largest weight, (2,)
 
 
 class DynamicsPrior(nn.Module):

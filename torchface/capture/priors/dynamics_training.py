@@ -25,39 +25,24 @@ _MIN_SCALE = 1e-3  # a standard deviation below which a shape counts as one that
 
 @dataclass(frozen=True, eq=False)
 class _Steps:
-    """What the first pass finds.
-
-    Args:
-        center: mean of the frames that follow them, (N,).
-        limits: smallest and largest weight, (2,).
-        coefficients: of the autoregression, (J,N).
-        left_out: the same from all but each fold.
-    """
+    """What the first pass finds."""
 
     count: int
-    center: Tensor
-    limits: Tensor
-    coefficients: Tensor
-    left_out: list[Tensor]
+    center: Tensor  # mean of the frames that follow them, (N,)
+    limits: Tensor  # smallest and largest weight, (2,)
+    coefficients: Tensor  # of the autoregression, (J,N)
+    left_out: list[Tensor]  # the same from all but each fold
 
 
 @dataclass(frozen=True, eq=False)
 class _Scales:
-    """What the second pass finds, and the windows that were drawn.
+    """What the second pass finds, and the windows that were drawn."""
 
-    Args:
-        feature: standard deviations of place, slope and curvature, (O,N).
-        target: of what the autoregression leaves of a step, (N,).
-        moving: root mean squares of the kinds of motion, (K,N).
-        inputs: of the windows drawn, scaled, (S,O·N).
-        targets: of the same, scaled, (S,N).
-    """
-
-    feature: Tensor
-    target: Tensor
-    moving: Tensor
-    inputs: Tensor
-    targets: Tensor
+    feature: Tensor  # standard deviations of place, slope and curvature, (O,N)
+    target: Tensor  # of what the autoregression leaves of a step, (N,)
+    moving: Tensor  # root mean squares of the kinds of motion, (K,N)
+    inputs: Tensor  # of the windows drawn, scaled, (S,O·N)
+    targets: Tensor  # of the same, scaled, (S,N)
 
 
 def fit_dynamics_prior(

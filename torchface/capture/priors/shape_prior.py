@@ -26,8 +26,7 @@ _KINDS: dict[str, type[ParzenDensity] | type[GaussianMixture] | type[StudentDens
     "mixture": GaussianMixture,
     "student": StudentDensity,
 }
-STRENGTH = 0.15
-"""Of a fitted prior: chosen by the error of solves of real takes that were left out of the learning."""
+STRENGTH = 0.15  # of a fitted prior: chosen by the error of solves of real takes that were left out of the learning
 
 
 class Density(Protocol):

@@ -14,8 +14,7 @@ from torchface.capture.priors.parzen_window import checked_samples, checked_size
 from torchface.errors import FileFormatError, ShapeError, ValueRangeError
 
 _ITERATIONS = 50
-PARTING_VARIANCE = 3e-5
-"""Added to each variance: shapes that always moved together stay distinguishable."""
+PARTING_VARIANCE = 3e-5  # added to each variance: shapes that always moved together stay distinguishable
 
 
 class StudentDensity(nn.Module):

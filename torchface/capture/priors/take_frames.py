@@ -10,24 +10,17 @@ from torch import Tensor
 
 from torchface.errors import ShapeError, ValueRangeError
 
-MOST_FRAMES = 40_000
-"""What methods learn from that need all frames at once; of more, so many are drawn."""
+MOST_FRAMES = 40_000  # what methods learn from that need all frames at once; of more, so many are drawn
 _SHUFFLED = 2**22
 
 
 @dataclass(frozen=True, eq=False)
 class TakeFrames:
-    """The frames in which every weight is known, of takes that are read anew each time.
+    """The frames in which every weight is known, of takes that are read anew each time."""
 
-    Args:
-        takes: weights of each, (T,N); a list, or what reads them from a disk.
-        shapes: N.
-        group: columns that are wanted; all if absent.
-    """
-
-    takes: Sequence[Tensor]
-    shapes: int
-    group: tuple[int, ...] | None = None
+    takes: Sequence[Tensor]  # weights of each, (T,N); a list, or what reads them from a disk
+    shapes: int  # N
+    group: tuple[int, ...] | None = None  # columns that are wanted; all if absent
 
     def __iter__(self) -> Iterator[Tensor]:
         """Those of each take, (T,D) float64; takes of fewer than two are left out."""

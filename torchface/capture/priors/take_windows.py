@@ -20,19 +20,12 @@ _POOLING = 0.02  # weight of the coefficients that all shapes share against each
 
 @dataclass(frozen=True, eq=False)
 class Part:
-    """Windows of a take, or of a quarter of the only one.
+    """Windows of a take, or of a quarter of the only one."""
 
-    Args:
-        fold: what is left out together with it.
-        begin: number of its first window among all.
-        windows: (B,J,N), with the noise that the prior should expect.
-        following: (B,N).
-    """
-
-    fold: int
-    begin: int
-    windows: Tensor
-    following: Tensor
+    fold: int  # what is left out together with it
+    begin: int  # number of its first window among all
+    windows: Tensor  # (B,J,N), with the noise that the prior should expect
+    following: Tensor  # (B,N)
 
     def steps(self, coefficients: Tensor) -> Tensor:
         """The step to the next frame less what the shapes' own frames predict, (B,N)."""
@@ -46,17 +39,11 @@ class Part:
 
 @dataclass(frozen=True, eq=False)
 class TakeWindows:
-    """The windows of takes, which are read anew in each pass, with the same noise each time.
+    """The windows of takes, which are read anew in each pass, with the same noise each time."""
 
-    Args:
-        takes: weights of each, (T,N); a list, or what reads them from a disk.
-        window: J.
-        input_noise: standard deviation of noise that is added to the windows.
-    """
-
-    takes: Sequence[Tensor]
-    window: int
-    input_noise: float
+    takes: Sequence[Tensor]  # weights of each, (T,N); a list, or what reads them from a disk
+    window: int  # J
+    input_noise: float  # standard deviation of noise that is added to the windows
     seed: int
 
     @property

@@ -98,17 +98,11 @@ class StreamingBasis:
 
 @dataclass(frozen=True, eq=False)
 class LearnedBasis:
-    """Components and coefficients of what was learned.
+    """Components and coefficients of what was learned."""
 
-    Args:
-        components: (r,n), half precision, root mean square 1 each.
-        coefficients: of every row, (K,r), in the rows' unit.
-        lost_share: of the rows' energy, by what the components do not hold.
-    """
-
-    components: Tensor
-    coefficients: Tensor
-    lost_share: float
+    components: Tensor  # (r,n), half precision, root mean square 1 each
+    coefficients: Tensor  # of every row, (K,r), in the rows' unit
+    lost_share: float  # of the rows' energy, by what the components do not hold
 
 
 def blended(components: Tensor, coefficients: Tensor, weights: Tensor) -> Tensor:

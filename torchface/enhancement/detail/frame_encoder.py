@@ -19,20 +19,13 @@ _MOST_RESIDUAL = 0.35  # of the head's size: beyond, vertices are not where they
 
 @dataclass(frozen=True, eq=False)
 class Encoder:
-    """The steps that turn frames into smooth parts, features and details.
+    """The steps that turn frames into smooth parts, features and details."""
 
-    Args:
-        alignment: aligns frames with the neutral.
-        low_pass: smooths their displacements.
-        frames: turns the vertices' frames with their smooth part.
-        detail: encodes what the smooth part lacks.
-    """
-
-    alignment: FrameAlignment
-    low_pass: LowPass
-    frames: SurfaceFrames
+    alignment: FrameAlignment  # aligns frames with the neutral
+    low_pass: LowPass  # smooths their displacements
+    frames: SurfaceFrames  # turns the vertices' frames with their smooth part
     gradients: PatchGradients
-    detail: DisplacementDetail | GradientDetail
+    detail: DisplacementDetail | GradientDetail  # encodes what the smooth part lacks
 
 
 def make_encoder(neutral: Tensor, faces: Tensor, patches: Tensor, wavelength: float, detail: DetailKind) -> Encoder:

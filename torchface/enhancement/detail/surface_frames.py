@@ -18,13 +18,9 @@ from torchface.geometry.meshes.operators import edges, triangle_areas, vertex_no
 
 @dataclass(frozen=True, eq=False)
 class TurnedFrames:
-    """The rest frame of every vertex, turned with the surface.
+    """The rest frame of every vertex, turned with the surface."""
 
-    Args:
-        axes: two tangents and the normal, (3,3,V,B): axis, coordinate, vertex, frame.
-    """
-
-    axes: Tensor
+    axes: Tensor  # two tangents and the normal, (3,3,V,B): axis, coordinate, vertex, frame
 
     def to_world(self, local: Tensor) -> Tensor:
         """Vectors (B,3,V), given along the axes, as vectors of space (B,V,3)."""

@@ -18,8 +18,7 @@ from torchface.errors import ShapeError, ValueRangeError
 from torchface.geometry.meshes.operators import components, corners, edges, triangle_areas
 from torchface.number_checks import checked_count
 
-SIGMA = 10.0
-"""Standard deviation of the regions' borders, millimetres."""
+SIGMA = 10.0  # standard deviation of the regions' borders, millimetres
 
 _LIMIT = 4.0  # standard deviations, where 0.0003 of the weight is left: half precision holds it
 _LANDMARKS = 68
@@ -30,18 +29,13 @@ _LID_REACH = 0.25  # of the eye's width: how far an eye's region goes beyond the
 
 @dataclass(frozen=True, eq=False)
 class Regions:
-    """Where each region of a face counts, and how much.
+    """Where each region of a face counts, and how much."""
 
-    Args:
-        names: of the regions, such as ``mouth_left``, or ``region_03`` where no landmarks show the place. Left is the
-            actor's left.
-        weights: of each region at each triangle, (R,F), in [0,1]: 1 inside, less outside.
-        voluntary: (R,) bool, whether the actor moves the region at will: mouth and brows. False for all where no
-            landmarks are given.
-    """
-
+    # Of the regions, such as mouth_left, or region_03 where no landmarks show the place. Left is the actor's left.
     names: tuple[str, ...]
-    weights: Tensor
+    weights: Tensor  # of each region at each triangle, (R,F), in [0,1]: 1 inside, less outside
+    # (R,) bool, whether the actor moves the region at will: mouth and brows. False for all where no landmarks are
+    # given.
     voluntary: Tensor
 
     def __post_init__(self) -> None:

@@ -9,8 +9,7 @@ from torchface.enhancement.matching.region_projection import Matched, RegionProj
 from torchface.number_checks import checked_count, checked_number
 
 COMPONENTS = 60
-RIDGE = 1e-4
-"""Of the mean variance of a component."""
+RIDGE = 1e-4  # of the mean variance of a component
 _TURNS, _TRIED = 4, 400  # parts of the sequences; frames at most
 
 

@@ -12,8 +12,7 @@ from torchface.number_checks import checked_number
 from torchface.optim.eigenpairs import largest_eigenpairs
 from torchface.optim.simplex_qp import SimplexQP
 
-RIDGE = 1e-4
-"""Of the mean squared norm of the database's features."""
+RIDGE = 1e-4  # of the mean squared norm of the database's features
 
 _HELD_OUT = 200  # frames at most that limits are estimated from
 _QUANTILE, _MARGIN = 0.95, 2.0
@@ -28,37 +27,24 @@ _UNITS = (2**0.5, 2**0.5, 2**0.5, 1.0, 2**0.5, 2**0.5, 1.0, 2**0.5, 1.0)
 
 @dataclass(frozen=True, eq=False)
 class Matched:
-    """What a projection finds.
+    """What a projection finds."""
 
-    Args:
-        weights: of the database's frames in each region, (T,R,K), non-negative, of sum 1.
-        distances: from the combinations, (T,R), in units of the database's spread about its mean.
-        excess: how much further from the mean frames go than all of the database's in the same direction, (T,R), in
-            the same units; negative inside, 0 in a region that does not move. None where nobody asked.
-    """
-
-    weights: Tensor
-    distances: Tensor
+    weights: Tensor  # of the database's frames in each region, (T,R,K), non-negative, of sum 1
+    distances: Tensor  # from the combinations, (T,R), in units of the database's spread about its mean
+    # How much further from the mean frames go than all of the database's in the same direction, (T,R), in the same
+    # units; negative inside, 0 in a region that does not move. None where nobody asked.
     excess: Tensor | None = None
 
 
 @dataclass(frozen=True, eq=False)
 class _Space:
-    """One region's features in few coordinates, which keep their distances.
+    """One region's features in few coordinates, which keep their distances."""
 
-    Args:
-        patches: that count in it, (p,).
-        roots: of their weights times the features' units, (p,9).
-        mean: of the database, weighted, (9p,).
-        axes: orthonormal, (9p,q).
-        known: the database's coordinates, (K,q).
-    """
-
-    patches: Tensor
-    roots: Tensor
-    mean: Tensor
-    axes: Tensor
-    known: Tensor
+    patches: Tensor  # that count in it, (p,)
+    roots: Tensor  # of their weights times the features' units, (p,9)
+    mean: Tensor  # of the database, weighted, (9p,)
+    axes: Tensor  # orthonormal, (9p,q)
+    known: Tensor  # the database's coordinates, (K,q)
 
     def centred(self, features: Tensor) -> Tensor:
         """Weighted features (T,9p) about the database's mean, of features (T,P,9)."""

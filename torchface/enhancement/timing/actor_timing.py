@@ -22,8 +22,7 @@ from torchface.enhancement.timing.nearest_timing import (
 from torchface.errors import ValueRangeError
 from torchface.number_checks import checked_count, checked_number
 
-LEAST_MOTIONS = 12
-"""How many captured motions a region needs: of fewer no regression is learned."""
+LEAST_MOTIONS = 12  # how many captured motions a region needs: of fewer no regression is learned
 _MOMENTS = 40  # at which a velocity profile is known
 _DIRECTIONS = 2  # principal components of a region's poses; more were no better on takes left out
 _BEND = 0.3  # of a sequence's range: how far a motion may leave the straight way and be one motion still
@@ -86,27 +85,19 @@ class ActorTiming:
 
 @dataclass(frozen=True, eq=False)
 class LearnedTiming:
-    """Velocity profiles of one region's motions, by kernel ridge regression on pose, way and length.
+    """Velocity profiles of one region's motions, by kernel ridge regression on pose, way and length."""
 
-    Args:
-        scale: square roots of the region's shares in the patches, (P,1).
-        centre, directions: of the region's poses, (D,) and (D,q).
-        mean, deviation: of the inputs, (c,).
-        inputs: of the captured motions, (m,c), each multiplied by its inverse length scale.
-        inverse_lengths: the inverse length scales, (c,).
-        mean_profile: velocities in the mean of all motions, (40,), 1 in the mean.
-        dual: coefficients of the motions, (m,40).
-    """
-
-    scale: Tensor
+    scale: Tensor  # square roots of the region's shares in the patches, (P,1)
+    # centre, directions: of the region's poses, (D,) and (D,q)
     centre: Tensor
     directions: Tensor
+    # mean, deviation: of the inputs, (c,)
     mean: Tensor
     deviation: Tensor
-    inputs: Tensor
-    inverse_lengths: Tensor
-    mean_profile: Tensor
-    dual: Tensor
+    inputs: Tensor  # of the captured motions, (m,c), each multiplied by its inverse length scale
+    inverse_lengths: Tensor  # the inverse length scales, (c,)
+    mean_profile: Tensor  # velocities in the mean of all motions, (40,), 1 in the mean
+    dual: Tensor  # coefficients of the motions, (m,40)
 
     @classmethod
     def fit(cls, database: Tensor, sequences: Tensor, region: Tensor, fps: float) -> LearnedTiming | None:

@@ -13,15 +13,10 @@ from torchface.errors import ShapeError
 
 @dataclass(frozen=True, eq=False)
 class SequenceProjection:
-    """Where the frames of one sequence lie on another.
+    """Where the frames of one sequence lie on another."""
 
-    Args:
-        times: on the other's timeline, from 0 to its number of frames minus 1, never falling, (m,).
-        distances: from the points at those times, (m,).
-    """
-
-    times: Tensor
-    distances: Tensor
+    times: Tensor  # on the other's timeline, from 0 to its number of frames minus 1, never falling, (m,)
+    distances: Tensor  # from the points at those times, (m,)
 
 
 def project_sequence(alpha: Tensor, beta: Tensor) -> SequenceProjection:

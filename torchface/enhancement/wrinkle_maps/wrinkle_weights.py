@@ -14,8 +14,7 @@ from torchface.number_checks import checked_count
 from torchface.optim.eigenpairs import largest_eigenpairs
 from torchface.rig import BlendshapeRig
 
-SITES = 2000
-"""Vertices that are looked at: of a face more would only say the same again."""
+SITES = 2000  # vertices that are looked at: of a face more would only say the same again
 
 ROTATION_STEPS = 7
 """Of the iteration that finds how the head is turned: a matrix half strained away is a rotation to all digits."""

@@ -12,10 +12,8 @@ from torchface.number_checks import checked_count, checked_number
 
 __all__ = ["Camera", "look_at"]
 
-MAX_SIDE = 16384
-"""Pixels that an image may have a side."""
-MAX_ANGLE = 36000.0
-"""Degrees; beyond a hundred turns rounding errors show."""
+MAX_SIDE = 16384  # pixels that an image may have a side
+MAX_ANGLE = 36000.0  # degrees; beyond a hundred turns rounding errors show
 
 
 @dataclass(frozen=True, eq=False)

@@ -18,17 +18,11 @@ _ORTHOGRAPHIC_ITERATIONS, _MAX_ITERATIONS, _DONE = 5, 60, 1e-10
 
 @dataclass(frozen=True, eq=False)
 class Pose:
-    """World to camera for a batch.
+    """World to camera for a batch."""
 
-    Args:
-        rotation: (B,3,3).
-        translation: (B,3), millimetres.
-        errors: reprojection, weighted root mean square, (B,), pixels.
-    """
-
-    rotation: Tensor
-    translation: Tensor
-    errors: Tensor
+    rotation: Tensor  # (B,3,3)
+    translation: Tensor  # (B,3), millimetres
+    errors: Tensor  # reprojection, weighted root mean square, (B,), pixels
 
 
 def solve_pnp(

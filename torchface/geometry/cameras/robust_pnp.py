@@ -21,15 +21,10 @@ _DRAWS, _CONFIDENCE = 4000, 1 - 1e-9
 
 @dataclass(frozen=True, eq=False)
 class RobustPose:
-    """World to camera for a batch, and the points that agree with it.
+    """World to camera for a batch, and the points that agree with it."""
 
-    Args:
-        pose: rotations (B,3,3), translations (B,3), errors (B,) over the inliers; NaN where none was found.
-        inliers: points that are seen where the pose has them, (B,N) bool.
-    """
-
-    pose: Pose
-    inliers: Tensor
+    pose: Pose  # rotations (B,3,3), translations (B,3), errors (B,) over the inliers; NaN where none was found
+    inliers: Tensor  # points that are seen where the pose has them, (B,N) bool
 
     @property
     def found(self) -> Tensor:

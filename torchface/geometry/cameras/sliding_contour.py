@@ -17,18 +17,12 @@ class LevelCurves:
     """Curves over the skin at constant height, one for each of J points, as points on mesh edges.
 
     They are fixed in the material: on another face of the same topology they lie on the same edges.
-
-    Args:
-        vertices: both ends of the edge of each point, (J,C,2) int64; the first point is the start itself.
-        share: how far along the edge, (J,C).
-        valid: (J,C) bool; shorter curves are padded with their start.
-        side: +1 where a curve lies on the side of positive x, -1, or 0 on the midline, (J,).
     """
 
-    vertices: Tensor
-    share: Tensor
-    valid: Tensor
-    side: Tensor
+    vertices: Tensor  # both ends of the edge of each point, (J,C,2) int64; the first point is the start itself
+    share: Tensor  # how far along the edge, (J,C)
+    valid: Tensor  # (J,C) bool; shorter curves are padded with their start
+    side: Tensor  # +1 where a curve lies on the side of positive x, -1, or 0 on the midline, (J,)
 
     def interpolate(self, values: Tensor) -> Tensor:
         """Values (V,...) of vertices at the curves' points, (J,C,...)."""

@@ -15,15 +15,10 @@ from torchface.geometry.meshes.operators import components, edges, vertex_normal
 
 @dataclass(frozen=True, eq=False)
 class ContactPairs:
-    """Vertices that face each other across a gap.
+    """Vertices that face each other across a gap."""
 
-    Args:
-        pairs: (K,2) int64.
-        closeness: (K,), from 1 where they touch to 0 at the finder's reach.
-    """
-
-    pairs: Tensor
-    closeness: Tensor
+    pairs: Tensor  # (K,2) int64
+    closeness: Tensor  # (K,), from 1 where they touch to 0 at the finder's reach
 
 
 class ContactFinder:

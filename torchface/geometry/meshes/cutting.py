@@ -14,17 +14,11 @@ from torchface.geometry.meshes.operators import edges
 
 @dataclass(frozen=True, eq=False)
 class CutMesh:
-    """A mesh of V vertices after cuts, with W ≥ V.
+    """A mesh of V vertices after cuts, with W ≥ V."""
 
-    Args:
-        shares: what each vertex is of those there were, (W,V), sparse; the first V are themselves.
-        faces: (G,3).
-        source: the triangle that each is a part of, (G,).
-    """
-
-    shares: sparse.csr_array
-    faces: Tensor
-    source: Tensor
+    shares: sparse.csr_array  # what each vertex is of those there were, (W,V), sparse; the first V are themselves
+    faces: Tensor  # (G,3)
+    source: Tensor  # the triangle that each is a part of, (G,)
 
     @staticmethod
     def of(count: int, faces: Tensor) -> CutMesh:

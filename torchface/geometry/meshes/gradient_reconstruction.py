@@ -17,16 +17,11 @@ from torchface.optim.sparse import SparseCholesky
 
 @dataclass(frozen=True, eq=False)
 class SoftConstraints:
-    r"""Linear soft constraints :math:`\omega_k \lVert \sum_v C_{kv} \tilde x_v - y_k \rVert^2`.
+    r"""Linear soft constraints :math:`\omega_k \lVert \sum_v C_{kv} \tilde x_v - y_k \rVert^2`."""
 
-    Args:
-        matrix: C, (K,V) sparse.
-        values: y, (..., K,3), millimetres; leading dimensions as the gradients that are solved for.
-        weights: omega, (K,), non-negative, in units of the squared gradient error of one triangle a square millimetre.
-    """
-
-    matrix: sparse.csr_array
-    values: Tensor
+    matrix: sparse.csr_array  # C, (K,V) sparse
+    values: Tensor  # y, (..., K,3), millimetres; leading dimensions as the gradients that are solved for
+    # Omega, (K,), non-negative, in units of the squared gradient error of one triangle a square millimetre.
     weights: Tensor
 
 

@@ -24,19 +24,13 @@ _RINGS = 4  # texels of margin around the charts
 
 @dataclass(frozen=True, eq=False)
 class TexelMap:
-    """The M texels of a texture that lie in a triangle; the rest of the texture is outside the charts.
-
-    Args:
-        texels: row-major indices, first row on top, ascending, (M,) int64.
-        triangles: (M,) int64.
-        barycentric: of the texel's centre in its triangle, (M,3) float64.
-    """
+    """The M texels of a texture that lie in a triangle; the rest of the texture is outside the charts."""
 
     height: int
     width: int
-    texels: Tensor
-    triangles: Tensor
-    barycentric: Tensor
+    texels: Tensor  # row-major indices, first row on top, ascending, (M,) int64
+    triangles: Tensor  # (M,) int64
+    barycentric: Tensor  # of the texel's centre in its triangle, (M,3) float64
 
     def interpolate(self, values: Tensor, faces: Tensor) -> Tensor:
         """Values (V,C) at triangle corners ``faces`` (F,3), interpolated at the texels, (M,C)."""
@@ -143,19 +137,12 @@ def _refuse_overlap(work: int, texels: int) -> None:
 
 @dataclass(frozen=True, eq=False)
 class DrawnPixels:
-    """The pixels that a mesh covers.
+    """The pixels that a mesh covers."""
 
-    Args:
-        pixel: row-major index in the image, each once, (S,) int64.
-        triangle: in front there, (S,) int64.
-        barycentric: of the pixel's centre in the image, three times (S,) float32.
-        nearness: as the corners', interpolated, (S,) float32.
-    """
-
-    pixel: Tensor
-    triangle: Tensor
-    barycentric: tuple[Tensor, Tensor, Tensor]
-    nearness: Tensor
+    pixel: Tensor  # row-major index in the image, each once, (S,) int64
+    triangle: Tensor  # in front there, (S,) int64
+    barycentric: tuple[Tensor, Tensor, Tensor]  # of the pixel's centre in the image, three times (S,) float32
+    nearness: Tensor  # as the corners', interpolated, (S,) float32
 
     def of_vertices(self, values: Tensor, faces: Tensor) -> Tensor:
         """Values (V,) of vertices at the pixels, (S,), linear in the image."""
@@ -214,16 +201,11 @@ def _nearest(pixel: np.ndarray, nearness: np.ndarray, count: int) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False)
 class _Planes:
-    """P triangles that may cover a pixel, with linear functions ``a x + b y + c`` of the pixel.
+    """P triangles that may cover a pixel, with linear functions ``a x + b y + c`` of the pixel."""
 
-    Args:
-        triangle: their numbers, (P,) int64.
-        edges: of each corner's barycentric coordinate a, b and c, (3,3,P).
-        first, rows: the first row that each touches, and how many, (P,).
-    """
-
-    triangle: np.ndarray
-    edges: np.ndarray
+    triangle: np.ndarray  # their numbers, (P,) int64
+    edges: np.ndarray  # of each corner's barycentric coordinate a, b and c, (3,3,P)
+    # first, rows: the first row that each touches, and how many, (P,)
     first: np.ndarray
     rows: np.ndarray
 

@@ -21,19 +21,12 @@ _TINY = 1e-300
 
 @dataclass(frozen=True, eq=False)
 class SurfacePoints:
-    """Points on the triangles of a mesh.
+    """Points on the triangles of a mesh."""
 
-    Args:
-        points: positions, (Q,3), float64.
-        triangle: rows of the mesh's faces, (Q,) int64.
-        barycentric: weights of each triangle's corners, (Q,3), float64.
-        distance: how far each query was, (Q,), float64.
-    """
-
-    points: Tensor
-    triangle: Tensor
-    barycentric: Tensor
-    distance: Tensor
+    points: Tensor  # positions, (Q,3), float64
+    triangle: Tensor  # rows of the mesh's faces, (Q,) int64
+    barycentric: Tensor  # weights of each triangle's corners, (Q,3), float64
+    distance: Tensor  # how far each query was, (Q,), float64
 
 
 class SurfaceIndex:

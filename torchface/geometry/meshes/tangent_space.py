@@ -19,21 +19,13 @@ from torchface.geometry.meshes.rasterization import interpolate
 
 @dataclass(frozen=True, eq=False)
 class TangentSpace:
-    """Tangents of a mesh; a vertex on a seam or between mirrored halves has several.
+    """Tangents of a mesh; a vertex on a seam or between mirrored halves has several."""
 
-    Args:
-        normals: unit, (V,3).
-        tangents: unit and perpendicular to the normal, (C,3).
-        signs: of the bitangent, (C,).
-        faces: vertices at each triangle's corners, (F,3).
-        tangent_faces: rows of ``tangents`` at each triangle's corners, (F,3).
-    """
-
-    normals: Tensor
-    tangents: Tensor
-    signs: Tensor
-    faces: Tensor
-    tangent_faces: Tensor
+    normals: Tensor  # unit, (V,3)
+    tangents: Tensor  # unit and perpendicular to the normal, (C,3)
+    signs: Tensor  # of the bitangent, (C,)
+    faces: Tensor  # vertices at each triangle's corners, (F,3)
+    tangent_faces: Tensor  # rows of tangents at each triangle's corners, (F,3)
 
     def frames(self, triangles: Tensor, barycentric: Tensor) -> Tensor:
         """Columns T, B, N at points of triangles (M,) with barycentric coordinates (M,3): (M,3,3)."""

@@ -13,17 +13,11 @@ _MAX_SORTED_COLUMNS = 8
 
 @dataclass(frozen=True)
 class Split:
-    """One row for each pair of vertex and texture coordinate that occurs, in the order of the coordinates.
+    """One row for each pair of vertex and texture coordinate that occurs, in the order of the coordinates."""
 
-    Args:
-        vertex_of: the vertex of each, (C,); those that no face has come last.
-        uv_of: its row of the texture coordinates, (C,); none without them.
-        triangles: the mesh's, into these rows, (F,3).
-    """
-
-    vertex_of: NDArray[np.int64]
-    uv_of: NDArray[np.int64] | None
-    triangles: NDArray[np.int64]
+    vertex_of: NDArray[np.int64]  # the vertex of each, (C,); those that no face has come last
+    uv_of: NDArray[np.int64] | None  # its row of the texture coordinates, (C,); none without them
+    triangles: NDArray[np.int64]  # the mesh's, into these rows, (F,3)
 
 
 def split_at_seams(

@@ -17,19 +17,12 @@ CLIP = 0.4
 
 @dataclass(frozen=True)
 class HogLayout:
-    """How a window is described.
+    """How a window is described."""
 
-    Args:
-        window: side of the square window, pixels.
-        cell: side of a cell, pixels; the window holds (window/cell)² of them.
-        bins: orientations, over half a turn (a gradient and its opposite are one).
-        stride: a window is described at every ``stride``-th pixel.
-    """
-
-    window: int = 32
-    cell: int = 8
-    bins: int = 9
-    stride: int = 4
+    window: int = 32  # side of the square window, pixels
+    cell: int = 8  # side of a cell, pixels; the window holds (window/cell)² of them
+    bins: int = 9  # orientations, over half a turn (a gradient and its opposite are one)
+    stride: int = 4  # a window is described at every stride-th pixel
 
     def __post_init__(self) -> None:
         if min(self.window, self.cell, self.bins, self.stride) < 1 or self.window % (2 * self.cell):

@@ -50,13 +50,10 @@ class LandmarkPairs:
 
 @dataclass(frozen=True, eq=False)
 class TemplateFeatures:
-    """Where a template has the landmarks and lines: found once, used for every scan.
-
-    Args:
-        lines: by name, vertex ids (N,) and their shares (N,) in [0,1] of the line's length, from its left end.
-    """
+    """Where a template has the landmarks and lines: found once, used for every scan."""
 
     landmarks: dict[str, int]
+    # By name, vertex ids (N,) and their shares (N,) in [0,1] of the line's length, from its left end.
     lines: dict[str, tuple[Tensor, Tensor]]
 
 

@@ -12,8 +12,7 @@ from torchface.errors import ValueRangeError
 from torchface.rendering.gaussian_blur import gaussian_blur
 
 STATIONS = 17
-REACH = 10
-"""Rows above and below a line that its profile spans."""
+REACH = 10  # rows above and below a line that its profile spans
 
 _MIN_DEVIATION = 0.02  # of the length: corners are not found more exactly
 _BLUR = 1.0
@@ -21,19 +20,14 @@ _BLUR = 1.0
 
 @dataclass(frozen=True, eq=False)
 class LineShape:
-    """The usual course of a line, in fractions of the length of its chord, and its profile.
+    """The usual course of a line, in fractions of the length of its chord, and its profile."""
 
-    Args:
-        offset: how far below the chord the line runs at equal steps from its left to its right corner, (K,).
-        deviation: standard deviation of that, (K,).
-        corner_deviation: standard deviation of how far above or below their true places corners are found, pixels.
-        profile: grey values from ``REACH`` rows above the line to as many below, at the same steps, with mean 0 and
-            norm 1, (K,2·REACH+1); a line without one is dark.
-    """
-
-    offset: Tensor
-    deviation: Tensor
+    offset: Tensor  # how far below the chord the line runs at equal steps from its left to its right corner, (K,)
+    deviation: Tensor  # standard deviation of that, (K,)
+    # Standard deviation of how far above or below their true places corners are found, pixels.
     corner_deviation: float = 0.0
+    # Grey values from REACH rows above the line to as many below, at the same steps, with mean 0 and norm 1,
+    # (K,2·REACH+1); a line without one is dark.
     profile: Tensor | None = None
 
     @staticmethod

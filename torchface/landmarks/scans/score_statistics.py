@@ -17,18 +17,13 @@ _NEVER = 2.0  # no cosine is that large
 
 @dataclass(frozen=True, eq=False)
 class ScoreStatistics:
-    """Scores of L·M filters, L landmarks of M images each, in M images.
+    """Scores of L·M filters, L landmarks of M images each, in M images."""
 
-    Args:
-        good, bad: mean and standard deviation near the landmark and elsewhere, (L,M,2).
-        best: the R best scores in every image, (M,L,M,R); 0 in the image that the filter comes from.
-        places: where those are, rows of the flattened map.
-    """
-
+    # good, bad: mean and standard deviation near the landmark and elsewhere, (L,M,2)
     good: Tensor
     bad: Tensor
-    best: Tensor
-    places: Tensor
+    best: Tensor  # the R best scores in every image, (M,L,M,R); 0 in the image that the filter comes from
+    places: Tensor  # where those are, rows of the flattened map
 
 
 def best_scores(scores: Tensor, count: int) -> tuple[Tensor, Tensor]:

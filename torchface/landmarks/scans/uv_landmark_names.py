@@ -23,8 +23,7 @@ UV_LANDMARK_NAMES = (
 )
 """In order; left and right are the performer's own, so ``right_`` lies on the image's left."""
 
-MIRRORED = (0, 1, 5, 4, 3, 2, 7, 6, 9, 8, 10, 11)
-"""The landmark on the other side of the face."""
+MIRRORED = (0, 1, 5, 4, 3, 2, 7, 6, 9, 8, 10, 11)  # the landmark on the other side of the face
 
 LINES = {
     "right_lids": ("right_eye_outer", "right_eye_inner"),

@@ -21,16 +21,12 @@ _SMOOTH = 5  # columns
 
 @dataclass(frozen=True, eq=False)
 class EyeOpening:
-    """The edges of an eye's lids, from the viewer's left to the right.
+    """The edges of an eye's lids, from the viewer's left to the right."""
 
-    Args:
-        upper, lower: (n,3), each column of pixels one point.
-        share: how far each lies along the line between the corners, (n,) in [0,1].
-    """
-
+    # upper, lower: (n,3), each column of pixels one point
     upper: Tensor
     lower: Tensor
-    share: Tensor
+    share: Tensor  # how far each lies along the line between the corners, (n,) in [0,1]
 
     def at(self, shares: Tensor) -> tuple[Tensor, Tensor]:
         """Points of the upper and lower edge (k,3) at shares (k,) of the way between the corners."""

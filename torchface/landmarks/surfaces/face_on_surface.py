@@ -37,17 +37,12 @@ _FACE_OF_HEAD = 0.5  # side of the box round a face, in sides of a picture that 
 
 @dataclass(frozen=True, eq=False)
 class ReferencePoints:
-    """Where a reference head has what finders find, millimetres, upright and looking along z.
+    """Where a reference head has what finders find, millimetres, upright and looking along z."""
 
-    Args:
-        landmarks: iBUG's 68, (68,3).
-        points: the other points of the finder, (P,3).
-        surface: the head, painted (True) or in clay; where it is given, what the finder always has off on it is taken
-            out of what it finds on surfaces that are painted or not.
-    """
-
-    landmarks: Tensor
-    points: Tensor
+    landmarks: Tensor  # iBUG's 68, (68,3)
+    points: Tensor  # the other points of the finder, (P,3)
+    # The head, painted (True) or in clay; where it is given, what the finder always has off on it is taken out of what
+    # it finds on surfaces that are painted or not.
     surface: Callable[[bool], TexturedSurface] | None = None
 
     @property
@@ -58,23 +53,14 @@ class ReferencePoints:
 
 @dataclass(frozen=True, eq=False)
 class FaceOnSurface:
-    """A face on a surface.
+    """A face on a surface."""
 
-    Args:
-        points: of the reference on the surface, (68+P,3) in its unit, NaN where none was seen.
-        pose: the similarity that takes the reference to the surface; its scale holds the unit.
-        presence: how likely the pictures from near show a face, their mean, in [0,1].
-        misfit: root mean square distance of the points from the reference in ``pose``, in distances of the eyes.
-        views: pictures from near with what was found, (3,H,W) each.
-        others: middles of other faces on the surface, (K,3).
-    """
-
-    points: Tensor
-    pose: Similarity
-    presence: float
-    misfit: float
-    views: tuple[Tensor, ...]
-    others: Tensor
+    points: Tensor  # of the reference on the surface, (68+P,3) in its unit, NaN where none was seen
+    pose: Similarity  # the similarity that takes the reference to the surface; its scale holds the unit
+    presence: float  # how likely the pictures from near show a face, their mean, in [0,1]
+    misfit: float  # root mean square distance of the points from the reference in pose, in distances of the eyes
+    views: tuple[Tensor, ...]  # pictures from near with what was found, (3,H,W) each
+    others: Tensor  # middles of other faces on the surface, (K,3)
 
     @property
     def doubt(self) -> float:
@@ -98,17 +84,12 @@ class NoFaceOnSurfaceError(AlignmentError):
 
 @dataclass(frozen=True, eq=False)
 class FaceSearch:
-    """What finds a face on surfaces.
+    """What finds a face on surfaces."""
 
-    Args:
-        detector: of faces in pictures, at any roll.
-        reference: where a head has those points.
-        rings: of directions from which the surface is seen, the likeliest first: pitch in degrees and their number.
-    """
-
-    detector: FaceDetector
+    detector: FaceDetector  # of faces in pictures, at any roll
     finder: LandmarkFinder
-    reference: ReferencePoints
+    reference: ReferencePoints  # where a head has those points
+    # Of directions from which the surface is seen, the likeliest first: pitch in degrees and their number.
     rings: tuple[tuple[float, int], ...] = _RINGS
 
     def find(

@@ -22,34 +22,24 @@ _BLOCK_BYTES = 2**27
 _ROWS = 64  # of a block's product with itself, of which only the lower triangle is formed
 _WHOLE_SPECTRUM = 1500
 _MAX_COMPONENTS = 200
-_GRAM_SAMPLES = 4000
-"""Above, time and memory of the Gram matrix grow past those of passes over the samples."""
-_NO_VARIANCE = 1e-12
-"""Of the largest eigenvalue: what rounding leaves where there is nothing."""
+_GRAM_SAMPLES = 4000  # above, time and memory of the Gram matrix grow past those of passes over the samples
+_NO_VARIANCE = 1e-12  # of the largest eigenvalue: what rounding leaves where there is nothing
 _METHOD = "gram rows/2"
 _STEP = "fitting principal components"
 SUBSPACE = "subspace.safetensors"
 _SEED = 0
 _MAX_PASSES = 30
-_SETTLED = 1e-6
-"""Relative change of a variance from one pass to the next, below which all have settled."""
+_SETTLED = 1e-6  # relative change of a variance from one pass to the next, below which all have settled
 
 
 @dataclass(frozen=True, eq=False)
 class PrincipalComponents:
-    """The mean of samples and the directions in which they vary, what a linear Gaussian model learns.
+    """The mean of samples and the directions in which they vary, what a linear Gaussian model learns."""
 
-    Args:
-        mean: (D,) float64.
-        components: orthonormal rows (K,D) float64, the one that varies most first.
-        standard_deviations: of the samples along them, (K,) float64.
-        total_variance: of the samples, all D dimensions summed, whether a component holds it or not.
-    """
-
-    mean: Tensor
-    components: Tensor
-    standard_deviations: Tensor
-    total_variance: float
+    mean: Tensor  # (D,) float64
+    components: Tensor  # orthonormal rows (K,D) float64, the one that varies most first
+    standard_deviations: Tensor  # of the samples along them, (K,) float64
+    total_variance: float  # of the samples, all D dimensions summed, whether a component holds it or not
 
 
 def principal_components(
@@ -227,15 +217,10 @@ class _Rows:
 
 @dataclass(frozen=True, eq=False)
 class LeadingComponents:
-    """What samples vary in most.
+    """What samples vary in most."""
 
-    Args:
-        values: eigenvalues of the scatter matrix, the largest first, (K,) float64.
-        vectors: its orthonormal eigenvectors, (K,D) float64.
-    """
-
-    values: Tensor
-    vectors: Tensor
+    values: Tensor  # eigenvalues of the scatter matrix, the largest first, (K,) float64
+    vectors: Tensor  # its orthonormal eigenvectors, (K,D) float64
     trace: float
     passes: int
 

@@ -17,23 +17,17 @@ _REMARKABLE, _MOST_NAMED = 5.0, 8
 
 @dataclass(frozen=True, eq=False)
 class LandmarkPull:
-    """Template vertices and where they belong.
+    """Template vertices and where they belong."""
 
-    Args:
-        vertices: (L,) int64.
-        points: (L,3) float64.
-        contour: which of them outline the jaw, (L,) bool: annotators set these along the outline that they see, in
-            an image or from a side, and not at a place of the skin.
-        shaped: which of them lie on the nose, (L,) bool, whose shape shows where each belongs: where every vertex moves
-            by itself, a landmark that is a millimetre off would pull the tip out of the surface or along it.
-        numbers: what each is called in messages, (L,): iBUG's number from 0, or the row of the given ones.
-    """
-
-    vertices: Tensor
-    points: Tensor
+    vertices: Tensor  # (L,) int64
+    points: Tensor  # (L,3) float64
+    # Which of them outline the jaw, (L,) bool: annotators set these along the outline that they see, in an image or
+    # from a side, and not at a place of the skin.
     contour: Tensor
+    # Which of them lie on the nose, (L,) bool, whose shape shows where each belongs: where every vertex moves by
+    # itself, a landmark that is a millimetre off would pull the tip out of the surface or along it.
     shaped: Tensor
-    numbers: Tensor
+    numbers: Tensor  # what each is called in messages, (L,): iBUG's number from 0, or the row of the given ones
 
     @staticmethod
     def of(vertices: Tensor, points: Tensor, template: Mesh) -> LandmarkPull:

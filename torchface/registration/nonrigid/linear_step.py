@@ -21,34 +21,21 @@ _MAX_ITERATIONS = 200
 
 @dataclass(frozen=True, eq=False)
 class Data:
-    """What pulls the vertices.
+    """What pulls the vertices."""
 
-    Args:
-        targets: u, (n,3).
-        normals: unit, of the scan at u, (n,3).
-        weights: w, (n,).
-        landmarks: :math:`U_L`, (L,3).
-    """
-
-    targets: Array
-    normals: Array
-    weights: Array
-    landmarks: Array
+    targets: Array  # u, (n,3)
+    normals: Array  # unit, of the scan at u, (n,3)
+    weights: Array  # w, (n,)
+    landmarks: Array  # U_L, (L,3)
 
 
 @dataclass(frozen=True, eq=False)
 class Contacts:
-    """Vertices that keep their place beside each other.
+    """Vertices that keep their place beside each other."""
 
-    Args:
-        pairs: (K,2) int64.
-        offsets: o, from the first to the second, (K,3).
-        weights: c, (K,).
-    """
-
-    pairs: NDArray[np.int64]
-    offsets: Array
-    weights: Array
+    pairs: NDArray[np.int64]  # (K,2) int64
+    offsets: Array  # o, from the first to the second, (K,3)
+    weights: Array  # c, (K,)
 
 
 class LinearStep:

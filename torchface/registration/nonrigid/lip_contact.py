@@ -23,15 +23,10 @@ _CLOSED = 1.0
 
 @dataclass(frozen=True, eq=False)
 class ContactPull:
-    """Pairs of template vertices that touch, and how they lie to each other.
+    """Pairs of template vertices that touch, and how they lie to each other."""
 
-    Args:
-        pairs: (K,2) int64.
-        offsets: from the first to the second with the template aligned with the scan, (K,3) float64.
-    """
-
-    pairs: Tensor
-    offsets: Tensor
+    pairs: Tensor  # (K,2) int64
+    offsets: Tensor  # from the first to the second with the template aligned with the scan, (K,3) float64
 
     def weights(self, current: Tensor, scan: SurfaceIndex, caster: RayCaster) -> Tensor:
         r"""How firmly each pair is to keep together, (K,) in [0,1].

@@ -37,35 +37,24 @@ class StageRecord:
 
 @dataclass(frozen=True)
 class RegistrationRecord:
-    """A whole registration.
+    """A whole registration."""
 
-    Args:
-        start: how the template came to lie on the scan: ``"landmarks"``, ``"detected landmarks"`` or ``"shape"``.
-        start_distance: median distance from template to scan after that, millimetres.
-        stages: in order.
-        notes: what was found in the input and what was done about it, for people to read.
-        median_distance: of the exposed vertices that found the scan, to it, millimetres.
-        matched: share of the template's vertices whose position the scan shows; the others follow their neighbours.
-        far_distance: as the median, but the 95th percentile.
-        shown: share of what faces outward, whose position the scan shows.
-        covered: share of what faces outward that lies under hair, cloth or on an ear in pieces: the template's.
-        stretch: by which share of its length the 95th percentile of the edges that the scan shows has grown or shrunk
-            beyond the whole.
-        slid: how far the landmarks inside the face end from their vertices, median, millimetres; NaN without any. What
-            slides along the surface is as near to it as what does not: no distance to the scan shows this.
-    """
-
-    start: str
-    start_distance: float
-    stages: tuple[StageRecord, ...]
-    notes: tuple[str, ...]
-    median_distance: float
-    matched: float
+    start: str  # how the template came to lie on the scan: "landmarks", "detected landmarks" or "shape"
+    start_distance: float  # median distance from template to scan after that, millimetres
+    stages: tuple[StageRecord, ...]  # in order
+    notes: tuple[str, ...]  # what was found in the input and what was done about it, for people to read
+    median_distance: float  # of the exposed vertices that found the scan, to it, millimetres
+    matched: float  # share of the template's vertices whose position the scan shows; the others follow their neighbours
     seconds: float = field(compare=False)
-    far_distance: float = math.nan
-    shown: float = math.nan
+    far_distance: float = math.nan  # as the median, but the 95th percentile
+    shown: float = math.nan  # share of what faces outward, whose position the scan shows
+    # Share of what faces outward that lies under hair, cloth or on an ear in pieces: the template's.
     covered: float = 0.0
+    # By which share of its length the 95th percentile of the edges that the scan shows has grown or shrunk beyond the
+    # whole.
     stretch: float = math.nan
+    # How far the landmarks inside the face end from their vertices, median, millimetres; NaN without any. What slides
+    # along the surface is as near to it as what does not: no distance to the scan shows this.
     slid: float = math.nan
 
     def figures(self) -> str:

@@ -13,8 +13,7 @@ from torchface.viz.figures.face_views import clay_colors, color_bar, face_views
 
 __all__ = ["compared_views", "error_colors", "error_views"]
 
-GREEN_TO_RED = "RdYlGn_r"
-"""The colour map, as matplotlib calls it."""
+GREEN_TO_RED = "RdYlGn_r"  # the colour map, as matplotlib calls it
 NOT_COMPARED = (0.75, 0.75, 0.75)
 
 _STEPS = (1.0, 2.0, 5.0, 10.0)

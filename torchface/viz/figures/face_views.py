@@ -17,8 +17,7 @@ from torchface.viz.figures.region_colors import as_seen
 __all__ = ["face_views", "frame_face", "heat_map"]
 
 FRONT, THREE_QUARTER, PROFILE = 0.0, 35.0, 90.0
-PICTURE_HEIGHTS = (16, 4096)
-"""Least and largest height that a command draws a view in, pixels."""
+PICTURE_HEIGHTS = (16, 4096)  # least and largest height that a command draws a view in, pixels
 
 _OVER_HAIR = 0.02  # of the picture, free above hair
 _COLUMNS, _MOST, _WIDTH, _HEIGHT = 6, 24, 200, 250

@@ -45,19 +45,13 @@ class Played:
 
 @dataclass(frozen=True)
 class Panel:
-    """One of the faces side by side.
-
-    Args:
-        take: which of the player's; the one that the viewer of the page has chosen if absent.
-        error: coloured by the distance to the first take's face.
-        yaw: from where it is seen, degrees.
-    """
+    """One of the faces side by side."""
 
     title: str
-    take: int | None = None
-    error: bool = False
+    take: int | None = None  # which of the player's; the one that the viewer of the page has chosen if absent
+    error: bool = False  # coloured by the distance to the first take's face
     markers: bool = False
-    yaw: float = 0.0
+    yaw: float = 0.0  # from where it is seen, degrees
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,25 +65,16 @@ class Markers:
 
 @dataclass(frozen=True, eq=False)
 class Player:
-    """What is played.
+    """What is played."""
 
-    Args:
-        takes: rigs of one mesh, with weights of as many frames and shapes of the same names.
-        panels: from left to right.
-        choices: rows of ``takes`` between which the viewer of the page chooses; the first to begin with.
-        reference: row of ``takes`` whose curves lie under the others'.
-        markers: over the panels that ask for them.
-        maximum: distance at the end of the colours, millimetres.
-    """
-
-    takes: Sequence[Played]
-    panels: Sequence[Panel]
+    takes: Sequence[Played]  # rigs of one mesh, with weights of as many frames and shapes of the same names
+    panels: Sequence[Panel]  # from left to right
     fps: float
-    choices: Sequence[int] = (0,)
-    reference: int | None = None
+    choices: Sequence[int] = (0,)  # rows of takes between which the viewer of the page chooses; the first to begin with
+    reference: int | None = None  # row of takes whose curves lie under the others'
     curves: Sequence[str] = ()
-    markers: Markers | None = None
-    maximum: float = 2.0
+    markers: Markers | None = None  # over the panels that ask for them
+    maximum: float = 2.0  # distance at the end of the colours, millimetres
     start: int = 0
 
 
