@@ -59,8 +59,12 @@ TOGETHER = {
     "browsers": (
         "export/web_app/test_app_in",
         "export/web_app/test_app_controls",
+        "export/web_app/test_character_files",
+        "io/gltf/test_gltf_browser",
+        "io/vrm/test_vrm_in_browser",
         "viz/browser",
         "viz/reports/test_player",
+        "workflows/live/test_page_server",
     ),
     "action units": ("capture/action_units", "train/test_action_units", "train/filmed_performers/test_camera_stage"),
 }
@@ -274,7 +278,14 @@ def receiver() -> Iterator[Any]:
 
 
 @pytest.fixture(scope="session")
-def chromium(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
-    """The driver of a Chromium that draws pages, one after the other."""
+def started_chromium(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
     with headless_chromium(tmp_path_factory.mktemp("chromium"), size=(600, 600)) as driver:
         yield driver
+
+
+@pytest.fixture(scope="module")
+def chromium(started_chromium: Any) -> Iterator[Any]:
+    """The driver of a Chromium that draws pages, one after the other; the last one is left: it would be drawn on."""
+    yield started_chromium
+    started_chromium.get("about:blank")
+    started_chromium.set_window_size(600, 600)

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from typing import Any
 
 import pytest
 import torch
 import trimesh
-from headless_chromium import headless_chromium
 
 from torchface.mesh import Mesh
 from torchface.rig import BlendshapeRig
@@ -50,9 +48,9 @@ def ball_rig(two_balls: Mesh) -> BlendshapeRig:
     return BlendshapeRig(two_balls, deltas, tuple(masks))
 
 
-@pytest.fixture(scope="session")
-def chromium(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
-    """A driver of Debian's Chromium, without the network."""
+@pytest.fixture(scope="module")
+def chromium(chromium: Any) -> Any:
+    """Wide enough for a page with a panel."""
     pytest.importorskip("viser", reason="the extra viewer is not installed")
-    with headless_chromium(tmp_path_factory.mktemp("profile"), size=(1280, 900)) as running:
-        yield running
+    chromium.set_window_size(1280, 900)
+    return chromium

@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from headless_chromium import headless_chromium, until
+from headless_chromium import until
 from PIL import Image
 from planted_faces import FRONTAL, JAW, Endless, ShadeSolver
 from websockets.exceptions import InvalidStatus
@@ -249,14 +249,9 @@ def live(dome_rig: BlendshapeRig, tmp_path_factory: pytest.TempPathFactory) -> I
         opened.close()
 
 
-@pytest.fixture(scope="module")
-def chromium(live: Opened, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
-    with headless_chromium(tmp_path_factory.mktemp("profile"), size=(700, 600)) as driver:
-        yield driver
-
-
 @pytest.fixture
 def page(chromium: Any, live: Opened) -> Any:
+    chromium.set_window_size(700, 600)
     chromium.get(live.url)
     until(lambda: chromium.execute_script("return document.documentElement.dataset.running") == "on")
     return chromium
