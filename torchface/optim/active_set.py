@@ -33,7 +33,6 @@ def primal_dual_active_set(problem: BoxProblem, start: Tensor, iterations: int =
     """The minimisers (B,N) of the problems whose active set settles, ``start`` of the others, and the gradient there.
 
     Args:
-        problem: B problems, float64.
         start: in the box, (B,N); its variables at a bound are the first active set.
         iterations: at most so many factorisations.
     """
@@ -69,11 +68,7 @@ def primal_dual_active_set(problem: BoxProblem, start: Tensor, iterations: int =
 def projected_newton(problem: BoxProblem, start: Tensor, tolerance: float, iterations: int = 100) -> Tensor:
     """The minimisers (B,N), from feasible ``start`` (B,N), by steps that always descend.
 
-    Args:
-        problem: B problems, float64.
-        start: feasible points, (B,N).
-        tolerance: on ``problem.residual``; a problem that reaches it is left alone.
-        iterations: at most so many steps.
+    A problem whose residual is within the tolerance is left alone.
     """
     checked_number("projected_newton: tolerance", tolerance)
     checked_count("projected_newton: iterations", iterations)

@@ -38,10 +38,7 @@ def solve_batch(
     """The minimisers (B,N), or where steps do not reach them the last of these.
 
     Args:
-        problem: B problems.
         factors: of one H of all of them; those of an H each are made here, as far as needed.
-        start: (B,N), or none.
-        tolerance: on the residual of ``box_qp``.
     """
     left = _Unsolved(problem, factors, start, tolerance)
     if start is not None:

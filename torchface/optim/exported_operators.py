@@ -64,16 +64,10 @@ def _(constant: Tensor, *_: Any) -> tuple[Tensor, Tensor]:
 def split_box_program(
     H: Tensor, gradient: Tensor, lower: Tensor, upper: Tensor, dual: Tensor, identity: Tensor, rho: float, steps: int
 ) -> tuple[Tensor, Tensor]:
-    r"""The least of :math:`\tfrac12 x^\top H x + g^\top x` in a box, (1,D), and the scaled dual there, (D,).
+    r"""The least of :math:`\tfrac12 x^\top H x + g^\top x` in a box, (1,D), and the scaled dual (D,) there.
 
     Args:
-        H: positive definite, (D,D).
-        gradient: g, (D,).
-        lower, upper: the box, (D,).
-        dual: the scaled dual to start from, (D,).
-        identity: (D,D).
         rho: of the metric, a share of H's diagonal.
-        steps: of operator splitting.
     """
     diagonal = (H * identity).sum(0)
     inverse = symmetric_inverse(H + rho * diagonal * identity)

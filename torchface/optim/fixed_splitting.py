@@ -130,8 +130,6 @@ def newton_inverse(matrix: Tensor, rho: float, doublings: int) -> Tensor:
     r"""The inverses (B,N,N) of :math:`M + \rho I` for matrices M (B,N,N) with a unit diagonal, by products alone.
 
     Args:
-        matrix: M.
-        rho: :math:`\rho`.
         doublings: of the digits, for N = 1.
     """
     size = matrix.shape[-1]
@@ -144,11 +142,7 @@ def newton_inverse(matrix: Tensor, rho: float, doublings: int) -> Tensor:
 
 
 def fixed_loop(step: Callable[..., tuple[Tensor, ...]], count: int, carried: tuple[Tensor, ...]) -> tuple[Tensor, ...]:
-    """What some calls of a function make of tensors, each of what the one before gave; exported as one ``Loop``.
-
-    Args:
-        step: takes tensors and gives as many of the same shapes.
-    """
+    """Some calls of a function of tensors, each on what the one before gave; exported as one ``Loop``."""
     if count == 0 or not torch.compiler.is_exporting():
         for _ in range(count):  # each needs the one before
             carried = step(*carried)

@@ -22,11 +22,8 @@ def solve_free(H: Tensor, diagonal: Tensor, free: Tensor, right: Tensor, damping
     r"""Solves :math:`(H_{FF} + \delta D) x_F = b_F` with :math:`x = 0` elsewhere.
 
     Args:
-        H: (N,N) or (B,N,N), positive semidefinite, float64.
         diagonal: the metric in which it is scaled, (N,) or (B,N).
         free: which variables take part, (B,N) bool.
-        right: :math:`b`, (B,N).
-        damping: :math:`\delta`, (B,); none if absent.
     """
     scale = diagonal.rsqrt()
     scaled = H * scale[..., :, None] * scale[..., None, :]

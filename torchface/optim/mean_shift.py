@@ -23,14 +23,12 @@ class Clusters:
 
 
 def mean_shift(points: Tensor, bandwidth: float, weights: Tensor | None = None) -> Clusters:
-    r"""Moves a seed to the mean of the points within the bandwidth until it rests; seeds that meet are one cluster.
+    r"""Moves a seed to the mean of the points (N,D) within the bandwidth until it rests; seeds that meet are a cluster.
 
     Seeds are the bins of a grid of one bandwidth that hold a point. A centre closer than a bandwidth to one with more
     weight around it is dropped; a point belongs to the nearest centre.
 
     Args:
-        points: (N,D), at least one.
-        bandwidth: h, in the points' unit.
         weights: how often each point counts, (N,); once if absent.
 
     Source: Comaniciu and Meer 2002; the same rules as scikit-learn's ``MeanShift(bin_seeding=True)``.

@@ -52,11 +52,7 @@ class OneByOne:
         return OneByOne, self._given
 
     def solve(self, f: Array, tolerance: float) -> tuple[Array, Array]:
-        """The minimisers (B,N), in the bounds, and rows of those not solved to the tolerance of ``box_qp``.
-
-        Args:
-            f: (B,N), float64; a problem where it is not finite is not solved.
-        """
+        """The minimisers (B,N), in the bounds, and rows of those not solved to ``box_qp``'s tolerance."""
         slopes = f * self._scale
         y = np.empty_like(slopes)
         with self._lock:

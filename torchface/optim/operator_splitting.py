@@ -127,15 +127,7 @@ def splitting_steps(
     steps: int,
     dtype: torch.dtype = torch.float64,
 ) -> SplittingState:
-    """The state after some steps.
-
-    Args:
-        problem: B problems.
-        factors: of its H.
-        state: where to start.
-        steps: how many.
-        dtype: in which the steps run; what goes in and comes out is float64.
-    """
+    """The state after some steps, which run in ``dtype``; what goes in and comes out is float64."""
     checked_count("splitting_steps: steps", steps)
     shared, first = factors.step.ndim == 2, factors.first if dtype == torch.float32 else None
     stages: list[tuple[SplittingFactors, Tensor, int]] = []

@@ -41,13 +41,7 @@ class PreparedProgram:
         return cls(exact, *checked_bounds(lower, upper, exact))
 
     def solve(self, f: Tensor, start: Tensor | None, tolerance: float) -> Tensor:
-        """The minimisers (B,N), in the dtype of f: of few problems by DAQP, of many, and what that leaves, as batches.
-
-        Args:
-            f: (B,N).
-            start: (B,N), or none.
-            tolerance: on the residual of ``box_qp``.
-        """
+        """The minimisers (B,N) in the dtype of f: of few problems by DAQP, of many, and what it leaves, as batches."""
         if len(f) <= self._few:
             x = self._solve_few(f.detach().numpy(), tolerance)
         else:

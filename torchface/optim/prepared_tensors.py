@@ -29,12 +29,7 @@ class Prepared(Generic[Value]):
         self._value: Value | None = None
 
     def get(self, inputs: tuple[Tensor | float, ...], compute: Callable[[], Value]) -> Value:
-        """The value of ``compute``, called where an input is not what it was (type, device or any entry).
-
-        Args:
-            inputs: all that ``compute`` depends on, always as many.
-            compute: gives the value; called without gradients.
-        """
+        """The value of ``compute``, called without gradients where an input's type, device or any entry has changed."""
         if self._inputs is None or not all(map(_same, self._inputs, inputs)):
             with torch.no_grad():
                 self._value = compute()

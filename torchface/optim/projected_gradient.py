@@ -202,11 +202,7 @@ class ProjectedGradient(nn.Module):
 
 
 def largest_eigenvalue(H: Tensor) -> Tensor:
-    r"""The largest eigenvalue of :math:`(\mathrm{diag} H)^{-1} H` by power iteration, () or (B,), from below.
-
-    Args:
-        H: (N,N) or (B,N,N), symmetric, positive semidefinite.
-    """
+    r"""The largest eigenvalue of :math:`(\mathrm{diag} H)^{-1} H`, (N,N) or (B,N,N), by power iteration, from below."""
     spread = metric(H)
     # Without a pattern that the eigenvector could be orthogonal to.
     v = torch.cos(1.0 + torch.arange(H.shape[-1], dtype=H.dtype, device=H.device).square()) * spread.rsqrt()

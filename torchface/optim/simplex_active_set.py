@@ -68,9 +68,6 @@ def solve_simplex(problems: SimplexProblems, start: Mixture) -> Tensor:
     The variables whose gradients lie furthest below the multiplier :math:`x^\top g` join those that take part, the
     problem among these candidates alone is solved exactly, and so on until none lies below. As it includes what took
     part, it always lowers the energy, so no set comes twice.
-
-    Args:
-        start: points of the simplex; their positive variables take part first.
     """
     variables = problems.f.shape[1]
     chunk = max(1, _CHUNK_NUMBERS // max(variables, (start.index.shape[1] + _SEVERAL) ** 2))

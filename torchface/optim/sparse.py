@@ -50,13 +50,9 @@ class SparseCholesky:
         return self  # it never changes
 
     def solve(self, rhs: Array) -> Array:
-        """The solution x of A x = b.
+        """The solution x of A x = b for b (n,) or (n,K), an array or tensor of its kind, dtype and device.
 
-        Args:
-            rhs: b, (n,) or (n,K), a numpy array or a tensor.
-
-        Returns:
-            x, of the same kind, shape, floating dtype and device as ``rhs``; computed in float64.
+        It is computed in float64.
         """
         if rhs.ndim not in (1, 2) or rhs.shape[0] != self.size:
             raise ShapeError(f"SparseCholesky: found a right-hand side {tuple(rhs.shape)}, expected ({self.size},*)")

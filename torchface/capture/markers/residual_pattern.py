@@ -28,18 +28,12 @@ class ResidualPattern:
 
 
 def residual_pattern(residual: Tensor, points: Tensor, normals: Tensor) -> ResidualPattern:
-    r"""How much of a residual neighbouring markers share, beyond a similarity and one distance from the skin.
+    r"""How much of residuals (M,3) neighbouring markers share, beyond a similarity and one distance from the skin.
 
     With :math:`\bar r_m` the mean of the other markers' residuals, weighted by a Gaussian of their distance, the smooth
     part is :math:`\sqrt{\sum_m r_m \cdot \bar r_m / M}`.
 
-    Args:
-        residual: of each marker over a take, (M,3), millimetres; NaN where not seen.
-        points: the sites at rest, (M,3), millimetres.
-        normals: of the skin there, (M,3).
-
-    Returns:
-        A ``ResidualPattern``; of fewer than 20 markers one of zeros.
+    Fewer than 20 markers give zeros.
 
     Source: Moran 1950, for vectors.
     """

@@ -165,8 +165,7 @@ def inlier_markers(error: Tensor) -> Tensor:
 def sample_limits(distance: Tensor) -> Tensor:
     """The distance beyond which a sample of each marker is an outlier, (M,): five times its median, at least 2 mm.
 
-    Args:
-        distance: of each sample from its expected place, (T,M), millimetres; NaN for what does not count.
+    The distances (T,M) are NaN for what does not count.
     """
     own = (_LIMIT_RATIO * distance.nanmedian(0).values.nan_to_num(0.0)).clamp(min=_MIN_LIMIT)
     # A marker that is an outlier much of the time must not set its own limit.
@@ -174,13 +173,7 @@ def sample_limits(distance: Tensor) -> Tensor:
 
 
 def check_not_mirrored(paths: Tensor, rest: Tensor, name: str = "markers") -> None:
-    """Raises ``AlignmentError`` where the mirror image of a take's median fits the sites clearly better.
-
-    Args:
-        paths: markers (T,M,3), NaN for not seen.
-        rest: their sites, (M,3).
-        name: of the take, for messages.
-    """
+    """Raises ``AlignmentError`` where the mirror image of a take's median fits the sites (M,3) clearly better."""
     found = check_mirrored(paths.nanmedian(0).values, rest)
     if found.mirrored:
         raise AlignmentError(

@@ -239,11 +239,9 @@ def with_sparsity(solver: MarkerSolver, sparsity: float) -> MarkerSolver:
 
 
 def smooth_in_box(H: Tensor, slopes: Tensor, fps: float, smoothness: float) -> Tensor:
-    r"""Weights (T,N) in [0,1] of consecutive frames that share H, calm in time as those of :class:`WholeTakeSolver`.
+    r"""Weights (T,N) in [0,1] of frames of one H (N,N) and slopes f (T,N), calm as :class:`WholeTakeSolver`'s.
 
     Args:
-        H: of the frames' energies, (N,N) float64.
-        slopes: f of each, (T,N) float64.
         smoothness: :math:`\lambda` at 60 frames a second, in the unit of the energies.
 
     Example:

@@ -92,12 +92,7 @@ def _shown_meshes() -> list[tuple[Any, Any]]:
 
 
 class _MeshReader:
-    """Reads mesh objects one after the other.
-
-    Args:
-        arrays: gets those of each under its prefix.
-        left_out: gets what was left out, in words.
-    """
+    """Reads mesh objects one after the other, each one's arrays under its prefix, and what was left out, in words."""
 
     def __init__(self, arrays: dict[str, Any], left_out: list[str]) -> None:
         self.arrays, self.left_out = arrays, left_out

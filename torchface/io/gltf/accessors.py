@@ -28,9 +28,7 @@ def read_floats(
     """Rows (C,D) of an attribute; integers are normalised where the accessor says so.
 
     Args:
-        where: who asks, for errors.
         types: what D may be, such as ``("VEC3",)``.
-        count: the C that it must be.
     """
     accessor = document.item("accessors", index, where)
     rows = _read(document, accessor, f"accessors[{index}]", types, count)

@@ -260,11 +260,7 @@ def _chunks(path: Path, data: bytes) -> tuple[bytes, memoryview | None]:
 
 
 def glb_pieces(root: dict[str, Any], buffers: BufferWriter, source: str | Path = "glTF") -> Iterator[bytes]:
-    """A ``.glb`` of one scene whose root is the first node, in pieces to write one behind the other.
-
-    Args:
-        root: nodes, meshes, materials and what else the document has.
-    """
+    """A ``.glb`` of one scene whose root is the first node, in pieces to write one behind the other."""
     root = {
         "asset": {"version": "2.0", "generator": "torchface"},
         "scene": 0,

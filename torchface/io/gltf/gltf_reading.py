@@ -45,10 +45,6 @@ def read_gltf_rig(path: str | Path, unit: str = "m") -> BlendshapeRig:
     Names come from ``mesh.extras.targetNames``, where Blender and three.js write and look for them; without they are
     ``target_0`` and so on; those that the file calls correctives become those. A scene of several meshes gets a region
     a node. Vertices split at seams become one again.
-
-    Args:
-        path: a ``.glb`` or ``.gltf``.
-        unit: what the file's numbers are; glTF says metres.
     """
     document = read_document(path)
     neutral, deltas, names = _read(document, millimetres_per(unit))
@@ -194,11 +190,7 @@ def read_texture(document: Document, index: int) -> Tensor | None:
 
 
 def rejoined(document: Document, instanced: Sequence[tuple[Instance, Part]]) -> tuple[Instance, Part] | None:
-    """The parts of a scene as one, in the scene's axes; none where they were not written as one.
-
-    Args:
-        found: the scene's meshes and where they stand.
-    """
+    """The parts of a scene as one, in the scene's axes; none where they were not written as one."""
     first = instanced[0]
     location = f"meshes[{first[0].mesh}].extras.torchface"
     if read_mesh_count(document, first[1].extras.get("torchface"), location) != len(instanced) or len(instanced) == 1:

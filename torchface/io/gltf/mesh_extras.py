@@ -32,12 +32,7 @@ def write_extras(mesh: Mesh) -> dict[str, Any]:
 
 
 def write_order(rows: Tensor, meshes: int) -> dict[str, Any]:
-    """The JSON of what parts do to the order of triangles: runs of rows that follow each other; none of one part.
-
-    Args:
-        rows: for each triangle, in the file's order, its row in the mesh, (F,).
-        meshes: how many meshes of the scene are parts of this one.
-    """
+    """The JSON of what parts do to the order of triangles, as runs of rows that follow each other; none of one part."""
     ids = rows.numpy()
     start = np.flatnonzero(np.diff(ids, prepend=-2) != 1)
     extras: dict[str, Any] = {} if meshes == 1 else {"meshes": meshes}

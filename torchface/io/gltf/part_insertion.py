@@ -35,11 +35,7 @@ class ExtendedBlock:
 
 
 def document_with_parts(character: Character, blocks: Sequence[ExtendedBlock], page: bytes) -> Document:
-    """The character's file with more vertices, in memory: accessors, bufferViews and bytes behind those it has.
-
-    Args:
-        page: a PNG, the image of the parts.
-    """
+    """The character's file with more vertices and a PNG: accessors, bufferViews and bytes behind those it has."""
     document = character.document
     root, writer = copy.deepcopy(document.root), None
     writer = AppendedArrays(document, root)

@@ -36,10 +36,6 @@ def performed_glb(document: Document, performance: Performance) -> bytes:
     """The ``.glb`` with the performance: shapes by name, and head, neck and eyes where the character has them.
 
     A character without a bone for its head turns as a whole, about a node of its own.
-
-    Args:
-        document: of a ``.glb``, whose data may be compressed.
-        performance: at least one frame.
     """
     root = copy.deepcopy(document.root)
     buffers = _appended(root, bytes(document.binary or b""))

@@ -28,8 +28,6 @@ class PrimitiveWriter:
     """Writes the primitives of one mesh into a buffer.
 
     Args:
-        mesh: on the CPU.
-        buffers: where accessors go.
         tangents: glTF's, at each triangle's corners, (F,3,4), for the first primitive; its material has a normal map.
     """
 
@@ -41,11 +39,7 @@ class PrimitiveWriter:
         self._written: list[tuple[dict[str, Any], NDArray[np.int64]]] = []
 
     def add(self, surface: Surface, material: int, origin: Tensor) -> dict[str, Any]:
-        """A primitive without morph targets yet.
-
-        Args:
-            origin: the node's place (3,), millimetres.
-        """
+        """A primitive without morph targets yet, about the node's place (3,), millimetres."""
         triangles = self.split.triangles[surface.triangles.numpy()]
         rows, local = np.unique(triangles, return_inverse=True)
         local = local.reshape(-1, 3)
@@ -129,8 +123,6 @@ class MaterialWriter:
     """Collects the materials of one mesh; ``fields`` is what the document gets of them.
 
     Args:
-        mesh: on the CPU.
-        buffers: where images go.
         jpeg: whether images of three channels are JPEG, which is smaller; else all are PNG.
     """
 

@@ -45,7 +45,6 @@ class ArrayFile:
     """The arrays of a file by name, read one by one.
 
     Args:
-        path: ``.npz``, ``.safetensors`` or ``.npy``.
         largest: bytes that all arrays that are read may take.
     """
 
@@ -97,12 +96,7 @@ class ArrayFile:
         return FileFormatError(f"{self.path}: found {name} of {stored.kind}{list(stored.shape)}, expected {expected}")
 
     def numbers(self, name: str, *shape: int | None, finite: bool = True) -> Tensor:
-        """An array of real numbers in float32.
-
-        Args:
-            shape: what it has to be; None for any size.
-            finite: whether NaN and numbers beyond any length are refused.
-        """
+        """An array of real numbers in float32, of a shape in which None is any size; finite ones alone where asked."""
         values = self._read(name, "fiub", shape)
         with np.errstate(over="ignore"):
             read = np.require(values, np.float32, ["C", "W"])

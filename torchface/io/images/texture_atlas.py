@@ -56,15 +56,10 @@ def with_used_looks(mesh: Mesh, look: Tensor, looks: Sequence[Look], images_only
 
 
 def with_looks(mesh: Mesh, look: Tensor, looks: Sequence[Look]) -> Mesh:
-    """The mesh with one image of all looks, and texture coordinates there; with one look as it is, without an image.
+    """The mesh with one image of its looks, a row (F,) a triangle, and their layout; unchanged with one look.
 
     A triangle whose coordinates lie in another tile of a repeated image shows the same texels. One that reaches over a
     tile's border shows the border's texels from there on.
-
-    Args:
-        mesh: of F triangles, without a texture.
-        look: which of the looks each has, (F,) int64.
-        looks: all that occur.
     """
     if len(looks) == 1:
         one = looks[0]

@@ -36,9 +36,6 @@ def first_directory(data: bytes, source: str) -> dict[int, tuple[int, ...]]:
 
     Decoders copy what each tag points at, and thousands of tags may point at one place: a directory that claims more
     bytes than the file has is refused.
-
-    Args:
-        data: a TIFF or BigTIFF, or the content of an EXIF block.
     """
     values: dict[int, tuple[int, ...]] = {}
     try:

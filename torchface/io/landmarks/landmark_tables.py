@@ -55,9 +55,6 @@ def load_landmark_table(path: str | Path) -> LandmarkTable:
     ``confidence_0``, ... and ``visibility_0``, ... each landmark, ``timestamp`` or ``time`` (seconds) the rate. Other
     columns are passed over.
 
-    Args:
-        path: the file, of one face.
-
     Source: OpenFace wiki, "Output Format"; py-feat's ``Fex``.
     """
     path = Path(path)

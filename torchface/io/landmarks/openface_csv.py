@@ -36,9 +36,6 @@ def load_landmarks_csv(path: str | Path) -> Take:
     (gaze, pose, 3D points, action units) is in ``extras["columns"]`` by name, (T,) float64. Frame numbers other than
     1, 2, ... are kept in ``extras["frame_numbers"]``; frames that come unevenly keep their times.
 
-    Args:
-        path: the file, of one face.
-
     Returns:
         landmarks (T,L,2) in pixels, float32, with the frame's confidence for each.
 
@@ -89,13 +86,10 @@ def openface_times(numbers: np.ndarray, times: np.ndarray, path: Path) -> tuple[
 
 
 def save_landmarks_csv(take: Take, path: str | Path) -> None:
-    """Writes 2D landmarks as OpenFace would have; a landmark that is NaN becomes empty cells.
+    """Writes 2D landmarks (T,L,2), pixels, as OpenFace would have; a landmark that is NaN becomes empty cells.
 
     A frame's confidence is the mean over its landmarks, its success whether any was seen. The numbers in
     ``extras["columns"]`` follow.
-
-    Args:
-        take: landmarks (T,L,2), pixels.
 
     Source: OpenFace wiki, "Output Format".
     """

@@ -76,11 +76,7 @@ def _labels(channels: Sequence[str]) -> dict[str, dict[str, str]] | None:
 
 
 def save_markers_csv(take: Take, path: str | Path) -> None:
-    """Writes the markers of a take as CSV in millimetres; what is NaN becomes empty cells.
-
-    Args:
-        take: markers (T,M,3), millimetres. What else it holds is left out.
-    """
+    """Writes the markers of a take, and nothing else of it, as CSV in millimetres; what is NaN becomes empty cells."""
     path = Path(path)
     labels, positions = values_to_write(take.markers, "marker positions", 3, path)
     write_numbered(

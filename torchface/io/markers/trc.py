@@ -111,12 +111,7 @@ def _scaled(values: np.ndarray, factor: float) -> np.ndarray:
 
 
 def save_trc(take: Take, path: str | Path) -> None:
-    """Writes the markers of a take as a TRC file in millimetres; what is NaN becomes empty cells.
-
-    What else the take holds is left out.
-
-    Args:
-        take: markers (T,M,3), millimetres.
+    """Writes the markers of a take, nothing else of it, as a TRC file in millimetres; what is NaN becomes empty cells.
 
     Source: OpenSim documentation, "Marker (.trc) Files".
     """

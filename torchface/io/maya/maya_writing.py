@@ -66,8 +66,7 @@ def write_maya_rig(rig: BlendshapeRig, path: str | Path, keys: WeightKeys | None
     and underscores: other signs become underscores, and the node's ``notes`` list what was renamed. The texture,
     vertex colours and annotations are left out.
 
-    Args:
-        path: it appears only when it is complete.
+    The file appears only when it is complete.
     """
     path = Path(path)
     if len(rig.neutral.faces) == 0:

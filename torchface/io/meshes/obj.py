@@ -25,9 +25,8 @@ _MAX_MATERIALS = 2**20  # bytes, of all material files of a mesh
 def read_obj(path: str | Path, unit: str = "mm") -> Mesh:
     """The mesh in an OBJ file: polygons, texture coordinates with seams, vertex colours, the material's image.
 
-    Args:
-        path: the file; its material library and image are looked for beside it, never outside its folder.
-        unit: the file's unit, ``"mm"``, ``"cm"`` or ``"m"``.
+    The material library and image are looked for beside the file, never outside its folder. Its unit is ``"mm"``,
+    ``"cm"`` or ``"m"``.
     """
     path, scale = Path(path), millimetres_per(unit)
     statements = read_statements(path, read_file(path))
@@ -42,12 +41,10 @@ def read_obj(path: str | Path, unit: str = "mm") -> Mesh:
 
 
 def read_obj_vertices(path: str | Path, neutral: Mesh, topology: bytes | None, unit: str = "mm") -> Tensor:
-    """The vertices (V,3) of a shape whose faces are those of ``neutral``; fast for many files.
+    """The vertices (V,3) of a shape whose faces are those of the mesh at rest; fast for many files.
 
     Args:
-        neutral: the mesh at rest.
         topology: ``face_bytes`` of the neutral's file; a shape with the same bytes there is not parsed further.
-        unit: the file's unit.
     """
     path, data = Path(path), read_file(path)
     table = read_vertices(path, data)
@@ -81,12 +78,7 @@ def write_obj(mesh: Mesh, path: str | Path) -> None:
 
 
 def write_obj_shapes(mesh: Mesh, shapes: Iterable[tuple[str, Tensor]], neutral: str | Path) -> None:
-    """Writes shapes of a mesh beside its own file, with the same faces and material.
-
-    Args:
-        mesh: the neutral, as ``write_obj`` wrote it.
-        shapes: the name and the vertices (V,3) of each; its file is called so.
-    """
+    """Writes shapes of a mesh, vertices (V,3) by name, beside what ``write_obj`` wrote, with its faces and material."""
     surface, material = _surface_lines(mesh), _material_line(mesh, Path(neutral))
     with all_or_none():
         for name, vertices in shapes:  # a file each

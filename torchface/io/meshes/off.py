@@ -20,11 +20,7 @@ _HEADS = (b"OFF", b"COFF", b"NOFF", b"CNOFF", b"STOFF")
 
 
 def read_off(path: str | Path, unit: str = "mm") -> Mesh:
-    """The mesh in an OFF file: vertices in the file's order, triangles; polygons are cut, colours left out.
-
-    Args:
-        unit: the file's unit, ``"mm"``, ``"cm"`` or ``"m"``.
-    """
+    """The mesh in an OFF file of ``mm``, ``cm`` or ``m``, its vertices in order; polygons are cut, colours left out."""
     path, scale = Path(path), millimetres_per(unit)
     lines = _filled_lines(path, read_file(path))
     vertex_count, face_count = _counts(path, lines)

@@ -20,11 +20,7 @@ _UV_NAMES = (("s", "t"), ("u", "v"), ("texture_u", "texture_v"))
 
 
 def read_ply(path: str | Path, unit: str = "mm") -> Mesh:
-    """The mesh in a PLY file.
-
-    Args:
-        unit: the file's unit, ``"mm"``, ``"cm"`` or ``"m"``.
-    """
+    """The mesh in a PLY file of ``mm``, ``cm`` or ``m``."""
     path, scale = Path(path), millimetres_per(unit)
     tables, elements = read_tables(path, read_file(path), ("vertex", "face"))
     columns = tables.get("vertex", {})

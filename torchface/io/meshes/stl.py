@@ -24,11 +24,7 @@ _VERTEX = re.compile(rb"vertex\s+(\S+)\s+(\S+)\s+(\S+)")
 
 
 def read_stl(path: str | Path, unit: str = "mm") -> Mesh:
-    """The mesh in an STL file; vertices are numbered by first appearance.
-
-    Args:
-        unit: the file's unit, ``"mm"``, ``"cm"`` or ``"m"``.
-    """
+    """The mesh in an STL file of ``mm``, ``cm`` or ``m``; vertices are numbered by first appearance."""
     from trimesh.exchange.stl import load_stl_binary  # takes a while to import
 
     path, scale = Path(path), millimetres_per(unit)

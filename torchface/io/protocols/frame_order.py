@@ -43,12 +43,7 @@ class FrameOrder:
         self._steps: deque[int] = deque(maxlen=_RECENT)
 
     def takes(self, sender: str, number: int | None, now: float) -> bool:
-        """Whether a frame is taken; counts it.
-
-        Args:
-            number: how the sender counts it; None where it does not.
-            now: seconds.
-        """
+        """Whether a frame is taken, by the sender's number, if it counts, and the time in seconds; counts it."""
         if sender != self.sender:
             if now - self._heard < _FREE:
                 self.counts.others += 1

@@ -36,9 +36,6 @@ _NAMES = tuple(_app_name(name) for name in ARKIT)
 class IFacialMocapPackets:
     """Packets of frames as the app would send them: weights in percent, rotations in degrees.
 
-    Args:
-        names: of the weights that come, (N,); any rig's names that ARKit's can be had from.
-
     Source: iFacialMocap, communication specifications, ifacialmocap.com/for-developer.
     """
 

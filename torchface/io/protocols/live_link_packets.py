@@ -23,11 +23,7 @@ _MOST_TEXT = 256  # bytes of a device's or a subject's name
 
 
 class ArkitWeights:
-    """Turns weights by a rig's names into weights by ARKit's.
-
-    Args:
-        names: of the weights that come, (N,).
-    """
+    """Turns weights by a rig's names into weights by ARKit's."""
 
     def __init__(self, names: Sequence[str]) -> None:
         self._matrix = mapping(names, ARKIT).float()
@@ -54,7 +50,6 @@ class LiveLinkPackets:
     """Packets of frames, as the app would send them: ARKit's 52 weights and nine rotations each.
 
     Args:
-        names: of the weights that come, (N,); any rig's names that ARKit's can be had from.
         subject: the name under which the receiver lists the face.
     """
 

@@ -25,10 +25,6 @@ _NOT_IN_ADDRESSES = re.compile(r"[^!-~]|[#*,/?\[\]{}]")  # what OSC gives anothe
 class OscPackets:
     """Packets of plain OSC, one bundle a frame: ``PREFIX/weights/NAME`` and, in radians,
     ``PREFIX/rotations/HeadYaw`` and so on by Live Link Face's nine names, one float each.
-
-    Args:
-        names: of the weights that come, (N,).
-        prefix: of the addresses; ``/torchface`` if empty.
     """
 
     def __init__(self, names: Sequence[str], prefix: str = "") -> None:

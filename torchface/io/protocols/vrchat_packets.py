@@ -86,11 +86,7 @@ _LARGER = {"EyeWide": ("EyeWideLeft", "EyeWideRight"), "EyeSquint": ("EyeSquintL
 
 
 class VrchatPackets:
-    """Packets of avatar parameters and eye tracking; an avatar takes those that it has.
-
-    Args:
-        names: of the weights that come, (N,); any rig's names that ARKit's can be had from.
-        namings: of ``VRCHAT_NAMINGS``.
+    """Packets of avatar parameters, by ``VRCHAT_NAMINGS``, and eye tracking; an avatar takes those that it has.
 
     Source: docs.vrchat.com, OSC Eye Tracking and OSC Avatar Parameters.
     """

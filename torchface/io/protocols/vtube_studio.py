@@ -81,8 +81,6 @@ class VTubeStudioSender:
     opened again. Beside the parameters that every model has, 52 of its own are made, named as ARKit's with a capital.
 
     Args:
-        host, port: where VTube Studio listens.
-        names: of the weights that come, (N,).
         token: the file of the token; in the user's cache if absent.
         rate: frames a second at most; VTube Studio's own if absent.
     """
@@ -103,11 +101,7 @@ class VTubeStudioSender:
         self._thread.start()
 
     def send(self, weights: Tensor, rotations: Tensor | None = None) -> bool:
-        """Gives the thread a frame: weights (N,), rotations (9,); one that waits is dropped.
-
-        Returns:
-            Whether VTube Studio takes frames now.
-        """
+        """Gives the thread a frame, weights (N,), rotations (9,), in place of one that waits; whether any is taken."""
         frame = self._arkit(weights), rotations_sent(rotations)
         with self._change:
             self._newest = frame

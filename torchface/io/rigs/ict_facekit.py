@@ -207,17 +207,11 @@ _MAX_UNMATCHED = 1000
 
 
 def mirror_by_parts(vertices: Tensor, parts: dict[str, Tensor]) -> Tensor | None:
-    """The mirror map (V,) of a head whose parts lie apart, left ones named ``..._left`` and right ones ``..._right``.
+    """The mirror map (V,) of a head whose parts lie apart, left ones named ``..._left`` and right ones ``..._right``;
+    None where a vertex would be more than 1 mm from its image, or the map is not its own inverse.
 
     Left and right parts go by the order of their vertices where that fits, else, as parts on the midline, by nearest
     place; vertices that lie on each other are matched one to one so that the map is its own inverse.
-
-    Args:
-        vertices: (V,3), millimetres, mirrored in x.
-        parts: masks (V,) that together cover every vertex once.
-
-    Returns:
-        None where a vertex would be more than 1 mm from its image, or the map is not its own inverse.
     """
     points = vertices.double().numpy()
     flipped = points * [-1, 1, 1]

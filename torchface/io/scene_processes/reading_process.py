@@ -22,8 +22,6 @@ def read_scene(command: Sequence[str], path: Path, reader: str, seconds: float) 
 
     Args:
         command: leaves a scene in the folder; see ``torchface.io.scene_processes.scene_arrays``.
-        reader: what reads it, for errors.
-        seconds: of time that it may take.
     """
     with tempfile.TemporaryDirectory(prefix="torchface-scene-") as folder:
         said = run_process([*command, str(path.absolute()), folder], f"{path}", reader, seconds)

@@ -88,8 +88,6 @@ def common_keys(rig: BlendshapeRig, keys: WeightKeys, bound: float) -> tuple[Wei
     weights, stay within the bound too.
 
     Args:
-        rig: of the N shapes.
-        keys: one a frame.
         bound: of the distance between a frame's weights and the lines between keys.
     """
     values = with_correctives(rig, keys).weights

@@ -53,11 +53,7 @@ class Table:
 
 
 class TableReader:
-    """A file whose header is read, and whose rows are read once their columns are known.
-
-    Args:
-        path: the file, UTF-8, its first row the header.
-    """
+    """A UTF-8 file whose first row, the header, is read, and whose other rows are read once their columns are known."""
 
     def __init__(self, path: str | Path) -> None:
         self.path = Path(path)
@@ -130,11 +126,7 @@ class TableReader:
 
 
 class TextLines:
-    """The lines of a UTF-8 file with their ends, decoded as they are asked for.
-
-    Args:
-        newline: as ``open`` takes it.
-    """
+    """The lines of a UTF-8 file with their ends, decoded as they are asked for."""
 
     def __init__(self, path: Path, data: bytes, newline: str = "") -> None:
         self.path = path
@@ -164,13 +156,7 @@ class TextLines:
 
 
 def parse_numbers(cells: Sequence[str], names: Sequence[str], where: str) -> list[float]:
-    """A row's numbers, NaN where a cell is empty.
-
-    Args:
-        cells: one a column.
-        names: of the columns, for messages.
-        where: file and row, which begin a message.
-    """
+    """A row's numbers, NaN where a cell is empty; messages name file, row and column."""
     joined = "".join(cells)
     if joined.isascii() and "_" not in joined:  # Python would take 1_000 and other scripts' digits for numbers
         try:

@@ -73,13 +73,10 @@ def file_error(where: object) -> Callable[[str, str], FileFormatError]:
 
 
 def frame_times(times: np.ndarray, source: TimeSource) -> FrameTimes:
-    """The rate of frames, and when each is shown where they do not come evenly: of every file that has times.
+    """The rate of frames (T,), seconds, and when each is shown where they do not come evenly, in every kind of file.
 
     Frames that lie on an even grid, dropped ones left out, get its times exactly; others keep the file's. Times in
     milliseconds or finer are repaired with a ``UserWarning``.
-
-    Args:
-        times: of the frames, (T,), seconds.
     """
     times = np.array(times, np.float64)  # of its own: a column holds its table in memory
     if not np.isfinite(times).all():

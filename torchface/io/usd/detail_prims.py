@@ -21,15 +21,10 @@ WRINKLE_MAPS = "wrinkleMaps"
 def write_wrinkles(
     usd: Any, stage: Any, material: str, detail: DetailMaps, stem: str
 ) -> tuple[dict[str, bytes], dict[str, Any]]:
-    """Adds maps to a material.
+    """Adds maps to a material: PNG files by name, which belong beside the layer, and what the mesh notes.
 
     Args:
-        stage: where the material is.
-        detail: of 8 bits a channel in the file.
         stem: what names of image files begin with.
-
-    Returns:
-        PNG files by name, which belong beside the layer, and what the mesh notes.
     """
     images: dict[str, bytes] = {}
 

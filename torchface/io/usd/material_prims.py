@@ -35,9 +35,6 @@ def write_materials(usd: Any, stage: Any, prim: Any, mesh: Mesh, root: str, stem
     """Binds materials to a mesh prim; parts that regions name are ``GeomSubset``s of its polygons.
 
     Args:
-        stage: where ``root`` is.
-        mesh: on the CPU.
-        root: path of the prim that gets a scope of materials.
         stem: what names of image files begin with.
 
     Returns:

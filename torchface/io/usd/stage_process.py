@@ -37,7 +37,6 @@ def extract(path: Path, limit: Callable[[int], None]) -> tuple[dict[str, Any], d
     """A USD scene as what JSON can hold, and arrays by name; see ``torchface.io.scene_processes.scene_arrays``.
 
     Args:
-        path: the root layer, or a package.
         limit: called with the bytes of all files so far, before the next is opened.
     """
     with _refusals():

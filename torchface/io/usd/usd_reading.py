@@ -56,7 +56,6 @@ def read_usd_points(path: str | Path, count: int) -> tuple[Tensor, Tensor] | Non
     """The frames of a point cache, as Audio2Face and other programs write it: points (T,V,3), millimetres, y up.
 
     Args:
-        path: a USD file in which the points of a prim have time samples.
         count: V, by which the prim is known.
 
     Returns:

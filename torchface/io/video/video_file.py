@@ -248,12 +248,7 @@ def _planes_into(frame: np.ndarray, target: np.ndarray) -> None:
 
 
 def check_even_rate(path: Path, seconds: np.ndarray, fps: float) -> None:
-    """Refuses a video of variable frame rate, where what reads it counts in frames of one length.
-
-    Args:
-        path: for the message.
-        seconds, fps: as of :func:`rate_changes`.
-    """
+    """Refuses a video of variable frame rate, where what reads it counts in frames of one length."""
     changes = rate_changes(seconds, fps)
     if changes:
         usual = float(np.median(np.diff(np.unique(seconds[np.isfinite(seconds)]))))

@@ -155,12 +155,7 @@ def open_container(path: Path) -> Iterator[tuple[InputContainer, VideoStream]]:
 
 
 def frames_beside(path: Path, codec: str, width: int, height: int, bits: int) -> int:
-    """How many frames may be decoded beside one another, at least one, within the budget of memory.
-
-    Args:
-        width, height: pixels.
-        bits: of a pixel.
-    """
+    """How many frames, at least one, of so many bits a pixel may be decoded beside one another within the memory."""
     pixels, size = width * height, path.stat().st_size
     frame = max(1, pixels * bits // 8)
     room = max(_BYTES_ALWAYS, _BYTES_PER_BYTE * size)

@@ -61,12 +61,9 @@ def vrm_expressions(document: Document) -> dict[str, tuple[MorphBind, ...]]:
 def add_expressions(
     document: Document, root: dict[str, Any], added: Mapping[str, Sequence[MorphBind]]
 ) -> tuple[str, ...]:
-    """Adds custom expressions to the JSON of a VRM, behind those that it has; which were added.
+    """Adds custom expressions behind those of a VRM's JSON, by name what each drives; which were added.
 
     An expression that the file has by the same name, in any case of letters, is kept as it is.
-
-    Args:
-        added: by name what each drives.
     """
     version = vrm_version(document)
     known = {name.lower() for name in vrm_expressions(document)}

@@ -36,9 +36,6 @@ def rotations_of_degrees(head: Sequence[float], left: Sequence[float], right: Se
     """Live Link Face's nine rotations (9,), radians, of degrees about ARKit's axes x, y, z.
 
     ARKit's y turns to the person's left, as the head's yaw does; the yaw of eyes turns to the right.
-
-    Args:
-        head, left, right: of the head and of the eyes; of eyes x and y count.
     """
     angles = [head[1], head[0], head[2], -left[1], left[0], 0.0, -right[1], right[0], 0.0]
     return torch.tensor(angles) * (math.pi / 180)

@@ -55,10 +55,7 @@ def load_weights_csv(path: str | Path) -> Take:
 def save_weights_csv(take: Take, path: str | Path) -> None:
     """Writes the weights of a take as CSV, all digits that float32 has; NaN becomes an empty cell.
 
-    Timecode and head and eye rotations, where the take has them, come with them.
-
-    Args:
-        take: weights (T,N,1). What else it holds is left out.
+    Timecode and head and eye rotations, where the take has them, come with them; what else it holds is left out.
     """
     path = Path(path)
     names, values = values_to_write(take.weights, "weights", 1, path)

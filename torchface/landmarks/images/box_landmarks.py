@@ -40,12 +40,7 @@ def refined_face(face: FaceReading, image: Tensor, appearance: AppearanceModel |
 
 @torch.no_grad()
 def appearance_landmarks(appearance: AppearanceModel, grey: Tensor, start: Tensor) -> Tensor:
-    """Landmarks (68,2) where the face looks more as the person does; the start (68,2) where it does not.
-
-    Args:
-        grey: the image, uint8 (H,W).
-        start: (68,2), pixels.
-    """
+    """Landmarks (68,2), pixels, where the face looks more as the person does; the start where it does not."""
     box = box_around(start)
     height, width = grey.shape
     low = (box[:2] - box[2:] / 2).clamp(min=0).long()

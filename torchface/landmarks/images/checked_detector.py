@@ -31,12 +31,9 @@ _SMALLEST, _BESIDE, _SAME = 6.0, 0.2, 0.3  # pixels; overlaps from which a box i
 
 
 class CheckedDetector:
-    """Faces of a detector that a landmark network takes for faces too, in the boxes round their landmarks.
+    """Faces of a detector that a landmark network too takes for faces, in the boxes round their landmarks.
 
     Each box is looked at turned upright as the detector says, then once more round what was found.
-
-    Args:
-        network: says whether they are faces; or a finder that runs its graph.
     """
 
     def __init__(self, detector: FaceDetector, network: LandmarkNetwork | CropFinder) -> None:

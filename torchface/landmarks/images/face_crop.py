@@ -45,32 +45,17 @@ def crop_transform(box: Tensor, tilt: float, size: int, margin: float = CROP_MAR
 
 
 def cut_crop(image: Tensor, transform: Tensor, size: int) -> Tensor:
-    """The square of an image that a transform shows; beyond the border the border's pixels go on.
+    """The square uint8 (3,S,S) of an image that a transform shows; beyond the border the border's pixels go on.
 
     Where the face is larger than the crop it is made smaller by averaging first, so that no pixels are skipped.
 
-    Args:
-        image: uint8 (H,W), or (3,H,W) red first.
-        transform: (2,3), see :func:`crop_transform`.
-        size: pixels a side.
-
-    Returns:
-        uint8 (3,S,S), red first; a grey image gives three alike.
+    A grey image (H,W) gives three planes alike; others are (3,H,W) red first.
     """
     return cut_crops(image, transform[None], size, size)[0]
 
 
 def cut_crops(image: Tensor, transforms: Tensor, width: int, height: int) -> Tensor:
-    """Rectangles of one image, near each other and of one scale; see :func:`cut_crop`.
-
-    Args:
-        image: uint8 (H,W), or (3,H,W) red first.
-        transforms: (N,2,3) float64.
-        width, height: pixels of the crops.
-
-    Returns:
-        uint8 (N,3,h,w), red first.
-    """
+    """Rectangles uint8 (N,3,h,w) of one image, near each other and of one scale; see :func:`cut_crop`."""
     check_image(image)
     rows, columns = image.shape[-2:]
     ways, last, low = transforms.double().numpy(), width - 0.5, height - 0.5  # NumPy is quicker on few numbers

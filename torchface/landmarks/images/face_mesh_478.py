@@ -32,14 +32,7 @@ _PAIRS = [one if isinstance(one, tuple) else (one, one) for one in (*_JAW, *_BRO
 
 
 def landmarks_of_mesh(points: Tensor) -> Tensor:
-    """iBUG's 68 landmarks of face meshes.
-
-    Args:
-        points: (...,478,D), or (...,468,D) without irises.
-
-    Returns:
-        (...,68,D).
-    """
+    """iBUG's 68 landmarks (...,68,D) of face meshes (...,478,D), or (...,468,D) without irises."""
     if points.ndim < 2 or points.shape[-2] not in (FACE_POINTS, MESH_POINTS):
         raise ShapeError(f"mesh points: found {tuple(points.shape)}, expected (...,{MESH_POINTS},D)")
     return points[..., torch.tensor(_PAIRS), :].mean(-2)

@@ -180,9 +180,6 @@ def trust_of(confidence: Tensor, visibility: Tensor) -> Tensor:
     A landmark behind a hand is a guess, however sure: below a visibility of 0.7 it does not count at all, above 0.95
     fully. Brows, nose, eyes and lips are each hidden as a whole where they are hidden in the mean: from a few points
     beside a hand a mouth would be invented.
-
-    Args:
-        confidence, visibility: of landmarks, (...,68) in [0,1].
     """
     parts = [visibility[..., group] for group in _GROUPS]
     whole = [part.minimum(part.mean(-1, keepdim=True)) for part in parts]

@@ -30,13 +30,7 @@ def find_faces(image: Tensor, detector: FaceDetector | None = None) -> FaceBoxes
 
 
 def find_some_faces(image: Tensor, number: int = 0, detector: FaceDetector | None = None) -> FaceBoxes:
-    """All faces in an image, the largest first, one of this number among them.
-
-    Args:
-        image: uint8 (H,W), or (3,H,W) red first.
-        number: of the face that must be there, from 0.
-        detector: see :func:`find_faces`.
-    """
+    """All faces in an image, the largest first, one of this number, from 0, among them; see :func:`find_faces`."""
     faces = find_faces(image, detector)
     if not 0 <= number < len(faces):
         found = "no face" if not len(faces) else f"{len(faces)} {'face' if len(faces) == 1 else 'faces'}"

@@ -51,9 +51,6 @@ def as_annotated(landmarks: Tensor) -> Tensor:
 def tilt_around(landmarks: Tensor) -> Tensor:
     """How far a face is turned in the image plane: from where eyes and mouth lie to each other.
 
-    Args:
-        landmarks: iBUG's 68, (...,68,2), pixels.
-
     Returns:
         (...,) radians, clockwise as the image is seen, 0 for an upright face; NaN where landmarks are missing.
     """
@@ -109,10 +106,9 @@ def turned_box(landmarks: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def relative_errors(found: Tensor, truth: Tensor) -> Tensor:
-    """The mean distance of each face's landmarks from the truth, over that of the outer corners of its eyes, (B,).
+    """The mean distance (B,) of landmarks (B,68,2) from the truth, over that of the outer corners of the eyes.
 
-    Args:
-        found, truth: iBUG's 68, (B,68,2), pixels; rows where one of them is NaN are left out.
+    Landmarks of NaN are left out.
     """
     if found.shape != truth.shape or truth.ndim != 3 or truth.shape[1:] != (68, 2):
         raise ShapeError(f"landmarks: found {tuple(found.shape)} and {tuple(truth.shape)}, expected (B,68,2) twice")

@@ -59,11 +59,7 @@ def flow(points: Tensor) -> Tensor:
 
 @lru_cache(maxsize=2)
 def scalp_hair(thick: float) -> GrownPart:
-    """The cap under the locks: the scalp's quads raised; it has the scalp's place on the page.
-
-    Args:
-        thick: how much of the height of cropped hair it has.
-    """
+    """The cap under the locks: the scalp's quads, and their place on the page, raised by a share of cropped hair."""
     t, flat, v = topology(), unwrapping(), mean_vertices()
     normals = vertex_normals(v, fan_triangulation(t.quads))
     bare = torch.zeros(t.count, dtype=torch.bool)

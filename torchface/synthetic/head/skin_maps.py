@@ -73,7 +73,6 @@ def skin_maps(look: Look, size: int = 2048, skin: Tensor | None = None) -> SkinM
     """The images of a person.
 
     Args:
-        size: texels of a side.
         skin: colours of skin, lips and brows in the head's layout in place of the look's, (3,size,size), such as a fit
             to photographs gives.
     """

@@ -33,19 +33,13 @@ class DepthNoise:
 def fuse(
     mesh: Mesh, eyes: Tensor, voxel: float, noise: DepthNoise, generator: torch.Generator
 ) -> tuple[Tensor, Tensor]:
-    """What viewers at ``eyes`` see of a mesh, as one new mesh; what nobody sees is a hole.
+    """What viewers at ``eyes`` (E,3) see of a mesh: vertices (V,3), faces (F,3); what nobody sees is a hole.
 
     The truncated signed distance along each viewing ray is averaged over the views in the voxels round the surface;
     its zero becomes triangles by surface nets.
 
     Args:
-        mesh: millimetres; only what can be seen from outside matters.
-        eyes: viewpoints, (E,3).
         voxel: millimetres a side.
-        noise: of each view's depth.
-
-    Returns:
-        Vertices (V,3) float64 and faces (F,3).
 
     Source: Curless and Levoy 1996; Gibson 1998 (surface nets).
     """

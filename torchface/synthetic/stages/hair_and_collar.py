@@ -25,13 +25,7 @@ class Dress:
 
 
 def dressed(head: Mesh, landmarks: Tensor, dress: Dress, generator: torch.Generator) -> Mesh:
-    """A head with hair and collar.
-
-    Args:
-        head: in the head's space (y up, z forward), fine enough to carry the lumps, with vertex colours.
-        landmarks: the 68 of iBUG, (68,3).
-        generator: of the lumps.
-    """
+    """A head with colours, fine enough to carry lumps, in its own space (y up, z forward), with hair and collar."""
     vertices = head.vertices.double()
     colors = torch.full_like(vertices, 0.7) if head.colors is None else head.colors.double()
     eyes, chin, ears = landmarks[36:48].mean(0), landmarks[8], landmarks[[0, 16]].mean(0)

@@ -147,14 +147,7 @@ def scan_head(head: Mesh, seed: int, settings: ScannerSettings | None = None) ->
 
 
 def _photographed(scan: Mesh, subject: Mesh, centre: Tensor, photography: Photography) -> Mesh:
-    """A scan with a texture and texture coordinates.
-
-    Args:
-        scan: the fused surface, in the subject's place.
-        subject: what stood before the cameras, with colours or a texture.
-        centre: of the face, (3,).
-        photography: how images are taken.
-    """
+    """A fused scan with a texture and texture coordinates, of what stood before the cameras."""
     width = round(photography.height * 0.8)
     cameras = [look_at(centre, yaw, 0.0, photography.span, width, photography.height) for yaw in _YAWS]
     texture = torch.cat([render(subject, camera, lighting=_FLASH, samples=1) for camera in cameras], dim=2)

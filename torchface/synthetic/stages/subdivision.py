@@ -65,14 +65,10 @@ def catmull_clark(
 
 
 def divided_corner_values(polygons: Tensor, corner_values: Tensor) -> Tensor:
-    """Values at the corners of the quads that a round makes of each polygon, divided linearly.
+    """Values (Q,4,E) at the corners of the quads that a round makes of each polygon, divided linearly.
 
     Args:
         polygons: (P,K) int64, padded with -1.
-        corner_values: (P,K,E).
-
-    Returns:
-        (Q,4,E), in the order of the quads.
     """
     after, before, sides, valid = _neighbouring_slots(polygons)
     corner = corner_values.masked_fill(~valid[..., None], 0.0)
@@ -84,15 +80,13 @@ def divided_corner_values(polygons: Tensor, corner_values: Tensor) -> Tensor:
 
 
 def subdivision_operator(polygons: Tensor, count: int) -> tuple[sparse.csr_array, Tensor]:
-    """What one round does to values at the vertices, as a matrix: the round is linear in them.
+    """What one round does to values at V vertices: a matrix (V',V), for the round is linear in them, and quads (Q,4).
+
+    Rows are the old vertices, then a point an edge, then a point a polygon; a quad holds an old vertex, the point of
+    the edge after it, the polygon's, that of the edge before it.
 
     Args:
         polygons: (P,K) int64, padded with -1.
-        count: how many vertices there are, V.
-
-    Returns:
-        The matrix (V',V), float64, and quads (Q,4). Rows are the old vertices, then a point an edge, then a point a
-        polygon; a quad holds an old vertex, the point of the edge after it, the polygon's, that of the edge before it.
     """
     after, before, _, valid = _neighbouring_slots(polygons)
     width = polygons.shape[1]

@@ -82,11 +82,10 @@ class Sites:
 
 
 def best_sites(points: Tensor, faces: Tensor, candidates: Tensor, moments: PathMoments) -> Sites:
-    """The best site of each marker among the points of its candidate triangles, exact and at once.
+    """The best site of each marker among the points of its candidate triangles, rows (M,Q) of ``faces``, exact.
 
     Args:
         points: affine maps of the vertices, (V,3,N+1), float64.
-        candidates: rows of ``faces``, (M,Q) int64.
 
     Source: thesis 4.1.2, algorithm 4, steps 4 and 5.
     """

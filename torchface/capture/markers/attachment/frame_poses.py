@@ -22,16 +22,11 @@ def frame_poses(paths: Tensor, target: Tensor, scale: Tensor) -> Similarity:
 def solve_frames(
     affine: Tensor, paths: Tensor, pose: Similarity, ridge: float, initial: Tensor | None
 ) -> tuple[Tensor, Similarity]:
-    """Weights of all frames; where every frame has a pose of its own, its motion together with them.
+    """Weights (T,N) of all frames; where every frame has a pose of its own, its motion together with them.
 
     Args:
         affine: of the sites, (M,3,N+1), millimetres.
         paths: markers (T,M,3), NaN for not seen.
-        pose: (1,) or (T,).
-        ridge, initial: as in ``solve_weights``.
-
-    Returns:
-        Weights (T,N) and the pose.
     """
     moved = pose.apply(paths)
     if len(pose.scale) == 1:

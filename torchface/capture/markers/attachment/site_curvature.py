@@ -54,7 +54,6 @@ class TakeCurvature:
         """At sites, pose and weights.
 
         Args:
-            fit: where they are.
             ridge: mm² a marker for a squared weight of 1.
             bounded: weights at 0 or 1 are in the active set.
         """
@@ -108,14 +107,10 @@ class TakeCurvature:
         )
 
     def step(self, precision: Tensor, gradient: Tensor) -> tuple[Tensor, Tensor]:
-        """One Newton step of everything, with a quadratic prior on sites and pose.
+        """A Newton step of sites and pose (2M+G,), with a quadratic prior on them, and the change of the weights (T,N).
 
         Args:
             precision: of the prior, (2M+G,), mm² a squared unit.
-            gradient: of the prior, (2M+G,).
-
-        Returns:
-            Steps of sites and pose, (2M+G,), and the change of the weights, (T,N).
         """
         step = torch.linalg.solve(self.information + torch.diag(precision), self.gradient + gradient)
         return step, torch.cholesky_solve((self.weight_gradient - self.cross @ step)[..., None], self.factor)[..., 0]

@@ -243,11 +243,10 @@ class SiteSearch:
         return self.rows[found.reshape(len(points), count)]
 
     def similar_motion(self, lifted: Tensor, points: Tensor, moments: PathMoments) -> Tensor:
-        """Of the faces round points (M,3) those whose middle moves most like the marker, (M,Q): across the lips, say.
+        """Of the faces round sites at rest (M,3) those, (M,Q), whose middle moves most like the marker.
 
         Args:
             lifted: affine maps of the vertices, (V,3,N+1).
-            points: the sites at rest.
         """
         around = self.near(points, _NEIGHBOURHOOD)
         used, row = around.unique(return_inverse=True)

@@ -91,10 +91,6 @@ def site_uncertainty(fit: SitesOnTake, seconds: float, names: Sequence[str], lab
     reaches bounds too. T counts frames a tenth of a second apart, and fewer where markers keep an offset from their
     sites, which more frames would not average out. The fit's ridge
     pulls all weights to zero; how far levels move in one Newton step without it is added in quadrature.
-
-    Args:
-        fit: sites, pose and weights, spread over the take.
-        seconds: how long the take is.
     """
     affine, moved, weights = fit.affine, fit.moved, fit.weights
     residual = moved - torch.einsum("mcn,tn->tmc", affine[..., 1:], weights) - affine[..., 0]

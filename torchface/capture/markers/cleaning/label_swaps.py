@@ -33,14 +33,11 @@ class Swap:
 
 
 def find_swaps(seen: Tensor, prediction: Prediction, fps: float) -> list[Swap]:
-    """Stretches in which two markers are each at the other's expected place.
+    """Stretches in which two of the markers (T,M,3), in rig space, are each at the other's expected place.
 
     An outlier that is nearer to another marker's expected place than to any other, within that one's limit,
     votes for an exchange of the two, unless the other marker is an inlier in that frame. Votes of a pair
     in consecutive frames make a stretch; a stretch counts with votes of both markers, or three of one.
-
-    Args:
-        seen: markers in rig space, (T,M,3), NaN for not seen.
     """
     outlier = prediction.outliers
     inlier = ~torch.isnan(prediction.distance) & ~outlier
@@ -59,15 +56,12 @@ def find_swaps(seen: Tensor, prediction: Prediction, fps: float) -> list[Swap]:
 
 
 def find_swaps_by_shape(markers: Tensor, fps: float) -> list[Swap]:
-    """Stretches in which two markers are each at the other's place in the take's own median shape, without a rig.
+    """Stretches in which two of the markers (T,M,3) are each at the other's place in their own median shape.
 
     Two labels are in the wrong order in a frame where :math:`(y_a - y_b) \\cdot (e_a - e_b) < 0`, with markers y moved
     rigidly onto their medians e: an expression bends the face, but does not turn two markers about one another. In such
     a frame the pair that is most in the wrong order is exchanged, then the next. It holds for any share of frames below
     half.
-
-    Args:
-        markers: (T,M,3), NaN for not seen.
     """
     median = _centres(markers)
     seen = ~torch.isnan(markers).any(-1)
@@ -115,13 +109,10 @@ def find_swaps_by_shape(markers: Tensor, fps: float) -> list[Swap]:
 
 
 def whole_take_exchanges(seen: Tensor, prediction: Prediction) -> list[tuple[int, ...]]:
-    """Cycles of markers that stand at one another's expected place in most frames.
+    """Cycles of the markers (T,M,3), in rig space, that stand at one another's expected place in most frames.
 
     Each marker of a cycle is an outlier in its median frame, and nearest to the expected place of the next one: within
     that one's limit, or a quarter of its distance from its own place, as weights that the exchange bent predict.
-
-    Args:
-        seen: markers in rig space, (T,M,3), NaN for not seen.
     """
     own = prediction.distance.nanmedian(0).values
     out = (own > prediction.limit).nonzero()[:, 0]

@@ -22,12 +22,7 @@ _SIDE, _DENSE = 1024, 0.6
 
 
 def painted_lashes(mesh: Mesh, triangles: Tensor, material: PartMaterial) -> Paint:
-    """Hairs for lashes whose cards each begin at a lid.
-
-    Args:
-        triangles: rows of its faces that are lashes, (K,).
-        material: whose colour they have.
-    """
+    """Hairs of a material's colour for lashes, rows (K,) of the faces, whose cards each begin at a lid."""
     faces = mesh.faces[triangles]
     ids, local = faces.unique(return_inverse=True)
     card = components(local.reshape(-1, 3), len(ids))
@@ -98,10 +93,6 @@ def surfaces(mesh: Mesh, has_image: bool) -> list[Surface]:
 
     A part has the mesh's texture where texels are its own. Texture coordinates beyond the unit square name other
     images (UDIM), which a mesh does not have, and charts that lie on those of another part's have lost theirs.
-
-    Args:
-        mesh: V vertices.
-        has_image: there is an image in its layout: a texture, or normal maps.
     """
     groups = _groups(mesh)
     if len(groups) == 1 and groups[0][0] is SKIN:

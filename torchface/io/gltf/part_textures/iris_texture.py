@@ -34,20 +34,12 @@ def stands_alone(faces: Tensor, inside: Tensor) -> bool:
 
 
 def eye_centre(mesh: Mesh, triangles: Tensor) -> Tensor:
-    """The point (3,) about which an eyeball rotates: the centre of the sphere that most of its outer shell lies on.
-
-    Args:
-        triangles: rows of its faces that are the eyeball, (K,).
-    """
+    """The point (3,) about which an eyeball, rows (K,) of the faces, rotates: the centre of most of its outer shell."""
     return _sphere(_shells(mesh, triangles)[0].unique(), mesh)[0]
 
 
 def painted_eye(mesh: Mesh, triangles: Tensor) -> list[tuple[Tensor, PartMaterial, Paint | None]]:
-    """The layers of an eyeball that looks along z, or where its pupil is: rows of the faces, material, paint of each.
-
-    Args:
-        triangles: rows of its faces that are the eyeball, (K,).
-    """
+    """The layers of an eyeball that looks along z, or where its pupil is: rows of faces, material, paint of each."""
     outer, inner = _shells(mesh, triangles)
     centre, radius = _sphere(outer.unique(), mesh)
     points = mesh.vertices.detach().double() - centre
@@ -181,14 +173,10 @@ class Paint:
 
 
 def painted(mesh: Mesh, rows: Tensor, values: Tensor, color: Callable[[Tensor], Tensor], side: int = _SIDE) -> Paint:
-    """Colours by values at the vertices, as an image where one tile holds the part's texture coordinates.
+    """Colours by values (V,C) at the vertices of triangles (K,), as an image where one tile holds their layout.
 
     Args:
-        mesh: V vertices.
-        rows: the part's triangles, (K,).
-        values: of the vertices, (V,C).
         color: sRGB and opacity (N,4) of values (N,C).
-        side: texels a side of the image.
     """
     if mesh.uvs is None or mesh.uv_faces is None:
         return Paint(None, color(values).float())

@@ -31,9 +31,6 @@ class AppearanceLevel(nn.Module):
     coefficients are computed once, and a step costs as much as sampling does.
 
     Args:
-        places: N.
-        channels: C, of the features.
-        modes: K, of the texture.
         motions: Q, shape modes and the similarity's four.
 
     Source: Tzimiropoulos and Pantic 2013; thesis 4.2.2.
@@ -82,10 +79,7 @@ class AppearanceLevel(nn.Module):
     def step(self, residual: TextureResidual, state: Tensor, precision: Tensor, terms: Tensor) -> Tensor:
         """By how much the template should move, (B,Q).
 
-        Args:
-            state: the current shape along the motions (B,Q), 0 for the similarity's.
-            precision: of the shape along each, (Q,), 0 for the similarity's.
-            terms: of :meth:`curvature_terms`.
+        State (B,Q) and the shape's precision (Q,) are 0 for the similarity's motions.
         """
         mixed = _with_one(residual.coefficients)
         slope = (mixed @ self.slope.flatten(1)).unflatten(1, self.slope.shape[1:])

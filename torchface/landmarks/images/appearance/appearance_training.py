@@ -122,13 +122,10 @@ def _learn_textures(model: AppearanceModel, level: AppearanceLevel, textures: Te
 
 
 def left_out_residual(gram: Tensor) -> Tensor:
-    r"""What the span of all others leaves of each sample, squared and summed over the samples.
+    r"""What the span of all others leaves of each centred sample, squared and summed; of their Gram matrix (M,M).
 
     For the affine span of the others the residual's square is :math:`1 / (K^{-1})_{ii}` of the Gram matrix bordered
     with ones.
-
-    Args:
-        gram: of centred samples, (M,M).
     """
     count = len(gram)
     bordered = gram.new_ones(count + 1, count + 1)

@@ -24,7 +24,6 @@ def with_forehead(landmarks: Tensor, jaw_margin: float = 0.0) -> Tensor:
     Brows lie on the border of the 68; without skin above them their upper edge cannot be found.
 
     Args:
-        landmarks: (B,68,2).
         jaw_margin: by how much of its distance from the nose the jaw line is moved outward.
     """
     eyes = torch.stack([landmarks[:, 36:42].mean(1), landmarks[:, 42:48].mean(1)], dim=1)

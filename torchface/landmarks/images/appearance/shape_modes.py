@@ -39,13 +39,9 @@ class ShapeModes(NamedTuple):
 
 
 def planar_pose(mean: Tensor, shapes: Tensor) -> PlanarPose:
-    r"""The similarity that moves a centred shape onto each of others with least squared error.
+    r"""The similarity that moves a centred shape (L,2) onto each of others (B,L,2) with least squared error.
 
     .. math:: a = \frac{\sum_i \bar z_i w_i}{\sum_i |z_i|^2}, \quad t = \frac1L \sum_i w_i
-
-    Args:
-        mean: (L,2), centred.
-        shapes: (B,L,2).
 
     Source: Cootes et al. 1995.
     """

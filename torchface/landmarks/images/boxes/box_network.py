@@ -204,11 +204,10 @@ def _said_faces(maps: FaceMaps) -> Tensor:
 
 
 def face_geometry(faces: Tensor, cells: Tensor) -> Tensor:
-    """What maps are to say of faces in cells: the geometry of :class:`FaceMaps`, (...,5).
+    """What maps say of faces (...,4) in cells, column and row (...,2): the geometry (...,5) of :class:`FaceMaps`.
 
     Args:
         faces: x and y of the centre, side, pixels, and roll angle, radians, (...,4).
-        cells: column and row, (...,2).
     """
     middle = (faces[..., :2] + 0.5) / STRIDE - 0.5 - cells
     side = (faces[..., 2:3] / TYPICAL_SIDE).log()

@@ -149,9 +149,7 @@ def box_loss(maps: FaceMaps, faces: Tensor, uncertain: Tensor) -> Tensor:
     Cells of uncertain faces count neither way.
 
     Args:
-        maps: of B images.
         faces: centre, side, roll angle, (B,F,4), NaN for none.
-        uncertain: (B,F).
 
     Source: Law and Deng 2018; Zhou, Wang, Krähenbühl 2019.
     """

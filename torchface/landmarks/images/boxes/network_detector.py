@@ -64,11 +64,7 @@ class NetworkDetector:
 
 
 def graph_boxes(content: bytes) -> Callable[[Tensor], Tensor]:
-    """A network of face boxes as its graph, in ONNX Runtime on one thread: a sixth of PyTorch's time on a CPU.
-
-    Args:
-        content: what ``torchface.onnx.network_graphs.network_model`` exports.
-    """
+    """A network of face boxes as its graph, in ONNX Runtime on one thread: a sixth of PyTorch's time on a CPU."""
     session = graph_session(content)
 
     def network(pictures: Tensor) -> Tensor:

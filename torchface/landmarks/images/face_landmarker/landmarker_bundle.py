@@ -30,11 +30,7 @@ _NETWORKS = {
 
 
 class LiteNetwork:
-    """One TensorFlow Lite network of float32 tensors.
-
-    Args:
-        given, wanted: shapes of the input and of outputs.
-    """
+    """One TensorFlow Lite network of float32 tensors, with the shapes of its input and outputs."""
 
     def __init__(self, content: bytes, name: str, given: tuple[int, ...], wanted: tuple[tuple[int, ...], ...]) -> None:
         interpreter = _interpreter(content, name)

@@ -86,11 +86,7 @@ class MeshFace:
 
 
 class FaceLandmarker:
-    """The networks of a bundle on squares and pictures.
-
-    Args:
-        bundle: the networks, or the file that holds them.
-    """
+    """The networks of a bundle, given or read from a file, on squares and pictures."""
 
     def __init__(self, bundle: LandmarkerBundle | str | Path) -> None:
         self.bundle = bundle if isinstance(bundle, LandmarkerBundle) else load_bundle(bundle)
@@ -137,9 +133,6 @@ class MediaPipeFinder:
     """Finds landmarks, irises and blendshapes in a box, by a Face Landmarker bundle.
 
     It gives no deviation and no visibility of its own: every landmark has the confidence 0.8 and is visible.
-
-    Args:
-        bundle: the networks, or the file that holds them.
     """
 
     def __init__(self, bundle: LandmarkerBundle | str | Path, name: str = "mediapipe") -> None:
@@ -157,11 +150,7 @@ class MediaPipeFinder:
 
 
 class MediaPipeTracker:
-    """Follows one face as Face Landmarker does: in the square round its last points, by the box network where lost.
-
-    Args:
-        bundle: the networks, or the file that holds them.
-    """
+    """Follows one face as Face Landmarker does: in the square round its last points, by the box network where lost."""
 
     def __init__(self, bundle: LandmarkerBundle | str | Path) -> None:
         self.landmarker = FaceLandmarker(bundle)
@@ -180,11 +169,7 @@ class MediaPipeTracker:
 
 
 class MediaPipeDetector:
-    """Finds faces by a Face Landmarker bundle's box network, which is made for faces near the camera.
-
-    Args:
-        bundle: the networks, or the file that holds them.
-    """
+    """Finds faces by a Face Landmarker bundle's box network, which is made for faces near the camera."""
 
     def __init__(self, bundle: LandmarkerBundle | str | Path) -> None:
         self.landmarker = FaceLandmarker(bundle)
@@ -215,9 +200,7 @@ def reading_of(face: MeshFace, weights: Tensor) -> FaceReading:
 def measured_expression(weights: Tensor) -> tuple[Tensor, Tensor]:
     """The network's weights (...,52) without what it takes off and adds, and their deviations (52,).
 
-    Returns:
-        Weights that differ from the true ones by noise alone, NaN for those that the network does not see; and the
-        noise's deviation, infinite for these.
+    They differ from the true ones by noise alone; those that the network does not see are NaN, of infinite deviation.
     """
     parts = [_MEASURED.get(name.removesuffix("Left").removesuffix("Right"), _MEASURED.get(name)) for name in ARKIT]
     slope, offset, spread = torch.tensor([part or (torch.nan, 0.0, torch.inf) for part in parts]).T

@@ -51,14 +51,7 @@ def decoded(regressors: np.ndarray, logits: np.ndarray, least: float) -> tuple[T
 
 
 def merged(boxes: Tensor, points: Tensor, scores: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """One box a face: the mean of those that overlap its best one, weighted by score.
-
-    Args:
-        boxes, points, scores: see :func:`decoded`; best first.
-
-    Returns:
-        The same of each face; scores are the best ones'.
-    """
+    """One box a face: the mean of those that overlap its best one, weighted by score; all as of :func:`decoded`."""
     left, kept = torch.arange(len(boxes)), []
     while len(left):  # the best box decides which are of its face
         best = left[0]

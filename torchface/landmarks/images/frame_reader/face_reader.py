@@ -80,9 +80,6 @@ class FaceReader(nn.Module):
     A face is looked for in the square round where it was in the picture before, turned as it was and as it lay to the
     landmarks when it was found: one that moved far is looked at once more. Without one the box network looks for it.
     Tensor operations alone: it is exported as it is.
-
-    Args:
-        settings: when a face counts as found and as lost.
     """
 
     def __init__(self, networks: WebcamNetworks, settings: ReaderSettings | None = None) -> None:
@@ -205,14 +202,9 @@ def _either(
 
 
 def read_eyes(image: Tensor, face: FaceReading, network: EyeNetwork) -> FaceReading:
-    """A face with its eyes, and its lids where both networks together put them.
+    """A face with its eyes, of which the network is shown the left in a mirror, and lids where both networks put them.
 
-    Args:
-        image: uint8 (H,W,C), red first.
-        network: is shown both eyes, the left in a mirror.
-
-    Returns:
-        Eyes that are too small have irises and openness of NaN and a visibility of 0.
+    Eyes that are too small have irises and openness of NaN and a visibility of 0.
     """
     width, height = network.width, network.height
     back = picture_transforms(eye_transforms(face.landmarks, width, height))

@@ -18,18 +18,13 @@ def picture_size(image: Tensor) -> Tensor:
 
 
 def sampled(image: Tensor, points: Tensor, spacing: Tensor, beyond: Tensor) -> Tensor:
-    """A picture's colours at points between its pixels; beyond the border the border's pixels go on.
+    """A picture's colours (3,P) in [0,1] at points between its pixels; beyond the border the border's pixels go on.
 
     Where the points are further apart than pixels, whole pixels are averaged first, so that none are skipped.
 
     Args:
-        image: uint8 (H,W,C), red first; a fourth channel counts for nothing.
-        points: (P,2), pixels, finite.
         spacing: from one point to the next, () pixels.
         beyond: how far what is averaged goes on beyond the points, () pixels.
-
-    Returns:
-        (3,P) in [0,1].
     """
     last = picture_size(image) - 1
     low = (points.amin(0) - beyond).clamp(min=0).minimum(last).floor()
@@ -59,18 +54,12 @@ def whole_numbers(values: Tensor) -> list[int]:
 
 
 def cut_square(image: Tensor, place: Tensor, size: int, margin: float) -> Tensor:
-    """The square of a picture round a face, upright, as a network takes it.
+    """The square (1,3,S,S) in [0,1] of a picture uint8 (H,W,C) round a face (5,), upright, as a network takes it.
 
     It shows what :func:`~torchface.landmarks.images.face_crop.cut_crop` does.
 
     Args:
-        image: uint8 (H,W,C), red first.
-        place: of the face (5,), see ``face_place``.
-        size: pixels a side of the copy, S.
         margin: side of the square, of the place's.
-
-    Returns:
-        (1,3,S,S) in [0,1].
     """
     spacing = place[2] * (margin / size)
     points = torch.addmm(place[:2], crop_grid(size, size), spacing * axes(place))
@@ -93,10 +82,6 @@ def whole_picture(image: Tensor, longest: int) -> tuple[Tensor, Tensor]:
     """A picture made smaller until its longer side has so many pixels, its sides multiples of 32.
 
     Halved before by interpolation where it is more than twice as large, so that few pixels are skipped.
-
-    Args:
-        image: uint8 (H,W,C), red first.
-        longest: pixels of the longer side.
 
     Returns:
         (1,3,h,w) in [0,1], the last rows and columns repeated; and what to multiply its pixels by, (2,), x and y.

@@ -21,10 +21,7 @@ class AnsweringProcess:
     """A process whose requests go in at its standard input and whose answers come out at its standard output.
 
     Args:
-        name: what it is, for messages.
         error: what is raised where it fails.
-        environment: of the process; this one's if absent.
-        folder: where it runs; this one's if absent.
     """
 
     def __init__(

@@ -40,10 +40,6 @@ class DenseHead(nn.Module):
     features under all landmarks and points, the deepest features on a grid in the face's frame, and their mean. Weights
     are read off h and off where points were found.
 
-    Args:
-        points: P.
-        hidden: units of h.
-
     Source: Wood et al. 2022 (many points with a deviation each, from rendered pictures).
     """
 
@@ -76,14 +72,8 @@ class DenseHead(nn.Module):
         nn.init.constant_(cast(nn.Linear, self.sure[1]).bias, -2.0)  # a seventh of the face's size
 
     def forward(self, landmarks: Tensor, under: Tensor, features: Tensor, deep: Tensor, size: int) -> DenseReading:
-        """What is read.
-
-        Args:
-            landmarks: iBUG's 68, (B,68,2) pixels of the crop.
-            under: features under each, (B,68,C).
-            features: (B,C,h,w).
-            deep: the deepest features, (B,D,h',w').
-            size: pixels a side of the crop.
+        """What is read of landmarks (B,68,2), crop's pixels, features under them (B,68,C), all features and the
+        deepest.
         """
         middle, axes = face_frame(landmarks)
         own = in_face_frame(landmarks, landmarks).flatten(1)

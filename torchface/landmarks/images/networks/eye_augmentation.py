@@ -63,15 +63,7 @@ def augmented_eyes(
     generator: torch.Generator,
     settings: EyeAugmentation | None = None,
 ) -> EyeCrops:
-    """Draws a crop of one eye of each picture.
-
-    Args:
-        rgba: cut-out pictures of both eyes, uint8 (B,4,H,W).
-        labels: of the B pictures.
-        eyes: which eye, (B,): 0 is the right one.
-        width, height: of crops, pixels.
-        settings: how widely.
-    """
+    """Draws a crop of one eye, 0 for the right one, of each cut-out picture uint8 (B,4,H,W)."""
     from kornia.geometry.transform import warp_affine  # loaded here: it takes half a second
 
     settings = settings or EyeAugmentation()

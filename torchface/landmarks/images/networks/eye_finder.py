@@ -61,10 +61,6 @@ class EyeFinder:
         """The face with its eyes, and landmarks 36 to 47 where both networks together put them.
 
         A face that is not there, or too small for its eyes to be seen, comes back as it is.
-
-        Args:
-            image: uint8 (H,W), or (3,H,W) red first.
-            face: landmarks, deviation, visibility and presence are read.
         """
         transforms = eye_transforms(face.landmarks.double(), self.width, self.height)
         scale = math.hypot(*transforms[0, 0, :2].tolist())  # NaN where there is no face
@@ -130,11 +126,7 @@ def _ordered(lids: Tensor) -> Tensor:
 
 
 def graph_eye_finder(content: bytes) -> EyeFinder:
-    """The finder of an eye network's graph, in ONNX Runtime on one thread.
-
-    Args:
-        content: what ``torchface.onnx.network_graphs.network_model`` exports.
-    """
+    """The finder of an eye network's graph, in ONNX Runtime on one thread."""
     session = graph_session(content)
     _, _, height, width = session.get_inputs()[0].shape
 

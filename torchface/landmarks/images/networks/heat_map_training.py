@@ -14,13 +14,7 @@ from torchface.optim import DescentSettings
 
 
 def check_pictures(pictures: Dataset[tuple[Tensor, ...]], expected: str, *shapes: tuple[int, ...]) -> None:
-    """Refuses a data set that is empty, or whose first picture or labels have another shape.
-
-    Args:
-        pictures: gives tuples of uint8 (B,4,H,W) and labels for numbers (B,).
-        expected: the form of its tuples, for the message.
-        shapes: of one picture's labels.
-    """
+    """Refuses a data set that is empty, or whose first picture (4,H,W) or labels have other shapes than expected."""
     count: int = len(pictures)  # type: ignore[arg-type]  # data sets by number have a length
     rgba, *labels = pictures[torch.arange(min(count, 1))]
     forms = [tuple(one.shape[1:]) for one in labels]
@@ -60,24 +54,18 @@ def point_loss(points: Tensor, truth: Tensor, deviation: Tensor | None, weight: 
 
 
 def deviation_loss(distance: Tensor, deviation: Tensor, weight: Tensor) -> Tensor:
-    r"""The Gaussian negative log likelihood :math:`\tfrac{r^2}{2 \sigma^2} + 2 \ln \sigma` of stated deviations alone.
+    r"""The negative log likelihood :math:`\tfrac{r^2}{2 \sigma^2} + 2 \ln \sigma` of stated deviations (B,L), pixels.
 
-    Args:
-        distance: r, (B,L) pixels; nothing is learned through it.
-        deviation: :math:`\sigma` of a coordinate, (B,L) pixels.
-        weight: (B,L).
+    Nothing is learned through the distances r.
     """
     likelihood = 0.5 * (distance.detach() / deviation).square() + 2 * deviation.log()
     return (likelihood * weight).sum() / weight.sum().clamp(min=1)
 
 
 def gap_loss(points: Tensor, truth: Tensor, weight: Tensor, pairs: Tensor, steepness: float) -> Tensor:
-    """The loss of the vectors between pairs of points, such as between upper and lower lid.
+    """The loss of the vectors between pairs (P,2) of points (B,L,2), such as between upper and lower lid.
 
     Args:
-        points, truth: (B,L,2) pixels.
-        weight: of points, (B,L).
-        pairs: (P,2) int64.
         steepness: how much steeper it is near the truth than far away.
     """
     first, second = pairs.to(points.device).unbind(1)
@@ -88,12 +76,9 @@ def gap_loss(points: Tensor, truth: Tensor, weight: Tensor, pairs: Tensor, steep
 
 
 def heat_loss(heat: Tensor, truth: Tensor, weight: Tensor, stride: int, spread: float) -> Tensor:
-    """The weighted mean cross entropy of heat maps with a Gaussian about the truth.
+    """The weighted mean cross entropy of heat maps (B,L,h,w) with a Gaussian about the truth (B,L,2), crop's pixels.
 
     Args:
-        heat: (B,L,h,w).
-        truth: (B,L,2) pixels of the crop.
-        weight: (B,L).
         stride: pixels of the crop a side of a cell.
         spread: the Gaussian's standard deviation, cells.
     """

@@ -33,11 +33,7 @@ def doubled(x: Tensor) -> Tensor:
 
 
 def cell_places(heat: Tensor, stride: int) -> Tensor:
-    """Where the cells of heat maps (B,L,h,w) lie in the crop, (h*w,2) pixels.
-
-    Args:
-        stride: pixels of the crop a side of a cell.
-    """
+    """Where the cells of heat maps (B,L,h,w), ``stride`` pixels a side, lie in the crop, (h*w,2) pixels."""
     y, x = ((torch.arange(side).to(heat) + 0.5) * stride - 0.5 for side in heat.shape[2:])
     return torch.stack(torch.meshgrid(x, y, indexing="xy"), dim=-1).reshape(-1, 2)
 
@@ -51,12 +47,9 @@ class HeatReading(NamedTuple):
 
 
 def read_heat(heat: Tensor, features: Tensor, stride: int) -> HeatReading:
-    r"""Points as means of heat maps, :math:`x_l = \sum_p \mathrm{softmax}(h_l)_p \, p`.
+    r"""Points as means of heat maps (B,L,h,w), :math:`x_l = \sum_p \mathrm{softmax}(h_l)_p \, p`.
 
-    Args:
-        heat: (B,L,h,w).
-        features: of the same cells, (B,C,h,w).
-        stride: pixels of the crop a side of a cell.
+    Features (B,C,h,w) are of the same cells.
 
     Source: Sun et al. 2018.
     """

@@ -152,13 +152,7 @@ def cropped(
     generator: torch.Generator,
     settings: AugmentationSettings,
 ) -> tuple[Crops, Tensor]:
-    """Crops of pictures as a data set gives them, and the weights (B,52) that they show; (B,0) without points.
-
-    Args:
-        pictures: see :meth:`LandmarkNetwork.fit`.
-        mirrored: a network's ``mirror``, (P,).
-        settings: how widely crops are drawn.
-    """
+    """Crops of pictures as a data set gives them, and the weights (B,52) that they show; (B,0) without points."""
     rgba, landmarks, visible, *more = pictures
     if not len(mirrored):
         return augmented(rgba, landmarks, visible, size, margin, generator, settings), landmarks[:, :0, 0]
@@ -209,7 +203,6 @@ def openings(points: Tensor, face: Tensor) -> Tensor:
     """How far a face is open, (B,7) of its size: right and left lids, lips inside and outside, mouth's width, brows.
 
     Args:
-        points: iBUG's 68, (B,68,2).
         face: the landmarks whose size counts, (B,68,2).
     """
     size = (face - face.mean(1, keepdim=True)).square().sum(-1).mean(1).clamp(min=1e-4).sqrt()
@@ -223,10 +216,6 @@ def opening_loss(points: Tensor, truth: Tensor, weight: Tensor) -> Tensor:
 
     What is uncertain is drawn toward its mean where distances alone are learned: so the slope of what is read over
     what is true, in each batch, is to be 1.
-
-    Args:
-        points, truth: iBUG's 68, (B,68,2) pixels.
-        weight: of points, (B,68).
     """
     read, true = openings(points, truth), openings(truth, truth)
     both = weight[:, _PAIRS].amin(-1)
@@ -245,10 +234,6 @@ def opening_loss(points: Tensor, truth: Tensor, weight: Tensor) -> Tensor:
 def weight_loss(dense: DenseReading, weights: Tensor, present: Tensor) -> Tensor:
     r"""The Gaussian negative log likelihood of weights, each times its deviation, so that what is uncertain is learned
     too.
-
-    Args:
-        weights: the truth, (B,52).
-        present: whether a face is there, (B,).
 
     Source: Seitzer et al. 2022 (half of the deviation's square as weight).
     """

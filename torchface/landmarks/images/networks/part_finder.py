@@ -48,12 +48,7 @@ class PartFinder:
 
     @torch.no_grad()
     def __call__(self, image: Tensor, landmarks: Tensor) -> FaceParts:
-        """The parts of the face with these landmarks.
-
-        Args:
-            image: uint8 (H,W), or (3,H,W) red first.
-            landmarks: iBUG's 68, (68,2) pixels; NaN for missing.
-        """
+        """The parts of the face with these landmarks, (68,2) pixels; NaN for missing."""
         known = landmarks.float()
         known = torch.where(known.isfinite(), known, known[known.isfinite().all(-1)].mean(0))
         box, tilt = turned_box(known)
@@ -64,10 +59,6 @@ class PartFinder:
 
 
 def graph_part_finder(content: bytes) -> PartFinder:
-    """The finder of a part network's graph, in ONNX Runtime on one thread.
-
-    Args:
-        content: what ``torchface.onnx.network_graphs.network_model`` exports.
-    """
+    """The finder of a part network's graph, in ONNX Runtime on one thread."""
     session = graph_session(content)
     return PartFinder(lambda crops: torch.from_numpy(session.run(["shares"], {"faces": crops.contiguous().numpy()})[0]))

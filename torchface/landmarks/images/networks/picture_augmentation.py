@@ -238,12 +238,7 @@ def _hair(picture: np.ndarray, uniform: Uniform) -> None:
 
 
 def with_light(images: Tensor, generator: torch.Generator, grey_share: float = 0.15) -> Tensor:
-    """Images (B,3,H,W) brighter, darker, of more or less contrast and colour, as lights and cameras differ.
-
-    Args:
-        images: in [0,1].
-        grey_share: of images without colour.
-    """
+    """Images (B,3,H,W) of other brightness, contrast and colour, as lights and cameras differ; a share is grey."""
     # Loaded here, as below: kornia takes half a second, and what finds faces never blurs.
     from kornia.color import rgb_to_grayscale
 
@@ -263,12 +258,7 @@ def with_light(images: Tensor, generator: torch.Generator, grey_share: float = 0
 
 
 def with_blur(images: Tensor, generator: torch.Generator, share: float, widest: float) -> Tensor:
-    """Images (B,3,H,W) of which a share is out of focus, and an eighth moves.
-
-    Args:
-        images: in [0,1]; changed in place.
-        widest: standard deviation of their blur beyond 0.3, pixels, at most.
-    """
+    """Images (B,3,H,W), changed in place, of which a share is out of focus, and an eighth moves."""
     from kornia.filters import gaussian_blur2d, motion_blur
 
     count = len(images)

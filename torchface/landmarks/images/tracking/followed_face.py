@@ -94,14 +94,9 @@ class FollowedFace:
 
 
 def face_look(image: Tensor, place: Tensor) -> Tensor:
-    """A face's colours, upright and small, about their mean: enough to distinguish two people of one video.
+    """A face's colours, small and upright, about their mean, (1200,) of unit length: they distinguish people.
 
-    Args:
-        image: uint8 (H,W), or (3,H,W) red first.
-        place: its upright box and its tilt, (5,).
-
-    Returns:
-        (1200,) float32 of unit length; the product of two is their correlation.
+    The product of two is their correlation. The place (5,) is an upright box and its tilt.
     """
     crop = cut_crop(image, crop_transform(place[:4], float(place[4]), _SIZE, _MARGIN), _SIZE).float()
     # The mean of all colours goes, not that of each: how red a face is beside how blue differs between people.

@@ -67,18 +67,15 @@ class Consensus(NamedTuple):
 def consensus(
     trees: LandmarkTrees, image: Tensor, box: Tensor, tilt: float = 0.0, settings: ConsensusSettings | None = None
 ) -> Consensus:
-    r"""Landmarks of one face, the robust mean over several starts.
+    r"""Landmarks of one face in a grey image, uint8 (H,W), the robust mean over several starts.
 
     The face is cut out and brought to one size first, so that large images cost no more than small ones and no
     pixels are skipped. A start k counts for landmark l with the weight :math:`1 / (1 + (d_{kl} / d_0)^2)`,
     :math:`d_{kl}` its distance from the starts' median.
 
     Args:
-        trees: find iBUG's 68.
-        image: grey, uint8 (H,W).
         box: x, y, width, height of the face, (4,) pixels; it may reach out of the image.
         tilt: of the face, radians, clockwise as the image is seen.
-        settings: from where the trees start.
     """
     settings = settings or ConsensusSettings()
     if image.ndim != 2 or image.dtype != torch.uint8:

@@ -34,10 +34,6 @@ def dense_surface(coarse: Mesh, vertices: int) -> DenseSurface:
     Every dense vertex is a vertex of the whole last round. Quads that are not divided keep the middles of edges that
     their neighbours have, so the surface has no cracks.
 
-    Args:
-        coarse: with 68 landmarks.
-        vertices: how many to come near to.
-
     Source: Catmull and Clark 1978.
     """
     polygons = coarse.faces if coarse.polygons is None else coarse.polygons

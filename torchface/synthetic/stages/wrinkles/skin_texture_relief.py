@@ -24,10 +24,6 @@ def pore_heights(neutral: Mesh, seed: int) -> Tensor:
 
     A function of the place alone, so the skin is the same for every density of a mesh: a denser one shows more of it.
 
-    Args:
-        neutral: a dense mesh.
-        seed: of where the cells lie.
-
     Source: Worley 1996, A Cellular Texture Basis Function.
     """
     places = neutral.vertices.double().numpy()

@@ -29,12 +29,7 @@ class WrinkleLine:
 
 
 def wrinkle_lines(neutral: Mesh, seed: int) -> list[WrinkleLine]:
-    """All the lines of a face.
-
-    Args:
-        neutral: a dense face with 68 landmarks, y up, z toward the viewer.
-        seed: of spacing, length, course and depth; left and right differ.
-    """
+    """All the lines of a dense face, y up, z toward the viewer; left and right differ."""
     chart = _Chart(neutral)
     marks = chart.flat(neutral.vertices[neutral.landmarks].double())
     lines = (chart.lay(stroke) for stroke in wrinkle_strokes(marks, seed))

@@ -28,12 +28,7 @@ class Stroke:
 
 
 def wrinkle_strokes(marks: Tensor, seed: int) -> list[Stroke]:
-    """All the strokes of a face.
-
-    Args:
-        marks: the 68 landmarks, millimetres round the face and up, (68,2).
-        seed: of spacing, length, course and depth; left and right differ.
-    """
+    """All the strokes of a face, by its 68 landmarks (68,2), millimetres round the face and up."""
     draw = _Draw(torch.Generator().manual_seed(seed))
     scale = float((marks[42:48].mean(0) - marks[36:42].mean(0)).norm()) / _INTEROCULAR
     strokes = [

@@ -236,9 +236,6 @@ def performer_face(identity: Tensor | None = None) -> BlendshapeRig:
     """Skin from the neck to the crown and before the ears, with 68 landmarks and regions.
 
     Eyes and the inside of the mouth are left out: lids and lips are borders, as in a captured mesh.
-
-    Args:
-        identity: see ``performer``.
     """
     head = performer(identity, texture=False)
     face = head.part(captured_skin(head))
