@@ -24,10 +24,6 @@ class CorrectiveActivation(nn.Module):
 
     for a combination of the drivers :math:`D_c`, and for an in-between with its peak :math:`p` between its neighbours
     :math:`l` and :math:`r`.
-
-    Args:
-        definitions: C correctives.
-        names: of the N shapes.
     """
 
     drivers: Tensor
@@ -106,7 +102,6 @@ class CorrectiveActivation(nn.Module):
         r"""The product :math:`(\partial a / \partial w)^\top Z` (B,N,K), by its few numbers that are not zero.
 
         Args:
-            derivative: (B,C,K), as :meth:`derivative` gives it.
             matrix: :math:`Z`, (C,K) for all frames or (B,C,K).
         """
         if torch.compiler.is_compiling():  # how many are not zero is for a call to find
@@ -170,9 +165,6 @@ class RoundedActivation(CorrectiveActivation):
 
     A solve whose in-betweens bend at their peaks may end on the wrong side of one; on these it does not, and what it
     finds is near the answer.
-
-    Args:
-        activation: C correctives.
     """
 
     def __init__(self, activation: CorrectiveActivation) -> None:

@@ -16,11 +16,7 @@ _FEWEST = 4  # frames of a motion that has a timing
 
 
 def retimed_moments(model: EnhancementModel, features: Tensor, fps: float) -> Tensor:
-    """Which moment of an animation each region shows in each frame, (R,T), in frames, never falling.
-
-    Args:
-        features: of the animation's frames, (T,P,9).
-    """
+    """Which moment of an animation, features (T,P,9), each region shows in each frame, (R,T), never falling."""
     prepared = model.prepared
     weights = prepared.patch_weights
     moments = torch.arange(len(features), dtype=torch.float64).expand(len(weights), -1).clone()
@@ -38,15 +34,11 @@ def retimed_moments(model: EnhancementModel, features: Tensor, fps: float) -> Te
 
 
 def at_moments(frames: Tensor, moments: Tensor, vertex_weights: Tensor) -> Tensor:
-    """An animation whose regions stand at moments of their own.
+    """An animation (T,V,3) whose regions stand at moments of their own.
 
     Args:
-        frames: (S,V,3).
         moments: in frames from the first of ``frames`` on, (R,T).
         vertex_weights: the share of each region in each vertex, (R,V), of sum 1.
-
-    Returns:
-        (T,V,3).
     """
     # From the first region's on, so that where all agree no rounding of the shares' sum moves the moment.
     base = moments[0]

@@ -35,10 +35,6 @@ def coarse_level(vertices: Tensor, faces: Tensor, count: int) -> CoarseLevel:
     Vertices are chosen on a grid, every vertex goes to the one that is nearest along the edges, and three that meet in
     a triangle make a coarse triangle. Values are carried from the nearest coarse triangle at a vertex's own, linearly:
     what lies close by and hangs together elsewhere only, such as the other lip, does not take part.
-
-    Args:
-        vertices: (V,3), millimetres.
-        count: of vertices to be left.
     """
     points, faces = vertices.detach().double().cpu(), faces.cpu()
     if len(points) <= count:

@@ -133,11 +133,7 @@ def learn_frames(
 
     Args:
         performance: frames in any rigid pose each; their coarse frames, where there are any, in the same poses.
-        encoder: for their mesh.
-        rank: components of the detail to keep at most.
         key: of the settings; with the frames' own content it says whether a checkpoint is of this run.
-        folder: of the checkpoint; none is kept if absent.
-        progress: called with the frames that are done.
     """
     frames, coarse = performance.frames, performance.coarse
     count, size = len(frames), encoder.detail.size

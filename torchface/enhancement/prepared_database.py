@@ -45,10 +45,6 @@ class InputLids:
     by a third and more: its lids are those found. Lids that hardly move are off by as much as they move; they are the
     input's where its whole face shows the detail found: :math:`\langle a - \ell, x - \ell \rangle / |x - \ell|^2` by
     area is near 1 and the two correlate. A face that was smoothed shows less.
-
-    Args:
-        neutral: (V,3), millimetres.
-        eyes: which triangles are each eye's region, (E,F) bool.
     """
 
     def __init__(self, neutral: Tensor, faces: Tensor, eyes: Tensor) -> None:

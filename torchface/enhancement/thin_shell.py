@@ -208,11 +208,7 @@ class ThinShell:
 
 
 def rigid_motion(rest: Tensor, points: Tensor) -> Similarity:
-    """How a head moved, from points on its face that also move by themselves.
-
-    Args:
-        rest: where they are at rest, (M,3), millimetres.
-        points: where they were seen, (T,M,3); NaN rows were not.
+    """How a head moved, from points (T,M,3) on its face that also move by themselves; NaN rows were not seen.
 
     Returns:
         The motion of every frame from rest, scale 1: least squares in which a point that is :math:`r` from where the

@@ -25,16 +25,10 @@ _open_to_parts: ContextVar[frozenset[Path]] = ContextVar("open_to_parts", defaul
 
 @contextmanager
 def job_lock(folder: str | Path) -> Iterator[Path]:
-    """Holds a folder of results for one run, from before its first file to after its last.
+    """Holds a folder of results, which ``--out`` names and it returns, for one run, from before its first file on.
 
     The folder is made where it is missing, and goes again if nothing came into it. The lock is the operating system's:
     however a run ends, the next one may begin.
-
-    Args:
-        folder: what ``--out`` names.
-
-    Returns:
-        The folder.
     """
     folder = Path(folder)
     path = folder.resolve() / LOCK
@@ -52,11 +46,7 @@ def file_lock(file: str | Path, *endings: str) -> Iterator[Path]:
     """Holds one file of results, and what is written beside it, for one run; see :func:`job_lock`.
 
     Args:
-        file: what ``--out`` names, or a folder that is written as a whole; what is missing above is made.
         endings: those that the file may have; any if absent.
-
-    Returns:
-        The file.
     """
     file = Path(file)
     if endings:

@@ -66,13 +66,10 @@ def write_file(path: str | Path, data: bytes) -> None:
 
 @contextmanager
 def replaced_file(path: str | Path) -> Iterator[Path]:
-    """A temporary file for a writer that needs a path; it takes the place of ``path`` at the end of the block.
+    """A temporary file, empty, for a writer that needs a path; it takes the place of ``path`` at the end of the block.
 
     Before it does it is on the disk. An error in the block, or a process that is killed, leaves what was there before.
     A file that is replaced hands on its permissions; a link in the place of ``path`` is replaced and not followed.
-
-    Returns:
-        The temporary path: an empty file beside ``path``.
     """
     with _replaced(Path(path)) as (_, temporary):
         yield temporary

@@ -13,12 +13,7 @@ _LONGEST_NAME = 255
 
 
 def unwritten(path: Path, error: Exception) -> FileFormatError:
-    """The error of a file that could not be written.
-
-    Args:
-        path: of the file, not of a temporary one.
-        error: an ``OSError``, or the ``ValueError`` of a name that can be none.
-    """
+    """The error of a file, not of a temporary one, that could not be written."""
     unchanged = "; what was there before is unchanged" if _is_file(path) else ""
     return FileFormatError(f"{path}: cannot be written: {_reason(path, error)}{unchanged}")
 

@@ -39,14 +39,9 @@ class MirrorCheck:
 
 
 def check_mirrored(source: Tensor, target: Tensor) -> MirrorCheck:
-    """Compares the best similarity with the best one of the mirror image; which plane mirrors does not matter.
+    """Compares the best similarity with the best one of the mirror image, of points (N,3), whichever plane mirrors.
 
-    Args:
-        source: points (N,3); NaN rows are skipped.
-        target: where they belong, (N,3), in the same order.
-
-    Returns:
-        A ``MirrorCheck``; of fewer than four common points, which always lie in a plane, one of no distance.
+    Rows of NaN are skipped. Fewer than four common points, which always lie in a plane, have a check of no distance.
     """
     x, y = source.detach().double(), target.detach().double()
     seen = torch.isfinite(x).all(-1) & torch.isfinite(y).all(-1)

@@ -11,15 +11,11 @@ from torchface.geometry.rotations import rotation_matrix
 
 
 def joint_transforms(positions: Tensor, parents: Sequence[int], rotations: Tensor) -> tuple[Tensor, Tensor]:
-    r"""Where joints take the space around them: :math:`x \mapsto A_j x + t_j`.
+    r"""Where joints take the space around them: :math:`x \mapsto A_j x + t_j`, (B,J,3,3) and (B,J,3).
 
     Args:
-        positions: of the joints at rest, (J,3), millimetres.
         parents: of each joint, -1 for a root; before its children.
         rotations: of each joint beside its parent, axis times angle, (B,J,3).
-
-    Returns:
-        A (B,J,3,3) and t (B,J,3).
     """
     own = rotation_matrix(rotations.reshape(-1, 3)).reshape(*rotations.shape, 3)
     turns: list[Tensor] = []
@@ -36,16 +32,7 @@ def joint_transforms(positions: Tensor, parents: Sequence[int], rotations: Tenso
 
 
 def skinned(vertices: Tensor, weights: Tensor, turns: Tensor, shifts: Tensor) -> Tensor:
-    r"""Vertices that follow joints, :math:`\sum_j w_{vj} (A_j x_v + t_j)`.
-
-    Args:
-        vertices: (B,V,3) or (V,3), millimetres.
-        weights: (V,J).
-        turns, shifts: of :func:`joint_transforms`.
-
-    Returns:
-        (B,V,3).
-    """
+    r"""Vertices (B,V,3) that follow joints, :math:`\sum_j w_{vj} (A_j x_v + t_j)`."""
     turn, shift = blended(weights, turns, shifts)
     return (turn @ vertices[..., None])[..., 0] + shift
 

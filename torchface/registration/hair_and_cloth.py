@@ -44,8 +44,6 @@ class Cover:
     have other colours too. All of it asks for the 68 landmarks on the template; nothing is covered without.
 
     Args:
-        template: with 68 annotated landmarks.
-        exposed: ids of the vertices that look for a place on the scan.
         colors: of the scan; without them only ears are judged.
     """
 
@@ -77,7 +75,6 @@ class Cover:
         """The covered vertices, (V,) bool, with the template's vertices (V,3) about where they belong.
 
         Args:
-            current: (V,3) float64.
             settled: whether they lie near enough to the scan that an ear can be judged.
         """
         if not self.known or (self._colors is None and not (settled and self.ears)):
@@ -160,9 +157,6 @@ def find_ears(template: Mesh) -> list[Tensor]:
 
     A vertex belongs to one where a ray into the sheet leaves it after a few millimetres; lengths go by the distance
     between the jaw's ends, about 150 mm on an adult.
-
-    Args:
-        template: upright, looking along z.
     """
     notes = template.annotations
     if notes is None or notes.landmarks is None or len(notes.landmarks) != 68:

@@ -102,10 +102,7 @@ def fit_to_scan(
     explain it misses by patches, not by vertices: however many there are, a square of :math:`\ell` = 20 mm counts once.
 
     Args:
-        start: the template aligned with the scan, (V,3) float64.
-        exposed: vertices that look for a correspondence, ids.
         landmarks: template vertices (L,) and where they belong (L,3) float64; none of them is needed.
-        largest_angle: between the normals of a correspondence, degrees.
 
     Source: Amberg, Knothe, Vetter 2008 (a statistical model in non-rigid ICP); thesis 3.2.3 and 3.2.4.
     """

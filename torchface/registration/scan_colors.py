@@ -59,12 +59,7 @@ def without_colors(scan: Mesh) -> Mesh:
 
 
 def vertex_colors(source: ScanColors, nearest: SurfacePoints, trusted: Tensor) -> Tensor:
-    """Colours (V,3) of the registered mesh's vertices; one that the scan does not show has its nearest neighbour's.
-
-    Args:
-        nearest: of each vertex.
-        trusted: which vertices lie on the scan, (V,) bool.
-    """
+    """Colours (V,3) of the registered mesh's vertices; one not on the scan, not in ``trusted``, has its neighbour's."""
     colors = source.at(nearest.triangle, nearest.barycentric)
     if trusted.any() and not trusted.all():
         known = nearest.points[trusted]
@@ -74,13 +69,7 @@ def vertex_colors(source: ScanColors, nearest: SurfacePoints, trusted: Tensor) -
 
 
 def skin_base(colors: Tensor, template: Mesh, seen: Tensor) -> Tensor:
-    """What is painted where nothing is seen, (V,3): the template's colours in the person's tone, else one skin colour.
-
-    Args:
-        colors: of the registered mesh's vertices, (V,3).
-        template: with or without vertex colours.
-        seen: whose colours are the person's, (V,) bool.
-    """
+    """What is painted where nothing is seen, (V,3): the template's colours in the person's tone, else skin colour."""
     skin = colors[seen].median(0).values if seen.any() else colors.mean(0)
     if template.colors is None:
         return skin.expand(len(colors), 3)
@@ -89,12 +78,7 @@ def skin_base(colors: Tensor, template: Mesh, seen: Tensor) -> Tensor:
 
 
 def shown_share(vertices: Tensor, unseen: Tensor) -> Tensor:
-    """How much of each vertex's colour is the scan's, (V,) in [0,1]: 0 where unseen, 1 from 10 mm away from there on.
-
-    Args:
-        vertices: (V,3) millimetres.
-        unseen: (V,) bool.
-    """
+    """How much of each vertex's colour is the scan's, (V,) in [0,1]: 0 where unseen, 1 from 10 mm away on."""
     if not unseen.any():
         return torch.ones(len(vertices))
     gap, _ = cKDTree(vertices[unseen].numpy()).query(vertices.numpy())
@@ -111,10 +95,8 @@ def resampled_texture(mesh: Mesh, colors: Tensor, shown: Tensor, source: ScanCol
     their seams.
 
     Args:
-        mesh: registered, with texture coordinates.
         colors: of its vertices, (V,3).
         shown: how much of the colour is the scan's, (V,) in [0,1].
-        size: texels a side.
     """
     if mesh.uvs is None or mesh.uv_faces is None:
         raise TopologyError("mesh: found no texture coordinates, expected some to lay a texture out in")

@@ -26,8 +26,6 @@ def completed_form(rest: Tensor, current: Tensor, faces: Tensor, unseen: Tensor,
     .. math:: \min_y \int \lVert \Delta y \rVert^2 + \ell^{-4} \lVert y \rVert^2
 
     Args:
-        rest: the template, (V,3) float64.
-        current: registered, (V,3) float64.
         unseen: whose positions the scan does not show, (V,) bool; the rest of the mesh stays.
         shown: whose positions it shows, (V,) bool: they align the template.
 
@@ -45,10 +43,7 @@ def completed_colors(colors: Tensor, base: Tensor, vertices: Tensor, faces: Tens
     """Colours (V,3), the unseen ones going over from those around to a base within some 40 mm, as a membrane does.
 
     Args:
-        colors: (V,3).
         base: what the skin looks like far from anything seen, (V,3).
-        vertices: (V,3) float64, millimetres.
-        unseen: (V,) bool.
     """
     if not unseen.any():
         return colors

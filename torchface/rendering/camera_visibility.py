@@ -62,15 +62,7 @@ def shown_in(
     normals: Tensor,
     calibration: CameraCalibration | None = None,
 ) -> Shown:
-    """What a photograph (3,H,W) shows at points (Q,3) with normals (Q,3).
-
-    Args:
-        image: the photograph, in the camera's size.
-        caster: the mesh that the points lie on, which hides some of them.
-        points: millimetres.
-        normals: unit.
-        calibration: of a lens that bends the image; none if absent.
-    """
+    """What a photograph (3,H,W) shows at points (Q,3) with normals (Q,3)."""
     if image.ndim != 3 or image.shape != (3, camera.height, camera.width):
         raise ShapeError(f"images: found {tuple(image.shape)}, expected (3,{camera.height},{camera.width})")
     points, normals = points.double(), normals.double()

@@ -11,8 +11,6 @@ def gaussian_blur(images: Tensor, sigma: float, truncate: float = 3.0) -> Tensor
     """Images (B,C,H,W) blurred with a standard deviation in pixels; the border is repeated outward.
 
     Args:
-        images: floating point, any device; gradients pass.
-        sigma: 0 leaves the images as they are.
         truncate: standard deviations at which the kernel ends.
     """
     # Loaded here: kornia takes half a second, and most of what imports this module never blurs.

@@ -52,12 +52,10 @@ class Footprint:
         )
 
     def softened(self, values: Tensor, weights: Tensor | None = None, sigma: float = 1.0) -> Tensor:
-        """Values (S,C) of the samples, blurred over the image, (S,C).
+        """Values (S,C) of the samples, blurred over the image by ``sigma`` pixels.
 
         Args:
-            values: of each sample.
             weights: what each counts beside its share of a pixel, (S,).
-            sigma: standard deviation of the blur, pixels.
         """
         weight = (self.share if weights is None else self.share * weights).float()[:, None]
         rows, columns = self.pixel // self.width, self.pixel % self.width
@@ -84,7 +82,6 @@ def footprint(
     """The samples of those triangles that show: what the mesh itself hides, or is seen from behind, is missing.
 
     Args:
-        vertices: (V,3), millimetres.
         faces: (F,3) int64; all of them hide what is behind them.
         shows: the triangles wanted, (F,) bool.
         calibration: of a lens that bends the image; rays are bent with it, so that nothing has to be warped.

@@ -51,12 +51,7 @@ class QuickClay:
 
     @staticmethod
     def of(mesh: Mesh, skin: bool = False) -> QuickClay:
-        """A mesh at rest, prepared; eyes look along z there.
-
-        Args:
-            mesh: at rest.
-            skin: draw its texture, where it has one, in place of clay.
-        """
+        """A mesh at rest, prepared, its eyes along z; with its texture in place of clay if asked for."""
         regions = {} if mesh.annotations is None else mesh.annotations.regions
         faces = mesh.faces.cpu()
 
@@ -81,7 +76,6 @@ class QuickClay:
         """The mesh before a dark ground, (H,W,3) uint8.
 
         Args:
-            vertices: (V,3), millimetres.
             tint: how far each vertex is marked, (V,) in [0,1]; none if absent.
         """
         image = np.empty((camera.height, camera.width, 3), np.uint8)

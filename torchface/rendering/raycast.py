@@ -26,9 +26,6 @@ class RayCaster:
     """A mesh prepared for ray casting.
 
     Embree keeps single precision, so the mesh is moved to its own centre first.
-
-    Args:
-        vertices: (V,3), millimetres.
     """
 
     def __init__(self, vertices: Tensor, faces: Tensor) -> None:

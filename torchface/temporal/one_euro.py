@@ -109,7 +109,6 @@ def one_euro_step(
     """The next filtered values (...) and their speeds (...), a second; see :class:`OneEuroFilter`.
 
     Args:
-        interval: seconds since then.
         unit: what counts as much as a value of 1, of each channel.
         opening: factor of the cutoff of the values.
     """

@@ -26,9 +26,6 @@ class GroupClassifier(nn.Module):
     """Gabor features of merged regions against rest, principal components, a vote between classes, a table of levels.
 
     Args:
-        group: regions and units.
-        size: pixels a side of a region.
-        components: K.
         classes: C; the first is rest.
     """
 
@@ -50,13 +47,9 @@ class GroupClassifier(nn.Module):
         self.register_buffer("intensities", torch.zeros(classes, len(group.units)))
 
     def features(self, images: Tensor, rest: Tensor) -> Tensor:
-        """Gabor magnitudes less those at rest, (B,D).
+        """Gabor magnitudes of the group's regions (B,G,h,w) less those of this performer at rest, (B,D).
 
         Patterns differ between faces; the change that an expression makes differs less.
-
-        Args:
-            images: the group's regions, (B,G,h,w).
-            rest: the same of this performer's face at rest, (G,h,w), or (B,G,h,w) a frame.
         """
         return self.magnitudes(images) - self.magnitudes(rest if rest.ndim == 4 else rest[None])
 

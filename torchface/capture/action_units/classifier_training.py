@@ -88,8 +88,6 @@ def label_group(
 
     Args:
         patterns: the group's regions over all videos, one after the other, (T,G,h,w).
-        labels: of each video.
-        group: regions and units.
     """
     classes = torch.zeros(len(patterns), dtype=torch.int64)
     rows: list[tuple[float, ...]] = [(0.0,) * len(group.units)]
@@ -220,7 +218,6 @@ def intensity_levels(images: Tensor, at_rest: Tensor, levels: int = 4, seed: int
     Args:
         images: one region, or several side by side, in every repetition of the action, (T,...).
         at_rest: frames just before and after a repetition, (T,) bool.
-        levels: k; the lowest is rest.
 
     Returns:
         (T,) int64 from 0 to ``levels - 1``.

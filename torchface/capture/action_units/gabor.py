@@ -22,10 +22,6 @@ class GaborBank(nn.Module):
     with m such that even light gives no response. Magnitudes change little when a stroke moves by less than a
     wavelength, so they are kept at every ``stride``-th pixel only.
 
-    Args:
-        wavelengths: :math:`\lambda`, pixels, one a scale.
-        stride: of the places at which they are kept.
-
     Source: thesis 4.1.10.
     """
 

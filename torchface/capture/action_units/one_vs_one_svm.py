@@ -19,10 +19,6 @@ class OneVsOne(nn.Module):
 
     where d > 0 is a vote for i. The second term is less than a vote and breaks ties.
 
-    Args:
-        classes: C, at least 2.
-        features: K.
-
     Source: thesis 4.1.11; scikit-learn's ``SVC`` with ``break_ties``.
     """
 
@@ -49,11 +45,9 @@ class OneVsOne(nn.Module):
         return votes + margin / (3 * (margin.abs() + 1))
 
     def fit(self, features: Tensor, classes: Tensor, penalty: float = 1.0) -> OneVsOne:
-        """Learns the planes.
+        """Learns the planes from features (T,K) of classes (T,), every one of which occurs.
 
         Args:
-            features: (T,K).
-            classes: (T,) int64; every class from 0 to C-1 occurs.
             penalty: C of the machine, the penalty of a margin violation.
         """
         count = self.first_class.shape[1]

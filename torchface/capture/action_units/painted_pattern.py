@@ -44,10 +44,8 @@ class PatternLevels:
 
 
 def pattern_levels(neutral: Tensor, names: Sequence[str]) -> PatternLevels:
-    """The greys of skin and paint, by Otsu's threshold in each region, taken again where it found skin.
-
-    Args:
-        neutral: regions of an image of the face at rest, (R,h,w) in [0,1].
+    """The greys of skin and paint at rest, (R,h,w), by Otsu's threshold in each region, taken again where it found
+    skin.
 
     Source: Otsu 1979; thesis 4.1.9.
     """
@@ -84,18 +82,14 @@ def otsu_threshold(values: Tensor) -> float:
 
 
 def neutral_flow(own: Tensor, reference: Tensor, method: Method = "dis") -> Tensor:
-    r"""The flow from each pixel of the reference's neutral pattern to the same spot of one's own.
+    r"""The flow (R,h,w,2), pixels, from each pixel of the reference's neutral pattern to the same spot of one's own.
 
     .. math:: \text{own}(x + u(x)) \approx \text{reference}(x)
 
     Found once a performer, at rest, and used for every frame: a flow a frame would remove the expression.
 
     Args:
-        own, reference: neutral patterns, (R,h,w) in [0,1].
         method: OpenCV's dense flow: DIS, or Farnebäck's polynomials, which lose fine dashes more easily.
-
-    Returns:
-        u, (R,h,w,2), pixels of the region, x first.
 
     Source: Farnebäck 2003; Kroeger et al. 2016; thesis 4.1.12.
     """

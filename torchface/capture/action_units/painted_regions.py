@@ -47,8 +47,6 @@ def region_grid(boxes: Mapping[str, Box], names: Sequence[str], size: int, width
 
     Args:
         boxes: (left, top, right, bottom) by name.
-        names: which regions, R, in which order.
-        size: pixels a side that every region is brought to.
     """
     lacking = [name for name in names if name not in boxes]
     if lacking:
@@ -68,10 +66,9 @@ def region_grid(boxes: Mapping[str, Box], names: Sequence[str], size: int, width
 
 
 def sample_regions(frames: Tensor, grid: Tensor, transforms: Tensor) -> Tensor:
-    """Regions (t,R,h,w) of frames, each read in one interpolation.
+    """Regions (t,R,h,w) of frames (t,H,W), each read in one interpolation.
 
     Args:
-        frames: (t,H,W), floats.
         grid: pixels of the neutral image, (R,h,w,2).
         transforms: neutral image to frame, (t,2,3).
     """

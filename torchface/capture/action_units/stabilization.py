@@ -23,9 +23,7 @@ class PointTracker:
     helmet, and is the intensity centroid of its blob.
 
     Args:
-        reference: grey image, (H,W) uint8.
         helmet: a point of the helmet, (2,), pixels.
-        markers: (M,2), pixels.
 
     Source: Lucas and Kanade 1981, Bouguet 2001; thesis 4.1.10.
     """
@@ -109,10 +107,6 @@ def steady_transforms(reference: Tensor, tracked: Tensor) -> Tensor:
     .. math:: \min_{a,b \in \mathbb{C}} \sum_p \lvert a z_p + b - z'_{tp} \rvert^2
 
     with points as complex numbers. A frame in which a point was lost takes the frames' around it.
-
-    Args:
-        reference: z, (P,2), pixels.
-        tracked: z', (T,P,2); NaN where lost.
 
     Returns:
         (T,2,3): a pixel (x,y,1) of the reference is at ``transform @ (x,y,1)`` in frame t.

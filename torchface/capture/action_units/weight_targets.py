@@ -120,13 +120,10 @@ def action_unit_curves(
 def smooth_intensities(
     intensities: Tensor, units: Sequence[str], windows: Mapping[str, int] = WINDOWS, fps: float = _RATE
 ) -> Tensor:
-    """A classifier's levels as continuous curves in [0,1].
+    """A classifier's levels (T,A) as continuous curves in [0,1].
 
     Args:
-        intensities: (T,A).
-        units: their names, A.
         windows: of the Savitzky-Golay filter by unit, frames at 60 a second; ``WINDOW`` for the others.
-        fps: frames a second; a window lasts as long at any rate.
 
     Source: thesis 4.1.12.
     """

@@ -116,14 +116,7 @@ class GaussianProcesses(nn.Module):
         )
 
     def forward(self, inputs: Tensor) -> tuple[Tensor, Tensor]:
-        """The mean of all targets, and the variance of each process' function.
-
-        Args:
-            inputs: (B,F).
-
-        Returns:
-            (B,N), summed over the processes, and (B,G) in units of the signal.
-        """
+        """The mean (B,N) of all targets, and the variance (B,G) of each process' function, in units of the signal."""
         scaled = inputs * self.inverse_lengths[:, None]
         near = self.signal[:, None, None] * torch.exp(-0.5 * squared_distances(scaled, self.inducing))
         projected = near @ self.covariance_root
@@ -172,8 +165,6 @@ def posterior(
     """The posterior of a process given the statistics of its frames.
 
     Args:
-        inducing: Z, (M,F).
-        whitening: of :func:`whitening_of`, (M,M).
         redundancy: number of correlated frames that count as one independent frame.
     """
     noise = kernel.noise * redundancy

@@ -47,14 +47,12 @@ def motion_basis(window: int) -> Tensor:
 
 
 def moving_parts(windows: Tensor, motion: Tensor) -> Tensor:
-    """The motion in a window: slope, curvature, and the last step by itself, which has no lag.
+    """The motion in windows (B,J,N): slope, curvature, and the last step by itself, which has no lag; (B,K,N).
+
+    K is 3, 2 for a window of two frames, 0 for a window of one.
 
     Args:
-        windows: (B,J,N).
         motion: the same along the columns of :func:`motion_basis`, (B,O,N).
-
-    Returns:
-        (B,K,N); K is 3, 2 for a window of two frames, 0 for a window of one.
     """
     if windows.shape[1] < 2:
         return motion[:, 1:]

@@ -71,11 +71,8 @@ class MotionNoise(nn.Module):
         """The likeliest coefficients for errors of predictions on takes left out, in float64.
 
         Args:
-            motion: of the windows, see :func:`moving_parts`, (B,K,N).
-            errors: (B,N).
             model_variance: variance of the errors that the noise does not have to explain, (B,N).
             scale: root mean squares of the K kinds of motion, (K,N).
-            groups: rows of shapes, a tuple a group.
             floor: minimum of the standard deviation.
         """
         count = errors.shape[1]

@@ -21,9 +21,6 @@ def fitted_kernel(inputs: Tensor, targets: Tensor, inducing: Tensor, active: Ten
     positive.
 
     Args:
-        inputs: (B,O·N), scaled.
-        targets: (B,n), scaled.
-        inducing: (M,O·N).
         active: 1 for inputs that the kernel uses, else 0, (O,N).
 
     Source: Titsias 2009.
@@ -70,8 +67,6 @@ class LeftOutProcess:
     folds make of a part, and ``compare`` how well. Memory is two matrices a fold.
 
     Args:
-        inducing: Z, (M,F).
-        targets: n.
         folds: K; what is left out together has one number below it.
     """
 
@@ -87,12 +82,7 @@ class LeftOutProcess:
         self._toward = self._length = 0.0
 
     def learn(self, fold: int, inputs: Tensor, targets: Tensor) -> None:
-        """Takes up a part.
-
-        Args:
-            inputs: (B,F).
-            targets: under autoregression coefficients learned from the other folds, (B,n).
-        """
+        """Takes up a part: inputs (B,F), and targets (B,n) under autoregression coefficients of the other folds."""
         features = self.kernel.between(inputs, self._inducing) @ self._whitening
         self._squares[fold].addmm_(features.T, features)
         self._products[fold].addmm_(features.T, targets)

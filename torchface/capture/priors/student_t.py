@@ -161,12 +161,7 @@ def _sample_weights(x: Tensor, precision: Tensor | None, degrees_of_freedom: flo
 
 
 class StudentGroups(nn.Module):
-    """The energy of Student's distributions of G groups of shapes, its products prepared: for exported solvers.
-
-    Args:
-        groups: rows of the N shapes, one tuple a density; every shape in one group.
-        densities: one a group.
-    """
+    """The energy of Student's distributions of G groups of shapes, its products prepared: for exported solvers."""
 
     precisions: Tensor
     freedoms: Tensor

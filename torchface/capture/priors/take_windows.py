@@ -104,11 +104,6 @@ class Autoregression:
     A window at rest must stay at rest whatever the weights there, so the step is a linear function of the steps before:
     a shape that the takes never raised must not be drawn back to 0. The coefficients are pooled: each shape's are drawn
     toward those that fit all shapes.
-
-    Args:
-        shapes: N.
-        window: J.
-        folds: K.
     """
 
     def __init__(self, shapes: int, window: int, folds: int) -> None:

@@ -106,7 +106,7 @@ class LearnedBasis:
 
 
 def blended(components: Tensor, coefficients: Tensor, weights: Tensor) -> Tensor:
-    r"""Rows of several regions, blended where their borders are soft.
+    r"""Rows (T,n) of several regions, blended where their borders are soft; differentiable in the coefficients.
 
     .. math:: b_{tcs} = \sum_r \omega_{rs} \sum_k c_{trk} \, U_{kcs}
 
@@ -114,9 +114,6 @@ def blended(components: Tensor, coefficients: Tensor, weights: Tensor) -> Tensor
         components: U, (k,n) in half precision or any, n = C·S: channels, then sites.
         coefficients: c, (T,R,k).
         weights: of the regions at every site, (R,S), of sum 1.
-
-    Returns:
-        (T,n), of the coefficients' dtype; differentiable in the coefficients.
 
     Source: Facial Performance Enhancement Using Dynamic Shape Space Analysis, equation 4.
     """
@@ -136,12 +133,7 @@ def blended(components: Tensor, coefficients: Tensor, weights: Tensor) -> Tensor
 
 
 def region_products(components: Tensor, weights: Tensor) -> Tensor:
-    """Inner products of components over each region, (R,k,k), float64, of every so many sites.
-
-    Args:
-        components: (k,n), see :func:`blended`.
-        weights: of the regions at every site, (R,S).
-    """
+    """Inner products of components, see :func:`blended`, over each region, (R,k,k), float64, of every so many sites."""
     sites = weights.shape[1]
     some = slice(None, None, max(1, sites // _SAMPLED_SITES))
     planes = components.view(len(components), -1, sites)[..., some].double()

@@ -30,10 +30,6 @@ class DisplacementDetail:
 
     :math:`d = R_v^\top (x_v - \ell_v)`, with :math:`R_v` the turn of the smooth part's surface at the vertex. Nothing
     is solved for. Numbers of a frame are ordered by axis, (3,V): two tangents, then the normal.
-
-    Args:
-        neutral: (V,3), millimetres.
-        frames: those of the mesh, where they are known.
     """
 
     def __init__(self, neutral: Tensor, faces: Tensor, frames: SurfaceFrames | None = None) -> None:
@@ -46,15 +42,10 @@ class DisplacementDetail:
         return 3 * len(self._neutral)
 
     def encode(self, low: Tensor, frames: Tensor, turned: TurnedFrames | None = None) -> Tensor:
-        """The detail of frames.
+        """The detail (B,3V), millimetres, of frames (B,V,3) beyond their smooth parts.
 
         Args:
-            low: their smooth parts, (B,V,3), millimetres.
-            frames: (B,V,3).
             turned: how the smooth parts' surface is turned, where that is known.
-
-        Returns:
-            (B,3V), millimetres.
         """
         turned = self._frames.turned(low - self._neutral.to(low)) if turned is None else turned
         return turned.to_local(frames - low).reshape(len(low), -1)
@@ -77,9 +68,6 @@ class GradientDetail:
     axes that turn with the smooth part. On another smooth part it becomes :math:`F = R_\ell G S_\ell`, and one solve
     finds the surface. Numbers of a frame are ordered by part, (9,F).
 
-    Args:
-        neutral: (V,3), millimetres.
-
     Source: Facial Performance Enhancement Using Dynamic Shape Space Analysis, sections 4.2, 5.4 and 5.5.
     """
 
@@ -98,16 +86,7 @@ class GradientDetail:
         return 9 * len(self._faces)
 
     def encode(self, low: Tensor, frames: Tensor, turned: TurnedFrames | None = None) -> Tensor:
-        """The detail of frames.
-
-        Args:
-            low: their smooth parts, (B,V,3), millimetres.
-            frames: (B,V,3).
-            turned: not used; triangles have rotations of their own.
-
-        Returns:
-            (B,9F).
-        """
+        """The detail (B,9F) of frames (B,V,3) beyond their smooth parts; triangles have rotations of their own."""
         rotation, stretch = polar_parts(self._gradients(low))
         G = rotation.transpose(-1, -2) @ self._gradients(frames) @ torch.linalg.inv(stretch)
         return encode_gradients(G).transpose(1, 2).flatten(1)
@@ -138,9 +117,6 @@ class SurfaceReconstruction:
     whose bends stay those of the smooth surface. As the unknown is the step from :math:`\ell`, each part of the mesh
     stays in its place.
 
-    Args:
-        neutral: (V,3), millimetres.
-
     Source: Facial Performance Enhancement Using Dynamic Shape Space Analysis, section 5.5; Botsch et al. 2006.
     """
 
@@ -157,14 +133,10 @@ class SurfaceReconstruction:
         self._factor = SparseCholesky(system + anchor * sparse.eye_array(len(rest)))
 
     def __call__(self, low: Tensor, changes: Tensor) -> Tensor:
-        """The surface.
+        """The surface (B,V,3) near a smooth one.
 
         Args:
-            low: the smooth surface, (B,V,3), millimetres.
             changes: of the triangles' gradients from the smooth surface's, (B,F,3,3); differentiable, as ``low`` is.
-
-        Returns:
-            (B,V,3).
         """
         count, triangles = changes.shape[:2]
         columns = changes.permute(1, 3, 0, 2).reshape(3 * triangles, 3 * count)

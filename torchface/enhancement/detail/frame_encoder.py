@@ -43,26 +43,14 @@ def make_encoder(neutral: Tensor, faces: Tensor, patches: Tensor, wavelength: fl
 
 
 class FrameAlignment:
-    """Frames aligned with the neutral by the means over patches: Horn's alignment, translation and rotation.
-
-    Args:
-        neutral: (V,3), millimetres.
-        means: takes the means over patches, (P,V).
-    """
+    """Frames aligned with the neutral by the means over patches: Horn's alignment, translation and rotation."""
 
     def __init__(self, neutral: Tensor, means: SparseOperator) -> None:
         self.neutral, self._means = neutral, means
         self._points = means(neutral.double())
 
     def aligned(self, frames: Tensor, name: str) -> tuple[Tensor, Similarity]:
-        """Displacements from the neutral of frames aligned with it, and how they were moved.
-
-        Args:
-            frames: (B,V,3), millimetres; differentiable.
-
-        Returns:
-            Displacements (B,V,3), and the similarity of scale 1 from where the frames were.
-        """
+        """Displacements (B,V,3) from the neutral of frames aligned with it, and the similarity of that, of scale 1."""
         count, vertices, _ = frames.shape
         # The first vertex goes to the origin before any rounding to means.
         begin = frames[:, :1].detach()

@@ -37,7 +37,6 @@ class LowPass:
     from the neutral leave the neutral as it is, triangles and pores included.
 
     Args:
-        neutral: (V,3), millimetres.
         wavelength: :math:`\lambda`, millimetres.
 
     Source: Facial Performance Enhancement Using Dynamic Shape Space Analysis, section 4.2, equation 1 with its sign
@@ -57,14 +56,7 @@ class LowPass:
         )
 
     def __call__(self, displacements: Tensor) -> Tensor:
-        """The smooth part of displacements.
-
-        Args:
-            displacements: (B,V,C), of any unit; differentiable.
-
-        Returns:
-            (B,V,C), of the same dtype and device.
-        """
+        """The smooth part of displacements (B,V,C), of their unit, dtype and device; differentiable."""
         if displacements.ndim != 3 or displacements.shape[1] != len(self._masses):
             raise ShapeError(f"low_pass: found {tuple(displacements.shape)}, expected (B,{len(self._masses)},C)")
         count, _, channels = displacements.shape

@@ -17,16 +17,10 @@ _SINGULAR = 1e-5  # of the determinant to the norm's cube: Newton's iteration ne
 
 
 def polar_parts(gradients: Tensor) -> tuple[Tensor, Tensor]:
-    r"""Rotation and symmetric stretch of each matrix, :math:`F = R S`.
+    r"""Rotation and symmetric stretch (...,3,3) of each matrix (...,3,3), :math:`F = R S`.
 
     Newton's iteration for all at once. A mirrored or singular matrix gets its nearest rotation too; the stretch of a
     mirrored one then has a negative eigenvalue. Differentiable where the rotation is unique.
-
-    Args:
-        gradients: F, (...,3,3), float32 or float64.
-
-    Returns:
-        R and S, (...,3,3) each.
 
     Source: Higham 1986, Computing the polar decomposition; the derivative solves
     :math:`(\operatorname{tr} S\, I - S)\, \omega = \operatorname{axial}(R^\top dF - dF^\top R)`.

@@ -15,11 +15,7 @@ from torchface.optim.sparse import SparseCholesky
 
 
 class SparseOperator:
-    """A constant sparse matrix for dense columns.
-
-    Args:
-        matrix: (N,M), any scipy sparse format.
-    """
+    """A constant sparse matrix (N,M), of any scipy format, for dense columns."""
 
     def __init__(self, matrix: sparse.sparray) -> None:
         self._matrix = sparse.csr_array(matrix, dtype=np.float64)

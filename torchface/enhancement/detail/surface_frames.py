@@ -41,9 +41,6 @@ class SurfaceFrames:
     With :math:`T` a vertex's two tangents at rest and :math:`\bar A` the mean of its triangles' gradient operators,
     weighted by area, the tangents' images are :math:`J = T + (T^\top \bar P T)^{-1} T^\top \bar A u` for displacements
     u; the normal is their cross product, and the turned frame the orthonormal one nearest to J, in closed form.
-
-    Args:
-        neutral: (V,3), millimetres.
     """
 
     def __init__(self, neutral: Tensor, faces: Tensor) -> None:
@@ -88,7 +85,6 @@ class PatchGradients:
 
     Args:
         shares: of the vertices in the patches, (P,V), rows of sum 1.
-        tangents: the matrix (2V,V) that ``frames`` is made of.
     """
 
     def __init__(self, frames: SurfaceFrames, shares: sparse.csr_array, tangents: sparse.csr_array) -> None:
@@ -111,11 +107,7 @@ class PatchGradients:
         self.means = SparseOperator(shares)
 
     def features(self, displacements: Tensor, turned: TurnedFrames) -> Tensor:
-        """Rotation vector and stretch of every patch, (B,P,9); zeros at rest.
-
-        Args:
-            displacements: (B,V,3), millimetres; differentiable.
-        """
+        """Rotation vector and stretch of every patch, (B,P,9), of displacements (B,V,3); zeros at rest."""
         count, vertices, _ = displacements.shape
         columns = displacements.permute(1, 2, 0).reshape(vertices, 3 * count)
         normals = turned.axes[2] - self._rest_normals.T.to(displacements)[..., None]

@@ -46,12 +46,7 @@ class Regions:
             )
 
     def patch_weights(self, patches: Tensor, areas: Tensor) -> Tensor:
-        """How much each patch counts in each region, (R,P), of sum 1: by its area and the weight of its triangles.
-
-        Args:
-            patches: the patch of each triangle, (F,) int64.
-            areas: of the triangles, (F,).
-        """
+        """How much each patch counts in each region, (R,P), of sum 1: by the area and the weight of its triangles."""
         shared = self.weights.float() * areas.float()
         total = shared.new_zeros(len(shared), int(patches.max()) + 1).index_add(1, patches, shared)
         return total / total.sum(1, keepdim=True)
@@ -172,11 +167,9 @@ def _pieces(links: Tensor, count: int) -> Tensor:
 
 
 def surface_distances(vertices: Tensor, faces: Tensor, sources: Tensor, limit: float = float("inf")) -> Tensor:
-    """The length of the shortest way along edges from the nearest source to each vertex, (V,), millimetres.
+    """The shortest way along edges from the nearest of the sources (S,) to each vertex, (V,), millimetres.
 
     Args:
-        vertices: (V,3), millimetres.
-        sources: ids (S,) int64.
         limit: what is further away gets infinity.
     """
     pairs = edges(faces)
@@ -187,15 +180,9 @@ def surface_distances(vertices: Tensor, faces: Tensor, sources: Tensor, limit: f
 
 
 def soft_weights(labels: Tensor, count: int, vertices: Tensor, faces: Tensor, sigma: float) -> Tensor:
-    r"""The weight of each region at each triangle, (R,F) half: 1 inside, outside a Gaussian of the distance.
+    r"""The weight of each region at each triangle (F,), (R,F) half: 1 inside, outside a Gaussian of the distance.
 
     .. math:: \omega_{r,t} = \exp(-d_{r,t}^2 / 2\sigma^2)
-
-    Args:
-        labels: the region of each triangle, (F,) int64.
-        count: of regions, R.
-        vertices: (V,3), millimetres.
-        sigma: millimetres.
 
     Source: Facial Performance Enhancement Using Dynamic Shape Space Analysis, section 5.3.
     """

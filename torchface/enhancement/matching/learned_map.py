@@ -25,8 +25,6 @@ class LearnedMap:
     left. How much of it counts, :math:`\beta`, see :func:`map_shares`.
 
     Args:
-        coefficients: C, (K,r).
-        components: principal components of each region's features.
         ridge: as a share of their mean variance.
     """
 
@@ -43,8 +41,6 @@ class LearnedMap:
         r"""What to add to the blend's coefficients, (T,R,r).
 
         Args:
-            features: (T,P,9); differentiable.
-            matched: the projection of the same frames.
             reach: :math:`\delta` of each region, (R,), in units of the database's spread.
             shares: :math:`\beta` of each region, (R,).
         """
@@ -65,7 +61,6 @@ def map_shares(
     animation lacks much motion that goes on linearly it is near 1; of wrinkles alone, which saturate, it is less.
 
     Args:
-        coefficients: of its details, (K,r).
         reach: see :class:`LearnedMap`, (R,).
         products: of the details' components with each other over each region, (R,r,r).
         sequences: the number of each frame's sequence, (K,) int64.

@@ -36,8 +36,6 @@ def motion_clusters(
 
     Args:
         motion: how far each patch is from its mean place or shape in every frame, (K,P,C).
-        centres: of the patches, (P,3), millimetres.
-        pairs: neighbouring patches, (E,2).
         midline: the plane of symmetry is x = ``midline``.
         apart: patches, such as those of the mouth, whose clusters stay two halves.
 

@@ -51,13 +51,7 @@ def grow_groups(pairs: Ids, count: int, size: float, seed: int) -> Ids:
 
 
 def patch_means(values: Tensor, patches: Tensor, areas: Tensor) -> Tensor:
-    """The means of triangles' values over each patch, weighted by area, (B,P,C).
-
-    Args:
-        values: (B,F,C).
-        patches: the patch of each triangle, (F,) int64.
-        areas: of the triangles, (F,); a patch without area gets the plain mean.
-    """
+    """The means of triangles' values (B,F,C) over each patch, weighted by area, (B,P,C); plain ones without area."""
     count = int(patches.max()) + 1
     weights = areas.to(values) + torch.finfo(values.dtype).tiny ** 0.5
     weights = weights / weights.new_zeros(count).index_add(0, patches, weights)[patches]

@@ -123,12 +123,7 @@ class RegionProjection:
         return (_MARGIN * distances.quantile(_QUANTILE, dim=0)).clamp(_LEAST_LIMIT, _MOST_LIMIT)
 
     def project_without(self, chosen: Tensor, left_out: Tensor) -> Matched:
-        """The combinations that look most like some of the database's own frames, without others of its frames.
-
-        Args:
-            chosen: numbers of the frames, (T,) int64.
-            left_out: which frames take no part in each, (T,K) bool.
-        """
+        """The combinations that look most like some (T,) of the database's own frames, without others (T,K) of them."""
         rows = [space.known[chosen] for space in self._spaces]
         linear = torch.stack([-own @ space.known.T for own, space in zip(rows, self._spaces, strict=True)])
         # Frames that are left out cost more than any others could: one matrix serves for all.

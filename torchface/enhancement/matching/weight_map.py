@@ -26,8 +26,6 @@ class WeightMap:
     its limit v, for unseen expressions or another rig's weights, :math:`c_0` takes over.
 
     Args:
-        weights: of its frames, (K,N).
-        coefficients: C, of their details, (K,r).
         terms: :math:`\ell, \epsilon, v` of each region, (R,3), see :func:`weight_terms`.
 
     Source: Rasmussen and Williams, Gaussian Processes for Machine Learning, equations 2.25 and 2.26.
@@ -45,12 +43,9 @@ class WeightMap:
             self._maps.append(torch.cholesky_solve(coefficients.double() - self._mean, factor))
 
     def blended(self, features: Tensor, weights: Tensor, matched: Matched, found: Tensor) -> Tensor:
-        r"""Coefficients (T,R,r) that weights improve.
+        r"""Coefficients (T,R,r) that weights (T,N) improve, of features (T,P,9); differentiable in both.
 
         Args:
-            features: (T,P,9); differentiable.
-            weights: of the same frames, (T,N); differentiable.
-            matched: the projection of the same frames.
             found: :math:`c_0`, (T,R,r).
         """
         own = weights.double() / self._spread
@@ -76,8 +71,6 @@ def weight_terms(projection: RegionProjection, weights: Tensor, coefficients: Te
     limit is twice the variance below which 95 % of them lie.
 
     Args:
-        weights: of its frames, (K,N).
-        coefficients: of their details, (K,r).
         sequences: the number of each frame's sequence, (K,) int64.
     """
     chosen = torch.linspace(0, len(weights) - 1, min(_TRIED, len(weights))).long()

@@ -42,9 +42,7 @@ class ActorTiming:
     :func:`~torchface.enhancement.timing.nearest_timing.nearest_timing`; one at rest follows the whole face.
 
     Args:
-        database: features of the captured frames, (K,P,C).
         sequences: the number of each captured frame's sequence, (K,).
-        weights: of patches in each region, (R,P).
     """
 
     def __init__(self, database: Tensor, sequences: Tensor, weights: Tensor, fps: float) -> None:
@@ -57,8 +55,6 @@ class ActorTiming:
         """How far the motion between two keyframes has come in each frame, (R,frames), 0 first, 1 last, never falling.
 
         Args:
-            keyframes: features of both, (2,P,C).
-            frames: at even distance, both keyframes counted.
             length: of the motion, in frames of the database.
             extend: to the whole motion of which the keyframes meet a part; regressions know whole motions alone, so
                 the nearest motions are taken otherwise.
@@ -101,17 +97,13 @@ class LearnedTiming:
 
     @classmethod
     def fit(cls, database: Tensor, sequences: Tensor, region: Tensor, fps: float) -> LearnedTiming | None:
-        """Learns from captured sequences, cut into motions where they turn.
+        """Learns from captured sequences, cut into motions where they turn; None from few motions.
 
         The inverse length scales and the ridge have the least leave-one-out error, which has a closed form.
 
         Args:
-            database: features of the captured frames, (K,P,C).
             sequences: the number of each frame's sequence, (K,).
             region: share of each patch in the region, (P,).
-
-        Returns:
-            None where the region has fewer than ``LEAST_MOTIONS`` motions.
         """
         scale = region.detach().double().clamp(min=0).sqrt()[:, None].clone()
         frames = (database.detach().double() * scale).flatten(1)
@@ -135,11 +127,9 @@ class LearnedTiming:
         return cls(scale, centre, directions, mean, deviation, inputs, inverse_lengths, mean_profile, dual)
 
     def times(self, keyframes: Tensor, frames: int, length: float) -> Tensor:
-        """How far the motion between two keyframes has come, (frames,), 0 first and 1 last, never falling.
+        """How far the motion between two keyframes, features (2,P,C), has come, (frames,), from 0 to 1, never falling.
 
         Args:
-            keyframes: features of both, (2,P,C).
-            frames: at even distance, both keyframes counted, at least 2.
             length: of the motion, in frames of the database.
         """
         checked_count("frames", frames, 2)

@@ -10,14 +10,10 @@ _SMOOTHING = 1 / 30  # s, standard deviation: quicker changes of speed are noise
 
 
 def find_keyframes(path: Tensor, tolerance: float) -> list[int]:
-    """The frames at which a motion turns, the first and the last among them, rising.
+    """The frames at which a motion (T,D) turns, the first and the last among them, rising.
 
     The path is simplified as a line: it is cut where it leaves the straight way between two keyframes furthest, until
     it nowhere leaves it by more than a share of the animation's range.
-
-    Args:
-        path: (T,D).
-        tolerance: that share.
 
     Source: Douglas and Peucker 1973.
     """

@@ -37,10 +37,7 @@ def nearest_timing(
     are averaged, nearer ones weighing more.
 
     Args:
-        keyframes: features of both, (2,P,C).
         captured: features of each captured sequence, (n,P,C) each, see :func:`captured_sequences`.
-        region: the share of each patch in the region, (P,).
-        frames: at even distance, both keyframes counted.
         length: of the motion, in frames of the database.
         nearest: how many captured motions are averaged; the paper takes one.
         extend: to the whole motion of which the keyframes meet a part.
@@ -105,12 +102,7 @@ def moving_regions(keyframes: Tensor, weights: Tensor) -> Tensor:
 
 
 def motion_progress(motion: Tensor, frames: int) -> Tensor:
-    """The timing of a captured motion: how far it has come from its first to its last pose, (frames,), never falling.
-
-    Args:
-        motion: features, (n,D), n at least 2.
-        frames: how many moments are asked for, at even distance.
-    """
+    """How far a captured motion, features (n,D), has come from first to last pose, (frames,), never falling."""
     if len(motion) == 2:
         return torch.linspace(0, 1, frames, dtype=torch.float64)
     count = max(_STEPS, 2 * len(motion))

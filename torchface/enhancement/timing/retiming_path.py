@@ -20,16 +20,12 @@ class SequenceProjection:
 
 
 def project_sequence(alpha: Tensor, beta: Tensor) -> SequenceProjection:
-    r"""Projects a sequence onto another in order.
+    r"""Projects a sequence (m,D) onto another (n,D), of two frames at least, in order.
 
     Each frame is projected onto each segment; the path that never goes back and has the least sum of distances is
     found by dynamic programming. Frames that share a segment are put in order by isotonic regression.
 
     .. math:: \min_P \sum_i E_{i,P(i)}, \quad P(i) \le P(i+1)
-
-    Args:
-        alpha: the frames, (m,D).
-        beta: the sequence to project onto, (n,D), of two frames at least.
 
     Source: Facial Performance Enhancement Using Dynamic Shape Space Analysis, section 6.1, equations 5 and 6. Changed:
     order is held inside segments too.

@@ -31,7 +31,6 @@ class WrinkleBasis:
     Args:
         maps: B, (M,3,V), millimetres along two tangents and the normal of the smooth skin.
         region_weights: :math:`\omega`, (R,V), of sum 1 in every vertex.
-        areas: of the vertices, (V,).
     """
 
     maps: Tensor
@@ -73,9 +72,6 @@ def learn_wrinkle_basis(
 
     Args:
         details: of an actor's frames, displacements (K,3V) as components and coefficients.
-        region_weights: (R,V), of sum 1 in every vertex.
-        areas: of the vertices, (V,).
-        count: M, of maps.
 
     Source: Ding, Li, Jordan 2010, Convex and semi-nonnegative matrix factorizations.
     """

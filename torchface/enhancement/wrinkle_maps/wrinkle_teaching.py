@@ -20,7 +20,7 @@ _STRONGEST = 1.2  # of what the actor showed
 
 
 def captured_poses(model: EnhancementModel, shapes: Tensor) -> Tensor:
-    r"""The rig's weights that look most like each frame of the actor's.
+    r"""The rig's weights (K,N) in [0,1] that look most like each frame of the actor's.
 
     .. math:: \min_{0 \le w \le 1} \lVert \textstyle\sum_i w_i z_i - z_k \rVert^2
 
@@ -29,9 +29,6 @@ def captured_poses(model: EnhancementModel, shapes: Tensor) -> Tensor:
     Args:
         shapes: :math:`z_i`, features of the rig's shapes at weight 1 on the model's mesh, (N,P,9); see
             ``EnhancementModel.features``.
-
-    Returns:
-        (K,N), in [0,1].
     """
     areas = model.prepared.patch_weights.sum(0).double()
     root = (areas / areas.sum()).sqrt()[:, None]

@@ -41,13 +41,6 @@ class WrinkleWeights(nn.Module):
 
     All that it needs of the displacements is linear in them (:meth:`moments`), so blendshape weights give the same
     answer without any vertex, see :class:`RigWrinkles`.
-
-    Args:
-        region_names: of the R regions.
-        maps: M.
-        vertices: of the rig, V.
-        components: q, numbers a region.
-        centers: K, poses that kernels sit on.
     """
 
     sites: Tensor
@@ -108,12 +101,9 @@ class WrinkleWeights(nn.Module):
         """Learns from poses whose weights are known.
 
         Args:
-            neutral: of the rig, (V,3), millimetres.
             poses: the rig's vertices, (K,V,3), millimetres, each in any rigid place.
             weights: of the maps at these poses, (K,R,M), in [0,1].
-            region_weights: the share of each region in each vertex of the rig, (R,V).
             sites: vertices to look at, (S,); some 2,000, evenly picked, if absent.
-            components: numbers that are kept a region.
         """
         regions, vertices = region_weights.shape
         shapes = poses.shape[1:] == neutral.shape == (vertices, 3) and weights.shape[:2] == (len(poses), regions)
@@ -247,12 +237,7 @@ def _principal_axes(rows: Tensor, count: int) -> Tensor:
 
 
 class RigWrinkles(nn.Module):
-    """Weights of wrinkle maps of a rig's blendshape weights, the same as of the vertices that these make.
-
-    Args:
-        wrinkles: learned for the rig.
-        rig: with or without correctives.
-    """
+    """Weights of wrinkle maps of a rig's blendshape weights, the same as of the vertices that these make."""
 
     moved: Tensor
     corrected: Tensor | None

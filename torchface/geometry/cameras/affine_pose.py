@@ -9,10 +9,9 @@ from torchface.optim.exported_operators import symmetric_inverse
 
 
 def affine_pose(points: Tensor, rays: Tensor, trust: Tensor) -> tuple[Tensor, Tensor]:
-    """The pose, (3,3) and (3,) millimetres, in which an affine camera sees points where they are seen.
+    """The pose, (3,3) and (3,) millimetres, in which an affine camera sees points (L,3), not in a plane.
 
     Args:
-        points: (L,3), millimetres, not in a plane.
         rays: where they are seen, (L,2), at depth 1.
         trust: how much each counts, (L,), not all zero.
 

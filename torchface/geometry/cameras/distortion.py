@@ -12,19 +12,13 @@ _MAX_ITERATIONS, _DONE = 20, 1e-13
 
 
 def distort(pixels: Tensor, calibration: CameraCalibration) -> Tensor:
-    r"""Where the camera shows what a pinhole camera of the same K shows at some pixels.
+    r"""Where (...,2) the camera shows what a pinhole camera of the same K shows at some pixels (...,2); NaN stays NaN.
 
     .. math::
         x' = x (1 + k_1 r^2 + k_2 r^4 + k_3 r^6) + 2 p_1 x y + p_2 (r^2 + 2 x^2), \qquad
         y' = y (1 + k_1 r^2 + k_2 r^4 + k_3 r^6) + p_1 (r^2 + 2 y^2) + 2 p_2 x y
 
     with :math:`(x, y, 1) \propto K^{-1} q` and :math:`r^2 = x^2 + y^2`; differentiable.
-
-    Args:
-        pixels: of the pinhole camera, (...,2); NaN stays NaN.
-
-    Returns:
-        Pixels in the camera's images, (...,2).
 
     Source: Brown 1966, as in OpenCV; thesis 4.2.4.
     """

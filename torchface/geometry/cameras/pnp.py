@@ -171,9 +171,6 @@ def refined_poses(x: Tensor, q: Tensor, K: Tensor, w: Tensor, rotation: Tensor, 
     Args:
         x: points, (B,N,3), millimetres.
         q: pixels, (B,N,2).
-        K: intrinsics, (B,3,3).
-        w: weights, (B,N).
-        rotation, translation: the initial poses, (B,3,3) and (B,3).
 
     Returns:
         ``Pose``; errors are infinite where points stay behind the camera.

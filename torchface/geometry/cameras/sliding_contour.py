@@ -35,8 +35,6 @@ def level_curves(vertices: Tensor, faces: Tensor, starts: Tensor) -> LevelCurves
     """Curves from points at the side of an upright face to its midline, each at the height of its start.
 
     Args:
-        vertices: (V,3), y up, z toward the viewer, x = 0 about the midline.
-        faces: the triangles that curves may run over, (F,3) int64.
         starts: vertex ids (J,).
 
     Returns:
@@ -84,7 +82,6 @@ def outermost(pixels: Tensor, valid: Tensor, outward: Tensor) -> Tensor:
     """The point of each curve that is seen furthest out: the rows (B,J) of pixels (B,J,C,2).
 
     Args:
-        pixels: where the curves' points are seen.
         valid: which of them are points, (J,C) bool.
         outward: directions in the image, (B,J,2); zero for curves whose start is meant.
     """

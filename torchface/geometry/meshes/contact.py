@@ -28,10 +28,6 @@ class ContactFinder:
     vertices of one connected part meet: what else lies close, such as teeth in gums, is attached and not in contact.
     Where contacts are named, partners are sought among those: one from the first column, one from the second,
     whichever lie opposite each other in the pose.
-
-    Args:
-        count: how many vertices there are.
-        contacts: given pairs of vertices that touch, (K,2) int64.
     """
 
     def __init__(self, faces: Tensor, count: int, contacts: Tensor | None = None) -> None:

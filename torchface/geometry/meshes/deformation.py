@@ -10,16 +10,10 @@ from torchface.geometry.meshes.operators import corners, triangle_cross
 
 
 def triangle_frames(vertices: Tensor, faces: Tensor) -> Tensor:
-    r"""The matrix of two edges and a scaled normal of each triangle.
+    r"""The matrix (...,F,3,3) of two edges and a scaled normal of each triangle, as columns; the third 0 without area.
 
     .. math:: V = [v_2 - v_1,\; v_3 - v_1,\; v_4 - v_1], \quad v_4 - v_1 = n / \sqrt{|n|}, \quad
         n = (v_2 - v_1) \times (v_3 - v_1)
-
-    Args:
-        vertices: (...,V,3), millimetres.
-
-    Returns:
-        Frames (...,F,3,3), the three vectors as columns. The third is zero where a triangle has no area.
 
     Source: thesis 3.3.1, equations 18 and 20.
     """
@@ -38,17 +32,12 @@ def degenerate_triangles(vertices: Tensor, faces: Tensor, tolerance: float = 1e-
 
 
 def deformation_gradients(rest: Tensor, deformed: Tensor, faces: Tensor) -> Tensor:
-    r"""The linear part of the affine map that carries each triangle from rest to its deformed place.
+    r"""The linear part (...,F,3,3) of the affine map that carries each triangle from rest to its deformed place.
 
     .. math:: Q = \tilde V V^{-1}
 
-    Args:
-        rest: (V,3), millimetres.
-        deformed: (...,V,3), millimetres.
-
-    Returns:
-        Gradients (...,F,3,3). A triangle that has no area at rest has no gradient: it gets the identity.
-        One that loses its area keeps the gradient of its edges; its normal is mapped to zero.
+    A triangle that has no area at rest has no gradient: it gets the identity. One that loses its area keeps the
+    gradient of its edges; its normal is mapped to zero.
 
     Source: thesis 3.3.1, equations 19 to 21; Sumner and Popovic 2004.
     """

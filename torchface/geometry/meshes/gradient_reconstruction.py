@@ -50,7 +50,6 @@ class GradientReconstruction:
     The last term is so small that it only places what nothing else does: a loose part, a vertex without a triangle.
 
     Args:
-        rest: the mesh at rest, (V,3), millimetres.
         triangle_weights: :math:`a_t`, (F,); 1 if absent, as in equation 23.
 
     Source: thesis 3.3.1, equations 23 to 25, solved in float64 on the CPU.
@@ -71,28 +70,17 @@ class GradientReconstruction:
     def solve(
         self, gradients: Tensor, positions: Tensor, pinned: Tensor, constraints: Sequence[SoftConstraints] = ()
     ) -> Tensor:
-        """Vertices for N sets of gradients that share pins and constraint matrices: one factorisation for all.
+        """Vertices (N,V,3), float64, of N gradients that share pins and constraint matrices: one factorisation for all.
 
         Args:
-            gradients: :math:`Q`, (N,F,3,3).
             positions: where pinned vertices are held, and :math:`\\bar x` for the others, (N,V,3), millimetres.
-            pinned: (V,) bool.
-            constraints: soft constraints, values (N,K,3) or (K,3).
-
-        Returns:
-            Vertices (N,V,3), float64.
         """
         self._check(gradients, positions, pinned)
         prepared = self.prepare(pinned, constraints)
         return prepared.solve(gradients, positions, [constraint.values for constraint in constraints])
 
     def prepare(self, pinned: Tensor, constraints: Sequence[SoftConstraints] = ()) -> PreparedReconstruction:
-        """Factors the system once, for many solves with the same pins and the same matrices of constraints.
-
-        Args:
-            pinned: (V,) bool.
-            constraints: their values are not used.
-        """
+        """Factors the system once, for many solves with the same pins (V,) and the same matrices of constraints."""
         free = (~pinned).nonzero()[:, 0].cpu().numpy()
         matrix = self.stiffness[free]
         system = matrix[:, free] + self._anchor * sparse.eye_array(len(free), format="csr")
@@ -137,15 +125,11 @@ class PreparedReconstruction:
         self.vertex_count = stiffness.shape[1]
 
     def solve(self, gradients: Tensor, positions: Tensor, values: Sequence[Tensor]) -> Tensor:
-        """Vertices for N sets of gradients.
+        """Vertices (N,V,3), float64, for N sets of gradients.
 
         Args:
-            gradients: (N,F,3,3).
             positions: where pinned vertices are held, and where the others are drawn by next to nothing, (N,V,3).
             values: of each constraint, (N,K,3) or (K,3), millimetres.
-
-        Returns:
-            Vertices (N,V,3), float64.
         """
         result = positions.detach().double().cpu().numpy().copy()
         if len(self._free) == 0:

@@ -49,7 +49,6 @@ class TexelMap:
         all.
 
         Args:
-            values: of each texel.
             rings: how many texels wide the margin is.
         """
         channels = values.shape[1]
@@ -87,11 +86,6 @@ def rasterise_uvs(uvs: Tensor, uv_faces: Tensor, height: int, width: int) -> Tex
 
     The centre of texel (row, column) is at :math:`u = (column + 1/2)/W`, :math:`v = 1 - (row + 1/2)/H`. Where
     triangles overlap, the first one has the texel. What lies outside the unit square is left out.
-
-    Args:
-        uvs: texture coordinates, origin at the lower left, (U,2).
-        uv_faces: their rows at each triangle's corners, (F,3) int64.
-        height, width: texels.
     """
     if uvs.ndim != 2 or uvs.shape[1] != 2 or uv_faces.ndim != 2 or uv_faces.shape[1] != 3:
         raise ShapeError(f"uvs: found {tuple(uvs.shape)} and {tuple(uv_faces.shape)}, expected (U,2) and (F,3)")
@@ -161,7 +155,6 @@ def rasterise(points: Tensor, nearness: Tensor, faces: Tensor, height: int, widt
         points: the vertices in the image (V,2), pixels, centres at integers, x right, y down.
         nearness: larger is nearer, linear in the image, as the inverse depth is, (V,).
         faces: (F,3) int64, counter-clockwise as seen from in front.
-        height, width: of the image, pixels.
     """
     if points.ndim != 2 or points.shape[1] != 2 or nearness.shape != points.shape[:1]:
         raise ShapeError(f"points: found {tuple(points.shape)} and {tuple(nearness.shape)}, expected (V,2) and (V,)")
@@ -248,7 +241,6 @@ class _Planes:
         """Row and column of every pixel that a triangle covers, and which of the P it is; each (S,) int64, by triangle.
 
         Args:
-            width: of the image, pixels.
             slack: that triangles are wider by, pixels.
             batch: about how many pixels are given at once, the last triangles' first; all if absent.
         """

@@ -14,11 +14,7 @@ _LEAST_SINE = 1e-3  # a triangle without height would have infinite cotangents
 
 
 def stretching_energy(vertices: Tensor, faces: Tensor) -> sparse.csr_array:
-    r"""The cotangent stiffness matrix, (V,V): :math:`u^\top L u = \int |\nabla u|^2`, the weak form of :math:`-\Delta`.
-
-    Args:
-        vertices: the shell at rest, (V,3), millimetres.
-    """
+    r"""The cotangent stiffness matrix, (V,V), of :math:`-\Delta`: :math:`u^\top L u = \int |\nabla u|^2`."""
     gradients = gradient_operator(vertices, faces)
     areas = triangle_areas(vertices.double().cpu(), faces.cpu()).repeat_interleave(3).numpy()
     return sparse.csr_array(gradients.T @ sparse.diags_array(areas) @ gradients)
@@ -38,9 +34,6 @@ def bending_energy(vertices: Tensor, faces: Tensor) -> sparse.csr_array:
     with :math:`\alpha, \beta` the angles at the edge's ends 0 and 1 in its two triangles and 2, 3 the corners opposite.
     An edge that only one triangle has, or more than two, costs nothing: the rims of eyes and mouth are free, and on a
     flat mesh every affine field is free, at the rim too.
-
-    Args:
-        vertices: the shell at rest, (V,3), millimetres.
 
     Source: Bergou, Wardetzky, Harmon, Zorin, Grinspun 2006, A Quadratic Bending Model for Inextensible Surfaces.
     """

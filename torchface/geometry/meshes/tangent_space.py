@@ -43,12 +43,6 @@ def tangent_space(vertices: Tensor, faces: Tensor, uvs: Tensor, uv_faces: Tensor
 
     Where a triangle has no extent in the texture it is ignored; a vertex of such triangles only gets any tangent.
 
-    Args:
-        vertices: (V,3), millimetres.
-        uvs: origin at the lower left, (U,2).
-        uv_faces: (F,3) int64.
-        normals: unit vertex normals, (V,3).
-
     Source: Mikkelsen 2008, Simulation of Wrinkled Surfaces Revisited; glTF 2.0 specification, 3.7.2.1 and 3.9.3.
     """
     direction, sign = _directions(vertices, faces, uvs, uv_faces)

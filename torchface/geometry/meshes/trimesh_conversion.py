@@ -29,16 +29,7 @@ def to_trimesh(
     colors: Tensor | None = None,
     texture: Tensor | None = None,
 ) -> trimesh.Trimesh:
-    """The ``trimesh.Trimesh`` of a mesh; see ``Mesh.to_trimesh`` for what is lost.
-
-    Args:
-        vertices: (V,3).
-        faces: triangles, (F,3).
-        uvs: texture coordinates, (U,2).
-        uv_faces: rows of ``uvs`` at the triangles' corners, (F,3).
-        colors: of the vertices, in [0,1], (V,3).
-        texture: in [0,1], (3,H,W).
-    """
+    """The ``trimesh.Trimesh`` of a mesh; see ``Mesh.to_trimesh`` for what is lost."""
     import trimesh
 
     triangles = faces.cpu().numpy()

@@ -29,8 +29,6 @@ def check_unit(name: str, points: Tensor, beside: float, what: str, least: float
     """Refuses points whose extent shows another unit than millimetres.
 
     Args:
-        name: of the points, for the message.
-        points: (n,3), millimetres.
         beside: the extent to be expected, millimetres; see :func:`extent`.
         what: has that extent, such as ``"a template"``.
         least, most: the ratios of the extents that are taken.

@@ -29,9 +29,6 @@ def split_at_seams(
     """Vertices with one texture coordinate each.
 
     Args:
-        vertex_count: V.
-        faces: triangles, (F,3).
-        uv_faces: rows of the texture coordinates at their corners, (F,3).
         mirrored: at which corners (F,3) the texture is; a pair that is on both sides gets two rows.
     """
     if uv_faces is None:

@@ -15,12 +15,7 @@ def in_one_tile(uvs: Tensor, uv_faces: Tensor, kind: Tensor) -> tuple[Tensor, Te
     another kind, as eyeballs over a face, have small ones along two edges.
 
     Args:
-        uvs: texture coordinates, (U,2).
-        uv_faces: the rows of ``uvs`` at each triangle's corners, (F,3) int64.
         kind: of each triangle, (F,) int64: those of different kinds have tiles of their own.
-
-    Returns:
-        The coordinates (U',2) and their rows (F,3).
     """
     tiles = uvs[uv_faces].mean(1).floor().long()
     if not bool(tiles.any()):

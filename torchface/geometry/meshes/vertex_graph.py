@@ -9,12 +9,7 @@ from torchface.geometry.meshes.operators import edges
 
 
 class VertexGraph:
-    """Which vertices are neighbours: values are blurred and filled over the mesh rather than over its layout.
-
-    Args:
-        faces: triangles (F,3).
-        count: of vertices, V.
-    """
+    """Which vertices are neighbours: values are blurred and filled over the mesh rather than over its layout."""
 
     def __init__(self, faces: Tensor, count: int) -> None:
         self.first, self.second = edges(faces).T

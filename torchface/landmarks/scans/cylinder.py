@@ -187,14 +187,7 @@ def _colors(mesh: Mesh, triangle: Tensor, barycentric: Tensor) -> Tensor | None:
 
 
 def fill_holes(image: Tensor, mask: Tensor) -> Tensor:
-    """Keeps an image where the mask is set and fills the rest from ever coarser means around (push and pull).
-
-    Args:
-        image: (C,H,W) float32.
-        mask: where it is known, (H,W) bool, somewhere at least.
-
-    Returns:
-        (C,H,W); untouched where known.
+    """Keeps an image (C,H,W) where the mask is set and fills the rest from ever coarser means around (push and pull).
 
     Source: Gortler et al. 1996, The Lumigraph, 3.4.
     """

@@ -45,17 +45,11 @@ class HogLayout:
 
 
 def cell_map(images: Tensor, layout: HogLayout) -> Tensor:
-    """Normalised orientation histograms of cells centred at every stride.
+    """Orientation histograms (B,bins,H/stride+1,W/stride+1) of images (B,C,H,W), normalised, of cells at every stride.
 
     Gradients vote with their magnitude for the two nearest orientations, of all channels the steepest; a cell is
     divided by the root mean square of the cells around, clipped, and its root taken, so that strong edges do not
     hide faint ones.
-
-    Args:
-        images: (B,C,H,W) in [0,1].
-
-    Returns:
-        (B,bins,H/stride+1,W/stride+1).
 
     Source: Dalal and Triggs 2005.
     """
@@ -101,15 +95,8 @@ def unit_windows(cells: Tensor, layout: HogLayout) -> Tensor:
 
 
 def similarity(columns: Tensor, filters: Tensor) -> Tensor:
-    r"""Cosine of the angle between filters and the windows at every place: a convolution, normalised.
+    r"""Cosine (B,K,P) of the angle between filters (K,bins,side,side) and windows: a normalised convolution.
 
     The windows of a map are put side by side once and serve every landmark's filters.
-
-    Args:
-        columns: of ``unit_windows``, (B,bins·side²,P).
-        filters: (K,bins,side,side).
-
-    Returns:
-        (B,K,P) in [-1,1].
     """
     return normalize(filters.flatten(1), dim=1, eps=1e-9) @ columns

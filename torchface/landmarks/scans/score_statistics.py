@@ -42,7 +42,6 @@ def score_statistics(
     """Scores every filter in all images but its own.
 
     Args:
-        maps: centred maps of the M images, each (bins,h,w).
         filters: (L,M,bins,side,side).
         landmarks: pixels, (M,L,2); NaN where one is not known.
 

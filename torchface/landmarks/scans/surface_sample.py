@@ -39,9 +39,6 @@ def sample_surface(mesh: Mesh) -> SurfaceSample:
 
     Normals that point inward on the whole (a scan turned inside out) are flipped: those of a head point away from the
     middle of its points more often than toward it.
-
-    Args:
-        mesh: a scan, millimetres.
     """
     vertices = mesh.vertices.detach().cpu().double()
     faces = mesh.faces.cpu()

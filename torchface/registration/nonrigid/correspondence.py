@@ -46,10 +46,7 @@ def correspondences(
     that hair a few centimetres off pulls little.
 
     Args:
-        current: template vertices, (V,3) float64.
         vertices: ids of those that look for one, (n,).
-        reach: millimetres.
-        largest_angle: degrees.
 
     Source: Amberg, Romdhani, Vetter 2007, section 4; thesis 3.2.3, figure 15.
     """

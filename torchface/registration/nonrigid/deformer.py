@@ -38,9 +38,6 @@ class Deformer:
     """A template on its way to a scan; vertices in ``hidden`` (V,) have no place there, and follow the others.
 
     Args:
-        vertices: the template aligned with the scan, (V,3) float64.
-        landmarks: what is known of where vertices belong; none of them is needed.
-        contacts: what touches at rest.
         schedule: of its constants; the stages are given one by one to ``run``.
     """
 

@@ -35,9 +35,6 @@ class ContactPull:
         c = 0.7 mm: what the scan's surface and landmarks have parted stays apart. And 0 where the scan is open
         between the places that the two are nearest to: where these are more than 1 mm apart and a ray from before
         their middle into the head finds no surface, or one deeper than a crease between closed lips would be.
-
-        Args:
-            current: vertices, (V,3) float64.
         """
         ends = [scan.among_nearest_samples(current[self.pairs[:, k]]) for k in (0, 1)]
         first, second = (end.points for end in ends)
@@ -52,12 +49,7 @@ class ContactPull:
 
 
 def contact_pull(aligned: Tensor, template: Mesh) -> ContactPull:
-    """The pairs of a template that touch at rest: its annotated contacts, else vertices that face each other.
-
-    Args:
-        aligned: the template's vertices on the scan, (V,3) float64.
-        template: its size decides what is close.
-    """
+    """The pairs of a template that touch at rest: its annotated contacts, else vertices that face each other."""
     notes = template.annotations
     named = None if notes is None else notes.contacts
     vertices, faces = template.vertices.detach().cpu().double(), template.faces.cpu()

@@ -54,7 +54,6 @@ def stiffness_rows(vertices: Tensor, faces: Tensor, gradient_length: float) -> s
     wherever the origin lies, and zero for every affine motion of the whole.
 
     Args:
-        vertices: at rest, (V,3).
         gradient_length: :math:`g`, millimetres.
 
     Source: Amberg, Romdhani, Vetter 2007, equations 3 and 10; thesis 3.2.3, equation 5.

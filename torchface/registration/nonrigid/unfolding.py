@@ -31,10 +31,6 @@ def unfolded(rest: Tensor, current: Tensor, faces: Tensor) -> Tensor:
 
     The corners of such triangles go to where an affine map, fitted to what lies around them, sends their places at
     rest; in widening circles, until nothing is turned over. A sliver turns for a hundredth of a millimetre.
-
-    Args:
-        rest: (V,3) float64.
-        current: (V,3) float64.
     """
     best, min_count = current, int(turned_over(rest, current, faces).sum())
     for circle in range(_MAX_CIRCLES):

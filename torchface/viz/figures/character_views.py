@@ -29,11 +29,7 @@ def character_sheet(
     """A column a pose of :data:`SHOWN`, a row a view; (3,H,W).
 
     Args:
-        surface: upright, looking along z.
         shapes: by ARKit's names how far each vertex goes, (V,3) of the surface's unit; one that is absent is left out.
-        middle: what is looked at, (3,).
-        span: of each picture.
-        side: of each picture, pixels.
     """
     columns = []
     for pose, names in SHOWN.items():

@@ -258,7 +258,11 @@ def with_light(images: Tensor, generator: torch.Generator, grey_share: float = 0
 
 
 def with_blur(images: Tensor, generator: torch.Generator, share: float, widest: float) -> Tensor:
-    """Images (B,3,H,W), changed in place, of which a share is out of focus, and an eighth moves."""
+    """Images (B,3,H,W), changed in place, of which a share is out of focus, and an eighth moves.
+
+    Args:
+        widest: standard deviation of their blur beyond 0.3, pixels, at most.
+    """
     from kornia.filters import gaussian_blur2d, motion_blur
 
     count = len(images)
