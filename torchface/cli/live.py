@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from tyro.conf import Positional, UseAppendAction, arg
 
-from torchface.cli.command_options import Output, picture_size
+from torchface.cli.command_options import OptionalOutputPath, Output, picture_size
 from torchface.cli.progress_bars import progress_bars
 from torchface.cli.terminal import Quiet, console, print_lines, print_path
 
@@ -28,7 +28,7 @@ def live(
     calibrate: bool = False,
     to: UseAppendAction[tuple[str, ...]] = (),
     record: Annotated[Path | None, Output(_FILES)] = None,
-    takes: Path | None = None,
+    takes: OptionalOutputPath = None,
     page: bool = True,
     port: int = 8080,
     size: str = "640x480",

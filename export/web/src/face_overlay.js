@@ -14,7 +14,10 @@ const LINES = [
 export function drawFace(canvas, solved) {
   const context = canvas.getContext("2d");
   const [width, height] = solved ? [solved.width, solved.height] : [canvas.width, canvas.height];
-  if (canvas.width !== width || canvas.height !== height) [canvas.width, canvas.height] = [width, height];
+  if (canvas.width !== width || canvas.height !== height) {
+    [canvas.width, canvas.height] = [width, height];
+    canvas.parentElement.style.aspectRatio = `${width} / ${height}`; // no bands beside the picture
+  }
   context.clearRect(0, 0, width, height);
   if (!solved || !Number.isFinite(solved.landmarks[0])) return;
   const at = (i) => [solved.landmarks[2 * i] + 0.5, solved.landmarks[2 * i + 1] + 0.5]; // pixels' centres are at integers

@@ -189,12 +189,15 @@ def test_a_take_is_kept_from_rows_read_again_and_imported_from_files(dome: Path,
 
 
 def test_a_takes_film_has_its_pictures_at_their_times(dome: Path, tmp_path: Path) -> None:
-    session, recordings = a_session(Endless(20, fps=25.0), tmp_path / "out", dome, [])
+    told: list[str] = []
+    session, recordings = a_session(Endless(20, fps=25.0), tmp_path / "out", dome, told)
     session.record(True, filmed=True)
     session.run()
+    session.asked({"record": False})
     recordings.finish()
+    assert told[-1] == f"recorded into {tmp_path / 'out'}: 20 frames"
     (kept,) = kept_takes(tmp_path / "out")
-    assert kept.filmed
+    assert (kept.name, kept.filmed) == ("Take 1", True)
     video = open_video(film_of(tmp_path / "out", kept.place))
     assert (video.width, video.height, video.count, video.fps) == (64, 48, 20, pytest.approx(25, abs=0.1))
     shades = torch.stack([frame.float().mean() for frame in video.color_frames()])

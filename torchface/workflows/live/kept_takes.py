@@ -61,7 +61,8 @@ def kept_takes(folder: Path) -> list[KeptTake]:
                 with suppress(FileFormatError, ValueError, TypeError, KeyError):
                     facts = _summary(place)
                     name = _FIRST if place == folder else place.name
-                    called, filmed = str(facts.get("name", place.name)), (place / FILM).is_file()
+                    number = "1" if place == folder else place.name.removeprefix("take_")
+                    called, filmed = str(facts.get("name", f"Take {number}")), (place / FILM).is_file()
                     take = KeptTake(name, called, float(facts["seconds"]), int(facts["frames"]), filmed)
                     found.append(((place / SUMMARY).stat().st_mtime, take))
     return [take for _, take in sorted(found, key=lambda one: -one[0])]

@@ -207,7 +207,7 @@ class LiveSession:
             if on:
                 seen = filmed and not isinstance(self._source, ReceivedSource)  # which has no pictures
                 return f"recording into {self._recordings.start(filmed=seen)}"
-            self._recordings.stop()
+            self._recordings.stop(self._notes)
             return "recorded; its files are being written"
 
     def run(self, seconds: float | None = None, progress: Progress | None = None) -> None:

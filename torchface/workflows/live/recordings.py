@@ -28,7 +28,7 @@ from torchface.shape_names import ARKIT
 from torchface.take import Take, Track
 from torchface.workflows.browser_app.character import Character
 from torchface.workflows.live.kept_takes import ANIMATION, LIVE_LINK, SUMMARY, WEIGHTS, printable
-from torchface.workflows.live.live_frames import LiveFrame
+from torchface.workflows.live.live_frames import LiveFrame, Say
 from torchface.workflows.live.take_film import FILM, TakeFilm
 
 _EVEN = 1e-6  # seconds by which times that are even may be off
@@ -224,13 +224,17 @@ class Recordings:
         if self._film is not None and picture is not None:
             self._film.add(came, picture)
 
-    def stop(self) -> None:
-        """Ends the take that runs; its files are made beside what goes on, see :meth:`finish`."""
+    def stop(self, told: Say | None = None) -> None:
+        """Ends the take that runs; its files are made beside what goes on, see :meth:`finish`.
+
+        Args:
+            told: called, in another thread, with how that ended.
+        """
         log, self._log = self._log, None
         film, self._film = self._film, None
         if log is None:
             return
-        given = (log, self._place, self._found, film)
+        given = (log, self._place, self._found, film, told)
         thread = threading.Thread(target=self._save, args=given, name="torchface-recording")
         self._saving.append(thread)
         thread.start()
@@ -249,7 +253,7 @@ class Recordings:
         numbered = (self._folder / f"take_{number}" for number in range(2, _MAX_TAKES))
         return next(folder for folder in numbered if folder not in self._begun and not folder.exists())
 
-    def _save(self, log: FrameLog, folder: Path, found: int, film: TakeFilm | None) -> None:
+    def _save(self, log: FrameLog, folder: Path, found: int, film: TakeFilm | None, told: Say | None) -> None:
         with log:
             try:
                 if film is not None:  # before the summary, by which a take is listed
@@ -259,6 +263,8 @@ class Recordings:
                 self.saved.append(SavedTake(folder, log.count, note=film.problem if film is not None else ""))
             except (TorchfaceError, OSError) as error:
                 self.saved.append(SavedTake(folder, log.count, str(error)))
+        if told is not None:
+            told(self.saved[-1].error or f"recorded into {folder}: {log.count} frames")
 
     def _write(self, log: FrameLog, folder: Path, found: int, more: Mapping[str, str] = MappingProxyType({})) -> None:
         take = log.take(self._fps)

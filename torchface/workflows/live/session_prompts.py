@@ -131,7 +131,8 @@ class FaceWatch:
         self._ever |= seen
         if seen and now >= self._due and (self._looking is None or not self._looking.is_alive()):
             self._due = now + _INTERVAL
-            self._looking = threading.Thread(target=self._look_for_others, args=(picture,), daemon=True)
+            # No daemon: the program's end inside the network would end in an abort.
+            self._looking = threading.Thread(target=self._look_for_others, args=(picture,))
             self._looking.start()
         if seen and len(self._middles) > 1:
             self.words = self._which(float(solved.landmarks[:, 0].nanmean()))

@@ -8,6 +8,7 @@ from contextlib import suppress
 from fractions import Fraction
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from warnings import catch_warnings
 
 import numpy as np
 
@@ -89,6 +90,7 @@ def solved_again(film: Path) -> Take:
     from torchface.workflows.track.track_inputs import TrackSettings
     from torchface.workflows.track.track_video import track_video
 
-    with TemporaryDirectory(prefix="torchface-") as folder:
+    # A camera's times are never even, of which `track` warns.
+    with TemporaryDirectory(prefix="torchface-") as folder, catch_warnings(action="ignore", category=UserWarning):
         track_video(film, None, Path(folder), TrackSettings(whole_take=True, overlay="none"))
         return load_live_link(Path(folder) / LIVE_LINK)
