@@ -22,9 +22,10 @@ from torchface.io.gltf.gltf_reading import image_bytes
 from torchface.io.gltf.primitive_reading import (
     BYTES_A_CORNER,
     BYTES_A_VERTEX,
-    DECOMPRESSED,
+    read_positions,
     read_target_names,
     read_triangles,
+    read_uvs,
 )
 from torchface.io.gltf.scene import node_transforms
 from torchface.io.images.image_samples import decode_samples
@@ -179,13 +180,7 @@ class _Shelf:
         under: set[int],
     ) -> None:
         document, location = self.document, f"meshes[{mesh}].primitives[{group[0][0]}]"
-        first = group[0][1]
-        if "KHR_draco_mesh_compression" in document.record(first.get("extensions"), f"{location}.extensions"):
-            raise document.error(location, "Draco compression", DECOMPRESSED)
-        attributes = document.record(first.get("attributes"), f"{location}.attributes")
-        if "POSITION" not in attributes:
-            raise document.error(f"{location}.attributes", "no POSITION", "one")
-        positions = read_floats(document, attributes["POSITION"], f"{location}.POSITION", ("VEC3",)).astype(np.float64)
+        attributes, positions = read_positions(document, group[0][1], location)
         count = len(positions)
         document.reserve(count * (BYTES_A_VERTEX + 16 * 8), f"{location}.POSITION")
         record = document.item("nodes", node, "nodes")
@@ -194,7 +189,7 @@ class _Shelf:
         else:
             matrices, head = np.broadcast_to(transform, (count, 4, 4)), np.full(count, node in under, np.float32)
         with np.errstate(over="ignore", invalid="ignore"):
-            placed = np.einsum("cij,cj->ci", matrices[:, :3, :3], positions) + matrices[:, :3, 3]
+            placed = np.einsum("cij,cj->ci", matrices[:, :3, :3], positions.astype(np.float64)) + matrices[:, :3, 3]
         if not np.isfinite(placed).all():
             raise document.error(location, "positions that overflow", "finite numbers")
         uvs = np.zeros((count, 2), np.float32)
@@ -202,10 +197,8 @@ class _Shelf:
             faces = read_triangles(document, primitive, f"meshes[{mesh}].primitives[{number}]", count)
             document.reserve(faces.size * BYTES_A_CORNER, location)
             material, texcoord = self._material(primitive, f"meshes[{mesh}].primitives[{number}].material")
-            name = f"TEXCOORD_{texcoord}"
-            if name in attributes:
-                read = read_floats(document, attributes[name], f"{location}.{name}", ("VEC2",), count)
-                uvs = np.stack([read[:, 0], 1 - read[:, 1]], axis=1)
+            if (found := read_uvs(document, attributes, texcoord, location, count)) is not None:
+                uvs = found
             mirrored = np.linalg.det(matrices[faces[:, 0], :3, :3]) < 0
             self.faces.append(np.where(mirrored[:, None], faces[:, ::-1], faces) + self._count)
             self.material.append(np.full(len(faces), material))

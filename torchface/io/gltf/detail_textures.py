@@ -87,21 +87,13 @@ def read_gltf_detail(path: str | Path) -> DetailMaps | None:
     names = [_name(document, entry, i) for i, entry in enumerate(listed)]
     if len(set(names)) != len(names):
         raise document.error(f"extras.torchface.{_LIST}", names, "each shape once")
-    reader = TextureReader(document, path)
-    images: list[Tensor] = []
     neutral = normal_texture(document, mesh)
-    for index in ([] if neutral is None else [neutral]) + [entry.get("texture") for entry in listed]:
-        image = reader.read(index, _LIST)
-        if images and image.shape != images[0].shape:
-            raise document.error(
-                _LIST, f"maps of {tuple(image.shape[1:])} and {tuple(images[0].shape[1:])}", "one size"
-            )
-        images.append(decode_normals(image))
-    if not images:
+    indices = [*([] if neutral is None else [neutral]), *(entry.get("texture") for entry in listed)]
+    if not indices:
         return None
-    shapes = images if neutral is None else images[1:]
-    maps = torch.stack(shapes) if shapes else images[0].new_zeros(0, *images[0].shape)
-    return DetailMaps(tuple(names), maps, None if neutral is None else images[0])
+    images = TextureReader(document, path).stacked(indices, _LIST)
+    maps = torch.stack([decode_normals(image) for image in images])
+    return DetailMaps(tuple(names), maps, None) if neutral is None else DetailMaps(tuple(names), maps[1:], maps[0])
 
 
 def _listed(document: Document) -> tuple[list[dict[str, Any]], dict[str, Any]]:
@@ -141,7 +133,18 @@ class TextureReader:
         self._document = document
         self._unpacked, self._allowed = 0, max(_UNPACKED_ALWAYS, _UNPACKED_PER_BYTE * Path(path).stat().st_size)
 
-    def read(self, index: object, location: str) -> Tensor:
+    def stacked(self, indices: Sequence[object], location: str) -> Tensor:
+        """Images (K,3,H,W) in [0,1] of one size, one at least."""
+        images: list[Tensor] = []
+        for index in indices:
+            image = self._read(index, location)
+            if images and image.shape != images[0].shape:
+                sizes = f"maps of {tuple(images[0].shape[1:])} and {tuple(image.shape[1:])}"
+                raise self._document.error(location, sizes, "one size")
+            images.append(image)
+        return torch.stack(images)
+
+    def _read(self, index: object, location: str) -> Tensor:
         """An image (3,H,W) in [0,1]."""
         self._document.item("textures", index, f"{location}.texture")
         assert isinstance(index, int)

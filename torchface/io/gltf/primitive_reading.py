@@ -102,13 +102,31 @@ class _Block:
     vertex_ids: NDArray[np.int64] | None
 
 
-def _read_block(document: Document, primitive: dict[str, Any], location: str, first: int) -> _Block:
+def read_positions(
+    document: Document, primitive: dict[str, Any], location: str
+) -> tuple[dict[str, Any], NDArray[np.float32]]:
+    """The attributes of a primitive, and its positions (C,3)."""
     if "KHR_draco_mesh_compression" in document.record(primitive.get("extensions"), f"{location}.extensions"):
         raise document.error(location, "Draco compression", DECOMPRESSED)
     attributes = document.record(primitive.get("attributes"), f"{location}.attributes")
     if "POSITION" not in attributes:
         raise document.error(f"{location}.attributes", "no POSITION", "one")
-    positions = read_floats(document, attributes["POSITION"], f"{location}.POSITION", ("VEC3",))
+    return attributes, read_floats(document, attributes["POSITION"], f"{location}.POSITION", ("VEC3",))
+
+
+def read_uvs(
+    document: Document, attributes: dict[str, Any], number: int, location: str, count: int
+) -> NDArray[np.float32] | None:
+    """A set of texture coordinates (C,2), origin at the lower left; none where it is absent."""
+    name = f"TEXCOORD_{number}"
+    if name not in attributes:
+        return None
+    uvs = read_floats(document, attributes[name], f"{location}.{name}", ("VEC2",), count)
+    return np.stack([uvs[:, 0], 1 - uvs[:, 1]], axis=1)
+
+
+def _read_block(document: Document, primitive: dict[str, Any], location: str, first: int) -> _Block:
+    attributes, positions = read_positions(document, primitive, location)
     count = len(positions)
     document.reserve(count * BYTES_A_VERTEX, f"{location}.POSITION")
     targets = document.array(primitive, "targets", location)
@@ -118,11 +136,8 @@ def _read_block(document: Document, primitive: dict[str, Any], location: str, fi
         target = document.record(row, f"{location}.targets[{i}]")
         if "POSITION" in target:
             deltas[i] = read_floats(document, target["POSITION"], f"{location}.targets[{i}].POSITION", ("VEC3",), count)
-    uv_name = f"TEXCOORD_{_look(document, primitive, location)[1]}"
-    uvs = colors = ids = None
-    if uv_name in attributes:
-        uvs = read_floats(document, attributes[uv_name], f"{location}.{uv_name}", ("VEC2",), count)
-        uvs = np.stack([uvs[:, 0], 1 - uvs[:, 1]], axis=1)
+    uvs = read_uvs(document, attributes, _look(document, primitive, location)[1], location, count)
+    colors = ids = None
     color_name = "_COLOR" if "_COLOR" in attributes or _painted(primitive) else "COLOR_0"
     if color_name in attributes:
         colors = read_floats(document, attributes[color_name], f"{location}.{color_name}", ("VEC3", "VEC4"), count)

@@ -75,14 +75,12 @@ def load_region_maps(path: str | Path) -> RegionMaps | None:
     neutral = normal_texture(document, mesh)
     if neutral is None:
         raise document.error(location, "a material without a normal texture", "the normals of the face at rest in it")
-    normals = _stacked(document, reader, [neutral, *document.array(listed, "normals", location)], f"{location}.normals")
+    normals = reader.stacked([neutral, *document.array(listed, "normals", location)], f"{location}.normals")
     count = len(normals) - 1
     if count < 1:
         raise document.error(f"{location}.normals", "no map", "one or more")
-    heights = _stacked(document, reader, _textures(document, listed, "heights", count, location), f"{location}.heights")
-    masks = _stacked(
-        document, reader, _textures(document, listed, "masks", len(regions), location), f"{location}.masks"
-    )
+    heights = reader.stacked(_textures(document, listed, "heights", count, location), f"{location}.heights")
+    masks = reader.stacked(_textures(document, listed, "masks", len(regions), location), f"{location}.masks")
     if heights.shape[2:] != normals.shape[2:]:
         raise document.error(
             location, f"maps of {tuple(normals.shape[2:])} and heights of {tuple(heights.shape[2:])}", "one size"
@@ -111,16 +109,6 @@ def _textures(document: Document, listed: dict[str, Any], key: str, channels: in
     if len(indices) != wanted:
         raise document.error(f"{location}.{key}", f"{len(indices)} textures", f"{wanted}, three channels each")
     return indices
-
-
-def _stacked(document: Document, reader: TextureReader, indices: list[Any], location: str) -> Tensor:
-    images: list[Tensor] = []
-    for index in indices:
-        image = reader.read(index, location)
-        if images and image.shape != images[0].shape:
-            raise document.error(location, f"{tuple(images[0].shape[1:])} and {tuple(image.shape[1:])}", "one size")
-        images.append(image)
-    return torch.stack(images)
 
 
 def _range(document: Document, listed: dict[str, Any], location: str) -> tuple[float, float]:
