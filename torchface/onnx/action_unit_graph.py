@@ -105,11 +105,7 @@ def action_unit_model(classifier: ActionUnitClassifier, facts: Mapping[str, obje
 
 
 class IntensityVotes(nn.Module):
-    """``ActionUnitClassifier`` with one convolution for all regions; mean and deviations go into the components.
-
-    Args:
-        classifier: a trained one.
-    """
+    """``ActionUnitClassifier`` with one convolution for all regions; mean and deviations go into the components."""
 
     filters: Tensor
 

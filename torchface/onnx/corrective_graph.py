@@ -27,9 +27,6 @@ class CorrectiveGraph(nn.Module):
     First the solve of the shapes alone, then Gauss-Newton's steps: each a quadratic program in the box by operator
     splitting, taken whole, by half or by less, whichever leaves the least energy. In the first two in-betweens are
     rounded, as in ``torchface.capture.corrective_energy``. A frame without a marker gives ``previous``.
-
-    Args:
-        solver: the exact solve, of a rig with correctives.
     """
 
     def __init__(self, solver: MarkerSolver, steps: int = STEPS) -> None:

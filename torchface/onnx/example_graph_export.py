@@ -29,16 +29,12 @@ _RATIO = 1.05
 
 @dataclass(frozen=True)
 class ExampleGap:
-    """How far the graph is from the exact solve, on the frames that it was checked with.
-
-    Args:
-        error: mean distance of landmarks over the eyes', percent: the graph's and the exact solve's.
-    """
+    """How far the graph is from the exact solve, on the frames that it was checked with."""
 
     frames: str
     mean: float
     worst: float
-    error: tuple[float, float]
+    error: tuple[float, float]  # mean distance of landmarks over the eyes', percent: the graph's and the exact solve's
 
 
 @dataclass(frozen=True)

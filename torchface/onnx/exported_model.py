@@ -135,14 +135,7 @@ def half_stored(model: onnx.ModelProto, names: Collection[str]) -> onnx.ModelPro
 def chained_models(
     first: onnx.ModelProto, second: onnx.ModelProto, outputs: Sequence[str], metadata: Mapping[str, object]
 ) -> onnx.ModelProto:
-    """One model of two of ``exported_model``, of which the second takes outputs of the first by their names.
-
-    Args:
-        first: with the inputs of the whole.
-        second: without inputs that the first does not give.
-        outputs: names of those of the whole, of either.
-        metadata: as for :func:`exported_model`.
-    """
+    """One model of two of ``exported_model``, of which the second takes outputs of the first by their names."""
     model, rest = onnx.ModelProto(), onnx.GraphProto()
     model.CopyFrom(first)
     rest.CopyFrom(second.graph)

@@ -27,10 +27,6 @@ def export_expression_regression(
 
     The graph takes ``neutrals`` (B,V,3), millimetres, in any pose, and gives ``offsets`` (B,N,V,3), what a weight of 1
     of each expression adds. The metadata holds ``shape_names`` and ``topology``.
-
-    Args:
-        model: in float32.
-        facts: further metadata, such as licence and data.
     """
     if model.form != "offsets":
         raise ValueRangeError(f"{path}: found a regression of the form {model.form!r}, expected 'offsets'")
@@ -70,9 +66,6 @@ class OffsetRegression(nn.Module):
 
     Its rotation onto the mean neutral is Horn's: the largest eigenvector q of a symmetric 4×4 matrix A that is linear
     in the covariance. Squared again and again, A + I comes to :math:`q q^\top`, in which the rotation is linear.
-
-    Args:
-        model: of the form "offsets".
     """
 
     target: Tensor

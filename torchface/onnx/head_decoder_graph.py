@@ -24,10 +24,6 @@ def export_head_decoder(model: HeadModel, path: str | Path, facts: Mapping[str, 
     The graph takes ``shape`` (B,K) and, where the model knows colours, ``color`` (B,L), in standard deviations, and
     gives ``vertices`` (B,V,3), millimetres, and ``colors`` (B,V,3), clipped to [0,1]. The metadata holds ``triangles``
     and, where annotated, ``landmarks``, as JSON.
-
-    Args:
-        model: in float32.
-        facts: further metadata, such as licence and data.
     """
     graph = head_decoder_model(model, facts)
     cases = []

@@ -18,8 +18,7 @@ from torchface.landmarks.images.trees.landmark_trees import FAINTEST, LandmarkTr
 from torchface.onnx.checked_export import ExportReport, write_checked
 from torchface.onnx.operator_set import IR_VERSION, OPSET
 
-PixelType = Literal["uint8", "float32"]
-"""What the image's values are: 0 to 255, or [0,1]."""
+PixelType = Literal["uint8", "float32"]  # what the image's values are: 0 to 255, or [0,1]
 
 _PARITY = 0.1  # pixels; a rounding error may read the pixel beside, which moves a face by some hundredths
 
@@ -58,13 +57,7 @@ class _Graph:
     def model(
         self, inputs: Mapping[str, tuple[int, Sequence[int | str]]], landmarks: int, facts: Mapping[str, object]
     ) -> onnx.ModelProto:
-        """The checked model.
-
-        Args:
-            inputs: type and shape of each.
-            landmarks: how many it finds.
-            facts: metadata; what is not text becomes JSON.
-        """
+        """The checked model."""
         given = [helper.make_tensor_value_info(name, kind, list(shape)) for name, (kind, shape) in inputs.items()]
         found = helper.make_tensor_value_info("landmarks", TensorProto.FLOAT, ["faces", landmarks, 2])
         graph = helper.make_graph(self._nodes, "landmark_trees", given, [found], list(self._constants.values()))
@@ -87,9 +80,6 @@ def export_landmark_trees(
 
     The graph takes ``image`` (height,width), grey, and ``boxes`` (B,4) of faces in it: x, y, width, height in pixels.
     It gives ``landmarks`` (B,L,2), pixels, x right and y down; a box that is not finite gives NaN.
-
-    Args:
-        facts: further metadata, such as licence and data.
     """
     generator = torch.Generator().manual_seed(0)
     cases = []

@@ -29,18 +29,12 @@ _PIXELS = {"landmarks", "iris", "deviation", "faces", "points", "point_deviation
 
 @dataclass(frozen=True)
 class _Form:
-    """The graph of a network.
-
-    Args:
-        sizes: names of the input's axes that may have any size.
-        example: an input, 2 images or more.
-        parity: by output, how far ONNX Runtime may be from PyTorch.
-    """
+    """The graph of a network."""
 
     images: str
-    sizes: tuple[str | None, ...]
-    example: Tensor
-    parity: Mapping[str, float]
+    sizes: tuple[str | None, ...]  # names of the input's axes that may have any size
+    example: Tensor  # an input, 2 images or more
+    parity: Mapping[str, float]  # by output, how far ONNX Runtime may be from PyTorch
     metadata: Mapping[str, object]
 
 
@@ -85,9 +79,6 @@ def export_network(network: ImageNetwork, path: str | Path, facts: Mapping[str, 
     and sine of the roll angle, clockwise as the image is seen. What is no face has a score near 0.
 
     Images are red, green, blue in [0,1]. Weights of the first three are stored in half precision.
-
-    Args:
-        facts: further metadata, such as licence and data.
     """
     form, cases = _form(network.eval()), []
     smaller = form.example[..., : form.example.shape[-1] - 64] if "width" in form.sizes else form.example

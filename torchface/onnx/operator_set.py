@@ -2,7 +2,5 @@
 
 from __future__ import annotations
 
-OPSET = 18
-"""Of the operators: the oldest that the exporter of PyTorch writes."""
-IR_VERSION = 8
-"""Of the file's format, the oldest that runtimes of the last years read."""
+OPSET = 18  # of the operators: the oldest that the exporter of PyTorch writes
+IR_VERSION = 8  # of the file's format, the oldest that runtimes of the last years read

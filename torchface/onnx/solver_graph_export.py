@@ -46,19 +46,14 @@ _MISSING = (0.0, 0.1, 0.3)
 
 @dataclass(frozen=True)
 class SolverGap:
-    """How far the graph is from the exact solve, as (E(w) - E*) / E* with E in mm² a marker.
+    """How far the graph is from the exact solve, as (E(w) - E*) / E* with E in mm² a marker."""
 
-    Args:
-        missing: share of markers missing.
-        parity: largest difference of a weight between ONNX Runtime and the same graph in PyTorch.
-        rounding: the same between PyTorch in single and in double precision: what shapes that the markers hardly see
-            owe to rounding alone.
-    """
-
-    missing: float
+    missing: float  # share of markers missing
     worst: float
     median: float
-    parity: float
+    parity: float  # largest difference of a weight between ONNX Runtime and the same graph in PyTorch
+    # The same between PyTorch in single and in double precision: what shapes that the markers hardly see owe to
+    # rounding alone.
     rounding: float
 
 
@@ -182,9 +177,6 @@ def export_marker_solver(
     """Writes a solver as ONNX, and checks it; see :func:`export_solver`.
 
     Args:
-        solver: of N shapes and M markers.
-        path, steps, markers: as there.
-        facts: further metadata, such as licence and data.
         hybrid: with the inputs of :func:`export_hybrid_solver`.
     """
     progress = progress or silent

@@ -30,9 +30,6 @@ class LandmarkBank(nn.Module):
     As ``UVLandmarkDetector``, with mean shift in a fixed form: it starts at the place where most votes lie within a
     bandwidth, weighed by the prior, and takes five steps. A cluster's size is the votes within a bandwidth of its
     centre.
-
-    Args:
-        detector: with L landmarks, learned from M images of S×S pixels.
     """
 
     filters: Tensor
@@ -133,7 +130,6 @@ def export_landmark_bank(
     ``landmark_names`` and ``appearance``.
 
     Args:
-        facts: further metadata, such as licence and data.
         images: to check with; cloudy noise if absent.
     """
     bank = LandmarkBank(detector).eval()

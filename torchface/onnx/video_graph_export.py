@@ -128,26 +128,15 @@ def export_video_solver(
 
 @dataclass(frozen=True, eq=False)
 class CheckFrames:
-    """What a graph is checked with.
+    """What a graph is checked with."""
 
-    Args:
-        landmarks: as solvers take them, (T,68,2), pixels, NaN for not seen.
-        confidence: (T,68).
-        weights: the true ones, (T,N), where they are known.
-    """
-
-    landmarks: Tensor
-    confidence: Tensor
-    weights: Tensor | None = None
+    landmarks: Tensor  # as solvers take them, (T,68,2), pixels, NaN for not seen
+    confidence: Tensor  # (T,68)
+    weights: Tensor | None = None  # the true ones, (T,N), where they are known
 
 
 def check_frames(video: Track, camera: CameraCalibration) -> CheckFrames:
-    """The first frames of a video from where a face is seen, as ``torchface track`` solves them.
-
-    Args:
-        video: landmarks as found, (T,68,2), pixels of the camera's images.
-        camera: whose lens bends them.
-    """
+    """The first frames of a video from where a face is seen, as ``torchface track`` solves them."""
     if video.values.shape[1:] != (LANDMARKS, 2):
         raise ShapeError(f"video: found landmarks {tuple(video.values.shape)}, expected (T,{LANDMARKS},2)")
     landmarks = adaptive_filter(undistort(video.values.double(), camera), LANDMARK_SETTINGS).float()

@@ -28,8 +28,7 @@ READ = (
 )  # fmt: skip
 """What the first part of the graph hands to the second."""
 
-SOLVED = ("weights", "rotation", "translation", "gaze", "calibrated", "next_state")
-"""What the second part gives."""
+SOLVED = ("weights", "rotation", "translation", "gaze", "calibrated", "next_state")  # what the second part gives
 
 OUTPUTS = (
     "weights", "rotation", "translation", "gaze", "landmarks", "iris", "presence", "calibrated", "next_state"
@@ -54,11 +53,7 @@ class WebcamAnswer(NamedTuple):
 
 
 class WebcamSolverGraph(nn.Module):
-    """``WebcamSolver`` with named outputs beside its state, float32.
-
-    Args:
-        solver: as it is to be exported.
-    """
+    """``WebcamSolver`` with named outputs beside its state, float32."""
 
     def __init__(self, solver: WebcamSolver) -> None:
         super().__init__()
@@ -81,11 +76,7 @@ class AnswerSolver(Protocol):
 
 
 class WebcamReading(nn.Module):
-    """The first part of what the graph computes: the picture's face, and all that the second part takes.
-
-    Args:
-        reader: reads faces.
-    """
+    """The first part of what the graph computes: the picture's face, and all that the second part takes."""
 
     def __init__(self, reader: FaceReader) -> None:
         super().__init__()
@@ -103,11 +94,7 @@ class WebcamReading(nn.Module):
 
 
 class WebcamSolving(nn.Module):
-    """The second part: weights, head and next state of what the first has read.
-
-    Args:
-        solver: solves weights, such as ``WebcamSolverGraph``.
-    """
+    """The second part: weights, head and next state of what the first has read."""
 
     def __init__(self, solver: AnswerSolver) -> None:
         super().__init__()
@@ -125,9 +112,6 @@ class WebcamGraph(nn.Module):
 
     Whatever comes, numbers that are not finite or beyond their range count as usual ones, and a state that is not
     finite as a start.
-
-    Args:
-        solver: solves weights, such as ``WebcamSolverGraph``.
     """
 
     def __init__(self, reader: FaceReader, solver: AnswerSolver) -> None:

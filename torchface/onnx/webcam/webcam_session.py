@@ -14,43 +14,28 @@ from torch import Tensor
 from torchface.capture.anybody import WebcamControls
 from torchface.errors import FileFormatError, ShapeError, ValueRangeError
 
-SMALLEST = 64
-"""Pixels a side of a picture, at least."""
+SMALLEST = 64  # pixels a side of a picture, at least
 
 _TASK = "webcam"
 
 
 @dataclass(frozen=True, eq=False)
 class WebcamFrame:
-    """What is solved of one picture.
+    """What is solved of one picture."""
 
-    Args:
-        weights: by ARKit's 52 names, (52,) in [0,1].
-        rotation, translation: head to camera, (3,3) and (3,) millimetres.
-        gaze: of the right eye and the left, (2,2) radians: to the person's left, up.
-        landmarks: iBUG's 68, (68,2) pixels; NaN without a face.
-        iris: centres of the irises, the right eye's first, (2,2) pixels; NaN without a face.
-        presence: in [0,1]: how likely there is a face; 0 where none was found.
-        calibrated: in [0,1]: how far the person has been learned.
-    """
-
-    weights: Tensor
+    weights: Tensor  # by ARKit's 52 names, (52,) in [0,1]
+    # rotation, translation: head to camera, (3,3) and (3,) millimetres
     rotation: Tensor
     translation: Tensor
-    gaze: Tensor
-    landmarks: Tensor
-    iris: Tensor
-    presence: float
-    calibrated: float
+    gaze: Tensor  # of the right eye and the left, (2,2) radians: to the person's left, up
+    landmarks: Tensor  # iBUG's 68, (68,2) pixels; NaN without a face
+    iris: Tensor  # centres of the irises, the right eye's first, (2,2) pixels; NaN without a face
+    presence: float  # in [0,1]: how likely there is a face; 0 where none was found
+    calibrated: float  # in [0,1]: how far the person has been learned
 
 
 class WebcamSession:
-    """Weights, pose and gaze of whoever sits before a webcam, picture by picture, on one thread.
-
-    Args:
-        model: the graph, as ``torchface export webcam`` writes it.
-        name: of the file, for messages.
-    """
+    """Weights, pose and gaze of whoever sits before a webcam, picture by picture, on one thread."""
 
     controls: WebcamControls
     """What the user asks for from the next picture on."""

@@ -53,19 +53,12 @@ _INSIST = "--insist writes the sites all the same"
 
 @dataclass(frozen=True, eq=False)
 class AttachReport:
-    """What came of a range of motion.
+    """What came of a range of motion."""
 
-    Args:
-        fit: the sites and how they were found.
-        moved: how far each marker's site is from the first guess, (M,), millimetres.
-        cleanup: what was wrong with the take.
-        warnings: what the user should know before they use the sites.
-    """
-
-    fit: AttachmentFit
-    moved: Tensor
-    cleanup: Cleanup
-    warnings: tuple[str, ...] = ()
+    fit: AttachmentFit  # the sites and how they were found
+    moved: Tensor  # how far each marker's site is from the first guess, (M,), millimetres
+    cleanup: Cleanup  # what was wrong with the take
+    warnings: tuple[str, ...] = ()  # what the user should know before they use the sites
 
     def lines(self) -> list[str]:
         """For people to read."""
@@ -279,12 +272,9 @@ def attach(
 
 @dataclass(frozen=True)
 class MotionJob:
-    """How the sites of each take are found; ``{name}`` in a path is the take's name.
+    """How the sites of each take are found; ``{name}`` in a path is the take's name."""
 
-    Args:
-        rig, settings: see :func:`attach`.
-    """
-
+    # rig, settings: see attach
     rig: Path
     settings: AttachSettings
 

@@ -20,27 +20,20 @@ if TYPE_CHECKING:
 
 S = TypeVar("S", bound="DataclassInstance")
 
-NAME = "{name}"
-"""Stands in an option's path for the item's name."""
+NAME = "{name}"  # stands in an option's path for the item's name
 
 SCAN_ENDINGS = (*MESH_ENDINGS, *SCENE_ENDINGS)
-SUMMARY, RECORDS = "summary.csv", "records"
-"""Of a batch: its table, and the folder of its records."""
+SUMMARY, RECORDS = "summary.csv", "records"  # of a batch: its table, and the folder of its records
 _OWN = (SUMMARY, RECORDS)
 _KINDS = (("scan or mesh", SCAN_ENDINGS), ("marker take", MARKER_ENDINGS), ("video", VIDEO_ENDINGS))
 
 
 @dataclass(frozen=True)
 class BatchItem:
-    """One scan, take or video.
+    """One scan, take or video."""
 
-    Args:
-        name: of its results and its record, without ending; no two of a batch have the same.
-        path: the file or folder, absolute.
-    """
-
-    name: str
-    path: Path
+    name: str  # of its results and its record, without ending; no two of a batch have the same
+    path: Path  # the file or folder, absolute
 
     @overload
     def path_of(self, path: Path) -> Path: ...
@@ -71,17 +64,12 @@ class BatchItem:
 
 @dataclass(frozen=True)
 class ItemKind:
-    """What a command works on.
+    """What a command works on."""
 
-    Args:
-        noun: what one is called.
-        done: what it is afterwards, such as "registered".
-        is_item: whether a file with one of the endings, or a folder, is one; every file and no folder if absent.
-    """
-
-    noun: str
-    done: str
+    noun: str  # what one is called
+    done: str  # what it is afterwards, such as "registered"
     endings: tuple[str, ...]
+    # Whether a file with one of the endings, or a folder, is one; every file and no folder if absent.
     is_item: Callable[[Path], bool] | None = None
 
     def holds(self, path: Path) -> bool:

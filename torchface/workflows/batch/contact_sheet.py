@@ -19,23 +19,15 @@ from torchface.workflows.batch.batch_job import picture_path
 from torchface.workflows.batch.outcomes import Outcome
 
 CONTACT_SHEET = "contact_sheet.png"
-MOST_PICTURES = 400
-"""On one sheet: more is not looked at, and a picture of 60 megapixels opens slowly."""
+MOST_PICTURES = 400  # on one sheet: more is not looked at, and a picture of 60 megapixels opens slowly
 _TEXT = 11
-_LETTER = 7
-"""Pixels a letter takes at most in a text of that size, on average."""
-_SKIPPED = 217
-"""The grey of what has no picture, of 255."""
-WIDTH, HEIGHT = 144, 180
-"""Of one view of a face, pixels."""
+_LETTER = 7  # pixels a letter takes at most in a text of that size, on average
+_SKIPPED = 217  # the grey of what has no picture, of 255
+WIDTH, HEIGHT = 144, 180  # of one view of a face, pixels
 
 
 def contact_sheet(outcomes: Sequence[Outcome], out: Path) -> Tensor:
-    """The pictures with their names and headlines, of skipped items why they were; (3,H,W).
-
-    Args:
-        outcomes: of all items; the first :data:`MOST_PICTURES` are shown.
-    """
+    """The pictures of the first :data:`MOST_PICTURES` outcomes, with names, and headlines or errors; (3,H,W)."""
     pictured = outcomes[:MOST_PICTURES]
     pictures = [_picture(outcome, out) for outcome in pictured]
     size = next((picture.shape[1:] for picture in pictures if picture is not None), torch.Size((HEIGHT, WIDTH)))

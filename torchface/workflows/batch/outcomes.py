@@ -24,55 +24,37 @@ _MAX_RECORD = 16 * 2**20
 _DONE, _SKIPPED = "done", "skipped"
 _COLUMNS = ("name", "status", "seconds", "processor_seconds", "input", "results", "remarks")
 
-Figures = Mapping[str, float | str]
-"""What was measured, by column of the table."""
+Figures = Mapping[str, float | str]  # what was measured, by column of the table
 
 
 @dataclass(frozen=True, eq=False)
 class Made:
-    """What a job has made of an item.
+    """What a job has made of an item."""
 
-    Args:
-        results: the files, inside the folder of results.
-        headline: the most telling of it, a few words for the contact sheet.
-        notes: what people should know before they use the results.
-        picture: for the contact sheet, (3,H,W) in [0,1].
-        details: what else the record is to hold.
-    """
-
-    results: tuple[Path, ...]
+    results: tuple[Path, ...]  # the files, inside the folder of results
     figures: Figures = field(default_factory=dict)
-    headline: str = ""
-    notes: tuple[str, ...] = ()
-    picture: Tensor | None = None
-    details: Mapping[str, Any] = field(default_factory=dict)
+    headline: str = ""  # the most telling of it, a few words for the contact sheet
+    notes: tuple[str, ...] = ()  # what people should know before they use the results
+    picture: Tensor | None = None  # for the contact sheet, (3,H,W) in [0,1]
+    details: Mapping[str, Any] = field(default_factory=dict)  # what else the record is to hold
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """What became of one item.
-
-    Args:
-        results: the files; empty where it was skipped.
-        figures, headline, notes: see :class:`Made`.
-        error: why it was skipped; empty where it was not.
-        lasting: the error lies in the item itself: another run would meet it again.
-        fatal: the error meets every item, such as a full disk.
-        processor_seconds: of all threads.
-        reused: it was finished by an earlier run.
-    """
+    """What became of one item."""
 
     item: BatchItem
-    results: tuple[Path, ...] = ()
+    results: tuple[Path, ...] = ()  # the files; empty where it was skipped
+    # figures, headline, notes: see Made
     figures: Figures = field(default_factory=dict)
     headline: str = ""
     notes: tuple[str, ...] = ()
-    error: str = ""
-    lasting: bool = False
-    fatal: bool = False
+    error: str = ""  # why it was skipped; empty where it was not
+    lasting: bool = False  # the error lies in the item itself: another run would meet it again
+    fatal: bool = False  # the error meets every item, such as a full disk
     seconds: float = 0.0
-    processor_seconds: float = 0.0
-    reused: bool = False
+    processor_seconds: float = 0.0  # of all threads
+    reused: bool = False  # it was finished by an earlier run
 
     @property
     def name(self) -> str:

@@ -58,10 +58,6 @@ def in_processes(
     time limit, takes only its item with it: the item is reported as skipped, without a record, and another process
     takes its place. Processes share nothing that a dead one could keep, no lock and no pipe. All of them end with this
     process, however it ends.
-
-    Args:
-        job: what is done with each.
-        time_limit: seconds that an item may take.
     """
     limit = inf if time_limit is None else time_limit
     waiting = deque(items)
@@ -165,11 +161,7 @@ def _none_started() -> ValueRangeError:
 
 
 def lost(item: BatchItem, end: str) -> Outcome:
-    """The outcome of an item whose process has died.
-
-    Args:
-        end: how it ended.
-    """
+    """The outcome of an item whose process has died."""
     return Outcome(item, error=f"the process that worked on it {end}")
 
 

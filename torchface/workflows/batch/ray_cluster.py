@@ -91,8 +91,6 @@ def on_cluster(
 
     Args:
         job: what is done with each; travels once to each machine.
-        out: the folder of results, where all machines see it.
-        time_limit: seconds that an item may take.
     """
     ray = _import_ray()
     started_here = not ray.is_initialized()

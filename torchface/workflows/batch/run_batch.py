@@ -21,19 +21,15 @@ from torchface.workflows.batch.ray_cluster import check_cluster, on_cluster
 
 @dataclass(frozen=True)
 class BatchOptions:
-    """Where items are worked on.
+    """Where items are worked on."""
 
-    Args:
-        jobs: how many processes of one thread each; 1 works in this one, with all its threads. A script that asks for
-            more must call under ``if __name__ == "__main__"``.
-        cluster: the address of a Ray cluster, or ``"auto"`` on one of its machines, instead of ``jobs``; inputs and
-            results must lie where all its machines see them.
-        time_limit: seconds that an item may take; then its process is killed, and it is skipped.
-    """
-
+    # How many processes of one thread each; 1 works in this one, with all its threads. A script that asks for more must
+    # call under if __name__ == "__main__".
     jobs: int = 1
+    # The address of a Ray cluster, or "auto" on one of its machines, instead of jobs; inputs and results must lie where
+    # all its machines see them.
     cluster: str | None = None
-    time_limit: float | None = None
+    time_limit: float | None = None  # seconds that an item may take; then its process is killed, and it is skipped
 
     def check(self) -> None:
         """Raises where the options make no sense, ray is missing, or no cluster answers."""
@@ -45,24 +41,17 @@ class BatchOptions:
             check_cluster(self.cluster)
 
 
-ONE_BY_ONE = BatchOptions()
-"""In this process, without a time limit."""
+ONE_BY_ONE = BatchOptions()  # in this process, without a time limit
 
 
 @dataclass(frozen=True)
 class BatchReport:
-    """What became of a batch.
-
-    Args:
-        outcomes: one an item, in the order found.
-        out: the folder of results and records.
-        left_out: what lay beside the items and is none.
-    """
+    """What became of a batch."""
 
     kind: ItemKind
-    outcomes: tuple[Outcome, ...]
-    out: Path
-    left_out: tuple[str, ...] = ()
+    outcomes: tuple[Outcome, ...]  # one an item, in the order found
+    out: Path  # the folder of results and records
+    left_out: tuple[str, ...] = ()  # what lay beside the items and is none
 
     @property
     def summary(self) -> Path:

@@ -54,39 +54,26 @@ FLAWS = StageFlaws(noise=0.3, missing=0.02, gaps=1.0, gap_seconds=0.4)
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """What the demo plays: a template, a head that nobody has rigged, its true rig, and the weights that move it.
+    """What the demo plays: a template, a head that nobody has rigged, its true rig, and the weights that move it."""
 
-    Args:
-        title: for the report.
-        head: the new neutral.
-        truth: the rig that really is the new head's.
-        weights: (T,N), in the order of ``truth.names``.
-    """
-
-    title: str
+    title: str  # for the report
     template: BlendshapeRig
-    head: Mesh
-    truth: BlendshapeRig
-    weights: Tensor
+    head: Mesh  # the new neutral
+    truth: BlendshapeRig  # the rig that really is the new head's
+    weights: Tensor  # (T,N), in the order of truth.names
     fps: float
 
 
 @dataclass(frozen=True, eq=False)
 class Solved:
-    """Weights beside the true ones.
+    """Weights beside the true ones."""
 
-    Args:
-        weights: (T,N).
-        weight_error, mesh_error: against the truth; the mesh's over the face.
-        marker_rmse: (T,), millimetres, against the markers as seen.
-        jitter: how many times as much as the true weights they tremble; see ``torchface.evaluation.weight_jitter``.
-    """
-
-    weights: Tensor
+    weights: Tensor  # (T,N)
+    # weight_error, mesh_error: against the truth; the mesh's over the face
     weight_error: WeightError
     mesh_error: MeshError
-    marker_rmse: Tensor
-    jitter: float
+    marker_rmse: Tensor  # (T,), millimetres, against the markers as seen
+    jitter: float  # how many times as much as the true weights they tremble; see torchface.evaluation.weight_jitter
 
     @property
     def correlation(self) -> float:
@@ -97,33 +84,21 @@ class Solved:
 
 @dataclass(frozen=True, eq=False)
 class DemoResult:
-    """What came out, beside what was true.
-
-    Args:
-        rig: the template transferred to the head.
-        transfer: how that went.
-        attachment: where the markers sat.
-        layout: the make-up artist's, which has names for it; none where the rig has too little for one.
-        solved: the take solved at once, which is what the files hold.
-        frame_by_frame: every frame on its own.
-        seconds: what the solve at once took.
-        face: mask (V,) of the vertices that the mesh errors are about.
-        seen: what the markers observe of the rig.
-        solver: how the exported solver compares.
-    """
+    """What came out, beside what was true."""
 
     scene: Scene
-    rig: BlendshapeRig
-    transfer: TransferReport
-    attachment: Attachment
+    rig: BlendshapeRig  # the template transferred to the head
+    transfer: TransferReport  # how that went
+    attachment: Attachment  # where the markers sat
+    # The make-up artist's, which has names for it; none where the rig has too little for one.
     layout: MakeupLayout | None
     recording: Recording
-    solved: Solved
-    frame_by_frame: Solved
-    seconds: float
-    face: Tensor
-    seen: Observability
-    solver: SolverReport
+    solved: Solved  # the take solved at once, which is what the files hold
+    frame_by_frame: Solved  # every frame on its own
+    seconds: float  # what the solve at once took
+    face: Tensor  # mask (V,) of the vertices that the mesh errors are about
+    seen: Observability  # what the markers observe of the rig
+    solver: SolverReport  # how the exported solver compares
     files: dict[str, Path]
 
 
@@ -199,15 +174,7 @@ def _weight_take(path: Path) -> Take:
 
 
 def run_demo(scene: Scene, out: Path, seed: int = 0, progress: Progress | None = None) -> DemoResult:
-    """Plays a scene and writes every file of the main job into a folder.
-
-    Args:
-        scene: see ``embedded_scene`` and ``scene_from``.
-        out: the folder; made if absent.
-
-    Returns:
-        A ``DemoResult``; ``torchface.workflows.demo.demo_page.write_demo_page`` makes the report of it.
-    """
+    """Plays a scene and writes every file of the main job into a folder."""
     with within_job(out):
         return _run_demo(scene, out, seed, FLAWS, progress or silent)
 

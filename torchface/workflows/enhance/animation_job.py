@@ -30,16 +30,12 @@ ANIMATIONS = ItemKind("animation", "enhanced", (*MARKER_ENDINGS, ".csv", ".safet
 
 @dataclass(frozen=True)
 class AnimationJob:
-    """How each animation is enhanced; ``{name}`` in a path is the animation's name.
+    """How each animation is enhanced; ``{name}`` in a path is the animation's name."""
 
-    Args:
-        model, settings: see :func:`enhance_animation`.
-        height: of each view of a face in the reports, pixels.
-    """
-
+    # model, settings: see enhance_animation
     model: str
     settings: EnhanceSettings = field(default_factory=EnhanceSettings)
-    height: int = 380
+    height: int = 380  # of each view of a face in the reports, pixels
 
     def key(self, item: BatchItem) -> str:
         """A key of all that an animation's results depend on."""

@@ -26,19 +26,13 @@ _CHUNK = 8
 
 @dataclass(frozen=True, eq=False)
 class AnimationTargets:
-    """An animation as morph targets.
+    """An animation as morph targets."""
 
-    Args:
-        kind: ``frames``, a target a frame, or ``components``, the principal components of all frames.
-        deltas: of the targets, (N,V,3), millimetres.
-        weights: of every frame, (T,N); components are weighed below 0 too.
-        rms, largest: how far the frames that these give are from those they were made of: root mean square over all
-            vertices and frames, and the worst frame's root mean square, millimetres.
-    """
-
-    kind: str
-    deltas: Tensor
-    weights: Tensor
+    kind: str  # frames, a target a frame, or components, the principal components of all frames
+    deltas: Tensor  # of the targets, (N,V,3), millimetres
+    weights: Tensor  # of every frame, (T,N); components are weighed below 0 too
+    # rms, largest: how far the frames that these give are from those they were made of: root mean square over all
+    # vertices and frames, and the worst frame's root mean square, millimetres
     rms: float
     largest: float
 
@@ -46,14 +40,12 @@ class AnimationTargets:
 def animation_targets(
     sequence: MeshSequence, neutral: Tensor, megabytes: float, progress: Progress
 ) -> AnimationTargets:
-    r"""Every frame as a target where these are small enough, else as few principal components as show it.
+    r"""Every frame (T,V,3) as a target where these are small enough, else as few principal components as show it.
 
     Components are those of frames spread over the animation, as many as leave 0.005 mm, root mean square, or as fit.
     Their weights in all frames are projections: no frame is left out.
 
     Args:
-        sequence: the meshes, (T,V,3).
-        neutral: what the targets add to, (V,3).
         megabytes: that the targets may take, not counting what glTF leaves out of them because it is still.
     """
     frames, vertices = sequence.shape[:2]

@@ -23,33 +23,24 @@ _UNITS = ((1000.0, "metres"), (10.0, "centimetres"), (25.4, "inches"), (0.001, "
 
 @dataclass(frozen=True, eq=False)
 class CoarseAnimation:
-    """An animation of the model's dense mesh, without its fine detail.
+    """An animation of the model's dense mesh, without its fine detail."""
 
-    Args:
-        path: where it came from.
-        read: vertices (t,V,3) of the frames from one number up to another, without it, millimetres.
-        shown: what the file itself holds of these frames, in the same place: (t,N,3), NaN where a point was not seen.
-        shown_faces: triangles of that, (G,3); None where it is points.
-        residual: root mean square distance of its face at rest from the model's, aligned with it, millimetres; None
-            where it holds no face at rest.
-        notes: lines for people to read; warnings begin with ``warning: ``.
-        head: its own head at rest in the model's vertices, (V,3), where that is another person's.
-        weights: of the rig that moves it, where that is of the model's mesh and actor.
-        moments: which of its frames each region shows in each frame, (R,T), where it was retimed.
-    """
-
-    path: Path
+    path: Path  # where it came from
     kind: str
     count: int
+    # Vertices (t,V,3) of the frames from one number up to another, without it, millimetres.
     read: Callable[[int, int], Tensor]
     fps: float
+    # What the file itself holds of these frames, in the same place: (t,N,3), NaN where a point was not seen.
     shown: Callable[[int, int], Tensor]
-    shown_faces: Tensor | None
+    shown_faces: Tensor | None  # triangles of that, (G,3); None where it is points
+    # Root mean square distance of its face at rest from the model's, aligned with it, millimetres; None where it holds
+    # no face at rest.
     residual: float | None = None
-    notes: tuple[str, ...] = ()
-    head: Tensor | None = None
-    weights: Track | None = None
-    moments: Tensor | None = None
+    notes: tuple[str, ...] = ()  # lines for people to read; warnings begin with warning:
+    head: Tensor | None = None  # its own head at rest in the model's vertices, (V,3), where that is another person's
+    weights: Track | None = None  # of the rig that moves it, where that is of the model's mesh and actor
+    moments: Tensor | None = None  # which of its frames each region shows in each frame, (R,T), where it was retimed
 
     def rig_weights(self, names: Sequence[str]) -> Tensor | None:
         """The weights of these shapes, (T,N); None where one is missing, or none are asked for."""

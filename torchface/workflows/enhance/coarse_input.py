@@ -66,7 +66,6 @@ def read_coarse(path: Path, model: Mesh, settings: InputSettings, state: Path, p
     Args:
         path: ``.c3d``, ``.trc``, ``.csv`` of markers or weights, ``.glb``, ``.safetensors``, a mesh, a folder of
             meshes, or the folder of ``torchface track``.
-        model: the model's neutral.
         state: a folder for what a later run may take up.
     """
     progress("reading the input")
@@ -113,13 +112,7 @@ def tracked_animation(path: Path) -> Path:
 def other_topology(
     animated: AnimatedMesh, model: Mesh, correspondence: HeadCorrespondence, fps: float | None
 ) -> CoarseAnimation:
-    """An animation of other vertices, spread over the model's by the thin shell.
-
-    Args:
-        model: the model's neutral.
-        correspondence: of ``animated.neutral`` with it.
-        fps: frames a second; as the file has them if absent.
-    """
+    """An animation of other vertices, spread over the model's by the thin shell."""
     carry = correspondence.carrier(animated.neutral, model, animated.path)
 
     def read(begin: int, end: int) -> Tensor:

@@ -59,20 +59,15 @@ class EnhanceSettings:
 
 @dataclass(frozen=True, eq=False)
 class Enhanced:
-    """What came of an animation.
-
-    Args:
-        mesh: the model's neutral, framed by what moves.
-        notes: lines for people to read; warnings begin with ``warning: ``.
-    """
+    """What came of an animation."""
 
     animation: CoarseAnimation
     model: EnhancementModel
     model_name: str
     frames: EnhancedFrames
-    mesh: Mesh
+    mesh: Mesh  # the model's neutral, framed by what moves
     products: dict[str, Path]
-    notes: tuple[str, ...]
+    notes: tuple[str, ...]  # lines for people to read; warnings begin with warning:
 
     @property
     def outside_share(self) -> float:

@@ -19,14 +19,7 @@ _HEIGHT = 380
 
 
 def write_enhance_page(done: Enhanced, out: Path, height: int = _HEIGHT) -> Path:
-    """Writes the report's page and figures into a folder.
-
-    Args:
-        height: of each view of a face, pixels.
-
-    Returns:
-        The page's path.
-    """
+    """Writes the report's page and figures into a folder; the page's path."""
     shown = [shown_frame(done.animation, done.model, done.frames, t) for t in spread_frames(done, _SHOWN)]
     files = ", ".join(f"{what}: {path.name}" for what, path in done.products.items())
     sections = [

@@ -39,20 +39,13 @@ _ALIGNED_BY = 4000  # vertices, which are plenty for a rigid motion
 
 @dataclass(frozen=True, eq=False)
 class ShownFrame:
-    """One frame, its head held still in the neutral's place.
-
-    Args:
-        given: what the input's file holds, (N,3), millimetres; NaN points were not seen.
-        coarse: that on the model's mesh, (V,3).
-        smooth: its low frequencies, to which detail is added, (V,3).
-        enhanced: the result, (V,3).
-    """
+    """One frame, its head held still in the neutral's place."""
 
     number: int
-    given: Tensor
-    coarse: Tensor
-    smooth: Tensor
-    enhanced: Tensor
+    given: Tensor  # what the input's file holds, (N,3), millimetres; NaN points were not seen
+    coarse: Tensor  # that on the model's mesh, (V,3)
+    smooth: Tensor  # its low frequencies, to which detail is added, (V,3)
+    enhanced: Tensor  # the result, (V,3)
 
 
 def shown_frame(animation: CoarseAnimation, model: EnhancementModel, found: EnhancedFrames, number: int) -> ShownFrame:

@@ -29,20 +29,13 @@ _MOST_A_PIECE = 16
 
 @dataclass(frozen=True, eq=False)
 class EnhancedFrames:
-    """What came of an animation.
-
-    Args:
-        colors: their vertex colours, on disk; None where the model has none.
-        distances: of each region from the database, relative to the database's own spread, (T,R).
-        outside: frames and regions that the database does not hold, (T,R) bool.
-        seconds: that the frames took which this run enhanced, and how many these were.
-    """
+    """What came of an animation."""
 
     sequence: MeshSequence
-    colors: MeshSequence | None
-    distances: Tensor
-    outside: Tensor
-    seconds: float = 0.0
+    colors: MeshSequence | None  # their vertex colours, on disk; None where the model has none
+    distances: Tensor  # of each region from the database, relative to the database's own spread, (T,R)
+    outside: Tensor  # frames and regions that the database does not hold, (T,R) bool
+    seconds: float = 0.0  # that the frames took which this run enhanced, and how many these were
     enhanced: int = 0
 
 
@@ -70,7 +63,6 @@ def enhance_frames(
     """Enhances an animation into files of a folder.
 
     Args:
-        out: the folder of results, held for this run.
         state: a folder for what a killed run leaves to the next.
         key: of everything that the frames come from; what another key left is made anew.
     """

@@ -37,21 +37,13 @@ PLACE = "the result stands where the model stands, not where the input does"
 
 @dataclass(frozen=True, eq=False)
 class HeadCorrespondence:
-    """How another head lies on the model's.
+    """How another head lies on the model's."""
 
-    Args:
-        pose: from its space to the model's, a batch of one.
-        bent: its vertices at rest, bent onto the model's surface, (N,3), millimetres of the model's space.
-        known: which of them lie on that surface, (N,) bool.
-        residual: root mean square distance between ``bent`` and what the pose alone gives, of the known, millimetres.
-        how: its vertices were found to lie there, in words; empty where they are the model's own.
-    """
-
-    pose: Similarity
-    bent: Tensor
-    known: Tensor
-    residual: float
-    how: str = ""
+    pose: Similarity  # from its space to the model's, a batch of one
+    bent: Tensor  # its vertices at rest, bent onto the model's surface, (N,3), millimetres of the model's space
+    known: Tensor  # which of them lie on that surface, (N,) bool
+    residual: float  # root mean square distance between bent and what the pose alone gives, of the known, millimetres
+    how: str = ""  # its vertices were found to lie there, in words; empty where they are the model's own
 
     def notes(self, path: Path) -> list[str]:
         """Lines for people to read on the head of a file."""
@@ -67,13 +59,7 @@ class HeadCorrespondence:
         ]
 
     def carrier(self, head: Mesh, model: Mesh, path: Path) -> Callable[[Tensor], Tensor]:
-        """What carries the head's vertices (t,N,3) to the model's (t,V,3), by the thin shell where they differ.
-
-        Args:
-            head: at rest.
-            model: the model's neutral.
-            path: of the head, for messages.
-        """
+        """What carries the head's vertices (t,N,3) to the model's (t,V,3), by the thin shell where they differ."""
         if not self.how:
             return lambda vertices: placed(self.pose, vertices)
         ids, sites = self.on_model(SurfaceIndex(model.vertices, model.faces), head.faces)
@@ -91,10 +77,6 @@ class HeadCorrespondence:
 
         A vertex whose surface faces another way than the model's does there has come to lie on the other lip or lid,
         and is left out.
-
-        Args:
-            surface: the model's, at rest.
-            faces: triangles of the head, (F,3).
         """
         ids = self.sparse_points(faces)
         nearest = surface.nearest(self.bent[ids])
@@ -117,10 +99,7 @@ def find_correspondence(
     """Aligns a head at rest with the model's and bends it onto its surface.
 
     Args:
-        head: of any topology, millimetres.
-        model: the model's neutral.
         pairs: places known by the user, for a head of another topology; by registration if absent.
-        path: of the head, for messages.
         state: a file that keeps the correspondence for a later run of the same.
     """
     if has_topology_of(head, model):
@@ -167,8 +146,6 @@ def load_pairs(path: Path, head: Mesh, model: Mesh) -> tuple[Tensor, Tensor]:
     Args:
         path: ``.csv`` with the columns ``input`` and ``model``, vertex numbers from 0; or ``.json`` as ``torchface
             pick`` writes it, with the input's mesh for the template and the model's for the scan.
-        head: the input at rest.
-        model: the model at rest.
     """
     if path.suffix.lower() == ".json":
         picked = load_correspondences(path)

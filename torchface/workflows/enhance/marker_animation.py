@@ -30,16 +30,11 @@ _FAR_MM = 3.0
 
 @dataclass(frozen=True, eq=False)
 class MarkerSites:
-    """Where markers sit on the model, and the rig that says so.
-
-    Args:
-        rig: whose mesh it belongs to; None where that is the model's.
-        correspondence: how the rig's neutral lies on the model's, where there is a rig.
-    """
+    """Where markers sit on the model, and the rig that says so."""
 
     attachment: Attachment
-    rig: BlendshapeRig | None = None
-    correspondence: HeadCorrespondence | None = None
+    rig: BlendshapeRig | None = None  # whose mesh it belongs to; None where that is the model's
+    correspondence: HeadCorrespondence | None = None  # how the rig's neutral lies on the model's, where there is a rig
 
     def on_model(self, model: Mesh) -> Attachment:
         """The same sites on the model's triangles."""
@@ -89,10 +84,7 @@ def marker_animation(
     from those before and after.
 
     Args:
-        sites: where its markers sit.
-        model: the model's neutral.
         neutral: a frame with the face at rest, from which motion counts; else from the sites.
-        options: unit, labels, axes.
     """
     take, notes = read_markers(path, sites.attachment.labels, options)
     if take.seconds is not None:

@@ -34,13 +34,9 @@ _FRAME = re.compile(r"(.+)@(\d+)")
 
 @dataclass(frozen=True, eq=False)
 class Retimed:
-    """What came of two keyframes.
+    """What came of two keyframes."""
 
-    Args:
-        curves: how far each region has come in each frame, (R,T), 0 first and 1 last.
-    """
-
-    curves: Tensor
+    curves: Tensor  # how far each region has come in each frame, (R,T), 0 first and 1 last
     names: tuple[str, ...]
     fps: float
     products: dict[str, Path]
@@ -59,14 +55,10 @@ class Retimed:
 
 @dataclass(frozen=True)
 class Keyframe:
-    """A mesh, or a frame of an animation as ``FILE@NUMBER``.
-
-    Args:
-        frame: its number, from 0; None for a file of one mesh.
-    """
+    """A mesh, or a frame of an animation as ``FILE@NUMBER``."""
 
     path: Path
-    frame: int | None = None
+    frame: int | None = None  # its number, from 0; None for a file of one mesh
     rig: Path | None = None
 
     @staticmethod

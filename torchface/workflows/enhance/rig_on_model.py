@@ -22,18 +22,12 @@ _SITES = 2000
 
 @dataclass(frozen=True, eq=False)
 class RigOnModel:
-    """How a rig lies on a model's mesh.
-
-    Args:
-        correspondence: of its neutral with the model's.
-        dense: vertices (T,V,3) of the model's mesh for the rig's own (T,N,3).
-        notes: lines for people to read; warnings begin with ``warning: ``.
-    """
+    """How a rig lies on a model's mesh."""
 
     rig: BlendshapeRig
-    correspondence: HeadCorrespondence
-    dense: Callable[[Tensor], Tensor]
-    notes: tuple[str, ...]
+    correspondence: HeadCorrespondence  # of its neutral with the model's
+    dense: Callable[[Tensor], Tensor]  # vertices (T,V,3) of the model's mesh for the rig's own (T,N,3)
+    notes: tuple[str, ...]  # lines for people to read; warnings begin with warning:
 
     @property
     def neutral(self) -> Mesh:
@@ -67,9 +61,6 @@ def rig_on_model(
     """Finds how a rig lies on a model's mesh: by its vertices if they are the model's, else by registration or pairs.
 
     Args:
-        rig: millimetres.
-        path: of the rig, for messages.
-        model: the model's neutral.
         pairs: vertices of the rig and where they lie on the model; found by registration if absent.
         state: a file that keeps the correspondence for a later run of the same.
     """

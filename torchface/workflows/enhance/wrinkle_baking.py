@@ -30,12 +30,9 @@ def bake_region_maps(
     """Bakes the actor's face at rest, and with each map of displacements everywhere at 1.
 
     Args:
-        mesh: the rig's neutral on the model's surface, with texture coordinates.
-        model: the model's neutral.
         displacements: of the maps, (M,3,V), millimetres along two tangents and the normal of the model's neutral.
         shares: of the regions in the rig's vertices, (R,N).
         scale: from the rig's millimetres to the model's.
-        size: of the maps, texels a side.
     """
     still = Similarity(
         torch.ones(1, dtype=torch.float64),

@@ -67,23 +67,17 @@ class WrinkleSettings:
 
 @dataclass(frozen=True, eq=False)
 class ExportedWrinkles:
-    """What was made, and how much of the actor's detail it shows.
-
-    Args:
-        missed_by_maps: of the model's detail on poses whose weights were not learned, with the best weights, root mean
-            square, as a share.
-        missed: the same with the weights that are found for them.
-        graphs: how the graphs were checked.
-        notes: lines for people to read; warnings begin with ``warning: ``.
-    """
+    """What was made, and how much of the actor's detail it shows."""
 
     maps: RegionMaps
     wrinkles: WrinkleWeights
+    # Of the model's detail on poses whose weights were not learned, with the best weights, root mean square, as a
+    # share.
     missed_by_maps: float
-    missed: float
-    graphs: tuple[ExportReport, ...]
+    missed: float  # the same with the weights that are found for them
+    graphs: tuple[ExportReport, ...]  # how the graphs were checked
     products: dict[str, Path]
-    notes: tuple[str, ...]
+    notes: tuple[str, ...]  # lines for people to read; warnings begin with warning:
 
     def lines(self) -> list[str]:
         """For people to read."""

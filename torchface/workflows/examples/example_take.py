@@ -43,34 +43,22 @@ _EYES = (36, 45)
 
 @dataclass(frozen=True)
 class MethodFigures:
-    """What a method costs and how near it comes on one video.
+    """What a method costs and how near it comes on one video."""
 
-    Args:
-        method: all shapes at once with size, roll and place; the head first and then regions; or by a linear model.
-        pixels: mean distance of the landmarks.
-        share: the same, of the distance of the eyes' outer corners.
-        milliseconds: a frame, solved one after the other from the frame before, mean.
-    """
-
+    # All shapes at once with size, roll and place; the head first and then regions; or by a linear model.
     method: Method
-    pixels: float
-    share: float
-    milliseconds: float
+    pixels: float  # mean distance of the landmarks
+    share: float  # the same, of the distance of the eyes' outer corners
+    milliseconds: float  # a frame, solved one after the other from the frame before, mean
 
 
 @dataclass(frozen=True, eq=False)
 class ExampleTake:
-    """What came of a video.
+    """What came of a video."""
 
-    Args:
-        weights: of the examples, (T,N); NaN where no face was found.
-        solved: where the chosen method puts the landmarks, (T,68,2).
-        figures: one for each method.
-    """
-
-    weights: Tensor
-    solved: Tensor
-    figures: tuple[MethodFigures, ...]
+    weights: Tensor  # of the examples, (T,N); NaN where no face was found
+    solved: Tensor  # where the chosen method puts the landmarks, (T,68,2)
+    figures: tuple[MethodFigures, ...]  # one for each method
     products: dict[str, Path]
 
 

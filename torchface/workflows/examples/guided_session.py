@@ -17,15 +17,13 @@ from torchface.number_checks import checked_number
 from torchface.workflows.live.live_frames import open_source, planes
 from torchface.workflows.named_finders import DEFAULT_LANDMARKS, load_finder
 
-SECONDS = 4.0
-"""For each expression, if nothing else is asked for."""
+SECONDS = 4.0  # for each expression, if nothing else is asked for
 
 _READY = 0.5  # the share of that time in which the person gets into the expression
 _MORE = 10.0  # seconds more where a camera sees no face
 _LEAST = 3
 
-Say = Callable[[str], None]
-"""Takes a sentence for the person."""
+Say = Callable[[str], None]  # takes a sentence for the person
 
 
 def guided_examples(

@@ -26,7 +26,6 @@ class ExamplesSolver:
     Args:
         examples: what ``torchface examples`` wrote; of several people the mean is taken.
         method: all shapes at once, the head first and then regions, or by a linear model of landmarks.
-        landmarks: what finds them; see :func:`~torchface.workflows.named_finders.load_finder`.
     """
 
     names = ARKIT
