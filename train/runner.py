@@ -144,7 +144,7 @@ class Recipe(Generic[Settings, Trained]):
                 default = read_settings(Path(given), self.settings)
                 del flags[place : place + (1 if "=" in word else 2)]
                 break
-        text = (self.description or "") + _CONFIG
+        text = ((self.description or "") + _CONFIG).replace("``", "`")
         name = f"torchface train {recipe_name(self.settings)}"
         if default is None:
             return tyro.cli(self.settings, prog=name, description=text, args=flags)

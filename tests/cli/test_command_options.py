@@ -135,6 +135,18 @@ def test_an_output_that_is_an_input_is_refused_before_any_work(
     assert path.read_bytes() == b"content"
 
 
+@pytest.mark.parametrize("command", ["enhance", "register"])
+def test_the_help_names_what_a_command_takes_and_no_empty_default(
+    command: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit):
+        main([command, "--help"])
+    told = " ".join(capsys.readouterr().out.split())
+    assert "(default: )" not in told
+    assert "--no-no" not in told
+    assert command != "register" or "TEMPLATE SCAN..." in told
+
+
 @pytest.mark.parametrize("kind", ["symbolic link", "hard link", "link to the folder", "way round"])
 def test_another_name_of_the_same_file_is_the_same(
     kind: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]

@@ -38,10 +38,12 @@ def test_every_recipe_is_listed_with_what_it_makes(
 
 def test_a_recipe_takes_its_flags(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as ended:
-        main(["train", "marker_solver", "--help"])
+        main(["train", "marker-solver", "--help"])  # as commands are spelled, too
     assert ended.value.code == 0
     told = capsys.readouterr().out
     assert "--sparsity" in told
+    assert "`torchface train marker_solver" in told
+    assert "``" not in told
     assert "None" not in told  # Python's word, not the user's
 
 

@@ -40,6 +40,9 @@ def test_a_head_model_of_others_says_what_it_has(tmp_path: Path) -> None:
 def test_what_fit_and_arkit_write_is_known(tmp_path: Path) -> None:
     save_pts(torch.tensor([[1.0, 2.0], [11.0, 32.0]]), tmp_path / "face.pts")
     assert dict(describe(tmp_path / "face.pts"))["extent, pixels"] == "10.0 x 30.0"
+    points = '{"version": 2, "labels": [], "landmarks": {"points": [[0, 0, 0], [1, 2, 3]]}}'
+    (tmp_path / "scan.ljson").write_text(points)
+    assert dict(describe(tmp_path / "scan.ljson"))["extent, the scan's unit"] == "1.0 x 2.0 x 3.0"
     K = torch.tensor([[900.0, 0, 319.5], [0, 900, 239.5], [0, 0, 1]], dtype=torch.float64)
     save_calibration(CameraCalibration(K, torch.zeros(5, dtype=torch.float64), 640, 480), tmp_path / "c.toml")
     assert dict(describe(tmp_path / "c.toml"))["focal length, pixels"] == "900.0, 900.0"
@@ -72,6 +75,7 @@ def test_a_head_of_two_metres_and_a_texture_that_is_not_read_are_said(tmp_path: 
     whole.write_bytes(packed(root, binary))
     ((_, said),) = [row for row in describe(whole) if row[0] == "warning"]
     assert "1 of its textures cannot be read (KHR_texture_basisu)" in said
+    assert "texture none" not in said
 
 
 def test_what_is_not_there_is_told_before_its_ending(tmp_path: Path) -> None:

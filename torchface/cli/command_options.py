@@ -5,14 +5,14 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager
-from dataclasses import dataclass
+from dataclasses import dataclass, is_dataclass
 from functools import wraps
 from inspect import signature
 from pathlib import Path
 from types import NoneType, UnionType
 from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
-from tyro.conf import arg
+from tyro.conf import FlagCreatePairsOff, arg
 
 from torchface.cli.terminal import console
 from torchface.errors import FileFormatError
@@ -116,13 +116,21 @@ def plain_options(command: Command) -> Command:
     for name, parameter in signature(command).parameters.items():
         kind, *notes = get_args(hints[name]) if get_origin(hints[name]) is Annotated else (hints[name],)
         named = any(getattr(note, "metavar", None) is not None for note in notes)
-        changes: dict[str, Any] = {"help_behavior_hint": ""} if parameter.default is None else {}
+        empty = parameter.default in (None, False, ()) or (parameter.default is parameter.empty and _many(kind))
+        changes: dict[str, Any] = {"help_behavior_hint": ""} if empty else {}
         if not named and (word := _word(kind)):
             changes["metavar"] = word
+        if parameter.default is False and not is_dataclass(command):  # whose defaults may come from a file
+            notes += get_args(FlagCreatePairsOff[bool])[1:]  # no --no-quiet
         if changes:
             hints[name] = Annotated[(kind, *notes, arg(**changes))]  # type: ignore[misc]
     command.__annotations__ = hints
     return command
+
+
+def _many(kind: Any) -> bool:
+    """Whether an option takes several values; tyro takes none of them for a default."""
+    return get_origin(kind) in (list, tuple)
 
 
 def _word(kind: Any) -> str | None:
@@ -134,7 +142,7 @@ def _word(kind: Any) -> str | None:
         return None
     if get_origin(given[0]) is Literal:
         return "{" + ",".join(map(str, get_args(given[0]))) + "}"
-    if get_origin(given[0]) in (list, tuple) and (word := _WORDS.get(get_args(given[0])[0])):
+    if _many(given[0]) and (word := _WORDS.get(get_args(given[0])[0])):
         return f"[{word} ...]"
     return _WORDS.get(given[0])
 

@@ -13,6 +13,7 @@ from torchface.cli.command_options import Output
 from torchface.cli.progress_bars import progress_bars
 from torchface.cli.terminal import Quiet, console, print_path
 
+_SHOWN = 8  # regions
 _COLUMNS = (
     Column("mean", "mean_mm", "{:.3f} mm"),
     Column("95 %", "p95_mm", "{:.3f} mm"),
@@ -119,9 +120,13 @@ def evaluate(
     table = Table(title=f"{evaluation.result} against {evaluation.truth}, millimetres")
     for head in ("region", "mean", "median", "95 %", "largest", "total", "vertices"):
         table.add_column(head, justify="left" if head == "region" else "right")
-    for name, figures in evaluation.regions.items():
+    whole, *regions = evaluation.regions.items()
+    regions.sort(key=lambda region: -region[1].mean)
+    for name, figures in (whole, *regions[:_SHOWN]):
         numbers = (figures.mean, figures.median, figures.percentile_95, figures.largest)
         table.add_row(name, *(f"{x:.3f}" for x in numbers), f"{figures.total:.4e}", str(figures.vertices))
+    if len(regions) > _SHOWN:
+        table.caption = f"the {_SHOWN} regions that are farthest off; regions.csv has all {len(regions)}"
     console.print(table)
     for line in evaluation.lines():
         console.print(line, highlight=False)

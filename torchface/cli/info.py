@@ -18,7 +18,7 @@ def info(
     Args:
         path: A .glb, USD, .obj, .ply, .stl, .off, .c3d, .trc, .csv, .txt (Face Cap, iFacialMocap), .json (attachment,
             Audio2Face, ARKit), .gesichter or .onnx file, what `fit` writes of a photograph
-            (.pts, .toml), or a rig's folder.
+            (.pts, .toml), landmarks (.ljson), or a rig's folder.
         attachment: Report which shapes of the rig these markers distinguish.
         part: Look at this region of the rig only, such as face.
     """

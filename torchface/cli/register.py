@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Annotated
 
-from tyro.conf import Positional
+from tyro.conf import Positional, arg
 
 from torchface.cli.batch_report import Cluster, Column, Jobs, TimeLimit, show_batch, skipped_lines
 from torchface.cli.command_options import OutputPath
@@ -13,8 +14,8 @@ from torchface.cli.terminal import Quiet
 
 
 def register(
-    template: Positional[Path],
-    scans: Positional[tuple[Path, ...]],
+    template: Annotated[Positional[Path], arg(metavar="TEMPLATE")],
+    scans: Annotated[Positional[tuple[Path, ...]], arg(metavar="SCAN...")],
     out: OutputPath,
     landmarks: Path | None = None,
     part: str | None = None,
@@ -41,8 +42,8 @@ def register(
             folder.
         scans: Files (.obj, .ply, .stl, .off, .glb, .gltf, USD), or folders of them.
         out: The folder to write into.
-        landmarks: Folder of landmark files named as the scans are: .ljson, .pts or .json in the order of the
-            template's annotated landmarks, or correspondences saved by `torchface pick`.
+        landmarks: Folder of landmark files named as the scans are, or the file of the only scan: .ljson, .pts or .json
+            in the order of the template's annotated landmarks, or correspondences saved by `torchface pick`.
         part: Keep this region of the template only, such as face.
         unit: Unit of the scans (mm, cm, m) where it is not the format's own.
         detector: Landmark detector for scans without landmarks, by name or folder; `uv_landmarks` has learned from

@@ -36,8 +36,8 @@ def train(words: Sequence[str]) -> None:
     name, *flags = words
     if name.endswith(".py"):
         module = _loaded(Path(name), package)
-    elif name in recipes:
-        module = import_module(f"{package.__name__}.{name}")
+    elif (known := name.replace("-", "_")) in recipes:
+        module = import_module(f"{package.__name__}.{known}")
     else:
         raise NameMismatchError(
             f"train: found the recipe {name!r}, expected one of {', '.join(recipes)}, or a .py file"

@@ -21,7 +21,10 @@ _MAX_FILE = 16 * 2**20
 
 
 def landmark_file(folder: Path, scan: Path) -> Path | None:
-    """The file of a scan's landmarks: its name with ``.ljson``, ``.json`` or ``.pts``; None where there is none."""
+    """The file of a scan's landmarks: its name with ``.ljson``, ``.json`` or ``.pts``, or the file that is given in
+    place of a folder; None where there is none."""
+    if folder.is_file():
+        return folder
     return next((path for ending in ENDINGS if (path := folder / f"{scan.stem}{ending}").is_file()), None)
 
 

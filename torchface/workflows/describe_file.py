@@ -53,6 +53,7 @@ _LENGTH, _LONGEST_HEADER = "_mm", 4096  # ends the names of columns that are no 
 _MAX_NAMED, _MAX_LISTED = 8, 10
 _HEADS, _BODY, _TALLEST = (80, 700), 0.45, 2500.0
 """Millimetres: the largest extent of a face or head; a body's least width of its height, and its height."""
+_LANDMARK_ENDINGS = (".ljson", ".pts")
 _GLTF_ENDINGS = (".glb", ".gltf", ".vrm")
 
 
@@ -73,9 +74,9 @@ def describe(path: Path, attachment: Path | None = None, part: str | None = None
     if path.is_dir() or suffix in SCENE_ENDINGS:
         mesh, rig = load_neutral(path, part=part)
         if rig is None and attachment is None:
-            return [*_mesh_rows(mesh), *_texture_rows(path)]
+            return _with_texture_rows(path, _mesh_rows(mesh))
         rig = rig or load_rig(path, part=part)  # whose error says what is missing
-        rows = [*_rig_rows(rig), *_texture_rows(path), *_animation_rows(path)]
+        rows = [*_with_texture_rows(path, _rig_rows(rig)), *_animation_rows(path)]
         if attachment is not None:
             from torchface.capture.markers import MarkerSolver, observability
 
@@ -102,9 +103,10 @@ def describe(path: Path, attachment: Path | None = None, part: str | None = None
         return _attachment_rows(Attachment.load(path))
     if suffix == ".onnx":
         return _graph_rows(path)
-    if suffix == ".pts":
+    if suffix in _LANDMARK_ENDINGS:
         points = load_landmark_points(path).points
-        return [("landmarks", f"{len(points)}, pixels"), ("extent, pixels", _extent(points[points.isfinite().all(1)]))]
+        unit = "the scan's unit" if points.shape[1] == 3 else "pixels"
+        return [("landmarks", f"{len(points)}, {unit}"), (f"extent, {unit}", _extent(points[points.isfinite().all(1)]))]
     if suffix == ".toml":
         return _camera_rows(load_calibration(path))
     if suffix in VIDEO_ENDINGS:
@@ -124,7 +126,7 @@ def describe(path: Path, attachment: Path | None = None, part: str | None = None
         *TAKE_ENDINGS,
         *RECORDING_ENDINGS,
         ".onnx",
-        ".pts",
+        *_LANDMARK_ENDINGS,
         ".toml",
     )
     if not suffix:
@@ -226,11 +228,13 @@ def _mesh_rows(mesh: Mesh) -> Rows:
     return rows
 
 
-def _texture_rows(path: Path) -> Rows:
+def _with_texture_rows(path: Path, rows: Rows) -> Rows:
     unread = unread_textures(path) if path.is_file() and path.suffix.lower() in _GLTF_ENDINGS else []
     if not unread:
-        return []
-    return [("warning", f"{len(unread)} of its textures cannot be read ({unread[0]}): export it with PNG or JPEG")]
+        return rows
+    rows = [("texture", "cannot be read") if row == ("texture", "none") else row for row in rows]
+    more = f"{len(unread)} of its textures cannot be read ({unread[0]}): export it with PNG or JPEG"
+    return [*rows, ("warning", more)]
 
 
 def _extent(points: Tensor) -> str:

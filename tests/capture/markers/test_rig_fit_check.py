@@ -121,6 +121,8 @@ def test_sites_of_other_markers_are_refused_wherever_the_take_lies(performance: 
     laid = check_fit(sites(rig, others), found.similarity.apply(markers))
     assert laid.refused
     assert laid.cause == "attachment"
+    # A move brings them to less than half of the distance, and still not to their sites.
+    assert check_fit(sites(rig, others), markers + torch.tensor([150.0, 0.0, 0.0])).cause == "attachment"
 
 
 def test_units_by_scale() -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 from dataclasses import replace
+from importlib import import_module
 from pathlib import Path
 
 import numpy as np
@@ -84,8 +85,9 @@ def test_a_planted_displacement_is_found_against_every_form_of_the_truth(
 
 
 def test_weights_are_compared_by_shape_and_the_report_shows_it_all(
-    folder: Path, weights: torch.Tensor, capsys: pytest.CaptureFixture[str]
+    folder: Path, weights: torch.Tensor, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr(import_module("torchface.cli.evaluate"), "_SHOWN", 0)
     wrong = (weights * torch.tensor([1.0, 0.5, 1, 1])).clamp(0, 1)
     save_weights_csv(Take(30.0, weights=Track(NAMES, wrong[..., None])), folder / "found.csv")
     words = (
@@ -101,6 +103,8 @@ def test_weights_are_compared_by_shape_and_the_report_shows_it_all(
     told = capsys.readouterr()
     assert told.out.strip() == str(folder / "out" / "index.html")
     assert "over 4 shapes" in told.err
+    assert "regions.csv has all" in " ".join(told.err.split())
+    assert "upper" not in told.err.partition("frames compared")[0]
     rows = {row["shape"]: row for row in csv.DictReader((folder / "out" / "shapes.csv").open())}
     assert float(rows["browInnerUp"]["mean"]) == pytest.approx(float(weights[:, 1].mean() / 2), rel=1e-4)
     assert float(rows["jawOpen"]["mean"]) == pytest.approx(0, abs=1e-6)

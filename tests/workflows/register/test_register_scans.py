@@ -213,6 +213,14 @@ def test_scans_of_one_name_get_results_of_different_names(template: Mesh, scans:
     assert "no such file" in report.outcomes[-1].error
 
 
+def test_landmarks_of_the_only_scan_come_as_its_file(template: Mesh, scans: Path, tmp_path: Path) -> None:
+    settings = ScanSettings(landmarks=scans / "s0.ljson", schedule=SHORT, texture_size=0)
+    (entry,) = register_scans(template, [scans / "s0.ply"], tmp_path / "one", settings).done
+    assert entry.figures["start"] == "landmarks"
+    with pytest.raises(FileFormatError, match=r"landmarks: found no folder .*s0.ljson"):
+        register_scans(template, [scans], tmp_path / "many", settings)
+
+
 def test_landmarks_come_as_points_in_the_templates_order_or_as_correspondences(template: Mesh, tmp_path: Path) -> None:
     points = template.vertices[template.landmarks] + 3
     rows = "\n".join(" ".join(f"{x:.6f}" for x in row) for row in (points / 10).tolist())

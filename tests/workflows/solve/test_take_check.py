@@ -163,6 +163,23 @@ def test_a_take_that_fits_is_good_without_a_warning(stage: Path, capsys: pytest.
     assert "warning" not in told
 
 
+def test_a_spike_in_a_take_that_is_not_cleaned_is_no_good_result(
+    stage: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def spiked(markers: Tensor) -> Tensor:
+        markers[20, 3, 1] += 500.0
+        return markers
+
+    take = changed(stage, "spiked.c3d", spiked)
+    solve(stage, take)
+    told = " ".join(capsys.readouterr().err.split())
+    assert "result: in part, single frames are wrong" in told
+    assert "20" in told.split("mm from the solved face, at worst")[0]
+    assert "add --clean" in told
+    solve(stage, take, "--clean")
+    assert "warning" not in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(("noise", "verdict"), [(0.7, "in part"), (2.0, "poor")])
 def test_markers_that_lie_beside_the_solved_face_are_no_good_result(
     stage: Path, noise: float, verdict: str, capsys: pytest.CaptureFixture[str]

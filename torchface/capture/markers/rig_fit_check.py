@@ -149,7 +149,7 @@ def check_fit(affine: Tensor, markers: Tensor, slip: bool = False) -> FitCheck:
         steady = _distance(affine, _without_motion(affine, laid))
         if steady < _CORRECTED * corrected:
             return replace(found, cause="slip", corrected=steady)
-    if corrected < _CORRECTED * distance:
+    if corrected < _CORRECTED * distance and corrected <= found.limit:
         cause = "unit" if unit_of_scale(float(pose.scale[0])) else "alignment"
         return replace(found, cause=cause, corrected=corrected)
     return _uncorrected(found)

@@ -42,8 +42,8 @@ class ScanSettings:
     """What is known of scans, and how each is registered.
 
     Args:
-        landmarks: a folder of landmark files named as the scans are; see ``load_scan_landmarks``. A scan without one
-            is registered without landmarks.
+        landmarks: a folder of landmark files named as the scans are, or the file of the only scan; see
+            ``load_scan_landmarks``. A scan without one is registered without landmarks.
         unit: of the scans' files; if absent metres for glTF, millimetres for the others.
         schedule, texture_size: see ``register``.
         detector: a landmark detector for the scans without landmarks, by name or folder; see ``zoo.get_model``.
@@ -89,7 +89,8 @@ def register_scans(
     landmarks, detector, model = settings.landmarks, settings.detector, settings.model
     check_template(template)
     items = find_items(scans, SCANS)
-    marks = None if landmarks is None else _folder("landmarks", landmarks)
+    one = landmarks is not None and len(items.items) == 1 and Path(landmarks).is_file()
+    marks = None if landmarks is None else Path(landmarks).resolve() if one else _folder("landmarks", landmarks)
     if marks == Path(out).resolve():
         raise ValueRangeError(f"out: found {out}, which holds landmarks; expected another folder")
     job = ScanJob(

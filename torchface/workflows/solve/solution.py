@@ -41,6 +41,7 @@ from torchface.workflows.solve.weight_stream import StreamReport
 # A take is cleaned again where its alignment moves a site farther after the first cleaning, mm.
 _REALIGNED = 0.1
 _MOST = 0.8  # of the samples, below which a take shows too little
+_STRAY = 8.0  # times the median distance: noise stays below it, spikes and exchanged labels do not
 _SHOWN_SPANS = 6
 _SHOWN_DEFECTS = 12
 
@@ -118,6 +119,22 @@ class Solution:
         radius = float((sites - sites.mean(0)).norm(dim=-1).mean())
         return FitCheck(float(self.offsets.norm(dim=-1).nanmedian()), radius)
 
+    @cached_property
+    def stray_warnings(self) -> list[str]:
+        """The frames in which a marker lies far from the solved face; nothing where all lie near."""
+        limit = max(self.fit.limit, _STRAY * self.fit.distance)
+        distance = self.offsets.norm(dim=-1).nan_to_num()
+        far = (distance > limit).any(1).nonzero()[:, 0]
+        if not len(far):
+            return []
+        frame, marker = divmod(int(distance.argmax()), distance.shape[1])
+        worst = f"{float(distance[frame, marker]):.4g} mm ({(self.attachment.labels or ())[marker]})"
+        advice = "they can be wrong there" if self.cleanup else "add --clean"
+        return [
+            f"{_frames(self.take, far)} with a marker more than {limit:.2g} mm from the solved face, at worst {worst}; "
+            f"spikes and exchanged labels spoil the weights of the frames around them, too: {advice}"
+        ]
+
     @property
     def rmse(self) -> Tensor:
         """Marker RMSE a frame, (T,), millimetres."""
@@ -157,6 +174,8 @@ class SolveReport:
         if fit.noisy:
             why = "more noise than a stage's, another head's rig, or a take that needs --clean or --slip?"
             return f"result: in part, {lie}; {why}); {seen}"
+        if self.solution.stray_warnings:
+            return f"result: in part, single frames are wrong, see the warning; {lie}); {seen}"
         if self.seen < _MOST:
             return f"result: in part, {seen}, and where they are missing weights are guessed; {lie})"
         return f"result: good, {lie}); {seen}"
@@ -263,7 +282,8 @@ def solve_markers(
     if cleanup is not None and cleanup.take.markers is not None:  # what was filled in was not seen
         markers = torch.where(torch.isnan(cleanup.take.markers.select(labels).values), torch.nan, markers)
     sites = attachment.select(labels)
-    return Solution(rig, solved, markers, sites, alignment, motion, cleanup, tuple(warnings))
+    solution = Solution(rig, solved, markers, sites, alignment, motion, cleanup)
+    return replace(solution, warnings=(*warnings, *solution.stray_warnings))
 
 
 def _moved(take: Take, move: Callable[[Tensor], Tensor]) -> Take:
@@ -284,14 +304,19 @@ def _without_slip(
 
 
 def _empty_frame_warnings(take: Take) -> list[str]:
-    """Which frames show no marker: ``10 frames (120–128, 340)``; nothing where all show some."""
+    """Which frames show no marker; nothing where all show some."""
     empty = empty_frames(take)
     if not len(empty):
         return []
-    rows = take.extras.get("frame_numbers", torch.arange(len(take)))[empty]
+    return [f"{_frames(take, empty)} show no marker; their weights come from the frames before and after"]
+
+
+def _frames(take: Take, rows: Tensor) -> str:
+    """Rows of a take (K,) as a text: ``10 frames (120–128, 340)``."""
+    rows = take.extras.get("frame_numbers", torch.arange(len(take)))[rows.cpu()]
     breaks = (rows.diff() > 1).nonzero()[:, 0].tolist()
     firsts, lasts = [0, *(i + 1 for i in breaks)], [*breaks, len(rows) - 1]
     spans = [(int(rows[a]), int(rows[b])) for a, b in zip(firsts, lasts, strict=True)]
     shown = ", ".join(str(a) if a == b else f"{a}–{b}" for a, b in spans[:_SHOWN_SPANS])
     more = f" and {len(spans) - _SHOWN_SPANS} more stretches" if len(spans) > _SHOWN_SPANS else ""
-    return [f"{len(rows)} frames ({shown}{more}) show no marker; their weights come from the frames before and after"]
+    return f"{len(rows)} frames ({shown}{more})"

@@ -255,7 +255,9 @@ def _cause(fit: FitCheck, aligned: bool) -> str:
         )
     if fit.cause == "slip":
         return f"without the motion of the helmet against the head {fit.corrected:.2g} mm are left: add --slip"
-    tried = "the take is aligned with the rig" if aligned else "turning, moving and scaling the take does not help"
+    tried = (
+        "the take is aligned with the rig" if aligned else "turning, moving and scaling the take does not help enough"
+    )
     return (
         f"{tried}, so the attachment or the rig is another one's, or labels are mixed up: look at the sites "
         "(torchface view), find them anew (torchface attach)"
