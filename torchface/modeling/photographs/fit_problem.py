@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from torchface.modeling.photographs.fit_settings import FitSettings, SurfacePoints
-from torchface.modeling.photographs.landmark_view import JAW, LinearPoints, PickedPoints, Views, Whitening
+from torchface.modeling.photographs.landmark_view import BROWS, JAW, LinearPoints, PickedPoints, Views, Whitening
 
 _MIN_NOISE = 1e-5  # of the focal length: finer than any landmark is found
 _LEAST, _MOST, _FAR = 0.5, 4.0, 100.0  # deviations beside the median; of points of the surface
@@ -18,6 +18,9 @@ _FOUND_NOISE = 0.02  # of the distance of the eyes' outer corners
 # so much larger than stated at landmarks, smaller at points of the surface.
 _TOGETHER, _ALIKE_OVER = 0.5, 25.0
 _STATED_68, _STATED_POINTS = 1.2, 0.75
+# By twelve films: how much of these errors is alike in all pictures of one person, whom pictures then show once and not
+# each anew; and how much further landmarks of brows lie from a head's, for hair grows where it will.
+_ALIKE_IN_PICTURES, _BROWS_GROW = 0.3, 3.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,6 +79,12 @@ class Problem:
         return torch.linalg.solve_triangular(torch.linalg.cholesky(alike), one, upper=False)
 
     @property
+    def identity_precision(self) -> float:
+        """Of the prior on a coefficient of identity, which has a deviation of 1, beside errors that are taken to be
+        independent in each picture."""
+        return 1.0 if self.settings.surface is None else 1.0 + _ALIKE_IN_PICTURES * (len(self.found) - 1)
+
+    @property
     def expressions(self) -> int:
         """How many there are, E: one a view, or one for all."""
         return 1 if self.settings.one_expression else len(self.found)
@@ -112,8 +121,8 @@ class Problem:
         precision, linear = (
             torch.zeros(*shape, dtype=torch.float64) for shape in ((self.unknowns,) * 2, (self.unknowns,))
         )
-        precision.diagonal()[:k] = 1.0
-        precision.diagonal()[k - self.smooth : k] = 1 / state.unknown
+        precision.diagonal()[:k] = self.identity_precision
+        precision.diagonal()[k - self.smooth : k] /= state.unknown
         if settings.expression_prior is None:
             own = torch.eye(count, dtype=torch.float64) / settings.expression_ridge**2
             each, pull = own.expand(len(weights), -1, -1), torch.full_like(weights, 1 / settings.expression_mean)
@@ -176,6 +185,7 @@ def _relative(deviations: Tensor, surface: SurfacePoints | None) -> Tensor:
     landmarks = (deviations.double() / typical).nan_to_num(_MOST, _MOST).clamp(_LEAST, _MOST)
     if surface is None:
         return landmarks
+    landmarks[:, BROWS] *= _BROWS_GROW
     points = (_STATED_POINTS / _STATED_68) * surface.deviations.double() / typical
     return torch.cat([landmarks, points.nan_to_num(_FAR, _FAR).clamp(_LEAST, _FAR)], dim=1)
 

@@ -15,6 +15,7 @@ from torchface.geometry.cameras.sliding_contour import LevelCurves, level_curves
 from torchface.geometry.similarity import similarity_transform
 from torchface.mesh import Mesh
 from torchface.modeling.morphable.head_model import HeadModel
+from torchface.modeling.photographs.feature_alignment import FeatureAlignment
 from torchface.modeling.photographs.fit_problem import Problem, State
 from torchface.modeling.photographs.fit_settings import FitSettings
 from torchface.modeling.photographs.image_input import (
@@ -187,6 +188,13 @@ def with_skin(fit: ImageFit, model: HeadModel, images: Sequence[Tensor], setting
         images: the photographs, (3,H,W) each.
         settings: the texture's size, parts and irises of the photographs.
     """
+    bent = [FeatureAlignment.of(*one) for one in zip(fit.landmarks, fit.residuals, strict=True)]
+    images = [way.image(image[:3].cpu()) for way, image in zip(bent, images, strict=True)]
+    if settings.parts is not None:
+        settings = replace(settings, parts=[way.parts(one) for way, one in zip(bent, settings.parts, strict=True)])
+    if settings.irises is not None:
+        irises = [way.points(one) for way, one in zip(bent, settings.irises, strict=True)]
+        settings = replace(settings, irises=torch.stack(irises))
     skin = photographed_skin(fit.posed, model.color, images, fit.cameras, settings, fit.mesh)
     return replace(
         fit,

@@ -212,7 +212,7 @@ def _spreads(problem: Problem, state: State, picked: PickedPoints, factors: Whit
         return replace(state, noise=noise)
     some = slice(problem.identities - problem.smooth, problem.identities)
     found = float(state.coefficients[some].square().sum())
-    known = problem.smooth - float(posterior.diagonal()[some].sum()) / state.unknown
+    known = problem.smooth - float((posterior.diagonal() * precision.diagonal())[some].sum())
     unknown = (found + _EXPECTED) / (known + _EXPECTED)
     return replace(state, noise=noise, unknown=min(max(unknown, _LEAST_UNKNOWN), 1.0 / _LEAST_UNKNOWN))
 
@@ -220,10 +220,10 @@ def _spreads(problem: Problem, state: State, picked: PickedPoints, factors: Whit
 def covariance(problem: Problem, state: State) -> Tensor:
     r"""Of the coefficients' errors, (D,D), cameras unknown; rows of those that lie on a bound are zero.
 
-    .. math:: (H + P)^{-1} (s^2 H + P) (H + P)^{-1}
+    .. math:: (H + P)^{-1} (s^2 H + P P_0^{-1} P) (H + P)^{-1}
 
-    with the precision P of the prior, which true coefficients have, and errors of points s times as large along heads'
-    forms as the solve, of normal matrix H, takes them to be.
+    with the precision P of the prior as the solve weighs it, P_0 that true coefficients have, and errors of points s
+    times as large along heads' forms as the solve, of normal matrix H, takes them to be.
     """
     picked = problem.points.picked(state.rows)
     factors = whitening(problem, state, picked)
@@ -231,11 +231,13 @@ def covariance(problem: Problem, state: State) -> Tensor:
     precision, _ = problem.prior(state)
     H = normal_equations(problem, at, state.views).H
     along = 1.0 if problem.settings.surface is None else _ALONG_FORMS
+    weighed = precision.clone()  # P P_0^{-1} P
+    weighed.diagonal()[: problem.identities] *= problem.identity_precision
     lower, upper = problem.bounds()
     x = state.coefficients
     inside = ((x > lower + 1e-9) & (x < upper - 1e-9)).nonzero()[:, 0]
-    H, precision = (one[inside[:, None], inside] for one in (H, precision))
+    H, precision, weighed = (one[inside[:, None], inside] for one in (H, precision, weighed))
     back = torch.linalg.inv(H + precision)
     result = torch.zeros(len(x), len(x), dtype=torch.float64)
-    result[inside[:, None], inside] = back @ (along**2 * H + precision) @ back
+    result[inside[:, None], inside] = back @ (along**2 * H + weighed) @ back
     return result

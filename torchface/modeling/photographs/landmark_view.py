@@ -16,6 +16,8 @@ from torchface.landmarks.images.ibug_68 import as_annotated
 LANDMARKS = 68
 JAW = 17
 """How many of the 68 landmarks trace the face's contour; they come first."""
+BROWS = slice(17, 27)
+"""Which of them trace the brows."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,4 +1,4 @@
-"""The skin of a head that was solved with a take, from its sharpest frames."""
+"""The skin of a head that was solved with a take, from sharp frames in which the face acts little."""
 
 from __future__ import annotations
 
@@ -20,12 +20,13 @@ from torchface.workflows.track.person_head import PersonHead
 from torchface.workflows.track.track_inputs import TrackInputs
 
 _SIDES = 15.0  # degrees from which a head shows another side
+_SHARP = 0.6  # of the sharpest frame
 
 
 def with_filmed_skin(
     head: PersonHead, inputs: TrackInputs, model: HeadModel, reading: FaceReading, progress: Progress
 ) -> PersonHead:
-    """A head as it is shown: with skin of the sharpest frame from the front and from each side, and what belongs to it.
+    """A head as it is shown: with skin of sharp frames from the front and from each side, and what belongs to it.
 
     Args:
         head: solved from frames of the take.
@@ -40,7 +41,7 @@ def with_filmed_skin(
             wanted[number] = undistorted(frame, inputs.calibration)
         if number >= max(wanted):
             break
-    rows = _sharpest(head, [frame for frame in wanted.values() if frame is not None], reading)
+    rows = _chosen(head, [frame for frame in wanted.values() if frame is not None], reading)
     frames = head.frames[rows]
     pictures = [wanted[number] for number in frames.tolist()]
     images = [picture.float() / 255 for picture in pictures if picture is not None]
@@ -52,6 +53,8 @@ def with_filmed_skin(
         head.fit,
         posed=tuple(head.fit.posed[row] for row in rows),
         cameras=tuple(head.fit.cameras[row] for row in rows),
+        landmarks=head.fit.landmarks[rows],
+        residuals=head.fit.residuals[rows],
     )
     fit = with_skin(views, model, images, settings)
     assert inputs.actor is not None
@@ -59,13 +62,16 @@ def with_filmed_skin(
     return replace(head, shown=dressed.rig.select(head.rig.names), surface=dressed.surface)
 
 
-def _sharpest(head: PersonHead, pictures: list[Tensor], reading: FaceReading) -> list[int]:
-    """Which of the head's frames are the sharpest: from the front, from the left and from the right."""
+def _chosen(head: PersonHead, pictures: list[Tensor], reading: FaceReading) -> list[int]:
+    """Which of the head's frames show the skin: from the front, from the left and from the right, of the sharp ones
+    that in which the face acts least, for a smile paints its folds and the light on its cheeks."""
     ahead = torch.stack([camera.rotation[2] for camera in head.fit.cameras])
     yaw = torch.rad2deg(torch.atan2(-ahead[:, 0], -ahead[:, 2]))
     sharp = torch.stack([
         sharpness_of(picture, reading.box[number])
         for picture, number in zip(pictures, head.frames.tolist(), strict=True)
     ])  # fmt: skip
+    acts = head.fit.weights.sum(1)
     sides = (yaw.abs() <= _SIDES, yaw > _SIDES, yaw < -_SIDES)
-    return [int(torch.where(side, sharp, -1.0).argmax()) for side in sides if bool(side.any())]
+    chosen = [side & (sharp >= _SHARP * sharp[side].amax()) for side in sides if bool(side.any())]
+    return [int(torch.where(some, acts, torch.inf).argmin()) for some in chosen]
