@@ -93,8 +93,6 @@ def expression_score(found: Tensor, found_names: Sequence[str], true: Tensor, fp
     Args:
         found: (T,N); a column of NaN is a shape that the method does not support, NaN elsewhere a lost face, for
             which the frame before stands.
-        found_names: theirs, see :func:`torchface.shape_names.mapping`.
-        true: of ARKit's shapes, (T,52).
     """
     if found.ndim != 2 or true.shape != (len(found), len(ARKIT)) or len(found) < 3:
         raise ShapeError(

@@ -36,31 +36,20 @@ _KEPT = 8  # meshes
 
 @dataclass(frozen=True, eq=False)
 class AnimatedMesh:
-    """A mesh that moves.
+    """A mesh that moves."""
 
-    Args:
-        path: where it came from.
-        neutral: its topology and annotations; at rest where it came with a rig, else as in its first frame.
-        read: vertices (t,V,3) of the frames from one number up to another, without it; NaN where a frame has none.
-        fps: frames a second, where that is known.
-        weights: what moves it, where that is known.
-        rig: of its topology, where one came with it.
-        take: of the weights, where there is one, with the times of its frames.
-        numbered: whether its frames are numbered from a beginning that others may share.
-        missing: which frames of a folder are not there, for people to read; empty where none is known to be.
-        colors: of the vertices, (t,V,3) in [0,1], read as ``read`` does, where meshes have them.
-    """
-
-    path: Path
-    neutral: Mesh
+    path: Path  # where it came from
+    neutral: Mesh  # its topology and annotations; at rest where it came with a rig, else as in its first frame
     count: int
+    # Vertices (t,V,3) of the frames from one number up to another, without it; NaN where a frame has none.
     read: Callable[[int, int], Tensor]
-    fps: float | None = None
-    weights: Track | None = None
-    rig: BlendshapeRig | None = None
-    take: Take | None = None
-    numbered: bool = False
-    missing: str = ""
+    fps: float | None = None  # frames a second, where that is known
+    weights: Track | None = None  # what moves it, where that is known
+    rig: BlendshapeRig | None = None  # of its topology, where one came with it
+    take: Take | None = None  # of the weights, where there is one, with the times of its frames
+    numbered: bool = False  # whether its frames are numbered from a beginning that others may share
+    missing: str = ""  # which frames of a folder are not there, for people to read; empty where none is known to be
+    # Of the vertices, (t,V,3) in [0,1], read as read does, where meshes have them.
     colors: Callable[[int, int], Tensor] | None = None
 
     def require_topology_of(self, other: AnimatedMesh, hint: str = "") -> None:

@@ -35,16 +35,12 @@ _SHOWN, _CELL = 6, 420
 
 @dataclass(frozen=True)
 class Board:
-    """A checkerboard.
+    """A checkerboard."""
 
-    Args:
-        columns, rows: of inner corners, where four squares meet.
-        square: a square's side, millimetres.
-    """
-
+    # columns, rows: of inner corners, where four squares meet
     columns: int = 9
     rows: int = 6
-    square: float = 25.0
+    square: float = 25.0  # a square's side, millimetres
 
     def __post_init__(self) -> None:
         if not (3 <= self.columns <= 100 and 3 <= self.rows <= 100 and 0 < self.square < math.inf):
@@ -62,37 +58,23 @@ class Board:
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """An image in which the whole board was found.
+    """An image in which the whole board was found."""
 
-    Args:
-        name: of the file, or the number of the video's frame.
-        image: uint8 (H,W).
-        corners: (N,2), pixels.
-    """
-
-    name: str
-    image: Tensor
-    corners: Tensor
+    name: str  # of the file, or the number of the video's frame
+    image: Tensor  # uint8 (H,W)
+    corners: Tensor  # (N,2), pixels
 
 
 @dataclass(frozen=True, eq=False)
 class CalibrationReport:
-    """A camera, and what it rests on.
-
-    Args:
-        used: names of the images used.
-        errors: reprojection of each, root mean square, (M,), pixels.
-        left_out: names of the others, and why.
-        focal_deviation: standard deviation of the focal length, relative to it.
-        tilt: the largest angle between the boards of two views, degrees.
-    """
+    """A camera, and what it rests on."""
 
     calibration: CameraCalibration
-    used: tuple[str, ...]
-    errors: Tensor
-    left_out: tuple[tuple[str, str], ...]
-    focal_deviation: float
-    tilt: float
+    used: tuple[str, ...]  # names of the images used
+    errors: Tensor  # reprojection of each, root mean square, (M,), pixels
+    left_out: tuple[tuple[str, str], ...]  # names of the others, and why
+    focal_deviation: float  # standard deviation of the focal length, relative to it
+    tilt: float  # the largest angle between the boards of two views, degrees
     overlay_path: Path | None = None
 
     def lines(self) -> list[str]:

@@ -36,19 +36,12 @@ from torchface.workflows.weight_files import checked_reduction
 
 @dataclass(frozen=True, eq=False)
 class Converted:
-    """What was written.
+    """What was written."""
 
-    Args:
-        mesh: at rest.
-        rig: as written, where there are shapes.
-        take: its animation, where there is one.
-        notes: what the new file has no place for, and how shapes were named.
-    """
-
-    mesh: Mesh
-    rig: BlendshapeRig | None
-    take: Take | None
-    notes: tuple[str, ...]
+    mesh: Mesh  # at rest
+    rig: BlendshapeRig | None  # as written, where there are shapes
+    take: Take | None  # its animation, where there is one
+    notes: tuple[str, ...]  # what the new file has no place for, and how shapes were named
 
 
 def convert_file(

@@ -26,8 +26,7 @@ from torchface.workflows.batch.batch_items import ItemKind
 
 # Of the six real takes on ICT's rig, with slip, gaps, 0.3 mm of noise and 12 to 100 markers, the scale is 1 within
 # 0.0024; with markers 2 mm off the skin 0.988, with two labels exchanged in 9 % of the frames 1 within 0.0015.
-MAX_SCALE_DIFFERENCE = 0.01
-"""A take of the rig's own performer in true units fits it at scale 1, within this."""
+MAX_SCALE_DIFFERENCE = 0.01  # a take of the rig's own performer in true units fits it at scale 1, within this
 
 _SHOWN = 6
 _AXES = "xyz"
@@ -36,20 +35,13 @@ _SPAN = re.compile(r"\s*(\d{0,9})\s*:\s*(\d{0,9})\s*")
 
 @dataclass(frozen=True)
 class MarkerOptions:
-    """How a marker file is read.
+    """How a marker file is read."""
 
-    Args:
-        unit: of its coordinates; what the file says if absent.
-        labels: a table that maps the take's labels to the attachment's.
-        frames: ``A:B``, the frames from A up to, not including, B; all if absent.
-        flip: ``x``, ``y`` or ``z``, the axis whose coordinates are negated: a take in left-handed axes is mirrored.
-        scale: of an alignment with the rig: ``held`` at 1 or ``free``; held where the unit is known, if absent.
-    """
-
-    unit: str | None = None
-    labels: Path | None = None
-    frames: str | None = None
-    flip: str | None = None
+    unit: str | None = None  # of its coordinates; what the file says if absent
+    labels: Path | None = None  # a table that maps the take's labels to the attachment's
+    frames: str | None = None  # A:B, the frames from A up to, not including, B; all if absent
+    flip: str | None = None  # x, y or z, the axis whose coordinates are negated: a take in left-handed axes is mirrored
+    # Of an alignment with the rig: held at 1 or free; held where the unit is known, if absent.
     scale: Literal["held", "free"] | None = None
 
     def frees_scale(self, path: Path) -> bool:
@@ -59,8 +51,7 @@ class MarkerOptions:
         return self.unit is None and path.suffix.lower() not in MARKER_ENDINGS
 
 
-DEFAULT_OPTIONS = MarkerOptions()
-"""In the file's own unit, by its own labels, all frames."""
+DEFAULT_OPTIONS = MarkerOptions()  # in the file's own unit, by its own labels, all frames
 
 
 def is_marker_take(path: Path) -> bool:

@@ -32,17 +32,10 @@ if TYPE_CHECKING:
 
 __all__ = ["NamedFinder", "load_finder"]
 
-DEFAULT_LANDMARKS = "landmark_network"
-"""The model of the zoo that finds landmarks where none is named."""
-
-EYES = "eye_network"
-"""The model of the zoo that reads eyes."""
-
-PARTS = "face_parts"
-"""The model of the zoo that says which part of a face each pixel shows."""
-
-BUNDLE = ".task"
-"""The ending of MediaPipe's Face Landmarker bundles."""
+DEFAULT_LANDMARKS = "landmark_network"  # the model of the zoo that finds landmarks where none is named
+EYES = "eye_network"  # the model of the zoo that reads eyes
+PARTS = "face_parts"  # the model of the zoo that says which part of a face each pixel shows
+BUNDLE = ".task"  # the ending of MediaPipe's Face Landmarker bundles
 
 
 @dataclass(frozen=True)

@@ -38,18 +38,12 @@ from torchface.workflows.weight_files import (
 
 @dataclass(frozen=True, eq=False)
 class Retargeted:
-    """What a retarget gave.
+    """What a retarget gave."""
 
-    Args:
-        take: weights by the target's names.
-        warnings: what a file leaves out, what examples do not determine.
-        notes: what was learned of examples, and how many keys files have.
-    """
-
-    take: Take
+    take: Take  # weights by the target's names
     shapes: ShapeMap
-    warnings: tuple[str, ...]
-    notes: tuple[str, ...] = ()
+    warnings: tuple[str, ...]  # what a file leaves out, what examples do not determine
+    notes: tuple[str, ...] = ()  # what was learned of examples, and how many keys files have
 
 
 def retarget_weights(

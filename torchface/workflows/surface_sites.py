@@ -19,8 +19,7 @@ from torchface.synthetic.head.head_annotations import head_annotations
 from torchface.synthetic.head.identity import mean_vertices
 from torchface.synthetic.head.performer import performer
 
-SHARED = [*range(4, 13), *range(27, 68)]
-"""Landmarks that all heads mean alike."""
+SHARED = [*range(4, 13), *range(27, 68)]  # landmarks that all heads mean alike
 
 _SMOOTHING, _OTHER_SIZE, _TURNED = 1.0, 0.2, 20.0  # the second a logarithm, the third in degrees
 _JAW, _LIDS = 8.0, 6.0  # millimetres that a whole motion of the jaw and of the lids counts when points are compared

@@ -26,18 +26,12 @@ _ROUNDED = 1e-3  # what a file's rounding leaves beyond 0 or 1
 
 @dataclass(frozen=True)
 class WeightFiles:
-    """What is written of a take's weights.
+    """What is written of a take's weights."""
 
-    Args:
-        out: the weights, see :func:`write_weights`.
-        animation: the rig with this animation, ``.glb``, USD or ``.ma``, if wanted.
-        live_link: Live Link Face's CSV whatever the names are, if wanted.
-        reduce: keep as few keys as stay within this of every frame's weights; a row and a key a frame if absent.
-    """
-
-    out: Path
-    animation: Path | None = None
-    live_link: Path | None = None
+    out: Path  # the weights, see write_weights
+    animation: Path | None = None  # the rig with this animation, .glb, USD or .ma, if wanted
+    live_link: Path | None = None  # Live Link Face's CSV whatever the names are, if wanted
+    # Keep as few keys as stay within this of every frame's weights; a row and a key a frame if absent.
     reduce: float | None = None
 
     def check(self, folder: Path | None = None) -> None:

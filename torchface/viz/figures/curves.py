@@ -94,12 +94,7 @@ def compared_curves(
     first: int = 0,
     last: int | None = None,
 ) -> Tensor:
-    """True curves (T,N), those of the take solved at once and those of single frames, in two columns; (3,H,W).
-
-    Args:
-        true, smooth, single: weights (T,N).
-        names: of the shapes, N.
-    """
+    """True curves (T,N), those of the take solved at once and those of single frames, in two columns; (3,H,W)."""
     lines = -(-len(names) // 2)
     figure = new_figure(12, 1.7 * lines, layout="constrained")
     grid = figure.subplots(lines, 2, sharex=True, squeeze=False).flatten()

@@ -129,13 +129,7 @@ def clay_colors(mesh: Mesh) -> Tensor:
 
 
 def pose_pairs(rig: BlendshapeRig, names: Sequence[str], wanted: Tensor, found: Tensor) -> Tensor:
-    """A column a pose: as an animator set it above, as the rules give it below; (3,H,W), 24 poses at most.
-
-    Args:
-        rig: the character, N shapes.
-        names: of the P poses.
-        wanted, found: weights, (P,N).
-    """
+    """A column a pose: as an animator set it above, as the rules give it below; (3,H,W), 24 poses at most."""
     colors = clay_colors(rig.neutral)
 
     def view(weights: Tensor, text: str) -> Tensor:

@@ -48,11 +48,7 @@ class Section:
 
 
 def write_page(folder: str | Path, title: str, sections: Sequence[Section]) -> Path:
-    """Writes ``index.html`` and its figures into a folder; they take their places together.
-
-    Returns:
-        The page's path.
-    """
+    """Writes ``index.html`` and its figures into a folder; they take their places together; the page's path."""
     folder = make_folder(folder)
     with all_or_none():
         return _write(folder, title, sections)

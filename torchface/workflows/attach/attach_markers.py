@@ -196,20 +196,13 @@ def _usable(cleanup: Cleanup, take: Take) -> Take:
 
 @dataclass(frozen=True)
 class AttachSettings:
-    """How marker sites are found on a rig.
+    """How marker sites are found on a rig."""
 
-    Args:
-        initial: a file of sites to begin from; found by the markers' shape if absent.
-        standoff: find how far the markers' centres lie above the skin.
-        part: an annotated region that the rig is cut to, such as ``"face"``.
-        options: how the take's markers are read.
-        insist: write the sites although the rig does not explain the markers, or the take leaves most uncertain.
-    """
-
-    initial: Path | None = None
-    standoff: bool = False
-    part: str | None = None
-    options: MarkerOptions = DEFAULT_OPTIONS
+    initial: Path | None = None  # a file of sites to begin from; found by the markers' shape if absent
+    standoff: bool = False  # find how far the markers' centres lie above the skin
+    part: str | None = None  # an annotated region that the rig is cut to, such as "face"
+    options: MarkerOptions = DEFAULT_OPTIONS  # how the take's markers are read
+    # Write the sites although the rig does not explain the markers, or the take leaves most uncertain.
     insist: bool = False
 
 

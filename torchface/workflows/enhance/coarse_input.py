@@ -39,25 +39,16 @@ CORRESPONDENCE = "correspondence.safetensors"
 
 @dataclass(frozen=True)
 class InputSettings:
-    """How an input is read.
+    """How an input is read."""
 
-    Args:
-        rig: what weights move, whose topology the meshes have, or on which the attachment's markers sit.
-        attachment: where the markers sit, on the rig or on the model's mesh.
-        pairs: vertices of the input and where they lie on the model; found by registration if absent.
-        part: keep this annotated region of the rig only.
-        neutral: a frame of the markers with the face at rest.
-        fps: frames a second of meshes, where their file does not say.
-        markers: how the marker file is read.
-    """
-
+    # What weights move, whose topology the meshes have, or on which the attachment's markers sit.
     rig: Path | None = None
-    attachment: Path | None = None
-    pairs: Path | None = None
-    part: str | None = None
-    neutral: int | None = None
-    fps: float | None = None
-    markers: MarkerOptions = DEFAULT_OPTIONS
+    attachment: Path | None = None  # where the markers sit, on the rig or on the model's mesh
+    pairs: Path | None = None  # vertices of the input and where they lie on the model; found by registration if absent
+    part: str | None = None  # keep this annotated region of the rig only
+    neutral: int | None = None  # a frame of the markers with the face at rest
+    fps: float | None = None  # frames a second of meshes, where their file does not say
+    markers: MarkerOptions = DEFAULT_OPTIONS  # how the marker file is read
 
 
 def read_coarse(path: Path, model: Mesh, settings: InputSettings, state: Path, progress: Progress) -> CoarseAnimation:

@@ -36,25 +36,15 @@ _BADLY_SHOWN_MM = 0.1
 
 @dataclass(frozen=True)
 class EnhanceSettings:
-    """What is written.
+    """What is written."""
 
-    Args:
-        given: how the input is read.
-        meshes: also every frame as a mesh file of this kind.
-        glb: the animated ``.glb``.
-        megabytes: that its morph targets may take.
-        detail: how strong the detail is; 1 is the actor's.
-        video: the video of input and result side by side.
-        retime: give the motions between the animation's keyframes the actor's timing first.
-    """
-
-    given: InputSettings = field(default_factory=InputSettings)
-    meshes: Literal["none", "obj", "ply"] = "none"
-    glb: bool = True
-    megabytes: float = MEGABYTES
-    detail: float = 1.0
-    video: bool = True
-    retime: bool = False
+    given: InputSettings = field(default_factory=InputSettings)  # how the input is read
+    meshes: Literal["none", "obj", "ply"] = "none"  # also every frame as a mesh file of this kind
+    glb: bool = True  # the animated .glb
+    megabytes: float = MEGABYTES  # that its morph targets may take
+    detail: float = 1.0  # how strong the detail is; 1 is the actor's
+    video: bool = True  # the video of input and result side by side
+    retime: bool = False  # give the motions between the animation's keyframes the actor's timing first
 
 
 @dataclass(frozen=True, eq=False)

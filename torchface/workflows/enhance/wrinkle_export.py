@@ -47,22 +47,14 @@ BEYOND_SHAPES = 20
 
 @dataclass(frozen=True)
 class WrinkleSettings:
-    """What is made.
+    """What is made."""
 
-    Args:
-        maps: how many.
-        size: of each, texels a side.
-        pairs: vertices of the rig and where they lie on the model; found by registration if absent.
-        part: keep this annotated region of the rig only.
-        animation: weights that the ``.glb`` plays, with the maps' weights beside it.
-    """
-
-    maps: int = MAPS
-    size: int = 1024
+    maps: int = MAPS  # how many
+    size: int = 1024  # of each, texels a side
     poses: int = 300
-    pairs: Path | None = None
-    part: str | None = None
-    animation: Path | None = None
+    pairs: Path | None = None  # vertices of the rig and where they lie on the model; found by registration if absent
+    part: str | None = None  # keep this annotated region of the rig only
+    animation: Path | None = None  # weights that the .glb plays, with the maps' weights beside it
 
 
 @dataclass(frozen=True, eq=False)

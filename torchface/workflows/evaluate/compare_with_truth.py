@@ -39,32 +39,21 @@ _GROUP_OF_LANDMARK = (*[0] * 17, *[1] * 10, *[2] * 9, *[3] * 12, *[4] * 20)
 
 @dataclass(frozen=True)
 class EvaluationSettings:
-    """What is compared how.
+    """What is compared how."""
 
-    Args:
-        rig: moves the result's weights, is the template of scans, and annotates meshes of its topology.
-        truth_rig: moves the truth's weights; ``rig`` if absent.
-        part: keep this annotated region only.
-        frames: frames of the result that the truth's are, in order, from 0; all if absent.
-        scans: the truth is raw scans, which are registered first.
-        landmarks: a folder of the scans' landmark files.
-        unit: of the scans' files; each format's own if absent.
-        align: align each frame of the result rigidly with the truth; if absent, with scans only, which have a space
-            of their own.
-        maximum: of the heat maps' scale, millimetres; the 95th percentile, rounded up, if absent.
-        by_number: the first frame is compared with the first, and so on, whatever their times.
-    """
-
+    # Moves the result's weights, is the template of scans, and annotates meshes of its topology.
     rig: Path | None = None
-    truth_rig: Path | None = None
-    part: str | None = None
-    frames: tuple[int, ...] | None = None
-    scans: bool = False
-    landmarks: Path | None = None
-    unit: str | None = None
+    truth_rig: Path | None = None  # moves the truth's weights; rig if absent
+    part: str | None = None  # keep this annotated region only
+    frames: tuple[int, ...] | None = None  # frames of the result that the truth's are, in order, from 0; all if absent
+    scans: bool = False  # the truth is raw scans, which are registered first
+    landmarks: Path | None = None  # a folder of the scans' landmark files
+    unit: str | None = None  # of the scans' files; each format's own if absent
+    # Align each frame of the result rigidly with the truth; if absent, with scans only, which have a space of their
+    # own.
     align: bool | None = None
-    maximum: float | None = None
-    by_number: bool = False
+    maximum: float | None = None  # of the heat maps' scale, millimetres; the 95th percentile, rounded up, if absent
+    by_number: bool = False  # the first frame is compared with the first, and so on, whatever their times
 
 
 def evaluate(
@@ -109,12 +98,7 @@ def _evaluate(
 def compare(
     found: AnimatedMesh, true: AnimatedMesh, settings: EvaluationSettings, scans: ScanTruth | None = None
 ) -> Evaluation:
-    """Compares frame by frame.
-
-    Args:
-        settings: which frames, and how.
-        scans: the truth's scans, where it was registered to such.
-    """
+    """Compares frame by frame."""
     frames, true_rows, paired = _pairs(found, true, settings)
     aligned = scans is not None if settings.align is None else settings.align
     notes = [*([] if scans is None else scans.notes), *paired]

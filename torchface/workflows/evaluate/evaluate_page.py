@@ -17,14 +17,7 @@ _RATE = 30.0
 
 
 def write_evaluation_page(evaluation: Evaluation, out: Path, height: int = 290) -> Path:
-    """Writes the report's page and figures into a folder.
-
-    Args:
-        height: of each view of a face, pixels.
-
-    Returns:
-        The page's path.
-    """
+    """Writes the report's page and figures into a folder; the page's path."""
     sections = [Section("What was compared", "; ".join(evaluation.lines()))]
     heading = ("region", "mean", "median", "95 %", "largest", "total", "vertices")
     rows = [

@@ -15,60 +15,41 @@ from torchface.files.whole_files import delete_file
 from torchface.io.tables.csv_table import write_table
 from torchface.mesh import Mesh
 
-ALL = "all vertices"
-"""What the table of regions calls the whole mesh."""
+ALL = "all vertices"  # what the table of regions calls the whole mesh
 _SUMMARY = "torchface.evaluation/1"
 
 
 @dataclass(frozen=True, eq=False)
 class Compared:
-    """One frame as it was compared, for figures.
-
-    Args:
-        found, true: vertices (V,3); the found ones as they were compared, aligned with the truth where asked for.
-        errors: (V,), millimetres; NaN was not compared.
-    """
+    """One frame as it was compared, for figures."""
 
     frame: int
+    # found, true: vertices (V,3); the found ones as they were compared, aligned with the truth where asked for
     found: Tensor
     true: Tensor
-    errors: Tensor
+    errors: Tensor  # (V,), millimetres; NaN was not compared
 
 
 @dataclass(frozen=True, eq=False)
 class Evaluation:
-    """How far a result is from the truth.
-
-    Args:
-        mesh: topology and annotations, in the pose that errors are painted on.
-        frames: which of the result were compared, (T,) int64.
-        fps: frames a second, where that is known.
-        errors: (T,V), millimetres; NaN was not compared.
-        regions: figures by region, all vertices first.
-        shapes: by shape, where both have weights.
-        aligned: whether each frame was aligned rigidly with the truth.
-        rotation, translation: degrees and millimetres of that, (T,); none without.
-        shown: frames for figures: the one of median error and the worst.
-        maximum: of the heat maps' scale, millimetres.
-        notes: what was found and done, for people to read.
-        surface: where the truth was scans, how far the result is from their surface, aligned with it again where it was
-            aligned.
-    """
+    """How far a result is from the truth."""
 
     result: str
     truth: str
-    mesh: Mesh
-    frames: Tensor
-    fps: float | None
-    errors: Tensor
-    regions: dict[str, ErrorFigures]
-    shapes: ShapeErrors | None
-    aligned: bool
+    mesh: Mesh  # topology and annotations, in the pose that errors are painted on
+    frames: Tensor  # which of the result were compared, (T,) int64
+    fps: float | None  # frames a second, where that is known
+    errors: Tensor  # (T,V), millimetres; NaN was not compared
+    regions: dict[str, ErrorFigures]  # figures by region, all vertices first
+    shapes: ShapeErrors | None  # by shape, where both have weights
+    aligned: bool  # whether each frame was aligned rigidly with the truth
+    # rotation, translation: degrees and millimetres of that, (T,); none without
     rotation: Tensor | None
     translation: Tensor | None
-    shown: tuple[Compared, ...]
-    maximum: float
-    notes: tuple[str, ...]
+    shown: tuple[Compared, ...]  # frames for figures: the one of median error and the worst
+    maximum: float  # of the heat maps' scale, millimetres
+    notes: tuple[str, ...]  # what was found and done, for people to read
+    # Where the truth was scans, how far the result is from their surface, aligned with it again where it was aligned.
     surface: ErrorFigures | None = None
 
     @property

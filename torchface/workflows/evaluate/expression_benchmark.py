@@ -22,8 +22,7 @@ from torchface.take import Track
 from torchface.viz.figures.curves import named_bars
 from torchface.viz.reports.report_page import Section, Table, write_page
 
-NOTHING = "nothing moves"
-"""The method beside all others: every weight is 0."""
+NOTHING = "nothing moves"  # the method beside all others: every weight is 0
 
 FIGURES: dict[str, Callable[[MethodScore], str]] = {
     "error": lambda method: f"{method.error():.3f}",
@@ -56,18 +55,12 @@ _TEXT = (
 
 @dataclass(frozen=True, eq=False)
 class ExpressionBenchmark:
-    """Scores of methods over films.
-
-    Args:
-        frames: how many they have together.
-        methods: scores by the methods' names; the last is ``NOTHING``.
-        missing: films without a result, by method, which counts as nothing that moves.
-    """
+    """Scores of methods over films."""
 
     films: tuple[str, ...]
-    frames: int
-    methods: dict[str, MethodScore]
-    missing: dict[str, tuple[str, ...]]
+    frames: int  # how many they have together
+    methods: dict[str, MethodScore]  # scores by the methods' names; the last is NOTHING
+    missing: dict[str, tuple[str, ...]]  # films without a result, by method, which counts as nothing that moves
 
     def table(self) -> Table:
         """A row a method."""

@@ -23,17 +23,11 @@ _SHEET_MAXIMUM = 1.0  # millimetres; the same for all, which lie side by side
 
 @dataclass(frozen=True)
 class ResultJob:
-    """How each result is compared; ``{name}`` in a path is the result's name.
+    """How each result is compared; ``{name}`` in a path is the result's name."""
 
-    Args:
-        truth: of all results, or a folder that holds one of each result's name.
-        settings: see :func:`evaluate`.
-        height: of each view of a face in the reports, pixels.
-    """
-
-    truth: Path
-    settings: EvaluationSettings = field(default_factory=EvaluationSettings)
-    height: int = 290
+    truth: Path  # of all results, or a folder that holds one of each result's name
+    settings: EvaluationSettings = field(default_factory=EvaluationSettings)  # see evaluate
+    height: int = 290  # of each view of a face in the reports, pixels
 
     def key(self, item: BatchItem) -> str:
         """A key of all that a comparison depends on."""

@@ -24,17 +24,12 @@ _MIN_VERTICES, _MAX_ITERATIONS = 12, 20
 
 @dataclass(frozen=True, eq=False)
 class ScanTruth:
-    """Scans, and the meshes registered to them.
+    """Scans, and the meshes registered to them."""
 
-    Args:
-        animated: the registered meshes, a frame each; NaN where the scan does not show a vertex.
-        notes: what there is to say of each.
-    """
-
-    animated: AnimatedMesh
+    animated: AnimatedMesh  # the registered meshes, a frame each; NaN where the scan does not show a vertex
     scans: tuple[Path, ...]
     unit: str | None
-    notes: tuple[str, ...]
+    notes: tuple[str, ...]  # what there is to say of each
 
     def surface_errors(self, begin: int, vertices: Tensor) -> Tensor:
         """Distances (t,V) from vertices (t,V,3) of the frames from ``begin`` on to the scans' surfaces; NaN where the
@@ -102,10 +97,7 @@ def scan_truth(
 
     Args:
         result: what they are the truth of; its face at rest is what is bent.
-        scans: files, or folders of them; in the order of their names a frame each.
-        out: the folder of registered meshes and their records.
         landmarks: a folder of landmark files named as the scans.
-        unit: of the scans; each format's own if absent.
     """
     if result.rig is None:
         raise TopologyError(

@@ -39,25 +39,20 @@ def load_template(path: Path, part: str | None = None, unit: str | None = None) 
 
 @dataclass(frozen=True, eq=False)
 class ScanSettings:
-    """What is known of scans, and how each is registered.
+    """What is known of scans, and how each is registered."""
 
-    Args:
-        landmarks: a folder of landmark files named as the scans are, or the file of the only scan; see
-            ``load_scan_landmarks``. A scan without one is registered without landmarks.
-        unit: of the scans' files; if absent metres for glTF, millimetres for the others.
-        schedule, texture_size: see ``register``.
-        detector: a landmark detector for the scans without landmarks, by name or folder; see ``zoo.get_model``.
-        model: of faces in the template's topology, which each registration starts from; see ``register``.
-        colors: whether the scans' colours are used, to find hair and as the results'.
-    """
-
+    # A folder of landmark files named as the scans are, or the file of the only scan; see load_scan_landmarks. A scan
+    # without one is registered without landmarks.
     landmarks: str | Path | None = None
-    unit: str | None = None
+    unit: str | None = None  # of the scans' files; if absent metres for glTF, millimetres for the others
+    # schedule, texture_size: see register
     schedule: Schedule = DEFAULT_SCHEDULE
     texture_size: int = 1024
+    # A landmark detector for the scans without landmarks, by name or folder; see zoo.get_model.
     detector: str | Path | None = None
+    # Of faces in the template's topology, which each registration starts from; see register.
     model: ShapeModel | HasShape | None = None
-    colors: bool = True
+    colors: bool = True  # whether the scans' colours are used, to find hair and as the results'
 
     def __post_init__(self) -> None:
         if self.unit is not None:

@@ -40,26 +40,17 @@ _MAX_DISTANCE = 1.0  # end of the distance maps' scale, millimetres
 
 @dataclass(frozen=True, eq=False)
 class ScanJob:
-    """What all scans share.
+    """What all scans share."""
 
-    Args:
-        template: bent onto each.
-        schedule, texture_size: see ``register``.
-        landmarks: a folder of landmark files named as the scans.
-        unit: of the scans' files; each format's own if absent.
-        detector: the folder of a landmark detector for the scans without landmarks.
-        model: of faces, which each registration starts from.
-        colors: whether the scans' colours are used.
-    """
-
-    template: Mesh
+    template: Mesh  # bent onto each
+    # schedule, texture_size: see register
     schedule: Schedule
     texture_size: int
-    landmarks: Path | None = None
-    unit: str | None = None
-    detector: Path | None = None
-    model: LinearShape | None = None
-    colors: bool = True
+    landmarks: Path | None = None  # a folder of landmark files named as the scans
+    unit: str | None = None  # of the scans' files; each format's own if absent
+    detector: Path | None = None  # the folder of a landmark detector for the scans without landmarks
+    model: LinearShape | None = None  # of faces, which each registration starts from
+    colors: bool = True  # whether the scans' colours are used
 
     def key(self, item: BatchItem) -> str:
         """A key of everything that a scan's result depends on: its files (those beside it of the same name and those

@@ -29,38 +29,25 @@ _BLEND_SECONDS, _MIN_BLEND_FRAMES = 15 / 60, 5
 
 @dataclass(frozen=True)
 class HeadCamera:
-    """A video of the face with painted patterns, and its classifier.
-
-    Args:
-        classifier: a trained ``ActionUnitClassifier``, by name or folder.
-        labels: where helmet, markers and regions are in the video; the video's name with ``.toml`` if absent.
-        table: action units in the rig's shapes: ``arkit``, ``ict`` or a file; whichever of the two has
-            the rig's names if absent.
-        units: those that count; all of the classifier's if empty.
-        gamma: the largest weight of a prediction, mm² over all markers.
-    """
+    """A video of the face with painted patterns, and its classifier."""
 
     video: Path
-    classifier: str | Path
+    classifier: str | Path  # a trained ActionUnitClassifier, by name or folder
+    # Where helmet, markers and regions are in the video; the video's name with .toml if absent.
     labels: Path | None = None
+    # Action units in the rig's shapes: arkit, ict or a file; whichever of the two has the rig's names if absent.
     table: str | Path | None = None
-    units: tuple[str, ...] = ()
-    gamma: float = GAMMA
+    units: tuple[str, ...] = ()  # those that count; all of the classifier's if empty
+    gamma: float = GAMMA  # the largest weight of a prediction, mm² over all markers
 
 
 @dataclass(frozen=True, eq=False)
 class Predicted:
-    """Curves for the hybrid solve, frame by frame of a take.
+    """Curves for the hybrid solve, frame by frame of a take."""
 
-    Args:
-        weights: the classifier's predictions, (T,K,1).
-        gamma: their weights, (T,K,1), mm² over all markers.
-        notes: what had to be assumed, for people to read.
-    """
-
-    weights: Track
-    gamma: Track
-    notes: tuple[str, ...]
+    weights: Track  # the classifier's predictions, (T,K,1)
+    gamma: Track  # their weights, (T,K,1), mm² over all markers
+    notes: tuple[str, ...]  # what had to be assumed, for people to read
 
     def frames(self, rows: slice) -> Predicted:
         """Some of the frames."""

@@ -48,56 +48,37 @@ _SHOWN_DEFECTS = 12
 
 @dataclass(frozen=True)
 class SolveSettings:
-    """How a take is solved.
+    """How a take is solved."""
 
-    Args:
-        neutral: a frame with the face at rest, by which the take is aligned with the rig; by the whole take if absent
-            and ``align``.
-        align: align the take with the rig; otherwise its markers are in the rig's space already, unless ``neutral``
-            is given.
-        subtract_rest: subtract what is left at rest between markers and sites of an aligned take.
-        slip: the helmet moves on the head.
-        clean: find and repair swapped labels, spikes and markers that drift or fell off.
-        frame_by_frame: every frame on its own; otherwise the weights of the whole take at once, smooth over time. With
-            what a head camera saw every frame is on its own.
-        sparsity, ridge: see ``MarkerSolver``.
-        insist: solve what the rig does not explain, too.
-        free_scale: an alignment estimates the take's scale; otherwise it is 1.
-    """
-
+    # A frame with the face at rest, by which the take is aligned with the rig; by the whole take if absent and align.
     neutral: int | None = None
+    # Align the take with the rig; otherwise its markers are in the rig's space already, unless neutral is given.
     align: bool = False
-    subtract_rest: bool = True
-    slip: bool = False
-    clean: bool = False
+    subtract_rest: bool = True  # subtract what is left at rest between markers and sites of an aligned take
+    slip: bool = False  # the helmet moves on the head
+    clean: bool = False  # find and repair swapped labels, spikes and markers that drift or fell off
+    # Every frame on its own; otherwise the weights of the whole take at once, smooth over time. With what a head camera
+    # saw every frame is on its own.
     frame_by_frame: bool = False
+    # sparsity, ridge: see MarkerSolver
     sparsity: float = SPARSITY
     ridge: float = RIDGE
-    insist: bool = False
-    free_scale: bool = True
+    insist: bool = False  # solve what the rig does not explain, too
+    free_scale: bool = True  # an alignment estimates the take's scale; otherwise it is 1
 
 
 @dataclass(frozen=True, eq=False)
 class Solution:
-    """The solution of a take's markers.
-
-    Args:
-        markers: as the solve used them, (T,M,3), in rig space, without slip, bad samples NaN.
-        attachment: the sites, with what was subtracted at rest; of the take's markers.
-        alignment: marker space to rig space, where one was estimated.
-        motion: the helmet's, where it was asked for.
-        cleanup: what was wrong with the take, where that was asked for.
-        warnings: what the user should know before they use the weights.
-    """
+    """The solution of a take's markers."""
 
     rig: BlendshapeRig
     take: Take
-    markers: Tensor
-    attachment: Attachment
-    alignment: Similarity | None = None
-    motion: HelmetMotion | None = None
-    cleanup: Cleanup | None = None
-    warnings: tuple[str, ...] = ()
+    markers: Tensor  # as the solve used them, (T,M,3), in rig space, without slip, bad samples NaN
+    attachment: Attachment  # the sites, with what was subtracted at rest; of the take's markers
+    alignment: Similarity | None = None  # marker space to rig space, where one was estimated
+    motion: HelmetMotion | None = None  # the helmet's, where it was asked for
+    cleanup: Cleanup | None = None  # what was wrong with the take, where that was asked for
+    warnings: tuple[str, ...] = ()  # what the user should know before they use the weights
 
     @property
     def weights(self) -> Tensor:
@@ -143,23 +124,15 @@ class Solution:
 
 @dataclass(frozen=True, eq=False)
 class SolveReport:
-    """The report of a solve.
-
-    Args:
-        seen: fraction of the samples of the attachment's markers that were seen.
-        predicted: what the head camera saw, where there was a video.
-        sent: what was streamed, where that was asked for.
-        warnings: what the user should know before they use the weights.
-        notes: what else there is to say of the files.
-    """
+    """The report of a solve."""
 
     solution: Solution
-    seen: float
+    seen: float  # fraction of the samples of the attachment's markers that were seen
     seconds: float
-    predicted: Predicted | None = None
-    sent: StreamReport | None = None
-    warnings: tuple[str, ...] = ()
-    notes: tuple[str, ...] = ()
+    predicted: Predicted | None = None  # what the head camera saw, where there was a video
+    sent: StreamReport | None = None  # what was streamed, where that was asked for
+    warnings: tuple[str, ...] = ()  # what the user should know before they use the weights
+    notes: tuple[str, ...] = ()  # what else there is to say of the files
 
     def verdict(self) -> str:
         """Whether the weights are to be used, in a line."""
@@ -224,8 +197,6 @@ def solve_markers(
     """A take's weights: aligned with the rig, cleaned, freed of slip and of what is left at rest, solved.
 
     Args:
-        attachment: where the markers sit; markers match by label.
-        take: markers, in any space.
         predicted: what a head camera saw, for the hybrid solve.
     """
     progress = progress or silent

@@ -36,14 +36,7 @@ _MAX_ROWS = 60
 
 
 def write_solve_page(folder: Path, title: str, report: SolveReport) -> Path:
-    """Writes the report's page and figures into a folder.
-
-    Args:
-        folder: where to; made if absent.
-
-    Returns:
-        The page's path.
-    """
+    """Writes the report's page and figures into a folder, made if absent; the page's path."""
     solution = report.solution
     fps, weights = solution.take.fps, solution.weights.float()
     shown = solution.take.even_rows()

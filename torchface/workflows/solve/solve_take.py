@@ -22,22 +22,14 @@ from torchface.workflows.weight_files import WeightFiles, check_live_link, write
 
 @dataclass(frozen=True)
 class TakeInputs:
-    """What is solved.
+    """What is solved."""
 
-    Args:
-        rig: a file or folder of the performer's rig.
-        attachment: a file that says where the markers sit on the rig.
-        part: an annotated region that the rig is cut to, such as ``"face"``.
-        camera: what a head camera saw of the take.
-        options: how the take's markers are read.
-    """
-
-    rig: Path
+    rig: Path  # a file or folder of the performer's rig
     take: Path
-    attachment: Path
-    part: str | None = None
-    camera: HeadCamera | None = None
-    options: MarkerOptions = DEFAULT_OPTIONS
+    attachment: Path  # a file that says where the markers sit on the rig
+    part: str | None = None  # an annotated region that the rig is cut to, such as "face"
+    camera: HeadCamera | None = None  # what a head camera saw of the take
+    options: MarkerOptions = DEFAULT_OPTIONS  # how the take's markers are read
 
 
 @dataclass(frozen=True)

@@ -32,16 +32,12 @@ _INSIST = "--insist writes the weights all the same"
 
 @dataclass(frozen=True)
 class Coverage:
-    """The markers of an attachment that a take shows.
-
-    Args:
-        present: of them, seen in some frame of the take.
-        poor: frames that show some markers, but fewer coordinates than the rig has shapes while most frames show more.
-    """
+    """The markers of an attachment that a take shows."""
 
     markers: int
-    present: int
+    present: int  # of them, seen in some frame of the take
     shapes: int
+    # Frames that show some markers, but fewer coordinates than the rig has shapes while most frames show more.
     poor: int
 
     @property
@@ -97,8 +93,6 @@ def check_explained(solver: MarkerSolver, take: Take, aligned: bool, slip: bool,
 
     Args:
         take: markers in rig space, all known to the solver.
-        aligned: the take was aligned with the rig.
-        slip: the helmet's motion will be taken out.
         insist: refuse nothing.
     """
     assert take.markers is not None
@@ -164,13 +158,7 @@ def check_head(rig: BlendshapeRig, attachment: Attachment, take: Take, insist: b
 
 
 def neutral_warnings(rig: BlendshapeRig, attachment: Attachment, take: Take, frame: int, scale: bool) -> list[str]:
-    """Warnings where a frame that is given as neutral moves the face more than the calmest frame of its take.
-
-    Args:
-        take: markers, in any space.
-        frame: the one that is to be neutral.
-        scale: an alignment estimates the scale.
-    """
+    """Warnings where a frame that is given as neutral moves the face more than the calmest frame of its take."""
     assert take.markers is not None
     rows = torch.arange(0, len(take), max(1, len(take) // _LABEL_FRAMES))
     rows = torch.cat([rows, torch.tensor([frame])])
@@ -196,12 +184,7 @@ def neutral_warnings(rig: BlendshapeRig, attachment: Attachment, take: Take, fra
 
 
 def label_warnings(solver: MarkerSolver, take: Take, slip: bool) -> list[str]:
-    """Warnings for labels that are exchanged in the whole take or in part of it; for takes that are not cleaned.
-
-    Args:
-        take: markers in rig space.
-        slip: the helmet moves on the head.
-    """
+    """Warnings for labels that are exchanged in the whole take or in part of it; for takes that are not cleaned."""
     assert take.markers is not None
     few = solver.arrange(take.markers).double()
     few = few[:: max(1, len(few) // _LABEL_FRAMES)]

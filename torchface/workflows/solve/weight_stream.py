@@ -16,15 +16,10 @@ from torchface.workflows.live.weight_streams import mapped_sender
 
 @dataclass(frozen=True, eq=False)
 class StreamReport:
-    """What was sent.
+    """What was sent."""
 
-    Args:
-        weights: of each frame, (T,N).
-        latency: from when the frame was due to its packet on the way, (T,), milliseconds.
-    """
-
-    weights: Tensor
-    latency: Tensor
+    weights: Tensor  # of each frame, (T,N)
+    latency: Tensor  # from when the frame was due to its packet on the way, (T,), milliseconds
 
     def lines(self) -> list[str]:
         """For people to read."""
@@ -48,9 +43,6 @@ def stream_weights(
 
     Args:
         frames: (N,) each; each is taken when it is due.
-        fps: frames a second; a frame that comes too early waits, one that comes too late goes at once.
-        address: where to and how; see :func:`torchface.io.open_sender`.
-        clock, wait: what time it is, and to let it pass, in seconds.
         times: when each frame is due, seconds after the first; ``fps`` a second if absent.
     """
     sent: list[Tensor] = []

@@ -42,27 +42,17 @@ _EAGER, _PAUSE = 0.5, 0.1  # seconds after a face was lost in which every frame 
 
 @dataclass(frozen=True)
 class ReaderSettings:
-    """When a face counts as found and as lost.
+    """When a face counts as found and as lost."""
 
-    Args:
-        new: presence from which what the box network finds is a face.
-        vague: mean confidence of the landmarks under which it is none, and under which one that is followed is doubted.
-        sure: presence from which nothing is asked about a face that is followed.
-        likely: presence from which it is kept though the box network sees none.
-        least: presence under which it is lost at once.
-        smallest: pixels a side of the box round a face, at least.
-        score: of the box network that a face has at least.
-        again: score that confirms a face which is followed.
-    """
-
-    new: float = 0.6
+    new: float = 0.6  # presence from which what the box network finds is a face
+    # Mean confidence of the landmarks under which it is none, and under which one that is followed is doubted.
     vague: float = 0.5
-    sure: float = 0.9
-    likely: float = 0.5
-    least: float = 0.1
-    smallest: float = 12.0
-    score: float = 0.3
-    again: float = 0.25
+    sure: float = 0.9  # presence from which nothing is asked about a face that is followed
+    likely: float = 0.5  # presence from which it is kept though the box network sees none
+    least: float = 0.1  # presence under which it is lost at once
+    smallest: float = 12.0  # pixels a side of the box round a face, at least
+    score: float = 0.3  # of the box network that a face has at least
+    again: float = 0.25  # score that confirms a face which is followed
 
 
 @dataclass(frozen=True, eq=False)

@@ -24,24 +24,16 @@ _MAX_SIDE = 4096
 
 @dataclass(frozen=True)
 class ConsensusSettings:
-    """From where trees start.
+    """From where trees start."""
 
-    Args:
-        starts: how many, an even number; half of them on the mirrored image. Their mean is steadier than any of
-            them, and knows no side.
-        side: pixels a side that the box is given in the image that the trees see.
-        translation: standard deviation of the starts' place, of the box.
-        scale: standard deviation of the logarithm of their size.
-        rotation: standard deviation of their tilt, degrees.
-        seed: draws them, once for all images.
-    """
-
+    # How many, an even number; half of them on the mirrored image. Their mean is steadier than any of them, and knows
+    # no side.
     starts: int = 16
-    side: int = 110
-    translation: float = 0.04
-    scale: float = 0.06
-    rotation: float = 4.0
-    seed: int = 0
+    side: int = 110  # pixels a side that the box is given in the image that the trees see
+    translation: float = 0.04  # standard deviation of the starts' place, of the box
+    scale: float = 0.06  # standard deviation of the logarithm of their size
+    rotation: float = 4.0  # standard deviation of their tilt, degrees
+    seed: int = 0  # draws them, once for all images
 
     def __post_init__(self) -> None:
         if not (2 <= self.starts <= 4096 and self.starts % 2 == 0 and 16 <= self.side <= 1024):
