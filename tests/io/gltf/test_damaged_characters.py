@@ -37,7 +37,7 @@ def test_damaged_documents_end_in_errors_of_our_own(tmp_path: Path) -> None:
         whole = tmp_path / "whole.vrm"
         count = write_character(whole, HEAD, lift, Planted(vrm=version, expressions={expression: "lid"}))
         root, binary = unpacked(whole)
-        for _ in range(150):
+        for _ in range(60):
             broken = copy.deepcopy(root)
             for _ in range(draws.randint(1, 3)):
                 owner, key = draws.choice(places(broken, []))
@@ -54,4 +54,4 @@ def test_damaged_documents_end_in_errors_of_our_own(tmp_path: Path) -> None:
                 read += 1
             except TorchfaceError:
                 pass
-    assert read > 50
+    assert read > 20

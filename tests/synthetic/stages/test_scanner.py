@@ -99,20 +99,19 @@ def test_the_texture_shows_the_head(scan: RawScan) -> None:
     assert lips[0] / lips[1] > 1.1 * cheek[0] / cheek[1]
 
 
-def test_the_same_seed_gives_the_same_scan(closed: Mesh, scan: RawScan) -> None:
-    plain = replace(COARSE, photography=None)
-    again = scan_head(closed, 3, plain)
-    assert torch.equal(again.mesh.vertices, scan.mesh.vertices)
-    assert torch.equal(again.mesh.faces, scan.mesh.faces)
-    other = scan_head(closed, 4, plain)
+def test_another_seed_gives_another_scan(closed: Mesh, scan: RawScan) -> None:
+    other = scan_head(closed, 4, replace(COARSE, photography=None))
     assert len(other.mesh.vertices) != len(scan.mesh.vertices)
 
 
-def test_files_hold_what_a_user_would_bring(closed: Mesh, scan: RawScan, tmp_path: Path) -> None:
+def test_files_hold_what_a_user_would_bring_the_same_from_the_same_seed(
+    closed: Mesh, scan: RawScan, tmp_path: Path
+) -> None:
     paths = write_scans([closed], tmp_path, COARSE, seed=3)
     assert sorted(p.suffix for p in tmp_path.iterdir()) == [".json", ".ljson", ".mtl", ".obj", ".png"]
     read = load_mesh(paths[0])
     assert (read.vertices - scan.mesh.vertices).abs().max() < 1e-3
+    assert torch.equal(read.faces, scan.mesh.faces)
     assert read.texture is not None
     assert (load_landmark_points(paths[0].with_suffix(".ljson")).ibug() - scan.ibug).abs().max() < 1e-6
     truth = load_annotations(tmp_path / "annotations.json")[paths[0].name]

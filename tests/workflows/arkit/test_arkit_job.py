@@ -1,7 +1,9 @@
 """Tests of ``torchface arkit`` from files to files, on planted models of the embedded performer's head."""
 
 import json
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,8 +17,9 @@ from torchface.progress import silent
 from torchface.rig import BlendshapeRig
 from torchface.shape_names import ARKIT
 from torchface.synthetic import performer
-from torchface.workflows.arkit import arkit_rig
+from torchface.workflows.arkit import arkit_job, arkit_rig
 from torchface.workflows.arkit.arkit_job import AnimationSettings, animation_to_weights, arkit_head, weights_back
+from torchface.workflows.arkit.arkit_rig import ArkitRig, Source
 from torchface.workflows.named_heads import load_head_model, matching
 
 FRAMES = 30
@@ -49,6 +52,22 @@ def folder(tmp_path_factory: pytest.TempPathFactory, rig: BlendshapeRig, weights
     save_rig(rig, folder / "rig.glb")
     save_rig(rig.select(SHAPES), folder / "template.glb")
     return folder
+
+
+@pytest.fixture(scope="module", autouse=True)
+def shapes_made_once() -> Iterator[None]:
+    """A source's shapes take seconds, and several tests ask for those of the same file."""
+    make, made = arkit_job.make_arkit, {}
+
+    def once(source: Source, template: Path | None = None, *more: Any, **named: Any) -> ArkitRig:
+        key = source.path, template
+        if key not in made:
+            made[key] = make(source, template, *more, **named)
+        return made[key]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(arkit_job, "make_arkit", once)
+        yield
 
 
 def solved(path: Path, rig: BlendshapeRig) -> torch.Tensor:

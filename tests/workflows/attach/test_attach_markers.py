@@ -20,8 +20,7 @@ def motion(dome_rig: BlendshapeRig) -> tuple[Attachment, Take]:
     return sites, record(dome_rig, sites, weights, torch.Generator().manual_seed(0), StageFlaws(noise=0.05)).take
 
 
-@pytest.mark.parametrize("pair", [(0, 20), (4, 11), (7, 29)])
-@pytest.mark.parametrize("share", [0.09, 0.46])
+@pytest.mark.parametrize(("pair", "share"), [((0, 20), 0.09), ((4, 11), 0.46), ((7, 29), 0.46)])
 def test_labels_exchanged_in_less_than_half_move_no_site(
     dome_rig: BlendshapeRig, motion: tuple[Attachment, Take], pair: tuple[int, int], share: float
 ) -> None:
