@@ -8,6 +8,7 @@ import numpy as np
 import torch
 from scipy.linalg.lapack import dposv
 from torch import Tensor
+from torch.nn.functional import pad
 
 Array: TypeAlias = "np.ndarray"
 
@@ -57,15 +58,38 @@ def _solution(matrix: Array, ids: Array, side: Array, ridge: float) -> Array:
 
 
 def _solved_at_once(scaled: Tensor, free: Tensor, right: Tensor, ridge: Tensor) -> Tensor:
-    """On an accelerator: all variables are factored, those that are held as rows of the identity."""
-    solved = torch.zeros_like(right)
-    for rows in torch.arange(len(right), device=right.device).split(max(1, _CHUNK_NUMBERS // right.shape[1] ** 2)):
-        taken = free[rows]
+    """Problems are sorted by how many variables are free, so that those factored together are of nearly one size."""
+    size = scaled.shape[-1] + 1
+    # A row and a column of zeros pad the blocks of problems with fewer free variables.
+    scaled, wide = pad(scaled, (0, 1, 0, 1)), pad(right, (0, 1))
+    counts, order = free.sum(-1).sort(descending=True)
+    most = counts.tolist()
+    solved = torch.zeros_like(wide)
+    first = 0
+    while first < len(most) and most[first]:
+        last = first + max(1, _CHUNK_NUMBERS // most[first] ** 2)
+        rows = order[first:last]
+        ids = _free_ids(free[rows], counts[first:last], most[first])
+        places = ids[:, :, None] * size + ids[:, None, :]
         matrices = scaled if scaled.ndim == 2 else scaled[rows]
-        block = torch.where(taken[:, :, None] & taken[:, None], matrices, 0.0)
-        block.diagonal(dim1=-2, dim2=-1).add_(torch.where(taken, ridge[rows, None], 1.0))
-        solved[rows] = _factored_solve(block, torch.where(taken, right[rows], 0.0))
-    return solved
+        if scaled.ndim == 3:
+            places += (torch.arange(len(rows), device=rows.device) * size**2)[:, None, None]
+        block = matrices.view(-1).index_select(0, places.view(-1)).view_as(places)
+        block.diagonal(dim1=-2, dim2=-1).add_(torch.where(ids == size - 1, 1.0, ridge[rows, None]))
+        x = _factored_solve(block, wide[rows].gather(1, ids))
+        solved[rows] = torch.zeros_like(wide[: len(rows)]).scatter_(1, ids, x)
+        first = last
+    return solved[:, :-1]
+
+
+def _free_ids(free: Tensor, counts: Tensor, size: int) -> Tensor:
+    """The free variables of each problem, (B,size), those of a shorter one followed by N."""
+    row, column = free.nonzero(as_tuple=True)
+    first = counts.cumsum(0) - counts
+    place = torch.arange(len(row), device=row.device) - first[row]
+    ids = torch.full((len(free), size), free.shape[1], device=row.device)
+    ids[row, place] = column
+    return ids
 
 
 def _factored_solve(block: Tensor, right: Tensor) -> Tensor:

@@ -60,7 +60,11 @@ _TRIED = 5  # boxes, where no face was asked for by number
 
 
 def find_landmarks(
-    image: Tensor, finder: LandmarkFinder | LandmarkTrees, face: int = 0, detector: FaceDetector | None = None
+    image: Tensor,
+    finder: LandmarkFinder | LandmarkTrees,
+    face: int = 0,
+    detector: FaceDetector | None = None,
+    appearance: AppearanceModel | None = None,
 ) -> FaceReading:
     """Landmarks of one face in a photograph.
 
@@ -69,6 +73,7 @@ def find_landmarks(
         finder: finds 68 landmarks in a box; landmark trees do so from 48 starts.
         face: which one, from 0, the largest first.
         detector: finds boxes; see :func:`find_faces`.
+        appearance: of this person; refines what the finder finds.
 
     Raises:
         NoFaceError: there are not so many faces, or the finder says that the box shows none.
@@ -89,7 +94,7 @@ def find_landmarks(
     for number in range(len(faces))[:_TRIED] if face == 0 else [face]:  # the largest box may show none
         reading = settled_face(finder, image, faces.boxes[number], float(faces.tilts[number]))
         if float(reading.presence) >= _PHOTOGRAPHED:
-            return reading
+            return refined_face(reading, image, appearance)
         refused.append(reading)
     x, y, wide = (round(float(value)) for value in refused[0].search_box[:3])
     raise NoFaceError(
