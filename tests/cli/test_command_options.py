@@ -135,7 +135,7 @@ def test_an_output_that_is_an_input_is_refused_before_any_work(
     assert path.read_bytes() == b"content"
 
 
-@pytest.mark.parametrize("command", ["enhance", "register"])
+@pytest.mark.parametrize("command", ["enhance", "register", "render"])
 def test_the_help_names_what_a_command_takes_and_no_empty_default(
     command: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -145,6 +145,7 @@ def test_the_help_names_what_a_command_takes_and_no_empty_default(
     assert "(default: )" not in told
     assert "--no-no" not in told
     assert command != "register" or "TEMPLATE SCAN..." in told
+    assert command != "render" or "(default: 0)" in told  # of --frame
 
 
 @pytest.mark.parametrize("kind", ["symbolic link", "hard link", "link to the folder", "way round"])

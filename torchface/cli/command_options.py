@@ -116,7 +116,8 @@ def plain_options(command: Command) -> Command:
     for name, parameter in signature(command).parameters.items():
         kind, *notes = get_args(hints[name]) if get_origin(hints[name]) is Annotated else (hints[name],)
         named = any(getattr(note, "metavar", None) is not None for note in notes)
-        empty = parameter.default in (None, False, ()) or (parameter.default is parameter.empty and _many(kind))
+        empty = parameter.default is parameter.empty and _many(kind)
+        empty = empty or parameter.default is None or parameter.default is False or parameter.default == ()
         changes: dict[str, Any] = {"help_behavior_hint": ""} if empty else {}
         if not named and (word := _word(kind)):
             changes["metavar"] = word

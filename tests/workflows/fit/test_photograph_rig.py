@@ -145,6 +145,8 @@ def test_photographs_without_a_face_are_said(studio: Path, tmp_path: Path) -> No
         )
     with pytest.raises(FileFormatError, match=r"head\.glb: found a mesh, expected photographs; torchface rig"):
         fit_photographs([tmp_path / "head.glb"], [], studio / "heads", out)
+    with pytest.raises(FileFormatError, match="found a folder, expected photographs, by name"):
+        fit_photographs([tmp_path], [], studio / "heads", out)
     assert not out.exists()
 
 

@@ -219,6 +219,8 @@ def test_landmarks_of_the_only_scan_come_as_its_file(template: Mesh, scans: Path
     assert entry.figures["start"] == "landmarks"
     with pytest.raises(FileFormatError, match=r"landmarks: found no folder .*s0.ljson"):
         register_scans(template, [scans], tmp_path / "many", settings)
+    with pytest.raises(FileFormatError, match=r"found no file of a scan's name .*such as bad.ljson"):
+        register_scans(template, [scans], tmp_path / "many", ScanSettings(landmarks=tmp_path))
 
 
 def test_landmarks_come_as_points_in_the_templates_order_or_as_correspondences(template: Mesh, tmp_path: Path) -> None:

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import pytest
 import torch
 
 from torchface import Take, Track
 from torchface.capture.action_units import ActionUnitCurves
-from torchface.workflows.solve.head_camera import resampled_curves
+from torchface.errors import FileFormatError
+from torchface.workflows.solve.head_camera import HeadCamera, predicted_curves, resampled_curves
 
 
 def curves(frames: int, fps: float) -> ActionUnitCurves:
@@ -54,3 +57,8 @@ def test_gamma_is_the_largest_weight_of_a_prediction() -> None:
     usual, weak = resampled_curves(curves(90, 60), take(90, 60)), resampled_curves(curves(90, 60), take(90, 60), 1.0)
     torch.testing.assert_close(weak.gamma.values, usual.gamma.values / 4)
     assert float(usual.gamma.values.max()) > 3
+
+
+def test_a_video_without_labels_says_what_they_are() -> None:
+    with pytest.raises(FileFormatError, match=r"take\.toml: found no such file, .* in take\.mp4; --video-labels"):
+        predicted_curves(HeadCamera(Path("take.mp4"), "action_units"), take(2, 60.0), ("jawOpen",))

@@ -186,7 +186,8 @@ def fit_photographs(
         if path.suffix.lower() in (*MESH_ENDINGS, *SCENE_ENDINGS):
             raise FileFormatError(f"{path}: found a mesh, expected photographs; torchface rig makes a rig of a mesh")
         if not path.is_file():
-            raise FileFormatError(f"{path}: found no such file, expected a photograph or a video")
+            found = "a folder" if path.is_dir() else "no such file"
+            raise FileFormatError(f"{path}: found {found}, expected photographs, by name, or a video")
     progress("reading the model")
     named = NamedHeads.of(model)
     heads, rig = matching(load_head_model(named.name), settings.template, settings.part)

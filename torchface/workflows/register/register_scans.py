@@ -16,6 +16,7 @@ from torchface.mesh import Mesh, submesh
 from torchface.modeling import HeadModel, MorphableModel
 from torchface.modeling.morphable.published_models import head_model_of
 from torchface.progress import Progress
+from torchface.registration.landmark_files import ENDINGS, landmark_file
 from torchface.registration.model_fit import HasShape, LinearShape, ShapeModel, shape_model
 from torchface.registration.nonrigid.schedule import DEFAULT_SCHEDULE, Schedule
 from torchface.registration.scan_preparation import check_template
@@ -86,6 +87,11 @@ def register_scans(
     items = find_items(scans, SCANS)
     one = landmarks is not None and len(items.items) == 1 and Path(landmarks).is_file()
     marks = None if landmarks is None else Path(landmarks).resolve() if one else _folder("landmarks", landmarks)
+    if marks is not None and items.items and not any(landmark_file(marks, item.path) for item in items.items):
+        wanted = " or ".join(f"{items.items[0].path.stem}{ending}" for ending in ENDINGS)
+        raise FileFormatError(
+            f"landmarks: found no file of a scan's name in {landmarks}, expected one such as {wanted}"
+        )
     if marks == Path(out).resolve():
         raise ValueRangeError(f"out: found {out}, which holds landmarks; expected another folder")
     job = ScanJob(

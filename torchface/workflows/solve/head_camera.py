@@ -18,7 +18,7 @@ from torchface.capture.action_units import (
 from torchface.capture.action_units.shape_table import built_in_tables
 from torchface.capture.markers import gamma_curves
 from torchface.capture.markers.hybrid_solver import GAMMA
-from torchface.errors import NameMismatchError
+from torchface.errors import FileFormatError, NameMismatchError
 from torchface.io.action_labels import load_action_labels
 from torchface.progress import Progress
 from torchface.take import Take, Track
@@ -63,7 +63,13 @@ def predicted_curves(
     take the markers are left alone.
     """
     classifier = zoo.get_model(camera.classifier, ActionUnitClassifier)
-    labels = load_action_labels(camera.labels or camera.video.with_suffix(".toml"))
+    where = camera.labels or camera.video.with_suffix(".toml")
+    if not where.is_file():
+        raise FileFormatError(
+            f"{where}: found no such file, expected where helmet, markers and regions are in {camera.video.name}; "
+            "--video-labels names another (docs/how_to/head_camera.md)"
+        )
+    labels = load_action_labels(where)
     table = load_shape_table(camera.table if camera.table is not None else _fitting_table(classifier.units, names))
     settings = CurveSettings(units=camera.units or None)
     curves = action_unit_curves(classifier, camera.video, labels, table, names, settings, progress)
