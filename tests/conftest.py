@@ -43,6 +43,7 @@ LONGEST = (
     "capture/action_units",
     "onnx",
     "test_packaging",
+    "test_docstrings",
     "viz/browser",
     "workflows",
     "train",
