@@ -20,10 +20,11 @@ $(VENV)/.installed-%: $(STAMP)
 	$(RUN) -m pip install --quiet --constraint constraints.txt --editable '.[test,$*]'
 	touch $@
 
-# Two processes of one thread each, the longest files first; what is costly to make once (a synthetic video, a browser) stays in one.
+# Three processes of one thread each for two cores, as browsers and programs are waited for; the longest files first, and what is
+# costly to make once (a synthetic video, a browser) stays in one.
 # Bytecode is written, whatever the shell says: many tests start a process.
 test: $(VENV)/.installed-test
-	PYTHONDONTWRITEBYTECODE= OMP_NUM_THREADS=1 $(RUN) -m pytest --numprocesses 2 --dist loadfile --no-loadscope-reorder
+	PYTHONDONTWRITEBYTECODE= OMP_NUM_THREADS=1 $(RUN) -m pytest --numprocesses 3 --dist loadfile --no-loadscope-reorder
 
 # Blender's package has a Python of its own: it wants 3.11 and numpy below 2.
 BLENDER_PYTHON ?= python3.11
