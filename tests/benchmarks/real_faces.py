@@ -28,7 +28,7 @@ from torchface.landmarks import (
     landmark_jitter,
 )
 from torchface.landmarks.images.checked_detector import shipped_detector
-from torchface.landmarks.images.ibug_68 import INNER, box_around, relative_errors, tilt_around
+from torchface.landmarks.images.ibug_68 import INNER, box_around, relative_errors, tilt_around, turned_box
 from torchface.landmarks.images.landmark_finder import LandmarkFinder
 
 GROUPS = {
@@ -138,8 +138,8 @@ class GivenBox:
     def __call__(self, image: Tensor) -> FaceBoxes:
         if image.shape[-2:] != self.shape:  # the tracker's look at the face's surroundings
             return self.piece(image)
-        tilt = tilt_around(self.landmarks)
-        return FaceBoxes(box_around(self.landmarks, float(tilt))[None], torch.ones(1), tilt[None])
+        box, tilt = turned_box(self.landmarks)
+        return FaceBoxes(box[None], torch.ones(1), tilt[None])
 
 
 def follow(finder: LandmarkFinder, clip: Clip) -> Follow:
@@ -155,13 +155,12 @@ def follow(finder: LandmarkFinder, clip: Clip) -> Follow:
 
 def see(finder: LandmarkFinder, picture: Picture, seed: int = 0) -> FaceReading:
     """The landmarks of a picture from its face's box, moved and sized as a detector's is."""
-    tilt = float(tilt_around(picture.landmarks)) if picture.told is None else picture.told
-    box = box_around(picture.landmarks, tilt)
+    box, tilt = turned_box(picture.landmarks, None if picture.told is None else torch.tensor(picture.told))
     drawn = torch.randn(3, generator=torch.Generator().manual_seed(seed)).clamp(-2, 2)
     side = box[2] * (0.06 * drawn[2]).exp()
     middle = box[:2] + box[2:] * (0.5 + 0.04 * drawn[:2])
     moved = torch.cat([middle - side / 2, side.expand(2)])
-    given = FaceBoxes(moved[None], torch.ones(1), torch.tensor([tilt]))
+    given = FaceBoxes(moved[None], torch.ones(1), tilt[None])
     try:
         return find_landmarks(picture.image, finder, detector=lambda _: given)
     except NoFaceError:  # the finder says so

@@ -12,6 +12,7 @@ import torch
 from PIL import Image, ImageDraw, ImageFilter, ImageOps
 from torch import Tensor
 
+from torchface.color_space import to_linear, to_srgb
 from torchface.geometry.cameras.pinhole import look_at
 from torchface.landmarks import FaceReading, NoFaceError
 from torchface.landmarks.images.networks.part_finder import FaceParts
@@ -20,7 +21,7 @@ from torchface.modeling import ImageFit
 from torchface.synthetic import neutral_head
 from torchface.workflows.fit.fit_checks import strange_lines
 from torchface.workflows.fit.fit_landmarks import PhotographLandmarks, find_in_photographs
-from torchface.workflows.fit.picture_checks import cover_lines, picture_lines, profile_lines
+from torchface.workflows.fit.picture_checks import cover_lines, light_lines, picture_lines, profile_lines
 
 
 def skin() -> Tensor:
@@ -179,3 +180,26 @@ def test_a_photograph_that_is_spoilt(data: Path) -> None:
         (small, "pixels between the eyes' outer corners"),
     ):
         assert any(line in one for one in seen(image)[1]), line
+
+
+@pytest.mark.parametrize(
+    ("right", "words"),
+    [
+        ((1.0, 1.0, 1.0), None),
+        ((0.7, 0.7, 0.7), None),
+        ((0.3, 0.3, 0.3), "a factor of 3.3 in brightness, 1.0 in blue over red"),
+        ((0.9, 0.7, 0.45), "1.5 in brightness, 2.0 in blue over red"),
+    ],
+)
+def test_light_from_one_side_is_remarked_on(right: tuple[float, ...], words: str | None) -> None:
+    picture = to_linear(skin())
+    picture[:, :, 100:] *= torch.tensor(right)[:, None, None]
+    points = reading().landmarks
+    points[36:42], points[42:48] = torch.tensor([70.0, 80.0]), torch.tensor([130.0, 80.0])
+    points[36], points[45] = torch.tensor([55.0, 80.0]), torch.tensor([145.0, 80.0])
+    points[48], points[54] = torch.tensor([75.0, 130.0]), torch.tensor([125.0, 130.0])
+    shares = torch.zeros(len(PARTS), 100, 100)
+    shares[PARTS.index("skin")] = 1.0
+    parts = FaceParts(shares, torch.tensor([[0.5, 0.0, 0.0], [0.0, 0.5, 0.0]], dtype=torch.float64))
+    lines = light_lines(Path("a.png"), to_srgb(picture), parts, points)
+    assert [words in line for line in lines] == [True] if words else lines == []

@@ -87,17 +87,18 @@ def box_around(landmarks: Tensor) -> Tensor:
     return torch.where(torch.isfinite(box).all(-1, keepdim=True), box, torch.nan)
 
 
-def turned_box(landmarks: Tensor) -> tuple[Tensor, Tensor]:
-    """The box of :func:`box_around` with each face's own tilt, and these tilts.
+def turned_box(landmarks: Tensor, tilt: Tensor | None = None) -> tuple[Tensor, Tensor]:
+    """The box of :func:`box_around` with each face's tilt, and these tilts.
 
     Args:
         landmarks: iBUG's 68, (...,68,2), pixels.
+        tilt: (...,) radians; :func:`tilt_around` the landmarks if absent.
 
     Returns:
         x, y, width, height of squares whose middle and side are those of the box in the face's own frame, (...,4); and
-        :func:`tilt_around` the landmarks, (...).
+        the tilts, (...).
     """
-    angle = tilt_around(landmarks)
+    angle = tilt_around(landmarks) if tilt is None else tilt
     across = torch.stack([angle.cos(), angle.sin()], dim=-1)
     frame = torch.stack([across, torch.stack([-across[..., 1], across[..., 0]], dim=-1)], dim=-1)  # (...,2,2), columns
     upright = box_around(landmarks @ frame)

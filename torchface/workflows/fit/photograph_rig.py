@@ -47,7 +47,7 @@ from torchface.workflows.fit.fit_landmarks import (
 )
 from torchface.workflows.fit.fit_readings import with_readings
 from torchface.workflows.fit.fitted_character import dressed_rig
-from torchface.workflows.fit.picture_checks import cover_lines, picture_lines, profile_lines
+from torchface.workflows.fit.picture_checks import cover_lines, light_lines, picture_lines, profile_lines
 from torchface.workflows.fit.video_pictures import video_pictures
 from torchface.workflows.named_finders import part_finder
 from torchface.workflows.named_heads import NamedHeads, load_head_model, matching
@@ -186,8 +186,8 @@ def fit_photographs(
         if path.suffix.lower() in (*MESH_ENDINGS, *SCENE_ENDINGS):
             raise FileFormatError(f"{path}: found a mesh, expected photographs; torchface rig makes a rig of a mesh")
         if not path.is_file():
-            found = "a folder" if path.is_dir() else "no such file"
-            raise FileFormatError(f"{path}: found {found}, expected photographs, by name, or a video")
+            what = "a folder" if path.is_dir() else "no such file"
+            raise FileFormatError(f"{path}: found {what}, expected photographs, by name, or a video")
     progress("reading the model")
     named = NamedHeads.of(model)
     heads, rig = matching(load_head_model(named.name), settings.template, settings.part)
@@ -223,8 +223,8 @@ def fit_photographs(
         readings = FaceReading.stacked([one.face for one in found])
         fitting = with_readings(fitting, readings, found[0].places, rig)
     remarks = [line for one, image in zip(found, images, strict=False) for line in picture_lines(one, image, insist)]
-    for photograph, shown, points in zip(photographs, parts, marks, strict=True):
-        remarks += cover_lines(photograph, shown, points)
+    for photograph, image, shown, points in zip(photographs, images, parts, marks, strict=True):
+        remarks += [*cover_lines(photograph, shown, points), *light_lines(photograph, image, shown, points)]
     # The tracker has followed one face through a film.
     remarks += one_person_lines(photographs, marks, bare, insist or one_film)
     fit = fit_images(heads, rig, marks, sizes, images, settings.focal, fitting, progress)

@@ -9,6 +9,7 @@ import cv2
 import torch
 from torch import Tensor
 
+from torchface.color_space import to_linear
 from torchface.landmarks import NoFaceError
 from torchface.landmarks.images.networks.part_finder import FaceParts
 from torchface.modeling import ImageFit
@@ -26,6 +27,8 @@ _RED, _BLUE = (
 )  # logarithms of red and blue over green of skin; 8 faces 0.20 to 0.51, -0.53 to -0.08
 _ONE_HUE = 0.02  # of red over green, its logarithm's middle 80 %; 19 photographs 0.11 to 0.76, clay 0.008
 _FLAT, _FLAT_GREY = 0.65, 0.18  # share of pixels like their neighbours; 9 photographs at most 0.12
+_CHEEK = 0.14  # of the distance of the eyes' outer corners
+_ONE_SIDE, _TWO_HUES = 2.5, 1.6  # factors; of 5 photographs 1.0 to 1.15 and 1.0 to 1.25, of a patchy one 1.5 and 2.1
 _PROFILE = 50.0  # degrees
 _GRID = 40
 _COVERS = {
@@ -113,6 +116,36 @@ def cover_lines(photograph: Path, parts: FaceParts, landmarks: Tensor) -> list[s
         if share > least:
             lines.append(f"WARNING: {photograph.name}: {words} {share:.0%} of the face; its skin there is completed")
     return lines
+
+
+def light_lines(photograph: Path, image: Tensor, parts: FaceParts, landmarks: Tensor) -> list[str]:
+    """Whether light from one side leaves the cheeks too far apart to be divided out, for people to read.
+
+    Args:
+        image: the photograph, (3,H,W) in [0,1].
+        parts: what it shows.
+        landmarks: of the face, (68,2) pixels; NaN for missing.
+    """
+    marks = landmarks.double()
+    reach = _CHEEK * (marks[45] - marks[36]).norm()
+    side = reach * torch.linspace(-1, 1, _GRID, dtype=torch.float64)
+    around = torch.cartesian_prod(side, side)
+    cheeks = []
+    for eye, corner in ((slice(36, 42), 48), (slice(42, 48), 54)):
+        at = (marks[eye].mean(0) + marks[corner]) / 2 + around[around.norm(dim=1) < reach]
+        at = at[parts.at(at, "skin").nan_to_num(0.0) > _PRESENT].round().long()
+        at = at[((at >= 0) & (at < torch.tensor([image.shape[2], image.shape[1]]))).all(1)]
+        if not len(at):
+            return []
+        cheeks.append(to_linear(image[:3, at[:, 1], at[:, 0]].double()).median(1).values.clamp(min=1e-3).log())
+    apart = cheeks[0] - cheeks[1]
+    light, hue = math.exp(abs(float(apart.mean()))), math.exp(abs(float(apart[2] - apart[0])))
+    if light < _ONE_SIDE and hue < _TWO_HUES:
+        return []
+    return [
+        f"WARNING: {photograph.name}: light from one side (cheeks differ by a factor of {light:.1f} in brightness, "
+        f"{hue:.1f} in blue over red; in even light by less than 1.3): the skin stays patchy; give one in even light"
+    ]
 
 
 def _hidden_parts(found: PhotographLandmarks) -> dict[str, float]:
