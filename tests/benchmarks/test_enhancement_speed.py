@@ -74,14 +74,14 @@ def test_parts(size: int) -> None:
     points = torch.linspace(0, len(model.neutral) - 1, 250).long()
     shell = ThinShell(model.neutral, model.faces, points)
     with torch.no_grad():
-        laid, _ = encoder.alignment.laid_on_neutral(coarse, "coarse")
+        laid, _ = encoder.alignment.aligned(coarse, "coarse")
         low = encoder.low_pass(laid)
         turned = encoder.frames.turned(low)
         features = encoder.gradients.features(low, turned)
         details = encoder.detail.encode(model.neutral + low, coarse)
         parts = {
             "thin shell, 250 points": lambda: shell.spread((coarse - model.neutral)[:, points]),
-            "alignment": lambda: encoder.alignment.laid_on_neutral(coarse, "coarse"),
+            "alignment": lambda: encoder.alignment.aligned(coarse, "coarse"),
             "low-pass": lambda: encoder.low_pass(laid),
             "turned frames": lambda: encoder.frames.turned(low),
             "features of patches": lambda: encoder.gradients.features(low, turned),

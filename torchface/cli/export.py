@@ -125,10 +125,13 @@ def video_solver(
     dynamics: str | None = None,
     fps: float | None = None,
     landmarks: Path | None = None,
+    offsets: Path | None = None,
     part: str | None = None,
     quiet: Quiet = False,
 ) -> None:
-    """Write the video solve of one rig and one camera as an ONNX file, and check it: the one of `torchface track`.
+    """Write the video solve of one rig and one camera as an ONNX file, and check it: `torchface track`'s of a table.
+
+    Of a film `track` also counts the expression and the eyes that networks read, which no graph takes.
 
     Inputs of the graph: `landmarks` (68,2), pixels, NaN where not seen, `confidence` (68,), and what the frame before
     gave, `previous_` and its name; all NaN for the first frame. Outputs: `weights` (N,), `rotation` (3,3),
@@ -145,9 +148,12 @@ def video_solver(
         fps: Frames a second of the application's camera; those that the dynamics prior has learned if absent.
         landmarks: The landmarks.csv that `torchface track` wrote of a video of this camera, to check the graph with; a
             synthetic video if absent.
+        offsets: The landmark_offsets.json that `torchface track` wrote of this person and rig; without it the rig's
+            landmarks are taken to lie where they are found.
         part: Keep this region of the rig only, such as face.
         quiet: Show no progress.
     """
+    from torchface.capture.own_rig.landmark_offsets import LandmarkOffsets
     from torchface.errors import FileFormatError, ValueRangeError
     from torchface.files.job_lock import file_lock
     from torchface.io import load_rig, load_take
@@ -155,6 +161,7 @@ def video_solver(
     from torchface.number_checks import check_rate
     from torchface.onnx import export_video_solver
     from torchface.workflows.named_priors import load_priors
+    from torchface.workflows.track.take_solution import rig_digest
 
     with file_lock(out, ".onnx"), progress_bars(quiet) as progress:
         if fps is not None:
@@ -165,8 +172,13 @@ def video_solver(
         video = None if landmarks is None else load_take(landmarks).landmarks
         if landmarks is not None and video is None:
             raise FileFormatError(f"{landmarks}: found no landmarks, expected the landmarks.csv of torchface track")
+        shift = None if offsets is None else LandmarkOffsets.load(offsets)
+        if shift is not None and offsets is not None:
+            shift.require(rig_digest(loaded), "", offsets)
         progress("exporting and checking")
-        report = export_video_solver(loaded, calibration, out, priors.shapes, priors.dynamics, video=video)
+        report = export_video_solver(
+            loaded, calibration, out, priors.shapes, priors.dynamics, video=video, offsets=shift
+        )
     print_table(report.rows())
     if priors.unlearned:
         console.print(f"the priors say nothing of {', '.join(priors.unlearned)}", soft_wrap=True)

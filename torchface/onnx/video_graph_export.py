@@ -16,6 +16,7 @@ from torch import Tensor
 from torchface import __version__
 from torchface.capture.antagonist_shapes import one_side
 from torchface.capture.own_rig import VideoSettings, VideoSolver
+from torchface.capture.own_rig.landmark_offsets import LandmarkOffsets
 from torchface.capture.priors import AdaptedDynamicsPrior, DynamicsPrior, ShapePrior
 from torchface.errors import ShapeError, ValueRangeError
 from torchface.files.whole_files import write_file
@@ -83,7 +84,7 @@ class VideoReport(WrittenGraph):
         return rows
 
 
-def export_video_solver(
+def export_video_solver(  # noqa: PLR0913  # each is a part of the solve
     rig: BlendshapeRig,
     camera: CameraCalibration,
     path: str | Path,
@@ -92,6 +93,7 @@ def export_video_solver(
     settings: VideoSettings | None = None,
     facts: Mapping[str, object] | None = None,
     video: Track | None = None,
+    offsets: LandmarkOffsets | None = None,
 ) -> VideoReport:
     """Writes the video solve of one rig and camera as ONNX, and checks it.
 
@@ -111,6 +113,7 @@ def export_video_solver(
         facts: further metadata, such as licence and data.
         video: landmarks that ``torchface track`` found in a video of this camera, pixels; the check runs on them,
             without the lens' distortion and filtered as ``track`` does. A synthetic video if absent.
+        offsets: between the rig's landmarks and the finder's, as ``track`` estimated them with a take; none if absent.
 
     Raises:
         NameMismatchError: a prior was learned for other shapes than the rig has.
@@ -122,6 +125,7 @@ def export_video_solver(
         raise ShapeError("rig: found no landmarks, expected the 68 of iBUG's order; see torchface annotate")
     settings = settings or VideoSettings.of_found_landmarks(dynamics is not None)
     solver = VideoSolver(rig, None, camera.intrinsics, prior, dynamics, settings)
+    solver = solver if offsets is None else solver.shifted(offsets)
     frames_to_check = None if video is None else check_frames(video, camera)
     return write_video_solver(solver, path, _camera_facts(camera) | dict(facts or {}), frames_to_check)
 

@@ -114,7 +114,7 @@ def known_offsets(inputs: TrackInputs, out: Path) -> LandmarkOffsets | None:
 def offsets_of(path: Path, inputs: TrackInputs) -> LandmarkOffsets:
     """A file's offsets, which must be this rig's and this finder's."""
     offsets = LandmarkOffsets.load(path)
-    offsets.require(_rig_digest(inputs.actor), _finder_digest(inputs), path)
+    offsets.require(rig_digest(inputs.actor), _finder_digest(inputs), path)
     return offsets
 
 
@@ -132,7 +132,7 @@ def new_offsets(
         return None
     return replace(
         offsets,
-        rig=_rig_digest(inputs.actor),
+        rig=rig_digest(inputs.actor),
         finder=_finder_digest(inputs),
         video=inputs.offsets_key,
         source=inputs.clip.path.name,
@@ -217,7 +217,7 @@ def solution_key(
         landmarks=inputs.reading_key,
         models=inputs.models.solving,
         neutral=inputs.actor.neutral,
-        rig=_rig_digest(inputs.actor),
+        rig=rig_digest(inputs.actor),
         calibration=inputs.calibration,
         whole_take=inputs.settings.whole_take,
         one_person=inputs.settings.one_person,
@@ -276,7 +276,7 @@ def keep_solution(state: TrackState, key: str, solution: VideoSolution) -> None:
     write_checkpoint(make_folder(state.folder) / _SOLUTION, tensors, key)
 
 
-def _rig_digest(rig: BlendshapeRig) -> str:
+def rig_digest(rig: BlendshapeRig) -> str:
     """Changes when a rig does."""
     correctives = rig.correctives
     more = {} if correctives is None else {"correctives": correctives.deltas, "definitions": correctives.definitions}
