@@ -64,3 +64,35 @@ def test_covariance_is_that_of_planted_errors() -> None:
         off = (found.coefficients - truth)[free]
         squares.append(off @ torch.linalg.solve(covariance[free][:, free], off) / free.sum())
     assert 0.85 < float(torch.stack(squares).mean().sqrt()) < 1.15
+
+
+def test_errors_that_pictures_share_count_about_once() -> None:
+    """Eight pictures with the same errors lead hardly farther from the truth than one of them."""
+    model, rig = zoo.get_model("head"), performer(texture=False)
+    mean, faces, marks = model.shape.mean, rig.neutral.faces, rig.neutral.landmarks
+    sites = Attachment.from_vertices(rig.neutral, marks[31:33])
+    placed = LandmarkSites(marks, contour_curves(mean, faces, marks), False, faces, sites)
+    points, modes = LinearPoints.of(mean, model.shape.modes, placed), model.shape.count
+    camera = look_at(mean[marks].double().mean(0), 0.0, 0.0, 300.0, 800, 800)
+    generator, apart = torch.Generator().manual_seed(3), list[list[float]]()
+    for _ in range(12):
+        truth = torch.randn(modes, generator=generator).double()
+        wrong = 6 * torch.randn(1, points.count, 2, generator=generator).double()
+        apart.append([])
+        for count in (1, 8):
+            views = Views(
+                *(
+                    one.double().expand(count, *one.shape)
+                    for one in (camera.intrinsics, camera.rotation, camera.translation)
+                )
+            )
+            found = views.pixels(points.at(truth)[None, : points.count]) + wrong
+            surface = SurfacePoints(found[:, 68:], torch.full((count, 2), 1.6), sites)
+            settings = FitSettings(
+                sliding=False, noise=6.0, deviations=torch.ones(count, 68), surface=surface, one_expression=True
+            )
+            problem = Problem(points, modes, found, views.intrinsics[:, 0, 0], settings)
+            start = State(torch.zeros(modes).double(), views, torch.arange(points.count).expand(count, -1), 6.0)
+            apart[-1].append(float((image_solve.solve(problem, start).coefficients - truth).norm()))
+    one, eight = torch.tensor(apart).mean(0).tolist()
+    assert eight < 1.1 * one
