@@ -46,12 +46,12 @@ def test_a_disk_that_fills_ends_the_curves_and_not_the_stream(
     append = FrameLog.append
 
     def full(log: FrameLog, *given: Any) -> None:
-        if log.count == 2:
+        if log.count == 1:  # a slow machine drops most frames
             raise FileFormatError("the disk is full")
         append(log, *given)
 
     monkeypatch.setattr(FrameLog, "append", full)
     report = track_live(str(filmed.video), filmed.rig, ["udp://127.0.0.1:9"], tmp_path)
-    assert report.figures.frames + report.dropped == FRAMES > 2
-    assert "the curves end at frame 2: the disk is full" in report.notes
-    assert len(load_take(tmp_path / "weights.csv")) == 2
+    assert report.figures.frames + report.dropped == FRAMES > 1
+    assert "the curves end at frame 1: the disk is full" in report.notes
+    assert len(load_take(tmp_path / "weights.csv")) == 1
