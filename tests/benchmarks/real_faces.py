@@ -53,12 +53,12 @@ class Picture:
     Args:
         image: uint8 (3,H,W).
         landmarks: (68,2) pixels, of a person's hand or of another predictor.
-        told: tilt that the finder is told, radians.
+        tilt: that the finder is given, radians; the face's own if absent.
     """
 
     image: Tensor
     landmarks: Tensor
-    told: float | None = None
+    tilt: float | None = None
 
     @property
     def width(self) -> float:
@@ -129,7 +129,7 @@ class Follow:
 
 
 class GivenBox:
-    """A detector that is told where the face is, so that finders alone are compared."""
+    """A detector that is given where the face is, so that finders alone are compared."""
 
     def __init__(self) -> None:
         self.landmarks, self.shape = torch.full((68, 2), torch.nan), torch.Size()
@@ -143,7 +143,7 @@ class GivenBox:
 
 
 def follow(finder: LandmarkFinder, clip: Clip) -> Follow:
-    """A clip's landmarks by the tracker; where it starts and where it loses the face it is told the reference's box."""
+    """A clip's landmarks by the tracker; where it starts or loses the face it is given the reference's box."""
     detector = GivenBox()
     tracker = LandmarkTracker(finder, detector=detector)
     found, begin = [], time.perf_counter()
@@ -155,7 +155,7 @@ def follow(finder: LandmarkFinder, clip: Clip) -> Follow:
 
 def see(finder: LandmarkFinder, picture: Picture, seed: int = 0) -> FaceReading:
     """The landmarks of a picture from its face's box, moved and sized as a detector's is."""
-    box, tilt = turned_box(picture.landmarks, None if picture.told is None else torch.tensor(picture.told))
+    box, tilt = turned_box(picture.landmarks, None if picture.tilt is None else torch.tensor(picture.tilt))
     drawn = torch.randn(3, generator=torch.Generator().manual_seed(seed)).clamp(-2, 2)
     side = box[2] * (0.06 * drawn[2]).exp()
     middle = box[:2] + box[2:] * (0.5 + 0.04 * drawn[:2])
@@ -226,8 +226,8 @@ def hostile(pictures: list[Picture]) -> Iterator[tuple[str, list[Picture]]]:
         turned = [_turned(one, math.radians(degrees)) for one in pictures]
         yield f"turned by {degrees} degrees", turned
         yield (
-            f"turned by {degrees} degrees, not told",
-            [replace(one, told=float(tilt_around(old.landmarks))) for one, old in zip(turned, pictures, strict=True)],
+            f"turned by {degrees} degrees, tilt not given",
+            [replace(one, tilt=float(tilt_around(old.landmarks))) for one, old in zip(turned, pictures, strict=True)],
         )
     yield "half the face black", [_half_black(one) for one in pictures]
     yield "mouth black", [_black(one, slice(48, 68)) for one in pictures]

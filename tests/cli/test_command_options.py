@@ -141,11 +141,11 @@ def test_the_help_names_what_a_command_takes_and_no_empty_default(
 ) -> None:
     with pytest.raises(SystemExit):
         main([command, "--help"])
-    told = " ".join(capsys.readouterr().out.split())
-    assert "(default: )" not in told
-    assert "--no-no" not in told
-    assert command != "register" or "TEMPLATE SCAN..." in told
-    assert command != "render" or "(default: 0)" in told  # of --frame
+    printed = " ".join(capsys.readouterr().out.split())
+    assert "(default: )" not in printed
+    assert "--no-no" not in printed
+    assert command != "register" or "TEMPLATE SCAN..." in printed
+    assert command != "render" or "(default: 0)" in printed  # of --frame
 
 
 @pytest.mark.parametrize("kind", ["symbolic link", "hard link", "link to the folder", "way round"])

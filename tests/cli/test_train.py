@@ -40,11 +40,11 @@ def test_a_recipe_takes_its_flags(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as ended:
         main(["train", "marker-solver", "--help"])  # as commands are spelled, too
     assert ended.value.code == 0
-    told = capsys.readouterr().out
-    assert "--sparsity" in told
-    assert "`torchface train marker_solver" in told
-    assert "``" not in told
-    assert "None" not in told  # Python's word, not the user's
+    printed = capsys.readouterr().out
+    assert "--sparsity" in printed
+    assert "`torchface train marker_solver" in printed
+    assert "``" not in printed
+    assert "None" not in printed  # Python's word, not the user's
 
 
 def test_a_file_is_a_recipe_too(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

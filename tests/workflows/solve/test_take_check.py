@@ -96,10 +96,10 @@ def test_a_take_that_the_rig_does_not_explain_is_refused_with_the_cause(
         solve(stage, take, *more, attachment=where)
     assert ended.value.code == 2
     assert not (stage / "weights.csv").exists()
-    told = " ".join(capsys.readouterr().err.split())
-    assert "bad.c3d" in told
-    assert "mm (median)" in told
-    assert cause in told
+    printed = " ".join(capsys.readouterr().err.split())
+    assert "bad.c3d" in printed
+    assert "mm (median)" in printed
+    assert cause in printed
     assert solve(stage, take, *more, "--insist", attachment=where).is_file()
     assert "warning: the rig brings the marker sites no nearer" in " ".join(capsys.readouterr().err.split())
 
@@ -117,8 +117,8 @@ def test_a_mirrored_take_is_refused_and_flipped_by_hand(stage: Path, capsys: pyt
     take = changed(stage, "mirrored.c3d", lambda markers: flipped(elsewhere(markers)))
     with pytest.raises(SystemExit):
         solve(stage, take, "--align")
-    told = " ".join(capsys.readouterr().err.split())
-    assert "mirrored.c3d: the markers are a mirror image of their sites: turned, moved and scaled" in told
+    printed = " ".join(capsys.readouterr().err.split())
+    assert "mirrored.c3d: the markers are a mirror image of their sites: turned, moved and scaled" in printed
     each = ("--align", "--frame-by-frame")
     right = load_take(solve(stage, stage / "take.c3d", *each)).weights
     again = load_take(solve(stage, take, *each, "--flip", "y")).weights
@@ -138,16 +138,16 @@ def test_the_scale_is_held_where_the_unit_is_known_and_warned_of(
     for factor, said in ((0.75, "at 1.33"), (0.98, "at 1.02"), (0.1, "the take seems to be in cm (--unit cm)")):
         take = changed(stage, "small.c3d", lambda markers, f=factor: f * markers)  # type: ignore[misc]
         solve(stage, take, *each, "--scale", "free")
-        told = " ".join(capsys.readouterr().err.split())
-        assert said in told
-        assert "held" not in told
-        assert abs(aligned_scale(told) * factor - 1) < 0.01
+        printed = " ".join(capsys.readouterr().err.split())
+        assert said in printed
+        assert "held" not in printed
+        assert abs(aligned_scale(printed) * factor - 1) < 0.01
     small = changed(stage, "small.c3d", lambda markers: 0.98 * markers)
     solve(stage, small, *each)
-    told = " ".join(capsys.readouterr().err.split())
-    assert "warning: the take fits the rig at 1.02" in told
-    assert "it was held at 1: --scale free" in told
-    assert aligned_scale(told) == 1.0
+    printed = " ".join(capsys.readouterr().err.split())
+    assert "warning: the take fits the rig at 1.02" in printed
+    assert "it was held at 1: --scale free" in printed
+    assert aligned_scale(printed) == 1.0
     # A CSV has no unit unless one is given.
     table = changed(stage, "small.csv", lambda markers: 0.98 * markers)
     for more, scale in (((), 1 / 0.98), (("--unit", "mm"), 1.0)):
@@ -158,9 +158,9 @@ def test_the_scale_is_held_where_the_unit_is_known_and_warned_of(
 
 def test_a_take_that_fits_is_good_without_a_warning(stage: Path, capsys: pytest.CaptureFixture[str]) -> None:
     solve(stage, stage / "take.c3d")
-    told = capsys.readouterr().err
-    assert told.startswith("result: good, the markers lie 0.0")
-    assert "warning" not in told
+    printed = capsys.readouterr().err
+    assert printed.startswith("result: good, the markers lie 0.0")
+    assert "warning" not in printed
 
 
 def test_a_spike_in_a_take_that_is_not_cleaned_is_no_good_result(
@@ -172,10 +172,10 @@ def test_a_spike_in_a_take_that_is_not_cleaned_is_no_good_result(
 
     take = changed(stage, "spiked.c3d", spiked)
     solve(stage, take)
-    told = " ".join(capsys.readouterr().err.split())
-    assert "result: in part, single frames are wrong" in told
-    assert "20" in told.split("mm from the solved face, at worst")[0]
-    assert "add --clean" in told
+    printed = " ".join(capsys.readouterr().err.split())
+    assert "result: in part, single frames are wrong" in printed
+    assert "20" in printed.split("mm from the solved face, at worst")[0]
+    assert "add --clean" in printed
     solve(stage, take, "--clean")
     assert "warning" not in capsys.readouterr().err
 
@@ -187,9 +187,9 @@ def test_markers_that_lie_beside_the_solved_face_are_no_good_result(
     """Normal noise of s mm a coordinate lies 1.54 s from its site in the median; 0.6 and 1.4 mm are usual, the most."""
     generator = torch.Generator().manual_seed(0)
     solve(stage, changed(stage, "noisy.c3d", lambda x: x + noise * torch.randn(x.shape, generator=generator)))
-    told = " ".join(capsys.readouterr().err.split())
-    assert f"result: {verdict}, the markers lie" in told
-    distance = float(told.split("the markers lie ")[1].split(" mm")[0])
+    printed = " ".join(capsys.readouterr().err.split())
+    assert f"result: {verdict}, the markers lie" in printed
+    distance = float(printed.split("the markers lie ")[1].split(" mm")[0])
     assert distance == pytest.approx(1.54 * noise, rel=0.15)
 
 
@@ -201,10 +201,10 @@ def test_coverage_is_of_the_attachment(
     for count, name in ((12, "some.c3d"), (1, "one.c3d")):
         save_take(replace(take, markers=take.markers.select(take.markers.names[:count])), stage / name)
     solve(stage, stage / "some.c3d")
-    told = " ".join(capsys.readouterr().err.split())
-    assert "warning: the take shows 12 of the attachment's 30 markers" in told
+    printed = " ".join(capsys.readouterr().err.split())
+    assert "warning: the take shows 12 of the attachment's 30 markers" in printed
     share = float(torch.isfinite(take.markers.values[:, :12, 0]).double().mean()) * 12 / 30
-    assert told.startswith(f"result: in part, {100 * share:.1f} % of the markers' samples were seen")
+    assert printed.startswith(f"result: in part, {100 * share:.1f} % of the markers' samples were seen")
     with pytest.raises(SystemExit):
         solve(stage, stage / "one.c3d")
     assert not (stage / "weights.csv").exists()

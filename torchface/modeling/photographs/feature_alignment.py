@@ -97,8 +97,8 @@ class FeatureAlignment:
         moved = self.to_found.at(grid).view_as(grid).float().numpy()
         fine = (np.linspace(0, k - 1, n, dtype=np.float32) for n, k in ((width, across), (height, down)))
         x, y = np.meshgrid(*fine)
-        shift = cv2.remap(moved, x, y, cv2.INTER_LINEAR)
-        at = shift + np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1)
+        at = cv2.remap(moved, x, y, cv2.INTER_LINEAR)  # float32, for photographs are large
+        at += np.stack(np.meshgrid(*(np.arange(n, dtype=np.float32) for n in (width, height))), axis=-1)
         return torch.stack([_looked_up(channel, at, cv2.INTER_CUBIC) for channel in image]).clamp(0, 1)
 
     def parts(self, parts: FaceParts) -> FaceParts:
@@ -108,7 +108,7 @@ class FeatureAlignment:
         crop = torch.stack(torch.meshgrid(side, side, indexing="xy"), dim=-1)
         turn, shift = parts.transform[:, :2], parts.transform[:, 2]
         moved = self.to_found.at((crop - shift) @ torch.linalg.inv(turn).T).view_as(crop) @ turn.T
-        at = (crop + moved).numpy()
+        at = (crop + moved).float().numpy()
         return replace(parts, shares=torch.stack([_looked_up(share, at, cv2.INTER_LINEAR) for share in parts.shares]))
 
     def points(self, points: Tensor) -> Tensor:
@@ -117,6 +117,6 @@ class FeatureAlignment:
 
 
 def _looked_up(picture: Tensor, at: np.ndarray, how: int) -> Tensor:
-    """A picture (H,W) at places (H,W,2), x before y."""
-    x, y = (at[..., axis].astype(np.float32) for axis in (0, 1))
+    """A picture (H,W) at places (H,W,2) float32, x before y."""
+    x, y = at[..., 0].copy(), at[..., 1].copy()
     return torch.from_numpy(cv2.remap(picture.numpy(), x, y, how, borderMode=cv2.BORDER_REPLICATE))

@@ -224,17 +224,17 @@ class Recordings:
         if self._film is not None and picture is not None:
             self._film.add(came, picture)
 
-    def stop(self, told: Say | None = None) -> None:
+    def stop(self, say: Say | None = None) -> None:
         """Ends the take that runs; its files are made beside what goes on, see :meth:`finish`.
 
         Args:
-            told: called, in another thread, with how that ended.
+            say: called, in another thread, with how that ended.
         """
         log, self._log = self._log, None
         film, self._film = self._film, None
         if log is None:
             return
-        given = (log, self._place, self._found, film, told)
+        given = (log, self._place, self._found, film, say)
         thread = threading.Thread(target=self._save, args=given, name="torchface-recording")
         self._saving.append(thread)
         thread.start()
@@ -253,7 +253,7 @@ class Recordings:
         numbered = (self._folder / f"take_{number}" for number in range(2, _MAX_TAKES))
         return next(folder for folder in numbered if folder not in self._begun and not folder.exists())
 
-    def _save(self, log: FrameLog, folder: Path, found: int, film: TakeFilm | None, told: Say | None) -> None:
+    def _save(self, log: FrameLog, folder: Path, found: int, film: TakeFilm | None, say: Say | None) -> None:
         with log:
             try:
                 if film is not None:  # before the summary, by which a take is listed
@@ -263,8 +263,8 @@ class Recordings:
                 self.saved.append(SavedTake(folder, log.count, note=film.problem if film is not None else ""))
             except (TorchfaceError, OSError) as error:
                 self.saved.append(SavedTake(folder, log.count, str(error)))
-        if told is not None:
-            told(self.saved[-1].error or f"recorded into {folder}: {log.count} frames")
+        if say is not None:
+            say(self.saved[-1].error or f"recorded into {folder}: {log.count} frames")
 
     def _write(self, log: FrameLog, folder: Path, found: int, more: Mapping[str, str] = MappingProxyType({})) -> None:
         take = log.take(self._fps)

@@ -8,7 +8,7 @@ from contextlib import suppress
 from fractions import Fraction
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from warnings import catch_warnings
+from warnings import catch_warnings, filterwarnings
 
 import numpy as np
 
@@ -90,7 +90,7 @@ def solved_again(film: Path) -> Take:
     from torchface.workflows.track.track_inputs import TrackSettings
     from torchface.workflows.track.track_video import track_video
 
-    # A camera's times are never even, of which `track` warns.
-    with TemporaryDirectory(prefix="torchface-") as folder, catch_warnings(action="ignore", category=UserWarning):
+    with TemporaryDirectory(prefix="torchface-") as folder, catch_warnings():
+        filterwarnings("ignore", message=".*found a variable frame rate")  # a camera's times are never even
         track_video(film, None, Path(folder), TrackSettings(whole_take=True, overlay="none"))
         return load_live_link(Path(folder) / LIVE_LINK)
