@@ -9,7 +9,7 @@ import sys
 import numpy as np
 import onnxruntime
 
-if len(sys.argv) != 4:
+if len(sys.argv) != 4 or not sys.argv[3].endswith(".npy"):  # which numpy.save would append
     sys.exit(__doc__)
 session = onnxruntime.InferenceSession(sys.argv[1], providers=["CPUExecutionProvider"])
 names = json.loads(session.get_modelmeta().custom_metadata_map["shape_names"])

@@ -17,6 +17,8 @@ from tyro.conf import arg
 from torchface.cli import COMMANDS, GROUPS, main
 from torchface.cli.command_options import Output, checked
 from torchface.cli.export import export_model
+from torchface.io import save_mesh
+from torchface.synthetic import neutral_head
 
 ALL = {
     **{(name,): command for name, command in COMMANDS.items()},
@@ -133,6 +135,12 @@ def test_an_output_that_is_an_input_is_refused_before_any_work(
     said = " ".join(capsys.readouterr().err.split())
     assert "is the input" in said
     assert path.read_bytes() == b"content"
+
+
+def test_o_is_short_for_out(tmp_path: Path) -> None:
+    save_mesh(neutral_head(texture=False), tmp_path / "head.obj")
+    main(["render", str(tmp_path / "head.obj"), "-o", str(tmp_path / "head.png"), "--height", "64", "--yaw", "0"])
+    assert (tmp_path / "head.png").is_file()
 
 
 @pytest.mark.parametrize("command", ["enhance", "register", "render"])

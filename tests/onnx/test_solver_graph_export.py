@@ -99,6 +99,9 @@ def test_the_example_solves_with_onnxruntime_and_numpy_alone(
     assert "30 frames" in done.stdout
     solved = torch.from_numpy(np.load(tmp_path / "weights.npy"))
     torch.testing.assert_close(solved, turned_bumps(markers), rtol=0, atol=5e-3)
+    command[-1] = str(tmp_path / "weights.csv")  # which it would write as weights.csv.npy
+    done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
+    assert (done.returncode, "weights.npy" in done.stderr) == (1, True)
 
 
 def test_a_graph_that_disagrees_is_not_written(

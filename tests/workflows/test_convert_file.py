@@ -28,6 +28,15 @@ def test_files_are_converted_without_blender_where_it_is_not_needed(
     with pytest.raises(SystemExit):
         main(["convert", str(tmp_path / "scan.obj"), str(tmp_path / "other")])
     assert "found a mesh without shapes, expected a rig" in " ".join(capsys.readouterr().err.split())
+    for words, told in (
+        (["take.c3d", "take.csv"], "take.c3d: found a take, expected a rig or a mesh: `torchface solve`"),
+        (["rig.glb", "pose.obj", "--at", "jawOpn=1"], "--at: found jawOpn; expected shapes of the rig: did you mean"),
+        (["rig.glb", "pose.obj", "--at", "jawOpen=1e9"], "--at: found 'jawOpen=1e9', expected NAME=NUMBER"),
+    ):
+        (tmp_path / "take.c3d").touch()
+        with pytest.raises(SystemExit):
+            main(["convert", *(word if "." not in word else str(tmp_path / word) for word in words)])
+        assert told in " ".join(capsys.readouterr().err.split())
 
 
 def test_wrinkle_maps_by_region_stay_in_a_glb_and_are_named_where_there_is_no_place_for_them(tmp_path: Path) -> None:

@@ -52,6 +52,19 @@ def test_what_fit_and_arkit_write_is_known(tmp_path: Path) -> None:
     assert "weights" not in rows
 
 
+def test_what_other_commands_read_is_described(tmp_path: Path) -> None:
+    np.savez(tmp_path / "frames.npz", exp=np.zeros((7, 50)), jaw=np.zeros((7, 3)))
+    assert describe(tmp_path / "frames.npz") == [("exp", "array (7,50)"), ("jaw", "array (7,3)")]
+    box = "<image file='{}.jpg'><box top='1' left='2' width='3' height='4'><part name='00' x='5' y='6'/></box></image>"
+    images = box.format("a") + 2 * box.format("b")
+    (tmp_path / "faces.xml").write_text(f"<dataset><images>{images}</images></dataset>")
+    rows = describe(tmp_path / "faces.xml")
+    assert rows == [("faces", "3 in 2 photographs"), ("landmarks", "1 of a face, pixels")]
+    (tmp_path / "broken.task").write_bytes(b"no zip")
+    with pytest.raises(FileFormatError, match=r"broken\.task"):
+        describe(tmp_path / "broken.task")
+
+
 def test_folders_that_are_no_rigs_say_what_they_are(tmp_path: Path) -> None:
     for name in ("a.glb", "neutral.obj"):
         (tmp_path / name).touch()

@@ -41,6 +41,16 @@ def test_the_jaw_is_opened_once(tmp_path: Path) -> None:
     torch.testing.assert_close(ruled.take.weights.values[..., 0], weights, atol=1e-4, rtol=0)
 
 
+def test_a_target_of_another_unit_is_said_with_its_size(tmp_path: Path) -> None:
+    rig = performer(texture=False).select(["jawOpen", "mouthClose"])
+    large = BlendshapeRig(rig.neutral.with_vertices(10 * rig.vertices), 10 * rig.deltas, rig.names)
+    save_rig(large, tmp_path / "large.glb")
+    save_take(Take(60.0, weights=Track(rig.names, torch.full((2, 2, 1), 0.5))), tmp_path / "take.csv")
+    done = retarget_weights(tmp_path / "take.csv", tmp_path / "large.glb", WeightFiles(tmp_path / "out.csv"))
+    size = 10 * float((rig.vertices.amax(0) - rig.vertices.amin(0)).max())
+    assert done.warnings[0].startswith(f"{tmp_path / 'large.glb'}: {size:,.4g} mm, expected 80 to 700 of a head")
+
+
 def test_a_map_is_learned_from_poses_kept_and_drawn(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     whole = performer(texture=False)
     creature = whole.select(["jawOpen", "mouthPucker", "browInnerUp"])

@@ -12,7 +12,7 @@ from pathlib import Path
 from types import NoneType, UnionType
 from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
-from tyro.conf import FlagCreatePairsOff, arg
+from tyro.conf import FlagCreatePairsOff, Positional, arg
 
 from torchface.cli.terminal import console
 from torchface.errors import FileFormatError
@@ -123,6 +123,8 @@ def plain_options(command: Command) -> Command:
             changes["metavar"] = word
         if parameter.default is False and not is_dataclass(command):  # whose defaults may come from a file
             notes += get_args(FlagCreatePairsOff[bool])[1:]  # no --no-quiet
+        if name == "out" and Positional not in notes:
+            changes["aliases"] = ["-o"]
         if changes:
             hints[name] = Annotated[(kind, *notes, arg(**changes))]  # type: ignore[misc]
     command.__annotations__ = hints

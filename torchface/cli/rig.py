@@ -124,7 +124,7 @@ def rig(
     if inner_mouth or eyes:
         raise ValueRangeError("--inner-mouth, --eyes: for a character's file, without --template and --neutral")
     options = RigOptions(
-        part, unit, pose_weights(pose), detector, model, texture_size, detail_size, names, colors, expressions
+        part, unit, pose_weights(pose, "--pose"), detector, model, texture_size, detail_size, names, colors, expressions
     )
     if neutral is not None:
         unused = [

@@ -14,14 +14,14 @@ from torch import Tensor
 
 from torchface.color_space import grey_images
 from torchface.errors import AlignmentError, FileFormatError, ShapeError, ValueRangeError
-from torchface.files.whole_files import check_ending, check_writable, make_folder
+from torchface.files.whole_files import check_ending, check_writable, make_folder, write_beside
 from torchface.geometry.cameras.calibration import CameraCalibration, PlacedCamera
 from torchface.io.camera_files import save_calibration, save_cameras
-from torchface.io.images.image_files import load_image
+from torchface.io.images.image_files import encode_png, load_image
 from torchface.io.video import open_video
 from torchface.io.video.timecodes import start_of
 from torchface.progress import Progress, silent
-from torchface.rendering.compositing import caption, save_rendered_image, sheet
+from torchface.rendering.compositing import caption, sheet
 
 _VIDEOS = (".avi", ".mkv", ".webm", ".mp4", ".mov")
 _MIN_VIEWS, _MAX_FRAMES = 5, 60
@@ -114,10 +114,9 @@ def calibrate(paths: Sequence[Path], board: Board, out: Path, progress: Progress
     progress("writing the calibration and the overlay")
     make_folder(out.parent)
     overlay_path = out.with_suffix(".png")
+    corners = overlay([view for view in views if view.name in report.used], report.calibration, board)
+    write_beside(out, overlay_path, encode_png(corners))
     save_calibration(report.calibration, out)
-    save_rendered_image(
-        overlay([view for view in views if view.name in report.used], report.calibration, board), overlay_path
-    )
     return replace(report, overlay_path=overlay_path)
 
 

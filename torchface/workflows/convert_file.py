@@ -24,6 +24,7 @@ from torchface.io.rig_files import (
 )
 from torchface.io.rigs.ict_facekit import region
 from torchface.io.scenes.weight_keys import weight_keys
+from torchface.io.take_files import RECORDING_ENDINGS, TAKE_ENDINGS
 from torchface.io.usd.usd_library import require_usd
 from torchface.mesh import Mesh, submesh
 from torchface.progress import Progress, silent
@@ -67,6 +68,12 @@ def convert_file(
         reduce: keep as few keys as stay within this of every frame's weights; all if absent.
     """
     progress = progress or silent
+    if source.suffix.lower() in (*TAKE_ENDINGS, *RECORDING_ENDINGS):
+        raise FileFormatError(
+            f"{source}: found a take, expected a rig or a mesh: `torchface solve` makes weights of markers, "
+            "`torchface retarget` an animated rig of weights, torchface.save_take(torchface.load_take(...), ...) "
+            "another kind of take"
+        )
     if out.suffix.lower() in BLENDER_ENDINGS:
         require_usd()
     if {source.suffix.lower(), out.suffix.lower()} & set(BLENDER_ENDINGS):
@@ -84,7 +91,7 @@ def convert_file(
     if pose:
         if source_rig.rig is None:
             raise FileFormatError(f"{source}: found a mesh without shapes, expected a rig for a pose")
-        source_rig = Converted(posed_mesh(source_rig.rig, pose), None, None, ())
+        source_rig = Converted(posed_mesh(source_rig.rig, pose, "--at"), None, None, ())
     progress("writing")
     make_folder(out.parent)
     if source_rig.rig is None:

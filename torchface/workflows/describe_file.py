@@ -25,10 +25,12 @@ from torchface.io import (
 )
 from torchface.io.gltf.gltf_reading import unread_textures
 from torchface.io.head_models.head_model_files import is_head_model_file
+from torchface.io.head_models.array_files import ArrayFile
 from torchface.io.images.image_files import IMAGE_ENDINGS, load_image
+from torchface.io.landmarks.dlib_xml import load_dlib_faces
 from torchface.io.landmarks.landmark_points import load_landmark_points
 from torchface.io.mesh_files import MESH_ENDINGS
-from torchface.io.rig_files import SCENE_ENDINGS
+from torchface.io.rig_files import GLTF_ENDINGS, SCENE_ENDINGS
 from torchface.io.tables.csv_table import TableReader
 from torchface.io.tables.numbered_csv import COLUMNS, read_numbered
 from torchface.io.take_files import RECORDING_ENDINGS, TAKE_ENDINGS
@@ -38,7 +40,8 @@ from torchface.io.weights.json_recordings import is_weight_json
 from torchface.mesh import Mesh
 from torchface.rig import BlendshapeRig
 from torchface.take import Take
-from torchface.workflows.posed_mesh import load_neutral
+from torchface.workflows.named_finders import BUNDLE
+from torchface.workflows.posed_mesh import load_neutral, size_faults
 from torchface.workflows.weight_files import weight_faults
 
 if TYPE_CHECKING:  # solvers and onnx take seconds to load; few files need them
@@ -51,10 +54,8 @@ Rows = list[tuple[str, str]]
 _MAX_LENGTH = 240
 _LENGTH, _LONGEST_HEADER = "_mm", 4096  # ends the names of columns that are no weights
 _MAX_NAMED, _MAX_LISTED = 8, 10
-_HEADS, _BODY, _TALLEST = (80, 700), 0.45, 2500.0
-"""Millimetres: the largest extent of a face or head; a body's least width of its height, and its height."""
-_LANDMARK_ENDINGS = (".ljson", ".pts")
-_GLTF_ENDINGS = (".glb", ".gltf", ".vrm")
+_LANDMARK_ENDINGS = (".ljson", ".pts", ".xml")
+_ARRAY_ENDINGS = (".npz", ".npy", ".safetensors")
 
 
 def describe(path: Path, attachment: Path | None = None, part: str | None = None) -> Rows:
@@ -103,6 +104,21 @@ def describe(path: Path, attachment: Path | None = None, part: str | None = None
         return _attachment_rows(Attachment.load(path))
     if suffix == ".onnx":
         return _graph_rows(path)
+    if suffix == BUNDLE:
+        from torchface.landmarks.images.face_landmarker.landmarker_bundle import load_bundle
+
+        load_bundle(path)
+        return [("Face Landmarker bundle", "finds landmarks: --landmarks of track, live, fit, examples and annotate")]
+    if suffix == ".xml":
+        faces = load_dlib_faces(path)
+        marks = sorted({len(face.points) for face in faces})
+        return [
+            ("faces", f"{len(faces)} in {len({face.image for face in faces})} photographs"),
+            ("landmarks", f"{', '.join(map(str, marks)) or 'none'} of a face, pixels"),
+        ]
+    if suffix in _ARRAY_ENDINGS:
+        arrays = ArrayFile(path)
+        return [(name, f"array ({','.join(map(str, arrays.shape(name)))})") for name in arrays.names]
     if suffix in _LANDMARK_ENDINGS:
         points = load_landmark_points(path).points
         unit = "the scan's unit" if points.shape[1] == 3 else "pixels"
@@ -125,8 +141,10 @@ def describe(path: Path, attachment: Path | None = None, part: str | None = None
         *IMAGE_ENDINGS,
         *TAKE_ENDINGS,
         *RECORDING_ENDINGS,
-        ".onnx",
         *_LANDMARK_ENDINGS,
+        *_ARRAY_ENDINGS,
+        BUNDLE,
+        ".onnx",
         ".toml",
     )
     if not suffix:
@@ -211,12 +229,7 @@ def _mesh_rows(mesh: Mesh) -> Rows:
         ("texture coordinates", "none" if mesh.uvs is None else f"{len(mesh.uvs):,}"),
         ("texture", "none" if mesh.texture is None else "x".join(str(n) for n in mesh.texture.shape[:0:-1])),
     ]
-    width, height, depth = (mesh.vertices.amax(0) - mesh.vertices.amin(0)).tolist()
-    largest, body = max(width, height, depth), min(width, depth) < _BODY * height
-    if not _HEADS[0] <= largest <= _HEADS[1] and not (body and largest < _TALLEST):
-        rows.append(
-            ("warning", f"{largest:,.4g} mm, expected {_HEADS[0]} to {_HEADS[1]} of a head: --unit says another unit")
-        )
+    rows += [("warning", fault) for fault in size_faults(mesh)]
     if mesh.annotations is not None:
         notes = mesh.annotations
         rows += [
@@ -229,7 +242,7 @@ def _mesh_rows(mesh: Mesh) -> Rows:
 
 
 def _with_texture_rows(path: Path, rows: Rows) -> Rows:
-    unread = unread_textures(path) if path.is_file() and path.suffix.lower() in _GLTF_ENDINGS else []
+    unread = unread_textures(path) if path.is_file() and path.suffix.lower() in GLTF_ENDINGS else []
     if not unread:
         return rows
     rows = [("texture", "cannot be read") if row == ("texture", "none") else row for row in rows]

@@ -18,6 +18,9 @@ from torchface.rig import BlendshapeRig
 from torchface.shape_names import mapping, near_names
 from torchface.workflows.weight_files import load_weight_take
 
+_HEADS, _BODY, _TALLEST = (80, 700), 0.45, 2500.0
+"""Millimetres: the largest extent of a face or head; a body's least width of its height, and its height."""
+
 
 @dataclass(frozen=True, eq=False)
 class Posed:
@@ -27,17 +30,17 @@ class Posed:
     neutral: Mesh
 
 
-def pose_weights(words: Sequence[str]) -> dict[str, float]:
-    """``["jawOpen=0.5"]`` as a dictionary."""
+def pose_weights(words: Sequence[str], option: str = "--weights") -> dict[str, float]:
+    """``["jawOpen=0.5"]`` as a dictionary; errors name the option that the words are of."""
     weights = {}
     for word in words:
         name, equals, number = word.partition("=")
         try:
             weights[name] = float(number)
         except ValueError:
-            raise ValueRangeError(f"weights: found {word!r}, expected NAME=NUMBER such as jawOpen=0.5") from None
+            raise ValueRangeError(f"{option}: found {word!r}, expected NAME=NUMBER such as jawOpen=0.5") from None
         if not equals or not name or not abs(weights[name]) <= 10:
-            raise ValueRangeError(f"weights: found {word!r}, expected NAME=NUMBER with a number from -10 to 10")
+            raise ValueRangeError(f"{option}: found {word!r}, expected NAME=NUMBER with a number from -10 to 10")
     return weights
 
 
@@ -70,21 +73,21 @@ def load_posed(
     return Posed(rig.neutral.with_vertices(rig(row[None].to(rig.deltas))[0]), rig.neutral)
 
 
-def pose_row(rig: BlendshapeRig, weights: Mapping[str, float]) -> Tensor:
+def pose_row(rig: BlendshapeRig, weights: Mapping[str, float], option: str = "--weights") -> Tensor:
     """Weights (N,) of a rig by name, in any of the spellings that ``torchface.shape_names`` reads."""
     names = tuple(weights)
     matrix = mapping(names, rig.names)
     unknown = [name for name, used in zip(names, matrix.any(0), strict=True) if not used]
     if unknown:
         hint = near_names(unknown, rig.names)
-        raise NameMismatchError(f"weights: found {', '.join(unknown)}; expected shapes of the rig: {hint}")
+        raise NameMismatchError(f"{option}: found {', '.join(unknown)}; expected shapes of the rig: {hint}")
     return (matrix @ torch.tensor([weights[name] for name in names])).to(rig.deltas)
 
 
-def posed_mesh(rig: BlendshapeRig, weights: Mapping[str, float]) -> Mesh:
+def posed_mesh(rig: BlendshapeRig, weights: Mapping[str, float], option: str = "--weights") -> Mesh:
     """The rig's mesh in a pose; see :func:`pose_row`."""
     with torch.no_grad():
-        return rig.neutral.with_vertices(rig(pose_row(rig, weights)[None])[0])
+        return rig.neutral.with_vertices(rig(pose_row(rig, weights, option)[None])[0])
 
 
 def load_neutral(path: Path, unit: str | None = None, part: str | None = None) -> tuple[Mesh, BlendshapeRig | None]:
@@ -103,3 +106,12 @@ def load_neutral(path: Path, unit: str | None = None, part: str | None = None) -
             pass
     mesh = load_mesh(path, unit)
     return mesh if part is None else submesh(mesh, region(mesh, part)).mesh, None
+
+
+def size_faults(mesh: Mesh) -> list[str]:
+    """What to say of a mesh that is too small or too large for a head in millimetres, unless it is a body."""
+    width, height, depth = (mesh.vertices.amax(0) - mesh.vertices.amin(0)).tolist()
+    largest, body = max(width, height, depth), min(width, depth) < _BODY * height
+    if _HEADS[0] <= largest <= _HEADS[1] or (body and largest < _TALLEST):
+        return []
+    return [f"{largest:,.4g} mm, expected {_HEADS[0]} to {_HEADS[1]} of a head: the file may be in another unit"]

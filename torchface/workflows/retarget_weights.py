@@ -27,6 +27,7 @@ from torchface.rig import BlendshapeRig
 from torchface.shape_names import arkit_sources, mapping
 from torchface.take import Take, Track
 from torchface.viz.figures.face_views import pose_pairs
+from torchface.workflows.posed_mesh import size_faults
 from torchface.workflows.weight_files import (
     WeightFiles,
     check_live_link,
@@ -69,6 +70,7 @@ def retarget_weights(
         )
     target = load_rig(to, part=part)
     check_live_link(target.names, files.live_link)
+    faults += [f"{to}: {fault}; weights have no unit" for fault in size_faults(target.neutral)]
     rig = None
     if source is not None:
         rig = load_rig(source)

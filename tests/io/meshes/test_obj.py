@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -48,6 +49,19 @@ def test_the_texture_goes_beside_the_file_and_comes_back(tmp_path: Path) -> None
     assert sorted(path.name for path in tmp_path.iterdir()) == ["sheet.mtl", "sheet.obj", "sheet.png"]
     found = load_mesh(tmp_path / "sheet.obj")
     assert (found.texture - mesh.texture).abs().max() <= 0.5 / 255 + 1e-6
+
+
+@pytest.mark.parametrize("scene", ["sheet.obj", "sheet.usdc"])
+def test_a_picture_of_the_users_beside_the_file_is_kept(scene: str, tmp_path: Path) -> None:
+    mesh, picture = quad_sheet(), tmp_path / "sheet.png"
+    picture.write_bytes(b"the user's")
+    with pytest.raises(FileFormatError, match=rf"sheet.png: found a file where {scene} keeps a part of its own"):
+        save_mesh(mesh, tmp_path / scene)
+    assert [path.read_bytes() for path in tmp_path.iterdir()] == [b"the user's"]
+    picture.unlink()
+    save_mesh(mesh, tmp_path / scene)
+    save_mesh(replace(mesh, texture=mesh.texture / 2), tmp_path / scene)  # its own is replaced
+    assert (load_mesh(tmp_path / scene).texture - mesh.texture / 2).abs().max() <= 0.5 / 255 + 1e-6
 
 
 @pytest.mark.real

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchface.errors import FileFormatError, TopologyError
-from torchface.files.whole_files import all_or_none, read_file, write_file
+from torchface.files.whole_files import all_or_none, read_file, write_beside, write_file
 from torchface.io.images.image_files import encode_png, load_image
 from torchface.io.images.texture_atlas import MAX_TEXELS, Look, with_looks
 from torchface.io.length_units import finite_vertices, millimetres_per
@@ -70,8 +70,9 @@ def write_obj(mesh: Mesh, path: str | Path) -> None:
     path = Path(path)
     with all_or_none():
         if mesh.texture is not None:
-            write_file(path.with_suffix(".png"), encode_png(mesh.texture))
-            write_file(path.with_suffix(".mtl"), f"newmtl skin\nKd 1 1 1\nmap_Kd {path.stem}.png\n".encode())
+            material = f"newmtl skin\nKd 1 1 1\nmap_Kd {path.stem}.png\n"
+            write_beside(path, path.with_suffix(".png"), encode_png(mesh.texture))
+            write_beside(path, path.with_suffix(".mtl"), material.encode())
         colors = None if mesh.colors is None else mesh.colors.detach().cpu().double().numpy()
         rows = _vertex_lines(mesh.vertices, colors)
         write_file(path, _material_line(mesh, path) + rows + _surface_lines(mesh))

@@ -19,7 +19,7 @@ from torch import Tensor
 
 from torchface.color_space import to_linear
 from torchface.errors import FileFormatError, TopologyError
-from torchface.files.whole_files import all_or_none, replaced_file, write_file
+from torchface.files.whole_files import all_or_none, replaced_file, write_beside
 from torchface.files.write_errors import unwritten
 from torchface.geometry.meshes.normal_maps import DetailMaps
 from torchface.io.gltf.corrective_extras import write_correctives
@@ -91,7 +91,7 @@ def _write(
             layer = _package(usd, layer)
         with all_or_none():
             for name, data in {}.items() if packed else images.items():
-                write_file(path.with_name(name), data)
+                write_beside(path, path.with_name(name), data)
             with replaced_file(path) as temporary:
                 shutil.copyfile(layer, temporary)
 

@@ -206,7 +206,7 @@ def _rig_actor(
 ) -> ActorReport:
     progress("reading the template")
     rig = load_rig(template, part=options.part)
-    shown = weights_row(options.pose, rig.names, "pose") if options.pose else torch.zeros(len(rig.names))
+    shown = weights_row(options.pose, rig.names, "--pose") if options.pose else torch.zeros(len(rig.names))
     expressions = [] if examples is None else expressions_in(examples, rig.names)
     if examples is not None and not expressions:
         raise FileFormatError(f"{examples}: found no scan of an expression, expected {LAYOUT}")
