@@ -13,7 +13,7 @@ from torchface.geometry.similarity import similarity_transform
 from torchface.io.gltf.region_materials import part_material
 from torchface.mesh import Mesh
 
-_SEEN = 0.05
+_SEEN = 0.5
 _SEAM = 4
 
 
@@ -38,10 +38,10 @@ def in_place_of(mesh: Mesh, template: Mesh, weights: Tensor | None = None) -> Me
 
 
 def hidden_parts(mesh: Mesh, matched: Tensor) -> Tensor:
-    """The vertices inside a head that the scan has not shown, (V,) bool.
+    """The vertices that the scan has not shown of what is no skin, (V,) bool.
 
-    They are those of parts that share no vertex with the largest, such as eyeballs, and of regions that by their names
-    are no skin, such as ``mouth_interior``.
+    They are those of parts that share no vertex with the largest, such as eyeballs, hair or a shirt, unless the scan
+    shows half of the part, and those of regions that by their names are no skin, such as ``mouth_interior``.
 
     Args:
         mesh: V vertices.

@@ -240,6 +240,9 @@ def test_hidden_eyeballs_and_the_mouth_keep_the_templates_skin_and_nothing_else_
     assert not hidden[template.landmarks].any()
     assert template.annotations is not None
     assert hidden[template.annotations.regions["mouth_interior"]].all()
+    eyeball = template.annotations.regions["eyeball_left"]
+    front = eyeball & (template.vertices[:, 2] > template.vertices[eyeball, 2].quantile(0.75))
+    assert hidden_parts(template, front)[eyeball].all()  # a quarter of a part is no picture of it
     worn = with_template_skin(black, white, hidden)
     assert worn.colors is not None
     assert worn.texture is not None
