@@ -24,8 +24,8 @@ from torchface.io import (
     load_take,
 )
 from torchface.io.gltf.gltf_reading import unread_textures
-from torchface.io.head_models.head_model_files import is_head_model_file
 from torchface.io.head_models.array_files import ArrayFile
+from torchface.io.head_models.head_model_files import is_head_model_file
 from torchface.io.images.image_files import IMAGE_ENDINGS, load_image
 from torchface.io.landmarks.dlib_xml import load_dlib_faces
 from torchface.io.landmarks.landmark_points import load_landmark_points
