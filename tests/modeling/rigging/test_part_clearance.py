@@ -9,11 +9,16 @@ import pytest
 import torch
 from torch import Tensor
 
+from planted.characters import caricature
+from torchface.geometry.rotations import rotation_matrix
+from torchface.geometry.similarity import Similarity, similarity_transform
 from torchface.io.rigs.ict_facekit import load_ict_facekit, load_identity_modes
 from torchface.mesh import Mesh
 from torchface.modeling import InnerParts, clear_parts, inner_parts, place_parts, shape_depths, transfer_with_report
+from torchface.modeling.rigging.part_placement import with_placed_parts
 from torchface.modeling.rigging.penetration import TOLERANCE
 from torchface.modeling.rigging.transfer_system import ShapeTransfer
+from torchface.registration import Registration
 from torchface.rig import BlendshapeRig
 from torchface.synthetic.head.identity import IDENTITY
 from torchface.synthetic.head.performer import performer
@@ -107,6 +112,50 @@ def test_another_performers_eyeballs_are_found_from_the_lids() -> None:
             dim=-1
         )
         assert float((sphere_error / found_radius[parts.group] - own_error / template_radius[parts.group]).std()) < 1e-3
+
+
+@pytest.mark.parametrize("strange", [False, True])
+def test_lids_stay_before_an_eye_with_a_bulge_whichever_way_it_looks(strange: bool) -> None:
+    names = ["eyeBlinkLeft", "eyeLookUpLeft", "eyeLookDownLeft", "eyeWideLeft"]
+    rig = performer(texture=False).select(names)
+    rig = caricature(rig, rig.vertices[rig.neutral.landmarks], eyes=0.5) if strange else rig
+    ball = rig.neutral.annotations.regions["eyeball_left"]  # type: ignore[union-attr]
+    vertices, deltas = rig.vertices.double(), rig.deltas.double()
+    eye = vertices[ball]
+    centre = (eye.amax(0) + eye.amin(0)) / 2
+    ways = torch.nn.functional.normalize(eye - centre, dim=-1)
+    vertices[ball] = eye + 5.0 * ((ways[:, 2:] - 0.85) / 0.15).clamp(0, 1) * ways  # millimetres, round the pupil
+    turn = similarity_transform(eye.expand(4, -1, -1), eye + deltas[:, ball], scale=False)
+    deltas[:, ball] = turn.apply(vertices[ball].expand(4, -1, -1)) - vertices[ball]
+    own = BlendshapeRig(rig.neutral.with_vertices(vertices.float()), deltas.float(), names)
+    parts = inner_parts(own)
+
+    def deepest(one: BlendshapeRig) -> Tensor:
+        blink = one.deltas[:1]
+        looks = BlendshapeRig(one.neutral, torch.cat([one.deltas, blink + one.deltas[1:]]), [*names, *"udw"])
+        return shape_depths(looks, parts).amax(1)[1:]
+
+    assert float(deepest(own).max()) > 3
+    assert float(deepest(clear_parts(own, parts)).max()) <= TOLERANCE
+
+
+def test_a_registration_that_bent_eyeballs_gets_round_ones_behind_the_lids() -> None:
+    template = performer(texture=False)
+    parts, true = inner_parts(template), performer(torch.full((len(IDENTITY),), 0.7), texture=False).neutral
+    spoiled = true.vertices.double()
+    balls = parts.vertices
+    spoiled[balls] += torch.stack([torch.zeros(len(balls)), torch.zeros(len(balls)), 5 * spoiled[balls, 1].sin()], 1)
+    turn = rotation_matrix(torch.tensor([0.1, 0.4, -0.3], dtype=torch.float64))
+    pose = Similarity(torch.tensor([1.1]).double(), turn[None], torch.tensor([[5.0, 900.0, -40.0]]).double())
+    seen = torch.ones(len(spoiled), dtype=torch.bool)
+    bent = Registration(true.with_vertices(pose.apply(spoiled)[0]), pose, seen.double(), seen, None)  # type: ignore[arg-type]
+    found = pose.inverse().apply(with_placed_parts(template.neutral, bent).mesh.vertices)[0]
+    assert float(parts.depth(spoiled).max()) > 1
+    assert float(parts.depth(found).max()) <= TOLERANCE
+    centres = eyes(template, parts, true)[0]
+    off = (found[balls] - eyes(template, parts, true.with_vertices(found))[0][parts.group]).norm(dim=-1)
+    own = (true.vertices[balls].double() - centres[parts.group]).norm(dim=-1)
+    assert float((off - own * off.mean() / own.mean()).abs().max()) < 0.1
 
 
 @pytest.mark.bench

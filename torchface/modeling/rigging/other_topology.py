@@ -23,8 +23,8 @@ from torchface.geometry.meshes.operators import (
 from torchface.geometry.meshes.shell_energies import stretching_energy
 from torchface.geometry.meshes.surface_index import triangle_coordinates
 from torchface.mesh import Mesh
-from torchface.modeling.rigging.blinks_that_shut import SkinOfHead, eyes_seen, lids_looking_down, shut_blinks
 from torchface.modeling.rigging.deformation_transfer import transfer_with_report
+from torchface.modeling.rigging.eyelid_closure import SkinOfHead, eyes_seen, lids_looking_down, shut_blinks
 from torchface.modeling.rigging.loose_parts import moved_parts
 from torchface.modeling.rigging.part_clearance import clear_parts
 from torchface.modeling.rigging.part_placement import place_parts

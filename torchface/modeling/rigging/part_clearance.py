@@ -100,6 +100,9 @@ def clearance_poses(rig: BlendshapeRig, parts: InnerParts) -> Tensor:
         if len(movers) < 2:
             continue
         for number, row in enumerate(mixed):  # each draws shapes of its own, every other with the strongest, a blink
+            if number + 1 < len(movers):  # first a whole blink with each other shape, such as a whole look up
+                row[movers[[0, number + 1]]] = 1.0
+                continue
             others = 1 + torch.randperm(len(movers) - 1, generator=generator)
             drawn = movers[torch.cat([torch.zeros(1 - number % 2, dtype=torch.int64), others])[:_MIXED]]
             strength = torch.rand(len(drawn), generator=generator, dtype=torch.float64)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from scipy.spatial import cKDTree
@@ -12,7 +12,8 @@ from torchface.geometry.meshes.operators import triangle_normals
 from torchface.geometry.similarity import Similarity, similarity_transform
 from torchface.mesh import Mesh
 from torchface.modeling.rigging.part_clearance import Clearance
-from torchface.modeling.rigging.penetration import InnerParts
+from torchface.modeling.rigging.penetration import InnerParts, inner_parts
+from torchface.registration import Registration
 from torchface.rendering.raycast import RayCaster
 from torchface.rig import BlendshapeRig
 
@@ -88,6 +89,18 @@ def place_parts(template: BlendshapeRig, neutral: Mesh, parts: InnerParts) -> Me
     if float((placed - found).abs().max()) < _NOTHING:
         return neutral
     return neutral.with_vertices(placed.to(neutral.vertices))
+
+
+def with_placed_parts(template: Mesh, registration: Registration) -> Registration:
+    """A registration whose eyeballs and teeth are where ``place_parts`` has them, and round, in place of bent ones."""
+    rig = BlendshapeRig(template, template.vertices.new_zeros(0, len(template.vertices), 3), ())
+    parts = inner_parts(rig)
+    if len(parts.vertices) == 0:
+        return registration
+    upright = registration.pose.inverse().apply(registration.mesh.vertices.detach().cpu().double())[0]
+    placed = place_parts(rig, template.with_vertices(upright.to(template.vertices)), parts)
+    vertices = registration.pose.apply(placed.vertices.detach().cpu().double())[0]
+    return replace(registration, mesh=registration.mesh.with_vertices(vertices.to(registration.mesh.vertices)))
 
 
 def _following(aligned: Tensor, found: Tensor, parts: InnerParts, body: Tensor) -> Tensor:

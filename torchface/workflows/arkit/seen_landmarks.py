@@ -8,7 +8,7 @@ from torch import Tensor
 from torchface.landmarks.images.ibug_68 import COUNT
 from torchface.landmarks.surfaces.face_on_surface import NoFaceOnSurfaceError
 from torchface.mesh import Mesh
-from torchface.modeling.rigging.blinks_that_shut import SkinOfHead
+from torchface.modeling.rigging.eyelid_closure import SkinOfHead
 from torchface.modeling.rigging.other_topology import joined_vertices
 from torchface.progress import Progress
 from torchface.registration.scan_preparation import Landmarks

@@ -18,6 +18,7 @@ from torchface.io.meshes.named_files import named_files
 from torchface.landmarks import UVLandmarkDetector
 from torchface.landmarks.scans.landmark_pairs import AutomaticLandmarks
 from torchface.mesh import Annotations, Mesh
+from torchface.modeling.rigging.part_placement import with_placed_parts
 from torchface.registration.landmark_files import landmark_file, load_scan_landmarks
 from torchface.registration.model_fit import LinearShape
 from torchface.registration.nonrigid.schedule import Schedule
@@ -33,7 +34,7 @@ from torchface.workflows.batch.batch_items import BatchItem
 from torchface.workflows.batch.contact_sheet import HEIGHT, WIDTH
 from torchface.workflows.batch.outcomes import Made
 
-_METHOD = "register/4"
+_METHOD = "register/5"
 """What results are made with; another number where the same scan and settings come to give another result."""
 _MAX_DISTANCE = 1.0  # end of the distance maps' scale, millimetres
 
@@ -110,7 +111,7 @@ class ScanJob:
             schedule=self.schedule,
             texture_size=self.texture_size,
         )
-        return registration, 0 if landmarks is None else len(landmarks[0])
+        return with_placed_parts(self.template, registration), 0 if landmarks is None else len(landmarks[0])
 
     def _picture(self, registration: Registration) -> Tensor:
         """The face from the template's front, its lines, and its distances to the scan, (3,H,W)."""

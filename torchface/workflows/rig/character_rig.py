@@ -24,7 +24,7 @@ from torchface.io.images.image_files import encode_png
 from torchface.io.mesh_files import MESH_ENDINGS
 from torchface.io.vrm.vrm_expressions import VRM_ENDING, MorphBind, add_expressions, vrm_expressions
 from torchface.landmarks.surfaces.face_on_surface import NoFaceOnSurfaceError
-from torchface.modeling.rigging.blinks_that_shut import BLINKS
+from torchface.modeling.rigging.eyelid_closure import BLINKS
 from torchface.modeling.rigging.loose_parts import tongue_out
 from torchface.modeling.rigging.other_topology import CarriedShapes, joined_vertices, shapes_on
 from torchface.progress import Progress, silent

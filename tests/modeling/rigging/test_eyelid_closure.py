@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from torchface.modeling.rigging.blinks_that_shut import (
+from torchface.modeling.rigging.eyelid_closure import (
     BLINKS,
     SkinOfHead,
     _before_the_eye,
