@@ -1,4 +1,4 @@
-"""The README's Python runs when it is pasted, in an empty folder."""
+"""The Python of the README and of a how-to page runs when it is pasted."""
 
 from __future__ import annotations
 
@@ -6,9 +6,13 @@ import re
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
+import torch
 
+from torchface import Attachment, Take, Track, save_rig, save_take
 from torchface.io import load_animation
+from torchface.synthetic import performer
 
 README = Path(__file__).resolve().parents[2] / "README.md"
 
@@ -23,3 +27,23 @@ def test_the_first_python_of_the_readme_runs(tmp_path: Path, monkeypatch: pytest
     take = load_animation(tmp_path / "smile.glb")
     assert take is not None
     assert len(take) == 60
+
+
+def test_the_markers_for_a_graph_are_brought_into_the_rigs_space(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    page = README.parent / "docs" / "how_to" / "applications.md"
+    (code,) = re.findall(r"```python\n(.*?)```", page.read_text(encoding="utf-8"), re.DOTALL)
+    actor = performer(texture=False).select(["jawOpen", "mouthSmileLeft", "mouthSmileRight"])
+    sites = Attachment.from_vertices(actor.neutral, actor.neutral.landmarks[17:])
+    markers = sites.on(actor.neutral.faces, actor(torch.rand(20, 3, generator=torch.Generator().manual_seed(0))))
+    turn = torch.tensor([[0.8, 0.0, 0.6], [0.0, 1.0, 0.0], [-0.6, 0.0, 0.8]])
+    labels, order = list(sites.labels), torch.arange(len(sites.labels)).flip(0)
+    save_rig(actor, "actor.glb")
+    sites.save("attachment.json")
+    moved = Track([labels[i] for i in order], markers[:, order] @ turn.T + torch.tensor([90.0, -1200.0, 40.0]))
+    save_take(Take(30.0, markers=moved), "take.c3d")
+    exec(compile(code, str(page), "exec"), {})
+    written = torch.from_numpy(np.load("markers.npy"))
+    assert float((written - markers).norm(dim=-1).max()) < 0.2

@@ -248,6 +248,8 @@ def attach(
         check_attachment(fit, loaded)
     except (AlignmentError, ValueRangeError) as error:
         why = f"{error}{_standoff_hint(loaded, take, start, settings, fit)}"
+        if settings.initial is None:
+            why += ", or the markers' shape alone does not show where they sit: --initial says it roughly"
         if not settings.insist:
             raise type(error)(f"{rom}: {why}; {_INSIST}") from None
         notes = [*notes, why]

@@ -236,7 +236,7 @@ def solve_markers(
     if alignment is not None:
         free = alignment if settings.free_scale else align_take(rig, attachment, steady, insist=True)
         warnings += scale_warnings(float(free.scale[0]), not settings.free_scale, take.extras.get("unit"))
-    warnings += check_head(rig, attachment, steady, settings.insist)
+    warnings += check_head(rig, attachment, steady, settings.insist, fit.cause)
     if settings.subtract_rest and alignment is not None:
         attachment = rest_residual(rig, attachment, steady)
         # Sites that are nearer to the markers show the helmet's motion better.

@@ -117,13 +117,16 @@ def fit_warnings(fit: FitCheck, aligned: bool) -> list[str]:
     ]
 
 
-def check_head(rig: BlendshapeRig, attachment: Attachment, take: Take, insist: bool = False) -> list[str]:
+def check_head(
+    rig: BlendshapeRig, attachment: Attachment, take: Take, insist: bool = False, cause: str = ""
+) -> list[str]:
     """Whether rig, attachment and take belong to one head.
 
     Args:
         rig: whose mesh has the attachment's triangles.
         take: markers in rig space, without the helmet's motion.
         insist: warn in place of the error.
+        cause: what :func:`check_explained` has found, which leaves a smooth residual too.
 
     Returns:
         Warnings where the residual of the take is that of another head.
@@ -149,7 +152,7 @@ def check_head(rig: BlendshapeRig, attachment: Attachment, take: Take, insist: b
     faces, rest = rig.neutral.faces, rig.vertices.detach()
     normals = attachment.on(faces, vertex_normals(rest, faces))
     pattern = residual_pattern(residual if given is None else residual - given, attachment.on(faces, rest), normals)
-    if pattern.other_head:
+    if pattern.other_head and cause in ("", "attachment"):
         warnings.append(
             f"what is left at rest is smooth over the face ({pattern.smooth:.2g} mm, correlation of neighbours "
             f"{pattern.correlation:.2f}): the rig is most likely another head's; weights will be wrong"
