@@ -7,27 +7,25 @@ import inspect
 import os
 import sys
 from collections.abc import Iterator
+from compileall import compile_file
 from copy import copy, deepcopy
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import pytest
-import torch
-from headless_chromium import headless_chromium
+from _pytest.assertion import rewrite
 from hypothesis import settings
-from PIL import Image
+from hypothesis.internal.conjecture import providers
 
-from torchface.attachment import Attachment
-from torchface.geometry.cameras.pinhole import Camera
-from torchface.io import load_rig, load_take
-from torchface.io.rigs import ict_facekit
-from torchface.mesh import Mesh
-from torchface.rendering.clay_shading import DEFAULT_LIGHTING, render
-from torchface.rig import BlendshapeRig
-from torchface.shape_names import mapping
-from torchface.synthetic.stages.marker_stage import place_markers
+if TYPE_CHECKING:  # fixtures import what they need: the process that only hands out tests reads this file too
+    import torch
+
+    from torchface.attachment import Attachment
+    from torchface.geometry.cameras.pinhole import Camera
+    from torchface.mesh import Mesh
+    from torchface.rig import BlendshapeRig
 
 REPOSITORY = Path(__file__).resolve().parent.parent
 DATA = Path(os.environ.get("TORCHFACE_DATA", REPOSITORY.parent / "shared" / "data"))
@@ -37,6 +35,8 @@ gc.disable()  # until all tests are imported
 settings.register_profile("ci", derandomize=True, deadline=None, print_blob=True, max_examples=25)
 settings.register_profile("dev", deadline=None, max_examples=25)
 settings.load_profile("ci" if os.environ.get("CI") else "dev")
+# Hypothesis reads the constants of all source for examples, five seconds a process; tests name their own edges.
+providers._get_local_constants = lambda: providers._local_constants
 
 
 LONGEST = (
@@ -83,6 +83,22 @@ def pytest_configure(config: pytest.Config) -> None:
         raise pytest.UsageError(
             f"tests/conftest.py: found no tests at {', '.join(lost)}; expected LONGEST and TOGETHER true"
         )
+    if hasattr(config, "workerinput") and not sys.dont_write_bytecode:
+        given = config.workerinput
+        _write_bytecode(config, int(given["workerid"].removeprefix("gw")), given["workercount"])
+
+
+def _write_bytecode(config: pytest.Config, process: int, processes: int) -> None:
+    """Writes a process's share of all bytecode: in a fresh clone each process would make all of it, ten seconds."""
+    for path in [path for name in ("torchface", "train") for path in sorted((REPOSITORY / name).rglob("*.py"))][
+        process::processes
+    ]:
+        compile_file(path, quiet=1)
+    for path in sorted((REPOSITORY / "tests").rglob("test_*.py"))[process::processes]:
+        written = rewrite.get_cache_dir(path) / (path.stem + rewrite.PYC_TAIL)
+        if rewrite._read_pyc(path, written) is None and rewrite.try_makedirs(written.parent):
+            source, code = rewrite._rewrite_test(path, config)
+            rewrite._write_pyc(config.stash[rewrite.assertstate_key], code, source, written)
 
 
 @pytest.hookimpl(optionalhook=True)
@@ -104,6 +120,8 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
 @pytest.fixture(scope="session", autouse=True)
 def quick_files() -> Iterator[None]:
     """No test's files need survive a power cut, and no PNG need be small: a texture takes a third of the time."""
+    from PIL import Image
+
     save = Image.Image.save
 
     def packed_quickly(image: Image.Image, *given: Any, **more: Any) -> None:
@@ -118,6 +136,8 @@ def quick_files() -> Iterator[None]:
 @pytest.fixture(scope="session", autouse=True)
 def head_read_once() -> Iterator[None]:
     """A process reads the real head's files once, which takes seconds; each test has a copy of its own."""
+    from torchface.io.rigs import ict_facekit
+
     known: dict[Any, Any] = {}
 
     def once(read: Any) -> Any:
@@ -143,7 +163,6 @@ def pytest_collection_finish() -> None:
 
     It does so for each graph, a third of an export's time.
     """
-    gc.collect()
     gc.freeze()
     gc.set_threshold(50_000, 20, 20)  # Python's 700 takes one part in twenty of a run
     gc.enable()
@@ -201,6 +220,10 @@ def real_capture(ict_folder: Path, performances: list[Path]) -> tuple[Blendshape
 
     The markers come best first, so the first 50 are a layout of their own.
     """
+    from torchface.io import load_rig, load_take
+    from torchface.shape_names import mapping
+    from torchface.synthetic.stages.marker_stage import place_markers
+
     rig = load_rig(ict_folder, part="face")
     weights = []
     for path in performances:
@@ -213,6 +236,10 @@ def real_capture(ict_folder: Path, performances: list[Path]) -> tuple[Blendshape
 @pytest.fixture(scope="module")
 def coarse_figures() -> Iterator[None]:
     """Figures of reports with one ray for 4 × 4 pixels and no shadow in creases, for tests that do not look at them."""
+    import torch
+
+    from torchface.rendering.clay_shading import DEFAULT_LIGHTING, render
+
     figures = ("face_views", "marker_maps", "registration_views")
     pages = (
         "workflows.fit.photograph_rig",
@@ -242,6 +269,11 @@ def coarse_figures() -> Iterator[None]:
 @pytest.fixture(scope="session")
 def dome_rig() -> BlendshapeRig:
     """A dome that bulges here and there: 100 mm wide, four shapes; the lowest rows never move."""
+    import torch
+
+    from torchface.mesh import Mesh
+    from torchface.rig import BlendshapeRig
+
     side = 25
     y, x = torch.meshgrid(torch.linspace(-50, 50, side), torch.linspace(-50, 50, side), indexing="ij")
     vertices = torch.stack([x, y, 60 - (x**2 + y**2) / 100], dim=-1).reshape(-1, 3)
@@ -260,6 +292,8 @@ def dome_rig() -> BlendshapeRig:
 @pytest.fixture(scope="session")
 def filmed_session(tmp_path_factory: pytest.TempPathFactory) -> Any:
     """A performer before the camera stage: two repetitions of each unit, one of a combination, 20 frames a second."""
+    import torch
+
     from train.filmed_performers.action_performance import PerformanceSettings
     from train.filmed_performers.camera_stage import StageSettings, record_session
     from train.filmed_performers.helmet_camera import CameraFlaws
@@ -283,6 +317,8 @@ def receiver() -> Iterator[Any]:
 
 @pytest.fixture(scope="session")
 def started_chromium(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
+    from headless_chromium import headless_chromium
+
     with headless_chromium(tmp_path_factory.mktemp("chromium"), size=(600, 600)) as driver:
         yield driver
 
