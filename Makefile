@@ -22,9 +22,11 @@ $(VENV)/.installed-%: $(STAMP)
 
 # Three processes of one thread each for two cores, as browsers and programs are waited for; the longest files first, and what is
 # costly to make once (a synthetic video, a browser) stays in one.
-# Bytecode is written, whatever the shell says: many tests start a process.
+# Bytecode is written, whatever the shell says: many tests start a process. glibc keeps freed memory: else each large tensor is
+# asked of the system anew, a tenth of the time.
 test: $(VENV)/.installed-test
-	PYTHONDONTWRITEBYTECODE= OMP_NUM_THREADS=1 $(RUN) -m pytest --numprocesses 3 --dist loadfile --no-loadscope-reorder
+	PYTHONDONTWRITEBYTECODE= OMP_NUM_THREADS=1 MALLOC_MMAP_THRESHOLD_=1073741824 MALLOC_TRIM_THRESHOLD_=4294967296 \
+		$(RUN) -m pytest --numprocesses 3 --dist loadfile --no-loadscope-reorder
 
 # Blender's package has a Python of its own: it wants 3.11 and numpy below 2.
 BLENDER_PYTHON ?= python3.11
