@@ -294,15 +294,19 @@ def filmed_session(tmp_path_factory: pytest.TempPathFactory) -> Any:
     """A performer before the camera stage: two repetitions of each unit, one of a combination, 20 frames a second."""
     import torch
 
+    from train.filmed_performers import camera_stage
     from train.filmed_performers.action_performance import PerformanceSettings
-    from train.filmed_performers.camera_stage import StageSettings, record_session
+    from train.filmed_performers.camera_stage import StageSettings
     from train.filmed_performers.helmet_camera import CameraFlaws
+    from train.filmed_performers.reflective_paint import reflective_paint
 
     performance = PerformanceSettings(2, 1, (("4", "9"),), fps=20.0, pace=1.3)
     flaws = CameraFlaws(shake_rotation=0.6, shake_translation=1.2)
     settings = StageSettings(128, 170, markers=20, flaws=flaws, performance=performance)
     folder = tmp_path_factory.mktemp("camera_stage")
-    return record_session(folder, "first", None, torch.Generator().manual_seed(3), settings)
+    with pytest.MonkeyPatch.context() as patch:  # of a texture as fine as the pictures
+        patch.setattr(camera_stage, "reflective_paint", lambda size, *more: reflective_paint(size // 2, *more))
+        return camera_stage.record_session(folder, "first", None, torch.Generator().manual_seed(3), settings)
 
 
 @pytest.fixture

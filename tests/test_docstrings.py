@@ -52,6 +52,7 @@ LONG = (
 )
 
 
+@pytest.mark.usefixtures("coarse_figures")
 @pytest.mark.parametrize(
     "name", [pytest.param(name, marks=pytest.mark.bench) if name in LONG else name for name in MODULES]
 )
