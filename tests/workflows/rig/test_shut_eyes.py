@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from dataclasses import replace
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -16,7 +17,7 @@ from torchface.registration import Registration
 from torchface.registration.nonrigid.registration_record import RegistrationRecord
 from torchface.rig import BlendshapeRig
 from torchface.synthetic.head.performer import performer
-from torchface.workflows.rig.shut_eyes import with_eye_note
+from torchface.workflows.rig.shut_eyes import eyes_shut_at_rest, with_eye_note, with_shut_eyes
 
 
 @pytest.fixture(scope="module")
@@ -74,3 +75,31 @@ def test_without_colours_two_fits_say_which_lids_they_are(
     notes = with_eye_note(rig, scan, first, weights(rig, 0.0), second).record.notes
     assert torch.equal(asked[0], weights(rig, 1.0))
     assert [("eyes are shut, as the lids' shape says" in note) for note in notes] == [True] * shut
+
+
+def test_a_character_s_shut_eye_is_one_whose_lids_meet_before_an_eyeball() -> None:
+    actor = performer(texture=False)
+    for sides in ((True, True), (False, True), (False, False)):
+        blinks = [f"eyeBlink{side}" for side, yes in zip(("Right", "Left"), sides, strict=True) if yes]
+        posed = actor.neutral.with_vertices(actor.vertices + actor.deltas[actor.index(blinks)].sum(0))
+        points = posed.vertices[actor.neutral.landmarks].double()
+        one = torch.ones(1, dtype=torch.float64)
+        pose = Similarity(one, torch.eye(3).double()[None], 0 * one[:, None].expand(1, 3))
+        face = SimpleNamespace(head=posed, found=SimpleNamespace(points=points, pose=pose))
+        assert eyes_shut_at_rest(face, actor.neutral) == sides  # type: ignore[arg-type]
+
+
+def test_a_shut_eye_opens_as_wide_as_ever_and_its_lids_do_not_pass_each_other() -> None:
+    actor = performer(texture=False)
+    shut = with_shut_eyes(actor, (False, True))
+    left, wide, right = (actor.index([name])[0] for name in ("eyeBlinkLeft", "eyeWideLeft", "eyeBlinkRight"))
+    torch.testing.assert_close(shut.vertices, actor.vertices + actor.deltas[left])
+    torch.testing.assert_close(shut.vertices + shut.deltas[wide], actor.vertices + actor.deltas[wide])
+    assert not bool(shut.deltas[left].any())
+    assert torch.equal(shut.deltas[right], actor.deltas[right])
+    lids = actor.deltas[left].norm(dim=-1) > 4
+    for name in ("eyeLookDownLeft", "eyeSquintLeft"):
+        assert float(shut.deltas[actor.index([name])[0]][lids].norm(dim=-1).max()) == 0
+    ball = actor.neutral.annotations.regions["eyeball_left"]  # type: ignore[union-attr]
+    down = actor.index(["eyeLookDownLeft"])[0]
+    assert torch.equal(shut.deltas[down][ball], actor.deltas[down][ball])

@@ -74,15 +74,25 @@ class CarriedShapes:
     tongue: Tensor
     open_lids: tuple[float | None, ...]
 
-    def notes(self, lips_cut: bool = False) -> list[str]:
-        """Of eyes that may not shut and lips that do not part, if nobody has cut them, for people to read."""
+    def notes(self, lips_cut: bool = False, shut: tuple[bool, bool] = (False, False)) -> list[str]:
+        """Of eyes that may not shut and lips that do not part, if nobody has cut them, for people to read.
+
+        Args:
+            shut: whether the right and left eye are modelled shut.
+        """
         named = list(zip(("right", "left"), self.open_lids, strict=True))
-        unseen = [side for side, left in named if left is None]
+        at_rest = [side for (side, _), yes in zip(named, shut, strict=True) if yes]
+        unseen = [side for side, left in named if left is None and side not in at_rest]
         notes = [
             f"warning: {side} eye: its blink leaves {left:.0%} of it open"
             for side, left in named
             if (left or 0) > _OPEN
         ]
+        if at_rest:
+            notes.append(
+                f"warning: {' and '.join(at_rest)} eye: modelled shut: eyeBlink moves nothing and eyeWide opens it; "
+                "ARKit's shapes expect open eyes at rest"
+            )
         if unseen:
             notes.append(
                 f"warning: {' and '.join(unseen)} eye: the lids cannot be told from the eye (painted, shut or "

@@ -38,6 +38,7 @@ from torchface.synthetic import performer
 from torchface.viz.figures.character_views import SHOWN, character_sheet
 from torchface.workflows.rig.added_parts import AddedParts, added_parts
 from torchface.workflows.rig.character_face import CharacterFace, find_character_face, textured
+from torchface.workflows.rig.shut_eyes import eyes_shut_at_rest, with_shut_eyes
 
 CHARACTER_ENDINGS = (".glb", VRM_ENDING)
 """Files of characters that are read and written."""
@@ -130,6 +131,8 @@ def rig_character(
             )
         found_after = time.perf_counter() - begin
         template = performer(texture=False)
+        shut = eyes_shut_at_rest(face, template.neutral)
+        template = with_shut_eyes(template, shut) if any(shut) else template
         registration = _registered(template, face, path, progress)
         given: AddedParts | None = None
         if inner_mouth or eyes:
@@ -150,7 +153,7 @@ def rig_character(
         )
         rig = _with_tongue(carried)
         made = tuple(name for name in missing if name in rig.names)
-        job = _Job(character, face, carried, rig, made, given, empty)
+        job = _Job(character, face, carried, rig, made, given, empty, shut)
         progress("writing the character")
         added = job.targets()
         root, data = (
@@ -302,6 +305,7 @@ class _Job:
     made: tuple[str, ...]
     parts: AddedParts | None
     empty: tuple[str, ...]
+    shut: tuple[bool, bool]
 
     def targets(self) -> list[AddedTargets]:
         """The new morph targets of the meshes that move, in their own axes and unit."""
@@ -391,7 +395,7 @@ class _Job:
         lines += [f"parts: {note}" for note in (() if self.parts is None else self.parts.notes)]
         if any(name in self.made for name in (*BLINKS, _JAW)):
             cut = self.parts is not None and self.parts.lips_cut
-            lines += [f"  {note}" for note in self.carried.notes(lips_cut=cut)]
+            lines += [f"  {note}" for note in self.carried.notes(lips_cut=cut, shut=self.shut)]
         lines += _present_lines(there)
         lines += self._doubts(there)
         missing = [name for name in ARKIT if name not in self.made and name not in there]

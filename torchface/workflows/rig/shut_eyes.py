@@ -1,4 +1,4 @@
-"""Eyes that a neutral scan shows shut where they are taken as open, or the other way: by its texture or by two fits."""
+"""Eyes that are shut at rest: a scan's, by its texture or by two fits, and a character's, by what lies behind lids."""
 
 from __future__ import annotations
 
@@ -13,13 +13,17 @@ from torchface.geometry.similarity import similarity_transform
 from torchface.landmarks.images.box_landmarks import settled_face
 from torchface.landmarks.images.ibug_68 import COUNT, box_around
 from torchface.mesh import Mesh
+from torchface.modeling.rigging.eyelid_closure import SkinOfHead, eyes_seen
+from torchface.modeling.rigging.other_topology import joined_vertices
 from torchface.registration import Registration
 from torchface.registration.scan_colors import has_colors
 from torchface.rendering.clay_shading import render
+from torchface.rendering.raycast import RayCaster
 from torchface.rig import BlendshapeRig
 from torchface.shape_names import mapping
 from torchface.viz.figures.face_views import frame_face
 from torchface.workflows.named_finders import load_finder
+from torchface.workflows.rig.character_face import CharacterFace
 
 _BLINKS = ("eyeBlinkLeft", "eyeBlinkRight")
 # Likelihoods of the eye network: 0.9 and more of shut eyes, 0.08 at most of open and half shut ones.
@@ -29,6 +33,9 @@ _LIDS = 2.0  # millimetres that a blink moves skin of the lids
 # and more where they are open.
 _BETTER, _WORSE = 0.6, 1.6
 _WIDTH, _HEIGHT = 480, 600
+_BLINKS_OF = ("Right", "Left")  # in the order of iBUG's eyes
+_BALL, _HIDDEN = 1.8, 0.75  # radii of a reference's eyeball; the share of a ball's front that skin covers
+_LID = 0.3  # of a blink's longest way: from there on a vertex is of the lids alone
 
 
 def with_eye_note(
@@ -67,6 +74,48 @@ def with_eye_note(
     )
     record = registration.record
     return replace(registration, record=replace(record, notes=(*record.notes, f"warning: {note}")))
+
+
+def eyes_shut_at_rest(face: CharacterFace, reference: Mesh) -> tuple[bool, bool]:
+    """Whether a character's right and left eye are modelled shut: no opening, and an eyeball under the skin."""
+    assert reference.annotations is not None
+    vertices, faces = face.head.vertices.double(), face.head.faces
+    joined = joined_vertices(vertices, faces)
+    skin_part = int(joined.part[joined.faces[:, 0]].bincount().argmax())
+    head = SkinOfHead(joined.vertices, joined.faces, joined.part != skin_part, joined.part)
+    placed = face.found.pose.inverse().apply(face.found.points)[0]
+    caster, shut = RayCaster(head.vertices, head.skin), []
+    forward = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
+    for opening, side in zip(eyes_seen(head, placed), ("right", "left"), strict=True):
+        ball = reference.vertices[reference.annotations.regions[f"eyeball_{side}"]].double()
+        centre = (ball.amax(0) + ball.amin(0)) / 2
+        near = head.loose & ((head.vertices - centre).norm(dim=-1) < _BALL * (ball - centre).norm(dim=-1).median())
+        hidden = [0.0]
+        for one in head.part[near].unique().tolist() if opening is None else ():  # balls and lashes
+            own = head.vertices[head.part == one]
+            if bool(near[head.part == one].all()):
+                front = own[own[:, 2] >= own[:, 2].median()]
+                hidden.append(float(caster.occluded(front, forward.expand_as(front)).double().mean()))
+        shut.append(max(hidden) > _HIDDEN)
+    return shut[0], shut[1]
+
+
+def with_shut_eyes(rig: BlendshapeRig, shut: tuple[bool, bool]) -> BlendshapeRig:
+    """The rig whose right or left eye is shut at rest: its blink moves nothing, ``eyeWide`` opens it as far as ever.
+
+    Lids that meet do not go further in any other shape of the eye.
+    """
+    vertices, deltas = rig.vertices.clone(), rig.deltas.clone()
+    for side in (side for side, yes in zip(_BLINKS_OF, shut, strict=True) if yes):
+        blink = deltas[rig.index([f"eyeBlink{side}"])[0]].clone()
+        way = blink.norm(dim=-1, keepdim=True)
+        outside = 1 - (way / (_LID * way.max())).clamp(max=1)
+        others = rig.index([f"eye{what}{side}" for what in ("LookUp", "LookDown", "LookIn", "LookOut", "Squint")])
+        deltas[others] *= torch.where(way > 0, outside, 1.0)
+        deltas[rig.index([f"eyeWide{side}"])] -= blink
+        deltas[rig.index([f"eyeBlink{side}"])] = 0.0
+        vertices += blink
+    return BlendshapeRig(rig.neutral.with_vertices(vertices), deltas, rig.names)
 
 
 def _by_texture(scan: Mesh, registration: Registration, rig: BlendshapeRig) -> bool | None:
