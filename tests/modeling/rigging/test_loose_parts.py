@@ -23,9 +23,8 @@ def gums(height: float) -> tuple[Tensor, Tensor, Tensor]:
 
 def test_a_tongue_in_one_piece_with_gums_comes_out_and_the_arch_stays() -> None:
     points, faces, hill = gums(18.0)
-    tongue = _tongue_of_gums(
-        points, faces, torch.ones(len(points), dtype=torch.bool), -points[:, 1] - 0.2 * points[:, 2]
-    )
+    whole = torch.ones(len(points), dtype=torch.bool)
+    tongue = _tongue_of_gums(points, faces, whole, -points[:, 1] - 0.2 * points[:, 2], whole)
     assert float(tongue[hill].min()) > 0.8
     assert float(tongue[(points[:, 0].abs() > 20) | (points[:, 2] > -8)].max()) < 0.01
     out = tongue_out(points, tongue, torch.zeros(20, 3, dtype=torch.float64))
@@ -39,8 +38,8 @@ def test_what_is_near_teeth_is_gums_and_stays() -> None:
     below = -points[:, 1] - 0.2 * points[:, 2]
     near = (points - torch.tensor([0.0, 0.0, -16.0])).norm(dim=-1) < 2.5  # of the hill's front edge
     whole = torch.ones(len(points), dtype=torch.bool)
-    assert float(_tongue_of_gums(points, faces, whole, below)[near].min()) > 0.8
-    tongue = _tongue_of_gums(points, faces, whole, below, [near])
+    assert float(_tongue_of_gums(points, faces, whole, below, whole)[near].min()) > 0.8
+    tongue = _tongue_of_gums(points, faces, whole, below, whole, [near])
     assert float(tongue[near].max()) < 0.01
     assert float(tongue[hill & (points[:, 2] < -24)].min()) > 0.8
 
@@ -60,7 +59,20 @@ def test_tufts_of_a_beard_are_not_in_the_mouth_though_their_roots_are_under_the_
 def test_a_mouths_floor_is_no_tongue() -> None:
     points, faces, _ = gums(0.0)
     below = -points[:, 1] - 0.2 * points[:, 2]
-    assert not bool(_tongue_of_gums(points, faces, torch.ones(len(points), dtype=torch.bool), below).any())
+    whole = torch.ones(len(points), dtype=torch.bool)
+    assert not bool(_tongue_of_gums(points, faces, whole, below, whole).any())
+
+
+def test_what_lies_under_gums_is_a_bag_and_no_tongue() -> None:
+    points, faces, _ = gums(18.0)
+    cover, triangles, _ = gums(18.0)
+    cover[:, 1] += 3.0
+    both = torch.cat([points, cover])
+    first = torch.arange(len(both)) < len(points)
+    own = -points[:, 1] - 0.2 * points[:, 2]
+    faces = torch.cat([faces, triangles + len(points)])
+    assert bool(_tongue_of_gums(both, faces, first, own, first).any())
+    assert not bool(_tongue_of_gums(both, faces, first, own, torch.ones(len(both), dtype=torch.bool)).any())
 
 
 def test_teeth_that_sit_low_behind_the_lips_belong_to_the_jaws_of_their_rows() -> None:

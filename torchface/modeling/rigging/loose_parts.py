@@ -39,6 +39,7 @@ _BACK, _BEHIND_TEETH, _TEETH, _LEAST_BACK, _FALLS = (
     8,
     4.0,
 )  # of half the arch's width; millimetres
+_COVERED = 0.3  # of what is taken for a tongue: what lies under other parts
 _STANDS, _GUM = 1.0, (3.0, 6.0)  # millimetres from teeth: a part they stand in; gums at most, tongue at least
 _TONGUE_OUT, _TONGUE_DOWN = 12.0, 8.0
 _OPEN, _TONGUE_RISE, _TONGUE_DROP = 0.33, 2.0, 15.0  # of jawOpen; millimetres over the lower teeth, and at the tip
@@ -227,7 +228,7 @@ def _in_the_mouth(head: _Head, faces: Tensor, left: Tensor, lips: Tensor) -> tup
     if among_teeth or not tongue.any():  # gums with a tongue, or a tongue that touches teeth
         of_gums = torch.zeros_like(tongue)
         for rows, below in gums:
-            of_gums += _tongue_of_gums(head.vertices, faces, rows, below, teeth)
+            of_gums += _tongue_of_gums(head.vertices, faces, rows, below, share > 0.5, teeth)
         tongue = of_gums if of_gums.any() else tongue
     return inside, share, tongue
 
@@ -267,11 +268,12 @@ def _bite_plane(parts: list[Tensor]) -> tuple[float, float]:
 
 
 def _tongue_of_gums(
-    vertices: Tensor, faces: Tensor, rows: Tensor, below: Tensor, teeth: Sequence[Tensor] = ()
+    vertices: Tensor, faces: Tensor, rows: Tensor, below: Tensor, jaw: Tensor, teeth: Sequence[Tensor] = ()
 ) -> Tensor:
     """How much each vertex (J,) is of a tongue in one piece with gums: harmonic from its back to the arch around it.
 
-    What is near teeth that are parts of their own is of the arch.
+    What is near teeth that are parts of their own is of the arch, and so is what lies under others of the ``jaw`` (J,):
+    of a bag, its floor.
     """
     none = torch.zeros(len(vertices), dtype=torch.float64)
     ids = rows.nonzero()[:, 0]
@@ -288,16 +290,19 @@ def _tongue_of_gums(
     upper_side = arch & low & (facing[:, 1] > 0.5)
     if int(back.sum()) < _LEAST_BACK or not bool(upper_side.any()):
         return none
-    gum = float(points[upper_side, 1].median())
-    if float(points[back, 1].quantile(0.9)) < gum:  # the mouth's floor
+    gum = float(below[upper_side].median())
+    if float(below[back].quantile(0.1)) > gum:  # the mouth's floor
         return none
-    back &= points[:, 1] > gum - _FALLS
+    back &= below < gum + _FALLS
     if teeth:
         nearby = cKDTree(vertices[torch.stack(list(teeth)).any(0)].numpy()).query(points.numpy())[0]
         arch |= torch.from_numpy(nearby < _GUM[0])
         back &= torch.from_numpy(nearby > _GUM[1])
     up = torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64).expand_as(points)
-    under = RayCaster(points, own[low[own].all(1)]).occluded(points + 0.1 * up, up) & low & (facing[:, 1] > 0.5)
+    over = RayCaster(vertices, faces[jaw[faces].all(1)])
+    under = over.occluded(points + 0.1 * up, up) & low & (facing[:, 1] > 0.5)
+    if float(under[back].double().mean()) > _COVERED:  # a bag's floor
+        return none
     arch |= under  # what a tongue lies on
     back &= ~under
     weight = torch.where(back | arch, 1e3, 1e-6)

@@ -34,7 +34,7 @@ from torchface.workflows.named_finders import load_finder
 
 _HEAD_SHARE = 0.5  # of a vertex's weights on the head's bone, from which pictures frame it
 _REACH, _BELOW, _NECK = 280.0, -210.0, 60.0  # millimetres of the reference: from its middle, below its eyes
-_EYE_REACH, _MOUTH_REACH, _SKIN_REACH = 48.0, 115.0, 8.0
+_EYE_REACH, _MOUTH_REACH, _SKIN_REACH = 48.0, 140.0, 8.0  # a muzzle is long
 _BEFORE_LIPS, _MOUTH_HEIGHT = 4.0, 38.0
 _FACE_REACH, _BEARD_REACH = 95.0, 130.0
 _TUFT, _ROOTED = 40.0, 3.0  # millimetres: the size of a tuft of a beard, and how near to the skin it begins
