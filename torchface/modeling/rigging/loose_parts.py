@@ -351,6 +351,9 @@ def tongue_out(vertices: Tensor, tongue: Tensor, lips: Tensor, jaw_open: Tensor 
     out = (lips[:, 2].double().max() + _TONGUE_OUT - own.max()).clamp(min=0.0)
     if jaw_open is None:
         return torch.stack([torch.zeros_like(share), -_TONGUE_DOWN * share.square(), out * share], 1).to(vertices)
-    # Before the lips it falls; up to there it stays over teeth and lip, which go down with the jaw.
-    over = torch.stack([torch.zeros_like(share), _TONGUE_RISE * share - _TONGUE_DROP * share**12, out * share], 1)
+    # Before the lips it falls; up to there it stays over teeth and lip, which go down with the jaw, and under the other.
+    tip = (share > 0.5 * weight.max()) & (weight > 0.5 * weight.max())
+    high = (vertices[tip, 1].double().quantile(0.9) - lips[:, 1].double().mean()).clamp(min=0.0)
+    up = (_TONGUE_RISE - high) * share - _TONGUE_DROP * share**12
+    over = torch.stack([torch.zeros_like(share), up, out * share], 1)
     return (over + _OPEN * (1 - share[:, None]) * jaw_open.double()).to(vertices)
