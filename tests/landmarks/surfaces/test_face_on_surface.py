@@ -89,3 +89,21 @@ def test_a_doubtful_face_is_taken_only_where_all_directions_show_no_better_one(
     monkeypatch.setattr(FaceSearch, "_from_near", lambda self, surface, group, *_: found[group])
     head = neutral_head(texture=False)
     assert search.find(clay(head.vertices, head.faces)) is found[chosen]
+
+
+def test_a_doubtful_face_of_many_colours_is_looked_for_in_clay_too(
+    search: FaceSearch, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A thin head in three colours on its back: its temple was taken for a face."""
+    one = torch.ones(1, dtype=torch.float64)
+    pose = Similarity(one, torch.eye(3, dtype=torch.float64)[None], torch.zeros(1, 3, dtype=torch.float64))
+    read = {False: (0.99, 0.212), True: (1.0, 0.154)}
+    found = {
+        key: FaceOnSurface(torch.zeros(68, 3), pose, *values, (), torch.zeros(0, 3)) for key, values in read.items()
+    }
+    monkeypatch.setattr(FaceSearch, "_candidates", lambda self, surface, framed, sure, plain, *_: [(plain, None)])
+    monkeypatch.setattr(FaceSearch, "_from_near", lambda self, surface, group, *_: found[group])
+    head = neutral_head(texture=False)
+    plain = clay(head.vertices, head.faces)
+    assert search.find(plain) is found[False]
+    assert search.find(replace(plain, materials=2 * plain.materials)) is found[True]

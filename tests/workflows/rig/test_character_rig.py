@@ -198,7 +198,8 @@ def test_few_triangles_and_shapes_that_move_far_are_warned_of(tmp_path: Path, mo
     there, empty = character_rig._present(character)
     record = SimpleNamespace(figures=str, notes=())
     carried = SimpleNamespace(registration=SimpleNamespace(record=record))
-    lines = character_rig._Job(character, face, carried, coarse, (), None, empty).notes(there, (), (0.0, 0.0))
+    job = character_rig._Job(character, face, carried, coarse, (), None, empty, (False, False))  # type: ignore[arg-type]
+    lines = job.notes(there, (), (0.0, 0.0))
     warnings = [line for line in lines if "warning" in line]
     assert len(warnings) == 2
     assert f"its skin has {len(face.skin.faces):,} triangles, expected 1,500" in warnings[0]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from itertools import product
 
 import torch
 from torch import Tensor
@@ -31,7 +32,7 @@ _ASTRAY = 0.5  # of the eyes' distance: a view's hit that is further from the me
 _TRIED = 3  # places that are looked at from near
 _LOST = 0.07  # of the eyes' distance: what is off by more on the reference is no habit of the finder
 _PRESENCE, _MISFIT = 0.7, 0.35
-_DOUBT = 0.45  # above it other places are looked at too; faces, caricatures too, are below
+_DOUBT = 0.2  # above it other places are looked at too, from all around and in clay; most faces are below
 _FACE_OF_HEAD = 0.5  # side of the box round a face, in sides of a picture that frames the head
 
 
@@ -105,8 +106,9 @@ class FaceSearch:
         pictures: list[Tensor] = []
         refused, doubtful = None, []
         # What is taken for a face for sure may be none from near, or hardly one; then all directions are looked at.
-        for sure in (_SURE, torch.inf):
-            for group, others in self._candidates(surface, framed, sure, pictures, progress):
+        painted = any(one.texture is not None for one in surface.materials) or len(surface.materials) > 1
+        for sure, plain in product((_SURE, torch.inf), (False, True) if painted else (False,)):
+            for group, others in self._candidates(surface, framed, sure, plain, pictures, progress):
                 try:
                     found = self._from_near(surface, group, others, progress)
                 except NoFaceOnSurfaceError as error:
@@ -115,7 +117,7 @@ class FaceSearch:
                     if found.doubt < _DOUBT:
                         return found
                     doubtful.append(found)
-            if refused is None and not doubtful:
+            if refused is None and not doubtful and plain == painted:
                 break
         if doubtful:
             return min(doubtful, key=lambda one: one.doubt)
@@ -124,14 +126,18 @@ class FaceSearch:
         )
 
     def _candidates(
-        self, surface: TexturedSurface, framed: Tensor | None, sure: float, pictures: list[Tensor], progress: Progress
+        self,
+        surface: TexturedSurface,
+        framed: Tensor | None,
+        sure: float,
+        plain: bool,
+        pictures: list[Tensor],
+        progress: Progress,
     ) -> list[tuple[_Sighting, Tensor]]:
         """The surest sightings, each of another place, and where other faces are."""
         seen: list[_Sighting] = []
-        textured = any(one.texture is not None for one in surface.materials)
         for frame in [framed, None] if framed is not None and bool(framed.any()) else [None]:
-            for plain in (False, True) if textured else (False,):
-                seen = seen or self._around(surface, frame, plain, sure, pictures, progress)
+            seen = seen or self._around(surface, frame, plain, sure, pictures, progress)
         groups, found = _places(seen), []
         for group in groups[:_TRIED]:
             others = [one[0].middle for one in groups if one is not group and len(one) > 1 and one[0].score > 0.5]

@@ -351,7 +351,7 @@ def tongue_out(vertices: Tensor, tongue: Tensor, lips: Tensor, jaw_open: Tensor 
     out = (lips[:, 2].double().max() + _TONGUE_OUT - own.max()).clamp(min=0.0)
     if jaw_open is None:
         return torch.stack([torch.zeros_like(share), -_TONGUE_DOWN * share.square(), out * share], 1).to(vertices)
-    # Before the lips it falls; up to there it stays over teeth and lip, which go down with the jaw, and under the other.
+    # Before the lips it falls; up to there it stays between teeth and lips, of which the lower ones go with the jaw.
     tip = (share > 0.5 * weight.max()) & (weight > 0.5 * weight.max())
     high = (vertices[tip, 1].double().quantile(0.9) - lips[:, 1].double().mean()).clamp(min=0.0)
     up = (_TONGUE_RISE - high) * share - _TONGUE_DROP * share**12
