@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchface.color_space import to_linear
+from torchface.geometry.meshes.normal_maps import DetailMaps, encode_normals
 from torchface.io.gltf.part_textures.head_primitives import Surface, surfaces
 from torchface.io.gltf.region_materials import PartMaterial
 from torchface.io.images.image_files import encode_png
@@ -142,3 +143,41 @@ def _reader(usd: Any, stage: Any, path: str, kind: str, primvar: str) -> Any:
     reader.CreateIdAttr(kind)
     reader.CreateInput("varname", usd.Sdf.ValueTypeNames.String).Set(primvar)
     return reader
+
+
+def write_wrinkles(
+    usd: Any, stage: Any, material: str, detail: DetailMaps, stem: str
+) -> tuple[dict[str, bytes], dict[str, Any]]:
+    """Adds detail maps to a material: PNG files by name, which belong beside the layer, and what the mesh notes.
+
+    The neutral's is the material's normal. Those of shapes are connected to nothing, as ``UsdPreviewSurface`` has no
+    place for them; the mesh's ``customData`` names them: ``"wrinkleMaps": [{"shape": ..., "texture": name of the
+    prim}]`` in the JSON under ``torchface``.
+
+    Args:
+        stem: what names of image files begin with.
+    """
+    images: dict[str, bytes] = {}
+
+    def add(name: str, normals: Tensor) -> Any:
+        file = f"{stem}_{name}.png"
+        images[file] = encode_png(encode_normals(normals.detach().cpu()))
+        return _normal_texture(usd, stage, material, name, file)
+
+    if detail.neutral is not None:
+        result = add("neutral_normals", detail.neutral).CreateOutput("rgb", usd.Sdf.ValueTypeNames.Float3)
+        surface = usd.UsdShade.Shader(stage.GetPrimAtPath(f"{material}/surface"))
+        surface.CreateInput("normal", usd.Sdf.ValueTypeNames.Normal3f).ConnectToSource(result)
+    listed = []
+    for number, (shape, normals) in enumerate(zip(detail.names, detail.maps, strict=True)):
+        add(f"wrinkles_{number}", normals)
+        listed.append({"shape": shape, "texture": f"wrinkles_{number}"})
+    return images, {"wrinkleMaps": listed} if listed else {}
+
+
+def _normal_texture(usd: Any, stage: Any, material: str, name: str, file: str) -> Any:
+    types = usd.Sdf.ValueTypeNames
+    texture = image_texture(usd, stage, material, name, file, "raw")
+    texture.CreateInput("scale", types.Float4).Set(usd.Gf.Vec4f(2, 2, 2, 1))  # from [0,1] to [-1,1]
+    texture.CreateInput("bias", types.Float4).Set(usd.Gf.Vec4f(-1, -1, -1, 0))
+    return texture

@@ -28,8 +28,7 @@ from torchface.io.gltf.mesh_extras import write_extras
 from torchface.io.gltf.primitive_writing import metres, shading_normals, shown_motion
 from torchface.io.meshes.polygons import corners_of_polygons
 from torchface.io.scenes.weight_keys import WeightKeys, with_correctives
-from torchface.io.usd.detail_prims import write_wrinkles
-from torchface.io.usd.material_prims import write_materials
+from torchface.io.usd.material_prims import write_materials, write_wrinkles
 from torchface.io.usd.usd_library import usd_library
 from torchface.mesh import Mesh
 from torchface.rig import BlendshapeRig
@@ -58,7 +57,7 @@ def write_usd_rig(
             them, and images of eyes and lashes that no texture shows; ``.usdz`` holds all. It appears only when it is
             complete.
         keys: an animation of its shapes, by way of ``skel:animationSource``; a frame is a time code.
-        detail: detail maps of its shapes; see ``detail_prims``.
+        detail: detail maps of its shapes; see ``write_wrinkles``.
     """
     if detail is not None:
         check_detail(detail, rig.neutral, rig.names)
