@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -13,11 +14,12 @@ from torch import Tensor
 
 from torchface.geometry.meshes.operators import triangle_cross
 from torchface.geometry.meshes.surface_index import SurfaceIndex
-from torchface.io import load_identity_modes, load_mesh
+from torchface.io import load_identity_modes, load_mesh, load_rig
 from torchface.io.landmarks.landmark_points import load_landmark_points
 from torchface.mesh import Mesh
-from torchface.registration import Level, Registration, Schedule, Stage, register
+from torchface.registration import DEFAULT_SCHEDULE, Level, Registration, Schedule, Stage, register
 from torchface.registration.scan_preparation import Landmarks
+from torchface.synthetic import neutral_head
 
 
 def error(result: Registration, truth: Tensor) -> Tensor:
@@ -288,6 +290,25 @@ def test_a_real_registration_lies_at_its_landmarks(real: RealScan) -> None:
     residual = (real.given.mesh.vertices[real.template.landmarks[17:]].double() - real.points[17:]).norm(dim=1)
     assert float(residual.mean()) < 1.2
     assert any("along the jaw" in note for note in real.given.record.notes)
+
+
+@pytest.mark.real
+@pytest.mark.parametrize(
+    "size", [0.07, pytest.param(0.1, marks=pytest.mark.bench)]
+)  # millimetres of its unit: a small child's head, and a very large one
+def test_a_head_of_another_size_and_shape_is_found_without_landmarks(data: Path, size: float) -> None:
+    """Whose face fits best is taken: at one size of the template alone, one of these is laid on upside down."""
+    head = load_rig(data / "characters" / "facecap.glb").neutral
+    scan = Mesh(head.vertices * size, head.faces)
+    found = register(neutral_head(texture=False), scan, schedule=Schedule(DEFAULT_SCHEDULE.stages[:1]), texture_size=0)
+    assert float(found.pose.rotation[0].diagonal().sum()) > 1 + 2 * math.cos(math.radians(10))
+
+
+def test_a_face_that_fits_nowhere_well_is_said_with_its_fit(mask: Mesh) -> None:
+    drawn = torch.randn(mask.vertices.shape, generator=torch.Generator().manual_seed(0)) * 3.0
+    rough = Mesh((mask.vertices + drawn).float(), mask.faces)
+    found = register(mask, rough, schedule=Schedule(DEFAULT_SCHEDULE.stages[:1]))
+    assert any("fits 0." in note and "give landmarks" in note for note in found.record.notes)
 
 
 @pytest.mark.real

@@ -131,19 +131,29 @@ def rigid_icp(
         growth = (1 + step[:, 6]).clamp(0.9, 1.1) if scale else torch.ones_like(pose.scale)
         growth = (pose.scale * growth).clamp(lowest, highest) / pose.scale
         pose = pose.moved(step[:, :3], growth, step[:, 3:6], centre[:, 0])
-    return Fit(pose, _planes(samples, scan, pose, reaches[-1], slack)[3].mean(1))
+    return Fit(pose, fit_of(samples, scan, pose, reaches[-1], slack))
 
 
-def find_pose(samples: Samples, scan: ScanPoints) -> Fit:
+def fit_of(samples: Samples, scan: ScanPoints, pose: Similarity, reach: float, slack: float = 0.0) -> Tensor:
+    """How well the template fits in B similarities, (B,) in [0,1]: the mean weight of its correspondences."""
+    return _planes(samples, scan, pose, reach, slack)[3].mean(1)
+
+
+def find_pose(samples: Samples, scan: ScanPoints, size: float = 1.0) -> Fit:
     """The similarity that lays the template on the scan, found from starts in all directions.
 
     Few points of the template from 400 rotations, then more of them from the best of these, and all from the best few.
+
+    Args:
+        samples: of the template.
+        scan: where to find it.
+        size: times its own that the template starts with; of a size that differs by more than a tenth little is found.
     """
     all_rotations = _rotations(_ROTATIONS)
-    one = torch.ones(len(all_rotations), dtype=torch.float64)
+    sizes = torch.full((len(all_rotations),), size, dtype=torch.float64)
     middle = (scan.points.amax(0) + scan.points.amin(0)) / 2
     own = (samples.points.amax(0) + samples.points.amin(0)) / 2
-    start = Similarity(one, all_rotations, middle - all_rotations @ own)
+    start = Similarity(sizes, all_rotations, middle - size * (all_rotations @ own))
     for first, reaches, half, kept, slack in _SEARCH:
         some, scale, early = samples.first(first), slack == 0, len(reaches) // 3 + 1
         left = rigid_icp(some, scan, start, reaches[:early], scale, slack=slack).best(half)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from itertools import product
 
 import torch
 from torch import Tensor
@@ -25,7 +26,7 @@ from torchface.registration.nonrigid.lip_contact import contact_pull
 from torchface.registration.nonrigid.registration_record import RegistrationRecord
 from torchface.registration.nonrigid.schedule import DEFAULT_SCHEDULE, Schedule
 from torchface.registration.nonrigid.unfolding import grown
-from torchface.registration.rigid_icp import Samples, ScanPoints, find_pose, rigid_icp
+from torchface.registration.rigid_icp import Samples, ScanPoints, find_pose, fit_of, rigid_icp
 from torchface.registration.scan_colors import (
     ScanColors,
     has_colors,
@@ -45,6 +46,7 @@ from torchface.registration.scan_preparation import (
 
 _RIGID_SAMPLES = 1500
 _RIGID_REACHES = (20.0, 17.0, 14.0, 12.0, 10.0, 8.0)
+_SIZES, _SURE_FIT = (1.0, 0.85, 1.15), 0.6  # of a template that looks for its place by shape; of its face there
 _NEAR = 3.0
 _FAR = 10.0
 _SETTLED = 12.0  # reach of a stage, millimetres: from there on the template lies close to the scan
@@ -229,18 +231,18 @@ def _start(
     vertices, faces = template.vertices.detach().cpu().double(), template.faces.cpu()
     exposed = exposed_vertices(vertices, faces, schedule.opening).nonzero()[:, 0]
     samples = Samples.of(vertices, faces, evenly_spread(vertices, exposed, _RIGID_SAMPLES))
-    by, surface, notes = "landmarks", SurfaceIndex(prepared.vertices, prepared.faces), []
+    by, surface, notes = "landmarks", SurfaceIndex(prepared.vertices, prepared.faces), list[str]()
     if landmarks is None:
         by = "shape"
-        pose = _pose_by_shape(template, samples, ScanPoints(prepared.vertices, prepared.faces), exposed)
+        pose, notes = _pose_by_shape(template, samples, ScanPoints(prepared.vertices, prepared.faces), exposed)
         if detector is not None:
             aligned = template.with_vertices(pose.apply(vertices)[0].to(template.vertices))
             landmarks = detector(aligned, scan, pose)
             by = "detected landmarks" if landmarks is not None else by
     if landmarks is None:
-        return _Start(by, pose, LandmarkPull.none(), prepared, surface, prepared.notes)
+        return _Start(by, pose, LandmarkPull.none(), prepared, surface, (*prepared.notes, *notes))
     (ids, points), pose, note = check_landmarks(landmarks, template, surface)
-    notes += [note] if note else []
+    notes = [note] if note else []
     if _faces_away(samples, surface, pose):
         prepared = prepared.turned()
         surface = SurfaceIndex(prepared.vertices, prepared.faces)
@@ -249,19 +251,35 @@ def _start(
     return _Start(by, pose, LandmarkPull.of(ids, points, template), prepared, surface, (*prepared.notes, *notes))
 
 
-def _pose_by_shape(template: Mesh, samples: Samples, scan: ScanPoints, exposed: Tensor) -> Similarity:
-    """By the whole template, or by its face alone where the rest (shoulders, another hairdo) is not on the scan."""
-    try:
-        return find_pose(samples, scan).pose
-    except AlignmentError:
-        notes = template.annotations
-        if notes is None or "face" not in notes.regions:
-            raise
-        face = exposed[notes.regions["face"].cpu()[exposed]]
-        if len(face) < 3:
-            raise
-        vertices, faces = template.vertices.detach().cpu().double(), template.faces.cpu()
-        return find_pose(Samples.of(vertices, faces, evenly_spread(vertices, face, _RIGID_SAMPLES)), scan).pose
+def _pose_by_shape(template: Mesh, samples: Samples, scan: ScanPoints, exposed: Tensor) -> tuple[Similarity, list[str]]:
+    """The pose in which the face fits best, and a note where that is not well.
+
+    By the whole template, or by its face alone where the rest (shoulders, another hairdo) is not on the scan; larger
+    and smaller where it fits in neither way.
+    """
+    notes, face = template.annotations, samples
+    if notes is not None and "face" in notes.regions and int(notes.regions["face"].cpu()[exposed].sum()) >= 3:
+        ids = exposed[notes.regions["face"].cpu()[exposed]]
+        vertices = template.vertices.detach().cpu().double()
+        face = Samples.of(vertices, template.faces.cpu(), evenly_spread(vertices, ids, _RIGID_SAMPLES))
+    best, pose, refused = 0.0, None, AlignmentError("")
+    for size, some in product(_SIZES, (samples,) if face is samples else (samples, face)):
+        try:
+            found = find_pose(some, scan, size).pose
+        except AlignmentError as error:
+            refused = error
+            continue
+        fit = float(fit_of(face, scan, found, float(found.scale) * _RIGID_REACHES[-1])[0])
+        if fit > best:
+            best, pose = fit, found
+        if best >= _SURE_FIT:
+            return found, []
+    if pose is None:
+        raise refused
+    return pose, [
+        f"the face was found by its shape alone and fits {best:.2f} of 1 there, where heads fit {_SURE_FIT} and more: "
+        "look at the report's pictures, and give landmarks if it lies elsewhere"
+    ]
 
 
 def _model_fit(model: ShapeModel, template: Mesh, aligned: Tensor, start: _Start, schedule: Schedule) -> ModelFit:
