@@ -290,19 +290,19 @@ def _tongue_of_gums(
     upper_side = arch & low & (facing[:, 1] > 0.5)
     if int(back.sum()) < _LEAST_BACK or not bool(upper_side.any()):
         return none
-    gum = float(below[upper_side].median())
-    if float(below[back].quantile(0.1)) > gum:  # the mouth's floor
+    lower, deeper = (float(one[upper_side].median()) for one in (points[:, 1], below))
+    if float(points[back, 1].quantile(0.9)) < lower and float(below[back].quantile(0.1)) > deeper:  # the mouth's floor
         return none
-    back &= below < gum + _FALLS
+    back &= (points[:, 1] > lower - _FALLS) | (below < deeper + _FALLS)
     if teeth:
         nearby = cKDTree(vertices[torch.stack(list(teeth)).any(0)].numpy()).query(points.numpy())[0]
         arch |= torch.from_numpy(nearby < _GUM[0])
         back &= torch.from_numpy(nearby > _GUM[1])
     up = torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64).expand_as(points)
-    over = RayCaster(vertices, faces[jaw[faces].all(1)])
-    under = over.occluded(points + 0.1 * up, up) & low & (facing[:, 1] > 0.5)
-    if float(under[back].double().mean()) > _COVERED:  # a bag's floor
-        return none
+    others = faces[(jaw & ~rows)[faces].all(1)]
+    if len(others) and float(RayCaster(vertices, others).occluded(points, up)[back].double().mean()) > _COVERED:
+        return none  # a bag's floor
+    under = RayCaster(points, own[low[own].all(1)]).occluded(points + 0.1 * up, up) & low & (facing[:, 1] > 0.5)
     arch |= under  # what a tongue lies on
     back &= ~under
     weight = torch.where(back | arch, 1e3, 1e-6)
