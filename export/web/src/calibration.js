@@ -4,7 +4,7 @@
 import { ARKIT } from "./arkit_names.js";
 
 const row = (name) => ARKIT.indexOf(name);
-const REST = { pose: 1, words: "Look into the camera with a resting face.", shapes: [] };
+const REST = { pose: 1, words: "Look into the camera with a resting face.", short: "resting face", shapes: [] };
 /** What the solvers call each pose (0: none of theirs), what the person is asked for, and in which shapes it is seen. */
 const POSES = [
   { pose: 2, words: "Open your mouth wide.", short: "open mouth", shapes: [["jawOpen"]] },
@@ -16,7 +16,7 @@ const POSES = [
 const COUNTDOWN = 3; // seconds at rest
 const STILL = 0.12; // of a weight from its mean of late; more is a face that moves
 const MEMORY = 0.3; // seconds of that mean
-const LONGEST_REST = 20; // seconds until a restless face is taken as it is
+const LONGEST_REST = 20; // seconds until a restless face is given up: poses are then seen over its mean
 const LEAST = 0.2; // of a weight over rest: a pose that is held
 const NEARLY = 0.08; // and one that has begun
 const HOLD = 1; // seconds
@@ -74,6 +74,13 @@ export class Calibration {
     return this.#missed;
   }
 
+  /** What came of it, in words. */
+  get result() {
+    const missed = this.#missed.join(", ");
+    if (POSES.every(({ short }) => this.#missed.includes(short))) return `Not calibrated: no pose was seen (${missed}). Calibrate again, and hold each pose until the tone.`;
+    return missed ? `Calibrated in part; not seen: ${missed}.` : "Calibrated.";
+  }
+
   /** Factors by which shapes of this person are raised, by name. */
   get gains() {
     return this.#gains;
@@ -106,10 +113,11 @@ export class Calibration {
       moved = Math.max(moved, Math.abs(weights[i] - this.#mean[i]));
       this.#mean[i] = weights[i] + share * (this.#mean[i] - weights[i]);
     }
-    const restless = moved > STILL && this.#waited < LONGEST_REST;
+    const restless = moved > STILL, given = restless && this.#waited >= LONGEST_REST;
     this.#held = restless ? 0 : this.#held + passed;
     this.#remark = restless ? "Your face moves: let it rest." : `${Math.max(1, Math.ceil(COUNTDOWN - this.#held))} …`;
-    if (this.#held < COUNTDOWN) return "same";
+    if (given) this.#missed.push(this.#task.short);
+    else if (this.#held < COUNTDOWN) return "same";
     this.#rest = this.#mean;
     return this.#next();
   }

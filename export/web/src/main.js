@@ -89,10 +89,9 @@ function goOnCalibrating({ time, weights: seenWeights }, seen) {
   if (step === "same") return;
   tone();
   if (step === "done") {
-    const { missed, gains } = calibration;
-    keepSettings({ gains });
+    const { result, gains } = calibration;
+    keepSettings({ gains: { ...settings.gains, ...gains } }); // of a pose that was not seen, what was found before
     endCalibration();
-    const result = missed.length > 0 ? `Calibrated; not seen: ${missed.join(", ")}.` : "Calibrated.";
     showNotes([result]);
     speak(result);
   } else showPrompt(step === "again" ? "Once more, it was not seen: " : "");

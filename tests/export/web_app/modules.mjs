@@ -26,7 +26,7 @@ const jobs = {
       told.push({ number, step, pose: step === "done" ? 0 : calibration.pose, remark: calibration.remark });
       if (step === "done") break;
     }
-    return { told, missed: calibration.missed, gains: calibration.gains };
+    return { told, missed: calibration.missed, result: calibration.result, gains: calibration.gains };
   },
 
   /** Frames of {weights, rotation, gaze, interval} as settings want them. */

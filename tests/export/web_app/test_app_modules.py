@@ -88,6 +88,7 @@ def test_a_calibration_takes_the_poses_that_are_shown(run: Run) -> None:
     assert [one["number"] for one in told["told"] if one["step"] in ("next", "done")] == [1, 2, 3, 4, 5, 6]
     assert told["told"][-1]["step"] == "done"
     assert told["missed"] == []
+    assert told["result"] == "Calibrated."
     poses = np.array([one["pose"] for one in told["told"]])
     assert poses[np.flatnonzero(np.diff(poses, prepend=0))].tolist() == [1, 0, 2, 0, 3, 0, 4, 0, 5, 0]
     held = np.bincount(poses, minlength=6)[1:] / 30
@@ -106,6 +107,7 @@ def test_somebody_who_does_nothing_is_asked_twice_and_learns_what_was_not_seen(r
         (6, "done"),
     ]
     assert told["missed"] == ["open mouth", "smile", "raised eyebrows", "shut eyes", "puckered lips"]
+    assert told["result"].startswith("Not calibrated: no pose was seen")
     assert not any(one["pose"] for one in told["told"] if one["number"] > 1)
     assert "A little more." in {one["remark"] for one in told["told"] if one["number"] == 2}
 
@@ -122,6 +124,15 @@ def test_a_calibration_waits_until_the_face_rests_and_stands_while_none_is_seen(
         "Your face is not seen: the clock stands."
     }
     assert "Your face moves: let it rest." in {one["remark"] for one in told[: len(frames)]}
+
+
+def test_a_face_that_never_rests_is_told_so_and_nothing_is_learned_from_it(run: Run) -> None:
+    talking = [(0.2, {"jawOpen": 0.8 * (i % 2)}) for i in range(100)]
+    told = run("calibration", performed(*talking, (0.1, {}), *((1.6, shown) for shown in POSES)))
+    begun = next(i for i, one in enumerate(told["told"]) if one["step"] == "next")
+    assert begun == pytest.approx(30 * 20, abs=5)
+    assert not any(one["pose"] for one in told["told"][10 : begun + 1])
+    assert told["result"] == "Calibrated in part; not seen: resting face."
 
 
 def test_settings_of_a_face_are_kept_by_the_persons_name(run: Run) -> None:

@@ -19,6 +19,7 @@ def test_the_calibrations_clock_stands_while_no_face_is_seen() -> None:
     assert calibration == GuidedCalibration(3.0)
     assert calibration.pose == 2
     assert GuidedCalibration(9.95).after(0.1, seen_at(1.0)) is None
+    assert GuidedCalibration(9.95).result.startswith("Not calibrated: no pose was seen")
 
 
 def seen_at(x: float) -> LiveFrame:

@@ -269,5 +269,4 @@ class LiveSession:
             self._calibration = after
         if after is None:
             self._prompted = ""
-            missed = calibration.missed
-            self._prompt("Calibrated" if not missed else f"Calibrated; not seen: {'; '.join(missed)}")
+            self._prompt(calibration.result)

@@ -62,10 +62,13 @@ class GuidedCalibration:
         return moved if moved.elapsed < _STEP * len(STEPS) else None
 
     @property
-    def missed(self) -> tuple[str, ...]:
-        """What was asked for so far and not seen."""
+    def result(self) -> str:
+        """What came of the poses that were asked for so far."""
         asked = range(1, self.step + 1)
-        return tuple(STEPS[i] for i in asked if self.most[i] - self.rest[i] < _LEAST)
+        missed = [STEPS[i] for i in asked if self.most[i] - self.rest[i] < _LEAST]
+        if missed and len(missed) == len(asked):
+            return f"Not calibrated: no pose was seen ({'; '.join(missed)})"
+        return f"Calibrated in part; not seen: {'; '.join(missed)}" if missed else "Calibrated"
 
     @property
     def step(self) -> int:
