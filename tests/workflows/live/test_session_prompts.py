@@ -29,10 +29,17 @@ def seen_at(x: float) -> LiveFrame:
 
 def test_no_face_darkness_and_which_of_several_faces_are_said() -> None:
     counted: list[tuple[int, ...]] = []
+    boxes = [[40.0, 10.0, 20.0, 20.0], [0.0, 10.0, 20.0, 20.0]]
 
     def find(picture: torch.Tensor) -> list[list[float]]:
         counted.append(tuple(picture.shape))
-        return [[40.0, 10.0, 20.0, 20.0], [0.0, 10.0, 20.0, 20.0]]
+        return boxes
+
+    def look(solved: LiveFrame, now: float) -> str:
+        watch.look(bright, solved, now)
+        if watch._looking is not None:
+            watch._looking.join(5)
+        return watch.words
 
     watch = FaceWatch(find)
     bright, dark = np.full((48, 64, 3), 120, np.uint8), np.full((48, 64, 3), 9, np.uint8)
@@ -41,17 +48,18 @@ def test_no_face_darkness_and_which_of_several_faces_are_said() -> None:
     assert watch.words == "No face yet: sit before the camera and look into it"
     watch.look(dark, nobody, 0.1)
     assert watch.words.startswith("Too dark")
-    watch.look(bright, left, 0.2)
-    assert watch._looking is not None
-    watch._looking.join(5)
-    watch.look(bright, left, 0.3)
-    assert watch.words == "Two people: following the right one"  # as in a mirror
+    assert look(left, 0.2) == look(left, 0.6) == "Your face is followed"
+    assert look(left, 0.7) == "Two people: following the right one"  # as in a mirror
     watch.mirrored = False
-    watch.look(bright, left, 0.3)
-    assert watch.words == "Two people: following the left one"
-    assert counted == [(3, 48, 64)]  # not at every frame
-    watch.look(bright, nobody, 0.4)
-    assert watch.words == "Your face is hidden: the last expression is held, then relaxes"
+    assert look(left, 0.7) == "Two people: following the left one"
+    assert counted == [(3, 48, 64)] * 2  # not at every frame
+    boxes.append([20.0, 30.0, 5.0, 5.0])  # once something looks like a third face
+    look(left, 4.0)
+    boxes.pop()
+    assert look(left, 4.4) == look(left, 4.8) == "Two people: following the left one"
+    assert look(nobody, 5.0) == "Your face is hidden: the last expression is held, then relaxes"
+    boxes.pop()  # and the other is gone: said soon after this one is seen again
+    assert [look(left, 5.0 + 0.4 * i) for i in (1, 2, 3)][-1] == "Your face is followed"
 
 
 def test_latency_is_told_within_a_hundredth() -> None:

@@ -91,7 +91,7 @@ class GuidedCalibration:
         return f"{self.step + 1} of {len(STEPS)}: {STEPS[self.step]}"
 
 
-_INTERVAL = 3.0  # seconds between two counts of faces
+_INTERVAL, _SOON = 3.0, 0.3  # seconds between two counts of faces; where the last two differ, or the face was lost
 _DARK = 35.0  # mean of the brightest of the colours, of 255
 _SPARSE = 8  # pixels
 _NUMBERS = ("No", "One", "Two", "Three", "Four")
@@ -123,8 +123,8 @@ class FaceWatch:
     def __init__(self, find: Callable[..., Sequence[Sequence[float]]]) -> None:
         self._find = find
         self._middles: list[float] = []
-        self._due = float("-inf")
-        self._ever = False
+        self._counted, self._last = 0, float("-inf")
+        self._settled = self._ever = False
         self._looking: threading.Thread | None = None
         self.words, self.mirrored = "", True
 
@@ -132,8 +132,10 @@ class FaceWatch:
         """Updates ``words`` by a frame, uint8 (H,W,3), and what was solved of it."""
         seen = solved.seen
         self._ever |= seen
-        if seen and now >= self._due and (self._looking is None or not self._looking.is_alive()):
-            self._due = now + _INTERVAL
+        self._settled &= seen
+        due = now >= self._last + (_INTERVAL if self._settled else _SOON)
+        if seen and due and (self._looking is None or not self._looking.is_alive()):
+            self._last = now
             # No daemon: the program's end inside the network would end in an abort.
             self._looking = threading.Thread(target=self._look_for_others, args=(picture,))
             self._looking.start()
@@ -156,4 +158,8 @@ class FaceWatch:
         return f"{count} people: following the {name} one"
 
     def _look_for_others(self, picture: np.ndarray) -> None:
-        self._middles = [float(box[0]) + float(box[2]) / 2 for box in self._find(planes(picture))]
+        middles = [float(box[0]) + float(box[2]) / 2 for box in self._find(planes(picture))]
+        self._settled = len(middles) == self._counted  # now and then something else looks like a face for a moment
+        self._counted = len(middles)
+        if self._settled:
+            self._middles = middles

@@ -126,6 +126,20 @@ def test_it_stays_with_the_largest_and_finds_it_again(webcam: Webcam, portrait: 
     assert column(webcam.step(both(small, head))) > 190  # forgotten: the largest
 
 
+def test_what_was_refused_is_not_tried_again_and_again(
+    webcam: Webcam, portrait: tuple[Tensor, Tensor], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Long after a face was lost it is searched for now and then, and another candidate comes each time."""
+    frame, place, wall = scene(portrait[0], (60, 50)), torch.tensor([135.0, 120, 90]), torch.tensor([320.0, 60, 90])
+
+    def search(image: Tensor, last: Tensor, waiting: Tensor, attempt: Tensor) -> Tensor:
+        return torch.cat([place if attempt == 2 else wall, torch.tensor([1.0, 0, 1, 0])])
+
+    monkeypatch.setattr(webcam.reader, "search", search)
+    webcam.state[9] = 1.0  # seconds without a face
+    assert any(webcam.step(frame).presence > 0.9 for _ in range(15))
+
+
 def test_whatever_is_shown_is_read_safely(webcam: Webcam, portrait: tuple[Tensor, Tensor]) -> None:
     frame = scene(portrait[0], (60, 50))
     expected = webcam.step(frame).landmarks

@@ -141,7 +141,7 @@ class FaceReader(nn.Module):
             torch.where(good, 0.0, (missing + interval).clamp(max=_LONG)),
             torch.where(good & ~clear, doubt + interval, 0.0),
             torch.where(searched, 0.0, (since + interval).clamp(max=_LONG)),
-            torch.where(refused, attempt + 1, 0.0),
+            torch.where(good, 0.0, attempt + refused),  # kept between searches: else the same is tried each time
         ]
         anchor = torch.where(good & ~followed, relation(own, shown), anchor)
         after = torch.cat([torch.where(good, own, place), anchor, torch.stack(counts), size])
