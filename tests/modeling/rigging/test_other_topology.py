@@ -121,6 +121,25 @@ def test_vertices_split_at_a_seam_are_one_and_lips_that_touch_are_two() -> None:
     assert joined.part[joined.of[0]] == joined.part[joined.of[5]] != joined.part[joined.of[8]]
 
 
+@pytest.mark.parametrize(("triangles", "warned"), [(2, False), (3, True)])
+def test_teeth_of_both_jaws_that_share_an_edge_are_warned_of(
+    carried: CarriedShapes, triangles: int, warned: bool
+) -> None:
+    """An edge of the upper teeth with triangles to points of the lower ones, which go with the chin."""
+    mesh, jaw = carried.rig.neutral, carried.rig.names.index("jawOpen")
+    lips = carried.template.vertices[carried.template.neutral.landmarks[60:68]].double().mean(0)
+    upper = torch.tensor([[-2.0, 1, -14], [2, 1, -14]]).double()
+    lower = torch.tensor([[-2.0, -1, -14], [2, -1, -14], [0, -1, -12]]).double()
+    vertices = carried.registration.pose.apply(lips + torch.cat([upper, lower]))[0].to(mesh.vertices)
+    deltas = torch.zeros(len(SHAPES), 5, 3)
+    deltas[jaw, 2:] = carried.rig.deltas[jaw, mesh.landmarks[8]]
+    fan = len(mesh.vertices) + torch.tensor([[0, 1, 2], [0, 1, 3], [0, 1, 4]])[:triangles]
+    joined = Mesh(torch.cat([mesh.vertices, vertices]), torch.cat([mesh.faces, fan]))
+    rig = BlendshapeRig(joined, torch.cat([carried.rig.deltas, deltas.to(carried.rig.deltas)], 1), carried.rig.names)
+    notes = replace(carried, rig=rig).notes()
+    assert [f"{2 * triangles} edges inside the mouth join both jaws" in note for note in notes] == [True] * warned
+
+
 def test_lips_in_one_piece_are_warned_of(carried: CarriedShapes) -> None:
     assert carried.notes() == []
     mesh, marks = carried.rig.neutral, carried.rig.neutral.landmarks

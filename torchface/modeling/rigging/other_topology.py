@@ -46,6 +46,7 @@ _SMOOTH = 0.4
 _SKIN_SHARE, _BODY_SHARE = 0.3, 0.15
 _OPEN = 0.1  # of an eye: what a blink that shuts it leaves at most
 _JAW, _LIP, _DRAWN, _LEAST_DRAWN = "jawOpen", 10.0, 4.0, 3  # millimetres round the lips' line, times their length
+_MOUTH, _STRETCHED = (75.0, 25.0), 2.0  # millimetres behind the lips and over them; times an edge's length
 _SAME_PLACE = 1e-4
 _AT_LIPS = 1.5  # millimetres from the edge of lips that were cut
 _ALIKE = 0.2
@@ -102,22 +103,60 @@ class CarriedShapes:
             notes.append(
                 "warning: the lips are one piece: jawOpen stretches the skin between them; cut the mesh along the lips"
             )
+        if between := self._edges_between_jaws():
+            notes.append(
+                f"warning: {between} edges inside the mouth join both jaws where more than two triangles share an "
+                "edge, as in reduced meshes: jawOpen stretches them across the mouth; separate the two rows of teeth"
+            )
         return notes
+
+    def _opened(self) -> tuple[Tensor, Tensor, Tensor] | None:
+        """The inner lips, and the head at rest and with its jaw open, in the template's place."""
+        marks, jaw = _marks(self.template), mapping(self.rig.names, [_JAW])[0] > 0.5
+        if not bool(jaw.any()) or bool(marks.isnan().any()):
+            return None
+        back = self.registration.pose.inverse()
+        rest = back.apply(self.rig.vertices.detach().cpu().double())[0]
+        return marks[60:68], rest, rest + back.apply_vectors(self.rig.deltas[jaw][:1].detach().cpu().double())[0]
 
     def _lips_in_one_piece(self) -> bool:
         """Whether opening the jaw draws edges out from one lip to the other."""
-        marks, jaw = _marks(self.template), mapping(self.rig.names, [_JAW])[0] > 0.5
-        if not bool(jaw.any()) or bool(marks.isnan().any()):
+        if (opened := self._opened()) is None:
             return False
-        back = self.registration.pose.inverse()
-        rest = back.apply(self.rig.vertices.detach().cpu().double())[0]
-        posed = rest + back.apply_vectors(self.rig.deltas[jaw][:1].detach().cpu().double())[0]
-        lips = marks[60:68]
+        lips, rest, posed = opened
         beside = (rest - lips.mean(0)).abs() < torch.tensor([float(lips[4, 0] - lips[0, 0]) / 3, _LIP, _LIP])
         ends = edges(self.rig.neutral.faces.cpu())
         ends = ends[beside.all(1)[ends].all(1)]
-        before, after = ((one[ends[:, 0]] - one[ends[:, 1]]).norm(dim=-1) for one in (rest, posed))
-        return int(((after > _DRAWN * before) & (after - before > _LIP)).sum()) >= _LEAST_DRAWN
+        return int(_drawn(ends, rest, posed, _DRAWN).sum()) >= _LEAST_DRAWN
+
+    def _edges_between_jaws(self) -> int:
+        """How many edges behind the lips opening the jaw draws out beside those that more than two triangles share.
+
+        Cheeks and the wall of a mouth are drawn out as far, but there two triangles share an edge.
+        """
+        if (opened := self._opened()) is None:
+            return 0
+        lips, rest, posed = opened
+        joined = joined_vertices(rest, self.rig.neutral.faces.cpu())
+        away = joined.vertices - lips.mean(0)
+        inside = (away[:, 2] < 0) & (away.norm(dim=-1) < _MOUTH[0]) & (away[:, 1].abs() < _MOUTH[1])
+        faces = (
+            joined.faces[inside[joined.faces].all(1)].sort(1).values.unique(dim=0)
+        )  # a face of two sides counts once
+        faces = faces[(faces[:, :2] != faces[:, 1:]).all(1)]
+        pairs = torch.cat([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [0, 2]]])
+        ends, count = pairs.unique(dim=0, return_counts=True)
+        after = torch.zeros_like(joined.vertices)
+        after[joined.of] = posed
+        shared = torch.isin(ends, ends[count > 2]).any(1)
+        found = int((_drawn(ends, joined.vertices, after, _STRETCHED) & shared).sum())
+        return found if found >= _LEAST_DRAWN else 0
+
+
+def _drawn(ends: Tensor, rest: Tensor, posed: Tensor, times: float) -> Tensor:
+    """Which edges (E,) a pose makes longer by so many times and by more than a lip."""
+    before, after = ((one[ends[:, 0]] - one[ends[:, 1]]).norm(dim=-1) for one in (rest, posed))
+    return (after > times * before) & (after - before > _LIP)
 
 
 @dataclass(frozen=True, eq=False)
