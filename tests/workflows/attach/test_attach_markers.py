@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 import torch
 
 from torchface import Attachment, BlendshapeRig, Take, Track
+from torchface.errors import AlignmentError, ValueRangeError
+from torchface.io import save_rig, save_take
 from torchface.synthetic.stages.marker_stage import StageFlaws, place_markers, record
-from torchface.workflows.attach.attach_markers import cleaned_fit, helmet_markers
+from torchface.workflows.attach.attach_markers import AttachSettings, attach, cleaned_fit, helmet_markers
 
 
 @pytest.fixture(scope="module")
@@ -59,3 +62,31 @@ def test_markers_of_the_helmet_are_named_and_those_of_the_face_are_not(
     assert helmet_markers(fit, whole) == names
     alone, _ = cleaned_fit(dome_rig, take, sites, standoff=False, free_scale=False)
     assert helmet_markers(alone, take) == []
+
+
+@pytest.mark.parametrize(
+    ("moved", "by", "initial", "said"), [(1, 3.0, False, True), (1, 3.0, True, False), (5, 25.0, False, False)]
+)
+def test_markers_that_no_pose_explains_are_refused_with_the_flag_that_says_where_they_sit(
+    dome_rig: BlendshapeRig,
+    motion: tuple[Attachment, Take],
+    tmp_path: Path,
+    moved: int,
+    by: float,
+    initial: bool,
+    said: bool,
+) -> None:
+    sites, take = motion
+    assert take.markers is not None
+    values = take.markers.values[:40].clone()
+    phase = torch.rand(1, values[:, ::moved].shape[1], 3, generator=torch.Generator().manual_seed(0))
+    values[:, ::moved] += by * torch.sin(torch.arange(len(values))[:, None, None] / 3 + 6 * phase)
+    save_rig(dome_rig, tmp_path / "rig.glb")
+    save_take(Take(take.fps, markers=Track(take.markers.names, values)), tmp_path / "rom.c3d")
+    sites.save(tmp_path / "sites.json")
+    settings = AttachSettings(tmp_path / "sites.json" if initial else None)
+    with pytest.raises((AlignmentError, ValueRangeError)) as refused:
+        attach(tmp_path / "rig.glb", tmp_path / "rom.c3d", tmp_path / "out.json", settings)
+    assert "found no pose" not in str(refused.value)
+    assert ("--initial says it roughly" in str(refused.value)) == said
+    assert not (tmp_path / "out.json").exists()

@@ -49,6 +49,7 @@ _STANDOFF_RATIO = 0.95
 # One marker in so many may sit on the helmet.
 _MAX_HELMET = 3
 _INSIST = "--insist writes the sites all the same"
+_SETTLED = 1.0  # millimetres: where most markers stay so near to their sites, the pose was found
 
 
 @dataclass(frozen=True, eq=False)
@@ -248,7 +249,8 @@ def attach(
         check_attachment(fit, loaded)
     except (AlignmentError, ValueRangeError) as error:
         why = f"{error}{_standoff_hint(loaded, take, start, settings, fit)}"
-        if settings.initial is None:
+        astray = isinstance(error, ValueRangeError) or float(fit.errors[-1].median()) > _SETTLED
+        if settings.initial is None and astray:
             why += ", or the markers' shape alone does not show where they sit: --initial says it roughly"
         if not settings.insist:
             raise type(error)(f"{rom}: {why}; {_INSIST}") from None

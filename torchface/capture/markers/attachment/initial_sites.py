@@ -64,7 +64,7 @@ def sites_by_shape(rig: BlendshapeRig, rom: Take) -> Attachment:
     if not _MIN_SIZE_RATIO < size < _MAX_SIZE_RATIO:
         raise AlignmentError(
             f"markers: found them spread {size:.2g} times as far as the skin that moves, expected {_MIN_SIZE_RATIO} to "
-            f"{_MAX_SIZE_RATIO} times: is the take's unit right? Else give initial sites "
+            f"{_MAX_SIZE_RATIO} times: is the take's unit right? Else give initial sites by --initial "
             "(torchface pick --mode markers)"
         )
     try:
@@ -72,7 +72,7 @@ def sites_by_shape(rig: BlendshapeRig, rom: Take) -> Attachment:
     except AlignmentError as error:
         raise AlignmentError(
             f"markers: found no pose in which they lie on the face by their shape alone ({error}); "
-            "give initial sites (torchface pick --mode markers)"
+            "give initial sites by --initial (torchface pick --mode markers)"
         ) from None
     rows = (motion.skin & moves[motion.faces].all(1)).nonzero()[:, 0]
     on_skin = SurfaceIndex(vertices, motion.faces[rows]).nearest(pose.apply(points)[0])
