@@ -34,7 +34,7 @@ def annotated_pictures(path: Path, network: LandmarkNetwork) -> tuple[TensorData
     """
     rows = [_picture(image, landmarks, network) for image, landmarks in annotated_landmarks(path)]
     if len(rows) < 2:
-        raise ValueRangeError(f"data: found {len(rows)} annotated face in {path}, expected two at least")
+        raise ValueRangeError(f"--data: found {len(rows)} annotated face in {path}, expected two at least")
     kept = [i for i in range(len(rows)) if len(rows) < _LEAST_TESTED or i % TESTED != TESTED - 1]
     tested = [i for i in range(len(rows)) if len(rows) < _LEAST_TESTED or i not in kept]
     learned, test = ([torch.stack(part) for part in zip(*(rows[i] for i in of), strict=True)] for of in (kept, tested))

@@ -61,7 +61,7 @@ def train(settings: Settings, run: Run) -> Trained:
     progress = run.progress
     frames = load_annotated_frames(settings.data)
     if settings.folds < 0 or settings.folds == 1:
-        raise TorchfaceError(f"folds: found {settings.folds}, expected 0, or 2 and more")
+        raise TorchfaceError(f"--folds: found {settings.folds}, expected 0, or 2 and more")
     progress(f"{len(frames)} annotated frames")
     landmarks = torch.stack([frame.landmarks for frame in frames])
     folds = min(settings.folds, len(frames))

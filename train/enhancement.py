@@ -42,7 +42,7 @@ class Settings(RecipeSettings):
             neutral.* in the folder if absent.
         performer: Learn from the embedded performer with so many vertices instead.
         fps: Of the frames.
-        held_out: How many sequences, the last, are kept for the test.
+        held_out: How many sequences, the last, are kept for the test; two, or one of two, none of one if not said.
         wavelength: Of what counts as fine, millimetres: half of a wave of this length is detail.
         patch: Vertices a patch, in the mean of which frames are compared.
         regions: How many regions are looked for.
@@ -57,7 +57,7 @@ class Settings(RecipeSettings):
     performer: int = 0
     out: Path = Path("models/enhancement")
     fps: float = 30.0
-    held_out: int = 2
+    held_out: int | None = None
     wavelength: float = WAVELENGTH
     patch: int = 100
     regions: int = 13
@@ -71,12 +71,11 @@ def train(settings: Settings, run: Run) -> EnhancementModel:
     """Gathers, learns, tests, saves and draws."""
     progress = run.progress
     capture = _capture(settings)
-    learned = len(capture.sequences) - settings.held_out
-    if settings.held_out < 0 or learned < 1:
-        raise ValueRangeError(
-            f"held_out: found {settings.held_out} of {len(capture.sequences)} sequences, expected at least one to "
-            "learn from"
-        )
+    count = len(capture.sequences)
+    held_out = min(2, count - 1) if settings.held_out is None else settings.held_out
+    learned = count - held_out
+    if held_out < 0 or learned < 1:
+        raise ValueRangeError(f"--held-out: found {held_out} of {count} sequences, expected at least one to learn from")
     work = run.work
     pairs = _pairs(settings, capture)
 
@@ -88,7 +87,7 @@ def train(settings: Settings, run: Run) -> EnhancementModel:
     part = capture.part(0, learned)
     colors = gather(part, work / "learned_colors.safetensors", progress, colors=True)[0] if part.colored else None
     known, numbers = gathered("learned", 0, learned)
-    test = gathered("tested", learned, len(capture.sequences))[0] if settings.held_out else None
+    test = gathered("tested", learned, count)[0] if held_out else None
     progress(f"{len(known)} frames of {learned} sequences to learn from, {0 if test is None else len(test)} to test on")
     mesh = capture.neutral
     model = EnhancementModel.fit(

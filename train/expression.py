@@ -104,7 +104,9 @@ def fit(people: People, settings: Settings, progress: Progress | None = None) ->
 def gather(settings: Settings, work: Path, progress: Progress) -> People:
     """The people of a folder, or performers, kept in a folder; one is in memory at a time, or all if they are few."""
     if (settings.pairs is None) == (settings.performers == 0):
-        raise TorchfaceError("train.expression: expected either --pairs DIR or --performers COUNT")
+        raise TorchfaceError(
+            "found neither --pairs nor --performers, or both; expected one: --pairs DIR or --performers COUNT"
+        )
     if settings.pairs is None:
         identities = draw_identities(settings.performers, torch.Generator().manual_seed(settings.seed))
         return gather_people(

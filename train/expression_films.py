@@ -91,7 +91,7 @@ def scenes(settings: Settings) -> dict[str, Scene]:
     """What the settings ask for."""
     unknown = [name for name in settings.films if name not in FILMS]
     if unknown:
-        raise NameMismatchError(f"films: found {', '.join(unknown)}, expected some of {', '.join(FILMS)}")
+        raise NameMismatchError(f"--films: found {', '.join(unknown)}, expected some of {', '.join(FILMS)}")
     if not settings.small:
         return {name: FILMS[name] for name in settings.films or FILMS}
     return {name: replace(FILMS[name], length=2.0) for name in settings.films or SMALL}

@@ -73,8 +73,8 @@ def train(settings: Settings, run: Run) -> tuple[BoxNetwork, dict[str, float]]:
     progress = run.progress
     if not (0 < settings.held_out < settings.people and settings.tested > 0):
         raise ValueRangeError(
-            f"found held_out {settings.held_out} of {settings.people} people, tested {settings.tested}; expected some "
-            "people, not all, and 1 at least"
+            f"found --held-out {settings.held_out} of --people {settings.people}, --tested {settings.tested}; expected "
+            "some of the people, not all, and 1 at least"
         )
     files = picture_files(settings.folder, settings.people, settings.seed, settings.ict, settings.workers, progress)
     split = EACH * ((len(StoredPictures(files)) - settings.held_out) // EACH)  # whole people

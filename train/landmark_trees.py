@@ -76,7 +76,7 @@ def split(settings: Settings, progress: Progress | None = None) -> tuple[Faces, 
         progress(f"{path}: {len(real)} faces so far")
     learned, tested = held_out_people(real.people, settings.held_out) if settings.data else ([], [])
     if settings.data and not learned:
-        raise TorchfaceError(f"data: found {len(real)} faces, expected more than the {len(tested)} held out")
+        raise TorchfaceError(f"--data: found {len(real)} faces, expected more than the {len(tested)} held out")
     learn, test = real.some(learned), real.some(tested)
     if settings.performers:
         learn = learn + rendered_faces(settings.performers, settings.seed, settings.images, progress, settings.workers)

@@ -207,13 +207,14 @@ def _source(settings: Settings) -> tuple[Source, int]:
     count = len(source.names) - held_out
     if count < 2 or held_out < 0:
         raise TorchfaceError(
-            f"{settings.scans or 'performers'}: found {len(source.names)}, expected at least two to learn from besides "
-            f"the {held_out} held out"
+            f"{settings.scans or '--performers'}: found {len(source.names)}, expected at least two to learn from "
+            f"besides the {held_out} held out"
         )
     for name in ("components", "color_components"):
         asked = getattr(settings, name)
         if asked is not None and not 1 <= asked < count:
-            raise TorchfaceError(f"{name}: found {asked}, expected 1 to {count - 1} with {count} heads to learn from")
+            flag = f"--{name.replace('_', '-')}"
+            raise TorchfaceError(f"{flag}: found {asked}, expected 1 to {count - 1} with {count} heads to learn from")
     return source, held_out
 
 

@@ -188,8 +188,8 @@ def split(takes: PriorTakes, held_out: int | None) -> tuple[PriorTakes, PriorTak
     learn, test = held_out_people(takes.people, max(count // 3, 1) if held_out is None else held_out)
     if not learn or not test:
         raise ShapeError(
-            f"takes: found {count} of which {len(test)} are to be held out, expected at least one to learn from and "
-            "one to test on"
+            f"--held-out: found {len(test)} of {count} takes, with all others of the same people; expected at "
+            "least one take to learn from and one to test on"
         )
     return takes.some(learn), takes.some(test)
 

@@ -53,8 +53,8 @@ def train(settings: Settings, run: Run) -> dict[str, dict[str, float]]:
 def _check_one_source(settings: Settings) -> None:
     if (settings.takes is None) == (settings.performances <= 0):
         raise ValueRangeError(
-            f"found takes={settings.takes} and performances={settings.performances}; expected a folder of takes, or a "
-            "number of performances"
+            f"found --takes {settings.takes} and --performances {settings.performances}; expected a folder of "
+            "takes, or a number of performances"
         )
 
 

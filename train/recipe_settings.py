@@ -61,14 +61,16 @@ class RecipeSettings:
         try:
             device = torch.device(self.device)
         except RuntimeError:
-            raise ValueRangeError(f"device: found {self.device!r}, expected {able}, such as cuda:0") from None
+            raise ValueRangeError(f"--device: found {self.device!r}, expected {able}, such as cuda:0") from None
         if device.type not in self.devices:
-            raise ValueRangeError(f"device: found {self.device!r}, expected {able}: this recipe knows no other")
+            raise ValueRangeError(f"--device: found {self.device!r}, expected {able}: this recipe knows no other")
         if device.type == "cuda" and (device.index or 0) >= torch.cuda.device_count():
             there = ", ".join(f"cuda:{number}" for number in range(torch.cuda.device_count())) or "no CUDA device"
-            raise ValueRangeError(f"device: found {self.device!r}, but PyTorch sees {there} here; expected cpu")
+            raise ValueRangeError(f"--device: found {self.device!r}, but PyTorch sees {there} here; expected cpu")
         if device.type == "mps" and not torch.backends.mps.is_available():
-            raise ValueRangeError(f"device: found {self.device!r}, but PyTorch sees no such device here; expected cpu")
+            raise ValueRangeError(
+                f"--device: found {self.device!r}, but PyTorch sees no such device here; expected cpu"
+            )
         return device
 
 
@@ -97,7 +99,7 @@ class RenderedSettings(RecipeSettings):
         """Refuses fewer pictures than are held out and a ``part`` more."""
         if self.pictures < self.held_out + part:
             raise ValueRangeError(
-                f"pictures: found {self.pictures}, expected {self.held_out} to hold out and {part} more at least"
+                f"--pictures: found {self.pictures}, expected {self.held_out} to hold out and {part} more at least"
             )
 
     def rendered_data(self, of: str = "") -> str:

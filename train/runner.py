@@ -140,7 +140,7 @@ class Recipe(Generic[Settings, Trained]):
             if word == "--config" or word.startswith("--config="):
                 given = word.partition("=")[2] or "".join(flags[place + 1 : place + 2])
                 if not given or given.startswith("--"):
-                    raise ValueRangeError("config: found no file, expected --config FILE")
+                    raise ValueRangeError("--config: found no file, expected --config FILE")
                 default = read_settings(Path(given), self.settings)
                 del flags[place : place + (1 if "=" in word else 2)]
                 break

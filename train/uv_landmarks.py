@@ -151,8 +151,8 @@ def _split(settings: Settings, progress: Progress) -> tuple[list[AnnotatedScan],
     given = settings.scans is not None and settings.annotations is not None
     if given == (settings.performers > 0):
         raise TorchfaceError(
-            f"found scans={settings.scans}, annotations={settings.annotations}, performers={settings.performers}; "
-            "expected scans with their annotations, or a number of performers"
+            f"found --scans {settings.scans}, --annotations {settings.annotations}, --performers "
+            f"{settings.performers}; expected scans with their annotations, or a number of performers"
         )
     if settings.scans is None or settings.annotations is None:
         more = _TESTED_PERFORMERS if settings.held_out is None else settings.held_out

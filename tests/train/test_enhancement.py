@@ -5,6 +5,7 @@ from __future__ import annotations
 import zipfile
 from dataclasses import replace
 from pathlib import Path
+from shutil import rmtree
 
 import numpy as np
 import pytest
@@ -149,6 +150,24 @@ def test_weights_of_one_rig_are_learned_with_its_animations(folder, monkeypatch)
     assert train(settings(folder, coarse=coarse)).weight_names == ()  # not all of one rig
 
 
+@pytest.mark.parametrize(("kept", "learned"), [("ab", [1, 1]), ("abcd", [2, 2]), ("a", [1])])
+def test_of_two_sequences_one_is_held_out_and_of_one_none(folder, monkeypatch, kept, learned):
+    for path in [path for name in set("abcd") - set(kept) for path in folder.glob(f"{name}*")]:
+        rmtree(path) if path.is_dir() else path.unlink()
+    seen = []
+
+    def gathered(capture, *_, **__):
+        seen.append(len(capture.sequences))
+        if len(seen) == len(learned):
+            raise InterruptedError
+        return None, None
+
+    monkeypatch.setattr(f"{train.__module__}.gather", gathered)
+    with pytest.raises(InterruptedError):
+        train(replace(settings(folder), held_out=None))
+    assert seen == learned
+
+
 def test_broken_captures_are_told(folder):
     def fails(error: type[TorchfaceError], words: str) -> None:
         with pytest.raises(error, match=words):
@@ -156,7 +175,7 @@ def test_broken_captures_are_told(folder):
 
     with pytest.raises(TorchfaceError, match="expected one: --frames or --performer"):
         train(Settings())
-    with pytest.raises(ValueRangeError, match="found 9 of 4 sequences"):
+    with pytest.raises(ValueRangeError, match="--held-out: found 9 of 4 sequences"):
         train(replace(settings(folder), held_out=9))
     with pytest.raises(FileFormatError, match="found no such folder"):
         train(settings(folder / "none"))

@@ -94,7 +94,7 @@ def test_more_components_than_people_are_cut(pairs: Path, tmp_path: Path) -> Non
 
 
 def test_people_who_do_not_fit_are_named(pairs: Path, dome_rig: BlendshapeRig, tmp_path: Path) -> None:
-    with pytest.raises(TorchfaceError, match="either --pairs DIR or --performers"):
+    with pytest.raises(TorchfaceError, match="expected one: --pairs DIR or --performers"):
         train(Settings())
     with pytest.raises(TorchfaceError, match="found 0 people, expected at least three"):
         train(Settings(pairs=tmp_path, out=tmp_path.parent / "own"))

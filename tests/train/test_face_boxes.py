@@ -65,5 +65,5 @@ def test_mistakes_are_cut_out_of_pictures_without_people() -> None:
 
 
 def test_settings_that_cannot_be_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(TorchfaceError, match="found held_out 4 of 4"):
+    with pytest.raises(TorchfaceError, match="found --held-out 4 of --people 4"):
         train(Settings(out=tmp_path / "boxes", people=4, held_out=4))
