@@ -262,7 +262,7 @@ def _pose_by_shape(template: Mesh, samples: Samples, scan: ScanPoints, exposed: 
         ids = exposed[notes.regions["face"].cpu()[exposed]]
         vertices = template.vertices.detach().cpu().double()
         face = Samples.of(vertices, template.faces.cpu(), evenly_spread(vertices, ids, _RIGID_SAMPLES))
-    best, pose, refused = 0.0, None, AlignmentError("")
+    best, pose, refused = -1.0, None, AlignmentError("")
     for size, some in product(_SIZES, (samples,) if face is samples else (samples, face)):
         try:
             found = find_pose(some, scan, size).pose

@@ -70,7 +70,7 @@ def retarget_weights(
         )
     target = load_rig(to, part=part)
     check_live_link(target.names, files.live_link)
-    faults += [f"{to}: {fault}; weights have no unit" for fault in size_faults(target.neutral)]
+    faults += [f"{to}: {fault}, which changes no weight" for fault in size_faults(target.neutral)]
     rig = None
     if source is not None:
         rig = load_rig(source)
