@@ -39,6 +39,7 @@ def test_no_face_darkness_and_which_of_several_faces_are_said() -> None:
         watch.look(bright, solved, now)
         if watch._looking is not None:
             watch._looking.join(5)
+        watch.look(bright, solved, now)  # with what was found
         return watch.words
 
     watch = FaceWatch(find)
@@ -48,8 +49,8 @@ def test_no_face_darkness_and_which_of_several_faces_are_said() -> None:
     assert watch.words == "No face yet: sit before the camera and look into it"
     watch.look(dark, nobody, 0.1)
     assert watch.words.startswith("Too dark")
-    assert look(left, 0.2) == look(left, 0.6) == "Your face is followed"
-    assert look(left, 0.7) == "Two people: following the right one"  # as in a mirror
+    assert look(left, 0.2) == "Your face is followed"
+    assert look(left, 0.6) == "Two people: following the right one"  # as in a mirror
     watch.mirrored = False
     assert look(left, 0.7) == "Two people: following the left one"
     assert counted == [(3, 48, 64)] * 2  # not at every frame
@@ -59,7 +60,7 @@ def test_no_face_darkness_and_which_of_several_faces_are_said() -> None:
     assert look(left, 4.4) == look(left, 4.8) == "Two people: following the left one"
     assert look(nobody, 5.0) == "Your face is hidden: the last expression is held, then relaxes"
     boxes.pop()  # and the other is gone: said soon after this one is seen again
-    assert [look(left, 5.0 + 0.4 * i) for i in (1, 2, 3)][-1] == "Your face is followed"
+    assert [look(left, 5.0 + 0.4 * i) for i in (1, 2)][-1] == "Your face is followed"
 
 
 def test_latency_is_told_within_a_hundredth() -> None:
