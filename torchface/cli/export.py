@@ -66,13 +66,7 @@ def hybrid_solver(
 
 
 def _write_solver(
-    hybrid: bool,
-    rig: Path,
-    attachment: Path,
-    out: Path,
-    method: Method,
-    part: str | None,
-    quiet: bool,
+    hybrid: bool, rig: Path, attachment: Path, out: Path, method: Method, part: str | None, quiet: bool
 ) -> None:
     from torchface.attachment import Attachment
     from torchface.capture import MarkerSolver

@@ -68,12 +68,7 @@ def box_qp(
 
 @data_dependent(_EXPORTED)
 def _box_qp(
-    H: Tensor,
-    f: Tensor,
-    lower: float | Tensor,
-    upper: float | Tensor,
-    start: Tensor | None,
-    tolerance: float | None,
+    H: Tensor, f: Tensor, lower: float | Tensor, upper: float | Tensor, start: Tensor | None, tolerance: float | None
 ) -> Tensor:
     prepared = PreparedProgram.of(H, lower, upper)
     return _minimiser(H, prepared, f, start, checked_tolerance(tolerance, H.dtype))
@@ -105,11 +100,7 @@ class BoxQP(nn.Module):
     upper: Tensor
 
     def __init__(
-        self,
-        H: Tensor,
-        lower: float | Tensor = 0.0,
-        upper: float | Tensor = 1.0,
-        tolerance: float | None = None,
+        self, H: Tensor, lower: float | Tensor = 0.0, upper: float | Tensor = 1.0, tolerance: float | None = None
     ) -> None:
         super().__init__()
         H = as_tensor("H", H, "(N,N) or (B,N,N)")

@@ -159,12 +159,7 @@ class ProjectedGradient(nn.Module):
         return kept
 
     def _steps(
-        self,
-        H: Tensor,
-        f: Tensor,
-        start: Tensor | None,
-        eigenvalue: Tensor,
-        box: tuple[Tensor, Tensor],
+        self, H: Tensor, f: Tensor, start: Tensor | None, eigenvalue: Tensor, box: tuple[Tensor, Tensor]
     ) -> Tensor:
         lower, upper = box
         spread = metric(H)

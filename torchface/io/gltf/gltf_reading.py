@@ -18,14 +18,7 @@ from torchface.geometry.meshes.uv_seams import merge_equal_rows
 from torchface.io.gltf.corrective_extras import rig_of_targets, scene_correctives
 from torchface.io.gltf.gltf_document import Document, read_document
 from torchface.io.gltf.mesh_extras import read_annotations, read_mesh_count, read_order, read_polygons
-from torchface.io.gltf.primitive_reading import (
-    BYTES_A_CORNER,
-    BYTES_A_VERTEX,
-    MaterialLook,
-    Part,
-    filled,
-    read_part,
-)
+from torchface.io.gltf.primitive_reading import BYTES_A_CORNER, BYTES_A_VERTEX, MaterialLook, Part, filled, read_part
 from torchface.io.gltf.scene import Instance, instances
 from torchface.io.images.image_files import decode_image
 from torchface.io.images.texture_atlas import Look, with_used_looks

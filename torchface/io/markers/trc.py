@@ -12,14 +12,7 @@ import numpy as np
 from torchface.errors import FileFormatError, ValueRangeError
 from torchface.files.whole_files import read_file, write_file
 from torchface.io.markers.marker_checks import marker_take, millimetres, unique_labels
-from torchface.io.tables.csv_table import (
-    MAX_TABLE_BYTES,
-    TextLines,
-    number_texts,
-    parse_number,
-    parse_numbers,
-    quoted,
-)
+from torchface.io.tables.csv_table import MAX_TABLE_BYTES, TextLines, number_texts, parse_number, parse_numbers, quoted
 from torchface.io.tables.frame_rates import TimeSource, file_error, frame_numbers, frame_times, numbering_extras
 from torchface.io.tables.track_checks import values_to_write
 from torchface.number_checks import check_rate

@@ -106,11 +106,7 @@ def misfit(poses: Similarity, points: Tensor, normals: Tensor, surface: SurfaceS
 
 
 def refine(
-    poses: Similarity,
-    points: Tensor,
-    normals: Tensor,
-    surface: SurfaceSample,
-    reaches: tuple[float, ...],
+    poses: Similarity, points: Tensor, normals: Tensor, surface: SurfaceSample, reaches: tuple[float, ...]
 ) -> Similarity:
     r"""Similarity ICP, point to plane, for a batch of poses.
 
@@ -140,12 +136,7 @@ def refine(
 
 
 def find_pose(
-    points: Tensor,
-    normals: Tensor,
-    nose: Tensor,
-    direction: Tensor,
-    surface: SurfaceSample,
-    found: NoseCandidates,
+    points: Tensor, normals: Tensor, nose: Tensor, direction: Tensor, surface: SurfaceSample, found: NoseCandidates
 ) -> tuple[Similarity, float]:
     """The pose of points (N,3) with normals (N,3) in a scan, and its misfit in millimetres.
 

@@ -32,14 +32,8 @@ _BOTH_JAWS, _ARCH = 0.15, 30.0
 _JAW = "jaw"
 _ROW, _OFF_THE_LIPS, _RISES = 4, 10.0, (0.0, 0.1, _BITE, 0.3)  # least teeth of a row; millimetres from the lips' line
 _TONGUE, _FILLED = 15.0, 0.2  # millimetres at least: teeth are smaller; and the share near the middle
-_BACK, _BEHIND_TEETH, _TEETH, _LEAST_BACK, _FALLS = (
-    (0.3, 0.55),
-    12.0,
-    8.0,
-    8,
-    4.0,
-)  # of half the arch's width; millimetres
-_COVERED = 0.3  # of what is taken for a tongue: what lies under other parts
+_BACK, _BEHIND_TEETH, _TEETH, _LEAST_BACK, _FALLS = (0.3, 0.55), 12.0, 8.0, 8, 4.0  # of half the arch; millimetres
+_COVERED = 0.3  # the share of a tongue's back that may lie under other parts
 _STANDS, _GUM = 1.0, (3.0, 6.0)  # millimetres from teeth: a part they stand in; gums at most, tongue at least
 _TONGUE_OUT, _TONGUE_DOWN = 12.0, 8.0
 _OPEN, _TONGUE_RISE, _TONGUE_DROP = 0.33, 2.0, 15.0  # of jawOpen; millimetres over the lower teeth, and at the tip

@@ -11,14 +11,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from torchface.capture.anybody import (
-    AllAtOnce,
-    ExampleShapes,
-    ExampleSolver,
-    LandmarkModel,
-    Regional,
-    SolvedSimilarity,
-)
+from torchface.capture.anybody import AllAtOnce, ExampleShapes, ExampleSolver, LandmarkModel, Regional, SolvedSimilarity
 from torchface.errors import NameMismatchError, ValueRangeError
 from torchface.files.whole_files import all_or_none
 from torchface.geometry.similarity import similarity_transform

@@ -9,12 +9,7 @@ import torch
 
 from torchface import zoo
 from torchface.capture import ActionUnitClassifier
-from torchface.capture.action_units import (
-    ActionUnitCurves,
-    CurveSettings,
-    action_unit_curves,
-    load_shape_table,
-)
+from torchface.capture.action_units import ActionUnitCurves, CurveSettings, action_unit_curves, load_shape_table
 from torchface.capture.action_units.shape_table import built_in_tables
 from torchface.capture.markers import gamma_curves
 from torchface.capture.markers.hybrid_solver import GAMMA
