@@ -119,7 +119,10 @@ def _capture(settings: Settings) -> Capture:
     if (settings.frames is None) == (settings.performer == 0):
         raise TorchfaceError("found neither frames nor a performer, or both; expected one: --frames or --performer")
     if settings.frames is None:
-        return performed(settings.performer, settings.seed, settings.fps)
+        try:
+            return performed(settings.performer, settings.seed, settings.fps)
+        except ValueRangeError as error:
+            raise ValueRangeError(f"--performer: {error}") from None
     return read_capture(settings.frames, settings.neutral)
 
 

@@ -175,6 +175,8 @@ def test_broken_captures_are_told(folder):
 
     with pytest.raises(TorchfaceError, match="expected one: --frames or --performer"):
         train(Settings())
+    with pytest.raises(ValueRangeError, match="--performer: vertices: found 300"):
+        train(Settings(performer=300))
     with pytest.raises(ValueRangeError, match="--held-out: found 9 of 4 sequences"):
         train(replace(settings(folder), held_out=9))
     with pytest.raises(FileFormatError, match="found no such folder"):
