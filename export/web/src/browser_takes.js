@@ -18,6 +18,7 @@ export class BrowserTakes {
   /** @param {() => void} changed called when the list is another one. */
   constructor(changed) {
     this.#changed = changed;
+    addEventListener("beforeunload", (event) => this.#take && event.preventDefault()); // the browser asks before a take is lost
   }
 
   /** How long the take that runs is; null while none does. */
@@ -35,7 +36,7 @@ export class BrowserTakes {
   async stop() {
     const take = this.#take, filmed = this.#film?.();
     this.#take = this.#film = null;
-    if (!take?.frames.length) return;
+    if (!take?.frames.length) throw new Error("Nothing was recorded: no picture came before the take was ended.");
     const film = await filmed, name = new Date().toLocaleString([], { dateStyle: "short", timeStyle: "medium" });
     try {
       await this.keep(name, take, film);

@@ -16,7 +16,7 @@ export class CameraEngine {
   #stream = null;
   #pump = null;
   #reset = false;
-  #parts = 0;
+  #told = "";
 
   /**
    * @param {object} page `{controls(), show(solved), running(on), status(words), problem(words), takesChanged()}`.
@@ -51,7 +51,7 @@ export class CameraEngine {
       loaded.catch(() => {}); // said once the camera is there
       this.takes.stream = this.#stream = await openCamera(this.#video, () => this.stop("The camera was unplugged, or may no longer be used."));
       this.#page.running(true);
-      this.#tell(this.#parts);
+      this.#tell();
       await loaded;
       if (this.#stream !== null) this.#run(); // else it was taken away meanwhile
     } catch (error) {
@@ -86,14 +86,14 @@ export class CameraEngine {
     });
   }
 
-  #tell(parts) {
-    this.#parts = parts;
-    if (this.running) this.#page.status(`Loading the face reader: ${parts} of ${PARTS}…`);
+  #tell(parts = 0, bytes = 0) {
+    if (parts || bytes || !this.#told) this.#told = `Loading the face reader: ${(bytes / 1e6).toFixed(1)} MB are here, ${parts} of ${PARTS} steps are done…`;
+    if (this.running) this.#page.status(this.#told);
   }
 
   /** The solver, which is loaded once; after a failure once more. */
   async #loaded() {
-    this.#loading ??= (this.#solver = new Solver((parts) => this.#tell(parts))).load("./webcam.ort");
+    this.#loading ??= (this.#solver = new Solver((...here) => this.#tell(...here))).load("./webcam.ort");
     try {
       await this.#loading;
     } catch (error) {
@@ -105,6 +105,6 @@ export class CameraEngine {
   #forget() {
     this.#solver?.close();
     this.#solver = this.#loading = null;
-    this.#parts = 0;
+    this.#told = "";
   }
 }

@@ -9,17 +9,19 @@ export const PARTS = 4;
 const BLANK = 128; // pixels a side of the first picture
 const POSE = 0, GAIN = 1, SMOOTHING = 2, RESET = 3;
 
-async function fetched(graph) {
+async function fetched(graph, tell) {
   const answer = await fetch(graph);
   if (!answer.ok) throw new Error(`${new URL(graph).pathname} was not found (status ${answer.status})`);
-  return new Uint8Array(await answer.arrayBuffer());
+  let bytes = 0;
+  const counted = new TransformStream({ transform: (part, to) => (tell((bytes += part.length)), to.enqueue(part)) });
+  return new Uint8Array(await new Response(answer.body.pipeThrough(counted)).arrayBuffer());
 }
 
 /**
  * Answers the page's messages.
  *
  * - `{load: {graph, mjs, wasm, threads}}` with addresses, is answered by `{ready: {engine, threads}}`, and before by
- *   `{loaded: parts}` for each of `PARTS`;
+ *   `{loaded: parts, bytes}` for each of `PARTS` and while the graph comes, of which so many bytes are here;
  * - `{frame: {number, time, picture, pose, gain, smoothing, reset}}`, a picture of any size that is given away, its time
  *   in milliseconds, by `{solved: {number, time, interval, ..., milliseconds, width, height}}`;
  * - `{follow: pictures}`, a stream of a camera's pictures, by such answers to them, and by `{left: true}` when it ends;
@@ -44,9 +46,10 @@ export function answerFrames(ort, engine) {
       executionMode: "parallel", // else the making of the session looks for memory to be used again, in a time that grows with the square
       logSeverityLevel: 3, // errors alone
     };
-    let parts = 0;
-    const done = (value) => (self.postMessage({ loaded: ++parts }), value);
-    const [content] = await Promise.all([fetched(graph).then(done), ort.InferenceSession.create(IDENTITY, options).then(done)]);
+    let parts = 0, bytes = 0;
+    const tell = () => self.postMessage({ loaded: parts, bytes });
+    const done = (value) => (parts++, tell(), value);
+    const [content] = await Promise.all([fetched(graph, (here) => ((bytes = here), tell())).then(done), ort.InferenceSession.create(IDENTITY, options).then(done)]);
     session = done(await ort.InferenceSession.create(content, options));
     const size = session.inputMetadata.find((input) => input.name === "state").shape[0];
     state = new ort.Tensor("float32", new Float32Array(size), [size]);

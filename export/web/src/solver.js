@@ -16,7 +16,7 @@ export class Solver {
   #loaded;
   facts = null;
 
-  /** @param {(parts: number) => void} loaded called when parts of the engine are there. */
+  /** @param {(parts: number, bytes: number) => void} loaded called when parts of the engine, or bytes of its graph, are there. */
   constructor(loaded) {
     this.#loaded = loaded;
     this.#worker.onmessage = ({ data }) => this.#settle(data);
@@ -68,7 +68,7 @@ export class Solver {
   }
 
   #settle(answer) {
-    if ("loaded" in answer) return this.#loaded(answer.loaded);
+    if ("loaded" in answer) return this.#loaded(answer.loaded, answer.bytes);
     if (answer.solved?.number === 0) return this.#show(answer.solved);
     const waiting = this.#waiting.shift(); // answers come in the order of what was asked
     if ("failed" in answer) waiting?.reject(new Error(answer.failed));

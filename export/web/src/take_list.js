@@ -123,7 +123,7 @@ export class TakeList {
     if (open) return open.remove();
     const take = await this.#takes.take(id), part = Object.assign(document.createElement("div"), { className: "trimming" });
     const [from, to] = [["from", 0], ["to", take.duration]].map(([word, value]) => {
-      const input = Object.assign(document.createElement("input"), { type: "range", min: 0, max: take.duration, step: 0.01, value });
+      const input = Object.assign(document.createElement("input"), { type: "range", min: 0, max: take.duration, step: "any", value });
       const label = document.createElement("label"), time = document.createElement("output");
       const tell = () => (time.value = `${Number(input.value).toFixed(2)} s`);
       label.append(`${word} `, time, input);
@@ -137,7 +137,7 @@ export class TakeList {
     });
     const keep = Object.assign(document.createElement("button"), { type: "button", textContent: "Keep this part" });
     keep.addEventListener("click", () => this.#tried(async () => {
-      const kept = take.part(Number(from.value), Number(to.value));
+      const kept = take.part(Number(from.value), Number(to.value) + 1e-6); // a slider keeps fewer digits than a frame's time
       if (kept.frames.length === 0) throw new Error("No frame lies between these two times.");
       this.#playing?.stop();
       await this.#takes.keep(`${name}, part`, kept);

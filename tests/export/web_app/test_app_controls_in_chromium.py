@@ -227,6 +227,14 @@ def test_takes_are_trimmed_taken_from_a_file_and_deleted(opened: Open, recorded:
     driver.execute_script(press, "#takes .trim")
     slide = "const e = document.querySelectorAll('.trimming input'); e[0].value = 0.2; e[1].value = 0.55; "
     until(lambda: driver.execute_script("return document.querySelector('.trimming') !== null"))
+    driver.execute_script(press, ".trimming button")
+    until(lambda: len(driver.execute_script(names)) == count + 1)
+    facts = driver.execute_script("return [...document.querySelectorAll('#takes li > span')].map(e => e.innerText)")
+    assert facts[0] == facts[1]  # all of it: the last frame too, though its time is no hundredth
+    driver.execute_script(press, "#takes .delete")
+    until(lambda: len(driver.execute_script(names)) == count)
+    driver.execute_script(press, "#takes .trim")
+    until(lambda: driver.execute_script("return document.querySelector('.trimming') !== null"))
     driver.execute_script(slide + "for (const one of e) one.dispatchEvent(new Event('input'))")
     driver.execute_script(press, ".trimming button")
     until(lambda: len(driver.execute_script(names)) == count + 1)
@@ -252,6 +260,25 @@ def test_takes_are_trimmed_taken_from_a_file_and_deleted(opened: Open, recorded:
         driver.execute_script(press, "#takes .delete")
         until(lambda left=left: len(driver.execute_script(names)) == left)
     assert page.problem == ""  # what went wrong is no longer said after what went well
+
+
+def test_an_empty_take_is_said_and_a_running_one_is_not_left_unasked(opened: Open, recorded: Recorded) -> None:
+    page, driver = opened.page, opened.page.driver
+    leave = "const e = new Event('beforeunload', { cancelable: true }); dispatchEvent(e); "
+    page.start()
+    press = "document.getElementById('record').click(); "
+    # Begun and ended before a picture can come.
+    assert driver.execute_script(f"{press}{leave}{press}return e.defaultPrevented")
+    assert "Nothing was recorded" in until(lambda: page.problem, 20)
+    assert not driver.execute_script(f"{leave}return e.defaultPrevented")
+    driver.execute_script("document.querySelector('#problem button').click()")
+
+
+def test_what_is_loaded_is_told_in_bytes(opened: Open, app: Path) -> None:
+    opened.page.start()
+    told = watched(opened.page, "watched.loaded")
+    assert max(one["bytes"] for one in told) == (app / "webcam.ort").stat().st_size
+    assert told[-1]["loaded"] == 3  # and then it is ready
 
 
 @pytest.mark.real

@@ -1,7 +1,7 @@
 // Runs in the page before its own scripts: keeps what goes to the worker and what comes back, what is downloaded, and what
 // the page says of itself. While `held` is a list, pictures for the worker wait there.
 delete window.MediaStreamTrackProcessor; // so pictures pass through the page, where they can be kept and held
-window.watched = { sent: [], solved: [], workers: [], blobs: [], said: [], held: null };
+window.watched = { sent: [], solved: [], loaded: [], workers: [], blobs: [], said: [], held: null };
 {
   const post = Worker.prototype.postMessage, made = URL.createObjectURL, Original = window.Worker;
   window.Worker = class extends Original {
@@ -9,6 +9,7 @@ window.watched = { sent: [], solved: [], workers: [], blobs: [], said: [], held:
       super(address, options);
       watched.workers.push(String(address));
       this.addEventListener("message", ({ data }) => data.solved && watched.solved.push(data.solved));
+      this.addEventListener("message", ({ data }) => "loaded" in data && watched.loaded.push(data));
     }
   };
   Worker.prototype.postMessage = function (message, given) {

@@ -77,10 +77,15 @@ class Preparing:
         self.wishes: dict[str, Any] = {}
         self.takes: list[tuple[str, np.ndarray]] = []
         self._progress, self._words = progress, ""
+        self._step, self._began = "", 0.0
 
     def __call__(self, step: str, done: int = 0, total: int = 0) -> None:
         """Says a step, as ``Progress`` does."""
-        self._words = f"{step[:1].upper()}{step[1:]}" + (f": {done} of {total} parts are ready." if total else "…")
+        if step != self._step:
+            self._step, self._began = step, time.monotonic()
+        waited = int(time.monotonic() - self._began)
+        told = f": {done} of {total} parts are ready" + (f" after {waited} s." if waited else ".") if total else "…"
+        self._words = f"{step[:1].upper()}{step[1:]}{told}"
         self._progress(step, done, total)
 
     def next_view(self, before: LiveView | None, seconds: float) -> None:
