@@ -272,6 +272,7 @@ def test_an_empty_take_is_said_and_a_running_one_is_not_left_unasked(opened: Ope
     assert "Nothing was recorded" in until(lambda: page.problem, 20)
     assert not driver.execute_script(f"{leave}return e.defaultPrevented")
     driver.execute_script("document.querySelector('#problem button').click()")
+    page.stop()
 
 
 def test_what_is_loaded_is_told_in_bytes(opened: Open, app: Path) -> None:
@@ -279,6 +280,7 @@ def test_what_is_loaded_is_told_in_bytes(opened: Open, app: Path) -> None:
     told = watched(opened.page, "watched.loaded")
     assert max(one["bytes"] for one in told) == (app / "webcam.ort").stat().st_size
     assert told[-1]["loaded"] == 3  # and then it is ready
+    opened.page.stop()
 
 
 @pytest.mark.real
