@@ -297,7 +297,7 @@ def test_a_real_registration_lies_at_its_landmarks(real: RealScan) -> None:
     "size", [0.07, pytest.param(0.1, marks=pytest.mark.bench)]
 )  # millimetres of its unit: a small child's head, and a very large one
 def test_a_head_of_another_size_and_shape_is_found_without_landmarks(data: Path, size: float) -> None:
-    """Whose face fits best is taken: at one size of the template alone, one of these is laid on upside down."""
+    """Whose face fits best is taken: with one size of the template alone, both were found upside down."""
     head = load_rig(data / "characters" / "facecap.glb").neutral
     scan = Mesh(head.vertices * size, head.faces)
     found = register(neutral_head(texture=False), scan, schedule=Schedule(DEFAULT_SCHEDULE.stages[:1]), texture_size=0)

@@ -16,7 +16,7 @@ export class CameraEngine {
   #stream = null;
   #pump = null;
   #reset = false;
-  #told = "";
+  #loadingWords = "";
 
   /**
    * @param {object} page `{controls(), show(solved), running(on), status(words), problem(words), takesChanged()}`.
@@ -87,8 +87,8 @@ export class CameraEngine {
   }
 
   #tell(parts = 0, bytes = 0) {
-    if (parts || bytes || !this.#told) this.#told = `Loading the face reader: ${(bytes / 1e6).toFixed(1)} MB are here, ${parts} of ${PARTS} steps are done…`;
-    if (this.running) this.#page.status(this.#told);
+    if (parts || bytes || !this.#loadingWords) this.#loadingWords = `Loading the face reader: ${(bytes / 1e6).toFixed(1)} MB are here, ${parts} of ${PARTS} steps are done…`;
+    if (this.running) this.#page.status(this.#loadingWords);
   }
 
   /** The solver, which is loaded once; after a failure once more. */
@@ -105,6 +105,6 @@ export class CameraEngine {
   #forget() {
     this.#solver?.close();
     this.#solver = this.#loading = null;
-    this.#told = "";
+    this.#loadingWords = "";
   }
 }

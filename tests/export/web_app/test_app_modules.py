@@ -126,7 +126,7 @@ def test_a_calibration_waits_until_the_face_rests_and_stands_while_none_is_seen(
     assert "Your face moves: let it rest." in {one["remark"] for one in told[: len(frames)]}
 
 
-def test_a_face_that_never_rests_is_told_so_and_nothing_is_learned_from_it(run: Run) -> None:
+def test_a_face_that_never_rests_is_asked_to_and_nothing_is_learned_from_it(run: Run) -> None:
     talking = [(0.2, {"jawOpen": 0.8 * (i % 2)}) for i in range(100)]
     told = run("calibration", performed(*talking, (0.1, {}), *((1.6, shown) for shown in POSES)))
     begun = next(i for i, one in enumerate(told["told"]) if one["step"] == "next")

@@ -267,7 +267,7 @@ def _tongue_of_gums(
     """How much each vertex (J,) is of a tongue in one piece with gums: harmonic from its back to the arch around it.
 
     What is near teeth that are parts of their own is of the arch, and so is what lies under others of the ``jaw`` (J,):
-    of a bag, its floor.
+    of a bag, its bottom.
     """
     none = torch.zeros(len(vertices), dtype=torch.float64)
     ids = rows.nonzero()[:, 0]
@@ -285,7 +285,7 @@ def _tongue_of_gums(
     if int(back.sum()) < _LEAST_BACK or not bool(upper_side.any()):
         return none
     lower, deeper = (float(one[upper_side].median()) for one in (points[:, 1], below))
-    if float(points[back, 1].quantile(0.9)) < lower and float(below[back].quantile(0.1)) > deeper:  # the mouth's floor
+    if float(points[back, 1].quantile(0.9)) < lower and float(below[back].quantile(0.1)) > deeper:  # the mouth's bottom
         return none
     back &= (points[:, 1] > lower - _FALLS) | (below < deeper + _FALLS)
     if teeth:
@@ -295,7 +295,7 @@ def _tongue_of_gums(
     up = torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64).expand_as(points)
     others = faces[(jaw & ~rows)[faces].all(1)]
     if len(others) and float(RayCaster(vertices, others).occluded(points, up)[back].double().mean()) > _COVERED:
-        return none  # a bag's floor
+        return none  # a bag's bottom
     under = RayCaster(points, own[low[own].all(1)]).occluded(points + 0.1 * up, up) & low & (facing[:, 1] > 0.5)
     arch |= under  # what a tongue lies on
     back &= ~under

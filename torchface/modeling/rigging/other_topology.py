@@ -140,9 +140,8 @@ class CarriedShapes:
         joined = joined_vertices(rest, self.rig.neutral.faces.cpu())
         away = joined.vertices - lips.mean(0)
         inside = (away[:, 2] < 0) & (away.norm(dim=-1) < _MOUTH[0]) & (away[:, 1].abs() < _MOUTH[1])
-        faces = (
-            joined.faces[inside[joined.faces].all(1)].sort(1).values.unique(dim=0)
-        )  # a face of two sides counts once
+        # A face of two sides counts once.
+        faces = joined.faces[inside[joined.faces].all(1)].sort(1).values.unique(dim=0)
         faces = faces[(faces[:, :2] != faces[:, 1:]).all(1)]
         pairs = torch.cat([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [0, 2]]])
         ends, count = pairs.unique(dim=0, return_counts=True)

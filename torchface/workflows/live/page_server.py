@@ -84,8 +84,8 @@ class Preparing:
         if step != self._step:
             self._step, self._began = step, time.monotonic()
         waited = int(time.monotonic() - self._began)
-        told = f": {done} of {total} parts are ready" + (f" after {waited} s." if waited else ".") if total else "…"
-        self._words = f"{step[:1].upper()}{step[1:]}{told}"
+        ready = f": {done} of {total} parts are ready" + (f" after {waited} s." if waited else ".") if total else "…"
+        self._words = f"{step[:1].upper()}{step[1:]}{ready}"
         self._progress(step, done, total)
 
     def next_view(self, before: LiveView | None, seconds: float) -> None:
