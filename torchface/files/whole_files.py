@@ -64,16 +64,6 @@ def write_file(path: str | Path, data: bytes) -> None:
             rest = rest[os.write(handle, rest) :]
 
 
-def write_beside(path: Path, other: Path, data: bytes) -> None:
-    """Writes a file that belongs to ``path`` and that the user did not name, and so replaces only one of before."""
-    if other.is_file() and not path.exists() and read_file(other) != data:
-        raise FileFormatError(
-            f"{other}: found a file where {path.name} keeps a part of its own, expected none; "
-            f"another name in place of {path.name} keeps both"
-        )
-    write_file(other, data)
-
-
 @contextmanager
 def replaced_file(path: str | Path) -> Iterator[Path]:
     """A temporary file, empty, for a writer that needs a path; it takes the place of ``path`` at the end of the block.

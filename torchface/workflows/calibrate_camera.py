@@ -14,7 +14,8 @@ from torch import Tensor
 
 from torchface.color_space import grey_images
 from torchface.errors import AlignmentError, FileFormatError, ShapeError, ValueRangeError
-from torchface.files.whole_files import check_ending, check_writable, make_folder, write_beside
+from torchface.files.files_beside import check_beside, write_beside
+from torchface.files.whole_files import check_ending, check_writable, make_folder
 from torchface.geometry.cameras.calibration import CameraCalibration, PlacedCamera
 from torchface.io.camera_files import save_calibration, save_cameras
 from torchface.io.images.image_files import encode_png, load_image
@@ -106,6 +107,8 @@ def calibrate(paths: Sequence[Path], board: Board, out: Path, progress: Progress
     progress = progress or silent
     check_ending(out, ".toml")
     check_writable(out)
+    overlay_path = out.with_suffix(".png")
+    check_beside(out, overlay_path)
     if not paths:
         raise FileFormatError("calibrate: found no image, expected some of a checkerboard, or a video")
     views, left_out = find_boards(_images(paths), board, progress)
@@ -113,9 +116,8 @@ def calibrate(paths: Sequence[Path], board: Board, out: Path, progress: Progress
     report = calibrate_views(views, board, left_out)
     progress("writing the calibration and the overlay")
     make_folder(out.parent)
-    overlay_path = out.with_suffix(".png")
     corners = overlay([view for view in views if view.name in report.used], report.calibration, board)
-    write_beside(out, overlay_path, encode_png(corners))
+    write_beside(out, {overlay_path.name: encode_png(corners)})
     save_calibration(report.calibration, out)
     return replace(report, overlay_path=overlay_path)
 

@@ -10,6 +10,7 @@ import trimesh
 from hypothesis import given, settings
 from mutation import check_reader
 from rig_samples import quad_sheet, rigs
+from torch import Tensor
 
 from torchface.errors import FileFormatError, TopologyError, TorchfaceError
 from torchface.io import load_mesh, save_image, save_mesh
@@ -52,16 +53,42 @@ def test_the_texture_goes_beside_the_file_and_comes_back(tmp_path: Path) -> None
 
 
 @pytest.mark.parametrize("scene", ["sheet.obj", "sheet.usdc"])
-def test_a_picture_of_the_users_beside_the_file_is_kept(scene: str, tmp_path: Path) -> None:
+def test_a_picture_of_the_users_beside_the_file_is_kept_each_time(scene: str, tmp_path: Path) -> None:
     mesh, picture = quad_sheet(), tmp_path / "sheet.png"
+    darker = replace(mesh, texture=mesh.texture / 2)
+
+    def shown() -> Tensor:
+        texture = load_mesh(tmp_path / scene).texture
+        assert texture is not None
+        return texture
+
+    save_mesh(replace(mesh, texture=None), tmp_path / scene)
     picture.write_bytes(b"the user's")
-    with pytest.raises(FileFormatError, match=rf"sheet.png: found a file where {scene} keeps a part of its own"):
-        save_mesh(mesh, tmp_path / scene)
-    assert [path.read_bytes() for path in tmp_path.iterdir()] == [b"the user's"]
+    for _ in range(2):  # the second time a file of torchface's is there too
+        with pytest.warns(UserWarning, match=rf"sheet.png beside it.*it is kept, and {scene} takes sheet_2.png"):
+            save_mesh(mesh, tmp_path / scene)
+        assert picture.read_bytes() == b"the user's"
+        assert (shown() - mesh.texture).abs().max() <= 0.5 / 255 + 1e-6
     picture.unlink()
     save_mesh(mesh, tmp_path / scene)
-    save_mesh(replace(mesh, texture=mesh.texture / 2), tmp_path / scene)  # its own is replaced
-    assert (load_mesh(tmp_path / scene).texture - mesh.texture / 2).abs().max() <= 0.5 / 255 + 1e-6
+    save_mesh(darker, tmp_path / scene)  # its own is replaced
+    assert (shown() - darker.texture).abs().max() <= 0.5 / 255 + 1e-6
+    save_image(torch.zeros(3, 4, 4), picture)  # painted over by the user
+    painted = picture.read_bytes()
+    with pytest.warns(UserWarning, match="changed since"):
+        save_mesh(mesh, tmp_path / scene)
+    assert picture.read_bytes() == painted
+
+
+def test_two_scenes_share_a_picture_that_is_alike_and_no_other(tmp_path: Path) -> None:
+    mesh = quad_sheet()
+    save_mesh(mesh, tmp_path / "sheet.obj")
+    save_mesh(mesh, tmp_path / "sheet.usdc")
+    assert sorted(path.name for path in tmp_path.glob("*.png")) == ["sheet.png"]
+    with pytest.warns(UserWarning, match="takes sheet_2.png"):
+        save_mesh(replace(mesh, texture=mesh.texture / 2), tmp_path / "sheet.usdc")
+    found = load_mesh(tmp_path / "sheet.obj").texture
+    assert (found - mesh.texture).abs().max() <= 0.5 / 255 + 1e-6
 
 
 @pytest.mark.real

@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchface.errors import FileFormatError, TopologyError
-from torchface.files.whole_files import all_or_none, read_file, write_beside, write_file
+from torchface.files.files_beside import free_stem, write_beside
+from torchface.files.whole_files import all_or_none, read_file, write_file
 from torchface.io.images.image_files import encode_png, load_image
 from torchface.io.images.texture_atlas import MAX_TEXELS, Look, with_looks
 from torchface.io.length_units import finite_vertices, millimetres_per
@@ -65,29 +66,39 @@ def face_bytes(data: bytes) -> bytes | None:
     return None if start < 0 else data[start:]
 
 
-def write_obj(mesh: Mesh, path: str | Path) -> None:
-    """Writes polygons (or triangles), seams, vertex colours, in millimetres; a texture beside it, with a material."""
+def write_obj(mesh: Mesh, path: str | Path) -> str:
+    """Writes polygons (or triangles), seams, vertex colours, in millimetres; a texture beside it, with a material.
+
+    Returns:
+        What the names of the texture and the material begin with: the file's own name, unless the user has such files.
+    """
     path = Path(path)
+    stem = path.stem
     with all_or_none():
         if mesh.texture is not None:
-            material = f"newmtl skin\nKd 1 1 1\nmap_Kd {path.stem}.png\n"
-            write_beside(path, path.with_suffix(".png"), encode_png(mesh.texture))
-            write_beside(path, path.with_suffix(".mtl"), material.encode())
+            picture = encode_png(mesh.texture)
+            stem = free_stem(path, stem, _material(stem, picture))
+            write_beside(path, _material(stem, picture))
         colors = None if mesh.colors is None else mesh.colors.detach().cpu().double().numpy()
         rows = _vertex_lines(mesh.vertices, colors)
-        write_file(path, _material_line(mesh, path) + rows + _surface_lines(mesh))
+        write_file(path, _material_line(mesh, stem) + rows + _surface_lines(mesh))
+    return stem
 
 
-def write_obj_shapes(mesh: Mesh, shapes: Iterable[tuple[str, Tensor]], neutral: str | Path) -> None:
-    """Writes shapes of a mesh, vertices (V,3) by name, beside what ``write_obj`` wrote, with its faces and material."""
-    surface, material = _surface_lines(mesh), _material_line(mesh, Path(neutral))
+def write_obj_shapes(mesh: Mesh, shapes: Iterable[tuple[str, Tensor]], folder: Path, stem: str) -> None:
+    """Writes shapes of a mesh, vertices (V,3) by name, with its faces and the material that ``write_obj`` returned."""
+    surface, material = _surface_lines(mesh), _material_line(mesh, stem)
     with all_or_none():
         for name, vertices in shapes:  # a file each
-            write_file(Path(neutral).with_name(f"{name}.obj"), material + _vertex_lines(vertices) + surface)
+            write_file(folder / f"{name}.obj", material + _vertex_lines(vertices) + surface)
 
 
-def _material_line(mesh: Mesh, path: Path) -> bytes:
-    return b"" if mesh.texture is None else f"mtllib {path.stem}.mtl\n".encode()
+def _material(stem: str, picture: bytes) -> dict[str, bytes]:
+    return {f"{stem}.png": picture, f"{stem}.mtl": f"newmtl skin\nKd 1 1 1\nmap_Kd {stem}.png\n".encode()}
+
+
+def _material_line(mesh: Mesh, stem: str) -> bytes:
+    return b"" if mesh.texture is None else f"mtllib {stem}.mtl\n".encode()
 
 
 def _vertex_lines(vertices: Tensor, colors: NDArray[np.float64] | None = None) -> bytes:

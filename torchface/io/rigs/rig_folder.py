@@ -93,10 +93,10 @@ def save_obj_folder(rig: BlendshapeRig, folder: str | Path, detail: DetailMaps |
 
 def _write(rig: BlendshapeRig, folder: Path, detail: DetailMaps | None) -> None:
     mesh = rig.neutral.to("cpu")
-    write_obj(mesh, folder / f"{NEUTRAL}.obj")
+    stem = write_obj(mesh, folder / f"{NEUTRAL}.obj")
     deltas, names = all_targets(rig)
     moved = ((name, mesh.vertices + delta.cpu()) for name, delta in zip(names, deltas, strict=True))
-    write_obj_shapes(mesh, moved, folder / f"{NEUTRAL}.obj")
+    write_obj_shapes(mesh, moved, folder, stem)
     notes = write_extras(mesh)
     notes.pop("polygons", None)  # the OBJ files have them
     correctives = () if rig.correctives is None else rig.correctives.definitions

@@ -19,7 +19,8 @@ from torch import Tensor
 
 from torchface.color_space import to_linear
 from torchface.errors import FileFormatError, TopologyError
-from torchface.files.whole_files import all_or_none, replaced_file, write_beside
+from torchface.files.files_beside import free_stem, write_beside
+from torchface.files.whole_files import all_or_none, replaced_file
 from torchface.files.write_errors import unwritten
 from torchface.geometry.meshes.normal_maps import DetailMaps
 from torchface.io.gltf.corrective_extras import write_correctives
@@ -55,7 +56,7 @@ def write_usd_rig(
     Args:
         path: ``.usda`` is text, ``.usdc`` and ``.usd`` are binary, with the texture as a PNG of the same name beside
             them, and images of eyes and lashes that no texture shows; ``.usdz`` holds all. It appears only when it is
-            complete.
+            complete. A picture of the user's of such a name is kept: those of the file get another, with a warning.
         keys: an animation of its shapes, by way of ``skel:animationSource``; a frame is a time code.
         detail: detail maps of its shapes; see ``write_wrinkles``.
     """
@@ -82,6 +83,9 @@ def _write(
         layer = Path(folder, stem + (".usda" if path.suffix.lower() == ".usda" else ".usdc"))
         stage = usd.Usd.Stage.CreateInMemory()
         images = _fill(usd, stage, mesh, rig, keys, detail, stem)
+        if not packed and (free := free_stem(path, stem, images)) != stem:
+            stage = usd.Usd.Stage.CreateInMemory()
+            images = _fill(usd, stage, mesh, rig, keys, detail, free)
         if not stage.GetRootLayer().Export(str(layer)):
             raise FileFormatError(f"{path}: cannot be written (USD could not export it to {folder})")
         if packed:
@@ -89,8 +93,7 @@ def _write(
                 Path(folder, name).write_bytes(data)
             layer = _package(usd, layer)
         with all_or_none():
-            for name, data in {}.items() if packed else images.items():
-                write_beside(path, path.with_name(name), data)
+            write_beside(path, {} if packed else images)
             with replaced_file(path) as temporary:
                 shutil.copyfile(layer, temporary)
 
