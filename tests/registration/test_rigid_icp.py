@@ -38,7 +38,7 @@ def test_a_scan_larger_and_with_other_parts_is_found_too(mask, samples, moved, m
 def test_what_fits_nowhere_is_refused(samples) -> None:
     generator = torch.Generator().manual_seed(0)
     cloud = torch.randn(900, 3, generator=generator, dtype=torch.float64) * 60
-    with pytest.raises(AlignmentError, match="give landmarks"):
+    with pytest.raises(AlignmentError, match="best fit"):
         find_pose(samples, ScanPoints(cloud, torch.arange(900).reshape(-1, 3)))
 
 

@@ -214,5 +214,5 @@ def test_bad_words(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
 
 def test_a_picture_of_the_users_is_refused_before_any_view_is_read(tmp_path: Path) -> None:
     tmp_path.joinpath("camera.png").write_bytes(b"the user's")
-    with pytest.raises(FileFormatError, match="camera.png: found a file where camera.toml keeps a part of its own"):
+    with pytest.raises(FileFormatError, match=r"camera\.png: found a file where camera\.toml keeps a part of its own"):
         calibrate([tmp_path / "missing.png"], BOARD, tmp_path / "camera.toml")

@@ -161,8 +161,7 @@ def find_pose(samples: Samples, scan: ScanPoints, size: float = 1.0) -> Fit:
         start = most.pose
     if float(most.fit[0]) < _LEAST_FIT:
         raise AlignmentError(
-            f"register: found no pose in which the template fits the scan by shape (best fit {float(most.fit[0]):.2f} "
-            f"of 1, expected at least {_LEAST_FIT}); give landmarks"
+            f"found no pose that fits (best fit {float(most.fit[0]):.2f} of 1, expected at least {_LEAST_FIT})"
         )
     return most
 

@@ -275,7 +275,9 @@ def _pose_by_shape(template: Mesh, samples: Samples, scan: ScanPoints, exposed: 
         if best >= _SURE_FIT:
             return found, []
     if pose is None:
-        raise refused
+        raise AlignmentError(
+            f"register: the template lies nowhere on the scan by its shape alone: {refused}; give landmarks"
+        )
     return pose, [
         f"the face was found by its shape alone and fits {best:.2f} of 1 there, where heads fit {_SURE_FIT} and more: "
         "look at the report's pictures, and give landmarks if it lies elsewhere"

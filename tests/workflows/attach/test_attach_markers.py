@@ -87,6 +87,6 @@ def test_markers_that_no_pose_explains_are_refused_with_the_flag_that_says_where
     settings = AttachSettings(tmp_path / "sites.json" if initial else None)
     with pytest.raises((AlignmentError, ValueRangeError)) as refused:
         attach(tmp_path / "rig.glb", tmp_path / "rom.c3d", tmp_path / "out.json", settings)
-    assert "found no pose" not in str(refused.value)
+    assert "lie nowhere" not in str(refused.value)
     assert ("--initial says it roughly" in str(refused.value)) == said
     assert not (tmp_path / "out.json").exists()

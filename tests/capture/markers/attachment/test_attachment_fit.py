@@ -156,3 +156,11 @@ def test_the_first_guess_is_found_by_shape(performance: Performance, stage_space
     small = Take(60.0, markers=Track(take.markers.names, 0.1 * take.markers.values))
     with pytest.raises(AlignmentError, match="is the take's unit right"):
         sites_by_shape(rig, small)
+    blown = take.markers.values + 60 * torch.randn(
+        take.markers.values.shape[1:], generator=torch.Generator().manual_seed(1)
+    )
+    scattered = Take(60.0, markers=Track(take.markers.names, blown))
+    with pytest.raises(AlignmentError, match=r"markers: .*best fit.*by --initial") as refused:
+        sites_by_shape(rig, scattered)
+    assert "register" not in str(refused.value)
+    assert "landmarks" not in str(refused.value)

@@ -71,7 +71,7 @@ def sites_by_shape(rig: BlendshapeRig, rom: Take) -> Attachment:
         pose = find_pose(Samples(points, _outward(points)), ScanPoints(vertices, faces)).pose
     except AlignmentError as error:
         raise AlignmentError(
-            f"markers: found no pose in which they lie on the face by their shape alone ({error}); "
+            f"markers: by their shape alone they lie nowhere on the face: {error}; "
             "give initial sites by --initial (torchface pick --mode markers)"
         ) from None
     rows = (motion.skin & moves[motion.faces].all(1)).nonzero()[:, 0]
