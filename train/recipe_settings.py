@@ -113,11 +113,12 @@ def _check_numbers(settings: Any, above: str = "") -> None:
     for name, value in ((f"{above}{own.name}", getattr(settings, own.name)) for own in fields(settings)):
         if is_dataclass(value):
             _check_numbers(value, f"{name}.")
+        flag = f"--{name.replace('_', '-')}"
         for number in value if isinstance(value, tuple) else (value,):
             if type(number) is int:
-                checked_count(name, number, 0, LARGEST_SEED if name.rpartition(".")[2] == "seed" else _MOST)
+                checked_count(flag, number, 0, LARGEST_SEED if name.rpartition(".")[2] == "seed" else _MOST)
             elif type(number) is float:
-                checked_number(name, number)
+                checked_number(flag, number)
 
 
 def recipe_name(kind: type) -> str:

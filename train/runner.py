@@ -17,7 +17,7 @@ from torchface import zoo
 from torchface.cli.command_options import inputs_kept, plain_options
 from torchface.cli.progress_bars import progress_bars
 from torchface.cli.terminal import plain_errors
-from torchface.errors import ValueRangeError
+from torchface.errors import TorchfaceError, ValueRangeError
 from torchface.files.job_lock import job_lock
 from torchface.files.whole_files import made_folder, make_folder
 from torchface.progress import Progress, silent
@@ -146,9 +146,23 @@ class Recipe(Generic[Settings, Trained]):
                 break
         text = ((self.description or "") + _CONFIG).replace("``", "`")
         name = f"torchface train {recipe_name(self.settings)}"
-        if default is None:
-            return tyro.cli(self.settings, prog=name, description=text, args=flags)
-        return tyro.cli(self.settings, prog=name, description=text, args=flags, default=default)
+        try:
+            if default is None:
+                return tyro.cli(self.settings, prog=name, description=text, args=flags)
+            return tyro.cli(self.settings, prog=name, description=text, args=flags, default=default)
+        except TorchfaceError as error:
+            raise type(error)(_naming_flags(str(error), flags)) from None
+
+
+def _naming_flags(message: str, words: Sequence[str]) -> str:
+    """A message of settings within settings, which do not know their flags, with those that the user gave."""
+    given = [word.partition("=")[0].replace("_", "-") for word in words if word.startswith("--")]
+    nested = [flag for flag in given if "." in flag]
+    name = message.partition(":")[0]
+    if not nested or any(flag in message for flag in given):
+        return message
+    own = next((flag for flag in nested if flag.rpartition(".")[2] == name.replace("_", "-")), None)
+    return f"{', '.join(nested)}: {message}" if own is None else own + message.removeprefix(name)
 
 
 def metric_lines(metrics: Mapping[str, float], number: str = "8.3f") -> list[str]:

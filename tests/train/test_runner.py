@@ -6,10 +6,11 @@ import shlex
 import shutil
 import sys
 import types
-from dataclasses import dataclass, field
+from collections.abc import Iterator
+from dataclasses import MISSING, dataclass, field, fields, is_dataclass
 from importlib import import_module
 from pathlib import Path
-from typing import ClassVar, Literal
+from typing import Any, ClassVar, Literal
 
 import pytest
 import torch
@@ -157,6 +158,29 @@ def test_a_number_that_no_recipe_can_work_with_is_refused_before_any_work(
     assert ended.value.code == 2
     assert message in " ".join(capsys.readouterr().err.split())
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("name", RECIPES)
+def test_a_message_names_the_flag_of_what_the_user_gave(name: str) -> None:
+    """Settings within settings know their field alone: ``--network.rate`` is called ``rate`` there."""
+    kind = import_module(f"train.{name}").RECIPE
+    needed = [one for one in fields(kind.settings) if one.default is MISSING and one.default_factory is MISSING]
+    words = [word for one in needed for word in (f"--{one.name.replace('_', '-')}", "missing")]
+    for path, value in _numbers(kind.chosen(words)):
+        flag = f"--{path.replace('_', '-')}"
+        with pytest.raises((TorchfaceError, SystemExit)) as refused:
+            kind.chosen([*words, flag, "nan" if isinstance(value, float) else "-1"])
+        if isinstance(refused.value, TorchfaceError):  # what tyro refuses has the flag in its box
+            assert flag in str(refused.value)
+
+
+def _numbers(settings: Any, above: str = "") -> Iterator[tuple[str, float]]:
+    for one in fields(settings):
+        value = getattr(settings, one.name)
+        if is_dataclass(value):
+            yield from _numbers(value, f"{above}{one.name}.")
+        elif type(value) in (int, float):
+            yield f"{above}{one.name}", value
 
 
 def test_what_has_no_default_and_is_not_in_the_file_is_asked_for(
