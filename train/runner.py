@@ -127,7 +127,13 @@ class Recipe(Generic[Settings, Trained]):
             chosen = self.chosen(list(sys.argv[1:] if arguments is None else arguments))
             kept = inputs_kept(self.settings, vars(chosen))
             with kept, job_lock(chosen.out), progress_bars() as progress:
-                trained = self.train(chosen, progress)
+                try:
+                    trained = self.train(chosen, progress)
+                except TorchfaceError as error:
+                    name, _, rest = str(error).partition(": ")
+                    if name not in vars(chosen):
+                        raise
+                    raise type(error)(f"--{name.replace('_', '-')}: {rest}") from error  # what the library calls it
             for line in self.lines(chosen, trained):
                 print(line)
             print(f"written to {chosen.out}")

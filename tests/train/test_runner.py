@@ -174,6 +174,17 @@ def test_a_message_names_the_flag_of_what_the_user_gave(name: str) -> None:
             assert flag in str(refused.value)
 
 
+def test_what_the_library_calls_a_setting_is_called_by_its_flag(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def refuse(settings: Settings, run: Run) -> None:
+        raise TorchfaceError("slope: found 3.0, expected less")
+
+    with pytest.raises(SystemExit):
+        Recipe(Settings, recipe(refuse), None).main(["--data", "here", "--out", str(tmp_path / "out")])
+    assert "--slope: found 3.0, expected less" in capsys.readouterr().err
+
+
 def _numbers(settings: Any, above: str = "") -> Iterator[tuple[str, float]]:
     for one in fields(settings):
         value = getattr(settings, one.name)
