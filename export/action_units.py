@@ -1,7 +1,5 @@
 """``python -m export.action_units --model NAME --out FILE``: the action unit classifier as ONNX."""
 
-from __future__ import annotations
-
 import tyro
 
 from torchface import zoo

@@ -1,7 +1,5 @@
 """``python -m export.hybrid_solver --rig RIG --attachment FILE --out solver.onnx``: the hybrid solve as ONNX."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import tyro

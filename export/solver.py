@@ -1,7 +1,5 @@
 """``python -m export.solver --rig RIG --attachment FILE --out solver.onnx``: the marker solve as ONNX."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import tyro

@@ -1,7 +1,5 @@
 """``python -m export.video_solver --rig RIG --camera FILE --out video_solver.onnx``: the video solve as ONNX."""
 
-from __future__ import annotations
-
 import tyro
 
 from torchface.cli.export import video_solver

@@ -1,7 +1,5 @@
 """``python -m export.webcam --out webcam.onnx``: from a webcam's picture to weights, as ONNX."""
 
-from __future__ import annotations
-
 import tyro
 
 from torchface.cli.export import webcam

@@ -1,7 +1,5 @@
 """``python -m export.zoo --out DIR``: models of the zoo as ONNX, each as ``DIR/NAME.onnx``."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import tyro

@@ -1,7 +1,5 @@
 """What users pass by mistake ends in a clear error; NumPy's arrays and lists are taken where that is safe."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Modules run on a GPU unchanged: moved there, they give what they give on the CPU."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 

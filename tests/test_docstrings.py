@@ -1,7 +1,5 @@
 """The examples in docstrings run as they are written, in either float format (float64 in the bench)."""
 
-from __future__ import annotations
-
 import doctest
 import importlib
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """Links, figures, versions and checks that README, CONTRIBUTING and docs/ name are there and agree."""
 
-from __future__ import annotations
-
 import importlib
 import importlib.util
 import json

@@ -4,8 +4,6 @@
 licence texts that it carries are looked at here.
 """
 
-from __future__ import annotations
-
 import ctypes
 import mmap
 import re

@@ -1,7 +1,5 @@
 """Numbers that callers give are finite, in range, and numbers at all."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -3,8 +3,6 @@
 Public is what an ``__all__`` names.
 """
 
-from __future__ import annotations
-
 import importlib
 import inspect
 import re

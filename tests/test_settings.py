@@ -1,7 +1,5 @@
 """Weights of terms and other settings are finite and in range, wherever they are given."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Colours as images hold them (sRGB), and the light that they stand for, for any layout of channels."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

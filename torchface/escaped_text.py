@@ -1,7 +1,5 @@
 """Text from files as people may see it: what moves a cursor, colours a terminal or turns the line round is spelled."""
 
-from __future__ import annotations
-
 import html
 import re
 

@@ -1,7 +1,5 @@
 """What callers give (numbers, tensors, meshes, paths), checked in one way at the door."""
 
-from __future__ import annotations
-
 import math
 import os
 from numbers import Real

@@ -1,7 +1,5 @@
 """Progress reports of long work: one signature for every function."""
 
-from __future__ import annotations
-
 from typing import Protocol
 
 __all__ = ["Progress", "ValueLog", "silent"]

@@ -5,8 +5,6 @@ intensity are found without labels. Without videos, embedded performers are pain
 six minutes of one core.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 

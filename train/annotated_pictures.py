@@ -1,7 +1,5 @@
 """Annotated photographs for a network that goes on learning: its own readings stand for what nobody has annotated."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import torch

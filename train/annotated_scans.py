@@ -1,7 +1,5 @@
 """Raw scans and what is known of them: a user's own, or scanned performers."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePath

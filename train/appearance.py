@@ -3,8 +3,6 @@
 The folder holds images with a ``.pts`` beside each, as ``torchface annotate`` saves them.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from pathlib import Path
 

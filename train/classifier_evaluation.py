@@ -1,7 +1,5 @@
 """The accuracy of a classifier: by cross-validation over frames, and against the labels of other performers."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Literal
 

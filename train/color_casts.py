@@ -1,7 +1,5 @@
 """Colours of many scans on one topology, freed from each scan's exposure and white balance."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

@@ -1,7 +1,5 @@
 """Dynamics priors learned from takes; the window is chosen by predictions of a take left out."""
 
-from __future__ import annotations
-
 from torchface.capture.priors import DynamicsPrior, DynamicsSettings
 from torchface.errors import ValueRangeError
 from torchface.progress import Progress

@@ -6,8 +6,6 @@ too. ``--performer 20000`` learns from the embedded performer with so many verti
 file. Killed and started again, a run goes on where it was.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal

@@ -1,7 +1,5 @@
 """The pictures that lie beside an enhancement model: its regions, the detail it keeps, what compression loses."""
 
-from __future__ import annotations
-
 import textwrap
 from dataclasses import replace
 from pathlib import Path

@@ -3,8 +3,6 @@
 ``--performers 60`` learns from so many embedded performers instead, and needs no file.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 

@@ -5,8 +5,6 @@ and compare what it gives by ``torchface evaluate RESULTS FOLDER --benchmark``. 
 seeds that no recipe uses. The twelve take about five minutes of one core; what is rendered is kept.
 """
 
-from __future__ import annotations
-
 import os
 from dataclasses import dataclass, replace
 from pathlib import Path

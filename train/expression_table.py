@@ -1,7 +1,5 @@
 """People left out: which of three methods comes nearest to their true expressions."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 

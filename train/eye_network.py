@@ -5,8 +5,6 @@ performers. 14,000 pictures of two eyes take about 25 minutes of one core, 6,000
 there is one. Killed and started again it goes on.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from pathlib import Path
 

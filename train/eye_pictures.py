@@ -1,7 +1,5 @@
 """The pictures of eyes that the eye network learns from: rendered once, kept in a folder."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path

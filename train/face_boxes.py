@@ -3,8 +3,6 @@
 Its scenes are put together from rendered people, which are rendered once and kept in ``--pictures``.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, field, replace
 from functools import partial

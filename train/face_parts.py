@@ -5,8 +5,6 @@ performers. 4,800 pictures take about four minutes of one core, 3,000 steps ten;
 and started again it goes on.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The pictures that networks of faces learn from: rendered once, kept in a folder, read by all recipes."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from functools import lru_cache
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Alignment of many shapes in correspondence with their mean."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import torch

@@ -1,7 +1,5 @@
 """Colours of heads for a model: each scan freed from its cast; and the model of them."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 

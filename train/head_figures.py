@@ -1,7 +1,5 @@
 """Pictures of a head model, after the thesis's figures 20 to 24, and curves of how good it is."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 

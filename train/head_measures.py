@@ -1,7 +1,5 @@
 """Measures of a head model: on heads held out, on heads left out in turn, and of its random heads."""
 
-from __future__ import annotations
-
 import torch
 
 from torchface.geometry.sample_batches import Samples, blocks

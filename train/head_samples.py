@@ -1,7 +1,5 @@
 """Samples for head models: meshes gathered on disk, aligned with each other, freed from colour casts."""
 
-from __future__ import annotations
-
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, replace

@@ -7,8 +7,6 @@ network that ships. ``--start zoo --data FOLDER`` has it learn from photographs 
 a minute or two. Killed and started again it goes on.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 

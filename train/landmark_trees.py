@@ -4,8 +4,6 @@ A folder of iBUG's kind holds images with a ``.pts`` beside each; a dlib ``.xml`
 ``--performers 2000`` learns from so many rendered images of synthetic people, alone or besides the data.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from pathlib import Path
 

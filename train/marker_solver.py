@@ -3,8 +3,6 @@
 Without a rig it is that of the embedded performer with 100 markers.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 

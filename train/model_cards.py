@@ -1,7 +1,5 @@
 """Card of a recipe's model: the command that makes it again, its settings, what was measured."""
 
-from __future__ import annotations
-
 import shlex
 from collections.abc import Iterator, Mapping
 from dataclasses import MISSING, asdict, fields, is_dataclass

@@ -1,7 +1,5 @@
 """Quality of a morphable model: compactness, generalisation, specificity."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

@@ -6,8 +6,6 @@ expressions as the rig; ``--published FILE`` one of GNM Head, FLAME or Basel, wi
 where it was.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 

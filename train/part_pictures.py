@@ -1,7 +1,5 @@
 """The pictures that the network of a face's parts learns from: rendered once, kept in a folder."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 

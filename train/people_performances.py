@@ -10,8 +10,6 @@ Source: Ekman, Friesen and Hager 2002 (units, emotions); Mavadati et al. 2013 (D
 shares of frames and for units that go together; Evinger et al. 1991 (blinks), Malik et al. 2003 (lids and gaze).
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator
 

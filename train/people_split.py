@@ -1,7 +1,5 @@
 """People held out for the test: never single pictures, scans or takes of someone who is learned from."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 

@@ -1,7 +1,5 @@
 """Pictures for the cards of priors: how honest the variance is, what is predicted, how settings were chosen."""
 
-from __future__ import annotations
-
 import io
 from collections.abc import Mapping, Sequence
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Settings of the recipe of priors, and what both kinds of priors learn from."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal

@@ -1,7 +1,5 @@
 """Trials of a prior on takes that it has not seen: predictions of frames, and solves from a few points."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

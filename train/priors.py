@@ -5,8 +5,6 @@ are aligned with the rig and solved first. ``--performances 60`` learns from tak
 instead, and needs no file. ``--names`` and ``--rig`` make a prior for a rig's own names out of takes with ARKit's.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path

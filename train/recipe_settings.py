@@ -1,7 +1,5 @@
 """Settings of all recipes: the same words mean the same everywhere."""
 
-from __future__ import annotations
-
 import shutil
 import sys
 from dataclasses import dataclass, fields, is_dataclass

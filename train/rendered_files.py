@@ -1,7 +1,5 @@
 """Pictures that a recipe learns from, rendered once into files of a folder: a killed run loses one file at most."""
 
-from __future__ import annotations
-
 import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Captured frames as an enhancement model restores them from what a coarse animation shows, beside the truth."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import torch

@@ -1,7 +1,5 @@
 """Log of a run: a table on disk, TensorBoard where it is installed, and curves."""
 
-from __future__ import annotations
-
 import csv
 import io
 import shutil

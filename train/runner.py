@@ -1,7 +1,5 @@
 """Runner of all recipes: flags and files to settings, one run at a time, log, what was measured printed."""
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager

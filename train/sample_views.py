@@ -1,7 +1,5 @@
 """Samples made of other samples: moved, a range of them, or all but one."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import torch

@@ -1,7 +1,5 @@
 """Errors of found landmarks and lines against the true ones, in pixels and millimetres, and an image of both."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

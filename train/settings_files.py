@@ -1,7 +1,5 @@
 """Settings of recipes as TOML: nested ones are tables, paths are texts, what is absent is left out."""
 
-from __future__ import annotations
-
 from dataclasses import MISSING, Field, fields, is_dataclass
 from pathlib import Path
 from types import NoneType, UnionType

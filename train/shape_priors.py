@@ -1,7 +1,5 @@
 """Shape priors learned from takes; strength and width are chosen by trial solves."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 from torch import Tensor

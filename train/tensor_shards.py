@@ -1,7 +1,5 @@
 """Rows of tensors that lie in many safetensors files, read a few at a time."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path

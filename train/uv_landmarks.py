@@ -3,8 +3,6 @@
 ``--performers 30`` learns from scans of so many embedded performers instead, and needs no file.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal

@@ -3,8 +3,6 @@
 A cell is empty where the eye does not say yes or no at once. No frame plainly shows knit brows or eyes turned aside.
 """
 
-from __future__ import annotations
-
 import csv
 from collections.abc import Callable
 from pathlib import Path

@@ -1,7 +1,5 @@
 """What every table is printed with: the machine and the versions that its figures hold for."""
 
-from __future__ import annotations
-
 import json
 import os
 import platform

@@ -1,7 +1,5 @@
 """A rig of film size with planted correctives, and scans of a performance of it."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import torch

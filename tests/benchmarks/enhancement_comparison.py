@@ -1,7 +1,5 @@
 """Every way to enhance an animation, on one performer, measured alike."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace

@@ -1,7 +1,5 @@
 """Other ways from a smooth frame and a database of captured frames to the frame's fine detail."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import torch

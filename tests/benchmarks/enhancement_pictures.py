@@ -1,7 +1,5 @@
 """Pictures of what a comparison of enhanced animations measured; drawn where a folder for them is named."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path

@@ -5,8 +5,6 @@ and fall back to it; the other two takes are the test, their liveliest seconds a
 animation is the same performer's without its wrinkles.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,7 +1,5 @@
 """What turns a film into weights of ARKit's shapes, each by its own means, and writes them as Live Link Face does."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace

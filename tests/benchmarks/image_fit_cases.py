@@ -1,7 +1,5 @@
 """Planted heads for the benchmark of fits to images, and the rows of its tables."""
 
-from __future__ import annotations
-
 import time
 from dataclasses import dataclass, replace
 from pathlib import Path

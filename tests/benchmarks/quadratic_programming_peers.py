@@ -4,8 +4,6 @@ A solver takes f (N,) and gives x (N,), for one H and the box [0, 1]; what it re
 One for an H a call takes H (N,N) and f.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from importlib.util import find_spec
 

@@ -1,7 +1,5 @@
 """Real faces for a comparison of landmark finders: photographs, clips, and photographs that were spoilt."""
 
-from __future__ import annotations
-
 import math
 import time
 from collections import Counter

@@ -3,8 +3,6 @@
 Films four performers first, which takes minutes; the films stay in ``out/action_unit_films`` for the next run.
 """
 
-from __future__ import annotations
-
 import time
 from dataclasses import dataclass
 from pathlib import Path

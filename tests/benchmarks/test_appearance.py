@@ -13,8 +13,6 @@ A real clip has no truth: there the model learns fifteen frames of what MediaPip
 finds in the others.
 """
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace

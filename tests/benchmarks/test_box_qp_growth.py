@@ -1,7 +1,5 @@
 """How the solve grows with shapes and frames; plots to out/benchmarks/."""
 
-from __future__ import annotations
-
 import math
 import time
 from collections.abc import Callable

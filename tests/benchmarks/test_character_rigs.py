@@ -8,8 +8,6 @@ the same landmarks were aligned. Cosine and relative error are those of all vert
 shapes move.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """A rig of film size (80 shapes, 400 correctives, 10,000 vertices) beside the linear solve and scipy's."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable
 from dataclasses import dataclass

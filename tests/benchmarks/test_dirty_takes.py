@@ -1,7 +1,5 @@
 """Dirty takes cleaned, takes solved whole or streamed, helmets that slip: errors as shares of the plain solve's."""
 
-from __future__ import annotations
-
 import time
 
 import numpy as np

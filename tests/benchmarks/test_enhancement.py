@@ -5,8 +5,6 @@ timing of four real takes, what is enhanced comes from two others; see ``enhance
 the folder that ``TORCHFACE_ENHANCEMENT_PICTURES`` names.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -1,7 +1,5 @@
 """Another actor's detail: his model on a head of the same mesh, beside that head's own model and none at all."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -4,8 +4,6 @@ The performers of ``enhancement_scenes``: 200 database frames of four real takes
 weights are learned from the model on 300 poses of the coarse rig; nothing here has seen the test takes.
 """
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable
 from dataclasses import dataclass

@@ -4,8 +4,6 @@
 last column is how near any detail comes that is added to the input's own smooth part: the truth's.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path

@@ -3,8 +3,6 @@
 The frames only need the right sizes here: they are the smooth performer's, with a wave on top.
 """
 
-from __future__ import annotations
-
 import resource
 import time
 from collections.abc import Callable

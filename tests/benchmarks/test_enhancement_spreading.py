@@ -1,7 +1,5 @@
 """The thin shell on dense heads: what setting it up and a frame take, how near its coarse level comes to the whole."""
 
-from __future__ import annotations
-
 import time
 
 import pytest

@@ -1,7 +1,5 @@
 """The actor's timing: velocity profiles of real motions that were left out, linear, eased and retimed."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path

@@ -8,8 +8,6 @@ Errors are root mean squares over all vertices, the mean of the expressions, in 
 the true weights, ``solved`` at the weights that suit each rig best: what a solver would see of an unseen expression.
 """
 
-from __future__ import annotations
-
 import subprocess
 import sys
 from dataclasses import dataclass

@@ -9,8 +9,6 @@ of interpolation points cannot be set there: 2N + 1 = 31, where the paper asks f
 multiplies nothing; and nlopt ends by the change of the weights, not by the radius of its trust region.
 """
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """The thesis's table 1 on embedded performers: expressions from the neutral face, against transfer and mean offset."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -4,8 +4,6 @@ Four films of two seconds; with ``TORCHFACE_FILMS=all`` the twelve of ``train.ex
 minutes to render and are kept in ``out/expression_films``. ``TORCHFACE_METHODS=live,mediapipe`` runs some methods.
 """
 
-from __future__ import annotations
-
 import os
 from pathlib import Path
 

@@ -3,8 +3,6 @@
 ``make bench`` prints the figures.
 """
 
-from __future__ import annotations
-
 import time
 from pathlib import Path
 

@@ -4,8 +4,6 @@ nearer to who is filmed than the head model's mean and than the head of the land
 Four rendered films of unseen people. Errors are mean distances of 452 points after the best similarity, millimetres.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory

@@ -4,8 +4,6 @@ Films a performer who trains the classifier, and takes of that performer and of 
 stay in ``out/hybrid/films`` for the next run, pictures come in ``out/hybrid``.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from pathlib import Path
 

@@ -5,8 +5,6 @@ The embedded head, its eyes open, is registered to raw scans of performers with 
 place is known. ``$TORCHFACE_BENCH_HEADS`` sets how many scans (6 if absent).
 """
 
-from __future__ import annotations
-
 import os
 from dataclasses import dataclass
 from pathlib import Path

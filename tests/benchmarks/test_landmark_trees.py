@@ -1,8 +1,6 @@
 """Claim: landmark trees learn rendered faces as well as dlib's shape predictor from the same pictures, boxes and
 settings (within 5 %), and a model of 10 cascades of 500 trees takes at most 1.5 ms a face in ONNX Runtime."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable
 from dataclasses import replace

@@ -5,8 +5,6 @@ focal length each, which `fit` is not given. Errors are mean distances after the
 and of the 520 points that the network finds. The nearest head is looked for among the fits to all other pictures.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The guided calibration of ``live`` on films of people who do, or do not, what they are asked for."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -1,7 +1,5 @@
 """An hour before a webcam: memory while frames are solved, sent and recorded, and while the files are made."""
 
-from __future__ import annotations
-
 import threading
 import time
 from collections.abc import Iterator

@@ -6,8 +6,6 @@ MediaPipe's Face Landmarker in the same browser, which draws nothing. The marks 
 that see a later picture than the flash, as they were busy, know when it was.
 """
 
-from __future__ import annotations
-
 import base64
 import shutil
 import socket

@@ -1,7 +1,5 @@
 """Loading a real rig: ICT-FaceKit's 74 files, against trimesh on the same files, and the ``.glb`` it becomes."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable
 from functools import partial

@@ -1,7 +1,5 @@
 """The main job on a real rig and six real takes: transfer to a random head, film, solve, compare with the truth."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Marker sites from a range of motion: how many come within a millimetre, what that does to the weights, how long."""
 
-from __future__ import annotations
-
 import time
 
 import pytest

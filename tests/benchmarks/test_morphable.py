@@ -4,8 +4,6 @@ scikit-learn's solvers; ten thousand samples from disk in bounded memory.
 ``$TORCHFACE_BENCH_SAMPLES`` sets how many samples lie on disk (10,000 if absent: 1.1 GB of file, some minutes).
 """
 
-from __future__ import annotations
-
 import json
 import os
 import signal

@@ -3,8 +3,6 @@
 How long it takes beside other solvers is held in ``test_box_qp_peers.py``.
 """
 
-from __future__ import annotations
-
 import time
 from pathlib import Path
 

@@ -5,8 +5,6 @@ Twenty random heads and the scan of a real one are rigged with ICT-FaceKit's who
 performers with the performer's own. All shapes at weight 1 and 100 frames of six takes, the template's own beside.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

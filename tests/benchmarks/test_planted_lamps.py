@@ -7,8 +7,6 @@ to nothing, so there four of five are asked for. The peer minimises the thesis's
 Times are of the process.
 """
 
-from __future__ import annotations
-
 import math
 import time
 

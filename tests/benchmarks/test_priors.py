@@ -1,7 +1,5 @@
 """Priors on real takes that they have not seen: predictions beside simpler ones, variances, time, likelihoods."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable
 from pathlib import Path

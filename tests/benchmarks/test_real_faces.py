@@ -5,8 +5,6 @@ predictor (rounded to pixels, no truth) for 18 faces, MediaPipe (another network
 Face Landmarker runs in this process; its networks are newer than those that made the clips' landmarks.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 

@@ -4,8 +4,6 @@ The landmarks are what MediaPipe found in six clips, which is another network's 
 with ICT-FaceKit's mean head, which is none of these people, and with a head fitted to six of its frames.
 """
 
-from __future__ import annotations
-
 import time
 from dataclasses import dataclass
 from pathlib import Path

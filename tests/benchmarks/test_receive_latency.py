@@ -1,7 +1,5 @@
 """How long a phone's packet takes to become the packets that are sent on: median and 95th percentile, printed."""
 
-from __future__ import annotations
-
 import select
 import socket
 import time

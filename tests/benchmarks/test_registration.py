@@ -5,8 +5,6 @@ with 0.1 mm of noise and moved; the 68 landmarks lie where they truly are. ``$TO
 heads trimesh gets (10 if absent; it takes a quarter of a minute each); torchface gets all ten.
 """
 
-from __future__ import annotations
-
 import os
 import time
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """A real scan met by ICT-FaceKit's face, with its landmarks and without any: how near, and what it looks like."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

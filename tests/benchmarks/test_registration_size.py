@@ -1,7 +1,5 @@
 """How registration grows with the size of template and scan; each size in a process of its own, for its memory."""
 
-from __future__ import annotations
-
 import json
 import subprocess
 import sys

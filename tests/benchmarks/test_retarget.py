@@ -3,8 +3,6 @@
 Pictures of the same frames on all three rigs go to out/retarget.
 """
 
-from __future__ import annotations
-
 from itertools import combinations
 from pathlib import Path
 

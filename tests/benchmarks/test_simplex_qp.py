@@ -1,7 +1,5 @@
 """simplex_qp beside OSQP and quadprog: mixtures of few of many frames, all in one run, on one thread."""
 
-from __future__ import annotations
-
 import time
 
 import numpy as np

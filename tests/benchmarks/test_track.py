@@ -1,7 +1,5 @@
 """What a filmed performer comes back as through ``torchface track``: landmarks as they are found, priors on and off."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import torch

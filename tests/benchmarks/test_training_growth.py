@@ -3,8 +3,6 @@
 Each count is trained in a process of its own, so that its peak resident memory, PyTorch included, is its own.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess

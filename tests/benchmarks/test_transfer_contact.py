@@ -6,8 +6,6 @@ through each other in the template's own shapes, so their gap is signed: along t
 its nearest on the other lip, both fixed in the template's neutral. The opening is what stays open between the surfaces.
 """
 
-from __future__ import annotations
-
 import time
 from pathlib import Path
 

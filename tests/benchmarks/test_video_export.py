@@ -1,7 +1,5 @@
 """The exported video solver beside ``torchface track`` on real videos, with the zoo's priors and a rig of nobody's."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import asdict, replace
 from pathlib import Path

@@ -5,8 +5,6 @@ shifts, its pose is unknown. Priors learn from four takes, their strengths are c
 everything is measured on the two others.
 """
 
-from __future__ import annotations
-
 import time
 from dataclasses import dataclass
 from pathlib import Path

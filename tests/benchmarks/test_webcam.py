@@ -5,8 +5,6 @@ the two test takes; see ``webcam_film``. Two clips of four seconds by default; w
 four of nine seconds, which take ten minutes to render and are kept in ``out/webcam_clips``.
 """
 
-from __future__ import annotations
-
 import math
 import os
 from dataclasses import dataclass

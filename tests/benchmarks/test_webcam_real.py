@@ -5,8 +5,6 @@ move the embedded performer's landmarks, seen from the front, and the same dista
 own mean: a slope of 1 moves as far as MediaPipe says.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 

@@ -4,8 +4,6 @@ And the memory of an application that has onnxruntime, numpy and OpenCV alone. M
 beside it, in this process, from a picture to blendshapes.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import re

@@ -1,7 +1,5 @@
 """Claim: a 2048 x 2048 normal map from a scan of half a million triangles takes seconds and shows planted wrinkles."""
 
-from __future__ import annotations
-
 import importlib.util
 import time
 from collections.abc import Callable, Iterator

@@ -1,7 +1,5 @@
 """Every model of the zoo is made again by the one command in its card, to the same metrics."""
 
-from __future__ import annotations
-
 import os
 import shlex
 import subprocess

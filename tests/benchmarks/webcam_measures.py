@@ -1,7 +1,5 @@
 """How weights solved from a webcam compare with the truth: size, lag, tremor, blinks, gaze, and finding a lost face."""
 
-from __future__ import annotations
-
 import math
 
 import torch

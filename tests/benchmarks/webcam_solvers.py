@@ -1,7 +1,5 @@
 """What reads a clip's faces, and solvers that turn the same readings into weights of ARKit's shapes."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable
 from dataclasses import dataclass

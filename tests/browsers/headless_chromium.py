@@ -1,7 +1,5 @@
 """Debian's Chromium without a window or a graphics card, and how a test waits for its page."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import time

@@ -1,7 +1,5 @@
 """A small rig on which the marker solvers are tried."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 

@@ -1,7 +1,5 @@
 """Antagonists are one quantity with a sign, whatever a rig calls them."""
 
-from __future__ import annotations
-
 import torch
 
 from torchface.capture.antagonist_shapes import one_side, signed_difference, signed_quantities, weaker_sides

@@ -1,7 +1,5 @@
 """A planted person's rest and reach are learned, and lids are scaled without being shifted."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 

@@ -1,7 +1,5 @@
 """Energies mean what their formulas say, in mm² a marker, and add."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from torch import Tensor

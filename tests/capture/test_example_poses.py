@@ -1,7 +1,5 @@
 """Retargeting learned from example poses: planted maps come back, names decide what no pose shows."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

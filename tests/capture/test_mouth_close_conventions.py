@@ -1,7 +1,5 @@
 """ARKit's mouthClose and Audio2Face's: distinguished, and converted into each other."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -1,7 +1,5 @@
 """Weights on other rigs: split, merged, combined, gained and limited."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -1,7 +1,5 @@
 """Readings of weights are Gaussian terms of what they read."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 

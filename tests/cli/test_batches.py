@@ -1,7 +1,5 @@
 """What works on one take works on a folder of them by the same words."""
 
-from __future__ import annotations
-
 import csv
 import json
 import os

@@ -1,7 +1,5 @@
 """Steps of commands on a terminal and in a log."""
 
-from __future__ import annotations
-
 from functools import partial
 from io import StringIO
 

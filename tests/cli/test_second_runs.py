@@ -1,7 +1,5 @@
 """A second run into a place that another run writes into is refused before it reads or writes anything."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from contextlib import AbstractContextManager
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Commands that cannot go on end with a line, not with a traceback."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 import warnings

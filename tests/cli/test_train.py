@@ -1,7 +1,5 @@
 """``torchface train`` finds recipes by name or as a file; what it cannot find it says in words."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -1,7 +1,5 @@
 """Commands take USD wherever they take a ``.glb``."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

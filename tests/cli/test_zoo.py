@@ -1,7 +1,5 @@
 """``torchface zoo`` lists what models there are and which are damaged."""
 
-from __future__ import annotations
-
 import hashlib
 import shutil
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The Python of the README and of a how-to page runs when it is pasted."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 from typing import Any

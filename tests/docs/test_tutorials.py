@@ -1,7 +1,5 @@
 """The tutorials' code compiles, and what it takes of torchface is there and public; `make docs` runs it."""
 
-from __future__ import annotations
-
 import ast
 import importlib
 import re

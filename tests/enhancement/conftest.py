@@ -1,7 +1,5 @@
 """A wrinkled database on the embedded performer, small enough for quick tests."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import pytest

@@ -1,7 +1,5 @@
 """A retimed animation keeps its keyframes."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 

@@ -1,7 +1,5 @@
 """What holds of an actor's model: its own frames come back, motion goes along, bad input is told."""
 
-from __future__ import annotations
-
 import copy
 import errno
 import math

@@ -1,7 +1,5 @@
 """Eyes close where the input closes them; what a smoothed input cannot show stays as it was found."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 

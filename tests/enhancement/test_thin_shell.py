@@ -1,7 +1,5 @@
 """The thin shell against a solve of its own in scipy, and what a spread motion must keep."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

@@ -1,7 +1,5 @@
 """Scores of expressions find what was planted: slope, lag, jitter, missed blinks, antagonists, shapes that stay on."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

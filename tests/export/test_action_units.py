@@ -1,7 +1,5 @@
 """A classifier from the zoo's folder becomes an ONNX file that gives the same."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """What export/README.md shows runs: Python with onnxruntime, JavaScript with onnxruntime-web under Node."""
 
-from __future__ import annotations
-
 import json
 import re
 import shutil

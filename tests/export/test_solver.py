@@ -1,7 +1,5 @@
 """``python -m export.solver`` exports a rig on disk with the markers of a file."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -1,7 +1,5 @@
 """The shader of export/README.md in a real browser mixes wrinkle maps as ``RegionMaps.blend`` does."""
 
-from __future__ import annotations
-
 import json
 import re
 import shutil

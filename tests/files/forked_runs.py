@@ -1,7 +1,5 @@
 """Runs in a forked process of a test: one that is killed in its middle, one that holds a folder of results."""
 
-from __future__ import annotations
-
 import os
 import signal
 from collections.abc import Callable, Iterator

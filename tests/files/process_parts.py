@@ -1,7 +1,5 @@
 """Work that processes of tests do: without an import that would take them a second."""
 
-from __future__ import annotations
-
 import os
 import signal
 import time

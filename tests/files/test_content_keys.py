@@ -1,7 +1,5 @@
 """Keys differ wherever anything that a result is made of does, and nowhere else."""
 
-from __future__ import annotations
-
 import os
 from dataclasses import dataclass, replace
 from enum import Enum

@@ -1,7 +1,5 @@
 """Small documents: values of the right type, errors that name file, key, what was found and what was expected."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable
 from pathlib import Path

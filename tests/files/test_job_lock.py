@@ -1,7 +1,5 @@
 """Two runs never write into one place, however they are started, and a run that was killed holds up none."""
 
-from __future__ import annotations
-
 import errno
 import os
 import signal

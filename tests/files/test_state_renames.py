@@ -1,7 +1,5 @@
 """Models saved under the names of yesterday: they give the same numbers today, and nothing else is let in."""
 
-from __future__ import annotations
-
 import hashlib
 import tomllib
 from collections.abc import Mapping

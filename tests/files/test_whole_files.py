@@ -1,7 +1,5 @@
 """A file is there whole or as it was before, whatever fails, dies or writes beside it."""
 
-from __future__ import annotations
-
 import errno
 import os
 import re

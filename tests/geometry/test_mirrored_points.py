@@ -1,7 +1,5 @@
 """Mirrored points are told from turned ones, and points in a plane from neither."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 

@@ -1,7 +1,5 @@
 """Landmarks and small documents built by chance: strategies of :func:`built_files.check_built`."""
 
-from __future__ import annotations
-
 import json
 from typing import Any
 

@@ -5,8 +5,6 @@ A strategy gives the files by name, the one to read first. Readers are tested al
     check_built(load_mesh, "built_meshes", "obj_files")
 """
 
-from __future__ import annotations
-
 import importlib
 import json
 import math

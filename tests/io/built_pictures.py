@@ -3,8 +3,6 @@
 Readers are driven by ``built_files.check_built(reader, "built_pictures", "picture_files", cases)``.
 """
 
-from __future__ import annotations
-
 import io
 import struct
 import zlib

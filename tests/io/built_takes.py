@@ -1,7 +1,5 @@
 """Takes built by chance, of parts that disagree: strategies of :func:`built_files.check_built`."""
 
-from __future__ import annotations
-
 import math
 import struct
 

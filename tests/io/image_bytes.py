@@ -1,7 +1,5 @@
 """Image files put together byte by byte, of any size they claim, by the formats' specifications and no library."""
 
-from __future__ import annotations
-
 import struct
 import zlib
 from collections.abc import Sequence

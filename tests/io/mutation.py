@@ -8,8 +8,6 @@ Readers of whatever format are tested alike::
         check_reader(load_mesh, [tmp_path / "good.ply"], ".ply")
 """
 
-from __future__ import annotations
-
 import os
 import random
 import re

@@ -1,7 +1,5 @@
 """Messages received by python-osc's own server, in their order."""
 
-from __future__ import annotations
-
 from collections import defaultdict
 from typing import Any
 

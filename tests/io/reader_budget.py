@@ -9,8 +9,6 @@ Readers of whatever format are held to one budget::
         check_budget(load_take, tmp_path / "wide.csv")
 """
 
-from __future__ import annotations
-
 import importlib
 import importlib.util
 import inspect

@@ -1,7 +1,5 @@
 """Live Link Face's packets read back, as Unreal reads them."""
 
-from __future__ import annotations
-
 import struct
 from dataclasses import dataclass
 

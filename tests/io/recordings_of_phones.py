@@ -1,7 +1,5 @@
 """Recordings as phones and other programs write them, built from weights and rotations by each format's description."""
 
-from __future__ import annotations
-
 import gzip
 import json
 import math

@@ -1,7 +1,5 @@
 """Small rigs for the tests of readers and writers: polygons of several sizes, seams, annotations, a texture."""
 
-from __future__ import annotations
-
 import torch
 from hypothesis import strategies as st
 

@@ -1,7 +1,5 @@
 """Takes by chance, round trips and broken files for the tests of every take format."""
 
-from __future__ import annotations
-
 import tempfile
 from collections.abc import Callable
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Labels of a video come back as they were written; what cannot be is named."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Readers take files whose parts disagree as they take good ones: a value, or an error of ours."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Callable
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Calibrations come back from their files; broken files are refused by name."""
 
-from __future__ import annotations
-
 import contextlib
 from pathlib import Path
 

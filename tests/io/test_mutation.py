@@ -1,7 +1,5 @@
 """The check of readers catches what it is there for."""
 
-from __future__ import annotations
-
 import os
 import random
 import time

@@ -1,7 +1,5 @@
 """The budget of readers catches what it is there for."""
 
-from __future__ import annotations
-
 import time
 from pathlib import Path
 

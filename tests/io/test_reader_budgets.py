@@ -1,7 +1,5 @@
 """Files made to take memory or time are read or refused within the budget of every reader."""
 
-from __future__ import annotations
-
 import json
 import struct
 from collections.abc import Callable

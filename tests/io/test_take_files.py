@@ -1,7 +1,5 @@
 """load_take and save_take: which format by suffix, header, and what the take holds; the units of weights and angles."""
 
-from __future__ import annotations
-
 import math
 import warnings
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Times that come unevenly are the same again after each file that holds a take."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Videos that PyAV encodes: every codec, any times, rotated, of two sizes."""
 
-from __future__ import annotations
-
 import os
 import sys
 from collections.abc import Iterator, Sequence

@@ -1,7 +1,5 @@
 """Small instances of the classes that have tensors, each with inputs; the tests of modules go through them."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import cache

@@ -1,7 +1,5 @@
 """Modules behave as modules: what docs/concepts/modules.md says of each works, or is refused as it says there."""
 
-from __future__ import annotations
-
 import contextlib
 import copy
 import gc

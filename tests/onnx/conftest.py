@@ -1,7 +1,5 @@
 """Solvers that the tests of several graphs share."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 

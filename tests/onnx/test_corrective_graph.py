@@ -1,7 +1,5 @@
 """The marker solve's graph of a rig with correctives: near the exact solve, and what ONNX Runtime computes."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -1,7 +1,5 @@
 """A dynamics prior as ONNX says what the module says, and refuses a graph that does not."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Wrinkle weights as ONNX against PyTorch."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The graph of an example solver is its solve: one frame, many, and with landmarks missing."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Loops of a fixed number of short steps are written out; ONNX Runtime computes the same."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from torch import Tensor, nn

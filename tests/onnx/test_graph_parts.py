@@ -1,7 +1,5 @@
 """Parts that are exported by themselves: used twice and inside of a branch, the graph computes what the module does."""
 
-from __future__ import annotations
-
 import onnxruntime
 import pytest
 import torch

@@ -1,7 +1,5 @@
 """Learned models as ONNX graphs: ONNX Runtime computes what the models do, at any batch size."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Graphs of the networks that read images give what the networks give; face boxes for images of every size."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """ONNX Runtime's own format says and computes what the ONNX file does."""
 
-from __future__ import annotations
-
 import numpy as np
 import onnxruntime
 import torch

@@ -1,7 +1,5 @@
 """The fixed-step module is the marker solve and the hybrid solve."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from torch import Tensor

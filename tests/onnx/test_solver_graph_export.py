@@ -1,7 +1,5 @@
 """Files of the marker and the hybrid solve: what ONNX Runtime computes is the module, and near the exact solve."""
 
-from __future__ import annotations
-
 import json
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """The video solve's graph recovers what was planted, frame after frame, and ONNX Runtime computes the graph."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

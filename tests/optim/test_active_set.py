@@ -1,7 +1,5 @@
 """The pieces of the exact end: masked solves, Newton steps, the fixed point of splitting."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 

@@ -1,7 +1,5 @@
 """box_qp finds the minimum: planted solutions, scipy, optimality conditions, derivatives, bad input."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Mean shift against scikit-learn's, and with weights."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

@@ -1,7 +1,5 @@
 """DAQP one problem at a time: the optimum of the batch, whatever it was called with before."""
 
-from __future__ import annotations
-
 import copy
 import pickle
 

@@ -1,7 +1,5 @@
 """The projected gradient layer finds the optimum, also under transforms, compiled and in ONNX; its derivatives."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -1,7 +1,5 @@
 """simplex_qp finds the minimum: conditions of optimality, scipy, planted mixtures, derivatives, bad input."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

@@ -1,7 +1,5 @@
 """Sparse Cholesky against scipy, and the matrices it has to refuse."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

@@ -1,7 +1,5 @@
 """The box QP under the transforms of torch.func: as a loop over it would be."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import pytest

@@ -1,7 +1,5 @@
 """Characters by code: a head with a body of boxes, a skeleton, hair and materials in a ``.glb`` or ``.vrm``."""
 
-from __future__ import annotations
-
 import json
 import struct
 from collections.abc import Mapping

@@ -1,7 +1,5 @@
 """Pieces of a take that go from rest to an expression and back: what a database of expressions is made of."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from itertools import pairwise
 

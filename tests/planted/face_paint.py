@@ -1,7 +1,5 @@
 """Face paint for the embedded head: a mask round the eyes, stripes on the cheeks, red lips; with transparency."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

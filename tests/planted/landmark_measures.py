@@ -1,7 +1,5 @@
 """Measures of landmarks through a take: openings of lids and mouth, blinks, and how one signal follows another."""
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 

@@ -1,7 +1,5 @@
 """A performer recorded in colour under a light of known place: gloss, cast shadows, noise, and the truth beside it."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace

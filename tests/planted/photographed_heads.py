@@ -1,7 +1,5 @@
 """Planted heads, and the landmarks that cameras see of them."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import torch

@@ -1,7 +1,5 @@
 """Correctives for a rig that has none, of a known truth: smooth, local, where shapes overlap."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

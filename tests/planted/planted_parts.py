@@ -1,7 +1,5 @@
 """Parts of a face in a picture whose colours are known."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 
 import torch

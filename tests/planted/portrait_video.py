@@ -1,7 +1,5 @@
 """A performer recorded by an ordinary camera indoors: grey frames with their 68 landmarks."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

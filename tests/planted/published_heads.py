@@ -1,7 +1,5 @@
 """Head models in the layouts in which others publish theirs, made of the embedded performer's head."""
 
-from __future__ import annotations
-
 import struct
 from pathlib import Path
 from typing import Any

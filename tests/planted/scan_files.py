@@ -1,7 +1,5 @@
 """Folders of raw scans with the truth beside them."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from pathlib import Path
 

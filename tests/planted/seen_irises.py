@@ -1,7 +1,5 @@
 """Irises of a rig's eyeballs as a camera sees them."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

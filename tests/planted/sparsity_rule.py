@@ -1,7 +1,5 @@
 """The weight of the L1 penalty by the paper's rule."""
 
-from __future__ import annotations
-
 from torch import Tensor
 
 from torchface.capture import MarkerSolver

@@ -1,7 +1,5 @@
 """A take through a filter that runs frame by frame."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

@@ -1,7 +1,5 @@
 """Pieces of takes from rest to rest: found where they were planted, made neutral at both ends."""
 
-from __future__ import annotations
-
 import itertools
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Openings, blinks and agreements that were planted are found again."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

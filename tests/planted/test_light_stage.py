@@ -1,7 +1,5 @@
 """The film under a light shows what its settings say."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Motions of a face whose timing is known."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

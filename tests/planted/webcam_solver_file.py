@@ -1,7 +1,5 @@
 """The webcam's solver alone as an ONNX graph, without the networks that read pictures."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import onnx

@@ -1,7 +1,5 @@
 """A face-like surface by formula, and what a scanner makes of it."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Hair and ears in pieces: left out of the registration, form and colours there are the template's."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest

@@ -1,7 +1,5 @@
 """A model fitted to scans: planted coefficients come back, and what the model knows does not slide."""
 
-from __future__ import annotations
-
 import json
 import pickle
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """The pose of a template on a scan, planted and found again."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

@@ -1,7 +1,5 @@
 """A scan's colours on the template, where every point's colour is known."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest

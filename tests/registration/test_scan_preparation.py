@@ -1,7 +1,5 @@
 """Scans, templates and landmarks that cannot be right, and what is said of them."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

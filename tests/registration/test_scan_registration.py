@@ -1,7 +1,5 @@
 """A template bent onto scans whose true correspondence is known."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace

@@ -1,7 +1,5 @@
 """Colours of a picture: the texture's where it has a place for them, else the vertices'."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import torch

@@ -1,7 +1,5 @@
 """Panoramas light chalk as the integral over all directions does; files that are none are refused."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 

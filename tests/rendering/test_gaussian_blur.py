@@ -1,7 +1,5 @@
 """Blur and unsharp mask against SciPy's, on images of every size that kornia treats in its own way."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

@@ -1,7 +1,5 @@
 """A coarse mesh with a normal map looks like the fine surface that the map stands for."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

@@ -1,7 +1,5 @@
 """Light on a surface is the product it is said to be, with gradients, and shadow where something stands between."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

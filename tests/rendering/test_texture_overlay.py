@@ -1,7 +1,5 @@
 """Paint sits where the skin is, in the light of the film; a relit face looks as if filmed under the other source."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

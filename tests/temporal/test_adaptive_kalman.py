@@ -1,7 +1,5 @@
 """A filter that finds its settings while it runs: as good as the best that are set; landmarks of faces."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Kalman filters: the optimum that linear algebra gives, less jitter, no lag, gaps filled."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

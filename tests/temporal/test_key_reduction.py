@@ -1,7 +1,5 @@
 """Keys instead of samples: within the bound at every sample, few, and where NaN is, all."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

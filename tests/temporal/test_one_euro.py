@@ -1,7 +1,5 @@
 """Calm at rest, quick in motion, and never ahead of its time."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

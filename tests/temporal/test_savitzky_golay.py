@@ -1,7 +1,5 @@
 """Savitzky-Golay: what polynomials fitted window by window say."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

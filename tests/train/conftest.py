@@ -1,7 +1,5 @@
 """Recipes draw what they have learned; their tests do not look at it closely."""
 
-from __future__ import annotations
-
 import pytest
 
 

@@ -1,7 +1,5 @@
 """The recipe end to end on a filmed performer."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

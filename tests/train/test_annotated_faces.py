@@ -1,7 +1,5 @@
 """Annotated photographs of a folder, whatever kind of picture they are."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

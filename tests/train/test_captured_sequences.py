@@ -1,7 +1,5 @@
 """Archives of vertices and faces: read in every layout of NumPy's; damaged and built ones are refused."""
 
-from __future__ import annotations
-
 import io
 import struct
 import zipfile

@@ -1,7 +1,5 @@
 """Planted exposure and white balance are found and taken off; what differs between people stays."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest

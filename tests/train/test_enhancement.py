@@ -1,7 +1,5 @@
 """The recipe end to end: sequences in every form of file, a killed run, bad input."""
 
-from __future__ import annotations
-
 import zipfile
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The recipe for expressions on a handful of domes: a folder of pairs in, a table and a model out."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

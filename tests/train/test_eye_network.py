@@ -1,7 +1,5 @@
 """The recipe of the eye network end to end on a few rendered eyes: what it saves is what it has learned."""
 
-from __future__ import annotations
-
 from dataclasses import fields
 from pathlib import Path
 

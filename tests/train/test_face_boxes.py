@@ -1,7 +1,5 @@
 """The recipe of face boxes end to end on a few planted cut-outs: what it saves is what it has learned and measured."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The recipe of the network of a face's parts end to end on a few rendered people: what it saves is what it learned."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -1,7 +1,5 @@
 """Shapes that were moved come back onto their mean, from memory and in blocks."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from scipy.spatial import procrustes

@@ -1,7 +1,5 @@
 """The recipe for the landmark network: pictures that stay in files give what pictures in memory give."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -1,7 +1,5 @@
 """The recipe end to end: iBUG folders, dlib's XML, rendered performers, a killed run, bad input."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The measures from the Gram matrix against models made of vertices."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 

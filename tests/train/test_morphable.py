@@ -1,7 +1,5 @@
 """The recipe end to end: performers, registered meshes in any place and light, a killed run, bad input."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

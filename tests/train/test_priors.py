@@ -1,7 +1,5 @@
 """The recipe end to end: synthetic takes, weight takes, marker takes, another rig's names, bad input."""
 
-from __future__ import annotations
-
 import shutil
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Files of rendered pictures: damaged ones are named and made again."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -1,7 +1,5 @@
 """What every recipe has of the runner: settings files, logs, devices, runs that go on where they were killed."""
 
-from __future__ import annotations
-
 import shlex
 import shutil
 import sys

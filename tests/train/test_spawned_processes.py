@@ -1,7 +1,5 @@
 """Processes of recipes: a killed one is a plain error, and none outlives the run that started it."""
 
-from __future__ import annotations
-
 import os
 import signal
 import sys

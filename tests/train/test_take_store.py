@@ -1,7 +1,5 @@
 """Takes on disk: what another run has left there is read where it is whole and of the same, else made again."""
 
-from __future__ import annotations
-
 import json
 import warnings
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Rows of many files: those that were asked for, in their order, and files that do not fit are named."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

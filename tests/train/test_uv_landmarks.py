@@ -1,7 +1,5 @@
 """The recipe end to end on a handful of coarse scans, and what the detector then gives to registration."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from pathlib import Path

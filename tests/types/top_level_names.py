@@ -1,7 +1,5 @@
 """What checkers of types see at the top of torchface; `make lint` checks this file, and nothing runs it."""
 
-from __future__ import annotations
-
 from typing import assert_type
 
 import torchface

@@ -1,7 +1,5 @@
 """What checkers of types know of models; `make lint` checks this file, and nothing runs it."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import assert_type
 

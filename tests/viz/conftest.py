@@ -1,7 +1,5 @@
 """A small rig, and a headless Chromium that skips visibly where there is none."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import pytest

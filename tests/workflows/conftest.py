@@ -1,7 +1,5 @@
 """Jobs draw reports; their tests do not look at them closely."""
 
-from __future__ import annotations
-
 import pytest
 
 

@@ -1,7 +1,5 @@
 """What a folder holds is one animation, a mesh a frame, or several."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import torch

@@ -1,7 +1,5 @@
 """From a film to annotated frames: proposals, resuming, files, and the model learned from them."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """A graph is exported once, and anew where what was kept is damaged or what it is made of has changed."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -1,7 +1,5 @@
 """A planted camera comes back from pictures of a checkerboard, and useless images are refused by name."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Rigs and meshes from one kind of file to another."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

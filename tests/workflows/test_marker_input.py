@@ -1,7 +1,5 @@
 """Takes as they come from a recorder: prefixes, strangers, other labels, more frames than wanted."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Detector of faces in ONNX Runtime: it finds what PyTorch's finds."""
 
-from __future__ import annotations
-
 import torch
 
 from torchface.landmarks.images.checked_detector import shipped_detector

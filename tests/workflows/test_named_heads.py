@@ -1,7 +1,5 @@
 """The head model that is taken where nobody names one."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

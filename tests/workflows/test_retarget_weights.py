@@ -1,7 +1,5 @@
 """``torchface retarget`` onto a rig whose mouthClose opens the jaw."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -1,7 +1,5 @@
 """The command `corrective`: from a pose's mesh and an artist's change of it to a rig's file that shows it."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

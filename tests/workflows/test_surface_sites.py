@@ -1,7 +1,5 @@
 """Points of the mean head lie in the same places on heads of other topologies."""
 
-from __future__ import annotations
-
 import torch
 
 from torchface import zoo

@@ -1,7 +1,5 @@
 """Weights on disk: any rig's names, Live Link Face where they allow, and what a take holds beside them."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Small models, and a home of their own."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

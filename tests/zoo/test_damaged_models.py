@@ -1,7 +1,5 @@
 """Damaged models are named and refused; pickles are never loaded."""
 
-from __future__ import annotations
-
 import contextlib
 import hashlib
 import json

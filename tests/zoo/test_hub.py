@@ -1,7 +1,5 @@
 """Models of Hugging Face repositories: a server of one's own speaks the Hub's routes; nothing leaves this machine."""
 
-from __future__ import annotations
-
 import hashlib
 import re
 import sys

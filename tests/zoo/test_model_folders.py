@@ -1,7 +1,5 @@
 """Models by name: they come back as they were, and nothing outside the zoo is reached or run."""
 
-from __future__ import annotations
-
 import hashlib
 import re
 import shutil

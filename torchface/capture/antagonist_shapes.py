@@ -1,7 +1,5 @@
 """Antagonists in solves: of two shapes that are one quantity with a sign, one at most is above 0."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import torch

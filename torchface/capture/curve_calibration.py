@@ -1,7 +1,5 @@
 """Correction of a person's weights from a phone or another tracker: what rests is taken off, what is weak is raised."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import torch

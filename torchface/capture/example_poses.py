@@ -1,7 +1,5 @@
 """Retargeting rules learned from example poses: a character's weights that an animator sets for given weights."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path

@@ -8,8 +8,6 @@ that ``jawOpen`` is left out of it. With A for ARKit's and B for the other conve
     D^B_{close} = D^A_{close} + D_{jaw}, \qquad w^A_{jaw} = w^B_{jaw} + w^B_{close}, \qquad w^A_{close} = w^B_{close}.
 """
 
-from __future__ import annotations
-
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, replace

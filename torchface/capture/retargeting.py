@@ -1,7 +1,5 @@
 """One rig's weights on another: parallel parameterisation, by names and by a mapping table."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace

@@ -1,7 +1,5 @@
 """Observability of weights by points on a face: rank, conditioning, and shapes that look alike."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

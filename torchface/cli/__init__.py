@@ -1,7 +1,5 @@
 """The ``torchface`` command; one file a subcommand."""
 
-from __future__ import annotations
-
 import re
 import sys
 from collections.abc import Callable, Sequence

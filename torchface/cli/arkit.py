@@ -1,7 +1,5 @@
 """``torchface arkit``: ARKit's shapes on any head, and its animations as ARKit weights."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated
 

@@ -1,7 +1,5 @@
 """``torchface attach``: where the markers sit, fitted to a range of motion."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated, Literal
 

@@ -1,7 +1,5 @@
 """``torchface calibrate``: a camera's focal length and lens distortion from images of a checkerboard."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 from typing import Annotated

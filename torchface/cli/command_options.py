@@ -1,7 +1,5 @@
 """Options of commands: their help in plain words, without a default that is none, and texts that are read as values."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager

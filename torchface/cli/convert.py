@@ -1,7 +1,5 @@
 """``torchface convert``: a rig with its animation, or a mesh, as another kind of file."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated, Literal
 

@@ -1,7 +1,5 @@
 """``torchface corrective``: a corrective from a sculpted mesh."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated, Literal
 

@@ -1,7 +1,5 @@
 """``torchface demo``: the main job from end to end, with a report."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated

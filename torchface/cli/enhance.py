@@ -1,7 +1,5 @@
 """``torchface enhance``: a coarse animation gets an actor's wrinkles."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated, Literal
 

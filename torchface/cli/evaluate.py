@@ -1,7 +1,5 @@
 """``torchface evaluate``: how far a result is from the truth."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated
 

@@ -1,7 +1,5 @@
 """``torchface examples``: a person's example expressions, or a rig's, for the solve from landmarks."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated
 

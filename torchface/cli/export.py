@@ -1,7 +1,5 @@
 """``torchface export``: ONNX graphs for applications without PyTorch."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Literal

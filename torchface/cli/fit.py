@@ -1,7 +1,5 @@
 """``torchface fit``: a person's rig from photographs."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Literal

@@ -1,7 +1,5 @@
 """``torchface info``: what a file holds."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated
 

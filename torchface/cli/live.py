@@ -1,7 +1,5 @@
 """``torchface live``: anybody before a webcam, or with a phone, moves a character."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path

@@ -1,7 +1,5 @@
 """``torchface pick``: landmarks, marker sites and correspondences by clicking."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated, Literal
 

@@ -1,7 +1,5 @@
 """Progress bars of commands: steps with bars and rates on a terminal, lines of text elsewhere."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager

@@ -1,7 +1,5 @@
 """``torchface register``: a template bent onto many scans."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated
 

@@ -1,7 +1,5 @@
 """``torchface relight``: a tracked face under another light, with another skin or another head."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated, Literal
 

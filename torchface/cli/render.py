@@ -1,7 +1,5 @@
 """``torchface render``: images of a mesh or a rig in a pose."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated
 

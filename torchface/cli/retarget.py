@@ -1,7 +1,5 @@
 """``torchface retarget``: one rig's weights on another rig."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated
 

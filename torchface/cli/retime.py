@@ -1,7 +1,5 @@
 """``torchface retime``: a motion between two keyframes in an actor's timing."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated
 

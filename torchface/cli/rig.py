@@ -1,7 +1,5 @@
 """``torchface rig``: an actor's own rig from scans."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated, Literal
 

@@ -1,7 +1,5 @@
 """``torchface solve``: markers in, weights out."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Literal

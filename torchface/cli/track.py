@@ -1,7 +1,5 @@
 """``torchface track``: a face in a video, or before a camera, as weights of the actor's rig."""
 
-from __future__ import annotations
-
 from contextlib import nullcontext
 from pathlib import Path
 from typing import Annotated, Literal

@@ -1,7 +1,5 @@
 """``torchface train``: the recipes that make learned models, looked up by name: the library does not know them."""
 
-from __future__ import annotations
-
 import ast
 import sys
 from collections.abc import Sequence

@@ -1,7 +1,5 @@
 """``torchface transfer``: a template's shapes on another head."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated, Literal
 

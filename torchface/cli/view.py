@@ -1,7 +1,5 @@
 """``torchface view``: a rig in the browser."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from tyro.conf import Positional

@@ -1,7 +1,5 @@
 """``torchface zoo``: what learned models there are, what is known of them, and whether they are whole."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Annotated
 

@@ -1,7 +1,5 @@
 """Activation of correctives at given weights, and its derivatives."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 

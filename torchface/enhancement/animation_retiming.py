@@ -1,7 +1,5 @@
 """The actor's timing of a whole animation: its keyframes are found, and the motions between them are timed anew."""
 
-from __future__ import annotations
-
 from itertools import pairwise
 
 import numpy as np

@@ -1,7 +1,5 @@
 """An actor's captured frames, from which an enhancement learns."""
 
-from __future__ import annotations
-
 import warnings
 from dataclasses import dataclass
 

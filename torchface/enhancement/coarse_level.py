@@ -1,7 +1,5 @@
 """A dense mesh with few of its own vertices left, and how what moves those moves all."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Settings of an enhancement: how it splits frames and finds detail, and how large it is."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Literal
 

@@ -1,7 +1,5 @@
 """Training of an enhancement: frames in memory or on disk, a few at a time; a killed run continues."""
 
-from __future__ import annotations
-
 import time
 import warnings
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """Values computed once of an actor's database: filters, projections, the learned map, timing."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from functools import cached_property

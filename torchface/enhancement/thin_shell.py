@@ -1,7 +1,5 @@
 """From a few moving points to every vertex of a dense head: a linear thin shell with the points as constraints."""
 
-from __future__ import annotations
-
 import numpy as np
 import torch
 from numpy.typing import NDArray

@@ -1,7 +1,5 @@
 """Errors summed up: of all vertices, and region by region."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Errors of a solved performance against the true one at the markers and over the whole mesh."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import torch

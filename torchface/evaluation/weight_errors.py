@@ -1,7 +1,5 @@
 """Errors of solved weights, and of a rig's shapes, against the true ones."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Folders of files that can be made again: graphs and pages, each made once."""
 
-from __future__ import annotations
-
 import os
 import sys
 from pathlib import Path

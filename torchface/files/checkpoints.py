@@ -1,7 +1,5 @@
 """Checkpoints of unfinished work: tensors in one safetensors file that names what they were made of."""
 
-from __future__ import annotations
-
 import warnings
 from collections.abc import Mapping
 from pathlib import Path

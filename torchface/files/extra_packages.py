@@ -1,7 +1,5 @@
 """Packages that only some jobs need, imported where they are."""
 
-from __future__ import annotations
-
 import importlib
 import re
 import sys

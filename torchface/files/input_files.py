@@ -1,7 +1,5 @@
 """Inputs of a command, which none of its outputs may replace: compared as files, through links and spellings."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress

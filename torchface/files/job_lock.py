@@ -1,7 +1,5 @@
 """One run at a time in one output folder or file: a lock of the operating system, which ends with its process."""
 
-from __future__ import annotations
-
 import errno
 import os
 import warnings

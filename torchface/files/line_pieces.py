@@ -1,7 +1,5 @@
 """Large text in pieces of whole lines: words take up to fifty times the memory of the text that they are split from."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Folders of models: the checkout's, the installed package's, the user's; of models of one name the first wins."""
 
-from __future__ import annotations
-
 import re
 from functools import cache
 from pathlib import Path

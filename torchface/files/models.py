@@ -1,7 +1,5 @@
 """A learned model as a folder: ``model.toml``, ``state.safetensors`` and ``CARD.md``."""
 
-from __future__ import annotations
-
 import hashlib
 import math
 from collections.abc import Collection, Mapping

@@ -1,7 +1,5 @@
 """End of a process with the one that started it."""
 
-from __future__ import annotations
-
 import multiprocessing
 import os
 import threading

@@ -1,7 +1,5 @@
 """Names that parts of saved states and configs once had: models saved under them still load."""
 
-from __future__ import annotations
-
 from collections.abc import Collection, Mapping
 from typing import Any
 

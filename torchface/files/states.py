@@ -1,7 +1,5 @@
 """A module's state as safetensors: the header is held against the module before any memory is taken."""
 
-from __future__ import annotations
-
 from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any

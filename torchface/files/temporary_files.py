@@ -1,7 +1,5 @@
 """Files under temporary names: no two alike, made and opened where no link is planted, removed after whoever died."""
 
-from __future__ import annotations
-
 import hashlib
 import os
 import re

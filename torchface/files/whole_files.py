@@ -1,7 +1,5 @@
 """Whole files in and out: refused before they fill the memory, replaced only when they are complete."""
 
-from __future__ import annotations
-
 import errno
 import os
 import re

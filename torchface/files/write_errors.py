@@ -1,7 +1,5 @@
 """Errors of writing that say what to do about them."""
 
-from __future__ import annotations
-
 import errno
 import os
 import shutil

@@ -1,7 +1,5 @@
 """Check for points mirrored on their way, as left-handed axes or swapped sides do."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import torch

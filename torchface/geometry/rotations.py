@@ -1,7 +1,5 @@
 """Rotations from their axis and angle, and the way back, or from quaternions."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

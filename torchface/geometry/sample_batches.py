@@ -1,7 +1,5 @@
 """Samples of one form, read a few at a time from memory or from disk."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Protocol

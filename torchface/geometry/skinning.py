@@ -1,7 +1,5 @@
 """Linear blend skinning: vertices that follow joints, and the way back."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import torch

@@ -1,7 +1,5 @@
 """Spheres near points."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

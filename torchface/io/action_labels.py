@@ -1,7 +1,5 @@
 """Labels of a head-camera video as TOML: where to look, and which action units were performed when."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Calibrations of a camera, and of several that are fixed to each other, as TOML."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Lengths in files: the unit they are in, and vertices that must be numbers."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Meshes by path: OBJ, PLY, STL, OFF, glTF, USD."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from torchface.files.whole_files import check_ending

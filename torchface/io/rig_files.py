@@ -1,7 +1,5 @@
 """Rigs, their animations and detail maps by path: glTF, USD, a folder of OBJ files, ICT-FaceKit's folder."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path

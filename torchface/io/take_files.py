@@ -1,7 +1,5 @@
 """Takes in and out, by the file's suffix and header, in the usual units."""
 
-from __future__ import annotations
-
 import math
 import warnings
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """The action unit classifier as an ONNX graph."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass

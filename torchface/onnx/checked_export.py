@@ -1,7 +1,5 @@
 """Writes a graph only where ONNX Runtime computes what PyTorch does."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path

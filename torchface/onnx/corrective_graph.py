@@ -1,7 +1,5 @@
 """The marker solve of a rig with correctives with a fixed number of steps: the module that goes into an ONNX graph."""
 
-from __future__ import annotations
-
 import copy
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """A dynamics prior as ONNX: the last frames' weights to mean and variance of the next."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from pathlib import Path
 

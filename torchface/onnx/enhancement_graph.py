@@ -1,7 +1,5 @@
 """Weights of wrinkle maps as ONNX: of a rig's vertices, or of its blendshape weights."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """``ExampleSolver`` of squared distances, or of a landmark model, as a module that an ONNX model is exported of."""
 
-from __future__ import annotations
-
 import copy
 from collections.abc import Mapping
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """An expression regression as ONNX: neutral faces to the offsets of a rig."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from pathlib import Path
 

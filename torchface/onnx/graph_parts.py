@@ -3,8 +3,6 @@
 ``torch.export`` takes long in a graph whose sizes are known when it runs, and for each place where a part is used.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 

@@ -1,7 +1,5 @@
 """A head model's decoder as ONNX: coefficients to vertices and colours."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from pathlib import Path
 

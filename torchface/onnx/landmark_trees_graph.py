@@ -1,7 +1,5 @@
 """Landmark trees as ONNX: one grey image and boxes of faces in it to landmarks."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Any learned model that has a graph, written as ONNX."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """ONNX export of any module of tensors, such as a network with a solve in it or a prior's density."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """ONNX export of the networks that read images: landmarks, eyes, parts of faces, face boxes."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path

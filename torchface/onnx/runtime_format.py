@@ -1,7 +1,5 @@
 """Models in ONNX Runtime's own format, with which it begins in a fifth of the time."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from tempfile import TemporaryDirectory
 

@@ -1,7 +1,5 @@
 """Files of ``SolverGraph`` and ``CorrectiveGraph``, and how far they are from the exact solve."""
 
-from __future__ import annotations
-
 import copy
 import time
 from collections.abc import Mapping

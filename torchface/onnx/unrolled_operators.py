@@ -1,7 +1,5 @@
 """The ONNX form of ``torchface.optim.exported_operators``: loops written out."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from typing import Any
 

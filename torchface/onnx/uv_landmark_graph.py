@@ -1,7 +1,5 @@
 """A UV landmark detector's bank of filters as ONNX: images to landmarks, in a fixed number of steps."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from pathlib import Path
 

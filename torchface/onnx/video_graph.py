@@ -1,7 +1,5 @@
 """The video solve of one frame as it goes into an ONNX graph: its steps are a loop that ends where they settle."""
 
-from __future__ import annotations
-
 import copy
 
 import torch

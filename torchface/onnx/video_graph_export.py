@@ -1,7 +1,5 @@
 """Writes ``VideoGraph`` as an ONNX file and says how far it is from the exact solve."""
 
-from __future__ import annotations
-
 import copy
 import time
 from collections.abc import Mapping

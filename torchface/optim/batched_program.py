@@ -5,8 +5,6 @@
 3. Newton steps with a search, after more of splitting in float64: for an H that is singular or close to it.
 """
 
-from __future__ import annotations
-
 import math
 
 import torch

@@ -1,7 +1,5 @@
 """Checks of box-constrained quadratic programs: what does not fit, is not finite, or has no minimum."""
 
-from __future__ import annotations
-
 from numbers import Real
 
 import torch

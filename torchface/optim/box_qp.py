@@ -1,7 +1,5 @@
 """Box-constrained quadratic programs in batches: the solver behind every blendshape solve."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor, nn
 

@@ -1,7 +1,5 @@
 """Calls whose path depends on the numbers given, kept apart from what records one path for all numbers."""
 
-from __future__ import annotations
-
 import functools
 from collections.abc import Callable
 from typing import Any, ParamSpec, TypeVar

@@ -1,7 +1,5 @@
 """The largest eigenpairs of a symmetric matrix."""
 
-from __future__ import annotations
-
 import torch
 from scipy.linalg import eigh
 from torch import Tensor

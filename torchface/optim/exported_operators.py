@@ -1,7 +1,5 @@
 """Operators without an ONNX form: PyTorch runs them by itself, exported graphs as loops that are written out."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import torch

@@ -1,7 +1,5 @@
 """Box-constrained quadratic programs by a fixed number of splitting's steps: one module for PyTorch and for ONNX."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from functools import partial

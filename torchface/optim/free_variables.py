@@ -1,7 +1,5 @@
 """Linear systems in the free variables of box-constrained quadratic programs, batched: only these are factored."""
 
-from __future__ import annotations
-
 from typing import TypeAlias
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Gradient descent of small networks on batches that are drawn as it goes on, with checkpoints and a running mean."""
 
-from __future__ import annotations
-
 import math
 import time
 from collections.abc import Callable, Iterator

@@ -1,7 +1,5 @@
 """Derivatives of what a constrained quadratic program or an iteration finds, apart from the solver that found it."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Mean shift with a flat kernel: the modes of a set of weighted points."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import torch

@@ -1,7 +1,5 @@
 """Values computed once from tensors and kept until they change."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Generic, TypeVar
 

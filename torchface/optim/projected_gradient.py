@@ -11,8 +11,6 @@ with :math:`\lambda` the largest eigenvalue of :math:`D^{-1} H`. Where the momen
 Source: Nesterov 2004, 2.2; O'Donoghue and Candès 2015, Adaptive restart for accelerated gradient schemes.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 

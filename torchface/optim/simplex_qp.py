@@ -1,7 +1,5 @@
 """Quadratic programs on the simplex in batches: convex combinations of many, of which few take part."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

@@ -1,7 +1,5 @@
 """Hair and cloth on a scan, which hide the skin: found by their colour; and ears that came out in pieces."""
 
-from __future__ import annotations
-
 from functools import cached_property
 
 import torch

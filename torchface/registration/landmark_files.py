@@ -1,7 +1,5 @@
 """Landmark files beside scans, read as what ``register`` takes."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import torch

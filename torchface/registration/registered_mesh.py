@@ -1,7 +1,5 @@
 """A registered face at its template's place, with the template's material where the scan shows none."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import torch

@@ -1,7 +1,5 @@
 """A scan's colours on the registered mesh: one a vertex, and a texture in the template's layout."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, replace
 

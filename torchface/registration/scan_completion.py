@@ -1,7 +1,5 @@
 """Completion of a scan by the template: shape and colours that pass over into those of the scan."""
 
-from __future__ import annotations
-
 import numpy as np
 import torch
 from scipy import sparse

@@ -1,7 +1,5 @@
 """A template bent onto a raw scan: the scan's face in the template's topology."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace

@@ -1,7 +1,5 @@
 """Images of a mesh by ray casting, lit so that form shows: key, fill and rim light, soft shadow in creases."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Shells over eyes that a viewer blends with what lies behind them; drawn as opaque, they would hide the eyes."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import torch

@@ -1,7 +1,5 @@
 """Gaussian blur of images, and the unsharp mask made of it."""
 
-from __future__ import annotations
-
 import math
 
 from torch import Tensor

@@ -1,7 +1,5 @@
 """Rays against a triangle mesh, by Embree."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Names of blendshapes: ARKit's 52, what other rigs call the same shapes, and which is whose mirror image."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Sequence
 from difflib import get_close_matches

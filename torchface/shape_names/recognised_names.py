@@ -1,7 +1,5 @@
 """ARKit's shapes under the names that other programs give them: one table of aliases, and a reading by words."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """A Kalman filter that finds its settings while it runs."""
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, replace

@@ -1,7 +1,5 @@
 """Even grids of frames under times that come unevenly."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

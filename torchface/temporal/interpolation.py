@@ -1,7 +1,5 @@
 """Values of frames that have none, from the frames before and after."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

@@ -1,7 +1,5 @@
 """Keys of a curve: the few of its samples between which straight lines stay within a bound of all the others."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

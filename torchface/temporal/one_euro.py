@@ -1,7 +1,5 @@
 """A causal low-pass filter that opens with speed: calm where a signal rests, quick where it moves."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from typing import Any

@@ -1,7 +1,5 @@
 """Curves smoothed along time."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

@@ -1,7 +1,5 @@
 """Frames of a video to be annotated: tracked, chosen so that they span what the face does, kept for a resumed run."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,7 +1,5 @@
 """From images of a checkerboard to the calibration of a camera, or of several that are fixed to each other, on disk."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace

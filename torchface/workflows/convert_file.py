@@ -1,7 +1,5 @@
 """A rig, its animation or a mesh from one kind of file to another, FBX and Blender's own by way of Blender."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path

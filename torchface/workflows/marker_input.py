@@ -1,7 +1,5 @@
 """A marker take from disk: in millimetres, by an attachment's labels, cut to some frames."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace

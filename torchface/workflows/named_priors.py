@@ -1,7 +1,5 @@
 """Choice of the priors of a solve: read by name or folder, and brought to a rig's shapes and a video's frame rate."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """A mesh or a posed rig from whatever file it lies in."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path

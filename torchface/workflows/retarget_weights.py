@@ -1,7 +1,5 @@
 """From weights on disk to another rig's weights and animation on disk."""
 
-from __future__ import annotations
-
 import warnings
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace

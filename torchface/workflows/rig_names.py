@@ -1,7 +1,5 @@
 """Under which names a rig's shapes are written."""
 
-from __future__ import annotations
-
 from typing import Literal
 
 from torchface.geometry.meshes.normal_maps import DetailMaps

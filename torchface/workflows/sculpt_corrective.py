@@ -1,7 +1,5 @@
 """A rig's file with a corrective more, from a sculpted mesh."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path

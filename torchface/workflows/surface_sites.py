@@ -1,7 +1,5 @@
 """Sites on a rig of the points that a landmark network finds: a head's places are carried over to another's."""
 
-from __future__ import annotations
-
 import torch
 from scipy.interpolate import RBFInterpolator
 from scipy.spatial import KDTree

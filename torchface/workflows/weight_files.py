@@ -1,7 +1,5 @@
 """Weights on disk as the commands write them."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Descriptions of models, which need no loading."""
 
-from __future__ import annotations
-
 import re
 from dataclasses import dataclass
 from pathlib import Path

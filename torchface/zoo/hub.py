@@ -1,7 +1,5 @@
 """Models of Hugging Face repositories in the layout of a model's folder; nothing else of a repository is fetched."""
 
-from __future__ import annotations
-
 import os
 import re
 from contextlib import suppress

@@ -1,7 +1,5 @@
 """Classes of models by kind."""
 
-from __future__ import annotations
-
 import re
 
 from torch import nn

@@ -1,7 +1,5 @@
 """Models by name or folder, each with its class for type checkers."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any, Literal, TypeVar, overload
 

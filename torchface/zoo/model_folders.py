@@ -1,7 +1,5 @@
 """Folders of models by name, and the models that can be loaded."""
 
-from __future__ import annotations
-
 import os
 import warnings
 from functools import cache

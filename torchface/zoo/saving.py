@@ -1,7 +1,5 @@
 """Saved models: folders with a description, a state and a card."""
 
-from __future__ import annotations
-
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path

@@ -1,7 +1,5 @@
 """A performer does what a coach asks for: action units, alone and together, each a few times, from rest to rest."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -3,8 +3,6 @@
 A real video file, the markers as C3D beside it, a description of what was performed, and the truth.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path

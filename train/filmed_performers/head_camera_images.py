@@ -1,7 +1,5 @@
 """A painted head with marker balls under a helmet's rim, lit from where the camera is."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

@@ -1,7 +1,5 @@
 """A camera on a helmet: where it hangs before the face, how it shakes, what it shows of the helmet."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Files of labels of head-camera videos, as a person writes them."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -1,7 +1,5 @@
 """A pattern of white reflective strokes, painted by hand between the markers, that moves with the skin."""
 
-from __future__ import annotations
-
 import math
 from functools import lru_cache
 

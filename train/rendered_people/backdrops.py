@@ -1,7 +1,5 @@
 """Backdrops of a face in an image, and a camera's effects: structure, blur, noise, compression."""
 
-from __future__ import annotations
-
 import math
 
 import cv2

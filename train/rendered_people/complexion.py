@@ -1,7 +1,5 @@
 """The variation of skin between performers: melanin, blood, lips, hair, shadows under the eyes."""
 
-from __future__ import annotations
-
 from functools import lru_cache
 
 import torch

@@ -1,7 +1,5 @@
 """Points of a face's surface that a landmark network finds beside iBUG's 68: close at lids and lips, wide on cheeks."""
 
-from __future__ import annotations
-
 from functools import lru_cache
 
 import torch

@@ -1,7 +1,5 @@
 """Weights of ARKit's shapes for pictures: lids from wide to closed, mouths from pressed to wide, glances, gestures."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Protocol
 

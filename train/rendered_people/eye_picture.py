@@ -1,7 +1,5 @@
 """A colour picture of someone's eyes, cut out of its background, with lids, irises and which of them can be seen."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace

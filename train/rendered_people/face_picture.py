@@ -1,7 +1,5 @@
 """A colour picture of someone, cut out of its background, with landmarks and which of them can be seen."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace

@@ -1,7 +1,5 @@
 """Whole pictures with people in them, put together from cut-outs: what a face detector learns from."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from functools import cache, cached_property, lru_cache

@@ -4,8 +4,6 @@ Paint, hair and beards are functions of a point on that mean head. Another topol
 of its own mean head onto it, by their common landmarks.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import dataclass

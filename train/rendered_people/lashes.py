@@ -1,7 +1,5 @@
 """Eyelashes drawn over a picture of someone: they follow the lids, and hang where the lids are closed."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 import torch

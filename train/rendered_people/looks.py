@@ -1,7 +1,5 @@
 """Looks of someone beside the shape of the head: skin, hair, brows, beard, make-up, glasses, clothes."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import torch

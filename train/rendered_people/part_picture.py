@@ -1,7 +1,5 @@
 """A picture of someone whose every pixel is known: skin, hair, brows, eyes, lips, teeth, glasses, hand, cloth."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 

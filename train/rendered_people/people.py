@@ -1,7 +1,5 @@
 """People to take pictures of: a head of some kind, its looks, and its lids, which meet when they are to be closed."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """One picture's surface: a posed head with hair, teeth, shoulders; and where an annotator would put the landmarks."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import lru_cache
 

@@ -1,7 +1,5 @@
 """Geometry of a portrait besides the bare head: hair, teeth, shoulders; and the visible jaw line."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from functools import lru_cache

@@ -1,7 +1,5 @@
 """Grey portraits of synthetic people with exact landmarks, as varied as a landmark detector needs to learn from."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace

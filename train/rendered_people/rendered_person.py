@@ -1,7 +1,5 @@
 """Rendering of a person: the colour of each pixel under light sources, and its depth."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import torch

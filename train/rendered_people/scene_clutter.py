@@ -1,7 +1,5 @@
 """Clutter of a picture: coloured walls, shapes, stripes, writing, skin, hands, cloth, screens; no faces."""
 
-from __future__ import annotations
-
 import string
 
 import cv2

@@ -1,7 +1,5 @@
 """The colour of a head's surface, decided at points of the mean head, so that no texture is needed."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

@@ -1,7 +1,5 @@
 """Spectacles drawn over a picture of someone."""
 
-from __future__ import annotations
-
 import math
 
 import cv2

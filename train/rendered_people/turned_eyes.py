@@ -1,7 +1,5 @@
 """Eyeballs that look somewhere, and where their irises are."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from functools import lru_cache

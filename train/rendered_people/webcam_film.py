@@ -4,8 +4,6 @@ Where a take's mouth hardly moves, it talks, smiles and opens for some seconds a
 and brows are the take's own all the time.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field, fields, replace
 from functools import lru_cache
 from pathlib import Path

@@ -1,7 +1,5 @@
 """What someone before a webcam does: faces from a take, a head that never rests, turning away, a hand at the mouth."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

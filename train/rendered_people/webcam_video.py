@@ -1,7 +1,5 @@
 """Colour frames of someone before a webcam, as it takes them, with landmarks, irises and what hides them."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass, fields, replace
 

@@ -1,7 +1,5 @@
 """Two performers on the camera stage: one to learn from, one to try on."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 

@@ -1,7 +1,5 @@
 """Planted action units come back: on the performer learned from, on another, from disk and from ONNX."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from pathlib import Path
 

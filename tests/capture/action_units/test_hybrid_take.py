@@ -1,7 +1,5 @@
 """A classifier's curves lead the solve where markers are blind: from video and markers to weights."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 

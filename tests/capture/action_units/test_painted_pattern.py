@@ -1,7 +1,5 @@
 """The painted pattern is what is bright in a region; a flow aligns it with another's."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 

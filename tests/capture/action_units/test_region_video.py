@@ -1,7 +1,5 @@
 """Regions are read where they are; a video without them is refused."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest

@@ -1,7 +1,5 @@
 """Tables of action units in a rig's shapes."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -1,7 +1,5 @@
 """The command solves markers with a video: what the markers hardly see comes from the painted patterns."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

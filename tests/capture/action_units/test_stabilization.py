@@ -1,7 +1,5 @@
 """What the camera's shake did to the picture is found again from a helmet point and two markers."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest

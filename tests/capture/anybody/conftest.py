@@ -1,7 +1,5 @@
 """Examples of the embedded performer, and somebody else's landmarks made of them."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from torch import Tensor

@@ -1,7 +1,5 @@
 """How people's landmarks differ, as a basis that is the same wherever it is computed."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from torch import Tensor

@@ -1,7 +1,5 @@
 """The webcam's solver on planted people: landmarks of heads that it has never seen, with a finder's habits."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest

@@ -1,7 +1,5 @@
 """Marker sites that are wrong by a known distance along the skin, as a first guess by eye would be."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

@@ -1,7 +1,5 @@
 """Markers of a rig with correctives: planted weights, scipy's solvers, finite differences."""
 
-from __future__ import annotations
-
 import copy
 import time
 from pathlib import Path

@@ -1,7 +1,5 @@
 """A helmet that slips leaves the weights alone, and its motion is separated from them."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest

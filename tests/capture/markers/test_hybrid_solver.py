@@ -1,7 +1,5 @@
 """The hybrid solve: the markers' own weights where nothing is predicted, the right optimum where something is."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from torch import Tensor

@@ -1,7 +1,5 @@
 """Labels as recorders write them are found among an attachment's."""
 
-from __future__ import annotations
-
 import pytest
 
 from torchface.capture.markers import match_labels, own_labels

@@ -1,7 +1,5 @@
 """MarkerSolver gives back the weights that moved the markers."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest

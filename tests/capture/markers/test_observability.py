@@ -1,7 +1,5 @@
 """The report names what was made invisible; sparsity does what the rule says."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

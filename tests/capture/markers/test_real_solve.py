@@ -1,7 +1,5 @@
 """The solve on a real rig of 53 shapes, moved by six real takes."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from torch import Tensor

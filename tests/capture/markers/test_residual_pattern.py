@@ -1,7 +1,5 @@
 """A smooth residual over the face is another head's; noise, a similarity and a stand-off are not."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 

@@ -1,7 +1,5 @@
 """A take that the rig cannot explain is told from one that it can, and why."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest

@@ -1,7 +1,5 @@
 """What a solver prepares follows its state, whichever way that was changed."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import pytest

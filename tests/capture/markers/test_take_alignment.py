@@ -1,7 +1,5 @@
 """A take is aligned to the rig, whether it holds a neutral frame or not."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest

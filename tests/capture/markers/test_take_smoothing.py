@@ -1,7 +1,5 @@
 """Weights of a whole take at once: smoother where the face is slow, as high where it is fast."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest

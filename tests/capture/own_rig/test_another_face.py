@@ -1,7 +1,5 @@
 """A cut to another face is found by its look and its landmarks; hands, turns and cuts to the same face are not."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from torch import Tensor

@@ -3,8 +3,6 @@
 Most machines that run tests have one device; see ``pretended_device`` for the second.
 """
 
-from __future__ import annotations
-
 import contextlib
 from collections.abc import Callable, Iterator
 from typing import Any

@@ -1,7 +1,5 @@
 """Eyeballs of rigs, and gaze that is seen as it was planted."""
 
-from __future__ import annotations
-
 import torch
 
 from planted.seen_irises import irises

@@ -1,7 +1,5 @@
 """Measurements beside landmarks: what readings of weights and deviations add to a solve."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest

@@ -1,7 +1,5 @@
 """The same performance filmed at any rate, even or not, gives the same weights at the same times."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from torch import Tensor

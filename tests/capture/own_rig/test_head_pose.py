@@ -1,7 +1,5 @@
 """Head poses: planted ones come back in spite of outliers and gaps; real faces."""
 
-from __future__ import annotations
-
 import functools
 import math
 from pathlib import Path

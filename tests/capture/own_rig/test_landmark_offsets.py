@@ -1,7 +1,5 @@
 """Fixed offsets between rig and finder are found and kept in a file; expressions that never end are no offsets."""
 
-from __future__ import annotations
-
 import functools
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Planted lights come back from pictures with gloss, shadows and noise."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from pathlib import Path

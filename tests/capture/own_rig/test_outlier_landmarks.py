@@ -1,7 +1,5 @@
 """Landmarks that no face has where they are, are found; those of faces that move are not."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from torch import Tensor

@@ -1,7 +1,5 @@
 """Frames in which a face rests, of a take that laughs most of the time."""
 
-from __future__ import annotations
-
 import torch
 
 from torchface.capture.own_rig.resting_frames import activity_of_readings, activity_of_weights, resting_share

@@ -1,7 +1,5 @@
 """Landmarks of a real face, found by OpenFace, on the real rig."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -1,7 +1,5 @@
 """A video solver is its state and its config: saved, moved and loaded, it gives what it gave."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 

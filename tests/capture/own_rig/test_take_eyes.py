@@ -1,7 +1,5 @@
 """Eyes of a take: lids beside the person's own, gaze beside straight ahead, both as readings of a rig's weights."""
 
-from __future__ import annotations
-
 from dataclasses import fields, replace
 
 import pytest

@@ -1,7 +1,5 @@
 """Whole takes: the first frames may lack a face, progress is reported, uneven frames are solved at even times."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from torch import Tensor

@@ -1,7 +1,5 @@
 """The video solve recovers what was planted: weights, poses, gradients; and bridges what it does not see."""
 
-from __future__ import annotations
-
 import functools
 
 import pytest

@@ -1,7 +1,5 @@
 """Priors for a rig of other names and a video of another rate: the same density, the same motion."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from scipy.stats import multivariate_normal, multivariate_t

@@ -1,7 +1,5 @@
 """Dynamics against scikit-learn's Gaussian processes and planted motion; the variance is what errors have."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

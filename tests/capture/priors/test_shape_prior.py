@@ -1,7 +1,5 @@
 """Densities against scikit-learn and scipy, their quadratics against finite differences."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Regions are what moves together, named by place, with Gaussian borders."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 

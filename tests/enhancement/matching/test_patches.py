@@ -1,7 +1,5 @@
 """Patches are connected and even, their means are integrals."""
 
-from __future__ import annotations
-
 import numpy as np
 import torch
 from scipy.sparse import coo_array

@@ -1,7 +1,5 @@
 """Projections are the nearest points of convex hulls, region by region."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

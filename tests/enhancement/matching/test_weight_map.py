@@ -1,7 +1,5 @@
 """Detail planted by a rig's weights is found better with them; weights of another rig do little harm."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import pytest

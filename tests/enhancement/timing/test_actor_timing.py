@@ -1,7 +1,5 @@
 """Timing that was planted is learned, and never runs backwards."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from hypothesis import given, settings

@@ -1,7 +1,5 @@
 """The path through a sequence is the best there is."""
 
-from __future__ import annotations
-
 import itertools
 
 import pytest

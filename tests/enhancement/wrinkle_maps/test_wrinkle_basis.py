@@ -1,7 +1,5 @@
 """Maps of wrinkles that weights of regions mix."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from torch import Tensor

@@ -1,7 +1,5 @@
 """What wrinkle maps are learned from: the actor's poses as a rig's weights, mixtures of them, the model's detail."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from torch import Tensor

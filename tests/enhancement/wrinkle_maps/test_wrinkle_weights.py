@@ -1,7 +1,5 @@
 """The weights of wrinkle maps by a rig's pose."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from torch import Tensor

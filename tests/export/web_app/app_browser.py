@@ -1,7 +1,5 @@
 """The app's folder on a local server, and its page in a Chromium whose camera is a film."""
 
-from __future__ import annotations
-
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager

@@ -1,7 +1,5 @@
 """The page's modules under Node, and the app in a Chromium that the tests of a process share."""
 
-from __future__ import annotations
-
 import json
 import shutil
 import subprocess

@@ -1,7 +1,5 @@
 """Films that Chromium takes for its camera."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """A graph with the inputs and outputs of ``torchface export webcam`` that reads planted weights off the picture."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """What the page was shown and answered, recorded and downloaded; and what Python makes of the same pictures."""
 
-from __future__ import annotations
-
 import base64
 import json
 from dataclasses import dataclass

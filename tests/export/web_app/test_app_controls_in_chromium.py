@@ -1,7 +1,5 @@
 """The app's controls, characters and takes in a real Chromium, as hands, keys and screen readers have them."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

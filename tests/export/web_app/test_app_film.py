@@ -1,7 +1,5 @@
 """The app with the webcam's own graph before films of rendered faces: Python's weights, drawn, and how fast."""
 
-from __future__ import annotations
-
 import io
 import struct
 import zipfile

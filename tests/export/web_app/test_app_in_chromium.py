@@ -1,7 +1,5 @@
 """The app in a real Chromium whose camera is a film: what it records, what it says, and that nothing leaves it."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path

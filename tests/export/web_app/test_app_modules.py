@@ -1,7 +1,5 @@
 """The page's own modules under Node: names, calibration, settings, times."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 

@@ -1,7 +1,5 @@
 """The page's own modules under Node: characters, and takes saved as files."""
 
-from __future__ import annotations
-
 import base64
 import json
 import struct

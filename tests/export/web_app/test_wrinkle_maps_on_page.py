@@ -1,7 +1,5 @@
 """Wrinkle maps on the page move with the shapes, and are mixed as ``DetailMaps.blend`` mixes them."""
 
-from __future__ import annotations
-
 import base64
 import json
 import shutil

@@ -1,7 +1,5 @@
 """Lens distortion agrees with OpenCV, goes back and forth, and says where nothing is seen."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

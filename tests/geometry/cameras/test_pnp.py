@@ -1,7 +1,5 @@
 """A planted camera comes back; with noise the answer is OpenCV's, or better."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from scipy.spatial.transform import Rotation

@@ -1,7 +1,5 @@
 """Planted cameras come back although a third of the points is seen where it is not."""
 
-from __future__ import annotations
-
 import functools
 
 import pytest

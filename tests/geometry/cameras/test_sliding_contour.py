@@ -1,7 +1,5 @@
 """On a ball the furthest point of a level curve is where the ball ends before the background."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

@@ -1,7 +1,5 @@
 """Deformation gradients and the operator that reads them: affine maps come back, the fourth vertex does its part."""
 
-from __future__ import annotations
-
 import numpy as np
 import torch
 from scipy.spatial import Delaunay

@@ -1,7 +1,5 @@
 """Vertices from gradients, against a dense least squares solution of equation 25 with every fourth vertex unknown."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

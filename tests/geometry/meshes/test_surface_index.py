@@ -1,7 +1,5 @@
 """Nearest points on triangle meshes."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

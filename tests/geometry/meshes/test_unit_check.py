@@ -1,7 +1,5 @@
 """Lengths in another unit are told by the extent of what they show, with the cure."""
 
-from __future__ import annotations
-
 import re
 
 import pytest

@@ -1,7 +1,5 @@
 """Charts of several tiles come into one image, where none covers another, and keep their form."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

@@ -6,8 +6,6 @@ that they have when somebody moves these sliders. ``shown_in_blender.py export F
 Blender's exporters and their defaults.
 """
 
-from __future__ import annotations
-
 import sys
 from pathlib import Path
 from typing import Any

@@ -4,8 +4,6 @@
 places, metres, and ``scene_at_rest.npz`` without animation.
 """
 
-from __future__ import annotations
-
 import sys
 from pathlib import Path
 from typing import Any

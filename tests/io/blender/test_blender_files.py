@@ -1,7 +1,5 @@
 """Without Blender: what runs it, and what is said where it is missing or fails."""
 
-from __future__ import annotations
-
 import importlib.util
 import shutil
 import sys

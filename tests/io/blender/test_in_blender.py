@@ -1,7 +1,5 @@
 """In Blender itself: our files open as they are meant, and Blender's own come back. ``make test-blender``."""
 
-from __future__ import annotations
-
 import subprocess
 from pathlib import Path
 

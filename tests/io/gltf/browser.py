@@ -1,7 +1,5 @@
 """Pictures of a ``.glb`` by three.js in a headless Chromium."""
 
-from __future__ import annotations
-
 import base64
 import json
 import threading

@@ -1,7 +1,5 @@
 """glTF documents put together field by field, as other programs write them."""
 
-from __future__ import annotations
-
 import base64
 import json
 from pathlib import Path

@@ -1,7 +1,5 @@
 """A .glb whose JSON is changed, as a stranger's program might write it."""
 
-from __future__ import annotations
-
 import json
 import struct
 from collections.abc import Callable

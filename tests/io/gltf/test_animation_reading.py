@@ -1,7 +1,5 @@
 """Weights that an animated file plays are those that were written, at the rate that was meant."""
 
-from __future__ import annotations
-
 import json
 import struct
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Correctives in files: definitions in the extras, deltas as targets, weights in animations."""
 
-from __future__ import annotations
-
 import json
 import struct
 from collections.abc import Callable

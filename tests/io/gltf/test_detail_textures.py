@@ -1,7 +1,5 @@
 """Wrinkle maps on disk: 16-bit pictures and ``.glb``, there and back."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """What three.js draws of our rigs in a real browser: eyes that are eyes, expressions shaded as they are shaped."""
 
-from __future__ import annotations
-
 import json
 import struct
 from pathlib import Path

@@ -1,7 +1,5 @@
 """What others make of our files: Khronos' validator and three.js, both from npm."""
 
-from __future__ import annotations
-
 import json
 import shutil
 import subprocess

@@ -1,7 +1,5 @@
 """A head's parts as engines get them: primitives, materials, pivots, turned normals; and back as one rig."""
 
-from __future__ import annotations
-
 import json
 import struct
 from dataclasses import replace

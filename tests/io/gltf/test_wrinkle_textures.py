@@ -1,7 +1,5 @@
 """Wrinkle maps by region: mixed, in a ``.glb`` and back."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

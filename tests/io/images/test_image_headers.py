@@ -1,7 +1,5 @@
 """Every kind of image comes with the values that were planted, by whichever door, and upright."""
 
-from __future__ import annotations
-
 import io
 from collections.abc import Callable
 from pathlib import Path

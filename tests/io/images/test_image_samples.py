@@ -1,7 +1,5 @@
 """An image takes at most 500 MB or 20 times its file, whatever its header, tags and chunks claim."""
 
-from __future__ import annotations
-
 import io
 import struct
 import zlib

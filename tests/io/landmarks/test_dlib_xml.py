@@ -1,7 +1,5 @@
 """dlib's XML of faces: what imglab writes is read; entities, wrong places and wrong numbers are refused."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -1,7 +1,5 @@
 """Landmark files of menpo, iBUG and the toolkit's own."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Landmarks of other programs' tables come back where they were, frame by frame."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

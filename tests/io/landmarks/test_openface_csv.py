@@ -1,7 +1,5 @@
 """Landmark CSV in OpenFace's layout: a real file, round trips, broken files."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

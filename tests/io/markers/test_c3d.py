@@ -1,7 +1,5 @@
 """C3D: round trips, a second opinion by the ``c3d`` package, every processor's numbers, axes, units, broken files."""
 
-from __future__ import annotations
-
 import io
 import math
 import re

@@ -1,7 +1,5 @@
 """Tables of marker labels."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -1,7 +1,5 @@
 """TRC: round trips, a file as OpenSim writes it, broken files."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -1,7 +1,5 @@
 """Maya's files read by a parser of their grammar, and what their nodes show."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

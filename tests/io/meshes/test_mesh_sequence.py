@@ -1,7 +1,5 @@
 """Mesh sequences: what is written is read, a killed writer continues, damaged files are named."""
 
-from __future__ import annotations
-
 import os
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Readers of packets on damaged and built ones: faces with sane numbers, or an error of ours, at once."""
 
-from __future__ import annotations
-
 import json
 import os
 import random

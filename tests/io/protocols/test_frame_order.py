@@ -1,7 +1,5 @@
 """Frames in order: loss, lateness, a second sender and a clock that jumps are counted."""
 
-from __future__ import annotations
-
 from torchface.io.protocols.frame_order import FrameOrder
 
 

@@ -1,7 +1,5 @@
 """iFacialMocap's text, read by a parser written from the app's specification and from its own example."""
 
-from __future__ import annotations
-
 import re
 
 import pytest

@@ -1,7 +1,5 @@
 """Live Link Face's packets: bytes as the app lays them out."""
 
-from __future__ import annotations
-
 import struct
 
 import pytest

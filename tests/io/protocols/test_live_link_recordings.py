@@ -1,7 +1,5 @@
 """Recorded packets of an iPhone as takes."""
 
-from __future__ import annotations
-
 import gzip
 import struct
 from pathlib import Path

@@ -1,7 +1,5 @@
 """OSC as python-osc reads and writes it."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

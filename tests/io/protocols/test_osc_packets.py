@@ -1,7 +1,5 @@
 """Plain OSC as python-osc's own server receives it, and faces under several programs' addresses."""
 
-from __future__ import annotations
-
 from contextlib import closing
 
 import pytest

@@ -1,7 +1,5 @@
 """Addresses: schemes, hosts of every kind, ports and options."""
 
-from __future__ import annotations
-
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st

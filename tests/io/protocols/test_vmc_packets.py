@@ -1,7 +1,5 @@
 """VMC as python-osc's own server receives it, and faces gathered from packets."""
 
-from __future__ import annotations
-
 from collections import defaultdict
 from contextlib import closing
 from typing import Any

@@ -1,7 +1,5 @@
 """VRChat's parameters as python-osc reads them, each value by its definition."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

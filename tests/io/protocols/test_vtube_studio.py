@@ -1,7 +1,5 @@
 """VTube Studio's plug-in API, answered by a server written from its documentation."""
 
-from __future__ import annotations
-
 import json
 import math
 import time

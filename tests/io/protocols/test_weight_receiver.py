@@ -1,7 +1,5 @@
 """Faces received by UDP: an iPhone's packets as they are, other programs', and what is wrong on the way."""
 
-from __future__ import annotations
-
 import gzip
 import socket
 import struct

@@ -1,7 +1,5 @@
 """Senders by the scheme of an address, and receivers that are not there."""
 
-from __future__ import annotations
-
 import errno
 import socket
 from contextlib import closing

@@ -1,7 +1,5 @@
 """Few keys instead of one a frame in files that share times and in files whose curves have their own."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

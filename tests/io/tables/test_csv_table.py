@@ -1,7 +1,5 @@
 """Cells that a spreadsheet would run are written as text, and come back as they were."""
 
-from __future__ import annotations
-
 import csv
 from pathlib import Path
 

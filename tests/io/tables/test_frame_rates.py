@@ -1,7 +1,5 @@
 """Times of frames: even where they are, as the file has them where not, repaired or refused where they are none."""
 
-from __future__ import annotations
-
 import warnings
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Timecodes: rates recovered from clocks that were run, gaps found where frames were taken away."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

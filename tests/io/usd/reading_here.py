@@ -1,7 +1,5 @@
 """USD files read without a process of their own, which takes half a second each."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Sequence
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Wrinkle maps in USD, there and back, and those of other programs."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

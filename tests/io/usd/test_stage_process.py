@@ -1,7 +1,5 @@
 """USD files that are broken, hostile or of another kind end in an error that says what is wrong."""
 
-from __future__ import annotations
-
 import importlib.util
 import os
 import random

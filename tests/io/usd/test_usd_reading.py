@@ -1,7 +1,5 @@
 """Scenes as other programs write them: units, axes, transforms, instances, hidden prims, layers, skins."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

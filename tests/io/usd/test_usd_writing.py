@@ -1,7 +1,5 @@
 """Rigs and their animations come back from USD, and OpenUSD itself moves them as they move here."""
 
-from __future__ import annotations
-
 from itertools import count
 from pathlib import Path
 from typing import Any

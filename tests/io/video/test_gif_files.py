@@ -1,7 +1,5 @@
 """Animated GIFs come as whole frames, as another reader composes them; damaged and oversized ones are refused."""
 
-from __future__ import annotations
-
 import struct
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Videos are read within the budget of memory, however large their frames and however many their streams."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from fractions import Fraction
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Videos come back as they were written; what is no whole video, or has uneven frames, is refused in words."""
 
-from __future__ import annotations
-
 import os
 import sys
 from collections.abc import Iterator

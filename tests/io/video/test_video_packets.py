@@ -1,7 +1,5 @@
 """Videos of every codec come back whole, in order and upright; what no take can be made of is refused."""
 
-from __future__ import annotations
-
 import os
 import resource
 import struct

@@ -1,7 +1,5 @@
 """What three-vrm in Chromium makes of a VRM with added expressions: it loads, and each of them moves the mesh."""
 
-from __future__ import annotations
-
 import shutil
 import subprocess
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Face Cap's recordings: weights, rotations and times as they were written."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -1,7 +1,5 @@
 """iFacialMocap's recordings: a line a frame."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -1,7 +1,5 @@
 """JSON recordings: Audio2Face's 52 and 16 of the tongue, and ARKit's face anchors."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

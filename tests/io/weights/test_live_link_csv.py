@@ -1,7 +1,5 @@
 """Live Link Face CSV: real takes byte by byte, names, kept columns, dropped frames, broken files."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

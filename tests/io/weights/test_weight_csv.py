@@ -1,7 +1,5 @@
 """Weights CSV: round trips, broken files."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -1,7 +1,5 @@
 """Boxes that show no face go; those that do fit the landmarks, at every roll angle."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

@@ -1,7 +1,5 @@
 """Anybody's finder drives the tracker; one that breaks the protocol is named, with the frame."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """Tracing planted dark lines, and the local optimality that iterated conditional modes promises."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Unwrapping onto a cylinder, checked on surfaces whose unwrapped form is known."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

@@ -1,7 +1,5 @@
 """The face frame on heads whose landmarks are known: learned from some, found on others in any pose."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 import trimesh

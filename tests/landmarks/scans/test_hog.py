@@ -1,7 +1,5 @@
 """Dense HOG and its convolution against a plain computation at single places."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

@@ -1,7 +1,5 @@
 """Where a template has the lines of lips and lids."""
 
-from __future__ import annotations
-
 from torchface.landmarks.scans.landmark_pairs import template_features
 from torchface.landmarks.scans.uv_landmark_names import LINES
 from torchface.synthetic import neutral_head

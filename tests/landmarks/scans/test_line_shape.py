@@ -1,7 +1,5 @@
 """The profile of a line, learned: lines that are not dark, decoys that are, corners that are off."""
 
-from __future__ import annotations
-
 import math
 
 import torch

@@ -1,7 +1,5 @@
 """The detector on small images with planted landmarks: it learns, decides by location, keeps its state on disk."""
 
-from __future__ import annotations
-
 import hashlib
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Normal maps: planted wrinkles come back, whatever pose the scan is in; what is no scan of the mesh is refused."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Wrinkles 0.3 mm deep and 2 mm wide, planted on the performer's raised brow, come back."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

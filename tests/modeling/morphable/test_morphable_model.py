@@ -1,7 +1,5 @@
 """Morphable models against scikit-learn, planted coefficients, and their own definition."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Fitting from disk gives what fitting in memory gives, and continues when it was stopped."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

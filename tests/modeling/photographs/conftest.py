@@ -1,7 +1,5 @@
 """A rig and a model of heads, which tests of one folder share."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 

@@ -1,7 +1,5 @@
 """Frames that differ are chosen, and none whose landmarks are wrong or blurred."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 

@@ -1,7 +1,5 @@
 """Planted heads come back from the landmarks that cameras see of them; what is no such landmark is refused."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """Landmarks of real photographs are fitted; what is no such landmark is refused."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Errors of a solve are as wide as its covariance says, for points whose planted errors are of the kind it assumes."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import torch

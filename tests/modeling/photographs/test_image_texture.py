@@ -1,7 +1,5 @@
 """Irises planted on a head come back from its picture, and a written eyeball wears them."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest

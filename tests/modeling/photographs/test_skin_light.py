@@ -1,7 +1,5 @@
 """Light planted on a head's skin is found in its picture and divided out of its colours."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest

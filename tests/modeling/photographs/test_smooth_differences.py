@@ -1,7 +1,5 @@
 """Smooth differences have the covariance that is said of them, and are alike on both sides."""
 
-from __future__ import annotations
-
 import torch
 
 from torchface.modeling.photographs.smooth_differences import smooth_differences

@@ -1,7 +1,5 @@
 """A planted skin comes back from pictures of it, whatever the light; photographs on a head look as the head did."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest

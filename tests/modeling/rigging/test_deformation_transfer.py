@@ -1,7 +1,5 @@
 """Deformation transfer on small rigs whose answers are known, and on a real head."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -1,7 +1,5 @@
 """Rigs learned from examples whose true shapes are known."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

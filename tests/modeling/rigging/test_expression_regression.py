@@ -1,7 +1,5 @@
 """Expressions from a neutral face: planted laws come back, pose does not matter, identity does not leak."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Contact on a cut sheet whose two lips or lids close: what is found, what it changes, and on a real head."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Eyes scanned closed are opened as the person's own are."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 

@@ -1,7 +1,5 @@
 """Parts inside a head: how far they stand out, where they belong in a new head, and shapes that keep them in."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Correctives from sculpts: exact at the pose, nothing where a driver is off, refused where they do not fit."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from torch import Tensor

@@ -1,7 +1,5 @@
 """A webcam's graph whose reader and solver are planted."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from torch import Tensor, nn

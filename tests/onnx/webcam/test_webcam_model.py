@@ -1,7 +1,5 @@
 """From a picture to weights in a graph: the graph is the module, and whatever comes is taken safely."""
 
-from __future__ import annotations
-
 import numpy as np
 import onnxruntime
 import pytest

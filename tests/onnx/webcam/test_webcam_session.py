@@ -1,7 +1,5 @@
 """Pictures one at a time: what a session hands on, and what it refuses."""
 
-from __future__ import annotations
-
 import numpy as np
 import onnx
 import pytest

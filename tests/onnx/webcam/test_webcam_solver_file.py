@@ -1,7 +1,5 @@
 """The webcam's solver in ONNX Runtime gives what the module gives."""
 
-from __future__ import annotations
-
 import json
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Each test that refuses a correspondence, on surfaces made for it."""
 
-from __future__ import annotations
-
 import torch
 
 from torchface.geometry.meshes.surface_index import SurfaceIndex

@@ -1,7 +1,5 @@
 """Landmarks along the jaw that lie elsewhere than their vertices: they let go, and it is said."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest

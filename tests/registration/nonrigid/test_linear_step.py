@@ -1,7 +1,5 @@
 """The quadratic of non-rigid ICP, against scipy."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

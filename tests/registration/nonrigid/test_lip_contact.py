@@ -1,7 +1,5 @@
 """A mouth that is shut in the template: it comes out shut where the scan shows it shut, and open where it is open."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest

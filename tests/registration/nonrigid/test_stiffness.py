@@ -1,7 +1,5 @@
 """What the stiffness term and its subspaces keep unchanged."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

@@ -1,7 +1,5 @@
 """Triangles turned over come back, and nothing else moves."""
 
-from __future__ import annotations
-
 import torch
 
 from torchface.mesh import Mesh

@@ -1,7 +1,5 @@
 """What the stage films is what it says it filmed."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest

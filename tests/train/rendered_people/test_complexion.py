@@ -1,7 +1,5 @@
 """Complexions: the mean is the painted head's, pigments darken, eyes stay."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 

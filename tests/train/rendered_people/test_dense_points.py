@@ -1,7 +1,5 @@
 """Points of the face's surface: mirrored twins, apart as they should be, and on lids and lips where these meet."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

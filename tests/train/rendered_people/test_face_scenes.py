@@ -1,7 +1,5 @@
 """Scenes have faces where they say, at the angle they say; the same number is the same picture."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

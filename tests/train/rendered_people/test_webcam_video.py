@@ -1,7 +1,5 @@
 """Webcam videos of synthetic people: truth lies where it is drawn, weights drive it, who is away is not seen."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest

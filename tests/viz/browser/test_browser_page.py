@@ -1,7 +1,5 @@
 """The page of the viewer: who reaches it, which port it takes, and what is saved from it."""
 
-from __future__ import annotations
-
 import errno
 import socket
 import sys

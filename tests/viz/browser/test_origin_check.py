@@ -1,7 +1,5 @@
 """Who does not know the page's address, or is another page, can neither drive the viewer, nor read it, nor frame it."""
 
-from __future__ import annotations
-
 import http.client
 import threading
 from collections.abc import Iterator

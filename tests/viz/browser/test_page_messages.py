@@ -1,7 +1,5 @@
 """What a hostile browser says to a page reaches neither its state nor its files, and the page goes on."""
 
-from __future__ import annotations
-
 import math
 import time
 from collections.abc import Callable, Iterator

@@ -1,7 +1,5 @@
 """Line charts: lines lie where their numbers are, gaps stay empty, axes have round numbers."""
 
-from __future__ import annotations
-
 import torch
 
 from torchface.viz.figures.line_chart import LineChart, round_numbers

@@ -1,7 +1,5 @@
 """Parts that a texture does not cover are drawn in colours of their own."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import torch

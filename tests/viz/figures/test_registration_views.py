@@ -1,7 +1,5 @@
 """A registration's picture shows scan, result and distance upright, whatever the scan's pose."""
 
-from __future__ import annotations
-
 import torch
 
 from torchface.registration import Level, Schedule, Stage, register

@@ -1,7 +1,5 @@
 """The player in a report: opened from disk, it moves the face as the rig does and colours what is wrong."""
 
-from __future__ import annotations
-
 from io import BytesIO
 from pathlib import Path
 from typing import Any

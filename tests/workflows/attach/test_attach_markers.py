@@ -1,7 +1,5 @@
 """Sites from a range of motion with faults are those of the same take without them."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """A job that does what the text of its items says: what the tests of batches are run with, in other processes too."""
 
-from __future__ import annotations
-
 import os
 import signal
 import time

@@ -1,7 +1,5 @@
 """On a Ray cluster of two nodes each item is done once and whole, whatever is killed meanwhile; `make test-cluster`."""
 
-from __future__ import annotations
-
 import json
 import os
 import socket

@@ -1,7 +1,5 @@
 """A batch gives the same however many processes work on it, whatever is bad in it and whenever it is stopped."""
 
-from __future__ import annotations
-
 import csv
 import errno
 import json

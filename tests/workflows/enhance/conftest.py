@@ -1,7 +1,5 @@
 """A small actor: the performer's face with folds that deepen as it moves, learned, and a take of it in every form."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 

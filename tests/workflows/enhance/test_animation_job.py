@@ -1,7 +1,5 @@
 """A folder of animations is enhanced as each alone, whatever else lies in it."""
 
-from __future__ import annotations
-
 import csv
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context

@@ -1,7 +1,5 @@
 """Closed lips that touch, of another topology: each follows its own lip when the jaw opens."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

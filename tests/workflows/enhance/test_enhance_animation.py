@@ -1,7 +1,5 @@
 """Every kind of input through the whole job; killed runs, full disks, and input that does not fit."""
 
-from __future__ import annotations
-
 import errno
 import json
 from dataclasses import replace

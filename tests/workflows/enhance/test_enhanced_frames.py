@@ -1,7 +1,5 @@
 """A retimed animation is read piece by piece and is the same as in one."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -1,7 +1,5 @@
 """A live session's takes with an actor's wrinkles."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -1,7 +1,5 @@
 """Two keyframes and a length: the motion that is written, its curves, and keyframes that do not fit."""
 
-from __future__ import annotations
-
 import csv
 from pathlib import Path
 

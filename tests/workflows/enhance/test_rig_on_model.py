@@ -1,7 +1,5 @@
 """Poses of a rig of another topology on a model's dense mesh."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

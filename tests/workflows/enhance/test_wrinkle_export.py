@@ -1,7 +1,5 @@
 """An actor's wrinkles for an engine: maps, graphs of their weights, a ``.glb``."""
 
-from __future__ import annotations
-
 import csv
 import json
 from dataclasses import replace

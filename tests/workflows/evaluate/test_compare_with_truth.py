@@ -1,7 +1,5 @@
 """A result's files against the truth's: whatever form they have, the figures are those of what was planted."""
 
-from __future__ import annotations
-
 import csv
 import json
 from dataclasses import replace

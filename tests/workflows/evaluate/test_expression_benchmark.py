@@ -1,7 +1,5 @@
 """Folders of films' weights are compared with the truth, a row a method; what is missing counts as no motion."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

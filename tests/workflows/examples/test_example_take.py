@@ -1,7 +1,5 @@
 """Landmarks that examples explain: each method gives the planted weights back, and the files say what each costs."""
 
-from __future__ import annotations
-
 import csv
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Examples before a camera: weights follow a smile that grows, and the solved example is drawn."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """``torchface examples``: from pictures in order or by name, from a video in place of a camera, from a rig."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from pathlib import Path
 

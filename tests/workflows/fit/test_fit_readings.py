@@ -1,7 +1,5 @@
 """Expressions that were read are counted for each photograph, or for all where all show the same."""
 
-from __future__ import annotations
-
 import torch
 
 from torchface.capture.weight_readings import WeightReadings

@@ -1,7 +1,5 @@
 """A performer is photographed, and the command makes a rig of the pictures that looks as the performer does."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 

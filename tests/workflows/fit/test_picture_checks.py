@@ -1,7 +1,5 @@
 """What makes a photograph unfit for a likeness is said with its figure; what is hardly a face is refused."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path

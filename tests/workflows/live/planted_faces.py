@@ -1,7 +1,5 @@
 """A film whose shades are weights, and a solver that reads them: what comes out must be what went in."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path

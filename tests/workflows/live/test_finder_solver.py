@@ -1,7 +1,5 @@
 """A finder by name in the place of the webcam's graph: the same solver, on what a tracker reads."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Tests of torchface.workflows.live.live_actor."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Characters of other names are driven; those that cannot move are refused."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -1,7 +1,5 @@
 """Cameras that are slow, change, hang or are pulled out, and videos that are played as cameras are."""
 
-from __future__ import annotations
-
 import threading
 import time
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """Frames solved, sent, recorded and shown: what was planted comes out, whatever ends the session."""
 
-from __future__ import annotations
-
 import json
 import socket
 import tracemalloc

@@ -1,7 +1,5 @@
 """The live page's server: who gets what, and the page in Chromium with a planted session behind it."""
 
-from __future__ import annotations
-
 import io
 import json
 import threading

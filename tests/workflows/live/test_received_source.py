@@ -1,7 +1,5 @@
 """A phone as the camera: its packets move a character, are recorded and sent on; what is lost is held, then relaxes."""
 
-from __future__ import annotations
-
 import json
 import math
 import socket

@@ -1,7 +1,5 @@
 """What a session says to whoever performs: the guided calibration, faces that are not seen, latency."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

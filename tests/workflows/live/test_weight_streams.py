@@ -1,7 +1,5 @@
 """Several receivers at once: each has its rate and its names, and one that is dead slows none."""
 
-from __future__ import annotations
-
 import socket
 import time
 from pathlib import Path

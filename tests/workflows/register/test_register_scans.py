@@ -1,7 +1,5 @@
 """A corpus is registered as its scans one by one would be, whatever is bad among them and whenever it is killed."""
 
-from __future__ import annotations
-
 import csv
 import json
 import multiprocessing

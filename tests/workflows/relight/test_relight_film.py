@@ -1,7 +1,5 @@
 """A film of a lit performer behind a hand: relit as under the other light, the hand as it was; input that is wrong."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from pathlib import Path
 

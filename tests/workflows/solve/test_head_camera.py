@@ -1,7 +1,5 @@
 """Curves of a video, brought to the frames of a take."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

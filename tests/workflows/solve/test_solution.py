@@ -1,7 +1,5 @@
 """A take with faults solves as well as the same take without them, or the user is told."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest

@@ -1,7 +1,5 @@
 """The report of a solve shows the face, finds the worst marker, and no gap hides a swap."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """What ``torchface solve`` refuses, and what it only warns of, with the figure and the way out."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Frames of weights go out in their own time, those of a solved take as its file holds them."""
 
-from __future__ import annotations
-
 import socket
 from collections.abc import Iterator
 from pathlib import Path

@@ -1,7 +1,5 @@
 """A filmed performer, and what tracking gives of the film when it is killed and started again."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from pathlib import Path

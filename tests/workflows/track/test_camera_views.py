@@ -1,7 +1,5 @@
 """Films of one take by two cameras: brought together and solved in one; what does not fit is refused."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from fractions import Fraction

@@ -1,7 +1,5 @@
 """A table of landmarks is solved without a video; one that cannot be the video's is told."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

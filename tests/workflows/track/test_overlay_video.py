@@ -1,7 +1,5 @@
 """The rig beside the picture: where the camera sees it, tinted where landmarks are suspect, absent without a face."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Without a rig the head of whoever is seen is solved with the take, and the weights on it."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

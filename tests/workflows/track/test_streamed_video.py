@@ -1,7 +1,5 @@
 """A video as a stream: its frames are sent as they are solved, whatever happens to the curves."""
 
-from __future__ import annotations
-
 import socket
 from pathlib import Path
 from typing import Any

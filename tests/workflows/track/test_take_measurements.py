@@ -1,7 +1,5 @@
 """Tests of torchface.workflows.track.take_measurements."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import torch

@@ -1,7 +1,5 @@
 """Weights of a take are calmed by the frames around each: parabolas stay, noise does not, blinks are left alone."""
 
-from __future__ import annotations
-
 import torch
 
 from torchface.workflows.track.take_solution import calmed

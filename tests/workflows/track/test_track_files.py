@@ -1,7 +1,5 @@
 """A video of variable frame rate is tracked at its frames' own times, which the written files keep."""
 
-from __future__ import annotations
-
 import csv
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Models by name serve rigs of ARKit's shapes in any spelling; others are told."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

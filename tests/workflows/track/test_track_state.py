@@ -1,7 +1,5 @@
 """A run that was killed goes on, what is up to date is kept, and damaged files are made anew."""
 
-from __future__ import annotations
-
 import shutil
 from pathlib import Path
 

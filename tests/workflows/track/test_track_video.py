@@ -1,7 +1,5 @@
 """A filmed performer comes back as weights; what cannot be tracked is told."""
 
-from __future__ import annotations
-
 import json
 import shutil
 import warnings

@@ -1,7 +1,5 @@
 """The webcam's graph as a file, and what of it an interrupted start keeps."""
 
-from __future__ import annotations
-
 from functools import partial
 from pathlib import Path
 from types import SimpleNamespace

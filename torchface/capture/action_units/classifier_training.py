@@ -1,7 +1,5 @@
 """Training of a classifier of action units from performed ones."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Gabor filters: where edges of which direction and width are."""
 
-from __future__ import annotations
-
 import math
 
 import torch

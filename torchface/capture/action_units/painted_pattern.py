@@ -3,8 +3,6 @@
 A dense flow between two performers' neutral images serves for every frame.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal

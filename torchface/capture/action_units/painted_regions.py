@@ -1,7 +1,5 @@
 """Regions of the face sampled from every frame, stabilised, at one size."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 
 import torch

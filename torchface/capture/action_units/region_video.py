@@ -1,7 +1,5 @@
 """From a head-camera video to stabilised images of its painted regions."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import islice

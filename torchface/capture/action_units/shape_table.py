@@ -1,7 +1,5 @@
 """Action units as weights of a rig's shapes: a table a rig, in TOML."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Stabilisation of a loose camera: a point of the helmet and two markers are tracked through the video."""
 
-from __future__ import annotations
-
 import numpy as np
 import torch
 from torch import Tensor

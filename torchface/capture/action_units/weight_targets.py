@@ -1,7 +1,5 @@
 """A classified video as weight curves of a rig, for the hybrid solve."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Gains of a person's groups of shapes relative to the rig, from poses that are asked for."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import torch

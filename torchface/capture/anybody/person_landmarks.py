@@ -1,7 +1,5 @@
 """A person's landmarks beside a rig's: how people and finders differ, the rig's points on a person, learning them."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any
 

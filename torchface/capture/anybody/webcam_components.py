@@ -1,7 +1,5 @@
 """Components of the webcam's solver: what follows from the rig, people, the prior and ARKit's names, as buffers."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor, nn
 

@@ -1,7 +1,5 @@
 """Outputs of a webcam's frames: weights by ARKit's names, held and relaxed without a face, calmed with one."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import torch

@@ -1,7 +1,5 @@
 """Settings of the webcam's solve: the weights of its terms, and how quickly it learns a person."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 from torchface.number_checks import LARGEST_WEIGHT, checked_count, checked_number

@@ -1,7 +1,5 @@
 """A character's weights from one webcam, for anybody: the solver's head becomes the person's while frames come."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, replace
 

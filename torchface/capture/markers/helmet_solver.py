@@ -1,7 +1,5 @@
 """Blendshape weights from markers of a head-mounted stage whose helmet slips on the head."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import torch

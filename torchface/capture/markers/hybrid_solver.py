@@ -1,7 +1,5 @@
 """Blendshape weights from markers and from a classifier's predictions."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import torch

@@ -1,7 +1,5 @@
 """Matching of a take's labels with an attachment's markers, as recorders write labels."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Blendshape weights from meshes of the rig's own topology, every vertex a marker."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Observability of a rig's shapes by a layout of markers."""
 
-from __future__ import annotations
-
 from torchface.capture.markers.marker_solver import MarkerSolver
 from torchface.capture.weight_observability import Observability, weight_observability
 

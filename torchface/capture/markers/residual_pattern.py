@@ -1,7 +1,5 @@
 """The pattern of the residual at rest over the face: another head leaves a smooth one, wrong sites do not."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import torch

@@ -1,7 +1,5 @@
 """The two steps that align a take with a rig: weights of all frames, then one similarity."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import torch

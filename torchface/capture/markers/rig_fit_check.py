@@ -1,7 +1,5 @@
 """Check that a rig explains the markers of a take; if not, the cause whose correction helps most."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, replace
 

@@ -1,7 +1,5 @@
 """The alignment of a take with a rig, and the mean residual between its markers and their sites."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import torch

@@ -1,7 +1,5 @@
 """Spans of a film that show another face than its first frames: by how faces look and by where their landmarks lie."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from itertools import pairwise

@@ -1,7 +1,5 @@
 """Frame solver: the energy of frames on their own, and the weights and poses where it is least."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import torch

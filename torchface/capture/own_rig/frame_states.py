@@ -1,7 +1,5 @@
 """Inputs, states and results of the solve of a video's frames."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 from torch import Tensor

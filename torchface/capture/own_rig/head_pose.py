@@ -1,7 +1,5 @@
 """Head poses of frames from the landmarks that expression hardly moves."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import torch

@@ -1,7 +1,5 @@
 """The search for a light source: directions all round, then Gauss-Newton with the strengths eliminated."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

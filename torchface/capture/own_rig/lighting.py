@@ -1,7 +1,5 @@
 """The light that a face is filmed in, from its albedo and the frame: ambient light and one point source."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass

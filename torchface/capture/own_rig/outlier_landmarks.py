@@ -1,7 +1,5 @@
 """Landmarks where no face has them: outliers of a robust fit of the rig's landmarks to each frame."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

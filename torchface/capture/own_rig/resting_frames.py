@@ -1,7 +1,5 @@
 """Frames of a take in which the face rests: by an expression that was read, or by the weights that were solved."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import torch

@@ -1,7 +1,5 @@
 """Eyes of a whole take: openness and gaze beside the person's own, as readings of the weights of a rig."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

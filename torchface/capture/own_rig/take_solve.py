@@ -1,7 +1,5 @@
 """The solve of a whole take: frame after frame or from all frames at once, at even times or at the frames' own."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import torch

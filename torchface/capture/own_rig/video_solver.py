@@ -1,7 +1,5 @@
 """Blendshape weights from landmarks in the images of one camera."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 

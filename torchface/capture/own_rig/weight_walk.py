@@ -1,7 +1,5 @@
 """Motion of weights without a dynamics prior: a random walk, and rest for shapes that stay hidden."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

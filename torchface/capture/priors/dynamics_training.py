@@ -1,7 +1,5 @@
 """Training of the dynamics prior in passes over takes: hyperparameters by gpytorch, the rest in closed form."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace

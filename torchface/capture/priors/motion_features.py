@@ -1,7 +1,5 @@
 """Features of a window of weights: its place, slope and curvature."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Sequence
 

@@ -1,7 +1,5 @@
 """The shapes of a rig in the names that a prior has learned."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 from torch import Tensor

@@ -1,7 +1,5 @@
 """Learning of a Gaussian process: its kernel by gpytorch, its posterior from parts as they come, cross-validated."""
 
-from __future__ import annotations
-
 import math
 import warnings
 

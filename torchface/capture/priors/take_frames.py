@@ -1,7 +1,5 @@
 """Frames of takes as priors learn from them: one take after the other, or some of all, never all at once."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Windows of takes as the dynamics prior learns from them, a take at a time, and what adds up over a pass of them."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 

@@ -3,8 +3,6 @@
 Either encodes what a frame has beyond its smooth part, and puts it on another smooth part.
 """
 
-from __future__ import annotations
-
 from typing import Literal
 
 import numpy as np

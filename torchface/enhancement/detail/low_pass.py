@@ -1,7 +1,5 @@
 """The smooth part of a deformation: one implicit step of diffusion over the neutral, scaled by a wavelength."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Rotation and stretch of deformation gradients, as nine numbers that can be blended."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import torch

@@ -1,7 +1,5 @@
 """Regions of a face with soft borders, found by what moves together and named by where they lie."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Linear map, region by region, of the detail that frames beyond the database have."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

@@ -1,7 +1,5 @@
 """A mesh's triangles in connected patches, and means over them: a shape space a hundred times smaller."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 
 import numpy as np

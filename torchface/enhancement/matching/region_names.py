@@ -1,7 +1,5 @@
 """Names of regions by where they lie on a face, by its landmarks."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

@@ -1,7 +1,5 @@
 """The projection of frames onto a database, region by region: convex combinations of its frames that look alike."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import torch

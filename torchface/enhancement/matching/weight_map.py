@@ -1,7 +1,5 @@
 """Detail from the weights of the actor's rig, looked at beside the shape of each region."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

@@ -1,7 +1,5 @@
 """Keyframes between which a motion is timed: where it turns and where it holds."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

@@ -1,7 +1,5 @@
 """The timing of a motion between two keyframes by its nearest captured motions: a path in order through each."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 

@@ -1,7 +1,5 @@
 """The retiming path: where the frames of one sequence lie on another, in order."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import torch

@@ -1,7 +1,5 @@
 """A few maps that together show an actor's wrinkles: weights of regions say how much of each is seen where."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import torch

@@ -1,7 +1,5 @@
 """Poses from which the wrinkle maps of a rig are learned, and their detail by the actor's model."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import torch

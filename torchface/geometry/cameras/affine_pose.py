@@ -1,7 +1,5 @@
 """The pose in which an affine camera sees points as they are seen: products alone, where no search can be afforded."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

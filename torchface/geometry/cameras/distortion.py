@@ -1,7 +1,5 @@
 """Lens distortion: from an ideal pinhole camera's pixels to a real one's, and back."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

@@ -1,7 +1,5 @@
 """Pinhole cameras in OpenCV's convention: K, [R|t], x right, y down, pixel centres at integers."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

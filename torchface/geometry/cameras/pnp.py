@@ -1,7 +1,5 @@
 """Pose of a camera from points that it sees: the perspective-n-point problem."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import torch

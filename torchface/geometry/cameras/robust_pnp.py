@@ -1,7 +1,5 @@
 """Poses of a camera from points of which some are outliers."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import torch

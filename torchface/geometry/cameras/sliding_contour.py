@@ -1,7 +1,5 @@
 """Outline of a face before the background: points that slide over the skin as the head rotates."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import torch

@@ -1,7 +1,5 @@
 """Contacts of a surface with itself in a pose: lids that close, lips that touch."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

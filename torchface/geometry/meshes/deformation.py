@@ -1,7 +1,5 @@
 """Deformation gradients of triangles with a fourth vertex, and the sparse operator that computes them."""
 
-from __future__ import annotations
-
 import torch
 from scipy import sparse
 from torch import Tensor

@@ -1,7 +1,5 @@
 """Operators of a triangle mesh: normals, areas, edges, borders, parts. All functions are batched."""
 
-from __future__ import annotations
-
 import torch
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components

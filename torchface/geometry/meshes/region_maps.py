@@ -1,7 +1,5 @@
 """Wrinkle maps that regions mix each for itself: few textures, many patterns."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import torch

@@ -1,7 +1,5 @@
 """Energies of a displacement over a thin shell, linearised at rest: stretching and bending as sparse matrices."""
 
-from __future__ import annotations
-
 import numpy as np
 import torch
 from scipy import sparse

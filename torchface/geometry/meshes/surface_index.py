@@ -1,7 +1,5 @@
 """The nearest point on a triangle mesh, exact, for many points at once; and whether it lies on the mesh's border."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

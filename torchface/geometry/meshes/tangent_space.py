@@ -6,8 +6,6 @@ glTF's convention), :math:`\sigma = -1` where the texture is mirrored. Nothing i
 MikkTSpace's reference shader, and a map value t stands for the direction :math:`t_x T + t_y B + t_z N`.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import torch

@@ -1,7 +1,5 @@
 """Check that two meshes of people can be in one unit: heads differ by less than units do."""
 
-from __future__ import annotations
-
 import math
 
 from torch import Tensor

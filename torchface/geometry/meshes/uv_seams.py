@@ -1,7 +1,5 @@
 """Vertices split where texture coordinates differ, as glTF, trimesh and GPUs want them, and merged again."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Texture coordinates of several tiles (UDIM) brought into one image."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

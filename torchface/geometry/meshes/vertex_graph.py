@@ -1,7 +1,5 @@
 """A mesh's vertices as a graph along its edges."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

@@ -1,7 +1,5 @@
 """FBX and Blender files by way of Blender: its Python package, or the program that a user has installed."""
 
-from __future__ import annotations
-
 import importlib.util
 import json
 import os

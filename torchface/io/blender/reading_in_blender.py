@@ -5,8 +5,6 @@
 was expected.
 """
 
-from __future__ import annotations
-
 import json
 import sys
 import tempfile

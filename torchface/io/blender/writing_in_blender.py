@@ -5,8 +5,6 @@ JSON: ``fps``, ``names`` of all shape keys, ``ranges``, the least and the larges
 records of ``torchface.correctives`` with the ``expression`` that drives each.
 """
 
-from __future__ import annotations
-
 import json
 import sys
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Accessors as arrays: strided, normalised, sparse."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The animation of a rig's shapes in a glTF file, as a take."""
 
-from __future__ import annotations
-
 import warnings
 from collections.abc import Iterator
 from pathlib import Path

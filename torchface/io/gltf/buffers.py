@@ -1,7 +1,5 @@
 """The binary half of a glTF document under construction."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

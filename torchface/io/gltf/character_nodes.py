@@ -1,7 +1,5 @@
 """Nodes of a glTF character that a performance turns: head, neck and eyes, by VRM's table or by their names."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Mapping
 from typing import Any

@@ -1,7 +1,5 @@
 """The meshes of a character in a glTF file as they stand at rest, and the way back to the file's arrays."""
 
-from __future__ import annotations
-
 import json
 import re
 from collections.abc import Iterator

@@ -4,8 +4,6 @@ acts, as ``{"name": target, "drivers": [shape, ...], "peak": weight}``; only in-
 Other programs see plain morph targets, whose weights ``save_animation`` writes with the shapes'.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import Any
 

@@ -5,8 +5,6 @@ With the neutral's map come the tangents of ``torchface.geometry.meshes.tangent_
 file's normals are the ones that maps are baked about. Images have 8 bits a channel, as viewers show them.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any

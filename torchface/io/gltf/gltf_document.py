@@ -1,7 +1,5 @@
 """The two forms of a glTF file: one binary, or JSON with its buffers beside it or inside it."""
 
-from __future__ import annotations
-
 import base64
 import binascii
 import json

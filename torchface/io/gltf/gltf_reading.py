@@ -1,7 +1,5 @@
 """A glTF scene as one rig: all its meshes put together, shapes of the same name joined."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import accumulate

@@ -1,7 +1,5 @@
 """Meshes, rigs and their animations as ``.glb``: metres, y up, shapes as sparse morph targets."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Extras in ``mesh.extras.torchface`` that glTF has no place for: polygons and annotations, as compact JSON."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

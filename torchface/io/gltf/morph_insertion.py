@@ -1,7 +1,5 @@
 """Morph targets added to a binary glTF file; all else of it, and its numbering, stays as it was."""
 
-from __future__ import annotations
-
 import copy
 import json
 import struct

@@ -1,7 +1,5 @@
 """Vertices, triangles and a part's image added to meshes of a binary glTF file; what it has keeps place and bytes."""
 
-from __future__ import annotations
-
 import copy
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

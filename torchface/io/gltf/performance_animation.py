@@ -1,7 +1,5 @@
 """A performance as one more animation of a character's own ``.glb``; all else in the file stays as it is."""
 
-from __future__ import annotations
-
 import copy
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """A glTF mesh as one part of a rig: its primitives' vertices, triangles and morph targets put together."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Primitives and their morph targets: vertices split at seams and at the borders of parts."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Materials of the parts of a head, by the names of the regions that they are annotated as."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Literal
 

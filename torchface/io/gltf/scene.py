@@ -1,7 +1,5 @@
 """The meshes that a scene shows, each with the transform of its node."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any

@@ -9,8 +9,6 @@ low)`` millimetres; normals are as in ``wrinkleMaps``. A texel shows map m by th
 slopes of normals and heights add up so.
 """
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 from typing import Any

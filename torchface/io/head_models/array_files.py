@@ -1,7 +1,5 @@
 """Named arrays of a NumPy archive or a safetensors file: looked at before they are read, and never unpickled."""
 
-from __future__ import annotations
-
 import zipfile
 import zlib
 from collections.abc import Collection

@@ -3,8 +3,6 @@
 Source: University of Basel's scalismo-faces, whose reader names the groups; Gerig et al. 2018.
 """
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

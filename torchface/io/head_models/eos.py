@@ -3,8 +3,6 @@
 Source: the class ``MorphableModel`` of patrikhuber/eos (Apache-2.0), versions 1 to 4, in its members' order.
 """
 
-from __future__ import annotations
-
 import struct
 from pathlib import Path
 

@@ -3,8 +3,6 @@
 Source: MPI's FLAME and smplx, whose readers name the arrays; Li et al. 2017.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import torch

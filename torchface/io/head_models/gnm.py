@@ -3,8 +3,6 @@
 Source: google/GNM (Apache-2.0), whose reader names the arrays.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

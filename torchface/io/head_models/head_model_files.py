@@ -1,7 +1,5 @@
 """Head models of others by path, whichever project's they are."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from torchface.errors import FileFormatError

@@ -3,8 +3,6 @@
 Source: facebookresearch/MHR (Apache-2.0), whose converter names the arrays and the expressions.
 """
 
-from __future__ import annotations
-
 from torchface.io.head_models.array_files import ArrayFile
 from torchface.io.head_models.head_model_file import HeadModelFile
 from torchface.mesh import Mesh

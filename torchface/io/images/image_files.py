@@ -1,7 +1,5 @@
 """Images as tensors: (3,H,W) in [0,1], first row on top."""
 
-from __future__ import annotations
-
 import io
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Headers of image files, read before a pixel is decoded: kind, size, samples and orientation."""
 
-from __future__ import annotations
-
 import re
 import struct
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """The one opener of images: any file that is read as samples, upright, as they are stored."""
 
-from __future__ import annotations
-
 import io
 import warnings
 from dataclasses import dataclass

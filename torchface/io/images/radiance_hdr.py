@@ -1,7 +1,5 @@
 """Panoramas of light: Radiance HDR pictures."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The images and plain colours of a scene's materials side by side in the one image that a mesh has."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 

@@ -1,7 +1,5 @@
 """The first directory of a TIFF, of which EXIF is one: its numbers, read without trusting a size."""
 
-from __future__ import annotations
-
 import struct
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Faces in photographs as dlib's XML holds them: image files, boxes, landmarks by number."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 from xml.parsers import expat

@@ -1,7 +1,5 @@
 """Landmark points as other programs save them: menpo's LJSON, iBUG's PTS (also written), and the toolkit's own JSON."""
 
-from __future__ import annotations
-
 from array import array
 from dataclasses import dataclass, field
 from io import StringIO

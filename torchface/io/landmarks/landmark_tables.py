@@ -1,7 +1,5 @@
 """Landmarks of a face frame by frame, in tables of our own, OpenFace's, py-feat's, and of MediaPipe's mesh."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Landmark takes as CSV in OpenFace's layout: ``frame,timestamp,confidence,success,x_0,...,y_0,...``."""
 
-from __future__ import annotations
-
 import warnings
 from collections.abc import Sequence
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Points picked by hand, as JSON: landmark vertices of a mesh, and pairs of template vertex and scan point."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any

@@ -7,8 +7,6 @@ tests' second opinion.
 Source: The C3D File Format User Guide, Motion Lab Systems.
 """
 
-from __future__ import annotations
-
 import re
 import struct
 from collections.abc import Sequence

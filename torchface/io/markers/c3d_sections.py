@@ -3,8 +3,6 @@
 Source: The C3D File Format User Guide, Motion Lab Systems.
 """
 
-from __future__ import annotations
-
 import struct
 from dataclasses import dataclass
 from pathlib import Path

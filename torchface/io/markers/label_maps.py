@@ -1,7 +1,5 @@
 """Tables of a take's marker labels and what an attachment calls them."""
 
-from __future__ import annotations
-
 import csv
 import io
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Checks of all marker files: units, labels, and the numbers of a take of markers."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any

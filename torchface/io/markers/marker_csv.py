@@ -1,7 +1,5 @@
 """Marker takes as plain CSV: ``frame,time,<label>_x,<label>_y,<label>_z,...``."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Sequence
 from pathlib import Path

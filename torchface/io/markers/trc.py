@@ -1,7 +1,5 @@
 """Marker takes in TRC files, tab-separated text of Motion Analysis and OpenSim."""
 
-from __future__ import annotations
-
 from array import array
 from collections.abc import Iterator
 from itertools import islice

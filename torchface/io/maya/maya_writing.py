@@ -1,7 +1,5 @@
 """Rigs and their animations as Maya ASCII (``.ma``): a mesh, a blendShape node with named targets, animation curves."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """The files that a mesh's file names: material libraries, textures, buffers."""
 
-from __future__ import annotations
-
 import re
 from itertools import islice
 from pathlib import Path

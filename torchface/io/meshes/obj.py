@@ -1,7 +1,5 @@
 """Wavefront OBJ: every vertex in the file's order, polygons and seams as authored."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Statements of an OBJ as arrays: read piece by piece, since words take far more memory than their text."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import chain

@@ -1,7 +1,5 @@
 """OFF: a list of vertices, then of faces, as text; written through trimesh."""
 
-from __future__ import annotations
-
 from array import array
 from collections.abc import Iterator
 from itertools import islice

@@ -1,7 +1,5 @@
 """PLY, ASCII and binary: vertices in the file's order, polygons, colours, a texture coordinate a vertex."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

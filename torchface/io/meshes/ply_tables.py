@@ -1,7 +1,5 @@
 """The tables of a PLY file, ASCII or binary: a header that lists elements, then rows, some with lists in them."""
 
-from __future__ import annotations
-
 import struct
 from array import array
 from collections.abc import Callable, Collection

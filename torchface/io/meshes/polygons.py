@@ -1,7 +1,5 @@
 """Polygons between the two ways of writing them: counts with a flat list of corners, and rows padded with -1."""
 
-from __future__ import annotations
-
 import numpy as np
 import torch
 from numpy.typing import NDArray

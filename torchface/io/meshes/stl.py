@@ -1,7 +1,5 @@
 """STL, ASCII and binary: triangles whose equal corners become one vertex."""
 
-from __future__ import annotations
-
 import re
 from array import array
 from io import BytesIO

@@ -1,7 +1,5 @@
 """Order of frames that come by packets: those that were lost, came late or from somebody else are counted."""
 
-from __future__ import annotations
-
 from collections import deque
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """iFacialMocap's packets: a frame as text, sent by the app to whoever asks for it."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 from torch import Tensor

@@ -1,7 +1,5 @@
 """Live Link Face's packets: frames of weights as the iPhone app sends them to Unreal."""
 
-from __future__ import annotations
-
 import struct
 import uuid
 from collections.abc import Sequence

@@ -1,7 +1,5 @@
 """Recordings of Live Link Face's packets as they were sent: ``.gesichter``, gzip of sizes and packets."""
 
-from __future__ import annotations
-
 import struct
 import zlib
 from collections.abc import Iterator

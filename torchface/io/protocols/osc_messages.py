@@ -1,7 +1,5 @@
 """Messages of Open Sound Control as bytes, and bytes as messages."""
 
-from __future__ import annotations
-
 import struct
 from collections.abc import Iterable, Iterator
 

@@ -1,7 +1,5 @@
 """Faces as plain OSC: one address a weight, sent under any names and received under those of several programs."""
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Sequence

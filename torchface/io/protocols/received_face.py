@@ -1,7 +1,5 @@
 """A face as one packet or one frame of a file gives it, its numbers checked."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, field
 

@@ -1,7 +1,5 @@
 """Addresses of streams, where faces are sent to and received from: ``SCHEME://HOST:PORT/PATH?OPTION=VALUE``."""
 
-from __future__ import annotations
-
 import re
 import socket
 from collections.abc import Mapping

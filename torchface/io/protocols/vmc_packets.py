@@ -1,7 +1,5 @@
 """The VMC protocol, by which avatar programs send and receive faces: clips and bones as OSC messages."""
 
-from __future__ import annotations
-
 import math
 import time
 from collections.abc import Callable, Sequence

@@ -1,7 +1,5 @@
 """VRChat's OSC: avatar parameters by Unified Expressions (v2) and by ARKit's names, and its own eye tracking."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 

@@ -1,7 +1,5 @@
 """Senders of frames of weights over a network, by the scheme of an address."""
 
-from __future__ import annotations
-
 import socket
 import time
 from collections.abc import Callable, Sequence

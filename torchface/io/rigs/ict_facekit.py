@@ -3,8 +3,6 @@
 Source: ICT-VGL/ICT-FaceKit (MIT); Li et al. 2020, Learning Formation of Physically-Based Face Attributes.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path

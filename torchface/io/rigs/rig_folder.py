@@ -1,7 +1,5 @@
 """A rig as a folder of OBJ files: the neutral, a file a shape, and what OBJ has no place for in ``rig.json``."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """A process of its own that reads a file, so that neither a crash nor its memory is this one's."""
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess

@@ -12,8 +12,6 @@ belong to, if these are not all, and ``0/shape/0/between/0``, offsets of the sam
 and the arrays ``animation/times`` (T,), seconds, and ``animation/weights`` (T,N).
 """
 
-from __future__ import annotations
-
 import json
 import warnings
 from collections.abc import Iterator, Mapping, Sequence

@@ -1,7 +1,5 @@
 """The meshes of a scene put together as one rig."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import accumulate

@@ -1,7 +1,5 @@
 """A take's weights as the keys of a rig's animation."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field, replace
 
 import torch

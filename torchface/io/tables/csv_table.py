@@ -1,7 +1,5 @@
 """Comma-separated tables of numbers: every cell is checked, and a fault is named by row and column."""
 
-from __future__ import annotations
-
 import csv
 import io
 import re

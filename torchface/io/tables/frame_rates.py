@@ -1,7 +1,5 @@
 """Frame rates and frame numbers in files."""
 
-from __future__ import annotations
-
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass

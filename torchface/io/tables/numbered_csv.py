@@ -1,7 +1,5 @@
 """The plain CSV layout ``frame,time,<channel>,...``: one row a frame, times in seconds, an empty cell not seen."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Timecodes ``HH:MM:SS:FF.sss`` as Live Link Face writes them: the rate they run at, and the frames they skip."""
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Sequence

@@ -1,7 +1,5 @@
 """Checks of a take that is written to a file: values, names and kept columns."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

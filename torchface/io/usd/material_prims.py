@@ -1,7 +1,5 @@
 """Materials of a head as UsdPreviewSurface: the mesh's texture or colours, painted images, a plain colour else."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 

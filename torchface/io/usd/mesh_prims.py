@@ -1,7 +1,5 @@
 """A mesh of a USD stage: its faces, colours, image, shapes and detail maps, as arrays; see ``stage_process``."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterator
 from typing import Any

@@ -4,8 +4,6 @@
 mesh, and ``shapes.npz``, of mesh i and shape j ``i/j/rows`` and ``i/j/offsets``, in the mesh's own points.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import sys

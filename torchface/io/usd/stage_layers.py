@@ -1,7 +1,5 @@
 """The files that a USD stage is composed of: counted, and in one folder or package; see ``stage_process``."""
 
-from __future__ import annotations
-
 import os
 import posixpath
 from collections.abc import Callable

@@ -7,8 +7,6 @@ of a point cache (see ``extract_points``). OpenUSD is C++ that trusts
 its files: here a crash, a count of gigabytes or an endless composition ends a process that has nothing to lose.
 """
 
-from __future__ import annotations
-
 import json
 import re
 import sys

@@ -1,7 +1,5 @@
 """OpenUSD's own library, which is an extra: asked for in one place."""
 
-from __future__ import annotations
-
 import importlib
 import importlib.util
 import sys

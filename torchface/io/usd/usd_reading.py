@@ -1,7 +1,5 @@
 """A USD scene as one rig: all its meshes put together, blend shapes of the same name joined."""
 
-from __future__ import annotations
-
 import sys
 from pathlib import Path
 

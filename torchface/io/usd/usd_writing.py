@@ -1,7 +1,5 @@
 """Meshes, rigs and their animations as USD: metres, y up, shapes as UsdSkel's blend shapes."""
 
-from __future__ import annotations
-
 import json
 import re
 import shutil

@@ -1,7 +1,5 @@
 """A video of nothing, for takes whose pictures are not there."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Timecodes of films: the time of day at which the first frame was taken."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Expressions of VRM 1.0 (``VRMC_vrm``) and clips of VRM 0.x (``VRM``): read, and new ones added behind the others."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any

@@ -1,7 +1,5 @@
 """Values as programs for iPhones write them: ARKit's names in several spellings, angles in degrees, numbers as text."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 

@@ -1,7 +1,5 @@
 """Face Cap's text recordings: a line a frame, its time, head, eyes and ARKit's weights."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """iFacialMocap's text: a line a frame, as the app sends it and as its recordings hold it."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

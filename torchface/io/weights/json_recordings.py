@@ -1,7 +1,5 @@
 """JSON recordings of weights: Audio2Face's export, and ARKit's face anchors as apps write them."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

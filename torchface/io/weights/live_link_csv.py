@@ -1,7 +1,5 @@
 """Live Link Face's CSV: timecode, ARKit's 52 weights, head and eye rotations."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Blendshape weights as plain CSV: ``frame,time,<shape>,...``, with timecode and rotations where a take has them."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

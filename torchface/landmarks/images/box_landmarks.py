@@ -1,7 +1,5 @@
 """Landmarks of a face from a detector's box: of a photograph, and of what a tracker looks for."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import torch

@@ -1,7 +1,5 @@
 """Detector of faces whose boxes the landmark network checks: one that shows no face goes, the others fit better."""
 
-from __future__ import annotations
-
 import math
 from functools import cache
 

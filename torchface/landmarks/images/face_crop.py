@@ -1,7 +1,5 @@
 """The upright square that a network is shown of a face, and the way between its pixels and the image's."""
 
-from __future__ import annotations
-
 import math
 
 import cv2

@@ -1,7 +1,5 @@
 """iBUG's 68 landmarks among the 478 points of MediaPipe's face mesh."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

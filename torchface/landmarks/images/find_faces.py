@@ -1,7 +1,5 @@
 """Searches of an image for faces: all of them, and some of which one of a number must be there."""
 
-from __future__ import annotations
-
 from torch import Tensor
 
 from torchface.landmarks.images.boxes.face_box import FaceBoxes, FaceDetector, NoFaceError, check_image

@@ -1,7 +1,5 @@
 """Batch normalisations of a trained network as part of its convolutions."""
 
-from __future__ import annotations
-
 import copy
 from typing import TypeVar
 

@@ -1,7 +1,5 @@
 """iBUG's 68 landmarks: which are mirror images of each other, and the face boxes and tilts that go with them."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

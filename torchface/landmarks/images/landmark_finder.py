@@ -1,7 +1,5 @@
 """The protocol of what finds the landmarks of a face in a box, and the check of what it gives."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Protocol
 

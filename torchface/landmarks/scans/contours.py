@@ -1,7 +1,5 @@
 """The line between two lips or two lids, traced through an image by iterated conditional modes."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from itertools import product
 

@@ -1,7 +1,5 @@
 """Histograms of oriented gradients at every place of an image."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

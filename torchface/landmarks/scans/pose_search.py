@@ -1,7 +1,5 @@
 """Rigid pose of a known surface in a scan of any pose: hypotheses from noses, judged and refined by nearest points."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Landmarks and lines of many scans in one JSON file: what the detector learns from."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from pathlib import Path
 

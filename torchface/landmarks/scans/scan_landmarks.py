@@ -1,7 +1,5 @@
 """The twelve landmarks and the lip and lid lines of a raw scan, found in its unwrapped image."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import torch

@@ -1,7 +1,5 @@
 """Statistics of a filter's scores at its landmark in other images, and elsewhere: two Gaussians a filter."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """A raw scan as points with normals, spread evenly over its large parts."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import torch

@@ -1,7 +1,5 @@
 """The twelve landmarks that are found in UV space, and how they follow from the 68 of iBUG."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

@@ -1,7 +1,5 @@
 """The edges of lids on a head's skin without its eyeballs: where the skin, seen from the front, ends or falls away."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import cv2

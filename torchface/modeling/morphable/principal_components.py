@@ -1,7 +1,5 @@
 """Principal components of samples in memory or on disk, in passes over them; a killed run continues."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Head models of others as ``HeadModel``."""
 
-from __future__ import annotations
-
 import torch
 
 from torchface.errors import FileFormatError

@@ -1,7 +1,5 @@
 """Colour of the eyes: found in photographs, and given to painted eyeballs."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import replace

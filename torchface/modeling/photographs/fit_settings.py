@@ -1,7 +1,5 @@
 """Settings of a fit to photographs: the noise of points, the priors on faces, and what is made of them."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol

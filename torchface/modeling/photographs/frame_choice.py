@@ -1,7 +1,5 @@
 """Choice of a take's frames that together tell a person's head: of several angles and expressions, and well seen."""
 
-from __future__ import annotations
-
 import math
 
 import torch

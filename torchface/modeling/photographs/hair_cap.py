@@ -1,7 +1,5 @@
 """Hair as a cap of its colour in the photographs: paint on the head, no geometry."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

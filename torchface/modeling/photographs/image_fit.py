@@ -1,7 +1,5 @@
 """A head from landmarks in photographs: identity, expression and cameras at once."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 

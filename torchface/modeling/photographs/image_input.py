@@ -1,7 +1,5 @@
 """Checks of landmarks, images and lenses before a head is fitted to them."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import replace

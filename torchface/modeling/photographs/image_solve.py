@@ -1,7 +1,5 @@
 """Joint Gauss-Newton over identity, expression, poses and focal length, each step a quadratic program in a box."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import torch

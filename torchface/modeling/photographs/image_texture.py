@@ -1,7 +1,5 @@
 """Texture and colours of a fitted head from the photographs that it was fitted to: its skin and its irises."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 

@@ -1,7 +1,5 @@
 """Light of a photograph, estimated on the skin and divided out of its colours."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

@@ -1,7 +1,5 @@
 """Smooth differences of heads that a head model does not know: modes of a Gaussian process."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

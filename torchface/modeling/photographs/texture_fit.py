@@ -1,7 +1,5 @@
 """A colour model fitted to photographs: the thesis's colour error over the skin that they show."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

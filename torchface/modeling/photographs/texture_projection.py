@@ -1,7 +1,5 @@
 """Photographs as a head's texture: blended by viewing angle, seams hidden, completed where none shows the skin."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 

@@ -1,7 +1,5 @@
 """Choice of a regression's numbers of components, by cross-validation in sample space."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import torch

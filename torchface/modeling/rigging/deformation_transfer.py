@@ -1,7 +1,5 @@
 """A template's blendshapes on a new face, by deformation transfer."""
 
-from __future__ import annotations
-
 import warnings
 from dataclasses import dataclass
 

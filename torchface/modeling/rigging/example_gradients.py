@@ -1,7 +1,5 @@
 """The shapes' half of example-based rigging: what examples add to a prior, triangle by triangle."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

@@ -1,7 +1,5 @@
 """A personal rig from a template and a few example expressions of the person."""
 
-from __future__ import annotations
-
 import copy
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Training of an expression regression, in passes over people who are read a few at a time."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

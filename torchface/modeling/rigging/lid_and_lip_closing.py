@@ -1,7 +1,5 @@
 """The seams of a rig: lines along which its surface closes, found from its shapes, whatever their names."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

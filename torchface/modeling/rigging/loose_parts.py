@@ -1,7 +1,5 @@
 """The motion of a head's loose parts (eyeballs, teeth, gums, tongue, lashes) in shapes that its skin has."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise

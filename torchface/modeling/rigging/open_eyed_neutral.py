@@ -1,7 +1,5 @@
 """The open-eyed neutral of a person who was scanned with closed eyes."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 from torchface.errors import NameMismatchError

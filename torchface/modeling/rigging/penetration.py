@@ -1,8 +1,6 @@
 """The parts inside a head (teeth, gums, eyeballs, shells of the eye): how far they stand out of its skin, and which
 are bone."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import torch

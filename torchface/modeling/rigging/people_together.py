@@ -1,7 +1,5 @@
 """People with expressions, aligned with each other as they are read."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import torch

@@ -1,7 +1,5 @@
 """A corrective made from a sculpted mesh: what an artist changes where a rig's shapes act together or half-way."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import torch

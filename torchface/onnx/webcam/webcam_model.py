@@ -1,7 +1,5 @@
 """The whole way from a webcam's picture to blendshape weights, as one ONNX model."""
 
-from __future__ import annotations
-
 import copy
 from collections.abc import Callable, Mapping
 from typing import NamedTuple, Protocol

@@ -1,7 +1,5 @@
 """A webcam's pictures one at a time through the graph that solves weights, in ONNX Runtime."""
 
-from __future__ import annotations
-
 import json
 import math
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Correspondences of template vertices with scan points, and those refused: border, normal, distance."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

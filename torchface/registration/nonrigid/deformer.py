@@ -1,7 +1,5 @@
 """The template as it deforms: its stiffness, its levels, and one stage of Algorithm 1 after the other."""
 
-from __future__ import annotations
-
 import time
 from dataclasses import replace
 from functools import cached_property

@@ -1,7 +1,5 @@
 """The quadratic at the heart of non-rigid ICP: the best affine maps for given correspondences."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Lips that touch in the template touch on the scan too, unless the scan shows a gap between them."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import torch

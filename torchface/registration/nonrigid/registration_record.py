@@ -1,7 +1,5 @@
 """Record of a registration."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, field
 

@@ -1,7 +1,5 @@
 """Schedule of a registration, as data."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from enum import Enum
 

@@ -1,7 +1,5 @@
 """The stiffness term of non-rigid ICP: how much the affine maps of neighbouring vertices differ."""
 
-from __future__ import annotations
-
 import numpy as np
 import torch
 from numpy.typing import NDArray

@@ -1,7 +1,5 @@
 """Affine maps that a stage chooses from: all, those of a coarse graph, or translations on top of given ones."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import cached_property
 

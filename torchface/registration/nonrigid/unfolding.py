@@ -1,7 +1,5 @@
 """Triangles that a registration has turned over, turned back by moving as little as can be around them."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

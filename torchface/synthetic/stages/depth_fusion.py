@@ -1,7 +1,5 @@
 """Depth seen from several sides fused into one surface, as a hand-held scanner does it."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Hair and collar of a scanned head: lumps on the scalp, and cloth round the neck."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

@@ -4,8 +4,6 @@ A site is a weighted sum of the 68 landmarks, projected onto the skin. The table
 midline; the left side is the mirror image.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import torch

@@ -3,8 +3,6 @@
 Noise, gaps, labels that swap, markers that stand off the skin, a helmet that slips; what was true comes back beside it.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Raw scans of a synthetic head, as a hand-held scanner makes them: another topology, noise, holes, hair, collar."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, field, replace
 

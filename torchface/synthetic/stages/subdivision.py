@@ -1,7 +1,5 @@
 """A coarse mesh made smooth and fine, its texture turned into vertex colours: what a scanner looks at."""
 
-from __future__ import annotations
-
 import torch
 from scipy import sparse
 from torch import Tensor

@@ -1,7 +1,5 @@
 """Weights over time that move as a face does: blinks, glances, speech, and expressions that come and go."""
 
-from __future__ import annotations
-
 import math
 
 import torch

@@ -1,7 +1,5 @@
 """Landmarks of some frames being corrected, without a page: moves with their neighbours, undo, saving."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 

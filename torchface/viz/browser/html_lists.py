@@ -1,7 +1,5 @@
 """Lists of a page's panel as HTML; names from files are escaped."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 from torchface.escaped_text import as_markup

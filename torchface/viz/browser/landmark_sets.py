@@ -1,7 +1,5 @@
 """Sets of landmarks with their names, and which is whose mirror image."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Picks on a mesh and a scan, without a page: clicks as rays, mirrored picks, undo."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property

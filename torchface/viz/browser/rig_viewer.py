@@ -1,7 +1,5 @@
 """The rig viewer: a slider a shape, symmetric editing, playback of a take, saving what was edited."""
 
-from __future__ import annotations
-
 import re
 import time
 from collections.abc import Callable, Sequence

@@ -1,7 +1,5 @@
 """A head cut into pieces of one colour each, so that the page gets only the pieces that moved."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

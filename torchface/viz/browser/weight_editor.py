@@ -1,7 +1,5 @@
 """Blendshape weights under edit: one pose, or a take whose frames are corrected by hand."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """A character's face at rest and with shapes on, from the front and from three quarters, in its own materials."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import replace
 

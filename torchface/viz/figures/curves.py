@@ -1,7 +1,5 @@
 """Curves over a take: marker error, sums of weights, single weights (the thesis's figures 58 and 60), and bars."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import torch

@@ -1,7 +1,5 @@
 """Errors as the thesis shows them: green where a face is right, red where it is not, beside the face itself."""
 
-from __future__ import annotations
-
 import math
 
 import torch

@@ -1,7 +1,5 @@
 """Views of a face as a modeller would want them: front, three-quarter, profile, with an error as a heat map."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import torch

@@ -1,7 +1,5 @@
 """Landmarks found and landmarks solved, drawn on the picture that they were found in."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 import torch

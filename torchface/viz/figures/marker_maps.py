@@ -1,7 +1,5 @@
 """Markers on a face: their errors, their regions, and their sites before and after a fit."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import replace

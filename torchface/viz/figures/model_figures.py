@@ -1,7 +1,5 @@
 """Figures of a head model, after the thesis's figures 20 and 21."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

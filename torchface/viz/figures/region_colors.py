@@ -1,7 +1,5 @@
 """Colours for a mesh that brings none, by the names of its regions."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import torch

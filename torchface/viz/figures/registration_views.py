@@ -1,7 +1,5 @@
 """A registration for people to judge: scan, registered mesh and the distance between them, from three sides."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import torch

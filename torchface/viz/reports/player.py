@@ -1,7 +1,5 @@
 """Data of the player in a page, as scripts that a page opened from disk may load."""
 
-from __future__ import annotations
-
 import base64
 import json
 import math

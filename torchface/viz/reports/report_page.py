@@ -1,7 +1,5 @@
 """A report as one HTML page with images beside it; opens in any browser, from disk, without a network."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path

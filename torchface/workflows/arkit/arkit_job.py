@@ -1,7 +1,5 @@
 """Heads, animations and weights on disk to ARKit's and back."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """ARKit's 52 shapes on the topology of any head model or rig."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Expression parameters of head models over time, in and out."""
 
-from __future__ import annotations
-
 import io
 import re
 from dataclasses import dataclass, replace

@@ -1,7 +1,5 @@
 """Landmarks of a head that has none of its own: seen in pictures from around."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

@@ -1,7 +1,5 @@
 """Items of a batch: files and folders that a command works on, one by one, and their names."""
 
-from __future__ import annotations
-
 import hashlib
 from collections import Counter
 from collections.abc import Callable, Sequence

@@ -1,7 +1,5 @@
 """One item of a batch, from file to file: what every engine runs, here, in another process, or on another machine."""
 
-from __future__ import annotations
-
 import errno
 import time
 import warnings

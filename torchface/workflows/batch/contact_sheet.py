@@ -1,7 +1,5 @@
 """The pictures of all items of a batch on one sheet."""
 
-from __future__ import annotations
-
 import textwrap
 from collections.abc import Sequence
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The items of a batch spread over the machines of a Ray cluster."""
 
-from __future__ import annotations
-
 import logging
 import os
 import signal

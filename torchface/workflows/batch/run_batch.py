@@ -1,7 +1,5 @@
 """Many items worked on: one at a time, in processes, or on a cluster; killed, it continues where it was."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from itertools import chain

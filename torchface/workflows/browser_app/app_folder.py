@@ -1,7 +1,5 @@
 """The app in the browser as a folder: page, solver, character and licences."""
 
-from __future__ import annotations
-
 import gzip
 import json
 from dataclasses import dataclass

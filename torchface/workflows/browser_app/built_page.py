@@ -1,7 +1,5 @@
 """The page's built files: those that a wheel brings, else built once by Node and kept."""
 
-from __future__ import annotations
-
 import os
 import re
 import shutil

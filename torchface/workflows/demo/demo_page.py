@@ -1,7 +1,5 @@
 """The demo's report: what was true and what came back, as a performance that plays, in figures, curves and tables."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path

@@ -4,8 +4,6 @@ A template rig is transferred to a new head; that head's true rig plays a perfor
 to disk as C3D, comes back, is solved with the transferred rig, and what came back is compared with what was.
 """
 
-from __future__ import annotations
-
 import time
 from dataclasses import dataclass, replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """One animation of many, enhanced from file to file."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Meshes over time as morph targets with weights: what a ``.glb`` can hold of them."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Coarse animation to be enhanced, in the vertices of the model's dense mesh, whatever it came from."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The inputs of an enhancement, of any kind, as animations of the model's dense mesh."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from pathlib import Path
 

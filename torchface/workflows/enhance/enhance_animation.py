@@ -1,7 +1,5 @@
 """The whole job: read, enhance, write meshes, an animated ``.glb``, a video, tables and a summary."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal

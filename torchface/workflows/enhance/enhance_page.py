@@ -1,7 +1,5 @@
 """The report of an enhanced animation: frames side by side, curvature, what was added, what the model did not know."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import torch

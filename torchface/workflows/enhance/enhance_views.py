@@ -1,7 +1,5 @@
 """Pictures of an enhanced animation: input, smooth and enhanced side by side, curvature, what was added."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """The correspondence of another head with the model's dense mesh: by topology, registration, or given pairs."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path

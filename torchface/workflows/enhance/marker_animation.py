@@ -1,7 +1,5 @@
 """Markers as an animation of the model's dense mesh."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 

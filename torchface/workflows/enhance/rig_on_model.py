@@ -1,7 +1,5 @@
 """A rig's poses on the dense mesh of an actor's model."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path

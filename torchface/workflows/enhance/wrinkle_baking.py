@@ -1,7 +1,5 @@
 """Wrinkle maps for a rig, baked from an actor's displacements."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

@@ -1,7 +1,5 @@
 """Wrinkles for a game engine: an actor's model and a rig become maps, their weights' graphs and a ``.glb``."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any

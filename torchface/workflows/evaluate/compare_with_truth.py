@@ -1,7 +1,5 @@
 """From a result and the truth on disk to how far they are apart: figures, tables, heat maps."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The report of an evaluation: figures by region and by shape, error over time, heat maps."""
 
-from __future__ import annotations
-
 from dataclasses import asdict
 from pathlib import Path
 

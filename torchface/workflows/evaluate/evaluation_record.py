@@ -1,7 +1,5 @@
 """The record of an evaluation: figures, frames to draw, lines to read, and tables by region, frame and shape."""
 
-from __future__ import annotations
-
 from dataclasses import asdict, dataclass
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Comparison of many films' weights with their true ones, a table a method: ``torchface evaluate --benchmark``."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """One result of many, compared with its truth from file to file."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from pathlib import Path
 

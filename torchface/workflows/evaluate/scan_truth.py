@@ -1,7 +1,5 @@
 """Raw scans as the truth: each registered to the result's topology, and kept to measure the distance to its surface."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path

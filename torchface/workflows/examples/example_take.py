@@ -1,7 +1,5 @@
 """A video's weights by example expressions: the dissertation's three methods side by side, the solved one drawn."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Examples of somebody before a camera, who is asked for one expression after the other."""
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Callable, Iterator

@@ -1,7 +1,5 @@
 """Solver of a person's frames by example expressions, as the dissertation's program, before a camera."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from pathlib import Path

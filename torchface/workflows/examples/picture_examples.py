@@ -1,7 +1,5 @@
 """Examples from pictures, in the paper's order or by the files' names."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Sequence
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Checks of a fit: landmarks that do not fit, photographs that do not show one person."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Landmarks of photographs: given by files, or found and remarked on."""
 
-from __future__ import annotations
-
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, field

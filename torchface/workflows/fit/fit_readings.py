@@ -1,7 +1,5 @@
 """What a landmark network reads of photographs and frames beside the 68 landmarks, as a fit of a head counts it."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import torch

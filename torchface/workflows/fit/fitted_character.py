@@ -1,7 +1,5 @@
 """A fitted head as a character: the template's teeth, tongue, lashes, hair and collar in its photographs' colours."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """From photographs and a head model on disk to a personal rig on disk, with the fit drawn over each photograph."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path

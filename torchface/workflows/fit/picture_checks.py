@@ -1,7 +1,5 @@
 """Checks of what photographs show: a face that is large, uncovered, alone, in colour, not drawn and not filtered."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Frames of a video as photographs: sharp ones of several angles and expressions."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """A camera at this machine: opened with little delay, watched while it runs."""
 
-from __future__ import annotations
-
 import threading
 import time
 from collections.abc import Callable, Iterator

@@ -1,7 +1,5 @@
 """Cameras at this machine by number, and what is said where one is missing; torch is not needed for it."""
 
-from __future__ import annotations
-
 import re
 import sys
 from collections.abc import Mapping

@@ -1,7 +1,5 @@
 """Solver of anybody's frames for landmarks that a finder by name finds, in place of the webcam's graph."""
 
-from __future__ import annotations
-
 import numpy as np
 import torch
 

@@ -1,7 +1,5 @@
 """Takes in a folder: listed, renamed, deleted and read for the page."""
 
-from __future__ import annotations
-
 import json
 from contextlib import suppress
 from dataclasses import dataclass

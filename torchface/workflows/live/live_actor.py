@@ -1,7 +1,5 @@
 """An actor before a camera: landmarks, pose and the weights of the actor's own rig frame by frame, sent on."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Sequence
 from contextlib import closing, nullcontext

@@ -1,7 +1,5 @@
 """Anybody before a webcam moves a character: the whole job from a camera to streams, a page and files."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from contextlib import ExitStack, closing
 from dataclasses import dataclass, replace

@@ -1,7 +1,5 @@
 """The figures of a live session, in memory that does not grow: counts and a histogram of latency."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Frames in real time, from a camera or a video played at its own rate, and what is solved of each."""
 
-from __future__ import annotations
-
 import re
 import time
 from collections.abc import Callable, Iterator

@@ -1,7 +1,5 @@
 """Anybody before a camera: frames are solved, sent, recorded and shown, until it ends."""
 
-from __future__ import annotations
-
 import threading
 import time
 from collections import deque

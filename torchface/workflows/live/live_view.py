@@ -1,7 +1,5 @@
 """View of a live session: one moment as the page shows it, and its bytes."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import cv2

@@ -4,8 +4,6 @@ The page, the camera's pictures and the controls lie under a token that each sta
 view and its socket, which shows frames and takes nothing, lie beside it at addresses that stay.
 """
 
-from __future__ import annotations
-
 import json
 import logging
 import mimetypes

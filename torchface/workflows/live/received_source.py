@@ -1,7 +1,5 @@
 """A phone or another program as a camera: the faces that it sends, and what is made of each."""
 
-from __future__ import annotations
-
 import math
 import socket
 import time

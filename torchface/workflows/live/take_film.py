@@ -1,7 +1,5 @@
 """The camera's film of a take: written beside the session, and solved once more with all of its frames at once."""
 
-from __future__ import annotations
-
 import queue
 import threading
 from contextlib import suppress

@@ -1,7 +1,5 @@
 """Settings of the page applied to solved weights, as ``export/web/src/weight_controls.js`` applies them there."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace

@@ -1,7 +1,5 @@
 """From a template and scans to registered meshes, a record each, a table and a contact sheet on disk."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,7 +1,5 @@
 """One scan of many, registered from file to file."""
 
-from __future__ import annotations
-
 from dataclasses import asdict, dataclass, fields, replace
 from functools import cached_property
 from pathlib import Path

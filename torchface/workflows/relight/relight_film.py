@@ -1,7 +1,5 @@
 """A filmed face under another light, with another skin or another head, written as a film; what covers it stays."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import astuple, dataclass, replace

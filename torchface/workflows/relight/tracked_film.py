@@ -1,7 +1,5 @@
 """A film with what ``torchface track`` found in it: the rig, its weights and the head's pose in every frame."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The solution of a take's markers: aligned, cleaned, freed of slip and of what is left at rest, then solved."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property

@@ -1,7 +1,5 @@
 """The page of a solve: the face as it plays, marker errors on it and in a table, what was wrong, every curve."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path

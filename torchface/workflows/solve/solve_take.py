@@ -1,7 +1,5 @@
 """From a rig, a marker take and an attachment on disk to weights on disk."""
 
-from __future__ import annotations
-
 import time
 from dataclasses import dataclass, replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Checks of a marker take against a rig and an attachment, which refuse or warn."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, replace
 

@@ -1,7 +1,5 @@
 """One marker take of many, solved from file to file."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Frames of weights sent in their own time."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import closing

@@ -1,7 +1,5 @@
 """Views of other cameras that are fixed to the first: their films brought to its frames, and what they saw."""
 
-from __future__ import annotations
-
 import warnings
 from dataclasses import dataclass, replace
 from pathlib import Path

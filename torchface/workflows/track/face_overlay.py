@@ -1,7 +1,5 @@
 """The solved face drawn over its video: a shaded mesh with the landmarks, or a new texture under the video's light."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """A reading of the face in each frame: by a tracker, kept piece by piece for a killed run; or given by a table."""
 
-from __future__ import annotations
-
 import warnings
 from itertools import chain, islice
 from pathlib import Path

@@ -1,7 +1,5 @@
 """A head's pose before a camera as Live Link Face has it: yaw, pitch and roll."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

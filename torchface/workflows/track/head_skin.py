@@ -1,7 +1,5 @@
 """The skin of a head that was solved with a take, from sharp frames in which the face acts little."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import torch

@@ -1,7 +1,5 @@
 """The video of what was solved: the rig as clay beside the camera's picture, or over it."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path

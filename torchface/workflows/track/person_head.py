@@ -1,7 +1,5 @@
 """The head of whoever a video shows: solved with a head model from frames of several angles and expressions."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import torch

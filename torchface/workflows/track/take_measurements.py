@@ -1,7 +1,5 @@
 """Measurements of a take beside its landmarks, from what networks read of its frames."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import torch

@@ -1,7 +1,5 @@
 """From readings of all frames to weights: smoothed landmarks, fixed offsets of the rig's landmarks, the solve."""
 
-from __future__ import annotations
-
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, replace

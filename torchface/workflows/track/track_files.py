@@ -1,7 +1,5 @@
 """Files of a tracked video: curves of weights, landmarks and head pose, offsets, animation, summary."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from torchface.files.whole_files import delete_file

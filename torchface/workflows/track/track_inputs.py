@@ -1,7 +1,5 @@
 """Inputs of tracking, read and checked: settings, the video, the actor's rig, the camera, the models."""
 
-from __future__ import annotations
-
 import warnings
 from dataclasses import dataclass, replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The learned parts that track a video: landmarks of any face, the actor's own appearance, what faces do."""
 
-from __future__ import annotations
-
 import functools
 from dataclasses import dataclass, field
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Report of a tracked video: figures, frames with the solved face beside and over them, curves."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Result of tracking a video, and its report."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from math import nan

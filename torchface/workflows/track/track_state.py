@@ -1,7 +1,5 @@
 """State of a run of tracking on disk: readings of frames a piece at a time, and which product is up to date."""
 
-from __future__ import annotations
-
 import warnings
 from dataclasses import fields
 from pathlib import Path

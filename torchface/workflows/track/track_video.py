@@ -1,7 +1,5 @@
 """From a video of a face and the actor's rig on disk to weights, animation, landmarks and an overlay on disk."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager

@@ -1,7 +1,5 @@
 """One video of many, tracked from file to file."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The webcam's graph as a file, after ONNX Runtime has been compared with PyTorch over a rendered video."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """The webcam's solver, and its graph from a picture to weights: made once of the zoo's models, then cached."""
 
-from __future__ import annotations
-
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager

@@ -1,7 +1,5 @@
 """The 16 and their meaning, the file of examples, examples of rigs and of people, and what landmarks tell apart."""
 
-from __future__ import annotations
-
 import json
 import math
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Planted weights come back; the minima are those that independent solvers find; gradients are those of differences."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """What a range of motion does not tell is said, what the rig does not explain is refused, and slip is solved along."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

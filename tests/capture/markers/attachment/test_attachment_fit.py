@@ -1,7 +1,5 @@
 """Sites that were guessed wrong come back to where the markers were."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest

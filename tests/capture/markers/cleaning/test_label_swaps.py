@@ -1,7 +1,5 @@
 """Exchanged labels are found with and without a rig, in part of a take and in all of it; labels in order are left."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest

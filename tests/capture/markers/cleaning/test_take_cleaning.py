@@ -1,7 +1,5 @@
 """What was done to a take on purpose is found, named and undone; what is right stays as it was."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest

@@ -1,7 +1,5 @@
 """Frames for annotation span what a face does, whatever the head does meanwhile."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Appearance models: planted shapes come back, steps are those of the plain algorithm, and a filmed performer."""
 
-from __future__ import annotations
-
 import copy
 from collections.abc import Callable
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The network of face boxes says what it was taught, at every angle and size; its detector gives the image's pixels."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from pathlib import Path

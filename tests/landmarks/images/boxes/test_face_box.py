@@ -1,7 +1,5 @@
 """Faces are found where they are, and only there."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -1,7 +1,5 @@
 """Bundles are hostile files: whatever is wrong with one ends in a message, before memory is taken."""
 
-from __future__ import annotations
-
 import io
 import zipfile
 from pathlib import Path

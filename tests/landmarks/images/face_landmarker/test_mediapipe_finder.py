@@ -1,7 +1,5 @@
 """A Face Landmarker bundle in this process: squares and points, and on a real face what MediaPipe itself gives."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Anchors lie where cells have their middles; boxes that were planted come back, and those of one face become one."""
 
-from __future__ import annotations
-
 import numpy as np
 import torch
 

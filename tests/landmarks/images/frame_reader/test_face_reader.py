@@ -1,7 +1,5 @@
 """One face in a camera's pictures: it is kept, lost and found; its eyes are read as the library reads them."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from torch import Tensor

@@ -1,7 +1,5 @@
 """Squares of a picture as the library cuts them, and places of faces."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from torch import Tensor

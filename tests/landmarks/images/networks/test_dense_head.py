@@ -1,7 +1,5 @@
 """The landmark network's head for points and expression: its frame, its calibration, its graph, its training."""
 
-from __future__ import annotations
-
 import copy
 
 import onnxruntime

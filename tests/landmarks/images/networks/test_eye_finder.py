@@ -1,7 +1,5 @@
 """The eye finder: pixels of the picture, lids of two networks by their variances, irises and openings."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -1,7 +1,5 @@
 """A graph of the agreed signature finds landmarks in turned crops; one of another signature is told what it has."""
 
-from __future__ import annotations
-
 import json
 import math
 import struct

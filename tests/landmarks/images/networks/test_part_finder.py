@@ -1,7 +1,5 @@
 """Parts of a face: shares are found again at pixels of the picture, and both sides of a face count alike."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

@@ -1,7 +1,5 @@
 """A filmed performer's landmarks are followed, lost and found again; what trembles in one start is steady in many."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 

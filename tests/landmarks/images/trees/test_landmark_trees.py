@@ -1,7 +1,5 @@
 """Landmark trees against a plain computation, planted motion, a killed training, and faces, made-up and real."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import cv2

@@ -1,7 +1,5 @@
 """The paper's 16 expressions in its order, what each means in ARKit's shapes, and how they move a character."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache

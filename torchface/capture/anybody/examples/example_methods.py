@@ -1,7 +1,5 @@
 """Methods that solve landmarks for the weights of examples: all shapes at once, or the head first, then regions."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from typing import Protocol
 

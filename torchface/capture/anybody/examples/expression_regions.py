@@ -1,7 +1,5 @@
 """Regions of example shapes: the head as a whole, brows, eyes or mouth."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Sequence
 

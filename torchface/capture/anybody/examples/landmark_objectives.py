@@ -1,7 +1,5 @@
 """Objectives of a solve from landmarks: squared distances, or distances as they are, each with its penalties."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Protocol
 

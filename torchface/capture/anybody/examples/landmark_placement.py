@@ -1,7 +1,5 @@
 """Placement of a face in the picture, position and size, in a solve from its landmarks."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Protocol
 

@@ -1,7 +1,5 @@
 """Examples made without a person: a rig's shapes as a camera before it sees their landmarks."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 

@@ -1,7 +1,5 @@
 """Examples from pictures of a person: heads brought to one place, and what looks wrong said."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import torch

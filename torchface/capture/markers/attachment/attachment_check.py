@@ -1,7 +1,5 @@
 """Checks sites that were fitted to a range of motion; errors name the figure and the likely cause."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import torch

@@ -1,7 +1,5 @@
 """The sites of markers on a rig, fitted to a range-of-motion take."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import torch

@@ -1,7 +1,5 @@
 """The pose of a take in a rig's space: one similarity, or where the helmet slips one scale and a motion a frame."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

@@ -1,7 +1,5 @@
 """An automatic initial guess of marker sites: the markers' mean shape aligned with the face."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

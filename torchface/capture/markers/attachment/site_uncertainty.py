@@ -1,7 +1,5 @@
 """The uncertainty of a fit: standard deviations of each marker's site and each shape's level."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

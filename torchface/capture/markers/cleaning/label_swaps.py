@@ -1,7 +1,5 @@
 """Markers whose labels were exchanged, for a stretch of frames or for the whole take."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 

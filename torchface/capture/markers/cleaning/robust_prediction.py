@@ -1,7 +1,5 @@
 """The expected place of each marker in each frame: a robust solve from the markers that agree with each other."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import torch

@@ -1,7 +1,5 @@
 """Defects of a marker take, found, named, and repaired where that is safe; the raw take is not changed."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace

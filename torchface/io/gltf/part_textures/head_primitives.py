@@ -1,7 +1,5 @@
 """A head cut into the primitives that engines draw: skin, eyes, teeth, shells, each of one material."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Literal
 

@@ -1,7 +1,5 @@
 """Annotated frames: chosen so that they show all that a face does, and kept as images with iBUG's PTS beside them."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """One resolution of an appearance model: its texture modes, and the step that improves an alignment."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import torch

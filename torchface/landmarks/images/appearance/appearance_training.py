@@ -1,7 +1,5 @@
 """Training of an appearance model: shapes first, then the textures that they are warped from."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import torch

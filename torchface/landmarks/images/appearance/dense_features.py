@@ -1,7 +1,5 @@
 """Features of every pixel that do not depend on brightness and gain."""
 
-from __future__ import annotations
-
 import math
 from typing import Literal, get_args
 

@@ -1,7 +1,5 @@
 """The face's inside cut into triangles between landmarks, and what moves with them, pixel by pixel."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

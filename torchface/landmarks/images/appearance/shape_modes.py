@@ -1,7 +1,5 @@
 """Modes of one face's landmarks: a mean shape, modes with their deviations, and similarities apart from both."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import torch

@@ -1,7 +1,5 @@
 """Training of a :class:`BoxNetwork`: heat maps round the centres of faces in whole pictures."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial

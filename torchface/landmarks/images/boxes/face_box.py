@@ -1,7 +1,5 @@
 """Boxes of faces in an image: the record, the protocol of detectors, and what all detectors share."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Protocol
 

@@ -1,7 +1,5 @@
 """The network of face boxes as a detector: any image in, boxes and roll angles out."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import cv2

@@ -1,7 +1,5 @@
 """Face Landmarker bundle, ``FILE.task``: a zip of three TensorFlow Lite networks, run by LiteRT on one thread."""
 
-from __future__ import annotations
-
 import io
 import math
 import zipfile

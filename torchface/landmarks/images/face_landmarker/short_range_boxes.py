@@ -3,8 +3,6 @@
 Source: Bazarevsky et al. 2019, "BlazeFace"; the anchors' layout is the file's, see MediaPipe's documentation.
 """
 
-from __future__ import annotations
-
 import numpy as np
 import torch
 from torch import Tensor

@@ -3,8 +3,6 @@
 A place is (5,): x and y of the middle, side, cosine and sine of the roll angle, clockwise as the picture is seen.
 """
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

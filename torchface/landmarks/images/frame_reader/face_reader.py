@@ -1,7 +1,5 @@
 """Reading of one face in a camera's pictures, frame after frame."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 

@@ -1,7 +1,5 @@
 """Choice among the faces that the box network finds in a picture."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

@@ -1,7 +1,5 @@
 """Pieces of a picture: a turned square of it, and the whole made smaller."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 from torch.nn.functional import grid_sample, interpolate, pad

@@ -1,7 +1,5 @@
 """A process that answers requests through pipes, each within a time limit; it ends with this one."""
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess

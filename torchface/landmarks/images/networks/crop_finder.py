@@ -1,7 +1,5 @@
 """Landmarks by a network that is shown an upright crop of the face."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 

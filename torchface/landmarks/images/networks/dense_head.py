@@ -1,7 +1,5 @@
 """Head of the landmark network that reads many points of the face's surface, and the weights of its expression."""
 
-from __future__ import annotations
-
 from typing import NamedTuple, cast
 
 import torch

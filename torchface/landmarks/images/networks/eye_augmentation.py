@@ -1,7 +1,5 @@
 """Crops of rendered eyes as cameras might show them: beside their place, far away, hidden, in glare, compressed."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

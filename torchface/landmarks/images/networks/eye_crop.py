@@ -1,7 +1,5 @@
 """The upright rectangles that a network is shown of a face's eyes, and the way between their pixels and the image's."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

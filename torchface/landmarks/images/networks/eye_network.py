@@ -1,7 +1,5 @@
 """An eye in one pass of a small convolutional network: lids, iris, how sure each is, and how far it is open."""
 
-from __future__ import annotations
-
 from typing import Any, NamedTuple, Self
 
 import torch

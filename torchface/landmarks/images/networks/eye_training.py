@@ -1,7 +1,5 @@
 """Training of the eye network on cut-out pictures of eyes whose lids and irises are known."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from functools import partial
 

@@ -7,8 +7,6 @@ that never ends, or takes gigabytes, is ended without harm. The process ends whe
 a graph runs.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import queue

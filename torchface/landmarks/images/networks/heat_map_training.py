@@ -1,7 +1,5 @@
 """Parts of all trainings of networks with heat maps: batches, losses of places, gaps and maps."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import torch

@@ -1,7 +1,5 @@
 """Building blocks of networks whose heat maps are read by their means: convolutions, and points from heat maps."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import torch

@@ -1,7 +1,5 @@
 """Training of the landmark network on cut-out pictures with exact landmarks."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field, fields
 from functools import partial
 

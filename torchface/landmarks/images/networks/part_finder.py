@@ -1,7 +1,5 @@
 """Parts of the face in a photograph whose landmarks are known: skin, hair, brows, eyes, glasses, hands, cloth."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Parts of a face in a picture by a small convolutional network: skin, hair, brows, eyes, glasses, hands, cloth."""
 
-from __future__ import annotations
-
 from typing import Any, Self
 
 import torch

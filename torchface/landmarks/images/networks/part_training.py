@@ -1,7 +1,5 @@
 """Training of the network of a face's parts on pictures whose every pixel is known."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import partial
 from typing import NamedTuple

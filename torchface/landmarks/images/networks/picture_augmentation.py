@@ -1,7 +1,5 @@
 """Crops of cut-out faces as cameras might show them: turned, before walls, hidden in part, blurred, compressed."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import dataclass

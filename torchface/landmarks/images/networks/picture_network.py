@@ -1,7 +1,5 @@
 """Base of the networks that learn from pictures of faces: how they are trained."""
 
-from __future__ import annotations
-
 from abc import abstractmethod
 from pathlib import Path
 from typing import Any, Self

@@ -1,7 +1,5 @@
 """Follows one face through a video, frame by frame; a face that is lost is NaN and is found again."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

@@ -1,7 +1,5 @@
 """Landmarks of one face in all frames of a video, and how much they tremble."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator, Sized
 from contextlib import contextmanager
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Landmarks that trees find from several starts round one box: where they agree, and by how much they do not."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from typing import NamedTuple

@@ -1,7 +1,5 @@
 """Landmarks by regression trees from several starts, and what their agreement says of the face."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 
 import cv2

@@ -1,7 +1,5 @@
 """Training of regression trees: gradient boosting on shape-indexed pixel differences."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path

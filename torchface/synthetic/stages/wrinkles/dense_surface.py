@@ -1,7 +1,5 @@
 """A coarse face made dense by subdivision, as matrices that take coarse vertices to dense points and tangents."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Pores and the fine relief of skin: small static heights that ride on it."""
 
-from __future__ import annotations
-
 import itertools
 from dataclasses import dataclass
 

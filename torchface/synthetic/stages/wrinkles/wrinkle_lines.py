@@ -1,7 +1,5 @@
 """Lines of a face's wrinkles: curves on the skin, with how deep and how wide it folds there."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import torch

@@ -1,7 +1,5 @@
 """The form of folded skin: how each vertex moves in the skin's own frame when a line near it folds."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

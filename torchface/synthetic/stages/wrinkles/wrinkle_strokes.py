@@ -1,7 +1,5 @@
 """The courses along which faces fold, drawn by 68 landmarks with seeded variation, before they lie on the skin."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace

@@ -1,7 +1,5 @@
 """A performer at high resolution whose skin wrinkles: the truth for detail that a coarse animation lacks."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 
