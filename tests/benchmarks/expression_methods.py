@@ -11,6 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from planted.mediapipe_tracker import MediaPipeTracker
 from torchface.capture.anybody import (
     AllAtOnce,
     ExampleSolver,
@@ -22,7 +23,6 @@ from torchface.io import load_take, save_rig
 from torchface.io.rigs.ict_facekit import load_ict_facekit
 from torchface.io.video import open_video
 from torchface.io.weights.live_link_csv import save_live_link
-from torchface.landmarks.images.face_landmarker.mediapipe_finder import MediaPipeTracker
 from torchface.landmarks.images.face_mesh_478 import landmarks_of_mesh
 from torchface.progress import silent
 from torchface.rig import BlendshapeRig

@@ -19,8 +19,8 @@ import pytest
 import torch
 from torch import Tensor, nn
 
+from planted.mediapipe_tracker import MediaPipeTracker
 from torchface.io.video import open_video
-from torchface.landmarks.images.face_landmarker.mediapipe_finder import MediaPipeTracker
 from torchface.onnx.network_graphs import network_model
 from torchface.onnx.webcam.webcam_model import WebcamAnswer, reading_model, solving_model, webcam_model
 from torchface.onnx.webcam.webcam_session import WebcamSession

@@ -7,15 +7,14 @@ import numpy as np
 import pytest
 import torch
 
+from planted.mediapipe_tracker import MediaPipeTracker
 from torchface.io.video import open_video
 from torchface.landmarks.images.face_landmarker.landmarker_bundle import LandmarkerBundle
 from torchface.landmarks.images.face_landmarker.mediapipe_finder import (
     BLENDSHAPES,
     FaceLandmarker,
     FaceSquare,
-    MediaPipeDetector,
     MediaPipeFinder,
-    MediaPipeTracker,
     MeshFace,
     lid_openness,
     measured_expression,
@@ -91,7 +90,6 @@ def test_no_face_is_an_answer() -> None:
     image, box = torch.zeros(80, 100, dtype=torch.uint8), torch.tensor([20.0, 10.0, 40.0, 40.0])
     assert float(MediaPipeFinder(stand_in(-9.0))(image, box).presence) < 1e-3
     assert MediaPipeTracker(stand_in()).mesh(image) is None
-    assert len(MediaPipeDetector(stand_in())(image)) == 0
 
 
 def test_openness_of_lids() -> None:
@@ -117,10 +115,7 @@ def test_a_real_face_is_read_as_mediapipe_reads_it(data: Path) -> None:
         eyes = (reference[number, 36] - reference[number, 45]).norm()
         for landmarks in (landmarks_of_mesh(face.points), found(finder, frame, reference[number])):
             assert (landmarks - reference[number]).norm(dim=1).mean() < 0.016 * eyes
-    boxes = MediaPipeDetector(task)(frame)
     own, _ = turned_box(reference[5])
-    assert len(boxes) == 1
-    assert (boxes.boxes[0] - own).abs().amax() < 0.25 * own[2]
     reading = finder(frame, own)
     assert (reading.closed < 0.1).all()
     for eye, corners in enumerate(((36, 39), (42, 45))):  # the right eye comes first

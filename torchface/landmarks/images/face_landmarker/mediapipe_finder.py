@@ -1,4 +1,4 @@
-"""Landmarks, irises and blendshapes by a Face Landmarker bundle, face by face or followed through a video."""
+"""Landmarks, irises and blendshapes of a face by a Face Landmarker bundle."""
 
 from __future__ import annotations
 
@@ -6,15 +6,12 @@ import math
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import cv2
 import numpy as np
 import torch
 from torch import Tensor
 
-from torchface.landmarks.images.boxes.face_box import FaceBoxes, check_image, sorted_boxes
 from torchface.landmarks.images.face_crop import crop_transform, cut_crop, from_crop
 from torchface.landmarks.images.face_landmarker.landmarker_bundle import LandmarkerBundle, load_bundle
-from torchface.landmarks.images.face_landmarker.short_range_boxes import SIDE, decoded, merged
 from torchface.landmarks.images.face_mesh_478 import BLENDSHAPE_POINTS, IRISES, landmarks_of_mesh
 from torchface.landmarks.images.face_reading import FaceReading, box_side
 from torchface.landmarks.images.ibug_68 import COUNT
@@ -36,8 +33,8 @@ pictures of 120 people; both sides together. Shapes that are not here have slope
 
 _CROP = 256
 _CORNER = 0.3  # of its pixels: where the crop's first one has its middle; a mirrored crop gives mirrored points by it
-_ROUND = 1.5  # the crop's side, of the points' extent or of the detector's box
-_PRESENT, _LIKELY = 0.5, 0.5  # least presence of a face that is followed, and score of one that is found
+_ROUND = 1.5  # the crop's side, of the points' extent
+_PRESENT = 0.5  # least presence of a face
 _EYES = (33, 263)
 # The crop's middle and side beside the box round iBUG's 68, of that box's side: medians over six clips.
 _BELOW, _WIDER = 0.05, 1.46
@@ -106,28 +103,6 @@ class FaceLandmarker:
         weights[torch.tensor([ARKIT.index(name) for name in BLENDSHAPES[1:]])] = torch.from_numpy(found[1:].copy())
         return weights
 
-    def faces(self, image: Tensor) -> tuple[list[FaceSquare], Tensor]:
-        """Squares of the faces in a picture, the best first, and their scores (F,)."""
-        check_image(image)
-        pixels = (image if image.ndim == 3 else image.expand(3, *image.shape)).permute(1, 2, 0).cpu().numpy()
-        height, width = pixels.shape[:2]
-        scale = SIDE / max(height, width)
-        size = (max(1, round(width * scale)), max(1, round(height * scale)))
-        small = cv2.resize(np.ascontiguousarray(pixels), size, interpolation=cv2.INTER_AREA if scale < 1 else 1)
-        shown = np.zeros((SIDE, SIDE, 3), np.float32)  # black beside the picture, which stays in the middle
-        left, top = (SIDE - size[0]) // 2, (SIDE - size[1]) // 2
-        shown[top : top + size[1], left : left + size[0]] = small
-        regressors, logits = self.bundle.boxes(shown[None] / 127.5 - 1)
-        boxes, points, scores = merged(*decoded(regressors[0], logits[0, :, 0], _LIKELY))
-        ratio, corner = torch.tensor([width / size[0], height / size[1]]), torch.tensor([left, top])
-        squares = []
-        for box, marks in zip(boxes * SIDE, points * SIDE, strict=True):  # a few faces
-            middle = (box[:2] + box[2:] / 2 - corner) * ratio - 0.5
-            across = ((marks[1] - marks[0]) * ratio).tolist()
-            side = _ROUND * float(box[2:].amax() * ratio.mean())
-            squares.append(FaceSquare(middle, side, math.atan2(across[1], across[0])))
-        return squares, scores
-
 
 class MediaPipeFinder:
     """Finds landmarks, irises and blendshapes in a box, by a Face Landmarker bundle.
@@ -147,40 +122,6 @@ class MediaPipeFinder:
         if face.presence >= _PRESENT and not square.fits(face.square):
             face = self.landmarker.look(image, face.square)
         return replace(reading_of(face, self.landmarker.blendshapes(face.points)), search_box=box)
-
-
-class MediaPipeTracker:
-    """Follows one face as Face Landmarker does: in the square round its last points, by the box network where lost."""
-
-    def __init__(self, bundle: LandmarkerBundle | str | Path) -> None:
-        self.landmarker = FaceLandmarker(bundle)
-        self._square: FaceSquare | None = None
-
-    def mesh(self, image: Tensor) -> MeshFace | None:
-        """The face in the next picture, uint8 (H,W) or (3,H,W), red first; None where there is none."""
-        square = self._square
-        if square is None:
-            squares, _ = self.landmarker.faces(image)
-            square = squares[0] if squares else None
-        face = None if square is None else self.landmarker.look(image, square)
-        present = face is not None and face.presence >= _PRESENT
-        self._square = face.square if face is not None and present else None
-        return face if present else None
-
-
-class MediaPipeDetector:
-    """Finds faces by a Face Landmarker bundle's box network, which is made for faces near the camera."""
-
-    def __init__(self, bundle: LandmarkerBundle | str | Path) -> None:
-        self.landmarker = FaceLandmarker(bundle)
-
-    def __call__(self, image: Tensor) -> FaceBoxes:
-        """See :class:`~torchface.landmarks.images.boxes.face_box.FaceDetector`."""
-        squares, scores = self.landmarker.faces(image)
-        boxes = (
-            torch.stack([replace(one, side=one.side / _WIDER).box for one in squares]) if squares else torch.zeros(0, 4)
-        )
-        return sorted_boxes(boxes, scores, torch.tensor([one.tilt for one in squares]))
 
 
 def reading_of(face: MeshFace, weights: Tensor) -> FaceReading:
