@@ -11,7 +11,6 @@ import onnxruntime
 import torch
 from torch import Tensor, nn
 
-from torchface import __version__
 from torchface.capture.action_units.classifier import ActionUnitClassifier
 from torchface.capture.action_units.classifier_training import local_warps
 from torchface.errors import ValueRangeError
@@ -95,7 +94,6 @@ def action_unit_model(classifier: ActionUnitClassifier, facts: Mapping[str, obje
             "task": "action_units",
             "regions": list(classifier.regions),
             "units": list(classifier.units),
-            "version": __version__,
             **(facts or {}),
         },
         {"regions": ("batch",)},

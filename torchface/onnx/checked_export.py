@@ -8,10 +8,11 @@ import numpy as np
 import onnx
 import onnxruntime
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from torchface.errors import ValueRangeError
 from torchface.files.whole_files import write_file
+from torchface.onnx.exported_model import exported_model
 
 
 @dataclass(frozen=True)
@@ -49,10 +50,27 @@ class ExportReport(WrittenGraph):
         return rows
 
 
+Cases = Sequence[tuple[Mapping[str, Tensor], Mapping[str, Tensor]]]  # inputs by name, and outputs that PyTorch gives
+
+
+def export_checked(
+    module: nn.Module,
+    path: str | Path,
+    cases: Cases,
+    allowed: Mapping[str, float],
+    units: Mapping[str, str],
+    metadata: Mapping[str, object],
+) -> ExportReport:
+    """Exports a module of batches, the last case of two rows or more, and writes it as :func:`write_checked` does."""
+    example = cases[-1][0]
+    model = exported_model(module, example, list(allowed), metadata, dict.fromkeys(example, ("batch",)))
+    return write_checked(model, path, cases, allowed, units)
+
+
 def write_checked(
     model: onnx.ModelProto,
     path: str | Path,
-    cases: Sequence[tuple[Mapping[str, Tensor], Mapping[str, Tensor]]],
+    cases: Cases,
     allowed: Mapping[str, float],
     units: Mapping[str, str],
 ) -> ExportReport:
@@ -60,7 +78,6 @@ def write_checked(
 
     Args:
         path: the file to write; it appears only when it is complete and checked.
-        cases: inputs by name, and the outputs that PyTorch gives for them.
         allowed: by output, how far apart the two may be.
     """
     content = model.SerializeToString()

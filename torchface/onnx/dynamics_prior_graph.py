@@ -3,14 +3,11 @@
 from collections.abc import Mapping
 from pathlib import Path
 
-import onnx
 import torch
 from torch import Tensor, nn
 
-from torchface import __version__
 from torchface.capture.priors import DynamicsPrior
-from torchface.onnx.checked_export import ExportReport, write_checked
-from torchface.onnx.exported_model import exported_model
+from torchface.onnx.checked_export import ExportReport, export_checked
 
 _PARITY = {"mean": 1e-4, "deviation": 1e-4}
 _UNITS = {"mean": "of a weight of 1", "deviation": "of a weight of 1"}
@@ -40,30 +37,21 @@ def export_dynamics_prior(
         windows = (start + steps.cumsum(1)).clamp(model.limits[0], model.limits[1])
         mean, variance = model(windows)
         cases.append(({"windows": windows}, {"mean": mean, "deviation": variance.sqrt()}))
-    return write_checked(dynamics_model(model, facts), path, cases, _PARITY, _UNITS)
-
-
-def dynamics_model(model: DynamicsPrior, facts: Mapping[str, object] | None = None) -> onnx.ModelProto:
-    """The graph of ``DynamicsPrior.forward``, with the standard deviation in place of the variance."""
-    return exported_model(
-        _MeanAndDeviation(model),
-        {"windows": torch.zeros(2, model.window, len(model.names))},
-        ["mean", "deviation"],
-        {
-            "task": "dynamics_prior",
-            "shape_names": list(model.names),
-            "window": model.window,
-            "fps": model.fps,
-            "input_noise": model.input_noise,
-            "units": "weights, 1 is the whole shape",
-            "version": __version__,
-            **(facts or {}),
-        },
-        {"windows": ("batch",)},
-    )
+    metadata = {
+        "task": "dynamics_prior",
+        "shape_names": list(model.names),
+        "window": model.window,
+        "fps": model.fps,
+        "input_noise": model.input_noise,
+        "units": "weights, 1 is the whole shape",
+        **(facts or {}),
+    }
+    return export_checked(_MeanAndDeviation(model), path, cases, _PARITY, _UNITS, metadata)
 
 
 class _MeanAndDeviation(nn.Module):
+    """``DynamicsPrior.forward``, with the standard deviation in place of the variance."""
+
     def __init__(self, prior: DynamicsPrior) -> None:
         super().__init__()
         self.prior = prior

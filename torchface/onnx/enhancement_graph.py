@@ -3,14 +3,11 @@
 from collections.abc import Mapping
 from pathlib import Path
 
-import onnx
 import torch
 from torch import Tensor
 
-from torchface import __version__
 from torchface.enhancement.wrinkle_maps.wrinkle_weights import RigWrinkles, WrinkleWeights
-from torchface.onnx.checked_export import ExportReport, write_checked
-from torchface.onnx.exported_model import exported_model
+from torchface.onnx.checked_export import ExportReport, export_checked
 
 OUTPUT = "map_weights"
 _PARITY = 1e-4
@@ -37,25 +34,13 @@ def export_wrinkle_weights(
     Raises:
         ValueRangeError: ONNX Runtime and PyTorch differ; nothing is written.
     """
-    name = "weights" if isinstance(wrinkles, RigWrinkles) else "vertices"
-    graph = wrinkle_weights_model(wrinkles, facts)
-    with torch.no_grad():
-        cases = [({name: some}, {OUTPUT: wrinkles(some)}) for some in (poses[:1], poses)]
-    return write_checked(graph, path, cases, {OUTPUT: _PARITY}, {OUTPUT: "of the range"})
-
-
-def wrinkle_weights_model(
-    wrinkles: WrinkleWeights | RigWrinkles, facts: Mapping[str, object] | None = None
-) -> onnx.ModelProto:
-    """The graph of the module."""
-    size: tuple[int, ...]
     if isinstance(wrinkles, RigWrinkles):
-        learned, name, size = wrinkles.wrinkles, "weights", (len(wrinkles.names),)
+        learned, name = wrinkles.wrinkles, "weights"
         about: dict[str, object] = {"units": "weights in [0,1]", "shapes": list(wrinkles.names)}
     else:
-        learned, name, size = wrinkles, "vertices", (wrinkles.vertex_count, 3)
-        about = {"units": "millimetres"}
-    about |= {"task": "wrinkle_weights", "version": __version__, "regions": list(learned.region_names)}
-    return exported_model(
-        wrinkles, {name: torch.zeros(2, *size)}, [OUTPUT], about | dict(facts or {}), {name: ("batch",)}
-    )
+        learned, name, about = wrinkles, "vertices", {"units": "millimetres"}
+    about |= {"task": "wrinkle_weights", "regions": list(learned.region_names)}
+    with torch.no_grad():
+        cases = [({name: some}, {OUTPUT: wrinkles(some)}) for some in (poses[:1], torch.cat([poses[:1], poses]))]
+    units = {OUTPUT: "of the range"}
+    return export_checked(wrinkles, path, cases, {OUTPUT: _PARITY}, units, about | dict(facts or {}))

@@ -8,7 +8,6 @@ import onnx
 import torch
 from torch import Tensor, nn
 
-from torchface import __version__
 from torchface.capture.anybody import AllAtOnce, ExampleSolver, LandmarkModel, Regional, SolvedSimilarity
 from torchface.capture.anybody.examples.example_methods import head_rows, regional_basis
 from torchface.capture.anybody.examples.example_shapes import EYE_CORNERS
@@ -163,7 +162,6 @@ def example_model(
         "task": "example_solver",
         "shape_names": list(solver.names),
         "units": "pixels",
-        "version": __version__,
         "method": type(solver.method).__name__,
         "placement": type(solver.placement).__name__,
         "steps": steps_of(solver) if steps is None else steps,

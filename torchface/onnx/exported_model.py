@@ -14,6 +14,7 @@ import torch
 from onnx import TensorProto, helper, numpy_helper
 from torch import Tensor, nn
 
+from torchface import __version__
 from torchface.onnx.operator_set import IR_VERSION, OPSET
 
 if TYPE_CHECKING:
@@ -37,7 +38,7 @@ def exported_model(
     Args:
         module: of the inputs in their order.
         outputs: names of what the module returns.
-        metadata: values that are not text become JSON.
+        metadata: beside the version; values that are not text become JSON.
         sizes: names of the first axes of inputs, which may then have any size, None for one that keeps the example's;
             the example's is to be 2 or more.
         translations: of operators that PyTorch does not know from ONNX, functions of the operator's arguments.
@@ -164,9 +165,10 @@ def rename_values(graph: onnx.GraphProto, renamed: Callable[[str], str]) -> None
 
 
 def _set_metadata(model: onnx.ModelProto, metadata: Mapping[str, object]) -> None:
-    """Gives a model its metadata; values that are not text become JSON."""
+    """Gives a model its metadata and the version; values that are not text become JSON."""
+    facts = {"version": __version__, **metadata}
     helper.set_model_props(
-        model, {key: value if isinstance(value, str) else json.dumps(value) for key, value in metadata.items()}
+        model, {key: value if isinstance(value, str) else json.dumps(value) for key, value in facts.items()}
     )
 
 

@@ -3,15 +3,12 @@
 from collections.abc import Mapping
 from pathlib import Path
 
-import onnx
 import torch
 from torch import Tensor, nn
 
-from torchface import __version__
 from torchface.errors import ValueRangeError
 from torchface.modeling import ExpressionRegression
-from torchface.onnx.checked_export import ExportReport, write_checked
-from torchface.onnx.exported_model import exported_model
+from torchface.onnx.checked_export import ExportReport, export_checked
 
 _PARITY = 1e-3  # millimetres
 # Each squares the ratio of the largest eigenvalue to the next: heads are far from round, a few would do.
@@ -28,7 +25,6 @@ def export_expression_regression(
     """
     if model.form != "offsets":
         raise ValueRangeError(f"{path}: found a regression of the form {model.form!r}, expected 'offsets'")
-    graph = expression_model(model, facts)
     cases = []
     generator = torch.Generator().manual_seed(0)
     for batch in (1, 3):
@@ -38,25 +34,15 @@ def export_expression_regression(
         neutrals = neutrals @ orthonormal + 100 * torch.randn(batch, 1, 3, generator=generator)
         # Where positions are rounded to float32 is no affair of the graph's.
         cases.append(({"neutrals": neutrals}, {"offsets": model.offsets(neutrals.double()).float()}))
-    return write_checked(graph, path, cases, {"offsets": _PARITY}, {"offsets": "millimetres"})
-
-
-def expression_model(model: ExpressionRegression, facts: Mapping[str, object] | None = None) -> onnx.ModelProto:
-    """The graph of :class:`OffsetRegression`."""
-    return exported_model(
-        OffsetRegression(model),
-        {"neutrals": model.neutral_mean.expand(2, -1, -1).contiguous()},
-        ["offsets"],
-        {
-            "task": "expression_regression",
-            "shape_names": list(model.names),
-            "units": "millimetres",
-            "topology": model.topology or "",
-            "version": __version__,
-            **(facts or {}),
-        },
-        {"neutrals": ("batch",)},
-    )
+    metadata = {
+        "task": "expression_regression",
+        "shape_names": list(model.names),
+        "units": "millimetres",
+        "topology": model.topology or "",
+        **(facts or {}),
+    }
+    units = {"offsets": "millimetres"}
+    return export_checked(OffsetRegression(model), path, cases, {"offsets": _PARITY}, units, metadata)
 
 
 class OffsetRegression(nn.Module):

@@ -3,14 +3,11 @@
 from collections.abc import Mapping
 from pathlib import Path
 
-import onnx
 import torch
 from torch import Tensor, nn
 
-from torchface import __version__
-from torchface.modeling import HeadModel, MorphableModel
-from torchface.onnx.checked_export import ExportReport, write_checked
-from torchface.onnx.exported_model import exported_model
+from torchface.modeling import HeadModel
+from torchface.onnx.checked_export import ExportReport, export_checked
 
 _PARITY = {"vertices": 1e-3, "colors": 1e-4}
 _UNITS = {"vertices": "millimetres", "colors": "of the range"}
@@ -23,7 +20,6 @@ def export_head_decoder(model: HeadModel, path: str | Path, facts: Mapping[str, 
     gives ``vertices`` (B,V,3), millimetres, and ``colors`` (B,V,3), clipped to [0,1]. The metadata holds ``triangles``
     and, where annotated, ``landmarks``, as JSON.
     """
-    graph = head_decoder_model(model, facts)
     cases = []
     generator = torch.Generator().manual_seed(0)
     for batch in (1, 5):
@@ -35,37 +31,27 @@ def export_head_decoder(model: HeadModel, path: str | Path, facts: Mapping[str, 
             inputs["color"], outputs["colors"] = color, heads.colors.clamp(0, 1)
         cases.append((inputs, outputs))
     names = list(cases[0][1])
-    return write_checked(graph, path, cases, {n: _PARITY[n] for n in names}, {n: _UNITS[n] for n in names})
-
-
-def head_decoder_model(model: HeadModel, facts: Mapping[str, object] | None = None) -> onnx.ModelProto:
-    """The graph: a matrix product for shape, another for colour."""
-    parts = {"shape": model.shape} if model.color is None else {"shape": model.shape, "color": model.color}
     metadata = {
         "task": "head_decoder",
         "units": "millimetres",
         "coefficients": "standard deviations",
-        "version": __version__,
         "triangles": model.faces.tolist(),
         **(facts or {}),
     }
     if model.landmarks is not None:
         metadata["landmarks"] = model.landmarks.tolist()
-    return exported_model(
-        _Decoder(parts),
-        {name: torch.zeros(2, part.count) for name, part in parts.items()},
-        ["vertices", "colors"][: len(parts)],
-        metadata,
-        dict.fromkeys(parts, ("batch",)),
-    )
+    allowed, units = {name: _PARITY[name] for name in names}, {name: _UNITS[name] for name in names}
+    return export_checked(_Decoder(model), path, cases, allowed, units, metadata)
 
 
 class _Decoder(nn.Module):
-    """Shape and colour of coefficients, with the mean in the same operation as the product."""
+    """A matrix product for shape, another for colour, each with the mean in the same operation."""
 
-    def __init__(self, parts: Mapping[str, MorphableModel]) -> None:
+    def __init__(self, model: HeadModel) -> None:
         super().__init__()
-        for name, part in parts.items():
+        for name, part in (("shape", model.shape), ("color", model.color)):
+            if part is None:
+                continue
             self.register_buffer(f"{name}_modes", part.modes.flatten(1))
             self.register_buffer(f"{name}_mean", part.mean.flatten())
 

@@ -6,7 +6,6 @@ from pathlib import Path
 import torch
 from torch import Tensor, nn
 
-from torchface import __version__
 from torchface.capture.priors import ShapePrior
 from torchface.capture.priors.student_t import StudentDensity
 from torchface.errors import ShapeError, TraceError
@@ -64,7 +63,7 @@ def export_module(
         with torch.no_grad():
             cases.append((given, _named(module(*given.values()))))
     names = list(cases[0][1])
-    metadata = {"task": type(module).__name__, "version": __version__, **(facts or {})}
+    metadata = {"task": type(module).__name__, **(facts or {})}
     try:
         model = exported_model(module, inputs, names, metadata, dict.fromkeys(inputs, ("batch",)))
     except Exception as error:

@@ -8,7 +8,6 @@ import onnx
 import torch
 from torch import Tensor, nn
 
-from torchface import __version__
 from torchface.landmarks.images.boxes.box_network import BoxNetwork
 from torchface.landmarks.images.folded_normalisation import without_normalisation
 from torchface.landmarks.images.networks.eye_network import EyeFindings, EyeNetwork
@@ -103,7 +102,7 @@ def network_model(network: ImageNetwork, facts: Mapping[str, object] | None = No
         module,
         {form.images: form.example},
         list(form.parity),
-        {"task": task, **form.metadata, "version": __version__, **(facts or {})},
+        {"task": task, **form.metadata, **(facts or {})},
         {form.images: form.sizes},
     )
     return model if isinstance(network, BoxNetwork) else half_stored(model, halves(module))

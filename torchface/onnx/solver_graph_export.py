@@ -13,7 +13,6 @@ import onnxruntime
 import torch
 from torch import Tensor
 
-from torchface import __version__
 from torchface.attachment import Attachment
 from torchface.capture.markers.hybrid_solver import GAMMA, HybridSolver
 from torchface.capture.markers.marker_solver import RIDGE, SPARSITY, MarkerSolver, penalty_value
@@ -248,7 +247,6 @@ def solver_model(
             "marker_labels": list(solver.labels),
             **correctives,
             "units": "millimetres",
-            "version": __version__,
             "sparsity": penalty_value(solver.sparsity),
             "ridge": penalty_value(solver.ridge),
             "steps": list(graph.steps),

@@ -3,18 +3,15 @@
 from collections.abc import Mapping
 from pathlib import Path
 
-import onnx
 import torch
 from torch import Tensor, nn
 from torch.nn.functional import conv2d, normalize, pad
 
-from torchface import __version__
 from torchface.errors import ShapeError
 from torchface.landmarks import UVLandmarkDetector
 from torchface.landmarks.scans.hog import cell_map
 from torchface.landmarks.scans.uv_detector import MAX_DISTANCE
-from torchface.onnx.checked_export import ExportReport, write_checked
-from torchface.onnx.exported_model import exported_model
+from torchface.onnx.checked_export import ExportReport, export_checked
 from torchface.rendering.gaussian_blur import unsharp
 
 MEAN_SHIFT_STEPS = 5
@@ -137,25 +134,14 @@ def export_landmark_bank(
         images = nn.functional.interpolate(coarse, size=(bank.size, bank.size), mode="bicubic").clamp(0, 1)
     cases = []
     with torch.no_grad():
-        for part in (images[:1], images):
+        for part in (images[:1], torch.cat([images[:1], images])):
             pixels, confidence = bank(part)
             cases.append(({"images": part}, {"pixels": pixels, "confidence": confidence}))
-    return write_checked(landmark_bank_model(bank, facts), path, cases, _PARITY, _UNITS)
-
-
-def landmark_bank_model(bank: LandmarkBank, facts: Mapping[str, object] | None = None) -> onnx.ModelProto:
-    """The graph of :class:`LandmarkBank`."""
-    return exported_model(
-        bank,
-        {"images": torch.zeros(2, bank.channels, bank.size, bank.size)},
-        ["pixels", "confidence"],
-        {
-            "task": "uv_landmarks",
-            "landmark_names": list(bank.names),
-            "appearance": bank.appearance,
-            "units": "pixels",
-            "version": __version__,
-            **(facts or {}),
-        },
-        {"images": ("batch",)},
-    )
+    metadata = {
+        "task": "uv_landmarks",
+        "landmark_names": list(bank.names),
+        "appearance": bank.appearance,
+        "units": "pixels",
+        **(facts or {}),
+    }
+    return export_checked(bank, path, cases, _PARITY, _UNITS, metadata)

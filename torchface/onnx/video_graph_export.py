@@ -11,7 +11,6 @@ import onnxruntime
 import torch
 from torch import Tensor
 
-from torchface import __version__
 from torchface.capture.antagonist_shapes import one_side
 from torchface.capture.own_rig import VideoSettings, VideoSolver
 from torchface.capture.own_rig.landmark_offsets import LandmarkOffsets
@@ -173,7 +172,6 @@ def write_video_solver(
             "shape_names": list(solver.names),
             "state": list(graph.state),
             "units": "pixels, millimetres; weights, 1 is the whole shape",
-            "version": __version__,
             "intrinsics": solver.intrinsics.tolist(),
             "landmark_weights": solver.landmark_weights.tolist(),
             "window": graph.window,

@@ -8,7 +8,6 @@ import onnx
 import torch
 from torch import Tensor, nn
 
-from torchface import __version__
 from torchface.capture.anybody import WebcamControls, WebcamSolver
 from torchface.capture.anybody.webcam_state import CONTROLS, POSES
 from torchface.landmarks.images.face_reading import READ_FOR_SOLVER, FaceReading
@@ -232,7 +231,6 @@ def webcam_model(
         "poses": list(POSES),
         "image": "uint8, rows, columns, channels: red, green, blue, and one more that counts for nothing",
         "units": "seconds, pixels, millimetres, radians; weights, 1 is the whole shape",
-        "version": __version__,
         **(facts or {}),
     }
     return chained_models(reading, solving, OUTPUTS, metadata)
