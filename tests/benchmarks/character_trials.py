@@ -14,7 +14,7 @@ from planted.characters import UPRIGHT, Planted, packed, unpacked, write_charact
 from torchface.geometry.similarity import similarity_transform
 from torchface.io.gltf.character_scene import Character, read_character
 from torchface.io.gltf.gltf_document import read_document
-from torchface.modeling.rigging.other_topology import joined_vertices
+from torchface.modeling.rigging.joined_vertices import joined_vertices
 from torchface.rig import BlendshapeRig
 from torchface.shape_names.recognised_names import recognised_shapes
 from torchface.synthetic import performer

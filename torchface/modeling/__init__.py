@@ -15,6 +15,7 @@ from torchface.modeling.photographs.fit_settings import FitSettings
 from torchface.modeling.photographs.image_fit import ImageFit, fit_images
 from torchface.modeling.photographs.texture_fit import ColorFit, fit_colors
 from torchface.modeling.photographs.texture_projection import PhotoTexture, photo_texture
+from torchface.modeling.rigging.carried_shapes import CarriedShapes
 from torchface.modeling.rigging.deformation_transfer import (
     TransferredRig,
     TransferReport,
@@ -30,7 +31,7 @@ from torchface.modeling.rigging.expression_regression import (
     rig_from_neutral,
 )
 from torchface.modeling.rigging.open_eyed_neutral import open_eyes
-from torchface.modeling.rigging.other_topology import CarriedShapes, shapes_on
+from torchface.modeling.rigging.other_topology import shapes_on
 from torchface.modeling.rigging.part_clearance import clear_parts
 from torchface.modeling.rigging.part_placement import place_parts
 from torchface.modeling.rigging.penetration import InnerParts, inner_parts, shape_depths

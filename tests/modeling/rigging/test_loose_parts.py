@@ -89,3 +89,40 @@ def test_teeth_that_sit_low_behind_the_lips_belong_to_the_jaws_of_their_rows() -
     head = _Head(points, part, whole, torch.zeros(1, len(points), 3))
     _, share, _ = _in_the_mouth(head, torch.zeros(0, 3).long(), whole, torch.zeros(20, 3).double())
     assert torch.equal(share, (part >= len(across)).double())
+
+
+def test_a_tongue_that_touches_teeth_comes_out_whole_where_gums_are_a_part_of_their_own() -> None:
+    floor, triangles, hill = gums(12.0)
+    rim = ((floor[:, 0].abs() > 22) | (floor[:, 2] > -8)) & (floor[:, 2] > -50)
+    pieces = [(floor[rim], triangles[rim[triangles].all(1)]), (floor[hill], triangles[hill[triangles].all(1)])]
+    pieces[0] = pieces[0][0], (rim.cumsum(0) - 1)[pieces[0][1]]
+    pieces[1] = pieces[1][0] * torch.tensor([1.8, 1.0, 1.0]).double(), (hill.cumsum(0) - 1)[pieces[1][1]]
+    cube = torch.tensor([[x, y, z] for x in (-2, 2) for y in (-3, 3) for z in (-2, 2)]).double()
+    ahead = torch.tensor([[x, -3.0, -4.0] for x in (-20.0, -12.0, 12.0, 20.0)]).double()  # stand on the gums
+    beside = pieces[1][0][[0, 1, 2, 3]]  # touch the tongue
+    teeth = [cube + one for one in torch.cat([ahead, beside + torch.tensor([2.0, 3.0, 2.0])])]
+    points = torch.cat([pieces[0][0], pieces[1][0], *teeth])
+    sizes = [len(pieces[0][0]), len(pieces[1][0]), *[8] * len(teeth)]
+    part = torch.arange(len(sizes)).repeat_interleave(torch.tensor(sizes))
+    faces = torch.cat([pieces[0][1], pieces[1][1] + sizes[0]])
+    whole = torch.ones(len(points), dtype=torch.bool)
+    head = _Head(points, part, whole, torch.zeros(1, len(points), 3))
+    _, _, tongue = _in_the_mouth(head, faces, whole, torch.zeros(20, 3).double())
+    assert torch.equal(tongue, (part == 1).double())
+
+
+def test_gums_of_few_triangles_are_no_tongue_beside_a_longer_one() -> None:
+    """The share of a part near the middle is one of area, not of its few vertices."""
+    floor, triangles, hill = gums(12.0)
+    rim = ((floor[:, 0].abs() > 22) | (floor[:, 2] > -8)) & (floor[:, 2] > -50)
+    front = rim & (floor[:, 0].abs() < 5)
+    dense = torch.cat([floor[rim], floor[front].repeat(30, 1)])  # vertices in the middle that bear no area
+    faces = (rim.cumsum(0) - 1)[triangles[rim[triangles].all(1)]]
+    tongue = floor[hill]
+    points = torch.cat([dense, tongue])
+    part = (torch.arange(len(points)) >= len(dense)).long()
+    both = torch.cat([faces, (hill.cumsum(0) - 1)[triangles[hill[triangles].all(1)]] + len(dense)])
+    whole = torch.ones(len(points), dtype=torch.bool)
+    head = _Head(points, part, whole, torch.zeros(1, len(points), 3))
+    _, _, found = _in_the_mouth(head, both, whole, torch.zeros(20, 3).double())
+    assert torch.equal(found, part.double())

@@ -10,7 +10,9 @@ from torchface.errors import ValueRangeError
 from torchface.geometry.rotations import rotation_matrix
 from torchface.geometry.similarity import Similarity
 from torchface.mesh import Annotations
-from torchface.modeling.rigging.other_topology import CarriedShapes, TemplatePlaces, joined_vertices, shapes_on
+from torchface.modeling.rigging.carried_shapes import CarriedShapes
+from torchface.modeling.rigging.joined_vertices import joined_vertices
+from torchface.modeling.rigging.other_topology import TemplatePlaces, shapes_on
 from torchface.rig import BlendshapeRig
 from torchface.synthetic import performer
 

@@ -9,7 +9,7 @@ from scipy import sparse
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from torchface.geometry.meshes.operators import vertex_normals
+from torchface.geometry.meshes.operators import triangle_areas, vertex_normals
 from torchface.geometry.meshes.shell_energies import stretching_energy
 from torchface.geometry.meshes.surface_index import SurfaceIndex
 from torchface.geometry.similarity import Similarity, similarity_transform
@@ -31,6 +31,13 @@ _JAW = "jaw"
 _ROW, _OFF_THE_LIPS, _RISES = 4, 10.0, (0.0, 0.1, _BITE, 0.3)  # least teeth of a row; millimetres from the lips' line
 _TONGUE, _FILLED = 15.0, 0.2  # millimetres at least: teeth are smaller; and the share near the middle
 _BACK, _BEHIND_TEETH, _TEETH, _LEAST_BACK, _FALLS = (0.3, 0.55), 12.0, 8.0, 8, 4.0  # of half the arch; millimetres
+_MIDDLE = 5.0  # millimetres beside the middle: gums are an arch, a tongue lies there
+_OVER_A_TRIANGLE = (
+    torch.tensor(
+        [[a + 1 / 3, b + 1 / 3, 3 - a - b + 1 / 3] for a in range(4) for b in range(4 - a)], dtype=torch.float64
+    )
+    / 4.0
+)
 _COVERED = 0.3  # the share of a tongue's back that may lie under other parts
 _STANDS, _GUM = 1.0, (3.0, 6.0)  # millimetres from teeth: a part they stand in; gums at most, tongue at least
 _TONGUE_OUT, _TONGUE_DOWN = 12.0, 8.0
@@ -191,7 +198,7 @@ def _in_the_mouth(head: _Head, faces: Tensor, left: Tensor, lips: Tensor) -> tup
     inside = torch.zeros_like(left)
     share, tongue = torch.zeros(2, len(left), dtype=torch.float64)
     widest, gums, found, deep = _FILLED, [], [], _deep(head, faces, left)
-    among_teeth = False
+    held_tongue = torch.zeros_like(left)
     for one in head.part[left].unique().tolist():  # every tooth is a part
         rows = (head.part == one) & left
         away = head.vertices[rows] - middle
@@ -212,14 +219,15 @@ def _in_the_mouth(head: _Head, faces: Tensor, left: Tensor, lips: Tensor) -> tup
         lower = float(below.mean()) > 0 and not both
         held = lower and width > _ARCH and _holds(head.vertices[rows], [head.vertices[one] for one in teeth])
         if both or held:
-            gums.append((rows, below))
+            gums.append((rows, below, away))
         share[rows] = low * low * (3 - 2 * low) if both else float(below.mean() > 0)
-        filled = float((away[:, 0].abs() < 5.0).double().mean())  # gums are an arch, hollow in the middle
+        filled = _share_in_the_middle(head.vertices - middle, faces[rows[faces].all(1)])  # gums are an arch
         if lower and width > _TONGUE and depth > _TONGUE and filled > widest:
-            widest, tongue, among_teeth = filled, rows.double(), held
-    if among_teeth or not tongue.any():  # gums with a tongue, or a tongue that touches teeth
+            widest, tongue, held_tongue = filled, rows.double(), rows & held
+    own = head.vertices[held_tongue] - middle
+    if not tongue.any() or (len(own) and not any(_within(own, arch) for *_, arch in gums)):  # it is one with gums
         of_gums = torch.zeros_like(tongue)
-        for rows, below in gums:
+        for rows, below, _ in gums:
             of_gums += _tongue_of_gums(head.vertices, faces, rows, below, share > 0.5, teeth)
         tongue = of_gums if of_gums.any() else tongue
     return inside, share, tongue
@@ -242,6 +250,19 @@ def _holds(points: Tensor, teeth: list[Tensor]) -> bool:
     """Whether teeth stand in a part (n,3), as in gums."""
     tree = cKDTree(points.numpy())
     return sum(float(tree.query(one.numpy())[0].min()) < _STANDS for one in teeth) >= _ROW
+
+
+def _share_in_the_middle(vertices: Tensor, faces: Tensor) -> float:
+    """The share of the area of triangles (n,3) that lies less than so many millimetres beside x = 0."""
+    area = triangle_areas(vertices, faces)
+    x = vertices[faces][..., 0] @ _OVER_A_TRIANGLE.T
+    return float((area * (x.abs() < _MIDDLE).double().mean(1)).sum() / area.sum().clamp(min=1e-9))
+
+
+def _within(points: Tensor, arch: Tensor) -> bool:
+    """Whether a part (n,3) lies within gums (m,3) that are a part of their own, as a tongue does that touches teeth."""
+    sides = points[:, 0].amin() > arch[:, 0].amin() and points[:, 0].amax() < arch[:, 0].amax()
+    return bool(sides and points[:, 2].amax() < arch[:, 2].amax())
 
 
 def _bite_plane(parts: list[Tensor]) -> tuple[float, float]:

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-import numpy as np
 import torch
 from scipy import sparse
-from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 from torch import Tensor
 
@@ -15,7 +13,6 @@ from torchface.errors import ValueRangeError
 from torchface.geometry.meshes.operators import (
     border_vertices,
     corners,
-    edges,
     triangle_normals,
     vertex_areas,
     vertex_normals,
@@ -23,8 +20,10 @@ from torchface.geometry.meshes.operators import (
 from torchface.geometry.meshes.shell_energies import stretching_energy
 from torchface.geometry.meshes.surface_index import triangle_coordinates
 from torchface.mesh import Mesh
+from torchface.modeling.rigging.carried_shapes import CarriedShapes, marks_of
 from torchface.modeling.rigging.deformation_transfer import transfer_with_report
 from torchface.modeling.rigging.eyelid_closure import SkinOfHead, eyes_seen, lids_looking_down, shut_blinks
+from torchface.modeling.rigging.joined_vertices import JoinedMesh, connected_labels, joined_vertices
 from torchface.modeling.rigging.loose_parts import moved_parts
 from torchface.modeling.rigging.part_clearance import clear_parts
 from torchface.modeling.rigging.part_placement import place_parts
@@ -34,7 +33,6 @@ from torchface.progress import Progress, silent
 from torchface.registration import Registration, hidden_parts, register, with_template_skin
 from torchface.registration.scan_preparation import Landmarks
 from torchface.rig import BlendshapeRig
-from torchface.shape_names import mapping
 
 _NORMAL_REACH = 6.0
 """A normal that points the other way counts as far as twice these millimetres: lips that touch stay apart."""
@@ -44,118 +42,7 @@ _BLIND = 1e-3
 """How much the guess counts for a vertex that has no place on the template, beside one that has."""
 _SMOOTH = 0.4
 _SKIN_SHARE, _BODY_SHARE = 0.3, 0.15
-_OPEN = 0.1  # of an eye: what a blink that shuts it leaves at most
-_JAW, _LIP, _DRAWN, _LEAST_DRAWN = "jawOpen", 10.0, 4.0, 3  # millimetres round the lips' line, times their length
-_MOUTH, _STRETCHED = (75.0, 25.0), 2.0  # millimetres behind the lips and over them; times an edge's length
-_SAME_PLACE = 1e-4
 _AT_LIPS = 1.5  # millimetres from the edge of lips that were cut
-_ALIKE = 0.2
-
-
-@dataclass(frozen=True, eq=False)
-class CarriedShapes:
-    """A head of its own topology with a template's shapes.
-
-    Args:
-        rig: the head, every vertex where it was, with the template's names.
-        registration: of the template with the head, in the head's space.
-        template: the template's rig on the head's face, in the template's topology, place and size.
-        distance: of each of the head's vertices to that face, (V,), millimetres of the template's size.
-        places: which vertices have a place on it, (V,) bool; the others follow by smoothness or as loose parts.
-        tongue: how much each vertex is of the head's own tongue, (V,) in [0,1]; all zero where it has none.
-        open_lids: what the blinks of the right and left eye leave open, as a share of the opening; None where its lids
-            cannot be told from the eye, as of painted or welded eyes, and its blink is the template's.
-    """
-
-    rig: BlendshapeRig
-    registration: Registration
-    template: BlendshapeRig
-    distance: Tensor
-    places: Tensor
-    tongue: Tensor
-    open_lids: tuple[float | None, ...]
-
-    def notes(self, lips_cut: bool = False, shut: tuple[bool, bool] = (False, False)) -> list[str]:
-        """Of eyes that may not shut and lips that do not part, if nobody has cut them, for people to read.
-
-        Args:
-            shut: whether the right and left eye are modelled shut.
-        """
-        named = list(zip(("right", "left"), self.open_lids, strict=True))
-        at_rest = [side for (side, _), yes in zip(named, shut, strict=True) if yes]
-        unseen = [side for side, left in named if left is None and side not in at_rest]
-        notes = [
-            f"warning: {side} eye: its blink leaves {left:.0%} of it open"
-            for side, left in named
-            if (left or 0) > _OPEN
-        ]
-        if at_rest:
-            notes.append(
-                f"warning: {' and '.join(at_rest)} eye: modelled shut: eyeBlink moves nothing and eyeWide opens it; "
-                "ARKit's shapes expect open eyes at rest"
-            )
-        if unseen:
-            notes.append(
-                f"warning: {' and '.join(unseen)} eye: the lids cannot be told from the eye (painted, shut or "
-                "one piece with the skin): look whether it shuts"
-            )
-        if not lips_cut and self._lips_in_one_piece():
-            notes.append(
-                "warning: the lips are one piece: jawOpen stretches the skin between them; cut the mesh along the lips"
-            )
-        if between := self._edges_between_jaws():
-            notes.append(
-                f"warning: {between} edges inside the mouth join both jaws where more than two triangles share an "
-                "edge, as in reduced meshes: jawOpen stretches them across the mouth; separate the two rows of teeth"
-            )
-        return notes
-
-    def _opened(self) -> tuple[Tensor, Tensor, Tensor] | None:
-        """The inner lips, and the head at rest and with its jaw open, in the template's place."""
-        marks, jaw = _marks(self.template), mapping(self.rig.names, [_JAW])[0] > 0.5
-        if not bool(jaw.any()) or bool(marks.isnan().any()):
-            return None
-        back = self.registration.pose.inverse()
-        rest = back.apply(self.rig.vertices.detach().cpu().double())[0]
-        return marks[60:68], rest, rest + back.apply_vectors(self.rig.deltas[jaw][:1].detach().cpu().double())[0]
-
-    def _lips_in_one_piece(self) -> bool:
-        """Whether opening the jaw draws edges out from one lip to the other."""
-        if (opened := self._opened()) is None:
-            return False
-        lips, rest, posed = opened
-        beside = (rest - lips.mean(0)).abs() < torch.tensor([float(lips[4, 0] - lips[0, 0]) / 3, _LIP, _LIP])
-        ends = edges(self.rig.neutral.faces.cpu())
-        ends = ends[beside.all(1)[ends].all(1)]
-        return int(_drawn(ends, rest, posed, _DRAWN).sum()) >= _LEAST_DRAWN
-
-    def _edges_between_jaws(self) -> int:
-        """How many edges behind the lips opening the jaw draws out beside those that more than two triangles share.
-
-        Cheeks and the wall of a mouth are drawn out as far, but there two triangles share an edge.
-        """
-        if (opened := self._opened()) is None:
-            return 0
-        lips, rest, posed = opened
-        joined = joined_vertices(rest, self.rig.neutral.faces.cpu())
-        away = joined.vertices - lips.mean(0)
-        inside = (away[:, 2] < 0) & (away.norm(dim=-1) < _MOUTH[0]) & (away[:, 1].abs() < _MOUTH[1])
-        # A face of two sides counts once.
-        faces = joined.faces[inside[joined.faces].all(1)].sort(1).values.unique(dim=0)
-        faces = faces[(faces[:, :2] != faces[:, 1:]).all(1)]
-        pairs = torch.cat([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [0, 2]]])
-        ends, count = pairs.unique(dim=0, return_counts=True)
-        after = torch.zeros_like(joined.vertices)
-        after[joined.of] = posed
-        shared = torch.isin(ends, ends[count > 2]).any(1)
-        found = int((_drawn(ends, joined.vertices, after, _STRETCHED) & shared).sum())
-        return found if found >= _LEAST_DRAWN else 0
-
-
-def _drawn(ends: Tensor, rest: Tensor, posed: Tensor, times: float) -> Tensor:
-    """Which edges (E,) a pose makes longer by so many times and by more than a lip."""
-    before, after = ((one[ends[:, 0]] - one[ends[:, 1]]).norm(dim=-1) for one in (rest, posed))
-    return (after > times * before) & (after - before > _LIP)
 
 
 @dataclass(frozen=True, eq=False)
@@ -237,7 +124,7 @@ def shapes_on(
     skin = _Skin.of(moved, registration, joined, followed)
     deltas = skin.carried(moved.deltas.double())
     head = SkinOfHead(joined.vertices, joined.faces, skin.loose, joined.part)
-    openings, down = eyes_seen(head, _marks(moved)), lids_looking_down(template)
+    openings, down = eyes_seen(head, marks_of(moved)), lids_looking_down(template)
     deltas, left = shut_blinks(head, deltas, moved.names, openings, skin.distance, down)
     parts = moved_parts(moved, joined.vertices, joined.faces, joined.part, skin.loose, deltas)
     deltas = parts.deltas
@@ -255,14 +142,6 @@ def shapes_on(
     )
 
 
-def _marks(rig: BlendshapeRig) -> Tensor:
-    """iBUG's 68 of a rig, (68,3); NaN where it does not know them."""
-    notes = rig.neutral.annotations
-    if notes is None or notes.landmarks is None or len(notes.landmarks) != 68:
-        return torch.full((68, 3), torch.nan, dtype=torch.float64)
-    return rig.vertices.detach().cpu().double()[notes.landmarks.cpu()]
-
-
 def _among(parts: InnerParts, bones: Tensor) -> InnerParts:
     """Those parts that are bone: lashes and shells of the eye stand before the skin by nature."""
     kept = bones[parts.vertices]
@@ -276,48 +155,6 @@ def fitted_template(template: BlendshapeRig, registration: Registration) -> Mesh
     fitted = template.neutral.with_vertices(vertices.to(template.vertices))
     fitted = place_parts(template, fitted, inner_parts(template))
     return with_template_skin(fitted, template.neutral, hidden_parts(template.neutral, registration.matched))
-
-
-@dataclass(frozen=True, eq=False)
-class JoinedMesh:
-    """A mesh whose vertices in one place are one, unless they face apart.
-
-    Args:
-        vertices: (J,3) float64.
-        faces: (F,3) of them.
-        of: the joined vertex of each of the mesh's, (V,).
-        part: connected part of each, (J,).
-    """
-
-    vertices: Tensor
-    faces: Tensor
-    of: Tensor
-    part: Tensor
-
-
-def joined_vertices(vertices: Tensor, faces: Tensor) -> JoinedMesh:
-    """Joins the vertices that a file has split at seams; lips that touch, and lashes on a lid, stay apart.
-
-    Args:
-        vertices: (V,3), millimetres.
-    """
-    normals, seam = vertex_normals(vertices, faces), border_vertices(faces, len(vertices)).nonzero()[:, 0]
-    near = cKDTree(vertices[seam].numpy()).query_pairs(_SAME_PLACE, output_type="ndarray")
-    first, second = seam[torch.from_numpy(near)].T
-    alike = (normals[first] * normals[second]).sum(-1) > _ALIKE
-    pairs = torch.stack([first[alike], second[alike]])
-    of = torch.from_numpy(_labels(pairs, len(vertices)))
-    count = int(of.max()) + 1
-    kept = torch.zeros(count, dtype=torch.int64)
-    kept[of.flip(0)] = torch.arange(len(of)).flip(0)
-    own = of[faces]
-    along = torch.cat([own[:, [0, 1]], own[:, [1, 2]]]).T
-    return JoinedMesh(vertices[kept], own, of, torch.from_numpy(_labels(along, count)))
-
-
-def _labels(pairs: Tensor, count: int) -> np.ndarray:
-    graph = sparse.coo_array((np.ones(pairs.shape[1]), (pairs[0].numpy(), pairs[1].numpy())), (count, count))
-    return connected_components(graph, directed=False)[1].astype(np.int64)
 
 
 @dataclass(frozen=True, eq=False)
@@ -346,7 +183,7 @@ class _Skin:
         rig: BlendshapeRig, registration: Registration, joined: JoinedMesh, followed: TemplatePlaces | None = None
     ) -> _Skin:
         faces = rig.neutral.faces.cpu()
-        label = torch.from_numpy(_labels(torch.cat([faces[:, [0, 1]], faces[:, [1, 2]]]).T, len(rig.vertices)))
+        label = torch.from_numpy(connected_labels(torch.cat([faces[:, [0, 1]], faces[:, [1, 2]]]).T, len(rig.vertices)))
         faces = faces[(label == label.bincount().argmax())[faces[:, 0]]]
         surface = rig.vertices.detach().cpu().double()
         normals = vertex_normals(joined.vertices, joined.faces)

@@ -7,7 +7,7 @@ from torchface.landmarks.images.ibug_68 import COUNT
 from torchface.landmarks.surfaces.face_on_surface import NoFaceOnSurfaceError
 from torchface.mesh import Mesh
 from torchface.modeling.rigging.eyelid_closure import SkinOfHead
-from torchface.modeling.rigging.other_topology import joined_vertices
+from torchface.modeling.rigging.joined_vertices import joined_vertices
 from torchface.progress import Progress
 from torchface.registration.scan_preparation import Landmarks
 from torchface.workflows.rig.character_face import character_search, find_skin, mesh_surface, with_lids

@@ -25,7 +25,7 @@ from torchface.landmarks.surfaces.face_on_surface import (
 )
 from torchface.mesh import Mesh
 from torchface.modeling.rigging.eyelid_closure import EYES, SkinOfHead, eyes_seen
-from torchface.modeling.rigging.other_topology import joined_vertices
+from torchface.modeling.rigging.joined_vertices import joined_vertices
 from torchface.progress import Progress
 from torchface.registration.scan_preparation import LEAST_TRIANGLES, Landmarks
 from torchface.rendering.textured_surface import Material, TexturedSurface

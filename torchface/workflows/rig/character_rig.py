@@ -24,9 +24,11 @@ from torchface.io.images.image_files import encode_png
 from torchface.io.mesh_files import MESH_ENDINGS
 from torchface.io.vrm.vrm_expressions import VRM_ENDING, MorphBind, add_expressions, vrm_expressions
 from torchface.landmarks.surfaces.face_on_surface import NoFaceOnSurfaceError
+from torchface.modeling.rigging.carried_shapes import CarriedShapes
 from torchface.modeling.rigging.eyelid_closure import BLINKS
+from torchface.modeling.rigging.joined_vertices import joined_vertices
 from torchface.modeling.rigging.loose_parts import tongue_out
-from torchface.modeling.rigging.other_topology import CarriedShapes, joined_vertices, shapes_on
+from torchface.modeling.rigging.other_topology import shapes_on
 from torchface.progress import Progress, silent
 from torchface.registration import Registration, register
 from torchface.rendering.compositing import save_rendered_image, sheet

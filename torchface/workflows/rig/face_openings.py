@@ -11,7 +11,7 @@ from torch import Tensor
 
 from torchface.geometry.meshes.cutting import CutMesh
 from torchface.geometry.meshes.operators import border_edges
-from torchface.modeling.rigging.other_topology import joined_vertices
+from torchface.modeling.rigging.joined_vertices import joined_vertices
 from torchface.rendering.raycast import RayCaster
 
 _FINE, _ROUNDS, _REACH, _DEPTH = 1.5, 6, 3.0, 14.0  # millimetres: edges at a cut, and how far round it they are so

@@ -14,7 +14,7 @@ from torchface.landmarks.images.box_landmarks import settled_face
 from torchface.landmarks.images.ibug_68 import COUNT, box_around
 from torchface.mesh import Mesh
 from torchface.modeling.rigging.eyelid_closure import SkinOfHead, eyes_seen
-from torchface.modeling.rigging.other_topology import joined_vertices
+from torchface.modeling.rigging.joined_vertices import joined_vertices
 from torchface.registration import Registration
 from torchface.registration.scan_colors import has_colors
 from torchface.rendering.clay_shading import render

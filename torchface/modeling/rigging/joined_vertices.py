@@ -1,0 +1,59 @@
+"""A mesh whose vertices that a file has split at seams are one again, and its connected parts."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from scipy import sparse
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+from torchface.geometry.meshes.operators import border_vertices, vertex_normals
+
+_SAME_PLACE = 1e-4
+_ALIKE = 0.2
+
+
+@dataclass(frozen=True, eq=False)
+class JoinedMesh:
+    """A mesh whose vertices in one place are one, unless they face apart.
+
+    Args:
+        vertices: (J,3) float64.
+        faces: (F,3) of them.
+        of: the joined vertex of each of the mesh's, (V,).
+        part: connected part of each, (J,).
+    """
+
+    vertices: Tensor
+    faces: Tensor
+    of: Tensor
+    part: Tensor
+
+
+def joined_vertices(vertices: Tensor, faces: Tensor) -> JoinedMesh:
+    """Joins the vertices that a file has split at seams; lips that touch, and lashes on a lid, stay apart.
+
+    Args:
+        vertices: (V,3), millimetres.
+    """
+    normals, seam = vertex_normals(vertices, faces), border_vertices(faces, len(vertices)).nonzero()[:, 0]
+    near = cKDTree(vertices[seam].numpy()).query_pairs(_SAME_PLACE, output_type="ndarray")
+    first, second = seam[torch.from_numpy(near)].T
+    alike = (normals[first] * normals[second]).sum(-1) > _ALIKE
+    pairs = torch.stack([first[alike], second[alike]])
+    of = torch.from_numpy(connected_labels(pairs, len(vertices)))
+    count = int(of.max()) + 1
+    kept = torch.zeros(count, dtype=torch.int64)
+    kept[of.flip(0)] = torch.arange(len(of)).flip(0)
+    own = of[faces]
+    along = torch.cat([own[:, [0, 1]], own[:, [1, 2]]]).T
+    return JoinedMesh(vertices[kept], own, of, torch.from_numpy(connected_labels(along, count)))
+
+
+def connected_labels(pairs: Tensor, count: int) -> np.ndarray:
+    graph = sparse.coo_array((np.ones(pairs.shape[1]), (pairs[0].numpy(), pairs[1].numpy())), (count, count))
+    return connected_components(graph, directed=False)[1].astype(np.int64)
