@@ -15,9 +15,9 @@ from torch import Tensor
 from torchface import Attachment, BlendshapeRig
 from torchface.capture import DynamicsPrior, DynamicsSettings, ShapePrior
 from torchface.capture.priors import GaussianMixture, ReciprocalPrior, face_halves, face_regions, windows_of
+from torchface.capture.priors.dynamics_training import fitted_kernel
 from torchface.capture.priors.gaussian_process import GaussianProcesses, Statistics, posterior, whitening_of
 from torchface.capture.priors.motion_features import motion_basis
-from torchface.capture.priors.process_training import fitted_kernel
 from torchface.onnx import export_model
 from train.prior_figures import calibration_picture, curves_picture, save_figure
 from train.prior_trials import one_step, solve_error, synthetic_video

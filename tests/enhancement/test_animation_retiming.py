@@ -9,7 +9,7 @@ from torchface.enhancement import EnhancementModel
 from torchface.enhancement.animation_retiming import at_moments, retimed_moments
 from torchface.enhancement.timing.actor_timing import ActorTiming
 from torchface.enhancement.timing.motion_keyframes import find_keyframes
-from torchface.enhancement.timing.retiming_path import project_sequence
+from torchface.enhancement.timing.nearest_timing import project_sequence
 from torchface.errors import ShapeError, TorchfaceError, ValueRangeError
 
 

@@ -8,10 +8,12 @@ import torch
 
 from torchface.attachment import Attachment
 from torchface.cli import main
+from torchface.errors import FileFormatError
 from torchface.io import load_take, save_rig, save_take
 from torchface.rig import BlendshapeRig
 from torchface.synthetic.stages.marker_stage import StageFlaws, place_markers, record
 from torchface.take import Take, Track
+from torchface.workflows.marker_input import load_label_map
 
 
 @pytest.fixture(scope="module")
@@ -120,3 +122,26 @@ def test_a_cut_take_keeps_what_belongs_to_its_frames() -> None:
     assert cut.seconds.tolist() == seconds[3:5].double().tolist()
     assert cut.extras["frame_numbers"].tolist() == [3, 4]
     assert cut.extras["device"] == "phone"
+
+
+def test_a_map_with_and_without_a_heading(tmp_path: Path) -> None:
+    path = tmp_path / "map.csv"
+    for heading in ("take,attachment\n", ""):
+        path.write_text(f'{heading}LBrowIn,M001\n"a, b", M002 \n\nhelmet,\n')
+        assert load_label_map(path) == {"LBrowIn": "M001", "a, b": "M002", "helmet": ""}
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("a,b,c\n", r"row 1: found 'a', 'b', 'c', expected two cells"),
+        ("a,b\na,c\n", r"row 2: found 'a' again"),
+        ("take,attachment\n", "found no row"),
+        (",b\n", r"row 1: found '', 'b'"),
+    ],
+)
+def test_what_is_no_map_is_refused(text: str, said: str, tmp_path: Path) -> None:
+    path = tmp_path / "map.csv"
+    path.write_text(text)
+    with pytest.raises(FileFormatError, match=rf"map\.csv: {said}"):
+        load_label_map(path)

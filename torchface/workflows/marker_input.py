@@ -1,5 +1,7 @@
 """A marker take from disk: in millimetres, by an attachment's labels, cut to some frames."""
 
+import csv
+import io
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -12,12 +14,12 @@ from torch import Tensor
 from torchface.attachment import Attachment
 from torchface.capture.markers import match_labels, own_labels
 from torchface.capture.markers.rig_fit_check import unit_of_scale
-from torchface.errors import NameMismatchError, ValueRangeError
+from torchface.errors import FileFormatError, NameMismatchError, ValueRangeError
+from torchface.files.whole_files import read_file
 from torchface.geometry.similarity import MAX_HEAD_SCALE, MIN_HEAD_SCALE
 from torchface.io import load_take
-from torchface.io.markers.label_maps import load_label_map
 from torchface.io.markers.marker_csv import is_marker_header
-from torchface.io.tables.csv_table import TableReader
+from torchface.io.tables.csv_table import TableReader, quoted
 from torchface.io.take_files import MARKER_ENDINGS
 from torchface.take import Take, Track
 from torchface.workflows.batch.batch_items import ItemKind
@@ -152,3 +154,40 @@ def frame_span(frames: str | None, count: int) -> slice:
     if first >= last:
         raise ValueRangeError(f"--frames: found {frames!r} in a take of {count} frames, expected A < B and A < {count}")
     return slice(first, last)
+
+
+HEADER = ("take", "attachment")
+_MAX_BYTES = 2**22
+
+
+def load_label_map(path: str | Path) -> dict[str, str]:
+    """Reads CSV of two columns, the take's label and the attachment's::
+
+        take,attachment
+        LBrowIn,M001
+        helmet_front,
+        Jane:*,
+
+    The heading may be left out; an empty second cell leaves the marker out, or all markers of a subject.
+    """
+    path = Path(path)
+    try:
+        rows = list(csv.reader(io.StringIO(read_file(path, _MAX_BYTES).decode("utf-8-sig"), newline="")))
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise FileFormatError(f"{path}: no table of labels ({error}), expected rows of take,attachment") from error
+    renamed: dict[str, str] = {}
+    for number, row in enumerate(rows, 1):
+        cells = [cell.strip() for cell in row]
+        if not any(cells) or (number == 1 and tuple(cell.lower() for cell in cells) == HEADER):
+            continue
+        if len(cells) != 2 or not cells[0]:
+            raise FileFormatError(
+                f"{path}: row {number}: found {quoted(cells)}, expected two cells: a label of the take, and the "
+                "attachment's"
+            )
+        if cells[0] in renamed:
+            raise FileFormatError(f"{path}: row {number}: found {cells[0]!r} again, expected each label once")
+        renamed[cells[0]] = cells[1]
+    if not renamed:
+        raise FileFormatError(f"{path}: found no row, expected a label of the take and of the attachment in each")
+    return renamed

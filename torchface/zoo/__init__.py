@@ -1,9 +1,8 @@
 """Learned models by name: those that come with torchface, the user's own in ``$TORCHFACE_HOME`` or any folder."""
 
 from torchface.files.models import STATE
-from torchface.zoo.description import ModelDescription, describe
 from torchface.zoo.kinds import KINDS, register
-from torchface.zoo.loading import get_model, verify
+from torchface.zoo.loading import ModelDescription, describe, get_model, verify
 from torchface.zoo.model_folders import HOME, damaged_models, find, list_models
 from torchface.zoo.saving import ModelCard, save_model
 

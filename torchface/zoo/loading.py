@@ -1,5 +1,7 @@
 """Models by name or folder, each with its class for type checkers."""
 
+import re
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, TypeVar, overload
 
@@ -10,7 +12,7 @@ from torchface.capture.action_units.classifier import ActionUnitClassifier
 from torchface.capture.markers.marker_solver import MarkerSolver
 from torchface.capture.priors import DynamicsPrior, ShapePrior
 from torchface.errors import FileFormatError, NameMismatchError, ValueRangeError
-from torchface.files.models import CARD, read_model
+from torchface.files.models import CARD, ModelRecord, read_card, read_model, read_record
 from torchface.landmarks.images.boxes.box_network import BoxNetwork
 from torchface.landmarks.images.networks.eye_network import EyeNetwork
 from torchface.landmarks.images.networks.landmark_network import LandmarkNetwork
@@ -19,9 +21,69 @@ from torchface.landmarks.images.trees.landmark_trees import LandmarkTrees
 from torchface.landmarks.scans.uv_detector import UVLandmarkDetector
 from torchface.modeling.morphable.head_model import HeadModel
 from torchface.modeling.rigging.expression_regression import ExpressionRegression
-from torchface.zoo.description import ModelDescription, describe
+from torchface.zoo.hub import fetch_description, hub_reference
 from torchface.zoo.kinds import KINDS
-from torchface.zoo.model_folders import find
+from torchface.zoo.model_folders import find, is_path, named_folders
+
+
+@dataclass(frozen=True)
+class ModelDescription(ModelRecord):
+    """A :class:`ModelRecord`, and where the model was found.
+
+    Args:
+        name: of the model.
+        folder: that it lies in.
+        shadowed: folders of other models of the same name, which this one goes before.
+        summary: the card's first words; empty where there is no card.
+
+    Example:
+        >>> described = describe("marker_solver")
+        >>> described.licence, described.folder.name, described.shadowed
+        ('MIT', 'marker_solver', ())
+        >>> described.summary
+        'Weights of blendshapes from 3D markers in millimetres, NaN for not seen'
+    """
+
+    name: str = ""
+    folder: Path = Path()
+    shadowed: tuple[Path, ...] = ()
+    summary: str = ""
+
+
+def describe(name_or_path: str | Path) -> ModelDescription:
+    """What a model is, without loading it: kind, licence, data, metrics, recipe, url, size and sha256 of its state.
+
+    Of a Hugging Face repository only the description and the card are fetched.
+
+    Raises:
+        NameMismatchError: there is no model of this name.
+        FileFormatError: its ``model.toml`` cannot be read.
+
+    Example:
+        >>> describe("face_landmarks").kind
+        'landmark_trees'
+    """
+    reference = hub_reference(str(name_or_path))
+    folder = find(name_or_path) if reference is None else fetch_description(reference)
+    record = dict(vars(read_record(folder)))
+    record["url"] = record["url"] or (folder.resolve().as_uri() if reference is None else str(reference))
+    shadowed = () if is_path(name_or_path) else tuple(named_folders(str(name_or_path))[1:])
+    return ModelDescription(
+        **record,
+        name=folder.name if reference is None else reference.name,
+        folder=folder,
+        shadowed=shadowed,
+        summary=_summary(read_card(folder)),
+    )
+
+
+def _summary(card: str) -> str:
+    """The words of a card's first paragraph up to their first stop."""
+    for line in card.splitlines():
+        if line.strip() and not line.startswith(("#", "**")):
+            return re.split(r"[:;.](?:\s|$)", line.strip())[0]
+    return ""
+
 
 Model = TypeVar("Model", bound=nn.Module)
 Device = str | torch.device

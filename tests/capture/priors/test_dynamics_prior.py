@@ -13,9 +13,9 @@ from torchface import zoo
 from torchface.capture import DynamicsPrior, DynamicsSettings
 from torchface.capture.energy import Quadratic
 from torchface.capture.priors import face_regions, windows_of
+from torchface.capture.priors.dynamics_training import LeftOutProcess, fitted_kernel
 from torchface.capture.priors.gaussian_process import GaussianProcesses, Kernel, Statistics, posterior, whitening_of
 from torchface.capture.priors.motion_features import motion_basis
-from torchface.capture.priors.process_training import LeftOutProcess, fitted_kernel
 from torchface.errors import FileFormatError, NameMismatchError, ShapeError, ValueRangeError
 from torchface.io import load_take
 from torchface.synthetic.stages.weight_curves import perform

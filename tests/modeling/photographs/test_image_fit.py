@@ -16,11 +16,12 @@ from torchface.landmarks.images.ibug_68 import as_annotated
 from torchface.modeling.morphable.head_model import HeadModel
 from torchface.modeling.photographs.fit_problem import Problem
 from torchface.modeling.photographs.fit_settings import FitSettings, SurfacePoints
-from torchface.modeling.photographs.image_fit import ImageFit, contour_curves, fit_images
+from torchface.modeling.photographs.image_fit import ImageFit, contour_curves, fit_images, smooth_differences
 from torchface.modeling.photographs.image_input import annotated_vertices
 from torchface.modeling.photographs.landmark_view import LandmarkSites, LinearPoints
 from torchface.modeling.rigging.deformation_transfer import transfer_deformation
 from torchface.rig import BlendshapeRig
+from torchface.synthetic import neutral_head
 
 FIXED = FitSettings(sliding=False, contour_slide=1.0, one_expression=True)
 
@@ -296,3 +297,31 @@ def test_errors_that_go_together_are_whitened(rig: BlendshapeRig, model: HeadMod
     assert torch.isclose(alike[17, 68], torch.tensor(0.5).double())
     assert torch.equal(alike[3, :3].round(decimals=9), torch.zeros(3).double())
     assert torch.allclose(alike.diagonal(), torch.ones(81).double())
+
+
+def test_their_variance_is_that_of_a_process_made_symmetric() -> None:
+    head = neutral_head(texture=False)
+    marks = head.landmarks
+    x = head.vertices[marks].double()
+    modes = smooth_differences(head.vertices, marks, 2.0)[:, marks].double()
+    covariance = torch.einsum("mla,mka->alk", modes, modes)
+    mirrored = x * x.new_tensor([-1.0, 1.0, 1.0])
+    near, across = (torch.exp(-torch.cdist(x, y).square() / (2 * 20.0**2)) for y in (x, mirrored))
+    for axis, sign in enumerate((-1.0, 1.0, 1.0)):
+        expected = 2.0 * (near + sign * 0.5 * (across + across.T))  # 2², halved
+        assert float((covariance[axis] - expected).abs().max()) < 0.15
+
+
+def test_both_sides_move_alike() -> None:
+    head = neutral_head(texture=False)
+    assert head.annotations is not None
+    twin = head.annotations.mirror
+    assert twin is not None
+    modes = smooth_differences(head.vertices, head.landmarks, 1.0)
+    flipped = modes[:, twin] * torch.tensor([-1.0, 1.0, 1.0])
+    assert float((modes - flipped).abs().max()) < 0.02
+
+
+def test_none_are_expected() -> None:
+    head = neutral_head(texture=False)
+    assert smooth_differences(head.vertices, head.landmarks, 0.0).shape == (0, len(head.vertices), 3)

@@ -19,7 +19,7 @@ from torchface.modeling import (
     rig_from_neutral,
     transfer_deformation,
 )
-from torchface.modeling.rigging.component_choice import choose_components
+from torchface.modeling.rigging.expression_training import choose_components
 from torchface.synthetic import draw_identities, performer
 
 V = 40

@@ -6,8 +6,8 @@ import torch
 from scipy import sparse
 
 from torchface.mesh import Mesh
+from torchface.registration.nonrigid.deformer import identity_maps, linked_edges, stiffness_rows
 from torchface.registration.nonrigid.linear_step import Contacts, Data, LinearStep
-from torchface.registration.nonrigid.stiffness import identity_maps, linked_edges, stiffness_rows
 from torchface.registration.nonrigid.subspace import Subspace, all_maps, graph, translations
 
 ALPHA, BETA, LENGTH = 1.7, 2.5, 10.0

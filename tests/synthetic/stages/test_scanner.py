@@ -22,8 +22,7 @@ from torchface.rendering.clay_shading import sample_texture
 from torchface.synthetic import performer
 from torchface.synthetic.stages import scanner
 from torchface.synthetic.stages.depth_fusion import DepthNoise, fuse, surface_net
-from torchface.synthetic.stages.hair_and_collar import Dress
-from torchface.synthetic.stages.scanner import Photography, RawScan, ScannerSettings, eyes_closed, scan_head
+from torchface.synthetic.stages.scanner import Dress, Photography, RawScan, ScannerSettings, eyes_closed, scan_head
 from torchface.synthetic.stages.subdivision import catmull_clark, finely_coloured
 
 COARSE = ScannerSettings(voxel=3.0, detail=3.0, photography=Photography(height=200))

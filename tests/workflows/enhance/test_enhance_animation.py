@@ -33,9 +33,8 @@ from torchface.registration import Registration
 from torchface.rig import BlendshapeRig
 from torchface.take import Take, Track
 from torchface.workflows.enhance import enhance_views, enhanced_frames, head_correspondence
-from torchface.workflows.enhance.animation_targets import animation_targets
 from torchface.workflows.enhance.coarse_input import InputSettings, read_coarse
-from torchface.workflows.enhance.enhance_animation import EnhanceSettings, enhance_animation
+from torchface.workflows.enhance.enhance_animation import EnhanceSettings, animation_targets, enhance_animation
 from torchface.workflows.enhance.enhance_page import write_enhance_page
 
 PLAIN = EnhanceSettings(glb=False, video=False)

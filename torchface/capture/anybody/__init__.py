@@ -13,7 +13,7 @@ from torchface.capture.anybody.examples.landmark_objectives import Distances, Sq
 from torchface.capture.anybody.examples.landmark_placement import LandmarkBoxes, SolvedSimilarity
 from torchface.capture.anybody.examples.rig_examples import paper_examples, rig_examples
 from torchface.capture.anybody.examples.shown_examples import example_remarks, shown_examples
-from torchface.capture.anybody.webcam_settings import WebcamSettings
+from torchface.capture.anybody.webcam_components import WebcamSettings
 from torchface.capture.anybody.webcam_solver import WebcamSolver
 from torchface.capture.anybody.webcam_state import WebcamControls, WebcamState
 

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from torchface.enhancement import EnhancementModel
 from torchface.enhancement.detail.detail_basis import LearnedBasis
+from torchface.enhancement.detail.detail_encodings import DisplacementDetail
 from torchface.enhancement.detail.low_pass import vertex_areas
 from torchface.enhancement.wrinkle_maps.wrinkle_basis import MAPS, WrinkleBasis, learn_wrinkle_basis
 from torchface.enhancement.wrinkle_maps.wrinkle_teaching import captured_poses, taught_details, teaching_poses
@@ -17,10 +18,13 @@ from torchface.errors import FileFormatError, TopologyError, ValueRangeError
 from torchface.files.documents import write_json
 from torchface.files.job_lock import within_job
 from torchface.files.whole_files import make_folder
+from torchface.geometry.meshes.rasterization import rasterise_uvs
 from torchface.geometry.meshes.region_maps import RegionMaps
+from torchface.geometry.similarity import Similarity
 from torchface.io import load_rig, load_take, save_animation, save_image16, save_normal_map, save_rig
 from torchface.io.tables.csv_table import write_table
 from torchface.mesh import Mesh
+from torchface.modeling.detail.normal_map_baking import NormalMap, bake_normal_map, dilate
 from torchface.number_checks import checked_count
 from torchface.onnx import ExportReport, export_wrinkle_weights
 from torchface.progress import Progress, silent
@@ -30,7 +34,6 @@ from torchface.workflows.enhance.coarse_animation import OTHER_ACTOR_MM
 from torchface.workflows.enhance.coarse_input import CORRESPONDENCE
 from torchface.workflows.enhance.enhance_animation import STATE, SUMMARY, load_model
 from torchface.workflows.enhance.rig_on_model import RigOnModel, rig_on_model
-from torchface.workflows.enhance.wrinkle_baking import bake_region_maps
 
 GLB, BY_WEIGHTS, BY_VERTICES = "wrinkles.glb", "map_weights.onnx", "map_weights_of_vertices.onnx"
 TRACK, PICTURES = "map_weights.csv", "maps"
@@ -261,3 +264,58 @@ def _summary(done: ExportedWrinkles, model_name: str, rig: Path, poses: int) -> 
         "notes": list(done.notes),
         "files": {what: path.name for what, path in done.products.items()},
     }
+
+
+_MASK_SHARE = 4  # a mask is smooth: it has a quarter of the maps' texels a side
+_LEAST_MASK = 64
+
+
+def bake_region_maps(
+    mesh: Mesh,
+    model: Mesh,
+    displacements: Tensor,
+    shares: Tensor,
+    regions: tuple[str, ...],
+    scale: float,
+    size: int,
+    progress: Progress,
+) -> RegionMaps:
+    """Bakes the actor's face at rest, and with each map of displacements everywhere at 1.
+
+    Args:
+        displacements: of the maps, (M,3,V), millimetres along two tangents and the normal of the model's neutral.
+        shares: of the regions in the rig's vertices, (R,N).
+        scale: from the rig's millimetres to the model's.
+    """
+    still = Similarity(
+        torch.ones(1, dtype=torch.float64),
+        torch.eye(3, dtype=torch.float64)[None],
+        torch.zeros(1, 3, dtype=torch.float64),
+    )
+    detail = DisplacementDetail(model.vertices, model.faces)
+    count = len(displacements)
+
+    def baked(number: int, vertices: Tensor) -> NormalMap:
+        progress("baking maps", number, count + 1)
+        return bake_normal_map(mesh, model.with_vertices(vertices), size, alignment=still)
+
+    rest = baked(0, model.vertices)
+    normals, heights = [], []
+    for number, one in enumerate(displacements, start=1):  # a bake is minutes of rays at large sizes
+        shown = baked(number, detail.compose(model.vertices[None], one.flatten()[None])[0])
+        both = rest.hit & shown.hit
+        normals.append(torch.where(both, shown.normals, rest.normals))
+        heights.append(torch.where(both, shown.heights - rest.heights, 0.0) / scale)
+    progress("baking maps", count + 1, count + 1)
+    masks = _masks(mesh, shares, max(_LEAST_MASK, size // _MASK_SHARE))
+    return RegionMaps(regions, torch.stack(normals), torch.stack(heights), masks, rest.normals)
+
+
+def _masks(mesh: Mesh, shares: Tensor, size: int) -> Tensor:
+    """Values (R,N) of the vertices in texture space, (R,size,size), grown over the whole texture."""
+    assert mesh.uvs is not None
+    assert mesh.uv_faces is not None
+    texels = rasterise_uvs(mesh.uvs, mesh.uv_faces, size, size)
+    image = torch.zeros(len(shares), size * size)
+    image[:, texels.texels] = texels.interpolate(shares.T.double(), mesh.faces).T.float()
+    return dilate(image.view(-1, size, size), texels.mask(), size).clamp(0, 1)

@@ -11,7 +11,7 @@ from torch import Tensor
 from torchface import Attachment, BlendshapeRig, Take, Track
 from torchface.capture import fit_attachment
 from torchface.capture.markers import AttachmentFit, SiteUncertainty
-from torchface.capture.markers.attachment.attachment_check import check_sites
+from torchface.capture.markers.attachment.attachment_fit import check_sites
 from torchface.capture.markers.attachment.site_curvature import SitesOnTake, TakeCurvature, pose_columns
 from torchface.errors import AlignmentError, ValueRangeError
 from torchface.geometry.similarity import Similarity

@@ -11,8 +11,7 @@ from torch import Tensor
 
 from torchface.errors import ValueRangeError
 from torchface.optim import BoxQP, box_qp
-from torchface.optim.one_by_one import OneByOne
-from torchface.optim.prepared_program import PreparedProgram
+from torchface.optim.prepared_program import OneByOne, PreparedProgram
 
 SIZE = 30
 

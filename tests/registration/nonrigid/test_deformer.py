@@ -5,7 +5,7 @@ import pytest
 import torch
 import trimesh
 
-from torchface.registration.nonrigid.stiffness import identity_maps, linked_edges, positions, stiffness_rows
+from torchface.registration.nonrigid.deformer import identity_maps, linked_edges, positions, stiffness_rows
 from torchface.registration.nonrigid.subspace import graph
 
 

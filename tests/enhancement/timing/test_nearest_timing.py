@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from torchface.enhancement.timing.retiming_path import project_sequence
+from torchface.enhancement.timing.nearest_timing import project_sequence
 
 
 def random_points(seed: int, count: int, dimensions: int = 3) -> Tensor:
