@@ -1,7 +1,5 @@
 """A captured performance as files hold it: sequences of frames of one topology, gathered into one file on disk."""
 
-from __future__ import annotations
-
 import lzma
 import re
 import zipfile
@@ -82,7 +80,7 @@ class Capture:
     neutral_file: Path | None
     key: str
 
-    def part(self, begin: int, end: int) -> Capture:
+    def part(self, begin: int, end: int) -> "Capture":
         """Some of the sequences."""
         return Capture(self.sequences[begin:end], self.neutral, self.neutral_file, f"{self.key} {begin} {end}")
 

@@ -1,7 +1,5 @@
 """Weights for a prior to learn from: of weight takes, of marker takes solved with their rig, or made up."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -47,7 +45,7 @@ class PriorTakes:
     people: Sequence[str]
     solved: int = 0
 
-    def some(self, rows: Sequence[int]) -> PriorTakes:
+    def some(self, rows: Sequence[int]) -> "PriorTakes":
         """Some of the takes; none is read."""
         return replace(
             self,
@@ -57,7 +55,7 @@ class PriorTakes:
             people=[self.people[row] for row in rows],
         )
 
-    def spread(self, most: int) -> PriorTakes:
+    def spread(self, most: int) -> "PriorTakes":
         """At most so many of the takes, evenly spread."""
         count = len(self.weights)
         return self if count <= most else self.some([row * count // most for row in range(most)])

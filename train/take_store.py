@@ -1,7 +1,5 @@
 """Weights of takes on disk, a file a take, so that a prior can learn from more of them than memory holds."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -53,8 +51,8 @@ class TakesRead(Sequence[Tensor]):
     @overload
     def __getitem__(self, number: int) -> Tensor: ...
     @overload
-    def __getitem__(self, number: slice) -> TakesRead: ...
-    def __getitem__(self, number: int | slice) -> Tensor | TakesRead:
+    def __getitem__(self, number: slice) -> "TakesRead": ...
+    def __getitem__(self, number: int | slice) -> "Tensor | TakesRead":
         if isinstance(number, slice):
             return TakesRead(self.takes, self.rows[number], self.change)
         take = self.takes[self.rows[number]]

@@ -1,7 +1,5 @@
 """Characters whose shapes are stripped and made again, and how near to their own the made ones are."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import dataclass
 from pathlib import Path
@@ -50,7 +48,7 @@ class Scores:
     error: Tensor
 
     @staticmethod
-    def of(own: dict[str, Tensor], made: dict[str, Tensor], counted: Tensor) -> Scores:
+    def of(own: dict[str, Tensor], made: dict[str, Tensor], counted: Tensor) -> "Scores":
         """Of the vertices (V,) bool that count."""
         names = tuple(name for name in own if name in made and float(own[name].norm()) > 0)
         pairs = [(own[name].double()[counted], made[name].double()[counted]) for name in names]

@@ -1,7 +1,5 @@
 """How an enhanced animation compares with the truth: its fine part, its normals, its places, its flicker."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import torch
@@ -31,7 +29,7 @@ class Errors:
     flicker: Tensor
     frames: int
 
-    def __add__(self, other: Errors) -> Errors:
+    def __add__(self, other: "Errors") -> "Errors":
         return Errors(
             self.fine + other.fine, self.angle + other.angle, self.place + other.place, self.flicker + other.flicker,
             self.frames + other.frames,

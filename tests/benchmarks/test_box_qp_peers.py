@@ -4,8 +4,6 @@ Two tables: all frames at once, and one frame at a time from the solution of the
 updated and warm-started in both; those that take one problem a call are called in the order of the frames.
 """
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -73,7 +71,7 @@ class Frames:
     def energy(self, x: Tensor, every: int = 1) -> Tensor:
         return _objective(self.H, self.f[::every], x) + self.constant[::every]
 
-    def part(self, rows: slice) -> Frames:
+    def part(self, rows: slice) -> "Frames":
         return Frames(self.solver, self.markers[rows], self.H, self.f[rows], self.constant[rows], self.least[rows])
 
 
@@ -87,7 +85,7 @@ class Row:
     residual: float
 
     @staticmethod
-    def of(name: str, spent: float, x: Tensor, frames: Frames, every: int = 1) -> Row:
+    def of(name: str, spent: float, x: Tensor, frames: Frames, every: int = 1) -> "Row":
         gap = frames.energy(x, every) / frames.least[::every] - 1
         return Row(name, 1e3 * spent / len(x), float(gap.max()), residual(frames.H, frames.f[::every], x))
 

@@ -1,7 +1,5 @@
 """The sparsity experiment of the thesis's figure 74 on real takes, and what the rule for the weight gives."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -32,7 +30,7 @@ class Trial:
     weight_error: float
 
     @staticmethod
-    def of(solver: MarkerSolver, markers: Tensor, truth: Tensor) -> Trial:
+    def of(solver: MarkerSolver, markers: Tensor, truth: Tensor) -> "Trial":
         weights = solver(markers)
         return Trial(
             float(solver.sparsity),

@@ -1,8 +1,6 @@
 """Head pose beside OpenCV's RANSACs, many frames at once and one at a time, with and without outliers on the temples;
 and what filtering live costs and gains. One thread, processor time."""
 
-from __future__ import annotations
-
 import math
 import time
 from collections.abc import Callable
@@ -77,7 +75,7 @@ class Ransac:
     draws: int
     confidence: float
 
-    def poses(self, points: Tensor, pixels: Tensor, threshold: float = 4.0) -> Found:
+    def poses(self, points: Tensor, pixels: Tensor, threshold: float = 4.0) -> "Found":
         """Of each frame, and its inliers; OpenCV takes one view at a time, and weighs all points alike."""
         model, camera = points.numpy(), K.numpy()
         turns, moves, agreed = [], [], torch.zeros(pixels.shape[:2], dtype=torch.bool)
@@ -133,7 +131,7 @@ class Row:
     far: float
 
     @staticmethod
-    def of(spent: float, found: Found, rotation: Tensor, translation: Tensor) -> Row:
+    def of(spent: float, found: Found, rotation: Tensor, translation: Tensor) -> "Row":
         angle = degrees(found.rotation, rotation)
         far = (found.translation - translation).norm(dim=1).nan_to_num(1e9)
         wrong = float((angle > 10).double().mean())

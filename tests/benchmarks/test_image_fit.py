@@ -6,8 +6,6 @@ best similarity. Beside it runs eos (`pip install '.[bench]'`), whose wheel hold
 and shapes through its own classes. Pictures go to out/image_fit.
 """
 
-from __future__ import annotations
-
 import math
 import time
 from dataclasses import dataclass, replace
@@ -240,7 +238,7 @@ class Photographs:
     seconds: list[float]
 
     @staticmethod
-    def none() -> Photographs:
+    def none() -> "Photographs":
         return Photographs([], [], [], [], [])
 
     def add(self, seen: Tensor, marks: Tensor, weights: Tensor, apart: float, seconds: float) -> None:

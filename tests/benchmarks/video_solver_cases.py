@@ -1,7 +1,5 @@
 """Films of planted heads for the benchmark of the video solver, and the rows of its tables."""
 
-from __future__ import annotations
-
 import math
 import time
 from collections.abc import Callable
@@ -130,7 +128,7 @@ class Row:
     jerk: float
     milliseconds: float
 
-    def line(self, name: str, against: Row | None = None) -> str:
+    def line(self, name: str, against: "Row | None" = None) -> str:
         text = (
             f"{name:44s}{self.vertices:9.3f}{self.weights:9.4f}{self.square:9.4f}{self.jump:8.2f}{self.jerk:8.1f}"
             f"{self.milliseconds:9.1f}"

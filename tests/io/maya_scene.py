@@ -1,7 +1,5 @@
 """A parser of the subset of MEL that Maya ASCII files are made of, and the face that its nodes show."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -57,7 +55,7 @@ class MayaScene:
     unit: str = ""
 
     @classmethod
-    def read(cls, path: Path) -> MayaScene:
+    def read(cls, path: Path) -> "MayaScene":
         text = path.read_text(encoding="utf-8")
         assert text.startswith("//Maya ASCII ")
         scene, node = cls(), Node("")

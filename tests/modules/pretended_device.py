@@ -4,8 +4,6 @@ It holds its numbers on the CPU, takes no part in any operation with tensors of 
 for it.
 """
 
-from __future__ import annotations
-
 import contextlib
 from collections.abc import Iterator
 from typing import Any
@@ -27,7 +25,7 @@ class Elsewhere(torch.Tensor):
     numbers: Tensor
 
     @staticmethod
-    def __new__(cls, numbers: Tensor) -> Elsewhere:
+    def __new__(cls, numbers: Tensor) -> "Elsewhere":
         # Sparse ones have no strides, and pass for dense ones.
         placed = (numbers.stride(), numbers.storage_offset()) if numbers.layout == torch.strided else ()
         made = torch.Tensor._make_wrapper_subclass(cls, numbers.shape, *placed, dtype=numbers.dtype, device="meta")

@@ -1,7 +1,5 @@
 """Modules of tensors as ONNX: what ONNX Runtime computes is what PyTorch does, at any batch size."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import NamedTuple
 
@@ -110,7 +108,7 @@ class Gain(nn.Module):
         return {"count": len(self.gain)}
 
     @classmethod
-    def from_config(cls, config: dict[str, int]) -> Gain:
+    def from_config(cls, config: dict[str, int]) -> "Gain":
         return cls(config["count"])
 
     def forward(self, x: Tensor) -> Tensor:

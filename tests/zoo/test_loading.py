@@ -3,8 +3,6 @@
 What such a checker makes of it stands in ``tests/types/zoo_models.py``, which `make lint` reads.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import get_args, get_overloads, get_type_hints
 
@@ -65,7 +63,7 @@ class Own(torch.nn.Module):
     config = None
 
     @classmethod
-    def from_config(cls, config: dict[str, int]) -> Own:
+    def from_config(cls, config: dict[str, int]) -> "Own":
         return cls()
 
 

@@ -1,7 +1,5 @@
 """The energy of weights whose rig has correctives, and its least in a box by Gauss-Newton."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import torch
@@ -35,7 +33,7 @@ class CorrectiveEnergy:
     extended: Quadratic  # the quadratic of x, of L + C variables
     activation: CorrectiveActivation  # a, of N shapes and C correctives
 
-    def __add__(self, other: Quadratic) -> CorrectiveEnergy:
+    def __add__(self, other: Quadratic) -> "CorrectiveEnergy":
         """With an energy of the L variables added."""
         count = len(self.activation.definitions)
         H = pad(other.H, (0, count, 0, count))
@@ -47,7 +45,7 @@ class CorrectiveEnergy:
         """L."""
         return self.extended.f.shape[1] - len(self.activation.definitions)
 
-    def rows(self, keep: Tensor) -> CorrectiveEnergy:
+    def rows(self, keep: Tensor) -> "CorrectiveEnergy":
         """Of some frames."""
         H, f, constant = self.extended.H, self.extended.f, self.extended.constant
         H = H if H.ndim == 2 else H[keep]

@@ -1,7 +1,5 @@
 """``torchface annotate``: landmarks of a few frames of an actor, corrected by hand."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -61,7 +59,7 @@ def annotate(
     with job_lock(out):
         with progress_bars(quiet) as progress:
 
-            def track(video: VideoFile) -> tuple[Tensor, Tensor | None]:
+            def track(video: "VideoFile") -> "tuple[Tensor, Tensor | None]":
                 from torchface.landmarks.images.tracking.landmark_tracker import LandmarkTracker
                 from torchface.landmarks.images.tracking.video_landmarks import track_landmarks
 

@@ -1,7 +1,5 @@
 """Output of commands on a terminal: results, addresses of pages, errors."""
 
-from __future__ import annotations
-
 import os
 import sys
 import warnings
@@ -70,7 +68,7 @@ def print_lines(lines: Iterable[str]) -> None:
 _MISTAKE, _STOPPED, _NOBODY_READS = 2, 130, 141  # the last is the status of SIGPIPE in shells
 
 
-def serve_page(page: BrowserPage, line: str = "") -> None:
+def serve_page(page: "BrowserPage", line: str = "") -> None:
     """Prints a page's address and waits until it is closed, or for Ctrl-C, which closes it."""
     console.print(f"{line}Open this page; Ctrl+C ends.")
     print(page.url, flush=True)

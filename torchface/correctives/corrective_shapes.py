@@ -1,7 +1,5 @@
 """Correctives of a blendshape rig: what is added where shapes act together, or half-way along one of them."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -130,11 +128,11 @@ class Correctives:
         """One a corrective."""
         return tuple(definition.name for definition in self.definitions)
 
-    def with_deltas(self, deltas: Tensor) -> Correctives:
+    def with_deltas(self, deltas: Tensor) -> "Correctives":
         """The same correctives of another face or of other vertices, (C,V,3)."""
         return replace(self, deltas=deltas)
 
-    def select(self, shapes: Sequence[str]) -> Correctives | None:
+    def select(self, shapes: Sequence[str]) -> "Correctives | None":
         """Those whose drivers are all among these shapes, as the others stay at 0 without them; none where none is."""
         kept = set(shapes)
         rows = [i for i, definition in enumerate(self.definitions) if kept.issuperset(definition.drivers)]

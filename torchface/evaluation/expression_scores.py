@@ -1,7 +1,5 @@
 """Scores of expressions found in a film against the true weights of every frame."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -59,7 +57,7 @@ class BlinkCount:
         """Share of the reported blinks that are true."""
         return 1 - self.false / self.reported if self.reported else math.nan
 
-    def __add__(self, other: BlinkCount) -> BlinkCount:
+    def __add__(self, other: "BlinkCount") -> "BlinkCount":
         return BlinkCount(
             self.true + other.true, self.found + other.found, self.reported + other.reported, self.false + other.false
         )

@@ -1,7 +1,5 @@
 """Keys of what results were made of: a run takes up an earlier run's results only where their keys are the same."""
 
-from __future__ import annotations
-
 import hashlib
 from collections.abc import Mapping, Sequence
 from dataclasses import fields, is_dataclass

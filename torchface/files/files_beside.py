@@ -1,7 +1,5 @@
 """Files that belong to another one and that the user did not name: what the user has there is never replaced."""
 
-from __future__ import annotations
-
 import hashlib
 import itertools
 import warnings

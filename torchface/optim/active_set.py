@@ -12,8 +12,6 @@ Source: Hintermüller, Ito and Kunisch 2002, The primal-dual active set strategy
 1982, Projected Newton methods for optimization problems with simple constraints.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import torch
@@ -102,7 +100,7 @@ class _NewtonStep:
     damping: Tensor  # added to the scaled diagonal, (B,)
 
     @staticmethod
-    def at(problem: BoxProblem, x: Tensor, gradient: Tensor) -> _NewtonStep:
+    def at(problem: BoxProblem, x: Tensor, gradient: Tensor) -> "_NewtonStep":
         residual = problem.residual(x, gradient)
         # A variable closer to its bound than the residual counts as at it, else the search path could collapse.
         near = residual.clamp(max=1e-3)[:, None]
@@ -114,7 +112,7 @@ class _NewtonStep:
         descends = problem.change(moved, gradient) <= 0.1 * (gradient * moved).sum(-1)
         return _NewtonStep(full, descends, held, near, damping)
 
-    def rows(self, keep: Tensor) -> _NewtonStep:
+    def rows(self, keep: Tensor) -> "_NewtonStep":
         return _NewtonStep(self.full[keep], self.descends[keep], self.held[keep], self.near[keep], self.damping[keep])
 
 

@@ -1,7 +1,5 @@
 """A batch of box-constrained quadratic programs: its gradient, objective and how far a point is from the optimum."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import torch
@@ -25,10 +23,10 @@ class BoxProblem:
     diagonal: Tensor  # the metric, diag H kept from zero, (N,) or (B,N)
 
     @staticmethod
-    def of(H: Tensor, f: Tensor, lower: Tensor, upper: Tensor) -> BoxProblem:
+    def of(H: Tensor, f: Tensor, lower: Tensor, upper: Tensor) -> "BoxProblem":
         return BoxProblem(H, f, lower, upper, metric(H))
 
-    def rows(self, keep: Tensor | slice) -> BoxProblem:
+    def rows(self, keep: Tensor | slice) -> "BoxProblem":
         """Some of the problems."""
         if self.H.ndim == 2:
             return BoxProblem(self.H, self.f[keep], self.lower, self.upper, self.diagonal)

@@ -1,7 +1,5 @@
 """Sparse symmetric positive definite systems: one factorisation, many right-hand sides."""
 
-from __future__ import annotations
-
 from typing import TypeVar
 
 import numpy as np
@@ -46,7 +44,7 @@ class SparseCholesky:
         if not (self._factor.factors()[1] > 0).all():
             raise ValueRangeError("SparseCholesky: the matrix is not positive definite")
 
-    def __deepcopy__(self, memo: dict[int, object]) -> SparseCholesky:
+    def __deepcopy__(self, memo: dict[int, object]) -> "SparseCholesky":
         return self  # it never changes
 
     def solve(self, rhs: Array) -> Array:

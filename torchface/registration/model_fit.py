@@ -1,7 +1,5 @@
 """A model of faces fitted to a scan: where the template's vertices lie before they bend freely."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
@@ -44,7 +42,7 @@ class LinearShape:
     modes: Tensor
 
     @staticmethod
-    def of(model: ShapeModel) -> LinearShape:
+    def of(model: ShapeModel) -> "LinearShape":
         """On the CPU, float32."""
         return LinearShape(model.mean.detach().cpu().float(), model.modes.detach().cpu().float())
 

@@ -1,7 +1,5 @@
 """Faults of a scan and its landmarks: repaired where that is safe, reported where it is not."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import torch
@@ -35,7 +33,7 @@ class PreparedScan:
     face_ids: Tensor  # the scan's own row of each, (F',)
     notes: tuple[str, ...]  # what was done
 
-    def turned(self) -> PreparedScan:
+    def turned(self) -> "PreparedScan":
         """The other side out."""
         note = "the scan's triangles are clockwise seen from outside (flipped normals); they were turned over"
         return PreparedScan(self.vertices, self.faces.flip(1), self.face_ids, (*self.notes, note))

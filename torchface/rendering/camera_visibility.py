@@ -1,7 +1,5 @@
 """Visibility of a head's vertices in a photograph, and how squarely they are seen."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -38,7 +36,7 @@ class PosedSurface:
     caster: RayCaster
 
     @staticmethod
-    def each(posed: Mesh | Sequence[Mesh], count: int) -> list[PosedSurface]:
+    def each(posed: Mesh | Sequence[Mesh], count: int) -> "list[PosedSurface]":
         """One a photograph: of a mesh that all of them show, or of one for each."""
         meshes = [posed] if isinstance(posed, Mesh) else list(posed)
         if len(meshes) not in (1, count):

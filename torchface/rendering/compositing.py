@@ -1,7 +1,5 @@
 """Images put together: heat colours, captions, sheets of many, files."""
 
-from __future__ import annotations
-
 import warnings
 from collections.abc import Sequence
 from io import BytesIO
@@ -100,14 +98,14 @@ def from_pillow(image: Image.Image) -> Tensor:
     return torch.from_numpy(np.asarray(image.convert("RGB")).copy()).permute(2, 0, 1).float() / 255
 
 
-def new_figure(width: float, height: float, layout: Literal["constrained"] | None = None) -> Figure:
+def new_figure(width: float, height: float, layout: Literal["constrained"] | None = None) -> "Figure":
     """An empty figure, in hundreds of pixels. matplotlib is loaded here, so that other commands do not wait for it."""
     from matplotlib.figure import Figure
 
     return Figure(figsize=(width, height), dpi=100, layout=layout)
 
 
-def from_figure(figure: Figure) -> Tensor:
+def from_figure(figure: "Figure") -> Tensor:
     """(3,H,W) in [0,1] of a matplotlib figure; its texts are taken for what they say, names with dollar signs too."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.text import Text

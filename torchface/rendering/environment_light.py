@@ -1,7 +1,5 @@
 """Light from all around, as a panorama holds it, reflected as by chalk."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 
@@ -36,7 +34,7 @@ class EnvironmentLight:
             raise ValueRangeError("environment: found NaN or infinite coefficients, expected none")
 
     @staticmethod
-    def of(panorama: Tensor, turn: float = 0.0) -> EnvironmentLight:
+    def of(panorama: Tensor, turn: float = 0.0) -> "EnvironmentLight":
         """The light of a panorama around the face.
 
         Args:
@@ -69,7 +67,7 @@ class EnvironmentLight:
         kept = harmonics(toward_camera)[0] * torch.tensor(_KEPT, dtype=torch.float64)
         return kept @ self.coefficients.double()
 
-    def scaled(self, factor: float) -> EnvironmentLight:
+    def scaled(self, factor: float) -> "EnvironmentLight":
         """The same, so many times as bright."""
         return EnvironmentLight(self.coefficients * factor)
 

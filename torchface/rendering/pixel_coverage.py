@@ -1,7 +1,5 @@
 """Coverage of an image's pixels by a mesh: with which part of it, and by what share at its edges."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import torch
@@ -39,7 +37,7 @@ class Footprint:
         """Values (V,C) of vertices at the samples, (S,C)."""
         return interpolate(values, faces[self.triangle], self.barycentric)
 
-    def select(self, rows: Tensor) -> Footprint:
+    def select(self, rows: Tensor) -> "Footprint":
         """Some of the samples."""
         return replace(
             self,

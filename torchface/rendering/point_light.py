@@ -1,7 +1,5 @@
 """One light near a face and light from everywhere, reflected as by chalk."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 
@@ -61,7 +59,7 @@ class PointLight:
                 )
 
     @staticmethod
-    def directional(ambient: Tensor, intensity: Tensor, direction: Tensor) -> PointLight:
+    def directional(ambient: Tensor, intensity: Tensor, direction: Tensor) -> "PointLight":
         """A light so far away that it shines from one direction (3,), from the face toward the light."""
         return PointLight(ambient, intensity, MAX_DISTANCE * torch.nn.functional.normalize(direction, dim=0))
 
@@ -69,7 +67,7 @@ class PointLight:
         """Unit vectors L from points (...,3) in the camera's frame to the source."""
         return torch.nn.functional.normalize(self.position.to(points) - points, dim=-1)
 
-    def from_afar(self, point: Tensor) -> PointLight:
+    def from_afar(self, point: Tensor) -> "PointLight":
         """A directional light that comes to a point (3,) of the camera's frame from where this one does."""
         return PointLight.directional(self.ambient, self.intensity, self.toward(point.to(self.position)))
 

@@ -1,7 +1,5 @@
 """A rig with its skin, or as clay with coloured eyes and mouth, drawn fast enough to play."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import cv2
@@ -50,7 +48,7 @@ class QuickClay:
     paint: tuple[Tensor, Tensor] | None = None
 
     @staticmethod
-    def of(mesh: Mesh, skin: bool = False) -> QuickClay:
+    def of(mesh: Mesh, skin: bool = False) -> "QuickClay":
         """A mesh at rest, prepared, its eyes along z; with its texture in place of clay if asked for."""
         regions = {} if mesh.annotations is None else mesh.annotations.regions
         faces = mesh.faces.cpu()

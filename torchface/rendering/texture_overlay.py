@@ -1,7 +1,5 @@
 """A painted texture on a recorded face in the light of the video, and a recorded face under another light."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 
@@ -55,7 +53,7 @@ class FacePaint:
     skin: Tensor  # triangles that take paint, (F,)
 
     @staticmethod
-    def of(mesh: Mesh, texture: Tensor) -> FacePaint:
+    def of(mesh: Mesh, texture: Tensor) -> "FacePaint":
         """Paint of an image in the mesh's texture coordinates.
 
         Args:

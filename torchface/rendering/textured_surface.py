@@ -1,7 +1,5 @@
 """Surface of many materials, drawn as a viewer of characters would: textures, cut-outs, a light at the camera."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 
 import torch
@@ -38,7 +36,7 @@ class TexturedSurface:
     materials: tuple[Material, ...]
     _made: dict[str, object] = field(default_factory=dict, init=False, repr=False)
 
-    def draw(self, camera: Camera, plain: bool = False, side: float = -1.0) -> DrawnSurface:
+    def draw(self, camera: Camera, plain: bool = False, side: float = -1.0) -> "DrawnSurface":
         """A picture of the surface, a ray a pixel.
 
         Args:
@@ -64,7 +62,7 @@ class TexturedSurface:
         way = torch.tensor([0.45 * side, -0.55, -0.7], dtype=torch.float64)
         return torch.nn.functional.normalize(way, dim=0) @ camera.rotation
 
-    def moved(self, pose: Similarity) -> TexturedSurface:
+    def moved(self, pose: Similarity) -> "TexturedSurface":
         """The surface moved by a similarity, a batch of one."""
         return TexturedSurface(
             pose.apply(self.vertices.double())[0], self.faces, self.uvs, self.material, self.materials

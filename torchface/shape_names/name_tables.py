@@ -1,7 +1,5 @@
 """Tables from ARKit's names to Unified Expressions, VRM's clips, Oculus' visemes and MetaHuman's curves, and back."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
@@ -141,7 +139,7 @@ class ClipTable:
         """These names whose weight does not come back from ARKit."""
         return _changed(self.names, self.from_arkit(self.to_arkit(torch.eye(len(self.names)))))
 
-    def renamed(self, names: Mapping[str, str]) -> ClipTable:
+    def renamed(self, names: Mapping[str, str]) -> "ClipTable":
         """The same clips by other names."""
         both = {names[whole]: (names[left], names[right]) for whole, (left, right) in self.both.items()}
         return ClipTable({names[name]: pose for name, pose in self.poses.items()}, both)

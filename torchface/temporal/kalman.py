@@ -1,7 +1,5 @@
 """Kalman filters and smoothers of constant acceleration, for signals that come frame by frame."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -98,7 +96,7 @@ class KalmanFilter:
         self._jerk = torch.tensor([kind.jerk**2 for kind in kinds], dtype=torch.float64)[:, None, None]
         self._go_on(1.0)
 
-    def to(self, device: torch.device) -> KalmanFilter:
+    def to(self, device: torch.device) -> "KalmanFilter":
         """The filter itself, with all that it holds on a device; ``step`` follows its measurements there."""
         if self.state.device != device:
             for name, value in vars(self).items():

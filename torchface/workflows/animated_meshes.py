@@ -1,7 +1,5 @@
 """Meshes over time from any of their files: weights with their rig, an animated rig, a mesh sequence, meshes."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable, Iterable
 from contextlib import suppress
@@ -52,7 +50,7 @@ class AnimatedMesh:
     # Of the vertices, (t,V,3) in [0,1], read as read does, where meshes have them.
     colors: Callable[[int, int], Tensor] | None = None
 
-    def require_topology_of(self, other: AnimatedMesh, hint: str = "") -> None:
+    def require_topology_of(self, other: "AnimatedMesh", hint: str = "") -> None:
         """Checks that both have the same vertices and triangles."""
         own, theirs = self.neutral, other.neutral
         if len(own.vertices) != len(theirs.vertices) or not torch.equal(own.faces, theirs.faces):

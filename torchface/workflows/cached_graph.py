@@ -1,8 +1,6 @@
 """Cache of files that are made by code in seconds: each is made once, and anew where its models or its code have
 changed."""
 
-from __future__ import annotations
-
 import hashlib
 from collections.abc import Callable, Sequence
 from contextlib import suppress
@@ -21,7 +19,7 @@ if TYPE_CHECKING:
     import onnx
 
 
-def cached_graph(kind: str, make: Callable[[], onnx.ModelProto], code: Sequence[str], **models: object) -> bytes:
+def cached_graph(kind: str, make: "Callable[[], onnx.ModelProto]", code: Sequence[str], **models: object) -> bytes:
     """An ONNX graph's file; see :func:`cached_file`."""
     return cached_file(kind, ".onnx", lambda: make().SerializeToString(), code, **models)
 

@@ -1,7 +1,5 @@
 """Contents of a file, in rows for people to read."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -210,7 +208,7 @@ def _head_model_rows(model: HeadModelFile) -> Rows:
     ]
 
 
-def _example_rows(examples: ExampleShapes) -> Rows:
+def _example_rows(examples: "ExampleShapes") -> Rows:
     from torchface.capture.anybody import ExampleSolver, landmark_observability
 
     return [
@@ -325,7 +323,7 @@ def _graph_rows(path: Path) -> Rows:
     except Exception as error:  # protobuf raises its own kinds, which are not part of onnx's interface
         raise FileFormatError(f"{path}: not an ONNX file ({error})") from error
 
-    def shape(value: onnx.ValueInfoProto) -> str:
+    def shape(value: "onnx.ValueInfoProto") -> str:
         return f"{value.name} ({','.join(d.dim_param or str(d.dim_value) for d in value.type.tensor_type.shape.dim)})"
 
     return [

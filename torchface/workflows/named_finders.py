@@ -1,7 +1,5 @@
 """Landmark finders by the names that a user gives."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field, replace
 from functools import cache
 from pathlib import Path
@@ -132,7 +130,7 @@ def graph_detector() -> CheckedDetector:
 
 
 def _graph(network: LandmarkNetwork | EyeNetwork | PartNetwork | BoxNetwork) -> bytes:
-    def make() -> onnx.ModelProto:
+    def make() -> "onnx.ModelProto":
         from torchface.onnx.network_graphs import network_model
 
         return network_model(network)

@@ -1,7 +1,5 @@
 """Choice of a head model and of the rig whose shapes its heads are given."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -36,7 +34,7 @@ class NamedHeads:
     line: str = ""
 
     @staticmethod
-    def of(name: str | Path | None) -> NamedHeads:
+    def of(name: str | Path | None) -> "NamedHeads":
         """What the user names; else the best at hand.
 
         Models of people go before those of performers made by code, models that carry a rig before others, then those

@@ -1,7 +1,5 @@
 """A classifier of action units and their intensities from painted regions of the face."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -145,7 +143,7 @@ class ActionUnitClassifier(nn.Module):
         groups: Sequence[RegionGroup] | None = None,
         settings: TrainingSettings = DEFAULT_TRAINING,
         progress: Progress | None = None,
-    ) -> ActionUnitClassifier:
+    ) -> "ActionUnitClassifier":
         """Learns from one or several performers.
 
         Args:
@@ -198,7 +196,7 @@ class ActionUnitClassifier(nn.Module):
         }
 
     @classmethod
-    def from_config(cls, config: Mapping[str, Any]) -> ActionUnitClassifier:
+    def from_config(cls, config: Mapping[str, Any]) -> "ActionUnitClassifier":
         """A classifier of zeros for the state to be loaded into.
 
         Raises:

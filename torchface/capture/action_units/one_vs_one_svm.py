@@ -1,7 +1,5 @@
 """A linear support vector machine for many classes: a plane for each pair, and a vote."""
 
-from __future__ import annotations
-
 from itertools import combinations
 
 import torch
@@ -44,7 +42,7 @@ class OneVsOne(nn.Module):
         margin = distance @ (self.first_class - self.second_class)
         return votes + margin / (3 * (margin.abs() + 1))
 
-    def fit(self, features: Tensor, classes: Tensor, penalty: float = 1.0) -> OneVsOne:
+    def fit(self, features: Tensor, classes: Tensor, penalty: float = 1.0) -> "OneVsOne":
         """Learns the planes from features (T,K) of classes (T,), every one of which occurs.
 
         Args:

@@ -1,7 +1,5 @@
 """Signals of the eyes in a stream: openness and gaze beside what has been learned of the person until then."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import torch
@@ -41,7 +39,7 @@ class EyeSignals:
     straight_seen: Tensor
 
     @classmethod
-    def start(cls) -> EyeSignals:
+    def start(cls) -> "EyeSignals":
         """Before the first frame: open, straight ahead, nothing learned."""
         one, none = torch.ones(2).double(), torch.zeros(2, 2).double()
         return cls(one, 0 * one, none, 0 * one, none, none, none, none[0, 0])

@@ -1,7 +1,5 @@
 """Blendshape weights from 3D markers."""
 
-from __future__ import annotations
-
 import copy
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -180,7 +178,7 @@ class MarkerSolver(nn.Module):
         }
 
     @classmethod
-    def from_config(cls, config: Mapping[str, Any]) -> MarkerSolver:
+    def from_config(cls, config: Mapping[str, Any]) -> "MarkerSolver":
         """A solver of zeros for the state to be loaded into, without the rig it came from.
 
         Raises:
@@ -396,7 +394,7 @@ class MarkerSolver(nn.Module):
         rows = torch.cat([self.basis, self.corrective_basis], 2).double().flatten(0, 1)
         return (2.0 / len(self.rest)) * (rows.T @ rows), rows
 
-    def without_correctives(self) -> MarkerSolver:
+    def without_correctives(self) -> "MarkerSolver":
         """The same solver of the rig's shapes alone; the solver itself where there are no correctives."""
         if self.activation is None:
             return self

@@ -1,7 +1,5 @@
 """The points of a rig's surface, and points at a height above it, as affine maps of the weights."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import torch
@@ -22,7 +20,7 @@ class SurfaceMotion:
     skin: Tensor  # the triangles that belong to the largest connected part, (F,) bool: where markers can sit
 
     @staticmethod
-    def of(rig: BlendshapeRig, normals: bool = False) -> SurfaceMotion:
+    def of(rig: BlendshapeRig, normals: bool = False) -> "SurfaceMotion":
         """Of a rig's vertices; normals on request."""
         faces, rest = rig.neutral.faces, rig.vertices.double()
         deltas = rig.deltas.double()

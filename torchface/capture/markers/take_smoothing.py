@@ -1,7 +1,5 @@
 """Batch smoothing: blendshape weights of all frames of a take in one solve, with a smoothness term over time."""
 
-from __future__ import annotations
-
 import copy
 import math
 from collections.abc import Callable
@@ -276,7 +274,7 @@ class _SmoothProblem:
         huber_threshold: float,
         rho: Tensor | None = None,
         tolerance: float = _TOLERANCE,
-    ) -> _SmoothProblem:
+    ) -> "_SmoothProblem":
         rho = _RHO * H.diagonal().mean().expand(len(H)) if rho is None else rho
         values, vectors = torch.linalg.eigh(H + rho.diag())
         waves = torch.arange(frames, dtype=H.dtype, device=H.device) * (math.pi / frames)
@@ -312,7 +310,7 @@ class _TakeData:
     seen: Tensor  # in rig space, (T,M,3)
 
     @staticmethod
-    def of(solver: MarkerSolver, markers: Tensor) -> _TakeData:
+    def of(solver: MarkerSolver, markers: Tensor) -> "_TakeData":
         whole = None if bool(torch.isnan(markers).any()) else solver.complete_energy(markers)
         energy = whole if isinstance(whole, CorrectiveEnergy) else None
         return _TakeData(solver, energy, solver.in_rig_space(markers))

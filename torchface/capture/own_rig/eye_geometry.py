@@ -1,7 +1,5 @@
 """Geometry of eyes before a camera: how far lids are open, where eyeballs look, and which shapes say so."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -51,13 +49,13 @@ class Eyeballs:
     turns: Tensor
 
     @staticmethod
-    def usual() -> Eyeballs:
+    def usual() -> "Eyeballs":
         """As people have them, float64."""
         out = torch.tensor([[-_OUTWARD, _ABOVE, -_BEHIND], [_OUTWARD, _ABOVE, -_BEHIND]]).double()
         return Eyeballs(out, torch.full((2,), _IRIS).double(), torch.tensor([SIDEWAYS] * 4 + [UPWARD] * 4).double())
 
     @staticmethod
-    def of(rig: BlendshapeRig) -> Eyeballs:
+    def of(rig: BlendshapeRig) -> "Eyeballs":
         """By a rig's regions ``eyeball_right`` and ``eyeball_left``; what those do not show is as people have it.
 
         Of shapes that are halves or have no twin among ARKit's, and of eyeballs that a joint turns, the turn is the

@@ -1,7 +1,5 @@
 """Measurements of a face beside the pixels of its 68 landmarks: deviations, weights as read, other cameras."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import torch
@@ -60,7 +58,7 @@ class CameraView:
         R = self.rotation.to(rotation)
         return R.T @ rotation, (translation - self.translation.to(rotation)) @ R
 
-    def of_frames(self, frames: Tensor) -> CameraView:
+    def of_frames(self, frames: Tensor) -> "CameraView":
         """That of some frames, (F,) int64."""
         return replace(self, landmarks=self.landmarks[frames], deviation=self.deviation[frames])
 
@@ -84,7 +82,7 @@ class FaceMeasurements:
     weights: WeightReadings | None = None
     views: tuple[CameraView, ...] = ()
 
-    def of_frames(self, frames: Tensor) -> FaceMeasurements:
+    def of_frames(self, frames: Tensor) -> "FaceMeasurements":
         """Those of some frames, (F,) int64."""
         deviation = None if self.deviation is None else self.deviation[frames]
         views = tuple(view.of_frames(frames) for view in self.views)

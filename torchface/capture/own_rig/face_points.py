@@ -1,7 +1,5 @@
 """The 68 landmarks as points of a rig: inner ones are vertices, those of the contour slide to where the face ends."""
 
-from __future__ import annotations
-
 import copy
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -46,7 +44,7 @@ class FacePoints:
     corrective_basis: Tensor | None = None
 
     @staticmethod
-    def of(rig: BlendshapeRig, landmark_vertices: Tensor, slides: bool = True) -> FacePoints:
+    def of(rig: BlendshapeRig, landmark_vertices: Tensor, slides: bool = True) -> "FacePoints":
         """Those of a rig whose landmarks are the vertices (68,), float64.
 
         Args:
@@ -93,7 +91,7 @@ class FacePoints:
         )
 
     @staticmethod
-    def _made(rig: BlendshapeRig, values: Tensor, rows: Tensor, valid: Tensor, side: Tensor) -> FacePoints:
+    def _made(rig: BlendshapeRig, values: Tensor, rows: Tensor, valid: Tensor, side: Tensor) -> "FacePoints":
         basis = values[1:].permute(1, 2, 0).contiguous()
         shapes = len(rig.names)
         made = FacePoints(values[0].contiguous(), basis[..., :shapes].contiguous(), rows, valid, side)

@@ -1,7 +1,5 @@
 """Estimates the fixed offsets between a rig's landmarks and a finder's from a take, without eating its expressions."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import torch
@@ -131,7 +129,7 @@ class _Take:
     resting: Tensor | None
     read: WeightReadings | None = None
 
-    def of_frames(self, frames: Tensor) -> _Take:
+    def of_frames(self, frames: Tensor) -> "_Take":
         if frames.dtype == torch.bool:
             frames = frames.nonzero()[:, 0]
         rest = None if self.resting is None else self.resting[frames]

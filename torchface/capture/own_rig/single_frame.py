@@ -3,8 +3,6 @@
 The energy is that of ``FrameSolver.energy`` for one frame of one camera without learned priors; the tests compare them.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from typing import TypeAlias
@@ -37,7 +35,7 @@ class _Points:
     side: Array
 
     @classmethod
-    def of(cls, points: FacePoints) -> _Points:
+    def of(cls, points: FacePoints) -> "_Points":
         return cls(*(getattr(points, part).detach().numpy() for part in cls.__dataclass_fields__))
 
     def chosen(self, weights: Array, rotation: Array, translation: Array, K: Array) -> Array:

@@ -1,7 +1,5 @@
 """Samples of the skin in frames: colours of vertices beside their known albedo."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -65,7 +63,7 @@ class SeenSkin:
             lit[rows] = lit_by(position, caster, self.points[rows], self.normals[rows])
         return lit
 
-    def thinned(self, most: int) -> SeenSkin:
+    def thinned(self, most: int) -> "SeenSkin":
         """At most so many of the vertices, evenly through all of them."""
         rows = torch.arange(0, len(self.points), max(1, -(-len(self.points) // most)))
         return replace(

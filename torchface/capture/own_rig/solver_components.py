@@ -1,7 +1,5 @@
 """Components of a video solver: the rig's points, the camera, priors and settings; and how they are kept."""
 
-from __future__ import annotations
-
 import copy
 import re
 from collections.abc import Mapping, Sequence
@@ -188,7 +186,7 @@ class VideoSolverParts(nn.Module):
         }
 
     @classmethod
-    def from_config(cls, config: Mapping[str, Any]) -> VideoSolverParts:
+    def from_config(cls, config: Mapping[str, Any]) -> "VideoSolverParts":
         """A solver of zeros for the state to be loaded into, without the rig it came from."""
         names = config["names"]
         if not isinstance(names, list) or not all(isinstance(n, str) for n in names) or len(set(names)) < len(names):

@@ -1,7 +1,5 @@
 """Estimates of weights and head pose, with their covariance, from one frame to the next."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import torch
@@ -26,7 +24,7 @@ class StateEstimate:
     mean: HeadState
     covariance: Tensor
 
-    def predicted(self, steps: Tensor, variance: Tensor, motion_variance: Tensor) -> StateEstimate:
+    def predicted(self, steps: Tensor, variance: Tensor, motion_variance: Tensor) -> "StateEstimate":
         """One frame on.
 
         Args:
@@ -38,7 +36,7 @@ class StateEstimate:
         mean = HeadState(self.mean.weights + steps, self.mean.rotation, self.mean.translation)
         return StateEstimate(mean, self.covariance + torch.diag_embed(noise))
 
-    def expectation(self) -> Expectation:
+    def expectation(self) -> "Expectation":
         """As an energy."""
         return Expectation(self.mean, torch.cholesky_inverse(torch.linalg.cholesky(self.covariance)))
 

@@ -1,7 +1,5 @@
 """Settings of the video solve, alike for files, cameras and exported graphs: weights of terms, ends of steps."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 from torchface.number_checks import LARGEST_WEIGHT, checked_count, checked_number
@@ -72,7 +70,7 @@ class VideoSettings:
     @classmethod
     def of_found_landmarks(
         cls, remembers: bool = False, refined: bool = False, fps: float | None = None
-    ) -> VideoSettings:
+    ) -> "VideoSettings":
         """For landmarks that a model has found in images, as ``torchface track`` solves them.
 
         Models of landmarks err alike in frames that look alike. A dynamics prior takes each frame's errors for new

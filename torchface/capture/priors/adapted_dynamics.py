@@ -1,7 +1,5 @@
 """A dynamics prior for other shape names and another frame rate than those that it has learned."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -125,7 +123,7 @@ class AdaptedDynamicsPrior(nn.Module):
         return {"learned": self.learned.config, "names": list(self.names), "fps": self.fps}
 
     @classmethod
-    def from_config(cls, config: Mapping[str, Any]) -> AdaptedDynamicsPrior:
+    def from_config(cls, config: Mapping[str, Any]) -> "AdaptedDynamicsPrior":
         """A prior that has learned nothing, with the sizes of a ``config``.
 
         Raises:

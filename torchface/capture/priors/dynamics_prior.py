@@ -1,7 +1,5 @@
 """The dynamics prior: Gaussian processes from the last frames to the next, as an energy for the solvers."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -162,7 +160,7 @@ class DynamicsPrior(nn.Module):
         input_noise: float = 0.0,
         settings: DynamicsSettings | None = None,
         progress: Progress | None = None,
-    ) -> DynamicsPrior:
+    ) -> "DynamicsPrior":
         """Learns from takes, with cross-validation over takes that are left out in turn.
 
         The kernels' hyperparameters maximise the bound of the marginal likelihood (``gpytorch``). The gain of the
@@ -263,7 +261,7 @@ class DynamicsPrior(nn.Module):
         }
 
     @classmethod
-    def from_config(cls, config: Mapping[str, Any]) -> DynamicsPrior:
+    def from_config(cls, config: Mapping[str, Any]) -> "DynamicsPrior":
         """A prior that has learned nothing, with the sizes of a ``config``.
 
         Raises:

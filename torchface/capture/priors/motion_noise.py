@@ -1,7 +1,5 @@
 """The variance of the next frame about its prediction: small at rest, larger the more a window moves."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor, nn
 
@@ -67,7 +65,7 @@ class MotionNoise(nn.Module):
         scale: Tensor,
         groups: tuple[tuple[int, ...], ...],
         floor: float,
-    ) -> MotionNoise:
+    ) -> "MotionNoise":
         """The likeliest coefficients for errors of predictions on takes left out, in float64.
 
         Args:

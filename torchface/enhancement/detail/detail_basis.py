@@ -1,7 +1,5 @@
 """Basis of a thousand frames' details: few components in half precision, learned a block at a time."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 
@@ -84,7 +82,7 @@ class StreamingBasis:
             basis[:, some] = to_old @ self._basis[:, some] + to_new @ rest[:, some]
         self._basis, self._coefficients = basis, stacked @ turned
 
-    def finished(self) -> LearnedBasis:
+    def finished(self) -> "LearnedBasis":
         """The components of the rows so far."""
         count = min(self.rank, len(self._basis))
         # Entries near 1, not near 1 / sqrt(n), which half precision would not hold to its full digits.

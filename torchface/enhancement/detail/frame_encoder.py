@@ -1,7 +1,5 @@
 """The encoder of frames: aligned with the neutral, split into a smooth part and detail, compared by patches."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 from torch import Tensor
@@ -21,7 +19,7 @@ _MOST_RESIDUAL = 0.35  # of the head's size: beyond, vertices are not where they
 class Encoder:
     """The steps that turn frames into smooth parts, features and details."""
 
-    alignment: FrameAlignment  # aligns frames with the neutral
+    alignment: "FrameAlignment"  # aligns frames with the neutral
     low_pass: LowPass  # smooths their displacements
     frames: SurfaceFrames  # turns the vertices' frames with their smooth part
     gradients: PatchGradients

@@ -1,7 +1,5 @@
 """Sparse products and solves of many columns at once, with derivatives."""
 
-from __future__ import annotations
-
 import warnings
 from typing import Any
 
@@ -32,7 +30,7 @@ class SparseOperator:
         product: Tensor = _Product.apply(columns, self)
         return product
 
-    def __deepcopy__(self, memo: dict[int, object]) -> SparseOperator:
+    def __deepcopy__(self, memo: dict[int, object]) -> "SparseOperator":
         return self  # it never changes
 
     def multiplied(self, columns: Tensor, transposed: bool) -> Tensor:

@@ -1,7 +1,5 @@
 """Frames of a smooth deformation: rotation and stretch at every vertex, and in the mean over patches."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
@@ -62,7 +60,7 @@ class SurfaceFrames:
         axes = (first * (G + root) - second * F) * scale, (second * (E + root) - first * F) * scale, normal
         return TurnedFrames(torch.stack(axes))
 
-    def patch_gradients(self, patches: Tensor, faces: Tensor, neutral: Tensor) -> PatchGradients:
+    def patch_gradients(self, patches: Tensor, faces: Tensor, neutral: Tensor) -> "PatchGradients":
         """What takes the mean gradients over patches of triangles."""
         shares = _patch_shares(
             patches, triangle_areas(neutral.detach().double().cpu(), faces.cpu()), faces, len(neutral)

@@ -1,7 +1,5 @@
 """Clusters of a face's patches that move together: connected, and mirrored where face and motion are."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
@@ -72,7 +70,7 @@ class _Graph:
     centres: Numbers
     pairs: Ids
 
-    def only(self, keep: NDArray[np.bool_]) -> _Graph:
+    def only(self, keep: NDArray[np.bool_]) -> "_Graph":
         """The groups that are kept, renumbered, in one piece."""
         number = np.full(len(keep), -1)
         number[keep] = np.arange(keep.sum())

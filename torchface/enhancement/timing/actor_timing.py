@@ -3,8 +3,6 @@
 A learned timing is a regression from where a motion begins and ends, and how long it lasts, to its velocity.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -96,7 +94,7 @@ class LearnedTiming:
     dual: Tensor  # coefficients of the motions, (m,40)
 
     @classmethod
-    def fit(cls, database: Tensor, sequences: Tensor, region: Tensor, fps: float) -> LearnedTiming | None:
+    def fit(cls, database: Tensor, sequences: Tensor, region: Tensor, fps: float) -> "LearnedTiming | None":
         """Learns from captured sequences, cut into motions where they turn; None from few motions.
 
         The inverse length scales and the ridge have the least leave-one-out error, which has a closed form.

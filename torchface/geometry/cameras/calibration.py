@@ -1,7 +1,5 @@
 """The intrinsics of a camera: focal length, centre and lens distortion at one resolution."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, replace
 
@@ -64,7 +62,7 @@ class CameraCalibration:
         """Across the image's width, degrees."""
         return math.degrees(2 * math.atan(self.width / 2 / float(self.intrinsics[0, 0])))
 
-    def resized(self, width: int, height: int) -> CameraCalibration:
+    def resized(self, width: int, height: int) -> "CameraCalibration":
         """The same camera with its images scaled to another resolution of the same aspect.
 
         Raises:

@@ -1,7 +1,5 @@
 """Vertices from deformation gradients: pins hold exactly, soft constraints as well as their weights demand."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -79,7 +77,7 @@ class GradientReconstruction:
         prepared = self.prepare(pinned, constraints)
         return prepared.solve(gradients, positions, [constraint.values for constraint in constraints])
 
-    def prepare(self, pinned: Tensor, constraints: Sequence[SoftConstraints] = ()) -> PreparedReconstruction:
+    def prepare(self, pinned: Tensor, constraints: Sequence[SoftConstraints] = ()) -> "PreparedReconstruction":
         """Factors the system once, for many solves with the same pins (V,) and the same matrices of constraints."""
         free = (~pinned).nonzero()[:, 0].cpu().numpy()
         matrix = self.stiffness[free]

@@ -1,7 +1,5 @@
 """Normal maps as data: unit vectors in tangent space, mixed by weight as the heights they come from would be."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
@@ -70,7 +68,7 @@ class DetailMaps:
             raise NameMismatchError(f"detail maps: the rig has no shape {', '.join(map(repr, missing[:5]))}")
         return blend_normal_maps(self.maps, weights[[row[name] for name in self.names]], self.neutral)
 
-    def reduced(self, side: int) -> DetailMaps:
+    def reduced(self, side: int) -> "DetailMaps":
         """The maps with at most so many texels a side."""
         step = -(-max(self.maps.shape[-2:]) // side)
         if step <= 1:
@@ -78,7 +76,7 @@ class DetailMaps:
         neutral = None if self.neutral is None else _pooled(self.neutral, step)
         return DetailMaps(self.names, _pooled(self.maps, step), neutral)
 
-    def merged(self, sources: Mapping[str, Sequence[str]]) -> DetailMaps:
+    def merged(self, sources: Mapping[str, Sequence[str]]) -> "DetailMaps":
         """The maps of shapes that are sums of these.
 
         Args:

@@ -1,7 +1,5 @@
 """Triangles drawn into pixels: the texels of a layout, and pictures that must be quick, nearest in front."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import pairwise
@@ -212,7 +210,7 @@ class _Planes:
         slack: float,
         least_area: float,
         facing: bool = False,
-    ) -> _Planes:
+    ) -> "_Planes":
         """Of points (2,V) and faces (F,3); with ``facing`` clockwise ones are left out, as rows count downward."""
         x, y = points
         corners = faces.T.copy()

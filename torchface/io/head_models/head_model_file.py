@@ -1,7 +1,5 @@
 """A head model of others: mean head, ways in which people and expressions differ, joints and landmarks."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
@@ -73,7 +71,7 @@ class SurfacePlaces:
     shares: Tensor
 
     @classmethod
-    def at_vertices(cls, places: Mapping[int, int]) -> SurfacePlaces:
+    def at_vertices(cls, places: Mapping[int, int]) -> "SurfacePlaces":
         """Each landmark of iBUG's, by row, on one vertex."""
         ids = torch.tensor(list(places.values()))[:, None].expand(-1, 3).contiguous()
         return cls(torch.tensor(list(places)), ids, torch.tensor([1.0, 0.0, 0.0]).repeat(len(ids), 1))

@@ -1,7 +1,5 @@
 """Many meshes of one topology in one file, read a few at a time: a safetensors file whose numbers stay on disk."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import os
@@ -222,7 +220,7 @@ class MeshSequenceWriter:
         write_json(self._note, {"done": self.done, "sha256": self._hash.hexdigest()}, indent=None)
         self._noted = time.monotonic()
 
-    def __enter__(self) -> MeshSequenceWriter:
+    def __enter__(self) -> "MeshSequenceWriter":
         return self
 
     def __exit__(

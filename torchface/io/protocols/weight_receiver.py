@@ -1,7 +1,5 @@
 """Receiver of faces by UDP: what an iPhone or another program sends, decoded, checked and put in order."""
 
-from __future__ import annotations
-
 import errno
 import select
 import socket
@@ -190,7 +188,7 @@ class WeightReceiver:
         """Gives the port back."""
         self._socket.close()
 
-    def __enter__(self) -> WeightReceiver:
+    def __enter__(self) -> "WeightReceiver":
         return self
 
     def __exit__(self, *_: object) -> None:

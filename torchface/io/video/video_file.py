@@ -1,7 +1,5 @@
 """Video files, a few frames at a time, grey or in colour."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -224,7 +222,7 @@ def open_video(path: str | Path) -> VideoFile:
     return VideoFile(path, fps, frame.shape[1], frame.shape[0], count, pixel_aspect=aspect)
 
 
-def _rgb_frames(container: InputContainer, stream: VideoStream, errors: list[str]) -> Iterator[np.ndarray]:
+def _rgb_frames(container: "InputContainer", stream: "VideoStream", errors: list[str]) -> Iterator[np.ndarray]:
     """Upright frames (H,W,3) of the packets that can be decoded; what is wrong with the others goes to ``errors``."""
     av, path, codec = pyav(), Path(container.name), stream.codec_context.name
     reformatter, bicubic = av.video.reformatter.VideoReformatter(), av.video.reformatter.Interpolation.BICUBIC

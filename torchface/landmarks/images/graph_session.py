@@ -1,14 +1,12 @@
 """Session of ONNX Runtime for graphs of this library's own making."""
 
-from __future__ import annotations
-
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     import onnxruntime
 
 
-def graph_session(content: bytes) -> onnxruntime.InferenceSession:
+def graph_session(content: bytes) -> "onnxruntime.InferenceSession":
     """A session on one thread of the processor, without log, of an ONNX file's content."""
     import onnxruntime  # programs without graphs do not wait for it
 

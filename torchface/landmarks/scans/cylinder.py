@@ -1,7 +1,5 @@
 """A head unwrapped onto a cylinder round its vertical axis, so that scans without common UVs share pixels."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 
@@ -56,7 +54,7 @@ class CylinderLayout:
                 f"{self.radius} mm; expected at most {2 * math.pi * self.radius:.0f} mm"
             )
 
-    def resized(self, size: int) -> CylinderLayout:
+    def resized(self, size: int) -> "CylinderLayout":
         """The same field of view with ``size`` pixels a side."""
         return CylinderLayout(size, self.pitch * self.size / size, self.radius)
 

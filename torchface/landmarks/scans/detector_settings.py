@@ -1,7 +1,5 @@
 """Settings of the matching of landmarks in UV space."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -35,7 +33,7 @@ class DetectorSettings:
     bandwidth: float = 10.0
 
     @staticmethod
-    def of(given: DetectorSettings | dict[str, Any] | None) -> DetectorSettings:
+    def of(given: "DetectorSettings | dict[str, Any] | None") -> "DetectorSettings":
         """From the settings themselves, from a dict of them, or the usual ones."""
         if given is None:
             return DetectorSettings()

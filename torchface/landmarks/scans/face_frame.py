@@ -1,7 +1,5 @@
 """The frame that all faces share: learned from scans with landmarks, found on scans without."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 
@@ -56,7 +54,7 @@ class FaceFrame(nn.Module):
         return {"points": len(self.surface), "count": len(self.landmarks)}
 
     @classmethod
-    def fit(cls, scans: Sequence[Mesh], landmarks: Tensor) -> FaceFrame:
+    def fit(cls, scans: Sequence[Mesh], landmarks: Tensor) -> "FaceFrame":
         """Learns the mean face.
 
         Args:
@@ -85,7 +83,7 @@ class FaceFrame(nn.Module):
         return cls._of_poses(scans, landmarks.double(), poses)
 
     @classmethod
-    def _of_poses(cls, scans: Sequence[Mesh], landmarks: Tensor, poses: Similarity) -> FaceFrame:
+    def _of_poses(cls, scans: Sequence[Mesh], landmarks: Tensor, poses: Similarity) -> "FaceFrame":
         mean = poses.apply(landmarks).nanmean(0)
         heads = [unwrap(scan, _row(poses, i), _MAP) for i, scan in enumerate(scans)]
         depth = torch.stack([head.radius.double().masked_fill(~head.mask, torch.nan) for head in heads])

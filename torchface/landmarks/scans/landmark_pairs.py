@@ -1,7 +1,5 @@
 """Pairs of template vertex and scan point for registration: the twelve landmarks, and points along lips and lids."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import torch
@@ -41,7 +39,7 @@ class LandmarkPairs:
     confidence: Tensor
     names: tuple[str, ...]
 
-    def above(self, confidence: float) -> LandmarkPairs:
+    def above(self, confidence: float) -> "LandmarkPairs":
         """Those with more than this confidence."""
         keep = self.confidence > confidence
         names = tuple(name for name, kept in zip(self.names, keep.tolist(), strict=True) if kept)

@@ -1,7 +1,5 @@
 """Usual course of a line between two corners, and its grey profile: learned from annotated lines."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -31,7 +29,7 @@ class LineShape:
     profile: Tensor | None = None
 
     @staticmethod
-    def arc(sag: float, deviation: float) -> LineShape:
+    def arc(sag: float, deviation: float) -> "LineShape":
         """A parabola that sags by a share of its length; 0 is the straight line."""
         along = torch.linspace(0, 1, STATIONS, dtype=torch.float64)
         return LineShape(4 * sag * along * (1 - along), torch.full((STATIONS,), deviation, dtype=torch.float64))
@@ -39,7 +37,7 @@ class LineShape:
     @staticmethod
     def fit(
         lines: Sequence[Tensor], images: Sequence[Tensor] | None = None, corner_deviation: float = 0.0
-    ) -> LineShape:
+    ) -> "LineShape":
         """The mean course of pixel lines, each (N,2) from its left to its right corner; two lines at least.
 
         Args:

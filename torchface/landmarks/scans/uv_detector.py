@@ -1,7 +1,5 @@
 """Landmarks in UV space by a bank of HOG filters, the scores they give, and where landmarks usually lie."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
@@ -144,7 +142,7 @@ class UVLandmarkDetector(nn.Module):
         return self.appearance == "curvature" or textured or mesh.colors is not None
 
     @classmethod
-    def from_config(cls, config: dict[str, Any]) -> UVLandmarkDetector:
+    def from_config(cls, config: dict[str, Any]) -> "UVLandmarkDetector":
         """A detector of zeros for the state to be loaded into."""
         if config.get("appearance") == "relief":  # the name in older models
             config = {**config, "appearance": "curvature"}
@@ -161,7 +159,7 @@ class UVLandmarkDetector(nn.Module):
         frame: FaceFrame | None = None,
         lines: LineExamples | None = None,
         progress: Any = None,
-    ) -> UVLandmarkDetector:
+    ) -> "UVLandmarkDetector":
         """Learns from annotated images.
 
         Args:

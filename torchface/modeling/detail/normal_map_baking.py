@@ -1,7 +1,5 @@
 """Baking of normal maps: detail that a high-resolution scan shows and a face mesh is too coarse to hold."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -242,7 +240,7 @@ class _Surface:
     high: Tensor
 
     @staticmethod
-    def of(vertices: Tensor, faces: Tensor, alignment: Similarity) -> _Surface:
+    def of(vertices: Tensor, faces: Tensor, alignment: Similarity) -> "_Surface":
         moved = alignment.apply(vertices[None])[0]
         used = moved[faces.flatten().unique()]
         normals = vertex_normals(moved, faces).float()

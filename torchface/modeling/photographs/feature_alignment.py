@@ -1,7 +1,5 @@
 """Photographs bent so that eyes, nose and lips lie where the fitted head has them."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import cv2
@@ -33,7 +31,7 @@ class Displacement:
     reach: float
 
     @staticmethod
-    def of(places: Tensor, steps: Tensor, unit: float) -> Displacement:
+    def of(places: Tensor, steps: Tensor, unit: float) -> "Displacement":
         """Follows steps (L,2) of places (L,2), NaN for missing, as far as they agree.
 
         Args:
@@ -70,7 +68,7 @@ class FeatureAlignment:
     unit: float
 
     @staticmethod
-    def of(fitted: Tensor, residuals: Tensor) -> FeatureAlignment:
+    def of(fitted: Tensor, residuals: Tensor) -> "FeatureAlignment":
         """By the landmarks (68,2) of the fitted head and how far they lie from those found, (68,2); NaN for missing.
 
         Landmarks of the contour slide along it, so what they are off along it is none of the face's. Brows are hair:

@@ -1,7 +1,5 @@
 """Problem of a fit to photographs: what is looked for, the errors and the prior that the solve weighs."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -114,7 +112,7 @@ class Problem:
         lower[:k], upper[:k] = -self.settings.identity_bound, self.settings.identity_bound
         return lower, upper
 
-    def prior(self, state: State) -> tuple[Tensor, Tensor]:
+    def prior(self, state: "State") -> tuple[Tensor, Tensor]:
         """Of the energy ½ xᵀ P x + βᵀ x: P (D,D) and β (D,); it touches that of the expressions at the state."""
         weights, k = self.weights(state.coefficients), self.identities
         count, settings = weights.shape[1], self.settings

@@ -1,7 +1,5 @@
 """Mask of a photographed head's skin: neither hair nor clothes, nor what stands behind a misplaced ear."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import torch
@@ -57,7 +55,7 @@ class FacePlaces:
         return (self.out < _SURELY_SKIN) & ~self.features & (self.place[:, 1] < self.brows)
 
     @staticmethod
-    def of(mesh: Mesh) -> FacePlaces:
+    def of(mesh: Mesh) -> "FacePlaces":
         """Those of a mesh with the 68 landmarks."""
         vertices = mesh.vertices.detach().cpu().double()
         marks = vertices[mesh.landmarks.cpu()]
@@ -95,7 +93,7 @@ class ShownParts:
     hair: Tensor
 
     @staticmethod
-    def of(parts: FaceParts | None, pixels: Tensor, places: FacePlaces, graph: VertexGraph) -> ShownParts:
+    def of(parts: FaceParts | None, pixels: Tensor, places: FacePlaces, graph: VertexGraph) -> "ShownParts":
         """At the places of the vertices in the photograph, (V,2) pixels.
 
         Without parts all inside the face's outline is the person's. Far below the chin and behind the ears nothing is.

@@ -1,7 +1,5 @@
 """A head with a template's shapes, and what a person has to be warned of in them."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import torch

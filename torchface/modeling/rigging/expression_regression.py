@@ -1,7 +1,5 @@
 """Expressions from a neutral face alone, as learned from other people's faces and expressions."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
@@ -151,7 +149,7 @@ class ExpressionRegression(nn.Module):
         topology: str | None = None,
         region: Tensor | None = None,
         progress: Progress | None = None,
-    ) -> ExpressionRegression:
+    ) -> "ExpressionRegression":
         """Learns from people in correspondence, each with a neutral face and the same expressions.
 
         People may be read in blocks. Passes over them: four align the neutrals with each other, one finds what moves,
@@ -203,7 +201,7 @@ class ExpressionRegression(nn.Module):
         }
 
     @classmethod
-    def from_config(cls, config: Mapping[str, Any]) -> ExpressionRegression:
+    def from_config(cls, config: Mapping[str, Any]) -> "ExpressionRegression":
         """A regression of zeros for the state to be loaded into."""
         model = cls(**{name: value for name, value in config.items() if name != "judged"})
         if config.get("judged"):

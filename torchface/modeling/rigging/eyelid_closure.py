@@ -1,7 +1,5 @@
 """Blinks of a head of any topology that shut its own eyes: the edges of its lids meet, before what lies in the eye."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -182,7 +180,7 @@ class _Lids:
     eye: Tensor
 
     @staticmethod
-    def of(head: SkinOfHead, opening: EyeOpening, index: SurfaceIndex) -> _Lids:
+    def of(head: SkinOfHead, opening: EyeOpening, index: SurfaceIndex) -> "_Lids":
         above, below = opening.at(_SHARES)
         edge, skin = torch.cat([above, below]), head.skin
         middle, height = edge.mean(0), float((above - below)[:, 1].max())

@@ -1,7 +1,5 @@
 """A mesh whose vertices that a file has split at seams are one again, and its connected parts."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

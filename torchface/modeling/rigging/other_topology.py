@@ -1,7 +1,5 @@
 """A template's blendshapes on a head of another topology, whose vertices keep their number and order."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import torch
@@ -60,7 +58,7 @@ class TemplatePlaces:
     share: Tensor
 
     @staticmethod
-    def at(rows: Tensor, ids: Tensor) -> TemplatePlaces:
+    def at(rows: Tensor, ids: Tensor) -> "TemplatePlaces":
         """At vertices ids (n,) of the template."""
         return TemplatePlaces(rows, ids[:, None].expand(-1, 2), torch.tensor([1.0, 0.0]).double().repeat(len(ids), 1))
 
@@ -181,7 +179,7 @@ class _Skin:
     @staticmethod
     def of(
         rig: BlendshapeRig, registration: Registration, joined: JoinedMesh, followed: TemplatePlaces | None = None
-    ) -> _Skin:
+    ) -> "_Skin":
         faces = rig.neutral.faces.cpu()
         label = torch.from_numpy(connected_labels(torch.cat([faces[:, [0, 1]], faces[:, [1, 2]]]).T, len(rig.vertices)))
         faces = faces[(label == label.bincount().argmax())[faces[:, 0]]]

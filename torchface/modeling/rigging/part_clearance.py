@@ -1,7 +1,5 @@
 """Shapes in which no part of a head comes through the skin: shells give way to the lids, skin gives way to bone."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import torch
@@ -59,7 +57,7 @@ def clear_parts(rig: BlendshapeRig, parts: InnerParts, poses: Tensor | None = No
     return BlendshapeRig(rig.neutral, whole, rig.names, rig.correctives) if bool(changed.any()) else rig
 
 
-def _cleared(deltas: Tensor, moving: Tensor, poses: Tensor, clearance: Clearance) -> Tensor:
+def _cleared(deltas: Tensor, moving: Tensor, poses: Tensor, clearance: "Clearance") -> Tensor:
     """Changes deltas (N,V,3) in place until each pose (K,N) in turn is clear; which shapes were changed, (N,) bool."""
     changed = torch.zeros(len(deltas), dtype=torch.bool)
     for weights in poses:  # each pose builds on the changes of the one before

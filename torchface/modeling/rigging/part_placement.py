@@ -1,7 +1,5 @@
 """The parts inside a head put where they belong in a new one: eyeballs behind its lids, teeth behind its lips."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import torch
@@ -163,7 +161,7 @@ class _SkinBefore:
     across: Tensor
 
     @staticmethod
-    def of(vertices: Tensor, skin: Tensor, middle: Tensor, points: Tensor) -> _SkinBefore:
+    def of(vertices: Tensor, skin: Tensor, middle: Tensor, points: Tensor) -> "_SkinBefore":
         far = (points - middle).norm(dim=-1)
         ways = (points - middle) / far.clamp(min=1e-9)[:, None]
         hits = RayCaster(vertices, skin).cast(middle.expand_as(points), ways)

@@ -1,7 +1,5 @@
 """One template and one target, and how each shape's gradients become vertices: pins, ties between parts, contacts."""
 
-from __future__ import annotations
-
 import copy
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -90,7 +88,7 @@ class ShapeTransfer:
             progress("transferring shapes", done, len(moved))
         return moved
 
-    def follower(self, shape: int) -> Follower:
+    def follower(self, shape: int) -> "Follower":
         """What lets this shape, and those that share its group, go further than the transfer took them."""
         below = self.seams.undoes.get(shape)
         pose = self.rest + self.deltas[shape] + (0 if below is None else self.deltas[below])

@@ -1,7 +1,5 @@
 """A mesh on the page, kept up to date as it moves."""
 
-from __future__ import annotations
-
 import io
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
@@ -51,7 +49,7 @@ class HeadOnPage:
 
     def __init__(
         self,
-        server: viser.ViserServer,
+        server: "viser.ViserServer",
         mesh: Mesh,
         name: str,
         offset: tuple[float, float, float] = (0.0, 0.0, 0.0),

@@ -1,7 +1,5 @@
 """Messages that a page accepts from a browser: those that it is made for, with finite numbers and values that fit."""
 
-from __future__ import annotations
-
 import importlib
 import math
 from collections.abc import Callable, Mapping
@@ -76,7 +74,7 @@ class MessageCheck:
     def __init__(self) -> None:
         self._inputs: Mapping[str, Any] = {}
 
-    def watch(self, server: viser.ViserServer) -> None:
+    def watch(self, server: "viser.ViserServer") -> None:
         """Holds values for the page's inputs against these inputs from now on."""
         self._inputs = server.gui._gui_input_handle_from_uuid
 

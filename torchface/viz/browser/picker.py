@@ -1,7 +1,5 @@
 """The picking page: a click on the head, or on the scan beside it, becomes a landmark, a marker or a pair."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -148,7 +146,7 @@ class Picker(BrowserPage):
         self._marker_label.visible = mode == "markers"
         self._mirrored.visible = mode != "correspondences"
 
-    def _clicked(self, event: viser.SceneClickEvent) -> None:
+    def _clicked(self, event: "viser.SceneClickEvent") -> None:
         origin = torch.tensor(event.ray_origin, dtype=torch.float64) / SCALE
         try:
             self.click(origin, torch.tensor(event.ray_direction, dtype=torch.float64))

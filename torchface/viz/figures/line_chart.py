@@ -1,7 +1,5 @@
 """Line charts by OpenCV and Pillow, in a twentieth of the time that matplotlib takes with its loading."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -29,7 +27,7 @@ class LineChart:
         self.pixels: Array = np.full((height, width, 3), 255, np.uint8)
         self._texts: list[tuple[tuple[float, float], str, str, int, bool]] = []
 
-    def panel(self, box: tuple[int, int, int, int], x: tuple[float, float], y: tuple[float, float]) -> Panel:
+    def panel(self, box: tuple[int, int, int, int], x: tuple[float, float], y: tuple[float, float]) -> "Panel":
         """A panel whose first and last columns and rows are in ``box``, for numbers from the first to the second."""
         cv2.rectangle(self.pixels, box[:2], box[2:], ImageColor.getrgb(_INK))
         return Panel(self, *box, x, y)

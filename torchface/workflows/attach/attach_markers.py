@@ -1,7 +1,5 @@
 """From a rig, a range-of-motion take and a first guess on disk to marker sites on disk."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -175,7 +173,7 @@ def _in_order(take: Take) -> tuple[Take, list[Defect]]:
 
 
 def _standoff_hint(
-    rig: BlendshapeRig, take: Take, start: Attachment, settings: AttachSettings, fit: AttachmentFit
+    rig: BlendshapeRig, take: Take, start: Attachment, settings: "AttachSettings", fit: AttachmentFit
 ) -> str:
     """Advice where sites do not explain a take and a common distance from the skin, which was not asked for, does."""
     if settings.standoff or settings.options.scale == "free":

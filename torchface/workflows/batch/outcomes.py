@@ -1,7 +1,5 @@
 """Outcome of one item: in memory, as a JSON record below its results, as a row of the table."""
 
-from __future__ import annotations
-
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -35,7 +33,7 @@ class Made:
     figures: Figures = field(default_factory=dict)
     headline: str = ""  # the most telling of it, a few words for the contact sheet
     notes: tuple[str, ...] = ()  # what people should know before they use the results
-    picture: Tensor | None = None  # for the contact sheet, (3,H,W) in [0,1]
+    picture: "Tensor | None" = None  # for the contact sheet, (3,H,W) in [0,1]
     details: Mapping[str, Any] = field(default_factory=dict)  # what else the record is to hold
 
 

@@ -1,7 +1,5 @@
 """The character of the page: a ``.glb``, and what drives each of its shapes."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -78,7 +76,7 @@ class Character:
             moved[rows] = self.shapes(arkit[rows])
         return moved
 
-    def renamed(self, meanings: Mapping[str, str]) -> Character:
+    def renamed(self, meanings: Mapping[str, str]) -> "Character":
         """With other meanings of shapes: ARKit's name, or none for one that stays still, by the shape's name."""
         shapes, products = self.shapes, list(self.shapes.products)
         matrix, limits = shapes.matrix.clone(), [getattr(shapes, name).clone() for name in ("gain", "lower", "upper")]

@@ -1,7 +1,5 @@
 """The frames of an animation enhanced onto the disk, in the actor's timing where asked for; a killed run continues."""
 
-from __future__ import annotations
-
 import math
 import shutil
 import time
@@ -130,7 +128,7 @@ class _Output:
             self._writer.append(vertices[self.done - begin :])
             self.done = self._writer.done
 
-    def __enter__(self) -> _Output:
+    def __enter__(self) -> "_Output":
         return self
 
     def __exit__(self, *error: object) -> None:

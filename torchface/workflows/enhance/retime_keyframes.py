@@ -1,7 +1,5 @@
 """A motion between two keyframes in the actor's timing, with the curve of each region."""
 
-from __future__ import annotations
-
 import re
 from dataclasses import dataclass
 from pathlib import Path
@@ -62,7 +60,7 @@ class Keyframe:
     rig: Path | None = None
 
     @staticmethod
-    def parse(text: str, rig: Path | None = None) -> Keyframe:
+    def parse(text: str, rig: Path | None = None) -> "Keyframe":
         """The keyframe that a text names."""
         found = None if Path(text).exists() else _FRAME.fullmatch(text)
         return Keyframe(Path(text), None, rig) if found is None else Keyframe(Path(found[1]), int(found[2]), rig)

@@ -1,7 +1,5 @@
 """Takes performed live and kept: frames logged as they come, then weights, Live Link Face CSV, animation, summary."""
 
-from __future__ import annotations
-
 import json
 import os
 import shutil
@@ -119,7 +117,7 @@ class FrameLog:
         with suppress(OSError):
             self._path.unlink()
 
-    def __enter__(self) -> FrameLog:
+    def __enter__(self) -> "FrameLog":
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:

@@ -1,7 +1,5 @@
 """Prompts of a live session: the guided calibration, and what is wrong with a picture."""
 
-from __future__ import annotations
-
 import threading
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -49,7 +47,7 @@ class GuidedCalibration:
     rest: tuple[float, ...] = (0.0,) * len(STEPS)
     most: tuple[float, ...] = (0.0,) * len(STEPS)
 
-    def after(self, seconds: float, solved: LiveFrame) -> GuidedCalibration | None:
+    def after(self, seconds: float, solved: LiveFrame) -> "GuidedCalibration | None":
         """The state after a frame; None when it is over."""
         if not solved.seen:
             return self

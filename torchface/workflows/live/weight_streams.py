@@ -1,7 +1,5 @@
 """One frame of weights to several receivers, none of which can end the session."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
@@ -109,7 +107,7 @@ class WeightStreams:
             if lost
         )
 
-    def __enter__(self) -> WeightStreams:
+    def __enter__(self) -> "WeightStreams":
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:

@@ -1,7 +1,5 @@
 """A light in words, as bright on a face as the film's."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -37,7 +35,7 @@ class WantedLight:
     blue: float = 1.0
 
     @staticmethod
-    def parse(words: Sequence[str]) -> WantedLight:
+    def parse(words: Sequence[str]) -> "WantedLight":
         """Of words such as ``azimuth=60``."""
         bounds = {"azimuth": (-360, 360), "elevation": (-90, 90), "ambient": (0, 1)}
         names = tuple(WantedLight.__dataclass_fields__)

@@ -1,7 +1,5 @@
 """A head camera's predictions as weight curves for a marker take."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -44,7 +42,7 @@ class Predicted:
     gamma: Track  # their weights, (T,K,1), mm² over all markers
     notes: tuple[str, ...]  # what had to be assumed, for people to read
 
-    def frames(self, rows: slice) -> Predicted:
+    def frames(self, rows: slice) -> "Predicted":
         """Some of the frames."""
         return Predicted(self.weights.frames(rows), self.gamma.frames(rows), self.notes)
 

@@ -1,7 +1,5 @@
 """Landmarks of a neutral face and of example expressions, by name; and the file that holds them."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -96,7 +94,7 @@ class ExampleShapes:
         """What each expression adds to the neutral, (68,2,N)."""
         return (self.landmarks - self.neutral).permute(1, 2, 0).contiguous()
 
-    def select(self, names: Sequence[str]) -> ExampleShapes:
+    def select(self, names: Sequence[str]) -> "ExampleShapes":
         """These expressions alone, in this order, whatever order the examples are in.
 
         Raises:
@@ -128,7 +126,7 @@ class ExampleShapes:
         )
 
     @staticmethod
-    def load(path: str | Path) -> ExampleShapes:
+    def load(path: str | Path) -> "ExampleShapes":
         """Reads what :meth:`save` wrote.
 
         Raises:

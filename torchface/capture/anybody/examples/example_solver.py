@@ -1,7 +1,5 @@
 """Weights of anybody's example expressions from the 68 landmarks of anybody's face."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
@@ -134,7 +132,7 @@ class ExampleSolver(nn.Module):
         return {"names": list(self.names), "method": method, "placement": placement}
 
     @classmethod
-    def from_config(cls, config: Mapping[str, Any]) -> ExampleSolver:
+    def from_config(cls, config: Mapping[str, Any]) -> "ExampleSolver":
         """A solver of zeros for the state to be loaded into.
 
         Raises:

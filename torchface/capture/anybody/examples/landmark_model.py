@@ -1,7 +1,5 @@
 """A linear model of landmarks: projected on its components they say the weights of examples."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any
 
@@ -93,7 +91,7 @@ class LandmarkModel(nn.Module):
         noise: float = 0.002,
         sparsity: float = 2e-5,
         ridge: float = 1e-7,
-    ) -> LandmarkModel:
+    ) -> "LandmarkModel":
         """Learns the components from examples.
 
         Args:
@@ -133,7 +131,7 @@ class LandmarkModel(nn.Module):
         }
 
     @classmethod
-    def from_config(cls, config: Mapping[str, Any]) -> LandmarkModel:
+    def from_config(cls, config: Mapping[str, Any]) -> "LandmarkModel":
         """A model of zeros for the state to be loaded into."""
         count = config["components"]
         return cls(

@@ -11,8 +11,6 @@ With :math:`C = LL^\top` it is a squared distance in a space of :math:`3(N+1)` d
 the point of that triangle, in that space, nearest to the marker.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import torch
@@ -47,7 +45,7 @@ class PathMoments:
         on_rig: Tensor | None = None,
         initial: Tensor | None = None,
         prior_weight: float = 0.0,
-    ) -> PathMoments:
+    ) -> "PathMoments":
         """Of markers (T,M,3), NaN where not seen, and extended weights (T,N+1), float64.
 
         The initial guess of the sites at rest, ``initial`` (M,3), counts as ``prior_weight`` frames at rest.

@@ -10,8 +10,6 @@ eliminated frame by frame:
 S is the curvature in :math:`\theta` alone: directions in which it is small are those that the take does not determine.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import torch
@@ -50,7 +48,7 @@ class TakeCurvature:
     weight_gradient: Tensor  # (T,N)
 
     @staticmethod
-    def of(fit: SitesOnTake, ridge: float, bounded: bool = True) -> TakeCurvature:
+    def of(fit: SitesOnTake, ridge: float, bounded: bool = True) -> "TakeCurvature":
         """At sites, pose and weights.
 
         Args:

@@ -1,7 +1,5 @@
 """The iterations that fit marker sites, weights and pose to a take: alternating, then jointly."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import torch
@@ -65,7 +63,7 @@ class SiteSolver:
     """Solves for sites, weights and pose; holds what is the same in all iterations."""
 
     motion: SurfaceMotion
-    search: SiteSearch  # for candidate triangles
+    search: "SiteSearch"  # for candidate triangles
     initial: Tensor  # the initial guess of the sites at rest, (M,3), millimetres
     standoff: bool  # estimate the markers' distance from the skin
     scale: bool = True

@@ -4,8 +4,6 @@ An eyeball of one shell has sclera, iris and pupil. Of two, as in ICT-FaceKit, t
 under a clear cornea, and the inner one, which the hole shows, the iris round the pupil.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -38,7 +36,7 @@ def eye_centre(mesh: Mesh, triangles: Tensor) -> Tensor:
     return _sphere(_shells(mesh, triangles)[0].unique(), mesh)[0]
 
 
-def painted_eye(mesh: Mesh, triangles: Tensor) -> list[tuple[Tensor, PartMaterial, Paint | None]]:
+def painted_eye(mesh: Mesh, triangles: Tensor) -> "list[tuple[Tensor, PartMaterial, Paint | None]]":
     """The layers of an eyeball that looks along z, or where its pupil is: rows of faces, material, paint of each."""
     outer, inner = _shells(mesh, triangles)
     centre, radius = _sphere(outer.unique(), mesh)

@@ -1,7 +1,5 @@
 """Landmarks, irises and blendshapes of a face by a Face Landmarker bundle."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -56,7 +54,7 @@ class FaceSquare:
         """x, y, width, height of the square before it was turned, (4,)."""
         return torch.cat([self.middle - self.side / 2, self.middle.new_full((2,), self.side)])
 
-    def fits(self, other: FaceSquare) -> bool:
+    def fits(self, other: "FaceSquare") -> bool:
         """Whether a face looks much the same in the other square."""
         turn = math.remainder(self.tilt - other.tilt, 2 * math.pi)
         apart = float((self.middle - other.middle).norm()) / self.side

@@ -1,7 +1,5 @@
 """Lids, irises and what else is read off the eyes of a face whose landmarks are known."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -35,7 +33,7 @@ class EyedFinder:
     """Finds landmarks, then looks at the eyes among them."""
 
     finder: LandmarkFinder  # finds all 68
-    eyes: EyeFinder  # refines those of the lids, and reads irises
+    eyes: "EyeFinder"  # refines those of the lids, and reads irises
 
     @property
     def name(self) -> str:

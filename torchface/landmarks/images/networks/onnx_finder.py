@@ -1,7 +1,5 @@
 """Landmarks by anybody's ONNX graph of the agreed inputs and outputs."""
 
-from __future__ import annotations
-
 import json
 import math
 import os
@@ -98,7 +96,7 @@ def _finder(declared: dict[str, Any], network: CropNetwork, path: Path) -> CropF
 class _OwnGraph:
     """A graph as a function of crops."""
 
-    session: onnxruntime.InferenceSession
+    session: "onnxruntime.InferenceSession"
 
     def __call__(self, crops: Tensor) -> NetworkLandmarks:
         names = [one.name for one in self.session.get_outputs()]

@@ -1,7 +1,5 @@
 """State of a face that a tracker follows: its place, the finder's box beside it, its look, and counts."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import torch
@@ -43,7 +41,7 @@ class FollowedFace:
         return torch.cat([*(part.double() for part in known), torch.tensor(counts, dtype=torch.float64)])
 
     @classmethod
-    def unpack(cls, packed: Tensor) -> FollowedFace:
+    def unpack(cls, packed: Tensor) -> "FollowedFace":
         """What :meth:`pack` packed."""
         if packed.shape != (MEMORY,):
             raise ShapeError(f"resume: found a memory of {tuple(packed.shape)}, expected ({MEMORY},)")

@@ -1,7 +1,5 @@
 """Landmarks in an image by a cascade of regression trees that compare pixels near the current landmarks."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
@@ -100,11 +98,11 @@ class LandmarkTrees(nn.Module):
         images: Sequence[Tensor],
         boxes: Tensor,
         landmarks: Tensor,
-        settings: TreeSettings | None = None,
+        settings: "TreeSettings | None" = None,
         progress: Progress | None = None,
         mirror: Sequence[int] | None = None,
         checkpoint: Path | None = None,
-    ) -> LandmarkTrees:
+    ) -> "LandmarkTrees":
         """Learns landmarks from annotated images.
 
         Every image is started from several boxes near its own, half of them mirrored; a tree learns a share of what the
