@@ -45,7 +45,7 @@ def file_digest(path: str | Path) -> str:
     return digest.hexdigest()
 
 
-def _add(digest: hashlib._Hash, value: object) -> None:
+def _add(digest: "hashlib._Hash", value: object) -> None:
     """Adds a value with its kind and its length, so that no two different ones read the same."""
     if value is None or isinstance(value, str | bool | int | float):
         _add_text(digest, f"{type(value).__name__} {value!r}")
@@ -76,7 +76,7 @@ def _add(digest: hashlib._Hash, value: object) -> None:
         raise TypeError(f"found a {type(value).__qualname__}, expected what has a content of numbers and texts")
 
 
-def _add_path(digest: hashlib._Hash, path: Path) -> None:
+def _add_path(digest: "hashlib._Hash", path: Path) -> None:
     if path.is_dir():
         inside = sorted(file for file in path.rglob("*") if file.is_file())
         names = [file.relative_to(path).as_posix() for file in inside]
@@ -92,6 +92,6 @@ def _add_path(digest: hashlib._Hash, path: Path) -> None:
         _add_text(digest, "nothing that can be read")
 
 
-def _add_text(digest: hashlib._Hash, text: str) -> None:
+def _add_text(digest: "hashlib._Hash", text: str) -> None:
     data = text.encode("utf-8", "surrogatepass")
     digest.update(len(data).to_bytes(8, "little") + data)

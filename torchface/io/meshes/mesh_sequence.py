@@ -254,7 +254,7 @@ class MeshSequenceWriter:
         return done
 
 
-def _hashed(file: BinaryIO, size: int) -> hashlib._Hash:
+def _hashed(file: BinaryIO, size: int) -> "hashlib._Hash":
     """The hash of the next bytes of a file, of fewer where it ends."""
     digest = hashlib.sha256()
     while size > 0 and (block := file.read(min(size, _BLOCK))):
