@@ -1,6 +1,7 @@
 """Faces are found on surfaces in any pose and unit, where they are; what is no face is refused with pictures."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -84,9 +85,10 @@ def test_a_doubtful_face_is_taken_only_where_all_directions_show_no_better_one(
     found = {
         key: FaceOnSurface(torch.zeros(68, 3), pose, *values, (), torch.zeros(0, 3)) for key, values in read.items()
     }
-    rounds = iter([[(0, None), (1, None)], [(2, None), (0, None)] if clear else [(0, None)]])
+    seen = [(SimpleNamespace(number=number, score=0.8), None) for number in read]
+    rounds = iter([seen[:2], [seen[2], seen[0]] if clear else seen[:1]])
     monkeypatch.setattr(FaceSearch, "_candidates", lambda *_: next(rounds))
-    monkeypatch.setattr(FaceSearch, "_from_near", lambda self, surface, group, *_: found[group])
+    monkeypatch.setattr(FaceSearch, "_from_near", lambda self, surface, group, *_: found[group.number])
     head = neutral_head(texture=False)
     assert search.find(clay(head.vertices, head.faces)) is found[chosen]
 
@@ -101,9 +103,38 @@ def test_a_doubtful_face_of_many_colours_is_looked_for_in_clay_too(
     found = {
         key: FaceOnSurface(torch.zeros(68, 3), pose, *values, (), torch.zeros(0, 3)) for key, values in read.items()
     }
-    monkeypatch.setattr(FaceSearch, "_candidates", lambda self, surface, framed, sure, plain, *_: [(plain, None)])
-    monkeypatch.setattr(FaceSearch, "_from_near", lambda self, surface, group, *_: found[group])
+    monkeypatch.setattr(
+        FaceSearch,
+        "_candidates",
+        lambda self, surface, framed, sure, plain, *_: [(SimpleNamespace(plain=plain, score=0.8), None)],
+    )
+    monkeypatch.setattr(FaceSearch, "_from_near", lambda self, surface, group, *_: found[group.plain])
     head = neutral_head(texture=False)
     plain = clay(head.vertices, head.faces)
     assert search.find(plain) is found[False]
     assert search.find(replace(plain, materials=2 * plain.materials)) is found[True]
+
+
+@pytest.mark.parametrize(("likeness", "taken"), [(0.81, False), (0.0, True)])
+def test_a_doubtful_face_is_not_taken_beside_a_surer_one_whose_form_is_no_heads(
+    likeness: float, taken: bool, search: FaceSearch, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A head with a long muzzle: its face was refused, and the side behind an ear was taken for one."""
+    one = torch.ones(1, dtype=torch.float64)
+    pose = Similarity(one, torch.eye(3, dtype=torch.float64)[None], torch.zeros(1, 3, dtype=torch.float64))
+    behind = FaceOnSurface(torch.zeros(68, 3), pose, 0.98, 0.195, (), torch.zeros(0, 3))
+
+    def from_near(self: FaceSearch, surface: TexturedSurface, group: SimpleNamespace, *_: object) -> FaceOnSurface:
+        if group.score > 0.8:
+            raise NoFaceOnSurfaceError("its points lie elsewhere", (), likeness)
+        return behind
+
+    groups = [(SimpleNamespace(score=score), None) for score in (0.81, 0.71)]
+    monkeypatch.setattr(FaceSearch, "_candidates", lambda *_: groups)
+    monkeypatch.setattr(FaceSearch, "_from_near", from_near)
+    head = neutral_head(texture=False)
+    if taken:
+        assert search.find(clay(head.vertices, head.faces)) is behind
+    else:
+        with pytest.raises(NoFaceOnSurfaceError, match="elsewhere"):
+            search.find(clay(head.vertices, head.faces))

@@ -155,3 +155,20 @@ def test_lips_in_one_piece_are_warned_of(carried: CarriedShapes) -> None:
     assert "lips are one piece" in note
     (note,) = replace(carried, open_lids=(0.4, 0.0)).notes()
     assert note == "warning: right eye: its blink leaves 40% of it open"
+
+
+def test_folds_behind_the_upper_lip_that_are_drawn_out_are_no_lips_in_one_piece(carried: CarriedShapes) -> None:
+    """A head with a muzzle: some of its upper lip's inside went with the jaw, while the mouth opened."""
+    mesh, jaw = carried.rig.neutral, carried.rig.names.index("jawOpen")
+    lips = carried.template.vertices[carried.template.neutral.landmarks[60:68]].double().mean(0)
+    x = torch.tensor([-2.0, -1.0, 0.0, 1.0, 2.0, 3.0]).double()
+    upper = torch.stack([x, torch.full_like(x, 6.0), torch.full_like(x, -2.0)], 1)
+    own = torch.cat([upper, upper - torch.tensor([0.0, 1.5, 2.0])])
+    vertices = carried.registration.pose.apply(lips + own)[0].to(mesh.vertices)
+    deltas = torch.zeros(len(SHAPES), len(own), 3)
+    deltas[jaw, len(upper) :] = 0.6 * carried.rig.deltas[jaw, mesh.landmarks[8]]
+    row = len(mesh.vertices) + torch.arange(len(x) - 1)
+    fold = torch.stack([row, row + 1, row + len(x)], 1)
+    joined = Mesh(torch.cat([mesh.vertices, vertices]), torch.cat([mesh.faces, fold]))
+    rig = BlendshapeRig(joined, torch.cat([carried.rig.deltas, deltas.to(carried.rig.deltas)], 1), carried.rig.names)
+    assert not any("one piece" in note for note in replace(carried, rig=rig).notes())

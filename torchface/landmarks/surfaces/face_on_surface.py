@@ -76,11 +76,16 @@ class FaceOnSurface:
 
 
 class NoFaceOnSurfaceError(AlignmentError):
-    """A surface shows no face; ``views`` are pictures of what was seen."""
+    """A surface shows no face.
 
-    def __init__(self, message: str, views: Sequence[Tensor]) -> None:
+    Args:
+        views: pictures of what was seen.
+        likeness: of a face that pictures show though its form is none, the score from afar; else 0.
+    """
+
+    def __init__(self, message: str, views: Sequence[Tensor], likeness: float = 0.0) -> None:
         super().__init__(message)
-        self.views = tuple(views)
+        self.views, self.likeness = tuple(views), likeness
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,7 +109,8 @@ class FaceSearch:
         """
         progress = progress or silent
         pictures: list[Tensor] = []
-        refused, doubtful = None, []
+        refused: NoFaceOnSurfaceError | None = None
+        doubtful: list[tuple[FaceOnSurface, float]] = []
         # What is taken for a face for sure may be none from near, or hardly one; then all directions are looked at.
         painted = any(one.texture is not None for one in surface.materials) or len(surface.materials) > 1
         for sure, plain in product((_SURE, torch.inf), (False, True) if painted else (False,)):
@@ -112,15 +118,18 @@ class FaceSearch:
                 try:
                     found = self._from_near(surface, group, others, progress)
                 except NoFaceOnSurfaceError as error:
-                    refused = refused or error
+                    refused = error if refused is None or error.likeness > refused.likeness else refused
                 else:
                     if found.doubt < _DOUBT:
                         return found
-                    doubtful.append(found)
+                    doubtful.append((found, group.score))
             if refused is None and not doubtful and plain == painted:
                 break
         if doubtful:
-            return min(doubtful, key=lambda one: one.doubt)
+            best, score = min(doubtful, key=lambda one: one[0].doubt)
+            # Beside a surer face of another form, such as one with a long muzzle, what is doubtful is a false one.
+            if refused is None or refused.likeness < score:
+                return best
         raise refused or NoFaceOnSurfaceError(
             f"found no face in {len(pictures)} pictures from around, expected a head", pictures
         )
@@ -227,6 +236,7 @@ class FaceSearch:
                 f"{_PRESENCE:g}), its points {misfit:.2f} distances of the eyes from a head's (expected at most "
                 f"{_MISFIT:g})",
                 views,
+                first.score if presence >= _PRESENCE else 0.0,
             )
         return result
 

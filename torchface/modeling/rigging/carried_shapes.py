@@ -5,14 +5,15 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torchface.geometry.meshes.operators import edges
 from torchface.modeling.rigging.joined_vertices import joined_vertices
 from torchface.registration import Registration
+from torchface.rendering.raycast import RayCaster
 from torchface.rig import BlendshapeRig
 from torchface.shape_names import mapping
 
 _OPEN = 0.1  # of an eye: what a blink that shuts it leaves at most
-_JAW, _LIP, _DRAWN, _LEAST_DRAWN = "jawOpen", 10.0, 4.0, 3  # millimetres round the lips' line, times their length
+_JAW, _LIP, _BEFORE, _COLUMNS = "jawOpen", 10.0, 100.0, 9  # millimetres behind and before the lips; rays between them
+_SEEN_DRAWN, _LEAST_DRAWN = 3.0, 3  # times an edge's length, and edges
 _MOUTH, _STRETCHED = (75.0, 25.0), 2.0  # millimetres behind the lips and over them; times an edge's length
 
 
@@ -84,14 +85,21 @@ class CarriedShapes:
         return marks[60:68], rest, rest + back.apply_vectors(self.rig.deltas[jaw][:1].detach().cpu().double())[0]
 
     def _lips_in_one_piece(self) -> bool:
-        """Whether opening the jaw draws edges out from one lip to the other."""
+        """Whether what is seen between the lips of an open mouth is skin that was drawn out."""
         if (opened := self._opened()) is None:
             return False
         lips, rest, posed = opened
-        beside = (rest - lips.mean(0)).abs() < torch.tensor([float(lips[4, 0] - lips[0, 0]) / 3, _LIP, _LIP])
-        ends = edges(self.rig.neutral.faces.cpu())
-        ends = ends[beside.all(1)[ends].all(1)]
-        return int(_drawn(ends, rest, posed, _DRAWN).sum()) >= _LEAST_DRAWN
+        apart = self.template.deltas[mapping(self.template.names, [_JAW])[0] > 0.5][0].detach().cpu().double()
+        after = lips + apart[self.template.neutral.landmarks.cpu()[60:68]]  # type: ignore[union-attr]
+        share = torch.linspace(0, 1, _COLUMNS, dtype=torch.float64)[:, None]
+        upper, lower = (after[a] + share * (after[b] - after[a]) for a, b in ((1, 3), (7, 5)))
+        ways = torch.tensor([[0.0, 0.0, -1.0]], dtype=torch.float64).expand(_COLUMNS, 3)
+        faces = self.rig.neutral.faces.cpu()
+        hits = RayCaster(posed, faces).cast((upper + lower) / 2 - _BEFORE * ways, ways)
+        near = hits.distance < _BEFORE + _LIP
+        ends = faces[hits.triangle[near]]
+        drawn = [_drawn(ends[:, [a, b]], rest, posed, _SEEN_DRAWN, 0.0) for a, b in ((0, 1), (1, 2), (0, 2))]
+        return int(torch.stack(drawn).any(0).sum()) > _COLUMNS / 2
 
     def _edges_between_jaws(self) -> int:
         """How many edges behind the lips opening the jaw draws out beside those that more than two triangles share.
@@ -112,14 +120,14 @@ class CarriedShapes:
         after = torch.zeros_like(joined.vertices)
         after[joined.of] = posed
         shared = torch.isin(ends, ends[count > 2]).any(1)
-        found = int((_drawn(ends, joined.vertices, after, _STRETCHED) & shared).sum())
+        found = int((_drawn(ends, joined.vertices, after, _STRETCHED, _LIP) & shared).sum())
         return found if found >= _LEAST_DRAWN else 0
 
 
-def _drawn(ends: Tensor, rest: Tensor, posed: Tensor, times: float) -> Tensor:
-    """Which edges (E,) a pose makes longer by so many times and by more than a lip."""
+def _drawn(ends: Tensor, rest: Tensor, posed: Tensor, times: float, least: float) -> Tensor:
+    """Which edges (E,) a pose makes longer by so many times and by so many millimetres."""
     before, after = ((one[ends[:, 0]] - one[ends[:, 1]]).norm(dim=-1) for one in (rest, posed))
-    return (after > times * before) & (after - before > _LIP)
+    return (after > times * before) & (after - before > least)
 
 
 def marks_of(rig: BlendshapeRig) -> Tensor:
