@@ -1,6 +1,6 @@
 """``torchface train face_boxes --out models/NAME``: the network that finds faces in whole pictures, at every angle.
 
-Its scenes are put together from rendered people, which are rendered once and kept in ``--pictures``.
+Its scenes are put together from rendered people, which are rendered once and kept in ``--folder``.
 """
 
 import math

@@ -1,5 +1,6 @@
 """What every recipe has of the runner: settings files, logs, devices, runs that go on where they were killed."""
 
+import re
 import shlex
 import shutil
 import sys
@@ -181,6 +182,14 @@ def test_what_the_library_calls_a_setting_is_called_by_its_flag(
     with pytest.raises(SystemExit):
         Recipe(Settings, recipe(refuse), None).main(["--data", "here", "--out", str(tmp_path / "out")])
     assert "--slope: found 3.0, expected less" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("name", RECIPES)
+def test_what_a_recipe_says_of_itself_names_its_own_flags(name: str) -> None:
+    module = import_module(f"train.{name}")
+    own = {one.name.replace("_", "-") for one in fields(module.RECIPE.settings)}
+    said = f"{module.__doc__} {module.RECIPE.settings.__doc__}"
+    assert {flag.removeprefix("no-") for flag in re.findall(r"--([a-z-]+)", said)} <= own
 
 
 def _numbers(settings: Any, above: str = "") -> Iterator[tuple[str, float]]:
