@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import pytest
 import torch
+import trimesh
 from torch import Tensor
 
 from planted.light_stage import LightStageSettings, lit_image, turning_cameras
@@ -19,7 +20,7 @@ from torchface.mesh import Mesh
 from torchface.rendering.pixel_coverage import footprint
 from torchface.rendering.point_light import PointLight
 from torchface.rendering.raycast import RayCaster
-from torchface.rendering.texture_overlay import FacePaint, _soft_shadow, overlay, relight, skin_faces
+from torchface.rendering.texture_overlay import FacePaint, _light_on, _soft_shadow, overlay, relight, skin_faces
 from torchface.rig import BlendshapeRig
 from torchface.synthetic import performer
 
@@ -225,6 +226,30 @@ def test_a_shadow_ends_softly() -> None:
     assert float(seen[flat & (x > 95)].min()) > 0.95
     fading = x[flat & (seen > 0.1) & (seen < 0.9)]
     assert 25 < float(fading.max() - fading.min()) < 75
+
+
+def test_light_ends_on_a_ball_as_that_of_a_disc() -> None:
+    """The mean of many sources on the disc, and no darker edge where its middle sets."""
+    ball = trimesh.creation.icosphere(5, 80.0)
+    mesh = Mesh(torch.from_numpy(ball.vertices).float(), torch.from_numpy(ball.faces))
+    K = torch.tensor([[500.0, 0, 99.5], [0, 500.0, 99.5], [0, 0, 1]])
+    camera = Camera(K, torch.diag(torch.tensor([1.0, -1.0, -1.0])), torch.tensor([0.0, 0, 500]), 200, 200)
+    way = torch.tensor([1.0, 0.0, -0.3])
+    light = PointLight.directional(torch.zeros(3), torch.ones(3), way)
+    covered = footprint(mesh.vertices, mesh.faces, torch.ones(len(mesh.faces), dtype=torch.bool), camera)
+    found = _light_on(covered, light)[:, 0]
+    middle = torch.nn.functional.normalize(way.double(), dim=0)
+    first = torch.linalg.cross(middle, torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64))
+    across = torch.stack([first / first.norm(), torch.linalg.cross(middle, first / first.norm())])
+    count = 400
+    turn, radius = torch.arange(count) * math.pi * (3 - math.sqrt(5)), (torch.arange(count) + 0.5).div(count).sqrt()
+    disc = math.tan(math.radians(20)) * torch.stack([radius * turn.cos(), radius * turn.sin()], dim=1).double()
+    sources = torch.nn.functional.normalize(middle + disc @ across, dim=1)
+    true = (covered.normals.double() @ sources.T).clamp(min=0).mean(1)
+    inner = covered.normals[:, 2] < -0.4  # the outline is softened
+    assert float((found - true).abs()[inner].max()) < 0.04
+    dusk = inner & ((covered.normals.double() @ middle).abs() < 0.2)
+    assert float((found - true).abs()[dusk].mean()) < 0.01
 
 
 def test_light_reaches_beyond_the_mesh_where_asked(rig: BlendshapeRig, cameras: tuple[Camera, ...]) -> None:

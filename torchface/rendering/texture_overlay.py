@@ -14,7 +14,7 @@ from torchface.mesh import Mesh
 from torchface.rendering.environment_light import EnvironmentLight
 from torchface.rendering.gaussian_blur import gaussian_blur
 from torchface.rendering.pixel_coverage import Footprint, footprint
-from torchface.rendering.point_light import PointLight, irradiance, lit_by
+from torchface.rendering.point_light import PointLight, lit_by
 
 _NOT_SKIN = (
     "eyeball", "eye_socket", "eye_blend", "eye_occlusion", "eyelash", "lacrimal", "mouth_interior", "mouth_socket",
@@ -25,6 +25,7 @@ _FLOOR = 1e-3  # linear; light that lenses scatter, so that black has a quotient
 _BESIDE = 0.025  # of the root of the pixels that a head covers, standard deviation of a blur
 _FAINT = 0.05  # of a blurred cover, where light beyond the head ends
 _SOURCE = 20.0  # degrees, from the middle to the rim of a light source such as a window
+_WIDTH = 0.87 * math.sin(math.radians(_SOURCE))  # of a bar of light that falls off as the disc does, half of it
 _PLACES = 4  # by as many of them on the source's disc, each seen from one pixel of a square
 _RIM = 0.75  # cosine between the normals of a point and of those beside it, on the rims of lids and lips
 _MAX_SIDE = 8192
@@ -180,7 +181,8 @@ def relight(
     on_skin, most, least = (shaded / (_light_on(covered, light, seen) + _FLOOR) for seen in lights)
     # Where the old shadow ends, a pixel's lag between mesh and face would draw a line: the skin beside it goes there,
     # as far as a shadow can tell.
-    clear = (1 - 4 * lit * (1 - lit)).clamp(min=0) ** 2
+    seen_of = _unhidden(covered, light, lit).float()
+    clear = (1 - 4 * seen_of * (1 - seen_of)).clamp(min=0) ** 2
     reflected = torch.lerp(covered.softened(on_skin, clear + 1e-3, sigma), on_skin, clear[:, None])
     new = (reflected.clamp(least, most) * (_light_on(covered, new_light) + _FLOOR) - _FLOOR).clamp(min=0)
     gain = ((new + _FLOOR) / (old + _FLOOR)).clamp(max=_MAX_GAIN)
@@ -235,10 +237,35 @@ def _light_on(covered: Footprint, light: PointLight | EnvironmentLight, lit: Ten
         found = covered.softened(light.irradiance(covered.normals).float(), sigma=sigma)  # it knows no shadows
     else:
         lit = _soft_shadow(covered, light) if lit is None else lit
-        found = irradiance(covered.points, covered.normals, light, lit.double()).float()
+        falling = _falling(covered, light, lit.double())[:, None]
+        found = (light.ambient.double() + light.intensity.double() * falling).float()
     mean = torch.nn.functional.normalize(covered.softened(covered.normals, sigma=sigma), dim=1)
     smooth = (((mean * covered.normals.float()).sum(1) - _RIM) / (1 - _RIM)).clamp(1e-3, 0.5) * 2
     return torch.lerp(covered.softened(found, smooth, sigma), found, smooth[:, None])
+
+
+def _over_horizon(covered: Footprint, light: PointLight) -> tuple[Tensor, Tensor, Tensor]:
+    """Cosines to the middle of a source that is a disc, half of its width in cosines, its share over the horizon."""
+    cosine = (covered.normals * light.toward(covered.points)).sum(-1)
+    half = (_WIDTH * (1 - cosine.square()).clamp(min=1e-6).sqrt()).clamp(min=1e-3)
+    return cosine, half, ((cosine + half) / (2 * half)).clamp(0, 1)
+
+
+def _unhidden(covered: Footprint, light: PointLight, lit: Tensor) -> Tensor:
+    """The share of what is over the horizon that nothing hides, (S,), of the share ``lit`` of the whole source."""
+    above = _over_horizon(covered, light)[2]
+    return torch.where(above < 0.02, torch.ones_like(above), lit / above.clamp(min=0.02)).clamp(max=1)
+
+
+def _falling(covered: Footprint, light: PointLight, lit: Tensor) -> Tensor:
+    r"""What of a source that is a disc falls on samples, (S,), of which they see a share ``lit``.
+
+    .. math:: \frac{1}{2w} \int_{-w}^{w} \max(0, N \cdot L + t)\, dt
+
+    Where the middle of the disc sets, half of it still shines, unless something else hides it.
+    """
+    cosine, half, above = _over_horizon(covered, light)
+    return torch.where(cosine < half, above.square() * half, cosine) * _unhidden(covered, light, lit)
 
 
 def _coarseness(covered: Footprint, paint: FacePaint) -> float:
