@@ -7,12 +7,14 @@ import torch
 from torch import Tensor
 
 from tests.planted.planted_parts import planted_parts
+from torchface.color_space import to_linear, to_srgb
 from torchface.geometry.cameras.pinhole import Camera, look_at
 from torchface.geometry.meshes.operators import vertex_normals
+from torchface.geometry.meshes.vertex_graph import VertexGraph
 from torchface.mesh import Mesh
 from torchface.modeling.photographs.fit_settings import FitSettings
 from torchface.modeling.photographs.image_texture import part_vertices, photographed_skin
-from torchface.modeling.photographs.skin_light import skin_light, unlit
+from torchface.modeling.photographs.skin_light import exposed, light_hue, patch_offset, skin_light, unlit
 from torchface.modeling.photographs.skin_mask import FacePlaces
 from torchface.rendering.camera_visibility import PosedSurface
 from torchface.rendering.clay_shading import Lighting, render
@@ -103,3 +105,54 @@ def test_a_photographs_brows_are_the_only_ones(head: Mesh, camera: Camera) -> No
     found = photographed_skin([template], None, [picture], [camera], settings).colors
     assert found is not None
     assert float((found[places.brow & ~fringe] - SKIN).norm(dim=1).mean()) < 0.1
+
+
+def test_a_hard_shadow_on_the_face_is_taken_away_and_a_mole_is_not(head: Mesh, camera: Camera) -> None:
+    places = FacePlaces.of(head)
+    assert head.colors is not None
+    shade = torch.where(places.place[:, :1] > 0.1, torch.tensor([0.75, 0.6, 0.4]), torch.tensor([1.0, 1.0, 1.0]))
+    plain = render(head, camera, lighting=EVEN, samples=1)
+    cheeks = places.cheeks & (PosedSurface.each(head, 1)[0].shown_in(plain, camera).cosine > 0.5)
+    aside = (places.place - places.place.new_tensor([-0.35, -0.45, 0.0]))[:, :2].norm(dim=1)
+    mole = int(torch.where(cheeks, aside, torch.inf).argmin())
+    spots = head.colors.clone()
+    spots[mole] *= 0.5
+    shown = replace(head, colors=spots * shade)
+    picture = render(shown, camera, lighting=EVEN, samples=1)
+    parts = planted_parts(picture, {"background": torch.zeros(3)}, 0.05)
+    found = photographed_skin([head], None, [picture], [camera], FitSettings(texture_size=128, parts=[parts])).colors
+    assert found is not None
+    spread = (found[cheeks].log().std(0) / (spots * shade)[cheeks].log().std(0)).max()
+    assert float(spread) < 0.5
+    assert float(found[mole].mean() / found[cheeks].median(0).values.mean()) < 0.85
+
+
+def test_even_skin_stays_as_it_is(head: Mesh) -> None:
+    graph = VertexGraph(head.faces, len(head.vertices))
+    cheeks = FacePlaces.of(head).cheeks.double()
+    assert head.colors is not None
+    blush = head.colors * (1 + 0.04 * torch.sin(head.vertices[:, :1] / 20))
+    assert float(patch_offset(blush, cheeks, None, graph)[cheeks > 0].abs().max()) < 0.03
+    darker = 0.3 * head.colors  # one complexion may be darker than another all over
+    assert float(patch_offset(darker, cheeks, head.colors, graph)[cheeks > 0].abs().max()) < 1e-3
+
+
+def test_hue_of_a_coloured_light_beyond_peoples_skins_is_found(head: Mesh) -> None:
+    cheeks = FacePlaces.of(head).cheeks.double()
+    assert head.colors is not None
+    white = torch.ones(3, dtype=torch.float64)
+    assert torch.equal(light_hue(head.colors * torch.tensor([1.05, 1.0, 0.95]), cheeks, head.colors), white)
+    assert torch.equal(light_hue(head.colors * 0.4, cheeks, head.colors), white)
+    hue = light_hue(head.colors * torch.tensor([1.2, 1.0, 0.5]), cheeks, head.colors)
+    assert hue[0] > 1
+    assert hue[2] < 0.75
+
+
+@pytest.mark.parametrize("exposure", [0.45, 0.6, 1.0])
+def test_an_under_exposed_photograph_is_developed(head: Mesh, camera: Camera, exposure: float) -> None:
+    picture = render(head, camera, lighting=EVEN, samples=1).clamp(max=0.96)
+    dark = to_srgb(exposure * to_linear(picture))
+    parts = planted_parts(dark, {"background": dark[:, 0, 0]}, 0.02)
+    bright = exposed(dark, parts)
+    error = (to_linear(bright) / to_linear(picture).clamp(min=1e-3)).flatten().median()
+    assert float(error) == pytest.approx(1.0, abs=0.05)

@@ -199,5 +199,8 @@ def test_light_from_one_side_is_remarked_on(right: tuple[float, ...], words: str
     shares = torch.zeros(len(PARTS), 100, 100)
     shares[PARTS.index("skin")] = 1.0
     parts = FaceParts(shares, torch.tensor([[0.5, 0.0, 0.0], [0.0, 0.5, 0.0]], dtype=torch.float64))
+    picture[:, :10] = 0.9  # something white
     lines = light_lines(Path("a.png"), to_srgb(picture), parts, points)
     assert [words in line for line in lines] == [True] if words else lines == []
+    dim = light_lines(Path("a.png"), to_srgb(0.3 * picture), parts, points)
+    assert next(line for line in dim if "under-exposed" in line).startswith("note: a.png")

@@ -21,7 +21,7 @@ _EDGE, _FRINGE = 0.08, 0.07
 _ABOVE_BROWS, _SQUARE, _HAIR = 0.06, 0.3, 0.5
 _LEAST, _SHARE = 20, 0.3
 _DARKEST, _BLACK = 0.005, 0.07  # the share of a head's pixels that is black, and its usual value in photographs
-_BEYOND = 0.08  # share of hair in a picture above the brows
+_BEYOND, _MIDDLE = 0.2, 0.35  # share of hair in a picture above the brows, there about the face's middle
 _COLUMNS, _COLUMN, _FEW = 17, 0.05, 6  # across the forehead, half the width of each, vertices
 _STRANDS, _STRAND = 150.0, 0.10
 
@@ -110,9 +110,11 @@ def hair_beyond(
     for image, shown, points in zip(images, parts, marks, strict=True):
         size, transform = shown.shares.shape[-1], shown.transform
         crop = cut_crop((255 * image[:3].clamp(0, 1)).byte(), transform, size).float() / 255
-        top = int((points[17:27].double() @ transform[:, :2].T + transform[:, 2])[:, 1].amin().clamp(0, size))
+        at = points.double() @ transform[:, :2].T + transform[:, 2]
+        top = int(at[17:27, 1].amin().clamp(0, size))
         hair = shown.of("hair")[:top] > _HAIR
-        if hair.numel() and float(hair.double().mean()) > _BEYOND:
+        aside = (torch.arange(size) - at[36:48, 0].mean()).abs() / (at[45] - at[36]).norm()
+        if hair.numel() and float(hair[:, aside < _MIDDLE].double().mean()) > _BEYOND:
             colors.append(crop[:, :top][:, hair])
     if not colors:
         return None

@@ -16,7 +16,7 @@ from torchface.modeling.photographs.eye_color import IRIS_WIDTH, iris_color
 from torchface.modeling.photographs.fit_settings import FitSettings
 from torchface.modeling.photographs.hair_cap import HairCap, hair_beyond, hair_cap, without_veil
 from torchface.modeling.photographs.landmark_view import LANDMARKS
-from torchface.modeling.photographs.skin_light import skin_light, unlit
+from torchface.modeling.photographs.skin_light import exposed, light_hue, patch_offset, skin_light, unlit
 from torchface.modeling.photographs.skin_mask import FacePlaces, ShownParts
 from torchface.modeling.photographs.texture_fit import ColorFit, fit_colors
 from torchface.modeling.photographs.texture_projection import PhotoTexture, photo_texture
@@ -78,6 +78,8 @@ def photographed_skin(
     size, parts, irises, paint_hair = (
         settings.texture_size, settings.parts, settings.irises, settings.paint_hair
     )  # fmt: skip
+    if parts is not None:
+        images = [exposed(image, shown) for image, shown in zip(images, parts, strict=True)]
     fit = None if color is None else fit_colors(color, posed, images, cameras)
     mesh = posed[0]
     base = _own_colors(mesh) if fit is None else fit.colors
@@ -88,6 +90,7 @@ def photographed_skin(
     others, count = part_vertices(mesh), len(images)
     confidence: Tensor | None = None
     lights: list[EnvironmentLight | None] | None = None
+    patches: list[Tensor] | None = None
     cap: HairCap | None = None
     if _has_landmarks(mesh):
         surfaces, places = PosedSurface.each(posed, count), [FacePlaces.of(one) for one in posed]
@@ -109,6 +112,19 @@ def photographed_skin(
             for at, surface, camera, light in zip(shown, surfaces, cameras, lights, strict=True)
         ]
         if parts is not None:
+            sure = [
+                one.bare * at.cosine.clamp(min=0) * ~(where.features | others)
+                for at, one, where in zip(shown, known, places, strict=True)
+            ]
+            hues = [light_hue(at.colors, bare, base) for at, bare in zip(shown, sure, strict=True)]
+            images = [
+                (image / hue[:, None, None]).clamp(0, 1).to(image) for image, hue in zip(images, hues, strict=True)
+            ]
+            shown = [
+                replace(at, colors=(at.colors / hue).clamp(0, 1).to(at.colors))
+                for at, hue in zip(shown, hues, strict=True)
+            ]
+            patches = [patch_offset(at.colors, bare, base, graph) for at, bare in zip(shown, sure, strict=True)]
             skin = [_like_skin(at, one, where, graph) for at, one, where in zip(shown, known, places, strict=True)]
             confidence = torch.stack([one.own for one in known]) * torch.stack(skin)
             if base is not None and float(confidence[:, places[0].brow].amax(0).mean()) > _BROWS:
@@ -127,7 +143,7 @@ def photographed_skin(
     own = base is None and bool(others.any()) and not bool(others.all())
     if own:
         confidence = torch.where(others, 0.0, torch.ones(count, len(others)) if confidence is None else confidence)
-    texture = photo_texture(posed, images, cameras, size, base, confidence, lights)
+    texture = photo_texture(posed, images, cameras, size, base, confidence, lights, patches)
     if cap is not None and paint_hair:
         texture = _capped(texture, cap, mesh, others)
     colors = texture.colors

@@ -1,10 +1,15 @@
-"""Light of a photograph, estimated on the skin and divided out of its colours."""
+"""Light of a photograph, its exposure first, estimated on the face and divided out of its colours."""
+
+import math
 
 import torch
 from torch import Tensor
 
 from torchface.color_space import to_linear, to_srgb
 from torchface.geometry.cameras.pinhole import Camera
+from torchface.geometry.meshes.vertex_graph import VertexGraph
+from torchface.landmarks.images.face_crop import cut_crop
+from torchface.landmarks.images.networks.part_finder import FaceParts
 from torchface.rendering.camera_visibility import Shown
 from torchface.rendering.environment_light import EnvironmentLight, harmonics
 
@@ -15,6 +20,47 @@ _ROUNDS = 8
 _HELD = (0.0, *(0.02,) * 3, *(0.10,) * 5)
 _HELD_TO_GREY = 0.3
 _FAINT, _BRIGHT, _TINT = 0.4, 2.2, 1.12  # beside the mean: what the estimate may divide by
+_PATCH = 4  # rounds over the mesh: what is smaller is the skin's own
+_OWN_TONE, _OWN_HUE = 0.12, 0.08  # logarithms of sRGB by which one person's skin differs over the face
+_PEOPLE_HUE = (0.15, 0.06, 0.15)  # of the channels, by which skins of people differ from the colour model
+_AROUND = 40  # rounds
+_SURE, _DARKEST = 0.5, 0.02
+
+
+# In linear light: what is brightest in a picture that is well exposed, what is bright of an eye's white, fair skin.
+_WHITE, _EYE_WHITE, _FAIR = 0.91, 0.46, 0.36
+_BRIGHTEST, _EYE = 0.99, 0.85  # quantiles
+_DARKER, _BRIGHTER = 0.8, 2.5  # how far a picture is developed
+_FINE = 0.6  # pixels of the parts' crop a pixel of the picture, above which an eye's white is mixed with lids
+_EYE_PIXELS = 20  # of the crop
+
+
+def exposure_gain(image: Tensor, parts: FaceParts) -> float:
+    """What a photograph's light is multiplied by to be well exposed; what is too dark shows nobody's complexion.
+
+    By the whites of the eyes where it is large enough to show them, else by what is brightest in the whole picture and
+    about the face, but not more than makes its skin fair.
+
+    Args:
+        image: sRGB, (3,H,W).
+        parts: what it shows.
+    """
+    image = image[:3]
+    crop = to_linear(cut_crop((255 * image.clamp(0, 1)).byte(), parts.transform, parts.shares.shape[-1]) / 255).double()
+    eyes, skin = (crop[:, parts.of(name) > _SURE].mean(0) for name in ("eyes", "skin"))
+    if len(eyes) >= _EYE_PIXELS and float(torch.linalg.det(parts.transform[:, :2].double())) ** 0.5 < _FINE:
+        gain = _EYE_WHITE / max(float(eyes.quantile(_EYE)), 0.01)
+    else:
+        whole, near = (one.double().amax(0).flatten() for one in (to_linear(image), crop))
+        brightest = [float(one.kthvalue(1 + int(_BRIGHTEST * (len(one) - 1))).values) for one in (whole, near)]
+        gain = math.prod(max(1.0, _WHITE / max(one, 0.01)) for one in brightest) ** 0.5
+        gain = min(gain, max(1.0, _FAIR / float(skin.median()))) if len(skin) else gain
+    return min(max(gain, _DARKER), _BRIGHTER)
+
+
+def exposed(image: Tensor, parts: FaceParts) -> Tensor:
+    """A photograph (3,H,W), sRGB, as a well exposed one; see :func:`exposure_gain`."""
+    return to_srgb((to_linear(image) * exposure_gain(image, parts)).clamp(0, 1))
 
 
 def skin_light(shown: Shown, normals: Tensor, camera: Camera, skin: Tensor) -> EnvironmentLight | None:
@@ -67,6 +113,54 @@ def unlit(colors: Tensor, normals: Tensor, camera: Camera, light: EnvironmentLig
     grey = shade.mean(-1, keepdim=True).clamp(_FAINT, _BRIGHT)
     tint = (shade / grey).clamp(1 / _TINT, _TINT)  # what is dark has hardly a hue to be divided by
     return to_srgb((to_linear(colors.double().clamp(0, 1)) / (grey * tint)).clamp(0, 1)).to(colors)
+
+
+def light_hue(colors: Tensor, skin: Tensor, tone: Tensor | None) -> Tensor:
+    """The hue of a coloured light, (3,) of mean 1 in sRGB: how far skin's hue lies beyond where people's skin lies.
+
+    Args:
+        colors: in even light, sRGB (V,3).
+        skin: how surely each vertex is seen to be skin, (V,) in [0,1].
+        tone: of a skin like it, (V,3); the light is white if absent.
+    """
+    sure = skin > _SURE
+    if tone is None or int(sure.sum()) < _LEAST:
+        return torch.ones(3, dtype=torch.float64)
+    apart = (_log(colors[sure]) - _log(tone[sure])).median(0).values
+    hue, limit = apart - apart.mean(), apart.new_tensor(_PEOPLE_HUE)
+    return (hue - torch.maximum(torch.minimum(hue, limit), -limit)).exp()
+
+
+def patch_offset(colors: Tensor, skin: Tensor, tone: Tensor | None, graph: VertexGraph) -> Tensor:
+    """What takes away shadows that the face throws on itself and highlights that ``skin_light`` leaves, (V,3).
+
+    One person's skin differs little over the face: colours that lie further from its tone than that are brought near
+    it, brightness and hue apart. What is no skin takes the offset of the skin around it.
+
+    Args:
+        colors: in even light, sRGB (V,3).
+        skin: how surely each vertex is seen to be skin, (V,) in [0,1].
+        tone: of a skin like it, (V,3); one for all vertices if absent.
+
+    Returns:
+        To be added to the colours, so that grain in dark places is not multiplied.
+    """
+    if int((skin > _SURE).sum()) < _LEAST:
+        return torch.zeros_like(colors, dtype=torch.float64)
+    broad = graph.smoothed(colors.double(), skin, _PATCH)
+    like = torch.zeros_like(broad) if tone is None else _log(graph.smoothed(tone.double(), skin, _PATCH))
+    apart = _log(broad) - like
+    own = apart[skin > _SURE].median(0).values
+    level = (apart - own).mean(1, keepdim=True)
+    hue = apart - own - level
+    wanted = (like + own + level.clamp(-_OWN_TONE, _OWN_TONE) + hue.clamp(-_OWN_HUE, _OWN_HUE)).exp()
+    seen = graph.smoothed(skin[:, None], torch.ones_like(skin), _PATCH).clamp(max=1)
+    offset = wanted - broad
+    return torch.lerp(graph.smoothed(offset, seen[:, 0], _AROUND), offset, seen)
+
+
+def _log(colors: Tensor) -> Tensor:
+    return colors.double().clamp(min=_DARKEST).log()
 
 
 def in_camera(normals: Tensor, camera: Camera) -> Tensor:

@@ -53,6 +53,7 @@ def photo_texture(
     base: Tensor | None = None,
     confidence: Tensor | None = None,
     lights: Sequence[EnvironmentLight | None] | None = None,
+    patches: Sequence[Tensor] | None = None,
 ) -> PhotoTexture:
     """Projects photographs onto a head.
 
@@ -71,6 +72,7 @@ def photo_texture(
         confidence: that each photograph shows the head at each vertex, (I,V) in [0,1], such as ``skin_shares`` gives;
             everywhere if absent.
         lights: of each photograph, which is divided out; see ``skin_light``. Colours stay as they are if absent.
+        patches: what is added to each photograph's colours at the vertices then, (V,3) each; see ``patch_offset``.
 
     Raises:
         ShapeError: not one camera an image, an image of another size than its camera's, or a base of another shape.
@@ -104,15 +106,16 @@ def photo_texture(
         surface.shown_in(image, camera) for surface, image, camera in zip(surfaces, images, cameras, strict=True)
     ]
     lights = [None] * len(images) if lights is None else lights
+    patches = [torch.zeros_like(vertices)] * len(images) if patches is None else patches
     at_vertices = [
         replace(
             shown,
-            colors=unlit(shown.colors, surface.normals, camera, light),
+            colors=unlit(shown.colors, surface.normals, camera, light) + patch,
             # Under a brow and at a nose's wing skin is seen at a slant and yet is none's edge.
             cosine=(shown.cosine > 0)
             * graph.smoothed(shown.cosine[:, None].double(), (shown.cosine > 0).double(), _BENDS)[:, 0],
         )
-        for shown, surface, camera, light in zip(at_vertices, surfaces, cameras, lights, strict=True)
+        for shown, surface, camera, light, patch in zip(at_vertices, surfaces, cameras, lights, patches, strict=True)
     ]
     outside = _outer_border(vertices, faces)
     confidences = (
@@ -137,15 +140,16 @@ def photo_texture(
     colors = torch.lerp(filled, blended, alpha[:, None])
     texels = rasterise_uvs(mesh.uvs.cpu(), mesh.uv_faces.cpu(), size, size)
     total, values = torch.zeros(2, 1, 1, dtype=torch.float64)
-    for i, (at, image, camera, light) in enumerate(
-        zip(surfaces, images, cameras, lights, strict=True)
+    for i, (at, image, camera, light, patch) in enumerate(
+        zip(surfaces, images, cameras, lights, patches, strict=True)
     ):  # a ray a texel
         points = texels.interpolate(at.vertices, faces)
         outward = torch.nn.functional.normalize(texels.interpolate(at.normals, faces), dim=-1)
         shown = shown_in(image.cpu(), camera, at.caster, points, outward)
         weight = texels.interpolate(weights[i, :, None], faces) * (shown.cosine[:, None] > 0)
         tone = texels.interpolate(offsets[i], faces)
-        values = values + weight * (unlit(shown.colors, outward, camera, light).double() * gains[i] + tone)
+        own = unlit(shown.colors, outward, camera, light).double() + texels.interpolate(patch.double(), faces)
+        values = values + weight * (own * gains[i] + tone)
         total = total + weight
     under = texels.interpolate(filled, faces)
     share = texels.interpolate(alpha[:, None], faces) * (total > 0)

@@ -1,8 +1,10 @@
 """A fitted head as a character: the template's teeth, tongue, lashes, hair and collar in its photographs' colours."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
+import cv2
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -19,7 +21,9 @@ from torchface.synthetic.head.skin_maps import Look
 # In distances between the eyes' outer corners: how far from the face's middle hair hangs beside the neck, and how far
 # below the mouth.
 _BESIDE, _BELOW = (0.55, 1.15), (0.15, 0.75)
-_LONG = 0.3  # share of hair there on one side
+_LONG = 0.25  # share of hair there on one side
+_FAR = 0.5  # width of a turned face's far side beside the near one's
+_HAIR, _TUFT = 0.5, 30  # share, and pixels of the crop
 _SIZE = 1024
 _CLOTH, _LEAST = 0.7, 150  # share and crop's pixels
 
@@ -74,7 +78,9 @@ def dressed_rig(
 
 
 def hangs_down(parts: Sequence[FaceParts], marks: Tensor) -> bool:
-    """Whether photographs show hair beside the neck.
+    """Whether photographs show hair beside the neck that grows on the head.
+
+    Of a face that is turned the near side counts: beside the other lies what stands behind the head.
 
     Args:
         parts: what each shows.
@@ -88,10 +94,27 @@ def hangs_down(parts: Sequence[FaceParts], marks: Tensor) -> bool:
         sides = torch.linspace(*_BESIDE, 9, dtype=torch.float64)
         below = torch.linspace(*_BELOW, 9, dtype=torch.float64)
         mouth = points[48:].nanmean(0)
-        for side in (-1, 1):
-            place = mouth + side * sides[:, None, None] * unit + below[:, None] * down
-            found.append(shown.at(place, "hair").nanmean().nan_to_num(0.0))
-    return float(torch.stack(found).view(-1, 2).amax(1).median()) > _LONG
+        grown = replace(shown, shares=shown.shares * _grown(shown, points))
+        left, right = (
+            grown.at(mouth + side * sides[:, None, None] * unit + below[:, None] * down, "hair").nanmean().nan_to_num(0)
+            for side in (-1, 1)
+        )
+        jaw = torch.stack([points[:3].nanmean(0), points[14:17].nanmean(0)])
+        widths = ((points[30] - jaw) @ across).abs().nan_to_num(0.0)
+        turned = [bool(widths[k] < _FAR * widths[1 - k]) for k in (0, 1)]
+        found.append(right if turned[0] else left if turned[1] else torch.maximum(left, right))
+    return float(torch.stack(found).median()) > _LONG
+
+
+def _grown(shown: FaceParts, points: Tensor) -> Tensor:
+    """Which pixels (S,S) of a crop belong to hair that is one with hair over the brows, landmarks (68,2)."""
+    hair = cv2.erode((shown.of("hair") > _HAIR).numpy().astype(np.uint8), np.ones((3, 3), np.uint8))
+    _, label = cv2.connectedComponents(hair, connectivity=4)
+    brows = points[17:27] @ shown.transform[:, :2].T + shown.transform[:, 2]
+    high = int(brows[:, 1].nan_to_num(0.0).amin().clamp(0, len(label)))
+    names, counts = np.unique(label[:high], return_counts=True)
+    on_head = [name for name, count in zip(names, counts, strict=True) if name and count > _TUFT]
+    return torch.from_numpy(cv2.dilate(np.isin(label, on_head).astype(np.uint8), np.ones((3, 3), np.uint8)))
 
 
 def _cloth(images: Sequence[Tensor], parts: Sequence[FaceParts]) -> Tensor | None:

@@ -222,7 +222,8 @@ def fit_photographs(
         fitting = with_readings(fitting, readings, found[0].places, rig)
     remarks = [line for one, image in zip(found, images, strict=False) for line in picture_lines(one, image, insist)]
     for photograph, image, shown, points in zip(photographs, images, parts, marks, strict=True):
-        remarks += [*cover_lines(photograph, shown, points), *light_lines(photograph, image, shown, points)]
+        remarks += cover_lines(photograph, shown, points)
+        remarks += [] if settings.everything else light_lines(photograph, image, shown, points)
     # The tracker has followed one face through a film.
     remarks += one_person_lines(photographs, marks, bare, insist or one_film)
     fit = fit_images(heads, rig, marks, sizes, images, settings.focal, fitting, progress)

@@ -12,6 +12,7 @@ from torchface.landmarks import NoFaceError
 from torchface.landmarks.images.networks.part_finder import FaceParts
 from torchface.modeling import ImageFit
 from torchface.modeling.photographs.image_texture import GREY
+from torchface.modeling.photographs.skin_light import exposure_gain
 from torchface.workflows.fit.fit_landmarks import PhotographLandmarks
 
 # Pixels between the outer corners of the eyes: a face 40 pixels wide has 20.
@@ -27,6 +28,7 @@ _ONE_HUE = 0.02  # of red over green, its logarithm's middle 80 %; 19 photograph
 _FLAT, _FLAT_GREY = 0.65, 0.18  # share of pixels like their neighbours; 9 photographs at most 0.12
 _CHEEK = 0.14  # of the distance of the eyes' outer corners
 _ONE_SIDE, _TWO_HUES = 2.5, 1.6  # factors; of 5 photographs 1.0 to 1.15 and 1.0 to 1.25, of a patchy one 1.5 and 2.1
+_DEVELOPED = 1.4  # a factor of light
 _PROFILE = 50.0  # degrees
 _GRID = 40
 _COVERS = {
@@ -117,13 +119,35 @@ def cover_lines(photograph: Path, parts: FaceParts, landmarks: Tensor) -> list[s
 
 
 def light_lines(photograph: Path, image: Tensor, parts: FaceParts, landmarks: Tensor) -> list[str]:
-    """Whether light from one side leaves the cheeks too far apart to be divided out, for people to read.
+    """What a photograph's light keeps from the skin's own colour, for people to read; nothing in good light.
 
     Args:
         image: the photograph, (3,H,W) in [0,1].
         parts: what it shows.
         landmarks: of the face, (68,2) pixels; NaN for missing.
     """
+    lines, gain = list[str](), exposure_gain(image, parts)
+    if gain > _DEVELOPED:
+        lines.append(
+            f"note: {photograph.name}: taken for under-exposed, its light multiplied by {gain:.1f}: nothing in it is "
+            f"white; if the skin is too fair now, give a photograph in good light"
+        )
+    apart = _cheeks_apart(image, parts, landmarks)
+    if apart is None:
+        return lines
+    light, hue = math.exp(abs(float(apart.mean()))), math.exp(abs(float(apart[2] - apart[0])))
+    if light < _ONE_SIDE and hue < _TWO_HUES:
+        return lines
+    return [
+        *lines,
+        f"WARNING: {photograph.name}: light from one side (cheeks differ by a factor of {light:.1f} in brightness, "
+        f"{hue:.1f} in blue over red; in even light by less than 1.3): shadows are evened out and their detail is "
+        f"lost; give one in even light",
+    ]
+
+
+def _cheeks_apart(image: Tensor, parts: FaceParts, landmarks: Tensor) -> Tensor | None:
+    """Logarithms of one cheek's light over the other's, (3,); None where one shows no skin."""
     marks = landmarks.double()
     reach = _CHEEK * (marks[45] - marks[36]).norm()
     side = reach * torch.linspace(-1, 1, _GRID, dtype=torch.float64)
@@ -134,16 +158,9 @@ def light_lines(photograph: Path, image: Tensor, parts: FaceParts, landmarks: Te
         at = at[parts.at(at, "skin").nan_to_num(0.0) > _PRESENT].round().long()
         at = at[((at >= 0) & (at < torch.tensor([image.shape[2], image.shape[1]]))).all(1)]
         if not len(at):
-            return []
+            return None
         cheeks.append(to_linear(image[:3, at[:, 1], at[:, 0]].double()).median(1).values.clamp(min=1e-3).log())
-    apart = cheeks[0] - cheeks[1]
-    light, hue = math.exp(abs(float(apart.mean()))), math.exp(abs(float(apart[2] - apart[0])))
-    if light < _ONE_SIDE and hue < _TWO_HUES:
-        return []
-    return [
-        f"WARNING: {photograph.name}: light from one side (cheeks differ by a factor of {light:.1f} in brightness, "
-        f"{hue:.1f} in blue over red; in even light by less than 1.3): the skin stays patchy; give one in even light"
-    ]
+    return cheeks[0] - cheeks[1]
 
 
 def _hidden_parts(found: PhotographLandmarks) -> dict[str, float]:

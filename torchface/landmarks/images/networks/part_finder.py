@@ -12,6 +12,7 @@ from torchface.landmarks.images.graph_session import graph_session
 from torchface.landmarks.images.ibug_68 import turned_box
 from torchface.landmarks.images.networks.part_network import PART_MARGIN, PART_SIZE, PARTS
 
+_GREEN = 0.008  # of full white, by which leaves are greener than red or blue
 _ROW = {name: number for number, name in enumerate(PARTS)}
 
 
@@ -53,7 +54,17 @@ class PartFinder:
         transform = crop_transform(box, float(tilt), PART_SIZE, PART_MARGIN)
         crop = cut_crop(image, transform, PART_SIZE).float() / 255
         both = self.network(torch.stack([crop, crop.flip(-1)]))
-        return FaceParts((both[0] + both[1].flip(-1)) / 2, transform)
+        return FaceParts(_without_leaves((both[0] + both[1].flip(-1)) / 2, crop), transform)
+
+
+def _without_leaves(shares: Tensor, crop: Tensor) -> Tensor:
+    """Shares (10,S,S) of a crop (3,S,S) in which what is green is background and no hair, as leaves behind a head."""
+    green = crop[1] > crop[[0, 2]].amax(0) + _GREEN
+    hair, background = _ROW["hair"], _ROW["background"]
+    shares = shares.clone()
+    shares[background] += torch.where(green, shares[hair], 0.0)
+    shares[hair] *= ~green
+    return shares
 
 
 def graph_part_finder(content: bytes) -> PartFinder:

@@ -1,0 +1,60 @@
+"""Hair that hangs beside the neck is found in what photographs show, and what stands behind the head is none."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from torch import Tensor
+
+from torchface.geometry.cameras.pinhole import look_at
+from torchface.landmarks.images.networks.part_finder import FaceParts
+from torchface.landmarks.images.networks.part_network import PARTS
+from torchface.synthetic import neutral_head
+from torchface.workflows.fit.fitted_character import hangs_down
+
+SIZE, HAIR, SKIN = 128, PARTS.index("hair"), PARTS.index("skin")
+
+
+def _shown(yaw: float) -> tuple[Tensor, Tensor, Tensor]:
+    """Landmarks (68,2), and the columns and rows of a crop, (S,S) each, in widths between the outer corners of the eyes
+    about the mouth."""
+    head = neutral_head(texture=False)
+    camera = look_at(head.vertices[head.landmarks].mean(0), yaw, span=330.0, width=SIZE, height=SIZE)
+    marks = camera.project(head.vertices[head.landmarks].double())
+    mouth, unit = marks[48:].mean(0), (marks[45] - marks[36]).norm()
+    y, x = torch.meshgrid(*(torch.arange(SIZE, dtype=torch.float64),) * 2, indexing="ij")
+    return marks, (x - mouth[0]) / unit, (y - mouth[1]) / unit
+
+
+def _parts(hair: Tensor) -> FaceParts:
+    number = torch.where(hair, HAIR, SKIN)
+    shares = torch.nn.functional.one_hot(number, len(PARTS)).permute(2, 0, 1).float()
+    return FaceParts(shares, torch.eye(2, 3, dtype=torch.float64))
+
+
+def test_long_hair_hangs_and_short_hair_does_not() -> None:
+    marks, x, y = _shown(0.0)
+    cap = (y < -1.6) & (x.abs() < 1.2)
+    long = cap | ((x.abs() > 0.5) & (x.abs() < 1.2) & (y < 1.0))
+    assert hangs_down([_parts(long)], marks[None])
+    assert not hangs_down([_parts(cap)], marks[None])
+
+
+def test_what_is_not_one_with_the_hair_on_the_head_is_none() -> None:
+    marks, x, y = _shown(0.0)
+    cap = (y < -1.6) & (x.abs() < 1.2)
+    beside = (x > 0.5) & (x < 1.2) & (y > -0.8)  # someone's dark coat
+    assert not hangs_down([_parts(cap | beside)], marks[None])
+
+
+@pytest.mark.parametrize("yaw", [-50.0, 50.0])
+def test_of_a_turned_face_the_near_side_counts(yaw: float) -> None:
+    marks, x, y = _shown(yaw)
+    near = float(torch.sign((marks[30] - marks[[0, 16]].mean(0))[0])) * -1
+    cap = y < -1.4
+    wall, hair = cap | (x * near < -0.4), cap | (x * near > 0.4)
+    assert not hangs_down([_parts(wall)], marks[None])
+    assert hangs_down([_parts(hair)], marks[None])
+    unseen = marks.clone()
+    unseen[slice(0, 4) if near > 0 else slice(13, 17)] = torch.nan
+    assert not hangs_down([_parts(wall)], unseen[None])
