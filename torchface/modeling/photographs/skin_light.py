@@ -38,8 +38,8 @@ _EYE_PIXELS = 20  # of the crop
 def exposure_gain(image: Tensor, parts: FaceParts) -> float:
     """What a photograph's light is multiplied by to be well exposed; what is too dark shows nobody's complexion.
 
-    By the whites of the eyes where it is large enough to show them, else by what is brightest in the whole picture and
-    about the face, but not more than makes its skin fair.
+    By what is brightest in the whole picture and about the face, and by the whites of the eyes where the face is large
+    enough to show them, but not more than makes its skin fair.
 
     Args:
         image: sRGB, (3,H,W).
@@ -48,13 +48,12 @@ def exposure_gain(image: Tensor, parts: FaceParts) -> float:
     image = image[:3]
     crop = to_linear(cut_crop((255 * image.clamp(0, 1)).byte(), parts.transform, parts.shares.shape[-1]) / 255).double()
     eyes, skin = (crop[:, parts.of(name) > _SURE].mean(0) for name in ("eyes", "skin"))
+    whole, near = (one.double().amax(0).flatten() for one in (to_linear(image), crop))
+    brightest = [float(one.kthvalue(1 + int(_BRIGHTEST * (len(one) - 1))).values) for one in (whole, near)]
+    gain = math.prod(max(1.0, _WHITE / max(one, 0.01)) for one in brightest) ** 0.5
     if len(eyes) >= _EYE_PIXELS and float(torch.linalg.det(parts.transform[:, :2].double())) ** 0.5 < _FINE:
-        gain = _EYE_WHITE / max(float(eyes.quantile(_EYE)), 0.01)
-    else:
-        whole, near = (one.double().amax(0).flatten() for one in (to_linear(image), crop))
-        brightest = [float(one.kthvalue(1 + int(_BRIGHTEST * (len(one) - 1))).values) for one in (whole, near)]
-        gain = math.prod(max(1.0, _WHITE / max(one, 0.01)) for one in brightest) ** 0.5
-        gain = min(gain, max(1.0, _FAIR / float(skin.median()))) if len(skin) else gain
+        gain = (gain * _EYE_WHITE / max(float(eyes.quantile(_EYE)), 0.01)) ** 0.5
+    gain = min(gain, max(1.0, _FAIR / float(skin.median()))) if len(skin) else gain
     return min(max(gain, _DARKER), _BRIGHTER)
 
 

@@ -129,8 +129,8 @@ def light_lines(photograph: Path, image: Tensor, parts: FaceParts, landmarks: Te
     lines, gain = list[str](), exposure_gain(image, parts)
     if gain > _DEVELOPED:
         lines.append(
-            f"note: {photograph.name}: taken for under-exposed, its light multiplied by {gain:.1f}: nothing in it is "
-            f"white; if the skin is too fair now, give a photograph in good light"
+            f"note: {photograph.name}: taken for under-exposed, its light multiplied by {gain:.1f}, for what "
+            f"should be white in it is grey; if the skin is too fair now, give a photograph in good light"
         )
     apart = _cheeks_apart(image, parts, landmarks)
     if apart is None:
