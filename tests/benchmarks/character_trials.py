@@ -22,30 +22,19 @@ from torchface.workflows.rig.character_rig import CharacterReport, rig_character
 
 @dataclass(frozen=True, eq=False)
 class Trial:
-    """One character.
+    """One character."""
 
-    Args:
-        name: for the table.
-        whole: the file with its own shapes.
-    """
-
-    name: str
-    whole: Path
+    name: str  # for the table
+    whole: Path  # the file with its own shapes
 
 
 @dataclass(frozen=True, eq=False)
 class Scores:
-    """How near made shapes are to a character's own, by ARKit's names.
+    """How near made shapes are to a character's own, by ARKit's names."""
 
-    Args:
-        names: of the S shapes that both have and that move something.
-        cosine: of the directions in which all vertices go, (S,).
-        error: root of the summed squared error over that of the own shape, (S,).
-    """
-
-    names: tuple[str, ...]
-    cosine: Tensor
-    error: Tensor
+    names: tuple[str, ...]  # of the S shapes that both have and that move something
+    cosine: Tensor  # of the directions in which all vertices go, (S,)
+    error: Tensor  # root of the summed squared error over that of the own shape, (S,)
 
     @staticmethod
     def of(own: dict[str, Tensor], made: dict[str, Tensor], counted: Tensor) -> "Scores":

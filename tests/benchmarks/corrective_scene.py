@@ -19,19 +19,12 @@ NOISE, UNEXPLAINED = 0.1, 0.1
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """A rig, every vertex of which is a marker, and what was seen of a performance.
+    """A rig, every vertex of which is a marker, and what was seen of a performance."""
 
-    Args:
-        rig: of 80 shapes, 400 correctives and 10,000 vertices.
-        weights: true, (T,80).
-        face: true vertices, (T,V,3), millimetres.
-        seen: with noise, and with smooth motion that no shape explains, (T,V,3).
-    """
-
-    rig: BlendshapeRig
-    weights: Tensor
-    face: Tensor
-    seen: Tensor
+    rig: BlendshapeRig  # of 80 shapes, 400 correctives and 10,000 vertices
+    weights: Tensor  # true, (T,80)
+    face: Tensor  # true vertices, (T,V,3), millimetres
+    seen: Tensor  # with noise, and with smooth motion that no shape explains, (T,V,3)
 
     def solver(self, **terms: float) -> MarkerSolver:
         every = torch.arange(len(self.rig.vertices))

@@ -13,21 +13,13 @@ _FRAMES = 20  # at once
 
 @dataclass(frozen=True, eq=False)
 class Errors:
-    """Sums over frames of squared errors at each vertex, and how many frames they are of.
+    """Sums over frames of squared errors at each vertex, and how many frames they are of."""
 
-    Args:
-        fine: of the part that the low-pass takes away, mm², (V,).
-        angle: of normals, square degrees, (V,).
-        place: of vertices, mm², (V,).
-        flicker: squared second difference in time of the fine part, mm², (V,).
-        frames: that were compared.
-    """
-
-    fine: Tensor
-    angle: Tensor
-    place: Tensor
-    flicker: Tensor
-    frames: int
+    fine: Tensor  # of the part that the low-pass takes away, mm², (V,)
+    angle: Tensor  # of normals, square degrees, (V,)
+    place: Tensor  # of vertices, mm², (V,)
+    flicker: Tensor  # squared second difference in time of the fine part, mm², (V,)
+    frames: int  # that were compared
 
     def __add__(self, other: "Errors") -> "Errors":
         return Errors(
@@ -48,19 +40,12 @@ class Known:
 
 @dataclass(frozen=True)
 class Shares:
-    """Figures of one method in one region: shares of the smooth input's error, and flicker as a share of the truth's.
+    """Figures of one method in one region: shares of the smooth input's error, and flicker as one of the truth's."""
 
-    Args:
-        fine: root mean square error of the fine part.
-        angle: root mean square angle of normals.
-        place: root mean square error of vertices, millimetres.
-        flicker: root mean square second difference in time of the fine part, of the truth's own.
-    """
-
-    fine: float
-    angle: float
-    place: float
-    flicker: float
+    fine: float  # root mean square error of the fine part
+    angle: float  # root mean square angle of normals
+    place: float  # root mean square error of vertices, millimetres
+    flicker: float  # root mean square second difference in time of the fine part, of the truth's own
 
 
 class Ruler:

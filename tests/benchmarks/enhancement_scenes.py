@@ -27,29 +27,17 @@ _BATCH = 40  # frames
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """A performer, the captured frames of it, and an animation with its truth.
+    """A performer, the captured frames of it, and an animation with its truth."""
 
-    Args:
-        name: ``performer`` or ``ict``.
-        performer: what was captured.
-        frames: the database, (K,V,3), millimetres; the first is the neutral.
-        sequences: of each of its frames, (K,) int64.
-        rigged: the same frames as the rig alone moves them, without wrinkles, (K,V,3).
-        weights: of each of its frames, (K,N).
-        coarse: a window of each test take without wrinkles, (T,V,3) each.
-        truth: the same with them.
-        test_weights: of these frames, (T,N) each.
-    """
-
-    name: str
-    performer: WrinkledPerformer
-    frames: Tensor
-    sequences: Tensor
-    rigged: Tensor
-    weights: Tensor
-    coarse: tuple[Tensor, ...]
-    truth: tuple[Tensor, ...]
-    test_weights: tuple[Tensor, ...]
+    name: str  # `performer` or `ict`
+    performer: WrinkledPerformer  # what was captured
+    frames: Tensor  # the database, (K,V,3), millimetres; the first is the neutral
+    sequences: Tensor  # of each of its frames, (K,) int64
+    rigged: Tensor  # the same frames as the rig alone moves them, without wrinkles, (K,V,3)
+    weights: Tensor  # of each of its frames, (K,N)
+    coarse: tuple[Tensor, ...]  # a window of each test take without wrinkles, (T,V,3) each
+    truth: tuple[Tensor, ...]  # the same with them
+    test_weights: tuple[Tensor, ...]  # of these frames, (T,N) each
 
     @property
     def neutral(self) -> Tensor:

@@ -46,17 +46,11 @@ finder beside another."""
 
 @dataclass(frozen=True, eq=False)
 class Picture:
-    """A face in a picture.
+    """A face in a picture."""
 
-    Args:
-        image: uint8 (3,H,W).
-        landmarks: (68,2) pixels, of a person's hand or of another predictor.
-        tilt: that the finder is given, radians; the face's own if absent.
-    """
-
-    image: Tensor
-    landmarks: Tensor
-    tilt: float | None = None
+    image: Tensor  # uint8 (3,H,W)
+    landmarks: Tensor  # (68,2) pixels, of a person's hand or of another predictor
+    tilt: float | None = None  # that the finder is given, radians; the face's own if absent
 
     @property
     def width(self) -> float:
@@ -254,20 +248,14 @@ def pooled(pairs: list[tuple[Tensor, Tensor]]) -> Agreement:
 
 @dataclass(frozen=True, eq=False)
 class Outcome:
-    """What one finder does with all faces.
+    """What one finder does with all faces."""
 
-    Args:
-        hand, dlib: offsets, see :func:`errors`.
-        follows: of the clips.
-        verdicts: how many pictures are right, said so and wrong, a way of spoiling them.
-        milliseconds: wall clock a face in a frame, its box and tilt given, the quickest of 30.
-    """
-
+    # hand, dlib: offsets, see `errors`
     hand: Tensor
     dlib: Tensor
-    follows: list[Follow]
-    verdicts: dict[str, Counter[str]]
-    milliseconds: float
+    follows: list[Follow]  # of the clips
+    verdicts: dict[str, Counter[str]]  # how many pictures are right, said so and wrong, a way of spoiling them
+    milliseconds: float  # wall clock a face in a frame, its box and tilt given, the quickest of 30
 
     def rows(self) -> Iterator[tuple[str, str]]:
         """The table's rows."""

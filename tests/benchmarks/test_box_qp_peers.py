@@ -55,18 +55,14 @@ PEERS: dict[str, tuple[str, Callable[[np.ndarray], Solver], int]] = {
 
 @dataclass(frozen=True, eq=False)
 class Frames:
-    """Markers (B,M,3) of real frames with 0.3 mm of noise, in order, and what their solve minimises in float64.
-
-    Args:
-        least: the least energy that any exact solver finds, with the constant, (B,).
-    """
+    """Markers (B,M,3) of real frames with 0.3 mm of noise, in order, and what their solve minimises in float64."""
 
     solver: MarkerSolver
     markers: Tensor
     H: Tensor
     f: Tensor
     constant: Tensor
-    least: Tensor
+    least: Tensor  # the least energy that any exact solver finds, with the constant, (B,)
 
     def energy(self, x: Tensor, every: int = 1) -> Tensor:
         return _objective(self.H, self.f[::every], x) + self.constant[::every]

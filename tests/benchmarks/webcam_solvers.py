@@ -43,17 +43,11 @@ _LEAST = 6  # landmarks that a solve needs
 
 @dataclass(frozen=True, eq=False)
 class Solved:
-    """What a solver makes of a clip.
+    """What a solver makes of a clip."""
 
-    Args:
-        weights: by ARKit's names, (T,52).
-        gaze: (T,2,2) radians, see ``gaze_of``.
-        milliseconds: of processor time a frame, without reading the picture.
-    """
-
-    weights: Tensor
-    gaze: Tensor
-    milliseconds: float
+    weights: Tensor  # by ARKit's names, (T,52)
+    gaze: Tensor  # (T,2,2) radians, see `gaze_of`
+    milliseconds: float  # of processor time a frame, without reading the picture
 
 
 Solver = Callable[[list[FaceReading], float, tuple[int, int]], Solved]

@@ -41,19 +41,12 @@ _START: dict[str, float] = {}
 
 @dataclass(frozen=True)
 class Cost:
-    """What a reader took for a file.
+    """What a reader took for a file."""
 
-    Args:
-        file_megabytes: the file's size; a folder's is that of all its files.
-        seconds: processor time.
-        megabytes: how far the memory in use rose at its highest.
-        refused: the message of the ``TorchfaceError`` that refused the file; empty where it was read.
-    """
-
-    file_megabytes: float
-    seconds: float
-    megabytes: float
-    refused: str
+    file_megabytes: float  # the file's size; a folder's is that of all its files
+    seconds: float  # processor time
+    megabytes: float  # how far the memory in use rose at its highest
+    refused: str  # the message of the `TorchfaceError` that refused the file; empty where it was read
 
     def within_budget(self) -> bool:
         """At most 500 MB or 20 times the file, whichever is more, and 2 s and 2 s a megabyte."""

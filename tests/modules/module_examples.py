@@ -48,19 +48,13 @@ CAMERA = torch.tensor([[700.0, 0, 319.5], [0, 700.0, 239.5], [0, 0, 1]], dtype=t
 
 @dataclass(frozen=True)
 class Example:
-    """A class of modules.
+    """A class of modules."""
 
-    Args:
-        make: an instance; of 0 and 1 two that differ in nothing but their state.
-        inputs: that both take.
-        call: what is computed of the inputs, where it is not ``module(*inputs)``.
-        cells: of the table, by column, where they are not ``yes``.
-    """
-
-    make: Callable[[int], Any]
-    inputs: Callable[[], tuple[Tensor, ...]]
+    make: Callable[[int], Any]  # an instance; of 0 and 1 two that differ in nothing but their state
+    inputs: Callable[[], tuple[Tensor, ...]]  # that both take
+    # what is computed of the inputs, where it is not `module(*inputs)`
     call: Callable[..., Any] = lambda module, *inputs: module(*inputs)
-    cells: Mapping[str, str] = field(default_factory=dict)
+    cells: Mapping[str, str] = field(default_factory=dict)  # of the table, by column, where they are not `yes`
 
 
 def random(*shape: int, seed: int = 0) -> Tensor:

@@ -30,23 +30,14 @@ _SKIN = (0.86, 0.68, 0.58, 1.0)
 
 @dataclass(frozen=True)
 class Planted:
-    """How a character is written.
+    """How a character is written."""
 
-    Args:
-        turn: the whole of it, (3,3); upright if absent.
-        units: numbers of the file a metre: 100 for centimetres.
-        body: a body of boxes, hair and a skeleton.
-        vrm: "VRMC_vrm" (1.0), "VRM" (0.x) or none.
-        prefix: of the bones' names.
-        extra_heads: copies of the head beside, millimetres to the right of it.
-    """
-
-    turn: Tensor | None = None
-    units: float = 1.0
-    body: bool = True
-    vrm: str | None = None
-    prefix: str = "mixamorig:"
-    extra_heads: tuple[float, ...] = ()
+    turn: Tensor | None = None  # the whole of it, (3,3); upright if absent
+    units: float = 1.0  # numbers of the file a metre: 100 for centimetres
+    body: bool = True  # a body of boxes, hair and a skeleton
+    vrm: str | None = None  # "VRMC_vrm" (1.0), "VRM" (0.x) or none
+    prefix: str = "mixamorig:"  # of the bones' names
+    extra_heads: tuple[float, ...] = ()  # copies of the head beside, millimetres to the right of it
     expressions: Mapping[str, str] = field(default_factory=dict)
 
 

@@ -26,47 +26,30 @@ _WALL = (0.16, 0.18, 0.20)  # linear
 
 @dataclass(frozen=True)
 class LightStageSettings:
-    """How the performer is recorded.
+    """How the performer is recorded."""
 
-    Args:
-        width, height: pixels.
-        field_of_view: vertical, degrees.
-        span: millimetres that the image's height covers at the face.
-        turn: how far the head turns to each side, degrees; half as far up and down.
-        gloss: strength of highlights beside the light's; skin has about 0.15.
-        shininess: exponent of the highlights.
-        samples: rays a pixel side.
-        noise: of the camera, standard deviation at full white, linear; shot noise, less where it is dark.
-    """
-
+    # width, height: pixels
     width: int = 320
     height: int = 240
-    field_of_view: float = 24.0
-    span: float = 330.0
-    turn: float = 22.0
-    gloss: float = 0.15
-    shininess: float = 24.0
-    samples: int = 2
-    noise: float = 0.01
+    field_of_view: float = 24.0  # vertical, degrees
+    span: float = 330.0  # millimetres that the image's height covers at the face
+    turn: float = 22.0  # how far the head turns to each side, degrees; half as far up and down
+    gloss: float = 0.15  # strength of highlights beside the light's; skin has about 0.15
+    shininess: float = 24.0  # exponent of the highlights
+    samples: int = 2  # rays a pixel side
+    noise: float = 0.01  # of the camera, standard deviation at full white, linear; shot noise, less where it is dark
 
 
 @dataclass(frozen=True, eq=False)
 class LitVideo:
-    """A colour video of a performer, and the truth behind it.
+    """A colour video of a performer, and the truth behind it."""
 
-    Args:
-        video: the file.
-        rig: the performer, with skin.
-        weights: (T,N).
-        cameras: world to camera, one a frame: the camera stands still, so the head's motion is in here.
-        light: in the camera's frame.
-    """
-
-    video: VideoFile
-    rig: BlendshapeRig
-    weights: Tensor
+    video: VideoFile  # the file
+    rig: BlendshapeRig  # the performer, with skin
+    weights: Tensor  # (T,N)
+    # world to camera, one a frame: the camera stands still, so the head's motion is in here
     cameras: tuple[Camera, ...]
-    light: PointLight
+    light: PointLight  # in the camera's frame
 
     @property
     def vertices(self) -> Tensor:

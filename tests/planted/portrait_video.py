@@ -38,22 +38,15 @@ _UPPER = ("brow", "eye", "cheekSquint", "noseSneer")
 
 @dataclass(frozen=True)
 class PortraitSettings:
-    """How the video is taken.
+    """How the video is taken."""
 
-    Args:
-        width, height: pixels.
-        turn: how far the head turns at most about each axis, degrees.
-        sway: how far it moves at most along each axis, millimetres.
-        blur: of the lens, standard deviation in pixels.
-        noise: of a grey value, standard deviation, of 1.
-    """
-
+    # width, height: pixels
     width: int = 240
     height: int = 300
-    turn: float = 8.0
-    sway: float = 15.0
-    blur: float = 0.6
-    noise: float = 0.02
+    turn: float = 8.0  # how far the head turns at most about each axis, degrees
+    sway: float = 15.0  # how far it moves at most along each axis, millimetres
+    blur: float = 0.6  # of the lens, standard deviation in pixels
+    noise: float = 0.02  # of a grey value, standard deviation, of 1
 
 
 @dataclass(frozen=True, eq=False)

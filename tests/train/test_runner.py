@@ -34,22 +34,14 @@ RECIPES = (
 
 @dataclass(frozen=True, kw_only=True)
 class Settings(RecipeSettings):
-    """A line is learned.
+    """A line is learned."""
 
-    Args:
-        data: What there is no default for.
-        kind: One of two.
-        slope: Of the line.
-        parts: Several.
-        limit: A number, or none.
-        network: How it descends.
-    """
-
-    data: Path
-    kind: Literal["one", "two"] = "one"
-    slope: float = 3.0
-    parts: tuple[int, ...] = (1, 2)
-    limit: int | None = 14
+    data: Path  # What there is no default for
+    kind: Literal["one", "two"] = "one"  # One of two
+    slope: float = 3.0  # Of the line
+    parts: tuple[int, ...] = (1, 2)  # Several
+    limit: int | None = 14  # A number, or none
+    # How it descends
     network: DescentSettings = field(default_factory=lambda: DescentSettings(120, 8, 0.1, checkpoint_every=0))
 
     devices: ClassVar[tuple[str, ...]] = ANY_DEVICE

@@ -71,17 +71,11 @@ COMMANDS: dict[str, Callable[..., None]] = {
 
 @dataclass(frozen=True)
 class Group:
-    """Commands of two words, such as `torchface export solver`.
+    """Commands of two words, such as `torchface export solver`."""
 
-    Args:
-        summary: a line for the overview.
-        description: above the group's own help.
-        commands: by their second word.
-    """
-
-    summary: str
-    description: str
-    commands: dict[str, Callable[..., None]]
+    summary: str  # a line for the overview
+    description: str  # above the group's own help
+    commands: dict[str, Callable[..., None]]  # by their second word
 
 
 GROUPS = {

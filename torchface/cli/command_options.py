@@ -21,13 +21,9 @@ _WORDS = {Path: "PATH", str: "TEXT", int: "NUMBER", float: "NUMBER"}
 
 @dataclass(frozen=True)
 class Output:
-    """The mark of an option that names what a command writes; every other path is an input, which is kept.
+    """The mark of an option that names what a command writes; every other path is an input, which is kept."""
 
-    Args:
-        files: names of the files in it that a command writes, where it is a folder.
-    """
-
-    files: tuple[str, ...] = ()
+    files: tuple[str, ...] = ()  # names of the files in it that a command writes, where it is a folder
 
 
 OutputPath = Annotated[Path, Output()]

@@ -44,19 +44,12 @@ _FIRST_RHO, _OTHER_RHO, _FIRST_STEPS = 0.5, 1.3, 20
 
 @dataclass(frozen=True, eq=False)
 class SplittingFactors:
-    """What a step needs of H.
+    """What a step needs of H."""
 
-    Args:
-        step: :math:`G`, (N,N) or (B,N,N).
-        offset: :math:`-\\alpha (H + \\rho D)^{-1}`, (N,N) or (B,N,N).
-        relaxation: :math:`\\alpha`.
-        first: of another rho, for the first steps in float32 from zero.
-    """
-
-    step: Tensor
-    offset: Tensor
-    relaxation: float = RELAXATION
-    first: SplittingFactors | None = None
+    step: Tensor  # G, (N,N) or (B,N,N)
+    offset: Tensor  # -\\alpha (H + \\rho D)^{-1}, (N,N) or (B,N,N)
+    relaxation: float = RELAXATION  # \\alpha
+    first: SplittingFactors | None = None  # of another rho, for the first steps in float32 from zero
 
     def rows(self, keep: Tensor) -> SplittingFactors:
         """The factors of some problems; one H serves all."""

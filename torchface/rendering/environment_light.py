@@ -18,13 +18,11 @@ class EnvironmentLight:
 
     .. math:: I(N) = \sum_{lm} \frac{A_l}{\pi} L_{lm} Y_{lm}(N)
 
-    Args:
-        coefficients: :math:`A_l L_{lm} / \pi` of red, green, blue in the camera's frame (x right, y down, z forward),
-            (9,3); light of 1 from everywhere shows the albedo as it is.
-
     Source: Ramamoorthi and Hanrahan 2001, An Efficient Representation for Irradiance Environment Maps.
     """
 
+    # A_l L_{lm} / \pi of red, green, blue in the camera's frame (x right, y down, z forward), (9,3); light of 1 from
+    # everywhere shows the albedo as it is
     coefficients: Tensor
 
     def __post_init__(self) -> None:

@@ -27,17 +27,11 @@ Tracker = Callable[[VideoFile], tuple[Tensor, Tensor | None]]
 
 @dataclass(frozen=True, eq=False)
 class Annotation:
-    """Frames to be annotated.
+    """Frames to be annotated."""
 
-    Args:
-        frames: images, with the user's landmarks where there are some already, else those proposed.
-        saved: names of those with the user's own.
-        folder: where files go.
-    """
-
-    frames: list[AnnotatedFrame]
-    saved: list[str]
-    folder: Path
+    frames: list[AnnotatedFrame]  # images, with the user's landmarks where there are some already, else those proposed
+    saved: list[str]  # names of those with the user's own
+    folder: Path  # where files go
 
 
 def prepare_annotation(video: Path, folder: Path, track: Tracker, count: int = 15, key: str = "") -> Annotation:

@@ -19,19 +19,13 @@ from torchface.workflows.rig.actor_rig import check_out
 
 @dataclass(frozen=True)
 class SculptOptions:
-    """How a sculpt becomes a corrective.
+    """How a sculpt becomes a corrective."""
 
-    Args:
-        name: of the corrective; its drivers' if absent.
-        unit: of the sculpt, where it is not the format's own.
-        align: ``"remove"`` a motion of the whole mesh, or ``"keep"`` it; refused if absent.
-        replace: take the place of a corrective that acts there.
-    """
-
-    name: str | None = None
-    unit: str | None = None
+    name: str | None = None  # of the corrective; its drivers' if absent
+    unit: str | None = None  # of the sculpt, where it is not the format's own
+    # `"remove"` a motion of the whole mesh, or `"keep"` it; refused if absent
     align: Literal["remove", "keep"] | None = None
-    replace: bool = False
+    replace: bool = False  # take the place of a corrective that acts there
 
 
 def sculpt_corrective(

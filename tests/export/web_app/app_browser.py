@@ -17,14 +17,10 @@ _ISOLATED = {"Cross-Origin-Opener-Policy": "same-origin", "Cross-Origin-Embedder
 
 @dataclass
 class Server:
-    """A running server.
+    """A running server."""
 
-    Args:
-        url: of its root.
-        requests: method and path, or for a proxy the address, of each request.
-    """
-
-    url: str
+    url: str  # of its root
+    # method and path, or for a proxy the address, of each request
     requests: list[tuple[str, str]] = field(default_factory=list)
 
 

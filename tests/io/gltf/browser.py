@@ -21,21 +21,13 @@ _SECONDS = 120
 
 @dataclass(frozen=True)
 class Shot:
-    """What is seen.
+    """What is seen."""
 
-    Args:
-        weights: of shapes by name; the others are 0.
-        yaw: degrees that the camera stands to the side of the front.
-        target: what it looks at, metres.
-        span: metres that the picture is wide.
-        turns: pitch and yaw of nodes by name, radians.
-    """
-
-    weights: dict[str, float] = field(default_factory=dict)
-    yaw: float = 0.0
-    target: tuple[float, float, float] = (0.0, -0.02, 0.05)
-    span: float = 0.32
-    turns: dict[str, tuple[float, float]] = field(default_factory=dict)
+    weights: dict[str, float] = field(default_factory=dict)  # of shapes by name; the others are 0
+    yaw: float = 0.0  # degrees that the camera stands to the side of the front
+    target: tuple[float, float, float] = (0.0, -0.02, 0.05)  # what it looks at, metres
+    span: float = 0.32  # metres that the picture is wide
+    turns: dict[str, tuple[float, float]] = field(default_factory=dict)  # pitch and yaw of nodes by name, radians
 
 
 def posted(browser: Any, web: Path, page: str, files: dict[str, bytes]) -> dict:

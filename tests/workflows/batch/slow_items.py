@@ -30,14 +30,10 @@ class SpellJob:
     """Writes a word backwards.
 
     ``dies`` kills its process, ``dies once`` at the first attempt, ``sleeps`` takes a minute, ``nan`` is refused.
-
-    Args:
-        log: a folder; every attempt at an item leaves a file in it.
-        pause: seconds that each word takes.
     """
 
-    log: Path
-    pause: float = 0.0
+    log: Path  # a folder; every attempt at an item leaves a file in it
+    pause: float = 0.0  # seconds that each word takes
 
     def key(self, item: BatchItem) -> str:
         return content_key("spell", text=item.path, pause=self.pause)

@@ -23,23 +23,14 @@ FRAMES = 12
 
 @dataclass(frozen=True, eq=False)
 class Actor:
-    """Files of one actor.
+    """Files of one actor."""
 
-    Args:
-        model: name of the folder of the learned model.
-        rig: coarse, of the model's topology.
-        mesh: at rest.
-        weights: of the take, (T,N), from rest.
-        attachment: of 60 markers on the rig.
-        folder: of all files.
-    """
-
-    model: str
-    rig: BlendshapeRig
-    mesh: Mesh
-    weights: Tensor
-    attachment: Attachment
-    folder: Path
+    model: str  # name of the folder of the learned model
+    rig: BlendshapeRig  # coarse, of the model's topology
+    mesh: Mesh  # at rest
+    weights: Tensor  # of the take, (T,N), from rest
+    attachment: Attachment  # of 60 markers on the rig
+    folder: Path  # of all files
 
     @property
     def frames(self) -> Tensor:

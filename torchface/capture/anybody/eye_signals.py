@@ -19,20 +19,13 @@ _DOWNWARD = 0.2  # how quickly the open level falls beside how it rises: blinks 
 
 @dataclass(frozen=True, eq=False)
 class EyeSignals:
-    """Signals of the eyes in a frame, the person's right one first.
+    """Signals of the eyes in a frame, the person's right one first."""
 
-    Args:
-        open: openness beside the person's own, 1 open as at rest, 0 shut, (2,).
-        open_trust: how much that counts, (2,) in [0,1].
-        gaze: (2,2) radians, to the person's left and up, beside the head and beside straight ahead.
-        gaze_trust: (2,) in [0,1].
-        lids, lids_seen, straight, straight_seen: as of ``WebcamState``, with this frame.
-    """
-
-    open: Tensor
-    open_trust: Tensor
-    gaze: Tensor
-    gaze_trust: Tensor
+    open: Tensor  # openness beside the person's own, 1 open as at rest, 0 shut, (2,)
+    open_trust: Tensor  # how much that counts, (2,) in [0,1]
+    gaze: Tensor  # (2,2) radians, to the person's left and up, beside the head and beside straight ahead
+    gaze_trust: Tensor  # (2,) in [0,1]
+    # lids, lids_seen, straight, straight_seen: as of `WebcamState`, with this frame
     lids: Tensor
     lids_seen: Tensor
     straight: Tensor
@@ -47,12 +40,9 @@ class EyeSignals:
 
 @dataclass(frozen=True, eq=False)
 class EyesRead:
-    """What a picture shows of both eyes, each (2,), NaN where nobody said.
+    """What a picture shows of both eyes, each (2,), NaN where nobody said."""
 
-    Args:
-        openness, closed, visibility: as of a ``FaceReading``.
-    """
-
+    # openness, closed, visibility: as of a `FaceReading`
     openness: Tensor
     closed: Tensor
     visibility: Tensor

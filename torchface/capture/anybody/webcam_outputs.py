@@ -19,19 +19,12 @@ _OCTAVES = 4.0  # of the filter's cutoff, between no smoothing to speak of and t
 
 @dataclass(frozen=True, eq=False)
 class OutputTables:
-    """What outputs are made by.
+    """What outputs are made by."""
 
-    Args:
-        gain_shapes: which shapes each gain is of, as ``gain_factors`` wants them.
-        to_arkit: from the rig's weights to ARKit's, (52,N).
-        filter_units: what counts as one in the filter, of weights, radians and millimetres, (58,).
-        signed: of ARKit's antagonists, see ``signed_quantities``, (K,52).
-    """
-
-    gain_shapes: Tensor
-    to_arkit: Tensor
-    filter_units: Tensor
-    signed: Tensor
+    gain_shapes: Tensor  # which shapes each gain is of, as `gain_factors` wants them
+    to_arkit: Tensor  # from the rig's weights to ARKit's, (52,N)
+    filter_units: Tensor  # what counts as one in the filter, of weights, radians and millimetres, (58,)
+    signed: Tensor  # of ARKit's antagonists, see `signed_quantities`, (K,52)
 
 
 def lost_state(before: WebcamState, interval: Tensor) -> WebcamState:

@@ -36,30 +36,18 @@ _EAGER, _EAGER_FOR = 3.0, 0.7  # how much more the first frames of a person coun
 
 @dataclass(frozen=True, eq=False)
 class _Frame:
-    """What a frame shows of a face.
+    """What a frame shows of a face."""
 
-    Args:
-        rays: to the landmarks, (68,2), at a depth of 1.
-        trust: in each, (68,).
-        spread: of each, standard deviation of a coordinate, (68,), at a depth of 1.
-        read: weights by ARKit's names as a network reads them, and their deviations, (52,) both; NaN for what is not
-            seen.
-        iris: rays to the irises, (2,2).
-        eyes: how open they are.
-        interval: seconds since the frame before, ().
-        pose: what the person has been asked to hold, () of ``POSES``.
-        learns: 0 where nothing is to be learned of the person, ().
-    """
-
-    rays: Tensor
-    trust: Tensor
-    spread: Tensor
+    rays: Tensor  # to the landmarks, (68,2), at a depth of 1
+    trust: Tensor  # in each, (68,)
+    spread: Tensor  # of each, standard deviation of a coordinate, (68,), at a depth of 1
+    # weights by ARKit's names as a network reads them, and their deviations, (52,) both; NaN for what is not seen
     read: tuple[Tensor, Tensor]
-    iris: Tensor
-    eyes: EyesRead
-    interval: Tensor
-    pose: Tensor
-    learns: Tensor
+    iris: Tensor  # rays to the irises, (2,2)
+    eyes: EyesRead  # how open they are
+    interval: Tensor  # seconds since the frame before, ()
+    pose: Tensor  # what the person has been asked to hold, () of `POSES`
+    learns: Tensor  # 0 where nothing is to be learned of the person, ()
 
 
 class WebcamSolver(WebcamSolverParts):

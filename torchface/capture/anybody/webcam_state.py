@@ -133,15 +133,10 @@ PARTS = tuple(part.name for part in fields(WebcamState))
 
 @dataclass(frozen=True)
 class StateLayout:
-    """Where a state's parts lie in its vector.
+    """Where a state's parts lie in its vector."""
 
-    Args:
-        shapes: N, of the rig.
-        coefficients: D, of the person.
-    """
-
-    shapes: int
-    coefficients: int
+    shapes: int  # N, of the rig
+    coefficients: int  # D, of the person
 
     @property
     def sizes(self) -> dict[str, tuple[int, ...]]:

@@ -26,17 +26,12 @@ _EYES_NOSE = slice(27, 48)
 
 @dataclass(frozen=True)
 class AnotherFace:
-    """A span of frames that shows another face.
-
-    Args:
-        likeness: the largest correlation of looks, of its frames and the actor's.
-        apart: the mean distance of its landmarks of eyes and nose from the actor's, in distances of the eyes.
-    """
+    """A span of frames that shows another face."""
 
     first: int
     last: int
-    likeness: float
-    apart: float
+    likeness: float  # the largest correlation of looks, of its frames and the actor's
+    apart: float  # the mean distance of its landmarks of eyes and nose from the actor's, in distances of the eyes
 
 
 @dataclass(frozen=True, eq=False)

@@ -33,20 +33,15 @@ _UNSEEN = 0.3  # of an eye that is hidden, its twin's openness counts for less
 class Eyeballs:
     """Eyeballs of a rig, the right one first.
 
-    Args:
-        centre: beside the middle of the eye's corners, in the head's axes, (2,3) millimetres.
-        radius: from there to the iris, (2,) millimetres.
-        turns: by what each shape of ``LOOKS`` turns its eye at weight 1, (8,) radians.
-
     Example:
         >>> from torchface.synthetic import performer
         >>> Eyeballs.of(performer(texture=False)).turns.rad2deg().round().tolist()
         [30.0, 30.0, 30.0, 30.0, 26.0, 26.0, 26.0, 26.0]
     """
 
-    centre: Tensor
-    radius: Tensor
-    turns: Tensor
+    centre: Tensor  # beside the middle of the eye's corners, in the head's axes, (2,3) millimetres
+    radius: Tensor  # from there to the iris, (2,) millimetres
+    turns: Tensor  # by what each shape of `LOOKS` turns its eye at weight 1, (8,) radians
 
     @staticmethod
     def usual() -> "Eyeballs":

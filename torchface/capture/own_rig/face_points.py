@@ -24,22 +24,14 @@ _SPACING = 3.0  # millimetres
 
 @dataclass(frozen=True, eq=False)
 class FacePoints:
-    """P points that follow N weights: the landmarks, and the curves that the contour's ones slide along.
+    """P points that follow N weights: the landmarks, and the curves that the contour's ones slide along."""
 
-    Args:
-        rest: (P,3), millimetres; the first 68 rows are the landmarks' own vertices.
-        basis: what a unit of each weight adds, (P,3,N).
-        rows: which points each contour landmark may be, (J,C) into P; the first is the landmark itself.
-        valid: which of them count, (J,C) bool.
-        side: of the face, +1 toward positive x, (J,).
-        activation, corrective_basis: of C correctives, and what a unit of each adds, (P,3,C); none if absent.
-    """
-
-    rest: Tensor
-    basis: Tensor
-    rows: Tensor
-    valid: Tensor
-    side: Tensor
+    rest: Tensor  # (P,3), millimetres; the first 68 rows are the landmarks' own vertices
+    basis: Tensor  # what a unit of each weight adds, (P,3,N)
+    rows: Tensor  # which points each contour landmark may be, (J,C) into P; the first is the landmark itself
+    valid: Tensor  # which of them count, (J,C) bool
+    side: Tensor  # of the face, +1 toward positive x, (J,)
+    # activation, corrective_basis: of C correctives, and what a unit of each adds, (P,3,C); none if absent
     activation: CorrectiveActivation | None = None
     corrective_basis: Tensor | None = None
 

@@ -86,23 +86,16 @@ class VideoState:
 
 @dataclass(frozen=True, eq=False)
 class FrameTerms:
-    """What the energies of B frames are made of.
+    """What the energies of B frames are made of."""
 
-    Args:
-        landmarks: finite, (B,68,2).
-        precision: of each, one over its standard deviation, 0 where not seen, (B,68).
-        rotation, translation: the tracked pose, (B,3,3) and (B,3).
-        expected: what is known before the frames are seen.
-        read: what readings say of the weights (B,N) themselves; nothing if absent.
-        views: of other cameras, with finite landmarks; their deviations count all noise, infinite where not seen.
-    """
-
-    landmarks: Tensor
-    precision: Tensor
+    landmarks: Tensor  # finite, (B,68,2)
+    precision: Tensor  # of each, one over its standard deviation, 0 where not seen, (B,68)
+    # rotation, translation: the tracked pose, (B,3,3) and (B,3)
     rotation: Tensor
     translation: Tensor
-    expected: Expectation
-    read: Quadratic | None = None
+    expected: Expectation  # what is known before the frames are seen
+    read: Quadratic | None = None  # what readings say of the weights (B,N) themselves; nothing if absent
+    # of other cameras, with finite landmarks; their deviations count all noise, infinite where not seen
     views: tuple[CameraView, ...] = ()
 
     def tensors(self) -> tuple[Tensor, ...]:

@@ -34,17 +34,11 @@ _SERIES = tuple(accumulate((2 * k / (2 * k + 1) for k in range(1, 8)), mul, init
 
 @dataclass(frozen=True, eq=False)
 class HeadState:
-    """Weights and poses of B faces.
+    """Weights and poses of B faces."""
 
-    Args:
-        weights: (B,N).
-        rotation: rig to camera, (B,3,3).
-        translation: rig to camera, (B,3), millimetres.
-    """
-
-    weights: Tensor
-    rotation: Tensor
-    translation: Tensor
+    weights: Tensor  # (B,N)
+    rotation: Tensor  # rig to camera, (B,3,3)
+    translation: Tensor  # rig to camera, (B,3), millimetres
 
     def stepped(self, step: Tensor) -> HeadState:
         """After a step (B,N+6): of weights, a rotation vector in the camera's frame (radians), and millimetres."""
@@ -86,15 +80,10 @@ def rotation_between(start: Tensor, end: Tensor) -> Tensor:
 
 @dataclass(frozen=True, eq=False)
 class Linearised:
-    """Whitened residuals of landmarks and their derivatives.
+    """Whitened residuals of landmarks and their derivatives."""
 
-    Args:
-        residual: modelled minus found, in standard deviations, (B,L,2); zero for what is not seen.
-        jacobian: by the weights and the head's motion, (B,L,2,N+6).
-    """
-
-    residual: Tensor
-    jacobian: Tensor
+    residual: Tensor  # modelled minus found, in standard deviations, (B,L,2); zero for what is not seen
+    jacobian: Tensor  # by the weights and the head's motion, (B,L,2,N+6)
 
     def energy(self) -> Quadratic:
         r"""The landmarks' energy of a step d, :math:`\tfrac12 \lVert r + J d \rVert^2`."""

@@ -20,16 +20,12 @@ _TRUST = torch.tensor([0.25 if i < 17 else 1.0 for i in STABLE_LANDMARKS], dtype
 
 @dataclass(frozen=True)
 class PoseSettings:
-    """How head poses are found.
+    """How head poses are found."""
 
-    Args:
-        threshold: how far a stable landmark may be off before it counts as an outlier, millimetres on the head; twice
-            that for the temples. The rig is not the person to the millimetre, so this is more than landmarks are noisy.
-        min_landmarks: stable landmarks that a pose needs.
-    """
-
+    # how far a stable landmark may be off before it counts as an outlier, millimetres on the head; twice that for the
+    # temples. The rig is not the person to the millimetre, so this is more than landmarks are noisy
     threshold: float = 8.0
-    min_landmarks: int = 6
+    min_landmarks: int = 6  # stable landmarks that a pose needs
 
     def __post_init__(self) -> None:
         if not 0 < self.threshold < float("inf") or self.min_landmarks < 4:
@@ -41,19 +37,12 @@ class PoseSettings:
 
 @dataclass(frozen=True, eq=False)
 class HeadPoses:
-    """Rig to camera in each frame, in OpenCV's convention.
+    """Rig to camera in each frame, in OpenCV's convention."""
 
-    Args:
-        rotation: (T,3,3) float64; NaN where not found.
-        translation: (T,3), millimetres.
-        errors: of the stable landmarks, weighted root mean square, (T,), pixels; NaN where not found.
-        found: frames with a pose, (T,) bool.
-    """
-
-    rotation: Tensor
-    translation: Tensor
-    errors: Tensor
-    found: Tensor
+    rotation: Tensor  # (T,3,3) float64; NaN where not found
+    translation: Tensor  # (T,3), millimetres
+    errors: Tensor  # of the stable landmarks, weighted root mean square, (T,), pixels; NaN where not found
+    found: Tensor  # frames with a pose, (T,) bool
 
 
 def measure_poses(

@@ -37,22 +37,15 @@ _FREE = 1e3
 
 @dataclass(frozen=True, eq=False)
 class _Mean:
-    """What all frames together say of a constant expression (N) and of offsets (204), the heads' poses left to each.
+    """What all frames together say of a constant expression (N) and of offsets (204), the heads' poses left to each."""
 
-    Args:
-        read: what the frames' readings say of the expression on average.
-        H, gradient: of half the squared residual, in units of ``_MODEL_ERROR``, (N+204,N+204) and (N+204,).
-        weights: the frames' mean, (N,).
-        scale: how large offsets are beside what is expected of them.
-        noise: what varies of residuals, standard deviation as a share of the eyes' distance.
-    """
-
-    read: Quadratic | None
+    read: Quadratic | None  # what the frames' readings say of the expression on average
+    # H, gradient: of half the squared residual, in units of `_MODEL_ERROR`, (N+204,N+204) and (N+204,)
     H: Tensor
     gradient: Tensor
-    weights: Tensor
-    scale: float
-    noise: float
+    weights: Tensor  # the frames' mean, (N,)
+    scale: float  # how large offsets are beside what is expected of them
+    noise: float  # what varies of residuals, standard deviation as a share of the eyes' distance
 
 
 def estimate_offsets(

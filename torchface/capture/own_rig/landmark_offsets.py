@@ -29,19 +29,16 @@ class LandmarkOffsets:
 
     They hold for one rig and one finder: what annotators call an eyebrow's edge, and where the rig is not the person.
     They are in the rig's own space and so turn, and grow with the face's nearness, as the head does.
-
-    Args:
-        millimetres: added to each landmark's place on the rig, (68,3) float64.
-        noise: what landmarks are off by beside that, standard deviation of a coordinate, as a share of the distance
-            of the eyes' outer corners.
-        rig, finder: digests of what they were estimated with; empty if not known.
-        video, source: digest and name of the video that they were estimated from; empty if not known.
     """
 
-    millimetres: Tensor
+    millimetres: Tensor  # added to each landmark's place on the rig, (68,3) float64
+    # what landmarks are off by beside that, standard deviation of a coordinate, as a share of the distance of the eyes'
+    # outer corners
     noise: float
+    # rig, finder: digests of what they were estimated with; empty if not known
     rig: str = ""
     finder: str = ""
+    # video, source: digest and name of the video that they were estimated from; empty if not known
     video: str = ""
     source: str = ""
 

@@ -37,24 +37,16 @@ class LightSource:
 
 @dataclass(frozen=True, eq=False)
 class SourceFit:
-    """A source and what comes with it.
+    """A source and what comes with it."""
 
-    Args:
-        source: where it stands.
-        factors: of the columns, none negative, (3,3).
-        lit: 1 where the source reaches, else 0, (Q,).
-        columns: how vertices look under ambient light, under the source without gloss, and with all the gloss that
-            skin has, (3,Q,3).
-        residuals: shaded albedo minus frame, sRGB, (Q,3); 0 where blown out.
-        trust: robust weight of each vertex, in (0,1], (Q,).
-    """
-
-    source: LightSource
-    factors: Tensor
-    lit: Tensor
+    source: LightSource  # where it stands
+    factors: Tensor  # of the columns, none negative, (3,3)
+    lit: Tensor  # 1 where the source reaches, else 0, (Q,)
+    # how vertices look under ambient light, under the source without gloss, and with all the gloss that skin has,
+    # (3,Q,3)
     columns: Tensor
-    residuals: Tensor
-    trust: Tensor
+    residuals: Tensor  # shaded albedo minus frame, sRGB, (Q,3); 0 where blown out
+    trust: Tensor  # robust weight of each vertex, in (0,1], (Q,)
     cost: float
 
     @property

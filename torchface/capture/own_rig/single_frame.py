@@ -56,25 +56,18 @@ class _Points:
 
 @dataclass(frozen=True, eq=False)
 class SingleFrame:
-    """One frame's energy and its steps.
-
-    Args:
-        terms: of one frame; without views of other cameras.
-        points: of the rig; without correctives.
-        intrinsics: (3,3) float64.
-        lower, upper, l1_penalty, ridge: of a step, (N+6,) float64.
-        signed: see ``signed_quantities``, (K,N) float64.
-    """
+    """One frame's energy and its steps."""
 
     settings: VideoSettings
-    terms: FrameTerms
-    points: FacePoints
-    intrinsics: Tensor
+    terms: FrameTerms  # of one frame; without views of other cameras
+    points: FacePoints  # of the rig; without correctives
+    intrinsics: Tensor  # (3,3) float64
+    # lower, upper, l1_penalty, ridge: of a step, (N+6,) float64
     lower: Tensor
     upper: Tensor
     l1_penalty: Tensor
     ridge: Tensor
-    signed: Tensor
+    signed: Tensor  # see `signed_quantities`, (K,N) float64
 
     def solve(self, start: HeadState, exactness: float) -> tuple[HeadState, Tensor]:
         """Weights and pose from a start, with which point each landmark is; see ``FrameSolver.solve``."""

@@ -26,29 +26,17 @@ _MOST_AREA = 4.0  # of the mean; one large triangle shall not speak for all
 
 @dataclass(frozen=True, eq=False)
 class SeenSkin:
-    """Q vertices of all frames together, in the camera's frame, float64.
+    """Q vertices of all frames together, in the camera's frame, float64."""
 
-    Args:
-        points: (Q,3), millimetres.
-        normals: unit, (Q,3).
-        albedo: linear, (Q,3).
-        colors: of the frames there, linear, (Q,3).
-        valid: 0 where a channel is blown out, else 1, (Q,3).
-        area: pixels that a vertex stands for, of mean 1, (Q,).
-        frame: which of the T frames, (Q,) int64.
-        vertex: which vertex, (Q,) int64.
-        casters: the mesh in each frame.
-    """
-
-    points: Tensor
-    normals: Tensor
-    albedo: Tensor
-    colors: Tensor
-    valid: Tensor
-    area: Tensor
-    frame: Tensor
-    vertex: Tensor
-    casters: tuple[RayCaster, ...]
+    points: Tensor  # (Q,3), millimetres
+    normals: Tensor  # unit, (Q,3)
+    albedo: Tensor  # linear, (Q,3)
+    colors: Tensor  # of the frames there, linear, (Q,3)
+    valid: Tensor  # 0 where a channel is blown out, else 1, (Q,3)
+    area: Tensor  # pixels that a vertex stands for, of mean 1, (Q,)
+    frame: Tensor  # which of the T frames, (Q,) int64
+    vertex: Tensor  # which vertex, (Q,) int64
+    casters: tuple[RayCaster, ...]  # the mesh in each frame
 
     @property
     def centre(self) -> Tensor:

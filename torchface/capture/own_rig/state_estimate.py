@@ -15,14 +15,10 @@ class StateEstimate:
 
     The prior of which weights faces have and the weights' bounds are left out: they hold in every frame anew, and were
     they folded in, each frame would count them again. So the means may lie outside [0,1] where little was seen.
-
-    Args:
-        mean: weights (B,N) and pose.
-        covariance: of weights, rotation and translation in the camera's frame, (B,N+6,N+6).
     """
 
-    mean: HeadState
-    covariance: Tensor
+    mean: HeadState  # weights (B,N) and pose
+    covariance: Tensor  # of weights, rotation and translation in the camera's frame, (B,N+6,N+6)
 
     def predicted(self, steps: Tensor, variance: Tensor, motion_variance: Tensor) -> "StateEstimate":
         """One frame on.
@@ -43,15 +39,10 @@ class StateEstimate:
 
 @dataclass(frozen=True, eq=False)
 class Expectation:
-    r"""What is expected of a frame before it is seen, :math:`E(x) = \tfrac12 (x - m)^\top \Lambda (x - m)`.
+    r"""What is expected of a frame before it is seen, :math:`E(x) = \tfrac12 (x - m)^\top \Lambda (x - m)`."""
 
-    Args:
-        mean: m, weights (B,N) and pose.
-        information: :math:`\Lambda`, of weights, rotation and translation, (B,N+6,N+6).
-    """
-
-    mean: HeadState
-    information: Tensor
+    mean: HeadState  # m, weights (B,N) and pose
+    information: Tensor  # \Lambda, of weights, rotation and translation, (B,N+6,N+6)
 
     def energy(self, head: HeadState) -> Quadratic:
         """Of a step (B,N+6) from a state."""

@@ -52,25 +52,17 @@ _EYES = tuple(range(36, 42)), tuple(range(42, 48))
 
 @dataclass(frozen=True, eq=False)
 class TakeEyes:
-    """Eyes in T frames, the right one first.
+    """Eyes in T frames, the right one first."""
 
-    Args:
-        open: openness beside the person's own, 0 shut and 1 as at rest, (T,2); NaN where nothing is known.
-        open_deviation: of it, (T,2).
-        closed: how likely each is shut, (T,2); NaN where nobody said.
-        gaze: to the person's left and up, beside the head and straight ahead, (T,2,2) radians; held where eyes are
-            shut, NaN where they were never seen.
-        gaze_trust: (T,2) in [0,1].
-        lid_trust: how far the landmarks of each eye agree with that, (T,2) in [0,1].
-        straight: what was taken for the person's own straight ahead beside the model's, (2,2) radians; zero if absent.
-    """
-
-    open: Tensor
-    open_deviation: Tensor
-    closed: Tensor
+    open: Tensor  # openness beside the person's own, 0 shut and 1 as at rest, (T,2); NaN where nothing is known
+    open_deviation: Tensor  # of it, (T,2)
+    closed: Tensor  # how likely each is shut, (T,2); NaN where nobody said
+    # to the person's left and up, beside the head and straight ahead, (T,2,2) radians; held where eyes are shut, NaN
+    # where they were never seen
     gaze: Tensor
-    gaze_trust: Tensor
-    lid_trust: Tensor
+    gaze_trust: Tensor  # (T,2) in [0,1]
+    lid_trust: Tensor  # how far the landmarks of each eye agree with that, (T,2) in [0,1]
+    # what was taken for the person's own straight ahead beside the model's, (2,2) radians; zero if absent
     straight: Tensor | None = None
 
     def readings(self, rest: Tensor, basis: Tensor, names: Sequence[str], eyeballs: Eyeballs) -> WeightReadings:

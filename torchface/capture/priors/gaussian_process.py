@@ -32,17 +32,12 @@ class Kernel:
 
     .. math:: k(x, x') = \theta_0 \exp\Big(-\tfrac12 \sum_d \frac{(x_d - x'_d)^2}{\ell_d^2}\Big)
 
-    Args:
-        signal: :math:`\theta_0`.
-        inverse_lengths: :math:`1/\ell_d`, (F,); 0 for inputs that it does not use.
-        noise: :math:`\beta^{-1}`, the variance of targets around the function.
-
     Source: thesis 4.2.10, equations 58 and 59, with a length for each input.
     """
 
-    signal: float
-    inverse_lengths: Tensor
-    noise: float
+    signal: float  # \theta_0
+    inverse_lengths: Tensor  # 1/\ell_d, (F,); 0 for inputs that it does not use
+    noise: float  # \beta^{-1}, the variance of targets around the function
 
     def between(self, first: Tensor, second: Tensor) -> Tensor:
         """k of inputs (A,F) and (B,F), (A,B)."""
@@ -137,15 +132,10 @@ class Posterior:
 
 @dataclass(frozen=True, eq=False)
 class Statistics:
-    """Sufficient statistics: sums over frames, so that takes can be added and left out.
+    """Sufficient statistics: sums over frames, so that takes can be added and left out."""
 
-    Args:
-        square: :math:`\\Phi^\\top\\Phi`, (M,M).
-        product: :math:`\\Phi^\\top t`, (M,N).
-    """
-
-    square: Tensor
-    product: Tensor
+    square: Tensor  # \\Phi^\\top\\Phi, (M,M)
+    product: Tensor  # \\Phi^\\top t, (M,N)
 
     def __add__(self, other: Statistics) -> Statistics:
         return Statistics(self.square + other.square, self.product + other.product)

@@ -25,14 +25,10 @@ class WrinkleBasis:
 
     A map holds something else in each region, as the regions' weights are their own: M maps and R regions show M·R
     patterns of wrinkles.
-
-    Args:
-        maps: B, (M,3,V), millimetres along two tangents and the normal of the smooth skin.
-        region_weights: :math:`\omega`, (R,V), of sum 1 in every vertex.
     """
 
-    maps: Tensor
-    region_weights: Tensor
+    maps: Tensor  # B, (M,3,V), millimetres along two tangents and the normal of the smooth skin
+    region_weights: Tensor  # \omega, (R,V), of sum 1 in every vertex
     areas: Tensor
 
     def weights(self, details: LearnedBasis) -> Tensor:

@@ -18,17 +18,11 @@ _REACH, _STEP, _DOUBT = 0.25, 0.04, 0.2
 
 @dataclass(frozen=True, eq=False)
 class Displacement:
-    """A smooth displacement of a picture that moves L places by given steps; it fades beyond them.
+    """A smooth displacement of a picture that moves L places by given steps; it fades beyond them."""
 
-    Args:
-        places: (L,2) pixels.
-        factors: of the Gaussian bumps about them, (L,2) pixels.
-        reach: their standard deviation, pixels.
-    """
-
-    places: Tensor
-    factors: Tensor
-    reach: float
+    places: Tensor  # (L,2) pixels
+    factors: Tensor  # of the Gaussian bumps about them, (L,2) pixels
+    reach: float  # their standard deviation, pixels
 
     @staticmethod
     def of(places: Tensor, steps: Tensor, unit: float) -> "Displacement":
@@ -55,17 +49,11 @@ def _bumps(pixels: Tensor, places: Tensor, reach: float) -> Tensor:
 
 @dataclass(frozen=True, eq=False)
 class FeatureAlignment:
-    """How a photograph is bent.
+    """How a photograph is bent."""
 
-    Args:
-        to_found: from where the fitted head shows a place to where the photograph does.
-        to_fitted: the way back.
-        unit: the distance of the eyes' outer corners, pixels.
-    """
-
-    to_found: Displacement
-    to_fitted: Displacement
-    unit: float
+    to_found: Displacement  # from where the fitted head shows a place to where the photograph does
+    to_fitted: Displacement  # the way back
+    unit: float  # the distance of the eyes' outer corners, pixels
 
     @staticmethod
     def of(fitted: Tensor, residuals: Tensor) -> "FeatureAlignment":

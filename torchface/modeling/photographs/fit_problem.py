@@ -23,24 +23,15 @@ _ALIKE_IN_PICTURES, _BROWS_GROW = 0.3, 3.0
 
 @dataclass(frozen=True, eq=False)
 class Problem:
-    """What is looked for and where it was seen.
+    """What is looked for and where it was seen."""
 
-    Args:
-        points: landmarks and contour curves as functions of K coefficients of identity and N weights.
-        identities: K; the last ``smooth`` of them are differences that the head model does not know.
-        found: landmarks and points of the surface, (I,68+P,2), NaN for missing.
-        focal: the expected focal lengths, (I,), pixels.
-        twins: rows of shapes that mirror each other, (P,2); none if absent.
-        smooth: see ``smooth_differences``.
-    """
-
-    points: LinearPoints
-    identities: int
-    found: Tensor
-    focal: Tensor
+    points: LinearPoints  # landmarks and contour curves as functions of K coefficients of identity and N weights
+    identities: int  # K; the last `smooth` of them are differences that the head model does not know
+    found: Tensor  # landmarks and points of the surface, (I,68+P,2), NaN for missing
+    focal: Tensor  # the expected focal lengths, (I,), pixels
     settings: FitSettings
-    twins: Tensor | None = None
-    smooth: int = 0
+    twins: Tensor | None = None  # rows of shapes that mirror each other, (P,2); none if absent
+    smooth: int = 0  # see `smooth_differences`
 
     @property
     def seen(self) -> Tensor:
@@ -139,20 +130,13 @@ class Problem:
 
 @dataclass(frozen=True, eq=False)
 class State:
-    """Where the solve stands.
+    """Where the solve stands."""
 
-    Args:
-        coefficients: (D,).
-        rows: which point each landmark is, (I,68).
-        noise: of an inner landmark, pixels.
-        unknown: the variance of differences that the head model does not know, in what is expected of them.
-    """
-
-    coefficients: Tensor
+    coefficients: Tensor  # (D,)
     views: Views
-    rows: Tensor
-    noise: float
-    unknown: float = 1.0
+    rows: Tensor  # which point each landmark is, (I,68)
+    noise: float  # of an inner landmark, pixels
+    unknown: float = 1.0  # the variance of differences that the head model does not know, in what is expected of them
 
 
 def whitening(problem: Problem, state: State, picked: PickedPoints) -> Whitening:

@@ -33,17 +33,11 @@ class ExpressionPrior(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class SurfacePoints:
-    """Points of the face's surface as a dense network finds them beside the 68 landmarks.
+    """Points of the face's surface as a dense network finds them beside the 68 landmarks."""
 
-    Args:
-        points: (I,P,2) pixels; NaN for missing.
-        deviations: standard deviations of a coordinate as they are stated, (I,P) pixels.
-        sites: where they lie on the rig's mesh, P of them.
-    """
-
-    points: Tensor
-    deviations: Tensor
-    sites: Attachment
+    points: Tensor  # (I,P,2) pixels; NaN for missing
+    deviations: Tensor  # standard deviations of a coordinate as they are stated, (I,P) pixels
+    sites: Attachment  # where they lie on the rig's mesh, P of them
 
 
 @dataclass(frozen=True)

@@ -28,22 +28,16 @@ _ALONG_FORMS = 3.2
 
 @dataclass(frozen=True, eq=False)
 class Normal:
-    """The normal equations after the cameras are eliminated, and what brings them back.
+    """The normal equations after the cameras are eliminated, and what brings them back."""
 
-    Args:
-        H: of the coefficients, (D,D), without the prior.
-        g: (D,).
-        rows: of each view's coefficients, (I,K+N).
-        focal_back, focal_alone: the step of the focal lengths for one of the coefficients, (F,D), and at none, (F,).
-        pose_back, pose_alone: that of a view's pose for its coefficients and its focal length, (I,6,K+N+1), and at
-            none, (I,6).
-    """
-
-    H: Tensor
-    g: Tensor
-    rows: Tensor
+    H: Tensor  # of the coefficients, (D,D), without the prior
+    g: Tensor  # (D,)
+    rows: Tensor  # of each view's coefficients, (I,K+N)
+    # focal_back, focal_alone: the step of the focal lengths for one of the coefficients, (F,D), and at none, (F,)
     focal_back: Tensor
     focal_alone: Tensor
+    # pose_back, pose_alone: that of a view's pose for its coefficients and its focal length, (I,6,K+N+1), and at none,
+    # (I,6)
     pose_back: Tensor
     pose_alone: Tensor
 

@@ -22,40 +22,24 @@ BROWS = slice(17, 27)
 
 @dataclass(frozen=True, eq=False)
 class LandmarkSites:
-    """Where on a mesh points are that pictures show.
+    """Where on a mesh points are that pictures show."""
 
-    Args:
-        landmarks: vertices of the 68, (68,).
-        curves: that the contour's ones slide along.
-        annotated: the 68 lie where annotators put them.
-        faces: of the mesh, (F,3); not needed without other points.
-        surface: other points of the surface; none if absent.
-    """
-
-    landmarks: Tensor
-    curves: LevelCurves
-    annotated: bool = False
-    faces: Tensor | None = None
-    surface: Attachment | None = None
+    landmarks: Tensor  # vertices of the 68, (68,)
+    curves: LevelCurves  # that the contour's ones slide along
+    annotated: bool = False  # the 68 lie where annotators put them
+    faces: Tensor | None = None  # of the mesh, (F,3); not needed without other points
+    surface: Attachment | None = None  # other points of the surface; none if absent
 
 
 @dataclass(frozen=True, eq=False)
 class LinearPoints:
-    """Points that follow D coefficients: landmarks, others of the surface, curves that the contour's ones slide along.
+    """Points by D coefficients: landmarks, others of the surface, curves that contour landmarks slide along."""
 
-    Args:
-        mean: (P,3); the first 68 rows are the landmarks, those of the surface follow, then the curves.
-        basis: what a unit of each coefficient adds, (D,P,3).
-        rows: which points each contour landmark may be, (J,C) into P; the first is the landmark itself.
-        valid: which of them count, (J,C) bool.
-        side: of the face, +1 toward positive x, (J,).
-    """
-
-    mean: Tensor
-    basis: Tensor
-    rows: Tensor
-    valid: Tensor
-    side: Tensor
+    mean: Tensor  # (P,3); the first 68 rows are the landmarks, those of the surface follow, then the curves
+    basis: Tensor  # what a unit of each coefficient adds, (D,P,3)
+    rows: Tensor  # which points each contour landmark may be, (J,C) into P; the first is the landmark itself
+    valid: Tensor  # which of them count, (J,C) bool
+    side: Tensor  # of the face, +1 toward positive x, (J,)
 
     @staticmethod
     def of(mean: Tensor, modes: Tensor, sites: LandmarkSites) -> LinearPoints:
@@ -143,32 +127,20 @@ def chosen_points(points: LinearPoints, coefficients: Tensor, views: Views, slid
 
 @dataclass(frozen=True, eq=False)
 class Linearised:
-    """Residuals of I views with L landmarks, whitened, and their derivatives.
+    """Residuals of I views with L landmarks, whitened, and their derivatives."""
 
-    Args:
-        residual: seen minus found, (I,L,2).
-        by_coefficients: (I,L,2,D).
-        by_camera: by rotation and translation, (I,L,2,6).
-        by_focal: by the focal length's logarithm, (I,L,2).
-    """
-
-    residual: Tensor
-    by_coefficients: Tensor
-    by_camera: Tensor
-    by_focal: Tensor
+    residual: Tensor  # seen minus found, (I,L,2)
+    by_coefficients: Tensor  # (I,L,2,D)
+    by_camera: Tensor  # by rotation and translation, (I,L,2,6)
+    by_focal: Tensor  # by the focal length's logarithm, (I,L,2)
 
 
 @dataclass(frozen=True, eq=False)
 class Whitening:
-    """What makes errors of L points in I views unit and independent.
+    """What makes errors of L points in I views unit and independent."""
 
-    Args:
-        factors: of each point, (I,L,2,2).
-        mixing: across points whose errors go together, (I,L,L); nothing if absent.
-    """
-
-    factors: Tensor
-    mixing: Tensor | None = None
+    factors: Tensor  # of each point, (I,L,2,2)
+    mixing: Tensor | None = None  # across points whose errors go together, (I,L,L); nothing if absent
 
     def scaled(self, values: Tensor) -> Tensor:
         """Values (I,L,2,...) in each point's own deviations."""

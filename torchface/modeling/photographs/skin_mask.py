@@ -24,30 +24,18 @@ _SHADOW = 5  # pixels of the network's crop across which hair darkens skin
 
 @dataclass(frozen=True, eq=False)
 class FacePlaces:
-    """Where vertices lie beside a face's landmarks; lengths in distances between the outer corners of the eyes.
+    """Where vertices lie beside a face's landmarks; lengths in distances between the outer corners of the eyes."""
 
-    Args:
-        out: the way from the face's middle to its outline (jaw, and over the brows), seen from the front, (V,); 1 is
-            on it.
-        beyond: length beyond that outline, (V,); negative inside.
-        place: right, up and forward of the point between the eyes, (V,3).
-        features: near eyes, brows, nostrils or mouth, which are no skin and yet the person's, (V,) bool.
-        behind: length behind the ears' landmarks, (V,).
-        chin: the chin's place, (3,).
-        brows: how high the brows are.
-        brow: near a brow's landmarks, (V,) bool.
-        ears: how far forward the ears' landmarks lie.
-    """
-
+    # the way from the face's middle to its outline (jaw, and over the brows), seen from the front, (V,); 1 is on it
     out: Tensor
-    beyond: Tensor
-    place: Tensor
-    features: Tensor
-    behind: Tensor
-    chin: Tensor
-    brow: Tensor
-    brows: float
-    ears: float
+    beyond: Tensor  # length beyond that outline, (V,); negative inside
+    place: Tensor  # right, up and forward of the point between the eyes, (V,3)
+    features: Tensor  # near eyes, brows, nostrils or mouth, which are no skin and yet the person's, (V,) bool
+    behind: Tensor  # length behind the ears' landmarks, (V,)
+    chin: Tensor  # the chin's place, (3,)
+    brow: Tensor  # near a brow's landmarks, (V,) bool
+    brows: float  # how high the brows are
+    ears: float  # how far forward the ears' landmarks lie
 
     @property
     def cheeks(self) -> Tensor:
@@ -80,17 +68,11 @@ class FacePlaces:
 
 @dataclass(frozen=True, eq=False)
 class ShownParts:
-    """What a photograph shows at each vertex, (V,) in [0,1] each; of hidden vertices it says nothing.
+    """What a photograph shows at each vertex, (V,) in [0,1] each; of hidden vertices it says nothing."""
 
-    Args:
-        own: the person's skin, brows, eyes, lips, teeth, beard: all that is painted on the head.
-        bare: skin alone.
-        hair: hair, the beard not.
-    """
-
-    own: Tensor
-    bare: Tensor
-    hair: Tensor
+    own: Tensor  # the person's skin, brows, eyes, lips, teeth, beard: all that is painted on the head
+    bare: Tensor  # skin alone
+    hair: Tensor  # hair, the beard not
 
     @staticmethod
     def of(parts: FaceParts | None, pixels: Tensor, places: FacePlaces, graph: VertexGraph) -> "ShownParts":

@@ -77,17 +77,11 @@ def fit_expressions(
 
 @dataclass(frozen=True, eq=False)
 class _Motion:
-    """How far people move.
+    """How far people move."""
 
-    Args:
-        squared: mean of the squared offset of each vertex in each expression, (N,V).
-        places: rows of the N·V that anyone moves, (P,).
-        differs: whether people move these differently.
-    """
-
-    squared: Tensor
-    places: Tensor
-    differs: bool
+    squared: Tensor  # mean of the squared offset of each vertex in each expression, (N,V)
+    places: Tensor  # rows of the N·V that anyone moves, (P,)
+    differs: bool  # whether people move these differently
 
 
 def _motion(predicted: Predicted, expressions: int) -> _Motion:
@@ -169,19 +163,12 @@ _NO_VARIANCE = 1e-10
 
 @dataclass(frozen=True)
 class Choice:
-    """The least error found, and where.
+    """The least error found, and where."""
 
-    Args:
-        inputs: components of the input.
-        outputs: components of the output.
-        ridge: see ``ExpressionRegression.fit``.
-        error: squared, summed over the samples left out, in the unit of the outputs.
-    """
-
-    inputs: int
-    outputs: int
-    ridge: float
-    error: float
+    inputs: int  # components of the input
+    outputs: int  # components of the output
+    ridge: float  # see `ExpressionRegression.fit`
+    error: float  # squared, summed over the samples left out, in the unit of the outputs
 
 
 def choose_components(

@@ -46,18 +46,12 @@ _FINEST, _HELD = 1.3, 0.005  # millimetres: narrower folds go; how much each pla
 
 @dataclass(frozen=True, eq=False)
 class SkinOfHead:
-    """A head's skin apart from its other parts, upright, millimetres.
+    """A head's skin apart from its other parts, upright, millimetres."""
 
-    Args:
-        vertices: of the head, (J,3) float64.
-        loose: vertices that are no skin, (J,) bool.
-        part: connected part of each vertex, (J,).
-    """
-
-    vertices: Tensor
+    vertices: Tensor  # of the head, (J,3) float64
     faces: Tensor
-    loose: Tensor
-    part: Tensor
+    loose: Tensor  # vertices that are no skin, (J,) bool
+    part: Tensor  # connected part of each vertex, (J,)
 
     @property
     def skin(self) -> Tensor:
@@ -156,28 +150,18 @@ def _share(down: Tensor, blink: Tensor) -> float | None:
 
 @dataclass(frozen=True, eq=False)
 class _Lids:
-    """The lids of one eye.
-
-    Args:
-        skin: triangles (S,3).
-        edges: places of the upper and of the lower edge on the skin.
-        height: of the opening, millimetres.
-        rows: vertices of the skin around, (n,).
-        faces: triangles among them, (m,3) of 0 to n-1.
-        matrices: (k,n) each, points of the upper and of the lower edge from the vertices.
-        system: of the change of the vertices that moves the edges.
-        eye: the triangles of what lies in it.
-    """
+    """The lids of one eye."""
 
     head: SkinOfHead
-    skin: Tensor
-    edges: tuple[SurfacePoints, SurfacePoints]
-    height: float
-    rows: Tensor
-    faces: Tensor
+    skin: Tensor  # triangles (S,3)
+    edges: tuple[SurfacePoints, SurfacePoints]  # places of the upper and of the lower edge on the skin
+    height: float  # of the opening, millimetres
+    rows: Tensor  # vertices of the skin around, (n,)
+    faces: Tensor  # triangles among them, (m,3) of 0 to n-1
+    # (k,n) each, points of the upper and of the lower edge from the vertices
     matrices: tuple[sparse.csr_array, sparse.csr_array]
-    system: SparseCholesky
-    eye: Tensor
+    system: SparseCholesky  # of the change of the vertices that moves the edges
+    eye: Tensor  # the triangles of what lies in it
 
     @staticmethod
     def of(head: SkinOfHead, opening: EyeOpening, index: SurfaceIndex) -> "_Lids":

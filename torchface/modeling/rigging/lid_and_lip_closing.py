@@ -30,17 +30,13 @@ _CANCELLED = 0.2
 
 @dataclass(frozen=True, eq=False)
 class Seams:
-    """Pairs of vertices that touch, by when they do.
+    """Pairs of vertices that touch, by when they do."""
 
-    Args:
-        closed: pairs of seams that are closed at rest, such as lips, (K,2) int64.
-        closing: one entry a shape: the pairs of other seams, such as lids, that its pose brings together.
-        undoes: for a shape that makes sense only on top of another, because alone it would drive a closed seam far
-            through itself (closing lips over an open jaw), the index of that other shape.
-    """
-
-    closed: Tensor
+    closed: Tensor  # pairs of seams that are closed at rest, such as lips, (K,2) int64
+    # one entry a shape: the pairs of other seams, such as lids, that its pose brings together
     closing: list[ContactPairs]
+    # for a shape that makes sense only on top of another, because alone it would drive a closed seam far through itself
+    # (closing lips over an open jaw), the index of that other shape
     undoes: dict[int, int]
 
 

@@ -170,19 +170,12 @@ def _spread(points: Tensor, at: Tensor, steps: Tensor, reach: float) -> Tensor:
 
 @dataclass(frozen=True)
 class Penetration:
-    """The parts inside a head before its skin, at rest and in every shape at weight 1.
+    """The parts inside a head before its skin, at rest and in every shape at weight 1."""
 
-    Args:
-        deepest: how far a vertex of a part stands out at most, millimetres; see ``InnerParts.depth``.
-        pose: the shape in which it does, or ``rest``.
-        vertices: how many stand out by more than the tolerance, in the pose where most do.
-        poses: the poses in which some do.
-    """
-
-    deepest: float
-    pose: str
-    vertices: int
-    poses: tuple[str, ...]
+    deepest: float  # how far a vertex of a part stands out at most, millimetres; see `InnerParts.depth`
+    pose: str  # the shape in which it does, or `rest`
+    vertices: int  # how many stand out by more than the tolerance, in the pose where most do
+    poses: tuple[str, ...]  # the poses in which some do
 
     def line(self) -> str:
         """For people to read."""

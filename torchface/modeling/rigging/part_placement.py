@@ -146,19 +146,12 @@ def _fitted(aligned: Tensor, found: Tensor, bones: Tensor, parts: InnerParts) ->
 
 @dataclass(frozen=True, eq=False)
 class _SkinBefore:
-    """The skin before points (n,3), seen from a middle.
+    """The skin before points (n,3), seen from a middle."""
 
-    Args:
-        met: whether there is any, and faces the same way, (n,) bool.
-        thickness: how far it lies before each point, (n,), negative behind.
-        triangle: which, (n,) int64.
-        across: how much thinner it gets as the middle and the point move, (n,3).
-    """
-
-    met: Tensor
-    thickness: Tensor
-    triangle: Tensor
-    across: Tensor
+    met: Tensor  # whether there is any, and faces the same way, (n,) bool
+    thickness: Tensor  # how far it lies before each point, (n,), negative behind
+    triangle: Tensor  # which, (n,) int64
+    across: Tensor  # how much thinner it gets as the middle and the point move, (n,3)
 
     @staticmethod
     def of(vertices: Tensor, skin: Tensor, middle: Tensor, points: Tensor) -> "_SkinBefore":

@@ -34,19 +34,12 @@ _FOLLOWS, _FOLLOWS_SHARE = 1.0, 0.3
 
 @dataclass(frozen=True, eq=False)
 class Standing:
-    """Where parts stand to the skin in a pose.
+    """Where parts stand to the skin in a pose."""
 
-    Args:
-        depth: how far each vertex of a part stands out, (P,), millimetres; 0 where it does not.
-        outward: unit directions from the middle of its group through each vertex, (P,3).
-        triangle: row of ``InnerParts.skin`` that each vertex has come through, (P,) int64; -1 where it has not.
-        way: how far along ``outward`` that triangle lies behind the vertex, (P,), millimetres.
-    """
-
-    depth: Tensor
-    outward: Tensor
-    triangle: Tensor
-    way: Tensor
+    depth: Tensor  # how far each vertex of a part stands out, (P,), millimetres; 0 where it does not
+    outward: Tensor  # unit directions from the middle of its group through each vertex, (P,3)
+    triangle: Tensor  # row of `InnerParts.skin` that each vertex has come through, (P,) int64; -1 where it has not
+    way: Tensor  # how far along `outward` that triangle lies behind the vertex, (P,), millimetres
 
 
 @dataclass(frozen=True, eq=False)

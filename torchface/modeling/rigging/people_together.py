@@ -42,17 +42,11 @@ def _of(poses: Similarity, begin: int, end: int) -> Similarity:
 
 @dataclass(frozen=True, eq=False)
 class NeutralRegion:
-    """The part of each neutral that is learned from, (M,R,3) float32, aligned with the others.
+    """The part of each neutral that is learned from, (M,R,3) float32, aligned with the others."""
 
-    Args:
-        neutrals: (M,V,3).
-        poses: of :func:`align_neutrals`.
-        rows: which vertices, (R,).
-    """
-
-    neutrals: Samples
-    poses: Similarity
-    rows: Tensor
+    neutrals: Samples  # (M,V,3)
+    poses: Similarity  # of `align_neutrals`
+    rows: Tensor  # which vertices, (R,)
 
     @property
     def shape(self) -> tuple[int, ...]:
@@ -70,19 +64,12 @@ class NeutralRegion:
 
 @dataclass(frozen=True, eq=False)
 class Predicted:
-    """What is to be predicted of each person, (M,N·V,3) float64: offsets or expressions, turned as the neutral is.
+    """What is to be predicted of each person, (M,N·V,3) float64: offsets or expressions, turned as the neutral is."""
 
-    Args:
-        neutrals: (M,V,3).
-        expressions: (M,N·V,3).
-        poses: of :func:`align_neutrals`.
-        form: "offsets" or "expressions".
-    """
-
-    neutrals: Samples
-    expressions: Samples
-    poses: Similarity
-    form: Form
+    neutrals: Samples  # (M,V,3)
+    expressions: Samples  # (M,N·V,3)
+    poses: Similarity  # of `align_neutrals`
+    form: Form  # "offsets" or "expressions"
 
     @property
     def shape(self) -> tuple[int, ...]:
@@ -101,15 +88,10 @@ class Predicted:
 
 @dataclass(frozen=True, eq=False)
 class MovingPlaces:
-    """Those places of what is to be predicted that someone moves, (M,P,3) float32.
+    """Those places of what is to be predicted that someone moves, (M,P,3) float32."""
 
-    Args:
-        predicted: (M,N·V,3).
-        places: which rows, (P,).
-    """
-
-    predicted: Predicted
-    places: Tensor
+    predicted: Predicted  # (M,N·V,3)
+    places: Tensor  # which rows, (P,)
 
     @property
     def shape(self) -> tuple[int, ...]:

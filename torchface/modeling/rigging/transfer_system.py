@@ -216,14 +216,10 @@ class Follower:
     """How far vertices go beyond their transferred places where gradients ask for more.
 
     The transfer's energy is quadratic: what is added to its gradients adds to its solution. Pins stay.
-
-    Args:
-        matrices: of ties and contacts, each (K,V): what they measure may change too.
-        system: factored once, for the iterations to come.
     """
 
-    matrices: list[sparse.csr_array]
-    system: PreparedReconstruction
+    matrices: list[sparse.csr_array]  # of ties and contacts, each (K,V): what they measure may change too
+    system: PreparedReconstruction  # factored once, for the iterations to come
 
     def follow(self, gradients: Tensor, values: Sequence[Tensor]) -> Tensor:
         """Displacements (G,V,3) in the source's frame.
@@ -277,15 +273,10 @@ def _similarity(source: Tensor, target: Tensor) -> Similarity:
 
 @dataclass(frozen=True, eq=False)
 class PartLinks:
-    """Ties between a mesh's connected parts.
+    """Ties between a mesh's connected parts."""
 
-    Args:
-        pairs: a vertex of a part and one that it may hang on, (K,2) int64.
-        part: the connected part of every vertex, (V,) int64.
-    """
-
-    pairs: Tensor
-    part: Tensor
+    pairs: Tensor  # a vertex of a part and one that it may hang on, (K,2) int64
+    part: Tensor  # the connected part of every vertex, (V,) int64
 
     def strength(self, deltas: Tensor, tolerance: float) -> Tensor:
         r"""How firmly each tie holds in a shape, (K,), from 1 (the offset is kept) toward 0 (it changes).

@@ -6,30 +6,19 @@ from dataclasses import dataclass, field
 
 @dataclass(frozen=True)
 class StageRecord:
-    """One stage.
+    """One stage."""
 
-    Args:
-        stage: its number and what was free to move, for example ``"3 graph"``.
-        stiffness: :math:`\\alpha`.
-        iterations: linear steps made.
-        moved: mean motion of a vertex in the last of them, millimetres.
-        distance: mean distance of the correspondences that were used, millimetres.
-        landmark_distance: root mean square, millimetres; NaN without landmarks.
-        used: correspondences that were used.
-        dropped: correspondences refused, by reason: ``distance``, ``border``, ``normal``, ``fold`` where a triangle
-            would have turned over, and ``hidden`` under hair, cloth or where an ear came out in pieces.
-        energies: cost before and after each linear step, its correspondences held.
-    """
-
-    stage: str
-    stiffness: float
-    iterations: int
-    moved: float
-    distance: float
-    landmark_distance: float
-    used: int
+    stage: str  # its number and what was free to move, for example `"3 graph"`
+    stiffness: float  # \\alpha
+    iterations: int  # linear steps made
+    moved: float  # mean motion of a vertex in the last of them, millimetres
+    distance: float  # mean distance of the correspondences that were used, millimetres
+    landmark_distance: float  # root mean square, millimetres; NaN without landmarks
+    used: int  # correspondences that were used
+    # correspondences refused, by reason: `distance`, `border`, `normal`, `fold` where a triangle would have turned
+    # over, and `hidden` under hair, cloth or where an ear came out in pieces
     dropped: dict[str, int]
-    energies: tuple[tuple[float, float], ...]
+    energies: tuple[tuple[float, float], ...]  # cost before and after each linear step, its correspondences held
     seconds: float = field(compare=False)
 
 

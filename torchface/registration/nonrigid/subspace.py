@@ -14,15 +14,10 @@ _NEAREST = 6
 
 @dataclass(frozen=True, eq=False)
 class Subspace:
-    """The directions in which affine maps may change: :math:`X_0 + B y`.
+    """The directions in which affine maps may change: :math:`X_0 + B y`."""
 
-    Args:
-        basis: :math:`B`, (4V,N).
-        stiffness: :math:`M \\otimes G`, (4E,4V).
-    """
-
-    basis: sparse.csr_array
-    stiffness: sparse.csr_array
+    basis: sparse.csr_array  # B, (4V,N)
+    stiffness: sparse.csr_array  # M \\otimes G, (4E,4V)
 
     @cached_property
     def positions(self) -> sparse.csr_array:

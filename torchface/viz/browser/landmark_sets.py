@@ -8,15 +8,10 @@ from torchface.landmarks.images.ibug_68 import MIRROR_68
 
 @dataclass(frozen=True)
 class LandmarkSet:
-    """Landmarks in their order.
+    """Landmarks in their order."""
 
-    Args:
-        names: one a landmark; left and right are the performer's own.
-        mirror: for each its mirror image's row; a midline landmark names itself.
-    """
-
-    names: tuple[str, ...]
-    mirror: tuple[int, ...]
+    names: tuple[str, ...]  # one a landmark; left and right are the performer's own
+    mirror: tuple[int, ...]  # for each its mirror image's row; a midline landmark names itself
 
 
 def _numbered(part: str, count: int) -> list[str]:

@@ -31,18 +31,13 @@ class SurfacePoint:
 
 @dataclass(frozen=True)
 class Picks:
-    """All that is picked at one moment.
+    """All that is picked at one moment."""
 
-    Args:
-        landmarks: vertex ids in the set's order, nothing where not picked yet.
-        pairs: label, template vertex, scan point in the scan's space.
-        waiting: the template vertex whose scan point is still to come.
-    """
-
-    landmarks: tuple[int | None, ...] = ()
+    landmarks: tuple[int | None, ...] = ()  # vertex ids in the set's order, nothing where not picked yet
     markers: tuple[tuple[str, SurfacePoint], ...] = ()
+    # label, template vertex, scan point in the scan's space
     pairs: tuple[tuple[str, int, tuple[float, float, float]], ...] = ()
-    waiting: int | None = None
+    waiting: int | None = None  # the template vertex whose scan point is still to come
 
 
 class PickSession:

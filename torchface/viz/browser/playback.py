@@ -8,23 +8,15 @@ from dataclasses import dataclass, replace
 
 @dataclass(frozen=True)
 class Playback:
-    """The state of a timeline; moments are seconds of one clock, such as ``time.monotonic()``.
-
-    Args:
-        fps: frames a second at speed 1.
-        speed: 1 is the take's own.
-        loop: begin again at the end.
-        started: when it was set playing; stopped if absent.
-        origin: the frame at that moment, or the frame it stands at.
-        times: when each frame is shown, seconds after the first, where they come unevenly.
-    """
+    """The state of a timeline; moments are seconds of one clock, such as ``time.monotonic()``."""
 
     frames: int
-    fps: float
-    speed: float = 1.0
-    loop: bool = True
-    started: float | None = None
-    origin: int = 0
+    fps: float  # frames a second at speed 1
+    speed: float = 1.0  # 1 is the take's own
+    loop: bool = True  # begin again at the end
+    started: float | None = None  # when it was set playing; stopped if absent
+    origin: int = 0  # the frame at that moment, or the frame it stands at
+    # when each frame is shown, seconds after the first, where they come unevenly
     times: tuple[float, ...] | None = None
 
     @property

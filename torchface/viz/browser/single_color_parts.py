@@ -21,17 +21,11 @@ _MIN_FRACTION = 0.006
 
 @dataclass(frozen=True, eq=False)
 class Part:
-    """Some triangles of a mesh in one colour.
+    """Some triangles of a mesh in one colour."""
 
-    Args:
-        vertex_ids: which vertices of the mesh, (V',) int64.
-        faces: triangles into those, (F',3) int64.
-        color: in [0,1].
-    """
-
-    vertex_ids: Tensor
-    faces: Tensor
-    color: tuple[float, float, float]
+    vertex_ids: Tensor  # which vertices of the mesh, (V',) int64
+    faces: Tensor  # triangles into those, (F',3) int64
+    color: tuple[float, float, float]  # in [0,1]
 
 
 def split_parts(mesh: Mesh) -> list[Part]:

@@ -64,22 +64,15 @@ class AnimationSettings:
 
 @dataclass(frozen=True, eq=False)
 class MovingHead:
-    """An animation as meshes of one topology.
-
-    Args:
-        read: vertices (t,V,3), millimetres, of the frames from one number up to another, without it.
-        fps: frames a second, where that is known.
-        person: the head at rest that moves (V,3); None for the source's own.
-        parameters: that move it, where it came as such.
-        notes: lines for people to read.
-    """
+    """An animation as meshes of one topology."""
 
     count: int
+    # vertices (t,V,3), millimetres, of the frames from one number up to another, without it
     read: Callable[[int, int], Tensor]
-    fps: float | None = None
-    person: Tensor | None = None
-    parameters: HeadParameters | None = None
-    notes: tuple[str, ...] = ()
+    fps: float | None = None  # frames a second, where that is known
+    person: Tensor | None = None  # the head at rest that moves (V,3); None for the source's own
+    parameters: HeadParameters | None = None  # that move it, where it came as such
+    notes: tuple[str, ...] = ()  # lines for people to read
 
 
 def arkit_head(

@@ -43,43 +43,26 @@ _GIVE = "give the face's landmarks (--landmarks FILE, from torchface pick)"
 
 @dataclass(frozen=True, eq=False)
 class Source:
-    """What is given ARKit's shapes.
+    """What is given ARKit's shapes."""
 
-    Args:
-        path: of the file or folder.
-        neutral: its head at rest.
-        rig: its own shapes; None where it has none that are kept.
-        model: the head model that it is; None of a rig or a mesh.
-        unit: that the file was read in, where it was said.
-    """
-
-    path: Path
-    neutral: Mesh
-    rig: BlendshapeRig | None = None
-    model: HeadModelFile | None = None
-    unit: str | None = None
+    path: Path  # of the file or folder
+    neutral: Mesh  # its head at rest
+    rig: BlendshapeRig | None = None  # its own shapes; None where it has none that are kept
+    model: HeadModelFile | None = None  # the head model that it is; None of a rig or a mesh
+    unit: str | None = None  # that the file was read in, where it was said
 
 
 @dataclass(frozen=True, eq=False)
 class ArkitRig:
-    """A head with ARKit's shapes, and how it came to them.
-
-    Args:
-        kept: names that the source had itself.
-        made: names that were made.
-        others: the source's shapes that ARKit has not.
-        carried: how they were made, the head brought to the template's size; None where nothing was.
-        notes: lines for people to read.
-        pose: that takes the template to the head, where it was registered.
-    """
+    """A head with ARKit's shapes, and how it came to them."""
 
     rig: BlendshapeRig
-    kept: tuple[str, ...]
-    made: tuple[str, ...]
-    others: tuple[str, ...]
-    carried: CarriedShapes | None
-    notes: tuple[str, ...] = ()
-    pose: Similarity | None = None
+    kept: tuple[str, ...]  # names that the source had itself
+    made: tuple[str, ...]  # names that were made
+    others: tuple[str, ...]  # the source's shapes that ARKit has not
+    carried: CarriedShapes | None  # how they were made, the head brought to the template's size; None where nothing was
+    notes: tuple[str, ...] = ()  # lines for people to read
+    pose: Similarity | None = None  # that takes the template to the head, where it was registered
 
     def lines(self) -> list[str]:
         """For people to read."""
@@ -178,17 +161,12 @@ def _template(path: Path | None) -> BlendshapeRig:
 
 @dataclass(frozen=True, eq=False)
 class _SizedHead:
-    """A source at the template's size.
-
-    Args:
-        scan: what the template is registered to.
-        landmarks: template vertices and where they lie on it.
-    """
+    """A source at the template's size."""
 
     whole: Mesh
-    scan: Mesh
+    scan: Mesh  # what the template is registered to
     size: float
-    landmarks: Landmarks | None
+    landmarks: Landmarks | None  # template vertices and where they lie on it
 
     def back(self, pose: Similarity) -> Similarity:
         """A pose on it as one on the source."""

@@ -33,21 +33,13 @@ _FOLLOWS = 0.5
 
 @dataclass(frozen=True, eq=False)
 class HeadParameters:
-    """What moves a head model.
+    """What moves a head model."""
 
-    Args:
-        expressions: (T,e).
-        rotations: of its joints, axis times angle, (T,J,3); None without joints.
-        person: identity parameters, (k,); None for the mean head.
-        fps: frames a second, where the file says so.
-        unread: arrays that were left out.
-    """
-
-    expressions: Tensor
-    rotations: Tensor | None = None
-    person: Tensor | None = None
-    fps: float | None = None
-    unread: tuple[str, ...] = ()
+    expressions: Tensor  # (T,e)
+    rotations: Tensor | None = None  # of its joints, axis times angle, (T,J,3); None without joints
+    person: Tensor | None = None  # identity parameters, (k,); None for the mean head
+    fps: float | None = None  # frames a second, where the file says so
+    unread: tuple[str, ...] = ()  # arrays that were left out
 
     def __len__(self) -> int:
         return len(self.expressions)

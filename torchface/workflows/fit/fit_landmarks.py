@@ -143,23 +143,16 @@ _PARTS = {"jaw": slice(0, 17), "brows": slice(17, 27), "nose": slice(27, 36), "e
 
 @dataclass(frozen=True, eq=False)
 class PhotographLandmarks:
-    """What was found in one photograph.
-
-    Args:
-        number: which of the faces it is, from 0, the largest first.
-        boxes: of all faces, x, y, width, height, (F,4) pixels.
-        size: of the photograph, width and height.
-        asked: whether the user said which face.
-        places: of the points that the model finds beside the 68, on the embedded performer's mean head, (P,3) mm.
-    """
+    """What was found in one photograph."""
 
     photograph: Path
     model: str
     face: FaceReading
-    number: int
-    boxes: Tensor
-    size: tuple[int, int]
-    asked: bool = False
+    number: int  # which of the faces it is, from 0, the largest first
+    boxes: Tensor  # of all faces, x, y, width, height, (F,4) pixels
+    size: tuple[int, int]  # of the photograph, width and height
+    asked: bool = False  # whether the user said which face
+    # of the points that the model finds beside the 68, on the embedded performer's mean head, (P,3) mm
     places: Tensor = field(default_factory=lambda: torch.zeros(0, 3))
 
     @property

@@ -18,13 +18,9 @@ __all__ = ["with_readings"]
 
 @dataclass(frozen=True, eq=False)
 class ReadExpressions:
-    """A prior on the weights of I photographs, and what was read of each.
+    """A prior on the weights of I photographs, and what was read of each."""
 
-    Args:
-        prior: of any face; none if absent.
-    """
-
-    prior: ExpressionPrior | None
+    prior: ExpressionPrior | None  # of any face; none if absent
     readings: WeightReadings
 
     def energy(self, weights: Tensor) -> WeightQuadratic:

@@ -28,20 +28,14 @@ _MOST = 500
 
 @dataclass(frozen=True)
 class KeptTake:
-    """A take on the disk.
+    """A take on the disk."""
 
-    Args:
-        place: its folder's name; ``first`` for the one in the folder itself.
-        name: for people.
-        seconds, frames: how long it is.
-        filmed: whether the camera's film is kept.
-    """
-
-    place: str
-    name: str
+    place: str  # its folder's name; `first` for the one in the folder itself
+    name: str  # for people
+    # seconds, frames: how long it is
     seconds: float
     frames: int
-    filmed: bool = False
+    filmed: bool = False  # whether the camera's film is kept
 
     def fields(self) -> dict[str, Any]:
         """For the page."""

@@ -82,38 +82,24 @@ RECORDINGS = Path("recordings")
 
 @dataclass(frozen=True)
 class LiveSettings:
-    """What a live session is made of.
+    """What a live session is made of."""
 
-    Args:
-        camera: a device's number; a video file, which is played at its own rate, every frame of it where ``record``
-            names a folder; or an address at which faces are received, such as ``livelink://:11111``.
-        character: a rig by ARKit's names; the embedded performer if absent.
-        mapping: a table for shapes of other names.
-        addresses: see :func:`torchface.io.open_sender`.
-        record: a folder to record into from the first frame on.
-        takes: a folder of takes for the page, which also takes the recordings that lie there.
-        calibrate: begin with the guided calibration.
-        page: open the page in the browser.
-        port: the first that the page tries.
-        loop: play a video file again and again.
-        seconds: after which it ends.
-        enhance: an actor's model by name or folder, with which takes are enhanced when the session ends.
-        size: width and height to ask a camera for.
-    """
-
+    # a device's number; a video file, which is played at its own rate, every frame of it where `record` names a folder;
+    # or an address at which faces are received, such as `livelink://:11111`
     camera: str = "0"
-    character: Path | None = None
-    mapping: Path | None = None
-    addresses: tuple[str, ...] = ()
-    record: Path | None = None
-    takes: Path | None = None
-    calibrate: bool = False
-    page: bool = True
-    port: int = 8080
-    loop: bool = False
-    seconds: float | None = None
+    character: Path | None = None  # a rig by ARKit's names; the embedded performer if absent
+    mapping: Path | None = None  # a table for shapes of other names
+    addresses: tuple[str, ...] = ()  # see `open_sender`
+    record: Path | None = None  # a folder to record into from the first frame on
+    takes: Path | None = None  # a folder of takes for the page, which also takes the recordings that lie there
+    calibrate: bool = False  # begin with the guided calibration
+    page: bool = True  # open the page in the browser
+    port: int = 8080  # the first that the page tries
+    loop: bool = False  # play a video file again and again
+    seconds: float | None = None  # after which it ends
+    # an actor's model by name or folder, with which takes are enhanced when the session ends
     enhance: str | None = None
-    size: tuple[int, int] = DEFAULT_SIZE
+    size: tuple[int, int] = DEFAULT_SIZE  # width and height to ask a camera for
 
 
 def go_live(

@@ -47,16 +47,11 @@ class LiveFigures:
 
 @dataclass(frozen=True)
 class LiveReport:
-    """What was sent.
-
-    Args:
-        dropped: frames that came while another was solved.
-        notes: what the user should know, such as receivers that were not there.
-    """
+    """What was sent."""
 
     figures: LiveFigures
-    dropped: int
-    notes: tuple[str, ...] = ()
+    dropped: int  # frames that came while another was solved
+    notes: tuple[str, ...] = ()  # what the user should know, such as receivers that were not there
 
     def lines(self) -> list[str]:
         """For people to read."""

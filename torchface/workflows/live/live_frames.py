@@ -43,17 +43,12 @@ class FrameSource(Protocol):
 
 @dataclass(frozen=True)
 class SourceSettings:
-    """How frames are given.
+    """How frames are given."""
 
-    Args:
-        size: width and height to ask a camera for.
-        every: give every frame of a video, however late, as for a recording; else those that come too late are dropped.
-        loop: play a video again and again.
-    """
-
-    size: tuple[int, int] = DEFAULT_SIZE
+    size: tuple[int, int] = DEFAULT_SIZE  # width and height to ask a camera for
+    # give every frame of a video, however late, as for a recording; else those that come too late are dropped
     every: bool = False
-    loop: bool = False
+    loop: bool = False  # play a video again and again
 
 
 _DEFAULT = SourceSettings()
@@ -137,26 +132,18 @@ _SHORTEST = 1e-3  # seconds between frames
 
 @dataclass(frozen=True, eq=False)
 class LiveFrame:
-    """One frame as it was solved.
+    """One frame as it was solved."""
 
-    Args:
-        weights: (N,).
-        rotation: of the head, rig to camera, (3,3); NaN before the first face.
-        landmarks: (68,2), pixels; NaN where the face is lost.
-        iris: centres of the irises, right eye first, (2,2) pixels; NaN where nothing finds them.
-        gaze: right eye first, to the person's left and up, (2,2) radians.
-        calibrated: how far the person is learned, in [0,1].
-        found: whether a face is there, where no landmarks say so.
-        drawn: the picture with what was solved drawn over it, uint8 (H,W,3); the page shows it in the picture's place.
-    """
-
-    weights: Tensor
-    rotation: Tensor
-    landmarks: Tensor
+    weights: Tensor  # (N,)
+    rotation: Tensor  # of the head, rig to camera, (3,3); NaN before the first face
+    landmarks: Tensor  # (68,2), pixels; NaN where the face is lost
+    # centres of the irises, right eye first, (2,2) pixels; NaN where nothing finds them
     iris: Tensor = field(default_factory=lambda: torch.full((2, 2), torch.nan))
+    # right eye first, to the person's left and up, (2,2) radians
     gaze: Tensor = field(default_factory=lambda: torch.zeros(2, 2))
-    calibrated: float = 1.0
-    found: bool = False
+    calibrated: float = 1.0  # how far the person is learned, in [0,1]
+    found: bool = False  # whether a face is there, where no landmarks say so
+    # the picture with what was solved drawn over it, uint8 (H,W,3); the page shows it in the picture's place
     drawn: np.ndarray | None = None
 
     @cached_property

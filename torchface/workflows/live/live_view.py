@@ -21,19 +21,12 @@ _WIDTH, _QUALITY = 320, 70  # of the camera's small picture
 
 @dataclass(frozen=True, eq=False)
 class LiveView:
-    """One moment of a live session.
+    """One moment of a live session."""
 
-    Args:
-        came: when the frame came, seconds.
-        interval: since the frame before, seconds.
-        latency: from its arrival to its packets on the way, milliseconds.
-        picture: of the camera, uint8 (H,W,3), red first.
-    """
-
-    came: float
-    interval: float
-    latency: float
-    picture: np.ndarray
+    came: float  # when the frame came, seconds
+    interval: float  # since the frame before, seconds
+    latency: float  # from its arrival to its packets on the way, milliseconds
+    picture: np.ndarray  # of the camera, uint8 (H,W,3), red first
     solved: LiveFrame
 
     def message(self) -> bytes:

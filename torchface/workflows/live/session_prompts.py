@@ -35,17 +35,11 @@ _LEAST = 0.2  # of a weight over rest: a pose that is shown
 
 @dataclass(frozen=True)
 class GuidedCalibration:
-    """How far it is, where no page guides; the clock stands while no face is seen.
+    """How far it is, where no page guides; the clock stands while no face is seen."""
 
-    Args:
-        elapsed: seconds, 0 to 10.
-        rest: weights of each pose's shapes at rest, (5,).
-        most: and the largest while it was asked for, (5,).
-    """
-
-    elapsed: float = 0.0
-    rest: tuple[float, ...] = (0.0,) * len(STEPS)
-    most: tuple[float, ...] = (0.0,) * len(STEPS)
+    elapsed: float = 0.0  # seconds, 0 to 10
+    rest: tuple[float, ...] = (0.0,) * len(STEPS)  # weights of each pose's shapes at rest, (5,)
+    most: tuple[float, ...] = (0.0,) * len(STEPS)  # and the largest while it was asked for, (5,)
 
     def after(self, seconds: float, solved: LiveFrame) -> "GuidedCalibration | None":
         """The state after a frame; None when it is over."""

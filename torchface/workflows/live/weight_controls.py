@@ -21,23 +21,15 @@ def _each(value: float) -> Tensor:
 
 @dataclass(frozen=True, eq=False)
 class WeightSettings:
-    """What the user set of each shape, and of the head.
+    """What the user set of each shape, and of the head."""
 
-    Args:
-        gain: factors, (52,); 0 for a shape that is muted.
-        dead: weights below which a shape stays still, (52,) in [0,1).
-        smoothing: (52,) in [0,1].
-        rotation: of a head that looks into the camera, rig to camera, (3,3); as it is solved if absent.
-        gaze: of eyes that do, (2,2) radians.
-        frozen: hold the face as it is.
-    """
-
-    gain: Tensor = field(default_factory=lambda: _each(1.0))
-    dead: Tensor = field(default_factory=lambda: _each(0.0))
-    smoothing: Tensor = field(default_factory=lambda: _each(0.0))
+    gain: Tensor = field(default_factory=lambda: _each(1.0))  # factors, (52,); 0 for a shape that is muted
+    dead: Tensor = field(default_factory=lambda: _each(0.0))  # weights below which a shape stays still, (52,) in [0,1)
+    smoothing: Tensor = field(default_factory=lambda: _each(0.0))  # (52,) in [0,1]
+    # of a head that looks into the camera, rig to camera, (3,3); as it is solved if absent
     rotation: Tensor | None = None
-    gaze: Tensor | None = None
-    frozen: bool = False
+    gaze: Tensor | None = None  # of eyes that do, (2,2) radians
+    frozen: bool = False  # hold the face as it is
 
 
 class WeightControls:

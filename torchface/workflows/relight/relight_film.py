@@ -56,29 +56,17 @@ _CHIN, _NECK = 8, (5.0, 45.0)  # its landmark, and millimetres below it over whi
 
 @dataclass(frozen=True)
 class RelightSettings:
-    """What the film is to show.
+    """What the film is to show."""
 
-    Args:
-        light: another light, as words; see :class:`WantedLight`.
-        environment: a panorama of light (``.hdr``), of the film's mean brightness.
-        turn: of the panorama, degrees; its middle to the viewer's right.
-        exposure: how many times as bright as in the film the panorama makes the face.
-        texture: paint in the rig's texture coordinates.
-        rig: another head, which moves as the actor does.
-        film_light: whether the film's light is estimated once, or every eight frames.
-        occluders: leave what is before the face as it is; without, only what lies behind it stays.
-        camera: the calibration with which the film was tracked.
-    """
-
-    light: tuple[str, ...] = ()
-    environment: Path | None = None
-    turn: float = 0.0
-    exposure: float = 1.0
-    texture: Path | None = None
-    rig: Path | None = None
-    film_light: FilmLight = "once"
-    occluders: bool = True
-    camera: Path | None = None
+    light: tuple[str, ...] = ()  # another light, as words; see `WantedLight`
+    environment: Path | None = None  # a panorama of light (`.hdr`), of the film's mean brightness
+    turn: float = 0.0  # of the panorama, degrees; its middle to the viewer's right
+    exposure: float = 1.0  # how many times as bright as in the film the panorama makes the face
+    texture: Path | None = None  # paint in the rig's texture coordinates
+    rig: Path | None = None  # another head, which moves as the actor does
+    film_light: FilmLight = "once"  # whether the film's light is estimated once, or every eight frames
+    occluders: bool = True  # leave what is before the face as it is; without, only what lies behind it stays
+    camera: Path | None = None  # the calibration with which the film was tracked
 
 
 def relight_film(

@@ -24,22 +24,16 @@ _POSE = (*(f"pose_T{axis}" for axis in "xyz"), *(f"pose_{name.removeprefix('Head
 
 @dataclass(frozen=True, eq=False)
 class TrackedFilm:
-    """A film and the face in it.
-
-    Args:
-        weights: of its shapes, (T,N).
-        rotation, translation: from the rig to the camera, (T,3,3) and (T,3) millimetres.
-        landmarks: iBUG's 68 as they were found, (T,68,2) pixels.
-        seen: frames that show the face, (T,) bool.
-    """
+    """A film and the face in it."""
 
     video: VideoFile
     rig: BlendshapeRig
-    weights: Tensor
+    weights: Tensor  # of its shapes, (T,N)
+    # rotation, translation: from the rig to the camera, (T,3,3) and (T,3) millimetres
     rotation: Tensor
     translation: Tensor
-    landmarks: Tensor
-    seen: Tensor
+    landmarks: Tensor  # iBUG's 68 as they were found, (T,68,2) pixels
+    seen: Tensor  # frames that show the face, (T,) bool
     calibration: CameraCalibration
 
     def camera(self, frame: int) -> Camera:

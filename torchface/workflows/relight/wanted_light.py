@@ -15,21 +15,15 @@ _MOST = 100.0
 
 @dataclass(frozen=True)
 class WantedLight:
-    """A light from one direction and from everywhere, beside the film's.
+    """A light from one direction and from everywhere, beside the film's."""
 
-    Args:
-        azimuth: degrees from the camera to the viewer's right.
-        elevation: degrees upwards.
-        strength: of both together; with 1 a face is as bright in the mean as in the film, and with a source behind it
-            as bright as with one beside it, less what is lost there.
-        ambient: the share from everywhere.
-        red, green, blue: its colour beside the film's.
-    """
-
-    azimuth: float = 0.0
-    elevation: float = 0.0
+    azimuth: float = 0.0  # degrees from the camera to the viewer's right
+    elevation: float = 0.0  # degrees upwards
+    # of both together; with 1 a face is as bright in the mean as in the film, and with a source behind it as bright as
+    # with one beside it, less what is lost there
     strength: float = 1.0
-    ambient: float = _AMBIENT
+    ambient: float = _AMBIENT  # the share from everywhere
+    # red, green, blue: its colour beside the film's
     red: float = 1.0
     green: float = 1.0
     blue: float = 1.0

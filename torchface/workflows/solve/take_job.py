@@ -19,25 +19,21 @@ _METHOD = "solve/1"
 
 @dataclass(frozen=True)
 class TakeJob:
-    """How each take is solved; ``{name}`` in a path is the take's name.
+    """How each take is solved; ``{name}`` in a path is the take's name."""
 
-    Args:
-        rig, attachment: see :func:`solve_take`.
-        settings, part, camera, options: see :func:`solve_take`.
-        animation, report, live_link: what is to be written of each besides the weights, and where.
-        reduce: see :class:`~torchface.workflows.weight_files.WeightFiles`.
-    """
-
+    # rig, attachment: see `solve_take`
     rig: Path
     attachment: Path
+    # settings, part, camera, options: see `solve_take`
     settings: SolveSettings
     options: MarkerOptions = DEFAULT_OPTIONS
     part: str | None = None
     camera: HeadCamera | None = None
+    # animation, report, live_link: what is to be written of each besides the weights, and where
     animation: Path | None = None
     report: Path | None = None
     live_link: Path | None = None
-    reduce: float | None = None
+    reduce: float | None = None  # see `WeightFiles`
 
     def key(self, item: BatchItem) -> str:
         """A key of all that the take's weights depend on."""

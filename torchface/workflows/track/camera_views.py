@@ -26,16 +26,11 @@ from torchface.workflows.track.track_state import TrackState
 
 @dataclass(frozen=True, eq=False)
 class OtherCamera:
-    """A camera beside the first, and its film.
-
-    Args:
-        camera: where it stands.
-        begin: when its film began after the first one's, seconds.
-    """
+    """A camera beside the first, and its film."""
 
     inputs: TrackInputs
-    camera: PlacedCamera
-    begin: float
+    camera: PlacedCamera  # where it stands
+    begin: float  # when its film began after the first one's, seconds
 
     @property
     def key(self) -> str:

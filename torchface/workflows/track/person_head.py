@@ -25,20 +25,14 @@ _DOUBTED = 0.2  # trust below which a landmark does not count
 
 @dataclass(frozen=True, eq=False)
 class PersonHead:
-    """The person's rig, and the frames that it comes from.
+    """The person's rig, and the frames that it comes from."""
 
-    Args:
-        rig: the head found, with the shapes of the model's rig transferred to it.
-        frames: their numbers, (F,).
-        shown: it with skin, hair and teeth, where pictures show them; the shapes are the rig's.
-        surface: how that shades.
-    """
-
-    rig: BlendshapeRig
+    rig: BlendshapeRig  # the head found, with the shapes of the model's rig transferred to it
     fit: ImageFit
-    frames: Tensor
+    frames: Tensor  # their numbers, (F,)
+    # it with skin, hair and teeth, where pictures show them; the shapes are the rig's
     shown: BlendshapeRig | None = None
-    surface: SurfaceMaps | None = None
+    surface: SurfaceMaps | None = None  # how that shades
 
     def lines(self) -> list[str]:
         """For people to read."""

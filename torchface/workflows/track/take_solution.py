@@ -60,17 +60,11 @@ def frame_times(inputs: TrackInputs, count: int) -> Tensor | None:
 
 @dataclass(frozen=True, eq=False)
 class JudgedReading:
-    """A reading (T,...) with no confidence in what is not the actor's face.
+    """A reading (T,...) with no confidence in what is not the actor's face."""
 
-    Args:
-        reading: the rest of it as it was.
-        outliers: landmarks where no face has them, (T,68) bool; see :func:`outlier_landmarks`.
-        others: spans of frames that show another face than the first ones; see :func:`other_faces`.
-    """
-
-    reading: FaceReading
-    outliers: Tensor
-    others: list[AnotherFace]
+    reading: FaceReading  # the rest of it as it was
+    outliers: Tensor  # landmarks where no face has them, (T,68) bool; see `outlier_landmarks`
+    others: list[AnotherFace]  # spans of frames that show another face than the first ones; see `other_faces`
 
 
 def judged_reading(inputs: TrackInputs, reading: FaceReading, looks: Tensor | None) -> JudgedReading:

@@ -36,78 +36,54 @@ _AT_ITS_TIMES = "solved at the frames' own times; the overlay runs at the mean r
 
 @dataclass(frozen=True)
 class TrackSettings:
-    """How a video is tracked.
+    """How a video is tracked."""
 
-    Args:
-        landmarks: what finds them, see :func:`~torchface.workflows.named_finders.load_finder`; or a table that gives
-            them, see :func:`~torchface.io.landmarks.landmark_tables.load_landmark_table`.
-        appearance, prior, dynamics: models by name or folder; ``prior`` may be "none".
-        camera: a calibration; a focal length is assumed without.
-        face: which of several, from 0, the largest first.
-        whole_take: landmarks smoothed by all frames, those after each too; weights as well where there is a dynamics
-            prior.
-        part: keep this region of the rig only.
-        texture: an image to put on the face in the overlay, in the rig's texture coordinates.
-        overlay: the rig in a video "side" by side with the picture, "over" it half through, or "none"; a texture
-            goes over the face.
-        fps: frames a second of a table of landmarks without a video; by its times if absent.
-        size: width and height of the pictures that such landmarks were found in; the camera's if absent.
-        one_person: all frames show the actor, also those in which the face looks like another's.
-        reduce: keep as few rows of weights and keys as stay within this of every frame's; all if absent.
-        anybody: the rig is not the person's: the head is solved with the take.
-        heads: the head model for that, by name or folder; the best at hand if absent.
-        offsets: a file of fixed offsets between this rig's landmarks and this finder's; those in the folder of results,
-            or estimated with the take, if absent.
-        neutral_frame: of the video, in which the face has no expression: offsets are estimated there.
-        beside: films of the same take by other cameras, in the order of ``cameras``, whose first is the video's.
-        cameras: how these cameras lie, see :func:`~torchface.io.camera_files.load_cameras`.
-    """
-
+    # what finds them, see `load_finder`; or a table that gives them, see `load_landmark_table`
     landmarks: str | Path = DEFAULT_LANDMARKS
+    # appearance, prior, dynamics: models by name or folder; `prior` may be "none"
     appearance: str | Path | None = None
     prior: str | Path | None = DEFAULT_PRIOR
     dynamics: str | Path | None = None
-    camera: Path | None = None
-    face: int = 0
+    camera: Path | None = None  # a calibration; a focal length is assumed without
+    face: int = 0  # which of several, from 0, the largest first
+    # landmarks smoothed by all frames, those after each too; weights as well where there is a dynamics prior
     whole_take: bool = False
-    part: str | None = None
-    texture: Path | None = None
+    part: str | None = None  # keep this region of the rig only
+    texture: Path | None = None  # an image to put on the face in the overlay, in the rig's texture coordinates
+    # the rig in a video "side" by side with the picture, "over" it half through, or "none"; a texture goes over the
+    # face
     overlay: Overlay = "side"
-    fps: float | None = None
+    fps: float | None = None  # frames a second of a table of landmarks without a video; by its times if absent
+    # width and height of the pictures that such landmarks were found in; the camera's if absent
     size: tuple[int, int] | None = None
+    # a file of fixed offsets between this rig's landmarks and this finder's; those in the folder of results, or
+    # estimated with the take, if absent
     offsets: Path | None = None
-    one_person: bool = False
+    one_person: bool = False  # all frames show the actor, also those in which the face looks like another's
+    # keep as few rows of weights and keys as stay within this of every frame's; all if absent
     reduce: float | None = None
-    anybody: bool = False
-    heads: str | Path | None = None
-    neutral_frame: int | None = None
+    anybody: bool = False  # the rig is not the person's: the head is solved with the take
+    heads: str | Path | None = None  # the head model for that, by name or folder; the best at hand if absent
+    neutral_frame: int | None = None  # of the video, in which the face has no expression: offsets are estimated there
+    # films of the same take by other cameras, in the order of `cameras`, whose first is the video's
     beside: tuple[Path, ...] = ()
-    cameras: Path | None = None
+    cameras: Path | None = None  # how these cameras lie, see `load_cameras`
 
 
 @dataclass(frozen=True, eq=False)
 class TrackInputs:
-    """What tracking starts from.
-
-    Args:
-        clip: the video; or what stands for it, where a table gives the landmarks and there is none.
-        actor: the rig, with 68 landmarks.
-        calibration: of the camera, at the video's resolution.
-        times: when each frame is shown, (T,) seconds, where the frame rate varies.
-        rate_varies: how, in words.
-        heads: of the rig's topology, from which the person's is solved; None where the rig is the person's.
-        about: what there is to say of them.
-    """
+    """What tracking starts from."""
 
     settings: TrackSettings
-    clip: VideoFile
-    actor: BlendshapeRig
-    calibration: CameraCalibration
+    clip: VideoFile  # the video; or what stands for it, where a table gives the landmarks and there is none
+    actor: BlendshapeRig  # the rig, with 68 landmarks
+    calibration: CameraCalibration  # of the camera, at the video's resolution
     models: TrackModels
-    times: Tensor | None = None
-    rate_varies: str = ""
+    times: Tensor | None = None  # when each frame is shown, (T,) seconds, where the frame rate varies
+    rate_varies: str = ""  # how, in words
+    # of the rig's topology, from which the person's is solved; None where the rig is the person's
     heads: HeadModel | None = None
-    about: str = ""
+    about: str = ""  # what there is to say of them
 
     @property
     def reading_key(self) -> str:

@@ -25,28 +25,18 @@ HEADS = "head"
 
 @dataclass(frozen=True)
 class TrackModels:
-    """What tracks and solves.
+    """What tracks and solves."""
 
-    Args:
-        finder: finds landmarks in any face; absent where they are given.
-        appearance: refines them on the actor's own.
-        dynamics: how weights go on.
-        unlearned: shapes of the rig that a prior says nothing of: they stay near rest.
-        seeing: changes when what finds landmarks does.
-        solving: changes when what solves does.
-        expects: whether the finder reads which weights of the rig's shapes are to be expected: then solves have no
-            other prior.
-        places: of the points that the finder finds beside the 68, on the embedded performer's mean head, (P,3) mm.
-    """
-
-    finder: LandmarkFinder | None
-    appearance: AppearanceModel | None = None
+    finder: LandmarkFinder | None  # finds landmarks in any face; absent where they are given
+    appearance: AppearanceModel | None = None  # refines them on the actor's own
     prior: ShapePrior | None = None
-    dynamics: DynamicsPrior | AdaptedDynamicsPrior | None = None
-    unlearned: tuple[str, ...] = ()
-    seeing: str = ""
-    solving: str = ""
+    dynamics: DynamicsPrior | AdaptedDynamicsPrior | None = None  # how weights go on
+    unlearned: tuple[str, ...] = ()  # shapes of the rig that a prior says nothing of: they stay near rest
+    seeing: str = ""  # changes when what finds landmarks does
+    solving: str = ""  # changes when what solves does
+    # whether the finder reads which weights of the rig's shapes are to be expected: then solves have no other prior
     expects: bool = False
+    # of the points that the finder finds beside the 68, on the embedded performer's mean head, (P,3) mm
     places: Tensor = field(default_factory=lambda: torch.zeros(0, 3))
 
 

@@ -36,44 +36,29 @@ _OWN_EYES = 2.0  # degrees
 
 @dataclass(frozen=True, eq=False)
 class Tracked:
-    """What came of a video.
-
-    Args:
-        reading: the face in all frames, (T,...).
-        landmarks: the reading's as a camera without distortion has them, filtered along time, (T,68,2), pixels.
-        times: when each frame is shown, (T,) seconds, where the frame rate varies; even at the video's if absent.
-        offsets: between the rig's landmarks and those found; None where the take is too short for an estimate.
-        faces: how many there are in the first frame.
-        reused: frames whose readings were known from an earlier run.
-        seconds: what each step took, by its name.
-        products: the files, by what they are.
-        reductions: what few keys they have, in words, where few were asked for.
-        light: of the video, where a texture was put on the face.
-        outliers: landmarks that lie where no face has them, and so are not trusted, (T,68) bool; none if absent.
-        others: spans of frames that show another face, which are not solved.
-        head: the person's, where it was solved with the take.
-        cameras: the others that saw the take, a line each.
-        eyes: what the frames show of the eyes; None where nobody looked at them.
-        pictures: some frames by their numbers, uint8 (3,H,W), for the report; it reads others from the video.
-    """
+    """What came of a video."""
 
     inputs: TrackInputs
-    reading: FaceReading
-    landmarks: Tensor
+    reading: FaceReading  # the face in all frames, (T,...)
+    landmarks: Tensor  # the reading's as a camera without distortion has them, filtered along time, (T,68,2), pixels
     solution: VideoSolution
+    # when each frame is shown, (T,) seconds, where the frame rate varies; even at the video's if absent
     times: Tensor | None = None
+    # between the rig's landmarks and those found; None where the take is too short for an estimate
     offsets: LandmarkOffsets | None = None
-    faces: int = 0
-    reused: int = 0
-    seconds: dict[str, float] = field(default_factory=dict)
-    products: dict[str, Path] = field(default_factory=dict)
-    reductions: list[str] = field(default_factory=list)
-    light: PointLight | None = None
+    faces: int = 0  # how many there are in the first frame
+    reused: int = 0  # frames whose readings were known from an earlier run
+    seconds: dict[str, float] = field(default_factory=dict)  # what each step took, by its name
+    products: dict[str, Path] = field(default_factory=dict)  # the files, by what they are
+    reductions: list[str] = field(default_factory=list)  # what few keys they have, in words, where few were asked for
+    light: PointLight | None = None  # of the video, where a texture was put on the face
+    # landmarks that lie where no face has them, and so are not trusted, (T,68) bool; none if absent
     outliers: Tensor | None = None
-    others: Sequence[AnotherFace] = ()
-    head: PersonHead | None = None
-    eyes: TakeEyes | None = None
-    cameras: Sequence[str] = ()
+    others: Sequence[AnotherFace] = ()  # spans of frames that show another face, which are not solved
+    head: PersonHead | None = None  # the person's, where it was solved with the take
+    eyes: TakeEyes | None = None  # what the frames show of the eyes; None where nobody looked at them
+    cameras: Sequence[str] = ()  # the others that saw the take, a line each
+    # some frames by their numbers, uint8 (3,H,W), for the report; it reads others from the video
     pictures: dict[int, Tensor] = field(default_factory=dict)
 
     def __len__(self) -> int:

@@ -21,12 +21,9 @@ _METHOD = "track batch/1"
 
 @dataclass(frozen=True)
 class VideoJob:
-    """How each video is tracked; ``{name}`` in a path is the video's name.
+    """How each video is tracked; ``{name}`` in a path is the video's name."""
 
-    Args:
-        rig, settings: see :func:`track_video`.
-    """
-
+    # rig, settings: see `track_video`
     rig: Path | None
     settings: TrackSettings = field(default_factory=TrackSettings)
 

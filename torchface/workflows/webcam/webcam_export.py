@@ -32,23 +32,17 @@ _TIMED = (480, 640)  # rows, columns
 
 @dataclass(frozen=True)
 class WebcamReport:
-    """What was written.
-
-    Args:
-        landmarks: the largest mean distance of a frame's landmarks between ONNX Runtime and PyTorch, over that of the
-            eyes' outer corners.
-        weights: the largest difference of a weight.
-        state: numbers that one picture hands on to the next.
-        milliseconds: of processor time a picture of 640 x 480, by one thread here, by what is in it.
-    """
+    """What was written."""
 
     path: Path
     size: int
     frames: int
+    # the largest mean distance of a frame's landmarks between ONNX Runtime and PyTorch, over that of the eyes' outer
+    # corners
     landmarks: float
-    weights: float
-    state: int
-    milliseconds: dict[str, float]
+    weights: float  # the largest difference of a weight
+    state: int  # numbers that one picture hands on to the next
+    milliseconds: dict[str, float]  # of processor time a picture of 640 x 480, by one thread here, by what is in it
 
     def rows(self) -> list[tuple[str, str]]:
         """The report as pairs of what and how much."""

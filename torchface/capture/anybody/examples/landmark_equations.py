@@ -26,22 +26,14 @@ class LandmarkEquations:
     .. math:: r_i(w, \delta) = g \circ (o_i + E_i w + \Phi_i \delta)
 
     They are distances in the picture over that of the eyes, whatever the units of what is inside the brackets.
-
-    Args:
-        neutral: :math:`e_0`, (68,2), pixels of the examples.
-        basis: :math:`E`, (68,2,N).
-        offset: :math:`o`, (B,68,2), finite; what it is where a landmark is not seen does not count.
-        scale: :math:`g`, of x and y, (B,2).
-        seen: (B,68) bool.
-        free: :math:`\Phi`, (B,68,2,F).
     """
 
-    neutral: Tensor
-    basis: Tensor
-    offset: Tensor
-    scale: Tensor
-    seen: Tensor
-    free: Tensor
+    neutral: Tensor  # e_0, (68,2), pixels of the examples
+    basis: Tensor  # E, (68,2,N)
+    offset: Tensor  # o, (B,68,2), finite; what it is where a landmark is not seen does not count
+    scale: Tensor  # g, of x and y, (B,2)
+    seen: Tensor  # (B,68) bool
+    free: Tensor  # \Phi, (B,68,2,F)
 
     @cached_property
     def share(self) -> Tensor:
@@ -110,17 +102,11 @@ class LandmarkEquations:
 
 @dataclass(frozen=True, eq=False)
 class ReducedSquares:
-    """A sum of squares in which the placement is the best one for the weights.
+    """A sum of squares in which the placement is the best one for the weights."""
 
-    Args:
-        energy: of the weights alone.
-        start: the placement at weights of 0, (B,F,1).
-        slope: what each weight adds, (B,F,N).
-    """
-
-    energy: Quadratic
-    start: Tensor
-    slope: Tensor
+    energy: Quadratic  # of the weights alone
+    start: Tensor  # the placement at weights of 0, (B,F,1)
+    slope: Tensor  # what each weight adds, (B,F,N)
 
     def unknowns(self, weights: Tensor) -> Unknowns:
         """Weights and their placement."""

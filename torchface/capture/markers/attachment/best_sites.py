@@ -24,19 +24,12 @@ _MIN_MOMENT = 1e-8
 
 @dataclass(frozen=True, eq=False)
 class PathMoments:
-    """The moments of a take that the site search needs.
+    """The moments of a take that the site search needs."""
 
-    Args:
-        factor: :math:`L`, (N+1,N+1).
-        path: :math:`G L^{-T}`, (M,3,N+1).
-        residual: squared distance that no site can change, (M,), mm².
-        frames: in how many frames each marker was seen, (M,).
-    """
-
-    factor: Tensor
-    path: Tensor
-    residual: Tensor
-    frames: Tensor
+    factor: Tensor  # L, (N+1,N+1)
+    path: Tensor  # G L^{-T}, (M,3,N+1)
+    residual: Tensor  # squared distance that no site can change, (M,), mm²
+    frames: Tensor  # in how many frames each marker was seen, (M,)
 
     @staticmethod
     def of(

@@ -28,20 +28,14 @@ _NARROW = 0.03  # of the lids' opening: errors below count with their square
 
 @dataclass(frozen=True)
 class EyeSettings(DescentSettings):
-    """How an eye network is trained.
-
-    Args:
-        gap: weight of the distance between the lids.
-        heat: weight of the heat maps' form, which fades over the first half.
-        augmentation: how widely crops are drawn.
-    """
+    """How an eye network is trained."""
 
     steps: int = 5000
     batch: int = 128
     rate: float = 3e-3
-    gap: float = 1.5
-    heat: float = 0.5
-    augmentation: EyeAugmentation = field(default_factory=EyeAugmentation)
+    gap: float = 1.5  # weight of the distance between the lids
+    heat: float = 0.5  # weight of the heat maps' form, which fades over the first half
+    augmentation: EyeAugmentation = field(default_factory=EyeAugmentation)  # how widely crops are drawn
 
 
 def eye_task(

@@ -24,24 +24,16 @@ _RARE = torch.tensor([1.0, 1.0, 1.0, 2.0, 2.0, 2.0, 2.0, 2.0, 1.0, 1.0])  # of b
 
 @dataclass(frozen=True)
 class PartSettings(DescentSettings):
-    """How a network of parts is trained.
-
-    Args:
-        turn: standard deviation of a face's tilt in its crop, degrees.
-        scale: how much larger or smaller than its box a face may be, as a logarithm.
-        shift: standard deviation of its place, of the box.
-        grey: share of crops without colour.
-        bfloat16: share of the steps, the first, whose convolutions compute in bfloat16.
-    """
+    """How a network of parts is trained."""
 
     steps: int = 3000
     batch: int = 24
     rate: float = 3e-3
-    turn: float = 9.0
-    scale: float = 0.2
-    shift: float = 0.06
-    grey: float = 0.12
-    bfloat16: float = 0.0
+    turn: float = 9.0  # standard deviation of a face's tilt in its crop, degrees
+    scale: float = 0.2  # how much larger or smaller than its box a face may be, as a logarithm
+    shift: float = 0.06  # standard deviation of its place, of the box
+    grey: float = 0.12  # share of crops without colour
+    bfloat16: float = 0.0  # share of the steps, the first, whose convolutions compute in bfloat16
 
 
 class PartCrops(NamedTuple):

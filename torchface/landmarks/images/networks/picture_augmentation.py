@@ -18,23 +18,15 @@ _EYES, _MOUTH = slice(36, 48), slice(48, 68)
 
 @dataclass(frozen=True)
 class AugmentationSettings:
-    """How widely crops are drawn; shares lie in [0,1].
+    """How widely crops are drawn; shares lie in [0,1]."""
 
-    Args:
-        turn: standard deviation of the tilt that a tracker leaves, degrees; one crop in four is turned by up to 45.
-        scale: how much larger or smaller than its box a face may be, as a logarithm.
-        shift: standard deviation of its place, of the box.
-        hidden: share of crops with something before the face.
-        absent: share of crops that show no face, or one in the wrong place.
-        grey: share of crops without colour.
-    """
-
+    # standard deviation of the tilt that a tracker leaves, degrees; one crop in four is turned by up to 45
     turn: float = 11.0
-    scale: float = 0.22
-    shift: float = 0.05
-    hidden: float = 0.4
-    absent: float = 0.12
-    grey: float = 0.15
+    scale: float = 0.22  # how much larger or smaller than its box a face may be, as a logarithm
+    shift: float = 0.05  # standard deviation of its place, of the box
+    hidden: float = 0.4  # share of crops with something before the face
+    absent: float = 0.12  # share of crops that show no face, or one in the wrong place
+    grey: float = 0.15  # share of crops without colour
 
 
 @dataclass(frozen=True, eq=False)
