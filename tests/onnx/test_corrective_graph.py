@@ -11,7 +11,7 @@ from torchface import Attachment, BlendshapeRig
 from torchface.capture import HybridSolver, MarkerSolver
 from torchface.correctives import Corrective, Correctives
 from torchface.errors import ValueRangeError
-from torchface.onnx.checked_export import one_thread_session
+from torchface.landmarks.images.graph_session import graph_session
 from torchface.onnx.corrective_graph import CorrectiveGraph
 from torchface.onnx.solver_graph import SolverGraph
 from torchface.onnx.solver_graph_export import (
@@ -92,7 +92,7 @@ def test_onnx_runtime_computes_products_of_up_to_eight_shapes(solver: MarkerSolv
     attachment = Attachment.from_vertices(rig.neutral, moved[:: len(moved) // 40][:40])
     full = MarkerSolver(rig, attachment)
     graph = CorrectiveGraph(full, steps=3)
-    session = one_thread_session(solver_model(graph, hybrid=True).SerializeToString())
+    session = graph_session(solver_model(graph, hybrid=True).SerializeToString())
     metadata = session.get_modelmeta().custom_metadata_map
     assert (metadata["correctives"], metadata["task"]) == ("4", "hybrid_solver")
     weights = 0.5 + 0.5 * torch.rand(4, 10, generator=torch.Generator().manual_seed(1))

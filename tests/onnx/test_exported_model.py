@@ -4,7 +4,7 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from torchface.onnx.checked_export import one_thread_session
+from torchface.landmarks.images.graph_session import graph_session
 from torchface.onnx.exported_model import exported_model
 from torchface.optim.fixed_splitting import fixed_loop
 
@@ -30,5 +30,5 @@ def test_short_steps_are_written_out(sums: int, written_out: bool) -> None:
     module, x = Repeated(sums), torch.linspace(-1, 1, 4)
     model = exported_model(module, {"x": x}, ["y"], {})
     assert ("Loop" not in {node.op_type for node in model.graph.node}) == written_out
-    (found,) = one_thread_session(model.SerializeToString()).run(None, {"x": x.numpy()})
+    (found,) = graph_session(model.SerializeToString()).run(None, {"x": x.numpy()})
     torch.testing.assert_close(torch.from_numpy(found), module(x))

@@ -15,7 +15,8 @@ from torchface.capture.action_units.classifier import ActionUnitClassifier
 from torchface.capture.action_units.classifier_training import local_warps
 from torchface.errors import ValueRangeError
 from torchface.files.whole_files import write_file
-from torchface.onnx.checked_export import WrittenGraph, one_thread_session
+from torchface.landmarks.images.graph_session import graph_session
+from torchface.onnx.checked_export import WrittenGraph
 from torchface.onnx.exported_model import exported_model
 
 _TEST_FRAMES = 64
@@ -69,7 +70,7 @@ def export_action_units(
     classifier = classifier.cpu().float().eval()
     model = action_unit_model(classifier, facts)
     content = model.SerializeToString()
-    session = one_thread_session(content)
+    session = graph_session(content)
     frames = _test_frames(classifier) if regions is None else regions.float()
     rest = classifier.neutral
     (found,) = session.run(None, {"regions": frames.numpy(), "rest": rest.numpy()})

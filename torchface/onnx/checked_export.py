@@ -6,12 +6,12 @@ from pathlib import Path
 
 import numpy as np
 import onnx
-import onnxruntime
 import torch
 from torch import Tensor, nn
 
 from torchface.errors import ValueRangeError
 from torchface.files.whole_files import write_file
+from torchface.landmarks.images.graph_session import graph_session
 from torchface.onnx.exported_model import exported_model
 
 
@@ -81,7 +81,7 @@ def write_checked(
         allowed: by output, how far apart the two may be.
     """
     content = model.SerializeToString()
-    session = one_thread_session(content)
+    session = graph_session(content)
     parity = dict.fromkeys(allowed, 0.0)
     for inputs, expected in cases:
         found = session.run(list(allowed), {name: value.detach().numpy() for name, value in inputs.items()})
@@ -98,10 +98,3 @@ def write_checked(
             )
     write_file(path, content)
     return ExportReport(Path(path), len(content), parity, dict(units))
-
-
-def one_thread_session(model: bytes) -> onnxruntime.InferenceSession:
-    """Runs a model on one thread of the processor."""
-    options = onnxruntime.SessionOptions()
-    options.intra_op_num_threads = options.inter_op_num_threads = 1
-    return onnxruntime.InferenceSession(model, options, providers=["CPUExecutionProvider"])

@@ -14,7 +14,8 @@ from torch import Tensor
 from torchface.capture.anybody import ExampleSolver
 from torchface.errors import ValueRangeError
 from torchface.files.whole_files import write_file
-from torchface.onnx.checked_export import WrittenGraph, one_thread_session
+from torchface.landmarks.images.graph_session import graph_session
+from torchface.onnx.checked_export import WrittenGraph
 from torchface.onnx.example_graph import example_model
 
 _FRAMES, _FRAMES_A_POSE = 200, 10
@@ -91,7 +92,7 @@ def export_example_solver(
     """
     exact = copy.deepcopy(solver).cpu()
     content = example_model(exact, steps, facts).SerializeToString()
-    session = one_thread_session(content)
+    session = graph_session(content)
     frames = _random_frames(exact) if landmarks is None else landmarks.detach().cpu().float()
     hidden = torch.rand(frames.shape[:2], generator=torch.Generator().manual_seed(1)) < _HIDDEN
     missing = torch.where(hidden[..., None], torch.nan, frames)

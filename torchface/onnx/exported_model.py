@@ -15,11 +15,12 @@ from onnx import TensorProto, helper, numpy_helper
 from torch import Tensor, nn
 
 from torchface import __version__
-from torchface.onnx.operator_set import IR_VERSION, OPSET
 
 if TYPE_CHECKING:
     from onnxscript import ir
 
+OPSET = 18  # of the operators: the oldest that the exporter of PyTorch writes
+IR_VERSION = 8  # of the file's format, the oldest that runtimes of the last years read
 _FOLDED = 256  # numbers of a constant that is computed beforehand; ONNX Runtime computes larger ones when it loads
 _LONGEST = 8  # nodes of a loop's body that is written out; a step of splitting has six
 

@@ -3,7 +3,7 @@
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import onnx
@@ -14,9 +14,7 @@ from torch import Tensor
 from torchface import __version__
 from torchface.landmarks.images.trees.landmark_trees import FAINTEST, LandmarkTrees
 from torchface.onnx.checked_export import ExportReport, write_checked
-from torchface.onnx.operator_set import IR_VERSION, OPSET
-
-PixelType = Literal["uint8", "float32"]  # what the image's values are: 0 to 255, or [0,1]
+from torchface.onnx.exported_model import IR_VERSION, OPSET
 
 _PARITY = 0.1  # pixels; a rounding error may read the pixel beside, which moves a face by some hundredths
 
@@ -72,11 +70,11 @@ def export_landmark_trees(
     model: LandmarkTrees,
     path: str | Path,
     facts: Mapping[str, object] | None = None,
-    pixels: PixelType = "uint8",
 ) -> ExportReport:
     """Writes landmark trees as ONNX, and checks them.
 
-    The graph takes ``image`` (height,width), grey, and ``boxes`` (B,4) of faces in it: x, y, width, height in pixels.
+    The graph takes ``image`` (height,width), grey, 0 to 255, and ``boxes`` (B,4) of faces in it: x, y, width, height.
+    Boxes are in pixels.
     It gives ``landmarks`` (B,L,2), pixels, x right and y down; a box that is not finite gives NaN.
     """
     generator = torch.Generator().manual_seed(0)
@@ -87,16 +85,13 @@ def export_landmark_trees(
         stored = (255 * cloudy).round()
         boxes = torch.tensor([25.0, 20, 50, 50]) + 10 * torch.rand(faces, 4, generator=generator)
         expected = model((stored / 255).expand(faces, 1, height, width), boxes)
-        image = stored[0, 0].to(torch.uint8) if pixels == "uint8" else stored[0, 0] / 255
-        cases.append(({"image": image, "boxes": boxes}, {"landmarks": expected}))
+        cases.append(({"image": stored[0, 0].to(torch.uint8), "boxes": boxes}, {"landmarks": expected}))
     return write_checked(
-        landmark_trees_model(model, facts, pixels), path, cases, {"landmarks": _PARITY}, {"landmarks": "pixels"}
+        landmark_trees_model(model, facts), path, cases, {"landmarks": _PARITY}, {"landmarks": "pixels"}
     )
 
 
-def landmark_trees_model(
-    model: LandmarkTrees, facts: Mapping[str, object] | None = None, pixels: PixelType = "uint8"
-) -> onnx.ModelProto:
+def landmark_trees_model(model: LandmarkTrees, facts: Mapping[str, object] | None = None) -> onnx.ModelProto:
     """The graph."""
     build = _Graph()
     op, constant = build.op, build.constant
@@ -110,7 +105,7 @@ def landmark_trees_model(
                       "x_y": (1, 0), "last_column": (1,)}.items():  # fmt: skip
         constant(name, ids)
     constant("zero", 0.0)
-    constant("faintest", FAINTEST * (255.0 if pixels == "uint8" else 1.0))
+    constant("faintest", FAINTEST * 255.0)
     values = op("Reshape", "image", "flat")
     size = op("Reshape", op("Gather", op("Shape", "image"), "x_y"), constant("column", (2, 1)))  # width, height
     limits = op("Cast", op("Sub", size, constant("one", (1,))), to=TensorProto.FLOAT)
@@ -134,8 +129,7 @@ def landmark_trees_model(
         places = op("Cast", op("Min", op("Max", places, "zero"), limits), to=TensorProto.INT64)
         address = op("ReduceSum", op("Mul", places, strides), "second_axis", keepdims=0)
         grey = op("Gather", values, address)
-        if pixels == "uint8":
-            grey = op("Cast", grey, to=TensorProto.FLOAT)
+        grey = op("Cast", grey, to=TensorProto.FLOAT)
         centred = op("Sub", grey, op("ReduceMean", grey, axes=[1], keepdims=1))
         deviation = op("Sqrt", op("ReduceMean", op("Mul", centred, centred), axes=[1], keepdims=1))
         coefficients = _leaves(build, model, cascade, op("Div", grey, op("Max", deviation, "faintest")))
@@ -147,17 +141,16 @@ def landmark_trees_model(
         shapes = op("Add", shapes, moved)
     found = op("Where", usable, shapes, constant("nothing", float("nan")))
     op("Reshape", found, "points", output="landmarks")
-    byte = pixels == "uint8"
     return build.model(
         {
-            "image": (TensorProto.UINT8 if byte else TensorProto.FLOAT, ("height", "width")),
+            "image": (TensorProto.UINT8, ("height", "width")),
             "boxes": (TensorProto.FLOAT, ("faces", 4)),
         },
         count,
         {
             "task": "face_landmarks",
             "landmarks": "iBUG 68" if count == 68 else str(count),
-            "image": "grey, 0 to 255" if byte else "grey, 0 to 1",
+            "image": "grey, 0 to 255",
             "boxes": "x, y, width, height in pixels, as OpenCV's face detector gives them",
             "units": "pixels",
             "version": __version__,

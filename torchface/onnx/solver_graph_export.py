@@ -19,8 +19,9 @@ from torchface.capture.markers.marker_solver import RIDGE, SPARSITY, MarkerSolve
 from torchface.errors import ValueRangeError
 from torchface.files.whole_files import write_file
 from torchface.geometry.similarity import Similarity
+from torchface.landmarks.images.graph_session import graph_session
 from torchface.number_checks import checked_count
-from torchface.onnx.checked_export import WrittenGraph, one_thread_session
+from torchface.onnx.checked_export import WrittenGraph
 from torchface.onnx.corrective_graph import CorrectiveGraph
 from torchface.onnx.exported_model import exported_model
 from torchface.onnx.solver_graph import STEPS_WITH_GAPS, SolverGraph
@@ -274,7 +275,7 @@ def _export(
     """Checks and writes a graph; ``more`` are its inputs after the markers and the weights before."""
     progress("writing the graph, half a minute")
     content = solver_model(graph, bool(more), facts).SerializeToString()
-    session, gaps = one_thread_session(content), []
+    session, gaps = graph_session(content), []
     for count, missing in enumerate(_MISSING):
         progress("comparing the graph with the exact solve", count, len(_MISSING))
         gap = _gap(session, graph, solver, frames, more, missing)

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from torchface.onnx.operator_set import OPSET
+from torchface.onnx.exported_model import OPSET
 from torchface.optim import exported_operators
 
 _NEWTON_STEPS = 14  # to a residual of 1e-9 for rows' sums of 30 and a share of 0.05

@@ -20,7 +20,8 @@ from torchface.files.whole_files import write_file
 from torchface.geometry.cameras.calibration import CameraCalibration
 from torchface.geometry.cameras.distortion import undistort
 from torchface.geometry.rotations import rotation_matrix
-from torchface.onnx.checked_export import WrittenGraph, one_thread_session
+from torchface.landmarks.images.graph_session import graph_session
+from torchface.onnx.checked_export import WrittenGraph
 from torchface.onnx.exported_model import exported_model
 from torchface.onnx.unrolled_operators import TRANSLATIONS
 from torchface.onnx.video_graph import LANDMARKS, VideoGraph
@@ -182,7 +183,7 @@ def write_video_solver(
         translations=TRANSLATIONS,
     )
     content = model.SerializeToString()
-    session = one_thread_session(content)
+    session = graph_session(content)
     run = _run(graph, session, names, frames_to_check)
     if not run.parity <= _PARITY:
         raise ValueRangeError(
