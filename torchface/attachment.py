@@ -1,7 +1,5 @@
 """Sites of markers on a mesh: a triangle and barycentric coordinates each."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -81,7 +79,7 @@ class Attachment:
         object.__setattr__(self, "labels", labels)
 
     @staticmethod
-    def from_vertices(mesh: Mesh, ids: Tensor | Sequence[int], labels: Sequence[str] | None = None) -> Attachment:
+    def from_vertices(mesh: Mesh, ids: Tensor | Sequence[int], labels: Sequence[str] | None = None) -> "Attachment":
         """Markers that sit on vertices ``ids`` (M,).
 
         Raises:
@@ -115,7 +113,7 @@ class Attachment:
         barycentric = torch.nn.functional.one_hot(corners % 3, 3).to(torch.float32)
         return Attachment(corners // 3, barycentric, None if labels is None else tuple(labels)).made_for(mesh)
 
-    def made_for(self, mesh: Mesh) -> Attachment:
+    def made_for(self, mesh: Mesh) -> "Attachment":
         """The same with the fingerprint and the points at rest of a mesh, by which another head's is noticed."""
         rest = self.on(mesh.faces.cpu(), mesh.vertices.detach().cpu()).float()
         return replace(self, fingerprint=mesh.fingerprint(), rest=rest)
@@ -163,7 +161,7 @@ class Attachment:
         weights = self.barycentric.to(vertices)
         return (vertices[..., corners, :] * weights[..., None]).sum(-2)
 
-    def select(self, labels: Sequence[str]) -> Attachment:
+    def select(self, labels: Sequence[str]) -> "Attachment":
         """The markers of these labels, in this order."""
         row = {label: i for i, label in enumerate(self.labels or ())}
         missing = [label for label in labels if label not in row]
@@ -193,7 +191,7 @@ class Attachment:
         write_json(path, document)
 
     @staticmethod
-    def load(path: str | Path) -> Attachment:
+    def load(path: str | Path) -> "Attachment":
         """Reads what ``save`` wrote.
 
         Raises:

@@ -1,7 +1,5 @@
 """Energies of blendshape weights: quadratics that add up and go to ``box_qp``."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import torch
@@ -38,7 +36,7 @@ class Quadratic:
                 "expected (N,N) or (B,N,N) and (B,N)"
             )
 
-    def __add__(self, other: Quadratic) -> Quadratic:
+    def __add__(self, other: "Quadratic") -> "Quadratic":
         if self.H.shape[-1] != other.H.shape[-1]:
             raise ShapeError(f"quadratic: found {self.H.shape[-1]} and {other.H.shape[-1]} weights in a sum")
         constant = other.constant if self.constant is None else self.constant
@@ -46,7 +44,7 @@ class Quadratic:
             constant = self.constant + other.constant
         return Quadratic(self.H + other.H, self.f + other.f, constant)
 
-    def __mul__(self, factor: float) -> Quadratic:
+    def __mul__(self, factor: float) -> "Quadratic":
         return Quadratic(factor * self.H, factor * self.f, None if self.constant is None else factor * self.constant)
 
     __rmul__ = __mul__

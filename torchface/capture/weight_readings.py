@@ -1,7 +1,5 @@
 """Readings of weights by networks: linear in the weights, with a deviation each, as an energy."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -50,11 +48,11 @@ class WeightReadings:
             raise ShapeError(f"weight readings: found {self.values.shape[1]} values a frame, expected {len(self.rows)}")
 
     @classmethod
-    def of_expression(cls, expression: Tensor, deviation: Tensor, names: Sequence[str]) -> WeightReadings:
+    def of_expression(cls, expression: Tensor, deviation: Tensor, names: Sequence[str]) -> "WeightReadings":
         """Those of ARKit's 52 shapes, (T,52) both, of a rig whose shapes have ``names``; what it lacks says nothing."""
         return cls(mapping(names, ARKIT).to(expression), expression, deviation)
 
-    def beside(self, other: WeightReadings) -> WeightReadings:
+    def beside(self, other: "WeightReadings") -> "WeightReadings":
         """These and others of the same frames."""
         return WeightReadings(
             torch.cat([self.rows, other.rows.to(self.rows)]),
@@ -62,7 +60,7 @@ class WeightReadings:
             torch.cat([self.deviation, other.deviation.to(self.deviation)], dim=1),
         )
 
-    def of_frames(self, frames: Tensor) -> WeightReadings:
+    def of_frames(self, frames: Tensor) -> "WeightReadings":
         """Those of some frames, (F,) int64."""
         return WeightReadings(self.rows, self.values[frames], self.deviation[frames])
 

@@ -1,7 +1,5 @@
 """An actor's captured performance as a model that gives its fine detail to coarse animations."""
 
-from __future__ import annotations
-
 import copy
 import re
 from collections.abc import Mapping, Sequence
@@ -165,7 +163,7 @@ class EnhancementModel(nn.Module):
         seed: int = 0,
         folder: str | Path | None = None,
         progress: Progress | None = None,
-    ) -> EnhancementModel:
+    ) -> "EnhancementModel":
         """Learns from a captured performance.
 
         Args:
@@ -206,7 +204,7 @@ class EnhancementModel(nn.Module):
         }
 
     @classmethod
-    def from_config(cls, config: Mapping[str, Any]) -> EnhancementModel:
+    def from_config(cls, config: Mapping[str, Any]) -> "EnhancementModel":
         """A model of zeros for the state to be loaded into.
 
         Raises:
@@ -321,7 +319,7 @@ class EnhancementModel(nn.Module):
         fps = self.fps if fps is None else checked_number("fps", fps, MIN_FPS, MAX_FPS)
         return self.prepared.timing.times(self.features(keyframes), frames, (frames - 1) * self.fps / fps, extend)
 
-    def on_actor(self, neutral: Tensor, scale: float = 1.0) -> EnhancementModel:
+    def on_actor(self, neutral: Tensor, scale: float = 1.0) -> "EnhancementModel":
         """This actor's detail for another head of the same mesh, as much larger as that head is.
 
         Args:

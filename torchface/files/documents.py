@@ -1,7 +1,5 @@
 """Small documents, JSON and TOML: read with a limit, their values checked one by one, written whole."""
 
-from __future__ import annotations
-
 import json
 import re
 import reprlib
@@ -56,13 +54,13 @@ class Value:
         """Whether there is a value."""
         return self.found is not None
 
-    def __getitem__(self, name: str) -> Value:
+    def __getitem__(self, name: str) -> "Value":
         """A value of this table; an absent one is found as None."""
         if not isinstance(self.found, Mapping):
             raise self.error("a table")
         return Value(self.source, f"{self.key}.{name}" if self.key else name, self.found.get(name))
 
-    def table(self, *names: str, expected: str = "a table") -> dict[str, Value]:
+    def table(self, *names: str, expected: str = "a table") -> "dict[str, Value]":
         """The values of a table by name; with ``names`` it must have no others."""
         if not isinstance(self.found, Mapping) or not all(isinstance(name, str) for name in self.found):
             raise self.error(expected)
@@ -76,7 +74,7 @@ class Value:
         self.table()
         return dict(self.found)
 
-    def rows(self, minimum: int = 0, maximum: float = inf, expected: str = "a list") -> list[Value]:
+    def rows(self, minimum: int = 0, maximum: float = inf, expected: str = "a list") -> "list[Value]":
         """The values of a list."""
         if not isinstance(self.found, list) or not minimum <= len(self.found) <= maximum:
             raise self.error(expected)

@@ -1,7 +1,5 @@
 """Rigid and similarity alignment of corresponding points."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import torch
@@ -39,11 +37,11 @@ class Similarity:
         """Rotated and scaled, not translated: for deltas (..., B,N,3)."""
         return self.scale.to(vectors)[:, None, None] * (vectors @ self.rotation.transpose(-1, -2).to(vectors))
 
-    def __getitem__(self, rows: Tensor | slice) -> Similarity:
+    def __getitem__(self, rows: Tensor | slice) -> "Similarity":
         """Some of the batch."""
         return Similarity(self.scale[rows], self.rotation[rows], self.translation[rows])
 
-    def moved(self, turn: Tensor, growth: Tensor, shift: Tensor, centre: Tensor) -> Similarity:
+    def moved(self, turn: Tensor, growth: Tensor, shift: Tensor, centre: Tensor) -> "Similarity":
         r"""Followed by a small motion: turned and grown about a centre, then shifted.
 
         .. math:: x \mapsto c + g\, e^{[\omega]} (s R x + t - c) + d
@@ -58,7 +56,7 @@ class Similarity:
         arm = growth[:, None] * (rotation @ (self.translation - centre)[..., None])[..., 0]
         return Similarity(self.scale * growth, rotation @ self.rotation, centre + arm + shift)
 
-    def inverse(self) -> Similarity:
+    def inverse(self) -> "Similarity":
         """The similarity that undoes this one."""
         rotation = self.rotation.transpose(-1, -2)
         scale = 1 / self.scale

@@ -1,7 +1,5 @@
 """A module as an ONNX model, by ``torch.export``."""
 
-from __future__ import annotations
-
 import json
 import logging
 import warnings
@@ -213,7 +211,7 @@ def _shorten_names(model: Any) -> None:
             value.name = f"{number}.{place}"
 
 
-def unroll_loops(model: ir.Model) -> None:
+def unroll_loops(model: "ir.Model") -> None:
     """Writes out the short loops of ``torchface.optim.fixed_splitting.fixed_loop``, whose number of steps is fixed.
 
     ONNX Runtime takes some microseconds for a step of a ``Loop`` beside what its nodes take.
@@ -230,7 +228,7 @@ def unroll_loops(model: ir.Model) -> None:
             _unroll(node, body, count)
 
 
-def _steps(body: ir.Graph) -> int | None:
+def _steps(body: "ir.Graph") -> int | None:
     """How many steps a loop takes whose condition is that its counter is below a constant; None for another."""
     less = body.outputs[0].producer()
     if less is None or less.op_type != "Less" or less.inputs[0] is not body.outputs[1] or less.inputs[1] is None:
@@ -239,7 +237,7 @@ def _steps(body: ir.Graph) -> int | None:
     return None if limit is None else int(limit.numpy())
 
 
-def _unroll(loop: ir.Node, body: ir.Graph, count: int) -> None:
+def _unroll(loop: "ir.Node", body: "ir.Graph", count: int) -> None:
     from onnxscript import ir
 
     graph = loop.graph

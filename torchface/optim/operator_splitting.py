@@ -21,8 +21,6 @@ A small :math:`\rho` shrinks first what a large one shrinks last; where it chang
 Source: Boyd et al. 2011, sections 3.4.1, 3.4.3 and 5.2; the diagonal metric takes the place of a scaled H.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
@@ -49,9 +47,9 @@ class SplittingFactors:
     step: Tensor  # G, (N,N) or (B,N,N)
     offset: Tensor  # -\\alpha (H + \\rho D)^{-1}, (N,N) or (B,N,N)
     relaxation: float = RELAXATION  # \\alpha
-    first: SplittingFactors | None = None  # of another rho, for the first steps in float32 from zero
+    first: "SplittingFactors | None" = None  # of another rho, for the first steps in float32 from zero
 
-    def rows(self, keep: Tensor) -> SplittingFactors:
+    def rows(self, keep: Tensor) -> "SplittingFactors":
         """The factors of some problems; one H serves all."""
         if self.step.ndim == 2:
             return self
@@ -69,7 +67,7 @@ class SplittingState:
     z: Tensor
     t: Tensor
 
-    def rows(self, keep: Tensor) -> SplittingState:
+    def rows(self, keep: Tensor) -> "SplittingState":
         return SplittingState(self.z[keep], self.t[keep])
 
 

@@ -1,7 +1,5 @@
 """Pose of a template on a scan before it bends: by landmarks, or by its shape alone, in any pose."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 
@@ -41,12 +39,12 @@ class Samples:
     points: Tensor
     normals: Tensor
 
-    def first(self, count: int) -> Samples:
+    def first(self, count: int) -> "Samples":
         """Fewer of them."""
         return Samples(self.points[:count], self.normals[:count])
 
     @staticmethod
-    def of(vertices: Tensor, faces: Tensor, ids: Tensor) -> Samples:
+    def of(vertices: Tensor, faces: Tensor, ids: Tensor) -> "Samples":
         """Vertices ``ids`` in an order drawn once for all."""
         order = ids[torch.randperm(len(ids), generator=torch.Generator().manual_seed(_SEED))]
         points = vertices.double()
@@ -79,7 +77,7 @@ class Fit:
     pose: Similarity
     fit: Tensor
 
-    def best(self, count: int) -> Fit:
+    def best(self, count: int) -> "Fit":
         """The best fitting ones, best first."""
         order = self.fit.argsort(descending=True, stable=True)[:count]
         return Fit(self.pose[order], self.fit[order])

@@ -1,7 +1,5 @@
 """Hair that hangs beside the neck is found in what photographs show, and what stands behind the head is none."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from torch import Tensor

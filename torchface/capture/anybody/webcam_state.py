@@ -1,7 +1,5 @@
 """State of a webcam's solve between frames, as named tensors and as one vector, and the user's controls."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, fields
 from math import prod
 
@@ -118,11 +116,11 @@ class WebcamState:
         """All of it in one vector, (S,) float32; see :class:`StateLayout` for the way back."""
         return torch.cat([getattr(self, name).reshape(-1).float() for name in PARTS])
 
-    def double(self) -> WebcamState:
+    def double(self) -> "WebcamState":
         """In float64, as it is computed with."""
         return WebcamState(*(getattr(self, name).double() for name in PARTS))
 
-    def where(self, condition: Tensor, other: WebcamState) -> WebcamState:
+    def where(self, condition: Tensor, other: "WebcamState") -> "WebcamState":
         """This where a condition () holds, else another."""
         return WebcamState(*(torch.where(condition, getattr(self, name), getattr(other, name)) for name in PARTS))
 

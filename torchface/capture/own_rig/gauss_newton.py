@@ -4,8 +4,6 @@ An energy of a step is a ``Quadratic`` (B,N+6): of what N weights change by, and
 frame. Energies add up, and :func:`box_step` or :func:`split_step` goes to the least of their sum in the box.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import accumulate
@@ -40,21 +38,21 @@ class HeadState:
     rotation: Tensor  # rig to camera, (B,3,3)
     translation: Tensor  # rig to camera, (B,3), millimetres
 
-    def stepped(self, step: Tensor) -> HeadState:
+    def stepped(self, step: Tensor) -> "HeadState":
         """After a step (B,N+6): of weights, a rotation vector in the camera's frame (radians), and millimetres."""
         return self.moved(self.weights + step[:, :-6], step[:, -6:])
 
-    def moved(self, weights: Tensor, motion: Tensor) -> HeadState:
+    def moved(self, weights: Tensor, motion: Tensor) -> "HeadState":
         """With other weights (B,N), after a motion (B,6)."""
         rotation = rotation_matrix(motion[:, :3]) @ self.rotation
         return HeadState(weights, rotation, self.translation + motion[:, 3:])
 
-    def step_from(self, start: HeadState) -> Tensor:
+    def step_from(self, start: "HeadState") -> Tensor:
         """The step (B,N+6) that leads here from another state; turns are below half a turn."""
         turn = rotation_between(start.rotation, self.rotation)
         return torch.cat([self.weights - start.weights, turn, self.translation - start.translation], dim=1)
 
-    def mapped(self, function: Callable[[Tensor], Tensor]) -> HeadState:
+    def mapped(self, function: Callable[[Tensor], Tensor]) -> "HeadState":
         """With a function of each of its tensors."""
         return HeadState(function(self.weights), function(self.rotation), function(self.translation))
 

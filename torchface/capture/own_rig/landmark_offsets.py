@@ -1,7 +1,5 @@
 """Fixed offsets between a rig's landmarks and where a finder of landmarks sees them, and their file."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -54,7 +52,7 @@ class LandmarkOffsets:
                 f"most {_LARGEST:g} mm and a share of the eyes' distance, above 0 and below 1"
             )
 
-    def rounded(self) -> LandmarkOffsets:
+    def rounded(self) -> "LandmarkOffsets":
         """To a tenth of a micrometre, as files hold them."""
         return replace(self, millimetres=self.millimetres.double().round(decimals=4), noise=round(self.noise, 6))
 
@@ -75,7 +73,7 @@ class LandmarkOffsets:
         )
 
     @staticmethod
-    def load(path: str | Path) -> LandmarkOffsets:
+    def load(path: str | Path) -> "LandmarkOffsets":
         """Reads what :meth:`save` wrote."""
         document = read_json(path)
         if document["format"].found != _FORMAT:
@@ -100,7 +98,7 @@ class LandmarkOffsets:
                     "leave --offsets out and they are estimated anew"
                 )
 
-    def mismatch(self, other: LandmarkOffsets) -> tuple[float, float] | None:
+    def mismatch(self, other: "LandmarkOffsets") -> tuple[float, float] | None:
         """How far other offsets lie from these: the mean distance of landmarks within the face, millimetres, and their
         correlation; None where they agree within what two takes of one person do."""
         one, two = self.millimetres[JAW:], other.millimetres.to(self.millimetres)[JAW:]

@@ -1,7 +1,5 @@
 """A mixture of Gaussians with full covariances, fitted by expectation maximisation."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable, Mapping
 from typing import Any
@@ -50,7 +48,7 @@ class GaussianMixture(nn.Module):
     @classmethod
     def fit(
         cls, samples: Tensor | Iterable[Tensor], components: int = 1, floor: float = 1e-4, seed: int = 0
-    ) -> GaussianMixture:
+    ) -> "GaussianMixture":
         """One Gaussian in closed form, several by scikit-learn's expectation maximisation from k-means, in float64.
 
         Args:
@@ -83,7 +81,7 @@ class GaussianMixture(nn.Module):
         return cls(means, torch.linalg.cholesky(precisions), weights.log())
 
     @classmethod
-    def _single(cls, parts: Iterable[Tensor], floor: float) -> GaussianMixture:
+    def _single(cls, parts: Iterable[Tensor], floor: float) -> "GaussianMixture":
         count, total = 0, torch.zeros(())
         for part in parts:
             count, total = count + len(part), total + part.detach().double().sum(0)
@@ -117,7 +115,7 @@ class GaussianMixture(nn.Module):
         pulled = (precision @ self.means.to(samples)[..., None])[..., 0]
         return (responsibilities @ precision.flatten(1)).unflatten(1, precision.shape[1:]), -responsibilities @ pulled
 
-    def mapped(self, matrix: Tensor, floor: Tensor) -> GaussianMixture:
+    def mapped(self, matrix: Tensor, floor: Tensor) -> "GaussianMixture":
         """The density of y = Mx with a variance added to each y; see ``StudentDensity.mapped``."""
         factors, matrix = self.factors.double(), matrix.to(self.factors.device).double()
         covariance = matrix @ torch.cholesky_inverse(torch.linalg.cholesky(factors @ factors.mT)) @ matrix.T
@@ -141,7 +139,7 @@ class GaussianMixture(nn.Module):
         return {"kind": "mixture", "components": len(self.means), "dimensions": self.means.shape[1]}
 
     @classmethod
-    def from_config(cls, config: Mapping[str, Any]) -> GaussianMixture:
+    def from_config(cls, config: Mapping[str, Any]) -> "GaussianMixture":
         """A density with the sizes of a ``config``.
 
         Raises:

@@ -1,7 +1,5 @@
 """Gaussian processes with inducing points, ready to predict with plain tensors."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import torch
@@ -99,7 +97,7 @@ class GaussianProcesses(nn.Module):
             self.register_buffer(name, value.detach())
 
     @classmethod
-    def stacked(cls, learned: list[Posterior], kernels: list[Kernel]) -> GaussianProcesses:
+    def stacked(cls, learned: "list[Posterior]", kernels: list[Kernel]) -> "GaussianProcesses":
         """Processes that were learned one by one."""
         return cls(
             torch.stack([kernel.inverse_lengths for kernel in kernels]),
@@ -137,7 +135,7 @@ class Statistics:
     square: Tensor  # \\Phi^\\top\\Phi, (M,M)
     product: Tensor  # \\Phi^\\top t, (M,N)
 
-    def __add__(self, other: Statistics) -> Statistics:
+    def __add__(self, other: "Statistics") -> "Statistics":
         return Statistics(self.square + other.square, self.product + other.product)
 
 

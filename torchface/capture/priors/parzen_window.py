@@ -1,7 +1,5 @@
 """The Parzen window: a kernel density estimate of weights."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from typing import Any
@@ -50,7 +48,7 @@ class ParzenDensity(nn.Module):
         self.register_buffer("bandwidth", torch.as_tensor(bandwidth).detach().float().reshape(()))
 
     @classmethod
-    def fit(cls, samples: Tensor, bandwidth: float | None = None, seed: int = 0) -> ParzenDensity:
+    def fit(cls, samples: Tensor, bandwidth: float | None = None, seed: int = 0) -> "ParzenDensity":
         """Bins samples (T,D) by mean shift, so that frequent and rare weights count alike.
 
         Args:
@@ -88,7 +86,7 @@ class ParzenDensity(nn.Module):
         )
         return H, -precision * (responsibilities @ self.centers.to(samples))
 
-    def mapped(self, matrix: Tensor, floor: Tensor) -> ParzenDensity:
+    def mapped(self, matrix: Tensor, floor: Tensor) -> "ParzenDensity":
         """The density with its centres at Mc, M (E,D); its Gaussians are isotropic, so the floor has no effect."""
         return ParzenDensity(self.centers @ matrix.to(self.centers).T, self.bandwidth)
 
@@ -101,7 +99,7 @@ class ParzenDensity(nn.Module):
         return {"kind": "parzen", "centers": len(self.centers), "dimensions": self.centers.shape[1]}
 
     @classmethod
-    def from_config(cls, config: Mapping[str, Any]) -> ParzenDensity:
+    def from_config(cls, config: Mapping[str, Any]) -> "ParzenDensity":
         """A density of zeros with the sizes of a ``config``.
 
         Raises:

@@ -1,7 +1,5 @@
 """Student's t-distribution of weights, with its mode at rest."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
@@ -52,7 +50,7 @@ class StudentDensity(nn.Module):
     @classmethod
     def fit(
         cls, samples: Tensor | Iterable[Tensor], degrees_of_freedom: float = 10.0, floor: float = PARTING_VARIANCE
-    ) -> StudentDensity:
+    ) -> "StudentDensity":
         r"""The likeliest :math:`\Sigma`, by expectation maximisation in float64.
 
         Args:
@@ -120,7 +118,7 @@ class StudentDensity(nn.Module):
         scale = (nu + samples.shape[1]) / (nu + distance)
         return scale[:, None, None] * precision, torch.zeros_like(samples)
 
-    def mapped(self, matrix: Tensor, floor: Tensor) -> StudentDensity:
+    def mapped(self, matrix: Tensor, floor: Tensor) -> "StudentDensity":
         """The density of y = Mx with a variance added to each y.
 
         Args:
@@ -141,7 +139,7 @@ class StudentDensity(nn.Module):
         return {"kind": "student", "dimensions": len(self.factor)}
 
     @classmethod
-    def from_config(cls, config: Mapping[str, Any]) -> StudentDensity:
+    def from_config(cls, config: Mapping[str, Any]) -> "StudentDensity":
         """A density with the sizes of a ``config``.
 
         Raises:

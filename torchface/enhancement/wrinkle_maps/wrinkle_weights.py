@@ -1,7 +1,5 @@
 """From a rig's pose to the weights of wrinkle maps: small enough for an engine's every frame."""
 
-from __future__ import annotations
-
 import copy
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -83,7 +81,7 @@ class WrinkleWeights(nn.Module):
         }
 
     @classmethod
-    def from_config(cls, config: Mapping[str, Any]) -> WrinkleWeights:
+    def from_config(cls, config: Mapping[str, Any]) -> "WrinkleWeights":
         """A module of zeros for the state to be loaded into."""
         return cls(**config)
 
@@ -97,7 +95,7 @@ class WrinkleWeights(nn.Module):
         region_names: Sequence[str],
         sites: Tensor | None = None,
         components: int = _COMPONENTS,
-    ) -> WrinkleWeights:
+    ) -> "WrinkleWeights":
         """Learns from poses whose weights are known.
 
         Args:
@@ -131,7 +129,7 @@ class WrinkleWeights(nn.Module):
             model._learn(region, scores[region].double(), weights[:, region].double())
         return model.eval()
 
-    def of_whole(self, vertices: Tensor, count: int) -> WrinkleWeights:
+    def of_whole(self, vertices: Tensor, count: int) -> "WrinkleWeights":
         """The same for a rig of ``count`` vertices, of which those learned from are ``vertices`` (V,)."""
         whole = copy.deepcopy(self)
         whole.sites, whole.vertex_count = vertices[self.sites], count

@@ -1,7 +1,5 @@
 """Triangles cut at points of their edges: vertices keep their number, new ones lie behind as shares of them."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -21,7 +19,7 @@ class CutMesh:
     source: Tensor  # the triangle that each is a part of, (G,)
 
     @staticmethod
-    def of(count: int, faces: Tensor) -> CutMesh:
+    def of(count: int, faces: Tensor) -> "CutMesh":
         """A mesh of ``count`` vertices that is whole."""
         return CutMesh(sparse.eye_array(count, format="csr"), faces, torch.arange(len(faces)))
 
@@ -29,7 +27,7 @@ class CutMesh:
         """Values (V,D) at its vertices, (W,D) float64."""
         return torch.from_numpy(self.shares @ values.double().numpy())
 
-    def split(self, pairs: Tensor, share: Tensor) -> CutMesh:
+    def split(self, pairs: Tensor, share: Tensor) -> "CutMesh":
         """Edges (E,2), the smaller vertex first, cut at shares (E,) of their way; their triangles fall in pieces."""
         count, faces = self.shares.shape[0], self.faces
         key, order = (pairs[:, 0] * count + pairs[:, 1]).sort()
@@ -56,7 +54,7 @@ class CutMesh:
         mix = sparse.csr_array((weight, (row, pairs.flatten().numpy())), shape=(len(pairs), count))
         return CutMesh(sparse.vstack([self.shares, mix @ self.shares], "csr"), torch.cat(pieces), torch.cat(source))
 
-    def torn(self, vertices: Tensor, below: Tensor) -> CutMesh:
+    def torn(self, vertices: Tensor, below: Tensor) -> "CutMesh":
         """Copies of vertices (k,), behind all, for those triangles (G,) bool that lie below."""
         count = self.shares.shape[0]
         other = torch.arange(count)
@@ -64,7 +62,7 @@ class CutMesh:
         shares = sparse.vstack([self.shares, self.shares[vertices.numpy()]], "csr")
         return CutMesh(shares, torch.where(below[:, None], other[self.faces], self.faces), self.source)
 
-    def without(self, faces: Tensor) -> CutMesh:
+    def without(self, faces: Tensor) -> "CutMesh":
         """Without triangles (G,) bool."""
         return replace(self, faces=self.faces[~faces], source=self.source[~faces])
 

@@ -4,8 +4,6 @@
 vertex each row was. It is imported where it is needed, since it takes a while.
 """
 
-from __future__ import annotations
-
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -28,7 +26,7 @@ def to_trimesh(
     uv_faces: Tensor | None = None,
     colors: Tensor | None = None,
     texture: Tensor | None = None,
-) -> trimesh.Trimesh:
+) -> "trimesh.Trimesh":
     """The ``trimesh.Trimesh`` of a mesh; see ``Mesh.to_trimesh`` for what is lost."""
     import trimesh
 
@@ -53,7 +51,7 @@ def to_trimesh(
     return trimesh.Trimesh(points, triangles, visual=visual, vertex_attributes=attributes, process=False)
 
 
-def from_trimesh(mesh: trimesh.Trimesh) -> dict[str, Any]:
+def from_trimesh(mesh: "trimesh.Trimesh") -> dict[str, Any]:
     """The arguments of ``Mesh``: vertices, faces, uvs, uv_faces, colors, texture.
 
     Raises:
@@ -89,7 +87,7 @@ def from_trimesh(mesh: trimesh.Trimesh) -> dict[str, Any]:
     return parts
 
 
-def _joined(mesh: trimesh.Trimesh) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def _joined(mesh: "trimesh.Trimesh") -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """The vertex that each row is, and a row of each vertex; one to one where there are no ids or rows have moved."""
     ids, each = mesh.vertex_attributes.get("vertex_id"), np.arange(len(mesh.vertices))
     if ids is None or np.shape(ids) != each.shape or np.asarray(ids).dtype.kind not in "iu":

@@ -1,7 +1,5 @@
 """VTube Studio's plug-in API: parameters of a Live2D model set over a WebSocket, after the user allowed it once."""
 
-from __future__ import annotations
-
 import json
 import math
 import os
@@ -141,7 +139,7 @@ class VTubeStudioSender:
                 if self._open:
                     self._change.wait_for(lambda: not self._open, _RETRY)
 
-    def _authenticate(self, calls: _Calls) -> None:
+    def _authenticate(self, calls: "_Calls") -> None:
         token = ""
         with suppress(OSError, UnicodeDecodeError):
             token = self._token.read_text("ascii")[:_LONGEST_TOKEN].strip()
@@ -161,7 +159,7 @@ class VTubeStudioSender:
             if attempt:
                 raise _RefusedError(f"VTube Studio refused its own token ({answer.get('reason')!s:.80})", final=True)
 
-    def _make(self, calls: _Calls, name: str) -> bool:
+    def _make(self, calls: "_Calls", name: str) -> bool:
         """Makes a parameter; one that VTube Studio or another plug-in has already is left to them."""
         data = {"parameterName": name, "explanation": "torchface", "min": 0, "max": 1, "defaultValue": 0}
         try:
@@ -170,7 +168,7 @@ class VTubeStudioSender:
             return False
         return True
 
-    def _stream(self, calls: _Calls) -> None:
+    def _stream(self, calls: "_Calls") -> None:
         made = [(name, ARKIT.index(name[0].lower() + name[1:])) for name in self._made]
         while True:
             begun = time.monotonic()

@@ -1,7 +1,5 @@
 """Writing video files, grey or in colour."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable, Iterator
 from fractions import Fraction
@@ -98,7 +96,7 @@ def _check_written(expected: VideoFile, temporary: Path) -> None:
         )
 
 
-def _encode(container: OutputContainer, first: Tensor, others: Iterator[Tensor], fps: float) -> int:
+def _encode(container: "OutputContainer", first: Tensor, others: Iterator[Tensor], fps: float) -> int:
     """Writes all frames and gives their number."""
     stream = _add_stream(container, first, fps)
     layout = "rgb24" if first.ndim == 3 else "gray"
@@ -119,7 +117,7 @@ def _encode(container: OutputContainer, first: Tensor, others: Iterator[Tensor],
     return count
 
 
-def _add_stream(container: OutputContainer, first: Tensor, fps: float) -> VideoStream:
+def _add_stream(container: "OutputContainer", first: Tensor, fps: float) -> "VideoStream":
     """A stream for frames as the first: FFV1 for a lossless container, else H.264 or MPEG-4 in BT.709."""
     height, width = first.shape[-2:]
     lossless = container.format.name != "mp4"

@@ -1,7 +1,5 @@
 """A face found on a surface in any pose and unit: seen in pictures from around, its points placed by rays."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import product
@@ -142,7 +140,7 @@ class FaceSearch:
         plain: bool,
         pictures: list[Tensor],
         progress: Progress,
-    ) -> list[tuple[_Sighting, Tensor]]:
+    ) -> "list[tuple[_Sighting, Tensor]]":
         """The surest sightings, each of another place, and where other faces are."""
         seen: list[_Sighting] = []
         for frame in [framed, None] if framed is not None and bool(framed.any()) else [None]:
@@ -161,7 +159,7 @@ class FaceSearch:
         sure: float,
         pictures: list[Tensor],
         progress: Progress,
-    ) -> list[_Sighting]:
+    ) -> "list[_Sighting]":
         """The faces in pictures from around; from above and below only where those on the level show none for sure."""
         rows = surface.faces.unique() if framed is None else framed.nonzero()[:, 0]
         corners = surface.vertices[rows]
@@ -189,7 +187,7 @@ class FaceSearch:
 
     def _sighting(
         self, surface: TexturedSurface, camera: Camera, reading: FaceReading, score: float, plain: bool
-    ) -> _Sighting | None:
+    ) -> "_Sighting | None":
         hits = _hits(surface, camera, reading.landmarks[INNER], plain)
         if int(torch.isfinite(hits).all(-1).sum()) < _LEAST_POINTS:
             return None
@@ -202,7 +200,7 @@ class FaceSearch:
         )
 
     def _from_near(
-        self, surface: TexturedSurface, first: _Sighting, others: Tensor, progress: Progress
+        self, surface: TexturedSurface, first: "_Sighting", others: Tensor, progress: Progress
     ) -> FaceOnSurface:
         reference = self.reference.all
         eyes = float((reference[_EYES[0]] - reference[_EYES[1]]).norm())

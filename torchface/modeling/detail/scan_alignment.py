@@ -1,7 +1,5 @@
 """Alignment of a scan with a mesh of the same face: by picked points, or by itself."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import torch
@@ -125,14 +123,14 @@ class _Target:
     tree: cKDTree
 
     @staticmethod
-    def of(scan: Mesh) -> _Target:
+    def of(scan: Mesh) -> "_Target":
         vertices = scan.vertices.double()
         normals = vertex_normals(vertices, scan.faces)
         used = normals.norm(dim=1) > 0.5  # loose vertices and those of triangles without area have no normal
         points = vertices[used]
         return _Target(points, normals[used], border_vertices(scan.faces, len(vertices))[used], cKDTree(points.numpy()))
 
-    def thinned(self, count: int) -> _Target:
+    def thinned(self, count: int) -> "_Target":
         """Fewer points, but the whole border, so that points beyond it are still recognised."""
         keep = torch.randperm(len(self.points), generator=torch.Generator().manual_seed(_SEED))[:count]
         keep = torch.cat([keep, self.border.nonzero()[:, 0]]).unique()
@@ -145,7 +143,7 @@ class _Samples:
     points: Tensor
     normals: Tensor
 
-    def first(self, count: int) -> _Samples:
+    def first(self, count: int) -> "_Samples":
         return _Samples(self.points[:count], self.normals[:count])
 
 
@@ -170,7 +168,7 @@ class _Pose:
     near: float = 0.0
 
     @staticmethod
-    def of(similarity: Similarity) -> _Pose:
+    def of(similarity: Similarity) -> "_Pose":
         one = similarity
         return _Pose(one.scale[0].double(), one.rotation[0].double(), one.translation[0].double())
 

@@ -1,7 +1,5 @@
 """Shape and colour of heads together, on one topology."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple
@@ -130,7 +128,7 @@ class HeadModel(nn.Module):
         shape: MorphableModel,
         color: MorphableModel | None = None,
         rig: BlendshapeRig | None = None,
-    ) -> HeadModel:
+    ) -> "HeadModel":
         """The models with the topology and annotations of a mesh, and a rig of that topology.
 
         Raises:
@@ -181,7 +179,7 @@ class HeadModel(nn.Module):
         neutral = replace(self.template(), vertices=self.rig_vertices, colors=self.rig_colors)
         return BlendshapeRig(neutral, self.rig_deltas, self.rig_names)
 
-    def part(self, keep: Tensor) -> HeadModel:
+    def part(self, keep: Tensor) -> "HeadModel":
         """The model of some vertices only: a mask (V,) or ids; see ``torchface.mesh.submesh``."""
         piece, rig = submesh(self.template(), keep), self.rig
         return HeadModel.on(
@@ -238,7 +236,7 @@ class HeadModel(nn.Module):
         return config
 
     @classmethod
-    def from_config(cls, config: Mapping[str, Any]) -> HeadModel:
+    def from_config(cls, config: Mapping[str, Any]) -> "HeadModel":
         """A model of zeros with the sizes of a ``config``.
 
         Raises:

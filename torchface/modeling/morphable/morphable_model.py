@@ -1,7 +1,5 @@
 """The morphable model: a mean, the ways in which samples differ from it, and how much they do."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from pathlib import Path
@@ -86,7 +84,7 @@ class MorphableModel(nn.Module):
         components: int | None = None,
         checkpoint: str | Path | None = None,
         progress: Progress | None = None,
-    ) -> MorphableModel:
+    ) -> "MorphableModel":
         """Learns from samples in correspondence, in memory or read in blocks.
 
         Args:
@@ -232,7 +230,7 @@ class MorphableModel(nn.Module):
             raise ValueRangeError(f"steps: found {steps}, expected at least 2")
         return torch.lerp(first, second, torch.linspace(0, 1, steps, device=first.device, dtype=first.dtype)[:, None])
 
-    def truncate(self, count: int | None = None, variance: float | None = None) -> MorphableModel:
+    def truncate(self, count: int | None = None, variance: float | None = None) -> "MorphableModel":
         """The model of the first components.
 
         Args:
@@ -256,7 +254,7 @@ class MorphableModel(nn.Module):
             self.mean, self.components[:count], self.standard_deviations[:count], self.total_variance, self.samples
         )
 
-    def part(self, vertices: Tensor) -> MorphableModel:
+    def part(self, vertices: Tensor) -> "MorphableModel":
         """The same distribution seen at some vertices (N,) only; its components are orthonormal there."""
         modes = self.modes[:, vertices].double().flatten(1)
         _, deviations, components = torch.linalg.svd(modes, full_matrices=False)
@@ -275,7 +273,7 @@ class MorphableModel(nn.Module):
         return {"vertices": vertices, "channels": channels, "components": self.count, "samples": self.samples}
 
     @classmethod
-    def from_config(cls, config: Mapping[str, Any]) -> MorphableModel:
+    def from_config(cls, config: Mapping[str, Any]) -> "MorphableModel":
         """A model of zeros with the sizes of a ``config``.
 
         Raises:

@@ -1,7 +1,5 @@
 """Landmarks in photographs of a linear face: where its points are seen, and their derivatives."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import torch
@@ -42,7 +40,7 @@ class LinearPoints:
     side: Tensor  # of the face, +1 toward positive x, (J,)
 
     @staticmethod
-    def of(mean: Tensor, modes: Tensor, sites: LandmarkSites) -> LinearPoints:
+    def of(mean: Tensor, modes: Tensor, sites: LandmarkSites) -> "LinearPoints":
         """Those of a whole mesh: mean (V,3), modes (D,V,3)."""
         stacked, curves, landmarks = torch.cat([mean[None], modes]), sites.curves, sites.landmarks
         used, place = torch.cat([landmarks, curves.vertices.flatten()]).unique(return_inverse=True)
@@ -67,7 +65,7 @@ class LinearPoints:
         """Positions (...,P,3) at coefficients (...,D)."""
         return self.mean + torch.tensordot(coefficients, self.basis, dims=1)
 
-    def picked(self, rows: Tensor) -> PickedPoints:
+    def picked(self, rows: Tensor) -> "PickedPoints":
         """Those of rows (I,L)."""
         return PickedPoints(self.mean[rows], self.basis.movedim(0, -1)[rows])
 
@@ -92,7 +90,7 @@ class Views:
     rotation: Tensor
     translation: Tensor
 
-    def moved(self, step: Tensor, focal_step: Tensor) -> Views:
+    def moved(self, step: Tensor, focal_step: Tensor) -> "Views":
         """Rotated and translated by (I,6), with focal lengths longer by the factors exp of (I,)."""
         focal = torch.stack([focal_step.exp(), focal_step.exp(), torch.ones_like(focal_step)], dim=-1)
         scaled = self.intrinsics * torch.where(torch.eye(3, dtype=torch.bool), focal[:, :, None], 1.0)

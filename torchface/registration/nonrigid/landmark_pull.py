@@ -1,7 +1,5 @@
 """Pull of landmarks: points of the face in full, those of its contour as far as the surface agrees."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import torch
@@ -30,7 +28,7 @@ class LandmarkPull:
     numbers: Tensor  # what each is called in messages, (L,): iBUG's number from 0, or the row of the given ones
 
     @staticmethod
-    def of(vertices: Tensor, points: Tensor, template: Mesh) -> LandmarkPull:
+    def of(vertices: Tensor, points: Tensor, template: Mesh) -> "LandmarkPull":
         """With the contour given by the template's 68 landmarks, where it has as many."""
         contour = shaped = torch.zeros(len(vertices), dtype=torch.bool)
         known = None if template.annotations is None else template.annotations.landmarks
@@ -43,12 +41,12 @@ class LandmarkPull:
         return LandmarkPull(vertices, points, contour, shaped, numbers)
 
     @staticmethod
-    def none() -> LandmarkPull:
+    def none() -> "LandmarkPull":
         """No landmark at all."""
         empty = torch.zeros(0, dtype=torch.int64)
         return LandmarkPull(empty, torch.zeros(0, 3, dtype=torch.float64), empty.bool(), empty.bool(), empty)
 
-    def subset(self, rows: Tensor) -> LandmarkPull:
+    def subset(self, rows: Tensor) -> "LandmarkPull":
         """Those of a mask (L,) or of rows."""
         return LandmarkPull(*(part[rows] for part in vars(self).values()))
 

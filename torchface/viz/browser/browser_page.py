@@ -1,7 +1,5 @@
 """A browser page that only this machine can open: viser bound to 127.0.0.1, with light, camera and background."""
 
-from __future__ import annotations
-
 import errno
 import importlib
 import math
@@ -40,7 +38,7 @@ def import_viser() -> Any:
     return import_extra("viser", "viser", "viewer", "the viewer")
 
 
-def start_server(label: str, token: str, port: int = 8080) -> viser.ViserServer:
+def start_server(label: str, token: str, port: int = 8080) -> "viser.ViserServer":
     """A page on ``http://127.0.0.1:PORT/TOKEN/``, or on the next port that is free.
 
     Args:
@@ -105,7 +103,7 @@ class BrowserPage:
     def _add_save_button(self, label: str, hint: str, save: Callable[[], str]) -> None:
         """A button that saves and notifies whoever clicked it of the files, or of what went wrong."""
 
-        def clicked(event: viser.GuiEvent) -> None:
+        def clicked(event: "viser.GuiEvent") -> None:
             assert event.client is not None
             try:
                 event.client.add_notification("Saved", save(), auto_close_seconds=6.0, color="teal")
@@ -120,7 +118,7 @@ def icon(name: str) -> Any:
     return getattr(import_viser().Icon, name)
 
 
-def frame_camera(server: viser.ViserServer, mesh: Mesh, width: float = 1.0) -> None:
+def frame_camera(server: "viser.ViserServer", mesh: Mesh, width: float = 1.0) -> None:
     """Sets the camera before a mesh, looking along -z: round its landmarks where annotated, else the whole of it.
 
     Args:
@@ -145,7 +143,7 @@ def frame_camera(server: viser.ViserServer, mesh: Mesh, width: float = 1.0) -> N
     camera.fov = _FIELD_OF_VIEW
 
 
-def _light(server: viser.ViserServer) -> None:
+def _light(server: "viser.ViserServer") -> None:
     """Key from the viewer's upper left, weaker fill, rim from behind: form shows where flat light would hide it."""
     scene = server.scene
     scene.configure_default_lights(enabled=False)

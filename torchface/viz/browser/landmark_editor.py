@@ -1,7 +1,5 @@
 """The annotation page: a frame with its 68 landmarks, which are dragged to where they belong."""
 
-from __future__ import annotations
-
 import math
 from typing import TYPE_CHECKING, Any
 
@@ -198,7 +196,7 @@ class LandmarkEditor(BrowserPage):
             colors[self.chosen] = _CHOSEN
         return colors
 
-    async def _dragged(self, event: viser.SceneNodeDragEvent) -> None:  # async: start, updates and end stay in order
+    async def _dragged(self, event: "viser.SceneNodeDragEvent") -> None:  # async: start, updates and end stay in order
         if event.instance_index is None:
             return
         eye = torch.tensor(event.client.camera.position, dtype=torch.float64)
@@ -228,7 +226,7 @@ class LandmarkEditor(BrowserPage):
                 self.chosen = event.instance_index
                 self._refresh()
 
-    def _clicked(self, event: viser.SceneClickEvent) -> None:
+    def _clicked(self, event: "viser.SceneClickEvent") -> None:
         """Brings the chosen landmark to a click on the image; a click on a dot has just chosen it."""
         origin = torch.tensor(event.ray_origin, dtype=torch.float64)
         direction = torch.tensor(event.ray_direction, dtype=torch.float64)
@@ -245,7 +243,7 @@ class LandmarkEditor(BrowserPage):
             self.session.let_go()
             self._refresh()
 
-    def _straighten(self, client: viser.ClientHandle | None) -> None:
+    def _straighten(self, client: "viser.ClientHandle | None") -> None:
         """Puts a client's camera straight before the face."""
         if client is None:
             return

@@ -1,7 +1,5 @@
 """Requests that a page answers: those with its token, and none of another page in the same browser."""
 
-from __future__ import annotations
-
 import importlib
 import secrets
 import threading
@@ -91,7 +89,7 @@ def only_this_page(title: str, token: str, accepts: Callable[[bytes | str], bool
 
 
 def _filtered(listen: Listen, accepts: Callable[[bytes | str], bool]) -> Listen:
-    async def listen_to_accepted(connection: ServerConnection) -> None:
+    async def listen_to_accepted(connection: "ServerConnection") -> None:
         receive = connection.recv
         refused = 0
 
@@ -112,7 +110,7 @@ def _filtered(listen: Listen, accepts: Callable[[bytes | str], bool]) -> Listen:
 def _guarded(answer: Serve, title: str, token: str) -> Serve:
     named = b"<title>" + escape(title).encode() + b"</title>"
 
-    def process(connection: ServerConnection, request: Request) -> Response | None:
+    def process(connection: "ServerConnection", request: "Request") -> "Response | None":
         # Twice the same header is nothing that a browser sends, and get() would raise.
         hosts, origins = request.headers.get_all("Host"), request.headers.get_all("Origin")
         port = connection.local_address[1]

@@ -1,7 +1,5 @@
 """Playback of a take: the frame that is due at a moment."""
 
-from __future__ import annotations
-
 from bisect import bisect_right
 from dataclasses import dataclass, replace
 
@@ -44,21 +42,21 @@ class Playback:
         """Whether it plays without a loop and has reached the last frame."""
         return self.playing and not self.loop and self.frame(now) == self.frames - 1
 
-    def play(self, now: float) -> Playback:
+    def play(self, now: float) -> "Playback":
         """Playing from where it stands; from the beginning where it stands at the end."""
         frame = self.frame(now)
         return replace(self, started=now, origin=0 if frame == self.frames - 1 else frame)
 
-    def pause(self, now: float) -> Playback:
+    def pause(self, now: float) -> "Playback":
         """Stopped at the frame due."""
         return replace(self, started=None, origin=self.frame(now))
 
-    def seek(self, frame: int, now: float) -> Playback:
+    def seek(self, frame: int, now: float) -> "Playback":
         """At another frame, playing on if it played."""
         clamped = min(max(frame, 0), self.frames - 1)
         return replace(self, started=now if self.playing else None, origin=clamped)
 
-    def paced(self, now: float, speed: float | None = None, loop: bool | None = None) -> Playback:
+    def paced(self, now: float, speed: float | None = None, loop: bool | None = None) -> "Playback":
         """With another speed or loop, from the frame due on."""
         here = self.seek(self.frame(now), now)
         return replace(here, speed=self.speed if speed is None else speed, loop=self.loop if loop is None else loop)

@@ -1,7 +1,5 @@
 """The items of a batch spread over processes of this machine."""
 
-from __future__ import annotations
-
 import multiprocessing
 import os
 import pickle
@@ -107,7 +105,7 @@ def in_processes(
             pipe.close()
 
 
-def _start(job: BatchJob, out: Path) -> tuple[Connection, SpawnProcess]:
+def _start(job: BatchJob, out: Path) -> "tuple[Connection, SpawnProcess]":
     context = multiprocessing.get_context("spawn")
     ours, theirs = context.Pipe()
     process = context.Process(target=_work, args=(job, out, theirs), daemon=True)
@@ -117,7 +115,7 @@ def _start(job: BatchJob, out: Path) -> tuple[Connection, SpawnProcess]:
     return ours, process
 
 
-def _received(pipe: Connection, worker: _Worker) -> Outcome | None:
+def _received(pipe: "Connection", worker: _Worker) -> Outcome | None:
     """What a process says: that it is ready, None, or the outcome of its item; one that says else is killed."""
     try:
         data = pipe.recv_bytes(_MOST_BYTES)
@@ -134,7 +132,7 @@ def _received(pipe: Connection, worker: _Worker) -> Outcome | None:
     raise EOFError
 
 
-def _given(pipe: Connection, waiting: deque[BatchItem]) -> BatchItem | None:
+def _given(pipe: "Connection", waiting: deque[BatchItem]) -> BatchItem | None:
     """The next item, given to a process; None where that has just died."""
     try:
         pipe.send(waiting[0])
@@ -190,7 +188,7 @@ def _one_thread() -> Iterator[None]:
                 os.environ[name] = value
 
 
-def _work(job: BatchJob, out: Path, pipe: Connection) -> None:
+def _work(job: BatchJob, out: Path, pipe: "Connection") -> None:
     """What a process does: says that it is ready, then answers each item, until the pipe is closed."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the process that started this one ends it
     end_with_parent()

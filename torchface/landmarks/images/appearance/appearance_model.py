@@ -1,7 +1,5 @@
 """An active appearance model of one person: landmarks refined until the face looks as it was seen to look."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import Any, NamedTuple, get_args
@@ -81,7 +79,7 @@ class AppearanceSettings:
                 raise ValueRangeError(f"{name}: found {getattr(self, name)}, expected {least} to {most}")
 
     @classmethod
-    def of(cls, settings: AppearanceSettings | dict[str, Any] | None) -> AppearanceSettings:
+    def of(cls, settings: "AppearanceSettings | dict[str, Any] | None") -> "AppearanceSettings":
         """Settings from what a file holds."""
         if settings is None:
             return cls()
@@ -173,7 +171,7 @@ class AppearanceModel(nn.Module):
         landmarks: Tensor,
         settings: AppearanceSettings | None = None,
         progress: Progress | None = None,
-    ) -> AppearanceModel:
+    ) -> "AppearanceModel":
         """Learns a person from some annotated frames, fifteen or so that span what the face does.
 
         Args:
@@ -203,7 +201,7 @@ class AppearanceModel(nn.Module):
         }
 
     @classmethod
-    def from_config(cls, config: dict[str, Any]) -> AppearanceModel:
+    def from_config(cls, config: dict[str, Any]) -> "AppearanceModel":
         """A model of zeros for the state to be loaded into."""
         return cls(**config)
 

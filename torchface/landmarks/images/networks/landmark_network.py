@@ -1,7 +1,5 @@
 """Landmarks of a face in one pass of a small convolutional network, and with a head for it points of the whole face."""
 
-from __future__ import annotations
-
 from typing import Any, NamedTuple, Self
 
 import torch
@@ -46,7 +44,7 @@ class NetworkLandmarks(NamedTuple):
     expression_deviation: Tensor
 
     @classmethod
-    def of_68(cls, landmarks: Tensor, deviation: Tensor, visibility: Tensor, presence: Tensor) -> NetworkLandmarks:
+    def of_68(cls, landmarks: Tensor, deviation: Tensor, visibility: Tensor, presence: Tensor) -> "NetworkLandmarks":
         """What is found by a network without further points."""
         count = landmarks.shape[:1]
         points = landmarks.new_zeros((*count, 0, 2)), landmarks.new_zeros((*count, 0))
@@ -176,7 +174,7 @@ class LandmarkNetwork(PictureNetwork):
 
     def with_points(
         self, places: Tensor, mirror: Tensor, hidden: int = 176, size: int | None = None
-    ) -> LandmarkNetwork:
+    ) -> "LandmarkNetwork":
         """A network that finds the 68 as this one does, and has an untrained head for further points.
 
         Args:
@@ -194,7 +192,7 @@ class LandmarkNetwork(PictureNetwork):
         network.dense.mirror.copy_(mirror)
         return network
 
-    def resized(self, size: int) -> LandmarkNetwork:
+    def resized(self, size: int) -> "LandmarkNetwork":
         """This network with crops of another size, pixels a side, of which it is to learn first."""
         network = LandmarkNetwork.from_config(self.config | {"size": size})
         network.load_state_dict(self.state_dict())
