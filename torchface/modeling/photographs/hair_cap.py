@@ -28,15 +28,10 @@ _STRANDS, _STRAND = 150.0, 0.10
 
 @dataclass(frozen=True, eq=False)
 class HairCap:
-    """Hair that photographs show.
+    """Hair that photographs show."""
 
-    Args:
-        color: sRGB, (3,).
-        line: how high it begins over the face at places from the right temple to the left, (17,).
-    """
-
-    color: Tensor
-    line: Tensor
+    color: Tensor  # sRGB, (3,)
+    line: Tensor  # how high it begins over the face at places from the right temple to the left, (17,)
     places: FacePlaces
 
     def share(self, place: Tensor) -> Tensor:

@@ -60,31 +60,20 @@ _WHITE, _BLACK = (1.0, 1.0, 1.0), (0.0, 0.0, 0.0)
 
 @dataclass(frozen=True)
 class PhotographSettings:
-    """Settings of a fit to photographs on disk.
+    """Settings of a fit to photographs on disk."""
 
-    Args:
-        fit: the noise of landmarks, the priors on faces, the skin.
-        template: a rig with the model's topology; the model's own, or the embedded performer, if absent.
-        part: an annotated region that template and model are cut to, such as ``"face"`` of an ICT head.
-        focal: length in pixels, if given.
-        face: which of several, from 0: in the order of an XML, or where landmarks are found the largest first.
-        landmark_model: finds landmarks where no file gives them; by name or folder.
-        names: of the written shapes; see ``rig_names.renamed``.
-        prior: which weights faces have: a shape prior by name or folder, or "none".
-        insist: also where photographs do not seem to show one person.
-        everything: paint hair, clothes and what hangs before the face on the head.
-    """
-
-    fit: FitSettings = field(default_factory=FitSettings)
+    fit: FitSettings = field(default_factory=FitSettings)  # the noise of landmarks, the priors on faces, the skin
+    # a rig with the model's topology; the model's own, or the embedded performer, if absent
     template: Path | None = None
-    part: str | None = None
-    focal: float | None = None
+    part: str | None = None  # an annotated region that template and model are cut to, such as `"face"` of an ICT head
+    focal: float | None = None  # length in pixels, if given
+    # which of several, from 0: in the order of an XML, or where landmarks are found the largest first
     face: int | None = None
-    landmark_model: str | Path = DEFAULT_LANDMARKS
-    names: Naming | None = None
-    prior: str | Path = DEFAULT_PRIOR
-    insist: bool = False
-    everything: bool = False
+    landmark_model: str | Path = DEFAULT_LANDMARKS  # finds landmarks where no file gives them; by name or folder
+    names: Naming | None = None  # of the written shapes; see `rig_names.renamed`
+    prior: str | Path = DEFAULT_PRIOR  # which weights faces have: a shape prior by name or folder, or "none"
+    insist: bool = False  # also where photographs do not seem to show one person
+    everything: bool = False  # paint hair, clothes and what hangs before the face on the head
 
     def __post_init__(self) -> None:
         if self.face is not None:
@@ -96,25 +85,17 @@ _POOR = 0.04  # of the distance of the eyes' outer corners
 
 @dataclass(frozen=True, eq=False)
 class FittedHead:
-    """What was made, and how near it comes to the photographs.
-
-    Args:
-        fit: see ``ImageFit``.
-        overlays: the files written, one a photograph: it, the fit over it, landmarks found (green) and fitted (red).
-        transfer_summary: on triangles without area; empty where there are none.
-        found: the landmarks that no file gave; empty where files gave them.
-        heads: what there is to say of the head model.
-        shown: the photographs, and the frames of videos, by their names.
-    """
+    """What was made, and how near it comes to the photographs."""
 
     rig: BlendshapeRig
-    fit: ImageFit
+    fit: ImageFit  # see `ImageFit`
+    # the files written, one a photograph: it, the fit over it, landmarks found (green) and fitted (red)
     overlays: tuple[Path, ...]
-    transfer_summary: str
-    found: tuple[PhotographLandmarks, ...] = ()
+    transfer_summary: str  # on triangles without area; empty where there are none
+    found: tuple[PhotographLandmarks, ...] = ()  # the landmarks that no file gave; empty where files gave them
     remarks: tuple[str, ...] = ()
-    heads: str = ""
-    shown: tuple[Path, ...] = ()
+    heads: str = ""  # what there is to say of the head model
+    shown: tuple[Path, ...] = ()  # the photographs, and the frames of videos, by their names
 
     def verdict(self) -> str:
         """Whether the head is to be used, in a line; no landmark says whether skin and likeness are right."""
