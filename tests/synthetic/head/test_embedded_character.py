@@ -1,7 +1,5 @@
 """The character that is shown of the performer: its parts, how shapes move them, its images, its file."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 

@@ -1,7 +1,5 @@
 """The embedded head: its topology, its measurements, and how they answer to the identity."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from torch import Tensor

@@ -1,7 +1,5 @@
 """The embedded performer's shapes: what they do on the mean head and on random ones."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 

@@ -1,7 +1,5 @@
 """A make-up artist's markers: named, symmetric, on the face alone, and they see what the face does."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The scanner against the head that it scans: where the surface lies, what is torn, that files hold all of it."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

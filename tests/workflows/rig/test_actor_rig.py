@@ -1,7 +1,5 @@
 """From scans on disk to an actor's rig on disk: what was planted comes back."""
 
-from __future__ import annotations
-
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from multiprocessing import get_context

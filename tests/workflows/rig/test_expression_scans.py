@@ -1,7 +1,5 @@
 """Expression scans: names or a table say what they show, mirrored ones are found, what they do not show is left out."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

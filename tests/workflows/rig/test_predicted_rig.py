@@ -1,7 +1,5 @@
 """A rig from a neutral head alone: what the command writes, its report, and heads and models that do not fit."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Shut eyes of a scan are recognised by its texture and by two fits; open ones are not taken for shut."""
 
-from __future__ import annotations
-
 import re
 from dataclasses import replace
 from types import SimpleNamespace

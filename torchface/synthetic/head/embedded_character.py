@@ -1,7 +1,5 @@
 """The performer as a character to be shown: skin maps, teeth, gums, tongue, hair, and all 52 of ARKit's shapes."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import torch

@@ -1,7 +1,5 @@
 """Openings of the face, ring by ring from the block's border: lids, lips, nostrils, ears, eyeballs."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 

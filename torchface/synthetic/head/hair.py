@@ -1,7 +1,5 @@
 """Hair of the mean head: a cap over the scalp, and single hairs of brows and lashes with the skin that they grow on."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import lru_cache
 

@@ -1,7 +1,5 @@
 """Locks of a haircut: strips that start on the scalp of the mean head and follow its form along a style's way."""
 
-from __future__ import annotations
-
 from functools import lru_cache
 from typing import Literal
 

@@ -1,7 +1,5 @@
 """Weights by which the skin follows the lip handles and the jaw: smooth, solved once on the mean head."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import lru_cache
 

@@ -1,7 +1,5 @@
 """Annotations of the head's vertices: 68 landmarks, regions, pairs that touch."""
 
-from __future__ import annotations
-
 from functools import lru_cache
 
 import torch

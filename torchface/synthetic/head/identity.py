@@ -1,7 +1,5 @@
 """Identity of a head: measurable parameters, each a smooth field over the mean head."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache

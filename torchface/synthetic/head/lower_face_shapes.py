@@ -1,7 +1,5 @@
 """Shapes of the lower face: jaw, lips and mouth, in millimetres that follow the head's own jaw and mouth."""
 
-from __future__ import annotations
-
 import math
 
 import torch

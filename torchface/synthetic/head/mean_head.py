@@ -1,7 +1,5 @@
 """The mean head's vertices: the grid cast onto the form, then lids, lips, nostrils, ears and eyeballs laid in."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import lru_cache
 

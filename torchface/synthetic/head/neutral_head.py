@@ -1,7 +1,5 @@
 """The neutral head of any identity: positions, quads, texture coordinates, annotations, skin."""
 
-from __future__ import annotations
-
 from torch import Tensor
 
 from torchface.mesh import Mesh

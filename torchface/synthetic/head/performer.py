@@ -1,7 +1,5 @@
 """The embedded performer: a head of any identity with 51 of ARKit's 52 shapes."""
 
-from __future__ import annotations
-
 from functools import cache
 
 import torch

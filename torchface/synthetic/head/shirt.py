@@ -1,7 +1,5 @@
 """A shirt's collar and shoulders about the neck of the mean head, with its place on the texture's page."""
 
-from __future__ import annotations
-
 from functools import lru_cache
 
 import numpy as np

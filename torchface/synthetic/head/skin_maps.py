@@ -1,7 +1,5 @@
 """Skin, eyes, teeth and hair of a character as images: colour, normals in tangent space, roughness."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import lru_cache
 

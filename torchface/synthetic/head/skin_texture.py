@@ -1,7 +1,5 @@
 """Painted skin: colours decided at points of the mean head, so that no seam shows."""
 
-from __future__ import annotations
-
 from functools import lru_cache
 
 import numpy as np

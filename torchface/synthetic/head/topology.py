@@ -4,8 +4,6 @@ A ring system replaces a rectangular block of the grid by loops that run round t
 the inmost loop is closed by a small grid. So every face is a quad and every opening has edge loops round it.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from functools import lru_cache
 

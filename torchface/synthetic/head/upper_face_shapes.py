@@ -1,7 +1,5 @@
 """Shapes of the upper face: lids that slide over the eyeball, eye rotation, brows, nose and cheeks."""
 
-from __future__ import annotations
-
 import math
 
 import torch

@@ -1,7 +1,5 @@
 """Texture coordinates: the head unrolled from a seam at the back, crown and eyeballs as islands above it."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import lru_cache
 

@@ -1,7 +1,5 @@
 """One actor of many, from a neutral scan to a rig."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -26,13 +24,10 @@ _MAX_DISTANCE = 1.0  # millimetres, red in the picture
 
 @dataclass(frozen=True)
 class ActorJob:
-    """How each actor's rig is made; ``{name}`` in a path is the scan's name.
+    """How each actor's rig is made; ``{name}`` in a path is the scan's name."""
 
-    Args:
-        template, landmarks, examples, detail, options: see :func:`rig_actor`; ``landmarks`` may be a folder of files
-            named as the scans.
-    """
-
+    # template, landmarks, examples, detail, options: see `rig_actor`; `landmarks` may be a folder of files named as the
+    # scans
     template: Path
     landmarks: Path | None = None
     examples: Path | None = None
@@ -71,7 +66,7 @@ class ActorJob:
             _picture(done),
         )
 
-    def _own(self, item: BatchItem) -> ActorJob:
+    def _own(self, item: BatchItem) -> "ActorJob":
         own = item.settings_of(self)
         if own.landmarks is not None and own.landmarks.is_dir():
             return replace(own, landmarks=landmark_file(own.landmarks, item.path))

@@ -1,7 +1,5 @@
 """From raw scans of an actor and a template rig on disk to the actor's own rig on disk."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -74,61 +72,38 @@ _SCANNED = RiggingSchedule(beta=(0.5, 0.1), gamma=(25.0, 25.0))
 
 @dataclass(frozen=True)
 class RigOptions:
-    """How the files are read and what is made of them.
+    """How the files are read and what is made of them."""
 
-    Args:
-        part: keep this region of the template only.
-        unit: of all scans, where it is not each format's own.
-        pose: what the neutral scan shows in the template's shapes, such as closed eyes; the actor's neutral is opened
-            again by deformation transfer.
-        detector: of landmarks, by name or folder, for scans without landmarks.
-        model: of heads in the template's topology, by name or folder; the neutral's registration is initialised by it.
-        texture_size: of the actor's texture, texels a side.
-        detail_size: of each normal map, texels a side.
-        names: of the written shapes; see ``rig_names.renamed``.
-        colors: whether the scans' colours are used, to find hair and as the actor's.
-        expressions: a regression of expressions, by name or folder, which predicts those of the shapes that it knows.
-    """
-
-    part: str | None = None
-    unit: str | None = None
+    part: str | None = None  # keep this region of the template only
+    unit: str | None = None  # of all scans, where it is not each format's own
+    # what the neutral scan shows in the template's shapes, such as closed eyes; the actor's neutral is opened again by
+    # deformation transfer
     pose: dict[str, float] = field(default_factory=dict)
-    detector: str | Path | None = None
+    detector: str | Path | None = None  # of landmarks, by name or folder, for scans without landmarks
+    # of heads in the template's topology, by name or folder; the neutral's registration is initialised by it
     model: str | Path | None = None
-    texture_size: int = 2048
-    detail_size: int = 2048
-    names: Naming | None = None
-    colors: bool = True
+    texture_size: int = 2048  # of the actor's texture, texels a side
+    detail_size: int = 2048  # of each normal map, texels a side
+    names: Naming | None = None  # of the written shapes; see `rig_names.renamed`
+    colors: bool = True  # whether the scans' colours are used, to find hair and as the actor's
+    # a regression of expressions, by name or folder, which predicts those of the shapes that it knows
     expressions: str | Path | None = None
 
 
 @dataclass(frozen=True, eq=False)
 class ActorReport:
-    """What was made, and how near it comes to the scans.
+    """What was made, and how near it comes to the scans."""
 
-    Args:
-        rig: the actor's, in the template's place.
-        neutral: the neutral scan's registration.
-        transfer_summary: on triangles without area; empty where there are none.
-        examples: what the examples taught; None without any.
-        example_names: the examples used, in the order of ``examples.errors``.
-        maps: the baked normal maps by name, the neutral's first.
-        skipped: lines on scans that could not be used.
-        figure: of the registration: scan, face, distances and lines.
-        penetration: how far teeth, gums and eyes stand out of the skin.
-        predicted: how many of the shapes a model of expressions has predicted.
-    """
-
-    rig: BlendshapeRig
-    neutral: Registration
-    transfer_summary: str
-    examples: ExampleRig | None
-    example_names: tuple[str, ...]
-    maps: dict[str, NormalMap]
-    skipped: tuple[str, ...]
-    figure: Path
-    penetration: Penetration | None = None
-    predicted: int = 0
+    rig: BlendshapeRig  # the actor's, in the template's place
+    neutral: Registration  # the neutral scan's registration
+    transfer_summary: str  # on triangles without area; empty where there are none
+    examples: ExampleRig | None  # what the examples taught; None without any
+    example_names: tuple[str, ...]  # the examples used, in the order of `examples.errors`
+    maps: dict[str, NormalMap]  # the baked normal maps by name, the neutral's first
+    skipped: tuple[str, ...]  # lines on scans that could not be used
+    figure: Path  # of the registration: scan, face, distances and lines
+    penetration: Penetration | None = None  # how far teeth, gums and eyes stand out of the skin
+    predicted: int = 0  # how many of the shapes a model of expressions has predicted
 
     def lines(self) -> list[str]:
         """For people to read."""

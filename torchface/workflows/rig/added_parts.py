@@ -1,7 +1,5 @@
 """The inside of a mouth and the eyes that a character's mesh lacks, taken from the template on its face."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -28,21 +26,14 @@ _LOOSE = 12  # vertices of loose parts from which a mouth has teeth and an eye a
 
 @dataclass(frozen=True, eq=False)
 class AddedParts:
-    """What is added to a character's file, and what is said of it.
+    """What is added to a character's file, and what is said of it."""
 
-    Args:
-        blocks: of the file, with their new vertices; none where nothing was missing.
-        page: image of the parts, (3,H,W) in [0,1].
-        notes: for people to read.
-        lips_cut: lips that were one piece are two.
-        followed: which places of the template the vertices of the mouth's edge and bag follow, by the file's blocks:
-            its number, and their rows there.
-    """
-
-    blocks: tuple[ExtendedBlock, ...]
-    page: Tensor
-    notes: tuple[str, ...]
-    lips_cut: bool
+    blocks: tuple[ExtendedBlock, ...]  # of the file, with their new vertices; none where nothing was missing
+    page: Tensor  # image of the parts, (3,H,W) in [0,1]
+    notes: tuple[str, ...]  # for people to read
+    lips_cut: bool  # lips that were one piece are two
+    # which places of the template the vertices of the mouth's edge and bag follow, by the file's blocks: its number,
+    # and their rows there
     followed: tuple[tuple[int, TemplatePlaces], ...] = ()
 
     def followed_on(self, character: Character, face: CharacterFace) -> TemplatePlaces:

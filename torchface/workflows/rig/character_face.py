@@ -1,7 +1,5 @@
 """The face of a character: found on its surface, and which of the character's pieces move with it."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -52,29 +50,18 @@ _LIPS = slice(48, 68)
 
 @dataclass(frozen=True, eq=False)
 class CharacterFace:
-    """A character's head in the reference's place and size.
+    """A character's head in the reference's place and size."""
 
-    Args:
-        found: the face on the character's surface.
-        vertices: all of the character's, (V,3) float64, millimetres of the reference.
-        rows: the character's vertices in ``head``, (K,).
-        head: the pieces that move with the face.
-        skin: what the template is registered to.
-        skin_rows: the character's vertices in ``skin``, (S,).
-        movable: which of the head's vertices may move, (K,) bool: not those at the cut through the neck.
-        landmarks: template vertices and where they lie, as ``register`` takes them.
-    """
+    found: FaceOnSurface  # the face on the character's surface
+    vertices: Tensor  # all of the character's, (V,3) float64, millimetres of the reference
+    rows: Tensor  # the character's vertices in `head`, (K,)
+    head: Mesh  # the pieces that move with the face
+    skin: Mesh  # what the template is registered to
+    skin_rows: Tensor  # the character's vertices in `skin`, (S,)
+    movable: Tensor  # which of the head's vertices may move, (K,) bool: not those at the cut through the neck
+    landmarks: Landmarks  # template vertices and where they lie, as `register` takes them
 
-    found: FaceOnSurface
-    vertices: Tensor
-    rows: Tensor
-    head: Mesh
-    skin: Mesh
-    skin_rows: Tensor
-    movable: Tensor
-    landmarks: Landmarks
-
-    def on(self, character: Character) -> CharacterFace:
+    def on(self, character: Character) -> "CharacterFace":
         """The same face on a character that has got more vertices."""
         reference, search = character_search()
         return face_pieces(character, self.found, reference, search.reference)

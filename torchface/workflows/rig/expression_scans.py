@@ -1,7 +1,5 @@
 """Expression scans: which file of a folder shows what, whether it shows its side, and what it has not shown."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The openings of a face, found on its mesh or cut into it: between the lips, and between the lids of an eye."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -32,7 +30,7 @@ class Loop:
     share: Tensor
 
     @staticmethod
-    def of(vertices: Tensor, places: Tensor) -> Loop:
+    def of(vertices: Tensor, places: Tensor) -> "Loop":
         """Of vertices in order, whichever way round they run; a half of the way lies above."""
         x = places[vertices, 0]
         ordered = vertices.roll(-int(x.argmax()))
@@ -171,7 +169,7 @@ class OpenedFace:
         chain = torch.stack([rows[0] for rows in group])
         return Loop.of(torch.cat([chain, copy[chain[1:-1]].flip(0)]), self.places())
 
-    def _crease(self, line: _LipLine) -> _LipLine:
+    def _crease(self, line: "_LipLine") -> "_LipLine":
         """The deepest place of the face near the template's line between the lips, in each column."""
         share = torch.linspace(-0.95, 0.95, _COLUMNS, dtype=torch.float64)
         at, off = line.at(share), torch.linspace(-_CREASE, _CREASE, 41, dtype=torch.float64)

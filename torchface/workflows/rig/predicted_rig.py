@@ -1,7 +1,5 @@
 """A rig from a neutral head alone, by an expression regression beside deformation transfer, with a report of both."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Eyes that are shut at rest: a scan's, by its texture or by two fits, and a character's, by what lies behind lids."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """ARKit's shapes on the face of a character in a USD file: found and made on its meshes in a ``.glb`` for the time."""
 
-from __future__ import annotations
-
 import json
 import sys
 import tempfile

@@ -1,7 +1,5 @@
 """A performer whose skin wrinkles: neutral kept, depth with compression, lag in time, pores that move with the skin."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 
