@@ -11,7 +11,7 @@ from torchface.errors import AlignmentError, ValueRangeError
 from torchface.geometry.rotations import rotation_matrix
 from torchface.io import load_ict_facekit, save_rig
 from torchface.mesh import Annotations
-from torchface.modeling.rigging.loose_parts import tongue_out
+from torchface.modeling.rigging.mouth_parts import tongue_out
 from torchface.modeling.rigging.other_topology import shapes_on
 from torchface.rig import BlendshapeRig
 from torchface.synthetic import performer

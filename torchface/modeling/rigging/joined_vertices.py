@@ -1,4 +1,4 @@
-"""A mesh whose vertices that a file has split at seams are one again, and its connected parts."""
+"""A mesh whose vertices that a file has split at seams are one again, its connected parts, and its skin's shapes."""
 
 from dataclasses import dataclass
 
@@ -30,6 +30,16 @@ class JoinedMesh:
     faces: Tensor
     of: Tensor
     part: Tensor
+
+
+@dataclass(frozen=True, eq=False)
+class JoinedHead:
+    """A head's joined mesh in the template's place, and its skin's deltas."""
+
+    vertices: Tensor
+    part: Tensor
+    loose: Tensor
+    deltas: Tensor
 
 
 def joined_vertices(vertices: Tensor, faces: Tensor) -> JoinedMesh:

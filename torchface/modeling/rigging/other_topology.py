@@ -124,7 +124,7 @@ def shapes_on(
     head = SkinOfHead(joined.vertices, joined.faces, skin.loose, joined.part)
     openings, down = eyes_seen(head, marks_of(moved)), lids_looking_down(template)
     deltas, left = shut_blinks(head, deltas, moved.names, openings, skin.distance, down)
-    parts = moved_parts(moved, joined.vertices, joined.faces, joined.part, skin.loose, deltas)
+    parts = moved_parts(moved, joined.vertices, joined.faces, joined.part, skin.loose, deltas, openings)
     deltas = parts.deltas
     still = torch.zeros(len(joined.vertices), dtype=torch.bool)
     if movable is not None:

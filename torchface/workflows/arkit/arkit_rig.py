@@ -20,7 +20,7 @@ from torchface.modeling import HeadModel
 from torchface.modeling.morphable.published_models import head_model_of
 from torchface.modeling.rigging.carried_shapes import CarriedShapes
 from torchface.modeling.rigging.eyelid_closure import BLINKS
-from torchface.modeling.rigging.loose_parts import tongue_out
+from torchface.modeling.rigging.mouth_parts import tongue_out
 from torchface.modeling.rigging.other_topology import shapes_on
 from torchface.progress import Progress, silent
 from torchface.registration import Registration, register

@@ -27,7 +27,7 @@ from torchface.landmarks.surfaces.face_on_surface import NoFaceOnSurfaceError
 from torchface.modeling.rigging.carried_shapes import CarriedShapes
 from torchface.modeling.rigging.eyelid_closure import BLINKS
 from torchface.modeling.rigging.joined_vertices import joined_vertices
-from torchface.modeling.rigging.loose_parts import tongue_out
+from torchface.modeling.rigging.mouth_parts import tongue_out
 from torchface.modeling.rigging.other_topology import shapes_on
 from torchface.progress import Progress, silent
 from torchface.registration import Registration, register

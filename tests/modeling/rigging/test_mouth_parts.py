@@ -3,7 +3,8 @@
 import torch
 from torch import Tensor
 
-from torchface.modeling.rigging.loose_parts import _Head, _in_the_mouth, _tongue_of_gums, tongue_out
+from torchface.modeling.rigging.joined_vertices import JoinedHead
+from torchface.modeling.rigging.mouth_parts import in_the_mouth, tongue_of_gums, tongue_out
 
 
 def gums(height: float) -> tuple[Tensor, Tensor, Tensor]:
@@ -24,7 +25,7 @@ def gums(height: float) -> tuple[Tensor, Tensor, Tensor]:
 def test_a_tongue_in_one_piece_with_gums_comes_out_and_the_arch_stays() -> None:
     points, faces, hill = gums(18.0)
     whole = torch.ones(len(points), dtype=torch.bool)
-    tongue = _tongue_of_gums(points, faces, whole, -points[:, 1] - 0.2 * points[:, 2], whole)
+    tongue = tongue_of_gums(points, faces, whole, -points[:, 1] - 0.2 * points[:, 2], whole)
     assert float(tongue[hill].min()) > 0.8
     assert float(tongue[(points[:, 0].abs() > 20) | (points[:, 2] > -8)].max()) < 0.01
     out = tongue_out(points, tongue, torch.zeros(20, 3, dtype=torch.float64))
@@ -38,8 +39,8 @@ def test_what_is_near_teeth_is_gums_and_stays() -> None:
     below = -points[:, 1] - 0.2 * points[:, 2]
     near = (points - torch.tensor([0.0, 0.0, -16.0])).norm(dim=-1) < 2.5  # of the hill's front edge
     whole = torch.ones(len(points), dtype=torch.bool)
-    assert float(_tongue_of_gums(points, faces, whole, below, whole)[near].min()) > 0.8
-    tongue = _tongue_of_gums(points, faces, whole, below, whole, [near])
+    assert float(tongue_of_gums(points, faces, whole, below, whole)[near].min()) > 0.8
+    tongue = tongue_of_gums(points, faces, whole, below, whole, [near])
     assert float(tongue[near].max()) < 0.01
     assert float(tongue[hill & (points[:, 2] < -24)].min()) > 0.8
 
@@ -51,8 +52,8 @@ def test_tufts_of_a_beard_are_not_in_the_mouth_though_their_roots_are_under_the_
     points = torch.cat([skin, cube - torch.tensor([0.0, 6.0, 8.0]), tuft - torch.tensor([0.0, 0.0, 1.0])])
     part = torch.tensor([0] * 4 + [1] * 8 + [2] * 3)
     faces = torch.tensor([[0, 1, 2], [0, 2, 3]])
-    head = _Head(points, part, part > 0, torch.zeros(1, len(points), 3))
-    inside, _, _ = _in_the_mouth(head, faces, part > 0, torch.zeros(20, 3).double())
+    head = JoinedHead(points, part, part > 0, torch.zeros(1, len(points), 3))
+    inside, _, _ = in_the_mouth(head, faces, part > 0, torch.zeros(20, 3).double())
     assert torch.equal(inside, part == 1)
 
 
@@ -60,7 +61,7 @@ def test_a_mouths_floor_is_no_tongue() -> None:
     points, faces, _ = gums(0.0)
     below = -points[:, 1] - 0.2 * points[:, 2]
     whole = torch.ones(len(points), dtype=torch.bool)
-    assert not bool(_tongue_of_gums(points, faces, whole, below, whole).any())
+    assert not bool(tongue_of_gums(points, faces, whole, below, whole).any())
 
 
 def test_what_lies_under_gums_is_a_bag_and_no_tongue() -> None:
@@ -71,8 +72,8 @@ def test_what_lies_under_gums_is_a_bag_and_no_tongue() -> None:
     first = torch.arange(len(both)) < len(points)
     own = -points[:, 1] - 0.2 * points[:, 2]
     faces = torch.cat([faces, triangles + len(points)])
-    assert bool(_tongue_of_gums(both, faces, first, own, first).any())
-    assert not bool(_tongue_of_gums(both, faces, first, own, torch.ones(len(both), dtype=torch.bool)).any())
+    assert bool(tongue_of_gums(both, faces, first, own, first).any())
+    assert not bool(tongue_of_gums(both, faces, first, own, torch.ones(len(both), dtype=torch.bool)).any())
 
 
 def test_teeth_that_sit_low_behind_the_lips_belong_to_the_jaws_of_their_rows() -> None:
@@ -86,8 +87,8 @@ def test_teeth_that_sit_low_behind_the_lips_belong_to_the_jaws_of_their_rows() -
     part = torch.arange(len(teeth)).repeat_interleave(8)
     points = torch.cat(teeth)
     whole = torch.ones(len(points), dtype=torch.bool)
-    head = _Head(points, part, whole, torch.zeros(1, len(points), 3))
-    _, share, _ = _in_the_mouth(head, torch.zeros(0, 3).long(), whole, torch.zeros(20, 3).double())
+    head = JoinedHead(points, part, whole, torch.zeros(1, len(points), 3))
+    _, share, _ = in_the_mouth(head, torch.zeros(0, 3).long(), whole, torch.zeros(20, 3).double())
     assert torch.equal(share, (part >= len(across)).double())
 
 
@@ -106,8 +107,8 @@ def test_a_tongue_that_touches_teeth_comes_out_whole_where_gums_are_a_part_of_th
     part = torch.arange(len(sizes)).repeat_interleave(torch.tensor(sizes))
     faces = torch.cat([pieces[0][1], pieces[1][1] + sizes[0]])
     whole = torch.ones(len(points), dtype=torch.bool)
-    head = _Head(points, part, whole, torch.zeros(1, len(points), 3))
-    _, _, tongue = _in_the_mouth(head, faces, whole, torch.zeros(20, 3).double())
+    head = JoinedHead(points, part, whole, torch.zeros(1, len(points), 3))
+    _, _, tongue = in_the_mouth(head, faces, whole, torch.zeros(20, 3).double())
     assert torch.equal(tongue, (part == 1).double())
 
 
@@ -123,6 +124,6 @@ def test_gums_of_few_triangles_are_no_tongue_beside_a_longer_one() -> None:
     part = (torch.arange(len(points)) >= len(dense)).long()
     both = torch.cat([faces, (hill.cumsum(0) - 1)[triangles[hill[triangles].all(1)]] + len(dense)])
     whole = torch.ones(len(points), dtype=torch.bool)
-    head = _Head(points, part, whole, torch.zeros(1, len(points), 3))
-    _, _, found = _in_the_mouth(head, both, whole, torch.zeros(20, 3).double())
+    head = JoinedHead(points, part, whole, torch.zeros(1, len(points), 3))
+    _, _, found = in_the_mouth(head, both, whole, torch.zeros(20, 3).double())
     assert torch.equal(found, part.double())
