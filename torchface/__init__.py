@@ -59,15 +59,7 @@ if TYPE_CHECKING:
     from torchface.attachment import Attachment
     from torchface.correctives.corrective_shapes import Corrective, Correctives
     from torchface.errors import TorchfaceError
-    from torchface.io import (
-        load_mesh,
-        load_rig,
-        load_take,
-        save_animation,
-        save_mesh,
-        save_rig,
-        save_take,
-    )
+    from torchface.io import load_mesh, load_rig, load_take, save_animation, save_mesh, save_rig, save_take
     from torchface.mesh import Annotations, Mesh
     from torchface.rig import BlendshapeRig
     from torchface.take import Take, Track

@@ -10,13 +10,7 @@ from torchface.evaluation.mesh_errors import (
     rigidly_aligned,
     vertex_errors,
 )
-from torchface.evaluation.weight_errors import (
-    ShapeErrors,
-    WeightError,
-    shape_errors,
-    weight_error,
-    weight_jitter,
-)
+from torchface.evaluation.weight_errors import ShapeErrors, WeightError, shape_errors, weight_error, weight_jitter
 
 __all__ = [
     "ErrorFigures",

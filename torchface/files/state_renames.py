@@ -17,11 +17,7 @@ STATE_RENAMES: Mapping[str, Mapping[str, str]] = {
     "dynamics_prior": _DYNAMICS_PRIOR,
     "reciprocal_prior": _SHAPE_PRIOR,
     "shape_prior": _SHAPE_PRIOR,
-    "uv_landmarks": {
-        "courses": "line_statistics",
-        "looks": "line_profiles",
-        "looseness": "corner_deviation",
-    },
+    "uv_landmarks": {"courses": "line_statistics", "looks": "line_profiles", "looseness": "corner_deviation"},
     "video_solver": {**_SHAPE_PRIOR, **_DYNAMICS_PRIOR},
 }
 """For each kind of model: a state key's last parts as they were, and as they are now."""

@@ -91,12 +91,7 @@ def action_unit_model(classifier: ActionUnitClassifier, facts: Mapping[str, obje
         IntensityVotes(classifier),
         {"regions": rest.expand(2, -1, -1, -1).contiguous(), "rest": rest},
         ["intensities"],
-        {
-            "task": "action_units",
-            "regions": list(classifier.regions),
-            "units": list(classifier.units),
-            **(facts or {}),
-        },
+        {"task": "action_units", "regions": list(classifier.regions), "units": list(classifier.units), **(facts or {})},
         {"regions": ("batch",)},
     )
 

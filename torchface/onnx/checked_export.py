@@ -68,11 +68,7 @@ def export_checked(
 
 
 def write_checked(
-    model: onnx.ModelProto,
-    path: str | Path,
-    cases: Cases,
-    allowed: Mapping[str, float],
-    units: Mapping[str, str],
+    model: onnx.ModelProto, path: str | Path, cases: Cases, allowed: Mapping[str, float], units: Mapping[str, str]
 ) -> ExportReport:
     """Runs a graph on cases of different batch sizes and writes it if it agrees.
 

@@ -14,10 +14,7 @@ _PARITY = 1e-4
 
 
 def export_wrinkle_weights(
-    wrinkles: WrinkleWeights | RigWrinkles,
-    poses: Tensor,
-    path: str | Path,
-    facts: Mapping[str, object] | None = None,
+    wrinkles: WrinkleWeights | RigWrinkles, poses: Tensor, path: str | Path, facts: Mapping[str, object] | None = None
 ) -> ExportReport:
     """Writes the graph of a rig's wrinkle weights, and checks it.
 

@@ -67,9 +67,7 @@ class _Graph:
 
 
 def export_landmark_trees(
-    model: LandmarkTrees,
-    path: str | Path,
-    facts: Mapping[str, object] | None = None,
+    model: LandmarkTrees, path: str | Path, facts: Mapping[str, object] | None = None
 ) -> ExportReport:
     """Writes landmark trees as ONNX, and checks them.
 
@@ -142,10 +140,7 @@ def landmark_trees_model(model: LandmarkTrees, facts: Mapping[str, object] | Non
     found = op("Where", usable, shapes, constant("nothing", float("nan")))
     op("Reshape", found, "points", output="landmarks")
     return build.model(
-        {
-            "image": (TensorProto.UINT8, ("height", "width")),
-            "boxes": (TensorProto.FLOAT, ("faces", 4)),
-        },
+        {"image": (TensorProto.UINT8, ("height", "width")), "boxes": (TensorProto.FLOAT, ("faces", 4))},
         count,
         {
             "task": "face_landmarks",

@@ -114,10 +114,7 @@ class DescentRun:
 
 
 def descend(
-    network: Network,
-    task: DescentTask[Batch],
-    settings: DescentSettings | None = None,
-    run: DescentRun | None = None,
+    network: Network, task: DescentTask[Batch], settings: DescentSettings | None = None, run: DescentRun | None = None
 ) -> Network:
     """Trains a network by AdamW; the rate rises over a twentieth of the steps and falls as a cosine.
 

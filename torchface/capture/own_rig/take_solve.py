@@ -181,11 +181,7 @@ def _solved(solver: VideoSolver, states: list[VideoState], smoothed: StateEstima
     none = like.new_zeros(count, LANDMARKS)
     begin = torch.cat([state.weights[None] for state in states])
     terms = FrameTerms(
-        none[..., None].expand(-1, -1, 2),
-        none,
-        smoothed.mean.rotation,
-        smoothed.mean.translation,
-        expected,
+        none[..., None].expand(-1, -1, 2), none, smoothed.mean.rotation, smoothed.mean.translation, expected
     )
     head, _ = solver.solve(terms, HeadState(begin, smoothed.mean.rotation, smoothed.mean.translation))
     return head

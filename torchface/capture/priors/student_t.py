@@ -129,8 +129,7 @@ class StudentDensity(nn.Module):
         covariance = matrix @ torch.cholesky_inverse(torch.linalg.cholesky(factor @ factor.T)) @ matrix.T
         covariance.diagonal().add_(floor.to(covariance))
         return StudentDensity(
-            torch.linalg.cholesky(torch.cholesky_inverse(torch.linalg.cholesky(covariance))),
-            self.degrees_of_freedom,
+            torch.linalg.cholesky(torch.cholesky_inverse(torch.linalg.cholesky(covariance))), self.degrees_of_freedom
         )
 
     @property

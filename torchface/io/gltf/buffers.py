@@ -82,11 +82,7 @@ class BufferWriter:
     def _accessor(self, rows: NDArray[Any], view: int | None, bounds: bool) -> int:
         rows = rows.reshape(len(rows), -1)
         accessor: dict[str, Any] = {} if view is None else {"bufferView": view}
-        accessor |= {
-            "componentType": _COMPONENT[rows.dtype.str],
-            "count": len(rows),
-            "type": _TYPES[rows.shape[1]],
-        }
+        accessor |= {"componentType": _COMPONENT[rows.dtype.str], "count": len(rows), "type": _TYPES[rows.shape[1]]}
         if bounds:
             accessor |= {"min": rows.min(0).tolist(), "max": rows.max(0).tolist()}
         self.accessors.append(accessor)

@@ -38,10 +38,7 @@ def write_detail(
         image = encode_png(encode_normals(detail.neutral))
         root["materials"][0]["normalTexture"] = {"index": buffers.texture(root, image, name="neutral_normals")}
     listed = [
-        {
-            "shape": name,
-            "texture": buffers.texture(root, encode_png(encode_normals(normals)), name=f"{name}_normals"),
-        }
+        {"shape": name, "texture": buffers.texture(root, encode_png(encode_normals(normals)), name=f"{name}_normals")}
         for name, normals in zip(detail.names, detail.maps, strict=True)
     ]
     root["meshes"][0]["extras"]["torchface"][_LIST] = listed

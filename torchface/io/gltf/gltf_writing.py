@@ -104,11 +104,7 @@ def _write(
     meshes[0]["extras"]["torchface"] |= write_correctives(correctives)
     if len(nodes) > 1:
         nodes[0]["children"] = list(range(1, len(nodes)))
-    root: dict[str, Any] = {
-        "nodes": nodes,
-        "meshes": meshes,
-        **materials.fields,
-    }
+    root: dict[str, Any] = {"nodes": nodes, "meshes": meshes, **materials.fields}
     if isinstance(detail, RegionMaps):
         write_region_maps(detail, root, buffers)
     elif isinstance(detail, SurfaceMaps):

@@ -39,10 +39,7 @@ class VmcPackets:
     """
 
     def __init__(
-        self,
-        names: Sequence[str],
-        namings: Sequence[str] = NAMINGS[:3],
-        clock: Callable[[], float] = time.perf_counter,
+        self, names: Sequence[str], namings: Sequence[str] = NAMINGS[:3], clock: Callable[[], float] = time.perf_counter
     ) -> None:
         self._own = tuple(names) if "own" in namings else ()
         self._arkit = None if set(namings) == {"own"} else ArkitWeights(names)

@@ -91,11 +91,7 @@ def one_person_lines(photographs: Sequence[Path], marks: Tensor, bare: BareFit, 
 
 
 def landmark_lines(
-    photographs: Sequence[Path],
-    images: Sequence[Tensor],
-    marks: Tensor,
-    finder: str | Path,
-    bare: BareFit,
+    photographs: Sequence[Path], images: Sequence[Tensor], marks: Tensor, finder: str | Path, bare: BareFit
 ) -> list[str]:
     """Which given landmarks do not fit, and how those that are found do, for people to read.
 

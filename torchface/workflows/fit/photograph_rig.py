@@ -28,13 +28,7 @@ from torchface.rendering.compositing import save_rendered_image
 from torchface.rig import BlendshapeRig
 from torchface.synthetic.head.embedded_character import is_performers
 from torchface.viz.figures.landmark_dots import with_dots
-from torchface.workflows.fit.fit_checks import (
-    ALONE,
-    eyes_distances,
-    landmark_lines,
-    one_person_lines,
-    strange_lines,
-)
+from torchface.workflows.fit.fit_checks import ALONE, eyes_distances, landmark_lines, one_person_lines, strange_lines
 from torchface.workflows.fit.fit_landmarks import (
     DEFAULT_LANDMARKS,
     PhotographLandmarks,

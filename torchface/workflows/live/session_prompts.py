@@ -22,13 +22,7 @@ STEPS = (
 """What is asked for, in words; poses 1 to 5 of the solver."""
 
 
-_SHAPES = (
-    (),
-    ("jawOpen",),
-    ("mouthSmileLeft", "mouthSmileRight"),
-    ("browInnerUp",),
-    ("eyeBlinkLeft", "eyeBlinkRight"),
-)
+_SHAPES = ((), ("jawOpen",), ("mouthSmileLeft", "mouthSmileRight"), ("browInnerUp",), ("eyeBlinkLeft", "eyeBlinkRight"))
 _SEEN_IN = tuple(tuple(ARKIT.index(name) for name in names) for names in _SHAPES)
 _LEAST = 0.2  # of a weight over rest: a pose that is shown
 

@@ -110,11 +110,7 @@ def _marker_sections(solution: Solution) -> list[Section]:
     seen = torch.isfinite(errors).float().mean(0)
     order = each.nan_to_num(-1.0).argsort(descending=True).tolist()
     rows = [
-        (
-            labels[i],
-            *(f"{float(value[i]):.2f} mm" for value in (each, bias, high)),
-            f"{100 * float(seen[i]):.1f} %",
-        )
+        (labels[i], *(f"{float(value[i]):.2f} mm" for value in (each, bias, high)), f"{100 * float(seen[i]):.1f} %")
         for i in order
     ]
     heading = ("marker", "RMSE", "constant part", "95th percentile", "seen")

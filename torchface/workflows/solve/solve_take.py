@@ -45,10 +45,7 @@ class TakeOutputs(WeightFiles):
 
 
 def solve_take(
-    inputs: TakeInputs,
-    outputs: TakeOutputs,
-    settings: SolveSettings,
-    progress: Progress | None = None,
+    inputs: TakeInputs, outputs: TakeOutputs, settings: SolveSettings, progress: Progress | None = None
 ) -> SolveReport:
     """Reads, solves, writes; see ``torchface solve --help``."""
     progress = progress or silent

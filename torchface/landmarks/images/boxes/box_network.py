@@ -69,10 +69,7 @@ class BoxNetwork(nn.Module):
     """
 
     def __init__(
-        self,
-        channels: Sequence[int] = (24, 48, 64, 64),
-        blocks: Sequence[int] = (1, 4, 3, 1),
-        faces: int = 32,
+        self, channels: Sequence[int] = (24, 48, 64, 64), blocks: Sequence[int] = (1, 4, 3, 1), faces: int = 32
     ) -> None:
         super().__init__()
         numbers = (*channels, *blocks)

@@ -13,12 +13,7 @@ from torchface.landmarks.images.face_crop import cut_crops
 from torchface.landmarks.images.face_reading import FaceReading
 from torchface.landmarks.images.graph_session import graph_session
 from torchface.landmarks.images.landmark_finder import LandmarkFinder, finder_name
-from torchface.landmarks.images.networks.eye_crop import (
-    EYE_LANDMARKS,
-    eye_transforms,
-    moved,
-    picture_transforms,
-)
+from torchface.landmarks.images.networks.eye_crop import EYE_LANDMARKS, eye_transforms, moved, picture_transforms
 from torchface.landmarks.images.networks.eye_network import EyeFindings
 
 LEAST = 6.0  # pixels of the image that a crop must be wide

@@ -29,9 +29,7 @@ def naming_the_frame(number: int) -> Iterator[None]:
 
 
 def track_landmarks(
-    video: VideoFile | str | Path | Iterable[Tensor],
-    tracker: LandmarkTracker,
-    progress: Progress | None = None,
+    video: VideoFile | str | Path | Iterable[Tensor], tracker: LandmarkTracker, progress: Progress | None = None
 ) -> Track:
     """Landmarks of one face in all frames.
 
