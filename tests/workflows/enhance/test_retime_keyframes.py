@@ -35,7 +35,8 @@ def test_the_motion_goes_from_one_keyframe_to_the_other_by_the_curves(
     assert bool((curves.diff(dim=0) >= 0).all())
     assert curves[0].max() == 0
     assert curves[-1].min() == 1
-    assert (tmp_path / "out" / "timing.png").is_file()
+    written = ["index.html", "retimed.glb", "retimed.safetensors", "timing.csv", "timing.png"]
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == written
 
 
 def test_keyframes_that_do_not_fit_are_named(actor, tmp_path: Path) -> None:

@@ -144,17 +144,18 @@ def retime_keyframes(
         + ("." if extend else "; --extend takes the whole of these motions.")
     )
     progress("writing the motion")
-    with job_lock(out), all_or_none():
+    with job_lock(out):
         key = content_key("retime/1", frames=moved)
         with MeshSequenceWriter(out / SEQUENCE, frames, len(model.neutral), model.faces, key=key) as writer:
             writer.append(moved)
-        # Regions' shares in a vertex add up to 1: a target a region gives every frame.
-        deltas = shares.to(pair)[..., None] * (pair[1] - pair[0])
-        targets = BlendshapeRig(Mesh(pair[0], model.faces), deltas, names)
-        save_animation(targets, Take(rate, weights=Track(names, curves.T.float()[..., None])), out / GLB)
-        rows = [[str(t), f"{t / rate:.6g}", *(f"{x:.6g}" for x in curves[:, t].tolist())] for t in range(frames)]
-        write_table(out / CURVES, ["frame", "seconds", *names], rows)
-        figure = timing_curves(curves, names, rate, "share of the way")
-        title = f"{first.path.name} to {last.path.name} in {frames} frames"
-        products["page"] = write_page(out, title, [Section("Timing", text, figures=[("timing.png", figure)])])
+        with all_or_none():  # not around the sequence, which notes at once how far it is
+            # Regions' shares in a vertex add up to 1: a target a region gives every frame.
+            deltas = shares.to(pair)[..., None] * (pair[1] - pair[0])
+            targets = BlendshapeRig(Mesh(pair[0], model.faces), deltas, names)
+            save_animation(targets, Take(rate, weights=Track(names, curves.T.float()[..., None])), out / GLB)
+            rows = [[str(t), f"{t / rate:.6g}", *(f"{x:.6g}" for x in curves[:, t].tolist())] for t in range(frames)]
+            write_table(out / CURVES, ["frame", "seconds", *names], rows)
+            figure = timing_curves(curves, names, rate, "share of the way")
+            title = f"{first.path.name} to {last.path.name} in {frames} frames"
+            products["page"] = write_page(out, title, [Section("Timing", text, figures=[("timing.png", figure)])])
     return Retimed(curves, names, rate, products)
