@@ -3,7 +3,7 @@
 import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, is_dataclass
 from functools import wraps
 from pathlib import Path
 from typing import Generic, Protocol, TypeVar
@@ -129,7 +129,7 @@ class Recipe(Generic[Settings, Trained]):
                     trained = self.train(chosen, progress)
                 except TorchfaceError as error:
                     name, _, rest = str(error).partition(": ")
-                    if name not in vars(chosen):
+                    if name not in vars(chosen) or is_dataclass(vars(chosen)[name]):
                         raise
                     raise type(error)(f"--{name.replace('_', '-')}: {rest}") from error  # what the library calls it
             for line in self.lines(chosen, trained):

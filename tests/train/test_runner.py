@@ -168,12 +168,14 @@ def test_a_message_names_the_flag_of_what_the_user_gave(name: str) -> None:
 def test_what_the_library_calls_a_setting_is_called_by_its_flag(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    def refuse(settings: Settings, run: Run) -> None:
-        raise TorchfaceError("slope: found 3.0, expected less")
+    for name, told in (("slope", "--slope"), ("network", "network"), ("heads", "heads"), ("work", "work")):
 
-    with pytest.raises(SystemExit):
-        Recipe(Settings, recipe(refuse), None).main(["--data", "here", "--out", str(tmp_path / "out")])
-    assert "--slope: found 3.0, expected less" in capsys.readouterr().err
+        def refuse(settings: Settings, run: Run, name: str = name) -> None:
+            raise TorchfaceError(f"{name}: found 3.0, expected less")
+
+        with pytest.raises(SystemExit):
+            Recipe(Settings, recipe(refuse), None).main(["--data", "here", "--out", str(tmp_path / "out")])
+        assert f"error: {told}: found 3.0, expected less" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("name", RECIPES)

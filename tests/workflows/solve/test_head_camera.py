@@ -7,7 +7,7 @@ import torch
 
 from torchface import Take, Track
 from torchface.capture.action_units import ActionUnitCurves
-from torchface.errors import FileFormatError
+from torchface.errors import FileFormatError, NameMismatchError
 from torchface.workflows.solve.head_camera import HeadCamera, predicted_curves, resampled_curves
 
 
@@ -60,3 +60,9 @@ def test_gamma_is_the_largest_weight_of_a_prediction() -> None:
 def test_a_video_without_labels_says_what_they_are() -> None:
     with pytest.raises(FileFormatError, match=r"take\.toml: found no such file, .* in take\.mp4; --video-labels"):
         predicted_curves(HeadCamera(Path("take.mp4"), "action_units"), take(2, 60.0), ("jawOpen",))
+
+
+def test_units_that_a_classifier_does_not_know_are_named_by_the_flag() -> None:
+    camera = HeadCamera(Path("take.mp4"), "action_units", units=("9", "17"))
+    with pytest.raises(NameMismatchError, match=r"--units: found 17, expected some of .*18R"):
+        predicted_curves(camera, take(2, 60.0), ("jawOpen",))

@@ -56,6 +56,8 @@ def predicted_curves(
     take the markers are left alone.
     """
     classifier = zoo.get_model(camera.classifier, ActionUnitClassifier)
+    if unknown := [unit for unit in camera.units if unit not in classifier.units]:
+        raise NameMismatchError(f"--units: found {', '.join(unknown)}, expected some of {', '.join(classifier.units)}")
     where = camera.labels or camera.video.with_suffix(".toml")
     if not where.is_file():
         raise FileFormatError(
