@@ -42,7 +42,6 @@ def annotate(
         face: Which face, from 0, the largest first, where there are several.
         browser: Open the page; --no-browser writes the proposed landmarks at once, to be corrected elsewhere.
         port: The first port to try.
-        quiet: Show no progress.
     """
     from torchface.files.content_keys import content_key
     from torchface.files.job_lock import job_lock

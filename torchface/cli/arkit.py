@@ -51,7 +51,6 @@ def arkit(
         temporal: Solve all frames of an animation together, smooth in time; --no-temporal solves each by itself.
         fps: Frames a second of an animation that does not say so; 30 if absent.
         unit: Unit of SOURCE's file (mm, cm, m) where it is not the format's own.
-        quiet: Show no progress.
     """
     from torchface.errors import ValueRangeError
     from torchface.files.job_lock import file_lock

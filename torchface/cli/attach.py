@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 from tyro.conf import Positional, arg
 
 from torchface.cli.batch_report import Cluster, Column, Jobs, TimeLimit, show_batch, skipped_lines
-from torchface.cli.command_options import OptionalOutputPath, OutputPath
+from torchface.cli.command_options import OptionalOutputPath, OutputPath, Part
 from torchface.cli.progress_bars import progress_bars
 from torchface.cli.terminal import Quiet, print_lines, print_path
 
@@ -25,7 +25,7 @@ def attach(
     initial: Path | None = None,
     standoff: bool = False,
     picture: OptionalOutputPath = None,
-    part: str | None = None,
+    part: Part = None,
     labels: Path | None = None,
     frames: str | None = None,
     unit: Literal["um", "mm", "cm", "m", "in"] | None = None,
@@ -55,7 +55,6 @@ def attach(
             like the markers. Without it the pose is found by the markers' shape alone.
         standoff: Markers stand off the skin by one unknown distance: estimate it.
         picture: Also draw where each marker sat and sits, and its error after each iteration: .png or .jpg.
-        part: Keep this region of the rig only, such as face.
         labels: What the take's labels are called in INITIAL, and from then on: CSV, a row LABEL OF THE TAKE,LABEL
             each; an empty second cell leaves the marker out, with Jane:* all of a subject's. Unlabelled points and
             subjects' prefixes (Actor:M001) are left out without it.
@@ -66,7 +65,6 @@ def attach(
             --unit), if absent.
         insist: Write the sites although the rig does not explain the markers, or the take leaves most of them
             uncertain.
-        quiet: Show no progress.
     """
     from torchface.errors import ValueRangeError
     from torchface.files.job_lock import file_lock

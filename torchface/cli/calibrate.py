@@ -32,7 +32,6 @@ def calibrate(
         square: A square's side, millimetres.
         beside: Films by other cameras that are fixed to the first, again for each, of the same board at the same time,
             by timecode or begun together: OUT then says where all cameras lie, for `torchface track --cameras`.
-        quiet: Show no progress.
     """
     from torchface.files.job_lock import file_lock
     from torchface.workflows.calibrate_camera import Board, calibrate_beside

@@ -30,6 +30,8 @@ OutputPath = Annotated[Path, Output()]
 OptionalOutputPath = Annotated[Path | None, Output()]
 """A file or folder that a command writes; see :class:`Output`."""
 
+Part = Annotated[str | None, arg(help="Keep this region of the rig only, such as face.")]
+
 Reduce = Annotated[
     float | None,
     arg(

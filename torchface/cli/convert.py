@@ -34,7 +34,6 @@ def convert(
         part: Keep this region only, such as face.
         names: Names of the written shapes. "arkit": ARKit's where the rig's mean the same. All keep theirs if absent.
         at: Write the mesh in this pose, such as mouthSmileLeft=1 jawOpen=0.7, instead of the rig.
-        quiet: Show no progress.
     """
     from torchface.workflows.convert_file import convert_file
     from torchface.workflows.posed_mesh import pose_weights

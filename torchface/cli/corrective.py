@@ -37,7 +37,6 @@ def corrective(
         align: A sculpt of which the whole mesh has moved is refused; "remove" takes that motion out, "keep" takes it as
             part of the sculpt.
         replace: Take the place of a corrective that RIG has at this pose.
-        quiet: Show no progress.
     """
     from torchface.workflows.sculpt_corrective import SculptOptions, sculpt_corrective
 

@@ -34,7 +34,6 @@ def demo(
         target: Neutral mesh with the template's topology; ICT-FaceKit's folder needs none (a random head is drawn).
         out: Folder for the report, rig, take, weights, animation and solver.
         seed: Decides the random head, the noise and the gaps.
-        quiet: Show no progress.
     """
     from torchface.files.job_lock import job_lock
     from torchface.number_checks import LARGEST_SEED, checked_count

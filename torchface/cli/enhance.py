@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 from tyro.conf import Positional, arg
 
 from torchface.cli.batch_report import Cluster, Column, Jobs, TimeLimit, show_batch, skipped_lines
-from torchface.cli.command_options import Output
+from torchface.cli.command_options import Output, Part
 from torchface.cli.progress_bars import progress_bars
 from torchface.cli.terminal import Quiet, print_lines, print_path
 
@@ -24,7 +24,7 @@ def enhance(
     rig: Path | None = None,
     attachment: Path | None = None,
     pairs: Path | None = None,
-    part: str | None = None,
+    part: Part = None,
     neutral: int | None = None,
     fps: float | None = None,
     labels: Path | None = None,
@@ -63,7 +63,6 @@ def enhance(
         attachment: Where the markers sit, on the rig or on the model's own mesh, as JSON; at least 12.
         pairs: Where vertices of the input's topology lie on the model: a .csv with columns input and model, vertex
             numbers from 0, or a .json of `torchface pick` (input as template, model as scan); at least 12.
-        part: Keep this region of the rig only, such as face.
         neutral: A frame of the markers with the face at rest; motion counts from it. From the sites if absent.
         fps: Frames a second of meshes; 30 if absent.
         labels: What the take's labels are called in the attachment; see `torchface solve`.
@@ -76,7 +75,6 @@ def enhance(
         retime: First give the motions between the animation's keyframes the actor's timing; the keyframes stay.
         no_video: Do not write comparison.mp4.
         height: Of each view of a face in the report, pixels.
-        quiet: Show no progress.
     """
     from torchface.files.job_lock import job_lock
     from torchface.number_checks import checked_count

@@ -81,7 +81,6 @@ def evaluate(
         as_is: Leave the result where it is, with scans too.
         scale: Where the heat maps' red begins, millimetres; at a rounded 95th percentile if absent.
         height: Of each view of a face in the report, pixels.
-        quiet: Show no progress.
     """
     from torchface.errors import ValueRangeError
     from torchface.files.job_lock import job_lock

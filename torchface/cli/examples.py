@@ -38,7 +38,6 @@ def examples(
         seconds: For each expression before the camera.
         landmarks: What finds landmarks: a model of the zoo by name or folder, an .onnx file, or MediaPipe's Face
             Landmarker bundle (.task).
-        quiet: Show no progress.
     """
     from torchface.capture.anybody import (
         ExampleSolver,

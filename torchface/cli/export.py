@@ -4,7 +4,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Literal
 
-from torchface.cli.command_options import Output, OutputPath
+from torchface.cli.command_options import Output, OutputPath, Part
 from torchface.cli.progress_bars import progress_bars
 from torchface.cli.terminal import Quiet, console, print_lines, print_path, print_table
 
@@ -16,7 +16,7 @@ def solver(
     attachment: Path,
     out: OutputPath,
     method: Method = "splitting",
-    part: str | None = None,
+    part: Part = None,
     quiet: Quiet = False,
 ) -> None:
     """Write the marker solve of one rig and one marker layout as an ONNX file, and check it.
@@ -32,8 +32,6 @@ def solver(
         out: The .onnx file to write.
         method: How the graph solves: operator splitting, the quicker one, or projected gradient, a loop without a
             factorisation.
-        part: Keep this region of the rig only, such as face.
-        quiet: Show no progress.
     """
     _write_solver(False, rig, attachment, out, method, part, quiet)
 
@@ -43,7 +41,7 @@ def hybrid_solver(
     attachment: Path,
     out: OutputPath,
     method: Method = "splitting",
-    part: str | None = None,
+    part: Part = None,
     quiet: Quiet = False,
 ) -> None:
     """Write the hybrid solve of one rig and one marker layout as an ONNX file, and check it.
@@ -57,8 +55,6 @@ def hybrid_solver(
         out: The .onnx file to write.
         method: How the graph solves: operator splitting, the quicker one, or projected gradient, a loop without a
             factorisation.
-        part: Keep this region of the rig only, such as face.
-        quiet: Show no progress.
     """
     _write_solver(True, rig, attachment, out, method, part, quiet)
 
@@ -93,7 +89,6 @@ def action_units(model: str, out: OutputPath, quiet: Quiet = False) -> None:
     Args:
         model: Its name in the zoo, or a folder that `torchface train action_units` wrote.
         out: The .onnx file to write.
-        quiet: Show no progress.
     """
     from torchface import zoo
     from torchface.capture import ActionUnitClassifier
@@ -118,7 +113,7 @@ def video_solver(
     fps: float | None = None,
     landmarks: Path | None = None,
     offsets: Path | None = None,
-    part: str | None = None,
+    part: Part = None,
     quiet: Quiet = False,
 ) -> None:
     """Write the video solve of one rig and one camera as an ONNX file, and check it: `torchface track`'s of a table.
@@ -142,8 +137,6 @@ def video_solver(
             synthetic video if absent.
         offsets: The landmark_offsets.json that `torchface track` wrote of this person and rig; without it the rig's
             landmarks are taken to lie where they are found.
-        part: Keep this region of the rig only, such as face.
-        quiet: Show no progress.
     """
     from torchface.capture.own_rig.landmark_offsets import LandmarkOffsets
     from torchface.errors import FileFormatError, ValueRangeError
@@ -194,7 +187,6 @@ def examples(
         out: The .onnx file to write.
         solver: All shapes at once, with size, roll and place solved for; the head first and then regions; or projected
             on a linear model of landmarks. The last two place the face by boxes.
-        quiet: Show no progress.
     """
     from torchface.capture.anybody import (
         AllAtOnce,
@@ -237,7 +229,6 @@ def webcam(out: OutputPath, quiet: Quiet = False) -> None:
 
     Args:
         out: The .onnx file to write.
-        quiet: Show no progress.
     """
     from torchface.files.job_lock import file_lock
     from torchface.workflows.webcam.webcam_export import export_webcam
@@ -264,7 +255,6 @@ def export_app(
         out: The folder to write; an earlier app in it is replaced.
         character: A .glb, or another rig, whose shapes have ARKit's names; the embedded performer if absent.
         webcam: The graph from picture to weights, as `torchface export webcam` writes it; that one if absent.
-        quiet: Show no progress.
     """
     from torchface.workflows.browser_app import export_app as write
 
@@ -287,7 +277,7 @@ def export_enhancement(
     poses: int = 300,
     animation: Path | None = None,
     pairs: Path | None = None,
-    part: str | None = None,
+    part: Part = None,
     quiet: Quiet = False,
 ) -> None:
     """Write an actor's wrinkles as maps for a rig, with ONNX graphs that give the maps' weights every frame.
@@ -307,8 +297,6 @@ def export_enhancement(
         poses: Of the rig, for which the model is asked for wrinkles and that the weights are learned from.
         animation: Weights (.csv) that wrinkles.glb plays; then map_weights.csv holds the maps' weights of every frame.
         pairs: Where vertices of the rig lie on the model; see `torchface enhance`. By registration if absent.
-        part: Keep this region of the rig only, such as face.
-        quiet: Show no progress.
     """
     from torchface.files.job_lock import job_lock
     from torchface.workflows.enhance.wrinkle_export import WrinkleSettings, export_wrinkles
@@ -332,7 +320,6 @@ def export_model(name: str, /, out: OutputPath, quiet: Quiet = False) -> None:
     Args:
         name: Of the model, or its folder.
         out: The .onnx file to write.
-        quiet: Show no progress.
     """
     from torchface import zoo
     from torchface.files.job_lock import file_lock

@@ -69,7 +69,6 @@ def fit(
             alone, with the template's hair, teeth, tongue and lashes.
         insist: Fit also what is refused otherwise, with a warning: a face that is too small or hidden, several of
             similar size, photographs that seem to show different people.
-        quiet: Show no progress.
     """
     from torchface.files.job_lock import file_lock
     from torchface.modeling import FitSettings

@@ -80,7 +80,6 @@ def live(
         enhance: An actor's model, by name or folder, as `torchface enhance` takes it: when the session ends, each take
             gets a folder `enhanced` with the actor's wrinkles on its character; the page and --to stay as they are.
         cameras: Only list the cameras.
-        quiet: Show no progress.
     """
     from torchface.errors import FileFormatError, ValueRangeError
     from torchface.workflows.live.camera_devices import check_source, list_cameras

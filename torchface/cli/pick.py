@@ -43,7 +43,6 @@ def pick(
         scan_unit: Unit of the scan.
         part: Keep this region only, such as face.
         port: The first port to try.
-        quiet: Show no progress.
     """
     from torchface.io import load_mesh
     from torchface.viz.browser.browser_page import HOST, free_port, import_viser

@@ -51,7 +51,6 @@ def register(
             knows of heads does not slide along the scan.
         colors: Find hair by the scans' colours and keep them. --no-colors where they are not the people's: a map of
             distances or curvature, say.
-        quiet: Show no progress.
     """
     from torchface.files.job_lock import job_lock
     from torchface.registration.nonrigid.schedule import DEFAULT_SCHEDULE

@@ -45,7 +45,6 @@ def relight(
         film_light: Estimate the film's light once, or every eight frames, for lights that change or move.
         occluders: Leave what is before the face as it is. --no-occluders relights all but what is behind it.
         camera: The calibration with which the film was tracked, if there was one.
-        quiet: Show no progress.
     """
     from torchface.workflows.relight.relight_film import RelightSettings, relight_film
 

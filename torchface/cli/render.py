@@ -35,7 +35,6 @@ def render(
         height: Of the image, pixels.
         clay: Leave texture and vertex colours out.
         part: Keep this region only, such as face.
-        quiet: Show no progress.
     """
     from torchface.files.job_lock import file_lock
     from torchface.number_checks import checked_count

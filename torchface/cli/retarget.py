@@ -46,7 +46,6 @@ def retarget(
             does not have are left out.
         animation: Also write the target rig with this animation as .glb, USD or .ma (Maya).
         part: Keep this region of the target rig only, such as face.
-        quiet: Show no progress.
     """
     from torchface.files.job_lock import file_lock
     from torchface.workflows.retarget_weights import retarget_weights

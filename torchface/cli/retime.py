@@ -42,7 +42,6 @@ def retime(
             does of a large one.
         fps: Frames a second; the model's if absent.
         rig: The rig that weights move.
-        quiet: Show no progress.
     """
     from torchface.workflows.enhance.retime_keyframes import Keyframe, retime_keyframes
 

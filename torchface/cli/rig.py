@@ -102,7 +102,6 @@ def rig(
         inner_mouth: Give a character the inside of a mouth that its mesh lacks: a bag, teeth, gums, a tongue; lips in
             one piece are cut apart.
         eyes: Give a character eyeballs that its mesh lacks; eyes in one piece with the skin are cut out.
-        quiet: Show no progress.
     """
     from torchface.errors import ValueRangeError
     from torchface.workflows.batch.batch_items import check_folder, find_items, is_batch

@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 from tyro.conf import Positional, arg
 
 from torchface.cli.batch_report import Cluster, Column, Jobs, TimeLimit, show_batch, skipped_lines
-from torchface.cli.command_options import OptionalOutputPath, OutputPath, Reduce
+from torchface.cli.command_options import OptionalOutputPath, OutputPath, Part, Reduce
 from torchface.cli.progress_bars import progress_bars
 from torchface.cli.terminal import Quiet, print_lines, print_path
 
@@ -43,7 +43,7 @@ def solve(
     stream: str | None = None,
     sparsity: float | None = None,
     ridge: float | None = None,
-    part: str | None = None,
+    part: Part = None,
     labels: Path | None = None,
     frames: str | None = None,
     unit: Literal["um", "mm", "cm", "m", "in"] | None = None,
@@ -93,7 +93,6 @@ def solve(
             `torchface live --to` takes.
         sparsity: Pull of each weight toward zero, square millimetres; the default suits 0.3 mm noise.
         ridge: Quadratic pull of each weight toward zero, square millimetres.
-        part: Keep this region of the rig only, such as face.
         labels: What the take's labels are called in the attachment: CSV, a row LABEL OF THE TAKE,LABEL OF THE
             ATTACHMENT each; an empty second cell leaves the marker out, with Jane:* all of a subject's.
         frames: Solve the frames A:B of the take only, from A up to, not including, B; counted from 0.
@@ -102,7 +101,6 @@ def solve(
         scale: Of the take against the rig: held at 1, or free, to be estimated. Held where the unit is known (C3D, TRC,
             --unit), if absent.
         insist: Write weights although the rig does not explain the markers.
-        quiet: Show no progress.
     """
     from torchface.capture.markers.hybrid_solver import GAMMA
     from torchface.errors import FileFormatError, ValueRangeError

@@ -38,7 +38,7 @@ class PlainConsole(Console):
 
 console = PlainConsole()
 
-Quiet = Annotated[bool, arg(aliases=["-q"])]
+Quiet = Annotated[bool, arg(aliases=["-q"], help="Show no progress.")]
 """The option of every command that shows progress."""
 
 

@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 from tyro.conf import Positional, UseAppendAction, arg
 
 from torchface.cli.batch_report import Cluster, Column, Jobs, TimeLimit, show_batch, skipped_lines
-from torchface.cli.command_options import Output, Reduce, picture_size
+from torchface.cli.command_options import Output, Part, Reduce, picture_size
 from torchface.cli.progress_bars import progress_bars
 from torchface.cli.terminal import Quiet, console, print_lines, print_path, print_table
 
@@ -41,7 +41,7 @@ def track(
     anybody: bool = False,
     head_model: str | None = None,
     whole_take: bool = False,
-    part: str | None = None,
+    part: Part = None,
     overlay: Literal["side", "over", "none"] = "side",
     fps: float | None = None,
     size: str | None = None,
@@ -99,7 +99,6 @@ def track(
         head_model: Which head model a head is solved with, by name or folder; if absent one of people in
             $TORCHFACE_HOME or the checkout, else `head`, of performers made by code.
         whole_take: Smooth landmarks over all frames, those after each too; with --dynamics the weights as well.
-        part: Keep this region of the rig only, such as face.
         overlay: overlay.mp4: the rig, in its texture or clay, beside the picture, parts of low confidence tinted; half
             through over it; or none.
         fps: Frames a second of a .csv of landmarks without VIDEO; by its times if absent.
@@ -112,7 +111,6 @@ def track(
         stream: Where --live sends to; Unreal listens on port 11111. vmc://HOST:PORT and osc://HOST:PORT/PREFIX
             send by the VMC protocol and as plain OSC.
         seconds: After which --live ends; until Ctrl-C if absent.
-        quiet: Show no progress.
     """
     from torchface.errors import ValueRangeError
     from torchface.workflows.batch.batch_items import find_items, is_batch

@@ -32,7 +32,6 @@ def transfer(
         unit: Unit of the neutral's file (mm, cm, m) where it is not the format's own.
         names: Names of the written shapes. "arkit": ARKit's where the template's mean the same, halves of one of its
             shapes merged (browInnerUp, cheekPuff); shapes that ARKit lacks keep theirs. All keep theirs if absent.
-        quiet: Show no progress.
     """
     from torchface.io import load_mesh, load_rig, save_rig
     from torchface.modeling.rigging.deformation_transfer import transfer_with_report

@@ -4,7 +4,7 @@ from pathlib import Path
 
 from tyro.conf import Positional
 
-from torchface.cli.command_options import OptionalOutputPath
+from torchface.cli.command_options import OptionalOutputPath, Part
 from torchface.cli.progress_bars import progress_bars
 from torchface.cli.terminal import Quiet, serve_page
 
@@ -13,7 +13,7 @@ def view(
     rig: Positional[Path],
     weights: Positional[Path | None] = None,
     out: OptionalOutputPath = None,
-    part: str | None = None,
+    part: Part = None,
     port: int = 8080,
     quiet: Quiet = False,
 ) -> None:
@@ -27,9 +27,7 @@ def view(
         rig: A .glb or USD file, a folder of OBJ files, or ICT-FaceKit's FaceXModel folder.
         weights: A weight take to play and edit, such as a Live Link Face CSV.
         out: Where Save writes the weights: a .csv; if absent edited_weights.csv here, or beside the take.
-        part: Keep this region of the rig only, such as face.
         port: The first port to try.
-        quiet: Show no progress.
     """
     from torchface.files.whole_files import check_ending, check_writable
     from torchface.io import load_detail_maps, load_rig, load_take
