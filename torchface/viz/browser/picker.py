@@ -1,5 +1,6 @@
 """The picking page: a click on the head, or on the scan beside it, becomes a landmark, a marker or a pair."""
 
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -7,9 +8,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchface.errors import TorchfaceError
+from torchface.errors import TorchfaceError, ValueRangeError
+from torchface.files.whole_files import all_or_none, made_folder
 from torchface.geometry.meshes.operators import vertex_normals
-from torchface.mesh import Mesh
+from torchface.io import save_mesh, save_rig
+from torchface.io.landmarks.picks import save_correspondences, save_landmarks
+from torchface.mesh import Annotations, Mesh
 from torchface.rig import BlendshapeRig
 from torchface.viz.browser.browser_page import SCALE, BrowserPage, frame_camera, icon
 from torchface.viz.browser.head_mesh import HeadOnPage
@@ -19,13 +23,6 @@ from torchface.viz.browser.pick_session import PickSession, SurfacePoint
 
 if TYPE_CHECKING:
     import viser
-from dataclasses import replace
-
-from torchface.errors import ValueRangeError
-from torchface.files.whole_files import all_or_none, made_folder
-from torchface.io import save_mesh, save_rig
-from torchface.io.landmarks.picks import save_correspondences, save_landmarks
-from torchface.mesh import Annotations
 
 MODES = ("landmarks", "markers", "correspondences")
 _NEXT = "next"
