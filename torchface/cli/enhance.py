@@ -31,6 +31,8 @@ def enhance(
     unit: Literal["um", "mm", "cm", "m", "in"] | None = None,
     flip: Literal["x", "y", "z"] | None = None,
     meshes: Literal["none", "obj", "ply"] = "none",
+    textures: Path | None = None,
+    texture_size: int = 1024,
     no_glb: bool = False,
     glb_megabytes: float = 200.0,
     detail: float = 1.0,
@@ -69,6 +71,9 @@ def enhance(
         unit: What the markers' coordinates are in; what the file says if absent.
         flip: Negate this axis of the markers' coordinates.
         meshes: Also write every frame as a mesh file of this kind.
+        textures: A mesh of the model's topology with texture coordinates, such as the captured neutral: colours that
+            the model has learned are also written there, an image a frame (textures/frame_0000.png).
+        texture_size: Pixels a side of these images.
         no_glb: Do not write enhanced.glb.
         glb_megabytes: What its morph targets may take; a long animation is shown by principal components.
         detail: How strong the added detail is: 1 is the actor's, 0 none.
@@ -89,7 +94,10 @@ def enhance(
 
     checked_count("--height", height, *PICTURE_HEIGHTS)
     given = InputSettings(rig, attachment, pairs, part, neutral, fps, MarkerOptions(unit, labels, None, flip))
-    settings = EnhanceSettings(given, meshes, not no_glb, glb_megabytes, detail, not no_video, retime)
+    checked_count("--texture-size", texture_size, 16, 8192)
+    settings = EnhanceSettings(
+        given, meshes, not no_glb, glb_megabytes, detail, not no_video, retime, textures, texture_size
+    )
     if cluster is not None or is_batch(animation, ANIMATIONS):
         job = AnimationJob(model, settings, height)
         with progress_bars(quiet) as progress:

@@ -12,7 +12,7 @@ import torch
 from tests.workflows.enhance.conftest import FPS, FRAMES, Actor, folded
 from torchface import zoo
 from torchface.attachment import Attachment
-from torchface.enhancement import CapturedPerformance, EnhancementModel
+from torchface.enhancement import CapturedPerformance, EnhancementModel, EnhancementSettings
 from torchface.errors import (
     AlignmentError,
     FileFormatError,
@@ -23,13 +23,23 @@ from torchface.errors import (
 )
 from torchface.geometry.rotations import rotation_matrix
 from torchface.geometry.similarity import similarity_transform
-from torchface.io import MeshSequence, load_rig, load_take, save_animation, save_mesh, save_rig, save_take
+from torchface.io import (
+    MeshSequence,
+    load_image,
+    load_rig,
+    load_take,
+    save_animation,
+    save_mesh,
+    save_rig,
+    save_take,
+)
 from torchface.io.gltf.animation_reading import read_gltf_weights
 from torchface.io.landmarks.picks import Correspondences, save_correspondences
 from torchface.io.meshes.mesh_sequence import MeshSequenceWriter
 from torchface.mesh import Mesh
 from torchface.progress import silent
 from torchface.registration import Registration
+from torchface.rendering.clay_shading import sample_texture
 from torchface.rig import BlendshapeRig
 from torchface.take import Take, Track
 from torchface.workflows.enhance import enhance_views, enhanced_frames, head_correspondence
@@ -338,6 +348,43 @@ def test_another_actor_keeps_the_own_head_and_gets_the_detail(actor: Actor, tmp_
     added = made[1.0][-1] - made[0.0][-1]
     assert float(own.norm(dim=-1).max()) > 0.3
     assert float(torch.corrcoef(torch.stack([added.flatten(), own.flatten()]))[0, 1]) > 0.9
+
+
+def test_learned_colours_are_images_in_a_meshs_texture_coordinates(actor: Actor, tmp_path: Path) -> None:
+    mesh, frames = actor.mesh, folded(actor.frames, actor.mesh.vertices)
+    blush = (mesh.vertices[:, :1] / 160 + 0.5) * torch.linspace(0, 0.4, FRAMES)[:, None, None]
+    colors = 0.5 + blush * torch.tensor([1.0, -0.5, -0.5])
+    captured = CapturedPerformance(frames, mesh.faces, torch.zeros(FRAMES).long(), mesh.vertices, colors=colors)
+    model = EnhancementModel.fit(captured, EnhancementSettings(fps=FPS), rank=4)
+    zoo.save_model(model, tmp_path / "model", zoo.ModelCard("MIT", "made", {}, "here"))
+    save_mesh(mesh, tmp_path / "painted.glb")
+    settings = EnhanceSettings(
+        InputSettings(rig=actor.folder / "rig.glb"), glb=False, video=False, textures=tmp_path / "painted.glb",
+        texture_size=256,
+    )  # fmt: skip
+    out, weights = tmp_path / "out", actor.folder / "weights.csv"
+    done = enhance_animation(weights, str(tmp_path / "model"), out, settings)
+    assert done.products["colours, an image a frame"] == out / "textures"
+    assert len(list((out / "textures").glob("*.png"))) == FRAMES
+    known = MeshSequence(out / "colors.safetensors").read(FRAMES - 1, FRAMES)[0]
+    assert mesh.uvs is not None
+    assert mesh.uv_faces is not None
+    corner = torch.zeros(len(mesh.vertices), 2)
+    corner[mesh.faces.flatten()] = mesh.uvs[mesh.uv_faces.flatten()]
+    last = load_image(out / "textures" / f"frame_{FRAMES - 1:04d}.png")
+    shown = sample_texture(last, corner)
+    assert float((shown - known).abs().median()) < 0.01
+    assert float((known - 0.5).abs().max()) > 0.2
+    with pytest.raises(ValueRangeError, match=r"--textures: found the model .*, which knows no colours"):
+        enhance_animation(weights, actor.model, tmp_path / "none", settings)
+    save_mesh(Mesh(mesh.vertices, mesh.faces), tmp_path / "bare.obj")
+    save_mesh(
+        replace(mesh, faces=mesh.faces.flip(0), uv_faces=mesh.uv_faces.flip(0), polygons=None), tmp_path / "o.glb"
+    )
+    for name, said in (("bare.obj", "without texture coordinates"), ("o.glb", "in their order")):
+        other = replace(settings, textures=tmp_path / name)
+        with pytest.raises(TopologyError, match=said):
+            enhance_animation(weights, str(tmp_path / "model"), tmp_path / "none", other)
 
 
 def test_what_does_not_fit_the_model_is_named(actor: Actor, tmp_path: Path) -> None:

@@ -9,12 +9,13 @@ from torch import Tensor
 
 from torchface import zoo
 from torchface.enhancement import EnhancementModel
-from torchface.errors import NameMismatchError, ValueRangeError
+from torchface.errors import NameMismatchError, TopologyError, ValueRangeError
 from torchface.files.content_keys import content_key
 from torchface.files.documents import write_json
 from torchface.files.job_lock import within_job
 from torchface.files.whole_files import all_or_none, made_folder, make_folder
-from torchface.io import MeshSequence, save_animation, save_mesh
+from torchface.geometry.meshes.rasterization import TexelMap, rasterise_uvs
+from torchface.io import MeshSequence, load_mesh, save_animation, save_image, save_mesh
 from torchface.io.tables.csv_table import write_table
 from torchface.io.video import write_video
 from torchface.mesh import Mesh
@@ -25,7 +26,13 @@ from torchface.take import Take, Track
 from torchface.workflows.enhance.coarse_animation import CoarseAnimation
 from torchface.workflows.enhance.coarse_input import InputSettings, read_coarse
 from torchface.workflows.enhance.enhance_views import drawn_frames, framed_model
-from torchface.workflows.enhance.enhanced_frames import SEQUENCE, EnhancedFrames, enhance_frames, retimed_animation
+from torchface.workflows.enhance.enhanced_frames import (
+    SEQUENCE,
+    EnhancedFrames,
+    enhance_frames,
+    has_colors,
+    retimed_animation,
+)
 
 MEGABYTES = 200.0
 _BYTES_A_VERTEX = 24  # of a target: position and normal
@@ -102,7 +109,8 @@ def write_targets(targets: AnimationTargets, neutral: Mesh, fps: float, path: Pa
 
 
 STATE = "state"
-GLB, VIDEO, FRAMES, SUMMARY, MESHES = "enhanced.glb", "comparison.mp4", "frames.csv", "summary.json", "meshes"
+GLB, VIDEO, FRAMES, SUMMARY = "enhanced.glb", "comparison.mp4", "frames.csv", "summary.json"
+MESHES, TEXTURES = "meshes", "textures"
 _METHOD = "enhance/2"
 _FORMAT = "torchface.enhance-summary/1"
 _MANY_OUTSIDE = 0.25
@@ -120,6 +128,8 @@ class EnhanceSettings:
     detail: float = 1.0  # how strong the detail is; 1 is the actor's
     video: bool = True  # the video of input and result side by side
     retime: bool = False  # give the motions between the animation's keyframes the actor's timing first
+    textures: Path | None = None  # a mesh in whose texture coordinates colours are written, an image a frame
+    texture_size: int = 1024  # pixels a side
 
 
 @dataclass(frozen=True, eq=False)
@@ -176,8 +186,8 @@ def enhance_animation(
 ) -> Enhanced:
     """Reads, enhances, writes; see ``torchface enhance --help`` for the arguments.
 
-    Writes ``enhanced.safetensors``, ``enhanced.glb``, ``comparison.mp4``, ``frames.csv``, ``summary.json``, ``meshes/``
-    and ``colors.safetensors`` where asked for or known;
+    Writes ``enhanced.safetensors``, ``enhanced.glb``, ``comparison.mp4``, ``frames.csv``, ``summary.json``, and
+    ``meshes/``, ``textures/`` and ``colors.safetensors`` where asked for or known;
     :func:`torchface.workflows.enhance.enhance_page.write_enhance_page` makes the report.
     """
     with within_job(out), made_folder(out / STATE) as state:
@@ -190,6 +200,7 @@ def _enhance(
     progress("reading the model")
     model = load_model(model_name)
     neutral = Mesh(model.neutral, model.faces)
+    painted = None if settings.textures is None else _texels(settings.textures, model, model_name, settings)
     animation = read_coarse(path, neutral, settings.given, state, progress)
     if animation.head is not None or settings.detail != 1:
         model = model.on_actor(model.neutral if animation.head is None else animation.head, settings.detail)
@@ -211,6 +222,9 @@ def _enhance(
             f"warning: {share:.0%} of the frames are unlike any the model has seen, so their detail is the nearest it "
             "has; a take of more expressions, or another actor's model, would do better"
         )
+    if painted is not None:
+        assert frames.colors is not None
+        products["colours, an image a frame"] = _write_textures(frames.colors, mesh, painted, out / TEXTURES, progress)
     if settings.meshes != "none":
         products["meshes, a file a frame"] = _write_meshes(frames, mesh, out / MESHES, settings.meshes, progress)
     if settings.glb:
@@ -223,6 +237,33 @@ def _enhance(
     with all_or_none():
         _write_tables(done, out)
     return done
+
+
+def _texels(path: Path, model: EnhancementModel, name: str, settings: EnhanceSettings) -> TexelMap:
+    """Where the model's triangles lie in a mesh's texture coordinates."""
+    if not has_colors(model):
+        raise ValueRangeError(
+            f"--textures: found the model {name}, which knows no colours, expected one of captured meshes with vertex "
+            "colours"
+        )
+    mesh = load_mesh(path)
+    if mesh.uvs is None or mesh.uv_faces is None:
+        raise TopologyError(f"{path}: found a mesh without texture coordinates, expected some to write colours in")
+    if not torch.equal(mesh.faces, model.faces):
+        raise TopologyError(
+            f"{path}: found {len(mesh.vertices)} vertices and {len(mesh.faces)} triangles, expected the model's, "
+            f"{len(model.neutral)} and {len(model.faces)} in their order"
+        )
+    return rasterise_uvs(mesh.uvs, mesh.uv_faces, settings.texture_size, settings.texture_size)
+
+
+def _write_textures(colors: MeshSequence, mesh: Mesh, texels: TexelMap, folder: Path, progress: Progress) -> Path:
+    make_folder(folder)
+    for t in range(len(colors)):
+        shades = texels.interpolate(colors.read(t, t + 1)[0].clamp(0, 1).double(), mesh.faces)
+        save_image(texels.image(shades), folder / f"frame_{t:0{max(4, len(str(len(colors))))}d}.png")
+        progress("writing textures", t + 1, len(colors))
+    return folder
 
 
 def _write_meshes(found: EnhancedFrames, mesh: Mesh, folder: Path, ending: str, progress: Progress) -> Path:
