@@ -138,3 +138,15 @@ def test_a_doubtful_face_is_not_taken_beside_a_surer_one_whose_form_is_no_heads(
     else:
         with pytest.raises(NoFaceOnSurfaceError, match="elsewhere"):
             search.find(clay(head.vertices, head.faces))
+
+
+def test_a_head_with_holes_for_eyes_is_found_without_doubt(search: FaceSearch) -> None:
+    """Points of the eyes were seen on the back of the head, through its eyes, and made the face doubtful: 0.28."""
+    head = neutral_head(draw_identities(1, torch.Generator().manual_seed(3))[0], texture=False)
+    assert head.annotations is not None
+    regions = head.annotations.regions
+    hollow = torch.stack([regions[name] for name in ("eyeball_left", "eyeball_right", "eye_sockets")]).any(0)
+    faces = head.faces[~hollow[head.faces].any(1)]
+    found = replace(search, rings=((0.0, 6),)).find(clay(head.vertices, faces))
+    assert found.doubt < 0.12
+    assert not bool(torch.isfinite(found.points[36:48, 2]).any()) or float(found.points[36:48, 2].nanmean()) > 0

@@ -116,6 +116,25 @@ def test_a_chair_is_refused_with_a_picture_of_what_was_seen(tmp_path: Path, monk
     assert not (tmp_path / "out.glb").exists()
 
 
+@pytest.mark.parametrize(("met", "far", "refused"), [(0.42, 2.1, True), (0.84, 0.1, False)])
+def test_a_ball_on_a_box_in_which_networks_see_a_face_is_refused_and_a_muzzle_is_not(
+    met: float, far: float, refused: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """By figures that were measured on them."""
+    template = performer(texture=False)
+    share = torch.linspace(0, 1, len(template.vertices))
+    region = template.neutral.annotations.regions["face"]
+    share[region] = torch.linspace(0, 1, int(region.sum()))
+    found = SimpleNamespace(matched=share < met, distance=torch.full_like(share, far))
+    monkeypatch.setattr(character_rig, "register", lambda *_, **__: found)
+    face = SimpleNamespace(skin=template.neutral, landmarks=None)
+    if refused:
+        with pytest.raises(AlignmentError, match=r"doll\.glb: the template lies 2\.1 mm .* meets 42% .*is it a face"):
+            character_rig._registered(template, face, Path("doll.glb"), lambda *_: None)
+    else:
+        assert character_rig._registered(template, face, Path("doll.glb"), lambda *_: None) is found
+
+
 def test_a_face_on_a_flat_card_is_refused_by_the_files_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     card = Mesh(
         torch.tensor([[-150.0, -150, 0], [150, -150, 0], [150, 150, 0], [-150, 150, 0]]),

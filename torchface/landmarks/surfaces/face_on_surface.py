@@ -28,6 +28,7 @@ _LEAST_POINTS = 12
 _SLANTED = 0.25  # cosine between ray and normal below which a hit says nothing
 _ASTRAY = 0.5  # of the eyes' distance: a view's hit that is further from the median of all is left out
 _TRIED = 3  # places that are looked at from near
+_HOLE, _MOST_HOLES = 0.5, 0.35  # of the eyes' distance behind where a face has a point; the share of such points
 _LOST = 0.07  # of the eyes' distance: what is off by more on the reference is no habit of the finder
 _PRESENCE, _MISFIT = 0.7, 0.35
 _DOUBT = 0.2  # above it other places are looked at too, from all around and in clay; most faces are below
@@ -124,7 +125,7 @@ class FaceSearch:
             if refused is None and not doubtful and plain == painted:
                 break
         if doubtful:
-            best, score = min(doubtful, key=lambda one: one[0].doubt)
+            best, score = min(doubtful, key=lambda one: one[0].doubt / max(one[1], 1e-6))
             # Beside a surer face of another form, such as one with a long muzzle, what is doubtful is a false one.
             if refused is None or refused.likeness < score:
                 return best
@@ -191,8 +192,12 @@ class FaceSearch:
         hits = _hits(surface, camera, reading.landmarks[INNER], plain)
         if int(torch.isfinite(hits).all(-1).sum()) < _LEAST_POINTS:
             return None
-        pose, misfit = _robust_pose(self.reference.landmarks[INNER].double(), hits)
         eyes = float((self.reference.landmarks[_EYES[0]] - self.reference.landmarks[_EYES[1]]).norm())
+        inner = self.reference.landmarks[INNER].double()
+        pose, misfit = _robust_pose(inner, hits)
+        holes = _through_holes((pose.inverse().apply(hits)[0] - inner)[:, 2] / eyes)
+        if holes.any():
+            pose, misfit = _robust_pose(inner, hits.masked_fill(holes[:, None], torch.nan))
         middle = pose.apply(self.reference.landmarks[INNER].double().mean(0)[None])[0, 0]
         size = float(pose.scale[0]) * eyes
         return _Sighting(
@@ -218,6 +223,7 @@ class FaceSearch:
                 bias[bias.norm(dim=-1) > _LOST * eyes] = 0.0
                 bias[:COUNT] = 0.0  # the 68 follow annotators' habits, not the reference's vertices
             found = found - torch.nan_to_num(bias)
+            found[_through_holes((found - reference)[:, 2] / eyes)] = torch.nan
             if int(torch.isfinite(found).all(-1).sum()) < _LEAST_POINTS:
                 break
             better, _ = _robust_pose(reference[INNER.start :], found[INNER.start :])
@@ -344,6 +350,16 @@ def _together(points: Sequence[Tensor], weights: Sequence[Tensor], astray: float
     total = kept.sum(0)
     mean = (filled * kept[..., None]).sum(0) / total[:, None].clamp(min=1e-12)
     return mean.masked_fill((total <= 0)[:, None], torch.nan)
+
+
+def _through_holes(behind: Tensor) -> Tensor:
+    """Which points (N,) lie so far behind a face that they are seen through its eyes or mouth; none if many do.
+
+    Args:
+        behind: depth beside the reference, in distances of the eyes, (N,) with NaN.
+    """
+    holes = behind < -_HOLE
+    return holes & (float(holes.double().sum()) < _MOST_HOLES * float(torch.isfinite(behind).sum()))
 
 
 def _robust_pose(reference: Tensor, points: Tensor) -> tuple[Similarity, float]:
