@@ -5,7 +5,7 @@ from typing import Annotated, Literal
 
 from tyro.conf import Positional, arg
 
-from torchface.cli.batch_report import Cluster, Column, Jobs, TimeLimit, show_batch, skipped_lines
+from torchface.cli.batch_report import Cluster, Column, Jobs, TimeLimit, work_on
 from torchface.cli.command_options import OptionalOutputPath, OutputPath, Part
 from torchface.cli.progress_bars import progress_bars
 from torchface.cli.terminal import Quiet, print_lines, print_path
@@ -70,8 +70,7 @@ def attach(
     from torchface.files.job_lock import file_lock
     from torchface.workflows.attach.attach_markers import MOTIONS, AttachSettings, MotionJob
     from torchface.workflows.attach.attach_markers import attach as find_sites
-    from torchface.workflows.batch.batch_items import check_folder, find_items, is_batch
-    from torchface.workflows.batch.run_batch import BatchOptions, run_batch
+    from torchface.workflows.batch.batch_items import check_folder, is_batch
     from torchface.workflows.marker_input import MarkerOptions
 
     settings = AttachSettings(initial, standoff, part, MarkerOptions(unit, labels, frames, flip, scale), insist)
@@ -80,10 +79,7 @@ def attach(
         if picture is not None:
             raise ValueRangeError("--picture: found many takes, of which each gets OUT/NAME.png without it")
         job = MotionJob(rig, settings)
-        with progress_bars(quiet) as progress:
-            where = BatchOptions(jobs, cluster, time_limit)
-            batch = run_batch(job, MOTIONS, find_items(rom, MOTIONS), out, where, progress, skipped_lines(quiet))
-        show_batch(batch, _COLUMNS, "error_mm")
+        work_on(job, MOTIONS, rom, out, (jobs, cluster, time_limit), _COLUMNS, "error_mm", quiet)
         return
     with file_lock(out, ".json"), progress_bars(quiet) as progress:
         report = find_sites(rig, rom[0], out, settings, picture, progress)

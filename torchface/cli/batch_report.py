@@ -4,16 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from math import isnan
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, NamedTuple
 
 from rich.table import Table
 from rich.text import Text
 from tyro.conf import arg
 
+from torchface.cli.progress_bars import progress_bars
 from torchface.cli.terminal import console, print_path
 from torchface.errors import AlignmentError
 
 if TYPE_CHECKING:
+    from torchface.workflows.batch.batch_items import ItemKind
+    from torchface.workflows.batch.batch_job import BatchJob
     from torchface.workflows.batch.outcomes import Outcome
     from torchface.workflows.batch.run_batch import BatchReport
 
@@ -42,6 +46,26 @@ class Column(NamedTuple):
     head: str
     figure: str
     form: str
+
+
+def work_on(
+    job: BatchJob,
+    kind: ItemKind,
+    inputs: Sequence[Path],
+    out: Path,
+    options: tuple[int, str | None, float | None],
+    columns: Sequence[Column],
+    worst_by: str,
+    quiet: bool,
+) -> None:
+    """Works on each input by itself, with the command's --jobs, --cluster and --time-limit, and shows the table."""
+    from torchface.workflows.batch.batch_items import find_items
+    from torchface.workflows.batch.run_batch import BatchOptions, run_batch
+
+    with progress_bars(quiet) as progress:
+        found = find_items(inputs, kind)
+        report = run_batch(job, kind, found, out, BatchOptions(*options), progress, skipped_lines(quiet))
+    show_batch(report, columns, worst_by)
 
 
 def skipped_lines(quiet: bool) -> Callable[[Outcome], None]:

@@ -8,7 +8,7 @@ from tyro.conf import Positional, UseAppendAction, arg
 
 from torchface.cli.command_options import OutputPath
 from torchface.cli.progress_bars import progress_bars
-from torchface.cli.terminal import Quiet, console, print_path
+from torchface.cli.terminal import Quiet, print_lines, print_path
 from torchface.errors import ValueRangeError
 
 
@@ -48,7 +48,6 @@ def calibrate(
             reports, _, more = calibrate_beside([*images, *beside], board, out, progress)
         else:
             reports, more = [run(images, board, out, progress)], []
-    for line in [*(line for report in reports for line in report.lines()), *more]:
-        console.print(line, highlight=False)
+    print_lines([*(line for report in reports for line in report.lines()), *more])
     for path in (*(report.overlay_path for report in reports if report.overlay_path is not None), out):
         print_path(path)

@@ -5,7 +5,7 @@ from typing import Annotated, Literal
 
 from tyro.conf import Positional, arg
 
-from torchface.cli.batch_report import Cluster, Column, Jobs, TimeLimit, show_batch, skipped_lines
+from torchface.cli.batch_report import Cluster, Column, Jobs, TimeLimit, work_on
 from torchface.cli.command_options import Output, Part
 from torchface.cli.progress_bars import progress_bars
 from torchface.cli.terminal import Quiet, print_lines, print_path
@@ -84,8 +84,7 @@ def enhance(
     from torchface.files.job_lock import job_lock
     from torchface.number_checks import checked_count
     from torchface.viz.figures.face_views import PICTURE_HEIGHTS
-    from torchface.workflows.batch.batch_items import find_items, is_batch
-    from torchface.workflows.batch.run_batch import BatchOptions, run_batch
+    from torchface.workflows.batch.batch_items import is_batch
     from torchface.workflows.enhance.animation_job import ANIMATIONS, AnimationJob
     from torchface.workflows.enhance.coarse_input import InputSettings
     from torchface.workflows.enhance.enhance_animation import EnhanceSettings, enhance_animation
@@ -100,12 +99,7 @@ def enhance(
     )
     if cluster is not None or is_batch(animation, ANIMATIONS):
         job = AnimationJob(model, settings, height)
-        with progress_bars(quiet) as progress:
-            where = BatchOptions(jobs, cluster, time_limit)
-            batch = run_batch(
-                job, ANIMATIONS, find_items(animation, ANIMATIONS), out, where, progress, skipped_lines(quiet)
-            )
-        show_batch(batch, _COLUMNS, "outside")
+        work_on(job, ANIMATIONS, animation, out, (jobs, cluster, time_limit), _COLUMNS, "outside", quiet)
         return
     with job_lock(out), progress_bars(quiet) as progress:
         done = enhance_animation(animation[0], model, out, settings, progress)

@@ -6,10 +6,10 @@ from typing import Annotated
 from rich.table import Table
 from tyro.conf import Positional, arg
 
-from torchface.cli.batch_report import Cluster, Column, Jobs, TimeLimit, show_batch, skipped_lines
+from torchface.cli.batch_report import Cluster, Column, Jobs, TimeLimit, work_on
 from torchface.cli.command_options import Output
 from torchface.cli.progress_bars import progress_bars
-from torchface.cli.terminal import Quiet, console, print_path
+from torchface.cli.terminal import Quiet, console, print_lines, print_path
 
 _SHOWN = 8  # regions
 _COLUMNS = (
@@ -86,8 +86,7 @@ def evaluate(
     from torchface.files.job_lock import job_lock
     from torchface.number_checks import checked_count
     from torchface.viz.figures.face_views import PICTURE_HEIGHTS
-    from torchface.workflows.batch.batch_items import find_items, is_batch
-    from torchface.workflows.batch.run_batch import BatchOptions, run_batch
+    from torchface.workflows.batch.batch_items import is_batch
     from torchface.workflows.evaluate.compare_with_truth import EvaluationSettings
     from torchface.workflows.evaluate.compare_with_truth import evaluate as run
     from torchface.workflows.evaluate.evaluate_page import write_evaluation_page
@@ -105,10 +104,7 @@ def evaluate(
         if len(truth) != 1:
             raise ValueRangeError(f"truth: found {len(truth)} places for many results, expected one")
         job = ResultJob(truth[0], settings, height)
-        with progress_bars(quiet) as progress:
-            where = BatchOptions(jobs, cluster, time_limit)
-            batch = run_batch(job, RESULTS, find_items([result], RESULTS), out, where, progress, skipped_lines(quiet))
-        show_batch(batch, _COLUMNS, "mean_mm")
+        work_on(job, RESULTS, [result], out, (jobs, cluster, time_limit), _COLUMNS, "mean_mm", quiet)
         return
     with job_lock(out), progress_bars(quiet) as progress:
         evaluation = run(result, truth, out, settings, progress)
@@ -125,8 +121,7 @@ def evaluate(
     if len(regions) > _SHOWN:
         table.caption = f"the {_SHOWN} regions that are farthest off; regions.csv has all {len(regions)}"
     console.print(table)
-    for line in evaluation.lines():
-        console.print(line, highlight=False)
+    print_lines(evaluation.lines())
     print_path(page)
 
 
@@ -147,6 +142,5 @@ def _benchmark(result: Path, truth: tuple[Path, ...], out: Path, quiet: bool) ->
     for row in rows.rows:
         table.add_row(*row)
     console.print(table)
-    for line in found.lines()[1:]:
-        console.print(line, highlight=False)
+    print_lines(found.lines()[1:])
     print_path(out / "index.html")

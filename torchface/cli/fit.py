@@ -8,7 +8,7 @@ from tyro.conf import Positional, arg
 
 from torchface.cli.command_options import OutputPath
 from torchface.cli.progress_bars import progress_bars
-from torchface.cli.terminal import Quiet, console, print_path
+from torchface.cli.terminal import Quiet, print_lines, print_path
 
 
 def fit(
@@ -87,8 +87,7 @@ def fit(
     )
     with file_lock(out), progress_bars(quiet) as progress:
         made = fit_photographs(photographs, given, model, out, settings, progress)
-    for line in [*made.lines(), *naming_lines(made.rig, names)]:
-        console.print(line, highlight=False)
+    print_lines([*made.lines(), *naming_lines(made.rig, names)])
     marks = (overlay.with_suffix(".pts") for overlay in made.overlays[: len(made.found)])
     cameras = (overlay.with_suffix(".toml") for overlay in made.overlays)
     for path in (*marks, *cameras, *made.overlays, out):

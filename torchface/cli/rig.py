@@ -5,10 +5,10 @@ from typing import Annotated, Literal
 
 from tyro.conf import Positional, arg
 
-from torchface.cli.batch_report import Cluster, Column, Jobs, TimeLimit, show_batch, skipped_lines
+from torchface.cli.batch_report import Cluster, Column, Jobs, TimeLimit, work_on
 from torchface.cli.command_options import OutputPath
 from torchface.cli.progress_bars import progress_bars
-from torchface.cli.terminal import Quiet, console, print_path
+from torchface.cli.terminal import Quiet, print_lines, print_path
 
 _COLUMNS = (
     Column("median", "median_mm", "{:.3f} mm"),
@@ -104,8 +104,7 @@ def rig(
         eyes: Give a character eyeballs that its mesh lacks; eyes in one piece with the skin are cut out.
     """
     from torchface.errors import ValueRangeError
-    from torchface.workflows.batch.batch_items import check_folder, find_items, is_batch
-    from torchface.workflows.batch.run_batch import BatchOptions, run_batch
+    from torchface.workflows.batch.batch_items import check_folder, is_batch
     from torchface.workflows.posed_mesh import pose_weights
     from torchface.workflows.rig.actor_job import ACTORS, ActorJob
     from torchface.workflows.rig.actor_rig import RigOptions, rig_actor
@@ -141,8 +140,7 @@ def rig(
             raise ValueRangeError(f"--neutral: found {', '.join(unused)} beside it, which are for a scan")
         with progress_bars(quiet) as progress:
             made = predict_rig(neutral, out, expressions or EXPRESSIONS, template, options, progress)
-        for line in [*made.lines(), *naming_lines(made.made.rig, names)]:
-            console.print(line, highlight=False)
+        print_lines([*made.lines(), *naming_lines(made.made.rig, names)])
         print_path(out)
         return
     if not scan or template is None:
@@ -150,15 +148,11 @@ def rig(
     if cluster is not None or is_batch(scan, ACTORS):
         check_folder(out)
         job = ActorJob(template, landmarks, examples, detail, options)
-        with progress_bars(quiet) as progress:
-            where = BatchOptions(jobs, cluster, time_limit)
-            batch = run_batch(job, ACTORS, find_items(scan, ACTORS), out, where, progress, skipped_lines(quiet))
-        show_batch(batch, _COLUMNS, "median_mm")
+        work_on(job, ACTORS, scan, out, (jobs, cluster, time_limit), _COLUMNS, "median_mm", quiet)
         return
     with progress_bars(quiet) as progress:
         report = rig_actor(scan[0], template, out, landmarks, examples, detail, options, progress)
-    for line in [*report.lines(), *naming_lines(report.rig, names)]:
-        console.print(line, highlight=False)
+    print_lines([*report.lines(), *naming_lines(report.rig, names)])
     print_path(out)
 
 
@@ -183,8 +177,7 @@ def _rig_character(scan: tuple[Path, ...], out: Path, parts: tuple[bool, bool], 
             if usd
             else rig_character(scan[0], out, progress, inner_mouth=parts[0], eyes=parts[1])
         )
-    for line in report.lines():
-        console.print(line, highlight=False)
+    print_lines(report.lines())
     if report.figure is not None:
         print_path(report.figure)
     print_path(out)

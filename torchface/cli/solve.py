@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 from tyro.conf import Positional, arg
 
-from torchface.cli.batch_report import Cluster, Column, Jobs, TimeLimit, show_batch, skipped_lines
+from torchface.cli.batch_report import Cluster, Column, Jobs, TimeLimit, work_on
 from torchface.cli.command_options import OptionalOutputPath, OutputPath, Part, Reduce
 from torchface.cli.progress_bars import progress_bars
 from torchface.cli.terminal import Quiet, print_lines, print_path
@@ -105,8 +105,7 @@ def solve(
     from torchface.capture.markers.hybrid_solver import GAMMA
     from torchface.errors import FileFormatError, ValueRangeError
     from torchface.files.job_lock import file_lock
-    from torchface.workflows.batch.batch_items import check_folder, check_for_each, find_items, is_batch
-    from torchface.workflows.batch.run_batch import BatchOptions, run_batch
+    from torchface.workflows.batch.batch_items import check_folder, check_for_each, is_batch
     from torchface.workflows.marker_input import MARKER_TAKES, MarkerOptions
     from torchface.workflows.solve.head_camera import HeadCamera
     from torchface.workflows.solve.solution import SolveSettings
@@ -138,11 +137,7 @@ def solve(
         job = TakeJob(
             rig, attachment, settings, options, part, camera, animation, report, live_link, checked_reduction(reduce)
         )
-        items = find_items(take, MARKER_TAKES)
-        with progress_bars(quiet) as progress:
-            where = BatchOptions(jobs, cluster, time_limit)
-            batch = run_batch(job, MARKER_TAKES, items, out, where, progress, skipped_lines(quiet))
-        show_batch(batch, _COLUMNS, "rmse_mm")
+        work_on(job, MARKER_TAKES, take, out, (jobs, cluster, time_limit), _COLUMNS, "rmse_mm", quiet)
         return
     with file_lock(out, ".csv"), progress_bars(quiet) as progress:
         inputs = TakeInputs(rig, take[0], attachment, part, camera, options)

@@ -62,7 +62,7 @@ def print_path(path: object) -> None:
 def print_lines(lines: Iterable[str]) -> None:
     """Prints a report, its warnings so that they are seen."""
     for line in lines:
-        console.print(line, style="bold yellow" if line.startswith("warning: ") else None)
+        console.print(line, style="bold yellow" if line.startswith("warning: ") else None, highlight=False)
 
 
 _MISTAKE, _STOPPED, _NOBODY_READS = 2, 130, 141  # the last is the status of SIGPIPE in shells

@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 from tyro.conf import Positional, UseAppendAction, arg
 
-from torchface.cli.batch_report import Cluster, Column, Jobs, TimeLimit, show_batch, skipped_lines
+from torchface.cli.batch_report import Cluster, Column, Jobs, TimeLimit, work_on
 from torchface.cli.command_options import Output, Part, Reduce, picture_size
 from torchface.cli.progress_bars import progress_bars
 from torchface.cli.terminal import Quiet, console, print_lines, print_path, print_table
@@ -113,8 +113,7 @@ def track(
         seconds: After which --live ends; until Ctrl-C if absent.
     """
     from torchface.errors import ValueRangeError
-    from torchface.workflows.batch.batch_items import find_items, is_batch
-    from torchface.workflows.batch.run_batch import BatchOptions, run_batch
+    from torchface.workflows.batch.batch_items import is_batch
     from torchface.workflows.track.track_inputs import TrackSettings
     from torchface.workflows.track.video_job import VIDEOS, VideoJob
     from torchface.workflows.weight_files import checked_reduction
@@ -164,10 +163,7 @@ def track(
         raise ValueRangeError("track: found no folder for the results, expected one (--out DIR)")
     if cluster is not None or (video and is_batch(video, VIDEOS)):
         job = VideoJob(rig, settings)
-        with progress_bars(quiet) as progress:
-            where = BatchOptions(jobs, cluster, time_limit)
-            batch = run_batch(job, VIDEOS, find_items(video, VIDEOS), out, where, progress, skipped_lines(quiet))
-        show_batch(batch, _COLUMNS, "error_px")
+        work_on(job, VIDEOS, video, out, (jobs, cluster, time_limit), _COLUMNS, "error_px", quiet)
         return
     _file(video[0] if video else None, rig, out, settings, quiet)
 

@@ -7,7 +7,7 @@ from tyro.conf import Positional, arg
 
 from torchface.cli.command_options import OutputPath
 from torchface.cli.progress_bars import progress_bars
-from torchface.cli.terminal import Quiet, console, print_path
+from torchface.cli.terminal import Quiet, console, print_lines, print_path
 
 
 def transfer(
@@ -46,8 +46,7 @@ def transfer(
         progress("writing the rig")
         save_rig(renamed(transferred.rig, names), out)
     console.print(f"{len(transferred.rig.names)} shapes, {len(transferred.rig.vertices):,} vertices")
-    for line in naming_lines(transferred.rig, names):
-        console.print(line, highlight=False)
+    print_lines(naming_lines(transferred.rig, names))
     if summary := transferred.report.summary():
         console.print(summary)
     print_path(out)

@@ -34,22 +34,31 @@ def numbered_order(path: Path) -> list[tuple[int, int, str]]:
     return [(0, int(part[:18]), "") if part.isdecimal() else (1, 0, part) for part in parts]
 
 
-def read_file(path: str | Path, largest: int = LARGEST_FILE) -> bytes:
-    """The bytes of a file."""
-    path = Path(path)
+def checked_size(path: Path, largest: int = LARGEST_FILE) -> int:
+    """Bytes of a plain file that is there, not empty and not beyond reason."""
     try:
         if not path.exists():
             raise FileFormatError(f"{path}: found no such file, expected an existing one")
         if not path.is_file():
             raise FileFormatError(f"{path}: found a folder or a device, expected a plain file")
         size = path.stat().st_size
-        if size == 0:
-            raise FileFormatError(f"{path}: found an empty file, expected content")
-        if size > largest:
-            raise FileFormatError(f"{path}: found {size} bytes, expected at most {largest}")
+    except (OSError, ValueError) as error:  # ValueError: a NUL in the name
+        raise FileFormatError(f"{path}: cannot be read ({error})") from error
+    if size == 0:
+        raise FileFormatError(f"{path}: found an empty file, expected content")
+    if size > largest:
+        raise FileFormatError(f"{path}: found {size} bytes, expected at most {largest}")
+    return size
+
+
+def read_file(path: str | Path, largest: int = LARGEST_FILE) -> bytes:
+    """The bytes of a file."""
+    path = Path(path)
+    checked_size(path, largest)
+    try:
         note_read(path)
         return path.read_bytes()
-    except (OSError, ValueError) as error:  # ValueError: a NUL in the name
+    except OSError as error:
         raise FileFormatError(f"{path}: cannot be read ({error})") from error
 
 

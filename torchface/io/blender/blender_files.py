@@ -13,13 +13,12 @@ from typing import Any
 import torch
 
 from torchface.errors import FileFormatError, MissingExtraError
-from torchface.files.whole_files import replaced_file
+from torchface.files.whole_files import checked_size, replaced_file
 from torchface.io.blender import reading_in_blender, writing_in_blender
 from torchface.io.gltf.corrective_extras import all_targets
 from torchface.io.scene_processes.reading_process import read_scene, run_process
 from torchface.io.scene_processes.scene_arrays import scene_mesh, scene_rig, scene_weights
 from torchface.io.scenes.weight_keys import WeightKeys, with_correctives
-from torchface.io.usd.usd_reading import checked_size
 from torchface.io.usd.usd_writing import write_usd_rig
 from torchface.mesh import Mesh
 from torchface.rig import BlendshapeRig

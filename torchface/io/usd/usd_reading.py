@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from torchface.errors import FileFormatError, NameMismatchError, NoShapesError, ShapeError
-from torchface.files.whole_files import LARGEST_FILE
+from torchface.files.whole_files import checked_size
 from torchface.geometry.meshes.normal_maps import DetailMaps, decode_normals
 from torchface.io.images.image_files import decode_image
 from torchface.io.scene_processes.reading_process import read_scene
@@ -76,21 +76,6 @@ def read_stage(path: str | Path, *options: str) -> Scene:
     size = checked_size(path)
     seconds = _SECONDS_ALWAYS + _SECONDS_A_MEGABYTE * size / 2**20
     return read_scene([sys.executable, "-P", str(_PROCESS), *options], path, "OpenUSD", seconds)
-
-
-def checked_size(path: Path) -> int:
-    """Bytes of a plain file that is there, not empty and not beyond reason."""
-    try:
-        if not path.exists():
-            raise FileFormatError(f"{path}: found no such file, expected an existing one")
-        if not path.is_file():
-            raise FileFormatError(f"{path}: found a folder or a device, expected a plain file")
-        size = path.stat().st_size
-    except (OSError, ValueError) as error:  # ValueError: a NUL in the name
-        raise FileFormatError(f"{path}: cannot be read ({error})") from error
-    if not 0 < size <= LARGEST_FILE:
-        raise FileFormatError(f"{path}: found {size} bytes, expected 1 to {LARGEST_FILE}")
-    return size
 
 
 _UNPACKED_ALWAYS, _UNPACKED_PER_BYTE = 2**28, 1024  # as of glTF's
