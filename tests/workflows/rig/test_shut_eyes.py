@@ -8,6 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from planted.characters import caricature
 from torchface.geometry.rotations import rotation_matrix
 from torchface.geometry.similarity import Similarity
 from torchface.mesh import Mesh
@@ -85,6 +86,18 @@ def test_a_character_s_shut_eye_is_one_whose_lids_meet_before_an_eyeball() -> No
         pose = Similarity(one, torch.eye(3).double()[None], 0 * one[:, None].expand(1, 3))
         face = SimpleNamespace(head=posed, found=SimpleNamespace(points=points, pose=pose))
         assert eyes_shut_at_rest(face, actor.neutral) == sides  # type: ignore[arg-type]
+
+
+def test_a_caricature_s_shut_eyes_are_recognised_though_its_balls_are_large() -> None:
+    actor = performer(texture=False)
+    drawn = caricature(actor, actor.vertices[actor.neutral.landmarks], eyes=1.0)
+    for blink in (0.0, 1.0):
+        posed = drawn.neutral.with_vertices(drawn(weights(drawn, blink)[None])[0].detach())
+        one = torch.ones(1, dtype=torch.float64)
+        pose = Similarity(one, torch.eye(3).double()[None], 0 * one[:, None].expand(1, 3))
+        found = SimpleNamespace(points=posed.vertices[actor.neutral.landmarks].double(), pose=pose)
+        shut = eyes_shut_at_rest(SimpleNamespace(head=posed, found=found), actor.neutral)  # type: ignore[arg-type]
+        assert shut == (blink == 1.0, blink == 1.0)
 
 
 def test_a_shut_eye_opens_as_wide_as_ever_and_its_lids_do_not_pass_each_other() -> None:

@@ -32,7 +32,7 @@ _LIDS = 2.0  # millimetres that a blink moves skin of the lids
 _BETTER, _WORSE = 0.6, 1.6
 _WIDTH, _HEIGHT = 480, 600
 _BLINKS_OF = ("Right", "Left")  # in the order of iBUG's eyes
-_BALL, _HIDDEN = 1.8, 0.75  # radii of a reference's eyeball; the share of a ball's front that skin covers
+_BALL, _HIDDEN = 2.6, 0.75  # radii of a reference's eyeball; the share of a ball's front that skin covers
 _LID = 0.3  # of a blink's longest way: from there on a vertex is of the lids alone
 
 
