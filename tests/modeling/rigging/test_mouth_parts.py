@@ -34,6 +34,22 @@ def test_a_tongue_in_one_piece_with_gums_comes_out_and_the_arch_stays() -> None:
     assert float(tip[hill, 1].max()) < float(points[hill, 1].max()) + 1e-6
 
 
+def test_the_back_of_a_tongue_is_of_it_though_it_rises_over_the_line_between_the_jaws() -> None:
+    """ICT-FaceKit's: a strip of its front came out, and its back stayed with the upper jaw as the mouth opened."""
+    points, faces, hill = gums(18.0)
+    points[hill, 1] += (0.5 * (-18 - points[hill, 2])).clamp(0, 20)  # the back rises
+    below = -points[:, 1] - 0.2 * points[:, 2]
+    assert bool((below[hill] < -3).any())
+    whole = torch.ones(len(points), dtype=torch.bool)
+    tongue = tongue_of_gums(points, faces, whole, below, whole)
+    back = hill & (points[:, 0].abs() < 9) & (points[:, 2] < -20) & (points[:, 2] > -55)
+    assert float(tongue[back].min()) > 0.9
+    assert float(tongue[(points[:, 0].abs() > 20) | (points[:, 2] > -8)].max()) < 0.01
+    head = JoinedHead(points, torch.zeros(len(points)).long(), whole, torch.zeros(1, len(points), 3))
+    _, share, _ = in_the_mouth(head, faces, whole, torch.zeros(20, 3).double())
+    assert float(share[back].min()) > 0.9
+
+
 def test_what_is_near_teeth_is_gums_and_stays() -> None:
     points, faces, hill = gums(18.0)
     below = -points[:, 1] - 0.2 * points[:, 2]

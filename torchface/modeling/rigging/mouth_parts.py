@@ -13,7 +13,7 @@ from torch import Tensor
 from torchface.geometry.meshes.operators import triangle_areas, vertex_normals
 from torchface.geometry.meshes.shell_energies import stretching_energy
 from torchface.geometry.similarity import Similarity, similarity_transform
-from torchface.modeling.rigging.joined_vertices import JoinedHead
+from torchface.modeling.rigging.joined_vertices import JoinedHead, connected_labels
 from torchface.optim.sparse import SparseCholesky
 from torchface.rendering.raycast import RayCaster
 from torchface.rig import BlendshapeRig
@@ -28,6 +28,7 @@ _JAW = "jaw"
 _ROW, _OFF_THE_LIPS, _RISES = 4, 10.0, (0.0, 0.1, _BITE, 0.3)  # least teeth of a row; millimetres from the lips' line
 _TONGUE, _FILLED = 15.0, 0.2  # millimetres at least: teeth are smaller; and the share near the middle
 _BACK, _BEHIND_TEETH, _TEETH, _LEAST_BACK, _FALLS = (0.3, 0.55), 12.0, 8.0, 8, 4.0  # of half the arch; millimetres
+_RISING = 0.2  # of a normal, upward
 _MIDDLE = 5.0  # millimetres beside the middle: gums are an arch, a tongue lies there
 _OVER_A_TRIANGLE = (
     torch.tensor(
@@ -79,6 +80,7 @@ def in_the_mouth(head: JoinedHead, faces: Tensor, left: Tensor, lips: Tensor) ->
         for rows, below, _ in gums:
             of_gums += tongue_of_gums(head.vertices, faces, rows, below, share > 0.5, teeth)
         tongue = of_gums if of_gums.any() else tongue
+        share = torch.maximum(share, of_gums)
     return inside, share, tongue
 
 
@@ -155,11 +157,15 @@ def tongue_of_gums(
     lower, deeper = (float(one[upper_side].median()) for one in (points[:, 1], below))
     if float(points[back, 1].quantile(0.9)) < lower and float(below[back].quantile(0.1)) > deeper:  # the mouth's bottom
         return none
-    back &= (points[:, 1] > lower - _FALLS) | (below < deeper + _FALLS)
+    near = torch.full((len(points),), torch.inf)
     if teeth:
-        nearby = cKDTree(vertices[torch.stack(list(teeth)).any(0)].numpy()).query(points.numpy())[0]
-        arch |= torch.from_numpy(nearby < _GUM[0])
-        back &= torch.from_numpy(nearby > _GUM[1])
+        tree = cKDTree(vertices[torch.stack(list(teeth)).any(0)].numpy())
+        near = torch.from_numpy(tree.query(points.numpy())[0])
+    # A tongue's back may rise over the line between the jaws.
+    raised = (facing[:, 1] > _RISING) & (across < _BACK[1]) & (behind > _BEHIND_TEETH) & (near > _GUM[0])
+    raised = _reached(own, back, raised)
+    arch |= near < _GUM[0]
+    back = (raised | (back & (near > _GUM[1]))) & ((points[:, 1] > lower - _FALLS) | (below < deeper + _FALLS))
     up = torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64).expand_as(points)
     others = faces[(jaw & ~rows)[faces].all(1)]
     if len(others) and float(RayCaster(vertices, others).occluded(points, up)[back].double().mean()) > _COVERED:
@@ -167,10 +173,18 @@ def tongue_of_gums(
     under = RayCaster(points, own[low[own].all(1)]).occluded(points + 0.1 * up, up) & low & (facing[:, 1] > 0.5)
     arch |= under  # what a tongue lies on
     back &= ~under
+    arch &= ~back
     weight = torch.where(back | arch, 1e3, 1e-6)
     system = sparse.diags_array(weight.double().numpy()) + stretching_energy(points, own)
     none[ids] = SparseCholesky(system).solve((weight * back).double()[:, None])[:, 0].clamp(0, 1)
     return none
+
+
+def _reached(faces: Tensor, start: Tensor, allowed: Tensor) -> Tensor:
+    """The vertices (n,) that edges among those ``allowed`` join to some of ``start``."""
+    kept = faces[(start | allowed)[faces].all(1)]
+    label = torch.from_numpy(connected_labels(torch.cat([kept[:, [0, 1]], kept[:, [1, 2]]]).T, len(start)))
+    return allowed & torch.isin(label, label[start])
 
 
 def jaw_motions(template: BlendshapeRig) -> Similarity:
