@@ -14,7 +14,7 @@ from torchface.geometry.meshes.vertex_graph import VertexGraph
 from torchface.mesh import Mesh
 from torchface.modeling.photographs.fit_settings import FitSettings
 from torchface.modeling.photographs.image_texture import part_vertices, photographed_skin
-from torchface.modeling.photographs.skin_light import exposed, light_hue, patch_offset, skin_light, unlit
+from torchface.modeling.photographs.skin_light import exposed, exposure_gain, light_hue, patch_offset, skin_light, unlit
 from torchface.modeling.photographs.skin_mask import FacePlaces
 from torchface.rendering.camera_visibility import PosedSurface
 from torchface.rendering.clay_shading import Lighting, render
@@ -156,3 +156,15 @@ def test_an_under_exposed_photograph_is_developed(head: Mesh, camera: Camera, ex
     bright = exposed(dark, parts)
     error = (to_linear(bright) / to_linear(picture).clamp(min=1e-3)).flatten().median()
     assert float(error) == pytest.approx(1.0, abs=0.05)
+
+
+def test_a_dark_complexion_stays_dark_before_a_dark_wall() -> None:
+    def gain(skin: float, white: float) -> float:
+        picture = torch.full((3, 100, 100), 0.2)
+        picture[:, 20:80, 20:80] = skin
+        picture[:, 40:44, 30:40] = picture[:, 40:44, 60:70] = white
+        colors = {"background": [0.2] * 3, "eyes": [white] * 3}
+        return exposure_gain(picture, planted_parts(picture, colors, 0.02))
+
+    assert gain(0.25, 0.6) == pytest.approx(1.0, abs=0.05)  # its eyes are as bright as in good light
+    assert gain(0.35, 0.35) > 2.0  # fair in a dim picture: its eyes are dim too

@@ -93,53 +93,30 @@ def photographed_skin(
     patches: list[Tensor] | None = None
     cap: HairCap | None = None
     if _has_landmarks(mesh):
-        surfaces, places = PosedSurface.each(posed, count), [FacePlaces.of(one) for one in posed]
-        shown = [
-            surface.shown_in(image, camera) for surface, image, camera in zip(surfaces, images, cameras, strict=True)
-        ]
         graph = VertexGraph(mesh.faces.cpu(), len(mesh.vertices))
         seen: Sequence[FaceParts | None] = parts or [None] * count
-        known = [
-            ShownParts.of(one, camera.project(surface.vertices), where, graph)
-            for one, camera, surface, where in zip(seen, cameras, surfaces, places, strict=True)
+        views = [
+            _lit_evenly(image, camera, surface, FacePlaces.of(one), known, graph, others)
+            for image, camera, surface, one, known in zip(
+                images, cameras, PosedSurface.each(posed, count), posed, seen, strict=True
+            )
         ]
-        lights = [
-            skin_light(at, surface.normals, camera, where.cheeks & ~others & (one.bare > _BARE))
-            for at, surface, camera, where, one in zip(shown, surfaces, cameras, places, known, strict=True)
-        ]
-        shown = [
-            replace(at, colors=unlit(at.colors, surface.normals, camera, light))
-            for at, surface, camera, light in zip(shown, surfaces, cameras, lights, strict=True)
-        ]
+        lights = [view.light for view in views]
         if parts is not None:
-            sure = [
-                one.bare * at.cosine.clamp(min=0) * ~(where.features | others)
-                for at, one, where in zip(shown, known, places, strict=True)
-            ]
-            hues = [light_hue(at.colors, bare, base) for at, bare in zip(shown, sure, strict=True)]
-            images = [
-                (image / hue[:, None, None]).clamp(0, 1).to(image) for image, hue in zip(images, hues, strict=True)
-            ]
-            shown = [
-                replace(at, colors=(at.colors / hue).clamp(0, 1).to(at.colors))
-                for at, hue in zip(shown, hues, strict=True)
-            ]
-            patches = [patch_offset(at.colors, bare, base, graph) for at, bare in zip(shown, sure, strict=True)]
-            skin = [_like_skin(at, one, where, graph) for at, one, where in zip(shown, known, places, strict=True)]
-            confidence = torch.stack([one.own for one in known]) * torch.stack(skin)
+            views = [_without_patches(view, base, graph, others) for view in views]
+            images, patches = [view.image for view in views], [view.patch for view in views]
+            places = [view.places for view in views]
+            confidence = torch.stack([view.parts.own * _like_skin(view, graph) for view in views])
             if base is not None and float(confidence[:, places[0].brow].amax(0).mean()) > _BROWS:
                 base = _without_brows(base, places[0], graph)
-            cap = hair_cap(shown, places, torch.where(others, 0.0, torch.stack([one.hair for one in known])))
+            hair = torch.where(others, 0.0, torch.stack([view.parts.hair for view in views]))
+            cap = hair_cap([view.shown for view in views], places, hair)
+            pixels = [view.camera.project(view.surface.vertices) for view in views]
             if cap is None:
-                marks = [
-                    camera.project(surface.vertices[mesh.landmarks.cpu()])
-                    for surface, camera in zip(surfaces, cameras, strict=True)
-                ]
-                cap = hair_beyond(images, parts, marks, places[0])
-            bare = torch.cat([at.colors[one.bare > _BARE] for at, one in zip(shown, known, strict=True)])
+                cap = hair_beyond(images, parts, [one[mesh.landmarks.cpu()] for one in pixels], places[0])
+            bare = torch.cat([view.shown.colors[view.parts.bare > _BARE] for view in views])
             if cap is not None and len(bare):
-                heads = [camera.project(one.vertices) for one, camera in zip(surfaces, cameras, strict=True)]
-                cap = replace(cap, color=without_veil(cap.color, bare.median(0).values, images, heads))
+                cap = replace(cap, color=without_veil(cap.color, bare.median(0).values, images, pixels))
     own = base is None and bool(others.any()) and not bool(others.all())
     if own:
         confidence = torch.where(others, 0.0, torch.ones(count, len(others)) if confidence is None else confidence)
@@ -156,14 +133,57 @@ def photographed_skin(
     return Skin(colors, texture.image, fit, None if cap is None else cap.color, iris)
 
 
+@dataclass(frozen=True, eq=False)
+class _View:
+    """A photograph and what it shows of the head's vertices in even light."""
+
+    image: Tensor  # (3,H,W)
+    camera: Camera
+    surface: PosedSurface
+    places: FacePlaces
+    parts: ShownParts
+    shown: Shown
+    light: EnvironmentLight | None  # that was divided out
+    patch: Tensor  # that was added to the colours then, (V,3)
+
+
+def _lit_evenly(
+    image: Tensor,
+    camera: Camera,
+    surface: PosedSurface,
+    places: FacePlaces,
+    parts: FaceParts | None,
+    graph: VertexGraph,
+    others: Tensor,
+) -> _View:
+    shown, known = (
+        surface.shown_in(image, camera),
+        ShownParts.of(parts, camera.project(surface.vertices), places, graph),
+    )
+    light = skin_light(shown, surface.normals, camera, places.cheeks & ~others & (known.bare > _BARE))
+    shown = replace(shown, colors=unlit(shown.colors, surface.normals, camera, light))
+    return _View(image, camera, surface, places, known, shown, light, torch.zeros_like(surface.vertices))
+
+
+def _without_patches(view: _View, base: Tensor | None, graph: VertexGraph, others: Tensor) -> _View:
+    """A view without the hue of its light, and with what is to be added to its colours against shadows."""
+    shown = view.shown
+    skin = view.parts.bare * shown.cosine.clamp(min=0) * ~(view.places.features | others)
+    hue = light_hue(shown.colors, skin, base)
+    image = (view.image / hue[:, None, None]).clamp(0, 1).to(view.image)
+    shown = replace(shown, colors=(shown.colors / hue).clamp(0, 1).to(shown.colors))
+    return replace(view, image=image, shown=shown, patch=patch_offset(shown.colors, skin, base, graph))
+
+
 def _without_brows(colors: Tensor, places: FacePlaces, graph: VertexGraph) -> Tensor:
     """Vertex colours (V,3) with skin for brows: beside those of photographs a template's would be a second pair."""
     beside = graph.smoothed(colors.double(), (~places.brow).double(), _REPAINTED)
     return torch.where(places.brow[:, None], beside, colors.double()).to(colors)
 
 
-def _like_skin(shown: Shown, parts: ShownParts, places: FacePlaces, graph: VertexGraph) -> Tensor:
+def _like_skin(view: _View, graph: VertexGraph) -> Tensor:
     """0 where what is taken for skin ends in other colours than skin, as beside hair and in its shadow, (V,)."""
+    shown, parts, places = view.shown, view.parts, view.places
     bare = parts.bare * (shown.cosine > _SQUARE) * ~places.features
     if float(bare.max()) < _BARE:
         return torch.ones_like(bare)

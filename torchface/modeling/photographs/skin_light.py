@@ -27,19 +27,19 @@ _AROUND = 40  # rounds
 _SURE, _DARKEST = 0.5, 0.02
 
 
-# In linear light: what is brightest in a picture that is well exposed, what is bright of an eye's white, fair skin.
-_WHITE, _EYE_WHITE, _FAIR = 0.91, 0.46, 0.36
-_BRIGHTEST, _EYE = 0.99, 0.85  # quantiles
-_DARKER, _BRIGHTER = 0.8, 2.5  # how far a picture is developed
-_FINE = 0.6  # pixels of the parts' crop a pixel of the picture, above which an eye's white is mixed with lids
-_EYE_PIXELS = 20  # of the crop
+# In linear light: what is brightest in a picture that is well exposed, fair skin, and the white of an eye in the lids'
+# shade there: in 9 good photographs 0.31 to 0.66, in 4 dim ones 0.09 to 0.20.
+_WHITE, _FAIR, _EYE_WHITE = 0.91, 0.36, 0.3
+_BRIGHTEST, _EYE = 0.99, 0.95  # quantiles
+_BRIGHTER = 2.5  # at most
+_EYE_PIXELS = 10  # of the crop
 
 
 def exposure_gain(image: Tensor, parts: FaceParts) -> float:
     """What a photograph's light is multiplied by to be well exposed; what is too dark shows nobody's complexion.
 
-    By what is brightest in the whole picture and about the face, and by the whites of the eyes where the face is large
-    enough to show them, but not more than makes its skin fair.
+    By what is brightest in the whole picture and about the face; but not so far that its skin is more than fair, or the
+    whites of the eyes brighter than in good light: beside a dark complexion they are bright in a dim picture too.
 
     Args:
         image: sRGB, (3,H,W).
@@ -51,10 +51,9 @@ def exposure_gain(image: Tensor, parts: FaceParts) -> float:
     whole, near = (one.double().amax(0).flatten() for one in (to_linear(image), crop))
     brightest = [float(one.kthvalue(1 + int(_BRIGHTEST * (len(one) - 1))).values) for one in (whole, near)]
     gain = math.prod(max(1.0, _WHITE / max(one, 0.01)) for one in brightest) ** 0.5
-    if len(eyes) >= _EYE_PIXELS and float(torch.linalg.det(parts.transform[:, :2].double())) ** 0.5 < _FINE:
-        gain = (gain * _EYE_WHITE / max(float(eyes.quantile(_EYE)), 0.01)) ** 0.5
-    gain = min(gain, max(1.0, _FAIR / float(skin.median()))) if len(skin) else gain
-    return min(max(gain, _DARKER), _BRIGHTER)
+    limits = [_FAIR / max(float(skin.median()), 1e-3)] if len(skin) else []
+    limits += [_EYE_WHITE / max(float(eyes.quantile(_EYE)), 1e-3)] if len(eyes) >= _EYE_PIXELS else []
+    return max(1.0, min(gain, _BRIGHTER, *limits))
 
 
 def exposed(image: Tensor, parts: FaceParts) -> Tensor:
