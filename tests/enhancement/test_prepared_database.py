@@ -85,6 +85,6 @@ def test_lids_that_hardly_move_stay_those_of_the_input(model, database, monkeypa
 
     found, smoothed = moved(), model(model.low(shown))
     monkeypatch.setattr(InputLids, "_unsmoothed", lambda self, found, shown: found.new_zeros(len(found)))
-    assert found < 0.13
+    assert found < 0.15
     assert moved() > 0.3
     assert torch.equal(model(model.low(shown)), smoothed)

@@ -155,8 +155,7 @@ def test_curves_bend_in_seconds_where_frames_were_dropped(performance: Performan
     torch.testing.assert_close(solved.weights.values[..., 0], expected, atol=1e-6, rtol=0)
     assert solved.seconds.equal(take.seconds)
     shrunk = whole.solve_take(replace(take, seconds=None)).weights.values[..., 0]
-    error = (expected - true[rows]).abs().mean()
-    assert error < (shrunk - true[rows]).abs().mean()
+    assert float((shrunk - expected).abs().max()) > 0.01  # as if nothing were missing
 
 
 def test_a_variable_rate_is_solved_as_well_as_an_even_one(performance: Performance) -> None:

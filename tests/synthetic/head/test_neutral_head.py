@@ -81,6 +81,28 @@ def test_mean_head_measures_as_people_do(mean):
         assert found[name] == pytest.approx(expected, rel=0.05), name
 
 
+def test_the_profile_is_as_convex_as_peoples_and_the_lips_lie_behind_nose_and_chin(mean):
+    """Angle of glabella, subnasale and pogonion 12 degrees with a deviation of 4 (Legan and Burstone 1980); lips behind
+    the line from nose to chin, the lower one by 2 mm with a deviation of 2 (Ricketts 1968)."""
+    skin = mean.vertices[(mean.vertices[:, 0].abs() < 1) & (mean.vertices[:, 2] > 40)]
+
+    def foremost(low: float, high: float) -> Tensor:
+        rows = skin[(skin[:, 1] > low) & (skin[:, 1] < high)]
+        return rows[rows[:, 2].argmax(), 1:]
+
+    glabella, nose, upper, lower, chin = (
+        foremost(*heights) for heights in ((5, 25), (-45, -25), (-66, -57), (-80, -68), (-115, -92))
+    )
+    subnasale = mean.vertices[mean.landmarks[33], 1:]
+    up, down = glabella - subnasale, chin - subnasale
+    convexity = 180 - float(torch.rad2deg(torch.acos((up @ down) / (up.norm() * down.norm()))))
+    assert 8 < convexity < 16
+    along = torch.nn.functional.normalize(nose - chin, dim=0)
+    forward = torch.stack([-along[1], along[0]])
+    assert -4 < float((lower - chin) @ forward) < 0
+    assert -6 < float((upper - chin) @ forward) < 0
+
+
 @pytest.mark.parametrize("name", MEASURED)
 def test_two_deviations_change_the_measurement_by_what_they_say(mean, name):
     parameter = next(p for p in IDENTITY if p.name == name)

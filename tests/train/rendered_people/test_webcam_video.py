@@ -79,7 +79,7 @@ def test_lamps_room_and_looks_do_not_change_from_frame_to_frame(frames: dict[str
     marks = frames["rest"].landmarks
     brow = int(marks[17:27, 1].min()) - 2
     above = (frames["rest"].picture[:, :brow].float() - frames["open"].picture[:, :brow].float()).abs()
-    assert float(above.max()) <= 14  # compression, and an exposure that measures the whole skin
+    assert float(above.max()) <= 18  # compression, and an exposure that measures the whole skin
     below = frames["rest"].picture[:, brow:].float() - frames["open"].picture[:, brow:].float()
     assert float(below.abs().max()) > 40
 

@@ -87,7 +87,7 @@ def test_a_head_model_gets_the_shapes_on_its_own_vertices(folder: Path, rig: Ble
     assert torch.equal(made.neutral.faces, rig.neutral.faces)
     for name in SHAPES:
         a, b = (one.deltas[one.index([name])[0]] for one in (made, rig))
-        assert float((a - b).norm() / b.norm()) < 0.06, name
+        assert float((a - b).norm() / b.norm()) < 0.07, name
     landmarks = made.vertices[made.neutral.landmarks]
     assert float((landmarks - rig.vertices[rig.neutral.landmarks]).norm(dim=1).max()) < 1.0
 

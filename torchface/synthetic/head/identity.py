@@ -192,6 +192,21 @@ _FIELDS: tuple[tuple[str, str, float, float, Field], ...] = (
      * ramp(-p[:, 1], 105, 150)[:, None]),
 )  # fmt: skip
 
+# What heads have that the sculpture has not, which keeps the place of every point that networks learned: millimetres
+# along an axis (0 to the side) about a point of the left side, and how far that reaches. The profile becomes as convex
+# as people's (Legan and Burstone 1980: 12 degrees; the sculpture's 4).
+_PROPORTIONS: tuple[tuple[int, float, tuple[float, float, float], tuple[float, float, float]], ...] = (
+    (2, -5.6, (0, -104, 86), (22, 11, 40)),  # the chin stands behind the lips
+    (1, 1.6, (0, -111, 74), (24, 12, 30)),
+    (2, 1.8, (0, -54.5, 92), (20, 7, 25)),  # the skin between nose and lip before the bones
+    (0, 2.4, (60, -14, 24), (22, 24, 16)),  # the face before the ears
+    (0, 1.4, (50, -45, 20), (12, 18, 22)),
+    (0, -1.6, (47, -60, 34), (12, 14, 16)),  # the cheek beside the mouth
+    (0, 1.2, (66, 24, 42), (12, 18, 20)),  # the temple
+    (2, -1.3, (0, 50, 88), (40, 24, 40)),  # the forehead
+    (2, -0.9, (0, 14, 88), (9, 9, 20)),
+)
+
 # These four move lids and eyeball only; their fields are placed on the lid rings below.
 _EYE_PARAMETERS: tuple[tuple[str, str, float, float], ...] = (
     ("eye_width", "length of the opening between the lids, mm", 30, 1.3),
@@ -231,12 +246,35 @@ def both_sides(half_ids: Tensor) -> tuple[Tensor, Tensor]:
 
 
 @lru_cache(maxsize=1)
+def _proportions() -> Tensor:
+    """What the mean of people is beside the sculpture, (V+4,3); lids and eyeballs stay."""
+    t = topology()
+    points = torch.cat([mean_vertices(), _probes()])
+    moved = torch.zeros_like(points)
+    for axis, amount, centre, width in _PROPORTIONS:
+        outward = _side(points) if axis == 0 else torch.ones(len(points), dtype=points.dtype)
+        moved += _along(axis, amount * outward * bump(points, centre, width))
+    still = torch.zeros(len(points), 1, dtype=points.dtype)
+    for side in (0, 1):
+        still[both_sides(t.rings["eye"])[side]] = LID_SHARE[:, None, None]
+        still[both_sides(t.caps["eye"])[side]] = 1.0
+        still[_eyeball_ids(side)] = 1.0
+    return (1 - still) * moved
+
+
+def _probes() -> Tensor:
+    """The mean's eyes and joints of the jaw, left before right, (4,3)."""
+    probes = torch.tensor([EYE_CENTRE, EYE_CENTRE, HINGE, HINGE], dtype=torch.float64)
+    probes[1::2, 0] *= -1
+    return probes
+
+
+@lru_cache(maxsize=1)
 def _modes() -> tuple[Tensor, Tensor, Tensor]:
     """Displacement a standard deviation (K,V+4,3), lid share (V,), share by which lids keep to the eyeball (V,)."""
     t = topology()
     mean = mean_vertices()
-    probes = torch.tensor([EYE_CENTRE, EYE_CENTRE, HINGE, HINGE], dtype=torch.float64)
-    probes[1::2, 0] *= -1
+    probes = _probes()
     points = torch.cat([mean, probes])
     parts = _parts(len(points))
     modes = torch.stack([field(points, parts) * deviation for _, _, _, deviation, field in _FIELDS])
@@ -321,11 +359,9 @@ def anatomy(identity: Tensor | None = None) -> Anatomy:
     t = topology()
     modes, _, keep = _modes()
     mean = mean_vertices()
-    moved = torch.einsum("k,kvc->vc", coefficients, modes)
+    moved = _proportions() + torch.einsum("k,kvc->vc", coefficients, modes)
     vertices = mean + moved[: t.count]
-    probes = torch.tensor([EYE_CENTRE, EYE_CENTRE, HINGE, HINGE], dtype=torch.float64)
-    probes[1::2, 0] *= -1
-    probes = probes + moved[t.count :]
+    probes = _probes() + moved[t.count :]
     radius = EYE_RADIUS + coefficients[-1] * IDENTITY[-1].standard_deviation
     # Lids lie on the eyeball however it moved or grew; the eyeball itself stays round.
     for side in (0, 1):
