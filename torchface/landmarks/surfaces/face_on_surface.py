@@ -28,7 +28,8 @@ _LEAST_POINTS = 12
 _SLANTED = 0.25  # cosine between ray and normal below which a hit says nothing
 _ASTRAY = 0.5  # of the eyes' distance: a view's hit that is further from the median of all is left out
 _TRIED = 3  # places that are looked at from near
-_HOLE, _MOST_HOLES = 0.5, 0.35  # of the eyes' distance behind where a face has a point; the share of such points
+_HOLE, _AROUND_OPENING = 0.5, 0.25  # of the eyes' distance: behind where a face has a point, and round eyes and mouth
+_OPENINGS = (slice(36, 42), slice(42, 48), slice(48, 68))
 _LOST = 0.07  # of the eyes' distance: what is off by more on the reference is no habit of the finder
 _PRESENCE, _MISFIT = 0.7, 0.35
 _DOUBT = 0.2  # above it other places are looked at too, from all around and in clay; most faces are below
@@ -195,7 +196,7 @@ class FaceSearch:
         eyes = float((self.reference.landmarks[_EYES[0]] - self.reference.landmarks[_EYES[1]]).norm())
         inner = self.reference.landmarks[INNER].double()
         pose, misfit = _robust_pose(inner, hits)
-        holes = _through_holes((pose.inverse().apply(hits)[0] - inner)[:, 2] / eyes)
+        holes = _through_holes(inner, pose.inverse().apply(hits)[0], self.reference.landmarks)
         if holes.any():
             pose, misfit = _robust_pose(inner, hits.masked_fill(holes[:, None], torch.nan))
         middle = pose.apply(self.reference.landmarks[INNER].double().mean(0)[None])[0, 0]
@@ -223,7 +224,7 @@ class FaceSearch:
                 bias[bias.norm(dim=-1) > _LOST * eyes] = 0.0
                 bias[:COUNT] = 0.0  # the 68 follow annotators' habits, not the reference's vertices
             found = found - torch.nan_to_num(bias)
-            found[_through_holes((found - reference)[:, 2] / eyes)] = torch.nan
+            found[_through_holes(reference, found, self.reference.landmarks)] = torch.nan
             if int(torch.isfinite(found).all(-1).sum()) < _LEAST_POINTS:
                 break
             better, _ = _robust_pose(reference[INNER.start :], found[INNER.start :])
@@ -352,14 +353,18 @@ def _together(points: Sequence[Tensor], weights: Sequence[Tensor], astray: float
     return mean.masked_fill((total <= 0)[:, None], torch.nan)
 
 
-def _through_holes(behind: Tensor) -> Tensor:
-    """Which points (N,) lie so far behind a face that they are seen through its eyes or mouth; none if many do.
+def _through_holes(reference: Tensor, points: Tensor, landmarks: Tensor) -> Tensor:
+    """Which points (N,) of eyes and mouth lie so far behind a face that they are seen through holes there.
 
     Args:
-        behind: depth beside the reference, in distances of the eyes, (N,) with NaN.
+        reference: where a head has them, (N,3).
+        points: in its place, (N,3) with NaN.
+        landmarks: iBUG's 68 of the head, (68,3).
     """
-    holes = behind < -_HOLE
-    return holes & (float(holes.double().sum()) < _MOST_HOLES * float(torch.isfinite(behind).sum()))
+    eyes = (landmarks[_EYES[0]] - landmarks[_EYES[1]]).norm()
+    openings = torch.stack([landmarks[one].double().mean(0) for one in _OPENINGS])
+    near = torch.cdist(reference, openings).amin(1) < _AROUND_OPENING * eyes
+    return near & ((points - reference)[:, 2] < -_HOLE * eyes)
 
 
 def _robust_pose(reference: Tensor, points: Tensor) -> tuple[Similarity, float]:
