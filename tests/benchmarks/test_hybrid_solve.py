@@ -29,8 +29,11 @@ from train.filmed_performers.camera_stage import SIDE_MARKERS, StageSettings, re
 from train.filmed_performers.head_camera_images import MARKER_RADIUS
 
 OUT = Path(__file__).resolve().parents[2] / "out" / "hybrid"
-LED = ("4", "9", "6+43", "18L")
-"""Units that lead the solve: what markers between the brows, round the eyes and on the lips do not show."""
+LED = ("4", "9", "6+43", "45", "18L", "18R")
+"""Units that lead the solve: what markers between the brows, round the eyes and on the lips do not show.
+
+Those that share a shape are led together: where one of them is not, the shape is at rest while it is performed.
+"""
 LED_SHAPES = tuple(dict.fromkeys(shape for unit in LED for shape in MOVES[unit]))
 FLAWS = StageFlaws(noise=0.3, standoff=MARKER_RADIUS)
 TAKE = PerformanceSettings(repetitions=2, combination_repetitions=1)
@@ -184,7 +187,7 @@ def test_where_markers_are_blind(classifier: ActionUnitClassifier, number: int) 
             print(f"{'led units' if units else 'all units'} lead{', at rest too' if at_rest else ''}")
             found = solved(classifier, one, units, at_rest)
             led, others = shares(found)
-            assert not at_rest or (led <= 0.5 and others <= 1.05)
+            assert not at_rest or (led <= 0.55 and others <= 1.05)
             assert jerk(found.hybrid) <= jerk(found.alone)
     led_shapes, other_shapes = led_rows(one)
     true = one.weights
