@@ -9,6 +9,7 @@ from torch import Tensor
 from torchface.geometry.meshes.rasterization import rasterise_uvs
 from torchface.mesh import Mesh
 from torchface.registration import register
+from torchface.registration.scan_colors import with_edge_of_hair
 
 
 def paint(points: Tensor) -> Tensor:
@@ -99,3 +100,18 @@ def test_a_texture_of_one_texel_colours_everything_alike(mask: Mesh, finer: Mesh
     result = register(mask, one, given(mask), texture_size=32)
     assert torch.allclose(result.mesh.colors, torch.tensor([0.2, 0.4, 0.6]).expand(len(mask.vertices), 3))
     assert torch.allclose(result.mesh.texture.amin((1, 2)), result.mesh.texture.amax((1, 2)))
+
+
+def test_hair_beside_what_is_unseen_is_not_shown_and_a_mole_is(mask: Mesh) -> None:
+    height = mask.vertices[:, 1]
+    colors = torch.full((len(height), 3), 0.6)
+    unseen, strands = height > height.max() - 20, height > height.max() - 28
+    colors[strands] = 0.05
+    mole = int((mask.vertices[:, :2] - torch.tensor([10.0, -30.0])).norm(dim=1).argmin())
+    colors[mole] = 0.05
+    covered = with_edge_of_hair(unseen, colors, ~unseen, mask.faces)
+    assert bool(covered[strands].all())
+    assert not bool(covered[mole])
+    assert not bool(covered[height < height.max() - 60].any())
+    bare = torch.full_like(colors, 0.6)
+    assert torch.equal(with_edge_of_hair(unseen, bare, ~unseen, mask.faces), unseen)  # a hole in the scan

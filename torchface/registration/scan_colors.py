@@ -7,10 +7,12 @@ import torch
 from scipy.spatial import cKDTree
 from torch import Tensor
 
+from torchface.color_space import to_linear
 from torchface.errors import TopologyError
 from torchface.geometry.meshes.operators import vertex_normals
 from torchface.geometry.meshes.rasterization import interpolate, rasterise_uvs
 from torchface.geometry.meshes.surface_index import SurfacePoints
+from torchface.geometry.meshes.vertex_graph import VertexGraph
 from torchface.mesh import Mesh
 from torchface.rendering.clay_shading import sample_texture
 from torchface.rendering.raycast import RayCaster
@@ -18,6 +20,8 @@ from torchface.rendering.raycast import RayCaster
 _REACH = 5.0
 _BLEND = 10.0
 _MAX_ANGLE = 75.0
+_DARK = 0.25  # of the skin's light
+_STRANDS, _SHADOW = 3, 2  # rings of vertices
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,6 +86,30 @@ def shown_share(vertices: Tensor, unseen: Tensor) -> Tensor:
     gap, _ = cKDTree(vertices[unseen].numpy()).query(vertices.numpy())
     ramp = (torch.from_numpy(gap).float() / _BLEND).clamp(0, 1)
     return ramp.square() * (3 - 2 * ramp)
+
+
+def with_edge_of_hair(unseen: Tensor, shown: Tensor, matched: Tensor, faces: Tensor) -> Tensor:
+    """Unseen vertices (V,) and those beside them that hair covers or darkens: what is dark up to the first skin.
+
+    Args:
+        shown: colours of the scan nearest to each vertex, (V,3).
+        matched: which vertices lie on the scan's skin, (V,) bool.
+    """
+    if not matched.any() or not unseen.any():
+        return unseen
+    light = to_linear(shown.double()).mean(1)
+    dark, graph = light < _DARK * light[matched].median(), VertexGraph(faces, len(shown))
+
+    def beside(mask: Tensor) -> Tensor:
+        return graph.sum(mask.double()[:, None])[:, 0] > 0
+
+    covered = unseen
+    for _ in range(_STRANDS):  # rings of neighbours
+        covered = covered | (dark & beside(covered))
+    edge = dark & covered
+    for _ in range(_SHADOW):
+        edge = edge | beside(edge)
+    return covered | edge
 
 
 def resampled_texture(mesh: Mesh, colors: Tensor, shown: Tensor, source: ScanColors, size: int) -> Tensor:

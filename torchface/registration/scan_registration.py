@@ -32,6 +32,7 @@ from torchface.registration.scan_colors import (
     shown_share,
     skin_base,
     vertex_colors,
+    with_edge_of_hair,
 )
 from torchface.registration.scan_completion import completed_colors, completed_form
 from torchface.registration.scan_preparation import (
@@ -398,7 +399,9 @@ def _colored(
 ) -> Mesh:
     colors = vertex_colors(source, nearest, matched)
     place, faces = mesh.vertices.detach().cpu().double(), mesh.faces.cpu()
-    shown = shown_share(place, unseen)
+    shown = shown_share(
+        place, with_edge_of_hair(unseen, source.at(nearest.triangle, nearest.barycentric), matched, faces)
+    )
     # The last skin before hair is in its shadow: the fill starts where the scan's colours count in full.
     filled = completed_colors(colors, skin_base(colors, template, matched), place, faces, shown < 1)
     colors = torch.lerp(filled, colors, shown[:, None])

@@ -13,10 +13,11 @@ from torchface.geometry.similarity import Similarity, similarity_transform
 from torchface.io.rigs.ict_facekit import load_ict_facekit, load_identity_modes
 from torchface.mesh import Mesh
 from torchface.modeling import InnerParts, clear_parts, inner_parts, place_parts, shape_depths, transfer_with_report
-from torchface.modeling.rigging.part_placement import with_placed_parts
+from torchface.modeling.rigging.part_placement import with_mouth_behind_skin, with_placed_parts
 from torchface.modeling.rigging.penetration import TOLERANCE
 from torchface.modeling.rigging.transfer_system import ShapeTransfer
 from torchface.registration import Registration
+from torchface.rendering.raycast import RayCaster
 from torchface.rig import BlendshapeRig
 from torchface.synthetic.head.identity import IDENTITY
 from torchface.synthetic.head.performer import performer
@@ -154,6 +155,32 @@ def test_a_registration_that_bent_eyeballs_gets_round_ones_behind_the_lids() -> 
     off = (found[balls] - eyes(template, parts, true.with_vertices(found))[0][parts.group]).norm(dim=-1)
     own = (true.vertices[balls].double() - centres[parts.group]).norm(dim=-1)
     assert float((off - own * off.mean() / own.mean()).abs().max()) < 0.1
+
+
+@pytest.mark.parametrize("pose", ["rest", "open"])
+def test_a_mouth_that_came_through_the_chin_lies_behind_it_again(pose: str) -> None:
+    rig = performer(texture=False)
+    head = rig.neutral
+    if pose == "open":
+        head = head.with_vertices(head.vertices + rig.deltas[rig.names.index("jawOpen")])
+    assert head.annotations is not None
+    assert torch.equal(with_mouth_behind_skin(head).vertices, head.vertices)
+    bag = head.annotations.regions["mouth_interior"]
+    floor = bag & (head.vertices[:, 1] < head.vertices[bag, 1].min() + 6)
+    spoiled = head.vertices.clone()
+    spoiled[floor, 2] += 14.0
+    mended = with_mouth_behind_skin(head.with_vertices(spoiled)).vertices
+    skin = head.faces[~bag[head.faces].any(1)]
+
+    def shown(vertices: Tensor) -> int:
+        at = vertices[floor].double()
+        return int(
+            (RayCaster(vertices.double(), skin).cast(at, at.new_tensor([0.0, 0, 1]).expand_as(at)).triangle < 0).sum()
+        )
+
+    assert shown(spoiled) > 5
+    assert shown(mended) == 0
+    assert torch.equal(mended[~bag], spoiled[~bag])
 
 
 @pytest.mark.bench

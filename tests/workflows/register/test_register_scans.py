@@ -19,7 +19,7 @@ from torchface.errors import FileFormatError, MissingExtraError, ShapeError, Top
 from torchface.files import content_keys
 from torchface.io import load_mesh, save_mesh
 from torchface.io.landmarks.picks import Correspondences, save_correspondences
-from torchface.mesh import Mesh
+from torchface.mesh import Annotations, Mesh
 from torchface.registration import Level, Schedule, Stage, register
 from torchface.registration.landmark_files import load_scan_landmarks
 from torchface.registration.model_fit import LinearShape
@@ -78,6 +78,33 @@ def test_each_result_is_what_register_gives_for_that_scan(template: Mesh, scans:
         assert found.annotations is not None
         assert torch.equal(found.landmarks, template.landmarks)
         assert entry.figures["median_mm"] == pytest.approx(alone.record.median_distance, rel=1e-6)
+
+
+def test_a_loose_part_that_the_scan_does_not_show_keeps_the_templates_colours(
+    template: Mesh, rescanned: Callable[..., Mesh], tmp_path: Path
+) -> None:
+    """As hair and a shirt of a character do: the scan's colours were spread over them."""
+    scan = rescanned(template, 0)
+    save_mesh(replace(scan, colors=torch.full_like(scan.vertices, 0.5).float()), tmp_path / "grey.ply")
+    count = len(template.vertices)
+    part = torch.tensor([[0.0, 0, -400], [10, 0, -400], [0, 10, -400], [0, 0, -410]]).to(template.vertices)
+    faces = count + torch.tensor([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]])
+    colors = torch.cat([torch.full((count, 3), 0.7), torch.tensor([0.1, 0.2, 0.9]).expand(4, 3)])
+    whole = Mesh(
+        torch.cat([template.vertices, part]),
+        torch.cat([template.faces, faces]),
+        colors=colors,
+        annotations=Annotations(landmarks=template.landmarks),
+    )
+    points = tmp_path / "grey.ljson"
+    listed = template.vertices[template.landmarks].tolist()
+    points.write_text(json.dumps({"version": 2, "labels": [], "landmarks": {"points": listed}}))
+    settings = ScanSettings(landmarks=points, schedule=SHORT, texture_size=0)
+    report = register_scans(whole, [tmp_path / "grey.ply"], tmp_path / "out", settings)
+    found = load_mesh(report.done[0].results[0])
+    assert found.colors is not None
+    torch.testing.assert_close(found.colors[count:], colors[count:], atol=0.01, rtol=0)
+    assert float((found.colors[:count] - 0.5).abs().median()) < 0.02
 
 
 def test_bad_scans_are_told_and_skipped(scans: Path, done: BatchReport) -> None:

@@ -6,7 +6,8 @@ import torch
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from torchface.geometry.meshes.operators import triangle_normals
+from torchface.geometry.meshes.operators import components, triangle_normals
+from torchface.geometry.meshes.vertex_graph import VertexGraph
 from torchface.geometry.similarity import Similarity, similarity_transform
 from torchface.mesh import Mesh
 from torchface.modeling.rigging.part_clearance import Clearance
@@ -26,6 +27,7 @@ _OUTLIER = 2.0
 _HOSTS = 8
 _MAX_RISE, _MAX_DROP = 1.0, 0.2
 _NOTHING = 1e-3
+_BEHIND_SKIN, _SPREAD = 0.5, 8  # millimetres, rings of vertices
 
 
 def place_parts(template: BlendshapeRig, neutral: Mesh, parts: InnerParts) -> Mesh:
@@ -97,8 +99,41 @@ def with_placed_parts(template: Mesh, registration: Registration) -> Registratio
         return registration
     upright = registration.pose.inverse().apply(registration.mesh.vertices.detach().cpu().double())[0]
     placed = place_parts(rig, template.with_vertices(upright.to(template.vertices)), parts)
-    vertices = registration.pose.apply(placed.vertices.detach().cpu().double())[0]
+    inside = with_mouth_behind_skin(placed).vertices.detach().cpu().double()
+    vertices = registration.pose.apply(inside)[0]
     return replace(registration, mesh=registration.mesh.with_vertices(vertices.to(registration.mesh.vertices)))
+
+
+def with_mouth_behind_skin(head: Mesh) -> Mesh:
+    """A head whose mouth, where it has come through lip or chin, lies behind the skin again; its rim stays.
+
+    Args:
+        head: with the region ``mouth_interior``, upright: z points forward.
+    """
+    regions = {} if head.annotations is None else head.annotations.regions
+    if "mouth_interior" not in regions:
+        return head
+    bag, faces = regions["mouth_interior"].cpu(), head.faces.cpu()
+    vertices = head.vertices.detach().cpu().double()
+    rows = bag.nonzero()[:, 0]
+    front = vertices[rows].clone()
+    front[:, 2] = vertices[:, 2].amax() + 1
+    back = front.new_tensor([0.0, 0.0, -1.0]).expand_as(front)
+    label = components(faces, len(vertices))
+    skin = faces[(label == label[rows].mode().values)[faces].all(1) & ~bag[faces].any(1)]
+    hits = RayCaster(vertices, skin).cast(front, back)
+    # Between parted lips a ray meets the head's back from inside.
+    met = (hits.triangle >= 0) & (triangle_normals(vertices, skin)[hits.triangle.clamp(min=0), 2] > 0)
+    depth = torch.where(met, front[:, 2] - hits.distance - _BEHIND_SKIN, torch.inf)
+    moved = torch.zeros(len(vertices), 1, dtype=torch.float64)
+    least = (depth - vertices[rows, 2]).clamp(max=0)[:, None]
+    if not bool((least < -_BEHIND_SKIN).any()):
+        return head
+    graph = VertexGraph(faces, len(vertices))
+    for _ in range(_SPREAD):  # rings of neighbours
+        moved[rows] = torch.minimum(least, (graph.sum(moved) / graph.degree[:, None])[rows])
+    vertices[:, 2:] += moved
+    return head.with_vertices(vertices.to(head.vertices))
 
 
 def _following(aligned: Tensor, found: Tensor, parts: InnerParts, body: Tensor) -> Tensor:

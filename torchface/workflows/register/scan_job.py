@@ -20,7 +20,7 @@ from torchface.modeling.rigging.part_placement import with_placed_parts
 from torchface.registration.landmark_files import landmark_file, load_scan_landmarks
 from torchface.registration.model_fit import LinearShape
 from torchface.registration.nonrigid.schedule import Schedule
-from torchface.registration.registered_mesh import in_place_of
+from torchface.registration.registered_mesh import hidden_parts, in_place_of, with_template_skin
 from torchface.registration.scan_colors import without_colors
 from torchface.registration.scan_registration import Registration, register
 from torchface.rendering.clay_shading import render
@@ -32,7 +32,7 @@ from torchface.workflows.batch.batch_items import BatchItem
 from torchface.workflows.batch.contact_sheet import HEIGHT, WIDTH
 from torchface.workflows.batch.outcomes import Made
 
-_METHOD = "register/5"
+_METHOD = "register/6"
 """What results are made with; another number where the same scan and settings come to give another result."""
 _MAX_DISTANCE = 1.0  # end of the distance maps' scale, millimetres
 
@@ -109,7 +109,10 @@ class ScanJob:
             schedule=self.schedule,
             texture_size=self.texture_size,
         )
-        return with_placed_parts(self.template, registration), 0 if landmarks is None else len(landmarks[0])
+        found = with_placed_parts(self.template, registration)
+        hidden = hidden_parts(self.template, found.matched)
+        found = replace(found, mesh=with_template_skin(found.mesh, self.template, hidden))
+        return found, 0 if landmarks is None else len(landmarks[0])
 
     def _picture(self, registration: Registration) -> Tensor:
         """The face from the template's front, its lines, and its distances to the scan, (3,H,W)."""

@@ -42,6 +42,7 @@ from torchface.modeling import (
 )
 from torchface.modeling.rigging.example_rigging import RiggingSchedule
 from torchface.modeling.rigging.part_clearance import Penetration, penetration
+from torchface.modeling.rigging.part_placement import with_mouth_behind_skin
 from torchface.progress import Progress, silent
 from torchface.registration import Registration, hidden_parts, in_place_of, register, with_template_skin
 from torchface.registration.landmark_files import landmark_file, load_scan_landmarks
@@ -205,7 +206,7 @@ def _rig_actor(
     )
     neutral = _at_rest(rig, shown, _upright(registration, rig.neutral))
     parts = inner_parts(rig)
-    neutral = place_parts(rig, neutral, parts)
+    neutral = with_mouth_behind_skin(place_parts(rig, neutral, parts))
     neutral = with_template_skin(neutral, rig.neutral, hidden_parts(rig.neutral, registration.matched))
     transferred = transfer_with_report(rig, neutral, progress=progress)
     actor: BlendshapeRig = transferred.rig
