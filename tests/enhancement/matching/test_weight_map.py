@@ -97,7 +97,7 @@ def test_frames_of_the_database_come_back(scene: Scene, model: EnhancementModel)
     some = slice(0, LEARNED * EACH)
     found = model.enhance(scene.coarse[some], rig_weights=scene.weights[some]).vertices
     left = (found - scene.frames[some]).norm() / (scene.frames - scene.coarse)[some].norm()
-    assert float(left) < 0.04
+    assert float(left) < 0.06
     rest = model.enhance(scene.rig.vertices[None], rig_weights=torch.zeros(1, len(NAMES))).vertices
     assert torch.allclose(rest[0], scene.rig.vertices, atol=2e-3)
 

@@ -168,3 +168,20 @@ def test_a_dark_complexion_stays_dark_before_a_dark_wall() -> None:
 
     assert gain(0.25, 0.6) == pytest.approx(1.0, abs=0.05)  # its eyes are as bright as in good light
     assert gain(0.35, 0.35) > 2.0  # fair in a dim picture: its eyes are dim too
+
+
+def test_blush_on_both_cheeks_stays_and_light_on_one_goes(head: Mesh) -> None:
+    graph, places = VertexGraph(head.faces, len(head.vertices)), FacePlaces.of(head)
+    assert head.colors is not None
+    assert head.annotations is not None
+    skin, mirror = places.cheeks.double(), head.annotations.mirror
+    left = (places.place - places.place.new_tensor([0.5, -0.5, 0.0]))[:, :2].norm(dim=1) < 0.25
+    assert mirror is not None
+    red = torch.tensor([1.12, 1.0, 0.9])
+
+    def change(where: Tensor) -> float:
+        colors = torch.where(where[:, None], head.colors * red, head.colors)
+        return float(patch_offset(colors, skin, head.colors, graph, mirror)[where & places.cheeks].abs().mean())
+
+    assert change(left | left[mirror]) < 0.001
+    assert change(left) > 0.004

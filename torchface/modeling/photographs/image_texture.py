@@ -103,7 +103,8 @@ def photographed_skin(
         ]
         lights = [view.light for view in views]
         if parts is not None:
-            views = [_without_patches(view, base, graph, others) for view in views]
+            mirror = None if mesh.annotations is None else mesh.annotations.mirror
+            views = [_without_patches(view, base, graph, others, mirror) for view in views]
             images, patches = [view.image for view in views], [view.patch for view in views]
             places = [view.places for view in views]
             confidence = torch.stack([view.parts.own * _like_skin(view, graph) for view in views])
@@ -165,14 +166,16 @@ def _lit_evenly(
     return _View(image, camera, surface, places, known, shown, light, torch.zeros_like(surface.vertices))
 
 
-def _without_patches(view: _View, base: Tensor | None, graph: VertexGraph, others: Tensor) -> _View:
+def _without_patches(
+    view: _View, base: Tensor | None, graph: VertexGraph, others: Tensor, mirror: Tensor | None
+) -> _View:
     """A view without the hue of its light, and with what is to be added to its colours against shadows."""
     shown = view.shown
     skin = view.parts.bare * shown.cosine.clamp(min=0) * ~(view.places.features | others)
     hue = light_hue(shown.colors, skin, base)
     image = (view.image / hue[:, None, None]).clamp(0, 1).to(view.image)
     shown = replace(shown, colors=(shown.colors / hue).clamp(0, 1).to(shown.colors))
-    return replace(view, image=image, shown=shown, patch=patch_offset(shown.colors, skin, base, graph))
+    return replace(view, image=image, shown=shown, patch=patch_offset(shown.colors, skin, base, graph, mirror))
 
 
 def _without_brows(colors: Tensor, places: FacePlaces, graph: VertexGraph) -> Tensor:

@@ -21,7 +21,9 @@ _HELD = (0.0, *(0.02,) * 3, *(0.10,) * 5)
 _HELD_TO_GREY = 0.3
 _FAINT, _BRIGHT, _TINT = 0.4, 2.2, 1.12  # beside the mean: what the estimate may divide by
 _PATCH = 4  # rounds over the mesh: what is smaller is the skin's own
-_OWN_TONE, _OWN_HUE = 0.12, 0.08  # logarithms of sRGB by which one person's skin differs over the face
+# Logarithms of sRGB by which one person's skin differs over the face, and half of that between its sides.
+_OWN_TONE, _OWN_HUE, _TWIN = 0.2, 0.12, 0.04
+_BOTH = 0.2  # share of skin from which both sides are compared
 _PEOPLE_HUE = (0.15, 0.06, 0.15)  # of the channels, by which skins of people differ from the colour model
 _AROUND = 40  # rounds
 _SURE, _DARKEST = 0.5, 0.02
@@ -129,16 +131,20 @@ def light_hue(colors: Tensor, skin: Tensor, tone: Tensor | None) -> Tensor:
     return (hue - torch.maximum(torch.minimum(hue, limit), -limit)).exp()
 
 
-def patch_offset(colors: Tensor, skin: Tensor, tone: Tensor | None, graph: VertexGraph) -> Tensor:
+def patch_offset(
+    colors: Tensor, skin: Tensor, tone: Tensor | None, graph: VertexGraph, mirror: Tensor | None = None
+) -> Tensor:
     """What takes away shadows that the face throws on itself and highlights that ``skin_light`` leaves, (V,3).
 
-    One person's skin differs little over the face: colours that lie further from its tone than that are brought near
-    it, brightness and hue apart. What is no skin takes the offset of the skin around it.
+    One person's skin differs little over the face, and alike on both sides, as blush and stubble do: colours that lie
+    further from its tone than that are brought near it, sooner where the other side differs; brightness and hue apart.
+    What is no skin takes the offset of the skin around it.
 
     Args:
         colors: in even light, sRGB (V,3).
         skin: how surely each vertex is seen to be skin, (V,) in [0,1].
         tone: of a skin like it, (V,3); one for all vertices if absent.
+        mirror: of each vertex its twin on the other side, (V,).
 
     Returns:
         To be added to the colours, so that grain in dark places is not multiplied.
@@ -149,12 +155,21 @@ def patch_offset(colors: Tensor, skin: Tensor, tone: Tensor | None, graph: Verte
     like = torch.zeros_like(broad) if tone is None else _log(graph.smoothed(tone.double(), skin, _PATCH))
     apart = _log(broad) - like
     own = apart[skin > _SURE].median(0).values
-    level = (apart - own).mean(1, keepdim=True)
-    hue = apart - own - level
-    wanted = (like + own + level.clamp(-_OWN_TONE, _OWN_TONE) + hue.clamp(-_OWN_HUE, _OWN_HUE)).exp()
+    apart = apart - own
     seen = graph.smoothed(skin[:, None], torch.ones_like(skin), _PATCH).clamp(max=1)
-    offset = wanted - broad
+    twin = torch.zeros_like(apart)
+    if mirror is not None:
+        both = torch.minimum(seen, seen[mirror])
+        twin = torch.where(both > _BOTH, 0.5 * (apart - apart[mirror]), 0.0)
+    wanted = like + own + _limited(apart - twin, _OWN_TONE, _OWN_HUE) + _limited(twin, _TWIN, _TWIN)
+    offset = wanted.exp() - broad
     return torch.lerp(graph.smoothed(offset, seen[:, 0], _AROUND), offset, seen)
+
+
+def _limited(apart: Tensor, tone: float, hue: float) -> Tensor:
+    """Differences (V,3) of colours, limited in brightness and in hue."""
+    level = apart.mean(1, keepdim=True)
+    return level.clamp(-tone, tone) + (apart - level).clamp(-hue, hue)
 
 
 def _log(colors: Tensor) -> Tensor:

@@ -43,7 +43,7 @@ def error_with(rig: BlendshapeRig, sites: Attachment, take: Take, true: Tensor) 
 
 def check_fit(performance: Performance, space: Similarity) -> None:
     rig, attachment, takes = performance
-    performance = (rig, attachment, [takes[0][::12], takes[1][::12]])
+    performance = (rig, attachment, [takes[0][::10], takes[1][::10]])
     start = misplaced(rig, attachment, torch.Generator().manual_seed(1))
     assert float(site_distances(rig, start, attachment).min()) > 1.9
     fit = fit_attachment(rig, filmed(performance, 0, space), start)
@@ -54,7 +54,7 @@ def check_fit(performance: Performance, space: Similarity) -> None:
     assert abs(float(fit.alignment.scale * space.scale) - 1) < 0.01
     # Another take, the helmet put on anew.
     again = Similarity(space.scale, space.rotation.transpose(1, 2), -space.translation)
-    take, true = filmed(performance, 1, again, 2), takes[1][::12]
+    take, true = filmed(performance, 1, again, 2), takes[1][::10]
     ours = error_with(rig, fit.attachment, take, true)
     assert ours <= 0.6 * error_with(rig, by_nearest_vertex(rig, start), take, true)
 

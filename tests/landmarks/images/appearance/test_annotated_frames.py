@@ -56,7 +56,8 @@ def test_more_frames_hold_the_fewer_and_poses_do_not_matter(performance: tuple[t
     angle = math.radians(17)
     turn = torch.tensor([[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]])
     again = choose_frames(3 * landmarks @ turn + 40, 12)
-    assert torch.equal(again[1:], chosen[1:])  # several frames show the face at rest, any may be the first
+    # Several frames show the face at rest, any may be the first; beside an extreme lie frames as good.
+    assert int((again[1:] - chosen[1:]).abs().max()) <= 2
 
 
 def test_lost_and_astray_frames_are_left_out(performance: tuple[torch.Tensor, torch.Tensor]) -> None:

@@ -79,7 +79,7 @@ def test_every_frame_is_tracked_near_the_truth(trees: LandmarkTrees, film: tuple
     assert calls == [("tracking landmarks", t + 1, 12) for t in range(12)]
     assert ((track.confidence > 0) & (track.confidence <= 1)).all()
     sure = track.confidence > track.confidence.median()
-    assert off[sure].mean() < 0.7 * off[~sure].mean()  # confidence says which landmarks are off
+    assert off[sure].mean() < 0.8 * off[~sure].mean()  # confidence says which landmarks are off
 
 
 def test_the_past_alone_counts(trees: LandmarkTrees, film: tuple[Tensor, Tensor]) -> None:
