@@ -9,7 +9,7 @@ from torch import Tensor
 from torchface.geometry.meshes.rasterization import rasterise_uvs
 from torchface.mesh import Mesh
 from torchface.registration import register
-from torchface.registration.scan_colors import with_edge_of_hair
+from torchface.registration.scan_colors import skin_base, with_edge_of_hair
 
 
 def paint(points: Tensor) -> Tensor:
@@ -115,3 +115,20 @@ def test_hair_beside_what_is_unseen_is_not_shown_and_a_mole_is(mask: Mesh) -> No
     assert not bool(covered[height < height.max() - 60].any())
     bare = torch.full_like(colors, 0.6)
     assert torch.equal(with_edge_of_hair(unseen, bare, ~unseen, mask.faces), unseen)  # a hole in the scan
+
+
+def test_what_is_unseen_has_the_templates_texture_in_the_tone_of_the_skin_alone(mask: Mesh) -> None:
+    count = len(mask.vertices)
+    part = torch.tensor([[0.0, 0, -400], [10, 0, -400], [0, 10, -400]]).to(mask.vertices)
+    whole = Mesh(torch.cat([mask.vertices, part]), torch.cat([mask.faces, count + torch.tensor([[0, 1, 2]])]))
+    place = torch.cat([mask.vertices[:, 1] > 0, torch.tensor([False] * 3)])
+    uvs = torch.where(place[:, None], torch.tensor([0.75, 0.5]), torch.tensor([0.25, 0.5]))
+    texture = torch.full((3, 8, 8), 0.4)
+    texture[:, :, 4:] = 0.1  # hair
+    template = replace(whole, uvs=uvs, uv_faces=whole.faces, texture=texture)
+    colors = torch.full((count + 3, 3), 0.6)
+    colors[count:] = 0.01  # a black shirt
+    seen = ~place
+    base = skin_base(colors, template, seen)
+    assert float((base[:count][~place[:count]] - 0.6).abs().max()) < 0.01
+    assert float((base[place] - 0.15).abs().max()) < 0.01

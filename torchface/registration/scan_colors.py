@@ -9,7 +9,7 @@ from torch import Tensor
 
 from torchface.color_space import to_linear
 from torchface.errors import TopologyError
-from torchface.geometry.meshes.operators import vertex_normals
+from torchface.geometry.meshes.operators import components, vertex_normals
 from torchface.geometry.meshes.rasterization import interpolate, rasterise_uvs
 from torchface.geometry.meshes.surface_index import SurfacePoints
 from torchface.geometry.meshes.vertex_graph import VertexGraph
@@ -72,11 +72,24 @@ def vertex_colors(source: ScanColors, nearest: SurfacePoints, trusted: Tensor) -
 
 def skin_base(colors: Tensor, template: Mesh, seen: Tensor) -> Tensor:
     """What is painted where nothing is seen, (V,3): the template's colours in the person's tone, else skin colour."""
-    skin = colors[seen].median(0).values if seen.any() else colors.mean(0)
-    if template.colors is None:
+    label = components(template.faces.cpu(), len(colors))
+    seen = seen & (label == label.bincount().argmax())  # neither a shirt nor hair
+    skin, own = colors[seen].median(0).values if seen.any() else colors.mean(0), own_colors(template)
+    if own is None:
         return skin.expand(len(colors), 3)
-    own = template.colors.detach().cpu().to(colors)
+    own = own.to(colors)
     return (own * (skin / own[seen].median(0).values.clamp(min=1e-3))).clamp(0, 1) if seen.any() else own
+
+
+def own_colors(mesh: Mesh) -> Tensor | None:
+    """Vertex colours (V,3) of a mesh: its own, else those of its texture."""
+    if mesh.colors is not None:
+        return mesh.colors.detach().cpu().float()
+    if mesh.texture is None or mesh.uvs is None or mesh.uv_faces is None:
+        return None
+    row = torch.zeros(len(mesh.vertices), dtype=torch.int64)
+    row[mesh.faces.cpu().flatten()] = mesh.uv_faces.cpu().flatten()
+    return sample_texture(mesh.texture.cpu(), mesh.uvs.cpu()[row])
 
 
 def shown_share(vertices: Tensor, unseen: Tensor) -> Tensor:

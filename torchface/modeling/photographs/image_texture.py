@@ -20,8 +20,8 @@ from torchface.modeling.photographs.skin_light import exposed, light_hue, patch_
 from torchface.modeling.photographs.skin_mask import FacePlaces, ShownParts
 from torchface.modeling.photographs.texture_fit import ColorFit, fit_colors
 from torchface.modeling.photographs.texture_projection import PhotoTexture, photo_texture
+from torchface.registration.scan_colors import own_colors
 from torchface.rendering.camera_visibility import PosedSurface, Shown
-from torchface.rendering.clay_shading import sample_texture
 from torchface.rendering.environment_light import EnvironmentLight
 
 GREY = 0.015
@@ -82,7 +82,7 @@ def photographed_skin(
         images = [exposed(image, shown) for image, shown in zip(images, parts, strict=True)]
     fit = None if color is None else fit_colors(color, posed, images, cameras)
     mesh = posed[0]
-    base = _own_colors(mesh) if fit is None else fit.colors
+    base = own_colors(mesh) if fit is None else fit.colors
     if base is not None and all(float((one.amax(0) - one.amin(0)).mean()) < GREY for one in images):
         base = base.mean(1, keepdim=True).expand_as(base)  # else a grey face has a coloured neck
     if mesh.uvs is None or size == 0:
@@ -247,17 +247,6 @@ def _under_lids(mesh: Mesh, ball: Tensor, at: Tensor) -> Tensor:
 def _has_landmarks(mesh: Mesh) -> bool:
     annotations = mesh.annotations
     return annotations is not None and annotations.landmarks is not None and len(annotations.landmarks) == LANDMARKS
-
-
-def _own_colors(mesh: Mesh) -> Tensor | None:
-    """Vertex colours (V,3) of a mesh: its own, else those of its texture."""
-    if mesh.colors is not None:
-        return mesh.colors.cpu().float()
-    if mesh.texture is None or mesh.uvs is None or mesh.uv_faces is None:
-        return None
-    row = torch.zeros(len(mesh.vertices), dtype=torch.int64)
-    row[mesh.faces.cpu().flatten()] = mesh.uv_faces.cpu().flatten()
-    return sample_texture(mesh.texture.cpu(), mesh.uvs.cpu()[row])
 
 
 def part_vertices(mesh: Mesh) -> Tensor:
