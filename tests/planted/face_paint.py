@@ -4,7 +4,7 @@ import torch
 from torch import Tensor
 
 from torchface.synthetic.head.head_annotations import head_annotations
-from torchface.synthetic.head.identity import mean_vertices, ramp
+from torchface.synthetic.head.identity import ramp, sculpted_vertices
 from torchface.synthetic.head.skin_texture import texel_values
 
 _BLUE, _GOLD, _RED = (0.05, 0.30, 0.42), (0.95, 0.75, 0.20), (0.62, 0.04, 0.12)
@@ -19,7 +19,7 @@ def face_paint(size: int = 1024) -> Tensor:
     """
     regions = head_annotations().regions
     lips = (regions["upper_lip"] | regions["lower_lip"]).float()[:, None]
-    texels, values = texel_values(size, torch.cat([mean_vertices().float(), lips], dim=1))
+    texels, values = texel_values(size, torch.cat([sculpted_vertices().float(), lips], dim=1))
     x, y, front = values[:, 0].abs(), values[:, 1], values[:, 2] > 20
     eyes = ((x - 30) / 30) ** 2 + ((y - 3 - 0.18 * (x - 30)) / 19) ** 2
     outline = torch.minimum(eyes, (x / 14) ** 2 + ((y - 2) / 11) ** 2)  # 1 at the edge of the mask

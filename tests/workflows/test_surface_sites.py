@@ -4,7 +4,7 @@ import torch
 
 from torchface import zoo
 from torchface.rig import BlendshapeRig
-from torchface.synthetic.head.identity import mean_vertices
+from torchface.synthetic.head.identity import sculpted_vertices
 from torchface.synthetic.head.performer import performer
 from torchface.workflows.surface_sites import sites_on_rig
 
@@ -19,7 +19,7 @@ def renumbered(scale: float) -> BlendshapeRig:
     assert notes is not None
     assert notes.landmarks is not None
     moved = type(mesh)(
-        scale * mean_vertices().float()[order], place[mesh.faces], annotations=type(notes)(place[notes.landmarks])
+        scale * sculpted_vertices().float()[order], place[mesh.faces], annotations=type(notes)(place[notes.landmarks])
     )
     return BlendshapeRig(moved, scale * rig.deltas[:, order], rig.names)
 

@@ -43,7 +43,7 @@ class NamedFinder:
     Args:
         finder: finds them.
         source: the file or folder, for keys of what depends on it.
-        places: of the points that it finds beside the 68, on the embedded performer's mean head, (P,3) millimetres.
+        places: of the points that it finds beside the 68, on the embedded performer's sculpture, (P,3) millimetres.
         expects: whether it reads which weights are to be expected, so that solves need no other prior.
     """
 

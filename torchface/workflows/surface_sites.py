@@ -14,7 +14,7 @@ from torchface.mesh import Mesh
 from torchface.rig import BlendshapeRig
 from torchface.shape_names import ARKIT, mapping
 from torchface.synthetic.head.head_annotations import head_annotations
-from torchface.synthetic.head.identity import mean_vertices
+from torchface.synthetic.head.identity import sculpted_vertices
 from torchface.synthetic.head.performer import performer
 
 SHARED = [*range(4, 13), *range(27, 68)]  # landmarks that all heads mean alike
@@ -25,7 +25,7 @@ _AHEAD = -0.8  # z of a normal: what faces further back lies inside a mouth; edg
 
 
 def sites_on_rig(rig: BlendshapeRig, places: Tensor) -> Attachment:
-    """Where points of the embedded performer's mean head lie on a rig, as sites on its neutral mesh.
+    """Where points of the embedded performer's sculpture lie on a rig, as sites on its neutral mesh.
 
     The rig's head is bent onto the performer's by their landmarks, and each point goes to the vertex of the skin that
     lies nearest and moves alike with the jaw and the lids: so networks were taught where their points are on other
@@ -33,10 +33,10 @@ def sites_on_rig(rig: BlendshapeRig, places: Tensor) -> Attachment:
 
     Args:
         rig: with the 68 landmarks annotated.
-        places: of the points on the mean head, (P,3), millimetres; see ``LandmarkNetwork.places``.
+        places: of the points on the sculpture, (P,3), millimetres; see ``LandmarkNetwork.places``.
     """
     actor = performer(texture=False)
-    template = actor.neutral.with_vertices(mean_vertices().float())
+    template = actor.neutral.with_vertices(sculpted_vertices().float())
     own = _attached(template, places)
     neutral = rig.neutral
     if torch.equal(neutral.faces[: len(template.faces)].cpu(), template.faces):  # a character's come first
@@ -47,7 +47,7 @@ def sites_on_rig(rig: BlendshapeRig, places: Tensor) -> Attachment:
     theirs = head_annotations().landmarks
     assert theirs is not None
     vertices, faces = neutral.vertices.detach().cpu().double(), neutral.faces.cpu()
-    canonical = bent_onto(vertices, marks, mean_vertices().double()[theirs])
+    canonical = bent_onto(vertices, marks, sculpted_vertices().double()[theirs])
     part = components(faces, len(vertices))
     skin = torch.isin(part, part[marks]) & (vertex_normals(canonical, faces)[:, 2] > _AHEAD)
     motions = jaw_and_lids(rig, marks), jaw_and_lids(actor, theirs)
@@ -77,13 +77,13 @@ def bent_onto(vertices: Tensor, landmarks: Tensor, target: Tensor) -> Tensor:
 def alike_vertices(
     canonical: Tensor, skin: Tensor, places: Tensor, motions: tuple[Tensor, Tensor] | None = None
 ) -> Tensor:
-    """Vertices of another topology that are points of the mean head, (P,).
+    """Vertices of another topology that are points of the sculpture, (P,).
 
     Lids and lips of two topologies lie a few millimetres apart there, and their upper and lower ones close together:
     so motions are compared beside places.
 
     Args:
-        canonical: each vertex on the performer's mean head, (V,3).
+        canonical: each vertex on the performer's sculpture, (V,3).
         skin: which vertices may be points, (V,) bool.
         places: of the points, (P,3).
         motions: how far the jaw and both lids move each vertex, (V,2), and each point, (P,2); see ``jaw_and_lids``.

@@ -19,7 +19,7 @@ from torchface.io.video import VideoFile, write_video
 from torchface.progress import Progress, silent
 from torchface.rendering.gaussian_blur import gaussian_blur
 from torchface.rig import BlendshapeRig
-from torchface.synthetic.head.identity import both_sides, mean_vertices
+from torchface.synthetic.head.identity import both_sides, sculpted_vertices
 from torchface.synthetic.head.performer import performer
 from torchface.synthetic.head.topology import EYE_RIM, topology
 from torchface.synthetic.stages.marker_stage import Recording, StageFlaws, place_markers, record
@@ -136,7 +136,7 @@ def stage_markers(rig: BlendshapeRig, count: int = 40) -> Attachment:
         count: how many besides the two.
     """
     spots = place_markers(rig, count)
-    p = mean_vertices()
+    p = sculpted_vertices()
     aside = torch.tensor([60.0, -4.0, 44.0], dtype=p.dtype)
     left = int((p - aside).norm(dim=1).argmin())
     right = int(topology().mirror[left])
@@ -172,7 +172,7 @@ def _box(pixels: Tensor, margin: float = 0.08) -> Box:
 
 def _region_vertices() -> dict[str, Tensor]:
     """Vertices (V,) whose extent is a region: over the brows, between them, round the eyes, round the mouth."""
-    t, p = topology(), mean_vertices()
+    t, p = topology(), sculpted_vertices()
     x, y, front = p[:, 0], p[:, 1], p[:, 2] > 40
     skin = torch.zeros(t.count, dtype=torch.bool)
     skin[t.grid[t.grid >= 0]] = True

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from torchface.geometry.meshes.rasterization import TexelMap
-from torchface.synthetic.head.identity import both_sides, mean_vertices, ramp
+from torchface.synthetic.head.identity import both_sides, ramp, sculpted_vertices
 from torchface.synthetic.head.skin_texture import texel_values
 from torchface.synthetic.head.topology import EYE_RIM, MOUTH_BORDER, topology
 
@@ -53,7 +53,7 @@ def reflective_paint(size: int = 1024, generator: torch.Generator | None = None,
 
 @lru_cache(maxsize=2)
 def _painted_texels(size: int) -> tuple[TexelMap, Tensor]:
-    return texel_values(size, torch.cat([mean_vertices().float(), _ring_places()], dim=1))
+    return texel_values(size, torch.cat([sculpted_vertices().float(), _ring_places()], dim=1))
 
 
 def _ring_places() -> Tensor:

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from torchface.geometry.meshes.operators import vertex_normals
 from torchface.synthetic.head.head_annotations import head_annotations
-from torchface.synthetic.head.identity import mean_vertices
+from torchface.synthetic.head.identity import sculpted_vertices
 from torchface.synthetic.head.performer import performer
 
 COUNT = 452
@@ -27,7 +27,7 @@ def dense_vertices() -> tuple[Tensor, Tensor]:
 
     Points are taken one after the other, each the farthest from all before in distances that they may have there.
     """
-    mean, notes = mean_vertices(), head_annotations()
+    mean, notes = sculpted_vertices(), head_annotations()
     assert notes.landmarks is not None
     assert notes.mirror is not None
     regions, marks = notes.regions, mean[notes.landmarks]
@@ -66,9 +66,9 @@ def dense_vertices() -> tuple[Tensor, Tensor]:
 
 
 def dense_places() -> tuple[Tensor, Tensor]:
-    """Where the points lie on the performer's mean head, (P,3) millimetres, and of each its mirrored twin, (P,)."""
+    """Where the points lie on the performer's sculpture, (P,3) millimetres, and of each its mirrored twin, (P,)."""
     vertices, mirror = dense_vertices()
-    return mean_vertices()[vertices].float(), mirror
+    return sculpted_vertices()[vertices].float(), mirror
 
 
 def _nasolabial_folds() -> Tensor:

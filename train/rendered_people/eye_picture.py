@@ -30,7 +30,7 @@ EYES_WIDTH, EYES_HEIGHT = 160, 64
 """Pixels of a picture of both eyes."""
 _SPAN = 138.0  # millimetres that its width shows of a face seen from the front
 _BEHIND = 5.0  # millimetres that a landmark may lie behind what is seen
-_NEAR = ((-85.0, -40.0, 5.0), (85.0, 55.0, 200.0))  # corners of the part of the mean head that is rendered
+_NEAR = ((-85.0, -40.0, 5.0), (85.0, 55.0, 200.0))  # corners of the part of the sculpture that is rendered
 _FRAME = 2.1  # how much larger frames of spectacles are in pixels than in a picture of the whole face
 _SIDES = ("Right", "Left")
 

@@ -1,6 +1,6 @@
-"""Kinds of heads that pictures are rendered of, all described in the coordinates of the embedded performer's mean head.
+"""Kinds of heads that pictures are rendered of, all described in the coordinates of the embedded performer's sculpture.
 
-Paint, hair and beards are functions of a point on that mean head. Another topology takes them over through a smooth map
+Paint, hair and beards are functions of a point on that sculpture. Another topology takes them over through a smooth map
 of its own mean head onto it, by their common landmarks.
 """
 
@@ -19,7 +19,7 @@ from torchface.io.rigs.ict_facekit import IdentityModes
 from torchface.rig import BlendshapeRig
 from torchface.shape_names import ARKIT, mapping
 from torchface.synthetic.head.head_annotations import head_annotations
-from torchface.synthetic.head.identity import IDENTITY, draw_identities, mean_vertices
+from torchface.synthetic.head.identity import IDENTITY, draw_identities, sculpted_vertices
 from torchface.synthetic.head.performer import SHAPES, performer
 from torchface.synthetic.head.skin_texture import vertex_marks
 from torchface.workflows.surface_sites import SHARED, alike_vertices, bent_onto, jaw_and_lids
@@ -54,7 +54,7 @@ class HeadKind:
         faces: (F,3).
         material: of each face, (F,).
         landmarks: vertices of iBUG's 68, (68,).
-        canonical: each vertex on the performer's mean head, (V,3).
+        canonical: each vertex on the performer's sculpture, (V,3).
         marks: what skin is painted by, (V,8); see ``skin_texture``.
         outer: vertices of the skin that can be a contour, (V,) bool.
         shapes: from ARKit's 52 weights to the rig's, (N,52).
@@ -90,7 +90,7 @@ def performer_kind() -> HeadKind:
         identity = draw_identities(1, generator, 1.2)[0]
         leaning = torch.tensor([0.8 if parameter.name == "face_width" else 0.0 for parameter in IDENTITY])
         someone = performer(identity + leaning, texture=False)
-        return DrawnHead(_lumpy(someone.vertices, mean_vertices(), generator), someone.deltas)
+        return DrawnHead(_lumpy(someone.vertices, sculpted_vertices(), generator), someone.deltas)
 
     outer = ~torch.stack([regions[name] for name in hidden]).any(0)
     dense, _ = dense_vertices()
@@ -98,7 +98,7 @@ def performer_kind() -> HeadKind:
         faces,
         material,
         notes.landmarks,
-        mean_vertices(),
+        sculpted_vertices(),
         vertex_marks(),
         outer,
         mapping(ARKIT, SHAPES),
@@ -121,7 +121,7 @@ def people_kind(rig: BlendshapeRig, modes: IdentityModes) -> HeadKind:
     regions, mean = notes.regions, rig.vertices.double()
     marks68 = head_annotations().landmarks
     assert marks68 is not None
-    target = mean_vertices()[marks68]
+    target = sculpted_vertices()[marks68]
     shift = (target[SHARED] - mean[notes.landmarks[SHARED]]).mean(0)
     placed = mean + shift
     canonical = bent_onto(mean, notes.landmarks, target)
@@ -159,7 +159,7 @@ def people_kind(rig: BlendshapeRig, modes: IdentityModes) -> HeadKind:
     assert motions is not None
     assert theirs is not None
     moved = torch.stack(motions, dim=1), torch.stack(theirs, dim=1)[points]
-    dense = alike_vertices(canonical, outer, mean_vertices()[points], moved)
+    dense = alike_vertices(canonical, outer, sculpted_vertices()[points], moved)
     shapes = mapping(ARKIT, rig.names)
     return HeadKind(faces, material, notes.landmarks, canonical, own, outer, shapes, dense, 1.0, draw)
 
@@ -169,7 +169,7 @@ def _marks_of(canonical: Tensor, regions: dict[str, Tensor], placed: Tensor, inn
     theirs, notes = vertex_marks(), head_annotations()
     hidden = ("mouth_interior", "eye_sockets", "eyeball_left", "eyeball_right")
     skin = (~torch.stack([notes.regions[name] for name in hidden]).any(0)).nonzero()[:, 0]
-    nearest = torch.from_numpy(KDTree(mean_vertices()[skin].numpy()).query(canonical.numpy())[1])
+    nearest = torch.from_numpy(KDTree(sculpted_vertices()[skin].numpy()).query(canonical.numpy())[1])
     marks = theirs[skin[nearest]].clone()
     marks[:, 1:6] = 0.0
     marks[inner] = 0.0
@@ -200,7 +200,7 @@ def _inner_shell(faces: Tensor, balls: Tensor, placed: Tensor) -> Tensor:
 
 def _eye_canonical(placed: Tensor, regions: dict[str, Tensor], canonical: Tensor) -> Tensor:
     """Eyeballs (V,3) moved and scaled onto the mean performer's."""
-    moved, notes, mean = canonical.clone(), head_annotations(), mean_vertices()
+    moved, notes, mean = canonical.clone(), head_annotations(), sculpted_vertices()
     for side in ("left", "right"):
         own, theirs = regions[f"eyeball_{side}"], notes.regions[f"eyeball_{side}"]
         a, b = placed[own], mean[theirs]

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from torchface.geometry.meshes.operators import vertex_normals
 from torchface.synthetic.head.head_annotations import head_annotations
-from torchface.synthetic.head.identity import mean_vertices, ramp
+from torchface.synthetic.head.identity import ramp, sculpted_vertices
 
 _TEETH_DEEP = 3.5  # behind the lips, millimetres
 # The left brow's upper edge from its inner end: annotators mark it there, the head's own landmarks lie in its middle.
@@ -85,7 +85,7 @@ def widened(vertices: Tensor, share: float) -> Tensor:
 def hair_share(hairline: float) -> Tensor:
     """0 on the face, 1 on the scalp, (V,), for a hairline moved up by so many millimetres."""
     regions = head_annotations().regions
-    return hair_share_at(mean_vertices(), regions["ear_left"] | regions["ear_right"], hairline)
+    return hair_share_at(sculpted_vertices(), regions["ear_left"] | regions["ear_right"], hairline)
 
 
 def hair_share_at(p: Tensor, ear: Tensor, hairline: float) -> Tensor:
@@ -171,7 +171,7 @@ def shoulders(rest: Tensor, marks: Tensor | None = None) -> tuple[Tensor, Tensor
 def _performer_contours() -> tuple[Tensor, ...]:
     regions = head_annotations().regions
     hidden = ("mouth_interior", "nostrils", "eye_sockets", "eyeball_left", "eyeball_right", "ear_left", "ear_right")
-    return contour_lines(mean_vertices(), _marks(), ~torch.stack([regions[name] for name in hidden]).any(0))
+    return contour_lines(sculpted_vertices(), _marks(), ~torch.stack([regions[name] for name in hidden]).any(0))
 
 
 def contour_lines(p: Tensor, marks: Tensor, skin: Tensor) -> tuple[Tensor, ...]:
@@ -202,7 +202,7 @@ def _brow_edge() -> tuple[Tensor, Tensor]:
     """Vertices (10,3) and weights (10,3) that give the brows' upper edges, in the order of landmarks 17 to 26."""
     left = torch.tensor(_BROW_EDGE).double()
     spots = torch.cat([left.flip(0) * left.new_tensor([-1.0, 1.0, 1.0]), left])
-    distance, rows = torch.cdist(spots, mean_vertices()).topk(3, dim=1, largest=False)
+    distance, rows = torch.cdist(spots, sculpted_vertices()).topk(3, dim=1, largest=False)
     weights = 1 / distance.clamp(min=0.1)
     return rows, weights / weights.sum(1, keepdim=True)
 

@@ -16,7 +16,7 @@ from torchface.rendering.clay_shading import sample_texture
 from torchface.rendering.raycast import RayCaster
 from torchface.rig import BlendshapeRig
 from torchface.synthetic.head.head_annotations import head_annotations
-from torchface.synthetic.head.identity import IDENTITY, draw_identities, mean_vertices, ramp
+from torchface.synthetic.head.identity import IDENTITY, draw_identities, ramp, sculpted_vertices
 from torchface.synthetic.head.performer import performer
 from torchface.synthetic.stages.weight_curves import GESTURES
 
@@ -145,8 +145,8 @@ def _draw_person(settings: FaceImageSettings, generator: torch.Generator) -> _Pe
 def _facial_hair(generator: torch.Generator) -> Tensor:
     """What beard, moustache and shaven shadow leave of the skin's grey, (V,)."""
     if uniform(0, 1, generator) > 0.4:
-        return torch.ones(len(mean_vertices()))
-    p, regions = mean_vertices(), head_annotations().regions
+        return torch.ones(len(sculpted_vertices()))
+    p, regions = sculpted_vertices(), head_annotations().regions
     x, y, z = p[:, 0].abs(), p[:, 1], p[:, 2]
     lips = regions["upper_lip"] | regions["lower_lip"] | regions["mouth_interior"]
     front = ramp(z, -5, 15)

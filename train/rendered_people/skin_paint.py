@@ -19,7 +19,7 @@ def surface_color(points: Tensor, marks: Tensor, material: Tensor, looks: Looks,
     """sRGB colours (R,3) of points of a head.
 
     Args:
-        points: on the performer's mean head, (R,3), millimetres.
+        points: on the performer's sculpture, (R,3), millimetres.
         marks: see ``skin_texture.vertex_marks``, (R,8).
         material: of the triangles that they lie on, (R,).
         brow_lift: see ``HeadKind``.

@@ -92,15 +92,16 @@ def place_parts(template: BlendshapeRig, neutral: Mesh, parts: InnerParts) -> Me
 
 
 def with_placed_parts(template: Mesh, registration: Registration) -> Registration:
-    """A registration whose eyeballs and teeth are where ``place_parts`` has them, and round, in place of bent ones."""
+    """A registration whose eyeballs and teeth are where ``place_parts`` has them, and round, in place of bent ones, and
+    whose mouth lies behind the skin."""
     rig = BlendshapeRig(template, template.vertices.new_zeros(0, len(template.vertices), 3), ())
     parts = inner_parts(rig)
-    if len(parts.vertices) == 0:
-        return registration
     upright = registration.pose.inverse().apply(registration.mesh.vertices.detach().cpu().double())[0]
-    placed = place_parts(rig, template.with_vertices(upright.to(template.vertices)), parts)
-    inside = with_mouth_behind_skin(placed).vertices.detach().cpu().double()
-    vertices = registration.pose.apply(inside)[0]
+    bent = template.with_vertices(upright.to(template.vertices))
+    placed = with_mouth_behind_skin(place_parts(rig, bent, parts) if len(parts.vertices) else bent)
+    if placed is bent:
+        return registration
+    vertices = registration.pose.apply(placed.vertices.detach().cpu().double())[0]
     return replace(registration, mesh=registration.mesh.with_vertices(vertices.to(registration.mesh.vertices)))
 
 

@@ -15,7 +15,7 @@ from torchface.synthetic.head.hair import GrownPart, brow_hairs, lashes, scalp_h
 from torchface.synthetic.head.hair_locks import hair_locks
 from torchface.synthetic.head.handle_weights import handle_weights
 from torchface.synthetic.head.head_annotations import head_annotations
-from torchface.synthetic.head.identity import mean_vertices
+from torchface.synthetic.head.identity import sculpted_vertices
 from torchface.synthetic.head.performer import performer
 from torchface.synthetic.head.shirt import about_neck, shirt
 from torchface.synthetic.head.skin_maps import Look, skin_maps
@@ -130,7 +130,7 @@ def _mesh(skin: Mesh, vertices: Tensor, parts: dict[str, HeadPart], color: Tenso
         uvs.append(own)
         uv_quads.append(index.view(-1, 4) + corner)
         start, corner = end, corner + len(own)
-    mean = torch.cat([mean_vertices(), *(part.vertices for part in parts.values())])
+    mean = torch.cat([sculpted_vertices(), *(part.vertices for part in parts.values())])
     mirror = torch.from_numpy(cKDTree(mean.numpy()).query(mean.numpy() * [-1, 1, 1])[1]).long()
     mirror[: topology().count] = topology().mirror
     return Mesh.from_polygons(
@@ -144,11 +144,11 @@ def _mesh(skin: Mesh, vertices: Tensor, parts: dict[str, HeadPart], color: Tenso
 
 
 class _InTheMouth:
-    """Where parts of the mean head's mouth lie in another head, and how its jaw moves them."""
+    """Where parts of the sculpture's mouth lie in another head, and how its jaw moves them."""
 
     def __init__(self, rig: BlendshapeRig) -> None:
         line = topology().rings["mouth"][MOUTH_CONTACT]
-        skin, mean = rig.vertices.double(), mean_vertices()
+        skin, mean = rig.vertices.double(), sculpted_vertices()
         self._from, self._to = mean[line[[0, 26]]].mean(0), skin[line[[0, 26]]].mean(0)
         wide = float(skin[line[13], 0] / mean[line[13], 0])
         self._scale = torch.tensor([wide, 1.0, 1.0], dtype=torch.float64)
@@ -161,7 +161,7 @@ class _InTheMouth:
         self._jaw = similarity_transform(rest.expand(count, -1, -1), posed, scale=False)
 
     def place(self, points: Tensor) -> Tensor:
-        """Points (P,3) of the mean head in this one."""
+        """Points (P,3) of the sculpture in this one."""
         return self._to + (points - self._from) * self._scale
 
     def _in_front_of(self, skin: Tensor) -> float:
@@ -184,7 +184,7 @@ class _InTheMouth:
 def _grown(grown: GrownPart, skin: Tensor, moved: Tensor) -> tuple[Tensor, Tensor]:
     """A part that skin carries on this head, and its motion in each shape."""
     host = lambda values: (values[..., grown.hosts, :] * grown.weights[..., None]).sum(-2)  # noqa: E731
-    root = host(mean_vertices())
+    root = host(sculpted_vertices())
     offset = grown.part.vertices - root
     here = host(skin)
     motion = host(moved)

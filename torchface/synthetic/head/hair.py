@@ -1,4 +1,4 @@
-"""Hair of the mean head: a cap over the scalp, and single hairs of brows and lashes with the skin that they grow on."""
+"""Hair of the sculpture: a cap over the scalp, and single hairs of brows and lashes with the skin that they grow on."""
 
 from dataclasses import dataclass
 from functools import lru_cache
@@ -11,7 +11,7 @@ from torchface.geometry.meshes.operators import vertex_normals
 from torchface.mesh import fan_triangulation
 from torchface.rendering.raycast import RayCaster
 from torchface.synthetic.head.facial_openings import lid_order
-from torchface.synthetic.head.identity import mean_vertices, ramp
+from torchface.synthetic.head.identity import ramp, sculpted_vertices
 from torchface.synthetic.head.signed_distance import EYE_CENTRE
 from torchface.synthetic.head.skin_texture import brow_line, noise
 from torchface.synthetic.head.teeth_and_tongue import HeadPart
@@ -27,7 +27,7 @@ _BROW_HAIRS, _LASHES = 260, 3
 class GrownPart:
     """A part that skin carries: its own form, and for each vertex (V,) three skin vertices (V,3) with weights (V,3)."""
 
-    part: HeadPart  # its form on the mean head
+    part: HeadPart  # its form on the sculpture
     # hosts, weights: of the skin at each vertex's root
     hosts: Tensor
     weights: Tensor
@@ -35,7 +35,7 @@ class GrownPart:
 
 
 def hair_share(points: Tensor) -> Tensor:
-    """How thick hair stands over points (N,3) of the mean head, 0 on bare skin, 1 well inside the hairline."""
+    """How thick hair stands over points (N,3) of the sculpture, 0 on bare skin, 1 well inside the hairline."""
     x, y, z = points[:, 0].abs(), points[:, 1], points[:, 2]
     line = np.interp(
         z.numpy(),
@@ -58,7 +58,7 @@ def flow(points: Tensor) -> Tensor:
 @lru_cache(maxsize=2)
 def scalp_hair(thick: float) -> GrownPart:
     """The cap under the locks: the scalp's quads, and their place on the page, raised by a share of cropped hair."""
-    t, flat, v = topology(), unwrapping(), mean_vertices()
+    t, flat, v = topology(), unwrapping(), sculpted_vertices()
     normals = vertex_normals(v, fan_triangulation(t.quads))
     bare = torch.zeros(t.count, dtype=torch.bool)
     for part in (t.rings["ear"][1:], t.caps["ear"], t.rings["eye"][1:]):
@@ -95,7 +95,7 @@ def brow_hairs() -> GrownPart:
     starts = torch.stack([x, y, torch.full_like(x, 140.0)], 1)
     caster = _skin_caster()
     hits = caster.cast(starts, torch.tensor([0.0, 0.0, -1.0]).double().expand_as(starts))
-    faces, v = fan_triangulation(topology().quads), mean_vertices()
+    faces, v = fan_triangulation(topology().quads), sculpted_vertices()
     hosts, weights = faces[hits.triangle], hits.barycentric.double()
     roots = (v[hosts] * weights[..., None]).sum(1)
     normals = torch.nn.functional.normalize((vertex_normals(v, faces)[hosts] * weights[..., None]).sum(1), dim=1)
@@ -109,7 +109,7 @@ def brow_hairs() -> GrownPart:
 @lru_cache(maxsize=1)
 def lashes() -> GrownPart:
     """Lashes of all four lids, curved away from the eye."""
-    v, rim = mean_vertices(), topology().rings["eye"][EYE_RIM]
+    v, rim = sculpted_vertices(), topology().rings["eye"][EYE_RIM]
     random = np.random.default_rng(6)
     made, hosts, weights = [], [], []
     for lid, up, long in ((lid_order()[0], 1.0, 6.0), (lid_order()[1], -1.0, 2.6)):
@@ -168,4 +168,4 @@ def _both_sides(part: HeadPart, hosts: Tensor, weights: Tensor, turns: bool) -> 
 
 @lru_cache(maxsize=1)
 def _skin_caster() -> RayCaster:
-    return RayCaster(mean_vertices(), fan_triangulation(topology().quads))
+    return RayCaster(sculpted_vertices(), fan_triangulation(topology().quads))

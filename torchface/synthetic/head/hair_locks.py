@@ -1,4 +1,4 @@
-"""Locks of a haircut: strips that start on the scalp of the mean head and follow its form along a style's way."""
+"""Locks of a haircut: strips that start on the scalp of the sculpture and follow its form along a style's way."""
 
 from functools import lru_cache
 from typing import Literal
@@ -11,7 +11,7 @@ from torch import Tensor
 from torchface.geometry.meshes.operators import vertex_normals
 from torchface.mesh import fan_triangulation
 from torchface.synthetic.head.hair import GrownPart, hair_share
-from torchface.synthetic.head.identity import mean_vertices, ramp
+from torchface.synthetic.head.identity import ramp, sculpted_vertices
 from torchface.synthetic.head.signed_distance import gradient, signed_distance
 from torchface.synthetic.head.skin_texture import noise
 from torchface.synthetic.head.teeth_and_tongue import HeadPart
@@ -66,7 +66,7 @@ def hair_locks(style: Style) -> GrownPart:
     hosts, weights = hosts.repeat_interleave(3 * rows, 0), weights.repeat_interleave(3 * rows, 0)
     if style == "tied":
         knot = _knot()
-        top = torch.cdist(torch.tensor([KNOT]).double(), mean_vertices()).argmin()
+        top = torch.cdist(torch.tensor([KNOT]).double(), sculpted_vertices()).argmin()
         extra = len(knot.vertices)
         part = HeadPart.joined([part, knot])
         hosts = torch.cat([hosts, top.expand(extra, 3)])
@@ -76,7 +76,7 @@ def hair_locks(style: Style) -> GrownPart:
 
 def _roots(style: Style) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Places on the scalp about evenly far from each other: points, normals, hosts and weights."""
-    t, v = topology(), mean_vertices()
+    t, v = topology(), sculpted_vertices()
     faces = fan_triangulation(t.quads)
     bare = torch.zeros(t.count, dtype=torch.bool)
     for part in (t.rings["ear"], t.caps["ear"], t.rings["eye"][1:]):

@@ -1,4 +1,4 @@
-"""Weights by which the skin follows the lip handles and the jaw: smooth, solved once on the mean head."""
+"""Weights by which the skin follows the lip handles and the jaw: smooth, solved once on the sculpture."""
 
 from dataclasses import dataclass
 from functools import lru_cache
@@ -9,7 +9,7 @@ from scipy.sparse import coo_matrix, diags
 from scipy.sparse.linalg import splu
 from torch import Tensor
 
-from torchface.synthetic.head.identity import both_sides, mean_vertices, ramp
+from torchface.synthetic.head.identity import both_sides, ramp, sculpted_vertices
 from torchface.synthetic.head.topology import MOUTH_BORDER, MOUTH_CONTACT, topology
 
 LIP_HANDLES = 52
@@ -19,7 +19,7 @@ LIP_HANDLES = 52
 
 @dataclass(frozen=True, eq=False)
 class HandleWeights:
-    """Weights over the mean head's vertices."""
+    """Weights over the sculpture's vertices."""
 
     lips: Tensor  # how much each vertex follows each lip handle, (V,52); rows of the red of the lips sum to 1
     jaw: Tensor  # how much each vertex rotates with the jaw, (V,)
@@ -31,7 +31,7 @@ class HandleWeights:
 def handle_weights() -> HandleWeights:
     """The weights, computed once."""
     t = topology()
-    p = mean_vertices()
+    p = sculpted_vertices()
     position = torch.full((t.count,), -1)
     ring = torch.full((t.count,), -1)
     around = torch.arange(27)
@@ -90,7 +90,7 @@ def _unmoved_parts() -> Tensor:
 def _interpolated(values: Tensor, fixed: Tensor) -> Tensor:
     """Values given where fixed, (V,C), elsewhere interpolated as a thin plate: the squared Laplacian is zero there."""
     t = topology()
-    p = mean_vertices().numpy()
+    p = sculpted_vertices().numpy()
     quads = t.quads.numpy()
     pairs = np.concatenate([quads[:, [i, (i + 1) % 4]] for i in range(4)])
     pairs = np.unique(np.sort(pairs, axis=1), axis=0)

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from torchface.mesh import Annotations
 from torchface.synthetic.head.facial_openings import lid_order, lip_order
-from torchface.synthetic.head.identity import both_sides, mean_vertices
+from torchface.synthetic.head.identity import both_sides, sculpted_vertices
 from torchface.synthetic.head.topology import EAR, EYE_RIM, MOUTH_BORDER, MOUTH_CONTACT, NOSTRIL_RIM, Topology, topology
 
 # The left half of the jaw's contour from the ear to before the chin, and of the brow from its inner to its outer end.
@@ -38,13 +38,13 @@ def _outer_skin(t: Topology) -> Tensor:
 
 
 def _nearest(spots: tuple[tuple[float, float, float], ...], allowed: Tensor) -> Tensor:
-    p = mean_vertices()[: len(allowed)]
+    p = sculpted_vertices()[: len(allowed)]
     distance = torch.cdist(torch.tensor(spots, dtype=p.dtype), p)
     return distance.masked_fill(~allowed, torch.inf).argmin(1)
 
 
 def _landmarks(t: Topology) -> Tensor:
-    p = mean_vertices()[: t.half_count]
+    p = sculpted_vertices()[: t.half_count]
     skin = _outer_skin(t)
     twin = t.mirror
     jaw = _nearest(_JAW, skin)
@@ -93,7 +93,7 @@ def _contacts(t: Topology) -> Tensor:
 
 
 def _regions(t: Topology) -> dict[str, Tensor]:
-    p = mean_vertices()
+    p = sculpted_vertices()
     x, y, z = p[:, 0].abs(), p[:, 1], p[:, 2]
     left = p[:, 0] > -1e-9
     none = torch.zeros(t.count, dtype=torch.bool)

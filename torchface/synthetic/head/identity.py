@@ -1,4 +1,4 @@
-"""Identity of a head: measurable parameters, each a smooth field over the mean head."""
+"""Identity of a head: measurable parameters, each a smooth field over the sculpture."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -8,11 +8,11 @@ import torch
 from torch import Tensor
 
 from torchface.errors import ShapeError, ValueRangeError
-from torchface.synthetic.head.mean_head import sculpture
+from torchface.synthetic.head.sculpture import sculpture
 from torchface.synthetic.head.signed_distance import EYE_CENTRE, EYE_RADIUS
 from torchface.synthetic.head.topology import EYE_RIM, MOUTH_BORDER, topology
 
-HINGE = (57.0, -14.0, 8.0)  # the left jaw joint of the mean head
+HINGE = (57.0, -14.0, 8.0)  # the left jaw joint of the sculpture
 
 Field = Callable[[Tensor, "_Parts"], Tensor]
 
@@ -225,8 +225,11 @@ LID_SHARE = torch.tensor([0.0, 0.15, 0.4, 0.7, 0.9] + [1.0] * 11, dtype=torch.fl
 
 
 @lru_cache(maxsize=1)
-def mean_vertices() -> Tensor:
-    """The mean head, (V,3) float64."""
+def sculpted_vertices() -> Tensor:
+    """The sculpture, (V,3) float64: where skin is painted, hair is rooted and the points of networks have their places.
+
+    The mean head of people is ``anatomy()``.
+    """
     t = topology()
     half = sculpture().vertices
     whole = torch.zeros(t.count, 3, dtype=torch.float64)
@@ -247,9 +250,9 @@ def both_sides(half_ids: Tensor) -> tuple[Tensor, Tensor]:
 
 @lru_cache(maxsize=1)
 def _proportions() -> Tensor:
-    """What the mean of people is beside the sculpture, (V+4,3); lids and eyeballs stay."""
+    """From the sculpture's vertices and probes to the mean head's, (V+4,3); lids and eyeballs stay."""
     t = topology()
-    points = torch.cat([mean_vertices(), _probes()])
+    points = torch.cat([sculpted_vertices(), _probes()])
     moved = torch.zeros_like(points)
     for axis, amount, centre, width in _PROPORTIONS:
         outward = _side(points) if axis == 0 else torch.ones(len(points), dtype=points.dtype)
@@ -263,7 +266,7 @@ def _proportions() -> Tensor:
 
 
 def _probes() -> Tensor:
-    """The mean's eyes and joints of the jaw, left before right, (4,3)."""
+    """The sculpture's eyes and joints of the jaw, left before right, (4,3)."""
     probes = torch.tensor([EYE_CENTRE, EYE_CENTRE, HINGE, HINGE], dtype=torch.float64)
     probes[1::2, 0] *= -1
     return probes
@@ -273,7 +276,7 @@ def _probes() -> Tensor:
 def _modes() -> tuple[Tensor, Tensor, Tensor]:
     """Displacement a standard deviation (K,V+4,3), lid share (V,), share by which lids keep to the eyeball (V,)."""
     t = topology()
-    mean = mean_vertices()
+    mean = sculpted_vertices()
     probes = _probes()
     points = torch.cat([mean, probes])
     parts = _parts(len(points))
@@ -332,7 +335,7 @@ def _parts(count: int) -> _Parts:
         rings = both_sides(t.rings["mouth"])[side]
         upper[rings[:, :13]], lower[rings[:, 14:]] = share.expand(-1, 13), share.expand(-1, 13)
         ring[rings] = swell.expand(-1, 27)
-        shell = mean_vertices()[both_sides(t.rings["ear"])[side]][..., 0].abs()
+        shell = sculpted_vertices()[both_sides(t.rings["ear"])[side]][..., 0].abs()
         free = ramp(shell[4] - shell[0], -6.0, 12.0)  # in front its edge lies on the cheek
         held = torch.tensor([0.0, 0.12, 0.25, 0.4, 0.55, 0.7, 0.85] + [1.0] * 4).double()[:, None]
         grown = torch.tensor([0.0, 0.6, 0.72] + [1.0] * 8).double()[:, None]
@@ -358,7 +361,7 @@ def anatomy(identity: Tensor | None = None) -> Anatomy:
     coefficients = check_identity(identity)
     t = topology()
     modes, _, keep = _modes()
-    mean = mean_vertices()
+    mean = sculpted_vertices()
     moved = _proportions() + torch.einsum("k,kvc->vc", coefficients, modes)
     vertices = mean + moved[: t.count]
     probes = _probes() + moved[t.count :]

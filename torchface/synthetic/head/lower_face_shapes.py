@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from torchface.synthetic.head.handle_weights import LIP_HANDLES, HandleWeights, handle_weights
-from torchface.synthetic.head.identity import Anatomy, bump, mean_vertices, mirrored, ramp
+from torchface.synthetic.head.identity import Anatomy, bump, mirrored, ramp, sculpted_vertices
 from torchface.synthetic.head.topology import MOUTH_CONTACT, topology
 
 JAW_ANGLE = math.radians(19.0)
@@ -32,7 +32,7 @@ class Mouth:
     def __init__(self, head: Anatomy) -> None:
         self.head = head
         self.weights: HandleWeights = handle_weights()
-        self.mean = mean_vertices()
+        self.mean = sculpted_vertices()
         rings = topology().rings["mouth"]
         line, mean_line = head.vertices[rings[MOUTH_CONTACT]], self.mean[rings[MOUTH_CONTACT]]
         self.half_width = line[13, 0]
@@ -91,7 +91,7 @@ class Mouth:
         return self.weights.jaw[:, None] * moved
 
     def push(self, centre: tuple[float, float, float], width: tuple[float, float, float], way: Tensor) -> Tensor:
-        """Left skin near a point of the mean head moved along ``way`` (3,); the mouth's inside and the lips stay."""
+        """Left skin near a point of the sculpture moved along ``way`` (3,); the mouth's inside and the lips stay."""
         outside = (self.weights.lip_ring < MOUTH_CONTACT - 3) & ~_inside()
         amount = (bump(self.mean, centre, width) - 0.02).clamp(min=0) * ramp(self.mean[:, 0], -6, 10) * outside
         return amount[:, None] * way * self.size

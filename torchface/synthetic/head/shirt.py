@@ -1,4 +1,4 @@
-"""A shirt's collar and shoulders about the neck of the mean head, with its place on the texture's page."""
+"""A shirt's collar and shoulders about the neck of the sculpture, with its place on the texture's page."""
 
 from functools import lru_cache
 
@@ -7,7 +7,7 @@ import torch
 from scipy.interpolate import PchipInterpolator
 from torch import Tensor
 
-from torchface.synthetic.head.identity import mean_vertices
+from torchface.synthetic.head.identity import sculpted_vertices
 from torchface.synthetic.head.skin_texture import noise
 from torchface.synthetic.head.teeth_and_tongue import HeadPart
 from torchface.synthetic.head.topology import topology
@@ -26,7 +26,7 @@ _ROUND, _ROWS = 48, 22
 
 @lru_cache(maxsize=1)
 def shirt() -> HeadPart:
-    """The cloth on the mean head."""
+    """The cloth on the sculpture."""
     spots = np.linspace(0, len(_LOOPS) - 1, _ROWS)
     front, side, back, wide, deep, middle = PchipInterpolator(np.arange(len(_LOOPS)), _LOOPS)(spots).T[:, :, None]
     angle = (np.arange(_ROUND) + 0.5) * 2 * np.pi / _ROUND  # 0 to the person's left, a quarter forward
@@ -37,10 +37,10 @@ def shirt() -> HeadPart:
 
 
 def about_neck(points: Tensor, skin: Tensor) -> Tensor:
-    """Points (P,3) about the mean head's neck, about that of another head (V,3)."""
+    """Points (P,3) about the sculpture's neck, about that of another head (V,3)."""
     half = topology().grid[-1]
     ids = torch.cat([half, topology().mirror[half]])
-    mean, here = mean_vertices()[ids], skin[ids]
+    mean, here = sculpted_vertices()[ids], skin[ids]
     low, high, own_low, own_high = mean.amin(0), mean.amax(0), here.amin(0), here.amax(0)
     scale = (own_high - own_low) / (high - low)
     scale[1] = 1

@@ -1,4 +1,4 @@
-"""The mean head's outer form as a signed distance: ellipsoids and round cones, smoothly joined and cut.
+"""The sculpture's outer form as a signed distance: ellipsoids and round cones, smoothly joined and cut.
 
 The eyes are closed and the lips absent here; the mesh cuts its openings and lays the lips on (``sculpt``).
 Origin: on the midline at pupil height, above the ear canals; y up, z forward, millimetres.

@@ -11,7 +11,7 @@ from torchface.geometry.meshes.normal_maps import SurfaceMaps
 from torchface.geometry.meshes.rasterization import TexelMap
 from torchface.synthetic.head.hair import HAIR_PATCH, flow, hair_share
 from torchface.synthetic.head.hair_locks import LOCK_PATCH, Style, strand_shade
-from torchface.synthetic.head.identity import mean_vertices, ramp
+from torchface.synthetic.head.identity import ramp, sculpted_vertices
 from torchface.synthetic.head.shirt import SHIRT_PATCH, cloth
 from torchface.synthetic.head.skin_texture import (
     blob,
@@ -118,8 +118,8 @@ def _maps(look: Look, size: int, skin: Tensor | None) -> SkinMaps:
 
 @lru_cache(maxsize=1)
 def _texels(size: int) -> tuple[TexelMap, Tensor, Tensor]:
-    """Texels of the skin's page, the mean head's points there (M,3) and their marks (M,8)."""
-    texels, values = texel_values(size, torch.cat([mean_vertices().float(), vertex_marks()], 1))
+    """Texels of the skin's page, the sculpture's points there (M,3) and their marks (M,8)."""
+    texels, values = texel_values(size, torch.cat([sculpted_vertices().float(), vertex_marks()], 1))
     return texels, values[:, :3].contiguous(), values[:, 3:]
 
 
@@ -205,7 +205,7 @@ def _roughness(p: Tensor, lips: Tensor, mouth: Tensor, hair: Tensor, lash: Tenso
 
 
 def _normals(texels: TexelMap, p: Tensor, height: Tensor) -> Tensor:
-    """Unit normals (3,H,W) of a relief (M,), millimetres, over the mean head's points (M,3)."""
+    """Unit normals (3,H,W) of a relief (M,), millimetres, over the sculpture's points (M,3)."""
     table = torch.zeros(texels.height * texels.width, 5)
     table[texels.texels] = torch.cat([p, height[:, None], torch.ones(len(p), 1)], 1)
     image = table.view(texels.height, texels.width, 5)

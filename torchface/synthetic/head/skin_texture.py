@@ -1,4 +1,4 @@
-"""Painted skin: colours decided at points of the mean head, so that no seam shows."""
+"""Painted skin: colours decided at points of the sculpture, so that no seam shows."""
 
 from functools import lru_cache
 
@@ -10,7 +10,7 @@ from torchface.geometry.meshes.rasterization import TexelMap, rasterise_uvs
 from torchface.mesh import fan_triangulation
 from torchface.synthetic.head.facial_openings import lid_order
 from torchface.synthetic.head.head_annotations import head_annotations
-from torchface.synthetic.head.identity import both_sides, mean_vertices, ramp
+from torchface.synthetic.head.identity import both_sides, ramp, sculpted_vertices
 from torchface.synthetic.head.signed_distance import EYE_CENTRE
 from torchface.synthetic.head.topology import EYE_RIM, MOUTH_BORDER, MOUTH_CONTACT, topology
 from torchface.synthetic.head.uv_layout import unwrapping
@@ -25,7 +25,7 @@ _MARKS = 8
 @lru_cache(maxsize=2)
 def skin_texture() -> Tensor:
     """The skin texture of every performer, (3,1024,1024), first row on top."""
-    texels, values = texel_values(_SIZE, torch.cat([mean_vertices().float(), vertex_marks()], dim=1))
+    texels, values = texel_values(_SIZE, torch.cat([sculpted_vertices().float(), vertex_marks()], dim=1))
     return texels.image(_paint(values[:, :3], values[:, 3:]))
 
 
@@ -100,7 +100,7 @@ def _paint(p: Tensor, marks: Tensor) -> Tensor:
 
 
 def skin_color(p: Tensor, marks: Tensor, freckles: float = 1.0, red_lips: float = 1.0) -> Tensor:
-    """Colours (N,3) of bare skin and lips at points (N,3) of the mean head with their marks (N,8)."""
+    """Colours (N,3) of bare skin and lips at points (N,3) of the sculpture with their marks (N,8)."""
     lips, ear = marks[:, 0], marks[:, 7]
     color = torch.tensor(SKIN).expand(len(p), 3).clone()
     broad, fine, pores = noise(p, 16.0, 1), noise(p, 4.5, 2), noise(p, 0.9, 3)

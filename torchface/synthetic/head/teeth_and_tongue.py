@@ -1,4 +1,4 @@
-"""Teeth, gums and tongue of the mean head, with their places on the texture's page."""
+"""Teeth, gums and tongue of the sculpture, with their places on the texture's page."""
 
 from __future__ import annotations
 

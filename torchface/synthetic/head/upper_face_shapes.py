@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from torchface.synthetic.head.facial_openings import lid_order
-from torchface.synthetic.head.identity import Anatomy, both_sides, bump, mean_vertices, ramp
+from torchface.synthetic.head.identity import Anatomy, both_sides, bump, ramp, sculpted_vertices
 from torchface.synthetic.head.signed_distance import LID_THICKNESS
 from torchface.synthetic.head.topology import EYE_RIM, topology
 
@@ -130,8 +130,8 @@ def _push(
     way: tuple[float, float, float],
     one_side: bool = True,
 ) -> Tensor:
-    """Skin near a point of the mean head moved along ``way`` (millimetres, left side; x is mirrored)."""
-    p = mean_vertices()
+    """Skin near a point of the sculpture moved along ``way`` (millimetres, left side; x is mirrored)."""
+    p = sculpted_vertices()
     left = ramp(p[:, 0], -9, 9) if one_side else torch.ones(len(p), dtype=p.dtype)
     amount = bump(p, centre, width)
     amount = torch.where(amount > 0.02, amount - 0.02, 0.0) * left * _skin(head)
@@ -146,7 +146,7 @@ def _scale(head: Anatomy) -> Tensor:
     t = topology()
     corner = t.rings["mouth"][9, 13]
     size = lambda v, eyes: (eyes.mean(0)[1] - v[corner, 1]) * eyes[0, 0]  # noqa: E731
-    mean = size(mean_vertices(), torch.tensor([[31.5, 0.0, 66.5], [-31.5, 0.0, 66.5]]).double())
+    mean = size(sculpted_vertices(), torch.tensor([[31.5, 0.0, 66.5], [-31.5, 0.0, 66.5]]).double())
     return (size(head.vertices, head.eye_centres) / mean).sqrt()
 
 
@@ -184,11 +184,11 @@ def upper_face(head: Anatomy) -> dict[str, Tensor]:
 
 
 def _opening(head: Anatomy) -> float:
-    """The lids' opening against the mean head's."""
+    """The lids' opening against the sculpture's."""
     rim = topology().rings["eye"][EYE_RIM]
     above, below = lid_order()
     gap = lambda v: float(v[rim[above[8]], 1] - v[rim[below[8]], 1])  # noqa: E731
-    return gap(head.vertices) / gap(mean_vertices())
+    return gap(head.vertices) / gap(sculpted_vertices())
 
 
 def _sideways(head: Anatomy, amount: float) -> Tensor:

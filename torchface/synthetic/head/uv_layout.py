@@ -6,7 +6,7 @@ from functools import lru_cache
 import torch
 from torch import Tensor
 
-from torchface.synthetic.head.mean_head import sculpture
+from torchface.synthetic.head.sculpture import sculpture
 from torchface.synthetic.head.signed_distance import EYE_CENTRE, EYE_RADIUS
 from torchface.synthetic.head.topology import COLUMNS, ROWS, topology
 

@@ -152,7 +152,7 @@ class PhotographLandmarks:
     boxes: Tensor  # of all faces, x, y, width, height, (F,4) pixels
     size: tuple[int, int]  # of the photograph, width and height
     asked: bool = False  # whether the user said which face
-    # of the points that the model finds beside the 68, on the embedded performer's mean head, (P,3) mm
+    # of the points that the model finds beside the 68, on the embedded performer's sculpture, (P,3) mm
     places: Tensor = field(default_factory=lambda: torch.zeros(0, 3))
 
     @property

@@ -40,7 +40,7 @@ def with_readings(settings: FitSettings, readings: FaceReading, places: Tensor, 
     Args:
         settings: with the prior on expressions.
         readings: of I photographs by one model, (I,...).
-        places: of the points that the model finds beside the 68, on the embedded performer's mean head, (P,3) mm.
+        places: of the points that the model finds beside the 68, on the embedded performer's sculpture, (P,3) mm.
         rig: whose weights are solved for, with the 68 landmarks annotated.
 
     Example:

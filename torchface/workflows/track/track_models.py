@@ -36,7 +36,7 @@ class TrackModels:
     solving: str = ""  # changes when what solves does
     # whether the finder reads which weights of the rig's shapes are to be expected: then solves have no other prior
     expects: bool = False
-    # of the points that the finder finds beside the 68, on the embedded performer's mean head, (P,3) mm
+    # of the points that the finder finds beside the 68, on the embedded performer's sculpture, (P,3) mm
     places: Tensor = field(default_factory=lambda: torch.zeros(0, 3))
 
 

@@ -164,7 +164,7 @@ class LandmarkNetwork(PictureNetwork):
 
     @property
     def places(self) -> Tensor:
-        """Where its points are on the embedded performer's mean head, (P,3) millimetres."""
+        """Where its points are on the embedded performer's sculpture, (P,3) millimetres."""
         return torch.zeros(0, 3) if self.dense is None else self.dense.places
 
     @property
@@ -178,7 +178,7 @@ class LandmarkNetwork(PictureNetwork):
         """A network that finds the 68 as this one does, and has an untrained head for further points.
 
         Args:
-            places: of the points on the embedded performer's mean head, (P,3) millimetres.
+            places: of the points on the embedded performer's sculpture, (P,3) millimetres.
             mirror: which of them each becomes when the picture is mirrored, (P,) int64.
             hidden: units of the head.
             size: of its crops, pixels a side; as this one's if absent. Of crops of another size it is to learn first.

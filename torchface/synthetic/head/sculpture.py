@@ -1,4 +1,4 @@
-"""The mean head's vertices: the grid cast onto the form, then lids, lips, nostrils, ears and eyeballs laid in."""
+"""The sculpture's vertices: the grid cast onto the form, then lids, lips, nostrils, ears and eyeballs laid in."""
 
 from dataclasses import dataclass
 from functools import lru_cache
@@ -90,7 +90,7 @@ _NOSE_ROWS = {
 
 @dataclass(frozen=True, eq=False)
 class Sculpture:
-    """The mean's half head: vertices (H,3) float64 and where each lies in the unrolled plane, (H,2)."""
+    """The half head: vertices (H,3) float64 and where each lies in the unrolled plane, (H,2)."""
 
     vertices: Tensor
     plane: Tensor
@@ -164,7 +164,7 @@ def coons(border: Tensor, height: int, width: int) -> Tensor:
 
 @lru_cache(maxsize=1)
 def sculpture() -> Sculpture:
-    """The mean's half head, computed once."""
+    """The half head, computed once."""
     t = topology()
     vertices = torch.zeros(t.half_count, 3, dtype=torch.float64)
     plane = torch.zeros(t.half_count, 2, dtype=torch.float64)
