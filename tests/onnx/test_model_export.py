@@ -121,10 +121,10 @@ def test_the_bank_finds_what_the_detector_finds(detector: UVLandmarkDetector, tm
 
 
 def test_the_command_exports_models_of_a_folder(
-    head: HeadModel, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    head: HeadModel, regression: ExpressionRegression, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    kinds = {"head": "head_decoder", "trees": "face_landmarks"}
-    for name, model in zip(kinds, (head, zoo.get_model("face_landmarks")), strict=True):
+    kinds = {"head": "head_decoder", "expressions": "expression_regression"}
+    for name, model in zip(kinds, (head, regression), strict=True):
         zoo.save_model(model, tmp_path / name, zoo.ModelCard("MIT", "noise", {"error": 1.5}, "none"))
         out = tmp_path / f"{name}.onnx"
         main(["export", str(tmp_path / name), "--out", str(out), "--quiet"])

@@ -60,10 +60,15 @@ def export_checked(
     allowed: Mapping[str, float],
     units: Mapping[str, str],
     metadata: Mapping[str, object],
+    sizes: Mapping[str, Sequence[str | None]] | None = None,
 ) -> ExportReport:
-    """Exports a module of batches, the last case of two rows or more, and writes it as :func:`write_checked` does."""
+    """Exports a module of batches, the last case of two rows or more, and writes it as :func:`write_checked` does.
+
+    Args:
+        sizes: as of ``exported_model``; the first axis of each input is the batch if absent.
+    """
     example = cases[-1][0]
-    model = exported_model(module, example, list(allowed), metadata, dict.fromkeys(example, ("batch",)))
+    model = exported_model(module, example, list(allowed), metadata, sizes or dict.fromkeys(example, ("batch",)))
     return write_checked(model, path, cases, allowed, units)
 
 
