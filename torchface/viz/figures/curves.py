@@ -6,12 +6,11 @@ import torch
 from torch import Tensor
 
 from torchface.rendering.compositing import from_figure, new_figure
-from torchface.viz.figures.line_chart import LineChart
 
 __all__ = ["error_curve", "named_bars", "weight_curves"]
 
 SOLVED, TRUE, SINGLE = "#1f5fa8", "#d9822b", "#8e9aa8"
-_APART, _ROW = 1.15, 108  # from one curve of weights to the next, and pixels of that
+_APART, _ROW = 1.15, 1.08  # from one curve of weights to the next, and hundreds of pixels of that
 
 
 def error_curve(error: Tensor, fps: float, label: str = "marker RMSE (mm)") -> Tensor:
@@ -22,15 +21,14 @@ def error_curve(error: Tensor, fps: float, label: str = "marker RMSE (mm)") -> T
         >>> bool(picture.min() < 0.5 and picture.max() == 1)  # drawn on white
         True
     """
-    seconds, median = torch.arange(len(error)) / fps, float(error.nanmedian())
+    figure = new_figure(10, 2.6, layout="constrained")
+    axes, seconds, median = figure.subplots(), torch.arange(len(error)) / fps, float(error.nanmedian())
     most = float(error.nan_to_num(0.0).max()) or 1.0
-    chart = LineChart(1000, 260)
-    panel = chart.panel((80, 8, 990, 210), (0.0, float(seconds[-1])), (0.0, 1.05 * most))
-    panel.level(median, dashed=True)
-    panel.line(seconds, error, SOLVED)
-    panel.numbers("seconds", label)
-    panel.legend([(f"median {median:.3f}", "grey")], 200)
-    return chart.picture()
+    axes.axhline(median, color="grey", linewidth=0.8, linestyle="--", label=f"median {median:.3f}")
+    axes.plot(seconds, error.detach().cpu(), color=SOLVED, linewidth=0.9)
+    axes.set(xlabel="seconds", ylabel=label, xlim=(0.0, float(seconds[-1]) or 1.0), ylim=(0.0, 1.05 * most))
+    axes.legend(loc="lower right", frameon=False, fontsize=9)
+    return from_figure(figure)
 
 
 def timing_curves(values: Tensor, names: Sequence[str], fps: float, label: str) -> Tensor:
@@ -64,23 +62,23 @@ def weight_curves(solved: Tensor, true: Tensor | None, names: Sequence[str], fps
     order = (solved if true is None else true).std(0).argsort(descending=True)[:max_shapes].tolist()
     curves = [("sum of weights", solved.sum(1), None if true is None else true.sum(1))]
     curves += [(names[i], solved[:, i], None if true is None else true[:, i]) for i in order]
-    bottom = 10 + _ROW * len(curves)
-    chart, seconds = LineChart(1000, bottom + 45), torch.arange(len(solved)) / fps
-    panel = chart.panel((160, 10, 990, bottom), (0.0, float(seconds[-1])), (0.95 - _APART * len(curves), 1.1))
+    figure = new_figure(10, _ROW * len(curves) + 0.55, layout="constrained")
+    axes, seconds, ticks = figure.subplots(), torch.arange(len(solved)) / fps, []
     for row, (label, values, truth) in enumerate(curves):
         most = 1.0 if row else max(float(x.max()) for x in (values, truth) if x is not None) or 1.0
         base = -_APART * row
-        panel.level(base)
-        panel.level(base + 1, dashed=True)
+        axes.axhline(base, color="grey", linewidth=0.8)
+        axes.axhline(base + 1, color="grey", linewidth=0.8, linestyle="--")
         if truth is not None:
-            panel.line(seconds, base + truth / most, TRUE, 2)
-        panel.line(seconds, base + values / most, SOLVED)
-        middle = 10 + (0.6 - base) / (0.15 + _APART * len(curves)) * (bottom - 10)
-        chart.text((152, middle - 7), label, "rm", 12)
-        chart.text((152, middle + 8), f"0 to {most:.3g}", "rm", 12)
-    panel.numbers("seconds")
-    panel.legend([("true", TRUE)] * (true is not None) + [("solved", SOLVED)], 18)
-    return chart.picture()
+            axes.plot(seconds, base + truth.detach().cpu() / most, color=TRUE, linewidth=2, label="true")
+        axes.plot(seconds, base + values.detach().cpu() / most, color=SOLVED, linewidth=0.9, label="solved")
+        ticks.append((base + 0.5, f"{label}\n0 to {most:.3g}"))
+    axes.set_yticks(*zip(*ticks, strict=True), fontsize=9)
+    axes.set(xlabel="seconds", xlim=(0.0, float(seconds[-1]) or 1.0), ylim=(0.95 - _APART * len(curves), 1.1))
+    handles, names_shown = axes.get_legend_handles_labels()
+    shown = dict(zip(names_shown, handles, strict=True))
+    axes.legend(shown.values(), shown, loc="upper right", frameon=False, ncols=2, fontsize=9)
+    return from_figure(figure)
 
 
 def compared_curves(
@@ -134,18 +132,18 @@ def motion_curves(
     translation: Tensor, degrees: Tensor, fps: float, true: tuple[Tensor, Tensor] | None = None
 ) -> Tensor:
     """Translations (T,3), millimetres, and rotations (T,3), degrees, over time, with the true ones if any; (3,H,W)."""
-    chart, seconds = LineChart(1000, 600), torch.arange(len(translation)) / fps
+    figure = new_figure(10, 6, layout="constrained")
+    grid, seconds = figure.subplots(3, 2, sharex=True), torch.arange(len(translation)) / fps
     for column, (values, unit) in enumerate(((translation, "mm along"), (degrees, "° about"))):
         reach = 1.1 * max(float(values.abs().max()), 0.5 if column else 1.0)
-        left = 80 + 497 * column
         for axis, name in enumerate("xyz"):
-            top = 10 + 186 * axis
-            panel = chart.panel((left, top, left + 414, top + 168), (0.0, float(seconds[-1])), (-reach, reach))
-            panel.level(0.0)
+            axes = grid[axis, column]
+            axes.axhline(0.0, color="grey", linewidth=0.8)
             if true is not None:
-                panel.line(seconds, true[column][:, axis], TRUE, 2)
-            panel.line(seconds, values[:, axis], SOLVED)
-            panel.numbers("seconds" if axis == 2 else None, f"{unit} {name}")
-            if true is not None and not axis and not column:
-                panel.legend([("true", TRUE), ("solved", SOLVED)])
-    return chart.picture()
+                axes.plot(seconds, true[column][:, axis], color=TRUE, linewidth=2, label="true")
+            axes.plot(seconds, values[:, axis], color=SOLVED, linewidth=0.9, label="solved")
+            axes.set(ylabel=f"{unit} {name}", xlim=(0.0, float(seconds[-1]) or 1.0), ylim=(-reach, reach))
+        grid[2, column].set_xlabel("seconds")
+    if true is not None:
+        grid[0, 0].legend(loc="upper right", frameon=False, ncols=2, fontsize=9)
+    return from_figure(figure)
