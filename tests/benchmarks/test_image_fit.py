@@ -349,13 +349,12 @@ def test_photographs_beside_eos(faces: Faces, data: Path) -> None:
         print(f"\n{heading:34s}{'inner':>9s}{'all 68':>9s}{'weights':>10s}{'smiles apart':>14s}{'CPU s':>9s}")
         for name, row in ways.items():
             print(row.line(name))
-    # eos takes contour landmarks for vertices and weights beyond 1, so what is left is no measure of the face found;
-    # planted faces are.
+    # Contour landmarks slide along the silhouette, which eos takes for vertices: distances of all 68 compare nothing.
     for ways in told.values():
         assert max(ways["people"].weights) <= 1.0
-        (inner, whole), (_, theirs) = ways["people"].medians, ways["eos, people"].medians
+        (inner, _), (theirs, _) = ways["people"].medians, ways["eos, people"].medians
         assert inner < 0.028
-        assert whole < theirs
+        assert inner < theirs
 
 
 def test_planted_single_views_beside_eos(faces: Faces) -> None:

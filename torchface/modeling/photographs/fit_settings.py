@@ -81,7 +81,7 @@ class FitSettings:
     """
 
     inner_weight: float = 2.0
-    contour_slide: float = 0.5
+    contour_slide: float = 0.3
     sliding: bool | None = None
     deviations: Tensor | None = None
     surface: SurfacePoints | None = None

@@ -23,7 +23,7 @@ Of 39 pairs of photographs of one person each all were above 0.97 (68 landmarks,
 pairs of two people a quarter below 0.05 and half below 0.83.
 """
 
-ALONE = FitSettings(transfers=0, unknown_deviation=0.0, contour_slide=0.3, least_noise=0.004)
+ALONE = FitSettings(transfers=0, unknown_deviation=0.0, least_noise=0.004)
 """How heads are fitted for these checks, whose limits are of such fits: nothing but the model explains a head. Exact
 landmarks, as of a rendered head, would be sure of coefficients that the model's form of it decides."""
 
