@@ -12,9 +12,6 @@ import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-import torch
-
-from torchface.correctives.corrective_shapes import Corrective, Correctives
 from torchface.errors import NameMismatchError, ValueRangeError
 from torchface.rig import BlendshapeRig
 from torchface.shape_names import arkit_sources
@@ -25,8 +22,6 @@ __all__ = [
     "jaw_into_mouth_close",
     "jaw_out_of_mouth_close",
     "mouth_close_of",
-    "with_jaw_in_mouth_close",
-    "without_jaw_in_mouth_close",
 ]
 
 JAW, CLOSE = "jawOpen", "mouthClose"
@@ -79,39 +74,6 @@ def mouth_close_of(rig: BlendshapeRig) -> MouthClose | None:
     return MouthClose(share >= _UNCLEAR[1], share)
 
 
-def with_jaw_in_mouth_close(rig: BlendshapeRig) -> BlendshapeRig:
-    """ARKit's rig in Audio2Face's convention: the same faces at weights of :func:`jaw_into_mouth_close`.
-
-    Raises:
-        NameMismatchError: it lacks one of the shapes, or a corrective has no counterpart.
-        ValueRangeError: it is of that convention already.
-
-    Example:
-        >>> from torchface.synthetic import performer
-        >>> rig = with_jaw_in_mouth_close(performer(texture=False))
-        >>> mouth_close_of(rig).opens_jaw
-        True
-    """
-    _expect(rig, opens_jaw=False)
-    return _converted(rig, 1.0)
-
-
-def without_jaw_in_mouth_close(rig: BlendshapeRig) -> BlendshapeRig:
-    """Audio2Face's rig in ARKit's convention: the same faces at weights of :func:`jaw_out_of_mouth_close`.
-
-    Raises: as :func:`with_jaw_in_mouth_close`.
-
-    Example:
-        >>> from torchface.synthetic import performer
-        >>> rig = performer(texture=False)
-        >>> back = without_jaw_in_mouth_close(with_jaw_in_mouth_close(rig))
-        >>> torch.allclose(back.deltas, rig.deltas, atol=1e-4)
-        True
-    """
-    _expect(rig, opens_jaw=True)
-    return _converted(rig, -1.0)
-
-
 def jaw_into_mouth_close(track: Track) -> Track:
     """ARKit's weights for a rig whose ``mouthClose`` opens the jaw: its weight is taken from ``jawOpen``'s.
 
@@ -156,49 +118,6 @@ def _moved(track: Track, sign: float) -> Track:
             stacklevel=3,
         )
     return replace(track, values=values)
-
-
-def _expect(rig: BlendshapeRig, opens_jaw: bool) -> None:
-    convention = mouth_close_of(rig)
-    if convention is None:
-        raise NameMismatchError(f"rig: found no {JAW} and {CLOSE}, expected both")
-    if convention.opens_jaw is not opens_jaw:
-        meant = "opens the jaw itself already" if convention.opens_jaw else "leaves the jaw to jawOpen already"
-        raise ValueRangeError(f"rig: its {CLOSE} {meant} (it moves the chin {convention.share:.0%} of the way)")
-
-
-def _converted(rig: BlendshapeRig, sign: float) -> BlendshapeRig:
-    rows = _rows(rig.names)
-    assert rows is not None
-    jaw, close = rows
-    deltas = rig.deltas.clone()
-    deltas[close] += sign * deltas[jaw]
-    correctives = rig.correctives
-    if correctives is not None:
-        correctives = _converted_correctives(correctives, rig.names[jaw], rig.names[close], sign)
-    return BlendshapeRig(rig.neutral, deltas, rig.names, correctives)
-
-
-def _converted_correctives(correctives: Correctives, jaw: str, close: str, sign: float) -> Correctives:
-    """With the old weight of the jaw a sum of the new ones, a product of it is a product of each."""
-    definitions, deltas = list(correctives.definitions), list(correctives.deltas.unbind())
-    row = {frozenset(definition.drivers): i for i, definition in enumerate(definitions) if definition.peak is None}
-    for definition, delta in zip(correctives.definitions, correctives.deltas, strict=True):
-        if jaw not in definition.drivers:
-            continue
-        if close in definition.drivers or definition.is_in_between:
-            raise NameMismatchError(
-                f"corrective {definition.name!r}: driven by {' x '.join(definition.drivers)}, which has no counterpart "
-                f"where {close} and {jaw} share the jaw; expected none of both and no in-between of {jaw}: take it out"
-            )
-        drivers = tuple(close if driver == jaw else driver for driver in definition.drivers)
-        there = row.get(frozenset(drivers))
-        if there is None:
-            definitions.append(Corrective(f"{definition.name}_{close}", drivers))
-            deltas.append(sign * delta)
-        else:
-            deltas[there] = deltas[there] + sign * delta
-    return Correctives(torch.stack(deltas), tuple(definitions))
 
 
 def _rows(names: Sequence[str]) -> tuple[int, int] | None:
