@@ -12,7 +12,6 @@ from torchface import zoo
 from torchface.capture import ExampleSolver
 from torchface.capture.anybody import (
     AllAtOnce,
-    Distances,
     ExampleShapes,
     LandmarkBoxes,
     LandmarkModel,
@@ -88,6 +87,4 @@ def test_it_is_written_with_its_names_or_not_at_all(
     monkeypatch.undo()
     with pytest.raises(ValueRangeError, match="found Regional with the similarity solved for, expected all"):
         export_example_solver(ExampleSolver(examples, Regional(), SolvedSimilarity()), tmp_path / "poor.onnx")
-    with pytest.raises(ValueRangeError, match="found Distances, expected squared distances"):
-        export_example_solver(ExampleSolver(examples, AllAtOnce(Distances())), tmp_path / "poor.onnx")
     assert not (tmp_path / "poor.onnx").exists()

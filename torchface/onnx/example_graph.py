@@ -13,7 +13,6 @@ from torchface.capture.anybody.examples.example_methods import head_rows, region
 from torchface.capture.anybody.examples.example_shapes import EYE_CORNERS
 from torchface.capture.anybody.examples.expression_regions import HEAD, HEAD_LANDMARKS
 from torchface.capture.anybody.examples.landmark_equations import LandmarkEquations
-from torchface.capture.anybody.examples.landmark_objectives import SquaredDistances
 from torchface.errors import ValueRangeError
 from torchface.onnx.exported_model import exported_model
 from torchface.optim.fixed_splitting import FixedSplitting, newton_inverse
@@ -117,7 +116,7 @@ class ExampleGraph(nn.Module):
         """See :meth:`torchface.capture.anybody.LandmarkModel.solve`; its system is scaled to a unit diagonal."""
         eyes = (self.neutral[EYE_CORNERS[0]] - self.neutral[EYE_CORNERS[1]]).norm()
         squares = at.of_model(model.mean, model.components, eyes)
-        energy = squares.least_squares(squares.share).energy
+        energy = squares.least_squares().energy
         count = squares.seen.sum(1).clamp(min=1)[:, None]
         identity = torch.eye(energy.f.shape[-1]).double()
         H = energy.H + identity * (2 * (model.noise**2 / (model.variances + 1e-300)) / count)[..., None]
@@ -134,19 +133,10 @@ class ExampleGraph(nn.Module):
 
 
 def _check(solver: ExampleSolver) -> None:
-    method = solver.method
-    objective = method.objective if isinstance(method, AllAtOnce | Regional) else method
-    if isinstance(solver.placement, SolvedSimilarity):
-        if not (isinstance(method, AllAtOnce) and isinstance(objective, SquaredDistances)):
-            found = type(objective if isinstance(method, AllAtOnce) else method).__name__
-            raise ValueRangeError(
-                f"export examples: found {found} with the similarity solved for, expected all shapes at once and "
-                "squared distances; others have landmark boxes"
-            )
-    elif not isinstance(objective, SquaredDistances | LandmarkModel):
+    if isinstance(solver.placement, SolvedSimilarity) and not isinstance(solver.method, AllAtOnce):
         raise ValueRangeError(
-            f"export examples: found {type(objective).__name__}, expected squared distances or a landmark model: "
-            "distances take as many iterations as they need"
+            f"export examples: found {type(solver.method).__name__} with the similarity solved for, expected all "
+            "shapes at once; others have landmark boxes"
         )
 
 

@@ -79,8 +79,7 @@ def export_example_solver(
     (B,N) and ``carried`` (B,N), the next frame's ``previous``; zeros start. The metadata holds ``shape_names``.
 
     Args:
-        solver: of squared distances, or of a landmark model; with landmark boxes, or all at once with the similarity
-            solved for.
+        solver: with landmark boxes, or all at once with the similarity solved for.
         path: the file to write; it appears only when it is complete and checked.
         steps: of splitting; 168 of a regional solver and 96 of others if absent.
         landmarks: frames to check with, (T,68,2), none missing; random sparse weights with noise if absent.

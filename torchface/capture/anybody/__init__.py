@@ -5,11 +5,10 @@ from torchface.capture.anybody.examples.example_expressions import (
     character_matrix,
     paper_expressions,
 )
-from torchface.capture.anybody.examples.example_methods import AllAtOnce, ExampleMethod, Regional
+from torchface.capture.anybody.examples.example_methods import AllAtOnce, ExampleMethod, Regional, SquaredDistances
 from torchface.capture.anybody.examples.example_shapes import ExampleShapes
 from torchface.capture.anybody.examples.example_solver import ExampleFit, ExampleSolver, landmark_observability
 from torchface.capture.anybody.examples.landmark_model import LandmarkModel
-from torchface.capture.anybody.examples.landmark_objectives import Distances, SquaredDistances
 from torchface.capture.anybody.examples.landmark_placement import LandmarkBoxes, SolvedSimilarity
 from torchface.capture.anybody.examples.rig_examples import paper_examples, rig_examples
 from torchface.capture.anybody.examples.shown_examples import example_remarks, shown_examples
@@ -19,7 +18,6 @@ from torchface.capture.anybody.webcam_state import WebcamControls, WebcamState
 
 __all__ = [
     "AllAtOnce",
-    "Distances",
     "ExampleExpression",
     "ExampleFit",
     "ExampleMethod",

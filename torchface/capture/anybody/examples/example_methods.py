@@ -1,6 +1,6 @@
 """Methods that solve landmarks for the weights of examples: all shapes at once, or the head first, then regions."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Protocol
 
 import torch
@@ -8,7 +8,9 @@ from torch import Tensor
 
 from torchface.capture.anybody.examples.expression_regions import HEAD, HEAD_LANDMARKS, REGION_LANDMARKS
 from torchface.capture.anybody.examples.landmark_equations import LandmarkEquations, Unknowns
-from torchface.capture.anybody.examples.landmark_objectives import LandmarkObjective, SquaredDistances
+from torchface.capture.energy import ridge_term, sparsity_term
+from torchface.number_checks import LARGEST_WEIGHT, checked_number
+from torchface.optim import box_qp
 
 
 class ExampleMethod(Protocol):
@@ -21,6 +23,50 @@ class ExampleMethod(Protocol):
     """
 
     def solve(self, equations: LandmarkEquations, regions: tuple[str, ...], initial: Tensor | None) -> Unknowns: ...
+
+
+@dataclass(frozen=True)
+class SquaredDistances:
+    r"""The mean squared distance over that of the eyes, squared, with penalties: a box-constrained quadratic program.
+
+    .. math:: \frac{1}{|S|} \sum_{i \in S} \lVert r_i(w) \rVert^2 + \beta \sum_k w_k + \varepsilon \lVert w \rVert^2
+
+    Args:
+        sparsity: :math:`\beta`, of the L1 penalty.
+        ridge: :math:`\varepsilon`, which makes the solution unique where shapes look alike.
+
+    Raises:
+        ValueRangeError: a penalty is negative or not finite.
+
+    Source: realtime_facial_animation, equation 2.
+
+    Example:
+        >>> from torchface.capture.anybody import AllAtOnce, ExampleSolver, paper_examples
+        >>> from torchface.synthetic import performer
+        >>> examples = paper_examples(performer(texture=False))
+        >>> solver = ExampleSolver(examples, AllAtOnce(SquaredDistances(sparsity=0.0)))
+        >>> round(solver(examples.landmarks[:1].double())[0, 0].item(), 2)
+        1.0
+    """
+
+    sparsity: float = 2e-5
+    ridge: float = 1e-7
+
+    def __post_init__(self) -> None:
+        for name in ("sparsity", "ridge"):
+            checked_number(f"SquaredDistances: {name}", getattr(self, name), 0.0, LARGEST_WEIGHT)
+
+    def minimise(self, equations: LandmarkEquations, initial: Tensor | None = None) -> Unknowns:
+        """The minimum, differentiable in the equations.
+
+        Args:
+            equations: of B frames and N shapes, float64.
+            initial: guess of the weights, (B,N); the result does not depend on it.
+        """
+        squares = equations.least_squares()
+        shapes, like = equations.basis.shape[-1], equations.basis.detach()
+        energy = squares.energy + sparsity_term(shapes, self.sparsity, like) + ridge_term(shapes, self.ridge, like)
+        return squares.unknowns(box_qp(energy.H, energy.f, start=initial))
 
 
 @dataclass(frozen=True)
@@ -42,7 +88,7 @@ class AllAtOnce:
         [0, 1, 2, 3]
     """
 
-    objective: LandmarkObjective = field(default_factory=SquaredDistances)
+    objective: SquaredDistances = SquaredDistances()
 
     def solve(self, equations: LandmarkEquations, regions: tuple[str, ...], initial: Tensor | None) -> Unknowns:
         """Weights of N shapes, whatever their regions (N,)."""
@@ -72,7 +118,7 @@ class Regional:
         [0, 1, 2, 3]
     """
 
-    objective: LandmarkObjective = field(default_factory=SquaredDistances)
+    objective: SquaredDistances = SquaredDistances()
 
     def solve(self, equations: LandmarkEquations, regions: tuple[str, ...], initial: Tensor | None) -> Unknowns:
         """Weights of N shapes in their regions (N,)."""
@@ -86,7 +132,7 @@ class Regional:
         if len(head):
             placed = self.objective.minimise(first, None if initial is None else initial[:, head])
         else:  # the placement alone
-            placed = first.least_squares(first.share).unknowns(first.offset.new_zeros(len(first.offset), 0))
+            placed = first.least_squares().unknowns(first.offset.new_zeros(len(first.offset), 0))
         rest = equations.moved(basis[..., head], placed).with_basis(regional_basis(basis, regions)[..., others])
         expression = self.objective.minimise(rest, None if initial is None else initial[:, others])
         order = torch.cat([head, others]).argsort()

@@ -7,12 +7,11 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from torchface.capture.anybody.examples.example_methods import AllAtOnce, ExampleMethod, Regional
+from torchface.capture.anybody.examples.example_methods import AllAtOnce, ExampleMethod, Regional, SquaredDistances
 from torchface.capture.anybody.examples.example_shapes import ExampleShapes
 from torchface.capture.anybody.examples.expression_regions import shape_regions
 from torchface.capture.anybody.examples.landmark_equations import LandmarkEquations
 from torchface.capture.anybody.examples.landmark_model import LandmarkModel
-from torchface.capture.anybody.examples.landmark_objectives import Distances, SquaredDistances
 from torchface.capture.anybody.examples.landmark_placement import (
     LandmarkBoxes,
     Placement,
@@ -24,7 +23,6 @@ from torchface.errors import NameMismatchError, ShapeError, ValueRangeError
 from torchface.number_checks import checked_type
 from torchface.optim.data_dependent import data_dependent
 
-_OBJECTIVES = {"squared_distances": SquaredDistances, "distances": Distances}
 _METHODS = {"all_at_once": AllAtOnce, "regional": Regional}
 _PLACEMENTS: dict[str, Callable[[], PlacementModel]] = {
     "landmark_boxes": LandmarkBoxes,
@@ -120,7 +118,7 @@ class ExampleSolver(nn.Module):
         """What :meth:`from_config` needs beside the state: plain values only.
 
         Raises:
-            ValueRangeError: method, objective or placement is of a class of one's own.
+            ValueRangeError: method or placement is of a class of one's own.
         """
         placement = _name_of(self.placement, _PLACEMENTS)
         if isinstance(self.method, LandmarkModel):
@@ -128,7 +126,7 @@ class ExampleSolver(nn.Module):
         else:
             kind = _name_of(self.method, _METHODS)
             objective = getattr(self.method, "objective")  # noqa: B009
-            method = {"kind": kind, "objective": _name_of(objective, _OBJECTIVES), "settings": asdict(objective)}
+            method = {"kind": kind, "settings": asdict(objective)}
         return {"names": list(self.names), "method": method, "placement": placement}
 
     @classmethod
@@ -137,7 +135,7 @@ class ExampleSolver(nn.Module):
 
         Raises:
             NameMismatchError: a name is no text, or there twice.
-            ValueRangeError: there is no such method, objective or placement, or a penalty is out of range.
+            ValueRangeError: there is no such method or placement, or a penalty is out of range.
         """
         names, method = config["names"], dict(config["method"])
         if (
@@ -151,8 +149,7 @@ class ExampleSolver(nn.Module):
         if kind == "landmark_model":
             made = LandmarkModel.from_config(method)
         else:
-            objective = _of_name("objective", method["objective"], _OBJECTIVES)(**method["settings"])
-            made = _of_name("method", kind, _METHODS)(objective)
+            made = _of_name("method", kind, _METHODS)(SquaredDistances(**method["settings"]))
         self = cls.__new__(cls)
         nn.Module.__init__(self)
         placement = _of_name("placement", config["placement"], _PLACEMENTS)()

@@ -58,26 +58,15 @@ class LandmarkEquations:
         moved = self.offset + _along(columns, unknowns.weights) + _along(self.free, unknowns.free)
         return replace(self, offset=moved, free=self.free[..., :0])
 
-    def rows(self, keep: Tensor) -> LandmarkEquations:
-        """Those of some frames."""
-        return replace(
-            self, offset=self.offset[keep], scale=self.scale[keep], seen=self.seen[keep], free=self.free[keep]
-        )
-
-    def residual(self, unknowns: Unknowns) -> Tensor:
-        """:math:`r` (B,68,2); 0 where a landmark is not seen."""
-        inside = self.offset + _along(self.basis, unknowns.weights) + _along(self.free, unknowns.free)
-        return torch.where(self.seen[..., None], self.scale[:, None] * inside, 0.0)
-
     def columns(self) -> Tensor:
         """The derivative of :math:`r` in weights and placement, (B,68,2,N+F)."""
         shared = self.basis.expand(len(self.offset), -1, -1, -1)
         columns = self.scale[:, None, :, None] * torch.cat([shared, self.free], dim=-1)
         return torch.where(self.seen[..., None, None], columns, 0.0)
 
-    def least_squares(self, share: Tensor) -> ReducedSquares:
-        r""":math:`\sum_i a_i \lVert r_i \rVert^2` with shares a (B,68), the best placement put in for every w."""
-        factor = (share[..., None] * self.scale[:, None].square()).flatten(1)  # (B,136)
+    def least_squares(self) -> ReducedSquares:
+        """The mean of :math:`\\lVert r_i \\rVert^2` over the landmarks seen, the best placement put in for every w."""
+        factor = (self.share[..., None] * self.scale[:, None].square()).flatten(1)  # (B,136)
         rows, offset = self.basis.flatten(0, 1), self.offset.flatten(1)
         shapes = rows.shape[1]
         pairs = (rows[:, :, None] * rows[:, None, :]).flatten(1)

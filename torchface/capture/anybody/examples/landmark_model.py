@@ -149,7 +149,7 @@ class LandmarkModel(nn.Module):
         neutral = equations.neutral
         eyes = (neutral[EYE_CORNERS[0]] - neutral[EYE_CORNERS[1]]).norm()
         model = equations.of_model(mean, components, eyes)
-        squares = model.least_squares(model.share)
+        squares = model.least_squares()
         # The mean over the landmarks that are seen of squares over the eyes' distance: so is the prior's.
         count = model.seen.sum(1).clamp(min=1)[:, None]
         H = squares.energy.H + torch.diag_embed(2 * (self.noise**2 / (variances + 1e-300)) / count)
@@ -160,7 +160,7 @@ class LandmarkModel(nn.Module):
         f = (start - coefficients) @ onto + self.sparsity
         weights = self._program(equations.basis, eyes)(f, initial)
         # The placement that goes with these weights, of the shapes themselves.
-        return equations.least_squares(equations.share).unknowns(weights)
+        return equations.least_squares().unknowns(weights)
 
     def _program(self, basis: Tensor, eyes: Tensor) -> BoxQP:
         """The way back from coefficients: prepared once for the examples."""
