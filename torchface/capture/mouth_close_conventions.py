@@ -83,6 +83,7 @@ def jaw_into_mouth_close(track: Track) -> Track:
         NameMismatchError: the track lacks one of the shapes.
 
     Example:
+        >>> import torch
         >>> arkit = Track(("jawOpen", "mouthClose"), torch.tensor([[[0.75], [0.25]]]))
         >>> jaw_into_mouth_close(arkit).values[0, :, 0].tolist()
         [0.5, 0.25]
@@ -94,6 +95,7 @@ def jaw_out_of_mouth_close(track: Track) -> Track:
     """The weights of a rig whose ``mouthClose`` opens the jaw, for ARKit's; see :func:`jaw_into_mouth_close`.
 
     Example:
+        >>> import torch
         >>> other = Track(("jawOpen", "mouthClose"), torch.tensor([[[0.5], [0.25]]]))
         >>> jaw_out_of_mouth_close(other).values[0, :, 0].tolist()
         [0.75, 0.25]
