@@ -35,7 +35,6 @@ def track(
     camera: Path | None = None,
     videos: Annotated[UseAppendAction[tuple[Path, ...]], arg(name="video")] = (),
     cameras: Path | None = None,
-    texture: Path | None = None,
     face: int = 0,
     one_person: bool = False,
     anybody: bool = False,
@@ -92,7 +91,6 @@ def track(
         videos: Films of one take by several cameras, again for each, in the order of --cameras; the overlay is of the
             first. In place of VIDEO.
         cameras: Where these cameras lie, as `torchface calibrate --beside` writes it.
-        texture: An image to put on the face in the overlay, in the rig's texture coordinates, under the video's light.
         face: Which of several faces to follow, from 0, the largest first.
         one_person: All frames show the actor: solve those after a cut too in which the face looks like another's.
         anybody: The rig is not the actor's: a head is solved with its shapes, and the head model's topology.
@@ -141,7 +139,6 @@ def track(
         face,
         whole_take,
         part,
-        texture,
         overlay,
         fps,
         None if size is None else picture_size(size),

@@ -11,8 +11,7 @@ from torchface.io.video import VideoFile
 from torchface.landmarks import FaceReading
 from torchface.synthetic import performer
 from torchface.viz.figures.landmark_dots import with_dots
-from torchface.workflows.track.face_overlay import camera_at
-from torchface.workflows.track.overlay_video import head_window, side_by_side_drawer
+from torchface.workflows.track.overlay_video import camera_at, head_window, side_by_side_drawer
 from torchface.workflows.track.track_inputs import TrackInputs, TrackSettings
 from torchface.workflows.track.track_models import TrackModels
 from torchface.workflows.track.track_result import Tracked

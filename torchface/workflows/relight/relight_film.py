@@ -11,6 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from torchface.capture.own_rig.lighting import estimate_light
 from torchface.errors import AlignmentError, ValueRangeError
 from torchface.files.whole_files import check_ending, check_writable
 from torchface.geometry.similarity import similarity_transform
@@ -24,7 +25,7 @@ from torchface.mesh import Mesh
 from torchface.progress import Progress, silent
 from torchface.rendering.environment_light import EnvironmentLight
 from torchface.rendering.gaussian_blur import gaussian_blur
-from torchface.rendering.point_light import PointLight
+from torchface.rendering.point_light import PointLight, vertex_albedo
 from torchface.rendering.texture_overlay import FacePaint, overlay, relight, skin_faces
 from torchface.rig import BlendshapeRig
 from torchface.synthetic import Look, character
@@ -33,11 +34,11 @@ from torchface.take import Track
 from torchface.workflows.named_finders import part_finder
 from torchface.workflows.relight.tracked_film import TrackedFilm, bare, read_tracked_film
 from torchface.workflows.relight.wanted_light import WantedLight
-from torchface.workflows.track.face_overlay import light_of
 
 FilmLight = Literal["once", "each"]
 Draw = Callable[[int, Tensor, PointLight | EnvironmentLight], Tensor]
 _CHUNK = 8
+_EVEN_SKIN = (0.80, 0.62, 0.53)
 _LIT, _AGAIN = 5, 3  # frames from which the film's light is estimated, and those of a chunk
 _BEFORE_SKIN = ("glasses", "hand", "cloth", "hair", "background")
 _BEHIND = ("background",)  # the head of the track is wider than the filmed one here and there
@@ -239,11 +240,19 @@ def _shown(frame: Tensor, parts: FaceParts, before: Sequence[str], marks: Tensor
 
 
 def _light(tracked: TrackedFilm, frames: dict[int, Tensor], fallback: PointLight | None = None) -> PointLight:
-    """The light of some frames; the fallback where they show too little of the face."""
-    vertices = torch.stack([tracked.vertices(t) for t in frames])
-    cameras = [tracked.camera(t) for t in frames]
+    """The light of some frames, beside the rig's colours or skin of one colour; the fallback where they show too little
+    of the face."""
+    neutral = tracked.rig.neutral
     try:
-        return light_of(tracked.rig.neutral, torch.stack(list(frames.values())), vertices, cameras, tracked.calibration)
+        albedo = vertex_albedo(neutral)
+    except ValueRangeError:
+        albedo = torch.tensor(_EVEN_SKIN).expand(len(neutral.vertices), 3)
+    skin = torch.zeros(len(neutral.vertices))
+    skin[neutral.faces[skin_faces(neutral)].flatten()] = 1.0
+    vertices = torch.stack([tracked.vertices(t) for t in frames])
+    cameras, pictures = [tracked.camera(t) for t in frames], torch.stack(list(frames.values()))
+    try:
+        return estimate_light(pictures, vertices, neutral.faces, albedo, cameras, skin, tracked.calibration).light
     except AlignmentError:
         if fallback is None:
             raise

@@ -9,29 +9,28 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from torchface.capture.own_rig.face_points import FacePoints
+from torchface.geometry.cameras.calibration import CameraCalibration
 from torchface.geometry.cameras.pinhole import Camera
 from torchface.io.video import write_video
 from torchface.landmarks.images.boxes.face_box import interleaved
 from torchface.mesh import Mesh
 from torchface.progress import Progress
 from torchface.rendering.quick_clay import BACKGROUND, QuickClay
-from torchface.workflows.track.face_overlay import camera_at, mesh_drawer, paint_drawer
+from torchface.viz.figures.landmark_dots import with_dots
 from torchface.workflows.track.track_result import Tracked
 
 _HEIGHT = 480  # pixels of the two pictures
 _BORDER = 0.3  # of the face's height, round it
 _SURE = 0.5  # landmarks of at least this confidence are not marked
+_STRENGTH = 0.6  # of the mesh over the picture
 _REACH = 12.0  # millimetres round a landmark that are marked with it
 _FOUND, _SUSPECT, _WORDS = (60, 230, 60), (236, 92, 40), (225, 225, 225)
 
 
 def write_overlay(tracked: Tracked, path: Path, progress: Progress) -> None:
     """Writes the overlay of a whole video, as its settings ask for; it appears when it is complete."""
-    settings = tracked.inputs.settings
-    if settings.texture is not None:
-        draw = paint_drawer(tracked, settings.texture)
-    else:
-        draw = mesh_drawer(tracked) if settings.overlay == "over" else side_by_side_drawer(tracked)
+    draw = mesh_drawer(tracked) if tracked.inputs.settings.overlay == "over" else side_by_side_drawer(tracked)
 
     def drawn() -> Iterator[Tensor]:
         for at, frame in zip(range(len(tracked)), tracked.video.color_frames(), strict=False):
@@ -84,6 +83,48 @@ def side_by_side_drawer(tracked: Tracked) -> Callable[[int, Tensor], Tensor]:
         return torch.from_numpy(both).permute(2, 0, 1)
 
     return draw
+
+
+def mesh_drawer(tracked: Tracked) -> Callable[[int, Tensor], Tensor]:
+    """Draws frame number t, uint8 (3,H,W): the mesh half through, found landmarks green, the solved rig's red."""
+    rig, weights = tracked.rig, tracked.solution.weights.detach()
+    clay = QuickClay.of(rig.neutral)
+    points = FacePoints.of(rig, rig.neutral.landmarks)  # those of the contour slide, as the solver has them
+
+    def draw(t: int, frame: Tensor) -> Tensor:
+        if not tracked.seen[t]:
+            return frame
+        picture, camera = interleaved(undistorted(frame, tracked.calibration)), camera_at(tracked, t)
+        drawn = clay.draw(rig(weights[t : t + 1].to(rig.deltas))[0], camera)
+        covered = (drawn != np.array(BACKGROUND, np.uint8)).any(2, keepdims=True)
+        mixed = np.where(covered, cv2.addWeighted(drawn, _STRENGTH, picture, 1 - _STRENGTH, 0), picture)
+        here = weights[t : t + 1].double()
+        rows = points.chosen(here, camera.rotation[None], camera.translation[None], camera.intrinsics)[0]
+        places = camera.project(points.at(here)[0, rows])
+        return with_dots(torch.from_numpy(mixed).permute(2, 0, 1), tracked.landmarks[t], places)
+
+    return draw
+
+
+def camera_at(tracked: Tracked, t: int) -> Camera:
+    """The camera of frame t, from the rig's space, without distortion."""
+    solution, clip = tracked.solution, tracked.video
+    return Camera(
+        tracked.calibration.intrinsics.double(),
+        solution.rotation[t].detach().double(),
+        solution.translation[t].detach().double(),
+        clip.width,
+        clip.height,
+    )
+
+
+def undistorted(frame: Tensor, calibration: CameraCalibration) -> Tensor:
+    """What a camera without distortion would have seen, uint8 (3,H,W)."""
+    if not calibration.distortion.any():
+        return frame
+    image = np.ascontiguousarray(frame.permute(1, 2, 0).numpy())
+    straight = cv2.undistort(image, calibration.intrinsics.numpy(), calibration.distortion.numpy())
+    return torch.from_numpy(straight).permute(2, 0, 1)
 
 
 def head_window(tracked: Tracked) -> Camera:

@@ -13,7 +13,6 @@ from torchface.files.content_keys import content_key
 from torchface.geometry.cameras.calibration import CameraCalibration, assumed_calibration
 from torchface.io import load_rig
 from torchface.io.camera_files import load_calibration
-from torchface.io.images.image_files import load_paint
 from torchface.io.landmarks.landmark_tables import load_landmark_table
 from torchface.io.video import VideoFile, open_video
 from torchface.io.video.blank_video import BlankVideo
@@ -49,10 +48,7 @@ class TrackSettings:
     # landmarks smoothed by all frames, those after each too; weights as well where there is a dynamics prior
     whole_take: bool = False
     part: str | None = None  # keep this region of the rig only
-    texture: Path | None = None  # an image to put on the face in the overlay, in the rig's texture coordinates
-    # the rig in a video "side" by side with the picture, "over" it half through, or "none"; a texture goes over the
-    # face
-    overlay: Overlay = "side"
+    overlay: Overlay = "side"  # the rig in a video beside the picture, half through over it, or no video
     fps: float | None = None  # frames a second of a table of landmarks without a video; by its times if absent
     # width and height of the pictures that such landmarks were found in; the camera's if absent
     size: tuple[int, int] | None = None
@@ -122,12 +118,6 @@ def load_inputs(video: Path | None, rig: Path | None, settings: TrackSettings) -
     inputs.check_length(clip.count)
     if settings.neutral_frame is not None and settings.offsets is not None:
         raise ValueRangeError("--neutral-frame: found --offsets beside it, expected one of the two")
-    if settings.texture is not None:
-        load_paint(settings.texture)
-        if inputs.actor.neutral.uvs is None:
-            raise ValueRangeError(
-                f"{settings.texture}: found a rig without texture coordinates, expected some to put it on"
-            )
     return replace(inputs, times=times, rate_varies=rate_varies)
 
 
@@ -188,8 +178,6 @@ def _clip(video: Path | None, settings: TrackSettings) -> VideoFile:
         return replace(open_video(video), even=False)
     if not is_table(settings.landmarks):
         raise ValueRangeError("track: found neither a video nor a table of landmarks, expected one at least")
-    if settings.texture is not None:
-        raise ValueRangeError(f"{settings.texture}: found no video, expected one whose light falls on the texture")
     path = Path(settings.landmarks)
     table = load_landmark_table(path)
     rate = settings.fps or table.fps

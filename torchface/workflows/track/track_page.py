@@ -11,10 +11,9 @@ from torchface.evaluation import weight_jitter
 from torchface.rendering.compositing import caption, sheet
 from torchface.viz.figures.curves import error_curve, motion_curves, weight_curves
 from torchface.viz.reports.report_page import Section, Table, write_page
-from torchface.workflows.track.face_overlay import camera_at, mesh_drawer, paint_drawer
 from torchface.workflows.track.frame_readings import shown_frames
 from torchface.workflows.track.head_rotations import head_angles
-from torchface.workflows.track.overlay_video import side_by_side_drawer
+from torchface.workflows.track.overlay_video import camera_at, mesh_drawer, side_by_side_drawer
 from torchface.workflows.track.track_result import MIN_STABLE, Tracked
 
 _COLUMNS, _WIDTH = 4, 300
@@ -24,12 +23,9 @@ _MARGIN = 0.6
 
 def write_track_page(tracked: Tracked, out: Path) -> Path:
     """Writes the report's page and figures into a folder, and returns the page's path."""
-    fps, solution, texture = tracked.video.fps, tracked.solution, tracked.inputs.settings.texture
+    fps, solution = tracked.video.fps, tracked.solution
     files = ", ".join(f"{name}: {path.name}" for name, path in tracked.products.items())
-    drawers = [(side_by_side_drawer(tracked), False), (mesh_drawer(tracked), True)]
-    if texture is not None:
-        drawers.append((paint_drawer(tracked, texture), True))
-    beside, over, *painted = frames_sheets(tracked, drawers)
+    beside, over = frames_sheets(tracked, [(side_by_side_drawer(tracked), False), (mesh_drawer(tracked), True)])
     sections = [
         Section("What was done", "\n".join([*tracked.lines(), f"files: {files}"])),
         Section("Figures", tables=[Table(("figure", "value"), figures(tracked))]),
@@ -53,9 +49,6 @@ def write_track_page(tracked: Tracked, out: Path) -> Path:
             figures=[("error.png", error_curve(solution.errors.detach(), fps, "error (px)"))],
         ),
     ]
-    if texture is not None:
-        text = f"{texture.name} on the face, in the light of the video."
-        sections.insert(4, Section("Texture", text, figures=[("painted.png", painted[0])]))
     angles = torch.rad2deg(head_angles(solution.rotation.detach().double()))
     moved = solution.translation.detach().double()
     still = moved - moved.mean(0)

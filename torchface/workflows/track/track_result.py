@@ -19,7 +19,6 @@ from torchface.geometry.cameras.calibration import CameraCalibration
 from torchface.io.video import VideoFile
 from torchface.landmarks.images.face_reading import FaceReading
 from torchface.landmarks.images.tracking.video_landmarks import landmark_jitter
-from torchface.rendering.point_light import PointLight
 from torchface.rig import BlendshapeRig
 from torchface.workflows.track.person_head import PersonHead
 from torchface.workflows.track.take_solution import OFFSETS
@@ -51,7 +50,6 @@ class Tracked:
     seconds: dict[str, float] = field(default_factory=dict)  # what each step took, by its name
     products: dict[str, Path] = field(default_factory=dict)  # the files, by what they are
     reductions: list[str] = field(default_factory=list)  # what few keys they have, in words, where few were asked for
-    light: PointLight | None = None  # of the video, where a texture was put on the face
     # landmarks that lie where no face has them, and so are not trusted, (T,68) bool; none if absent
     outliers: Tensor | None = None
     others: Sequence[AnotherFace] = ()  # spans of frames that show another face, which are not solved

@@ -10,7 +10,6 @@ import torch
 from torch import Tensor
 
 from torchface.capture.own_rig import FaceMeasurements
-from torchface.files.checkpoints import read_checkpoint, write_checkpoint
 from torchface.files.content_keys import content_key
 from torchface.files.documents import write_json
 from torchface.files.job_lock import within_job
@@ -20,15 +19,13 @@ from torchface.landmarks.images.face_reading import FaceReading
 from torchface.modeling import FitSettings, HeadModel
 from torchface.modeling.photographs.image_fit import with_skin
 from torchface.progress import Progress, silent
-from torchface.rendering.point_light import PointLight
 from torchface.synthetic.head.embedded_character import is_performers
 from torchface.workflows.fit.fitted_character import dressed_rig
 from torchface.workflows.fit.video_pictures import sharpness_of
 from torchface.workflows.named_finders import part_finder
 from torchface.workflows.track.camera_views import OtherCamera, other_cameras
-from torchface.workflows.track.face_overlay import undistorted, video_light
 from torchface.workflows.track.frame_readings import read_frames
-from torchface.workflows.track.overlay_video import write_overlay
+from torchface.workflows.track.overlay_video import undistorted, write_overlay
 from torchface.workflows.track.person_head import PersonHead, person_head
 from torchface.workflows.track.take_measurements import (
     measured_trust,
@@ -57,7 +54,6 @@ from torchface.workflows.track.track_result import Tracked
 from torchface.workflows.track.track_state import TrackState
 
 HEAD = "head.glb"
-_LIGHT = "light.safetensors"
 
 
 def track_video(
@@ -155,35 +151,20 @@ def _track(inputs: TrackInputs, others: list[OtherCamera], out: Path, filmed: bo
             tracked.products["head"] = out / HEAD
             save_rig(tracked.shown, out / HEAD, head.surface)
     if filmed and inputs.settings.overlay != "none":
-        tracked = _with_overlay(tracked, out, state, key, progress)
+        _add_overlay(tracked, out, state, key, progress)
     write_json(out / SUMMARY, summary(tracked))
     return tracked
 
 
-def _with_overlay(tracked: Tracked, out: Path, state: TrackState, key: str, progress: Progress) -> Tracked:
-    """What was tracked with its overlay, drawn unless that of an earlier run is up to date."""
-    settings, path = tracked.inputs.settings, out / OVERLAY
-    if settings.texture is not None:
-        tracked = replace(tracked, light=_light(tracked, state, key, progress))
+def _add_overlay(tracked: Tracked, out: Path, state: TrackState, key: str, progress: Progress) -> None:
+    """Adds the overlay to what was tracked, drawn unless that of an earlier run is up to date."""
+    path = out / OVERLAY
     tracked.products["overlay"] = path
-    key = content_key(METHOD, solution=key, texture=settings.texture, kind=settings.overlay)
+    key = content_key(METHOD, solution=key, kind=tracked.inputs.settings.overlay)
     if not state.is_current(path, key):
         with _timed(tracked.seconds, "overlay"):
             write_overlay(tracked, path, progress)
         state.made(path, key)
-    return tracked
-
-
-def _light(tracked: Tracked, state: TrackState, key: str, progress: Progress) -> PointLight:
-    """The video's light, of an earlier run or estimated and kept."""
-    kept = read_checkpoint(state.folder / _LIGHT, key)
-    if kept is not None:
-        return PointLight(**kept)
-    progress("estimating the light")
-    with _timed(tracked.seconds, "light"):
-        light = video_light(tracked)
-    write_checkpoint(state.folder / _LIGHT, {name: values.float() for name, values in vars(light).items()}, key)
-    return light
 
 
 @contextmanager
