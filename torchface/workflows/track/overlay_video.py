@@ -97,7 +97,8 @@ def mesh_drawer(tracked: Tracked) -> Callable[[int, Tensor], Tensor]:
         picture, camera = interleaved(undistorted(frame, tracked.calibration)), camera_at(tracked, t)
         drawn = clay.draw(rig(weights[t : t + 1].to(rig.deltas))[0], camera)
         covered = (drawn != np.array(BACKGROUND, np.uint8)).any(2, keepdims=True)
-        mixed = np.where(covered, cv2.addWeighted(drawn, _STRENGTH, picture, 1 - _STRENGTH, 0), picture)
+        blue = np.ascontiguousarray(drawn[..., ::-1])  # clay that is not the colour of skin
+        mixed = np.where(covered, cv2.addWeighted(blue, _STRENGTH, picture, 1 - _STRENGTH, 0), picture)
         here = weights[t : t + 1].double()
         rows = points.chosen(here, camera.rotation[None], camera.translation[None], camera.intrinsics)[0]
         places = camera.project(points.at(here)[0, rows])
