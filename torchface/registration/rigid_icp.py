@@ -20,15 +20,16 @@ _LEAST_FIT = 0.35
 _SCAN_POINTS = 20_000
 
 
-def _falling(first: float, last: float, steps: int) -> tuple[float, ...]:
+def falling_reaches(first: float, last: float, steps: int) -> tuple[float, ...]:
+    """Reaches of the steps of :func:`rigid_icp`, each the same share of the one before, millimetres."""
     return tuple(first * (last / first) ** (i / (steps - 1)) for i in range(steps))
 
 
 # Of each round: points, reaches, poses that are kept after a third of the steps and at the end, slack of the matches.
 _SEARCH = (
-    (120, _falling(80, 40, 8), 80, 40, 1.0),
-    (400, _falling(40, 15, 12), 12, 8, 0.5),
-    (1500, _falling(20, 8, 20), 2, 1, 0.0),
+    (120, falling_reaches(80, 40, 8), 80, 40, 1.0),
+    (400, falling_reaches(40, 15, 12), 12, 8, 0.5),
+    (1500, falling_reaches(20, 8, 20), 2, 1, 0.0),
 )
 
 
@@ -52,14 +53,20 @@ class Samples:
 
 
 class ScanPoints:
-    """A scan's vertices with normals, to look up the nearest; at most 20,000 of them."""
+    """A scan's vertices with normals, to look up the nearest; at most 20,000 of them.
 
-    def __init__(self, vertices: Tensor, faces: Tensor) -> None:
+    Args:
+        whole_border: those of the border are among them, so that what lies beyond is recognised.
+    """
+
+    def __init__(self, vertices: Tensor, faces: Tensor, whole_border: bool = False) -> None:
         points = vertices.double()
         normals = vertex_normals(points, faces)
         used = (normals.norm(dim=1) > 0.5).nonzero()[:, 0]
         keep = used[torch.randperm(len(used), generator=torch.Generator().manual_seed(_SEED))[:_SCAN_POINTS]]
         border = border_vertices(faces, len(points))
+        if whole_border:
+            keep = torch.cat([keep, used[border[used]]]).unique()
         self.points, self.normals, self.border = points[keep], normals[keep], border[keep]
         self._tree = cKDTree(self.points.numpy())
 
@@ -147,7 +154,7 @@ def find_pose(samples: Samples, scan: ScanPoints, size: float = 1.0) -> Fit:
         scan: where to find it.
         size: times its own that the template starts with; of a size that differs by more than a tenth little is found.
     """
-    all_rotations = _rotations(_ROTATIONS)
+    all_rotations = even_rotations(_ROTATIONS)
     sizes = torch.full((len(all_rotations),), size, dtype=torch.float64)
     middle = (scan.points.amax(0) + scan.points.amin(0)) / 2
     own = (samples.points.amax(0) + samples.points.amin(0)) / 2
@@ -188,7 +195,7 @@ def _landmark_planes(
     return moved, targets, normals, torch.full(moved.shape[:2], weight, dtype=torch.float64)
 
 
-def _rotations(count: int) -> Tensor:
+def even_rotations(count: int) -> Tensor:
     """Rotations (N,3,3) spread evenly over all, the first the identity.
 
     Source: Alexa 2022, Super-Fibonacci spirals: fast, low-discrepancy sampling of SO(3).

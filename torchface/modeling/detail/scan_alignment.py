@@ -3,25 +3,26 @@
 from dataclasses import dataclass
 
 import torch
-from scipy.spatial import cKDTree
-from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from torchface.errors import AlignmentError, ShapeError, ValueRangeError
-from torchface.geometry.meshes.operators import border_vertices, triangle_areas, vertex_normals
+from torchface.geometry.meshes.operators import triangle_areas
 from torchface.geometry.meshes.unit_check import check_unit, extent
 from torchface.geometry.similarity import Similarity, similarity_transform
 from torchface.mesh import Mesh
 from torchface.number_checks import checked_type
+from torchface.registration.rigid_icp import Samples, ScanPoints, even_rotations, falling_reaches, rigid_icp
 from torchface.registration.scan_preparation import check_same_hand
 
 Correspondences = tuple[Tensor, Tensor]
 """Vertex ids (L,) or points (L,3) of the mesh, and points (L,3) of the scan."""
 
-_SAMPLES, _COARSE_SAMPLES = 3000, 400
-_COARSE_POINTS = 10_000
-_REACH = 40.0  # millimetres; no partner is sought beyond
+_SAMPLES, _SOME, _FEW = 3000, 800, 250
+_ROTATIONS, _FINALISTS = 150, 4
+_REACH = 40.0  # millimetres; what lies further from the scan has no place on it
 _NEAR = 3.0  # millimetres; what an expression's scan and its shape differ by at most places
+_FIRST_REACHES = falling_reaches(_REACH, 10.0, 12)
+_REACHES = falling_reaches(_REACH, _NEAR, 30)
 _MIN_NEAR = 0.6  # share of the samples with a place on the scan that must come to lie near it
 _MIN_OVERLAP = 0.1
 _LEAST_EXTENT, _MOST_EXTENT = 0.12, 12.0  # of a scan beside the mesh: faces differ by a factor of some, units by ten
@@ -81,13 +82,17 @@ def align_scan(
         _LEAST_EXTENT,
         _MOST_EXTENT,
     )
-    target = _Target.of(scan)
-    if correspondences is not None:
+    target = ScanPoints(scan.vertices, scan.faces, whole_border=True)
+    samples = _samples(mesh)
+    if correspondences is None:
+        pose = _found_by_itself(samples, target)
+    else:
         picked = _picked(mesh, correspondences)
         check_same_hand(*picked, "correspondences")
-        initial = similarity_transform(picked[0][None], picked[1][None], scale=scale)
-        return _result(_iterate(_samples(mesh, _SAMPLES), target, _Pose.of(initial), 40, scale))
-    return _automatic(mesh, target, scale)
+        pose = similarity_transform(picked[0][None], picked[1][None], scale=scale)
+    pose = rigid_icp(samples, target, pose, _REACHES, scale).pose
+    found = _nearness(samples, target, pose)
+    return ScanAlignment(pose.inverse(), found.distance, found.overlap)
 
 
 def _picked(mesh: Mesh, correspondences: Correspondences) -> tuple[Tensor, Tensor]:
@@ -115,174 +120,56 @@ def _picked(mesh: Mesh, correspondences: Correspondences) -> tuple[Tensor, Tenso
     return on_mesh.double(), on_scan.double()
 
 
-@dataclass(frozen=True, eq=False)
-class _Target:
-    points: Tensor
-    normals: Tensor
-    border: Tensor
-    tree: cKDTree
-
-    @staticmethod
-    def of(scan: Mesh) -> "_Target":
-        vertices = scan.vertices.double()
-        normals = vertex_normals(vertices, scan.faces)
-        used = normals.norm(dim=1) > 0.5  # loose vertices and those of triangles without area have no normal
-        points = vertices[used]
-        return _Target(points, normals[used], border_vertices(scan.faces, len(vertices))[used], cKDTree(points.numpy()))
-
-    def thinned(self, count: int) -> "_Target":
-        """Fewer points, but the whole border, so that points beyond it are still recognised."""
-        keep = torch.randperm(len(self.points), generator=torch.Generator().manual_seed(_SEED))[:count]
-        keep = torch.cat([keep, self.border.nonzero()[:, 0]]).unique()
-        points = self.points[keep]
-        return _Target(points, self.normals[keep], self.border[keep], cKDTree(points.numpy()))
-
-
-@dataclass(frozen=True, eq=False)
-class _Samples:
-    points: Tensor
-    normals: Tensor
-
-    def first(self, count: int) -> "_Samples":
-        return _Samples(self.points[:count], self.normals[:count])
-
-
-def _samples(mesh: Mesh, count: int) -> _Samples:
+def _samples(mesh: Mesh) -> Samples:
     """Vertices drawn evenly by area: they lie on the skin, which bulges out of the triangles between them."""
     vertices = mesh.vertices.double()
     areas = torch.zeros(len(vertices), dtype=torch.float64)
     areas.index_add_(0, mesh.faces.flatten(), triangle_areas(vertices, mesh.faces).repeat_interleave(3))
-    chosen = torch.multinomial(areas, count, True, generator=torch.Generator().manual_seed(_SEED))
-    return _Samples(vertices[chosen], vertex_normals(vertices, mesh.faces)[chosen])
+    chosen = torch.multinomial(areas, _SAMPLES, True, generator=torch.Generator().manual_seed(_SEED))
+    return Samples.of(vertices, mesh.faces, chosen)
 
 
-@dataclass(frozen=True, eq=False)
-class _Pose:
-    """Mesh to scan, with how well it fits."""
-
-    scale: Tensor
-    rotation: Tensor
-    translation: Tensor
-    distance: float = float("inf")
-    overlap: float = 0.0
-    near: float = 0.0
-
-    @staticmethod
-    def of(similarity: Similarity) -> "_Pose":
-        one = similarity
-        return _Pose(one.scale[0].double(), one.rotation[0].double(), one.translation[0].double())
-
-
-def _automatic(mesh: Mesh, target: _Target, scale: bool) -> ScanAlignment:
-    samples = _samples(mesh, _SAMPLES)
-    identity = _Pose(torch.ones(()).double(), torch.eye(3).double(), torch.zeros(3).double())
-    best = _iterate(samples, target, identity, 40, False)
-    if best.near < _MIN_NEAR:
-        few, thin = samples.first(_COARSE_SAMPLES), target.thinned(_COARSE_POINTS)
-        # Each initial pose is iterated by itself; four hundred points against a thinned scan take milliseconds.
-        coarse = [_iterate(few, thin, initial, 15, False) for initial in _initial_poses(samples, target)]
-        coarse.sort(key=lambda pose: -pose.near * pose.overlap)
-        best = max(
-            (_iterate(samples, target, pose, 40, False) for pose in coarse[:4]), key=lambda p: p.near * p.overlap
-        )
-    if best.near < _MIN_NEAR or best.overlap < _MIN_OVERLAP:
+def _found_by_itself(samples: Samples, target: ScanPoints) -> Similarity:
+    """The pose, of the mesh on the scan, that comes nearest: from where it lies, or else from any rotation."""
+    one = torch.ones(1, dtype=torch.float64)
+    still = Similarity(one, torch.eye(3, dtype=torch.float64)[None], torch.zeros(1, 3, dtype=torch.float64))
+    pose = rigid_icp(samples.first(_SOME), target, still, _REACHES).pose
+    if _nearness(samples, target, pose).near >= _MIN_NEAR:
+        return pose
+    rotations = even_rotations(_ROTATIONS)
+    middles = target.points.mean(0) - rotations @ samples.points.mean(0)
+    starts = Similarity(one.expand(len(rotations)), rotations, middles)
+    coarse = rigid_icp(samples.first(_FEW), target, starts, _FIRST_REACHES, slack=0.5).best(_FINALISTS)
+    poses = rigid_icp(samples.first(_SOME), target, coarse.pose, _REACHES).pose
+    found = [_nearness(samples, target, poses[row : row + 1]) for row in range(_FINALISTS)]
+    row = max(range(_FINALISTS), key=lambda row: found[row].near * found[row].overlap)
+    if found[row].near < _MIN_NEAR or found[row].overlap < _MIN_OVERLAP:
         raise AlignmentError(
-            f"scan: no pose found by itself that aligns it with the mesh (best: {best.near:.0%} of the overlap within "
-            f"{_NEAR:g} mm); expected scan and mesh of one face in one expression, triangles counter-clockwise seen "
-            "from outside, or at least three correspondences"
+            f"scan: no pose found by itself that aligns it with the mesh (best: {found[row].near:.0%} of the overlap "
+            f"within {_NEAR:g} mm); expected scan and mesh of one face in one expression, triangles counter-clockwise "
+            "seen from outside, or at least three correspondences"
         )
-    return _result(_iterate(samples, target, best, 40, scale) if scale else best)
+    return poses[row : row + 1]
 
 
-def _initial_poses(samples: _Samples, target: _Target) -> list[_Pose]:
-    """Centre on centre, rotated to each of the 24 poses of a cube and each half-way to its neighbours."""
-    one = torch.ones(()).double()
-    middle, other = samples.points.mean(0), target.points.mean(0)
-    cube = Rotation.create_group("O")
-    rotations = torch.from_numpy(
-        Rotation.concatenate([cube, Rotation.from_euler("xyz", [45, 35, 0], True) * cube]).as_matrix()
-    )
-    return [_Pose(one, rotation, other - rotation @ middle) for rotation in rotations]
+@dataclass(frozen=True)
+class _Nearness:
+    """Of samples that have a place on a scan and agree with it: the median distance, the share that have one, and the
+    share of these that come near."""
+
+    distance: float
+    overlap: float
+    near: float
 
 
-def _iterate(samples: _Samples, target: _Target, pose: _Pose, iterations: int, scale: bool) -> _Pose:
-    """Point to plane, each iteration on the pairs that agree, found in the pose of the one before."""
-    s, rotation, translation, reach = pose.scale, pose.rotation, pose.translation, _REACH
-    for _ in range(iterations):
-        points = s * samples.points @ rotation.T + translation
-        pairs = _pairs(points, samples.normals @ rotation.T, target, reach)
-        if len(pairs.rows) < 12:
-            break
-        step = _step(points[pairs.rows], target.points[pairs.nearest], target.normals[pairs.nearest], scale)
-        s, rotation, translation = s * step.scale, step.rotation @ rotation, step.apply(translation)
-        reach = min(_REACH, 6 * pairs.median + 2 * _NEAR)
-        if step.motion < 1e-3:
-            break
-    points = s * samples.points @ rotation.T + translation
-    pairs = _pairs(points, samples.normals @ rotation.T, target, _REACH)
-    if len(pairs.rows) == 0:
-        return _Pose(s, rotation, translation)
-    offset = ((points[pairs.rows] - target.points[pairs.nearest]) * target.normals[pairs.nearest]).sum(1).abs()
-    near = float((offset < _NEAR).sum()) / pairs.placed
-    return _Pose(s, rotation, translation, float(offset.median()), len(offset) / len(points), near)
-
-
-@dataclass(frozen=True, eq=False)
-class _Pairs:
-    """Samples ``rows`` that agree with scan vertices ``nearest``, their median distance, and how many have a place."""
-
-    rows: Tensor
-    nearest: Tensor
-    median: float
-    placed: int
-
-
-def _pairs(points: Tensor, normals: Tensor, target: _Target, reach: float) -> _Pairs:
-    workers = 1 if len(points) <= _COARSE_SAMPLES else -1
-    neighbours = target.tree.query(points.numpy(), distance_upper_bound=reach, workers=workers)
-    distance, nearest = torch.from_numpy(neighbours[0]), torch.from_numpy(neighbours[1])
-    rows = torch.isfinite(distance).nonzero()[:, 0]
+def _nearness(samples: Samples, target: ScanPoints, pose: Similarity) -> _Nearness:
+    points, normals = pose.apply(samples.points)[0], samples.normals @ pose.rotation[0].T
+    distance, row = target.nearest(points)
     # A sample whose nearest point is on the scan's border lies beyond it.
-    rows = rows[~target.border[nearest[rows]]]
-    placed = len(rows)
-    rows = rows[(normals[rows] * target.normals[nearest[rows]]).sum(1) > 0.5]
-    if len(rows) == 0:
-        return _Pairs(rows, rows, 0.0, placed)
-    median = float(distance[rows].median())
-    rows = rows[distance[rows] <= 2.5 * median + 1e-6]
-    return _Pairs(rows, nearest[rows], median, placed)
-
-
-@dataclass(frozen=True, eq=False)
-class _Step:
-    scale: Tensor
-    rotation: Tensor
-    centre: Tensor
-    translation: Tensor
-    motion: float
-
-    def apply(self, point: Tensor) -> Tensor:
-        return self.scale * self.rotation @ (point - self.centre) + self.centre + self.translation
-
-
-def _step(points: Tensor, targets: Tensor, normals: Tensor, scale: bool) -> _Step:
-    """The small motion that brings points onto the planes of their targets, in least squares."""
-    centre = points.mean(0)
-    offset = points - centre
-    reach = offset.norm(dim=1).mean()
-    columns = [torch.linalg.cross(offset, normals) / reach, normals]
-    if scale:
-        columns.append((offset * normals).sum(1, keepdim=True) / reach)
-    system = torch.cat(columns, dim=1)
-    right = ((targets - points) * normals).sum(1, keepdim=True)
-    # A little damping keeps still what the surface leaves open, such as the rotation of a ball.
-    gram = system.T @ system + 1e-6 * len(points) * torch.eye(system.shape[1], dtype=torch.float64)
-    x = torch.linalg.solve(gram, system.T @ right)[:, 0]
-    rotation = torch.from_numpy(Rotation.from_rotvec((x[:3] / reach).numpy()).as_matrix())
-    grown = 1 + x[6] / reach if scale else torch.ones(()).double()
-    return _Step(grown, rotation, centre, x[3:6], float(x.norm()))
-
-
-def _result(pose: _Pose) -> ScanAlignment:
-    mesh_to_scan = Similarity(pose.scale[None], pose.rotation[None], pose.translation[None])
-    return ScanAlignment(mesh_to_scan.inverse(), pose.distance, pose.overlap)
+    placed = (distance < _REACH) & ~target.border[row]
+    agree = placed & ((normals * target.normals[row]).sum(-1) > 0.5)
+    if not bool(agree.any()):
+        return _Nearness(float("inf"), 0.0, 0.0)
+    offset = ((points - target.points[row]) * target.normals[row]).sum(-1).abs()[agree]
+    near = float((offset < _NEAR).sum()) / int(placed.sum())
+    return _Nearness(float(offset.median()), len(offset) / len(points), near)
