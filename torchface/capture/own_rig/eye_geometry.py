@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from torchface.geometry.spheres import nearest_sphere
 from torchface.rig import BlendshapeRig
 from torchface.shape_names import ARKIT, mapping
 
@@ -65,7 +66,7 @@ class Eyeballs:
             if mask is None or int(mask.sum()) < 4:
                 continue
             ball = rig.vertices[mask].detach().double()
-            middle = _sphere(ball)
+            middle = nearest_sphere(ball)[0]
             made.centre[eye] = middle - 0.5 * (marks[corners[0]] + marks[corners[1]])
             made.radius[eye] = (ball - middle).norm(dim=1).mean()
             for row, look in enumerate(LOOKS):
@@ -74,12 +75,6 @@ class Eyeballs:
                     angle = _turn(ball - middle, ball + moved - middle)
                     made.turns[row] = angle if angle > _LEAST_TURN else made.turns[row]
         return made
-
-
-def _sphere(points: Tensor) -> Tensor:
-    """The centre (3,) of the sphere through points (K,3), by least squares."""
-    lines = torch.cat([2 * points, torch.ones_like(points[:, :1])], 1)
-    return torch.linalg.lstsq(lines, points.square().sum(1, keepdim=True)).solution[:3, 0]
 
 
 def _turn(before: Tensor, after: Tensor) -> float:

@@ -9,6 +9,7 @@ from torchface.capture.markers.surface_motion import SurfaceMotion
 from torchface.errors import AlignmentError, ValueRangeError
 from torchface.geometry.meshes.operators import vertex_normals
 from torchface.geometry.meshes.surface_index import SurfaceIndex
+from torchface.geometry.spheres import nearest_sphere
 from torchface.registration.rigid_icp import Samples, ScanPoints, find_pose
 from torchface.rig import BlendshapeRig
 from torchface.take import Take
@@ -81,7 +82,5 @@ def _outward(points: Tensor) -> Tensor:
     """Unit normals (M,3) of the surface that markers lie on: planes through neighbours, away from the head's middle."""
     near = points[torch.cdist(points, points).argsort(1)[:, :_NEIGHBOURS]]
     normals = torch.linalg.svd(near - near.mean(1, keepdim=True)).Vh[:, 2]
-    # The sphere nearest to all markers: |x|² = 2 x·c + const.
-    rows = torch.cat([2 * points, points.new_ones(len(points), 1)], dim=1)
-    centre = torch.linalg.lstsq(rows, points.square().sum(1, keepdim=True)).solution[:3, 0]
+    centre = nearest_sphere(points)[0]
     return normals * torch.sign((normals * (points - centre)).sum(1, keepdim=True))

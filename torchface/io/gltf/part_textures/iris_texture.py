@@ -12,6 +12,7 @@ from torch import Tensor
 
 from torchface.geometry.meshes.operators import components
 from torchface.geometry.meshes.rasterization import rasterise_uvs
+from torchface.geometry.spheres import nearest_sphere
 from torchface.io.gltf.region_materials import CORNEA, EYEBALL, IRIS, SCLERA, PartMaterial
 from torchface.mesh import Mesh
 
@@ -44,7 +45,7 @@ def painted_eye(mesh: Mesh, triangles: Tensor) -> "list[tuple[Tensor, PartMateri
     if len(inner):  # its front lies round the pupil, which need not be straight ahead
         ahead = points[inner.unique()]
         points = _looking_along(ahead[ahead[:, 2] > ahead[:, 2].max() - _FRONT].mean(0), points)
-    iris = min(_IRIS, _MAX_IRIS_FRACTION * float(radius))
+    iris = min(_IRIS, _MAX_IRIS_FRACTION * radius)
     iris_color = _given_iris_color(mesh, triangles, points, iris)
     is_outer = torch.isin(mesh.faces[triangles, 0], outer)
     if len(inner) == 0:
@@ -71,17 +72,13 @@ def _shells(mesh: Mesh, triangles: Tensor) -> tuple[Tensor, Tensor]:
     return faces[outmost], faces[~outmost]
 
 
-def _sphere(ids: Tensor, mesh: Mesh) -> tuple[Tensor, Tensor]:
+def _sphere(ids: Tensor, mesh: Mesh) -> tuple[Tensor, float]:
     """Centre (3,) and radius of the sphere most of the vertices lie on; a cornea that bulges is an outlier."""
     points = mesh.vertices[ids].double()
-    middle = points.mean(0)
     inliers = torch.ones(len(points), dtype=torch.bool)
-    centre, radius = middle, (points - middle).norm(dim=1).mean()
+    centre, radius = points.mean(0), 0.0
     for _ in range(_MAX_ITERATIONS):  # fit and outliers in turn
-        centred = points[inliers] - middle
-        system = torch.cat([2 * centred, torch.ones(len(centred), 1, dtype=centred.dtype)], dim=1)
-        solution = torch.linalg.lstsq(system, centred.square().sum(1, keepdim=True), driver="gelsd").solution[:, 0]
-        centre, radius = solution[:3] + middle, (solution[3] + solution[:3].square().sum()).clamp(min=0).sqrt()
+        centre, radius = nearest_sphere(points[inliers])
         residual = ((points - centre).norm(dim=1) - radius).abs()
         inliers = residual <= max(float(_OUTLIER * residual.median()), 1e-9)
     return centre, radius
