@@ -8,8 +8,8 @@ from torch import Tensor
 from torchface.geometry.meshes.operators import components
 from torchface.geometry.meshes.rasterization import rasterise_uvs
 from torchface.geometry.similarity import similarity_transform
-from torchface.io.gltf.region_materials import part_material
 from torchface.mesh import Mesh
+from torchface.part_materials import part_material
 
 _SEEN = 0.5
 _SEAM = 4

@@ -11,12 +11,11 @@ from torchface.geometry.cameras.pinhole import Camera
 from torchface.geometry.meshes.operators import vertex_normals
 from torchface.geometry.meshes.tangent_space import from_tangent_space, tangent_space
 from torchface.mesh import Mesh
-from torchface.rendering.clear_shells import without_clear_shells
+from torchface.rendering.part_colors import CLAY, without_clear_shells
 from torchface.rendering.raycast import RayCaster
 
 __all__ = ["Lighting", "render"]
 
-CLAY = (0.80, 0.72, 0.66)  # the colour of a mesh that brings none
 _OCCLUSION_REACH = 60.0  # millimetres beyond which a surface no longer dims
 
 

@@ -12,20 +12,11 @@ from torchface.geometry.meshes.operators import vertex_normals
 from torchface.geometry.meshes.rasterization import DrawnPixels, rasterise
 from torchface.mesh import Mesh
 from torchface.rendering.clay_shading import vertex_openness
-from torchface.rendering.clear_shells import CLEAR, triangles_of
+from torchface.rendering.part_colors import CLAY, clear_triangles, triangle_colors
 
 BACKGROUND = (38, 40, 44)
-_CLAY, _TINT = (205, 180, 163), (236, 92, 40)
-# Colours of parts, by the names of their regions.
-_PARTS: dict[tuple[str, ...], tuple[int, int, int]] = {
-    ("upper_lip", "lower_lip"): (196, 132, 120),
-    ("eyeball",): (238, 236, 232),
-    ("teeth",): (236, 230, 214),
-    ("gums", "tongue", "mouth_interior", "mouth_socket"): (122, 52, 50),
-    ("eye_socket",): (92, 50, 46),
-}
-_IRIS, _PUPIL = (92, 66, 44), (16, 14, 12)
-_IRIS_ANGLE, _PUPIL_ANGLE = 27.0, 11.0  # degrees from the way the eye looks
+_TINT = (236, 92, 40)
+_LIPS = (0.77, 0.52, 0.47)
 _LEVELS, _TINT_LEVELS = 256, 4
 _AMBIENT, _HIGHLIGHT = 0.30, 0.16
 _LIGHTS = (((-0.55, 0.60, 0.60), 0.66), ((0.80, 0.05, 0.45), 0.24))  # right, up, toward the viewer; strength
@@ -50,19 +41,16 @@ class QuickClay:
     @staticmethod
     def of(mesh: Mesh, skin: bool = False) -> "QuickClay":
         """A mesh at rest, prepared, its eyes along z; with its texture in place of clay if asked for."""
-        regions = {} if mesh.annotations is None else mesh.annotations.regions
-        faces = mesh.faces.cpu()
-
-        part = torch.zeros(len(faces), dtype=torch.int64)
-        for number, prefixes in enumerate(_PARTS, 1):
-            part[triangles_of(mesh, prefixes)] = number
-        for name, mask in regions.items():
-            if name.startswith("eyeball") and bool(mask.any()):
-                angle = _off_axis(mesh.vertices.cpu(), faces, mask.cpu())
-                part[angle < _IRIS_ANGLE] = len(_PARTS) + 1
-                part[angle < _PUPIL_ANGLE] = len(_PARTS) + 2
-        drawn = ~triangles_of(mesh, CLEAR)
-        palette = np.array([_CLAY, *_PARTS.values(), _IRIS, _PUPIL], np.float64)
+        faces, drawn = mesh.faces.cpu(), ~clear_triangles(mesh)
+        colors = triangle_colors(mesh)
+        for name, mask in ({} if mesh.annotations is None else mesh.annotations.regions).items():
+            if name in {"upper_lip", "lower_lip"}:
+                colors[mask.cpu()[faces].all(1)] = torch.tensor(_LIPS)
+        clay = torch.tensor([CLAY])
+        part = (colors != clay).any(1).long()
+        others, row = colors[part > 0].unique(dim=0, return_inverse=True)
+        part[part > 0] += row
+        palette = 255 * torch.cat([clay, others]).double().numpy()
         openness = vertex_openness(Mesh(mesh.vertices, mesh.faces[drawn.to(mesh.faces.device)]))
         lit = faces[drawn & (part > 0)].unique()  # a closed mouth at rest would leave its teeth dark when it opens
         openness[lit] = openness[lit].clamp(min=_LEAST_OPEN)
@@ -129,16 +117,6 @@ def _paint(mesh: Mesh, drawn: Tensor) -> tuple[Tensor, Tensor] | None:
     uvs = mesh.uvs.cpu().float()
     places = torch.stack([uvs[:, 0], 1 - uvs[:, 1]], 1) * size - 0.5
     return texture, places[mesh.uv_faces.cpu()[drawn]]
-
-
-def _off_axis(vertices: Tensor, faces: Tensor, eyeball: Tensor) -> Tensor:
-    """Degrees between z and the way from an eyeball's centre to each triangle, (F,); infinite off the eyeball."""
-    low, high = vertices[eyeball].amin(0), vertices[eyeball].amax(0)
-    middle = (low + high) / 2
-    middle[2] = high[2] - (high[:2] - low[:2]).amax() / 2  # what is seen is a ball, behind it may be a nerve
-    way = vertices[faces].mean(1) - middle
-    angle = torch.rad2deg(torch.acos((way[:, 2] / way.norm(dim=1)).clamp(-1, 1)))
-    return torch.where(eyeball[faces].all(1), angle, torch.inf)
 
 
 def _lit_colors(palette: np.ndarray) -> np.ndarray:

@@ -9,10 +9,10 @@ from torch import Tensor
 from torchface import zoo
 from torchface.errors import TopologyError
 from torchface.io import load_rig
-from torchface.io.gltf.region_materials import part_material
 from torchface.io.head_models.head_model_files import is_head_model_file
 from torchface.io.rigs.ict_facekit import region
 from torchface.modeling import HeadModel
+from torchface.part_materials import part_material
 from torchface.rig import BlendshapeRig
 from torchface.synthetic import performer
 from torchface.workflows.arkit.arkit_rig import published_head

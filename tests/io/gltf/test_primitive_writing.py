@@ -19,8 +19,8 @@ from torchface.io import load_detail_maps, load_mesh, load_rig, save_animation, 
 from torchface.io.gltf.animation_reading import read_gltf_weights
 from torchface.io.gltf.part_textures.head_primitives import painted_lashes, surfaces
 from torchface.io.gltf.part_textures.iris_texture import eye_centre
-from torchface.io.gltf.region_materials import EYELASHES
 from torchface.mesh import Annotations, Mesh
+from torchface.part_materials import EYELASHES
 from torchface.rig import BlendshapeRig
 from torchface.synthetic import performer
 from torchface.take import Take, Track

@@ -4,8 +4,8 @@ from dataclasses import replace
 
 import torch
 
-from torchface.io.gltf.region_materials import EYEBALL
 from torchface.mesh import Annotations, Mesh
+from torchface.part_materials import EYEBALL
 from torchface.synthetic import performer
 from torchface.viz.figures.region_colors import as_seen
 

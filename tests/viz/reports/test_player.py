@@ -12,8 +12,8 @@ from PIL import Image
 
 from torchface.errors import ShapeError
 from torchface.mesh import Annotations, Mesh
+from torchface.rendering.part_colors import clear_triangles, region_colors
 from torchface.rig import BlendshapeRig
-from torchface.viz.figures.region_colors import drawn_triangles, region_colors
 from torchface.viz.reports.player import Markers, Panel, Played, Player, write_player
 from torchface.viz.reports.report_page import Section, write_page
 
@@ -78,7 +78,7 @@ def test_eyes_without_colour_show_where_they_look_and_clear_shells_do_not_hide_t
         torch.cat([faces, shell_faces + len(vertices)]),
         annotations=Annotations(regions=regions),
     )
-    assert torch.equal(drawn_triangles(mesh), torch.arange(len(mesh.faces)) < len(faces))
+    assert torch.equal(clear_triangles(mesh), torch.arange(len(mesh.faces)) >= len(faces))
     colors = region_colors(mesh)[eye]
     dark = colors.amax(1) < 0.2
     assert 0 < int(dark.sum()) < 0.05 * len(vertices)

@@ -37,7 +37,7 @@ def write_gltf_rig(
 ) -> None:
     """Writes a rig as ``.glb`` in metres.
 
-    Each part that is named by a region (``region_materials``) is a primitive of its own material; an eyeball is a mesh
+    Each part that is named by a region (``part_materials``) is a primitive of its own material; an eyeball is a mesh
     of its own under a node at its centre. Vertices are split at the borders of primitives and where texture coordinates
     differ, as glTF wants it; the attribute ``_VERTEX_ID`` and ``mesh.extras.torchface`` bring vertices, polygons and
     annotations back in their order. Morph targets carry positions and normals, sparse where that is smaller;

@@ -12,10 +12,10 @@ from torchface.geometry.meshes.operators import vertex_normals
 from torchface.geometry.meshes.uv_seams import Split
 from torchface.io.gltf.buffers import BufferWriter
 from torchface.io.gltf.part_textures.head_primitives import Surface
-from torchface.io.gltf.region_materials import SKIN
 from torchface.io.images.image_files import encode_jpeg, encode_png
 from torchface.io.length_units import millimetres_per
 from torchface.mesh import Mesh
+from torchface.part_materials import SKIN
 
 MIN_MOVE = 1e-4  # millimetres; a vertex that a shape moves less than this is written as not moved
 _MIN_ROTATION = 1 / 256  # radians; a normal that a shape rotates less than this is written as unchanged

@@ -11,9 +11,9 @@ from torch import Tensor
 from torchface.color_space import to_linear
 from torchface.geometry.meshes.normal_maps import DetailMaps, encode_normals
 from torchface.io.gltf.part_textures.head_primitives import Surface, surfaces
-from torchface.io.gltf.region_materials import PartMaterial
 from torchface.io.images.image_files import encode_png
 from torchface.mesh import Mesh
+from torchface.part_materials import PartMaterial
 
 PAINTED = "torchface_painted"
 """The key of a material's ``customData`` that marks an image made for a part that had none from the mesh's texture."""

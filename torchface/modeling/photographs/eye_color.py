@@ -10,8 +10,8 @@ from torch import Tensor
 from torchface.geometry.cameras.pinhole import Camera
 from torchface.geometry.meshes.operators import vertex_normals
 from torchface.geometry.meshes.rasterization import rasterise_uvs
-from torchface.io.gltf.region_materials import EYEBALL, part_material
 from torchface.mesh import Mesh
+from torchface.part_materials import EYEBALL, part_material
 from torchface.rendering.camera_visibility import shown_in
 from torchface.rendering.raycast import RayCaster
 

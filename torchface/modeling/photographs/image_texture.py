@@ -8,7 +8,6 @@ from torch import Tensor
 
 from torchface.geometry.cameras.pinhole import Camera
 from torchface.geometry.meshes.vertex_graph import VertexGraph
-from torchface.io.gltf.region_materials import EYEBALL, IRIS, part_material
 from torchface.landmarks.images.networks.part_finder import FaceParts
 from torchface.mesh import Mesh
 from torchface.modeling.morphable.morphable_model import MorphableModel
@@ -20,6 +19,7 @@ from torchface.modeling.photographs.skin_light import exposed, light_hue, patch_
 from torchface.modeling.photographs.skin_mask import FacePlaces, ShownParts
 from torchface.modeling.photographs.texture_fit import ColorFit, fit_colors
 from torchface.modeling.photographs.texture_projection import PhotoTexture, photo_texture
+from torchface.part_materials import EYEBALL, IRIS, part_material
 from torchface.registration.scan_colors import own_colors
 from torchface.rendering.camera_visibility import PosedSurface, Shown
 from torchface.rendering.environment_light import EnvironmentLight

@@ -5,7 +5,8 @@ from scipy import sparse
 from torch import Tensor
 
 from torchface.mesh import Mesh
-from torchface.rendering.clay_shading import CLAY, sample_texture
+from torchface.rendering.clay_shading import sample_texture
+from torchface.rendering.part_colors import CLAY
 
 _MAX_FACES = 1_000_000
 _INTERPOLATION_ITERATIONS = 6

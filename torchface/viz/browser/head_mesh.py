@@ -18,11 +18,11 @@ from torchface.io.gltf.buffers import BufferWriter
 from torchface.io.gltf.gltf_document import glb_pieces
 from torchface.io.gltf.part_textures.head_primitives import ColorSource, Surface
 from torchface.io.gltf.primitive_writing import PrimitiveWriter
-from torchface.io.gltf.region_materials import SKIN
 from torchface.io.length_units import millimetres_per
 from torchface.mesh import Mesh
-from torchface.rendering.clay_shading import CLAY
+from torchface.part_materials import SKIN
 from torchface.rendering.compositing import to_pillow
+from torchface.rendering.part_colors import CLAY
 from torchface.viz.browser.browser_page import SCALE
 from torchface.viz.browser.single_color_parts import split_parts
 

@@ -8,10 +8,8 @@ from scipy.cluster.vq import kmeans2
 from torch import Tensor
 
 from torchface.geometry.meshes.operators import components
-from torchface.io.gltf.region_materials import part_material
 from torchface.mesh import Mesh
-from torchface.rendering.clay_shading import CLAY
-from torchface.viz.figures.region_colors import drawn_triangles
+from torchface.rendering.part_colors import clear_triangles, triangle_colors
 
 _MAX_COMPONENTS = 16
 _MAX_COLORS = 6
@@ -77,11 +75,7 @@ def _triangle_colors(mesh: Mesh) -> tuple[Tensor, Tensor]:
         return triangle_texture(mesh).float(), torch.ones(count, dtype=torch.bool)
     if mesh.colors is not None:
         return mesh.colors[mesh.faces].mean(1).float(), torch.ones(count, dtype=torch.bool)
-    colors = torch.tensor(CLAY).repeat(count, 1)
-    for name, mask in ({} if mesh.annotations is None else mesh.annotations.regions).items():
-        if (material := part_material(name)) is not None:
-            colors[mask[mesh.faces].all(1)] = torch.tensor(material.color)
-    return colors, drawn_triangles(mesh)
+    return triangle_colors(mesh), ~clear_triangles(mesh)
 
 
 def _components(mesh: Mesh) -> Tensor:

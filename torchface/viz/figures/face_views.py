@@ -7,8 +7,9 @@ from torch import Tensor
 
 from torchface.geometry.cameras.pinhole import Camera, look_at
 from torchface.mesh import Mesh
-from torchface.rendering.clay_shading import CLAY, DEFAULT_LIGHTING, Lighting, render
+from torchface.rendering.clay_shading import DEFAULT_LIGHTING, Lighting, render
 from torchface.rendering.compositing import caption, from_figure, heat_colors, new_figure, sheet
+from torchface.rendering.part_colors import CLAY
 from torchface.rig import BlendshapeRig
 from torchface.viz.figures.region_colors import as_seen
 

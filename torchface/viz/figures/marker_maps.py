@@ -13,10 +13,11 @@ from torchface.geometry.meshes.surface_index import SurfaceIndex
 from torchface.mesh import Mesh
 from torchface.rendering.clay_shading import DEFAULT_LIGHTING, render
 from torchface.rendering.compositing import from_figure, heat_colors, new_figure, sheet
+from torchface.rendering.part_colors import clear_triangles
 from torchface.rendering.raycast import RayCaster
 from torchface.viz.figures.curves import SOLVED, TRUE
 from torchface.viz.figures.face_views import FRONT, THREE_QUARTER, clay_colors, color_bar, frame_face
-from torchface.viz.figures.region_colors import as_seen, drawn_triangles
+from torchface.viz.figures.region_colors import as_seen
 
 _NAMED = 8
 
@@ -148,7 +149,7 @@ def site_views(mesh: Mesh, before: Tensor, after: Tensor) -> Tensor:
 
 def facing(mesh: Mesh, points: Tensor, yaw: float) -> Tensor:
     """Which points on a mesh, (M,3), a viewer sees who looks from ``yaw`` degrees, (M,) bool."""
-    faces, vertices = mesh.faces[drawn_triangles(mesh)], mesh.vertices.double()
+    faces, vertices = mesh.faces[~clear_triangles(mesh)], mesh.vertices.double()
     a, b, c = corners(vertices, faces[SurfaceIndex(vertices, faces).nearest(points).triangle])
     normals = torch.nn.functional.normalize(torch.linalg.cross(b - a, c - a), dim=-1)
     angle = math.radians(yaw)

@@ -10,8 +10,8 @@ from torch import Tensor
 from torchface.geometry.meshes.operators import components
 from torchface.geometry.meshes.rasterization import rasterise_uvs
 from torchface.io.gltf.part_textures.iris_texture import Paint, painted, painted_eye, stands_alone
-from torchface.io.gltf.region_materials import EYEBALL, EYELASHES, PARTS, SKIN, PartMaterial, part_material
 from torchface.mesh import Mesh
+from torchface.part_materials import EYEBALL, EYELASHES, PARTS, SKIN, PartMaterial, part_material
 
 _SPACING = 1.1  # millimetres between the hairs of one card
 # Fractions: of the spacing, the width of a root; of the card, the shortest hair; of the spacing, how far tips lean.

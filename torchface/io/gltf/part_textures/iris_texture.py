@@ -13,8 +13,8 @@ from torch import Tensor
 from torchface.geometry.meshes.operators import components
 from torchface.geometry.meshes.rasterization import rasterise_uvs
 from torchface.geometry.spheres import nearest_sphere
-from torchface.io.gltf.region_materials import CORNEA, EYEBALL, IRIS, SCLERA, PartMaterial
 from torchface.mesh import Mesh
+from torchface.part_materials import CORNEA, EYEBALL, IRIS, SCLERA, PartMaterial
 
 _IRIS, _PUPIL, _LIMBUS = 5.9, 1.9, 0.5
 """Millimetres: radii of iris and pupil in daylight, half the width of the limbus, where sclera turns into cornea."""
