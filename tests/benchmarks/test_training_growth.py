@@ -106,7 +106,7 @@ from train.rendered_people.face_scenes import face_scene
 from train.face_pictures import StoredCutOuts
 people = StoredCutOuts(sorted(Path(sys.argv[2]).glob("*.safetensors")), 0, int(sys.argv[1]))
 begin, start = peak(), time.process_time()
-BoxNetwork.fit(partial(face_scene, people), BoxTrainingSettings(int(sys.argv[3]) * int(sys.argv[4]), int(sys.argv[4])))
+BoxNetwork.fit(partial(face_scene, people), BoxTrainingSettings(int(sys.argv[3]), int(sys.argv[4])))
 tell(begin, start)
 """
 

@@ -26,7 +26,7 @@ def planted(folder: Path, *_: object) -> list[Path]:
 def test_what_is_saved_is_what_was_learned(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(recipe, "picture_files", planted)
     monkeypatch.setattr(recipe, "EACH", 1)
-    learning = BoxTrainingSettings(16, 8, channels=(8, 8, 8, 8), blocks=(1, 1, 1, 1))
+    learning = BoxTrainingSettings(2, 8, channels=(8, 8, 8, 8), blocks=(1, 1, 1, 1))
     out = tmp_path / "boxes"
     model, measured = train(
         Settings(
@@ -46,7 +46,7 @@ def test_what_is_saved_is_what_was_learned(tmp_path: Path, monkeypatch: pytest.M
         torch.testing.assert_close(saved.state_dict()[name].to(value), value, rtol=1e-3, atol=1e-4, msg=name)
     record = zoo.describe(out)
     assert record.metrics == pytest.approx(measured)
-    assert record.settings["training"]["pictures"] == 16
+    assert record.settings["training"]["steps"] == 2
 
 
 def test_mistakes_are_cut_out_of_pictures_without_people() -> None:

@@ -9,7 +9,6 @@ import torch
 from torch import Tensor
 from torch.nn.functional import l1_loss, logsigmoid
 
-from torchface.errors import ValueRangeError
 from torchface.files.content_keys import content_key
 from torchface.landmarks.images.boxes.box_network import STRIDE, BoxNetwork, FaceMaps, face_geometry
 from torchface.optim import DescentRun, DescentSettings, DescentTask, descend
@@ -47,61 +46,23 @@ class Pictures(Protocol):
 
 
 @dataclass(frozen=True)
-class BoxTrainingSettings:
-    """How a network of face boxes learns.
+class BoxTrainingSettings(DescentSettings):
+    """How a network of face boxes learns; see :class:`~torchface.optim.DescentSettings` for the rest.
 
     Args:
-        pictures: that it sees, none of them twice.
-        batch: pictures a step.
-        rate: the highest learning rate; it rises over the first steps and falls to none.
-        decay: of the weights.
-        averaged: steps over which the weights that are kept are averaged.
         channels, blocks: see :class:`BoxNetwork`.
-        seed: of the first weights.
-        workers: processes that make pictures; they do not change the result.
-        checkpoint_every: seconds from one checkpoint to the next.
 
     Example:
-        >>> BoxTrainingSettings(pictures=1600, batch=16).steps
-        100
+        >>> BoxTrainingSettings(steps=100).batch
+        32
     """
 
-    pictures: int = 400_000
+    steps: int = 12_500
     batch: int = 32
     rate: float = 3e-3
-    decay: float = 1e-4
-    averaged: int = 200
+    average: float = 0.995
     channels: tuple[int, ...] = (24, 48, 64, 64)
     blocks: tuple[int, ...] = (1, 4, 3, 1)
-    seed: int = 0
-    workers: int = 0
-    checkpoint_every: float = 120.0
-
-    def __post_init__(self) -> None:
-        if min(self.pictures, self.batch, self.averaged) < 1 or not self.rate > 0:
-            raise ValueRangeError(
-                f"training of boxes: found {self.pictures} pictures, {self.batch} a step, rate {self.rate}, averaged "
-                f"over {self.averaged}; expected positive numbers"
-            )
-
-    @property
-    def steps(self) -> int:
-        """How many."""
-        return -(-self.pictures // self.batch)
-
-    @property
-    def descent(self) -> DescentSettings:
-        """The same, as every network's training has it."""
-        return DescentSettings(
-            self.steps,
-            self.batch,
-            self.rate,
-            self.decay,
-            1 - 1 / self.averaged,
-            self.workers,
-            self.seed,
-            self.checkpoint_every,
-        )
 
 
 class _Batch(NamedTuple):
@@ -134,7 +95,7 @@ def fit_boxes(
 
     key = content_key("box_training/3", config=model.config, source=source or {})
     task = DescentTask(partial(_drawn, pictures, settings.batch), loss, key)
-    return descend(model, task, settings.descent, run)
+    return descend(model, task, settings, run)
 
 
 def _drawn(pictures: Pictures, size: int, step: int) -> _Batch:
