@@ -17,7 +17,7 @@ from torchface.progress import Progress
 from torchface.temporal import savitzky_golay
 
 WINDOW = 25  # frames at 60 a second; a blink is over sooner than the others, so its window is the shortest
-WINDOWS: dict[str, int] = {"45": 15, "7": 21, "6+43": 21, "18L": 29}  # Windows of units that have their own
+WINDOWS: dict[str, int] = {"45": 15, "7": 21, "6+43": 21, "18L": 29, "18R": 29}  # Windows of units that have their own
 
 _RATE = 60.0
 _MIN_WINDOW = 5
