@@ -79,15 +79,14 @@ def export_example_solver(
     (B,N) and ``carried`` (B,N), the next frame's ``previous``; zeros start. The metadata holds ``shape_names``.
 
     Args:
-        solver: with landmark boxes, or all at once with the similarity solved for.
+        solver: of examples, by any method.
         path: the file to write; it appears only when it is complete and checked.
         steps: of splitting; 168 of a regional solver and 96 of others if absent.
         landmarks: frames to check with, (T,68,2), none missing; random sparse weights with noise if absent.
         facts: further metadata.
 
     Raises:
-        ValueRangeError: there is no graph for such a solver, or it is too far from the exact solve; nothing is
-            written.
+        ValueRangeError: the graph is too far from the exact solve; nothing is written.
     """
     exact = copy.deepcopy(solver).cpu()
     content = example_model(exact, steps, facts).SerializeToString()

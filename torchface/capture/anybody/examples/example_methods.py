@@ -8,7 +8,7 @@ from torch import Tensor
 
 from torchface.capture.anybody.examples.expression_regions import HEAD, HEAD_LANDMARKS, REGION_LANDMARKS
 from torchface.capture.anybody.examples.landmark_equations import LandmarkEquations, Unknowns
-from torchface.capture.energy import ridge_term, sparsity_term
+from torchface.capture.energy import Quadratic, ridge_term, sparsity_term
 from torchface.number_checks import LARGEST_WEIGHT, checked_number
 from torchface.optim import box_qp
 
@@ -66,7 +66,11 @@ class SquaredDistances:
         squares = equations.least_squares()
         shapes, like = equations.basis.shape[-1], equations.basis.detach()
         energy = squares.energy + sparsity_term(shapes, self.sparsity, like) + ridge_term(shapes, self.ridge, like)
-        return squares.unknowns(box_qp(energy.H, energy.f, start=initial))
+        return squares.unknowns(self.solved(energy, initial))
+
+    def solved(self, energy: Quadratic, initial: Tensor | None) -> Tensor:
+        """The weights in [0,1] of least energy, (B,N)."""
+        return box_qp(energy.H, energy.f, start=initial)
 
 
 @dataclass(frozen=True)
@@ -123,19 +127,19 @@ class Regional:
     def solve(self, equations: LandmarkEquations, regions: tuple[str, ...], initial: Tensor | None) -> Unknowns:
         """Weights of N shapes in their regions (N,)."""
         basis = equations.basis
-        of_head = torch.tensor([region == HEAD for region in regions], device=basis.device)
-        head, others = of_head.nonzero()[:, 0], (~of_head).nonzero()[:, 0]
+        head = [column for column, region in enumerate(regions) if region == HEAD]
+        others = [column for column, region in enumerate(regions) if region != HEAD]
         rows = head_rows(basis)
         # Where a hand hides nose and eyes the whole face must do.
         shown = (equations.seen & rows).sum(1, keepdim=True) >= len(HEAD_LANDMARKS) // 2
-        first = equations.with_basis(basis[..., head]).among(torch.where(shown, rows, True))
+        first = equations.with_basis(basis[..., head]).among(rows | ~shown)
         if len(head):
             placed = self.objective.minimise(first, None if initial is None else initial[:, head])
         else:  # the placement alone
             placed = first.least_squares().unknowns(first.offset.new_zeros(len(first.offset), 0))
         rest = equations.moved(basis[..., head], placed).with_basis(regional_basis(basis, regions)[..., others])
         expression = self.objective.minimise(rest, None if initial is None else initial[:, others])
-        order = torch.cat([head, others]).argsort()
+        order = torch.tensor([*head, *others], device=basis.device).argsort()
         return Unknowns(torch.cat([placed.weights, expression.weights], dim=1)[:, order], placed.free)
 
 

@@ -55,7 +55,9 @@ class LandmarkEquations:
 
     def moved(self, columns: Tensor, unknowns: Unknowns) -> LandmarkEquations:
         """What is left when weights of some shapes, columns (68,2,M), and the placement are known."""
-        moved = self.offset + _along(columns, unknowns.weights) + _along(self.free, unknowns.free)
+        moved = self.offset + _along(columns, unknowns.weights)
+        if self.free.shape[-1]:
+            moved = moved + _along(self.free, unknowns.free)
         return replace(self, offset=moved, free=self.free[..., :0])
 
     def columns(self) -> Tensor:
@@ -81,8 +83,12 @@ class LandmarkEquations:
         pull = counted @ offset[..., None]
         # A frame with too few landmarks leaves part of its placement open: that part stays as it was guessed.
         information = information + torch.diag_embed(information.detach().diagonal(dim1=1, dim2=2) * 1e-12 + 1e-30)
-        solved = torch.linalg.solve(information, torch.cat([pull, cross], dim=-1))
-        start, slope = -solved[..., :1], -solved[..., 1:]
+        system, count = torch.cat([information, pull, cross], dim=-1), free.shape[1]
+        for k in range(count):  # Gauss and Jordan's elimination: ONNX has no factorisation
+            row = system[:, k : k + 1] / system[:, k : k + 1, k : k + 1]
+            others = system - system[:, :, k : k + 1] * row
+            system = torch.cat([others[:, :k], row, others[:, k + 1 :]], dim=1)
+        start, slope = -system[..., count : count + 1], -system[..., count + 1 :]
         H = H + cross.transpose(1, 2) @ slope
         return ReducedSquares(
             Quadratic(0.5 * (H + H.transpose(1, 2)), f + (cross.transpose(1, 2) @ start)[..., 0]), start, slope
