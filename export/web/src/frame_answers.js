@@ -75,7 +75,7 @@ export function answerFrames(ort, engine) {
       solved: {
         number, time, interval, width, height,
         weights: numbers("weights"), rotation: numbers("rotation"), translation: numbers("translation"),
-        gaze: numbers("gaze"), landmarks: numbers("landmarks"), iris: numbers("iris"),
+        gaze: numbers("gaze"), beside: numbers("beside"), landmarks: numbers("landmarks"), iris: numbers("iris"),
         presence: found.presence.data[0], calibrated: found.calibrated.data[0],
         milliseconds: performance.now() - started,
       },

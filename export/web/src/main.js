@@ -38,7 +38,6 @@ const page = {
   controls: () => ({
     solver: { pose: calibration?.pose ?? 0, gain: settings.gain, smoothing: settings.smoothing },
     weights,
-    mirror: settings.mirror,
   }),
   show(wanted, solved) {
     newest = solved;
@@ -46,7 +45,7 @@ const page = {
     if (!takes.playing) stage?.pose(wanted);
     if (stream) return;
     const seen = isSeen(solved);
-    if (!document.hidden) showStatus(said || words.of(solved)); // else the pause has been said
+    if (!document.hidden) showStatus(said || words.of(solved, settings.mirror)); // else the pause has been said
     drawFace(element("overlay"), seen ? solved : null);
     takes.tell();
     if (calibration !== null) goOnCalibrating(solved, seen);

@@ -6,7 +6,7 @@ const FRAME = 1, PICTURE = 2; // first number of a message
 const PART = 2 ** 15; // bytes of a take in a message
 const AGAIN = 1000; // milliseconds until a lost connection is tried again
 const PARTS = {
-  weights: 52, rotation: 9, gaze: 4, landmarks: 136, iris: 4,
+  weights: 52, rotation: 9, gaze: 4, landmarks: 136, iris: 4, beside: 2,
   presence: 1, calibrated: 1, interval: 1, milliseconds: 1, width: 1, height: 1,
 };
 

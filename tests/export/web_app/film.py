@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from planted_graph import BLOCK, COLUMNS, PRESENCE, YAW
+from planted_graph import BESIDE, BLOCK, COLUMNS, PRESENCE, YAW
 
 
 def write_y4m(path: Path, frames: NDArray[np.uint8], fps: int = 30) -> None:
@@ -29,7 +29,7 @@ def planted_film(frames: int = 60, unseen: range = range(0)) -> NDArray[np.uint8
     """Small grey frames (T,128,160) whose blocks rise and fall, each at its own speed; without a face in ``unseen``."""
     time, block = np.arange(frames)[:, None] / frames, np.arange(COLUMNS * COLUMNS)
     values = 0.5 + 0.4 * np.sin(2 * np.pi * (time * (1 + block % 5) + block / 9))
-    values[:, PRESENCE] = 0.95
+    values[:, PRESENCE], values[:, BESIDE] = 0.95, 0.05
     values[:, YAW] = 0.5 + 0.3 * np.sin(2 * np.pi * 4 * time[:, 0])
     values[list(unseen), PRESENCE] = 0.05
     film = np.full((frames, BLOCK * COLUMNS, 160), 128, np.uint8)

@@ -29,6 +29,13 @@ const jobs = {
     return { told, missed: calibration.missed, result: calibration.result, gains: calibration.gains };
   },
 
+  /** What is said of frames of [{presence, beside, calibrated}, whether the picture is shown in a mirror]. */
+  async words() {
+    const { StateWords } = await load("state_words");
+    const words = new StateWords();
+    return JSON.parse(input).map(([solved, mirrored]) => words.of(solved, mirrored));
+  },
+
   /** Frames of {weights, rotation, gaze, interval} as settings want them. */
   async controls() {
     const { WeightControls } = await load("weight_controls");

@@ -14,6 +14,8 @@ BLOCK, COLUMNS = 16, 8
 """Pixels of a block's side, and how many stand side by side in the picture's upper left corner."""
 PRESENCE, YAW = 60, 61
 """The blocks that tell whether there is a face, and how far the head is turned, behind those of the 52 weights."""
+BESIDE = (62, 63)
+"""The blocks whose brightness, rounded, tells whether somebody stands to the left and to the right."""
 STATE = len(ARKIT) + 1
 
 
@@ -61,6 +63,7 @@ def write_planted_graph(path: Path) -> None:
     node("Reshape", flat, constant([3, 3], np.int64), out="rotation")
     node("Identity", constant([0.0, 0.0, 600.0]), out="translation")
     node("Identity", constant([[0.1, 0.05], [0.1, 0.05]]), out="gaze")
+    node("Concat", *(part(values, which, which + 1) for which in BESIDE), out="beside", axis=0)
     marks = np.stack([160 + 60 * np.cos(np.arange(68)), 130 + 70 * np.sin(np.arange(68))], axis=1)
     there = node("Cast", "presence", to=TensorProto.BOOL)
     node("Where", there, constant(marks), constant(np.nan), out="landmarks")
@@ -86,6 +89,7 @@ def write_planted_graph(path: Path) -> None:
                 "iris": [2, 2],
                 "presence": [],
                 "calibrated": [],
+                "beside": [2],
                 "next_state": [STATE],
             }.items()
         ],

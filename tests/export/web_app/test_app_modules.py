@@ -64,6 +64,30 @@ def test_expressions_of_a_vrm_animation_are_those_that_vmc_sends(run: Run) -> No
         np.testing.assert_allclose([one[name] for name in VRM1.names], row, atol=1e-4)
 
 
+def test_several_people_are_said_and_which_one_is_followed(run: Run) -> None:
+    def frame(left: float, right: float, learned: float = 1.0) -> dict[str, object]:
+        return {"presence": 1, "beside": [left, right], "calibrated": learned}
+
+    assert run(
+        "words",
+        [
+            [frame(0, 0, 0.5), True],
+            [frame(0.4, 0), True],
+            [frame(0.6, 0), False],
+            [frame(0.6, 0, 0.5), True],  # in a mirror
+            [frame(1, 0.9), False],
+            [frame(0, 3), False],
+        ],
+    ) == [
+        "Learning your face: 50 %.",
+        "Your face is followed.",
+        "Two people: following the right one.",
+        "Two people: following the left one.",
+        "Three people: following the middle one.",
+        "Four people: following the left one.",
+    ]
+
+
 POSES = (
     {"jawOpen": 0.7},
     {"mouthSmileLeft": 0.6, "mouthSmileRight": 0.5},

@@ -10,16 +10,12 @@ from tests.workflows.enhance.conftest import Actor
 from torchface.errors import NameMismatchError
 from torchface.io import MeshSequence
 from torchface.io.gltf.animation_reading import read_gltf_weights
-from torchface.landmarks.images.boxes.face_box import FaceBoxes
 from torchface.workflows.enhance.enhance_animation import load_model
-from torchface.workflows.live import live_anybody
 from torchface.workflows.live.live_anybody import LiveSettings, go_live
 
 
 @pytest.mark.bench
 def test_a_take_gets_the_models_wrinkles(actor: Actor, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    nobody = FaceBoxes(torch.zeros(0, 4), torch.zeros(0))
-    monkeypatch.setattr(live_anybody, "shipped_detector", lambda: lambda picture: nobody)
     played, said = film(tmp_path / "film.avi", [0.0, 0.4, 0.8]), list[str]()
     settings = LiveSettings(
         str(played), actor.folder / "rig.glb", record=tmp_path / "out", page=False, enhance=actor.model

@@ -29,6 +29,8 @@ def film(path: Path, jaws: Sequence[float], fps: float = 25.0) -> Path:
 class GrowingSmile:
     """Reads a smile that grows, of the embedded performer straight before the camera; no face at first."""
 
+    beside = torch.zeros(2)
+
     def __init__(self) -> None:
         self.number = -1
 

@@ -20,7 +20,6 @@ from torchface.errors import FileFormatError, ValueRangeError
 from torchface.io.gltf.animation_reading import read_gltf_weights
 from torchface.io.video import open_video
 from torchface.io.video.video_packets import pyav
-from torchface.landmarks.images.boxes.face_box import FaceBoxes
 from torchface.shape_names import ARKIT
 from torchface.workflows.browser_app.character import load_character
 from torchface.workflows.live import live_anybody
@@ -46,8 +45,6 @@ def dome(dome_rig: BlendshapeRig, tmp_path_factory: pytest.TempPathFactory) -> P
 @pytest.fixture(autouse=True)
 def one_face(monkeypatch: pytest.MonkeyPatch) -> None:
     """Nothing looks for faces in pictures of one shade."""
-    nobody = FaceBoxes(torch.zeros(0, 4), torch.zeros(0))
-    monkeypatch.setattr(live_anybody, "shipped_detector", lambda: lambda picture: nobody)
 
 
 def a_session(source: Endless, folder: Path, dome: Path, told: list[str]) -> tuple[LiveSession, Recordings]:

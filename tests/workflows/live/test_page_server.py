@@ -24,7 +24,6 @@ from torchface.errors import FileFormatError, MissingExtraError, ValueRangeError
 from torchface.io import save_rig
 from torchface.io.gltf.animation_reading import read_gltf_weights
 from torchface.io.weights.live_link_csv import load_live_link
-from torchface.landmarks.images.boxes.face_box import FaceBoxes
 from torchface.progress import silent
 from torchface.rig import BlendshapeRig
 from torchface.workflows.browser_app.built_page import built_page
@@ -47,7 +46,8 @@ class Desk:
         time.sleep(0.01)
         self.number += 1
         weights, marks = torch.arange(52) / 52, torch.full((68, 2), 7.0)
-        solved = LiveFrame(weights, FRONTAL, marks, gaze=torch.tensor([[0.1, 0.2], [0.3, 0.4]]), calibrated=0.5)
+        gaze, beside = torch.tensor([[0.1, 0.2], [0.3, 0.4]]), torch.tensor([2.0, 0.0])
+        solved = LiveFrame(weights, FRONTAL, marks, gaze=gaze, beside=beside, calibrated=0.5)
         picture = np.full((48, 64, 3), (200, 100, 50), np.uint8)
         return LiveView(self.number / 100, 0.01, 9.0, picture, solved)
 
@@ -133,7 +133,7 @@ def test_the_pages_socket_gives_frames_pictures_and_state_and_takes_wishes(serve
     np.testing.assert_allclose(numbers[52:61], FRONTAL.flatten())
     np.testing.assert_allclose(numbers[61:65], [0.1, 0.2, 0.3, 0.4])
     assert (numbers[65:201] == 7).all()
-    np.testing.assert_allclose(numbers[205:], [1, 0.5, 0.01, 9, 64, 48], atol=1e-6)
+    np.testing.assert_allclose(numbers[205:], [2, 0, 1, 0.5, 0.01, 9, 64, 48], atol=1e-6)
     assert np.frombuffer(frame, "<f8", 1, 8)[0] == pytest.approx(10, abs=2000)
     small = messages[PICTURE]
     assert isinstance(small, bytes)
@@ -216,9 +216,7 @@ class Opened:
     def __init__(self, folder: Path, rig: BlendshapeRig, patch: pytest.MonkeyPatch) -> None:
         self.source, self.solver, self.kept = Steered(), ShadeSolver(), folder / "kept"
         save_rig(rig, folder / "dome.glb")
-        nobody = FaceBoxes(torch.zeros(0, 4), torch.zeros(0))
         patch.setattr(live_anybody, "open_source", lambda *_: self.source)
-        patch.setattr(live_anybody, "shipped_detector", lambda: lambda picture: nobody)
         patch.setattr(live_anybody, "RECORDINGS", self.kept)
         self.urls: list[str] = []
         self.said: list[str] = []

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from torchface.capture.anybody import WebcamControls, WebcamSolver
 from torchface.capture.anybody.webcam_state import CONTROLS, POSES
 from torchface.landmarks.images.face_reading import READ_FOR_SOLVER, FaceReading
-from torchface.landmarks.images.frame_reader.face_reader import STATE, FaceReader
+from torchface.landmarks.images.frame_reader.face_reader import STATE, FaceReader, people_beside
 from torchface.landmarks.images.frame_reader.face_search import FOUND
 from torchface.landmarks.images.frame_reader.picture_pieces import picture_size
 from torchface.onnx.exported_model import chained_models, exported_model, half_stored
@@ -25,10 +25,12 @@ READ = (
 )  # fmt: skip
 """What the first part of the graph hands to the second."""
 
-SOLVED = ("weights", "rotation", "translation", "gaze", "calibrated", "next_state")  # what the second part gives
+SOLVED = ("weights", "rotation", "translation", "gaze", "calibrated", "beside", "next_state")
+"""What the second part gives."""
 
 OUTPUTS = (
-    "weights", "rotation", "translation", "gaze", "landmarks", "iris", "presence", "calibrated", "next_state"
+    "weights", "rotation", "translation", "gaze", "landmarks", "iris", "presence", "calibrated", "beside",
+    "next_state",
 )  # fmt: skip
 
 _SHORTEST, _LONGEST, _USUAL = 1e-3, 1.0, 1 / 30  # seconds
@@ -100,7 +102,9 @@ class WebcamSolving(nn.Module):
     def forward(self, *read: Tensor) -> tuple[Tensor, ...]:
         """``SOLVED`` of ``READ``."""
         answer = self.solver(*read[:-1])
-        solved = answer._asdict() | {"next_state": torch.cat([read[-1], answer.next_state])}
+        reader_state = read[-1]
+        solved = answer._asdict() | {"beside": people_beside(reader_state)}
+        solved["next_state"] = torch.cat([reader_state, answer.next_state])
         return tuple(solved[name].clone() for name in SOLVED)  # outputs of a graph are its own
 
 
@@ -136,8 +140,8 @@ class _Cells(_Part):
 
 
 class _Search(_Part):
-    def forward(self, image: Tensor, place: Tensor, waiting: Tensor, attempt: Tensor) -> Tensor:
-        return self.reader.search(image, place, waiting, attempt)
+    def forward(self, image: Tensor, place: Tensor, waiting: Tensor, attempt: Tensor, longest: Tensor) -> Tensor:
+        return self.reader.search(image, place, waiting, attempt, longest)
 
 
 class _Look(_Part):
@@ -154,7 +158,7 @@ def reading_parts(reader: FaceReader) -> dict[str, Callable[[], onnx.ModelProto]
     """What makes the models of the parts of :class:`WebcamReading` that take long."""
     place = torch.tensor([64.0, 48.0, 64.0, 1.0, 0.0])
     picture, sizes = {"image": _PICTURE, "place": place}, {"image": ("height", "width", "channels")}
-    sought = {**picture, "waiting": torch.tensor(False), "attempt": torch.tensor(0.0)}
+    sought = {**picture, "waiting": torch.tensor(False), "attempt": torch.tensor(0.0), "longest": torch.tensor(128.0)}
 
     def cells() -> onnx.ModelProto:
         given = {"images": torch.zeros(1, 3, 96, 128)}
@@ -219,7 +223,8 @@ def webcam_model(
     Inputs are ``image`` uint8 (H,W,C), 3 channels or 4, red first; ``interval`` (), seconds; ``controls`` (5,), see
     ``CONTROLS``; ``state`` (S,), zeros to start. Outputs are ``weights`` (52,), ``rotation`` (3,3), ``translation``
     (3,), millimetres, ``gaze`` (2,2), radians, ``landmarks`` (68,2) and ``iris`` (2,2), pixels, NaN without a face,
-    ``presence`` (), ``calibrated`` () and ``next_state`` (S,).
+    ``presence`` (), ``calibrated`` (), ``beside`` (2,), how many other people stand to the left of the face in the
+    picture and to the right, smoothed, and ``next_state`` (S,).
     """
     size = reading.graph.input[3].type.tensor_type.shape.dim[0].dim_value
     metadata = {

@@ -30,6 +30,8 @@ class WebcamFrame:
     iris: Tensor  # centres of the irises, the right eye's first, (2,2) pixels; NaN without a face
     presence: float  # in [0,1]: how likely there is a face; 0 where none was found
     calibrated: float  # in [0,1]: how far the person has been learned
+    # how many other people stand to the left of the face in the picture, and to the right, smoothed, (2,)
+    beside: Tensor
 
 
 class WebcamSession:
@@ -115,4 +117,4 @@ class WebcamSession:
         return dict(zip(self._outputs, self._session.run(None, inputs), strict=True))
 
 
-_TENSORS = ("weights", "rotation", "translation", "gaze", "landmarks", "iris")
+_TENSORS = ("weights", "rotation", "translation", "gaze", "landmarks", "iris", "beside")

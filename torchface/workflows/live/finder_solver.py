@@ -38,5 +38,11 @@ class FinderSolver:
         ever = bool(state.rotation.any())
         rotation = state.rotation if ever else torch.full((3, 3), torch.nan)
         return LiveFrame(
-            state.weights, rotation, reading.landmarks, reading.iris, state.gaze, calibrated=float(state.calibrated)
+            state.weights,
+            rotation,
+            reading.landmarks,
+            reading.iris,
+            state.gaze,
+            float(state.calibrated),
+            beside=self._tracker.beside,
         )

@@ -16,7 +16,6 @@ from torchface.io import load_take
 from torchface.io.protocols.stream_address import is_source, parse_source
 from torchface.io.protocols.weight_sender import find_receiver
 from torchface.io.take_files import RECORDING_ENDINGS
-from torchface.landmarks.images.checked_detector import shipped_detector
 from torchface.number_checks import checked_number
 from torchface.onnx.webcam.webcam_session import WebcamSession
 from torchface.progress import Progress, silent
@@ -40,7 +39,7 @@ from torchface.workflows.live.live_session import LiveSession, Notes
 from torchface.workflows.live.page_server import PageServer, Preparing
 from torchface.workflows.live.received_source import ReceivedSolver, ReceivedSource, ReceivedWatch
 from torchface.workflows.live.recordings import Recordings, SavedTake
-from torchface.workflows.live.session_prompts import FaceWatch, Watch
+from torchface.workflows.live.session_prompts import LightWatch, Watch
 from torchface.workflows.live.weight_streams import WeightStreams
 from torchface.workflows.webcam.webcam_graph import prepared_webcam_graph
 
@@ -64,7 +63,13 @@ class PersonSolver:
         self._session.controls = controls
         answer = self._session.step(picture, _USUAL if interval is None else interval)
         solved = LiveFrame(
-            answer.weights, answer.rotation, answer.landmarks, answer.iris, answer.gaze, calibrated=answer.calibrated
+            answer.weights,
+            answer.rotation,
+            answer.landmarks,
+            answer.iris,
+            answer.gaze,
+            answer.calibrated,
+            beside=answer.beside,
         )
         self._ever = (self._ever and not controls.reset) or solved.seen
         # Before the first face the graph's head looks anywhere.
@@ -165,7 +170,7 @@ def go_live(
         else:
             preparing("loading the face reader")
             solver = make_solver(preparing)
-            watch = FaceWatch(lambda picture: shipped_detector()(picture).boxes.tolist())
+            watch = LightWatch()
         streams = stack.enter_context(WeightStreams(settings.addresses, ARKIT, source.video.fps, notes))
         if settings.takes is not None:
             import_recordings(settings.takes, recordings, notes)

@@ -145,6 +145,8 @@ class LiveFrame:
     found: bool = False  # whether a face is there, where no landmarks say so
     # the picture with what was solved drawn over it, uint8 (H,W,3); the page shows it in the picture's place
     drawn: np.ndarray | None = None
+    # how many other people stand to the left of the face in the picture, and to the right, smoothed, (2,)
+    beside: Tensor = field(default_factory=lambda: torch.zeros(2))
 
     @cached_property
     def seen(self) -> bool:

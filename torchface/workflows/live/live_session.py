@@ -22,7 +22,7 @@ from torchface.workflows.live.live_frames import FaceSolver, FrameSource, LiveFr
 from torchface.workflows.live.live_view import LiveView
 from torchface.workflows.live.received_source import ReceivedSource
 from torchface.workflows.live.recordings import Recordings
-from torchface.workflows.live.session_prompts import FOLLOWED, GuidedCalibration, Watch
+from torchface.workflows.live.session_prompts import GuidedCalibration, Watch
 from torchface.workflows.live.take_film import solved_again
 from torchface.workflows.live.weight_controls import WeightControls, read_weight_settings
 from torchface.workflows.live.weight_streams import WeightStreams
@@ -96,15 +96,13 @@ class LiveSession:
 
     def state(self) -> dict[str, Any]:
         """What the page shows beside the frames."""
-        view, recordings = self._view, self._recordings
-        seen, learned = view is not None and view.solved.seen, view.solved.calibrated if view is not None else 0.0
-        words = self._watch.words if self._watch is not None else ""
+        recordings = self._recordings
         running = recordings.running
         recording = (
             {"seconds": recordings.seconds(time.perf_counter()), "frames": recordings.frames} if running else None
         )
         return {
-            "words": "" if seen and learned < 1 and words == FOLLOWED else words,
+            "words": "" if self._watch is None else self._watch.words,
             "notes": self._notes.kept()[-_SHOWN_NOTES:],
             "recording": recording,
             "takes": self._listed(),
@@ -186,8 +184,6 @@ class LiveSession:
         checked = WebcamControls(solver.get("pose"), solver.get("gain"), solver.get("smoothing"))  # type: ignore[arg-type]
         self._weights.settings = read_weight_settings(weights)
         self._pose, self.gain, self.smoothing = checked.pose, checked.gain, checked.smoothing
-        if self._watch is not None:
-            self._watch.mirrored = controls.get("mirror") is not False
 
     def calibrate(self) -> None:
         """Begins a guided calibration."""

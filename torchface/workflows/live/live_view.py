@@ -34,8 +34,8 @@ class LiveView:
         solved = self.solved
         height, width = self.picture.shape[:2]
         facts = [float(solved.seen), solved.calibrated, self.interval, self.latency, float(width), float(height)]
-        parts = [solved.weights, solved.rotation, solved.gaze, solved.landmarks, solved.iris, torch.tensor(facts)]
-        numbers = torch.cat([part.detach().cpu().float().reshape(-1) for part in parts])
+        parts = [solved.weights, solved.rotation, solved.gaze, solved.landmarks, solved.iris, solved.beside]
+        numbers = torch.cat([part.detach().cpu().float().reshape(-1) for part in (*parts, torch.tensor(facts))])
         head = np.array([FRAME, 0], "<u4").tobytes() + np.array([1000 * self.came], "<f8").tobytes()
         return head + numbers.numpy().astype("<f4").tobytes()
 

@@ -136,7 +136,7 @@ class ReceivedWatch:
 
     def __init__(self, source: ReceivedSource, say: Say) -> None:
         self._source, self._say = source, say
-        self._state, self.mirrored = "", True
+        self._state = ""
         self.words = self._waiting()
         say(self.words)
 

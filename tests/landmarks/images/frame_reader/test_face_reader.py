@@ -1,14 +1,24 @@
 """One face in a camera's pictures: it is kept, lost and found; its eyes are read as the library reads them."""
 
+from typing import Any
+
 import pytest
 import torch
 from torch import Tensor
 
+from planted.crossing_people import crossing_film
 from torchface import zoo
 from torchface.geometry.cameras.pinhole import look_at
 from torchface.landmarks import FaceReading, LandmarkTracker
 from torchface.landmarks.images.checked_detector import shipped_detector
-from torchface.landmarks.images.frame_reader.face_reader import STATE, FaceReader, WebcamNetworks, read_eyes
+from torchface.landmarks.images.frame_reader.face_reader import (
+    STATE,
+    FaceReader,
+    WebcamNetworks,
+    people_beside,
+    read_eyes,
+)
+from torchface.landmarks.images.frame_reader.face_search import FOUND
 from torchface.landmarks.images.ibug_68 import relative_errors
 from torchface.landmarks.images.networks.crop_finder import CropFinder
 from torchface.landmarks.images.networks.eye_finder import EyeFinder
@@ -124,14 +134,44 @@ def test_it_stays_with_the_largest_and_finds_it_again(webcam: Webcam, portrait: 
     assert column(webcam.step(both(small, head))) > 190  # forgotten: the largest
 
 
+@pytest.mark.parametrize(
+    "film",
+    [{}, {"start": 400.0, "end": -160.0}, {"tint": (1.0, 1.0, 1.0)}, {"hidden": 0.8}, {"larger": 1.4}],
+    ids=["beside", "passing", "alike", "slow", "near"],
+)
+def test_it_stays_with_a_person_before_whom_another_passes(reader: FaceReader, film: dict[str, Any]) -> None:
+    """Reader and tracker alike: never for two frames with the other, soon with the first again; others are counted."""
+    crossing = crossing_film(**film)
+    network = zoo.get_model("landmark_network")
+    tracker = LandmarkTracker(CropFinder(network, network.size, network.margin), detector=shipped_detector())
+    webcam, away = Webcam(reader), torch.zeros(2, len(crossing.frames))
+    for i, frame in enumerate(crossing.frames):
+        for row, found in enumerate((webcam.step(frame), tracker.step(frame))):
+            away[row, i] = abs(float(found.landmarks[:, 0].mean()) - float(crossing.columns[i]))
+    assert (away[:, :15] < 2).all()
+    assert (away[:, -20:] < 2).all()
+    assert (away.nan_to_num(0.0) < 16).all()  # pixels, of a face of 75
+    assert ((away > 3).sum(1) <= 2).all()
+    others = [round(one) for one in people_beside(webcam.state).tolist()]
+    assert others == [round(one) for one in tracker.beside.tolist()] == [int(film.get("end") is None), 0]
+
+
+def test_a_person_who_passes_before_another_is_kept(webcam: Webcam) -> None:
+    frames = crossing_film(larger=1.3).frames[5:]  # the nearer is the larger, and so the one that is followed
+    columns = [column(webcam.step(frame)) for frame in frames]
+    assert min(columns) == pytest.approx(columns[-1], abs=2)
+    assert columns[0] - columns[-1] > 200
+    assert all(one == one for one in columns)
+
+
 def test_what_was_refused_is_not_tried_again_and_again(
     webcam: Webcam, portrait: tuple[Tensor, Tensor], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Long after a face was lost it is searched for now and then, and another candidate comes each time."""
     frame, place, wall = scene(portrait[0], (60, 50)), torch.tensor([135.0, 120, 90]), torch.tensor([320.0, 60, 90])
 
-    def search(image: Tensor, last: Tensor, waiting: Tensor, attempt: Tensor) -> Tensor:
-        return torch.cat([place if attempt == 2 else wall, torch.tensor([1.0, 0, 1, 0])])
+    def search(image: Tensor, last: Tensor, waiting: Tensor, attempt: Tensor, longest: Tensor) -> Tensor:
+        return torch.cat([place if attempt == 2 else wall, torch.tensor([1.0, 0, 1, 0]), torch.zeros(FOUND - 7)])
 
     monkeypatch.setattr(webcam.reader, "search", search)
     webcam.state[9] = 1.0  # seconds without a face

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor, nn
 
-from torchface.landmarks.images.boxes.box_network import BoxNetwork
+from torchface.landmarks.images.boxes.box_network import INPUT_SIZE, BoxNetwork
 from torchface.landmarks.images.face_reading import FaceReading, confidence_of
 from torchface.landmarks.images.folded_normalisation import without_normalisation
 from torchface.landmarks.images.frame_reader.face_place import overlap, place_around, plausible, relation, sought
@@ -23,9 +23,24 @@ from torchface.landmarks.images.networks.eye_crop import eye_transforms, moved, 
 from torchface.landmarks.images.networks.eye_finder import LEAST, merged_lids
 from torchface.landmarks.images.networks.eye_network import EyeNetwork
 from torchface.landmarks.images.networks.landmark_network import LandmarkNetwork
+from torchface.landmarks.images.person_identity import (
+    CANDIDATES,
+    FORGOTTEN,
+    IDENTITY,
+    LOOK_MARGIN,
+    LOOK_SIZE,
+    after_boxes,
+    after_face,
+    counted_beside,
+    face_look,
+    is_beside,
+    is_other,
+    known_look,
+)
 from torchface.shape_names import ARKIT
 
-STATE = 15
+_PLACED = 16
+STATE = _PLACED + IDENTITY
 """Numbers that a reader hands on."""
 
 _FAR, _LOOSE = 0.75, 0.25  # shared share of two places
@@ -35,6 +50,9 @@ _SHRUNK, _GROWN = 0.6, 1.6  # of a face from one picture to the next
 _LONG = 1e3  # seconds
 _DOUBT = 0.25  # seconds of presence below ``sure`` and the like after which the box network is asked, again and again
 _PATIENCE = 0.3  # seconds for which a lost face is waited for at its place before another of several is taken
+# Seconds after which the box network is asked who else is about, unless a landmark is less visible than the second; and
+# pixels of the followed face's side in the copy of the picture that it is shown for that.
+_COUNTED, _HIDDEN, _ENOUGH = 0.25, 0.3, 48.0
 _EAGER, _PAUSE = 0.5, 0.1  # seconds after a face was lost in which every frame is searched; between searches afterwards
 
 
@@ -89,21 +107,26 @@ class FaceReader(nn.Module):
         """
         settings = self.settings
         place, anchor, size = state[:5], state[5:8], picture_size(image)
-        following, missing, doubt, since, attempt = state[8:13].unbind()
-        same = (size == state[13:]).all()
+        following, missing, doubt, since, attempt, covered = state[8:14].unbind()
+        same = (size == state[14:_PLACED]).all()
         # Another picture size is another camera: its face may be anywhere.
-        place = place * same
+        place, people = place * same, state[_PLACED:] * same
         followed = (following > 0.5) & same & (interval <= _LONGEST)
-        asked = followed & (doubt >= _DOUBT) & (since >= _DOUBT)
+        crowded = is_beside(people)
+        asked = followed & (doubt >= _DOUBT) & ((since >= _DOUBT) | crowded)
         lost_now = ~followed & ((missing <= _EAGER) | (since >= _PAUSE))
-        searched = asked | lost_now
+        searched = asked | lost_now | (followed & (crowded | (since >= torch.where(covered > 0.5, 0.0, _COUNTED))))
+        # Who is about as large as the face that is followed is seen in a small copy too.
+        enough = (size.amax(0) * _ENOUGH / place[2].clamp(min=1)).clamp(max=INPUT_SIZE)
+        longest = torch.where(followed, enough, float(INPUT_SIZE))
         found = _either(
             searched,
             self.search,
-            lambda image, place, waiting, attempt: torch.zeros(FOUND),
-            (image, place, missing < _PATIENCE, attempt),
+            lambda image, place, waiting, attempt, longest: torch.zeros(FOUND),
+            (image, place, missing < torch.where(crowded, FORGOTTEN, _PATIENCE), attempt, longest),
         )
         there = found[5] > 0.5
+        people = after_boxes(people, found[7:].view(CANDIDATES, 4), searched, interval)
         begin = torch.where(followed, sought(place, anchor), found[:5])
         ready = plausible(begin, size, settings.smallest) & (followed | there)
         first = torch.where(ready, begin, torch.tensor(_ANYWHERE))
@@ -126,12 +149,20 @@ class FaceReader(nn.Module):
         marks, deviation, presence = looked.landmarks, looked.deviation, looked.presence
         own = place_around(marks)
         growth = own[2] / place[2].clamp(min=1)
+        around = torch.where(plausible(own, size, settings.smallest), own, first)
+        appearance = _either(
+            searched,
+            lambda image, around, known: face_look(cut_square(image, around, LOOK_SIZE, LOOK_MARGIN)),
+            lambda image, around, known: known.clone(),
+            (image, around, known_look(people)),
+        )
+        stranger = is_other(people, own, appearance, interval)
         vague = confidence_of(deviation / own[2].clamp(min=1)).mean() < settings.vague
         confirmed = found[6] > 0.5
         kept = ((presence >= settings.likely) & ~vague) | ~asked | confirmed
         kept = kept & (presence >= settings.least) & (growth > _SHRUNK) & (growth < _GROWN)
         good = (followed & kept) | (~followed & ~vague & (presence >= settings.new))
-        good = good & ready & plausible(own, size, settings.smallest)
+        good = good & ready & ~stranger & plausible(own, size, settings.smallest)
         clear = ((presence >= settings.sure) & ~vague) | confirmed
         refused = lost_now & there & ~good
         counts = [
@@ -140,9 +171,11 @@ class FaceReader(nn.Module):
             torch.where(good & ~clear, doubt + interval, 0.0),
             torch.where(searched, 0.0, (since + interval).clamp(max=_LONG)),
             torch.where(good, 0.0, attempt + refused),  # kept between searches: else the same is tried each time
+            (looked.visibility.amin(0) < _HIDDEN).float(),
         ]
         anchor = torch.where(good & ~followed, relation(own, shown), anchor)
-        after = torch.cat([torch.where(good, own, place), anchor, torch.stack(counts), size])
+        people = after_face(people, own, appearance, (good, stranger & (followed | there)), interval)
+        after = torch.cat([torch.where(good, own, place), anchor, torch.stack(counts), size, people])
         face = read_eyes(image, looked, self.eyes)
         nothing = dict.fromkeys(("landmarks", "iris", "openness", "closed", "expression"), torch.nan)
         nothing |= dict.fromkeys(("visibility", "presence", "eye_visibility"), 0.0)
@@ -150,9 +183,9 @@ class FaceReader(nn.Module):
         parts = {name: torch.where(good, getattr(face, name), value) for name, value in nothing.items()}
         return FaceReading(deviation=face.deviation, **parts), after
 
-    def search(self, image: Tensor, place: Tensor, waiting: Tensor, attempt: Tensor) -> Tensor:
+    def search(self, image: Tensor, place: Tensor, *asked: Tensor) -> Tensor:
         """See :func:`~torchface.landmarks.images.frame_reader.face_search.search`."""
-        return search(image, self.boxes, (self.settings.score, self.settings.again), place, waiting, attempt)
+        return search(image, self.boxes, (self.settings.score, self.settings.again), place, asked)
 
     def look(self, image: Tensor, place: Tensor) -> Tensor:
         """What the network finds in the square round a place, one after the other; see :meth:`_unpacked`."""
@@ -178,6 +211,12 @@ class FaceReader(nn.Module):
             expression=expression,
             expression_deviation=uncertain,
         )
+
+
+def people_beside(state: Tensor) -> Tensor:
+    """How many other people a reader that left a state (STATE,) has seen beside the face; see
+    :func:`~torchface.landmarks.images.person_identity.counted_beside`."""
+    return counted_beside(state[_PLACED:])
 
 
 def _either(

@@ -76,7 +76,7 @@ def from_square(points: Tensor, place: Tensor, size: int, margin: float) -> Tens
     return (points - (size - 1) / 2) * (place[2] * (margin / size)) @ axes(place) + place[:2]
 
 
-def whole_picture(image: Tensor, longest: int) -> tuple[Tensor, Tensor]:
+def whole_picture(image: Tensor, longest: int | Tensor) -> tuple[Tensor, Tensor]:
     """A picture made smaller until its longer side has so many pixels, its sides multiples of 32.
 
     Halved before by interpolation where it is more than twice as large, so that few pixels are skipped.

@@ -1,6 +1,6 @@
 """State of a face that a tracker follows: its place, the finder's box beside it, its look, and counts."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import torch
 from torch import Tensor
@@ -8,14 +8,14 @@ from torch import Tensor
 from torchface.errors import ShapeError
 from torchface.landmarks.images.face_crop import crop_transform, cut_crop
 from torchface.landmarks.images.ibug_68 import turned_box
+from torchface.landmarks.images.person_identity import IDENTITY, LOOK_MARGIN, face_look
 
-_SIZE, _MARGIN = 20, 1.1  # pixels of the crop that a look is read from, and its side in sides of the box
+_SIZE = 20  # pixels of the crop that a look is read from
 _LOOK = 3 * _SIZE * _SIZE
-_LEARNED = 0.1  # of how a face looks now that is taken up by what is known of its look
 _NEAR, _SMALLER, _LARGER = 0.75, 0.6, 1.6  # sides of the box, and factors of its size
 
 LOOK = _LOOK  # numbers of a look
-MEMORY = 5 + 3 + _LOOK + 4  # numbers that a followed face is packed into
+MEMORY = 5 + 3 + IDENTITY + 4  # numbers that a followed face is packed into
 
 
 @dataclass(eq=False)
@@ -26,18 +26,21 @@ class FollowedFace:
     # Where the finder's box lies as the face sees it: its middle from the upright box's (2,) in sides of that, and its
     # size by that's; (3,).
     anchor: Tensor | None = None
-    look: Tensor | None = None  # its colours, upright and small, (1200,) of unit length
+    # What is known of it and of somebody who passes before it; see
+    # :mod:`~torchface.landmarks.images.person_identity`.
+    people: Tensor = field(default_factory=lambda: torch.zeros(IDENTITY))
     missed: int = 0  # frames in a row without it
     frames: int = 0
     unconfirmed: int = 0  # checks in a row in which the detector saw no face at its place
-    crowded: bool = False  # whether somebody else is about who might be taken for it
-    latest_look: Tensor | None = None  # the same in the last frame that showed it; not packed
+    covered: bool = False  # whether a landmark was hidden in the last frame
+    # Its colours in the last frame that showed it, upright and small, (1200,) of unit length; not packed.
+    latest_look: Tensor | None = None
 
     def pack(self) -> Tensor:
-        """All of it as a tensor (1212,) float64; NaN for unknown."""
-        parts = (self.place, 5), (self.anchor, 3), (self.look, _LOOK)
+        """All of it as a tensor (218,) float64; NaN for unknown."""
+        parts = (self.place, 5), (self.anchor, 3), (self.people, IDENTITY)
         known = [torch.full((size,), torch.nan) if part is None else part.cpu() for part, size in parts]
-        counts = [self.missed, self.frames, self.unconfirmed, self.crowded]
+        counts = [self.missed, self.frames, self.unconfirmed, self.covered]
         return torch.cat([*(part.double() for part in known), torch.tensor(counts, dtype=torch.float64)])
 
     @classmethod
@@ -45,10 +48,10 @@ class FollowedFace:
         """What :meth:`pack` packed."""
         if packed.shape != (MEMORY,):
             raise ShapeError(f"resume: found a memory of {tuple(packed.shape)}, expected ({MEMORY},)")
-        *parts, counts = packed.float().split([5, 3, _LOOK, 4])
-        place, anchor, look = (part if bool(torch.isfinite(part).all()) else None for part in parts)
-        missed, frames, unconfirmed, crowded = (int(count) for count in counts.nan_to_num(0.0))
-        return cls(place, anchor, look, missed, frames, unconfirmed, crowded > 0)
+        *parts, people, counts = packed.float().split([5, 3, IDENTITY, 4])
+        place, anchor = (part if bool(torch.isfinite(part).all()) else None for part in parts)
+        missed, frames, unconfirmed, covered = (int(count) for count in counts.nan_to_num(0.0))
+        return cls(place, anchor, people.nan_to_num(0.0), missed, frames, unconfirmed, covered > 0)
 
     def set_anchor(self, box: Tensor) -> None:
         """Notes where the box (4,) lies that the face, whose place is known, was found in."""
@@ -77,29 +80,11 @@ class FollowedFace:
         near = (distance < _NEAR) & (ratio > _SMALLER) & (ratio < _LARGER)
         return [i for i in distance.argsort(stable=True).tolist() if near[i]]
 
-    def likeness(self, image: Tensor, landmarks: Tensor) -> float:
-        """How much a face looks like this one, the correlation of their colours; 1 where its look is not known."""
-        return 1.0 if self.look is None else float(self.look @ face_look(image, face_place(landmarks)))
 
-    def learn_look(self, image: Tensor, place: Tensor, least: float) -> None:
-        """Takes up a share of how the face looks now, unless others are about and it looks less like itself."""
-        look = self.latest_look = face_look(image, place)
-        if self.look is None:
-            self.look = look
-        elif not self.crowded or float(self.look @ look) >= least:
-            mixed = (1 - _LEARNED) * self.look + _LEARNED * look
-            self.look = mixed / mixed.norm().clamp(min=1e-6)
-
-
-def face_look(image: Tensor, place: Tensor) -> Tensor:
-    """A face's colours, small and upright, about their mean, (1200,) of unit length: they distinguish people.
-
-    The product of two is their correlation. The place (5,) is an upright box and its tilt.
-    """
-    crop = cut_crop(image, crop_transform(place[:4], float(place[4]), _SIZE, _MARGIN), _SIZE).float()
-    # The mean of all colours goes, not that of each: how red a face is beside how blue differs between people.
-    flat = (crop - crop.mean()).flatten()
-    return flat / flat.norm().clamp(min=1e-6)
+def look_at(image: Tensor, place: Tensor, size: int = _SIZE) -> Tensor:
+    """The look of a face at an upright box and its tilt (5,) in an image, from a square of so many pixels a side; see
+    :func:`~torchface.landmarks.images.person_identity.face_look`."""
+    return face_look(cut_crop(image, crop_transform(place[:4], float(place[4]), size, LOOK_MARGIN), size).float())
 
 
 def face_place(landmarks: Tensor) -> Tensor:

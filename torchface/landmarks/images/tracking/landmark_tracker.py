@@ -7,17 +7,26 @@ from torchface.errors import ValueRangeError
 from torchface.landmarks.images.appearance.appearance_model import AppearanceModel
 from torchface.landmarks.images.box_landmarks import refined_face, settled_face
 from torchface.landmarks.images.boxes.face_box import FaceBoxes, FaceDetector, at_most, check_image, overlaps
-from torchface.landmarks.images.checked_detector import shipped_detector
+from torchface.landmarks.images.checked_detector import CheckedDetector, shipped_detector
 from torchface.landmarks.images.face_reading import FaceReading
 from torchface.landmarks.images.find_faces import find_faces
+from torchface.landmarks.images.frame_reader.face_place import place_around
 from torchface.landmarks.images.ibug_68 import turned_box
 from torchface.landmarks.images.landmark_finder import LandmarkFinder, find_in_box
-from torchface.landmarks.images.tracking.followed_face import LOOK, FollowedFace, face_place
+from torchface.landmarks.images.person_identity import (
+    CANDIDATES,
+    LOOK_SIZE,
+    after_boxes,
+    after_face,
+    counted_beside,
+    is_beside,
+    is_other,
+)
+from torchface.landmarks.images.tracking.followed_face import LOOK, FollowedFace, face_place, look_at
 from torchface.landmarks.images.trees.landmark_trees import LandmarkTrees
 from torchface.landmarks.images.trees.tree_finder import TreeFinder
 
-_SAME_PLACE, _UNMOVED, _CONFIRMED, _APART = 0.5, 0.75, 0.4, 0.3  # overlaps of boxes
-_MOST_OTHERS = 4
+_SAME_PLACE, _UNMOVED, _CONFIRMED = 0.5, 0.75, 0.4  # overlaps of boxes
 _MOST_TRIED = 4  # boxes of a search beside those of the larger faces
 
 # The detector's, from which a box elsewhere than where a face was shows one; the network's, from which a face is one
@@ -25,12 +34,12 @@ _MOST_TRIED = 4  # boxes of a search beside those of the larger faces
 _NEW_PRESENCE, _SURE_PRESENCE, _LEAST_PRESENCE = 0.5, 0.9, 0.1
 # The mean under which a face that the detector misses so many times in a row is lost; frames after which it is asked.
 _LEAST_CONFIDENCE, _CHECKS, _CHECK_EVERY = 0.44, 3, 16
-_FRAMES_WAITED = 10  # for a lost face at its place before another is taken
-_CHECKED = 320  # pixels of the longer side of a copy that the detector is asked about, about twice the face's
+# Frames after which it is asked who else is about, unless a landmark is less visible than the second; and pixels of the
+# followed face's side in the copy that it is shown for that.
+_COUNT_EVERY, _HIDDEN, _ENOUGH = 4, 0.3, 48.0
+_FRAMES_WAITED, _FRAMES_HIDDEN = 10, 30  # for a lost face at its place before another is taken
 _LEAST_SIDE = 12.0  # of a box, pixels, under which a face is lost
-# Correlation of a face's look with how it looked before, under which it is another's where there are several, and how
-# much more another must look as this one did to be taken for it.
-_LEAST_LIKENESS, _LIKENESS_GAIN = 0.6, 0.15
+_INTERVAL = torch.tensor(1 / 30)  # seconds that a frame counts
 
 
 class LandmarkTracker:
@@ -69,17 +78,19 @@ class LandmarkTracker:
         self.finder: LandmarkFinder = TreeFinder(finder) if isinstance(finder, LandmarkTrees) else finder
         self.appearance, self.face = appearance, face
         self.detector = detector or shipped_detector()
+        self._quick = self.detector.detector if isinstance(self.detector, CheckedDetector) else self.detector
         self.reset()
 
     def reset(self) -> None:
         """Forgets the face, as before the first frame."""
         self._followed = FollowedFace()
+        self._faces: FaceBoxes | None = None  # of the frame, if it was searched
         self._moved = torch.zeros(0), torch.zeros(0)
         """Landmarks of the latest frame's face, and its place."""
 
     @property
     def memory(self) -> Tensor:
-        """What the next frame needs of those before it, (1212,) float64."""
+        """What the next frame needs of those before it, (218,) float64."""
         return self._followed.pack()
 
     @property
@@ -88,8 +99,13 @@ class LandmarkTracker:
         look = self._followed.latest_look
         return torch.full((LOOK,), torch.nan) if look is None or self._followed.missed > 0 else look
 
+    @property
+    def beside(self) -> Tensor:
+        """How many other people stand to the left of the face in the picture, and to the right, smoothed, (2,)."""
+        return counted_beside(self._followed.people)
+
     def resume(self, memory: Tensor) -> None:
-        """Goes on as a tracker would that has just had this :attr:`memory`, (1212,).
+        """Goes on as a tracker would that has just had this :attr:`memory`, (218,).
 
         Raises:
             ShapeError: another shape.
@@ -109,10 +125,13 @@ class LandmarkTracker:
         check_image(frame)
         followed = self._followed
         followed.frames += 1
+        self._faces = None
+        check = followed.missed > 0 or followed.covered or followed.frames % _COUNT_EVERY == 0
+        check = check or bool(is_beside(followed.people))
+        faces = self._about(frame) if check else torch.zeros(CANDIDATES, 4)
+        followed.people = after_boxes(followed.people, faces, torch.tensor(check), _INTERVAL)
         before = self._follow(frame) if followed.missed == 0 else None
-        face = None if before is None else self._same_person(frame, before)
-        if face is None:
-            face = self._search(frame)
+        face = before if before is not None and self._is_person(frame, before) else self._search(frame)
         if face is None:
             followed.missed += 1
             followed.anchor = None
@@ -123,42 +142,46 @@ class LandmarkTracker:
         place = followed.place = self._moved[1] if known else face_place(refined.landmarks)
         if face is not before:
             followed.set_anchor(face.search_box)
-        followed.learn_look(frame, place, _LEAST_LIKENESS)
+        followed.covered = bool(face.visibility.amin() < _HIDDEN)
+        followed.latest_look = look_at(frame, place)
+        self._note(frame, face, seen=True)
         return refined
 
-    def _likeness(self, frame: Tensor, face: FaceReading) -> float:
-        return self._followed.likeness(frame, face.landmarks)
+    def _found(self, frame: Tensor) -> FaceBoxes:
+        """The frame's faces, which are looked for once."""
+        if self._faces is None:
+            self._faces = find_faces(frame, self.detector)
+        return self._faces
 
-    def _same_person(self, frame: Tensor, face: FaceReading) -> FaceReading | None:
-        """What was followed, if it still looks as it did or nobody else is about; else another face near that does;
-        None where none does: it is hidden behind somebody."""
-        if not self._followed.crowded:
-            return face
-        alike = self._likeness(frame, face)
-        if alike >= _LEAST_LIKENESS:
-            return face
-        best = self._most_alike(frame, find_faces(frame, self.detector))
-        return best if best is not None and self._likeness(frame, best) >= alike + _LIKENESS_GAIN else None
+    def _about(self, frame: Tensor) -> Tensor:
+        """Who is about: x and y of the middle, side and score of the likeliest faces, (CANDIDATES,4), then zeros."""
+        followed = self._followed
+        if followed.missed == 0 and followed.place is not None:  # who is about as large is seen in a small copy too
+            small, ratio = at_most(frame, max(1, round(max(frame.shape[1:]) * _ENOUGH / float(followed.place[2]))))
+            faces = find_faces(small, self._quick)
+        else:
+            faces, ratio = self._found(frame), 1.0
+        rows = faces.scores.argsort(descending=True, stable=True)[:CANDIDATES]
+        boxes, scores = ratio * faces.boxes[rows].float(), faces.scores[rows, None].float()
+        found = torch.cat([boxes[:, :2] + boxes[:, 2:] / 2, boxes[:, 2:3], scores], 1)
+        return torch.cat([found, torch.zeros(CANDIDATES - len(rows), 4)])
 
-    def _most_alike(self, frame: Tensor, faces: FaceBoxes) -> FaceReading | None:
-        """Of the faces about where the person was the one that looks most like it, if any looks like it at all."""
-        read = [self._face_in(frame, faces, number) for number in self._followed.near(faces.boxes)]
-        alike = [(self._likeness(frame, one), one) for one in read if one is not None]
-        best = max(alike, key=lambda pair: pair[0], default=(-1.0, None))
-        return best[1] if best[0] >= _LEAST_LIKENESS else None
+    def _is_person(self, frame: Tensor, face: FaceReading) -> bool:
+        """Whether a face is the followed person's, and not somebody's who passes before them."""
+        around = place_around(face.landmarks)
+        other = is_other(self._followed.people, around, _look(frame, face), _INTERVAL)
+        if other:
+            self._note(frame, face, seen=False)
+        return not other
+
+    def _note(self, frame: Tensor, face: FaceReading, seen: bool) -> None:
+        around, whose = place_around(face.landmarks), (torch.tensor(seen), torch.tensor(not seen))
+        self._followed.people = after_face(self._followed.people, around, _look(frame, face), whose, _INTERVAL)
 
     def _face_in(self, frame: Tensor, faces: FaceBoxes, number: int) -> FaceReading | None:
         """One of the detector's faces with its landmarks, if it is one."""
         face = settled_face(self.finder, frame, faces.boxes[number], float(faces.tilts[number]))
         return face if self._plausible(face.box, frame) and face.presence >= _LEAST_PRESENCE else None
-
-    def _note_others(self, frame: Tensor, faces: FaceBoxes, box: Tensor) -> None:
-        """Notes whether somebody else than the face in a box (4,) is about, who might be taken for it."""
-        if self._followed.crowded or len(faces) < 2:
-            return
-        apart = (overlaps(faces.boxes, box[None])[:, 0] < _APART).nonzero()[:_MOST_OTHERS, 0].tolist()
-        others = [find_in_box(self.finder, frame, faces.boxes[i], float(faces.tilts[i])) for i in apart]
-        self._followed.crowded = any(float(one.presence) >= _SURE_PRESENCE for one in others)
 
     def _follow(self, frame: Tensor) -> FaceReading | None:
         """The face from where it was a frame ago; None where it is not there."""
@@ -188,22 +211,14 @@ class LandmarkTracker:
         return None if lost else face  # turned faces are none to the detector
 
     def _confirmed(self, frame: Tensor, box: Tensor) -> bool:
-        """Whether the detector sees a face where the landmarks are; it is shown no more than their surroundings."""
-        if not self._plausible(box, frame):
-            return False
-        x, y, side = (float(value) for value in (box[0], box[1], box[2]))
-        left, top = max(0, int(x - side / 2)), max(0, int(y - side / 2))
-        piece, ratio = at_most(frame[..., top : int(y + 1.5 * side) + 1, left : int(x + 1.5 * side) + 1], _CHECKED)
-        faces = find_faces(piece, self.detector)
-        corner = box.new_tensor([left, top, 0, 0])
-        faces = FaceBoxes(ratio * faces.boxes + corner, faces.scores, faces.tilts)
-        self._note_others(frame, faces, box)
-        return len(faces) > 0 and bool((overlaps(faces.boxes, box[None]) > _CONFIRMED).any())
+        """Whether the detector sees a face where the landmarks are."""
+        boxes = self._found(frame).boxes if self._plausible(box, frame) else box[:0].view(0, 4)
+        return bool((overlaps(boxes, box[None]) > _CONFIRMED).any())
 
     def _search(self, frame: Tensor) -> FaceReading | None:
         """The face wherever it is now; None where it is nowhere."""
         followed = self._followed
-        face = self._chosen(frame, find_faces(frame, self.detector))
+        face = self._chosen(frame, self._found(frame))
         if face is None and followed.place is not None and 0 < followed.missed < _FRAMES_WAITED:
             face = self._still_there(frame, followed.place)
         if face is not None:
@@ -217,21 +232,19 @@ class LandmarkTracker:
         """The one of these faces that is meant, if it is one."""
         followed = self._followed
         near = followed.near(faces.boxes)
-        if near and followed.crowded:
-            return self._most_alike(frame, faces)
-        waits = followed.place is not None and followed.missed < _FRAMES_WAITED
+        # Whoever is hidden behind somebody comes out again.
+        patience = _FRAMES_HIDDEN if is_beside(followed.people) else _FRAMES_WAITED
+        waits = followed.place is not None and followed.missed < patience
         if not near and (waits or self.face >= len(faces)):
             return None
         skipped = 0 if near else self.face
-        for number in near[:1] or range(min(len(faces), self.face + _MOST_TRIED)):  # a box may show no face
+        for number in near or range(min(len(faces), self.face + _MOST_TRIED)):  # a box may show no face
             face = self._face_in(frame, faces, number)
             if face is None or not (near or float(face.presence) >= _NEW_PRESENCE):
                 continue
-            if skipped == 0:
-                followed.look = followed.look if near else None  # a face elsewhere may be anybody's
-                self._note_others(frame, faces, faces.boxes[number])
+            if skipped == 0 and self._is_person(frame, face):
                 return face
-            skipped -= 1
+            skipped -= skipped > 0
         return None
 
     def _still_there(self, frame: Tensor, place: Tensor) -> FaceReading | None:
@@ -241,7 +254,7 @@ class LandmarkTracker:
         if not self._is_sure(face) or not self._plausible(moved, frame):
             return None
         near = float(overlaps(place[None, :4], moved[None])) > _SAME_PLACE
-        return face if near and self._likeness(frame, face) >= _LEAST_LIKENESS else None
+        return face if near and self._is_person(frame, face) else None
 
     def _plausible(self, box: Tensor, frame: Tensor) -> bool:
         """Whether a box is a size that a face can have, and its middle in the image."""
@@ -251,3 +264,7 @@ class LandmarkTracker:
         height, width = frame.shape[-2:]
         inside = 0 <= x < width and 0 <= y < height
         return inside and _LEAST_SIDE <= float(box[2]) <= 1.5 * max(height, width)
+
+
+def _look(frame: Tensor, face: FaceReading) -> Tensor:
+    return look_at(frame, face_place(face.landmarks), LOOK_SIZE)

@@ -1,0 +1,158 @@
+"""Which of two people a face belongs to: the one who is followed, or another who passes before them.
+
+Tensor operations alone: they go into graphs. A place is (5,), see
+:mod:`~torchface.landmarks.images.frame_reader.face_place`. What is known of two people is (IDENTITY,), zeros for
+nothing: the motion of the one who is followed, that of the other who was nearest, how many others stand to the left and
+to the right, and how the first looks. A motion is x and y of the face's middle, its side, pixels; its speed along x and
+y, pixels a second; and the seconds since it was seen; side 0 for nobody.
+"""
+
+import torch
+from torch import Tensor
+
+_MOTION = 6
+LOOK_SIZE, LOOK_MARGIN = 8, 1.1  # pixels a side of a look, and its side in sides of the face
+IDENTITY = 2 * _MOTION + 2 + 3 * LOOK_SIZE * LOOK_SIZE
+"""Numbers that are known of two people."""
+CANDIDATES = 4
+"""Faces of a picture that are told apart."""
+
+FORGOTTEN = 1.0  # seconds after which anybody is taken for one who is hidden
+_LIKELY = 0.4  # score of a box that shows somebody else
+_COAST = {0: 0.1, 1: 0.5}  # seconds for which the followed one, and the other, are expected to move on unseen
+_SPEED, _GROWTH, _LEARNING = 0.1, 0.3, 0.5  # seconds in which speed, side and look are learned
+_BESIDE, _REACH = 0.5, 1.0  # sides: nearer is the same face; farther the other cannot have moved between two pictures
+_NEAR = 2.5  # sides within which the other may be in the way in the next moment
+_COUNTING = 0.2  # of a new count of people that is taken up at once
+_LASTING = 0.6  # seconds for which it is known where the other is
+_ALIKE, _UNLIKE = 0.8, 1.5  # correlation of looks from which a face counts as the same, and what lacks counts in sides
+_RESEMBLING = 0.5  # what the logarithm of two sides counts in sides
+_SURE, _CLEARLY = 0.12, 2.0  # sides: nearer is the followed one; how much nearer than the other one that was hidden is
+
+
+def face_look(colors: Tensor) -> Tensor:
+    """A face's colours (...,3,S,S), upright, about their mean, flat, of unit length: they distinguish people.
+
+    The product of two is their correlation.
+    """
+    # The mean of all colours goes, not that of each: how red a face is beside how blue differs between people.
+    flat = (colors - colors.mean()).flatten()
+    return flat / flat.square().sum().sqrt().clamp(min=1e-6)
+
+
+def known_look(identity: Tensor) -> Tensor:
+    """How the followed face looks, (192,) of unit length; zeros where that is not known."""
+    return identity[2 * _MOTION + 2 :]
+
+
+def is_beside(identity: Tensor) -> Tensor:
+    """Whether somebody else is so near that they may be in the way in the next moment; () bool."""
+    own, other = _motions(identity)
+    return _is_known(identity) & (_apart(own, _expected(other, 1)) < _NEAR)
+
+
+def after_boxes(identity: Tensor, faces: Tensor, searched: Tensor, interval: Tensor) -> Tensor:
+    """What is known after the box network has looked at the next picture, before a face is read there.
+
+    Args:
+        faces: x and y of the middle, side, pixels, and score of the likeliest, (CANDIDATES,4).
+        searched: whether it has looked at all, () bool.
+        interval: seconds since the picture before, ().
+    """
+    own, other = _motions(identity)
+    aged = torch.cat([own.new_zeros(_MOTION - 1), interval[None]])
+    own, other = own + aged, other + aged
+    known = (other[2] > 0) & (other[5] < FORGOTTEN)
+    likely = (faces[:, 3] >= _LIKELY) & searched & (own[2] > 0)
+    from_own, from_other = _distance(own, faces, 0), _distance(other, faces, 1)
+    apart = _apart(own, faces[:, :2])
+    # Who appears where the followed one is no more may be that one, elsewhere.
+    new = (apart > _BESIDE) & (likely & (apart <= _BESIDE)).any()
+    its = (known & (from_other < from_own) & (from_other < _REACH) | ~known & new) & likely
+    row = torch.where(its, torch.where(known, from_other, apart), torch.inf).argmin()[None]
+    moved = _moved(torch.where(known, other, 0.0), faces[row][0, :3], interval)
+    other = torch.where(its.any(), moved, torch.where(known, other, 0.0))
+    to_left = faces[:, 0] < _expected(own, 0)[0]
+    others = likely & (apart > _BESIDE)
+    counted = torch.stack([(others & to_left).sum(), (others & ~to_left).sum()]).float()
+    # Now and then something else looks like a face for a moment.
+    known_beside = counted_beside(identity)
+    counted = torch.where(searched, known_beside + _COUNTING * (counted - known_beside), known_beside)
+    return torch.cat([own, other, counted, identity[2 * _MOTION + 2 :]])
+
+
+def is_other(identity: Tensor, place: Tensor, look: Tensor, interval: Tensor) -> Tensor:
+    """Whether a face at a place, that looks so (192,), is the other's rather than the followed one's; () bool."""
+    own, other = _motions(identity)
+    unlike = (_ALIKE - _likeness(identity, look)).clamp(min=0) * _UNLIKE
+    unlike = unlike + _RESEMBLING * (place[2].clamp(min=1) / own[2].clamp(min=1)).log().abs()
+    from_own, from_other = _distance(own, place, 0) + unlike, _distance(other, place, 1)
+    hidden = own[5] > 1.5 * interval
+    nearer = from_other < from_own * torch.where(hidden, _CLEARLY, 1.0)
+    return _is_known(identity) & nearer & (from_own > torch.where(hidden, 0.0, _SURE)) & (own[5] < FORGOTTEN)
+
+
+def after_face(identity: Tensor, place: Tensor, look: Tensor, whose: tuple[Tensor, Tensor], interval: Tensor) -> Tensor:
+    """What is known after a face has been seen at a place, where it looks so (192,).
+
+    Args:
+        whose: whether it is the followed one's, and whether it is the other's; () bool each.
+    """
+    seen, stranger = whose
+    own, other = _motions(identity)
+    fresh = (own[2] <= 0) | (own[5] >= FORGOTTEN)
+    known = torch.where(fresh, 0.0, identity)
+    moved = _moved(known[:_MOTION], place[:3], interval)
+    # Whoever is about to cover the face is no part of its look.
+    share = torch.where(is_beside(identity), 0.1, 1.0) * (1 - (-interval / _LEARNING).exp())
+    before = known[2 * _MOTION + 2 :]
+    mixed = before + torch.where(before.any(), share, 1.0) * (look - before)
+    mixed = mixed / mixed.square().sum().sqrt().clamp(min=1e-6)
+    other = torch.where(fresh, 0.0, other)
+    followed = torch.cat([moved, other, counted_beside(identity), mixed])
+    passing = torch.cat([own, _moved(other, place[:3], interval), identity[2 * _MOTION :]])
+    return torch.where(seen, followed, torch.where(stranger & (other[5] > 0), passing, identity))
+
+
+def counted_beside(identity: Tensor) -> Tensor:
+    """How many other people stand to the left of the followed one in the picture, and to the right, smoothed; (2,)."""
+    return identity[2 * _MOTION : 2 * _MOTION + 2]
+
+
+def _motions(identity: Tensor) -> tuple[Tensor, Tensor]:
+    return identity[:_MOTION], identity[_MOTION : 2 * _MOTION]
+
+
+def _is_known(identity: Tensor) -> Tensor:
+    own, other = _motions(identity)
+    return (own[2] > 0) & (other[2] > 0) & (other[5] < _LASTING)
+
+
+def _likeness(identity: Tensor, look: Tensor) -> Tensor:
+    """The correlation of a look with what is known of the followed one's; 1 where nothing is."""
+    known = known_look(identity)
+    return torch.where(known.any(), known @ look, 1.0)
+
+
+def _expected(motion: Tensor, who: int) -> Tensor:
+    return motion[:2] + motion[3:5] * motion[5].clamp(max=_COAST[who])
+
+
+def _apart(motion: Tensor, middles: Tensor) -> Tensor:
+    """How far middles (...,2) are from where somebody was seen last, in sides."""
+    return (middles - motion[:2]).square().sum(-1).sqrt() / motion[2].clamp(min=1)
+
+
+def _distance(motion: Tensor, faces: Tensor, who: int) -> Tensor:
+    """How far faces (...,2+) are from where somebody is expected, in sides, (...)."""
+    return (faces[..., :2] - _expected(motion, who)).square().sum(-1).sqrt() / motion[2].clamp(min=1)
+
+
+def _moved(motion: Tensor, face: Tensor, interval: Tensor) -> Tensor:
+    """A motion (6,) after its face (3,) was seen anew; of nobody's motion a new one."""
+    known, since = motion[2] > 0, motion[5].clamp(min=1e-3)
+    speed = (face[:2] - motion[:2]) / since
+    share = 1 - (-interval / _SPEED).exp()
+    speed = torch.where(known, motion[3:5] + torch.where(motion[3:5].any(), share, 1.0) * (speed - motion[3:5]), 0.0)
+    side = torch.where(known, motion[2] + (1 - (-interval / _GROWTH).exp()) * (face[2] - motion[2]), face[2])
+    return torch.cat([face[:2], side[None], speed, torch.zeros_like(side)[None]])
