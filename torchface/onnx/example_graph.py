@@ -37,6 +37,7 @@ class ExampleGraph(nn.Module):
 
     neutral: Tensor
     basis: Tensor
+    method: LandmarkModel | Regional | AllAtOnce
 
     def __init__(self, solver: ExampleSolver, steps: int | None = None) -> None:
         super().__init__()
