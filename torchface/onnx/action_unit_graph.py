@@ -9,7 +9,7 @@ import numpy as np
 import onnx
 import onnxruntime
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from torchface.capture.action_units.classifier import ActionUnitClassifier
 from torchface.capture.action_units.classifier_training import local_warps
@@ -85,49 +85,15 @@ def export_action_units(
 
 
 def action_unit_model(classifier: ActionUnitClassifier, facts: Mapping[str, object] | None = None) -> onnx.ModelProto:
-    """The graph of :class:`IntensityVotes`."""
+    """The classifier as a graph; see :func:`export_action_units`."""
     rest = classifier.neutral
     return exported_model(
-        IntensityVotes(classifier),
+        classifier,
         {"regions": rest.expand(2, -1, -1, -1).contiguous(), "rest": rest},
         ["intensities"],
         {"task": "action_units", "regions": list(classifier.regions), "units": list(classifier.units), **(facts or {})},
         {"regions": ("batch",)},
     )
-
-
-class IntensityVotes(nn.Module):
-    """``ActionUnitClassifier`` with one convolution for all regions; mean and deviations go into the components."""
-
-    filters: Tensor
-
-    def __init__(self, classifier: ActionUnitClassifier) -> None:
-        super().__init__()
-        self.parts = classifier.group_classifiers()
-        self.gabor = self.parts[0].gabor
-        self.register_buffer("filters", torch.cat([self.gabor.even, self.gabor.odd]))
-        for i, part in enumerate(self.parts):
-            components = (part.components.double() / part.deviations.double()[:, None]).T
-            self.register_buffer(f"rows_{i}", torch.tensor([classifier.regions.index(n) for n in part.group.regions]))
-            self.register_buffer(f"offset_{i}", -(part.mean.double() @ components).float())
-            self.register_buffer(f"components_{i}", components.float())
-
-    def forward(self, regions: Tensor, rest: Tensor) -> Tensor:
-        """Intensities (B,A) of regions (B,R,h,w) and those at rest (R,h,w)."""
-        features = self._magnitudes(regions) - self._magnitudes(rest[None])
-        intensities = []
-        for i, part in enumerate(self.parts):
-            own = features.index_select(1, getattr(self, f"rows_{i}")).flatten(1)
-            reduced = torch.addmm(getattr(self, f"offset_{i}"), own, getattr(self, f"components_{i}"))
-            intensities.append(part.intensities.index_select(0, part.machine(reduced).argmax(1)))
-        return torch.cat(intensities, dim=1)
-
-    def _magnitudes(self, regions: Tensor) -> Tensor:
-        """Of the Gabor filters, (B,R,D)."""
-        margin = self.filters.shape[-1] // 2
-        padded = nn.functional.pad(regions.flatten(0, 1)[:, None], (margin,) * 4, mode="replicate")
-        even, odd = nn.functional.conv2d(padded, self.filters, stride=self.gabor.stride).chunk(2, dim=1)
-        return (even.square() + odd.square() + 1e-8).sqrt().reshape(-1, regions.shape[1], even[0].numel())
 
 
 def _test_frames(classifier: ActionUnitClassifier) -> Tensor:

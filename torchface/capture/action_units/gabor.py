@@ -46,7 +46,7 @@ class GaborBank(nn.Module):
             raise ShapeError(f"images: found {tuple(images.shape)}, expected (B,h,w)")
         reach = self.even.shape[-1] // 2
         padded = pad(images[:, None], (reach,) * 4, mode="replicate")
-        even, odd = conv2d(padded, self.even, stride=self.stride), conv2d(padded, self.odd, stride=self.stride)
+        even, odd = conv2d(padded, torch.cat([self.even, self.odd]), stride=self.stride).chunk(2, dim=1)
         return (even.square() + odd.square() + 1e-8).sqrt()
 
 
