@@ -2,9 +2,11 @@
 
 import { ARKIT, sourcesOf } from "./arkit_names.js";
 import { headAngles, headRotation } from "./head_angles.js";
-import { LONGEST, Take, USUAL_RATES } from "./take.js";
+import { LONGEST, Take } from "./take.js";
 
 const ROTATIONS = ["Head", "LeftEye", "RightEye"].flatMap((part) => ["Yaw", "Pitch", "Roll"].map((axis) => part + axis));
+const BASE = 60; // frames of a second of the timecode, which count thousandths: readers take it whatever the steps
+const BASES = [BASE, 15, 20, 24, 25, 30, 48, 50, 72, 90, 96, 100, 120, 240]; // of others; the first where nothing says which
 const HEADER = [
   "Timecode", "BlendshapeCount", ...ARKIT.map((name) => name[0].toUpperCase() + name.slice(1)), ...ROTATIONS,
 ];
@@ -13,7 +15,7 @@ const HEADER = [
 export function liveLinkCsv(take) {
   const rows = take.frames.map(({ seconds, weights, rotation, gaze }) => {
     const numbers = [...weights, ...headAngles(rotation), ...eyeAngles(gaze)];
-    return [timecode(seconds, take.rate), ARKIT.length + ROTATIONS.length, ...numbers.map(decimal)].join(",");
+    return [timecode(seconds), ARKIT.length + ROTATIONS.length, ...numbers.map(decimal)].join(",");
   });
   return [HEADER.join(","), ...rows, ""].join("\n");
 }
@@ -47,11 +49,24 @@ export function readLiveLinkCsv(text) {
   return take;
 }
 
-/** Frames count up to the rate, which is the least usual one above the largest. */
 function clockSeconds(texts) {
   const clocks = texts.map((text) => (text ?? "").split(/[:;]/).map(Number));
-  const most = clocks.reduce((all, clock) => Math.max(all, clock[3] || 0), 0), rate = USUAL_RATES.find((usual) => usual > most) ?? 240;
-  return clocks.map(([hours, minutes, seconds, frames]) => 3600 * hours + 60 * minutes + seconds + frames / rate);
+  const base = clockBase(clocks);
+  return clocks.map(([hours, minutes, seconds, frames]) => 3600 * hours + 60 * minutes + seconds + frames / base);
+}
+
+/** Up to which number frames count: where a second ends they fall by it, less a usual step, as torchface's reader has it. */
+function clockBase(clocks) {
+  const most = clocks.reduce((all, clock) => Math.max(all, clock[3] || 0), 0), bases = BASES.filter((base) => base > most);
+  const pairs = clocks.slice(1).map((clock, i) => [clock[2] - clocks[i][2], clock[3] - clocks[i][3]]);
+  const steps = pairs.filter(([seconds, step]) => seconds === 0 && step > 0).map(([, step]) => step).sort((a, b) => a - b);
+  const falls = pairs.filter(([seconds, step]) => (seconds === 1 || seconds === -59) && step < 0).map(([, step]) => -step);
+  if (!steps.length || !falls.length || !bases.length) return bases[0] ?? 1000;
+  const [least, largest] = [steps[0], steps.at(-1)];
+  const off = (over) => (over <= 0 ? Infinity : Math.max(0, least - over, over - largest));
+  const faults = bases.map((base) => falls.reduce((all, fall) => all + off(base - fall), 0) / falls.length);
+  const allowed = Math.min(...faults) + steps[steps.length >> 1] / 2;
+  return bases[faults.findIndex((fault) => fault <= allowed)] ?? 1000;
 }
 
 /**
@@ -63,8 +78,8 @@ function eyeAngles([rightAside, rightUp, leftAside, leftUp]) {
 }
 
 /** Hours, minutes, seconds and frames with thousandths. */
-function timecode(time, rate) {
-  const ticks = Math.round(time * 1000 * rate), seconds = Math.floor(ticks / (1000 * rate)), part = ticks % (1000 * rate);
+function timecode(time) {
+  const ticks = Math.round(time * 1000 * BASE), seconds = Math.floor(ticks / (1000 * BASE)), part = ticks % (1000 * BASE);
   const two = (number) => String(number).padStart(2, "0");
   const clock = [Math.floor(seconds / 3600) % 24, Math.floor(seconds / 60) % 60, seconds % 60, Math.floor(part / 1000)];
   return `${clock.map(two).join(":")}.${String(part % 1000).padStart(3, "0")}`;

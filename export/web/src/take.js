@@ -1,7 +1,6 @@
 // A recording: weights and rotations of each frame, at the camera's own times.
 
 export const LONGEST = 3600; // seconds; about 40 MB
-export const USUAL_RATES = [15, 20, 24, 25, 30, 50, 60, 120]; // frames a second
 const ROW = 66;
 
 export class Take {
@@ -56,11 +55,8 @@ export class Take {
     return this.duration >= LONGEST;
   }
 
-  /** Frames a second: the usual rate that the median interval is nearest to. */
+  /** Frames a second in the mean, as all files of the take say; 30 of a single frame. */
   get rate() {
-    const steps = this.seconds.slice(1).map((time, i) => time - this.frames[i].seconds);
-    if (steps.length === 0) return 30;
-    const median = steps.sort((a, b) => a - b)[steps.length >> 1];
-    return USUAL_RATES.reduce((a, b) => (Math.abs(b * median - 1) < Math.abs(a * median - 1) ? b : a));
+    return this.duration > 0 ? (this.frames.length - 1) / this.duration : 30;
   }
 }

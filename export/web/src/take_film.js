@@ -7,7 +7,6 @@ const SIZE = { width: 1280, height: 720 };
 const CODECS = ["avc1.640028", "avc1.42001f"]; // H.264, high and baseline
 const BITS = 6_000_000; // a second
 const KEY_EVERY = 60, WAITING = 8; // pictures
-const LAST = 1 / 30; // seconds that the last picture is shown
 
 /**
  * @param {Character} character of its own, which nothing else poses.
@@ -49,7 +48,7 @@ export async function takeFilm(character, take, background, progress) {
     if (encoder.state !== "closed") encoder.close();
     stage.dispose();
   }
-  const ticks = [...take.seconds, take.duration + LAST].map((seconds) => Math.round(TICKS * seconds));
+  const ticks = [...take.seconds, take.duration + 1 / take.rate].map((seconds) => Math.round(TICKS * seconds));
   samples.forEach((sample, i) => (sample.ticks = ticks[i + 1] - ticks[i]));
   return mp4({ ...SIZE, description, samples });
 }

@@ -15,6 +15,7 @@ export class TakeList {
   #character;
   #show;
   #playing = null;
+  #rows = new Map(); // by the take's id: what is said of it, and its row
 
   /**
    * @param {object} takes that are kept, such as `BrowserTakes`.
@@ -60,9 +61,18 @@ export class TakeList {
 
   async refresh() {
     try {
-      const found = await this.#takes.list();
-      if (this.#playing?.button === null) this.#playing.stop(); // its row goes
-      element("takes").replaceChildren(...found.map((one) => this.#row(one)));
+      const found = await this.#takes.list(), before = this.#rows;
+      // What has not changed stays as it is: somebody may be typing there, or trimming.
+      this.#rows = new Map(found.map((one) => {
+        const facts = JSON.stringify(one), known = before.get(one.id);
+        return [one.id, known?.facts === facts ? known : { facts, row: this.#row(one) }];
+      }));
+      const playing = this.#playing, row = playing && this.#rows.get(playing.id);
+      if (playing && (playing.still ? row !== before.get(playing.id) : !row)) playing.stop(); // it was deleted, or its sliders are gone
+      const rows = [...this.#rows.values()].map(({ row }) => row), list = element("takes");
+      for (const row of [...list.children]) if (!rows.includes(row)) row.remove();
+      rows.forEach((row, i) => list.children[i] !== row && list.insertBefore(row, list.children[i] ?? null));
+      this.#tellPlaying();
       element("no-takes").hidden = found.length > 0;
     } catch {
       element("no-takes").textContent = "This browser keeps no takes here.";
@@ -92,7 +102,7 @@ export class TakeList {
     });
     row.append(
       title, facts,
-      button("Play", "play", (made) => this.#play(id, made)),
+      button("Play", "play", () => this.#play(id)),
       button("Trim", "trim", () => this.#trim(id, name, row)),
       saving,
       ...(solvable ? [button("Solve again", "solve", () => this.#takes.solve(id))] : []),
@@ -130,7 +140,7 @@ export class TakeList {
       tell();
       input.addEventListener("input", () => {
         tell();
-        this.#still(take.frames.findLast(({ seconds }) => seconds <= Number(input.value)) ?? take.frames[0]);
+        this.#still(id, take.frames.findLast(({ seconds }) => seconds <= Number(input.value)) ?? take.frames[0]);
       });
       part.append(label);
       return input;
@@ -147,8 +157,8 @@ export class TakeList {
   }
 
   /** Shows one frame until something else is shown. */
-  #still(frame) {
-    this.#playing ??= { button: null, stop: () => (this.#playing = null) };
+  #still(id, frame) {
+    this.#playing ??= { id, still: true, stop: () => (this.#playing = null) };
     this.#show(frame);
   }
 
@@ -166,14 +176,23 @@ export class TakeList {
     }, "Taken");
   }
 
-  async #play(id, button) {
+  /** Says at each take whether it plays; its row may be another than when it began. */
+  #tellPlaying() {
+    for (const [id, { row }] of this.#rows) {
+      const words = this.#playing?.id === id && !this.#playing.still ? "Stop" : "Play", button = row.querySelector(".play");
+      if (button.textContent !== words) button.textContent = words;
+    }
+  }
+
+  async #play(id) {
     const stopped = this.#playing;
     stopped?.stop();
-    if (stopped?.button === button) return;
+    if (stopped?.id === id && !stopped.still) return;
     const { frames } = await this.#takes.take(id), began = performance.now();
-    const playing = { button, stop: () => ((button.textContent = "Play"), (this.#playing = null)) };
+    if (this.#playing) this.#playing.stop(); // begun meanwhile
+    const playing = { id, still: false, stop: () => ((this.#playing = null), this.#tellPlaying()) };
     this.#playing = playing;
-    button.textContent = "Stop";
+    this.#tellPlaying();
     let at = 0;
     const next = (now) => {
       if (this.#playing !== playing) return;

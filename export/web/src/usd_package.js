@@ -41,7 +41,7 @@ export async function usdPackage(character, take) {
     meshes.push(meshPrim(mesh, `mesh_${meshes.length}`, `mat_${[...materials.keys()].indexOf(material)}`, joints, character.shapesOf(mesh), shapes));
   }
   const text = [
-    `#usda 1.0\n(\ndefaultPrim = "Character"\nmetersPerUnit = 1\nupAxis = "Y"\ntimeCodesPerSecond = ${take.rate}\nframesPerSecond = ${take.rate}`,
+    `#usda 1.0\n(\ndefaultPrim = "Character"\nmetersPerUnit = 1\nupAxis = "Y"\ntimeCodesPerSecond = ${digits(take.rate)}\nframesPerSecond = ${digits(take.rate)}`,
     `startTimeCode = 0\nendTimeCode = ${digits(take.duration * take.rate)}\n)`,
     prim("SkelRoot", "Character", [], [joints.prim(), animationPrim(character, take, joints, shapes), meshes, prim("Scope", "Materials", [], [...materials.values()])]),
   ].join("\n");

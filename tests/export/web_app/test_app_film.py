@@ -109,6 +109,7 @@ def test_a_take_is_saved_as_film_and_as_usd_with_its_textures(app: Path, faces: 
     assert len(frames) == len(seconds)
     times = [float(frame.pts * stream.time_base) for frame in frames]
     np.testing.assert_allclose(np.diff(times), np.diff(seconds), atol=2e-3)
+    assert float(stream.average_rate or 0) == pytest.approx((len(seconds) - 1) / float(seconds[-1]), rel=1e-3)
     assert frames[-1].to_ndarray(format="gray").std() > 15
     assert len(list(open_video(tmp_path / "camera.mp4").color_frames())) > 2
     stage = Usd.Stage.Open(str(tmp_path / "take.usdz"))

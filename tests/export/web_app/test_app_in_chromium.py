@@ -41,9 +41,8 @@ def test_the_csv_has_the_cameras_times_and_the_heads_rotation(recorded: Recorded
     take = load_live_link(recorded.csv)
     assert take.timecode is not None
     steps = np.array([one["interval"] for one in recorded.recorded[1:]])
-    base = min((15, 20, 24, 25, 30, 50, 60), key=lambda rate: abs(rate * np.median(steps) - 1))
     clocks = [[float(part) for part in text.split(":")] for text in take.timecode]
-    seconds = np.array([3600 * h + 60 * m + s + frame / base for h, m, s, frame in clocks])
+    seconds = np.array([3600 * h + 60 * m + s + frame / 60 for h, m, s, frame in clocks])
     np.testing.assert_allclose(np.diff(seconds), steps, rtol=0, atol=1e-3)
     rotations = torch.tensor([one["rotation"] for one in recorded.recorded], dtype=torch.float64).reshape(-1, 3, 3)
     columns = take.extras["columns"]

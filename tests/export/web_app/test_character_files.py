@@ -19,6 +19,7 @@ from test_vrm_in_browser import browser as vrm_browser  # noqa: F401  (three-vrm
 from planted.characters import Planted, write_character
 from torchface.io import load_rig, load_take, save_rig
 from torchface.io.gltf.accessors import read_floats
+from torchface.io.gltf.animation_reading import read_gltf_weights
 from torchface.io.gltf.gltf_document import read_document
 from torchface.io.gltf.performance_animation import Performance, performed_glb
 from torchface.io.gltf.primitive_reading import read_target_names
@@ -178,6 +179,29 @@ def test_a_take_comes_back_from_its_csv(run: Run, tmp_path: Path) -> None:
     for text in ("", "a,b\n1,2\n", "frame,time,antenna\n0,0,1\n", "Timecode,jawOpen\n"):
         (tmp_path / "other.csv").write_text(text)
         assert isinstance(run("csv", tmp_path / "other.csv"), str), text
+
+
+@pytest.mark.parametrize(("fps", "count"), [(30, 12), (60, 20), (25, 1), (13, 8), (13, 60)])
+def test_all_files_of_a_take_have_its_times_and_its_rate(run: Run, tmp_path: Path, fps: int, count: int) -> None:
+    """Also of one under a second, and of one whose frames come unevenly, as a slow camera's do."""
+    rows, character = planted_rows(count), sheet(tmp_path / "sheet.glb", ("jawOpen",))
+    uneven = np.random.default_rng(1).uniform(-0.2, 0.2, count) if fps == 13 else np.zeros(count)
+    rows[:, 0] = (np.arange(count) + uneven - uneven[0]) / fps
+    job = {"glb": str(character), "rows": rows.tolist()}
+    for kind in (".csv", ".glb", ".usdz"):
+        (tmp_path / f"take{kind}").write_bytes(saved(run, job, kind))
+    again = np.reshape(run("csv", tmp_path / "take.csv"), rows.shape)
+    table, animated = load_take(tmp_path / "take.csv"), read_gltf_weights(tmp_path / "take.glb")
+    assert animated is not None
+    for seconds in (again[:, 0], table.times, animated.times):
+        np.testing.assert_allclose(seconds, rows[:, 0], rtol=0, atol=2e-5)
+    from pxr import Usd
+
+    stage = Usd.Stage.Open(str(tmp_path / "take.usdz"))
+    if count > 1:
+        rate = (count - 1) / rows[-1, 0]
+        assert [table.fps, stage.GetTimeCodesPerSecond()] == pytest.approx([rate] * 2, rel=0.01)
+        assert stage.GetEndTimeCode() / stage.GetTimeCodesPerSecond() == pytest.approx(rows[-1, 0], rel=1e-5)
 
 
 def test_a_part_of_a_take_begins_at_0(run: Run) -> None:

@@ -299,7 +299,7 @@ def sent_jaw(live: Opened) -> float:
 @pytest.mark.browser
 def test_takes_are_recorded_played_renamed_and_deleted(page: Any, live: Opened) -> None:
     page.find_element("id", "record").click()
-    time.sleep(0.6)
+    time.sleep(2)
     page.find_element("id", "record").click()
     until((live.kept / "summary.json").exists)
     until(lambda: page.find_elements("css selector", "#takes li"))
@@ -313,13 +313,21 @@ def test_takes_are_recorded_played_renamed_and_deleted(page: Any, live: Opened) 
     page.execute_script(press, "#takes .play")
     until(lambda: "Stop" in text(page, "takes"))
     until(lambda: "Stop" not in text(page, "takes"))
+    page.execute_script(press, "#takes .play")
+    until(lambda: "Stop" in text(page, "takes"))
     renamed = "e.value = 'The <b>first</b>'; e.dispatchEvent(new Event('change'))"
     page.execute_script(f"const e = document.querySelector('#takes .name'); {renamed}")
     until(lambda: json.loads((live.kept / "summary.json").read_text()).get("name") == "The <b>first</b>")
     until(lambda: page.execute_script("return document.querySelector('#takes .name').value") == "The <b>first</b>")
+    assert "Stop" in text(page, "takes")  # a take with another name plays on, and its new row stops it
+    page.execute_script(press, "#takes .play")
+    assert "Stop" not in text(page, "takes")
+    page.execute_script(press, "#takes .play")
+    until(lambda: "Stop" in text(page, "takes"))
     page.execute_script(press, "#takes .delete")
     until(lambda: not page.find_elements("css selector", "#takes li"))
     assert not live.kept.exists()
+    assert page.execute_script("return document.getElementById('problem').hidden")
 
 
 @pytest.mark.bench
