@@ -6,7 +6,7 @@ from scipy.spatial import Delaunay
 
 from torchface.errors import ShapeError, TopologyError, ValueRangeError
 from torchface.geometry.cameras.pinhole import look_at
-from torchface.geometry.meshes.rasterization import rasterise, rasterise_uvs
+from torchface.geometry.meshes.rasterization import TexelMap, rasterise, rasterise_uvs
 from torchface.rendering.raycast import RayCaster
 from torchface.synthetic import performer
 
@@ -104,3 +104,10 @@ def test_nothing_behind_and_nothing_broken_is_drawn() -> None:
     near = torch.ones(4)
     assert len(rasterise(points, near, torch.tensor([[0, 1, 2]]), 10, 10).pixel) == 28
     assert len(rasterise(points, near, torch.tensor([[0, 2, 1], [0, 1, 3]]), 10, 10).pixel) == 0
+
+
+def test_an_image_has_a_margin_of_the_nearest_texel_before_its_background() -> None:
+    texels = TexelMap(9, 9, torch.tensor([40, 44]), torch.zeros(2).long(), torch.zeros(2, 3))
+    image = texels.image(torch.tensor([[1.0], [2.0]]), 2, torch.tensor([-1.0]))[0]
+    assert [float(image[r, c]) for r, c in ((4, 4), (4, 8), (4, 2), (4, 1), (3, 7), (2, 4))] == [1, 2, 1, -1, 2, 1]
+    assert float(texels.image(torch.tensor([[1.0], [2.0]]))[0, 0, 0]) == 1.5

@@ -16,7 +16,7 @@ from torchface.geometry.meshes.tangent_space import from_tangent_space, tangent_
 from torchface.geometry.similarity import Similarity
 from torchface.io import load_rig
 from torchface.mesh import Mesh, submesh
-from torchface.modeling.detail.normal_map_baking import BakeSettings, NormalMap, bake_normal_map, detail_maps, dilate
+from torchface.modeling.detail.normal_map_baking import BakeSettings, NormalMap, bake_normal_map, detail_maps
 from torchface.modeling.detail.scan_alignment import align_scan
 
 DEPTH, WIDTH = 0.3, 2.0
@@ -242,15 +242,6 @@ def test_wrinkles_planted_on_a_real_head_come_back_across_its_texture(ict_folder
     assert len(error) > 500
     assert turn[turn > 8].median() > 12
     assert error.median() < 5
-
-
-def test_dilation_takes_the_nearest_chart_texel() -> None:
-    image, covered = torch.zeros(3, 9, 9), torch.zeros(9, 9, dtype=torch.bool)
-    covered[4, 4] = covered[4, 8] = True
-    image[:, 4, 4], image[:, 4, 8] = 1.0, 2.0
-    wide = dilate(image, covered, 2)
-    assert [float(wide[0, r, c]) for r, c in ((4, 2), (4, 1), (3, 7), (2, 4))] == [1, 0, 2, 1]
-    assert torch.equal(wide[:, covered], image[:, covered])
 
 
 def test_shapes_keep_the_neutrals_skin_where_their_scan_told_nothing(face: Mesh, forehead: Mesh) -> None:

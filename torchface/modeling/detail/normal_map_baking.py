@@ -4,11 +4,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
-from scipy.ndimage import distance_transform_edt
 from torch import Tensor
 
 from torchface.errors import ShapeError, TopologyError, ValueRangeError
-from torchface.geometry.meshes.normal_maps import DetailMaps, encode_normals, flat_normal_map
+from torchface.geometry.meshes.normal_maps import DetailMaps, encode_normals
 from torchface.geometry.meshes.operators import vertex_normals
 from torchface.geometry.meshes.rasterization import TexelMap, interpolate, rasterise_uvs
 from torchface.geometry.meshes.tangent_space import TangentSpace, tangent_space, to_tangent_space
@@ -168,16 +167,12 @@ def bake_normal_map(
             f"scan: {float(opposed):.0%} of the rays meet it from inside; expected triangles that run "
             "counter-clockwise seen from outside"
         )
-    image = flat_normal_map(height, width)
-    image.view(3, -1)[:, texels.texels] = normals.T
     hit = torch.zeros(height * width, dtype=torch.bool)
     hit[texels.texels] = seen
-    heights = torch.zeros(1, height, width, dtype=torch.float32)
-    heights.view(-1)[texels.texels] = torch.where(seen, offset, 0.0)
     return NormalMap(
-        dilate(image, texels.mask(), settings.padding),
+        texels.image(normals, settings.padding, torch.tensor([0.0, 0.0, 1.0])),
         hit.view(height, width),
-        dilate(heights, texels.mask(), settings.padding)[0],
+        texels.image(torch.where(seen, offset, 0.0)[:, None], settings.padding, torch.zeros(1))[0],
         found,
         _statistics(offset[seen], len(offset)),
     )
@@ -214,19 +209,6 @@ def detail_maps(names: Sequence[str], baked: Sequence[NormalMap], neutral: Norma
         return DetailMaps(tuple(names), torch.stack([one.normals for one in baked]))
     filled = [torch.where(one.hit, one.normals, neutral.normals) for one in baked]
     return DetailMaps(tuple(names), torch.stack(filled), neutral.normals)
-
-
-def dilate(image: Tensor, covered: Tensor, distance: int) -> Tensor:
-    """The image (C,H,W) whose texels outside the charts take the value of the nearest inside, up to a distance."""
-    if distance == 0 or bool(covered.all()):
-        return image
-    # Only texels near a chart matter; the transform over all others would be thrown away.
-    gap, nearest = distance_transform_edt((~covered).numpy(), return_indices=True)
-    reached = torch.from_numpy(gap <= distance) & ~covered
-    source = torch.from_numpy(nearest[0]).long() * image.shape[2] + torch.from_numpy(nearest[1]).long()
-    flat = image.flatten(1).clone()
-    flat[:, reached.flatten()] = flat[:, source[reached]]
-    return flat.view_as(image)
 
 
 @dataclass(frozen=True, eq=False)

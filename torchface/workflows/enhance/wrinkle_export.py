@@ -24,7 +24,7 @@ from torchface.geometry.similarity import Similarity
 from torchface.io import load_rig, load_take, save_animation, save_image16, save_normal_map, save_rig
 from torchface.io.tables.csv_table import write_table
 from torchface.mesh import Mesh
-from torchface.modeling.detail.normal_map_baking import NormalMap, bake_normal_map, dilate
+from torchface.modeling.detail.normal_map_baking import NormalMap, bake_normal_map
 from torchface.number_checks import checked_count
 from torchface.onnx import ExportReport, export_wrinkle_weights
 from torchface.progress import Progress, silent
@@ -316,6 +316,4 @@ def _masks(mesh: Mesh, shares: Tensor, size: int) -> Tensor:
     assert mesh.uvs is not None
     assert mesh.uv_faces is not None
     texels = rasterise_uvs(mesh.uvs, mesh.uv_faces, size, size)
-    image = torch.zeros(len(shares), size * size)
-    image[:, texels.texels] = texels.interpolate(shares.T.double(), mesh.faces).T.float()
-    return dilate(image.view(-1, size, size), texels.mask(), size).clamp(0, 1)
+    return texels.image(texels.interpolate(shares.T.double(), mesh.faces), size).clamp(0, 1)
