@@ -16,6 +16,8 @@ from torchface.geometry.cameras.pinhole import Camera
 from torchface.io import save_animation, save_image, save_rig
 from torchface.io.landmarks.openface_csv import save_landmarks_csv
 from torchface.io.video import open_video, write_video
+from torchface.landmarks.images.networks.part_finder import FaceParts
+from torchface.landmarks.images.networks.part_network import PARTS
 from torchface.rendering.pixel_coverage import footprint
 from torchface.rendering.point_light import PointLight
 from torchface.rendering.texture_overlay import relight, skin_faces
@@ -30,6 +32,7 @@ from torchface.workflows.relight.relight_film import (
     _near_face,
     _other_head,
     _reaching,
+    _shown,
     relight_film,
 )
 from torchface.workflows.relight.tracked_film import bare, read_tracked_film
@@ -207,3 +210,14 @@ def test_what_does_not_fit_is_named(filmed: Filmed, tmp_path: Path, capsys: pyte
     with pytest.raises(ValueRangeError, match="found 'azimut=3', expected NAME=NUMBER with azimuth"):
         WantedLight.parse(("azimut=3",))
     assert not out.exists()
+
+
+def test_what_is_before_a_face_ends_at_the_frames_edge() -> None:
+    frame = torch.full((3, 256, 256), 200, dtype=torch.uint8)
+    frame[:, :, :121] = 60
+    crop = torch.zeros(len(PARTS), 64, 64)
+    crop[PARTS.index("hand"), :, :28] = 1.0  # up to pixel 112 of the frame, nine before the edge
+    parts = FaceParts(crop, torch.tensor([[0.25, 0, 0], [0, 0.25, 0]], dtype=torch.float64))
+    shown = _shown(frame, parts, ("hand",), torch.zeros(68, 2))
+    assert float(shown[:, :119].max()) < 0.05
+    assert float(shown[:, 123:].min()) > 0.95

@@ -24,7 +24,6 @@ from torchface.landmarks.images.networks.part_finder import FaceParts
 from torchface.mesh import Mesh
 from torchface.progress import Progress, silent
 from torchface.rendering.environment_light import EnvironmentLight
-from torchface.rendering.gaussian_blur import gaussian_blur
 from torchface.rendering.point_light import PointLight, vertex_albedo
 from torchface.rendering.texture_overlay import FacePaint, overlay, relight, skin_faces
 from torchface.rig import BlendshapeRig
@@ -43,7 +42,8 @@ _LIT, _AGAIN = 5, 3  # frames from which the film's light is estimated, and thos
 _BEFORE_SKIN = ("glasses", "hand", "cloth", "hair", "background")
 _BEHIND = ("background",)  # the head of the track is wider than the filmed one here and there
 _BEFORE_HEAD, _NAMED, _LEAST_HIDDEN = ("hand", "hair", "cloth"), ("hand", "glasses"), 0.005
-_HIDDEN, _EDGE, _SOFT = 0.5, 0.3, 0.7  # the share of what is before a face, and pixels of the network's crop
+_HIDDEN, _EDGE = 0.5, 0.3  # the share of what is before a face
+_SPREAD, _SAME = 40.0, 4.0  # squared pixels of the network's crop, and a difference of colours of 255
 _BACKLIT = 0.5  # of a panorama's mean; a face that gets less of it stays darker than in the film
 _BESIDE = 110.0  # degrees of azimuth beyond which a light reaches no front of a face
 _LEAST_SOURCE = 0.05  # share of the light below which its direction says nothing
@@ -234,9 +234,11 @@ def _shown(frame: Tensor, parts: FaceParts, before: Sequence[str], marks: Tensor
         inside = torch.from_numpy(cv2.fillConvexPoly(np.zeros(frame.shape[1:], np.uint8), hull, 1)).bool()
         others = parts.at(pixels, *(name for name in before if name != "hair")).nan_to_num(0.0)
         hidden = torch.where(inside, others, hidden)
-    sigma = max(1.0, _SOFT / float(parts.transform[:, :2].det().abs().sqrt()))
-    smooth = gaussian_blur(hidden[None, None], sigma)[0, 0]
-    return ((_HIDDEN - smooth) / _EDGE + 0.5).clamp(0, 1)
+    # The network's crop is coarser than the frame: what it found follows the edges of the frame.
+    guide = frame.permute(1, 2, 0).contiguous().numpy()
+    spread = _SPREAD / float(parts.transform[:, :2].det().abs())
+    smooth = cv2.ximgproc.fastGlobalSmootherFilter(guide, hidden.float().numpy(), spread, _SAME)
+    return ((_HIDDEN - torch.from_numpy(smooth)) / _EDGE + 0.5).clamp(0, 1)
 
 
 def _light(tracked: TrackedFilm, frames: dict[int, Tensor], fallback: PointLight | None = None) -> PointLight:
