@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from rig_samples import corrective_sheet
+from rig_samples import corrective_sheet, named_sheet
 from scipy.spatial import cKDTree
 
 from torchface.cli import main
@@ -168,14 +168,28 @@ def test_correctives_play_in_blender_and_come_back(
     assert (played.weights.values - values).abs().max() < 1e-5
 
 
+def posed_as_in_blender(rig: BlendshapeRig, poses: list[list[float]], folder: Path) -> None:
+    save_rig(rig, folder / "sheet.usdc")
+    main(["convert", str(folder / "sheet.usdc"), str(folder / "sheet.blend")])
+    for pose in poses:
+        sliders = [f"{name}={weight}" for name, weight in zip(rig.names, pose, strict=True)]
+        in_blender("pose", folder / "sheet.blend", folder / "posed.npz", *sliders)
+        expected = in_blenders_axes(rig(torch.tensor([pose]))[0])
+        assert np.abs(np.load(folder / "posed.npz")["places"] - expected).max() < METRES
+
+
 def test_sliders_of_a_blender_file_move_its_correctives(corrected: BlendshapeRig, tmp_path: Path) -> None:
-    save_rig(corrected, tmp_path / "sheet.usdc")
-    main(["convert", str(tmp_path / "sheet.usdc"), str(tmp_path / "sheet.blend")])
-    for pose in ([0.2, 0.5, 0.9], [0.45, 1.0, 0.3], [0.8, 0.0, 1.0]):
-        sliders = [f"{name}={weight}" for name, weight in zip(corrected.names, pose, strict=True)]
-        in_blender("pose", tmp_path / "sheet.blend", tmp_path / "posed.npz", *sliders)
-        expected = in_blenders_axes(corrected(torch.tensor([pose]))[0])
-        assert np.abs(np.load(tmp_path / "posed.npz")["places"] - expected).max() < METRES
+    posed_as_in_blender(corrected, [[0.2, 0.5, 0.9], [0.45, 1.0, 0.3], [0.8, 0.0, 1.0]], tmp_path)
+
+
+def test_a_corrective_of_eight_shapes_plays_in_blender_and_comes_back(tmp_path: Path) -> None:
+    plain = named_sheet(tuple(f'a long name of "shape" {number}, as some tools write them' for number in range(8)))
+    deltas = 20 * torch.randn(1, len(plain.vertices), 3, generator=torch.Generator().manual_seed(4))
+    definition = Corrective("all eight", plain.names)
+    rig = BlendshapeRig(plain.neutral, plain.deltas, plain.names, Correctives(deltas, (definition,)))
+    posed_as_in_blender(rig, [[1.0] * 8, [0.9, 0.8, 1.0, 0.7, 0.95, 1.0, 0.85, 0.9], [1.0] * 7 + [0.0]], tmp_path)
+    main(["convert", str(tmp_path / "sheet.blend"), str(tmp_path / "back.usdc")])
+    assert load_rig(tmp_path / "back.usdc").correctives.definitions == (definition,)
 
 
 @pytest.fixture(scope="module")
