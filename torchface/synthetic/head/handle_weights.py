@@ -15,6 +15,7 @@ from torchface.synthetic.head.topology import MOUTH_BORDER, MOUTH_CONTACT, topol
 LIP_HANDLES = 52
 """Handles round the mouth: 27 on the left from the upper midline over the corner (13) to the lower midline (26), and
 25 more on the right, back up."""
+_REACH = 5.0  # millimetres, of the lips
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,7 +50,7 @@ def _lip_weights(p: Tensor, position: Tensor, ring: Tensor) -> Tensor:
     fixed_skin = (p[:, 1] > -18) | (p[:, 1] < -111) | (p[:, 2] < 22) | (ring > MOUTH_CONTACT + 5) | _unmoved_parts()
     # The nose stays: only the skin beside its wings gives.
     fixed_skin |= (p[:, 1] > -44.5) & (p[:, 0].abs() < 20)
-    return _interpolated(values, on_lips | fixed_skin)
+    return _interpolated(values, on_lips | fixed_skin, _REACH)
 
 
 def _jaw_weights(p: Tensor, position: Tensor, ring: Tensor) -> Tensor:
@@ -87,8 +88,13 @@ def _unmoved_parts() -> Tensor:
     return mask
 
 
-def _interpolated(values: Tensor, fixed: Tensor) -> Tensor:
-    """Values given where fixed, (V,C), elsewhere interpolated as a thin plate: the squared Laplacian is zero there."""
+def _interpolated(values: Tensor, fixed: Tensor, reach: float | None = None) -> Tensor:
+    """Values given where fixed, (V,C), elsewhere interpolated as a thin plate: the squared Laplacian is zero there.
+
+    Args:
+        reach: under tension, so that the plate does not swing out farther than about so many millimetres; without if
+            absent.
+    """
     t = topology()
     p = sculpted_vertices().numpy()
     quads = t.quads.numpy()
@@ -103,6 +109,8 @@ def _interpolated(values: Tensor, fixed: Tensor) -> Tensor:
     laplacian = diags(degree) - adjacency
     area = np.bincount(pairs.ravel(), np.repeat(length**2, 2), count) / np.maximum(np.bincount(pairs.ravel()), 1)
     plate = (laplacian @ diags(1 / area) @ laplacian).tocsr()
+    if reach is not None:
+        plate = (plate + laplacian / reach**2).tocsr()
     known = fixed.numpy()
     free = ~known
     right = -(plate[free][:, known] @ values.numpy()[known])

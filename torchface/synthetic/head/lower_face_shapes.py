@@ -3,6 +3,7 @@
 import math
 
 import torch
+from scipy.interpolate import PchipInterpolator
 from torch import Tensor
 
 from torchface.synthetic.head.handle_weights import LIP_HANDLES, HandleWeights, handle_weights
@@ -15,14 +16,109 @@ _SIDE = torch.where(_HANDLE > 26, 52 - _HANDLE, _HANDLE)  # 0 upper midline, 13 
 _LEFT = torch.where(_HANDLE > 26, -1.0, 1.0).double()
 
 
+# How far lips go, millimetres (sideways, up, forward) at seven places of the left half: upper lip in the middle, a
+# quarter and most of the way to the corner; the corner; the lower lip back to the middle. How far each goes is what
+# rigs of ARKit's shapes have in common, measured on two of them.
+Lips = tuple[tuple[float, float, float], ...]
+_PLACES = (0, 6, 10, 13, 16, 20, 26)
+_STILL: Lips = ((0, 0, 0),) * 7
+_LEFT_LIPS: dict[str, Lips] = {
+    "mouthSmileLeft": ((0, 1.5, -0.5), (4.2, 3.8, -2.4), (7, 8, -6.4), (6.8, 10, -7.8),
+                       (5.5, 8.5, -5.4), (3.2, 4.6, -1.0), (0, 0.8, 0.9)),
+    "mouthFrownLeft": ((0, -0.7, -0.4), (1, -2.4, -1.8), (1.5, -4, -2.3), (1.4, -4.8, -2),
+                       (1.2, -3.8, -1.2), (0.6, -1.2, -0.3), (0, 0, 0)),
+    "mouthDimpleLeft": ((0, 0.1, 0), (1.7, -0.2, -1.2), (2.8, 1.1, -4.4), (2.4, 3, -5.8),
+                        (3, 4.2, -4.6), (2, 2.4, -0.9), (0, 0.4, 0.4)),
+    "mouthStretchLeft": ((0.3, -0.3, -0.4), (2.2, -1.2, -1.8), (4, -2.2, -5), (5.4, -2.6, -6.8),
+                         (4.9, -2.9, -5.2), (3.3, -1, -1.6), (0.4, 0, 0.2)),
+    "mouthUpperUpLeft": ((0.1, 3.8, -0.4), (2, 7, -1.3), (1.7, 5.9, -0.7), (0.2, 3.5, 0), (0, 1, 0.2), (0, 0.3, 0), (0, 0.1, 0)),
+    "mouthLowerDownLeft": ((0, 0, 0), (0, 0, 0), (0, -0.3, -0.1), (0, -1, -0.3),
+                           (0.6, -3, -1.1), (0.8, -5.2, -1.8), (0, -2, -0.8)),
+    "noseSneerLeft": ((0, 1.2, 0), (0.4, 3, 0.2), (0.2, 3.2, 0.4), (-0.3, 2.2, 0.4), (0, 1, 0.2), (0, 0.3, 0), (0, 0, 0)),
+    "mouthPressLeft": ((0, 0, 0.2), (0.2, 0.6, 0), (0.6, 1.8, 0.2), (0.8, 2.8, 0.8), (0.8, 4.2, 2), (0.4, 4.4, 2), (0, 2, 1)),
+}  # fmt: skip
+_WHOLE_LIPS: dict[str, Lips] = {
+    "mouthFunnel": ((0, 4.8, 6), (-1.5, 2.1, 6.7), (-3.4, -0.2, 8.4), (-4.5, 0, 8.3),
+                    (-3.4, -2.3, 8.6), (-1.6, -5.6, 7), (0, -8, 4.8)),
+    "mouthPucker": ((0, 1.6, 6.6), (-2.1, 1, 7), (-4.1, 0.2, 8.3), (-4.7, 0, 8.1), (-4.4, 0, 9), (-2.6, -0.9, 7), (0, -1.8, 6)),
+    "mouthRollLower": (*_STILL[:4], (0, 0.6, 0), (0, 1, 0), (0, 1, 0)),
+    "mouthRollUpper": ((0, -0.5, 0), (0, -0.5, 0), (0, -0.3, 0), *_STILL[:4]),
+    "mouthShrugLower": ((0, 0.8, 0.3), (0, 0.6, 0.2), (0.1, 0.4, 0.4), (0.3, 1, 1), (0.4, 3.2, 3), (0, 5.2, 4.2), (0, 6.2, 4.6)),
+    "mouthShrugUpper": ((0, 4.6, 0.8), (0, 3.5, 0.4), (0.1, 1.7, 0.2), (0, 0.5, 0), (0, 0.2, 0), (0, 0, 0), (0, 0, 0)),
+    "cheekPuff": ((0, -1.1, 6.6), (-2.3, -0.7, 7.2), (-2.8, 0, 9.8), (-2.3, 0.2, 11), (-3, -0.7, 10.5), (-2.4, -1.1, 8.4), (0, -1, 7)),
+}  # fmt: skip
+_MOUTH_LEFT: tuple[Lips, Lips] = (
+    ((11.5, 0.6, -2.2), (8.5, 2.8, -4.8), (6.8, 5.3, -5.3), (5.8, 7, -4.4), (7, 4.8, -4.6), (9.5, 2.4, -4.6), (12, 0.5, -3.2)),
+    ((11.5, 0.6, -2.2), (12.5, -0.8, 2.2), (11.2, -0.6, 4.4), (10.5, -0.4, 6.3), (11.7, -0.4, 4), (13.2, -0.6, 1.6), (12, 0.5, -3.2)),
+)  # fmt: skip
+
 # A lip rolled in over the teeth: for each ring the motion up and forward, millimetres.
 _ROLL_LOWER = {
-    4: (0.6, -0.6), 5: (3.2, -2.2), 6: (3.6, -4.2), 7: (2.4, -5.6),
-    8: (0.6, -5.0), 9: (0.0, -3.8), 10: (-0.6, -3.2), 11: (0.0, -2.4),
+    3: (2.2, 0.9), 4: (4.4, 0.5), 5: (6.8, -0.9), 6: (6.8, -3.8), 7: (5.6, -6.8),
+    8: (2.4, -6.6), 9: (0.4, -5.0), 10: (-0.6, -4.0), 11: (0.0, -3.0),
 }  # fmt: skip
 _ROLL_UPPER = {
-    4: (-0.6, -0.6), 5: (-3.0, -2.0), 6: (-3.2, -3.8), 7: (-2.0, -4.8),
-    8: (-0.6, -4.2), 9: (0.0, -3.4), 10: (0.5, -3.0), 11: (0.0, -2.4),
+    2: (-1.6, -0.4), 3: (-3.4, -1.2), 4: (-4.6, -2.6), 5: (-5.8, -4.4), 6: (-5.4, -6.0), 7: (-4.2, -7.4),
+    8: (-1.6, -6.6), 9: (-0.3, -5.0), 10: (0.4, -4.0), 11: (0.0, -3.0),
+}  # fmt: skip
+
+_FUNNELLED = (
+    {5: (0.2, -0.4), 6: (0.8, 0.6), 7: (0.8, 1.2), 8: (0.6, 1.2), 9: (0.2, 0.8)},
+    {5: (0.2, -0.4), 6: (-0.8, 1.0), 7: (-1.2, 2.0), 8: (-0.8, 1.6), 9: (-0.2, 0.8)},
+)
+_PUCKERED = (
+    {5: (0.2, 0.4), 6: (0.4, 1.0), 7: (0.4, 1.6), 8: (0.2, 1.0), 9: (0.0, 0.3)},
+    {5: (-0.2, 0.0), 6: (-0.4, 1.2), 7: (-0.2, 2.4), 8: (-0.1, 1.6), 9: (0.0, 0.3)},
+)
+_PRESSED = (
+    {5: (-0.8, 0.0), 6: (-0.7, -0.4), 7: (-0.5, -0.6), 8: (-0.2, -0.5), 9: (0.0, -0.3)},
+    {5: (1.0, 0.4), 6: (0.4, 0.0), 7: (-0.6, -0.8), 8: (-1.2, -1.4), 9: (-1.6, -1.2)},
+)
+_OPENED: Lips = ((0, 0, 0), (0, -1.6, -1), (-0.6, -2, -1.8), (-1.2, 0, -0.4), (-0.6, 0, 0), (0, 0, 0), (0, 0, 0))
+_BEYOND = 3.0  # handles from the midline to where the other half hardly follows
+
+# What skin does beyond following the lips: about a point of the sculpture, how far that reaches, along which way.
+Push = tuple[tuple[float, float, float], tuple[float, float, float], tuple[float, float, float]]
+_WING, _UNDER_WING, _PHILTRUM = ((15, -38, 93), (7, 7, 14)), ((14, -50, 89), (9, 7, 14)), ((0, -52, 95), (10, 6, 14))
+_FOLD_HIGH, _FOLD_LOW = ((24, -38, 80), (9, 9, 16)), ((31, -52, 74), (10, 10, 18))  # from the wing to the corner
+_CHEEK, _LOW_CHEEK, _CHEEKBONE = (
+    ((38, -24, 68), (14, 11, 20)),
+    ((44, -54, 56), (13, 13, 22)),
+    ((55, -30, 42), (12, 14, 20)),
+)
+_BESIDE, _UNDER_CORNER, _JAW = (
+    ((40, -68, 60), (11, 12, 20)),
+    ((27, -80, 72), (10, 10, 18)),
+    ((42, -90, 42), (14, 14, 22)),
+)
+_CHIN, _CHIN_SIDE, _HOLLOW = ((0, -97, 88), (13, 9, 16)), ((16, -88, 82), (9, 9, 16)), ((0, -83, 85), (12, 6, 16))
+_SKIN: dict[str, tuple[Push, ...]] = {
+    "mouthSmileLeft": ((*_CHEEK, (1.5, 2.5, 2)), (*_LOW_CHEEK, (6, 3, 7.5)), (*_CHEEKBONE, (1.5, 2.5, 1.5)),
+                       (*_UNDER_CORNER, (0, 5, 1.5)), (*_JAW, (0, 0.5, 2.5)), (*_UNDER_WING, (2, 1, -1.5)),
+                       (*_HOLLOW, (0, -1, 4))),
+    "mouthFrownLeft": ((*_UNDER_WING, (1.2, -2, -1.5)), (*_UNDER_CORNER, (0.5, -1, 3)), (*_CHIN_SIDE, (0, 1.5, 2.5)),
+                       (*_BESIDE, (1, -1, 1))),
+    "mouthDimpleLeft": ((*_FOLD_LOW, (0, 0, 6)), (*_LOW_CHEEK, (3, 1.5, 4.5)), (*_UNDER_CORNER, (0, 6, 2.5)),
+                        (*_CHIN_SIDE, (1.5, 3.5, 2))),
+    "mouthStretchLeft": ((*_FOLD_LOW, (-1, 0, 2.5)), (*_BESIDE, (2.5, 0, -1.5)), (*_UNDER_CORNER, (3, 0, -1.5)),
+                         (*_JAW, (2.5, -1, -2))),
+    "mouthUpperUpLeft": ((*_WING, (0.5, 1.5, 0)), (*_UNDER_WING, (1, 3.5, -2)), (*_FOLD_HIGH, (1.5, 3.5, 1.5)),
+                         (*_FOLD_LOW, (0.5, 4, 0)), (*_CHEEK, (0, 2, 1)), (*_LOW_CHEEK, (0, 1.5, 2))),
+    "mouthLowerDownLeft": ((*_UNDER_CORNER, (2, 2, -1)), (*_CHIN, (0, -2.5, -2))),
+    "mouthPressLeft": ((*_UNDER_CORNER, (1, 6, 3)), (*_CHIN_SIDE, (1.5, 6, 3)), (*_CHIN, (0, 6, 3)),
+                       (*_LOW_CHEEK, (2, 3, 1.5)), (*_FOLD_LOW, (2, 1.5, 2.5))),
+    "mouthFunnel": ((*_UNDER_WING, (-1.5, 0, 3)), (*_FOLD_HIGH, (-0.5, 0, 2.5)), (*_LOW_CHEEK, (-1, 3, 2)),
+                    (*_UNDER_CORNER, (0.5, 7, 3)), (*_JAW, (0, 2, 4)), (*_HOLLOW, (0, 3, -5))),
+    "mouthPucker": ((*_UNDER_WING, (-1.5, 0, 2.5)), (*_FOLD_HIGH, (-1, 0.5, 2)), (*_UNDER_CORNER, (0, 3, 0)),
+                    (*_HOLLOW, (0, 2, -4))),
+    "mouthRollLower": ((*_CHIN_SIDE, (-3, 6, 7)), (*_CHIN, (0, 3.5, 2)), (*_HOLLOW, (0, 6, 4))),
+    "mouthRollUpper": ((*_UNDER_WING, (0, -4.5, -0.5)), (*_PHILTRUM, (0, -4.5, -1))),
+    "mouthShrugLower": ((*_UNDER_CORNER, (-1.5, 2.5, 1)), (*_CHIN_SIDE, (-3, 5, 0)), (*_CHIN, (0, 6, 1.2)), (*_HOLLOW, (0, 3, 0))),
+    "mouthLeft": ((*_WING, (2.5, 1.5, -1.5)), (*_FOLD_LOW, (0, 3, 3.5)), (*_LOW_CHEEK, (3, 3, 4.5)), (*_PHILTRUM, (8, 2, -1)),
+                  (*_UNDER_CORNER, (0, 2.5, -2))),
+    "cheekPuff": ((*_UNDER_WING, (-1, 0, 4.5)), (*_FOLD_HIGH, (0, 1, 2)), (*_FOLD_LOW, (2.5, 4, 5.5)), (*_CHEEK, (0, 2, 0.5)),
+                  (*_LOW_CHEEK, (4.5, 2.5, 4.5)), (*_BESIDE, (4, 0.5, 4)), (*_UNDER_CORNER, (2, 0, 4)), (*_JAW, (0, 1.5, 2.5)),
+                  (*_PHILTRUM, (0, 0.5, 3)), (*_HOLLOW, (0, 0, -3))),
 }  # fmt: skip
 
 
@@ -40,8 +136,6 @@ class Mouth:
         jaw = lambda v, hinge: (v[rings[MOUTH_CONTACT, 26]] - hinge).norm()  # noqa: E731
         mean_hinge = torch.tensor([0.0, -14.0, 8.0], dtype=torch.float64)
         self.reach = jaw(head.vertices, head.hinges.mean(0)) / jaw(self.mean, mean_hinge)
-        # The dental arch: how far the line of contact falls back toward the corners.
-        self.arch = (line[0, 2] - line[13, 2]) / self.half_width**2.2
         # 0 on the midline to ±1 at the corners.
         across = torch.zeros(LIP_HANDLES, dtype=torch.float64)
         across[:27] = line[:, 0] / self.half_width
@@ -52,12 +146,19 @@ class Mouth:
         self.left = ramp(across, -0.35, 0.35)
         self.corner = torch.exp(-(((_SIDE - 13) / 3.6) ** 2))
 
-    def slide(self, x: Tensor | float, y: Tensor | float, z: Tensor | float = 0.0) -> Tensor:
-        """Handle motion (52,3): what goes sideways also follows the arch of the teeth."""
-        x, y, z = (torch.as_tensor(v, dtype=torch.float64).expand(LIP_HANDLES) for v in (x, y, z))
-        now = self.across.abs() * self.half_width
-        out = (now + x * self.across.sign()).clamp(min=0)
-        return torch.stack([x, y, z - self.arch * (out**2.2 - now**2.2)], dim=1)
+    def lips(self, left: Lips, right: Lips | None = None) -> Tensor:
+        """Skin that follows lips, (V,3): displacements at the places of the left half, and the right half's.
+
+        What only the left half does ends soon beyond the midline.
+        """
+        sides = _between(left)
+        if right is None:
+            off = torch.minimum(_SIDE, 26 - _SIDE).double()
+            middle = torch.where(_SIDE[:, None] < 13, sides[0], sides[26])
+            other = middle * torch.exp(-((off / _BEYOND) ** 2))[:, None]
+        else:
+            other = _between(right)[_SIDE]
+        return self.skin_motion(torch.where(_LEFT[:, None] > 0, sides[_SIDE], other) * self.size)
 
     def skin_motion(self, handles: Tensor) -> Tensor:
         """Displacement (V,3) of the skin that follows the handles (52,3)."""
@@ -91,10 +192,15 @@ class Mouth:
         return self.weights.jaw[:, None] * moved
 
     def push(self, centre: tuple[float, float, float], width: tuple[float, float, float], way: Tensor) -> Tensor:
-        """Left skin near a point of the sculpture moved along ``way`` (3,); the mouth's inside and the lips stay."""
-        outside = (self.weights.lip_ring < MOUTH_CONTACT - 3) & ~_inside()
-        amount = (bump(self.mean, centre, width) - 0.02).clamp(min=0) * ramp(self.mean[:, 0], -6, 10) * outside
+        """Left skin near a point of the sculpture moved along ``way`` (3,), as far as it does not follow the lips."""
+        free = (1 - self.weights.lips.sum(1)).clamp(0, 1) * ~_inside()
+        amount = (bump(self.mean, centre, width) - 0.02).clamp(min=0) * ramp(self.mean[:, 0], -6, 10) * free
         return amount[:, None] * way * self.size
+
+
+def _between(places: Lips) -> Tensor:
+    """Displacements of the handles of one half, (27,3)."""
+    return torch.from_numpy(PchipInterpolator(_PLACES, torch.tensor(places).double().numpy())(range(27)))
 
 
 def _inside() -> Tensor:
@@ -108,68 +214,28 @@ def _inside() -> Tensor:
 def lower_face(head: Anatomy) -> dict[str, Tensor]:
     """Left and unpaired shapes of jaw and mouth; displacements (V,3) by ARKit name."""
     m = Mouth(head)
-    w, size = m.half_width, m.size
-    a, aa = m.across, m.across.abs()
-    mid = (1 - aa**2).clamp(min=0)
-    left_corner = m.corner * (_LEFT > 0)
-    opened = m.jaw(JAW_ANGLE, (0, -1.0, -1.5)) + m.skin_motion(m.slide(-0.05 * a * w * m.corner, 0.0))
-    vec = lambda *xyz: torch.tensor(xyz, dtype=torch.float64)  # noqa: E731
-    chin = m.push((0, -96, 88), (16, 12, 16), vec(0, 3.4, 0.8))
-    return {
+    mid = (1 - m.across**2).clamp(min=0)
+    mirror = lambda lips: tuple((-x, y, z) for x, y, z in lips)  # noqa: E731
+    opened = m.jaw(JAW_ANGLE, (0, -1.0, -1.5)) + m.lips(_OPENED, mirror(_OPENED))
+    made = {name: m.lips(lips) for name, lips in _LEFT_LIPS.items()}
+    made |= {name: m.lips(lips, mirror(lips)) for name, lips in _WHOLE_LIPS.items()}
+    made |= {
         "jawOpen": opened,
-        "jawForward": m.jaw(translation=(0, -0.6, 6.5)),
+        "jawForward": m.jaw(translation=(0, -0.6, 7.2)),
         "jawLeft": m.jaw(translation=(2.5, -0.4, 0.0), yaw=math.radians(4.5)),
         "mouthClose": _close(m, opened),
-        "mouthFunnel": _funnel(m, mid),
-        "mouthPucker": _pucker(m, mid),
-        "mouthLeft": m.skin_motion(m.slide(0.24 * w * (0.65 + 0.35 * a), 0.8 * left_corner, 0.0)),
-        "mouthSmileLeft": _smile(m, left_corner)
-        + m.push((36, -34, 68), (13, 13, 20), vec(0.6, 3.2, 2.4))
-        + m.push((37, -62, 60), (8, 14, 16), vec(1.8, 1.0, -1.6)),
-        "mouthFrownLeft": _side_motion(m, 0.05 * w, -7.0 * size, -0.4, 4.2)
-        + m.push((24, -84, 78), (9, 8, 14), vec(0.6, -1.6, 1.0)),
-        "mouthDimpleLeft": _side_motion(m, 0.16 * w, 1.2 * size, -3.0, 2.8),
-        "mouthStretchLeft": _side_motion(m, 0.24 * w, -3.6 * size, -0.6, 5.0),
-        "mouthRollLower": m.profile({}, _ROLL_LOWER, mid)
-        + m.skin_motion(m.slide(0.0, 0.8 * m.is_lower * mid, 0.0)),
-        "mouthRollUpper": m.profile(_ROLL_UPPER, {}, mid)
-        + m.skin_motion(m.slide(0.0, -0.5 * m.is_upper * mid, 0.0)),
-        "mouthShrugLower": m.skin_motion(
-            m.slide(0.0, (3.6 * m.is_lower + 2.4 * m.is_upper) * mid * size, 1.6 * m.is_lower * mid)
-        ) + chin + mirrored(chin),
-        "mouthShrugUpper": m.skin_motion(
-            m.slide(0.0, (3.2 * m.is_upper + 0.9 * m.is_lower) * mid * size, 1.4 * m.is_upper * mid)
-        ),
-        "mouthPressLeft": _press(m),
-        "mouthLowerDownLeft": _lift(m, m.is_lower * mid, 0.6, -6.2, -0.4),
-        "mouthUpperUpLeft": _lift(m, m.is_upper * mid, 0.4, 5.6, -0.2)
-        + m.push((22, -42, 84), (9, 10, 16), vec(0.2, 2.2, 0.8)),
-    }  # fmt: skip
-
-
-def _gaussian(across: Tensor, centre: float, width: float) -> Tensor:
-    return torch.exp(-(((across - centre) / width) ** 2))
-
-
-def _lift(m: Mouth, lip: Tensor, out: float, up: float, forward: float) -> Tensor:
-    """The left half of a lip drawn up or down; ``lip`` (52,) says which handles, the rest is in millimetres."""
-    side = lip * m.left
-    return m.skin_motion(
-        m.slide(out * m.size * side, up * m.size * side * _gaussian(m.across, 0.35, 0.75), forward * side)
-    )
-
-
-def _smile(m: Mouth, corner: Tensor) -> Tensor:
-    reach = torch.exp(-(((_SIDE - 13) / 5.2) ** 2)) * (_LEFT > 0)
-    pull = 0.8 * reach + 0.2 * corner + 0.12 * (1 - m.across.abs()) * m.left
-    out = 0.27 * m.half_width * pull
-    up = 8.2 * m.size * (0.75 * reach**1.5 + 0.25 * corner) + 0.6 * m.size * (m.is_upper * m.left) * (1 - reach)
-    return m.skin_motion(m.slide(out, up, -0.8 * pull))
-
-
-def _side_motion(m: Mouth, out: Tensor, up: Tensor | float, back: float, breadth: float) -> Tensor:
-    reach = torch.exp(-(((_SIDE - 13) / breadth) ** 2)) * m.left
-    return m.skin_motion(m.slide(out * reach, up * reach, back * reach))
+        "mouthLeft": m.lips(*_MOUTH_LEFT),
+    }
+    made["mouthFunnel"] += m.profile(*_FUNNELLED, mid)
+    made["mouthPucker"] += m.profile(*_PUCKERED, mid)
+    made["mouthRollLower"] += m.profile({}, _ROLL_LOWER, mid)
+    made["mouthRollUpper"] += m.profile(_ROLL_UPPER, {}, mid)
+    made["mouthPressLeft"] += m.profile(*_PRESSED, m.left * mid)
+    for name, pushes in _SKIN.items():
+        for centre, width, way in pushes:
+            moved = m.push(centre, width, torch.tensor(way, dtype=torch.float64))
+            made[name] = made[name] + (moved + mirrored(moved) if name in _WHOLE_LIPS else moved)
+    return made
 
 
 def _close(m: Mouth, opened: Tensor) -> Tensor:
@@ -184,28 +250,3 @@ def _close(m: Mouth, opened: Tensor) -> Tensor:
     upper, lower = torch.where(_SIDE < 13, _HANDLE, twin), torch.where(_SIDE < 13, twin, _HANDLE)
     meet = (1 - share) * motion[upper] + share * motion[lower]
     return m.skin_motion(meet - motion)
-
-
-def _funnel(m: Mouth, mid: Tensor) -> Tensor:
-    narrow = -0.26 * m.half_width * m.across
-    part = (5.0 * m.is_upper - 6.5 * m.is_lower) * m.size * mid
-    lips = m.skin_motion(m.slide(narrow, part, (3.0 + 2.0 * mid) * m.size))
-    rolled = {5: (0.6, 0.6), 6: (1.2, 1.4), 7: (1.2, 2.0), 8: (0.8, 1.6), 9: (0.2, 0.8)}
-    return lips + m.profile(rolled, {k: (-up, forward) for k, (up, forward) in rolled.items()}, mid)
-
-
-def _pucker(m: Mouth, mid: Tensor) -> Tensor:
-    narrow = -0.42 * m.half_width * m.across
-    lips = m.skin_motion(m.slide(narrow, 0.0, (2.2 + 2.8 * mid) * m.size))
-    rolled = {5: (0.2, 0.4), 6: (0.8, 1.0), 7: (0.8, 1.4), 8: (0.3, 0.9), 9: (0.0, 0.2)}
-    return lips + m.profile(rolled, {k: (-up, forward) for k, (up, forward) in rolled.items()}, mid)
-
-
-def _press(m: Mouth) -> Tensor:
-    """The left half of the lower lip pressed up against the upper one; the skin below follows and bulges."""
-    share = m.left * (1 - m.across.abs() ** 4) * _gaussian(m.across, 0.45, 0.7)
-    upper = {4: (-0.2, 0.0), 5: (-1.0, -0.1), 6: (-0.8, -0.4), 7: (-0.5, -0.6), 8: (-0.2, -0.5), 9: (0.0, -0.3)}
-    lower = {4: (1.4, 0.9), 5: (2.6, 1.1), 6: (2.0, 0.5), 7: (1.1, -0.2), 8: (0.4, -0.5), 9: (0.0, -0.3)}
-    chin = m.push((14, -86, 86), (12, 9, 14), torch.tensor((0.0, 1.6, 0.7), dtype=torch.float64))
-    up = (0.9 * m.is_lower + 0.5 * m.is_upper) * share * m.size
-    return m.profile(upper, lower, share) + chin + m.skin_motion(m.slide(0.0, up, 0.6 * m.is_lower * share))

@@ -51,7 +51,9 @@ def _mean_deltas() -> Tensor:
 
 
 def _deltas(person: Anatomy) -> Tensor:
-    made = upper_face(person) | lower_face(person)
+    made = upper_face(person)
+    for name, moved in lower_face(person).items():
+        made[name] = made[name] + moved if name in made else moved
     for name in list(made):
         if name.endswith("Left"):
             made[name.removesuffix("Left") + "Right"] = mirrored(made[name])

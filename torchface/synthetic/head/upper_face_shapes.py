@@ -10,21 +10,28 @@ from torchface.synthetic.head.identity import Anatomy, both_sides, bump, ramp, s
 from torchface.synthetic.head.signed_distance import LID_THICKNESS
 from torchface.synthetic.head.topology import EYE_RIM, topology
 
-CLOSING_HEIGHT = 0.28  # where the lids meet, as a share of the way from the lower to the upper edge
+CLOSING_HEIGHT = 0.18  # where the lids meet, as a share of the way from the lower to the upper edge
 GAZE = math.radians(26.0)  # rotation of an eye at weight 1
 
 # How much of the lid edge's way each ring goes: skin from the orbit to the edge (8), then the inner lid and socket.
 _FOLLOW = torch.tensor(
-    [0.0, 0.04, 0.16, 0.34, 0.55, 0.76, 0.89, 0.96, 1.0, 1.0, 0.72, 0.42, 0.18, 0.05, 0.0, 0.0], dtype=torch.float64
+    [0.0, 0.02, 0.06, 0.15, 0.42, 0.72, 0.88, 0.96, 1.0, 1.0, 0.72, 0.42, 0.18, 0.05, 0.0, 0.0], dtype=torch.float64
 )
 
 
-def _lids(head: Anatomy, upper: Tensor | float, lower: Tensor | float, lean: float = 0.0) -> Tensor:
+def _lids(
+    head: Anatomy,
+    upper: Tensor | float,
+    lower: Tensor | float,
+    lean: float = 0.0,
+    aside: tuple[float, float] = (0.0, 0.0),
+) -> Tensor:
     """The left lids moved by shares of their own way to where they meet; negative opens. Displacement (V,3).
 
     Args:
         upper, lower: share of the way at weight 1, one number a lid or (17,) along it from the inner corner.
         lean: how far the upper skin fold follows beyond the edge's own motion, millimetres up.
+        aside: how far the upper and the lower lid are drawn along the ball, millimetres outward; the corners stay.
     """
     t = topology()
     rings = t.rings["eye"]
@@ -70,6 +77,12 @@ def _lids(head: Anatomy, upper: Tensor | float, lower: Tensor | float, lean: flo
     fold = torch.zeros(32, dtype=torch.float64)
     fold[above] = torch.sin(math.pi * torch.arange(17).double() / 16)
     moved[1:6, :, 1] += lean * fold * torch.tensor([0.3, 0.7, 1.0, 0.9, 0.5]).double()[:, None]
+    ways, along = torch.zeros(32, dtype=torch.float64), torch.sin(math.pi * step.double() / 16)
+    for lid, amount in zip((above, below), aside, strict=True):
+        ways[lid] = amount * along**2
+    radius = moved.norm(dim=-1, keepdim=True)
+    moved[..., 0] += _FOLLOW[:, None] * ways
+    moved *= radius / moved.norm(dim=-1, keepdim=True)
     delta = torch.zeros_like(head.vertices)
     delta[rings] = moved - around
     return delta
@@ -154,32 +167,57 @@ def upper_face(head: Anatomy) -> dict[str, Tensor]:
     """Left and unpaired shapes of eyes, brows, nose and cheeks; displacements (V,3) by ARKit name."""
     lids = lambda *args, **more: _lids(head, *args, **more)  # noqa: E731
     push = lambda *args, **more: _push(head, *args, **more)  # noqa: E731
-    open_height = _opening(head)
+    open_height, along = _opening(head), torch.sin(math.pi * torch.arange(17).double() / 16)
     brow_inner, brow_mid, brow_outer = (9.0, 22.0, 89.0), (26.0, 24.0, 86.0), (46.0, 19.0, 70.0)
+    under_lid, cheek, cheekbone, outer_fold = (
+        (32.0, -14.0, 77.0),
+        (38.0, -24.0, 68.0),
+        (55.0, -30.0, 42.0),
+        (46.0, 8.0, 72.0),
+    )
     return {
-        "eyeBlinkLeft": lids(1.0, 1.0) + push((30, 16, 80), (16, 7, 20), (0, -1.0, 0)),
+        "eyeBlinkLeft": lids(1.0, 1.0, aside=(-1.6, -1.6)),
         "eyeWideLeft": lids(-0.33, -0.12, lean=0.8) + push((30, 20, 82), (17, 8, 20), (0, 1.2, 0)),
-        "eyeSquintLeft": lids(0.26, 0.85) + push((34, -17, 70), (15, 9, 22), (0.3, 2.2, 0.8)),
-        "eyeLookDownLeft": _rotated_eye(head, -GAZE, 0) + lids(0.52, -0.35),
-        "eyeLookUpLeft": _rotated_eye(head, GAZE, 0) + lids(-0.45, 0.35, lean=0.8),
-        "eyeLookInLeft": _rotated_eye(head, 0, -1.15 * GAZE) + _sideways(head, -0.55),
-        "eyeLookOutLeft": _rotated_eye(head, 0, 1.15 * GAZE) + _sideways(head, 0.55),
-        "browDownLeft": push(brow_inner, (11, 11, 20), (-2.2, -6.5, 0.6))
-        + push(brow_mid, (15, 10, 20), (-1.6, -4.6, 0.4))
-        + push(brow_outer, (11, 9, 20), (-0.4, -1.4, 0.0))
+        "eyeSquintLeft": lids(0.04, 1.4 * along, aside=(0.0, -1.8))
+        + push(under_lid, (12, 6, 18), (-2.6, 1.4, 0.5))
+        + push((36, -20, 70), (12, 6, 20), (-1.0, 0.5, 0.2)),
+        "eyeLookDownLeft": _rotated_eye(head, -GAZE, 0)
+        + lids(0.66, -1.2 * along)
+        + push(under_lid, (12, 6, 18), (0, -0.8, -0.8)),
+        "eyeLookUpLeft": _rotated_eye(head, GAZE, 0) + lids(-0.42, 0.7 * along, lean=0.8),
+        "eyeLookInLeft": _rotated_eye(head, 0, -1.15 * GAZE)
+        + lids(0.0, 0.0, aside=(-1.8, -1.5))
+        + push(under_lid, (12, 6, 18), (-1, 0, 0)),
+        "eyeLookOutLeft": _rotated_eye(head, 0, 1.15 * GAZE)
+        + lids(0.0, 0.0, aside=(1.8, 1.5))
+        + push(under_lid, (12, 6, 18), (1, 0, 0)),
+        "browDownLeft": push(brow_inner, (11, 10, 20), (-1.4, -4.6, 0.9))
+        + push(brow_mid, (14, 10, 20), (-3.2, -4.6, 1.6))
+        + push(brow_outer, (11, 10, 20), (-2.2, -2.4, 2.8))
+        + push(outer_fold, (9, 8, 18), (-2, -3, 3))
+        + push((0, 14, 93), (6, 9, 16), (0, -1, 0.6))
         + lids(0.10 * open_height, 0.0),
-        "browOuterUpLeft": push(brow_outer, (13, 13, 24), (0.3, 6.5, -1.2)) + push(brow_mid, (11, 12, 24), (0, 3.6, 0)),
-        "browInnerUp": push((10.0, 25.0, 89.0), (15, 14, 24), (0.4, 8.0, -0.6), one_side=False)
-        + push((24.0, 24.0, 86.0), (10, 11, 24), (0, 2.6, 0), one_side=False),
-        "cheekSquintLeft": push((38, -24, 68), (16, 12, 22), (0.4, 5.2, 2.2))
-        + push((36, -14, 70), (16, 7, 22), (0, 2.2, 0.8))
-        + lids(0.0, 0.55),
-        "noseSneerLeft": push((15, -34, 92), (8, 9, 16), (1.2, 5.0, -0.4))
-        + push((20, -46, 86), (10, 9, 18), (0.6, 4.2, 0.4))
-        + push((9, 4, 84), (8, 11, 14), (0.4, 1.6, 0.9)),
-        "cheekPuff": push((38, -60, 56), (15, 15, 24), (8.5, 0.0, 4.5), one_side=False)
-        + push((14, -53, 88), (11, 6, 14), (0.5, 0.0, 2.2), one_side=False)
-        + push((14, -80, 86), (11, 6, 14), (0.5, 0.0, 2.0), one_side=False),
+        "browOuterUpLeft": push(brow_outer, (13, 13, 24), (1.2, 8.2, -2.8))
+        + push(brow_mid, (11, 12, 24), (1.2, 5, -0.4))
+        + push(outer_fold, (9, 8, 18), (0.4, 5, -0.5)),
+        "browInnerUp": push((10.0, 25.0, 89.0), (15, 14, 24), (0.6, 8.0, 0.2), one_side=False)
+        + push((24.0, 24.0, 86.0), (10, 11, 24), (0.8, 2.8, -0.4), one_side=False),
+        "cheekSquintLeft": push(cheek, (16, 12, 22), (-0.6, 5, 1.4))
+        + push(cheekbone, (12, 14, 20), (-0.5, 3, 2.5))
+        + push((44, -54, 56), (14, 13, 22), (1.0, 5, 2.2))
+        + push((53, -2, 62), (9, 10, 18), (-1.5, 1.5, 3))
+        + push((26, -42, 78), (10, 10, 16), (0.8, 1.4, -0.6))
+        + lids(0.0, 0.8 * along),
+        "noseSneerLeft": push((15, -34, 92), (8, 9, 16), (0.5, 3.0, 0.2))
+        + push((20, -46, 86), (10, 9, 18), (0.4, 2.6, 0.0))
+        + push((24, -38, 80), (9, 9, 16), (-1, 2.2, 1.2))
+        + push((12, -22, 90), (6, 10, 14), (-0.8, 2.4, 1.4))
+        + push(cheek, (14, 11, 20), (-0.8, 3.8, 1.8))
+        + push((44, -54, 56), (13, 13, 22), (-0.6, 1.4, 1.4))
+        + push((9, 4, 84), (8, 9, 14), (0.0, 0.8, 0.8))
+        + push((0, 14, 93), (6, 9, 16), (0, -1.6, 0.4))
+        + push(brow_inner, (9, 9, 20), (-0.6, -3.2, 0.0))
+        + push(brow_mid, (11, 9, 20), (-0.9, -2.2, 0.4)),
     }
 
 
@@ -189,19 +227,3 @@ def _opening(head: Anatomy) -> float:
     above, below = lid_order()
     gap = lambda v: float(v[rim[above[8]], 1] - v[rim[below[8]], 1])  # noqa: E731
     return gap(head.vertices) / gap(sculpted_vertices())
-
-
-def _sideways(head: Anatomy, amount: float) -> Tensor:
-    """Lids drawn a little along with an eye that looks aside; the corners stay."""
-    t = topology()
-    rings = t.rings["eye"]
-    ways = torch.zeros(32, dtype=torch.float64)
-    for lid in lid_order():
-        ways[lid] = torch.sin(math.pi * torch.arange(17).double() / 16) ** 2
-    delta = torch.zeros_like(head.vertices)
-    radial = head.vertices[rings] - head.eye_centres[0]
-    rotated = radial.clone()
-    rotated[..., 0] += amount * 1.2 * (_FOLLOW[:, None] * ways)
-    rotated *= (radial.norm(dim=-1) / rotated.norm(dim=-1))[..., None]
-    delta[rings] = rotated - radial
-    return delta
