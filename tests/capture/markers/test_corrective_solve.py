@@ -25,7 +25,8 @@ SHAPES = 16
 
 @pytest.fixture(scope="module")
 def rig() -> BlendshapeRig:
-    linear = performer(texture=False)
+    whole = performer(texture=False)  # of antagonists one: they are nearly each other's opposite
+    linear = whole.select([name for name in whole.names if name not in ("jawRight", "mouthRight")])
     reach = linear.deltas.norm(dim=-1)
     far = reach.amax(1).argsort(descending=True)[:SHAPES].tolist()
     linear = linear.select([linear.names[i] for i in far])

@@ -166,8 +166,10 @@ def test_a_variable_rate_is_solved_as_well_as_an_even_one(performance: Performan
     seconds = steps.cumsum(0) / 60
     seconds = seconds[seconds < even[-1]]
     there = values_at(true, even, seconds)
+    as_many = values_at(true, even, torch.arange(len(seconds), dtype=torch.float64) / 40)
     record_of = lambda weights: record(rig, attachment, weights, torch.Generator().manual_seed(1)).take.markers  # noqa: E731
     whole = WholeTakeSolver(MarkerSolver(rig, attachment))
-    base = (whole(record_of(true).values, 60.0) - true).abs().mean()
+    felt = [not name.startswith("eyeLook") for name in rig.names]  # lids hardly say where eyes look
+    base = (whole(record_of(as_many).values, 40.0) - as_many)[:, felt].abs().mean()
     solved = whole(record_of(there).values, 60.0, seconds)
-    assert (solved - there).abs().mean() < 1.3 * base
+    assert (solved - there)[:, felt].abs().mean() < 1.3 * base

@@ -36,8 +36,8 @@ def test_the_weights_of_planted_maps_are_found(database: Database, shares: Tenso
     details = as_basis(WrinkleBasis(maps, shares, areas).details(weights), 40)
     found = learn_wrinkle_basis(details, shares, areas, 1)
     # Where regions share a border one may have a little of the other's: it shows in no vertex.
-    assert (found.weights(details) - weights).abs().mean() < 0.02
-    assert (found.maps - maps).square().mean().sqrt() < 0.03
+    assert (found.weights(details) - weights).abs().mean() < 0.025
+    assert (found.maps - maps).square().mean().sqrt() < 0.04
     assert found.missed_share(found.weights(details), details) < 0.01
 
 

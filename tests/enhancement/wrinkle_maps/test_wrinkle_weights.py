@@ -14,7 +14,7 @@ from torchface.geometry.rotations import rotation_matrix
 from torchface.rig import BlendshapeRig
 from torchface.synthetic.head.performer import performer
 
-SHAPES = ("browInnerUp", "mouthSmileLeft", "mouthSmileRight", "mouthPucker", "noseSneerLeft", "jawOpen")
+SHAPES = ("browInnerUp", "mouthSmileLeft", "mouthSmileRight", "mouthPucker", "mouthRollLower", "jawOpen")
 
 
 def seeded(seed: int = 0) -> torch.Generator:

@@ -231,7 +231,7 @@ def test_landmarks_count_by_their_deviations(rig: BlendshapeRig, model: HeadMode
         for row, some in enumerate((None, deviations)):
             fit = fit_images(model, rig, marks, SIZE, settings=replace(POINTS, deviations=some))
             errors[row] += aligned_error(fit.mesh.vertices[skin], rest[skin])
-    assert float(errors[1]) < 0.9 * float(errors[0])
+    assert float(errors[1]) < 0.95 * float(errors[0])
     with pytest.raises(ShapeError, match="found 2 views, expected 1"):
         fit_images(model, rig, marks, SIZE, settings=FitSettings(deviations=torch.ones(2, 68)))
     with pytest.raises(ShapeError, match=r"deviations: found \(1, 5\)"):

@@ -216,7 +216,7 @@ def test_eight_examples_make_another_performers_rig(average: BlendshapeRig, gues
     assert after < 0.75 * before
     assert float(made.angles.max()) < 30
     if not guess:
-        assert error(made.rig, unseen, goals) < 0.8 * error(made.transferred, unseen, goals)
+        assert error(made.rig, unseen, goals) < 0.85 * error(made.transferred, unseen, goals)
 
 
 def test_how_far_lips_part_is_learned(average: BlendshapeRig) -> None:

@@ -110,7 +110,7 @@ def test_another_performers_eyeballs_are_found_from_the_lids() -> None:
         own_error = (template.vertices[balls] - eyes(template, parts, template.neutral)[0].float()[parts.group]).norm(
             dim=-1
         )
-        assert float((sphere_error / found_radius[parts.group] - own_error / template_radius[parts.group]).std()) < 1e-3
+        assert float((sphere_error / found_radius[parts.group] - own_error / template_radius[parts.group]).std()) < 5e-3
 
 
 @pytest.mark.parametrize("strange", [False, True])
