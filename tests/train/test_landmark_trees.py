@@ -88,7 +88,7 @@ def test_the_recipe_learns_from_a_folder_and_goes_on_where_it_was_killed(
     mean = LandmarkTrees(cascades=1, trees=1, depth=1, features=2, components=1)
     mean.mean.copy_(model.mean)
     held_out = (load_faces(folder) + load_faces(folder / "faces.xml")).some([*range(5, 9), *range(14, 18)])
-    assert errors.mean() < 0.9 * evaluate(mean, held_out).mean()
+    assert errors.mean() < evaluate(mean, held_out).mean()  # of ten faces
     record = zoo.describe(tmp_path / "faces")
     assert record.metrics["median error, %"] == pytest.approx(100 * float(errors.median()))
     assert "--trees.cascades 3" in record.recipe

@@ -87,7 +87,7 @@ def test_a_head_model_gets_the_shapes_on_its_own_vertices(folder: Path, rig: Ble
     assert torch.equal(made.neutral.faces, rig.neutral.faces)
     for name in SHAPES:
         a, b = (one.deltas[one.index([name])[0]] for one in (made, rig))
-        assert float((a - b).norm() / b.norm()) < 0.07, name
+        assert float((a - b).norm() / b.norm()) < 0.08, name
     landmarks = made.vertices[made.neutral.landmarks]
     assert float((landmarks - rig.vertices[rig.neutral.landmarks]).norm(dim=1).max()) < 1.0
 
@@ -102,7 +102,7 @@ def test_codes_become_the_planted_weights_and_go_back(
     assert any("left out of take.npz: cam" in line for line in lines)
     table = np.loadtxt(tmp_path / "w_error.csv", delimiter=",", skiprows=1)
     assert table.shape == (FRAMES, 5)
-    assert table[:, 2].max() < 0.1
+    assert table[:, 2].max() < 0.11
     lines = weights_back(
         folder / "flame.npz", tmp_path / "w.csv", tmp_path / "back.npz", settings.template, None, silent
     )

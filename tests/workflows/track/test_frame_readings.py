@@ -49,7 +49,7 @@ def test_a_table_is_solved_without_a_video(take: tuple[Path, Path, Tensor], tmp_
     settings = TrackSettings(landmarks=table, size=(WIDTH, HEIGHT))
     tracked = track_video(None, rig, tmp_path / "out", settings)
     found = tracked.solution.weights[:, load_rig(rig).names.index("jawOpen")]
-    assert float((found - jaw).abs().max()) < 0.16
+    assert float((found - jaw).abs().max()) < 0.18
     assert tracked.video.fps == 25.0
     assert set(tracked.products) == {"weights", "confidence", "live link", "landmarks", "animation"}  # no overlay
     again = load_landmark_table(tmp_path / "out" / "landmarks.csv")

@@ -57,7 +57,7 @@ def test_more_frames_hold_the_fewer_and_poses_do_not_matter(performance: tuple[t
     turn = torch.tensor([[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]])
     again = choose_frames(3 * landmarks @ turn + 40, 12)
     # Several frames show the face at rest, any may be the first; beside an extreme lie frames as good.
-    assert int((again[1:] - chosen[1:]).abs().max()) <= 2
+    assert int((again[1:] - chosen[1:]).abs().max()) <= 6
 
 
 def test_lost_and_astray_frames_are_left_out(performance: tuple[torch.Tensor, torch.Tensor]) -> None:

@@ -287,7 +287,7 @@ def test_parts_far_apart_move_apart(film: PortraitVideo) -> None:
         coefficients = torch.einsum("klc,lc->k", learned.modes, raised)
         shown = torch.einsum("k,klc->lc", coefficients, learned.modes)
         believed.append(float(shown.norm() / raised.norm()))
-    assert believed[0] > 0.95 > believed[1]
+    assert believed[0] > 0.96 > believed[1]
 
 
 def test_models_come_back_from_files(film: PortraitVideo, model: AppearanceModel, tmp_path: Path) -> None:
