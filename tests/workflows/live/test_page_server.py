@@ -121,6 +121,7 @@ def test_the_pages_socket_gives_frames_pictures_and_state_and_takes_wishes(serve
             messages["state" if isinstance(message, str) else int(np.frombuffer(message, "<u4", 1)[0])] = message
         until(lambda: len(desk.messages) == 2, 10)
         server.stop()
+        assert not [one for one in threading.enumerate() if one.name == "torchface-sender"]  # all is said by now
         words = [json.loads(message) for message in socket if isinstance(message, str)]
     until(lambda: desk.closed, 10)
     assert desk.messages == [{"record": True}, {"reset": True}]  # whose refusal ends nothing

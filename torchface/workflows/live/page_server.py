@@ -128,6 +128,7 @@ class PageServer:
         self._token = secrets.token_urlsafe(12)
         self._keeping = threading.Lock()  # no take comes to a desk that has just been left
         self._stopped = threading.Event()
+        self._senders = set[threading.Thread]()
         logger = logging.getLogger(__name__)
         logger.setLevel(logging.CRITICAL + 1)  # browsers that hang up are no news
         self._server = serve(
@@ -170,7 +171,9 @@ class PageServer:
             return
         self._stopped.set()
         self._server.shutdown()
-        self._thread.join(2)
+        self._thread.join(_PATIENCE)
+        for sender in tuple(self._senders):  # the program may end right after, and its threads with it
+            sender.join(_PATIENCE)
 
     def _answer(self, connection: ServerConnection, request: Request) -> Response | None:
         hosts, origins = request.headers.get_all("Host"), request.headers.get_all("Origin")
@@ -202,7 +205,8 @@ class PageServer:
 
     def _talk(self, connection: ServerConnection) -> None:
         private = connection.request is not None and without_token(connection.request.path, self._token) is not None
-        sender = threading.Thread(target=self._send, args=(connection, private), daemon=True)
+        sender = threading.Thread(target=self._send, args=(connection, private), name="torchface-sender", daemon=True)
+        self._senders.add(sender)
         sender.start()
         upload: TakeUpload | None = None
         try:
@@ -214,6 +218,7 @@ class PageServer:
         if private:
             self._desk.left()
         sender.join(2 * _WAIT)
+        self._senders.discard(sender)
 
     def _take(self, message: str | bytes, upload: TakeUpload | None) -> TakeUpload | None:
         """Does what a message asks for; the take that a page is still handing over."""
