@@ -44,13 +44,13 @@ class Settings(RenderedSettings):
 def train(settings: Settings, run: Run) -> PartNetwork:
     """Renders, trains, evaluates and saves."""
     settings.check_count(PART)
+    first = None if settings.start is None else zoo.get_model(settings.start, PartNetwork)
     files = part_picture_files(
         settings.folder, settings.pictures, settings.seed, settings.ict, settings.workers, run.progress
     )
     people = EACH * SCENES
     held_out = people * -(-settings.held_out // people)  # whole people
     learned = StoredPartPictures(files, held_out)
-    first = None if settings.start is None else zoo.get_model(settings.start, PartNetwork)
     model = PartNetwork.fit(learned, first, settings.network, run.progress, run.checkpoint, run.device, run.log)
     save(model, settings, overlaps(model, StoredPartPictures(files, 0, held_out)))
     return model

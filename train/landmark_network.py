@@ -71,13 +71,12 @@ def train(settings: Settings, run: Run) -> LandmarkNetwork:
     if settings.data is not None:
         return fine_tuned(settings, settings.data, run)
     settings.check_count(PART)
+    first = first_network(settings)
     files = picture_files(settings.folder, settings.pictures, settings.seed, settings.ict, settings.workers, progress)
     pictures = StoredExpressions(files)
     count = EACH * ((len(pictures) - settings.held_out) // EACH)  # whole people
     learned = StoredExpressions(files, count)
-    model = LandmarkNetwork.fit(
-        learned, first_network(settings), settings.network, progress, run.checkpoint, run.device, run.log
-    )
+    model = LandmarkNetwork.fit(learned, first, settings.network, progress, run.checkpoint, run.device, run.log)
     middle = EACH * ((count + len(pictures)) // (2 * EACH))
     calibrate(model, held_out(model, pictures, count, middle))
     save(model, settings, measures(held_out(model, pictures, middle, len(pictures))))

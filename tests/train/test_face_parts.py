@@ -53,3 +53,9 @@ def test_what_is_saved_is_what_was_learned(
 def test_too_few_pictures_are_refused(tmp_path: Path) -> None:
     with pytest.raises(TorchfaceError, match="pictures: found 300"):
         train(Settings(out=tmp_path / "parts", pictures=300))
+
+
+def test_a_model_of_another_kind_is_refused_before_pictures_are_drawn(tmp_path: Path) -> None:
+    with pytest.raises(TorchfaceError, match="a HeadModel, expected a PartNetwork"):
+        train(Settings(out=tmp_path / "out", folder=tmp_path / "pictures", start="head"))
+    assert not (tmp_path / "pictures").exists()
