@@ -21,8 +21,9 @@ FORGOTTEN = 1.0  # seconds after which anybody is taken for one who is hidden
 _LIKELY = 0.4  # score of a box that shows somebody else
 _COAST = {0: 0.1, 1: 0.5}  # seconds for which the followed one, and the other, are expected to move on unseen
 _SPEED, _GROWTH, _LEARNING = 0.1, 0.3, 0.5  # seconds in which speed, side and look are learned
-_BESIDE, _REACH = 0.5, 1.0  # sides: nearer is the same face; farther the other cannot have moved between two pictures
-_NEAR = 2.5  # sides within which the other may be in the way in the next moment
+_BESIDE = 0.5  # sides: what is nearer is the same face
+_REACH, _QUICK = 0.5, 6.0  # sides, and sides a second: farther the other cannot have moved from where it is expected
+_NEAR = 3.0  # sides within which the other may be in the way in the next moment
 _COUNTING = 0.2  # of a new count of people that is taken up at once
 _LASTING = 0.6  # seconds for which it is known where the other is
 _ALIKE, _UNLIKE = 0.8, 1.5  # correlation of looks from which a face counts as the same, and what lacks counts in sides
@@ -68,7 +69,7 @@ def after_boxes(identity: Tensor, faces: Tensor, searched: Tensor, interval: Ten
     apart = _apart(own, faces[:, :2])
     # Who appears where the followed one is no more may be that one, elsewhere.
     new = (apart > _BESIDE) & (likely & (apart <= _BESIDE)).any()
-    its = (known & (from_other < from_own) & (from_other < _REACH) | ~known & new) & likely
+    its = (known & (from_other < from_own) & (from_other < _REACH + _QUICK * other[5]) | ~known & new) & likely
     row = torch.where(its, torch.where(known, from_other, apart), torch.inf).argmin()[None]
     moved = _moved(torch.where(known, other, 0.0), faces[row][0, :3], interval)
     other = torch.where(its.any(), moved, torch.where(known, other, 0.0))
