@@ -1,5 +1,6 @@
 """Regions are what moves together, named by place, with Gaussian borders."""
 
+import numpy as np
 import pytest
 import torch
 
@@ -69,3 +70,12 @@ def test_a_face_that_does_not_move_has_no_regions(database):
     patches, motion = _motion_of_patches(database.smooth[:3], database)
     with pytest.raises(ValueRangeError, match=r"0 of \d+ patches that move"):
         regions_of_motion(torch.zeros_like(motion), patches, database.neutral, database.faces, 4)
+
+
+def test_a_cluster_that_no_triangle_is_left_of_is_no_region(database, monkeypatch: pytest.MonkeyPatch) -> None:
+    patches, motion = _motion_of_patches(database.smooth - database.neutral, database)
+    one = np.zeros(int(patches.max()) + 1, np.int64)
+    monkeypatch.setattr("torchface.enhancement.matching.face_regions.motion_clusters", lambda *_: one)
+    regions = regions_of_motion(motion, patches, database.neutral, database.faces, 4, database.landmarks)
+    assert regions.names == ("mouth", "eye_right", "eye_left")
+    assert bool((regions.weights.float().amax(1) == 1).all())

@@ -82,7 +82,7 @@ def regions_of_motion(
         landmarks: vertex ids of the 68 iBUG landmarks.
 
     Returns:
-        The regions; each is connected but for parts of the mesh that hang on nothing.
+        The regions, ``count`` at most; each is connected but for parts of the mesh that hang on nothing.
 
     Source: Tena, De la Torre, Matthews 2011; Facial Performance Enhancement Using Dynamic Shape Space Analysis,
     section 4.3.
@@ -113,8 +113,11 @@ def regions_of_motion(
     labels = torch.from_numpy(clusters)[patches]
     for number, mask in enumerate(eyes.values(), start=count - len(eyes)):
         labels[mask] = number
-    labels = _connected(labels, links, middles)
-    names, voluntary = named_regions(labels, count, neutral, faces, landmarks, tuple(eyes))
+    # A few short motions have fewer clusters than are asked for.
+    present, labels = _connected(labels, links, middles).unique(return_inverse=True)
+    eyes_present = [name for number, name in enumerate(eyes, start=count - len(eyes)) if number in present]
+    count = len(present)
+    names, voluntary = named_regions(labels, count, neutral, faces, landmarks, tuple(eyes_present))
     return Regions(names, soft_weights(labels, count, neutral, faces, SIGMA), voluntary)
 
 
