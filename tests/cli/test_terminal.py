@@ -210,6 +210,7 @@ def motion_figure(name: str) -> Figure:
         ("solve", "--sparsity", "nan"),
         ("solve", "--ridge", "-1"),
         ("solve", "--stream", "udp://a..b:1"),
+        ("enhance", "--model", "head", "--detail", "nan"),
         ("render", "--height", "0"),
         ("render", "--height", "1000000000"),
         ("render", "--height", "20", "--yaw", "nan"),

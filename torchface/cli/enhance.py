@@ -82,7 +82,7 @@ def enhance(
         height: Of each view of a face in the report, pixels.
     """
     from torchface.files.job_lock import job_lock
-    from torchface.number_checks import checked_count
+    from torchface.number_checks import checked_count, checked_number
     from torchface.viz.figures.face_views import PICTURE_HEIGHTS
     from torchface.workflows.batch.batch_items import is_batch
     from torchface.workflows.enhance.animation_job import ANIMATIONS, AnimationJob
@@ -94,6 +94,8 @@ def enhance(
     checked_count("--height", height, *PICTURE_HEIGHTS)
     given = InputSettings(rig, attachment, pairs, part, neutral, fps, MarkerOptions(unit, labels, None, flip))
     checked_count("--texture-size", texture_size, 16, 8192)
+    checked_number("--detail", detail, most=1000.0)
+    checked_number("--glb-megabytes", glb_megabytes, above=True)
     settings = EnhanceSettings(
         given, meshes, not no_glb, glb_megabytes, detail, not no_video, retime, textures, texture_size
     )
