@@ -19,7 +19,7 @@ IRIS_WIDTH = 11.7
 """Of people's irises, millimetres."""
 
 _MIN_DIAMETER = 14.0  # across an eyeball; of smaller ones a photograph shows no iris
-_SHARE = (0.15, 0.40)
+_SHARE = (0.35, 0.60)
 """Of the eyeball between the lids, the darkest first: lashes and pupil, then the iris, then white and highlights."""
 
 _MIN_PIXELS = 40

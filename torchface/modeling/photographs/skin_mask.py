@@ -13,10 +13,10 @@ from torchface.modeling.photographs.landmark_view import JAW, LANDMARKS
 
 _FEATURES = ("brows", "eyes", "lips", "teeth")
 _NOSE = -0.45
-_NEAR_FEATURES, _SURELY_SKIN = 0.10, 0.75
+_NEAR_FEATURES, _SURELY_SKIN = 0.12, 0.75
 _NECK, _BEHIND = (0.05, 0.35), (0.05, 0.30)
 _FOREHEAD = 0.15
-_BROW, _FRINGE = 0.11, (0.16, 0.30)
+_BROW, _FRINGE = 0.13, (0.16, 0.30)
 """In distances between the eyes' outer corners, but for the second row: shares of the way to the face's outline."""
 
 _SHADOW = 5  # pixels of the network's crop across which hair darkens skin
