@@ -9,6 +9,7 @@ from torch import Tensor
 from torchface.synthetic.head.handle_weights import LIP_HANDLES, HandleWeights, handle_weights
 from torchface.synthetic.head.identity import Anatomy, bump, mirrored, ramp, sculpted_vertices
 from torchface.synthetic.head.topology import MOUTH_CONTACT, topology
+from torchface.synthetic.head.upper_face_shapes import free_skin
 
 JAW_ANGLE = math.radians(19.0)
 _HANDLE = torch.arange(LIP_HANDLES)
@@ -204,7 +205,7 @@ class Mouth:
 
     def push(self, centre: tuple[float, float, float], width: tuple[float, float, float], way: Tensor) -> Tensor:
         """Left skin near a point of the sculpture moved along ``way`` (3,), as far as it does not follow the lips."""
-        free = (1 - self.weights.lips.sum(1)).clamp(0, 1) * ~_inside()
+        free = (1 - self.weights.lips.sum(1)).clamp(0, 1) * free_skin(self.head)
         amount = (bump(self.mean, centre, width) - 0.02).clamp(min=0) * ramp(self.mean[:, 0], -6, 10) * free
         return amount[:, None] * way * self.size
 
@@ -212,14 +213,6 @@ class Mouth:
 def _between(places: Lips) -> Tensor:
     """Displacements of the handles of one half, (27,3)."""
     return torch.from_numpy(PchipInterpolator(_PLACES, torch.tensor(places).double().numpy())(range(27)))
-
-
-def _inside() -> Tensor:
-    t = topology()
-    mask = torch.zeros(t.count, dtype=torch.bool)
-    mask[t.caps["mouth"]] = True
-    mask[t.mirror[t.caps["mouth"]]] = True
-    return mask
 
 
 def lower_face(head: Anatomy) -> dict[str, Tensor]:

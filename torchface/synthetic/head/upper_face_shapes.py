@@ -121,7 +121,7 @@ def _rotated_eye(head: Anatomy, pitch: float, yaw: float) -> Tensor:
     return delta
 
 
-def _skin(head: Anatomy) -> Tensor:
+def free_skin(head: Anatomy) -> Tensor:
     """1 where brow and cheek motion may go: not on lid edges, eyeballs, sockets or inside the mouth, (V,)."""
     t = topology()
     free = torch.ones(len(head.vertices), dtype=torch.float64)
@@ -147,7 +147,7 @@ def _push(
     p = sculpted_vertices()
     left = ramp(p[:, 0], -9, 9) if one_side else torch.ones(len(p), dtype=p.dtype)
     amount = bump(p, centre, width)
-    amount = torch.where(amount > 0.02, amount - 0.02, 0.0) * left * _skin(head)
+    amount = torch.where(amount > 0.02, amount - 0.02, 0.0) * left * free_skin(head)
     direction = torch.tensor(way, dtype=p.dtype) * torch.stack(
         [torch.tanh(p[:, 0] / 5), torch.ones(len(p)), torch.ones(len(p))], dim=1
     )
