@@ -18,8 +18,9 @@ from torchface.errors import ShapeError
 from torchface.io.rigs.ict_facekit import IdentityModes
 from torchface.rig import BlendshapeRig
 from torchface.shape_names import ARKIT, mapping
+from torchface.synthetic.head.drawn_identities import draw_identities
 from torchface.synthetic.head.head_annotations import head_annotations
-from torchface.synthetic.head.identity import IDENTITY, draw_identities, sculpted_vertices
+from torchface.synthetic.head.identity import IDENTITY, sculpted_vertices
 from torchface.synthetic.head.performer import SHAPES, performer
 from torchface.synthetic.head.skin_texture import vertex_marks
 from torchface.workflows.surface_sites import SHARED, alike_vertices, bent_onto, jaw_and_lids
