@@ -24,8 +24,8 @@ Lips = tuple[tuple[float, float, float], ...]
 _PLACES = (0, 6, 10, 13, 16, 20, 26)
 _STILL: Lips = ((0, 0, 0),) * 7
 _LEFT_LIPS: dict[str, Lips] = {
-    "mouthSmileLeft": ((0, 1.5, -0.5), (4.2, 3.8, -2.4), (7, 8, -6.4), (6.8, 10, -7.8),
-                       (5.5, 8.5, -5.4), (3.2, 4.6, -1.0), (0, 0.8, 0.9)),
+    "mouthSmileLeft": ((0, 0.9, -0.5), (4.2, 3.8, -2.4), (7, 8, -6.4), (6.8, 10, -7.8),
+                       (5.5, 8.5, -5.4), (3.2, 4.6, -1.0), (0, 0.9, 0.9)),
     "mouthFrownLeft": ((0, -0.7, -0.4), (1, -2.4, -1.8), (1.5, -4, -2.3), (1.4, -4.8, -2),
                        (1.2, -3.8, -1.2), (0.6, -1.2, -0.3), (0, 0, 0)),
     "mouthDimpleLeft": ((0, 0.1, 0), (1.7, -0.2, -1.2), (2.8, 1.1, -4.4), (2.4, 3, -5.8),
@@ -226,7 +226,7 @@ def lower_face(head: Anatomy) -> dict[str, Tensor]:
     made |= {
         "jawOpen": opened,
         "jawForward": m.jaw(translation=(0, -0.6, 7.2)),
-        "jawLeft": m.jaw(translation=(2.5, -0.4, 0.0), yaw=math.radians(4.5)),
+        "jawLeft": m.jaw(translation=(2.5, 0.0, 0.0), yaw=math.radians(4.5)),
         "mouthClose": _close(m, opened),
         "mouthLeft": m.lips(*_MOUTH_LEFT),
     }
