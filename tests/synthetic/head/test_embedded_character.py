@@ -72,17 +72,17 @@ def test_lower_teeth_go_rigidly_with_the_jaw_and_upper_ones_stay(shown) -> None:
     assert (opened[lower][front, 1] < rig.vertices[lower][front, 1] - 20).all()
 
 
-@pytest.mark.parametrize("person", [None, 0, 1])
+@pytest.mark.parametrize("person", [None, 1, 4])
 def test_no_part_comes_through_the_skin_in_any_shape_or_common_pair(shown, person) -> None:
     rig = shown.rig
     if person is not None:
-        drawn = draw_identities(2, torch.Generator().manual_seed(8), scale=0.7)[person]
+        drawn = draw_identities(10, torch.Generator().manual_seed(5))[person]
         rig = character(performer(drawn, texture=False), size=128).rig
     parts = inner_parts(rig)
     poses = [(name,) for name in rig.names if name not in ("tongueOut", "mouthClose")]
     for names in [(), *(poses if person is None else ()), *_PAIRS]:
         depth = parts.depth(rig(weights(rig, *names))[0].double())
-        assert depth.max() < 0.35, names
+        assert depth.max() < 0.15, names
 
 
 def test_tongue_comes_out_between_the_teeth_and_over_the_lip(shown) -> None:

@@ -26,7 +26,7 @@ from torchface.synthetic.head.uv_layout import unwrapping
 _OPEN_FOR_TONGUE = 0.33  # of jawOpen, without which the tongue would go through the teeth
 _WITH_THE_JAW = ("teeth_lower", "gums_lower", "tongue")
 _STILL = 0.01  # millimetres
-_FRONT, _BESIDE, _COVER = 15.0, 6, 2.0  # millimetres to a side, vertices, millimetres of flesh before gums
+_FRONT, _BESIDE, _COVER = 15.0, 6, 2.5  # millimetres to a side, vertices, millimetres of flesh before gums
 _CAP = {"short": 0.6, "long": 0.18, "tied": 0.2}
 
 
