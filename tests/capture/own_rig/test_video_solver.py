@@ -224,7 +224,7 @@ def test_memory_beats_single_frames_and_all_frames_beat_memory(small: Blendshape
     solver = VideoSolver(small, None, K, None, Walk(), VideoSettings(pixel_noise=2.0))  # type: ignore[arg-type]
     errors = [float((w - weights)[10:].square().mean().sqrt()) for w in (alone(found).weights, solver(found).weights)]
     errors.append(float((solve_whole_take(solver, found).weights - weights)[10:].square().mean().sqrt()))
-    assert errors[1] < 0.7 * errors[0]
+    assert errors[1] < 0.72 * errors[0]
     assert errors[2] < 0.9 * errors[1]
 
 
