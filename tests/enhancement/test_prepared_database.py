@@ -47,7 +47,6 @@ def test_lids_of_a_smoothed_input_are_those_found(model, database, blink, monkey
     smoothed = model.low(blink)
     found = model(smoothed)
     monkeypatch.setattr(InputLids, "__call__", lambda self, enhanced, low, own: enhanced)
-    print((found - model(smoothed)).norm(dim=-1).amax(1))
     assert torch.equal(found, model(smoothed))
 
 
@@ -88,6 +87,6 @@ def test_lids_that_hardly_move_stay_those_of_the_input(model, database, monkeypa
 
     found, smoothed = moved(), model(model.low(shown))
     monkeypatch.setattr(InputLids, "_unsmoothed", lambda self, found, shown: found.new_zeros(len(found)))
-    assert found < 0.15
     assert moved() > 0.3
+    assert found < 0.4 * moved()
     assert torch.equal(model(model.low(shown)), smoothed)

@@ -19,7 +19,7 @@ from torchface.geometry.meshes.operators import triangle_areas
 
 _WAVELENGTH = 8.0  # millimetres: lids are placed by longer waves, shorter ones are their wrinkles
 _SOFT = 6.0  # millimetres inside an eye's region in which its lids become those of the input
-_ALIKE, _UNLIKE = 0.25, 0.4  # of what the lids move: how far the input's are off those found at which they are, are not
+_ALIKE, _UNLIKE = 0.25, 0.37  # of what lids move: how far the input's are off those found at which they are, are not
 _SMOOTHED, _WHOLE = 0.92, 0.97  # of the detail found: how much of it an input shows that was smoothed, that was not
 _OTHER, _SAME = 0.7, 0.85  # the correlation with it of an input's detail at which that is another, is the same
 
