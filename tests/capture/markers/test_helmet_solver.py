@@ -35,7 +35,7 @@ def check_errors(performance: Performance, every: int = 3) -> None:
     alone = MarkerSolver(rig, attachment)
     least = error(alone(markers(steady)))
     assert error(alone(markers(slipping))) > 5 * least
-    for exact, most in ((False, 1.2), (True, 1.06)):
+    for exact, most in ((False, 1.25), (True, 1.06)):
         solver = HelmetSolver(rig, attachment, exact=exact)
         weights, motion = solver(markers(slipping))
         assert error(weights) <= most * least
