@@ -151,6 +151,7 @@ export class TakeList {
       if (kept.frames.length === 0) throw new Error("No frame lies between these two times.");
       this.#playing?.stop();
       await this.#takes.keep(`${name}, part`, kept);
+      part.remove();
     }, "Kept"));
     part.append(keep);
     row.append(part);

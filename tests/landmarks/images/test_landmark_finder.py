@@ -105,7 +105,8 @@ class Stage:
         return FaceReading(self.face + near, 0.01 * box[2] * torch.ones(68), torch.ones(68), there)
 
     def detect(self, image: Tensor) -> FaceBoxes:
-        boxes = torch.stack([box_around(self.face + place) for place in self.seen()])
+        smaller = image.shape[-1] / 400  # the copy that a detector is shown
+        boxes = smaller * torch.stack([box_around(self.face + place) for place in self.seen()])
         return FaceBoxes(boxes, torch.ones(len(boxes)))
 
 

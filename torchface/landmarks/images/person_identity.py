@@ -90,6 +90,7 @@ def is_other(identity: Tensor, place: Tensor, look: Tensor, interval: Tensor) ->
     from_own, from_other = _distance(own, place, 0) + unlike, _distance(other, place, 1)
     hidden = own[5] > 1.5 * interval
     nearer = from_other < from_own * torch.where(hidden, _CLEARLY, 1.0)
+    nearer = nearer & ((other[5] > 0.5 * interval) | (from_other < _BESIDE))  # else the other is seen beside this face
     return _is_known(identity) & nearer & (from_own > torch.where(hidden, 0.0, _SURE)) & (own[5] < FORGOTTEN)
 
 
