@@ -15,7 +15,7 @@ LOOK_SIZE, LOOK_MARGIN = 8, 1.1  # pixels a side of a look, and its side in side
 IDENTITY = 2 * _MOTION + 2 + 3 * LOOK_SIZE * LOOK_SIZE
 """Numbers that are known of two people."""
 CANDIDATES = 4
-"""Faces of a picture that are told apart."""
+"""Faces of a picture that are distinguished."""
 
 FORGOTTEN = 1.0  # seconds after which anybody is taken for one who is hidden
 _LIKELY = 0.4  # score of a box that shows somebody else

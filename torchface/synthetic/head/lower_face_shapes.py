@@ -56,9 +56,9 @@ _WHOLE_LIPS: dict[str, Lips] = {
 }  # fmt: skip
 _MOUTH_LEFT: tuple[Lips, Lips] = (
     ((11.5, 0.6, -2.2), (8.5, 2.8, -4.8), (6.8, 5.3, -5.3), (5.8, 7, -4.4), (7, 4.8, -4.6), (9.5, 2.4, -4.6),
-    (12, 0.5, -3.2)),
+     (12, 0.5, -3.2)),
     ((11.5, 0.6, -2.2), (12.5, -0.8, 2.2), (11.2, -0.6, 4.4), (10.5, -0.4, 6.3), (11.7, -0.4, 4),
-    (13.2, -0.6, 1.6), (12, 0.5, -3.2)),
+     (13.2, -0.6, 1.6), (12, 0.5, -3.2)),
 )  # fmt: skip
 
 # A lip rolled in over the teeth: for each ring the motion up and forward, millimetres.
@@ -88,50 +88,42 @@ _BEYOND = 3.0  # handles from the midline to where the other half hardly follows
 
 # What skin does beyond following the lips: about a point of the sculpture, how far that reaches, along which way.
 Push = tuple[tuple[float, float, float], tuple[float, float, float], tuple[float, float, float]]
-_WING, _UNDER_WING, _PHILTRUM = ((15, -38, 93), (7, 7, 14)), ((14, -50, 89), (9, 7, 14)), ((0, -52, 95), (10, 6, 14))
-_FOLD_HIGH, _FOLD_LOW = ((24, -38, 80), (9, 9, 16)), ((31, -52, 74), (10, 10, 18))  # from the wing to the corner
-_CHEEK, _LOW_CHEEK, _CHEEKBONE = (
-    ((38, -24, 68), (14, 11, 20)),
-    ((44, -54, 56), (13, 13, 22)),
-    ((55, -30, 42), (12, 14, 20)),
-)
-_BESIDE, _UNDER_CORNER, _JAW = (
-    ((40, -68, 60), (11, 12, 20)),
-    ((27, -80, 72), (10, 10, 18)),
-    ((42, -90, 42), (14, 14, 22)),
-)
+_ALA, _UNDER_ALA, _PHILTRUM = ((15, -38, 93), (7, 7, 14)), ((14, -50, 89), (9, 7, 14)), ((0, -52, 95), (10, 6, 14))
+# The fold from the ala of the nose to the corner of the mouth.
+_FOLD_HIGH, _FOLD_LOW = ((24, -38, 80), (9, 9, 16)), ((31, -52, 74), (10, 10, 18))
+_CHEEK, _LOW_CHEEK = ((38, -24, 68), (14, 11, 20)), ((44, -54, 56), (13, 13, 22))
+_CHEEKBONE, _JAW = ((55, -30, 42), (12, 14, 20)), ((42, -90, 42), (14, 14, 22))
+_BESIDE, _UNDER_CORNER = ((40, -68, 60), (11, 12, 20)), ((27, -80, 72), (10, 10, 18))
 _CHIN, _CHIN_SIDE, _HOLLOW = ((0, -97, 88), (13, 9, 16)), ((16, -88, 82), (9, 9, 16)), ((0, -83, 85), (12, 6, 16))
 _SKIN: dict[str, tuple[Push, ...]] = {
     "mouthSmileLeft": ((*_CHEEK, (1.5, 2.5, 2)), (*_LOW_CHEEK, (6, 3, 7.5)), (*_CHEEKBONE, (1.5, 2.5, 1.5)),
-                       (*_UNDER_CORNER, (0, 5, 1.5)), (*_JAW, (0, 0.5, 2.5)), (*_UNDER_WING, (2, 1, -1.5)),
+                       (*_UNDER_CORNER, (0, 5, 1.5)), (*_JAW, (0, 0.5, 2.5)), (*_UNDER_ALA, (2, 1, -1.5)),
                        (*_HOLLOW, (0, -1, 4))),
-    "mouthFrownLeft": ((*_UNDER_WING, (1.2, -2, -1.5)), (*_UNDER_CORNER, (0.5, -1, 3)), (*_CHIN_SIDE, (0, 1.5, 2.5)),
+    "mouthFrownLeft": ((*_UNDER_ALA, (1.2, -2, -1.5)), (*_UNDER_CORNER, (0.5, -1, 3)), (*_CHIN_SIDE, (0, 1.5, 2.5)),
                        (*_BESIDE, (1, -1, 1))),
     "mouthDimpleLeft": ((*_FOLD_LOW, (0, 0, 6)), (*_LOW_CHEEK, (3, 1.5, 4.5)), (*_UNDER_CORNER, (0, 6, 2.5)),
                         (*_CHIN_SIDE, (1.5, 3.5, 2))),
     "mouthStretchLeft": ((*_FOLD_LOW, (-1, 0, 2.5)), (*_BESIDE, (2.5, 0, -1.5)), (*_UNDER_CORNER, (3, 0, -1.5)),
                          (*_JAW, (2.5, -1, -2))),
-    "mouthUpperUpLeft": ((*_WING, (0.5, 1.5, 0)), (*_UNDER_WING, (1, 3.5, -2)), (*_FOLD_HIGH, (1.5, 3.5, 1.5)),
+    "mouthUpperUpLeft": ((*_ALA, (0.5, 1.5, 0)), (*_UNDER_ALA, (1, 3.5, -2)), (*_FOLD_HIGH, (1.5, 3.5, 1.5)),
                          (*_FOLD_LOW, (0.5, 4, 0)), (*_CHEEK, (0, 2, 1)), (*_LOW_CHEEK, (0, 1.5, 2))),
     "mouthLowerDownLeft": ((*_UNDER_CORNER, (2, 2, -1)), (*_CHIN, (0, -2.5, -2))),
     "mouthPressLeft": ((*_UNDER_CORNER, (1, 6, 3)), (*_CHIN_SIDE, (1.5, 6, 3)), (*_CHIN, (0, 6, 3)),
                        (*_LOW_CHEEK, (2, 3, 1.5)), (*_FOLD_LOW, (2, 1.5, 2.5))),
-    "mouthFunnel": ((*_UNDER_WING, (-1.5, 0, 3)), (*_FOLD_HIGH, (-0.5, 0, 2.5)), (*_LOW_CHEEK, (-1, 3, 2)),
+    "mouthFunnel": ((*_UNDER_ALA, (-1.5, 0, 3)), (*_FOLD_HIGH, (-0.5, 0, 2.5)), (*_LOW_CHEEK, (-1, 3, 2)),
                     (*_UNDER_CORNER, (0.5, 7, 3)), (*_JAW, (0, 2, 4)), (*_HOLLOW, (0, 3, -5))),
-    "mouthPucker": ((*_UNDER_WING, (-1.5, 0, 2.5)), (*_FOLD_HIGH, (-1, 0.5, 2)), (*_UNDER_CORNER, (0, 3, 0)),
+    "mouthPucker": ((*_UNDER_ALA, (-1.5, 0, 2.5)), (*_FOLD_HIGH, (-1, 0.5, 2)), (*_UNDER_CORNER, (0, 3, 0)),
                     (*_HOLLOW, (0, 2, -4))),
     "mouthRollLower": ((*_CHIN_SIDE, (-3, 6, 7)), (*_CHIN, (0, 3.5, 2)), (*_HOLLOW, (0, 6, 4))),
-    "mouthRollUpper": ((*_UNDER_WING, (0, -4.5, -0.5)), (*_PHILTRUM, (0, -4.5, -1))),
+    "mouthRollUpper": ((*_UNDER_ALA, (0, -4.5, -0.5)), (*_PHILTRUM, (0, -4.5, -1))),
     "mouthShrugLower": ((*_UNDER_CORNER, (-1.5, 2.5, 1)), (*_CHIN_SIDE, (-3, 5, 0)), (*_CHIN, (0, 6, 1.2)),
                         (*_HOLLOW, (0, 3, 0))),
-    "mouthLeft": ((*_WING, (2.5, 1.5, -1.5)), (*_FOLD_LOW, (0, 3, 3.5)), (*_LOW_CHEEK, (3, 3, 4.5)),
-                  (*_PHILTRUM, (8, 2, -1)),
-                  (*_UNDER_CORNER, (0, 2.5, -2))),
-    "cheekPuff": ((*_UNDER_WING, (-1, 0, 4.5)), (*_FOLD_HIGH, (0, 1, 2)), (*_FOLD_LOW, (2.5, 4, 5.5)),
-                  (*_CHEEK, (0, 2, 0.5)),
-                  (*_LOW_CHEEK, (4.5, 2.5, 4.5)), (*_BESIDE, (4, 0.5, 4)), (*_UNDER_CORNER, (2, 0, 4)),
-                  (*_JAW, (0, 1.5, 2.5)),
-                  (*_PHILTRUM, (0, 0.5, 3)), (*_HOLLOW, (0, 0, -3))),
+    "mouthLeft": ((*_ALA, (2.5, 1.5, -1.5)), (*_FOLD_LOW, (0, 3, 3.5)), (*_LOW_CHEEK, (3, 3, 4.5)),
+                  (*_PHILTRUM, (8, 2, -1)), (*_UNDER_CORNER, (0, 2.5, -2))),
+    "cheekPuff": ((*_UNDER_ALA, (-1, 0, 4.5)), (*_FOLD_HIGH, (0, 1, 2)), (*_FOLD_LOW, (2.5, 4, 5.5)),
+                  (*_CHEEK, (0, 2, 0.5)), (*_LOW_CHEEK, (4.5, 2.5, 4.5)), (*_BESIDE, (4, 0.5, 4)),
+                  (*_UNDER_CORNER, (2, 0, 4)), (*_JAW, (0, 1.5, 2.5)), (*_PHILTRUM, (0, 0.5, 3)),
+                  (*_HOLLOW, (0, 0, -3))),
 }  # fmt: skip
 
 
