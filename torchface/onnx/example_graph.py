@@ -16,8 +16,8 @@ from torchface.capture.energy import Quadratic
 from torchface.onnx.exported_model import exported_model
 from torchface.optim.fixed_splitting import FixedSplitting, newton_inverse
 
-STEPS, REGIONAL_STEPS = 96, 168
-"""Of splitting; every frame has a matrix of its own, and a region's few landmarks make a worse one."""
+STEPS = 168
+"""Of splitting; every frame has a matrix of its own, and few landmarks or shapes nearly alike make a bad one."""
 
 _RHO, _DOUBLINGS = 1e-7, 28  # of the inverse for a landmark model's coefficients, of a matrix with a unit diagonal
 
@@ -41,7 +41,7 @@ class ExampleGraph(nn.Module):
 
     def __init__(self, solver: ExampleSolver, steps: int | None = None) -> None:
         super().__init__()
-        steps = steps_of(solver) if steps is None else steps
+        steps = STEPS if steps is None else steps
         self.placement, self.regions, method = solver.placement, solver.regions, solver.method
         self.register_buffer("neutral", solver.neutral.detach().double().cpu())
         self.register_buffer("basis", solver.basis.detach().double().cpu())
@@ -84,10 +84,6 @@ class ExampleGraph(nn.Module):
         return (2 / (68 * eyes**2)) * (model.components.flatten(0, 1).T @ self.basis.flatten(0, 1))
 
 
-def steps_of(solver: ExampleSolver) -> int:
-    return REGIONAL_STEPS if isinstance(solver.method, Regional) else STEPS
-
-
 def example_model(
     solver: ExampleSolver, steps: int | None = None, facts: Mapping[str, object] | None = None
 ) -> onnx.ModelProto:
@@ -98,7 +94,7 @@ def example_model(
         "units": "pixels",
         "method": type(solver.method).__name__,
         "placement": type(solver.placement).__name__,
-        "steps": steps_of(solver) if steps is None else steps,
+        "steps": STEPS if steps is None else steps,
         **(facts or {}),
     }
     inputs = {
