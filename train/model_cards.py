@@ -10,7 +10,7 @@ from torchface import zoo
 
 from .recipe_settings import RecipeSettings, recipe_name
 
-_NOT_TOLD = ("out", "device", "resume", "seed")  # what does not change the model, or is stated in its place
+_NOT_TOLD = ("out", "device", "resume", "seed", "quiet")  # what does not change the model, or is stated in its place
 
 
 def model_card(
@@ -23,7 +23,7 @@ def model_card(
         metrics: what was measured on data held out.
         text: what the model is good for, measured how, its limits.
     """
-    effective = {name: value for name, value in asdict(settings).items() if name not in ("device", "resume")}
+    effective = {name: value for name, value in asdict(settings).items() if name not in ("device", "resume", "quiet")}
     return zoo.ModelCard(
         settings.licence or licence, data, metrics, command(settings), text, settings=_named(effective)
     )

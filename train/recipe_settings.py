@@ -8,6 +8,7 @@ from typing import Any, ClassVar
 
 import torch
 
+from torchface.cli.terminal import Quiet
 from torchface.errors import ValueRangeError
 from torchface.number_checks import LARGEST_SEED, checked_count, checked_number
 
@@ -27,6 +28,7 @@ class RecipeSettings:
             and there is one.
         resume: Go on where a run that was killed has stopped; --no-resume starts anew.
         licence: Under which the model may be used; what that which it has learned from allows, if absent.
+        quiet: Show no progress.
     """
 
     out: Path = Path("models/mine")
@@ -34,6 +36,7 @@ class RecipeSettings:
     device: str | None = None
     resume: bool = True
     licence: str | None = None
+    quiet: Quiet = False
 
     devices: ClassVar[tuple[str, ...]] = CPU_ALONE
     """Kinds of devices that the recipe can compute on."""

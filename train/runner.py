@@ -124,7 +124,7 @@ class Recipe(Generic[Settings, Trained]):
         with plain_errors():
             chosen = self.chosen(list(sys.argv[1:] if arguments is None else arguments))
             kept = inputs_kept(self.settings, vars(chosen))
-            with kept, job_lock(chosen.out), progress_bars() as progress:
+            with kept, job_lock(chosen.out), progress_bars(chosen.quiet) as progress:
                 try:
                     trained = self.train(chosen, progress)
                 except TorchfaceError as error:

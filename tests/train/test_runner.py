@@ -109,7 +109,7 @@ def test_flags_go_before_the_file_and_the_file_before_defaults(tmp_path: Path) -
 @pytest.mark.parametrize(
     ("document", "message"),
     [
-        ({"slop": 5}, "found slop = 5, expected only out, seed, device, resume, licence, data"),
+        ({"slop": 5}, "found slop = 5, expected only out, seed, device, resume, licence, quiet, data"),
         ({"slope": "steep"}, "found slope = 'steep', expected a number"),
         ({"resume": 1}, "found resume = 1, expected true or false"),
         ({"kind": "three"}, "found kind = 'three', expected one of 'one', 'two'"),
@@ -202,6 +202,18 @@ def test_what_has_no_default_and_is_not_in_the_file_is_asked_for(
     with pytest.raises(SystemExit):
         RECIPE.main(["--config", str(tmp_path / "own.toml")])
     assert "--data" in capsys.readouterr().err
+
+
+def test_a_quiet_run_shows_no_progress_and_prints_what_it_made(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    shown = []
+    for flags in ([], ["-q"]):
+        RECIPE.main(["--data", str(tmp_path), "--out", str(tmp_path / "line"), "--network.steps", "5", *flags])
+        shown.append(capsys.readouterr())
+    assert shown[0].err
+    assert not shown[1].err
+    assert shown[0].out == shown[1].out
 
 
 def test_a_killed_run_goes_on_to_the_same_model_and_log(tmp_path: Path) -> None:
