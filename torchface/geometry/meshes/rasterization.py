@@ -16,7 +16,8 @@ _MAX_OVERLAP = 64
 _SLACK = 1e-3  # pixels: neighbours overlap by this, so that no pixel on a shared edge falls between them
 _LEAST_AREA = 1e-6  # square pixels, twice
 _LEVEL = 1e-9
-_BATCH = 2**21  # pixels of triangles at once, which bounds the memory
+# At once, so that they stay in the processor's cache: pixels of triangles, points.
+_BATCH, _PIECE = 2**17, 2**14
 _MARGIN = 4  # texels around the charts
 
 
@@ -65,11 +66,14 @@ class TexelMap:
 
 def interpolate(values: Tensor, corners: Tensor, barycentric: Tensor) -> Tensor:
     """Values (V,C) at corners (M,3), weighted by barycentric coordinates (M,3): (M,C)."""
-    # Corner by corner: gathering (M,3,C) first takes thrice the time.
-    result = values[corners[:, 0]] * barycentric[:, :1]
-    for k in (1, 2):
-        result += values[corners[:, k]] * barycentric[:, k : k + 1]
-    return result
+    # Corner by corner, some points at once: gathering (M,3,C) takes ten times the time.
+    pieces = []
+    for at, shares in zip(corners.split(_PIECE), barycentric.split(_PIECE), strict=True):
+        piece = values[at[:, 0]] * shares[:, :1]
+        for k in (1, 2):
+            piece += values[at[:, k]] * shares[:, k : k + 1]
+        pieces.append(piece)
+    return torch.cat(pieces)
 
 
 def rasterise_uvs(uvs: Tensor, uv_faces: Tensor, height: int, width: int) -> TexelMap:
@@ -99,8 +103,12 @@ def rasterise_uvs(uvs: Tensor, uv_faces: Tensor, height: int, width: int) -> Tex
         owner[row[::-1]] = plane[::-1]  # of triangles that overlap the first is written last
     texels = np.flatnonzero(owner >= 0)
     triangles = planes.triangle[owner[texels]]
-    corners = points[:, uv_faces.cpu().numpy()[triangles]]
-    found = (texels, triangles, _barycentric(corners, np.stack([texels % width, texels // width]).astype(float)))
+    faces, barycentric = uv_faces.cpu().numpy(), np.empty((len(texels), 3))
+    for first in range(0, len(texels), _PIECE):
+        piece = slice(first, first + _PIECE)
+        centres = np.stack([texels[piece] % width, texels[piece] // width]).astype(float)
+        barycentric[piece] = _barycentric(points[:, faces[triangles[piece]]], centres)
+    found = (texels, triangles, barycentric)
     return TexelMap(height, width, *(torch.from_numpy(part).to(uvs.device) for part in found))
 
 

@@ -28,6 +28,7 @@ from torchface.synthetic.head.teeth_and_tongue import PAGE
 
 _MELANIN = (1.9, 2.2, 2.4)
 _MARGIN = 6  # texels round a part's rectangle
+_PIECE, _ROWS = 2**14, 16  # points, rows
 _WING = ((15.6, -28.6, 91.2), (17.6, -32.0, 87.8), (18.4, -38.5, 86.2), (16.8, -44.0, 87.0))
 """Along the groove between the nose's wing and the cheek, on the left."""
 
@@ -84,20 +85,37 @@ def _look_maps(look: Look, size: int) -> SkinMaps:
 
 def _maps(look: Look, size: int, skin: Tensor | None) -> SkinMaps:
     texels, p, marks = _texels(size)
+    bare = torch.empty(len(p), 0) if skin is None else skin.flatten(1)[:, texels.texels].T.float()
+    # All is decided point by point: a few at once stay in the processor's cache, in a third of the time.
+    pieces = [_painted(look, *piece) for piece in zip(*(one.split(_PIECE) for one in (p, marks, bare)), strict=True)]
+    color, rough, height = (torch.cat(parts) for parts in zip(*pieces, strict=True))
+    images = texels.image(torch.cat([color, rough[:, None]], 1))
+    color_image, rough_image = images[:3], images[3:]
+    normals = _normals(texels, p, height)
+    _paint_parts(color_image, rough_image, normals, look)
+    return SkinMaps(color_image, SurfaceMaps(normals, rough_image))
+
+
+def _painted(look: Look, p: Tensor, marks: Tensor, bare: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Colour (N,3), roughness (N,) and relief (N,) at points (N,3) with marks (N,8).
+
+    Args:
+        bare: the skin's colours (N,3), or (N,0) for the look's own.
+    """
     lips, mouth, _, socket, lash, eyeball, nostril, ear = marks.unbind(1)
     hair = hair_share(p) * (1 - ear) * (1 - ramp(eyeball + socket + mouth, 0.2, 0.5))
     hair = hair if look.haircut else torch.zeros_like(hair)
     ball = eyeball > 0.5
     old = max(0.0, (look.age - 32.0) / 40.0)
     creases, groove = _creases(p) * old, _wing_groove(p)
-    if skin is None:
+    if bare.shape[1] == 0:
         color = _pigmented(skin_color(p, marks, look.freckles, 0.75 * look.lips), look.melanin)
         color = color * (1 - 0.22 * creases.clamp(0, 1))[:, None]
         color = mix(color, (0.42, 0.27, 0.19), 0.35 * min(old, 1.0) * ramp(noise(p, 3.2, 41), 0.62, 0.85))
         color = mix(color, look.hair, 0.42 * _brow_shade(p))
         color = color * (1 - torch.tensor([0.10, 0.16, 0.17]) * groove[:, None])
     else:
-        color = skin.flatten(1)[:, texels.texels].T.float()
+        color = bare
     strand = _strands(p)
     tone = torch.tensor(look.hair) * (0.92 + 0.42 * strand)[:, None]
     root = 0.62 + 0.38 * ramp(hair, 0.05, 0.5)
@@ -108,12 +126,7 @@ def _maps(look: Look, size: int, skin: Tensor | None) -> SkinMaps:
     height = _height(p, lips, hair, strand, old) - 0.30 * creases - 0.9 * groove
     height = height + _neck(p) * (1 - ramp(hair, 0.0, 0.3))
     height = height * (1 - ramp(eyeball + socket + mouth + nostril, 0.1, 0.4))
-    rough = _roughness(p, lips, mouth, hair, lash, ball)
-    images = texels.image(torch.cat([color.clamp(0, 1), rough[:, None]], 1))
-    color_image, rough_image = images[:3], images[3:]
-    normals = _normals(texels, p, height)
-    _paint_parts(color_image, rough_image, normals, look)
-    return SkinMaps(color_image, SurfaceMaps(normals, rough_image))
+    return color.clamp(0, 1), _roughness(p, lips, mouth, hair, lash, ball), height
 
 
 @lru_cache(maxsize=1)
@@ -209,14 +222,21 @@ def _normals(texels: TexelMap, p: Tensor, height: Tensor) -> Tensor:
     table = torch.zeros(texels.height * texels.width, 5)
     table[texels.texels] = torch.cat([p, height[:, None], torch.ones(len(p), 1)], 1)
     image = table.view(texels.height, texels.width, 5)
-    slopes = []
-    for axis, sign in ((1, 1.0), (0, -1.0)):  # to the right, upward
-        ahead, back = image.roll(-1, axis), image.roll(1, axis)
-        step = (ahead[..., :3] - back[..., :3]).norm(dim=-1).clamp(min=0.05)
-        inside = (ahead[..., 4] * back[..., 4] * image[..., 4]) > 0
-        slopes.append(torch.where(inside & (step < 6), sign * (ahead[..., 3] - back[..., 3]) / step, 0.0))
-    normals = torch.stack([-slopes[0], -slopes[1], torch.ones_like(slopes[0])])
-    return torch.nn.functional.normalize(normals, dim=0)
+    wrapped, normals = torch.cat([image[-1:], image, image[:1]]), torch.empty(3, *image.shape[:2])
+    for first in range(0, len(image), _ROWS):  # as `_PIECE`
+        near = wrapped[first : first + _ROWS + 2]
+        here = near[1:-1]
+        right, down = _slope(here, here.roll(1, 1), here.roll(-1, 1)), _slope(here, near[:-2], near[2:])
+        piece = torch.stack([-right, down, torch.ones_like(right)])
+        normals[:, first : first + len(here)] = torch.nn.functional.normalize(piece, dim=0)
+    return normals
+
+
+def _slope(here: Tensor, back: Tensor, ahead: Tensor) -> Tensor:
+    """How steep the relief is from one texel to another, (R,W), both beside those of ``here``."""
+    step = (ahead[..., :3] - back[..., :3]).norm(dim=-1).clamp(min=0.05)
+    inside = (ahead[..., 4] * back[..., 4] * here[..., 4]) > 0
+    return torch.where(inside & (step < 6), (ahead[..., 3] - back[..., 3]) / step, 0.0)
 
 
 def _paint_parts(color: Tensor, rough: Tensor, normals: Tensor, look: Look) -> None:
