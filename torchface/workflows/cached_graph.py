@@ -2,7 +2,7 @@
 changed."""
 
 import hashlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -33,17 +33,32 @@ def cached_file(kind: str, ending: str, make: Callable[[], bytes], code: Sequenc
         code: folders of this package whose code says what becomes of the models.
         models: what the file is made of, as :func:`~torchface.files.content_keys.content_key` takes it.
     """
+    name = _name(kind, ending, code, models)
+    content = _kept(kind, name)
+    if content is None:
+        content = make()
+        with suppress(FileFormatError), all_or_none():
+            path = cache_folder(kind) / name
+            write_file(path, content)
+            write_file(path.with_suffix(".sha256"), hashlib.sha256(content).hexdigest().encode())
+    return content
+
+
+def kept_file(kind: str, ending: str, code: Sequence[str], **models: object) -> bytes | None:
+    """What :func:`cached_file` has kept; None where nothing whole is there."""
+    return _kept(kind, _name(kind, ending, code, models))
+
+
+def _name(kind: str, ending: str, code: Sequence[str], models: Mapping[str, object]) -> str:
     package = Path(torchface.__file__).parent
     sources = {one: sorted((package / one).rglob("*.py")) for one in code}
-    key = content_key(f"{kind} 2", torch=str(torch.__version__), sources=sources, models=models)[:32]
+    return content_key(f"{kind} 2", torch=str(torch.__version__), sources=sources, models=models)[:32] + ending
+
+
+def _kept(kind: str, name: str) -> bytes | None:
     with suppress(FileFormatError):  # not there, or damaged
-        path = cache_folder(kind) / f"{key}{ending}"
+        path = cache_folder(kind) / name
         content = read_file(path)
         if read_file(path.with_suffix(".sha256")).decode("ascii", "replace") == hashlib.sha256(content).hexdigest():
             return content
-    content = make()
-    with suppress(FileFormatError), all_or_none():
-        path = cache_folder(kind) / f"{key}{ending}"
-        write_file(path, content)
-        write_file(path.with_suffix(".sha256"), hashlib.sha256(content).hexdigest().encode())
-    return content
+    return None

@@ -7,7 +7,7 @@ from torch import Tensor, nn
 from torchface.landmarks import FaceReading
 from torchface.landmarks.images.frame_reader.face_reader import STATE
 from torchface.landmarks.images.frame_reader.picture_pieces import picture_size
-from torchface.onnx.webcam.webcam_model import WebcamAnswer, reading_model, solving_model, webcam_model
+from torchface.onnx.webcam.webcam_model import WebcamAnswer, WebcamGraph, reading_model, solving_model, webcam_model
 from torchface.shape_names import ARKIT
 
 
@@ -37,6 +37,12 @@ class PlantedSolver(nn.Module):
 @pytest.fixture(scope="session")
 def solver() -> PlantedSolver:
     return PlantedSolver()
+
+
+@pytest.fixture(scope="session")
+def webcam_module(solver: PlantedSolver) -> WebcamGraph:
+    """What the graph computes, in PyTorch."""
+    return WebcamGraph(PlantedReader(), solver)  # type: ignore[arg-type]
 
 
 @pytest.fixture(scope="session")

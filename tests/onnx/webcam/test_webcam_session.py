@@ -8,7 +8,8 @@ from onnx import TensorProto, helper
 
 from torchface.capture.anybody import WebcamControls
 from torchface.errors import FileFormatError, ShapeError, ValueRangeError
-from torchface.onnx.webcam.webcam_session import WebcamSession
+from torchface.onnx.webcam.webcam_model import WebcamGraph
+from torchface.onnx.webcam.webcam_session import ModuleSession, WebcamSession
 from torchface.shape_names import ARKIT
 
 
@@ -40,6 +41,25 @@ def test_a_session_goes_on_where_another_was(session: WebcamSession, frame: np.n
     assert torch.equal(again.landmarks, second.landmarks)
     other.reset()
     assert float(other.state.abs().sum()) == 0
+
+
+def test_pytorch_answers_as_the_graph_does_and_hands_its_state_over(
+    session: WebcamSession, frame: np.ndarray, webcam_module: WebcamGraph
+) -> None:
+    by_module = ModuleSession(webcam_module)
+    session.reset()
+    for controls in (WebcamControls(), WebcamControls(pose=3, gain=2.0)):
+        by_module.controls = session.controls = controls
+        found, expected = by_module.step(frame, 1 / 60), session.step(frame, 1 / 60)
+        for name in ("weights", "rotation", "translation", "gaze", "landmarks", "iris", "beside"):
+            torch.testing.assert_close(getattr(found, name), getattr(expected, name), msg=name)
+        assert (found.presence, found.calibrated) == pytest.approx((expected.presence, expected.calibrated))
+    torch.testing.assert_close(by_module.state, session.state)
+    session.reset()
+    session.resume(by_module.state)
+    session.step(frame, 1 / 60)
+    session.controls = WebcamControls()
+    assert float(session.state[-1]) == 3  # the planted solver counts
 
 
 def test_a_camera_may_change_its_size(session: WebcamSession, frame: np.ndarray) -> None:

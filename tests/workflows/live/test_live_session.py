@@ -2,6 +2,7 @@
 
 import json
 import socket
+import time
 import tracemalloc
 from collections.abc import Iterator
 from pathlib import Path
@@ -10,7 +11,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
-from planted_faces import JAW, SMILE, Endless, ShadeSolver, film
+from planted_faces import FRONTAL, JAW, SMILE, Endless, ShadeSolver, film
 from received_frames import decode_frame
 
 from torchface import BlendshapeRig, load_rig, load_take, save_rig
@@ -20,6 +21,7 @@ from torchface.errors import FileFormatError, ValueRangeError
 from torchface.io.gltf.animation_reading import read_gltf_weights
 from torchface.io.video import open_video
 from torchface.io.video.video_packets import pyav
+from torchface.progress import silent
 from torchface.shape_names import ARKIT
 from torchface.workflows.browser_app.character import load_character
 from torchface.workflows.live import live_anybody
@@ -361,6 +363,52 @@ def test_the_command_plays_records_and_says_what_is_wrong(
         assert ended.value.code == 2
         assert told in " ".join(capsys.readouterr().err.split())
     main(["live", "--list"])
+
+
+class CountingSession:
+    """A session of the webcam's graph whose state counts pictures."""
+
+    names = ARKIT
+
+    def __init__(self, maker: bytes | str) -> None:
+        self.maker, self.state = maker, 0
+
+    def resume(self, state: int) -> None:
+        self.state = state
+
+    def step(self, picture: np.ndarray, interval: float) -> SimpleNamespace:
+        self.state += 1
+        return SimpleNamespace(
+            weights=torch.full((52,), float(self.state)),
+            rotation=FRONTAL,
+            landmarks=torch.zeros(68, 2),
+            iris=torch.zeros(2, 2),
+            gaze=torch.zeros(2, 2),
+            calibrated=float(self.maker == b"graph"),
+            beside=torch.zeros(2),
+        )
+
+
+def test_the_first_start_solves_by_pytorch_until_its_graph_is_made(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made = tmp_path / "made"
+    monkeypatch.setattr(live_anybody, "_MAKE", f"import pathlib; pathlib.Path({str(made)!r}).write_bytes(b'graph')")
+    monkeypatch.setattr(live_anybody, "kept_webcam_graph", lambda: made.read_bytes() if made.exists() else None)
+    monkeypatch.setattr(live_anybody, "webcam_module", lambda: "module")
+    monkeypatch.setattr(live_anybody, "ModuleSession", CountingSession)
+    monkeypatch.setattr(live_anybody, "WebcamSession", CountingSession)
+    solver, picture = live_anybody.person_solver(silent), np.zeros((64, 64, 3), np.uint8)
+    frames = [solver.step(picture, None, WebcamControls())]
+    assert frames[0].calibrated == 0
+    until = time.monotonic() + 60
+    while not frames[-1].calibrated and time.monotonic() < until:
+        time.sleep(0.01)
+        frames.append(solver.step(picture, 0.01, WebcamControls()))
+    assert frames[-1].calibrated == 1
+    assert [float(frame.weights[0]) for frame in frames] == list(range(1, len(frames) + 1))  # nothing is begun anew
+    begun = live_anybody.person_solver(silent)  # the second start
+    assert begun.step(picture, None, WebcamControls()).calibrated == 1
 
 
 def test_a_take_that_was_dropped_outlives_a_solver_that_cannot_be_made(

@@ -11,6 +11,9 @@ from torch import Tensor
 
 from torchface.capture.anybody import WebcamControls
 from torchface.errors import FileFormatError, ShapeError, ValueRangeError
+from torchface.landmarks.images.frame_reader.face_reader import STATE
+from torchface.onnx.webcam.webcam_model import OUTPUTS, WebcamGraph
+from torchface.shape_names import ARKIT
 
 SMALLEST = 64  # pixels a side of a picture, at least
 
@@ -115,6 +118,22 @@ class WebcamSession:
             "state": self._state,
         }
         return dict(zip(self._outputs, self._session.run(None, inputs), strict=True))
+
+
+class ModuleSession(WebcamSession):
+    """The same by PyTorch, in three times the time: it needs no graph to be made."""
+
+    def __init__(self, module: WebcamGraph) -> None:
+        self._module, self.names = module.eval(), ARKIT
+        self._start = np.zeros(STATE + module.solver.state_size, np.float32)
+        self._state = self._start
+        self.controls = WebcamControls()
+        self._run(np.zeros((SMALLEST, SMALLEST, 3), np.uint8), 1 / 30)  # as above
+
+    def _run(self, pixels: np.ndarray, interval: float) -> dict[str, np.ndarray]:
+        given = torch.from_numpy(pixels), torch.tensor(interval), self.controls.tensor(), torch.from_numpy(self._state)
+        with torch.inference_mode():
+            return {name: one.numpy() for name, one in zip(OUTPUTS, self._module(*given), strict=True)}
 
 
 _TENSORS = ("weights", "rotation", "translation", "gaze", "landmarks", "iris", "beside")

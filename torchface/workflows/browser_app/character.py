@@ -177,7 +177,7 @@ def _taken(path: Path) -> bytes:
 
 def _written(path: str | Path | None, progress: Progress) -> bytes:
     def embedded() -> bytes:
-        progress("making the character, once; half a minute on a quiet machine")
+        progress("making the character, once; ten seconds on a quiet machine")
         shown = character()
         return _saved(shown.rig, shown.surface)
 

@@ -1,7 +1,13 @@
 """Anybody before a webcam moves a character: the whole job from a camera to streams, a page and files."""
 
+import atexit
+import queue
+import subprocess
+import sys
+import threading
 from collections.abc import Callable
-from contextlib import ExitStack, closing
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack, closing, suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -17,7 +23,7 @@ from torchface.io.protocols.stream_address import is_source, parse_source
 from torchface.io.protocols.weight_sender import find_receiver
 from torchface.io.take_files import RECORDING_ENDINGS
 from torchface.number_checks import checked_number
-from torchface.onnx.webcam.webcam_session import WebcamSession
+from torchface.onnx.webcam.webcam_session import ModuleSession, WebcamSession
 from torchface.progress import Progress, silent
 from torchface.shape_names import ARKIT
 from torchface.workflows.browser_app.app_folder import CHARACTER, TABLE
@@ -41,16 +47,28 @@ from torchface.workflows.live.received_source import ReceivedSolver, ReceivedSou
 from torchface.workflows.live.recordings import Recordings, SavedTake
 from torchface.workflows.live.session_prompts import LightWatch, Watch
 from torchface.workflows.live.weight_streams import WeightStreams
-from torchface.workflows.webcam.webcam_graph import prepared_webcam_graph
+from torchface.workflows.webcam.webcam_graph import kept_webcam_graph, webcam_module
 
 _USUAL = 1 / 30  # seconds
+# Beside a session, which goes first.
+_MAKE = """
+import os
+from torchface.workflows.webcam.webcam_graph import prepared_webcam_graph
+if hasattr(os, "nice"):
+    os.nice(5)
+prepared_webcam_graph()
+"""
 
 
 class PersonSolver:
-    """Solves frames for ARKit's weights."""
+    """Solves frames for ARKit's weights.
 
-    def __init__(self, session: WebcamSession) -> None:
-        self._session = session
+    Args:
+        better: gives once a session to go on with, else None.
+    """
+
+    def __init__(self, session: WebcamSession, better: Callable[[], WebcamSession | None] = lambda: None) -> None:
+        self._session, self._better = session, better
         self._ever = False
 
     @property
@@ -60,6 +78,9 @@ class PersonSolver:
 
     def step(self, picture: np.ndarray, interval: float | None, controls: WebcamControls) -> LiveFrame:
         """Solves the next frame; see :class:`torchface.workflows.live.live_frames.FaceSolver`."""
+        if (better := self._better()) is not None:
+            better.resume(self._session.state)
+            self._session = better
         self._session.controls = controls
         answer = self._session.step(picture, _USUAL if interval is None else interval)
         solved = LiveFrame(
@@ -77,8 +98,36 @@ class PersonSolver:
 
 
 def person_solver(progress: Progress) -> PersonSolver:
-    """A solver for whoever sits before a camera; the first time it is made, which takes a minute."""
-    return PersonSolver(WebcamSession(prepared_webcam_graph(progress)))
+    """A solver for whoever sits before a camera.
+
+    Its graph takes a minute to be made, once. Until then PyTorch solves, with the same weights at a lower rate.
+    """
+    if (graph := kept_webcam_graph()) is not None:
+        return PersonSolver(WebcamSession(graph))
+    progress("reading faces by PyTorch while the graph is made, once")
+    return PersonSolver(ModuleSession(webcam_module()), _SessionBeingMade().take)
+
+
+class _SessionBeingMade:
+    """A session whose graph is made in a process of its own, which ends with this one."""
+
+    def __init__(self) -> None:
+        self._made: queue.Queue[WebcamSession] = queue.Queue()
+        threading.Thread(target=self._make, name="torchface-graph", daemon=True).start()
+
+    def take(self) -> WebcamSession | None:
+        """The session, once."""
+        with suppress(queue.Empty):
+            return self._made.get_nowait()
+        return None
+
+    def _make(self) -> None:
+        nothing = subprocess.DEVNULL
+        making = subprocess.Popen([sys.executable, "-c", _MAKE], stdin=nothing, stdout=nothing, stderr=nothing)
+        atexit.register(making.kill)
+        making.wait()
+        if (graph := kept_webcam_graph()) is not None:  # else PyTorch goes on
+            self._made.put(WebcamSession(graph))
 
 
 RECORDINGS = Path("recordings")
@@ -148,11 +197,13 @@ def go_live(
             progress("opening the camera")
             source = open_source(settings.camera, notes, SourceSettings(settings.size, every, settings.loop))
         stack.enter_context(closing(source))
-        progress("reading the character")
-        character = load_character(settings.character, settings.mapping, progress)
-        for note in character.notes():
-            notes(note)
-        page = built_page(progress) if settings.page else None
+        with ThreadPoolExecutor(1) as beside:
+            building = beside.submit(built_page, progress) if settings.page else None  # by other programs
+            progress("reading the character")
+            character = load_character(settings.character, settings.mapping, progress)
+            for note in character.notes():
+                notes(note)
+            page = None if building is None else building.result()
         folder = settings.record or settings.takes or RECORDINGS
         recordings = Recordings(folder, character, source.video.path.name, source.video.fps)
         preparing, server = Preparing(progress), None

@@ -4,6 +4,7 @@ import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
+from pathlib import Path
 
 import onnx
 import onnxruntime
@@ -26,7 +27,7 @@ from torchface.onnx.webcam.webcam_model import (
 )
 from torchface.progress import Progress, silent
 from torchface.synthetic.head.performer import performer
-from torchface.workflows.cached_graph import cached_file, cached_graph
+from torchface.workflows.cached_graph import cached_file, cached_graph, kept_file
 from torchface.workflows.named_priors import DEFAULT_PRIOR, load_priors
 
 __all__ = ["default_webcam_solver"]
@@ -67,8 +68,7 @@ def webcam_graph(progress: Progress | None = None) -> bytes:
     """
 
     progress = progress or silent
-    models = {name: zoo.find(name) for name in MODELS}
-
+    models = _models()
     networks = {name: models[name] for name in NETWORKS}
 
     def make() -> onnx.ModelProto:
@@ -92,11 +92,17 @@ def webcam_graph(progress: Progress | None = None) -> bytes:
 def prepared_webcam_graph(progress: Progress | None = None) -> bytes:
     """The graph as :class:`~torchface.onnx.webcam.webcam_session.WebcamSession` begins with it soonest; see
     :func:`webcam_graph`."""
-    models = {name: zoo.find(name) for name in MODELS}
-    made_by = {"models": models, "runtime": onnxruntime.__version__}
-    return cached_file(
-        "webcam_prepared", ".ort", lambda: in_runtime_format(webcam_graph(progress))[0], _CODE, **made_by
-    )
+    make = lambda: in_runtime_format(webcam_graph(progress))[0]  # noqa: E731
+    return cached_file("webcam_prepared", ".ort", make, _CODE, models=_models(), runtime=onnxruntime.__version__)
+
+
+def kept_webcam_graph() -> bytes | None:
+    """That of :func:`prepared_webcam_graph`, if it has been made."""
+    return kept_file("webcam_prepared", ".ort", _CODE, models=_models(), runtime=onnxruntime.__version__)
+
+
+def _models() -> dict[str, Path]:
+    return {name: zoo.find(name) for name in MODELS}
 
 
 @contextmanager
