@@ -78,7 +78,7 @@ def _one_thread() -> onnxruntime.SessionOptions:
 
 
 def video_solver(readings: list[FaceReading], fps: float, size: tuple[int, int]) -> Solved:
-    """``VideoSolver`` on the embedded performer's mean head, as ``torchface track --live`` runs it."""
+    """``VideoSolver`` on the embedded performer's mean head, frame by frame."""
     rig = performer(texture=False)
     solver = solver_for(rig, load_track_models(rig, fps=fps), assumed_calibration(*size))
     smoother = AdaptiveFilter(68, 2, LANDMARK_SETTINGS)

@@ -18,7 +18,6 @@ Lock = Callable[[Path], AbstractContextManager[Path]]
     ("lock", "words"),
     [
         (job_lock, "track video.mp4 --rig rig.glb"),
-        (job_lock, "track --live 0 --rig rig.glb"),
         (job_lock, "demo"),
         (job_lock, "evaluate a.csv b.csv"),
         (job_lock, "register template.glb scans"),

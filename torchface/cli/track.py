@@ -1,6 +1,5 @@
-"""``torchface track``: a face in a video, or before a camera, as weights of the actor's rig."""
+"""``torchface track``: a face in a video as weights of the actor's rig."""
 
-from contextlib import nullcontext
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -9,7 +8,7 @@ from tyro.conf import Positional, UseAppendAction, arg
 from torchface.cli.batch_report import Cluster, Column, Jobs, TimeLimit, work_on
 from torchface.cli.command_options import Output, Part, Reduce, picture_size
 from torchface.cli.progress_bars import progress_bars
-from torchface.cli.terminal import Quiet, console, print_lines, print_path, print_table
+from torchface.cli.terminal import Quiet, console, print_path, print_table
 
 _COLUMNS = (
     Column("frames", "frames", "{}"),
@@ -48,9 +47,6 @@ def track(
     solver: Literal["rig", "examples"] = "rig",
     examples: tuple[Path, ...] = (),
     method: Literal["all", "regional", "linear"] = "all",
-    live: str | None = None,
-    stream: str = "udp://127.0.0.1:11111",
-    seconds: float | None = None,
     jobs: Jobs = 1,
     cluster: Cluster = None,
     time_limit: TimeLimit = None,
@@ -69,14 +65,12 @@ def track(
     Several videos, or a folder of them: OUT is a folder, for a folder NAME of each. {name} in an option's path is the
     video's name. One that cannot be tracked is reported and skipped, and the exit status is 1.
 
-    With --live it does so from a webcam as the face moves, and sends each frame as Live Link Face does.
-
     Args:
         video: A file: .avi, .mkv, .webm, .mp4, .mov or .gif, of one size; its frame rate may vary. Or several, or
             folders of them.
         rig: The actor's own rig, with 68 annotated landmarks: .glb, USD, or ICT-FaceKit's FaceXModel folder.
             A head is solved if absent.
-        out: Folder for everything; needed but with --live, where curves are kept only if it is given.
+        out: Folder for everything.
         landmarks: What finds the 68 landmarks: a model of the zoo by name or folder, an .onnx file, or MediaPipe's Face
             Landmarker bundle (.task); or a .csv that holds them, ours, OpenFace's, py-feat's or MediaPipe's mesh, then
             VIDEO may be left out.
@@ -105,10 +99,6 @@ def track(
             each method on this video, overlay.mp4 the solved example's landmarks (red) over those found.
         examples: What `torchface examples` wrote, for --solver examples; of several people the mean is taken.
         method: With examples: all at once, the head first and then regions, or by a linear model of landmarks.
-        live: A camera's number, such as 0, or a video file that is played in its own time.
-        stream: Where --live sends to; Unreal listens on port 11111. vmc://HOST:PORT and osc://HOST:PORT/PREFIX
-            send by the VMC protocol and as plain OSC.
-        seconds: After which --live ends; until Ctrl-C if absent.
     """
     from torchface.errors import ValueRangeError
     from torchface.workflows.batch.batch_items import is_batch
@@ -118,15 +108,13 @@ def track(
 
     beside = videos[1:]
     if videos:
-        if video or live is not None or solver == "examples" or cluster is not None:
-            raise ValueRangeError("track: found --video beside VIDEO, --live, --cluster or examples, expected it alone")
+        if video or solver == "examples" or cluster is not None:
+            raise ValueRangeError("track: found --video beside VIDEO, --cluster or examples, expected it alone")
         video = videos[:1]
-    given = landmarks.lower().endswith(".csv")
-    if (not video) == (live is None) and not (given and live is None):
-        found = "neither" if not video else "both"
-        raise ValueRangeError(f"track: found {found} of VIDEO and --live, expected one of the two")
+    if not video and not landmarks.lower().endswith(".csv"):
+        raise ValueRangeError("track: found no VIDEO, expected one, or a .csv of landmarks; a webcam: torchface live")
     if solver == "examples":
-        if live is not None or out is None or len(video) > 1 or rig is not None:
+        if out is None or len(video) > 1 or rig is not None:
             raise ValueRangeError("track: found --solver examples, expected one VIDEO, --examples and --out beside it")
         _by_examples(video[0] if video else None, examples, out, method, landmarks, face, quiet)
         return
@@ -151,11 +139,6 @@ def track(
         beside,
         cameras,
     )
-    if live is not None:
-        if rig is None:
-            raise ValueRangeError("track: found --live without a rig, expected --rig; for anybody: torchface live")
-        _live(live, rig, stream, out, settings, seconds, quiet)
-        return
     if out is None:
         raise ValueRangeError("track: found no folder for the results, expected one (--out DIR)")
     if cluster is not None or (video and is_batch(video, VIDEOS)):
@@ -202,19 +185,3 @@ def _by_examples(
     )
     for path in done.products.values():
         print_path(path)
-
-
-def _live(
-    camera: str, rig: Path, address: str, out: Path | None, settings: object, seconds: float | None, quiet: bool
-) -> None:
-    from torchface.files.job_lock import job_lock
-    from torchface.workflows.live.live_actor import track_live
-    from torchface.workflows.track.track_files import WEIGHTS
-    from torchface.workflows.track.track_inputs import TrackSettings
-
-    assert isinstance(settings, TrackSettings)
-    with nullcontext() if out is None else job_lock(out), progress_bars(quiet) as progress:
-        report = track_live(camera, rig, [address], out, settings, seconds, progress)
-    print_lines(report.lines())
-    if out is not None:
-        print_path(out / WEIGHTS)

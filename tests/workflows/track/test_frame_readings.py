@@ -122,7 +122,7 @@ def test_tables_that_do_not_fit_are_told(tmp_path: Path, capsys: pytest.CaptureF
         (["--landmarks", str(table), "--size", "wide"], "--size: found 'wide', expected WIDTHxHEIGHT"),
         (["--landmarks", str(table), "--size", "9x9", "--fps", "0.1"], "0.1 frames a second, expected 1 to 1000"),
         ([str(tmp_path / "wall.avi"), "--fps", "30"], "found --fps or --size beside a video"),
-        ([], "found neither of VIDEO and --live"),
+        ([], "found no VIDEO, expected one"),
     ):
         with pytest.raises(SystemExit):
             main(["track", *words, "--rig", str(tmp_path / "rig.glb"), "--out", str(tmp_path / "out")])
