@@ -32,11 +32,12 @@ _MOST_TRIED = 4  # boxes of a search beside those of the larger faces
 # The detector's, from which a box elsewhere than where a face was shows one; the network's, from which a face is one
 # without asking the detector, and where the detector sees one too.
 _NEW_PRESENCE, _SURE_PRESENCE, _LEAST_PRESENCE = 0.5, 0.9, 0.1
+_LIKELY_SCORE = 0.6  # of the detector's box in a small copy that confirms a face of which the network is sure
 # The mean under which a face that the detector misses so many times in a row is lost; frames after which it is asked.
 _LEAST_CONFIDENCE, _CHECKS, _CHECK_EVERY = 0.44, 3, 16
-# Frames after which it is asked who else is about, unless a landmark is less visible than the second; and pixels of the
-# followed face's side in the copy that it is shown for that.
-_COUNT_EVERY, _HIDDEN, _ENOUGH = 4, 0.3, 48.0
+# Frames after which it is asked who else is about, and after which where a landmark is less visible than the third; and
+# pixels of the followed face's side in the copy that it is shown for that.
+_COUNT_EVERY, _COVERED_EVERY, _HIDDEN, _ENOUGH = 4, 2, 0.3, 48.0
 _FRAMES_WAITED, _FRAMES_HIDDEN = 10, 30  # for a lost face at its place before another is taken
 _LEAST_SIDE = 12.0  # of a box, pixels, under which a face is lost
 _INTERVAL = torch.tensor(1 / 30)  # seconds that a frame counts
@@ -85,6 +86,7 @@ class LandmarkTracker:
         """Forgets the face, as before the first frame."""
         self._followed = FollowedFace()
         self._faces: FaceBoxes | None = None  # of the frame, if it was searched
+        self._nearby = torch.zeros(CANDIDATES, 4)  # faces in a small copy of it; see _about
         self._moved = torch.zeros(0), torch.zeros(0)
         """Landmarks of the latest frame's face, and its place."""
 
@@ -126,10 +128,10 @@ class LandmarkTracker:
         followed = self._followed
         followed.frames += 1
         self._faces = None
-        check = followed.missed > 0 or followed.covered or followed.frames % _COUNT_EVERY == 0
-        check = check or bool(is_beside(followed.people))
-        faces = self._about(frame) if check else torch.zeros(CANDIDATES, 4)
-        followed.people = after_boxes(followed.people, faces, torch.tensor(check), _INTERVAL)
+        every = _COVERED_EVERY if followed.covered else _COUNT_EVERY
+        check = followed.missed > 0 or followed.frames % every == 0 or bool(is_beside(followed.people))
+        self._nearby = self._about(frame) if check else torch.zeros(CANDIDATES, 4)
+        followed.people = after_boxes(followed.people, self._nearby, torch.tensor(check), _INTERVAL)
         before = self._follow(frame) if followed.missed == 0 else None
         face = before if before is not None and self._is_person(frame, before) else self._search(frame)
         if face is None:
@@ -144,7 +146,6 @@ class LandmarkTracker:
             followed.set_anchor(face.search_box)
         followed.covered = bool(face.visibility.amin() < _HIDDEN)
         followed.latest_look = look_at(frame, place)
-        self._note(frame, face, seen=True)
         return refined
 
     def _found(self, frame: Tensor) -> FaceBoxes:
@@ -167,16 +168,12 @@ class LandmarkTracker:
         return torch.cat([found, torch.zeros(CANDIDATES - len(rows), 4)])
 
     def _is_person(self, frame: Tensor, face: FaceReading) -> bool:
-        """Whether a face is the followed person's, and not somebody's who passes before them."""
-        around = place_around(face.landmarks)
-        other = is_other(self._followed.people, around, _look(frame, face), _INTERVAL)
-        if other:
-            self._note(frame, face, seen=False)
-        return not other
-
-    def _note(self, frame: Tensor, face: FaceReading, seen: bool) -> None:
-        around, whose = place_around(face.landmarks), (torch.tensor(seen), torch.tensor(not seen))
-        self._followed.people = after_face(self._followed.people, around, _look(frame, face), whose, _INTERVAL)
+        """Whether a face is the followed person's, and not somebody's who passes before them; notes whose it is."""
+        people, around = self._followed.people, place_around(face.landmarks)
+        look = look_at(frame, face_place(face.landmarks), LOOK_SIZE)
+        other = is_other(people, around, look, _INTERVAL)
+        self._followed.people = after_face(people, around, look, (~other, other), _INTERVAL)
+        return not bool(other)
 
     def _face_in(self, frame: Tensor, faces: FaceBoxes, number: int) -> FaceReading | None:
         """One of the detector's faces with its landmarks, if it is one."""
@@ -202,13 +199,19 @@ class LandmarkTracker:
         sure = float(face.presence) >= _SURE_PRESENCE
         if sure and followed.frames % _CHECK_EVERY:
             return face
-        if self._confirmed(frame, face.box):
+        if (sure and self._is_nearby(face.box)) or self._confirmed(frame, face.box):
             followed.unconfirmed = 0
             return face if float(face.presence) >= _LEAST_PRESENCE else None
         followed.unconfirmed += 1
         vague = float(face.confidence.mean()) < _LEAST_CONFIDENCE
         lost = not sure or (followed.unconfirmed >= _CHECKS and vague)
         return None if lost else face  # turned faces are none to the detector
+
+    def _is_nearby(self, box: Tensor) -> bool:
+        """Whether a likely face of those that were looked for in a small copy lies where the landmarks are."""
+        likely = self._nearby[self._nearby[:, 3] >= _LIKELY_SCORE]
+        boxes = torch.cat([likely[:, :2] - likely[:, 2:3] / 2, likely[:, 2:3].expand(-1, 2)], 1)
+        return bool((overlaps(boxes, box[None]) > _CONFIRMED).any())
 
     def _confirmed(self, frame: Tensor, box: Tensor) -> bool:
         """Whether the detector sees a face where the landmarks are."""
@@ -264,7 +267,3 @@ class LandmarkTracker:
         height, width = frame.shape[-2:]
         inside = 0 <= x < width and 0 <= y < height
         return inside and _LEAST_SIDE <= float(box[2]) <= 1.5 * max(height, width)
-
-
-def _look(frame: Tensor, face: FaceReading) -> Tensor:
-    return look_at(frame, face_place(face.landmarks), LOOK_SIZE)
