@@ -213,6 +213,24 @@ def test_pixels_of_an_absurd_aspect_are_refused(tmp_path: Path) -> None:
         open_video(squeezed(tmp_path / "film.mkv", Fraction(6)))
 
 
+@pytest.mark.parametrize(("layout", "height"), [("yuv420p", 64), ("yuv420p10le", 64), ("yuv422p", 63), ("yuv444p", 63)])
+def test_colours_are_interpolated_smoothly(layout: str, height: int, tmp_path: Path) -> None:
+    """The usual format is converted quickly into the bytes of FFmpeg's bicubic way, which others take."""
+    shades = np.random.default_rng(0).integers(0, 256, (16, 24, 3)).astype(np.uint8)
+    pixels = cv2.resize(shades, (96, height), interpolation=cv2.INTER_CUBIC)
+    path = tmp_path / "film.mkv"
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream("ffv1", rate=30)
+        stream.width, stream.height, stream.pix_fmt = 96, height, layout
+        coded = av.VideoFrame.from_ndarray(pixels, "rgb24").reformat(format=layout)
+        for packet in (*stream.encode(coded), *stream.encode(None)):
+            container.mux(packet)
+    with av.open(str(path)) as container:
+        decoded = next(container.decode(video=0))
+        smooth = decoded.reformat(format="rgb24", interpolation=av.video.reformatter.Interpolation.BICUBIC).to_ndarray()
+    assert np.array_equal(next(open_video(path).color_frames()).permute(1, 2, 0).numpy(), smooth)
+
+
 @pytest.mark.real
 @pytest.mark.parametrize(
     ("name", "count", "fps"),
