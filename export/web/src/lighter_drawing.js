@@ -6,7 +6,8 @@ const LARGEST = 1024; // texels a side: the first drawing waits for textures and
 const MATTE = 0.5; // roughness from which highlights are too faint to be missed
 
 /**
- * Gives the materials of a character smaller pictures, and matte ones a simpler light, which takes a third off a drawing.
+ * Gives the materials of a character smaller pictures, and matte ones a simpler light without the surface's fine normals, which
+ * takes half off a drawing; wrinkles that come and go stay.
  *
  * @param {THREE.Object3D} root whose materials are drawn as they are, by nothing that changes their shaders.
  */
@@ -24,9 +25,10 @@ export function lighten(root) {
 function simpler(material) {
   if (material.type !== "MeshStandardMaterial" || material.metalness > 0 || material.roughness < MATTE) return material;
   const { name, color, map, normalMap, normalScale, aoMap, emissive, emissiveMap, emissiveIntensity } = material;
+  const wrinkles = normalMap?.isRenderTargetTexture ? normalMap : null;
   const { alphaMap, alphaTest, transparent, opacity, side, depthWrite, vertexColors } = material;
   const matte = new THREE.MeshLambertMaterial({
-    name, color, map, normalMap, normalScale, aoMap, emissive, emissiveMap, emissiveIntensity,
+    name, color, map, normalMap: wrinkles, normalScale, aoMap, emissive, emissiveMap, emissiveIntensity,
     alphaMap, alphaTest, transparent, opacity, side, depthWrite, vertexColors,
   });
   material.dispose();

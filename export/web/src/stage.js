@@ -8,7 +8,7 @@ import { ProcessorMorphing } from "./processor_morphing.js";
 
 const FIELD = 24; // degrees; a portrait lens
 const MOST_PIXELS = 2; // for one of the page's: more is work that nobody sees
-const SOFTWARE_PIXELS = 125_000; // of a whole drawing without a graphics card, each of several samples: without these, hairs are specks
+const SOFTWARE_PIXELS = 250_000; // of a whole drawing without a graphics card, each of one sample: half of them with several take longer
 const SOFTWARE = /swiftshader|llvmpipe|softpipe|software|basic render/i; // WebGL without a graphics card
 
 export class Stage {
@@ -29,7 +29,7 @@ export class Stage {
    */
   constructor(canvas, film = null) {
     this.#film = film;
-    this.#renderer = new THREE.WebGLRenderer({ canvas, antialias: true, alpha: true });
+    this.#renderer = new THREE.WebGLRenderer({ canvas, antialias: film !== null || !this.#software, alpha: true });
     if (film !== null) this.#scene.background = new THREE.Color(film.background);
     this.#renderer.toneMapping = THREE.NeutralToneMapping;
     const key = new THREE.DirectionalLight(0xfff4e8, 2.2), rim = new THREE.DirectionalLight(0xdce8ff, 0.8);

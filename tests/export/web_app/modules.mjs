@@ -158,6 +158,17 @@ const jobs = {
     return { expected, found, left: meshes.some((mesh) => "position" in mesh.geometry.morphAttributes) };
   },
 
+  /** Materials of a skin, of one whose wrinkles come and go, and of an eye, made lighter: type, and whether normals are drawn. */
+  async lighter() {
+    const { lighten } = await load("lighter_drawing");
+    const THREE = await import("three");
+    const still = new THREE.Texture(), mixed = new THREE.WebGLRenderTarget(2, 2).texture, root = new THREE.Group();
+    for (const [normalMap, roughness] of [[still, 1], [mixed, 1], [still, 0.25]])
+      root.add(new THREE.Mesh(new THREE.BufferGeometry(), new THREE.MeshStandardMaterial({ normalMap, roughness, metalness: 0 })));
+    lighten(root);
+    return root.children.map(({ material }) => [material.type, material.normalMap !== null]);
+  },
+
   /** Drawings of [milliseconds, and those for each pixel drawn for one of the page's], from two on: their time, rest and ratio. */
   async pace() {
     const { DrawingPace } = await load("drawing_pace");

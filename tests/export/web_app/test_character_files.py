@@ -65,6 +65,11 @@ def test_morph_targets_summed_for_software_drawing_are_those_of_three(run: Run, 
     assert not told["left"]
 
 
+def test_matte_surfaces_are_drawn_without_fine_normals_but_with_wrinkles_in_software(run: Run) -> None:
+    matte, shiny = "MeshLambertMaterial", "MeshStandardMaterial"
+    assert run("lighter", None) == [[matte, False], [matte, True], [shiny, True]]
+
+
 def saved(run: Run, job: dict[str, Any], kind: str) -> bytes:
     return base64.b64decode(run("save", {**job, "kind": kind}))
 
