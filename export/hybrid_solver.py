@@ -5,7 +5,7 @@ from pathlib import Path
 import tyro
 
 from torchface import Attachment, load_rig
-from torchface.onnx import export_hybrid_solver
+from torchface.onnx import export_solver
 
 
 def hybrid_solver(rig: Path, attachment: Path, out: Path, part: str | None = None) -> None:
@@ -17,7 +17,7 @@ def hybrid_solver(rig: Path, attachment: Path, out: Path, part: str | None = Non
         out: The .onnx file to write.
         part: Keep this region of the rig only, such as face.
     """
-    print(export_hybrid_solver(load_rig(rig, part=part), Attachment.load(attachment), out))
+    print(export_solver(load_rig(rig, part=part), Attachment.load(attachment), out, hybrid=True))
 
 
 if __name__ == "__main__":

@@ -49,7 +49,6 @@ UNSHOWN = {
         "landmarks.AppearanceModel",
         "onnx.export_dynamics_prior",
         "onnx.export_example_solver",
-        "onnx.export_hybrid_solver",
         "onnx.export_solver",
         "onnx.export_wrinkle_weights",
         "onnx.export_video_solver",

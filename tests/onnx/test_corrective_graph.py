@@ -15,8 +15,8 @@ from torchface.landmarks.images.graph_session import graph_session
 from torchface.onnx.corrective_graph import CorrectiveGraph
 from torchface.onnx.solver_graph import SolverGraph
 from torchface.onnx.solver_graph_export import (
-    export_hybrid_solver,
     export_marker_solver,
+    export_solver,
     hide_markers,
     random_frames,
     solver_model,
@@ -113,9 +113,8 @@ def test_a_hybrid_file_is_written_and_checked(tmp_path: Path) -> None:
     whole = performer(texture=False)
     rig = whole.select(["jawOpen", "mouthPucker", "mouthSmileLeft", "mouthSmileRight"])
     rig = BlendshapeRig(rig.neutral, rig.deltas, rig.names, planted_correctives(rig, 3))
-    report = export_hybrid_solver(
-        rig, Attachment.from_vertices(rig.neutral, rig.neutral.landmarks), tmp_path / "a.onnx"
-    )
+    sites = Attachment.from_vertices(rig.neutral, rig.neutral.landmarks)
+    report = export_solver(rig, sites, tmp_path / "a.onnx", hybrid=True)
     assert all(gap.parity < 1e-5 for gap in report.gaps)
     print(report)
 

@@ -16,7 +16,7 @@ from torch import Tensor
 from torchface import Attachment, BlendshapeRig, __version__
 from torchface.capture import HybridSolver, MarkerSolver
 from torchface.errors import ValueRangeError
-from torchface.onnx import SolverReport, export_hybrid_solver, export_model, export_solver, solver_graph_export
+from torchface.onnx import SolverReport, export_model, export_solver, solver_graph_export
 from torchface.onnx.solver_graph_export import (
     GraphSteps,
     hide_markers,
@@ -119,7 +119,7 @@ def test_a_graph_that_disagrees_is_not_written(
 @pytest.mark.bench  # torch.export takes twenty seconds; test_solver_graph.py tries the module that is exported
 def test_the_hybrid_file_computes_it_and_says_what_it_takes(dome_rig: BlendshapeRig, tmp_path: Path) -> None:
     path = tmp_path / "hybrid.onnx"
-    report = export_hybrid_solver(dome_rig, place_markers(dome_rig, 30), path)
+    report = export_solver(dome_rig, place_markers(dome_rig, 30), path, hybrid=True)
     assert max(gap.parity for gap in report.gaps) <= 1e-5
     assert max(gap.worst for gap in report.gaps) <= 1e-4
     solver = MarkerSolver(dome_rig, place_markers(dome_rig, 30))

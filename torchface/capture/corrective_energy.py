@@ -8,6 +8,7 @@ from torch.nn.functional import pad
 
 from torchface.capture.energy import Quadratic, chunks_of_frames
 from torchface.correctives.activation import CorrectiveActivation, RoundedActivation
+from torchface.optim import box_qp
 from torchface.optim.box_problem import BoxProblem
 from torchface.optim.implicit import attach_gradients
 from torchface.optim.prepared_program import PreparedProgram
@@ -100,9 +101,14 @@ class CorrectiveEnergy:
 
 
 def least_in_box(
-    energy: CorrectiveEnergy, start: Tensor, lower: Tensor, upper: Tensor, tolerance: float, far: bool = True
+    energy: CorrectiveEnergy | Quadratic,
+    start: Tensor,
+    lower: Tensor,
+    upper: Tensor,
+    tolerance: float,
+    far: bool = True,
 ) -> Tensor:
-    r"""The least of an energy in a box near a start, by Gauss-Newton, each frame on its own.
+    r"""The least of an energy in a box near a start, by Gauss-Newton, each frame on its own; of a quadratic its own.
 
     A step goes to the least of the linearised energy in the box, half as far where E would not fall, and so on.
     Products of weights make E no longer convex: the least is the one downhill of the start. In-betweens bend it at
@@ -120,6 +126,8 @@ def least_in_box(
 
     Source: Bertsekas 1982 for steps in a box; Nocedal and Wright 2006, 10.3, for Gauss-Newton.
     """
+    if isinstance(energy, Quadratic):
+        return box_qp(energy.H, energy.f, lower, upper, start.detach(), tolerance)
     parts = []
     for rows in chunks_of_frames(torch.arange(len(start), device=start.device), energy.extended.f.shape[1]):
         part = energy.rows(rows)

@@ -8,7 +8,7 @@ from torchface.onnx.example_graph_export import ExampleReport, export_example_so
 from torchface.onnx.model_export import export_model
 from torchface.onnx.module_graph import export_module
 from torchface.onnx.solver_graph import SolverGraph
-from torchface.onnx.solver_graph_export import GraphSteps, SolverReport, export_hybrid_solver, export_solver
+from torchface.onnx.solver_graph_export import GraphSteps, SolverReport, export_solver
 from torchface.onnx.video_graph import VideoGraph
 from torchface.onnx.video_graph_export import VideoReport, export_video_solver
 
@@ -24,7 +24,6 @@ __all__ = [
     "export_action_units",
     "export_dynamics_prior",
     "export_example_solver",
-    "export_hybrid_solver",
     "export_model",
     "export_module",
     "export_solver",

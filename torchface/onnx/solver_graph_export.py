@@ -15,10 +15,9 @@ from torch import Tensor
 
 from torchface.attachment import Attachment
 from torchface.capture.markers.hybrid_solver import GAMMA, HybridSolver
-from torchface.capture.markers.marker_solver import RIDGE, SPARSITY, MarkerSolver, penalty_value
+from torchface.capture.markers.marker_solver import MarkerSolver, penalty_value
 from torchface.errors import ValueRangeError
 from torchface.files.whole_files import write_file
-from torchface.geometry.similarity import Similarity
 from torchface.landmarks.images.graph_session import graph_session
 from torchface.number_checks import checked_count
 from torchface.onnx.checked_export import WrittenGraph
@@ -136,31 +135,32 @@ def export_solver(
     rig: BlendshapeRig,
     attachment: Attachment,
     path: str | Path,
-    alignment: Similarity | None = None,
-    sparsity: float = SPARSITY,
-    ridge: float = RIDGE,
     steps: GraphSteps = GraphSteps(),
     markers: Tensor | None = None,
+    hybrid: bool = False,
 ) -> SolverReport:
     """Writes the marker solve of one rig and layout as ONNX, and checks it.
 
     The graph takes ``markers`` (B,M,3), millimetres, NaN where not seen, and ``previous`` (B,N), and gives ``weights``
-    (B,N). The metadata holds ``shape_names`` and ``marker_labels`` (JSON), ``units``, ``version`` and the settings.
+    (B,N). That of the hybrid solve takes two inputs more: ``predicted`` (B,N), the weights that a classifier says, and
+    ``gamma`` (B,N), how much that counts, mm² over all markers; where gamma is zero in a whole batch it computes what
+    the other graph does. The metadata holds ``shape_names`` and ``marker_labels`` (JSON), ``units``, ``version`` and
+    the settings.
 
     Args:
         rig: N shapes.
         attachment: M markers.
         path: the file to write; it appears only when it is complete and checked.
-        alignment: marker space to rig space, baked in.
-        sparsity, ridge: as in ``MarkerSolver``.
         steps: of the graph's solve; a rig with correctives takes ``CorrectiveGraph``'s.
         markers: frames to check with, (T,M,3), without gaps; random sparse weights and 0.3 mm of noise if absent.
+        hybrid: the hybrid solve, checked with random predictions for a seventh of the weights. ``export_model`` writes
+            a ``MarkerSolver`` with an alignment or other penalties.
 
     Raises:
         ValueRangeError: ONNX Runtime and PyTorch differ by more than 1e-5 and more than rounding explains; nothing is
             written.
     """
-    return export_marker_solver(MarkerSolver(rig, attachment, alignment, sparsity, ridge), path, steps, markers)
+    return export_marker_solver(MarkerSolver(rig, attachment), path, steps, markers, hybrid=hybrid)
 
 
 def export_marker_solver(
@@ -175,7 +175,7 @@ def export_marker_solver(
     """Writes a solver as ONNX, and checks it; see :func:`export_solver`.
 
     Args:
-        hybrid: with the inputs of :func:`export_hybrid_solver`.
+        hybrid: with the inputs of the hybrid solve.
     """
     progress = progress or silent
     solver = copy.deepcopy(solver).cpu().float()
@@ -189,28 +189,6 @@ def export_marker_solver(
     predicted, strength = torch.rand(shape, generator=generator), GAMMA * torch.rand(shape, generator=generator)
     gamma = torch.where(torch.rand(shape, generator=generator) < 1 / 7, strength, 0.0)
     return _export(graph, HybridSolver(solver), frames, (predicted, gamma), path, facts, progress)
-
-
-def export_hybrid_solver(
-    rig: BlendshapeRig,
-    attachment: Attachment,
-    path: str | Path,
-    alignment: Similarity | None = None,
-    sparsity: float = SPARSITY,
-    ridge: float = RIDGE,
-    steps: GraphSteps = GraphSteps(),
-    markers: Tensor | None = None,
-) -> SolverReport:
-    """Writes the hybrid solve of one rig and layout as ONNX, and checks it.
-
-    The graph has two inputs more than :func:`export_solver`'s: ``predicted`` (B,N), the weights that a classifier
-    says, and ``gamma`` (B,N), how much that counts, mm² over all markers. Where gamma is zero in a whole batch it
-    computes what the other graph does. It is checked with random predictions for a seventh of the weights.
-
-    Args, Raises: as :func:`export_solver`; a rig with correctives takes ``CorrectiveGraph``'s steps.
-    """
-    solver = MarkerSolver(rig, attachment, alignment, sparsity, ridge)
-    return export_marker_solver(solver, path, steps, markers, hybrid=True)
 
 
 def solver_graph(

@@ -1,5 +1,7 @@
 """The hybrid solve: the markers' own weights where nothing is predicted, the right optimum where something is."""
 
+from typing import Any
+
 import pytest
 import torch
 from torch import Tensor
@@ -67,12 +69,12 @@ def test_both_solves_stop_at_the_tolerance_of_the_markers(
     markers[1, :5] = torch.nan
     asked: list[float] = []
 
-    def watched(H: Tensor, f: Tensor, lower: float, upper: float, start: Tensor, tolerance: float) -> Tensor:
+    def watched(H: Tensor, f: Tensor, lower: Any, upper: Any, start: Tensor, tolerance: float) -> Tensor:
         asked.append(tolerance)
         return box_qp(H, f, lower, upper, start, tolerance)
 
-    for solver in ("marker_solver", "hybrid_solver"):
-        monkeypatch.setattr(f"torchface.capture.markers.{solver}.box_qp", watched)
+    for module in ("markers.marker_solver", "corrective_energy"):
+        monkeypatch.setattr(f"torchface.capture.{module}.box_qp", watched)
     hybrid(markers.to(dtype), truth.to(dtype), torch.ones_like(truth).to(dtype))
     assert asked == 2 * [default_tolerance(dtype)]
 

@@ -10,7 +10,6 @@ from torchface.capture.energy import Quadratic, chunks_of_frames, pull_term
 from torchface.capture.markers.marker_solver import MarkerSolver, frames_seen
 from torchface.errors import NameMismatchError, ShapeError, ValueRangeError
 from torchface.number_checks import LARGEST_WEIGHT, checked_number, checked_type
-from torchface.optim import box_qp
 from torchface.optim.box_checks import default_tolerance
 from torchface.optim.data_dependent import data_dependent
 from torchface.take import Take, Track
@@ -121,13 +120,9 @@ class HybridSolver(nn.Module):
         for chunk in chunks_of_frames(pulled, len(self.names)):
             active = gamma[chunk] > 0
             energy = self.energy(markers[chunk], torch.where(active, predicted[chunk], 0.0), gamma[chunk])
-            start = alone[chunk].detach().double()
-            if isinstance(energy, CorrectiveEnergy):
-                lower, upper = torch.zeros_like(start[0]), torch.ones_like(start[0])
-                parts.append(least_in_box(energy, start, lower, upper, tolerance).to(alone.dtype))
-                continue
-            H = energy.H if energy.H.ndim == 3 else energy.H.expand(len(chunk), -1, -1)
-            parts.append(box_qp(H, energy.f, 0.0, 1.0, start, tolerance).to(alone.dtype))
+            start = alone[chunk].double()
+            lower, upper = torch.zeros_like(start[0]), torch.ones_like(start[0])
+            parts.append(least_in_box(energy, start, lower, upper, tolerance).to(alone.dtype))
         return alone.index_copy(0, pulled, torch.cat(parts))
 
     def solve_take(self, take: Take, predicted: Track, gamma: Track) -> Take:

@@ -187,11 +187,8 @@ class MarkerSolver(nn.Module):
         """
         names, labels = config["names"], config["labels"]
         for what, found in (("names", names), ("labels", labels)):
-            if (
-                not isinstance(found, list)
-                or not all(isinstance(n, str) for n in found)
-                or len(set(found)) < len(found)
-            ):
+            texts = isinstance(found, list) and all(isinstance(name, str) for name in found)
+            if not texts or len(set(found)) < len(found):
                 raise NameMismatchError(f"{what}: found {found!r:.80}, expected a list of distinct names")
         self = cls.__new__(cls)
         nn.Module.__init__(self)
@@ -306,11 +303,9 @@ class MarkerSolver(nn.Module):
         both = (weaker & (weights > 0)).any(1)
         for held in weaker[both].unique(dim=0):  # frames with the same sides at rest share a box
             for rows in chunks_of_frames((both & (weaker == held).all(1)).nonzero()[:, 0], len(self.names)):
-                energy, upper = self.energy(markers[rows]), (~held).to(weights)
-                if isinstance(energy, Quadratic):
-                    part = box_qp(energy.H, energy.f, 0.0, upper, tolerance=tolerance)
-                else:
-                    part = least_in_box(energy, weights[rows], torch.zeros_like(upper), upper, tolerance, False)
+                upper, start = (~held).to(weights), weights[rows].detach() * ~held
+                energy = self.energy(markers[rows])
+                part = least_in_box(energy, start, torch.zeros_like(upper), upper, tolerance, False)
                 weights = weights.index_copy(0, rows, part)
         return one_side(weights, signed)
 
@@ -375,10 +370,15 @@ class MarkerSolver(nn.Module):
                 parts.append(least_in_box(energy, initial[chunk], lower, upper, tolerance, not guessed))
         return torch.zeros_like(initial).index_copy(0, torch.cat(rows), torch.cat(parts))
 
+    @property
+    def _learns(self) -> bool:
+        """Whether gradients are asked for in what is prepared once."""
+        parts = (self.basis, self.corrective_basis, self.rest, self.ridge)
+        return torch.is_grad_enabled() and any(isinstance(part, Tensor) and part.requires_grad for part in parts)
+
     def complete_energy(self, markers: Tensor) -> CorrectiveEnergy | Quadratic:
         """``energy`` of markers without gaps, its H formed on first use."""
-        parts = (self.basis, self.corrective_basis, self.rest, self.ridge)
-        if torch.is_grad_enabled() and any(isinstance(part, Tensor) and part.requires_grad for part in parts):
+        if self._learns:
             return self.energy(markers)
         assert self.corrective_basis is not None
         assert self.activation is not None
@@ -406,8 +406,7 @@ class MarkerSolver(nn.Module):
 
     def _shared(self, tolerance: float) -> BoxQP:
         """The problem of complete frames: prepared once, and anew where what it is made of has changed."""
-        parts = (self.basis, self.rest, self.ridge)
-        if torch.is_grad_enabled() and any(isinstance(part, Tensor) and part.requires_grad for part in parts):
+        if self._learns:
             return BoxQP(self.complete_hessian(), 0.0, 1.0, tolerance)  # a graph serves one backward pass
         prepare = self._prepared.setdefault(tolerance, Prepared())
         return prepare.get((self.basis, self.ridge), lambda: BoxQP(self.complete_hessian(), 0.0, 1.0, tolerance))

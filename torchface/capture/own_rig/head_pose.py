@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torchface.errors import AlignmentError, ShapeError, ValueRangeError
+from torchface.errors import AlignmentError, ShapeError
 from torchface.geometry.cameras.robust_pnp import robust_pnp
 
 STABLE_LANDMARKS = (0, 1, 15, 16, 27, 28, 29, 30, 33, 36, 39, 42, 45)
@@ -18,21 +18,10 @@ The next are nostrils, cheeks and brows with 1.3 to 2.5 mm; lips and chin move b
 _TRUST = torch.tensor([0.25 if i < 17 else 1.0 for i in STABLE_LANDMARKS], dtype=torch.float64)
 
 
-@dataclass(frozen=True)
-class PoseSettings:
-    """How head poses are found."""
-
-    # how far a stable landmark may be off before it counts as an outlier, millimetres on the head; twice that for the
-    # temples. The rig is not the person to the millimetre, so this is more than landmarks are noisy
-    threshold: float = 8.0
-    min_landmarks: int = 6  # stable landmarks that a pose needs
-
-    def __post_init__(self) -> None:
-        if not 0 < self.threshold < float("inf") or self.min_landmarks < 4:
-            raise ValueRangeError(
-                f"pose: found threshold {self.threshold} and min_landmarks {self.min_landmarks}, expected positive "
-                "millimetres and at least 4"
-            )
+# How far a stable landmark may be off before it counts as an outlier, millimetres on the head; twice that for the
+# temples. The rig is not the person to the millimetre, so this is more than landmarks are noisy.
+_THRESHOLD = 8.0
+_MIN_LANDMARKS = 6  # stable landmarks that a pose needs
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,13 +34,7 @@ class HeadPoses:
     found: Tensor  # frames with a pose, (T,) bool
 
 
-def measure_poses(
-    points: Tensor,
-    landmarks: Tensor,
-    intrinsics: Tensor,
-    confidence: Tensor | None = None,
-    settings: PoseSettings | None = None,
-) -> HeadPoses:
+def measure_poses(points: Tensor, landmarks: Tensor, intrinsics: Tensor, confidence: Tensor | None = None) -> HeadPoses:
     """The pose of each frame by itself.
 
     Args:
@@ -59,27 +42,25 @@ def measure_poses(
         landmarks: (T,68,2), pixels, NaN for not seen; undistorted.
         intrinsics: K, (3,3).
         confidence: from 0, (T,68); equal if absent.
-        settings: see :class:`PoseSettings`.
 
     Returns:
         ``HeadPoses``. Frames with fewer than six stable landmarks that agree are not found.
 
     Source: thesis 4.2.4.
     """
-    settings = settings or PoseSettings()
     _check_shapes(points, landmarks, confidence)
     stable = torch.tensor(STABLE_LANDMARKS, device=landmarks.device)
     x, q = points.detach().double()[stable], landmarks[:, stable].double()
     weights = _TRUST.to(q).expand(len(q), -1)
     if confidence is not None:
         weights = weights * confidence[:, stable].double().nan_to_num(0.0).clamp(min=0)
-    seen = robust_pnp(x, q, intrinsics, _limits(x, q, settings), weights)
-    found = seen.inliers.sum(1) >= settings.min_landmarks
+    seen = robust_pnp(x, q, intrinsics, _limits(x, q), weights)
+    found = seen.inliers.sum(1) >= _MIN_LANDMARKS
     if not bool(found.any()):
         most = int(torch.isfinite(q).all(-1).sum(1).max())
         raise AlignmentError(
             f"head pose: found at most {most} of the {len(STABLE_LANDMARKS)} stable landmarks in any of {len(q)} "
-            f"frames, expected {settings.min_landmarks} that agree with one pose in some frame"
+            f"frames, expected {_MIN_LANDMARKS} that agree with one pose in some frame"
         )
     return HeadPoses(
         torch.where(found[:, None, None], seen.pose.rotation, torch.nan),
@@ -89,14 +70,14 @@ def measure_poses(
     )
 
 
-def _limits(x: Tensor, q: Tensor, settings: PoseSettings) -> Tensor:
+def _limits(x: Tensor, q: Tensor) -> Tensor:
     """The threshold in pixels of each frame: millimetres times how large the head is seen, (T,)."""
     seen = torch.isfinite(q).all(-1)
     centre = torch.where(seen[..., None], q, torch.nan).nanmedian(1, keepdim=True).values
     # Medians, so that outliers do not make the head larger than it is.
     far = (q - centre).norm(dim=-1).nanmedian(1).values
     size = (x - x.median(0).values)[:, :2].norm(dim=-1).median()
-    return (settings.threshold * far / size).nan_to_num(1.0).clamp(min=1.0)
+    return (_THRESHOLD * far / size).nan_to_num(1.0).clamp(min=1.0)
 
 
 def _check_shapes(points: Tensor, landmarks: Tensor, confidence: Tensor | None) -> None:
