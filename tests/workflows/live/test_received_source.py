@@ -3,10 +3,11 @@
 import json
 import math
 import socket
+import struct
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from itertools import pairwise
 from pathlib import Path
 from types import SimpleNamespace
@@ -14,6 +15,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
+from osc_receiver import values_by_address
 from received_frames import decode_frame
 
 from torchface import BlendshapeRig, load_take, save_rig
@@ -91,6 +93,59 @@ def test_an_iphones_packets_move_a_character_and_are_recorded_and_sent_on(
     assert said[0].startswith(f"Waiting for a face at port {port}: have the app send to ")
     assert any(words.startswith("Receiving from LLV Default Device 127.0.0.1") for words in said)
     assert "ms from frame to packet" in report.lines()[1]
+
+
+@contextmanager
+def engine() -> Iterator[tuple[int, list[bytes]]]:
+    """A port that another program listens at, and the packets that come there."""
+    packets, ended = list[bytes](), threading.Event()
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as listening:
+        listening.bind(("127.0.0.1", 0))
+        listening.settimeout(0.2)
+
+        def receive() -> None:
+            while not ended.is_set():
+                with suppress(TimeoutError):
+                    packets.append(listening.recv(65536))
+
+        thread = threading.Thread(target=receive)
+        thread.start()
+        try:
+            yield int(listening.getsockname()[1]), packets
+        finally:
+            ended.set()
+            thread.join()
+
+
+@pytest.mark.real
+def test_a_performance_of_an_iphone_is_recorded_and_sent_by_two_protocols_at_once(
+    dome: Path, tmp_path: Path, data: Path
+) -> None:
+    """In its own time; read by python-osc. Between two packets of the file seven are missing."""
+    packets = list(recorded_packets(data / "protocols" / "live_link_dao.gesichter"))
+    acted = torch.tensor([struct.unpack("!61f", packet[-244:]) for packet in packets])
+    port, said = free_port(), list[str]()
+    with engine() as (vmc, vmc_packets), engine() as (osc, osc_packets), phone(packets, port, said, 60.0):
+        to = (f"vmc://127.0.0.1:{vmc}", f"osc://127.0.0.1:{osc}/face")
+        settings = LiveSettings(
+            f"livelink://127.0.0.1:{port}", dome, None, to, tmp_path / "out", page=False, seconds=4.5
+        )
+        report, _ = go_live(settings, said.append, print, lambda progress: pytest.fail("no solver is needed"))
+    assert report.figures.found >= len(packets)
+    assert report.notes == ("7 lost",)
+    take = load_take(tmp_path / "out" / "live_link.csv")
+    assert take.weights is not None
+    kept = take.weights.values[:, JAW, 0]
+    assert float(kept.max()) == pytest.approx(float(acted[:, JAW].max()), abs=0.05)
+    by_vmc, by_osc = values_by_address(vmc_packets), values_by_address(osc_packets)
+    sent = torch.tensor([value for name, value in by_vmc["/VMC/Ext/Blend/Val"] if name == "jawOpen"])
+    torch.testing.assert_close(sent, torch.tensor(by_osc["/face/weights/jawOpen"])[:, 0])
+    torch.testing.assert_close(sent, kept, atol=1e-5, rtol=0)
+    # The head turns as the phone's did: of its quaternion the part about the vertical axis.
+    turned = torch.tensor([values[4] for name, *values in by_vmc["/VMC/Ext/Bone/Pos"] if name == "Head"])
+    yaw = take.extras["columns"]["HeadYaw"].float()
+    assert float(yaw.max()) == pytest.approx(float(acted[:, 52].max()), abs=0.02)
+    assert abs(float(torch.corrcoef(torch.stack([turned, yaw]))[0, 1])) > 0.99
 
 
 def a_source() -> ReceivedSource:
