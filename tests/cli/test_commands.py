@@ -132,7 +132,7 @@ def test_render_and_info_and_export(
         assert fact in told
     out = shoot / "solver.onnx"
 
-    def exported(solver: MarkerSolver, path: Path, steps: GraphSteps, **_: object) -> Any:
+    def exported(solver: MarkerSolver, path: Path, steps: GraphSteps, hybrid: bool, **_: object) -> Any:
         """In place of twenty seconds of ``torch.export``."""
         values = [
             onnx.helper.make_tensor_value_info(name, 1, [len(solver.labels), 3]) for name in ("markers", "weights")
@@ -141,16 +141,21 @@ def test_render_and_info_and_export(
         opset = [onnx.helper.make_opsetid("", 18)]
         graph = onnx.helper.make_graph([node], "g", values[:1], values[1:])
         onnx.save(onnx.helper.make_model(graph, opset_imports=opset, ir_version=9), path)
-        rows = [(", ".join(solver.names), steps.method)]
+        rows = [(", ".join(solver.names), steps.method), ("hybrid", str(hybrid))]
         return SimpleNamespace(rows=lambda: rows, verdict=lambda: "result: good")
 
     monkeypatch.setattr("torchface.onnx.solver_graph_export.export_marker_solver", exported)
-    run("export", "solver", "--rig", shoot / "rig.glb", "--attachment", shoot / "attachment.json", "--out", out)
+    given = ("--rig", shoot / "rig.glb", "--attachment", shoot / "attachment.json", "--out", out)
+    run("export", "solver", *given)
     said = capsys.readouterr()
     assert "jawOpen, browInnerUp, mouthSmileLeft, mouthSmileRight" in said.out + said.err
     assert "splitting" in said.out + said.err
+    assert "False" in said.out + said.err
     run("info", out)
     assert "markers (30" in capsys.readouterr().err
+    run("export", "solver", *given, "--hybrid")
+    said = capsys.readouterr()
+    assert "True" in said.out + said.err
 
 
 def test_info_tells_of_the_animation_in_a_file(

@@ -16,6 +16,7 @@ def solver(
     attachment: Path,
     out: OutputPath,
     method: Method = "splitting",
+    hybrid: bool = False,
     part: Part = None,
     quiet: Quiet = False,
 ) -> None:
@@ -32,36 +33,9 @@ def solver(
         out: The .onnx file to write.
         method: How the graph solves: operator splitting, the quicker one, or projected gradient, a loop without a
             factorisation.
+        hybrid: The hybrid solve, with two inputs more: `predicted` (B,N), weights in [0,1] that a classifier says, and
+            `gamma` (B,N), how much that counts (0 to 4; 0 leaves a frame to its markers).
     """
-    _write_solver(False, rig, attachment, out, method, part, quiet)
-
-
-def hybrid_solver(
-    rig: Path,
-    attachment: Path,
-    out: OutputPath,
-    method: Method = "splitting",
-    part: Part = None,
-    quiet: Quiet = False,
-) -> None:
-    """Write the hybrid solve of one rig and one marker layout as an ONNX file, and check it.
-
-    As `torchface export solver`, with two inputs more: `predicted` (B,N), weights in [0,1] that a classifier says, and
-    `gamma` (B,N), how much that counts (0 to 4; 0 leaves a frame to its markers).
-
-    Args:
-        rig: A .glb or USD file, a folder of OBJ files, or ICT-FaceKit's FaceXModel folder.
-        attachment: Where the markers sit, as JSON.
-        out: The .onnx file to write.
-        method: How the graph solves: operator splitting, the quicker one, or projected gradient, a loop without a
-            factorisation.
-    """
-    _write_solver(True, rig, attachment, out, method, part, quiet)
-
-
-def _write_solver(
-    hybrid: bool, rig: Path, attachment: Path, out: Path, method: Method, part: str | None, quiet: bool
-) -> None:
     from torchface.attachment import Attachment
     from torchface.capture import MarkerSolver
     from torchface.files.job_lock import file_lock
@@ -346,7 +320,6 @@ def export_model(name: str, /, out: OutputPath, quiet: Quiet = False) -> None:
 
 EXPORTS: dict[str, Callable[..., None]] = {
     "solver": solver,
-    "hybrid-solver": hybrid_solver,
     "action-units": action_units,
     "video-solver": video_solver,
     "examples": examples,

@@ -94,7 +94,7 @@ class HybridSolver(nn.Module):
         energy = self.markers.energy(markers)
         return energy + pull_term(predicted.double(), gamma.double() / len(self.markers.labels))
 
-    @data_dependent("torchface.onnx.SolverGraph, which `torchface export hybrid-solver` writes")
+    @data_dependent("torchface.onnx.SolverGraph, which `torchface export solver --hybrid` writes")
     def forward(self, markers: Tensor, predicted: Tensor, gamma: Tensor) -> Tensor:
         r"""Weights for markers and predictions.
 
