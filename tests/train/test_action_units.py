@@ -79,7 +79,9 @@ def test_units_of_ones_own_are_grouped_by_the_labels(tmp_path: Path) -> None:
     save_action_labels(labels, tmp_path / "own.toml")
     again = load_action_labels(tmp_path / "own.toml")
     assert again == labels
-    assert performed_groups([again]) == (replace(groups[0], units=("18R",)), groups[1])
+    with pytest.warns(UserWarning, match="no frame shows 16, which"):
+        found = performed_groups([again])
+    assert found == (replace(groups[0], units=("18R",)), groups[1])
     with pytest.raises(NameMismatchError, match="group 'brows' has regions brow and units 4, expected some of mouth"):
         replace(labels, groups=(RegionGroup("brows", ("brow",), ("4",)),))
     with pytest.raises(TorchfaceError, match=r"found the units 15, 18R, expected .*; others need \[\[groups\]\]"):

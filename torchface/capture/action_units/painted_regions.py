@@ -1,5 +1,6 @@
 """Regions of the face sampled from every frame, stabilised, at one size."""
 
+import warnings
 from collections.abc import Mapping, Sequence
 
 import torch
@@ -22,7 +23,7 @@ Between the brows AU 4 shows too, but other performers' lowered brows are classi
 
 
 def performed_groups(labels: Sequence[ActionLabels]) -> tuple[RegionGroup, ...]:
-    """The groups that labels name, or the usual ones, of those units that are performed."""
+    """The groups that labels name, or the usual ones, of those units that are performed; warns of others they name."""
     performed = {unit for own in labels for unit in own.units}
     usual = next((own.groups for own in labels if own.groups), GROUPS)
     known = {unit for group in usual for unit in group.units}
@@ -32,6 +33,9 @@ def performed_groups(labels: Sequence[ActionLabels]) -> tuple[RegionGroup, ...]:
             f"labels: found the units {found}, expected some of {', '.join(sorted(known))}; others need [[groups]] in "
             "the labels, with name, regions and units"
         )
+    if usual is not GROUPS and known - performed:
+        lacking = ", ".join(sorted(known - performed))
+        warnings.warn(f"labels: no frame shows {lacking}, which [[groups]] name; not learned", stacklevel=2)
     shown = [
         RegionGroup(group.name, group.regions, *(tuple(unit for unit in units if unit in performed) for units in both))
         for group in usual
