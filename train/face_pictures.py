@@ -27,7 +27,7 @@ EACH = 4
 """Pictures of one person, in a row."""
 _TENSORS = ("rgba", "landmarks", "visible")
 _POINTS = ("points", "point_visible", "weights")
-_PEOPLE = 0.8  # of the pictures show ICT-FaceKit's heads, where there are some
+_PEOPLE = 0.5  # of the pictures show ICT-FaceKit's heads, where there are some
 
 
 class StoredPictures(Dataset[tuple[Tensor, ...]]):
@@ -101,7 +101,7 @@ def picture_files(
     folder: Path, count: int, seed: int, ict: Path | None = None, workers: int = 1, progress: Progress | None = None
 ) -> list[Path]:
     """Renders what a folder does not hold yet, :data:`PART` pictures a file; see ``rendered_files``."""
-    rendering = Rendering(_render, "face pictures/6", "pictures", "faces", PART)
+    rendering = Rendering(_render, "face pictures/7", "pictures", "faces", PART)
     return rendered_files(rendering, folder, count, seed, ict, workers, progress)
 
 
@@ -112,7 +112,7 @@ def _render(first: int, count: int, seed: int, ict: Path | None) -> dict[str, Te
 
 @lru_cache(maxsize=2)
 def head_kinds(ict: Path | None) -> tuple[tuple[HeadKind, ...], tuple[float, ...]]:
-    """Kinds of heads and how often each is drawn: embedded performers alone, or with ICT-FaceKit's, four in five."""
+    """Kinds of heads and how often each is drawn: embedded performers alone, or with ICT-FaceKit's, in equal parts."""
     if ict is None:
         return (performer_kind(),), (1.0,)
     return (people_kind(load_ict_facekit(ict), load_identity_modes(ict)), performer_kind()), (_PEOPLE, 1 - _PEOPLE)

@@ -7,6 +7,7 @@ network that ships. ``--start zoo --data FOLDER`` has it learn from photographs 
 a minute or two. Killed and started again it goes on.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 
@@ -14,6 +15,7 @@ import torch
 from torch import Tensor
 
 from torchface import zoo
+from torchface.errors import ValueRangeError
 from torchface.landmarks import LandmarkNetwork, NetworkSettings
 from torchface.landmarks.images.ibug_68 import COUNT, INNER
 from torchface.landmarks.images.networks.landmark_network import NetworkLandmarks
@@ -42,6 +44,8 @@ class Settings(RenderedSettings):
 
     Args:
         start: A network to go on from, by name or folder; zoo for the one that ships; a new one if absent.
+        kept: Share of that network in the mean of its weights and of those that it has learned since: it keeps what it
+            knew of pictures unlike the new ones (Wortsman et al. 2022, robust fine-tuning).
         size: Pixels a side of the crops that it learns from.
         network: How the network is trained.
         data: Photographs with iBUG's .pts files of the same names, or a dlib .xml: the network goes on learning from
@@ -54,6 +58,7 @@ class Settings(RenderedSettings):
     held_out: int = 480
     folder: Path = Path("out/face_pictures")
     start: str | None = None
+    kept: float = 0.0
     size: int = 176
     network: NetworkSettings = field(default_factory=NetworkSettings)
     data: Path | None = None
@@ -64,19 +69,23 @@ def train(settings: Settings, run: Run) -> LandmarkNetwork:
     """Renders, trains, calibrates, evaluates and saves.
 
     Raises:
-        ValueRangeError: fewer pictures than are held out and a part more.
+        ValueRangeError: fewer pictures than are held out and a part more, or a share that none has.
         NameMismatchError: ``start`` is no landmark network.
     """
     progress = run.progress
     if settings.data is not None:
         return fine_tuned(settings, settings.data, run)
     settings.check_count(PART)
+    if not 0 <= settings.kept < 1 or (settings.kept and settings.start is None):
+        raise ValueRangeError(f"--kept: found {settings.kept:g}, expected [0,1), and 0 without --start")
     first = first_network(settings)
+    before = {name: value.clone() for name, value in first.state_dict().items()}
     files = picture_files(settings.folder, settings.pictures, settings.seed, settings.ict, settings.workers, progress)
     pictures = StoredExpressions(files)
     count = EACH * ((len(pictures) - settings.held_out) // EACH)  # whole people
     learned = StoredExpressions(files, count)
     model = LandmarkNetwork.fit(learned, first, settings.network, progress, run.checkpoint, run.device, run.log)
+    keep(model, before, settings.kept)
     middle = EACH * ((count + len(pictures)) // (2 * EACH))
     calibrate(model, held_out(model, pictures, count, middle))
     save(model, settings, measures(held_out(model, pictures, middle, len(pictures))))
@@ -154,6 +163,14 @@ def held_out(model: LandmarkNetwork, pictures: StoredExpressions, first: int, la
         weights.append(posed)
     crops = Crops(*(torch.cat([getattr(one, part.name) for one in shown]) for part in fields(Crops)))
     return HeldOut(crops, torch.cat(weights), NetworkLandmarks(*(torch.cat(part) for part in zip(*found, strict=True))))
+
+
+@torch.no_grad()
+def keep(model: LandmarkNetwork, before: Mapping[str, Tensor], share: float) -> None:
+    """Moves a network's weights toward those that it had before."""
+    for name, value in model.state_dict().items():
+        if value.is_floating_point():
+            value.lerp_(before[name].to(value), share)
 
 
 def calibrate(model: LandmarkNetwork, seen: HeldOut) -> None:

@@ -49,7 +49,7 @@ def rendered_files(
     Args:
         folder: for the files; pictures of another seed or other heads lie beside each other there.
         count: of pictures, rounded up to whole files.
-        ict: ICT-FaceKit's ``FaceXModel``, whose heads are four in five; embedded performers alone without.
+        ict: ICT-FaceKit's ``FaceXModel``, whose heads are shown too; embedded performers alone without.
         workers: processes.
         progress: called with each step and how far it is.
 

@@ -107,3 +107,25 @@ def test_files_of_something_else_are_refused(files: list[Path], tmp_path: Path) 
     odd.write_bytes(files[0].read_bytes()[:-9])
     with pytest.raises(FileFormatError, match=r"odd\.safetensors: cannot be read"):
         StoredPictures([odd])
+
+
+def test_half_of_what_a_network_knew_stays() -> None:
+    """A network keeps a share of the weights that it had before, and of what it has learned the rest."""
+    model, other = small(), small()
+    before = {name: value.clone() for name, value in model.state_dict().items()}
+    with torch.no_grad():
+        for value in model.parameters():
+            value.add_(torch.rand_like(value))
+    other.load_state_dict(model.state_dict())
+    recipe.keep(model, before, 0.0)
+    torch.testing.assert_close(model.state_dict(), other.state_dict(), rtol=0, atol=0)
+    recipe.keep(model, before, 0.25)
+    for name, value in model.state_dict().items():
+        torch.testing.assert_close(
+            value.double(), 0.75 * other.state_dict()[name].double() + 0.25 * before[name].double()
+        )
+
+
+def test_a_share_of_no_network_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(ValueRangeError, match=r"--kept: found 0.5, expected \[0,1\), and 0 without --start"):
+        recipe.train(recipe.Settings(out=tmp_path / "own", kept=0.5))
