@@ -121,7 +121,7 @@ class WebcamSession:
 
 
 class ModuleSession(WebcamSession):
-    """The same by PyTorch, in three times the time: it needs no graph to be made."""
+    """The same by PyTorch, in up to twice the time: it needs no graph to be made."""
 
     def __init__(self, module: WebcamGraph) -> None:
         self._module, self.names = module.eval(), ARKIT
