@@ -1,9 +1,7 @@
 """Pose of a camera from points that it sees: the perspective-n-point problem."""
 
 from dataclasses import dataclass
-from functools import reduce
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -12,7 +10,8 @@ from torchface.geometry.rotations import rotation_matrix
 
 _MIN_POINTS = 4
 _MIN_DEPTH = 1e-3  # of the points' own size; what is nearer to the camera than this counts as behind it
-_MAX_ITERATIONS, _DONE = 60, 1e-10
+_FLAT = 1e-2  # relative; points that extend less in their third direction count as flat at first
+_ORTHOGRAPHIC_ITERATIONS, _MAX_ITERATIONS, _DONE = 5, 60, 1e-10
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,7 +30,8 @@ def solve_pnp(
 
     .. math:: \min_{R,t} \sum_i w_i \lVert \pi(K (R x_i + t)) - q_i \rVert^2, \quad R \in SO(3)
 
-    Initialised by OpenCV's SQPnP, view by view, refined by Levenberg's method in float64, all views at once.
+    Initialised by iterated scaled orthography (POSIT; for flat points from both of its mirrored answers), refined by
+    Levenberg's method in float64.
 
     Args:
         points: :math:`x`, (B,N,3) or (N,3) for all, millimetres.
@@ -43,15 +43,18 @@ def solve_pnp(
     Returns:
         ``Pose(rotation (B,3,3), translation (B,3), errors (B,))`` in float64.
 
-    Source: thesis 3.2.5, equation 12; Terzakis and Lourakis 2020 (SQPnP).
+    Source: thesis 3.2.5, equation 12; DeMenthon and Davis 1995.
     """
     x, q, K, w = _checked(points, pixels, intrinsics, weights)
+    inverse = torch.linalg.inv(K)
+    rays = torch.nn.functional.pad(q, (0, 1), value=1.0) @ inverse.transpose(-1, -2)
     if initial is not None:
-        starts = [(initial.rotation.double(), initial.translation.double())]
+        best = refined_poses(x, q, K, w, initial.rotation.double(), initial.translation.double())
     else:
-        _check_spread(x, w)
-        starts = _first_poses(x, q, K, w)
-    best = reduce(_better, [refined_poses(x, q, K, w, *start) for start in starts])
+        rotation, translation, normal, flat = _orthographic_pose(x, rays[..., :2] / rays[..., 2:], w)
+        best = refined_poses(x, q, K, w, rotation, translation)
+        if flat.any():
+            best = _better(best, refined_poses(x, q, K, w, *_mirrored(x, w, best, normal)))
     if not torch.isfinite(best.errors).all():
         bad = (~torch.isfinite(best.errors)).nonzero()[:, 0].tolist()
         raise AlignmentError(f"solve_pnp: found no pose with all points in front of the camera in views {bad[:5]}")
@@ -97,30 +100,58 @@ def _checked(
     return x, torch.where(seen[..., None], q, 0.0), intrinsics.detach().double().expand(len(q), 3, 3), w
 
 
-def _check_spread(x: Tensor, w: Tensor) -> None:
-    weight = (w / w.sum(1, keepdim=True))[..., None]
-    extent = torch.linalg.svdvals((x - (weight * x).sum(1, keepdim=True)) * weight.sqrt())
-    if (extent[:, 1] <= 1e-6 * extent[:, 0]).any():
-        raise AlignmentError("solve_pnp: found points that lie on a line, expected some beside it")
+def _orthographic_pose(x: Tensor, rays: Tensor, w: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Rotation, translation, the direction (B,3) in which points extend least, and whether they are flat, (B,).
 
-
-def _first_poses(x: Tensor, q: Tensor, K: Tensor, w: Tensor) -> list[tuple[Tensor, Tensor]]:
-    """Rotations (B,3,3) and translations (B,3) to begin with: of each view what OpenCV's SQPnP finds, the best first.
-
-    It finds several where the view is ambiguous, as of flat points; of a view with fewer than another the last again.
+    ``rays`` (B,N,2) are pixels of a camera with K = I.
     """
-    import cv2  # loads in 0.1 s
+    weight = (w / w.sum(1, keepdim=True))[..., None]
+    centre = (weight * x).sum(1, keepdim=True)
+    u, singular, vh = torch.linalg.svd((x - centre) * weight.sqrt(), full_matrices=False)
+    if (singular[:, 1] <= 1e-6 * singular[:, 0]).any():
+        raise AlignmentError("solve_pnp: found points that lie on a line, expected some beside it")
+    flat = singular[:, 2] < _FLAT * singular[:, 0]
+    kept = torch.where(flat[:, None] & (torch.arange(3, device=x.device) == 2), torch.inf, singular)
+    inverse = vh.transpose(-1, -2) @ (u / kept[:, None, :]).transpose(-1, -2)
+    normal = vh[:, 2]
+    deeper = torch.zeros_like(x[..., 0])
+    for _ in range(_ORTHOGRAPHIC_ITERATIONS):  # each corrects for perspective with the depths of the one before
+        goal = rays * (1 + deeper)[..., None]
+        middle = (weight * goal).sum(1, keepdim=True)
+        ij = (inverse @ ((goal - middle) * weight.sqrt())).transpose(-1, -2)
+        i, j = (ij + torch.where(flat[:, None, None], _out_of_plane(ij, normal), 0.0)).unbind(1)
+        scale = (i.norm(dim=-1) * j.norm(dim=-1)).sqrt().clamp(min=1e-12)
+        rows = torch.stack([i, j, torch.linalg.cross(i, j) / scale[:, None]], dim=1) / scale[:, None, None]
+        a, _, b = torch.linalg.svd(rows)
+        rotation = a @ b
+        deeper = ((x - centre) @ rotation[:, 2, :, None])[..., 0] * scale[:, None]
+        deeper = deeper.clamp(-0.5, 0.5)
+    depth = 1 / scale[:, None]
+    translation = torch.cat([middle[:, 0] * depth, depth], dim=1) - (rotation @ centre.transpose(-1, -2))[..., 0]
+    # In front of the camera, whatever the first guess was.
+    lack = _MIN_DEPTH * singular[:, 0] - ((x @ rotation.transpose(-1, -2))[..., 2] + translation[:, 2:]).amin(1)
+    translation[:, 2] += 2 * lack.clamp(min=0)
+    return rotation, translation, normal, flat
 
-    answers = []
-    for row, used in enumerate((w > 0).cpu()):
-        seen = (x[row].cpu()[used].numpy(), q[row].cpu()[used].numpy(), K[row].cpu().numpy())
-        _, turns, moves, _ = cv2.solvePnPGeneric(*seen, None, flags=cv2.SOLVEPNP_SQPNP)
-        answers.append([np.concatenate([turn[:, 0], move[:, 0]]) for turn, move in zip(turns, moves, strict=True)])
-    most = max(map(len, answers))
-    if min(map(len, answers)) == 0:
-        raise AlignmentError("solve_pnp: found points without a pose, expected some that do not lie on a line")
-    padded = torch.tensor(np.array([each + each[-1:] * (most - len(each)) for each in answers]), device=x.device)
-    return [(rotation_matrix(each[:, :3]), each[:, 3:].clone()) for each in padded.unbind(1)]
+
+def _out_of_plane(ij: Tensor, normal: Tensor) -> Tensor:
+    """What flat points leave open of the two rows (B,2,3): (λ, μ) times the normal, so that they are orthonormal."""
+    i, j = ij.unbind(1)
+    product, difference = -(i * j).sum(-1), j.square().sum(-1) - i.square().sum(-1)
+    first = (0.5 * (difference + (difference.square() + 4 * product.square()).sqrt())).clamp(min=0).sqrt()
+    second = torch.where(first > 1e-12, product / first.clamp(min=1e-12), (-difference).clamp(min=0).sqrt())
+    return torch.stack([first, second], dim=1)[..., None] * normal[:, None]
+
+
+def _mirrored(x: Tensor, w: Tensor, pose: Pose, normal: Tensor) -> tuple[Tensor, Tensor]:
+    """The pose in which flat points look nearly the same: tilted the other way about the line of sight."""
+    centre = (w[..., None] * x).sum(1) / w.sum(1, keepdim=True)
+    middle = (pose.rotation @ centre[..., None])[..., 0] + pose.translation
+    sight = torch.nn.functional.normalize(middle, dim=-1)
+    identity = torch.eye(3, dtype=x.dtype, device=x.device)
+    through, across = (identity - 2 * v[:, :, None] * v[:, None, :] for v in (sight, normal))
+    rotation = through @ pose.rotation @ across
+    return rotation, middle - (rotation @ centre[..., None])[..., 0]
 
 
 def _better(one: Pose, other: Pose) -> Pose:
