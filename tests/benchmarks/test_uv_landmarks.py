@@ -1,5 +1,5 @@
-"""Claim: learned from 30 scanned performers, landmarks of 20 others are found to 2.4 pixels at 1024², lip and lid lines
-to half a pixel, by their texture; by form alone to 8; on a real scan eyes, nose and mouth to 6 mm."""
+"""Claim: learned from 30 scanned performers, landmarks of 20 others are found to 2.2 pixels at 1024², lip and lid lines
+to half a pixel, by their texture; by form alone to 8; on a real scan eyes, nose and mouth to 3 mm."""
 
 import time
 from dataclasses import replace
@@ -37,7 +37,7 @@ def detectors(scans: list[AnnotatedScan]) -> dict[str, UVLandmarkDetector]:
     return {"texture": fit(scans[:LEARN], "texture"), "curvature": fit(scans[:LEARN], "curvature")}
 
 
-@pytest.mark.parametrize(("kind", "limit", "line_limit"), [("texture", 2.5, 0.5), ("curvature", 8.0, None)])
+@pytest.mark.parametrize(("kind", "limit", "line_limit"), [("texture", 2.4, 0.5), ("curvature", 8.0, None)])
 def test_landmarks_of_scanned_performers(
     kind: str,
     limit: float,
