@@ -87,4 +87,4 @@ def test_landmarks_of_a_real_scan(kind: str, data: Path, detectors: dict[str, UV
     ):
         print(f"    {name:24}{value:8.2f} mm, confidence {sure:.3f}")
     save_rendered_image(draw_result(found, truth), PICTURES / f"real_scan_{kind}.png")
-    assert mean <= 6.0
+    assert mean <= {"texture": 3.5, "curvature": 6.0}[kind]
