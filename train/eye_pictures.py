@@ -82,7 +82,7 @@ def eye_picture_files(
     folder: Path, count: int, seed: int, ict: Path | None = None, workers: int = 1, progress: Progress | None = None
 ) -> list[Path]:
     """Renders what a folder does not hold yet, :data:`PART` pictures a file; see ``rendered_files``."""
-    rendering = Rendering(_render, "eye pictures/3", "eyes", "eyes", PART)
+    rendering = Rendering(_render, "eye pictures/4", "eyes", "eyes", PART)
     return rendered_files(rendering, folder, count, seed, ict, workers, progress)
 
 

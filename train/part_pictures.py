@@ -44,7 +44,7 @@ def part_picture_files(
     folder: Path, count: int, seed: int, ict: Path | None = None, workers: int = 1, progress: Progress | None = None
 ) -> list[Path]:
     """Renders what a folder does not hold yet; see ``rendered_files``."""
-    rendering = Rendering(_render, "part pictures/1", "pictures", "faces and their parts", PART)
+    rendering = Rendering(_render, "part pictures/2", "pictures", "faces and their parts", PART)
     return rendered_files(rendering, folder, count, seed, ict, workers, progress)
 
 

@@ -123,7 +123,7 @@ class _SessionBeingMade:
 
     def _make(self) -> None:
         nothing = subprocess.DEVNULL
-        making = subprocess.Popen([sys.executable, "-c", _MAKE], stdin=nothing, stdout=nothing, stderr=nothing)
+        making = subprocess.Popen([sys.executable, "-P", "-c", _MAKE], stdin=nothing, stdout=nothing, stderr=nothing)
         atexit.register(making.kill)
         making.wait()
         if (graph := kept_webcam_graph()) is not None:  # else PyTorch goes on
