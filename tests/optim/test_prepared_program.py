@@ -72,6 +72,21 @@ def test_what_it_finds_is_checked_and_what_it_misses_is_solved_as_a_batch(
         BoxQP(H)(strange)
 
 
+@pytest.mark.parametrize("rows_left_out", [0.3, 0.6])
+@pytest.mark.parametrize("upper", [1.0, float("inf")])
+def test_problems_of_an_h_each_are_solved_however_much_alike_they_are(rows_left_out: float, upper: float) -> None:
+    generator = torch.Generator().manual_seed(1)
+    basis = torch.randn(90, SIZE, generator=generator, dtype=torch.float64)
+    seen = torch.rand(60, 90, generator=generator) > rows_left_out
+    rows = basis * seen[..., None] * 10.0 ** torch.arange(60).remainder(4)[:, None, None]  # not of one scale either
+    H = rows.mT @ rows + 1e-3 * torch.eye(SIZE, dtype=torch.float64)
+    f = -(torch.randn(60, SIZE, generator=generator, dtype=torch.float64)[:, None] @ H)[:, 0]
+    bounds = torch.zeros(SIZE).double(), torch.full((SIZE,), upper).double()
+    expected, left = OneByOne(H, *bounds).solve(f.numpy(), 1e-9)
+    assert not len(left)
+    torch.testing.assert_close(box_qp(H, f, 0.0, upper), torch.from_numpy(expected), rtol=0, atol=1e-8)
+
+
 def test_bounds_that_change_are_kept(program: tuple[Tensor, Tensor, Tensor]) -> None:
     H, f, _ = program
     qp = BoxQP(H, -torch.inf, 0.5)

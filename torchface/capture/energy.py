@@ -10,8 +10,8 @@ from torchface.number_checks import LARGEST_WEIGHT, checked_number
 
 # Numbers in the matrices of all markers at once; beyond it frames take their turn.
 _MOST_NUMBERS = 2**24
-# Numbers in the H of frames that have one each, at once: 64 MB of float64.
-_CHUNK_NUMBERS = 2**23
+# Numbers in the H of frames that have one each, at once: 8 MB of float64, which stay in a cache.
+_CHUNK_NUMBERS = 2**20
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,7 +94,7 @@ def marker_term(basis: Tensor, rest: Tensor, targets: Tensor) -> Quadratic:
         H = 2.0 * ((rows.T * share.repeat_interleave(3, 1)[:, None]) @ rows)
     elif markers * shapes * shapes <= _MOST_NUMBERS:
         own = (basis.transpose(1, 2) @ basis).flatten(1)
-        H = 2.0 * (share @ own).unflatten(1, (shapes, shapes))
+        H = ((2.0 * share) @ own).unflatten(1, (shapes, shapes))
     else:
         H = 2.0 * torch.stack([(rows * one.repeat_interleave(3)[:, None]).T @ rows for one in share])
     weighted = share[..., None] * offset

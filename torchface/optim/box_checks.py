@@ -3,6 +3,7 @@
 from numbers import Real
 
 import torch
+from scipy.linalg.lapack import dpotrf
 from torch import Tensor
 
 from torchface.errors import ShapeError, ValueRangeError
@@ -19,6 +20,8 @@ _RUN_AWAY, _STILL_MOVING = 1e9, 1e-2
 _NEAR_BOUND = 1e3
 # Splitting runs in float32, whose numbers end at 3e38.
 _STEEPEST = 1e30
+# Matrices that are factored in memory which stays in a cache.
+_CHUNK = 64
 
 
 def checked_hessian(H: Tensor, name: str = "box_qp") -> Tensor:
@@ -27,27 +30,34 @@ def checked_hessian(H: Tensor, name: str = "box_qp") -> Tensor:
         raise ShapeError(f"{name}: found H {tuple(H.shape)}, expected (N,N) or (B,N,N)")
     if H.dtype not in _TOLERANCE:
         raise ValueRangeError(f"{name}: found H of {H.dtype}, expected float32 or float64")
-    exact = H.detach().double()
-    if not torch.isfinite(exact).all():
+    exact = H.detach().double().contiguous()
+    if not _finite(exact):
         raise ValueRangeError(f"{name}: H holds NaN or infinite entries, expected finite ones")
-    precision = torch.finfo(H.dtype).eps * H.shape[-1]
-    largest = exact.abs().amax((-1, -2)) if exact.numel() else exact.new_zeros(len(exact))
-    skew = (exact - exact.transpose(-1, -2)).abs().amax((-1, -2)) if exact.numel() else largest
-    # Only the symmetric part counts, and an H of float32 that went to double precision keeps its rounding.
-    if (skew > 100 * torch.finfo(torch.float32).eps * H.shape[-1] * largest).any():
-        raise ValueRangeError(
-            f"{name}: H is not symmetric: entries differ from their mirror images by up to {float(skew.max()):.3g}"
-        )
-    exact = 0.5 * (exact + exact.transpose(-1, -2))
-    scale = metric(exact).rsqrt()
-    lifted = exact * scale[..., :, None] * scale[..., None, :]
-    lifted.diagonal(dim1=-2, dim2=-1).add_(100 * precision)
-    if (torch.linalg.cholesky_ex(lifted)[1] > 0).any():
+    if not torch.equal(exact, exact.mT):
+        largest, skew = exact.abs().amax((-1, -2)), (exact - exact.mT).abs().amax((-1, -2))
+        # Only the symmetric part counts, and an H of float32 that went to double precision keeps its rounding.
+        if (skew > 100 * torch.finfo(torch.float32).eps * H.shape[-1] * largest).any():
+            raise ValueRangeError(
+                f"{name}: H is not symmetric: entries differ from their mirror images by up to {float(skew.max()):.3g}"
+            )
+        exact = 0.5 * (exact + exact.mT)
+    lift = 100 * torch.finfo(H.dtype).eps * H.shape[-1] * metric(exact)
+    if not all(map(_all_factor, exact.view(-1, *H.shape[-2:]).split(_CHUNK), lift.view(-1, H.shape[-1]).split(_CHUNK))):
         least = float(torch.linalg.eigvalsh(exact).min())
         raise ValueRangeError(
             f"{name}: H is not positive semidefinite: found the eigenvalue {least:.3g}, expected none below 0"
         )
     return exact
+
+
+def _all_factor(H: Tensor, lift: Tensor) -> bool:
+    """Whether Cholesky's factorisation of each H (B,N,N) succeeds, its diagonal raised by (B,N)."""
+    lifted = H.clone()
+    lifted.diagonal(dim1=-2, dim2=-1).add_(lift)
+    if H.device.type != "cpu":
+        return not bool((torch.linalg.cholesky_ex(lifted)[1] > 0).any())
+    # One by one by LAPACK takes half of torch's time.
+    return not any(dpotrf(one.T, lower=1, clean=0, overwrite_a=1)[1] for one in lifted.numpy())
 
 
 def checked_bounds(
@@ -90,10 +100,14 @@ def check_vectors(H: Tensor, f: Tensor, start: Tensor | None, name: str = "box_q
 
 def check_finite(f: Tensor, start: Tensor | None, name: str = "box_qp") -> None:
     for which, vectors in (("f", f), ("start", start)):
-        # A sum shows NaN and infinity sooner than a look at each; where it overflows each is looked at.
-        if vectors is not None and not torch.isfinite(vectors.sum()) and not torch.isfinite(vectors).all():
+        if vectors is not None and not _finite(vectors):
             bad = (~torch.isfinite(vectors)).any(1).nonzero()[:, 0].tolist()
             raise ValueRangeError(f"{name}: {which} holds NaN or infinite entries in rows {bad[:5]}")
+
+
+def _finite(values: Tensor) -> bool:
+    """A sum shows NaN and infinity sooner than a look at each; where it overflows each is looked at."""
+    return bool(torch.isfinite(values.sum())) or bool(torch.isfinite(values).all())
 
 
 def check_slope(problem: BoxProblem) -> None:

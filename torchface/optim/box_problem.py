@@ -28,6 +28,8 @@ class BoxProblem:
 
     def rows(self, keep: Tensor | slice) -> "BoxProblem":
         """Some of the problems."""
+        if isinstance(keep, Tensor) and keep.dtype == torch.bool and bool(keep.all()):
+            return self
         if self.H.ndim == 2:
             return BoxProblem(self.H, self.f[keep], self.lower, self.upper, self.diagonal)
         return BoxProblem(self.H[keep], self.f[keep], self.lower, self.upper, self.diagonal[keep])
@@ -37,7 +39,8 @@ class BoxProblem:
 
     def curvature(self, x: Tensor) -> Tensor:
         """:math:`Hx` for x (B,N)."""
-        return x @ self.H if self.H.ndim == 2 else torch.bmm(self.H, x[..., None])[..., 0]
+        # A row by a symmetric H takes a third of the time of H by a column.
+        return x @ self.H if self.H.ndim == 2 else torch.bmm(x[:, None], self.H)[:, 0]
 
     def gradient(self, x: Tensor) -> Tensor:
         return self.curvature(x) + self.f

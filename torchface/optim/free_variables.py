@@ -24,30 +24,35 @@ def solve_free(H: Tensor, diagonal: Tensor, free: Tensor, right: Tensor, damping
         diagonal: the metric in which it is scaled, (N,) or (B,N).
         free: which variables take part, (B,N) bool.
     """
+    ridge = right.new_full((len(right),), RIDGE) if damping is None else damping.clamp(min=RIDGE)
+    if right.device.type == "cpu":
+        return _solved_one_by_one(H, diagonal, free, right, ridge)
     scale = diagonal.rsqrt()
     scaled = H * scale[..., :, None] * scale[..., None, :]
-    ridge = right.new_full((len(right),), RIDGE) if damping is None else damping.clamp(min=RIDGE)
-    solve = _solved_one_by_one if right.device.type == "cpu" else _solved_at_once
-    return solve(scaled, free, right * scale, ridge) * scale
+    return _solved_at_once(scaled, free, right * scale, ridge) * scale
 
 
-def _solved_one_by_one(scaled: Tensor, free: Tensor, right: Tensor, ridge: Tensor) -> Tensor:
-    """By NumPy and LAPACK: torch's batched factorisation goes one by one too, and more slowly."""
+def _solved_one_by_one(H: Tensor, diagonal: Tensor, free: Tensor, right: Tensor, ridge: Tensor) -> Tensor:
+    """By NumPy and LAPACK: torch's batched factorisation goes one by one too, and more slowly.
+
+    A Cholesky factor is as exact in any scale, so nothing is scaled but the ridge.
+    """
     found = torch.zeros_like(right)
-    every = scaled.numpy() if scaled.ndim == 3 else [scaled.numpy()] * len(right)
-    rows = zip(every, free.numpy(), right.numpy(), found.numpy(), ridge.tolist(), strict=True)
-    for matrix, taken, side, solution, lift in rows:
+    every = H.numpy() if H.ndim == 3 else [H.numpy()] * len(right)
+    lifts = diagonal.expand_as(right).numpy()
+    rows = zip(every, lifts, free.numpy(), right.numpy(), found.numpy(), ridge.tolist(), strict=True)
+    for matrix, lift, taken, side, solution, share in rows:
         ids = taken.nonzero()[0]
         if len(ids):
-            solution[ids] = _solution(matrix, ids, side, lift)
+            solution[ids] = _solution(matrix, lift, ids, side, share)
     return found
 
 
-def _solution(matrix: Array, ids: Array, side: Array, ridge: float) -> Array:
+def _solution(matrix: Array, lift: Array, ids: Array, side: Array, ridge: float) -> Array:
     """Of one system, of some variables; with a greater ridge where it does not factor."""
     for _ in range(1 + _RIDGE_TRIES):
         block = matrix.take(ids, 0).take(ids, 1)
-        block.ravel()[:: len(ids) + 1] += ridge
+        block.ravel()[:: len(ids) + 1] += ridge * lift.take(ids)
         _, x, failed = dposv(block.T, side.take(ids), lower=1, overwrite_a=1, overwrite_b=1)
         if not failed:
             break

@@ -21,7 +21,6 @@ A small :math:`\rho` shrinks first what a large one shrinks last; where it chang
 Source: Boyd et al. 2011, sections 3.4.1, 3.4.3 and 5.2; the diagonal metric takes the place of a scaled H.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -128,7 +127,7 @@ def splitting_steps(
     else:  # where the gradient is f, and there is less to form
         constant = _times(problem.f, factors.offset)
         z = torch.zeros_like(
-            constant.T if shared else constant[..., None], dtype=dtype, memory_format=torch.contiguous_format
+            constant.T if shared else constant[:, None], dtype=dtype, memory_format=torch.contiguous_format
         )
         t = torch.zeros_like(z)
         if first is not None:
@@ -136,33 +135,33 @@ def splitting_steps(
             slope = _columns(problem.f, shared, dtype)
             stages, steps = [(first, first.offset.to(dtype) @ slope, early)], steps - early
     stages.append((factors, _columns(constant, shared, dtype), steps))
-    lower, upper = _bounds(problem, dtype)
+    lower, upper = _bounds(problem, shared, dtype)
     v = torch.empty_like(z)
-    product: Callable[..., Tensor] = torch.addmm if shared else torch.baddbmm
     for number, (part, constant, count) in enumerate(stages):
         if number:
             t = torch.lerp(z, t, _FIRST_RHO / _OTHER_RHO)  # u of the new rho
-        matrix = part.step.to(dtype).mT.contiguous()
+        matrix = part.step.to(dtype)
+        matrix = matrix.T.contiguous() if shared else matrix
         for _ in range(count):  # each needs the one before
-            product(constant, matrix, t, out=v)
+            torch.addmm(constant, matrix, t, out=v) if shared else torch.baddbmm(constant, t, matrix, out=v)
             v.add_(z, alpha=2 - part.relaxation)
             torch.clamp(v, lower, upper, out=z)
             torch.lerp(v, z, 2.0, out=t)  # 2 z - v
-    z, t = (torch.empty_like(problem.f).copy_(x.T if x.ndim == 2 else x[..., 0]) for x in (z, t))
+    z, t = (torch.empty_like(problem.f).copy_(x.T if shared else x[:, 0]) for x in (z, t))
     return SplittingState(problem.clip(z), t)  # in float32 a bound may have been rounded to the wrong side of itself
 
 
 def _columns(x: Tensor, shared: bool, dtype: torch.dtype) -> Tensor:
-    """x (B,N) as a copy (N,B), by which products with one matrix are a fifth quicker, or as (B,N,1)."""
-    return x.new_empty(x.T.shape, dtype=dtype).copy_(x.T) if shared else x.to(dtype, copy=True)[..., None]
+    """x (B,N) as a copy (N,B), by which products with one matrix are a fifth quicker, or as rows (B,1,N)."""
+    return x.new_empty(x.T.shape, dtype=dtype).copy_(x.T) if shared else x.to(dtype, copy=True)[:, None]
 
 
-def _bounds(problem: BoxProblem, dtype: torch.dtype) -> tuple[Any, Any]:
-    """Numbers where all variables have the same, by which clamps are quicker, else (N,1)."""
+def _bounds(problem: BoxProblem, shared: bool, dtype: torch.dtype) -> tuple[Any, Any]:
+    """Numbers where all variables have the same, by which clamps are quicker, else (N,1) or (N,)."""
     lower, upper = problem.lower.to(dtype), problem.upper.to(dtype)
     if bool(((lower == lower[0]) & (upper == upper[0])).all()):
         return float(lower[0]), float(upper[0])
-    return lower[:, None], upper[:, None]
+    return (lower[:, None], upper[:, None]) if shared else (lower, upper)
 
 
 def _times(x: Tensor, matrix: Tensor) -> Tensor:

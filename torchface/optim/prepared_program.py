@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from threading import Lock
@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchface.optim.batched_program import solve_batch
+from torchface.optim.batched_program import solve_alike, solve_batch
 from torchface.optim.box_checks import check_bounded, check_finite, check_slope, checked_bounds, checked_hessian
 from torchface.optim.box_problem import BoxProblem, metric
 from torchface.optim.operator_splitting import SplittingFactors, prepare_two_stages
@@ -111,11 +111,14 @@ def _set_up(H: Array, low: Array, high: Array) -> daqp.Model | None:
 
 
 # Measured on 16 to 600 variables: DAQP is the faster one for up to so many problems of one H, each of which takes it a
-# time that grows as variables cubed and a constant; with an H each for up to so many variables, however many problems.
-_FEW, _CONSTANT, _FEW_VARIABLES = 230**3, 40**3, 80
+# time that grows as variables cubed and a constant; with an H each for so many, and for up to so many variables in what
+# is left of more.
+_FEW, _CONSTANT, _FEW_OWN, _FEW_VARIABLES = 230**3, 40**3, 24, 80
 # Numbers in one chunk of problems with an H each, twice those of one H, but so many frames at least: more take a fifth
-# longer where other work fills the third-level cache; an accelerator wants more.
+# longer where other work fills the third-level cache; an accelerator wants more. Problems taken as alike are so many
+# times as many.
 _CHUNK_NUMBERS, _LEAST_FRAMES = {"cpu": 2**17, "other": 2**23}, 256
+_ALIKE_SHARE = 8
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,7 +143,8 @@ class PreparedProgram:
             x = self._solve_few(f.detach().numpy(), tolerance)
         else:
             check_finite(f, start)
-            x = self._in_chunks(f.detach().double(), None if start is None else start.detach().double(), tolerance)
+            exact, guess = f.detach().double(), None if start is None else start.detach().double()
+            x = self._in_chunks(exact, guess, tolerance) if self.H.ndim == 2 else self._alike(exact, guess, tolerance)
         if f.dtype == torch.float64:
             return x
         # Rounding must not step over a bound.
@@ -162,7 +166,7 @@ class PreparedProgram:
         size = len(self.lower)
         if self.H.device.type != "cpu" or (self.H.ndim == 3 and size > _FEW_VARIABLES):
             return -1
-        return _FEW / (size**3 + _CONSTANT) if self.H.ndim == 2 else math.inf
+        return _FEW / (size**3 + _CONSTANT) if self.H.ndim == 2 else _FEW_OWN
 
     @cached_property
     def _one_by_one(self) -> OneByOne:
@@ -176,21 +180,39 @@ class PreparedProgram:
         return self if self.H.ndim == 2 else PreparedProgram(self.H[keep], self.lower, self.upper)
 
     @torch.no_grad()
+    def _alike(self, f: Tensor, start: Tensor | None, tolerance: float) -> Tensor:
+        """The minimisers (B,N), float64, of problems with an H each, first taken as much alike."""
+        found, solved = torch.empty_like(f), torch.empty(len(f), dtype=torch.bool, device=f.device)
+        for rows, problem in self._chunks(f, _ALIKE_SHARE):
+            found[rows], solved[rows] = solve_alike(problem, None if start is None else start[rows], tolerance)
+            check_bounded(problem.rows(solved[rows]), found[rows][solved[rows]])
+        rest = (~solved).nonzero()[:, 0]
+        if len(rest):
+            part, slopes, by_daqp = self._rows(rest), f[rest], self._few >= 0
+            found[rest] = (
+                part._solve_few(slopes.numpy(), tolerance) if by_daqp else part._in_chunks(slopes, None, tolerance)
+            )
+        return found
+
+    @torch.no_grad()
     def _in_chunks(self, f: Tensor, start: Tensor | None, tolerance: float) -> Tensor:
         """The minimisers (B,N), float64, as many at once as stay in a cache."""
-        count, size = f.shape
         solution = torch.empty_like(f)
-        numbers = _CHUNK_NUMBERS.get(f.device.type, _CHUNK_NUMBERS["other"])
+        factors = self._factors if self.H.ndim == 2 else None
+        for rows, problem in self._chunks(f, 1):
+            x = solve_batch(problem, factors, None if start is None else start[rows], tolerance)
+            check_bounded(problem, x)
+            solution[rows] = x
+        return solution
+
+    def _chunks(self, f: Tensor, share: int) -> Iterator[tuple[slice, BoxProblem]]:
+        count, size = f.shape
+        numbers = share * _CHUNK_NUMBERS.get(f.device.type, _CHUNK_NUMBERS["other"])
         most = max(_LEAST_FRAMES, numbers // (2 * size)) if self.H.ndim == 2 else max(1, numbers // size**2)
         chunk = max(1, -(-count // max(1, -(-count // most))))  # all of about one size: a short one costs as many calls
         chunk += -chunk % 16  # products are quicker where each row of a variable begins on a cache line
         for first in range(0, count, chunk):
             rows = slice(first, first + chunk)
-            part = self._rows(rows)
-            problem = BoxProblem.of(part.H, f[rows], self.lower, self.upper)
+            problem = BoxProblem.of(self._rows(rows).H, f[rows], self.lower, self.upper)
             check_slope(problem)
-            factors = self._factors if self.H.ndim == 2 else None
-            x = solve_batch(problem, factors, None if start is None else start[rows], tolerance)
-            check_bounded(problem, x)
-            solution[rows] = x
-        return solution
+            yield rows, problem
