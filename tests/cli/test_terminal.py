@@ -11,6 +11,8 @@ import torch
 from matplotlib.figure import Figure
 from rich.table import Table
 
+from torchface import zoo
+from torchface.capture import ShapePrior
 from torchface.cli import main
 from torchface.cli.terminal import PlainConsole, plain_errors, print_path
 from torchface.errors import FileFormatError
@@ -117,6 +119,23 @@ def test_what_a_system_call_says_is_told_with_the_file(capsys: pytest.CaptureFix
     assert "error: /some/file: Permission denied" in capsys.readouterr().err
     with pytest.raises(OSError, match="nobody's"), plain_errors():
         raise OSError("nobody's")
+
+
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [
+        (["fit", "--prior", "head"], "--prior: found head, a HeadModel"),
+        (["fit", "--prior=head"], "--prior: found head, a HeadModel"),
+        (["fit", "head", "--prior", "other"], "model: found head, a HeadModel"),
+    ],
+)
+def test_a_model_of_another_kind_is_named_by_the_flag_that_gave_it(
+    given: list[str], said: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("sys.argv", ["torchface", *given])
+    with pytest.raises(SystemExit), plain_errors():
+        zoo.get_model("head", ShapePrior)
+    assert f"error: {said}" in capsys.readouterr().err
 
 
 def test_a_warning_is_one_line_without_the_sources_path() -> None:

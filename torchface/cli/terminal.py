@@ -5,6 +5,7 @@ import sys
 import warnings
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
+from itertools import pairwise
 from typing import TYPE_CHECKING, Annotated, Any
 
 from rich.console import Console
@@ -100,7 +101,7 @@ def plain_errors() -> Iterator[None]:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         raise SystemExit(_NOBODY_READS) from None
     except TorchfaceError as error:
-        _say("error", str(error))
+        _say("error", _by_flag(str(error), sys.argv[1:]))
         raise SystemExit(_MISTAKE) from None
     except OSError as error:
         if error.filename is None:
@@ -110,6 +111,17 @@ def plain_errors() -> Iterator[None]:
     except KeyboardInterrupt:
         _say("stopped", "what was not complete is not written")
         raise SystemExit(_STOPPED) from None
+
+
+def _by_flag(message: str, given: list[str]) -> str:
+    """The message, with the flag that a user typed a value after in place of the argument that got it."""
+    argument, found, rest = message.partition(": found ")
+    words = [word for text in given for word in (text.split("=", 1) if text.startswith("--") else [text])]
+    for flag, value in pairwise(words):
+        starts = (f"{value},", f"{value} ", f"no {value!r}")
+        if found and argument.isidentifier() and flag.startswith("--") and value and rest.startswith(starts):
+            return f"{flag}{found}{rest}"
+    return message
 
 
 class _WarningLines:
