@@ -93,7 +93,7 @@ export class CameraEngine {
 
   /** The solver, which is loaded once; after a failure once more. */
   async #loaded() {
-    this.#loading ??= (this.#solver = new Solver((...here) => this.#tell(...here))).load("./webcam.ort");
+    this.#loading ??= (this.#solver = new Solver((...here) => this.#tell(...here))).load("./webcam.graph");
     try {
       await this.#loading;
     } catch (error) {

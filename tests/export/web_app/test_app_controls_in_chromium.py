@@ -277,7 +277,7 @@ def test_an_empty_take_is_said_and_a_running_one_is_not_left_unasked(opened: Ope
 def test_what_is_loaded_is_said_in_bytes(opened: Open, app: Path) -> None:
     opened.page.start()
     told = watched(opened.page, "watched.loaded")
-    assert max(one["bytes"] for one in told) == (app / "webcam.ort").stat().st_size
+    assert max(one["bytes"] for one in told) == (app / "webcam.graph").stat().st_size
     assert told[-1]["loaded"] == 3  # and then it is ready
     opened.page.stop()
 

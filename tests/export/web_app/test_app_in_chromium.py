@@ -80,7 +80,7 @@ def test_khronos_validator_finds_nothing_in_the_glb(recorded: Recorded, node: st
 def test_only_files_of_the_page_were_asked_for(opened: Open, recorded: Recorded) -> None:
     assert {method for method, _ in opened.host.requests} == {"GET"}
     paths = {path for _, path in opened.host.requests}
-    known = ("/index.html", "/webcam.ort", "/character.glb", "/character.json")
+    known = ("/index.html", "/webcam.graph", "/character.glb", "/character.json")
     assert set(known) <= paths
     assert all(path.startswith((*known, "/assets/")) for path in paths)
     strangers = [path for _, path in opened.outside.requests if not any(own in path for own in BROWSERS_OWN)]
