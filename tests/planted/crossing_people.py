@@ -26,7 +26,7 @@ class CrossingFilm:
 
 def crossing_film(
     before: int = 20, hidden: float = 0.4, after: int = 20, tint: tuple[float, ...] = (0.5, 0.42, 0.4),
-    start: float = 240.0, end: float = 10.0, larger: float = 1.1,
+    start: float = 240.0, end: float = 10.0, larger: float = 1.1, stays: float = 0.0,
 ) -> CrossingFilm:  # fmt: skip
     """The first person sits still, alone at first; the second comes, passes in front and stays at the other side.
 
@@ -37,6 +37,7 @@ def crossing_film(
         tint: of the second person's colours beside the first's.
         start: left border of the second's picture at first, pixels, 400 for beyond the picture; ``end``, at last.
         larger: the second's head beside the first's.
+        stays: seconds for which the second stands right before the first.
     """
     first, column = _head(torch.zeros(len(IDENTITY)), (1.0, 1.0, 1.0), 1.0)
     person = torch.linspace(-1.5, 1.5, len(IDENTITY))
@@ -44,7 +45,11 @@ def crossing_film(
     left = 120
     head = 100 * (1 + larger) / 2  # pixels: while it is nearer than that to the first, it covers it
     step = 2 * head / (hidden * FPS)
-    path = torch.cat([torch.full((before,), start), torch.arange(start, end, -step), torch.full((after,), end)]).round()
+    there = left - _SIDE * (larger - 1) / 2
+    passing = torch.arange(start, end, -step)
+    waiting = torch.full((round(stays * FPS),), there)
+    parts = [passing[passing >= there], waiting, passing[passing < there]]
+    path = torch.cat([torch.full((before,), start), *parts, torch.full((after,), end)]).round()
     wall = (255 * torch.tensor(_WALL)).byte()[:, None, None].expand(3, 240, 1000)
     frames = []
     for number, place in enumerate(path.long().tolist()):

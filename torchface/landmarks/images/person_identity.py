@@ -17,7 +17,10 @@ IDENTITY = 2 * _MOTION + 2 + 3 * LOOK_SIZE * LOOK_SIZE
 CANDIDATES = 4
 """Faces of a picture that are distinguished."""
 
-FORGOTTEN = 1.0  # seconds after which anybody is taken for one who is hidden
+_FORGOTTEN = 1.0  # seconds after which anybody is taken for one who is not seen
+# Sides within which somebody stands where the followed one is hidden; how slowly that one is forgotten meanwhile, and
+# after how many seconds that begins: eight in all, and some are left to find the followed one once the other has gone.
+_BEFORE, _SLOWLY, _SOON = 1.2, 0.1, 0.2
 _LIKELY = 0.4  # score of a box that shows somebody else
 _COAST = {0: 0.1, 1: 0.5}  # seconds for which the followed one, and the other, are expected to move on unseen
 _SPEED, _GROWTH, _LEARNING = 0.1, 0.3, 0.5  # seconds in which speed, side and look are learned
@@ -27,6 +30,7 @@ _NEAR = 3.0  # sides within which the other may be in the way in the next moment
 _COUNTING = 0.2  # of a new count of people that is taken up at once
 _LASTING = 0.6  # seconds for which it is known where the other is
 _ALIKE, _UNLIKE = 0.8, 1.5  # correlation of looks from which a face counts as the same, and what lacks counts in sides
+_STRANGE = 0.4  # correlation under which a face is not that of one who is hidden
 _RESEMBLING = 0.5  # what the logarithm of two sides counts in sides
 _SURE, _CLEARLY = 0.12, 2.0  # sides: nearer is the followed one; how much nearer than the other one that was hidden is
 
@@ -52,6 +56,12 @@ def is_beside(identity: Tensor) -> Tensor:
     return _is_known(identity) & (_apart(own, _expected(other, 1)) < _NEAR)
 
 
+def is_awaited(identity: Tensor) -> Tensor:
+    """Whether nobody else is taken for the followed one yet; () bool."""
+    own, _ = _motions(identity)
+    return (own[2] > 0) & (own[5] < _FORGOTTEN)
+
+
 def after_boxes(identity: Tensor, faces: Tensor, searched: Tensor, interval: Tensor) -> Tensor:
     """What is known after the box network has looked at the next picture, before a face is read there.
 
@@ -61,9 +71,10 @@ def after_boxes(identity: Tensor, faces: Tensor, searched: Tensor, interval: Ten
         interval: seconds since the picture before, ().
     """
     own, other = _motions(identity)
-    aged = torch.cat([own.new_zeros(_MOTION - 1), interval[None]])
-    own, other = own + aged, other + aged
-    known = (other[2] > 0) & (other[5] < FORGOTTEN)
+    hidden = _is_known(identity) & (_apart(own, _expected(other, 1)) < _BEFORE) & (own[5] >= _SOON)
+    aged = interval * torch.tensor([0.0] * (_MOTION - 1) + [1.0])
+    own, other = own + aged * torch.where(hidden, _SLOWLY, 1.0), other + aged
+    known = (other[2] > 0) & (other[5] < _FORGOTTEN)
     likely = (faces[:, 3] >= _LIKELY) & searched & (own[2] > 0)
     from_own, from_other = _distance(own, faces, 0), _distance(other, faces, 1)
     apart = _apart(own, faces[:, :2])
@@ -85,13 +96,15 @@ def after_boxes(identity: Tensor, faces: Tensor, searched: Tensor, interval: Ten
 def is_other(identity: Tensor, place: Tensor, look: Tensor, interval: Tensor) -> Tensor:
     """Whether a face at a place, that looks so (192,), is the other's rather than the followed one's; () bool."""
     own, other = _motions(identity)
-    unlike = (_ALIKE - _likeness(identity, look)).clamp(min=0) * _UNLIKE
+    likeness = _likeness(identity, look)
+    unlike = (_ALIKE - likeness).clamp(min=0) * _UNLIKE
     unlike = unlike + _RESEMBLING * (place[2].clamp(min=1) / own[2].clamp(min=1)).log().abs()
     from_own, from_other = _distance(own, place, 0) + unlike, _distance(other, place, 1)
     hidden = own[5] > 1.5 * interval
     nearer = from_other < from_own * torch.where(hidden, _CLEARLY, 1.0)
     nearer = nearer & ((other[5] > 0.5 * interval) | (from_other < _BESIDE))  # else the other is seen beside this face
-    return _is_known(identity) & nearer & (from_own > torch.where(hidden, 0.0, _SURE)) & (own[5] < FORGOTTEN)
+    nearer = nearer | (hidden & (likeness < _STRANGE))
+    return _is_known(identity) & nearer & (from_own > torch.where(hidden, 0.0, _SURE)) & (own[5] < _FORGOTTEN)
 
 
 def after_face(identity: Tensor, place: Tensor, look: Tensor, whose: tuple[Tensor, Tensor], interval: Tensor) -> Tensor:
@@ -102,7 +115,7 @@ def after_face(identity: Tensor, place: Tensor, look: Tensor, whose: tuple[Tenso
     """
     seen, stranger = whose
     own, other = _motions(identity)
-    fresh = (own[2] <= 0) | (own[5] >= FORGOTTEN)
+    fresh = (own[2] <= 0) | (own[5] >= _FORGOTTEN)
     known = torch.where(fresh, 0.0, identity)
     moved = _moved(known[:_MOTION], place[:3], interval)
     # Whoever is about to cover the face is no part of its look.
@@ -112,8 +125,10 @@ def after_face(identity: Tensor, place: Tensor, look: Tensor, whose: tuple[Tenso
     mixed = mixed / mixed.square().sum().sqrt().clamp(min=1e-6)
     other = torch.where(fresh, 0.0, other)
     followed = torch.cat([moved, other, counted_beside(identity), mixed])
-    passing = torch.cat([own, _moved(other, place[:3], interval), identity[2 * _MOTION :]])
-    return torch.where(seen, followed, torch.where(stranger & (other[5] > 0), passing, identity))
+    # Of two boxes that overlap the wrong one may have been taken for the other's.
+    mistaken = (other[5] <= 0) & (_likeness(identity, look) < _STRANGE)
+    passing = torch.cat([own, _moved(torch.where(mistaken, 0.0, other), place[:3], interval), identity[2 * _MOTION :]])
+    return torch.where(seen, followed, torch.where(stranger & ((other[5] > 0) | mistaken), passing, identity))
 
 
 def counted_beside(identity: Tensor) -> Tensor:

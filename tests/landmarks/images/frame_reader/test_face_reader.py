@@ -136,8 +136,16 @@ def test_it_stays_with_the_largest_and_finds_it_again(webcam: Webcam, portrait: 
 
 @pytest.mark.parametrize(
     "film",
-    [{}, {"start": 400.0, "end": -160.0}, {"tint": (1.0, 1.0, 1.0)}, {"hidden": 0.8}, {"larger": 1.4}],
-    ids=["beside", "passing", "alike", "slow", "near"],
+    [
+        {},
+        {"start": 400.0, "end": -160.0},
+        {"tint": (1.0, 1.0, 1.0)},
+        {"hidden": 0.8},
+        {"larger": 1.4},
+        {"stays": 5.0},
+        {"stays": 2.0, "tint": (1.0, 1.0, 1.0)},
+    ],
+    ids=["beside", "passing", "alike", "slow", "near", "before", "alike before"],
 )
 def test_it_stays_with_a_person_before_whom_another_passes(reader: FaceReader, film: dict[str, Any]) -> None:
     """Reader and tracker alike: never for two frames with the other, soon with the first again; others are counted."""
@@ -154,6 +162,24 @@ def test_it_stays_with_a_person_before_whom_another_passes(reader: FaceReader, f
     assert ((away > 3).sum(1) <= 2).all()
     others = [round(one) for one in people_beside(webcam.state).tolist()]
     assert others == [round(one) for one in tracker.beside.tolist()] == [int(film.get("end") is None), 0]
+
+
+def test_one_of_two_boxes_that_overlap_is_not_mistaken_for_good() -> None:
+    """Who comes out from behind another little by little is followed again."""
+    crossing = crossing_film(hidden=3.0)
+    network = zoo.get_model("landmark_network")
+    tracker = LandmarkTracker(CropFinder(network, network.size, network.margin), detector=shipped_detector())
+    away = torch.tensor([column(tracker.step(frame)) for frame in crossing.frames]) - crossing.columns
+    assert away[60:80].isnan().all()
+    assert (away.abs().nan_to_num(0.0) < 16).all()
+    assert (away[-20:].abs() < 2).all()
+
+
+def test_who_stays_before_another_is_followed_in_the_end(webcam: Webcam) -> None:
+    frames = crossing_film(stays=10.0, after=0).frames
+    seen = [column(webcam.step(frame)) for frame in frames]
+    assert all(one != one for one in seen[40:180])
+    assert seen[-20] == seen[-20]
 
 
 def test_a_person_who_passes_before_another_is_kept(webcam: Webcam) -> None:

@@ -25,7 +25,6 @@ from torchface.landmarks.images.networks.eye_network import EyeNetwork
 from torchface.landmarks.images.networks.landmark_network import LandmarkNetwork
 from torchface.landmarks.images.person_identity import (
     CANDIDATES,
-    FORGOTTEN,
     IDENTITY,
     LOOK_MARGIN,
     LOOK_SIZE,
@@ -33,6 +32,7 @@ from torchface.landmarks.images.person_identity import (
     after_face,
     counted_beside,
     face_look,
+    is_awaited,
     is_beside,
     is_other,
     known_look,
@@ -113,8 +113,10 @@ class FaceReader(nn.Module):
         place, people = place * same, state[_PLACED:] * same
         followed = (following > 0.5) & same & (interval <= _LONGEST)
         crowded = is_beside(people)
+        hidden = crowded & is_awaited(people)
+        waiting = hidden | (~crowded & (missing < _PATIENCE))
         asked = followed & (doubt >= _DOUBT) & ((since >= _DOUBT) | crowded)
-        lost_now = ~followed & ((missing <= _EAGER) | (since >= _PAUSE))
+        lost_now = ~followed & ((missing <= _EAGER) | (since >= _PAUSE) | hidden)
         searched = asked | lost_now | (followed & (crowded | (since >= torch.where(covered > 0.5, 0.0, _COUNTED))))
         # Who is about as large as the face that is followed is seen in a small copy too.
         enough = (size.amax(0) * _ENOUGH / place[2].clamp(min=1)).clamp(max=INPUT_SIZE)
@@ -123,7 +125,7 @@ class FaceReader(nn.Module):
             searched,
             self.search,
             lambda image, place, waiting, attempt, longest: torch.zeros(FOUND),
-            (image, place, missing < torch.where(crowded, FORGOTTEN, _PATIENCE), attempt, longest),
+            (image, place, waiting, attempt, longest),
         )
         there = found[5] > 0.5
         people = after_boxes(people, found[7:].view(CANDIDATES, 4), searched, interval)

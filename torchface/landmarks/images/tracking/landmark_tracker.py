@@ -19,6 +19,7 @@ from torchface.landmarks.images.person_identity import (
     after_boxes,
     after_face,
     counted_beside,
+    is_awaited,
     is_beside,
     is_other,
 )
@@ -38,7 +39,7 @@ _LEAST_CONFIDENCE, _CHECKS, _CHECK_EVERY = 0.44, 3, 16
 # Frames after which it is asked who else is about, and after which where a landmark is less visible than the third; and
 # pixels of the followed face's side in the copy that it is shown for that.
 _COUNT_EVERY, _COVERED_EVERY, _HIDDEN, _ENOUGH = 4, 2, 0.3, 48.0
-_FRAMES_WAITED, _FRAMES_HIDDEN = 10, 30  # for a lost face at its place before another is taken
+_FRAMES_WAITED = 10  # for a lost face at its place before another is taken
 _LEAST_SIDE = 12.0  # of a box, pixels, under which a face is lost
 _INTERVAL = torch.tensor(1 / 30)  # seconds that a frame counts
 
@@ -236,8 +237,8 @@ class LandmarkTracker:
         followed = self._followed
         near = followed.near(faces.boxes)
         # Whoever is hidden behind somebody comes out again.
-        patience = _FRAMES_HIDDEN if is_beside(followed.people) else _FRAMES_WAITED
-        waits = followed.place is not None and followed.missed < patience
+        hidden, awaited = is_beside(followed.people), is_awaited(followed.people)
+        waits = followed.place is not None and bool(awaited if hidden else followed.missed < _FRAMES_WAITED)
         if not near and (waits or self.face >= len(faces)):
             return None
         skipped = 0 if near else self.face
