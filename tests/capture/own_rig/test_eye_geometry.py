@@ -48,4 +48,8 @@ def test_hidden_and_shut_eyes() -> None:
     assert trust.tolist() == [[1.0, 1.0]]
     opened, trust = judged_openness(part, torch.full_like(closed, torch.nan), torch.tensor([[0.0, 1.0]]).double())
     assert opened.tolist() == [[1.0, 1.0]]  # as its twin
+    # Of an eye in the shade, that nobody calls shut, the other one says more than it does; a wink stays one.
+    dim, sure = torch.tensor([[0.2, 0.8]]).double(), torch.ones(1, 2).double()
+    assert float(judged_openness(dim, torch.tensor([[0.3, 0.02]]).double(), sure)[0].diff().abs()) < 0.15
+    assert float(judged_openness(dim, torch.tensor([[0.95, 0.02]]).double(), sure)[0].diff().abs()) > 0.75
     assert 0 < float(trust[0, 0]) < 0.5

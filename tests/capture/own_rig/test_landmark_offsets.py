@@ -209,6 +209,24 @@ def test_hidden_shapes_keep_their_weights_then_rest() -> None:
     assert bool((told[20:, rows[2]] > 0.99).all())
 
 
+def test_a_hidden_side_follows_the_other_one() -> None:
+    """Half a face behind a hand blinks, and smiles, with the half that is seen, a frame later."""
+    names = person().names
+    weights, blinks = talking(dict.fromkeys(SMILE, 0.6)), [names.index(f"eyeBlink{side}") for side in ("Left", "Right")]
+    weights[:, blinks] = 0.0
+    weights[10:14, blinks] = 0.9
+    landmarks, confidence = seen(person(), weights), torch.ones(FRAMES, 68)
+    confidence[4:, [*range(22, 27), *range(42, 48), *range(52, 57), *range(63, 66)]] = 0
+    found = solver_of(person())(landmarks, confidence=confidence).weights
+    blink = found[:, blinks[0]]
+    assert float(blink[4:10].max()) < 0.1
+    assert float(blink[10:15].max()) > 0.8 * float(found[10:15, blinks[1]].max()) > 0.4
+    assert float(blink[18:].max()) < 0.1
+    smile = found[12:, [names.index(name) for name in SMILE]]
+    assert float((smile[:, 0] - smile[:, 1]).abs().max()) < 0.1
+    assert float(smile.min()) > 0.3
+
+
 def test_frames_left_out_change_little() -> None:
     """The same second at half the rate, or with every third frame lost, gives the same weights at the same times."""
     weights = talking(dict.fromkeys(SMILE, 0.5))

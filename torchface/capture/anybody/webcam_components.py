@@ -11,6 +11,7 @@ from torchface.capture.anybody.person_landmarks import PersonLandmarks
 from torchface.capture.anybody.webcam_state import StateLayout, WebcamState
 from torchface.capture.own_rig.eye_geometry import LOOKS, arkit_names, openness_rows
 from torchface.capture.own_rig.face_points import JAW, LANDMARKS
+from torchface.capture.own_rig.weight_walk import twins_of
 from torchface.capture.priors import ShapePrior
 from torchface.errors import NameMismatchError
 from torchface.number_checks import LARGEST_WEIGHT, checked_count, checked_number, checked_type
@@ -81,7 +82,17 @@ _DAMPING_ROTATION, _DAMPING_TRANSLATION = 0.5, 500.0  # radians and millimetres 
 _CONTOUR_TRUST = 0.5  # how much a landmark of the contour counts beside an inner one
 _LIDS = ("eyeBlink", "eyeWide", "eyeSquint")
 _LID_MOTION = 3.0
-_CONSTANTS = ("signed", "arkit_signed", "landmark_weights", "camera", "look_eyes", "upright", "damping", "filter_units")
+_CONSTANTS = (
+    "signed",
+    "twins",
+    "arkit_signed",
+    "landmark_weights",
+    "camera",
+    "look_eyes",
+    "upright",
+    "damping",
+    "filter_units",
+)
 
 
 class WebcamSolverParts(nn.Module):
@@ -95,6 +106,7 @@ class WebcamSolverParts(nn.Module):
     look_eyes: Tensor
     gain_shapes: Tensor
     signed: Tensor
+    twins: Tensor
     arkit_signed: Tensor
     walk: Tensor
     landmark_weights: Tensor
@@ -138,6 +150,7 @@ class WebcamSolverParts(nn.Module):
             "look_shapes": mapping(LOOKS, rig.names).double(),
             "gain_shapes": gain_groups(rig.names),
             "signed": signed_quantities(rig.names),
+            "twins": twins_of(rig.names),
             "arkit_signed": signed_quantities(ARKIT),
             "walk": torch.tensor([(_LID_MOTION if n.startswith(_LIDS) else 1.0) for n in called]),
             "landmark_weights": landmark_weights,

@@ -17,7 +17,13 @@ from torchface.capture.energy import Quadratic
 from torchface.capture.own_rig.eye_geometry import CORNERS, look_weights, seen_gaze
 from torchface.capture.own_rig.face_points import EYE_CORNERS, JAW, LANDMARKS, FacePoints
 from torchface.capture.own_rig.gauss_newton import HeadState, Linearised, energy_of_step, linearise, split_step
-from torchface.capture.own_rig.weight_walk import faded, relative_trust, unseen_time, walk_information
+from torchface.capture.own_rig.weight_walk import (
+    counted_share,
+    expected_weights,
+    relative_trust,
+    unseen_time,
+    walk_information,
+)
 from torchface.geometry.cameras.affine_pose import affine_pose, orthonormal
 from torchface.geometry.cameras.calibration import ASSUMED_FIELD_OF_VIEW
 from torchface.landmarks.images.face_reading import READ_FOR_SOLVER, FaceReading, trust_of
@@ -174,7 +180,9 @@ class WebcamSolver(WebcamSolverParts):
 
         evidence = relative_trust(torch.where(frame.trust > 0, frame.trust, 0.0)[None]) @ self.influence
         hidden = unseen_time(before.hidden[None], evidence, frame.interval)
-        known = self._known_energy(signals, before, evidence, hidden, frame.interval) + self._read_energy(frame)
+        known = self._known_energy(signals, before, evidence, hidden, frame.interval) + self._read_energy(
+            frame, evidence
+        )
         upper = highest_weights(gain_factors(before.gains, self.gain_shapes), self.gain_shapes, frame.pose)
         unit = eyes / (points.rest[EYE_CORNERS[0]] - points.rest[EYE_CORNERS[1]]).norm()
         variance = (self.settings.noise * eyes).square() + (0.5 * frame.spread).square()
@@ -251,7 +259,7 @@ class WebcamSolver(WebcamSolverParts):
     ) -> Quadratic:
         """Of the weights (1,N), whatever they are: the frame before, openness, gaze, sparsity and ridge."""
         walked = walk_information((self.settings.motion * self.walk).square(), evidence, interval + before.lost)[0]
-        mean = before.shapes * faded(hidden, interval)[0]
+        mean = expected_weights(before.shapes[None], evidence, hidden, interval, self.twins)[0]
         looking = self.look_shapes @ look_weights(signals.gaze)
         pull = self.look_shapes @ signals.gaze_trust[self.look_eyes] / self.settings.gaze_noise**2
         sure = signals.open_trust / self.settings.openness_noise**2
@@ -261,10 +269,11 @@ class WebcamSolver(WebcamSolverParts):
         opened = (self.open_rows.T * sure) @ self.open_rows
         return Quadratic((H + opened)[None], (f + (sure * (1 - signals.open)) @ self.open_rows)[None])
 
-    def _read_energy(self, frame: _Frame) -> Quadratic:
+    def _read_energy(self, frame: _Frame, evidence: Tensor) -> Quadratic:
         """Of the weights (1,N), by what a network read of them."""
         values, deviation = frame.read
-        precision = torch.where(torch.isnan(values), 0.0, deviation.square().reciprocal())
+        seen = ((self.to_arkit != 0) * counted_share(evidence)).amax(1)
+        precision = seen * torch.where(torch.isnan(values), 0.0, deviation.square().reciprocal())
         pulled = precision * _known(values, 0.0)
         return Quadratic(((self.to_arkit.T * precision) @ self.to_arkit)[None], -(pulled @ self.to_arkit)[None])
 

@@ -27,6 +27,7 @@ _WIDEST = 0.9  # of an eyeball's radius
 _LEAST_TURN = 0.1  # radians; eyeballs that turn less are turned by something else than shapes
 SURELY_OPEN, SURELY_SHUT = 0.3, 0.9
 _LEAST_OPEN = 0.15  # of an eye that is surely not shut
+_ASYMMETRY = 0.2  # how much a difference of two eyes counts that is no wink
 _UNSEEN = 0.3  # of an eye that is hidden, its twin's openness counts for less
 
 
@@ -166,6 +167,8 @@ def judged_openness(part: Tensor, closed: Tensor, trust: Tensor) -> tuple[Tensor
     """How open eyes are with what is known of whether they are shut and of each other, and how much that counts.
 
     An eye that is surely shut is at 0, one that surely is not is never near it, and a hidden one is about as its twin.
+    Where no eye is shut and the other is not, what one is more open than the other counts little: in six real takes
+    ``eyeBlink`` of both differs by more than 0.1 in one frame of 300.
 
     Args:
         part: openness beside the person's own, 0 shut and 1 at rest, (...,2).
@@ -178,4 +181,8 @@ def judged_openness(part: Tensor, closed: Tensor, trust: Tensor) -> tuple[Tensor
     part = torch.maximum(part, least) * (1 - sure)
     twin, twin_trust = part.flip(-1), _UNSEEN * trust.flip(-1)
     total = trust + twin_trust * (1 - trust)
-    return (trust * part + twin_trust * (1 - trust) * twin) / total.clamp(min=1e-6), total
+    part = (trust * part + twin_trust * (1 - trust) * twin) / total.clamp(min=1e-6)
+    both = (total * part).sum(-1, keepdim=True) / total.sum(-1, keepdim=True).clamp(min=1e-6)
+    apart = (shut - shut.flip(-1)).abs()
+    wink = ((apart - 0.5) / (SURELY_SHUT - 0.5)).clamp(_ASYMMETRY, 1).where(~torch.isnan(closed), 1.0)
+    return both + wink * (part - both), total

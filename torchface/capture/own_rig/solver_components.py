@@ -13,7 +13,7 @@ from torchface.capture.antagonist_shapes import signed_quantities
 from torchface.capture.own_rig.face_points import JAW, LANDMARKS, FacePoints, make_room_for_points
 from torchface.capture.own_rig.landmark_offsets import LandmarkOffsets, shifted_points
 from torchface.capture.own_rig.video_settings import VideoSettings
-from torchface.capture.own_rig.weight_walk import relative_trust
+from torchface.capture.own_rig.weight_walk import relative_trust, twins_of
 from torchface.capture.priors import AdaptedDynamicsPrior, DynamicsPrior, ReciprocalPrior, ShapePrior
 from torchface.correctives.activation import CorrectiveActivation
 from torchface.correctives.corrective_shapes import definitions_from_records
@@ -53,6 +53,7 @@ class VideoSolverParts(nn.Module):
     side: Tensor
     corrective_basis: Tensor | None
     signed: Tensor
+    twins: Tensor
     intrinsics: Tensor
     lower: Tensor
     upper: Tensor
@@ -129,7 +130,9 @@ class VideoSolverParts(nn.Module):
             self.register_buffer(name, made, persistent=False)
         with torch.device("cpu"):
             signed = signed_quantities(names)
+            twins = twins_of(names)
         self.register_buffer("signed", signed.to(device), persistent=False)
+        self.register_buffer("twins", twins.to(device), persistent=False)
 
     @property
     def settings(self) -> VideoSettings:

@@ -14,7 +14,13 @@ from torchface.capture.own_rig.frame_states import FrameTerms, VideoSolution, Vi
 from torchface.capture.own_rig.gauss_newton import HeadState
 from torchface.capture.own_rig.solver_components import DEFAULT_WEIGHT_STEP, check_not_negative
 from torchface.capture.own_rig.state_estimate import Expectation, StateEstimate
-from torchface.capture.own_rig.weight_walk import faded, frame_intervals, read_evidence, unseen_time, walk_information
+from torchface.capture.own_rig.weight_walk import (
+    expected_weights,
+    frame_intervals,
+    read_evidence,
+    unseen_time,
+    walk_information,
+)
 from torchface.errors import ShapeError, ValueRangeError
 from torchface.geometry.cameras.pnp import solve_pnp
 from torchface.optim.data_dependent import data_dependent
@@ -191,7 +197,8 @@ class VideoSolver(FrameSolver):
 
         A frame with fewer than six landmarks keeps the weights of the frame before: rest is likeliest of all faces, but
         not of one that smiled a moment ago. So do shapes whose landmarks are hidden, where ``settings.motion`` says how
-        weights wander; after a third of a second those go to rest, and all of a face that is lost.
+        weights wander; after a third of a second those go to rest, and all of a face that is lost. Hidden shapes of one
+        side follow the other one while that is seen.
 
         Args:
             state: of the frame before; ``start()`` for the first.
@@ -285,7 +292,8 @@ class VideoSolver(FrameSolver):
         """
         weights = walk_information(self.walk_variance.double(), evidence, interval)
         motion = self.initial_information.double()[-6:].expand(len(weights), 6)
-        mean = HeadState(head.weights * faded(hidden, interval), head.rotation, head.translation)
+        mean = expected_weights(head.weights, evidence, hidden, interval, self.twins)
+        mean = HeadState(mean, head.rotation, head.translation)
         return Expectation(mean, torch.diag_embed(torch.cat([weights, motion], dim=1)))
 
     def predicted(self, state: VideoState, estimate: StateEstimate) -> StateEstimate:

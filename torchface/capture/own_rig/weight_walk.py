@@ -1,13 +1,18 @@
-"""Motion of weights without a dynamics prior: a random walk, and rest for shapes that stay hidden."""
+"""Motion of weights without a dynamics prior: a random walk; hidden shapes follow the face's other side, or rest."""
+
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor
 
+from torchface.capture.antagonist_shapes import signed_quantities
 from torchface.capture.energy import Quadratic
 from torchface.errors import ShapeError, ValueRangeError
+from torchface.shape_names import mirror
 
 HOLD, RELAXATION = 0.3, 0.3
 """Seconds that a hidden shape keeps its weight, and those in which it then falls to 1/e: at rest within about one."""
+_FOLLOWING = 0.03  # seconds in which a hidden shape comes to 1/e of its distance from its twin: lids are so quick
 HIDDEN = 0.25
 """Share of a shape's evidence, under which it counts as hidden."""
 # Of the random walk's variance: a shape without evidence is not led off by what others do.
@@ -46,9 +51,43 @@ def unseen_time(before: Tensor | None, evidence: Tensor, interval: float | Tenso
     return torch.where(evidence < HIDDEN, since + interval, 0.0)
 
 
-def faded(hidden: Tensor, interval: float | Tensor) -> Tensor:
-    """What is left of weights, (B,N), of shapes that have been hidden for (B,N) seconds, since the frame before."""
-    return (-(hidden - HOLD).clamp(min=0).clamp(max=interval) / RELAXATION).exp()
+def twins_of(names: Sequence[str]) -> Tensor:
+    """For each shape its mirror image on the face's other side, (N,) int64, itself where there is none.
+
+    Antagonists are none: a jaw is left or right, and eyes look aside together.
+    """
+    twins = mirror(names)
+    alone = signed_quantities(names).abs()
+    sides = torch.arange(len(names))
+    looks = torch.tensor(["look" in name.lower() for name in names])
+    opposed = (alone.T @ alone)[sides, twins] > 0
+    return torch.where((opposed & (twins != sides)) | looks, sides, twins)
+
+
+def expected_weights(
+    weights: Tensor, evidence: Tensor, hidden: Tensor, interval: float | Tensor, twins: Tensor
+) -> Tensor:
+    """The weights (B,N) that the frame before leads to: seen ones stay; hidden ones come to those of the face's other
+    side while that is seen, and else go to rest after ``HOLD`` seconds.
+
+    Args:
+        weights: of the frame before, (B,N).
+        evidence: share of each shape's evidence that is seen, (B,N) in [0,1].
+        hidden: for how long shapes have been hidden, (B,N), seconds; see ``unseen_time``.
+        interval: seconds since the frame before.
+        twins: of :func:`twins_of`, (N,).
+    """
+    rested = weights * (-(hidden - HOLD).clamp(min=0).clamp(max=interval) / RELAXATION).exp()
+    own = torch.arange(len(twins), device=twins.device)
+    followed = (hidden > 0) & (evidence[:, twins] >= HIDDEN) & (twins != own)
+    kept = torch.exp(-torch.as_tensor(interval).to(weights) / _FOLLOWING)
+    return torch.where(followed, kept * weights + (1 - kept) * weights[:, twins], rested)
+
+
+def counted_share(evidence: Tensor) -> Tensor:
+    """How much a network's reading of shapes counts, (B,N), beside one of a shape that is seen: of what is hidden it
+    reads what its training had most."""
+    return (evidence / HIDDEN).clamp(_LEAST_SHARE, 1.0)
 
 
 def walk_information(variance: Tensor, evidence: Tensor, interval: float | Tensor) -> Tensor:
@@ -59,7 +98,7 @@ def walk_information(variance: Tensor, evidence: Tensor, interval: float | Tenso
         evidence: share of each shape's evidence that is seen, (B,N) in [0,1].
         interval: seconds since the frame before.
     """
-    return 1 / (variance * interval * (evidence / HIDDEN).clamp(_LEAST_SHARE, 1.0))
+    return 1 / (variance * interval * counted_share(evidence))
 
 
 def frame_intervals(seconds: Tensor | None, count: int, interval: float) -> list[float]:

@@ -6,9 +6,10 @@ import torch
 from torch import Tensor
 
 from torchface.capture.own_rig import FaceMeasurements, VideoSolver
+from torchface.capture.own_rig.weight_walk import counted_share
 from torchface.capture.weight_readings import WeightReadings
 from torchface.landmarks.images.face_reading import FaceReading, trust_of
-from torchface.shape_names import ARKIT
+from torchface.shape_names import ARKIT, mapping
 from torchface.workflows.track.track_inputs import TrackInputs
 
 # What landmarks are off by beside what networks expect of the 68, in rendered films of people, and what they are
@@ -53,7 +54,12 @@ def take_measurements(inputs: TrackInputs, solver: VideoSolver, reading: FaceRea
     deviation = (_UNDERSTATED * reading.deviation).nan_to_num(0.0, posinf=1e6)
     read = None
     if bool(torch.isfinite(reading.expression_deviation).any()):
-        read = WeightReadings.of_expression(reading.expression, reading.expression_deviation, solver.names)
+        to_arkit = mapping(solver.names, ARKIT) != 0
+        seen = counted_share(solver.shape_confidence(measured_trust(reading.landmarks, reading).double()))
+        share = (to_arkit * seen[:, None].float()).amax(2)
+        read = WeightReadings.of_expression(
+            reading.expression, reading.expression_deviation / share.sqrt(), solver.names
+        )
     return FaceMeasurements(deviation, read)
 
 
