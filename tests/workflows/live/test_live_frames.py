@@ -199,8 +199,8 @@ def test_a_video_that_is_decoded_slower_than_it_plays_is_shown_all_the_same(
     monkeypatch.setattr(VideoFile, "color_frames", slow)
     gaps = [(came, clock.now - came) for came, _ in played.frames()]
     times, late = np.array(gaps).T
-    assert len(times) >= 7
-    assert np.diff(times).max() < 1.5
+    assert len(times) >= 100  # as leaving more out gains no time
+    assert np.diff(times).max() < 0.15
     assert late.max() < 0.021  # of the film's time, which goes on from there
 
 

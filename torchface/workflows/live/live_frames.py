@@ -53,6 +53,7 @@ class SourceSettings:
 
 _DEFAULT = SourceSettings()
 _LONGEST_GAP = 0.5  # seconds of a film that are left out at once
+_WORTH = 0.25  # frames that leaving one out has to gain
 
 
 class PlayedVideo:
@@ -80,7 +81,7 @@ class PlayedVideo:
 
     def _once(self) -> Iterator[tuple[float, np.ndarray]]:
         started: float | None = None
-        skipped = 0
+        skipped, before = 0, 0.0
         for number, frame in enumerate(self.video.color_frames()):
             started = time.perf_counter() if started is None else started  # with the first frame: opening takes a while
             due = started + self._time(number)
@@ -90,13 +91,14 @@ class PlayedVideo:
             elif (
                 -early > 1 / self.video.fps and not self._settings.every
             ):  # a camera would have shown the next one by now
-                if skipped < _LONGEST_GAP * self.video.fps:
-                    self.dropped, skipped = self.dropped + 1, skipped + 1
+                gained = (before + early) * self.video.fps if skipped else 1.0  # frames, by the one before
+                if skipped < _LONGEST_GAP * self.video.fps and gained > _WORTH:
+                    self.dropped, skipped, before = self.dropped + 1, skipped + 1, -early
                     continue
                 # It cannot be decoded in its own time, and then it is played in a longer one.
                 started, due = started - early, due - early
             skipped = 0
-            yield due, cv2.merge(list(frame.numpy()))
+            yield due, frame.permute(1, 2, 0).contiguous().numpy()
 
     def _time(self, number: int) -> float:
         if self._times is None or number >= len(self._times):
