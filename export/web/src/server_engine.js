@@ -105,6 +105,7 @@ export class ServerEngine {
     if (canvas.width !== picture.width || canvas.height !== picture.height)
       [canvas.width, canvas.height] = [picture.width, picture.height];
     canvas.getContext("2d").drawImage(picture, 0, 0);
+    document.documentElement.dataset.pictures = "on";
     picture.close();
   }
 }

@@ -217,7 +217,7 @@ def go_live(
         solver: FaceSolver
         watch: Watch
         if received is not None:
-            solver, watch = ReceivedSolver(received, notes), ReceivedWatch(received, notes)
+            solver, watch = ReceivedSolver(received, notes), ReceivedWatch(received, say)
         else:
             preparing("loading the face reader")
             solver = make_solver(preparing)

@@ -26,7 +26,7 @@ class LiveView:
     came: float  # when the frame came, seconds
     interval: float  # since the frame before, seconds
     latency: float  # from its arrival to its packets on the way, milliseconds
-    picture: np.ndarray  # of the camera, uint8 (H,W,3), red first
+    picture: np.ndarray  # of the camera, uint8 (H,W,3), red first; without pixels of what has none
     solved: LiveFrame
 
     def message(self) -> bytes:

@@ -249,7 +249,7 @@ class PageServer:
                     shown = view
                     connection.send(view.message())
                 now = time.monotonic()
-                if private and view is not None and now - picture_at >= _PICTURE_INTERVAL:
+                if private and view is not None and view.picture.size and now - picture_at >= _PICTURE_INTERVAL:
                     picture_at = now
                     connection.send(view.picture_message())
                 if private and now - state_at >= _STATE_INTERVAL:

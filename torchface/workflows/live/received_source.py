@@ -44,10 +44,10 @@ class ReceivedSource:
         self._in_parts = self.receiver.scheme == "osc"  # where each weight may come in a packet of its own
         self.face: ReceivedFace | None = None
         self.fresh, self.heard = False, float("-inf")
-        self._picture = np.full((_SIZE[1], _SIZE[0], 3), 60, np.uint8)
+        self._picture = np.empty((0, 0, 3), np.uint8)
 
     def frames(self) -> Iterator[tuple[float, np.ndarray]]:
-        """When each face came, and a picture without anything; ``face`` is the face."""
+        """When each face came, and a picture without pixels; ``face`` is the face."""
         wait = _WAIT
         while True:
             faces = self.receiver.faces(wait)
