@@ -151,7 +151,7 @@ def test_nobody_there_costs_no_time_and_who_comes_later_gets_frames(
         for _ in range(100):
             assert not sender.send(torch.zeros(52))
         assert time.perf_counter() - begun < 1.0
-        until(lambda: "not connected (" in sender.problem)
+        until(lambda: "not connected (nobody answers: open VTube Studio" in sender.problem)
         studio = Studio()
         with running(studio, port):
             until(lambda: sender.send(torch.zeros(52)))

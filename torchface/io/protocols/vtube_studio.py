@@ -21,6 +21,7 @@ from torchface.shape_names import ARKIT
 VTUBE_STUDIO_PORT = 8001
 
 _PLUGIN = {"pluginName": "torchface", "pluginDeveloper": "torchface"}
+_CLOSED = "nobody answers: open VTube Studio and start its API in the settings"
 _DENIED = 50  # the error of a user who said no
 _WAIT, _ASK, _RETRY, _TICK = 3.0, 120.0, 2.0, 0.5  # seconds: an answer, the user's answer, the next try, a look round
 _LARGEST, _LONGEST_TOKEN = 2**20, 64
@@ -132,7 +133,8 @@ class VTubeStudioSender:
                 if error.final:
                     break
             except (OSError, WebSocketException, ValueError, FileFormatError) as error:
-                self.problem = f"not connected ({error})"
+                refused = isinstance(error, ConnectionRefusedError)
+                self.problem = f"not connected ({_CLOSED if refused else error})"
             finally:
                 self._allowed = False
             with self._change:
