@@ -14,7 +14,15 @@ from torchface.geometry.meshes.vertex_graph import VertexGraph
 from torchface.mesh import Mesh
 from torchface.modeling.photographs.fit_settings import FitSettings
 from torchface.modeling.photographs.image_texture import part_vertices, photographed_skin
-from torchface.modeling.photographs.skin_light import exposed, exposure_gain, light_hue, patch_offset, skin_light, unlit
+from torchface.modeling.photographs.skin_light import (
+    exposed,
+    exposure_gain,
+    light_hue,
+    like_skin_around,
+    patch_offset,
+    skin_light,
+    unlit,
+)
 from torchface.modeling.photographs.skin_mask import FacePlaces
 from torchface.rendering.camera_visibility import PosedSurface
 from torchface.rendering.clay_shading import Lighting, render
@@ -185,3 +193,25 @@ def test_blush_on_both_cheeks_stays_and_light_on_one_goes(head: Mesh) -> None:
 
     assert change(left | left[mirror]) < 0.001
     assert change(left) > 0.002
+
+
+def test_an_upper_lid_that_paint_darkens_in_spots_is_skin_when_it_shuts(head: Mesh, camera: Camera) -> None:
+    places = FacePlaces.of(head)
+    assert head.colors is not None
+    lid = places.lids > 0.5
+    spots = lid & (torch.arange(len(lid)) % 2 == 0)
+    picture = render(replace(head, colors=torch.where(spots[:, None], 0.2 * SKIN, head.colors)), camera, lighting=EVEN)
+    parts = planted_parts(picture, {"background": torch.zeros(3)}, 0.05)
+    found = photographed_skin([head], None, [picture], [camera], FitSettings(texture_size=128, parts=[parts])).colors
+    assert found is not None
+    assert int(spots.sum()) > 5
+    assert float(found[spots].mean() / SKIN.mean()) > 0.75
+
+
+def test_a_place_of_skin_keeps_its_pores_and_loses_what_is_of_another_hue() -> None:
+    tone = torch.tensor([[0.7, 0.5, 0.4]], dtype=torch.float64)
+    pore, edge = 0.93 * tone, tone * torch.tensor([0.9, 0.6, 0.1])
+    assert torch.allclose(like_skin_around(pore, tone), pore, rtol=0.01)
+    left = (like_skin_around(edge, tone) / tone).log()
+    assert float(left.mean()) > -0.21
+    assert float(left.amax() - left.amin()) < 0.125  # 2.2 at the edge

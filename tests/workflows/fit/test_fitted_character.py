@@ -7,8 +7,9 @@ from torch import Tensor
 from torchface.geometry.cameras.pinhole import look_at
 from torchface.landmarks.images.networks.part_finder import FaceParts
 from torchface.landmarks.images.networks.part_network import PARTS
-from torchface.synthetic import neutral_head
-from torchface.workflows.fit.fitted_character import hangs_down
+from torchface.modeling import ImageFit
+from torchface.synthetic import neutral_head, performer
+from torchface.workflows.fit.fitted_character import dressed_rig, hangs_down
 
 SIZE, HAIR, SKIN = 128, PARTS.index("hair"), PARTS.index("skin")
 
@@ -56,3 +57,29 @@ def test_of_a_turned_face_the_near_side_counts(yaw: float) -> None:
     unseen = marks.clone()
     unseen[slice(0, 4) if near > 0 else slice(13, 17)] = torch.nan
     assert not hangs_down([_parts(wall)], unseen[None])
+
+
+@pytest.mark.parametrize("colors", [True, False])
+def test_teeth_are_as_bright_as_photographed_and_grey_in_black_and_white(colors: bool) -> None:
+    actor = performer(texture=False).select(["jawOpen"])
+    number = torch.full((SIZE, SIZE), SKIN)
+    number[90:100, 50:80] = PARTS.index("teeth")
+    shares = torch.nn.functional.one_hot(number, len(PARTS)).permute(2, 0, 1).float()
+    image = torch.tensor([0.8, 0.6, 0.5] if colors else [0.6, 0.6, 0.6])[:, None, None].repeat(1, SIZE, SIZE)
+    image[:, number == PARTS.index("teeth")] = 0.5
+    image[:, :8] = 1.0  # well exposed
+    photographed = ImageFit(
+        actor.neutral, (), *torch.zeros(2, 1, 0), (), *torch.zeros(2, 1, 68, 2), 0.0, torch.zeros(0, 0)
+    )
+    parts = [FaceParts(shares, torch.eye(2, 3, dtype=torch.float64))]
+    made = dressed_rig(actor, actor, photographed, [image], parts, torch.zeros(1, 68, 2), True).rig.neutral
+    assert made.texture is not None
+    assert made.uvs is not None
+    assert made.uv_faces is not None
+    assert made.annotations is not None
+    teeth = made.annotations.regions["teeth_upper"][made.faces].all(1)
+    at = made.uvs[made.uv_faces[teeth]].mean(1)
+    size = made.texture.shape[-1]
+    shown = made.texture[:, ((1 - at[:, 1]) * size).long(), (at[:, 0] * size).long()]
+    assert abs(float(shown.mean()) - 0.5) < 0.06
+    assert bool((made.texture == made.texture[:1]).all()) != colors

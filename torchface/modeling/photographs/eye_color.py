@@ -25,6 +25,7 @@ _SHARE = (0.35, 0.60)
 _MIN_PIXELS = 40
 _MIN_RADIUS, _MIN_RING, _RING = 2.5, 6, (0.45, 0.8)  # pixels, pixels, radii
 _DARKEST, _LARGE = 0.07, 0.4  # of the largest iris' radius: in which photographs colours count
+_PURPLE = 0.9  # of the lesser of red and blue: what green an iris has at least
 _WHITE = 0.72  # mean of the channels from which an eyeball's texel is no iris
 
 
@@ -93,7 +94,8 @@ def _ring_color(
         light = colors.mean(1)
         kept = (light >= light.quantile(0.35)) & (light <= light.quantile(0.75))
         color = colors[kept].median(0).values.float()
-        if float(color.max()) > _DARKEST:  # else nothing but pupil and shadow is seen
+        purple = float(color[1]) < _PURPLE * float(color[[0, 2]].min())  # no iris is, but flashed pupils and red lids
+        if float(color.max()) > _DARKEST and not purple:  # else nothing but pupil and shadow is seen
             found.append(color.clamp(0.03, 0.9))
             radii.append(radius)
     large = [color for color, radius in zip(found, radii, strict=True) if radius >= _LARGE * max(radii)]

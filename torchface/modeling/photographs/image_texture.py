@@ -15,7 +15,14 @@ from torchface.modeling.photographs.eye_color import IRIS_WIDTH, iris_color
 from torchface.modeling.photographs.fit_settings import FitSettings
 from torchface.modeling.photographs.hair_cap import HairCap, hair_beyond, hair_cap, without_veil
 from torchface.modeling.photographs.landmark_view import LANDMARKS
-from torchface.modeling.photographs.skin_light import exposed, light_hue, patch_offset, skin_light, unlit
+from torchface.modeling.photographs.skin_light import (
+    exposed,
+    light_hue,
+    like_skin_around,
+    patch_offset,
+    skin_light,
+    unlit,
+)
 from torchface.modeling.photographs.skin_mask import FacePlaces, ShownParts
 from torchface.modeling.photographs.texture_fit import ColorFit, fit_colors
 from torchface.modeling.photographs.texture_projection import PhotoTexture, photo_texture
@@ -33,6 +40,10 @@ _SQUARE, _UNLIKE, _AROUND, _WITHIN = 0.2, 0.16, 0.14, 0.85
 _BROWS, _REPAINTED = 0.5, 12  # share of a brow that photographs show, rings of vertices
 _PUPIL = 0.38  # of the iris
 _LID_SHADOW = 0.5  # of the eye's opening
+_TONE = 40  # rounds over the mesh: the skin around
+_EVEN = 0.04, 0.10  # of a skin's brightness: what is added to it against shadows in even light at most, in shadows
+_DARK = 0.02  # of full white
+_BROW_ENDS = 0.6, 0.95  # shares of skin between which hair of brows and beards ends
 _IRIS_COSINE = 0.9  # of the angle between the eye's axis and the border of an iris 11 mm wide
 
 
@@ -83,7 +94,7 @@ def photographed_skin(
     fit = None if color is None else fit_colors(color, posed, images, cameras)
     mesh = posed[0]
     base = own_colors(mesh) if fit is None else fit.colors
-    if base is not None and all(float((one.amax(0) - one.amin(0)).mean()) < GREY for one in images):
+    if base is not None and without_colors(images):
         base = base.mean(1, keepdim=True).expand_as(base)  # else a grey face has a coloured neck
     if mesh.uvs is None or size == 0:
         return Skin(base, None, fit)
@@ -122,6 +133,8 @@ def photographed_skin(
     if own:
         confidence = torch.where(others, 0.0, torch.ones(count, len(others)) if confidence is None else confidence)
     texture = photo_texture(posed, images, cameras, size, base, confidence, lights, patches)
+    if parts is not None and patches is not None:
+        texture = _without_sharp_shadows(texture, views, mesh, graph, others)
     if cap is not None and paint_hair:
         texture = _capped(texture, cap, mesh, others)
     colors = texture.colors
@@ -132,6 +145,11 @@ def photographed_skin(
         colors = colors if colored.colors is None else colored.colors
         texture = _with_parts(texture, colors, rest, others, painted) if own else texture
     return Skin(colors, texture.image, fit, None if cap is None else cap.color, iris)
+
+
+def without_colors(images: Sequence[Tensor]) -> bool:
+    """Whether all photographs, (3,H,W) each, are black and white."""
+    return all(float((one[:3].amax(0) - one[:3].amin(0)).mean()) < GREY for one in images)
 
 
 @dataclass(frozen=True, eq=False)
@@ -176,6 +194,32 @@ def _without_patches(
     image = (view.image / hue[:, None, None]).clamp(0, 1).to(view.image)
     shown = replace(shown, colors=(shown.colors / hue).clamp(0, 1).to(shown.colors))
     return replace(view, image=image, shown=shown, patch=patch_offset(shown.colors, skin, base, graph, mirror))
+
+
+def _without_sharp_shadows(
+    texture: PhotoTexture, views: Sequence[_View], mesh: Mesh, graph: VertexGraph, others: Tensor
+) -> PhotoTexture:
+    """A texture whose skin is like the skin around it where much was to be done against shadows, and on upper lids.
+
+    In even light it stays as it is, with its moles.
+
+    Args:
+        others: parts that are no skin, (V,) bool.
+    """
+    places, faces = views[0].places, mesh.faces.cpu()
+    bare = torch.stack([view.parts.bare * (view.shown.cosine > 0) for view in views]).amax(0)
+    bare = ((bare - _BROW_ENDS[0]) / (_BROW_ENDS[1] - _BROW_ENDS[0])).clamp(0, 1)
+    bare = torch.lerp((~places.brow).double(), bare, texture.seen.double()) * ~others
+    colors = texture.colors.double()
+    tone = graph.smoothed(colors, bare * ~places.features, _TONE)
+    added = torch.stack([view.patch for view in views]).abs().mean(-1).amax(0) / tone.mean(1).clamp(min=_DARK)
+    shaded = ((graph.smoothed(added[:, None], bare, _TONE)[:, 0] - _EVEN[0]) / (_EVEN[1] - _EVEN[0])).clamp(0, 1)
+    weight = torch.maximum(bare * places.rim * shaded, places.lids * ~others)
+    at = texture.texels.interpolate(torch.cat([tone, weight.double()[:, None]], dim=1), faces)
+    image = texture.image.flatten(1)[:, texture.texels.texels].T.double()
+    evened = torch.lerp(image, like_skin_around(image, at[:, :3]), at[:, 3:])
+    colors = torch.lerp(colors, like_skin_around(colors, tone), weight.double()[:, None])
+    return replace(texture, image=texture.texels.image(evened.clamp(0, 1)), colors=colors.float())
 
 
 def _without_brows(colors: Tensor, places: FacePlaces, graph: VertexGraph) -> Tensor:

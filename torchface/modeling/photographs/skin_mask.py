@@ -19,6 +19,8 @@ _FOREHEAD = 0.15
 _BROW, _FRINGE = 0.13, (0.16, 0.30)
 """In distances between the eyes' outer corners, but for the second row: shares of the way to the face's outline."""
 
+_LID, _LID_BROW, _RIM = (0.01, 0.03, 0.10, 0.15), (0.06, 0.10), (0.02, 0.05)
+"""In the same distances: from the upper lid's edge, from a brow, and from what is no skin beside it."""
 _SHADOW = 5  # pixels of the network's crop across which hair darkens skin
 
 
@@ -34,6 +36,8 @@ class FacePlaces:
     behind: Tensor  # length behind the ears' landmarks, (V,)
     chin: Tensor  # the chin's place, (3,)
     brow: Tensor  # near a brow's landmarks, (V,) bool
+    lids: Tensor  # how much each is of an upper lid, which open eyes fold away, (V,) in [0,1]
+    rim: Tensor  # how far each is off eyes, nostrils and lips, (V,) in [0,1]
     brows: float  # how high the brows are
     ears: float  # how far forward the ears' landmarks lie
 
@@ -61,9 +65,13 @@ class FacePlaces:
         reach = _radius(outline - middle, torch.atan2(offsets[:, 1], offsets[:, 0]))
         length = offsets.norm(dim=1)
         features = torch.cdist(place, torch.cat([at[JAW:27], at[31:LANDMARKS]])).amin(1) < _NEAR_FEATURES
-        brow = torch.cdist(place, at[JAW:27]).amin(1) < _BROW
+        from_brow = torch.cdist(place, at[JAW:27]).amin(1)
         ears, brows = float(at[[0, 16], 2].mean()), float(at[17:27, 1].mean())
-        return FacePlaces(length / reach, length - reach, place, features, ears - place[:, 2], at[8], brow, brows, ears)
+        beside = torch.cdist(place, at[[31, 32, 33, 34, 35, *range(36, LANDMARKS)]]).amin(1)
+        return FacePlaces(
+            length / reach, length - reach, place, features, ears - place[:, 2], at[8], from_brow < _BROW,
+            _upper_lids(place, at) * _ramp(from_brow, *_LID_BROW), _ramp(beside, *_RIM), brows, ears,
+        )  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,6 +107,16 @@ class ShownParts:
         seen = (bare * (1 - shaded) + features + grown) * falloff
         own = graph.smoothed(seen[:, None], torch.ones_like(bare), 2)[:, 0]
         return ShownParts(own, bare * falloff, hair - grown)
+
+
+def _upper_lids(place: Tensor, at: Tensor) -> Tensor:
+    """How much places (V,3) lie over the upper lids' edges, which landmarks (68,3) give, and not on them, (V,)."""
+    share = torch.linspace(0, 1, 9, dtype=torch.float64)[:, None]
+    edges = [at[k] + share * (at[k + 1] - at[k]) for k in (36, 37, 38, 42, 43, 44)]
+    edge = torch.cat(edges)
+    distance, nearest = torch.cdist(place, edge).min(1)
+    over = distance * (place[:, 1] > edge[nearest, 1])
+    return _ramp(over, *_LID[:2]) * (1 - _ramp(over, *_LID[2:]))
 
 
 def _radius(outline: Tensor, angle: Tensor) -> Tensor:

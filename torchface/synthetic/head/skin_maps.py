@@ -43,6 +43,7 @@ class Look:
         hair, iris, shirt: sRGB in [0,1].
         lips: how much redder than the skin the lips are, 1 as usual.
         freckles: how strong they are, 1 as usual.
+        teeth, whites: how bright teeth and the whites of the eyes are, 1 as usual.
         haircut: "short", "long" to the shoulders, or "tied" at the back; bald if absent.
 
     Example:
@@ -58,6 +59,8 @@ class Look:
     freckles: float = 1.0
     haircut: Style | None = "short"
     shirt: tuple[float, float, float] = (0.23, 0.28, 0.34)
+    teeth: float = 1.0
+    whites: float = 1.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,7 +125,7 @@ def _painted(look: Look, p: Tensor, marks: Tensor, bare: Tensor) -> tuple[Tensor
     shown = ramp(hair + 0.12 * strand * ramp(hair, 0.0, 0.15), 0.0, 0.30) * root
     color = color + (tone - color) * (0.94 * shown).clamp(0, 1)[:, None]
     color = inner_color(color, marks)
-    color[ball] = eye_color(p[ball], look.iris)
+    color[ball] = eye_color(p[ball], look.iris, look.whites)
     height = _height(p, lips, hair, strand, old) - 0.30 * creases - 0.9 * groove
     height = height + _neck(p) * (1 - ramp(hair, 0.0, 0.3))
     height = height * (1 - ramp(eyeball + socket + mouth + nostril, 0.1, 0.4))
@@ -279,7 +282,7 @@ def _teeth(at: Tensor, look: Look) -> Tensor:
         (0.35 + 0.5 * yellow) * (1 - ramp(v, 0.1, 0.7)),
     )
     color = mix(color, (0.84, 0.85, 0.86), 0.5 * ramp(v, 0.85, 1.0))
-    return mix(color, (0.80, 0.72, 0.58), 0.15 * yellow * torch.ones(len(at)))
+    return look.teeth * mix(color, (0.80, 0.72, 0.58), 0.15 * yellow * torch.ones(len(at)))
 
 
 def _gums(at: Tensor, look: Look) -> Tensor:

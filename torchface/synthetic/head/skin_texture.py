@@ -161,14 +161,14 @@ def _cropped_hair(p: Tensor, fine: Tensor, pores: Tensor) -> Tensor:
     return 0.66 * ramp(y - edge + 5.0 * fine, -6.0, 11.0) * (0.86 + 0.3 * pores)
 
 
-def eye_color(p: Tensor, brown: tuple[float, float, float] = (0.33, 0.24, 0.14)) -> Tensor:
+def eye_color(p: Tensor, brown: tuple[float, float, float] = (0.33, 0.24, 0.14), whites: float = 1.0) -> Tensor:
     """Colours (N,3) of points of an eyeball: sclera with veins, limbal ring, iris of a colour, pupil, highlight."""
     centre = torch.tensor(EYE_CENTRE)
     offset = torch.cat([p[:, :1].abs(), p[:, 1:]], dim=1) - centre
     way = torch.nn.functional.normalize(offset, dim=1)
     polar = torch.acos(way[:, 2].clamp(-1, 1))
     angle = torch.atan2(offset[:, 1], offset[:, 0])
-    color = torch.tensor((0.86, 0.83, 0.80)).expand(len(p), 3).clone()
+    color = whites * torch.tensor((0.86, 0.83, 0.80)).expand(len(p), 3)
     veins = ramp(1 - (noise(p * torch.tensor([1.0, 2.2, 1.0]), 2.6, 11).abs() * 6), 0.3, 1.0)
     color = mix(color, (0.78, 0.45, 0.42), 0.16 * veins * ramp(polar, 0.55, 0.9))
     color = mix(color, (0.78, 0.52, 0.48), 0.75 * ramp(polar, 0.75, 1.5))

@@ -13,6 +13,8 @@ from torchface.landmarks.images.face_crop import cut_crop
 from torchface.landmarks.images.networks.part_finder import FaceParts
 from torchface.modeling import ImageFit
 from torchface.modeling.photographs.eye_color import with_iris
+from torchface.modeling.photographs.image_texture import without_colors
+from torchface.modeling.photographs.skin_light import exposed
 from torchface.registration import hidden_parts, with_template_skin
 from torchface.rig import BlendshapeRig
 from torchface.synthetic.head.embedded_character import character
@@ -26,6 +28,11 @@ _FAR = 0.5  # width of a turned face's far side beside the near one's
 _HAIR, _TUFT = 0.5, 30  # share, and pixels of the crop
 _SIZE = 1024
 _CLOTH, _LEAST = 0.7, 150  # share and crop's pixels
+# Of teeth and whites of eyes: share and crop's pixels, which quantile of the pixels, the usual brightness of those
+# painted, how dark they get. Teeth that no picture shows are as bright as lips let them be in those that do.
+_SHOWN, _TEETH_PIXELS, _WHITE_PIXELS = 0.5, 20, 10
+_TEETH, _WHITES = (0.5, 0.86), (0.95, 0.83)
+_DARKEST_PART, _BEHIND_LIPS = 0.5, 0.85
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,12 +76,43 @@ def dressed_rig(
         iris=usual.iris if fit.iris is None else _color(fit.iris),
         haircut=None if fit.hair is None else "long" if hangs_down(parts, marks) else "short",
         shirt=usual.shirt if shirt is None else _color(shirt),
+        **_brightness(images, parts),
     )
     skin = neutral.texture
     made = character(
         BlendshapeRig(neutral, rig.deltas, rig.names), look, _SIZE if skin is None else skin.shape[-1], skin
     )
-    return DressedRig(made.rig, made.surface)
+    return DressedRig(_grey(made.rig) if without_colors(images) else made.rig, made.surface)
+
+
+def _grey(rig: BlendshapeRig) -> BlendshapeRig:
+    """A rig whose texture has no colours, as its photographs have none."""
+    skin = rig.neutral.texture
+    assert skin is not None
+    grey = skin[:3].mean(0, keepdim=True).expand_as(skin[:3])
+    return BlendshapeRig(replace(rig.neutral, texture=torch.cat([grey, skin[3:]])), rig.deltas, rig.names)
+
+
+def _brightness(images: Sequence[Tensor], parts: Sequence[FaceParts]) -> dict[str, float]:
+    """How bright teeth and the whites of the eyes are in well exposed photographs, beside the usual."""
+    teeth, eyes = (_pixels([exposed(*one) for one in zip(images, parts, strict=True)], parts, name, _SHOWN).mean(0)
+        for name in ("teeth", "eyes"))  # fmt: skip
+    whites = _beside(eyes, _WHITES) if len(eyes) >= _WHITE_PIXELS else 1.0
+    return {"teeth": _beside(teeth, _TEETH) if len(teeth) >= _TEETH_PIXELS else _BEHIND_LIPS * whites, "whites": whites}
+
+
+def _beside(light: Tensor, usual: tuple[float, float]) -> float:
+    """A quantile of pixels' brightness (P,) beside the usual one."""
+    return min(1.0, max(_DARKEST_PART, float(light.quantile(usual[0])) / usual[1]))
+
+
+def _pixels(images: Sequence[Tensor], parts: Sequence[FaceParts], name: str, share: float) -> Tensor:
+    """The colours (3,P) that crops of photographs have where they show a part by more than a share."""
+    seen = []
+    for image, shown in zip(images, parts, strict=True):
+        crop = cut_crop((255 * image[:3].clamp(0, 1)).byte(), shown.transform, shown.shares.shape[-1])
+        seen.append(crop[:, shown.of(name) > share].float() / 255)
+    return torch.cat(seen, 1)
 
 
 def hangs_down(parts: Sequence[FaceParts], marks: Tensor) -> bool:
@@ -119,11 +157,7 @@ def _grown(shown: FaceParts, points: Tensor) -> Tensor:
 
 def _cloth(images: Sequence[Tensor], parts: Sequence[FaceParts]) -> Tensor | None:
     """The colour of clothes, (3,); None where too little is seen."""
-    seen = []
-    for image, shown in zip(images, parts, strict=True):
-        crop = cut_crop((255 * image[:3].clamp(0, 1)).byte(), shown.transform, shown.shares.shape[-1])
-        seen.append(crop[:, shown.of("cloth") > _CLOTH].float() / 255)
-    colors = torch.cat(seen, 1)
+    colors = _pixels(images, parts, "cloth", _CLOTH)
     return colors.median(1).values if colors.shape[1] >= _LEAST else None
 
 
