@@ -4,6 +4,7 @@ import gzip
 import socket
 import struct
 import sys
+import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -74,6 +75,19 @@ def test_each_protocol_is_received_at_ipv4_and_ipv6(scheme: str, packets: list[b
             receiver._order._heard = float("-inf")
             (face,) = [face for _, face in receiver.faces(0.5)]
             torch.testing.assert_close(face.weights, WEIGHTS, atol=0.006, rtol=0)
+
+
+def test_a_part_of_a_face_ends_no_wait() -> None:
+    """Else each part would be a frame of its own, in which the face counts as not sent."""
+    packets = VmcPackets(ARKIT)(WEIGHTS, ROTATIONS)
+    assert len(packets) > 1
+    with WeightReceiver("vmc://127.0.0.1:0") as receiver, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
+        sender.connect(("127.0.0.1", receiver.port))
+        sender.send(packets[0])
+        rest = threading.Timer(0.1, lambda: [sender.send(packet) for packet in packets[1:]])
+        rest.start()
+        assert len(receiver.faces(5.0)) == 1
+        rest.join()
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="other systems have one address of their own, 127.0.0.1")

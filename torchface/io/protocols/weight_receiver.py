@@ -138,8 +138,15 @@ class WeightReceiver:
     def faces(self, seconds: float) -> list[tuple[float, ReceivedFace]]:
         """The faces that have come, in order, and when; waits so many seconds for the first."""
         self._ask()
-        select.select([self._socket], [], [], max(0.0, seconds))
-        found = []
+        end = time.perf_counter() + seconds
+        while not (found := self._arrived(max(0.0, end - time.perf_counter()))) and time.perf_counter() < end:
+            pass  # of a face that comes in several packets not all are there
+        return found
+
+    def _arrived(self, seconds: float) -> list[tuple[float, ReceivedFace]]:
+        """The faces of the packets that have come; waits for the first packet."""
+        select.select([self._socket], [], [], seconds)
+        found = list[tuple[float, ReceivedFace]]()
         for _ in range(_MOST_AT_ONCE):
             try:
                 packet, (host, *_) = self._socket.recvfrom(_LARGEST_PACKET)
