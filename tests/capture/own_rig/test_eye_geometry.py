@@ -11,6 +11,7 @@ from torchface.capture.own_rig.eye_geometry import (
     judged_openness,
     look_weights,
     seen_gaze,
+    undrifted,
 )
 from torchface.geometry.rotations import rotation_matrix
 from torchface.synthetic import performer
@@ -39,6 +40,21 @@ def test_looks_and_gaze_are_inverse() -> None:
     weights = look_weights(gaze, turns)
     torch.testing.assert_close(gaze_of_looks(weights, turns), gaze)
     assert bool(((weights > 0).sum(1) == 4).all())  # never both of two antagonists
+
+
+def test_irises_are_as_far_aside_as_beside_corners_that_do_not_follow_them() -> None:
+    """Corners that follow the iris by a fifth of its way along a tilted eye; up and down nothing is added."""
+    marks = torch.randn(68, 2, generator=torch.Generator().manual_seed(1)).double()
+    along = torch.tensor([0.8, 0.6]).double()
+    for a, b in CORNERS:
+        marks[b] = marks[a] + 3 * along
+    middle = torch.stack([0.5 * (marks[a] + marks[b]) for a, b in CORNERS])
+    across = torch.tensor([-0.6, 0.8]).double()
+    iris = middle + 0.5 * along + 0.2 * across
+    drifted = marks.clone()
+    drifted[[36, 39, 42, 45]] += 0.2 * 0.5 * along
+    found = undrifted(drifted, iris) - (middle + 0.1 * along)
+    torch.testing.assert_close(found, (0.5 * along + 0.2 * across).expand(2, 2))
 
 
 def test_hidden_and_shut_eyes() -> None:

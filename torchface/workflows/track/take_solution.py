@@ -11,7 +11,7 @@ from torch import Tensor
 from torchface.capture.antagonist_shapes import signed_difference, signed_quantities
 from torchface.capture.own_rig import FaceMeasurements, VideoSolution, VideoSolver
 from torchface.capture.own_rig.another_face import AnotherFace, other_faces
-from torchface.capture.own_rig.eye_geometry import CORNERS, LOOKS, Eyeballs, arkit_names, openness_rows
+from torchface.capture.own_rig.eye_geometry import CORNERS, LOOKS, Eyeballs, arkit_names, openness_rows, undrifted
 from torchface.capture.own_rig.face_points import LANDMARKS
 from torchface.capture.own_rig.head_pose import measure_poses
 from torchface.capture.own_rig.landmark_offset_estimate import estimate_offsets
@@ -167,7 +167,7 @@ def eye_rays(reading: FaceReading, calibration: CameraCalibration) -> tuple[Tens
         (undistort(one.double(), calibration) - K[:2, 2]) / K.diagonal()[:2]
         for one in (reading.trusted_landmarks, reading.iris)
     )
-    return seen, iris
+    return seen, undrifted(seen, iris)
 
 
 def lid_looks(solver: VideoSolver) -> tuple[Tensor, Tensor]:
