@@ -241,7 +241,8 @@ class Tracked:
             named = ", ".join(f"{self.rig.names[i]} {100 * float(dark[i]):.0f} %" for i in rarely[:_MAX_NAMED])
             lines.append(
                 f"often hidden: {named} of the frames; there they follow the other side of the face, or keep "
-                "their weight for a third of a second and then go to rest: do not take that for acting (confidence.csv says where)"
+                "their weight for a third of a second and then go to rest: do not take that for acting "
+                "(confidence.csv says where)"
             )
         if self.offsets is not None:
             size = float(self.offsets.millimetres.norm(dim=1).mean())
