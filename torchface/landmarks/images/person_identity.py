@@ -21,7 +21,7 @@ _FORGOTTEN = 1.0  # seconds after which anybody is taken for one who is not seen
 # Sides within which somebody stands where the followed one is hidden; how slowly that one is forgotten meanwhile, and
 # after how many seconds that begins: eight in all, and some are left to find the followed one once the other has gone.
 _BEFORE, _SLOWLY, _SOON = 1.2, 0.1, 0.2
-_LIKELY = 0.4  # score of a box that shows somebody else
+_LIKELY, _PERSON = 0.4, 0.5  # score of a box that may show somebody else, and of one that is counted
 _COAST = {0: 0.1, 1: 0.5}  # seconds for which the followed one, and the other, are expected to move on unseen
 _SPEED, _GROWTH, _LEARNING = 0.1, 0.3, 0.5  # seconds in which speed, side and look are learned
 _BESIDE = 0.5  # sides: what is nearer is the same face
@@ -85,7 +85,7 @@ def after_boxes(identity: Tensor, faces: Tensor, searched: Tensor, interval: Ten
     moved = _moved(torch.where(known, other, 0.0), faces[row][0, :3], interval)
     other = torch.where(its.any(), moved, torch.where(known, other, 0.0))
     to_left = faces[:, 0] < _expected(own, 0)[0]
-    others = likely & (apart > _BESIDE)
+    others = likely & (apart > _BESIDE) & (faces[:, 3] >= _PERSON)  # a skull on a shirt has less, in most frames
     counted = torch.stack([(others & to_left).sum(), (others & ~to_left).sum()]).float()
     # Now and then something else looks like a face for a moment.
     known_beside = counted_beside(identity)

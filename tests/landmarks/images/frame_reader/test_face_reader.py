@@ -22,6 +22,14 @@ from torchface.landmarks.images.frame_reader.face_search import FOUND
 from torchface.landmarks.images.ibug_68 import relative_errors
 from torchface.landmarks.images.networks.crop_finder import CropFinder
 from torchface.landmarks.images.networks.eye_finder import EyeFinder
+from torchface.landmarks.images.person_identity import (
+    IDENTITY,
+    LOOK_SIZE,
+    after_boxes,
+    after_face,
+    counted_beside,
+    face_look,
+)
 from torchface.rendering.clay_shading import Lighting, render
 from torchface.synthetic import performer
 
@@ -188,6 +196,18 @@ def test_a_person_who_passes_before_another_is_kept(webcam: Webcam) -> None:
     assert min(columns) == pytest.approx(columns[-1], abs=2)
     assert columns[0] - columns[-1] > 200
     assert all(one == one for one in columns)
+
+
+@pytest.mark.parametrize(("score", "others"), [(0.45, 0), (0.55, 1)], ids=["a skull on a shirt", "a person"])
+def test_who_is_counted(score: float, others: int) -> None:
+    """By scores of the box network in films; a face on a shirt moves with the person, so that motion tells nothing."""
+    interval, look = torch.tensor(1 / 30), face_look(torch.rand(3, LOOK_SIZE, LOOK_SIZE))
+    people, whose = torch.zeros(IDENTITY), (torch.tensor(True), torch.tensor(False))
+    faces = torch.tensor([[200.0, 100, 80, 0.6], [210, 260, 70, score], [0, 0, 0, 0], [0, 0, 0, 0]])
+    for _ in range(30):
+        people = after_boxes(people, faces, torch.tensor(True), interval)
+        people = after_face(people, torch.tensor([200.0, 100, 80, 1, 0]), look, whose, interval)
+    assert counted_beside(people).sum().round() == others
 
 
 def test_what_was_refused_is_not_tried_again_and_again(
