@@ -14,6 +14,7 @@ from torchface.modeling.rigging.eyelid_closure import (
     lids_looking_down,
     shut_blinks,
 )
+from torchface.rendering.raycast import RayCaster
 from torchface.rig import BlendshapeRig
 from torchface.synthetic import performer
 
@@ -89,8 +90,12 @@ def test_a_fold_of_the_open_lid_is_flatter_when_the_eye_is_shut(actor: Blendshap
         plain = (head.vertices + shut_blinks(head, blinks, actor.names, openings, apart)[0][row])[:, 2]
         shut = (folded.vertices + shut_blinks(folded, blinks, actor.names, openings, apart)[0][row])[:, 2]
         middle = opening.upper.mean(0)
-        there = (fold > 0.4) & ((head.vertices - middle)[:, 0].abs() < 10)
-        assert int(there.sum()) > 10
+        rays = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64).expand_as(head.vertices)
+        posed = torch.cat([head.vertices[:, :2], plain[:, None]], 1)
+        posed[:, :2] += shut_blinks(head, blinks, actor.names, openings, apart)[0][row][:, :2]
+        seen = RayCaster(posed, head.skin).distances(posed + 0.3 * rays, rays, 50.0) >= 50.0
+        there = (fold > 0.4) & ((head.vertices - middle)[:, 0].abs() < 10) & seen
+        assert int(there.sum()) > 5
         assert float((shut - plain)[there].abs().mean()) < 0.85 * float(fold[there].mean())
 
 
@@ -119,3 +124,21 @@ def test_a_large_triangle_of_a_lid_goes_before_a_round_eye(actor: BlendshapeRig)
     moved = _before_the_eye(whole, eye, torch.zeros(first + 3, 3).double(), rows)
     assert bool((corners[:, 2] + moved[rows, 2] > front - 0.6).all())  # one of the places looked at is near the front
     assert float(moved[rows, 2].max()) < 1.5
+
+
+def test_a_sockets_lining_behind_shut_lids_stays(actor: BlendshapeRig) -> None:
+    head, marks = head_of(actor)
+    ball = head.vertices[head.part == 2]
+    middle, reach = ball.mean(0), float(ball[:, 0].max() - ball[:, 0].min()) / 2 + 1
+    across = torch.tensor([[-1.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, -1.0, 0.0]], dtype=torch.float64)
+    count = len(head.vertices)
+    lined = SkinOfHead(
+        torch.cat([head.vertices, middle + reach * across]),
+        torch.cat([head.faces, count + torch.arange(3)[None]]),
+        torch.cat([head.loose, torch.zeros(3, dtype=torch.bool)]),
+        torch.cat([head.part, torch.zeros(3, dtype=torch.int64)]),
+    )
+    blinks = torch.cat([actor.deltas.double(), torch.zeros(2, 3, 3, dtype=torch.float64)], 1)
+    shut = shut_blinks(lined, blinks, actor.names, eyes_seen(lined, marks))[0]
+    row = actor.names.index("eyeBlinkRight" if middle[0] < 0 else "eyeBlinkLeft")
+    assert float(shut[row, count:].abs().max()) < 0.1

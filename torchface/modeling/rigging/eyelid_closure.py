@@ -32,7 +32,7 @@ _REACH, _LEAST_REACH = 0.5, 3.0  # of the opening's height, millimetres: how far
 _FIRM, _TOUCH = 100.0, 0.3
 _SPAN, _ASIDE = 76.0, 1.6
 _AROUND = 1.5  # of the opening's half width, round its middle: the lids
-_BEHIND, _BEFORE, _LIFT, _MOST = 1.5, 0.5, 0.25, 12.0
+_BEHIND, _BEFORE, _LIFT, _MOST, _HIDDEN = 1.5, 0.5, 0.25, 12.0, 0.2
 _PLACES = (
     torch.tensor(
         [[a, b, 4 - a - b] for a in range(5) for b in range(5 - a) if 4 not in (a, b, 4 - a - b)], dtype=torch.float64
@@ -245,10 +245,11 @@ def _before_the_eye(head: SkinOfHead, eye: Tensor, delta: Tensor, rows: Tensor) 
     free[rows] = _over(caster, head.vertices[rows]) < _BEFORE
     faces = skin[free[skin].all(1)]
     posed = head.vertices + delta
+    shell = RayCaster(posed, skin[torch.isin(skin, rows).any(1)])
     lift = torch.zeros(len(delta), dtype=torch.float64)
-    lift[free] = (_over(caster, posed[free]) + _LIFT).clamp(0, _MOST)
-    places = torch.einsum("pk,fkc->fpc", _PLACES, posed[faces])
-    lacking = _over(caster, places.flatten(0, 1)).view(len(faces), -1) - lift[faces] @ _PLACES.T
+    lift[free] = (_shown(caster, shell, posed[free]) + _LIFT).clamp(0, _MOST)
+    places = torch.einsum("pk,fkc->fpc", _PLACES, posed[faces]).flatten(0, 1)
+    lacking = _shown(caster, shell, places).view(len(faces), -1) - lift[faces] @ _PLACES.T
     lift.scatter_reduce_(0, faces.flatten(), (lift[faces] + lacking.amax(1).clamp(0, _MOST)[:, None]).flatten(), "amax")
     posed[:, 2] += lift
     return posed - head.vertices
@@ -271,6 +272,11 @@ def _eye(head: SkinOfHead, near: Tensor, edge: Tensor) -> Tensor:
     inside = torch.zeros_like(near)
     inside[ids] = mean[of] < -_BEHIND
     return head.faces[inside[head.faces].all(1)]
+
+
+def _shown(caster: RayCaster, skin: RayCaster, points: Tensor) -> Tensor:
+    """How far the eye stands before points (n,3), minus infinity behind other skin, as a lid's lining is and a fold."""
+    return torch.where(_over(skin, points) > _HIDDEN, -torch.inf, _over(caster, points))
 
 
 def _over(caster: RayCaster, points: Tensor) -> Tensor:
