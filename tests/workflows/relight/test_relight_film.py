@@ -221,3 +221,5 @@ def test_what_is_before_a_face_ends_at_the_frames_edge() -> None:
     shown = _shown(frame, parts, ("hand",), torch.zeros(68, 2))
     assert float(shown[:, :119].max()) < 0.05
     assert float(shown[:, 123:].min()) > 0.95
+    moved = FaceParts(crop, parts.transform - torch.tensor([[0, 0, 0], [0, 0, 20.0]]))  # its upper edge is row 80
+    assert float(_shown(frame, moved, ("hand",), torch.zeros(68, 2))[:70, :119].max()) < 0.05

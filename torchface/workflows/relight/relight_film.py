@@ -53,6 +53,7 @@ _INNER = ("eye", "lids", "brow", "nose", "upper_lip", "lower_lip")
 
 _FROM_ABOVE = WantedLight(azimuth=20.0, elevation=40.0, strength=1.1, ambient=0.45)
 _CHIN, _NECK = 8, (5.0, 45.0)  # its landmark, and millimetres below it over which another head fades into the neck
+_BROWS, _SCALP = slice(17, 27), 10.0  # landmarks, and millimetres beyond the face above them over which its scalp fades
 
 
 @dataclass(frozen=True)
@@ -175,6 +176,9 @@ def _painter(tracked: TrackedFilm, settings: RelightSettings) -> Draw | None:
         paint, moved = _head(other.neutral), _placed(other, tracked, settings.rig)
         height = other.vertices[:, 1] - other.vertices[other.neutral.landmarks[_CHIN], 1]
         share = ((height + _NECK[1]) / (_NECK[1] - _NECK[0])).clamp(0, 1)
+        # The film's own hair, or scalp, is kept.
+        brows = other.vertices[other.neutral.landmarks[_BROWS], 1].mean()
+        share = torch.where(other.vertices[:, 1] > brows, share * _near_face(other.neutral, _SCALP), share)
     else:
         return None
 
@@ -222,17 +226,17 @@ def _placed(other: BlendshapeRig, tracked: TrackedFilm, path: Path) -> Callable[
 
 
 def _shown(frame: Tensor, parts: FaceParts, before: Sequence[str], marks: Tensor) -> Tensor:
-    """How far each pixel of a frame (3,H,W) shows what some parts do not hide, (H,W) in [0,1]; 1 beyond their crop.
+    """How far each pixel of a frame (3,H,W) shows what some parts do not hide, (H,W) in [0,1].
 
     Hair within the hull of the landmarks (68,2) is a beard or brows, which belong to the face.
     """
     y, x = torch.meshgrid(torch.arange(frame.shape[1]), torch.arange(frame.shape[2]), indexing="ij")
     pixels = torch.stack([x, y], -1)
-    hidden = parts.at(pixels, *before).nan_to_num(0.0)
+    hidden = parts.around(pixels, *before)
     if "hair" in before:
         hull = cv2.convexHull(marks[torch.isfinite(marks).all(1)].float().numpy()).round().astype(np.int32)
         inside = torch.from_numpy(cv2.fillConvexPoly(np.zeros(frame.shape[1:], np.uint8), hull, 1)).bool()
-        others = parts.at(pixels, *(name for name in before if name != "hair")).nan_to_num(0.0)
+        others = parts.around(pixels, *(name for name in before if name != "hair"))
         hidden = torch.where(inside, others, hidden)
     # The network's crop is coarser than the frame: what it found follows the edges of the frame.
     guide = frame.permute(1, 2, 0).contiguous().numpy()
@@ -293,7 +297,7 @@ def _reaching(light: PointLight, middle: Tensor) -> PointLight:
     return replace(light, intensity=torch.zeros_like(light.intensity)) if _doubts(light.from_afar(middle)) else light
 
 
-def _near_face(mesh: Mesh) -> Tensor:
+def _near_face(mesh: Mesh, beyond: float = _BEYOND) -> Tensor:
     """1 on the face, eyes and mouth, less with the distance from it, (V,); 1 everywhere on a head without regions."""
     regions = {} if mesh.annotations is None else mesh.annotations.regions
     if "face" not in regions:
@@ -301,7 +305,7 @@ def _near_face(mesh: Mesh) -> Tensor:
     face = regions["face"].cpu() | _inner(mesh)
     exact = "donot_use_mm_for_euclid_dist"
     distance = torch.cdist(mesh.vertices, mesh.vertices[face], compute_mode=exact).amin(1)
-    return (1 - distance / _BEYOND).clamp(0, 1)
+    return (1 - distance / beyond).clamp(0, 1)
 
 
 def _inner(mesh: Mesh) -> Tensor:

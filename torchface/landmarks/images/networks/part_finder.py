@@ -29,13 +29,21 @@ class FaceParts:
 
     def at(self, pixels: Tensor, *names: str) -> Tensor:
         """The share of some of :data:`PARTS` together at pixels (...,2) of the picture, (...); NaN beyond the crop."""
+        values, inside = self._shares(pixels, *names)
+        return torch.where(inside, values, torch.nan)
+
+    def around(self, pixels: Tensor, *names: str) -> Tensor:
+        """As ``at``; beyond the crop that of its edge nearby."""
+        return self._shares(pixels, *names)[0]
+
+    def _shares(self, pixels: Tensor, *names: str) -> tuple[Tensor, Tensor]:
         place = pixels.double() @ self.transform[:, :2].T + self.transform[:, 2]
         size = self.shares.shape[-1]
         grid = ((2 * place + 1) / size - 1).to(self.shares)
         values = grid_sample(
             self.of(*names)[None, None], grid.reshape(1, 1, -1, 2), padding_mode="border", align_corners=False
         ).reshape(place.shape[:-1])
-        return torch.where((grid.abs() <= 1).all(-1), values, torch.nan)
+        return values, (grid.abs() <= 1).all(-1)
 
 
 @dataclass(frozen=True, eq=False)
