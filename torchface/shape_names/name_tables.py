@@ -1,6 +1,6 @@
 """Tables from ARKit's names to Unified Expressions, VRM's clips, Oculus' visemes and MetaHuman's curves, and back."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -11,6 +11,7 @@ from torchface.shape_names.arkit_names import ARKIT
 
 _SIDES = ("Left", "Right")
 _COMES_BACK = 0.99
+_NOTHING = 1e-6  # of a factor
 _RIDGE = 1e-5  # without it a clip without a pose has no weight of its own
 
 
@@ -130,6 +131,15 @@ class ClipTable:
             if not self.poses[name]:
                 clips[:, row] = (1 - clips.sum(1)).clamp(min=0)
         return clips.reshape(*weights.shape[:-1], -1).to(weights)
+
+    def factors(self, names: Sequence[str]) -> dict[str, dict[str, float]]:
+        """What each of some clips takes of ARKit's weights so that they alone are nearest to these, before limits."""
+        nearest = torch.linalg.pinv(self._matrix[[self.names.index(name) for name in names]].double())
+        rows = nearest.abs() > _NOTHING
+        return {
+            name: {ARKIT[row]: float(nearest[row, column]) for row in rows[:, column].nonzero()[:, 0].tolist()}
+            for column, name in enumerate(names)
+        }
 
     def lost(self) -> tuple[str, ...]:
         """ARKit's names whose weight does not come back from here."""

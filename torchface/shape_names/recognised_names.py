@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from functools import cache
 
 from torchface.shape_names.arkit_names import ARKIT
-from torchface.shape_names.name_tables import METAHUMAN
+from torchface.shape_names.name_tables import METAHUMAN, VRM1
 
 _PREFIX = re.compile(
     r"^(.*__(?=facs_)|.*(?=Fcl_)(?<!^)|.*[.:|](?=[^.:|]{3,}$)|(?:facs_)?(?:bs|jnt|ctrl|cbs)_|facs_|[at]\d\d_|arkit[_ ]|"
@@ -69,6 +69,18 @@ _PLAIN = {
 """Other programs' names of the other shapes."""
 
 
+_VOWEL = re.compile(r"(?:fcl_mth_|vrc[._]v_)(a|i|u|e|o|aa|ih|ou|oh)", re.IGNORECASE)
+_CLIPS = {"a": "aa", "i": "ih", "u": "ou", "e": "ee", "o": "oh"}
+_MOODS = {
+    "fcl_mth_fun": {"mouthSmileLeft": 0.5, "mouthSmileRight": 0.5},
+    "fcl_mth_down": {"mouthFrownLeft": 0.5, "mouthFrownRight": 0.5},
+    "fcl_brw_angry": {"browDownLeft": 0.5, "browDownRight": 0.5},
+    "fcl_brw_surprised": {"browInnerUp": 0.5, "browOuterUpLeft": 0.25, "browOuterUpRight": 0.25},
+    "fcl_eye_surprised": {"eyeWideLeft": 0.5, "eyeWideRight": 0.5},
+}
+"""What VRoid's shapes for moods are of ARKit's."""
+
+
 @dataclass(frozen=True)
 class RecognisedShape:
     """One of ARKit's shapes among a rig's.
@@ -123,6 +135,21 @@ def recognised_shapes(names: Sequence[str]) -> dict[str, RecognisedShape]:
         if rows:
             found[arkit] = RecognisedShape(rows, tuple(names[i] for i in rows), arkit in row)
     return found
+
+
+def vowel_sources(name: str) -> dict[str, float]:
+    """What a vowel's shape of VRoid or VRChat, or VRoid's for a mood, takes of ARKit's weights; limits are 0 and 1.
+
+    For characters that open their mouth by vowels alone. Vowels are VRM's clips (``VRM1``).
+    """
+    plain = name[max(0, name.find("Fcl_")) :].lower()
+    vowel = _VOWEL.fullmatch(plain)
+    return _vowels()[_CLIPS.get(vowel[1], vowel[1])] if vowel else _MOODS.get(plain, {})
+
+
+@cache
+def _vowels() -> dict[str, dict[str, float]]:
+    return VRM1.factors(tuple(_CLIPS.values()))
 
 
 def arkit_name(name: str) -> str | None:

@@ -1,6 +1,6 @@
 // ARKit's 52 blendshapes in Live Link Face's order, which is the graph's, and what other rigs call the same shapes.
 
-import { RECOGNISED } from "./shape_tables.js";
+import { MOODS, RECOGNISED, VOWELS } from "./shape_tables.js";
 
 const both = (...names) => names.flatMap((name) => [`${name}Left`, `${name}Right`]);
 const eye = (side) =>
@@ -49,6 +49,16 @@ export function sourcesOf(name) {
   if (whole !== wanted && ROW.has(whole)) return [[ROW.get(whole), 1]];
   const known = arkitName(name);
   return known === undefined || canonical(known) === wanted ? [] : sourcesOf(known);
+}
+
+const VOWEL = /^(?:fcl_mth_|vrc[._]v_)(a|i|u|e|o|aa|ih|ou|oh)$/;
+const CLIPS = { a: "aa", i: "ih", u: "ou", e: "ee", o: "oh" };
+
+/** The rule of a vowel's shape, or of one for a mood, as torchface's `vowel_sources`; none for another shape. */
+export function vowelRule(name) {
+  const plain = name.slice(Math.max(0, name.indexOf("Fcl_"))).toLowerCase(), vowel = VOWEL.exec(plain)?.[1];
+  const sources = vowel ? VOWELS[CLIPS[vowel] ?? vowel] : MOODS[plain];
+  return sources && { sum: Object.entries(sources).map(([arkit, factor]) => [ARKIT.indexOf(arkit), factor]), product: [], gain: 1, lower: 0, upper: 1 };
 }
 
 /** The weight of a shape of ARKit's weights: by its sources, by a rule of torchface's mapping tables, or as a corrective. */

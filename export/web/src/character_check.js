@@ -1,11 +1,12 @@
 // Whether a .glb can be moved by a face: looked at before three.js takes memory for it, and said in plain words.
 
-import { sourcesOf } from "./arkit_names.js";
+import { ARKIT, sourcesOf, vowelRule } from "./arkit_names.js";
 import { CharacterError, readGlb } from "./glb_container.js";
 
 export const LARGEST_FILE = 100 * 2 ** 20; // bytes
 const MOST_NUMBERS = 2 ** 27; // of all morph targets together, half a gigabyte once they are unpacked
 const SHOWN = 8;
+const JAW = ARKIT.indexOf("jawOpen");
 
 /** Refuses what is too large to be read, by its size alone. */
 export function checkSize(size) {
@@ -26,15 +27,18 @@ export function checkSize(size) {
  *   of each mesh its shapes in the file's order, each `{name, sources, rule}`; names each once.
  */
 export function checkCharacter(bytes, sources = null, changed = {}) {
+  checkSize(bytes.byteLength);
+  const { document, binary } = readGlb(bytes);
+  const namesOf = (mesh) => mesh.extras?.targetNames ?? mesh.primitives?.[0]?.extras?.targetNames ?? [];
+  const byVowels = !(document.meshes ?? []).flatMap(namesOf).some((name) => sourcesOf(String(name)).some(([row]) => row === JAW));
+  const meaning = (name) => (byVowels && vowelRule(name)) || sourcesOf(name);
   const shape = (name) => {
-    const given = Object.hasOwn(changed, name) ? sourcesOf(changed[name]) : sources === null ? sourcesOf(name) : (sources[name] ?? []);
+    const given = Object.hasOwn(changed, name) ? sourcesOf(changed[name]) : sources === null ? meaning(name) : (sources[name] ?? []);
     if (Array.isArray(given)) return { name, sources: given };
     if (!given.drivers) return { name, sources: [...given.sum, ...given.product.map((row) => [row, 1])], rule: given };
     const drivers = given.drivers.map(shape); // a corrective, which follows other shapes
     return { name, sources: drivers.flatMap((one) => one.sources), drivers, knots: given.knots };
   };
-  checkSize(bytes.byteLength);
-  const { document, binary } = readGlb(bytes);
   const outside = (document.images ?? []).some(({ uri }) => uri !== undefined && !uri.startsWith("data:"));
   if (outside || (document.buffers ?? []).some(({ uri }) => uri !== undefined && !uri.startsWith("data:")))
     throw new CharacterError("The character's data lie in other files. Export it as one .glb with everything inside.");
@@ -43,7 +47,7 @@ export function checkCharacter(bytes, sources = null, changed = {}) {
   for (const [index, mesh] of (document.meshes ?? []).entries()) {
     const counts = (mesh.primitives ?? []).map((one) => one.targets?.length ?? 0);
     if (!counts[0]) continue;
-    const names = mesh.extras?.targetNames ?? mesh.primitives[0].extras?.targetNames ?? [];
+    const names = namesOf(mesh);
     meshes.set(index, Array.from({ length: counts[0] }, (_, i) => shape(String(names[i] ?? `target_${i}`))));
     for (const primitive of mesh.primitives)
       for (const target of primitive.targets ?? [])

@@ -99,3 +99,21 @@ export const VRM_POSES = {
 
 /** Expressions that are two others at once. */
 export const VRM_BOTH = {"blink": ["blinkLeft", "blinkRight"]};
+
+/** What vowels take of ARKit's weights, where they alone open the mouth. */
+export const VOWELS = {
+  aa: {jawOpen: 1.42857, mouthFunnel: -0.71429, mouthPucker: -0.15873, mouthStretchLeft: -0.11905, mouthStretchRight: -0.11905, mouthLowerDownLeft: -0.53571, mouthLowerDownRight: -0.53571},
+  ih: {mouthStretchLeft: 0.83333, mouthStretchRight: 0.83333, mouthLowerDownLeft: -0.625, mouthLowerDownRight: -0.625},
+  ou: {mouthPucker: 1.11111},
+  ee: {mouthLowerDownLeft: 1.25, mouthLowerDownRight: 1.25},
+  oh: {mouthFunnel: 1.42857},
+};
+
+/** What VRoid's shapes for moods are of ARKit's. */
+export const MOODS = {
+  fcl_mth_fun: {mouthSmileLeft: 0.5, mouthSmileRight: 0.5},
+  fcl_mth_down: {mouthFrownLeft: 0.5, mouthFrownRight: 0.5},
+  fcl_brw_angry: {browDownLeft: 0.5, browDownRight: 0.5},
+  fcl_brw_surprised: {browInnerUp: 0.5, browOuterUpLeft: 0.25, browOuterUpRight: 0.25},
+  fcl_eye_surprised: {eyeWideLeft: 0.5, eyeWideRight: 0.5},
+};

@@ -111,8 +111,8 @@ const jobs = {
 
   /** Tables of names, and what ARKit calls a list of names. */
   async tables() {
-    const { arkitName } = await load("arkit_names");
-    return { ...(await load("shape_tables")), names: JSON.parse(input).map((name) => arkitName(name) ?? null) };
+    const { arkitName, vowelRule } = await load("arkit_names"), names = JSON.parse(input);
+    return { ...(await load("shape_tables")), names: names.map((name) => arkitName(name) ?? null), rules: names.map((name) => vowelRule(name)?.sum ?? []) };
   },
 
   /** VRM's expressions of weights. */

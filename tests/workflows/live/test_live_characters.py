@@ -57,3 +57,20 @@ def test_characters_that_cannot_move(dome_rig: BlendshapeRig, tmp_path: Path, mo
     monkeypatch.setattr(characters, "LARGEST_CHARACTER", 1000)
     with pytest.raises(FileFormatError, match=r"dome.glb: found 0 MB, expected at most 0 MB for a character"):
         load_character(tmp_path / "dome.glb")
+
+
+def test_a_mouth_of_vowels_alone_is_driven_by_them(dome_rig: BlendshapeRig, tmp_path: Path) -> None:
+    """As VRoid's are. A character that has ARKit's jawOpen beside them opens its mouth once."""
+    names = ["Fcl_MTH_A", "Fcl_MTH_U", "Fcl_MTH_O", "Fcl_EYE_Close_L"]
+    save_rig(BlendshapeRig(dome_rig.neutral, dome_rig.deltas, names), tmp_path / "vroid.glb")
+    row = ARKIT.index
+    faces = torch.zeros(3, len(ARKIT))
+    faces[0, JAW] = 0.7
+    faces[1, [row("mouthPucker"), JAW]] = torch.tensor([0.9, 0.1])
+    faces[2, [row("mouthFunnel"), JAW, row("eyeBlinkLeft")]] = torch.tensor([0.7, 0.35, 1.0])
+    found = load_character(tmp_path / "vroid.glb").weights(faces)
+    expected = torch.tensor([[1.0, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 1]])
+    torch.testing.assert_close(found, expected, atol=1e-3, rtol=0)
+    names[1] = "jawOpen"
+    save_rig(BlendshapeRig(dome_rig.neutral, dome_rig.deltas, names), tmp_path / "both.glb")
+    torch.testing.assert_close(load_character(tmp_path / "both.glb").weights(faces[:1]), torch.tensor([[0, 0.7, 0, 0]]))

@@ -23,7 +23,7 @@ from torchface.io.gltf.primitive_reading import read_target_names
 from torchface.io.tables.csv_table import quoted
 from torchface.progress import Progress, silent
 from torchface.rig import BlendshapeRig
-from torchface.shape_names import ARKIT, mapping, recognised_shapes
+from torchface.shape_names import ARKIT, mapping, recognised_shapes, vowel_sources
 from torchface.synthetic import character
 from torchface.workflows.cached_graph import cached_file
 
@@ -113,7 +113,8 @@ class Character:
         shapes = self.shapes
         used = [[column, float(shapes.matrix[row, column])] for column in shapes.matrix[row].nonzero()[:, 0].tolist()]
         limits = [float(values[row]) for values in (shapes.gain, shapes.lower, shapes.upper)]
-        if not shapes.products[row] and limits == [1.0, 0.0, 1.0]:
+        plain = all(0 <= factor <= 1 for _, factor in used)
+        if not shapes.products[row] and limits == [1.0, 0.0, 1.0] and plain:
             return used
         gain, lower, upper = limits
         return {"sum": used, "product": list(shapes.products[row]), "gain": gain, "lower": lower, "upper": upper}
@@ -162,8 +163,13 @@ def _recognised(names: Sequence[str]) -> dict[str, ShapeRule]:
     """Rules for shapes that other programs call otherwise, such as ``A25_Jaw_Open`` or ``Fcl_EYE_Close_L``."""
     known = mapping(ARKIT, names).any(1).tolist()
     plain = {name for name, known_one in zip(names, known, strict=True) if known_one}
-    found = recognised_shapes(names).items()
-    return {name: ShapeRule({arkit: 1.0}) for arkit, shape in found for name in shape.names if name not in plain}
+    found = recognised_shapes(names)
+    rules = {
+        name: ShapeRule({arkit: 1.0}) for arkit, shape in found.items() for name in shape.names if name not in plain
+    }
+    if "jawOpen" not in found:  # the mouth opens by vowels
+        rules |= {name: ShapeRule(sources) for name in names if (sources := vowel_sources(name))}
+    return rules
 
 
 def _taken(path: Path) -> bytes:
