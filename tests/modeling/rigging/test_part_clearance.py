@@ -78,6 +78,17 @@ def test_bone_that_comes_through_pushes_the_skin_out_and_shapes_without_fault_st
     assert torch.equal(cleared.deltas[:, ball], moving.deltas[:, ball])
 
 
+def test_lips_that_close_over_an_open_jaw_keep_its_teeth_in() -> None:
+    rig = ball_in_a_head()
+    parts, ball = inner_parts(rig), rig.deltas[0]
+    skin = 9.5 * (ball.norm(dim=-1) == 0)[:, None] * torch.tensor([1.0, 0.0, 0.0])
+    whole = BlendshapeRig(rig.neutral, torch.stack([ball + skin, -skin]), ["jawOpen", "mouthClose"])
+    cleared = clear_parts(whole, parts)
+    assert float(parts.depth(whole(torch.ones(1, 2))[0]).max()) > 1
+    assert float(parts.depth(cleared(torch.ones(1, 2))[0]).max()) <= TOLERANCE
+    assert torch.equal(cleared.deltas[0], whole.deltas[0])
+
+
 def eyes(rig: BlendshapeRig, parts: InnerParts, mesh: Mesh) -> tuple[Tensor, Tensor]:
     """Centres (2,3) and radii (2,) of the eyeballs."""
     places = [mesh.vertices[parts.vertices[parts.group == k]].double() for k in (0, 1)]

@@ -1,5 +1,6 @@
 """Shapes in which no part of a head comes through the skin: shells give way to the lids, skin gives way to bone."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import torch
@@ -9,6 +10,7 @@ from torch import Tensor
 from torchface.geometry.meshes.operators import triangle_normals
 from torchface.modeling.rigging.penetration import TOLERANCE, InnerParts, shape_depths
 from torchface.rig import BlendshapeRig
+from torchface.shape_names import mapping
 
 _BONE_MARGIN, _SHELL_MARGIN = 0.15, 0.5
 _ALLOWED = 0.1
@@ -27,7 +29,8 @@ def clear_parts(rig: BlendshapeRig, parts: InnerParts, poses: Tensor | None = No
     What has come through goes back along the line to the middle of its group: a shell of the eye moves itself, with
     its neighbourhood, and also leaves the slot between lids that close; before teeth, gums and eyeballs, which are
     hard, the skin moves out. What a pose asks for is shared by its shapes according to their weights. Vertices that a
-    shape leaves still stay still in it, and shapes in which nothing comes through keep their deltas bit by bit.
+    shape leaves still stay still in it, and shapes in which nothing comes through keep their deltas bit by bit. Lips
+    that close over an open jaw (``mouthClose``) are tested there and not by themselves.
 
     Args:
         rig: N shapes, V vertices.
@@ -47,22 +50,38 @@ def clear_parts(rig: BlendshapeRig, parts: InnerParts, poses: Tensor | None = No
     poses = clearance_poses(rig, parts) if poses is None else poses
     rest, deltas = rig.vertices.detach().cpu().double(), rig.deltas.detach().cpu().double().clone()
     moving = deltas.norm(dim=-1) > _STILL
-    clearance = Clearance(rest, parts)
-    changed = _cleared(deltas, moving, poses.double(), clearance)
+    clearance, under = Clearance(rest, parts), _closing_over_jaw(rig)
+    changed = _cleared(deltas, moving, poses.double(), clearance, under)
     # What mixtures ask of a shape may bring parts out again in its own pose.
     again = torch.eye(len(deltas), dtype=torch.float64)[changed]
-    changed |= _cleared(deltas, moving, again, clearance)
+    changed |= _cleared(deltas, moving, again, clearance, under)
     whole = rig.deltas.detach().clone()
     whole[changed.to(whole.device)] = deltas[changed].to(whole)
     return BlendshapeRig(rig.neutral, whole, rig.names, rig.correctives) if bool(changed.any()) else rig
 
 
-def _cleared(deltas: Tensor, moving: Tensor, poses: Tensor, clearance: "Clearance") -> Tensor:
-    """Changes deltas (N,V,3) in place until each pose (K,N) in turn is clear; which shapes were changed, (N,) bool."""
+def _closing_over_jaw(rig: BlendshapeRig) -> dict[int, int]:
+    """The row of a shape that undoes an open jaw at the lips, and the jaw's; none where it opens the jaw itself."""
+    closing, opening = ((row > 0.5).nonzero()[:, 0].tolist() for row in mapping(rig.names, ["mouthClose", "jawOpen"]))
+    return {
+        close: opening[0]
+        for close in closing
+        if len(opening) == 1 and float((rig.deltas[close] * rig.deltas[opening[0]]).sum()) < 0
+    }
+
+
+def _cleared(deltas: Tensor, moving: Tensor, poses: Tensor, clearance: "Clearance", under: Mapping[int, int]) -> Tensor:
+    """Changes deltas (N,V,3) in place until each pose (K,N) in turn is clear; which shapes were changed, (N,) bool.
+
+    Args:
+        under: rows of shapes that stand on another's pose, and that other's.
+    """
     changed = torch.zeros(len(deltas), dtype=torch.bool)
     for weights in poses:  # each pose builds on the changes of the one before
         active = weights.nonzero()[:, 0]
         pose = clearance.rest + torch.tensordot(weights[active], deltas[active], dims=1)
+        if len(active) == 1 and int(active) in under:
+            pose = pose + deltas[under[int(active)]]
         step = clearance.step(pose, closing=len(active) == 1)
         ids = step.abs().amax(1).nonzero()[:, 0]
         if len(ids) == 0:
