@@ -22,6 +22,13 @@ export function lighten(root) {
   });
 }
 
+/** Takes metal off: it shows what it reflects, and around the character there is nothing, so that it would be black. */
+export function withoutMetal(root) {
+  root.traverse(({ material }) => {
+    for (const one of [material ?? []].flat()) if (one.metalness > 0) one.metalness = 0;
+  });
+}
+
 function simpler(material) {
   if (material.type !== "MeshStandardMaterial" || material.metalness > 0 || material.roughness < MATTE) return material;
   const { name, color, map, normalMap, normalScale, aoMap, emissive, emissiveMap, emissiveIntensity } = material;

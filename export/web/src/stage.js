@@ -3,7 +3,7 @@
 import * as THREE from "three";
 
 import { DrawingPace, drawn, pause } from "./drawing_pace.js";
-import { lighten } from "./lighter_drawing.js";
+import { lighten, withoutMetal } from "./lighter_drawing.js";
 import { ProcessorMorphing } from "./processor_morphing.js";
 
 const FIELD = 24; // degrees; a portrait lens
@@ -43,6 +43,7 @@ export class Stage {
   show(character) {
     this.#character?.dispose();
     this.#character = character;
+    withoutMetal(character.root);
     this.#morphing = this.#software ? new ProcessorMorphing(character.root) : null;
     if (this.#software && this.#film === null) lighten(character.root);
     this.#scene.add(character.root);

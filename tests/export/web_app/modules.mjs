@@ -158,13 +158,14 @@ const jobs = {
     return { expected, found, left: meshes.some((mesh) => "position" in mesh.geometry.morphAttributes) };
   },
 
-  /** Materials of a skin, of one whose wrinkles come and go, and of an eye, made lighter: type, and whether normals are drawn. */
+  /** Materials of a skin, of one whose wrinkles come and go, of an eye, and of a skin that counts as metal, made lighter: type, and whether normals are drawn. */
   async lighter() {
-    const { lighten } = await load("lighter_drawing");
+    const { lighten, withoutMetal } = await load("lighter_drawing");
     const THREE = await import("three");
     const still = new THREE.Texture(), mixed = new THREE.WebGLRenderTarget(2, 2).texture, root = new THREE.Group();
-    for (const [normalMap, roughness] of [[still, 1], [mixed, 1], [still, 0.25]])
-      root.add(new THREE.Mesh(new THREE.BufferGeometry(), new THREE.MeshStandardMaterial({ normalMap, roughness, metalness: 0 })));
+    for (const [normalMap, roughness, metalness] of [[still, 1, 0], [mixed, 1, 0], [still, 0.25, 0], [still, 1, 1]])
+      root.add(new THREE.Mesh(new THREE.BufferGeometry(), new THREE.MeshStandardMaterial({ normalMap, roughness, metalness })));
+    withoutMetal(root);
     lighten(root);
     return root.children.map(({ material }) => [material.type, material.normalMap !== null]);
   },
