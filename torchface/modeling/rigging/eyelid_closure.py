@@ -242,7 +242,7 @@ def _before_the_eye(head: SkinOfHead, eye: Tensor, delta: Tensor, rows: Tensor) 
         return delta
     caster = RayCaster(head.vertices, eye)
     skin, free = head.skin, torch.zeros(len(delta), dtype=torch.bool)
-    free[rows] = _over(caster, head.vertices[rows]) < _BEFORE
+    free[rows] = stands_before(caster, head.vertices[rows]) < _BEFORE
     faces = skin[free[skin].all(1)]
     posed = head.vertices + delta
     shell = RayCaster(posed, skin[torch.isin(skin, rows).any(1)])
@@ -276,11 +276,11 @@ def _eye(head: SkinOfHead, near: Tensor, edge: Tensor) -> Tensor:
 
 def _shown(caster: RayCaster, skin: RayCaster, points: Tensor) -> Tensor:
     """How far the eye stands before points (n,3), minus infinity behind other skin, as a lid's lining is and a fold."""
-    return torch.where(_over(skin, points) > _HIDDEN, -torch.inf, _over(caster, points))
+    return torch.where(stands_before(skin, points) > _HIDDEN, -torch.inf, stands_before(caster, points))
 
 
-def _over(caster: RayCaster, points: Tensor) -> Tensor:
-    """How far the eye stands before points (n,3), seen from the front; minus infinity beside it."""
+def stands_before(caster: RayCaster, points: Tensor) -> Tensor:
+    """How far an eye, or other skin, stands before points (n,3), seen from the front; minus infinity beside it."""
     far = points + torch.tensor([0.0, 0.0, 200.0], dtype=torch.float64)
     hits = caster.cast(far, torch.tensor([0.0, 0.0, -1.0], dtype=torch.float64).expand_as(far))
     return torch.where(hits.triangle >= 0, 200.0 - hits.distance, -torch.inf)

@@ -13,12 +13,15 @@ from torchface.geometry.meshes.shell_energies import stretching_energy
 from torchface.geometry.meshes.surface_index import SurfaceIndex
 from torchface.landmarks.surfaces.eye_openings import EyeOpening
 from torchface.modeling.rigging.eye_motion import eyeballs, slid, turned
+from torchface.modeling.rigging.eyelid_closure import stands_before
 from torchface.modeling.rigging.joined_vertices import JoinedHead
 from torchface.modeling.rigging.mouth_parts import in_the_mouth, jaw_motions
 from torchface.optim.sparse import SparseCholesky
+from torchface.rendering.raycast import RayCaster
 from torchface.rig import BlendshapeRig
 
 _ROOT, _LYING, _STIFF = 0.3, 2.0, 0.01
+_SHELL, _CLEAR = 6.0, 0.2  # millimetres before an eye: where shells lie at most, how near they come at least
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,6 +72,7 @@ def moved_parts(
     for eyeball, opening in zip(eyeballs(template), reversed(openings), strict=False):  # the left one first
         ball = turned(head, template, eyeball, left)
         left &= ~(ball if ball.any() else slid(head, template, eyeball, opening, left))
+    eyes = loose & ~left
     notes = template.neutral.annotations
     if notes is not None and notes.landmarks is not None and len(notes.landmarks) == 68:
         mouth = template.vertices.double().cpu()[notes.landmarks.cpu()[48:68]]
@@ -80,6 +84,7 @@ def moved_parts(
         left &= ~inside
     if left.any():
         _attached(head, faces, left)
+        _before_eyes(head, faces[eyes[faces].all(1)], left)
     return LooseParts(deltas, loose & ~left, tongue)
 
 
@@ -101,6 +106,20 @@ def _attached(head: JoinedHead, faces: Tensor, left: Tensor) -> None:
     matrix = sparse.diags_array(weight) + _STIFF * stretching_energy(points, own)
     solved = SparseCholesky(matrix).solve(guess)
     head.deltas[:, ids] = solved.unflatten(1, (-1, 3)).permute(1, 0, 2)
+
+
+def _before_eyes(head: JoinedHead, eyes: Tensor, left: Tensor) -> None:
+    """Keeps shells of the eye, such as a tear film, before the triangles of the eyeballs that they cover at rest."""
+    if not len(eyes):
+        return
+    caster, ids = RayCaster(head.vertices, eyes), left.nonzero()[:, 0]
+    before = -stands_before(caster, head.vertices[ids])
+    shell = (before > 0) & (before < _SHELL)
+    ids, least = ids[shell], before[shell].clamp(max=_CLEAR)
+    for delta in head.deltas:
+        if bool(delta[ids].any()):
+            lacking = stands_before(caster, head.vertices[ids] + delta[ids]) + least
+            delta[ids, 2] += lacking.clamp(0, _SHELL)
 
 
 def _root_reach(distance: Tensor) -> Tensor:
