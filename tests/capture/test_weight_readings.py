@@ -51,3 +51,15 @@ def test_parts_that_do_not_fit_are_refused() -> None:
         WeightReadings(torch.zeros(2, 5), torch.zeros(4, 3), torch.ones(4, 3))
     with pytest.raises(ShapeError, match="expected"):
         WeightReadings(torch.zeros(2, 5), torch.zeros(4, 2), torch.ones(4, 3))
+
+
+def test_a_reading_of_blinks_is_outweighed_by_openness() -> None:
+    """An expression network that surely sees no blink, beside an eye that is measured 0.6 closed to 0.1."""
+    expression, sure = torch.zeros(1, 52).double(), torch.full((1, 52), 0.02).double()
+    read = WeightReadings.of_expression(expression, sure, ARKIT)
+    blink, jaw = ARKIT.index("eyeBlinkLeft"), ARKIT.index("jawOpen")
+    row = torch.eye(52).double()[[blink]]
+    both = read.beside(WeightReadings(row, torch.tensor([[0.6]]).double(), torch.tensor([[0.1]]).double())).energy()
+    weights = torch.linalg.solve(both.H[0], -both.f[0])
+    assert float(weights[blink]) > 0.45
+    assert float(both.H[0, jaw, jaw]) == pytest.approx(0.02**-2)

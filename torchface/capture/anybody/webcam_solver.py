@@ -24,6 +24,7 @@ from torchface.capture.own_rig.weight_walk import (
     unseen_time,
     walk_information,
 )
+from torchface.capture.weight_readings import doubted_blinks
 from torchface.geometry.cameras.affine_pose import affine_pose, orthonormal
 from torchface.geometry.cameras.calibration import ASSUMED_FIELD_OF_VIEW
 from torchface.landmarks.images.face_reading import READ_FOR_SOLVER, FaceReading, trust_of
@@ -273,7 +274,7 @@ class WebcamSolver(WebcamSolverParts):
         """Of the weights (1,N), by what a network read of them."""
         values, deviation = frame.read
         seen = ((self.to_arkit != 0) * counted_share(evidence)).amax(1)
-        precision = seen * torch.where(torch.isnan(values), 0.0, deviation.square().reciprocal())
+        precision = seen * torch.where(torch.isnan(values), 0.0, doubted_blinks(deviation).square().reciprocal())
         pulled = precision * _known(values, 0.0)
         return Quadratic(((self.to_arkit.T * precision) @ self.to_arkit)[None], -(pulled @ self.to_arkit)[None])
 
