@@ -201,7 +201,7 @@ def test_the_texture_is_hidden_in_motion_and_shown_at_rest(chromium: Any, ball_r
 
 _IN_VIEW = """
 const view = window.__viserMutable;
-for (const name of ['/head/textured', '/head/next']) {
+for (const name of ['/head/textured', '/head/next0', '/head/next1', '/head/next2']) {
     const node = view && view.nodeRefFromName[name];
     let found = null;
     if (node && node.visible) node.traverse(x => { const map = x.isMesh && x.material.normalMap;

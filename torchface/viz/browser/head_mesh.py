@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     import viser
 
 _MIN_MOVE = 1e-4
+_SPARES = 3  # heads that the page reads hidden, at most
 OVER = 0.12
 """Millimetres that the textured mesh lies over the pieces."""
 
@@ -63,7 +64,7 @@ class HeadOnPage:
         self._textured = TexturedHead(mesh) if has_colors or self._normal_map is not None else None
         self._texture_enabled, self._wrinkled = True, True
         self._stale = False
-        self._next: tuple[Any, Tensor] | None = None  # has been sent, and is not in view yet
+        self._sent: list[tuple[Any, Tensor]] = []  # not in view yet, the oldest first
         origin = SCALE * np.array(offset)
         self._nodes = [
             server.scene.add_mesh_simple(
@@ -80,7 +81,8 @@ class HeadOnPage:
             for number, part in enumerate(self._parts)
         ]
         self._textured_nodes: list[Any] = []
-        for spare in ("textured", "next") if self._normal_map else ("textured",) if self._textured else ():
+        spares = [f"next{number}" for number in range(_SPARES)] if self._normal_map else []
+        for spare in ["textured", *spares] if self._textured else []:
             node = server.scene.add_glb(
                 f"/{name}/{spare}",
                 self._glb(),
@@ -105,7 +107,7 @@ class HeadOnPage:
     @property
     def settled(self) -> bool:
         """Whether nothing is left for :meth:`settle` to do."""
-        return not self._texture_enabled or not (self._stale or self._next)
+        return not self._texture_enabled or not (self._stale or self._sent)
 
     @property
     def follows(self) -> bool:
@@ -138,24 +140,31 @@ class HeadOnPage:
                 sent += 1
         return sent
 
-    def settle(self) -> None:
-        """Shows the texture, where the head has one that is not shown; one with wrinkles at the call after."""
+    def settle(self, calls: int = 1) -> None:
+        """Shows the texture, where the head has one that is not shown.
+
+        Args:
+            calls: after how many more calls one with wrinkles is shown, 1 to 3; until then the page has to read it.
+        """
         if self.settled:
             return
         with self._server.atomic():
-            if self._next is not None:
+            del self._sent[: max(len(self._sent) - min(calls, _SPARES), 0)]
+            if self._sent and (len(self._sent) == min(calls, _SPARES) or not self._stale):
+                node, vertices = self._sent.pop(0)
                 self._hide()
-                self._next[0].visible = True
-                self._move(self._next[1])
-                self._next = None
+                node.visible = True
+                self._move(vertices)
             if self._stale:
-                node = next((node for node in self._textured_nodes if not node.visible), self._textured_nodes[0])
+                waiting = [node for node, _ in self._sent]
+                spare = (node for node in self._textured_nodes if not node.visible and node not in waiting)
+                node = next(spare, self._textured_nodes[0])
                 node.glb_data = self._glb()
                 self._stale = False
                 if len(self._textured_nodes) == 1:
                     node.visible = True
                 else:
-                    self._next = node, self._vertices
+                    self._sent.append((node, self._vertices))
 
     def _glb(self) -> bytes:
         assert self._textured is not None
@@ -180,7 +189,7 @@ class HeadOnPage:
             self.settle()
         else:
             self._hide()
-            self._stale, self._next = bool(self._textured_nodes), None
+            self._stale, self._sent = bool(self._textured_nodes), []
 
 
 _MAX_SIDE = 2048

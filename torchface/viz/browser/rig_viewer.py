@@ -26,6 +26,9 @@ from torchface.viz.browser.weight_editor import WeightEditor
 _TICK = 1 / 120
 _REST = 0.25
 _PANEL_INTERVAL = 0.12
+# Heads that a page reads while a take plays: without a graphics card one takes longer than the interval. A hand at a
+# slider is not kept waiting.
+_READING = 3
 _TEXTURE_INTERVAL, _ROUGH_SIDE = 0.2, 512  # seconds in which a page reads a head; texels of its wrinkles in motion
 _SPEEDS = ("0.1", "0.25", "0.5", "1", "2")
 _OPEN_GROUPS = ("brows", "eyes", "jaw", "mouth")
@@ -138,7 +141,7 @@ class RigViewer(BrowserPage):
             self.head.refresh_texture()
         if not self.head.settled and (self.head.follows or not moving) and now - self._settled_at > _TEXTURE_INTERVAL:
             self._rough = moving
-            self.head.settle()
+            self.head.settle(_READING if self.playback.playing else 1)
             self._settled_at = time.monotonic()
 
     def _refresh_panel(self) -> None:
