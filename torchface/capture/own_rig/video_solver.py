@@ -293,8 +293,8 @@ class VideoSolver(FrameSolver):
         weights = walk_information(self.walk_variance.double(), evidence, interval)
         motion = self.initial_information.double()[-6:].expand(len(weights), 6)
         mean = expected_weights(head.weights, evidence, hidden, interval, self.twins)
-        mean = HeadState(mean, head.rotation, head.translation)
-        return Expectation(mean, torch.diag_embed(torch.cat([weights, motion], dim=1)))
+        expected = HeadState(mean, head.rotation, head.translation)
+        return Expectation(expected, torch.diag_embed(torch.cat([weights, motion], dim=1)))
 
     def predicted(self, state: VideoState, estimate: StateEstimate) -> StateEstimate:
         """The prediction for the next frame from a frame's estimate."""
