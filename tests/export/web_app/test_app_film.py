@@ -5,6 +5,7 @@ import struct
 import zipfile
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 
 import av
@@ -34,7 +35,7 @@ def app(tmp_path_factory: pytest.TempPathFactory) -> Path:
         report = export_app(folder)
     except MissingExtraError as error:
         pytest.skip(f"the page cannot be built here: {error}")
-    assert sum(report.packed.values()) < 12 * 2**20
+    assert sum(report.packed.values()) < 12_000_000
     return folder
 
 
@@ -111,7 +112,8 @@ def test_a_take_is_saved_as_film_and_as_usd_with_its_textures(app: Path, faces: 
     np.testing.assert_allclose(np.diff(times), np.diff(seconds), atol=2e-3)
     assert float(stream.average_rate or 0) == pytest.approx((len(seconds) - 1) / float(seconds[-1]), rel=1e-3)
     assert frames[-1].to_ndarray(format="gray").std() > 15
-    assert len(list(open_video(tmp_path / "camera.mp4").color_frames())) > 2
+    filmed = replace(open_video(tmp_path / "camera.mp4"), even=False)  # a busy machine leaves frames out
+    assert len(list(filmed.color_frames())) > 2
     stage = Usd.Stage.Open(str(tmp_path / "take.usdz"))
     files = [
         UsdShade.Shader(prim).GetInput("file").Get()
