@@ -31,8 +31,8 @@ _CLOTH, _LEAST = 0.7, 150  # share and crop's pixels
 # Of teeth and whites of eyes: share and crop's pixels, which quantile of the pixels, the usual brightness of those
 # painted, how dark they get. Teeth that no picture shows are as bright as lips let them be in those that do.
 _SHOWN, _TEETH_PIXELS, _WHITE_PIXELS = 0.5, 20, 10
-_TEETH, _WHITES = (0.5, 0.86), (0.95, 0.83)
-_DARKEST_PART, _BEHIND_LIPS = 0.5, 0.85
+_TEETH, _WHITES = (0.7, 0.86), (0.95, 0.83)
+_DARKEST_PART, _BEHIND_LIPS = 0.6, 0.85
 
 
 @dataclass(frozen=True, eq=False)
