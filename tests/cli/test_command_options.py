@@ -156,6 +156,17 @@ def test_the_help_names_what_a_command_takes_and_no_empty_default(
     assert command != "render" or "(default: 0)" in printed  # of --frame
 
 
+@pytest.mark.parametrize(
+    ("command", "option"), [("live", "--to TEXT"), ("track", "--video PATH"), ("calibrate", "--beside PATH")]
+)
+def test_the_help_shows_one_value_where_an_option_is_given_again_for_each(
+    command: str, option: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit):
+        main([command, "--help"])
+    assert option in " ".join(capsys.readouterr().out.split())
+
+
 @pytest.mark.parametrize("kind", ["symbolic link", "hard link", "link to the folder", "way round"])
 def test_another_name_of_the_same_file_is_the_same(
     kind: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]

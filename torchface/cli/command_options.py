@@ -10,7 +10,7 @@ from pathlib import Path
 from types import NoneType, UnionType
 from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
-from tyro.conf import FlagCreatePairsOff, Positional, arg
+from tyro.conf import FlagCreatePairsOff, Positional, UseAppendAction, arg
 
 from torchface.cli.terminal import console
 from torchface.errors import FileFormatError
@@ -115,7 +115,9 @@ def plain_options(command: Command) -> Command:
         empty = parameter.default is parameter.empty and _many(kind)
         empty = empty or parameter.default is None or parameter.default is False or parameter.default == ()
         changes: dict[str, Any] = {"help_behavior_hint": ""} if empty else {}
-        if not named and (word := _word(kind)):
+        if UseAppendAction in notes:  # one value for each time that it is given
+            changes["metavar"] = _WORDS[get_args(kind)[0]]
+        elif not named and (word := _word(kind)):
             changes["metavar"] = word
         if parameter.default is False and not is_dataclass(command):  # whose defaults may come from a file
             notes += get_args(FlagCreatePairsOff[bool])[1:]  # no --no-quiet

@@ -22,7 +22,6 @@ def relight(
     rig: Path | None = None,
     film_light: Literal["once", "each"] = "once",
     occluders: bool = True,
-    camera: Path | None = None,
     quiet: Quiet = False,
 ) -> None:
     """Show a tracked face under another light, with another skin, or another head in its place, in its film.
@@ -44,11 +43,10 @@ def relight(
         rig: A head with a texture to show in the face's place; it moves as the actor does.
         film_light: Estimate the film's light once, or every eight frames, for lights that change or move.
         occluders: Leave what is before the face as it is. --no-occluders relights all but what is behind it.
-        camera: The calibration with which the film was tracked, if there was one.
     """
     from torchface.workflows.relight.relight_film import RelightSettings, relight_film
 
-    settings = RelightSettings(light, environment, turn, exposure, texture, rig, film_light, occluders, camera)
+    settings = RelightSettings(light, environment, turn, exposure, texture, rig, film_light, occluders)
     with progress_bars(quiet) as progress:
         lines = relight_film(film, track, out, settings, progress)
     print_lines(lines)

@@ -85,8 +85,8 @@ def filmed(tmp_path_factory: pytest.TempPathFactory) -> Filmed:
                          for c, w in zip(plain.cameras, weights, strict=True)])  # fmt: skip
     landmarks = Track(tuple(str(i) for i in range(marks.shape[1])), marks.float(), torch.ones(marks.shape[:2]))
     save_landmarks_csv(Take(25.0, landmarks=landmarks, extras={"columns": columns}), track / LANDMARKS)
-    focal = float(plain.cameras[0].intrinsics[0, 0])
-    write_json(track / SUMMARY, {"format": SUMMARY_FORMAT, "camera_assumed": True, "focal_px": focal})
+    lens = {"intrinsics": plain.cameras[0].intrinsics.tolist(), "distortion": [0.0] * 5}
+    write_json(track / SUMMARY, {"format": SUMMARY_FORMAT, **lens})
     return Filmed(folder / "film.avi", track, rig, weights, plain.cameras)
 
 

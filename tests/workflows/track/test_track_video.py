@@ -73,6 +73,8 @@ def test_every_file_tells_the_same(done: Done) -> None:
     told = json.loads((out / "summary.json").read_text())
     assert told["found"] == FRAMES
     assert told["camera_assumed"] is False
+    assert told["intrinsics"][0][0] == told["focal_px"]
+    assert len(told["distortion"]) == 5
     assert not list(out.rglob("*.part*"))
 
 

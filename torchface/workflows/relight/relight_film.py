@@ -68,7 +68,6 @@ class RelightSettings:
     rig: Path | None = None  # another head, which moves as the actor does
     film_light: FilmLight = "once"  # whether the film's light is estimated once, or every eight frames
     occluders: bool = True  # leave what is before the face as it is; without, only what lies behind it stays
-    camera: Path | None = None  # the calibration with which the film was tracked
 
 
 def relight_film(
@@ -99,7 +98,7 @@ def relight_film(
     light = WantedLight.parse(settings.light) if settings.light else None
     panorama = None if settings.environment is None else load_panorama(settings.environment)
     progress("reading the track")
-    tracked = read_tracked_film(film, track, settings.camera)
+    tracked = read_tracked_film(film, track)
     draw = _painter(tracked, settings)
     lit = _spread(tracked.seen, _LIT)
     found = _light(tracked, dict(zip(lit, _frames(tracked, lit, progress), strict=True)))
@@ -195,7 +194,10 @@ def _other_head(path: Path) -> BlendshapeRig:
     other = load_rig(path)
     texture = other.neutral.texture
     if texture is None or other.neutral.uvs is None:
-        raise ValueRangeError(f"{path}: found a rig without a texture, expected one, which the film is to show")
+        raise ValueRangeError(
+            f"{path}: found a rig without a texture that can be read, expected one as PNG or JPEG, which the film is "
+            "to show"
+        )
     if is_performers(other):
         other = character(other, Look(haircut=None), texture.shape[-1], texture.float()).rig
     return bare(other)

@@ -10,7 +10,7 @@ from torchface.errors import FileFormatError, NameMismatchError, ValueRangeError
 from torchface.files.documents import read_json
 from torchface.geometry.cameras.calibration import CameraCalibration
 from torchface.geometry.cameras.pinhole import Camera
-from torchface.io import load_animation, load_calibration, load_rig
+from torchface.io import load_animation, load_rig
 from torchface.io.landmarks.openface_csv import load_landmarks_csv
 from torchface.io.video import VideoFile, open_video
 from torchface.io.weights.weight_csv import ROTATIONS
@@ -52,12 +52,8 @@ class TrackedFilm:
         return self.rig(self.weights[frame : frame + 1].to(self.rig.deltas))[0]
 
 
-def read_tracked_film(film: Path, track: Path, camera: Path | None = None) -> TrackedFilm:
-    """Reads a film and the folder that ``torchface track`` wrote of it.
-
-    Args:
-        camera: the calibration with which it was tracked; needed where there was one.
-    """
+def read_tracked_film(film: Path, track: Path) -> TrackedFilm:
+    """Reads a film and the folder that ``torchface track`` wrote of it."""
     for name in (SUMMARY, LANDMARKS, ANIMATION):
         if not (track / name).is_file():
             raise FileFormatError(f"{track}: found no {name}, expected the folder that `torchface track` wrote")
@@ -85,15 +81,10 @@ def read_tracked_film(film: Path, track: Path, camera: Path | None = None) -> Tr
         raise ValueRangeError(f"{track}: found no frame with a face, expected some")
     pose = pose.nan_to_num(0.0)
     rig = bare(load_rig(track / ANIMATION))
-    if camera is not None:
-        calibration = load_calibration(camera).resized(video.width, video.height)
-    elif not record["camera_assumed"].found:
-        raise ValueRangeError(f"{track}: found a track with a calibrated camera, expected its calibration (--camera)")
-    else:
-        focal = record["focal_px"].number()
-        middle = (video.width - 1) / 2, (video.height - 1) / 2
-        intrinsics = torch.tensor([[focal, 0, middle[0]], [0, focal, middle[1]], [0, 0, 1]], dtype=torch.float64)
-        calibration = CameraCalibration(intrinsics, torch.zeros(5, dtype=torch.float64), video.width, video.height)
+    if not record["intrinsics"]:
+        raise FileFormatError(f"{track / SUMMARY}: found no intrinsics, which older tracks lack; track the film again")
+    lens = record["intrinsics"].tensor(3, 3), record["distortion"].tensor(5)
+    calibration = CameraCalibration(*lens, video.width, video.height)
     weights = rig.weights_from(animation.weights)
     marks_found = marks.landmarks.values
     return TrackedFilm(video, rig, weights, head_rotations(pose[:, 3:]), pose[:, :3], marks_found, seen, calibration)

@@ -92,6 +92,8 @@ def summary(tracked: Tracked) -> dict[str, object]:
         "reprojection_95_px": float(errors.nanquantile(0.95)),
         "camera_assumed": tracked.calibration.assumed,
         "focal_px": float(tracked.calibration.intrinsics[0, 0]),
+        "intrinsics": tracked.calibration.intrinsics.tolist(),
+        "distortion": tracked.calibration.distortion.tolist(),
         "faces_in_first_frame": tracked.faces,
         "seconds": tracked.seconds,
         "files": {name: path.name for name, path in tracked.products.items()},
