@@ -81,6 +81,7 @@ def test_files_are_refused_before_they_are_read(tmp_path: Path) -> None:
     for text, message in (
         ("{", "d.json: not JSON"),
         ("[" * 999, "d.json: not JSON"),
+        ("\0" + "[" * 999, "d.json: not JSON .found a byte 0, expected text"),
         ("[]", 'found format None, expected "test/1"'),
         ('{"format": "test/2"}', "found format 'test/2', expected \"test/1\""),
         (" " * 2000, "found 2000 bytes, expected at most 1000"),

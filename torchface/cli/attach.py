@@ -85,3 +85,5 @@ def attach(
         report = find_sites(rig, rom[0], out, settings, picture, progress)
     print_lines(report.lines())
     print_path(out)
+    if picture is not None:
+        print_path(picture)

@@ -143,4 +143,6 @@ def solve(
         inputs = TakeInputs(rig, take[0], attachment, part, camera, options)
         done = solve_take(inputs, TakeOutputs(out, animation, live_link, reduce, report, stream), settings, progress)
     print_lines(done.lines())
-    print_path(out)
+    for path in (out, animation, live_link, None if report is None else report / "index.html"):
+        if path is not None:
+            print_path(path)

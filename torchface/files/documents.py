@@ -146,6 +146,8 @@ def read_toml(path: str | Path, marker: str | None = None, max_bytes: int = _MAX
 
 def parse_json(data: bytes) -> Any:
     """The value that JSON text in UTF-8 stands for, its nesting and its numbers checked before it is built."""
+    if b"\0" in data:
+        raise ValueError("found a byte 0, expected text")
     plain = _ESCAPE.sub(b"", data) if b"\\" in data else data
     if sum(map(plain.count, _BRACKETS)) > 4 * _MAX_CONTAINERS:
         raise ValueError(

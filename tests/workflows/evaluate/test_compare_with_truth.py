@@ -114,6 +114,16 @@ def test_weights_are_compared_by_shape_and_the_report_shows_it_all(
     assert not list((folder / "out").glob(".*part*"))
 
 
+def test_files_of_one_name_are_named_with_their_folders(folder: Path, weights: torch.Tensor) -> None:
+    places = folder / "a" / "weights.csv", folder / "b" / "weights.csv"
+    for place in places:
+        place.parent.mkdir()
+        save_weights_csv(Take(30.0, weights=Track(NAMES, weights[..., None])), place)
+    main(["evaluate", *map(str, places), "--rig", str(folder / "rig.glb"), "--out", str(folder / "out"), "--quiet"])
+    page = (folder / "out" / "index.html").read_text()
+    assert f"{places[0]} against {places[1]}" in page
+
+
 def test_alignment_is_done_where_it_is_asked_for(folder: Path, rig: BlendshapeRig, weights: torch.Tensor) -> None:
     turn = rotation_matrix(torch.tensor([0.0, 0.2, 0.0]))
     moved = rig(weights) @ turn.T + torch.tensor([10.0, 0.0, 0.0])

@@ -127,9 +127,10 @@ def compare(
         raise ValueRangeError(f"scale: found {maximum}, expected a positive number of millimetres")
     regions = {ALL: torch.ones(distances.shape[1], dtype=torch.bool), **compared_regions(found.neutral)}
     figures = region_figures(distances, regions)
+    paths = found.path, true.path
+    named = [path.name if paths[0].name != paths[1].name else str(path) for path in paths]
     return Evaluation(
-        found.path.name,
-        true.path.name,
+        *named,
         found.neutral,
         frames,
         found.fps or true.fps,
