@@ -143,6 +143,13 @@ def test_o_is_short_for_out(tmp_path: Path) -> None:
     assert (tmp_path / "head.png").is_file()
 
 
+def test_a_frame_without_a_take_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    save_mesh(neutral_head(texture=False), tmp_path / "head.obj")
+    with pytest.raises(SystemExit):
+        main(["render", str(tmp_path / "head.obj"), "--out", str(tmp_path / "head.png"), "--frame", "4"])
+    assert "--frame: found 4 without a take" in " ".join(capsys.readouterr().err.split())
+
+
 @pytest.mark.parametrize("command", ["enhance", "register", "render"])
 def test_the_help_names_what_a_command_takes_and_no_empty_default(
     command: str, capsys: pytest.CaptureFixture[str]

@@ -36,6 +36,7 @@ def render(
         clay: Leave texture and vertex colours out.
         part: Keep this region only, such as face.
     """
+    from torchface.errors import ValueRangeError
     from torchface.files.job_lock import file_lock
     from torchface.number_checks import checked_count
     from torchface.rendering.compositing import PICTURE_ENDINGS, save_rendered_image
@@ -43,6 +44,8 @@ def render(
     from torchface.workflows.posed_mesh import load_posed, pose_weights
 
     checked_count("--height", height, *PICTURE_HEIGHTS)
+    if frame and take is None:
+        raise ValueRangeError(f"--frame: found {frame} without a take, expected --take (an animated .glb is one, too)")
     with file_lock(out, *PICTURE_ENDINGS), progress_bars(quiet) as progress:
         progress("reading")
         posed = load_posed(path, pose_weights(weights), take, frame, part)

@@ -175,6 +175,8 @@ def test_files_that_are_no_characters_are_refused(tmp_path: Path) -> None:
         FileFormatError, match=r"install Blender.*import_scene\.fbx\(filepath='.*hero\.fbx'\).*hero\.glb'"
     ):
         check_character(tmp_path / "hero.fbx")
+    with pytest.raises(FileFormatError, match=r"found '\.jpg'.*torchface fit .*face\.jpg"):
+        check_character(tmp_path / "face.jpg")
     with pytest.raises(FileFormatError, match=r"expected.*\.glb"):
         rig_character(empty, tmp_path / "out.obj")
     with pytest.raises(FileFormatError, match="found a folder"):

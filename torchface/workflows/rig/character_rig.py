@@ -20,7 +20,7 @@ from torchface.io.gltf.character_scene import Block, Character, read_character
 from torchface.io.gltf.gltf_document import Document, read_document
 from torchface.io.gltf.morph_insertion import AddedTargets, document_with_targets, rename_targets, write_edited
 from torchface.io.gltf.part_insertion import document_with_parts
-from torchface.io.images.image_files import encode_png
+from torchface.io.images.image_files import IMAGE_ENDINGS, encode_png
 from torchface.io.mesh_files import MESH_ENDINGS
 from torchface.io.vrm.vrm_expressions import VRM_ENDING, MorphBind, add_expressions, vrm_expressions
 from torchface.landmarks.surfaces.face_on_surface import NoFaceOnSurfaceError
@@ -63,6 +63,7 @@ _CONVERT = {
     'blender --background --python-expr "import bpy; bpy.ops.wm.read_factory_settings(use_empty=True); '
     "bpy.ops.import_scene.fbx(filepath='{path}'); bpy.ops.export_scene.gltf(filepath='{stem}.glb')\"",
     ".gltf": "pack it: npx @gltf-transform/cli copy {path} {stem}.glb",
+    **dict.fromkeys(IMAGE_ENDINGS, "of photographs: torchface fit {path} --out {stem}.glb"),
 }
 
 

@@ -148,7 +148,8 @@ def load_actor(rig: Path, part: str | None) -> BlendshapeRig:
     if count != 68:
         what = "no landmark vertices" if count == 0 else f"{count} landmark vertices"
         raise ValueRangeError(
-            f"{rig}: found {what}, expected the 68 of iBUG (torchface pick annotates them on the rig)"
+            f"{rig}: found {what}, expected the 68 of iBUG: torchface pick annotates them on the rig; or track without "
+            f"--rig, and torchface retarget OUT/weights.csv --to {rig} --animation TAKE.glb carries the weights over"
         )
     return actor
 
