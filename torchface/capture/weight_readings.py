@@ -21,7 +21,7 @@ def doubted_blinks(deviation: Tensor) -> Tensor:
     the eye network reads of the openness counted a tenth.
     """
     blinks = torch.tensor(_BLINKS, device=deviation.device)
-    return torch.where(blinks, deviation.clamp(min=_BLINK_DEVIATION), deviation)
+    return torch.where(blinks, deviation.abs().clamp(min=_BLINK_DEVIATION), deviation)
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,7 +14,7 @@ from torchface.workflows.track.track_inputs import TrackInputs
 
 # What landmarks are off by beside what networks expect of the 68, in rendered films of people, and what they are
 # all off by at least, a share of the eyes' distance. Those of the brows err together, by how the person's brows lie.
-_UNDERSTATED, _LEAST = torch.tensor([4.0 if 17 <= mark < 27 else 2.0 for mark in range(68)]), 0.01
+_UNDERSTATED, _LEAST = torch.tensor([3.0 if 17 <= mark < 27 else 2.0 for mark in range(68)]), 0.01
 # Weights of brows in the mean of a take, of six real ones, and their standard deviation from one to another: what a
 # network reads beyond is how the person's brows lie.
 _BROWS = {"browInnerUp": 0.15, "browOuterUpLeft": 0.07, "browOuterUpRight": 0.07, "browDownLeft": 0.13,
