@@ -6,7 +6,7 @@ import { writeGlb } from "./glb_container.js";
 const FLOAT = 5126;
 
 /**
- * The character's file with the recording as one more animation; all else in it stays as it was.
+ * The character's file with the recording as its first animation, which readers of one take; all else in it stays as it was.
  *
  * @param {object} character what `checkCharacter` returned.
  * @param {Take} take the recording, at least one frame.
@@ -34,7 +34,7 @@ export function animatedGlb(character, take, turned = []) {
   }
   for (const { node, pivot, quaternions } of turned)
     drive(node ?? hungUp(document, pivot), "rotation", writer.add(quaternions.flat(), "VEC4"));
-  document.animations = [...(document.animations ?? []), { name: "performance", samplers, channels }];
+  document.animations = [{ name: "performance", samplers, channels }, ...(document.animations ?? [])];
   return writeGlb(document, writer.binary());
 }
 

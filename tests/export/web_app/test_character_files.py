@@ -332,9 +332,9 @@ def test_arms_that_stand_off_hang_and_arms_that_hang_stay(run: Run, tmp_path: Pa
 
 
 def animated(path: Path) -> dict[tuple[str, str], np.ndarray]:
-    """The keys of a file's last animation by the name of the node and what of it moves."""
+    """The keys of a file's first animation by the name of the node and what of it moves."""
     document = read_document(path)
-    nodes, animation = document.objects("nodes"), document.objects("animations")[-1]
+    nodes, animation = document.objects("nodes"), document.objects("animations")[0]
     outputs = [
         read_floats(document, sampler["output"], "output", ("SCALAR", "VEC4")) for sampler in animation["samplers"]
     ]

@@ -4,6 +4,7 @@ import json
 import struct
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from mutation import check_reader
@@ -12,6 +13,8 @@ from rig_samples import sheet_rig, sheet_take
 from torchface.errors import FileFormatError
 from torchface.io import save_animation, save_rig
 from torchface.io.gltf.animation_reading import read_gltf_weights
+from torchface.io.gltf.gltf_document import read_document
+from torchface.io.gltf.performance_animation import Performance, performed_glb
 from torchface.take import Take, Track
 
 
@@ -107,3 +110,16 @@ def test_what_is_broken_is_named(tmp_path: Path) -> None:
 def test_mutated_animations_are_refused_or_read(tmp_path: Path) -> None:
     save_animation(sheet_rig(), sheet_take(), tmp_path / "take.glb")
     check_reader(read_gltf_weights, [tmp_path / "take.glb"], ".glb")
+
+
+@pytest.mark.filterwarnings("ignore:.*left out. animations")
+def test_a_performance_is_read_before_the_animations_that_the_file_had(tmp_path: Path) -> None:
+    rig, path = sheet_rig(), tmp_path / "take.glb"
+    save_animation(rig, sheet_take(), path)
+    played = np.full((5, len(rig.names)), 0.25, np.float32)
+    performance = Performance(np.arange(5) / 30, rig.names, played, np.zeros((5, 9)))
+    (tmp_path / "performed.glb").write_bytes(performed_glb(read_document(path), performance))
+    found = read_gltf_weights(tmp_path / "performed.glb")
+    assert found is not None
+    assert found.weights is not None
+    torch.testing.assert_close(found.weights.values[..., 0], torch.from_numpy(played))

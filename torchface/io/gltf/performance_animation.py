@@ -1,4 +1,4 @@
-"""A performance as one more animation of a character's own ``.glb``; all else in the file stays as it is."""
+"""A performance as the first animation of a character's own ``.glb``; all else in the file stays as it is."""
 
 import copy
 from collections.abc import Sequence
@@ -58,7 +58,7 @@ def performed_glb(document: Document, performance: Performance) -> bytes:
         quaternions = np.ascontiguousarray(turned.as_quat(), np.float32)
         drive(node_index, "rotation", buffers.keys(quaternions))
     animation = {"name": "performance", "samplers": samplers, "channels": channels}
-    root["animations"] = [*root.get("animations", []), animation]
+    root["animations"] = [animation, *root.get("animations", [])]  # programs that play one take the first
     return b"".join(glb_pieces(root, buffers, document.path))
 
 
