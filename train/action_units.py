@@ -98,7 +98,6 @@ def train(settings: Settings, run: Run) -> Trained:
         reference = videos[0].neutral if videos else None
         videos.append(read_regions(open_video(path), own, names, reference, settings.size))
         progress(f"{path.name}: {own.frames} frames, {len(own.performed)} repetitions")
-    classifier = ActionUnitClassifier.fit(videos, labels, groups, settings.training, progress)
     metrics: dict[str, float] = {}
     if settings.folds:
         alone = len(videos) == 1
@@ -107,6 +106,7 @@ def train(settings: Settings, run: Run) -> Trained:
         accuracy = cross_validation(videos, labels, groups, settings.training, folds, split)
         metrics = {f"cross-validated accuracy, {name}": value for name, value in accuracy.items()}
         metrics["cross-validated accuracy"] = sum(accuracy.values()) / len(accuracy)
+    classifier = ActionUnitClassifier.fit(videos, labels, groups, settings.training, progress)
     for path, own in held_out:
         video = read_regions(open_video(path), own, names, classifier.neutral, settings.size)
         truth = labelled_intensities(video, own, groups, settings.training)

@@ -17,7 +17,7 @@ from torchface.capture.action_units.classifier_training import (
 from torchface.capture.action_units.one_vs_one_svm import OneVsOne
 from torchface.capture.action_units.painted_regions import GROUPS, RegionGroup
 from torchface.capture.action_units.region_video import RegionVideo
-from torchface.errors import ShapeError
+from torchface.errors import ShapeError, ValueRangeError
 from torchface.io.action_labels import ActionLabels
 
 Split = Literal["frames", "repetitions", "performers"]
@@ -49,6 +49,11 @@ def cross_validation(
     names = group_regions(groups)
     patterns, rest = merged_videos(videos, names)
     fold = _folds(labels, folds, split, settings.seed)
+    if bool((fold == fold[0]).all()):
+        raise ValueRangeError(
+            f"folds: found one part of {split} to leave out, expected two at least: perform action units twice, or "
+            "train without cross-validation (--folds 0)"
+        )
     scores = {}
     for group in groups:
         own = patterns[:, [names.index(name) for name in group.regions]]

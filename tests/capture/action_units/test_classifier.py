@@ -24,6 +24,7 @@ from torchface.capture.action_units import (
 from torchface.capture.action_units.classifier_training import intensity_levels, label_group
 from torchface.capture.action_units.gabor import GaborBank
 from torchface.capture.action_units.one_vs_one_svm import OneVsOne
+from torchface.capture.action_units.painted_regions import performed_groups
 from torchface.capture.action_units.weight_targets import smooth_intensities
 from torchface.errors import FileFormatError, NameMismatchError, ShapeError, ValueRangeError
 from torchface.io.action_labels import ActionLabels
@@ -97,6 +98,12 @@ def test_learned_labels_are_the_planted_intensities(regions: RegionVideo, sessio
         labelled, truth = known.table[known.classes], planted(session, group.units)
         for a in range(len(group.units)):
             assert torch.corrcoef(torch.stack([labelled[:, a], truth[:, a]]))[0, 1] > 0.93, group.units[a]
+
+
+def test_units_performed_once_cannot_be_left_out(regions: RegionVideo, session: RecordedSession) -> None:
+    once = replace(session.labels, performed=session.labels.performed[:1])
+    with pytest.raises(ValueRangeError, match="one part of repetitions to leave out, expected two"):
+        cross_validation([regions], [once], performed_groups([once]), split="repetitions")
 
 
 @pytest.mark.bench
