@@ -71,6 +71,8 @@ def cross_validation(
 def _predicted(samples: Tensor, classes: Tensor, out: Tensor, settings: TrainingSettings) -> Tensor:
     """Classes of the frames left out, learned from the others."""
     present, inner = classes[~out].unique(return_inverse=True)
+    if len(present) == 1:
+        return present.expand(int(out.sum()))
     mean = samples[~out].double().mean(0)
     components, deviations = principal_components(samples[~out], mean, settings.variance)
     reduced = (samples - mean.float()) @ components.T / deviations
