@@ -128,9 +128,10 @@ def compare(
     regions = {ALL: torch.ones(distances.shape[1], dtype=torch.bool), **compared_regions(found.neutral)}
     figures = region_figures(distances, regions)
     paths = found.path, true.path
-    named = [path.name if paths[0].name != paths[1].name else str(path) for path in paths]
+    result, truth = (path.name if paths[0].name != paths[1].name else str(path) for path in paths)
     return Evaluation(
-        *named,
+        result,
+        truth,
         found.neutral,
         frames,
         found.fps or true.fps,
