@@ -5,9 +5,10 @@ from pathlib import Path
 import pytest
 import torch
 
-from torchface import Take, Track
-from torchface.capture.action_units import ActionUnitCurves
+from torchface import Take, Track, zoo
+from torchface.capture.action_units import ActionUnitClassifier, ActionUnitCurves
 from torchface.errors import FileFormatError, NameMismatchError
+from torchface.io.action_labels import load_action_labels
 from torchface.workflows.solve.head_camera import HeadCamera, predicted_curves, resampled_curves
 
 
@@ -65,4 +66,18 @@ def test_a_video_without_labels_says_what_they_are() -> None:
 def test_units_that_a_classifier_does_not_know_are_named_by_the_flag() -> None:
     camera = HeadCamera(Path("take.mp4"), "action_units", units=("9", "17"))
     with pytest.raises(NameMismatchError, match=r"--units: found 17, expected some of .*18R"):
+        predicted_curves(camera, take(2, 60.0), ("jawOpen",))
+
+
+def test_regions_that_the_labels_lack_are_named_with_their_file(tmp_path: Path) -> None:
+    """By the how-to's own labels, without two of their regions."""
+    page = (Path(__file__).parents[3] / "docs/how_to/head_camera.md").read_text()
+    labels = page.split("```toml\n")[1].split("```")[0]
+    whole = tmp_path / "whole.toml"
+    whole.write_text(labels)
+    assert set(load_action_labels(whole).regions) == set(zoo.get_model("action_units", ActionUnitClassifier).regions)
+    less = tmp_path / "less.toml"
+    less.write_text("\n".join(line for line in labels.splitlines() if not line.startswith("eye_")))
+    camera = HeadCamera(Path("take.mp4"), "action_units", less)
+    with pytest.raises(NameMismatchError, match=r"less\.toml: regions: found no eye_left, eye_right, expected .*mouth"):
         predicted_curves(camera, take(2, 60.0), ("jawOpen",))

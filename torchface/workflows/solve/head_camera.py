@@ -65,6 +65,11 @@ def predicted_curves(
             "--video-labels names another (docs/how_to/head_camera.md)"
         )
     labels = load_action_labels(where)
+    if lacking := [name for name in classifier.regions if name not in labels.regions]:
+        raise NameMismatchError(
+            f"{where}: regions: found no {', '.join(lacking)}, expected those that the classifier reads: "
+            f"{', '.join(classifier.regions)}"
+        )
     table = load_shape_table(camera.table if camera.table is not None else _fitting_table(classifier.units, names))
     settings = CurveSettings(units=camera.units or None)
     curves = action_unit_curves(classifier, camera.video, labels, table, names, settings, progress)
