@@ -151,6 +151,21 @@ def test_hidden_landmarks_and_a_picture_of_another_size(
     torch.testing.assert_close(bigger.translation, plain.translation, atol=0.5, rtol=0)
 
 
+def test_a_guess_of_a_hidden_mouth_counts_little(solver: WebcamSolver, person: Tensor, known: WebcamState) -> None:
+    """A network that reads a smile behind a hand moves next to nothing; of a mouth that is seen it is believed."""
+    names = ("mouthSmileLeft", "mouthSmileRight")
+    guess = {"expression": weights_of(**dict.fromkeys(names, 0.5)), "expression_deviation": torch.full((52,), 0.1)}
+    smiles = []
+    for visibility in (0.0, 1.0):
+        state, visible = known, torch.ones(68)
+        visible[48:] = visibility
+        for _ in range(8):
+            reading = seen(solver, person, weights_of(), (0, 0, 0))
+            state = solver.step(state, replace(reading, visibility=visible, **guess), 1 / FPS)
+        smiles.append(float(state.weights[[ARKIT.index(name) for name in names]].mean()))
+    assert smiles[0] < 0.1 * smiles[1]
+
+
 def test_a_state_packs_into_one_vector(solver: WebcamSolver, known: WebcamState) -> None:
     vector = known.pack()
     assert vector.shape == (solver.layout.length,)

@@ -99,7 +99,7 @@ def compared_curves(
     for i, (axes, name) in enumerate(zip(grid, names, strict=False)):
         axes.plot(seconds, single[stretch, i], color=SINGLE, linewidth=0.7, label="frame by frame")
         axes.plot(seconds, true[stretch, i], color=TRUE, linewidth=2.4, alpha=0.85, label="true")
-        axes.plot(seconds, smooth[stretch, i], color=SOLVED, linewidth=1.1, label="solved at once")
+        axes.plot(seconds, smooth[stretch, i], color=SOLVED, linewidth=1.1, label="whole take")
         axes.set_title(name, fontsize=9, loc="left")
         axes.set(ylim=(0, 1.02), xlim=(float(seconds[0]), float(seconds[-1])))
     for axes in grid[len(names) :]:
