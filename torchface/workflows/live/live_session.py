@@ -129,7 +129,7 @@ class LiveSession:
             if message.get("reset") is True:
                 self.reset()
             if isinstance(on := message.get("record"), bool):
-                self._notes(self.record(on, message.get("film") is True))
+                self.record(on, message.get("film") is True)
             if isinstance(names := message.get("names"), dict):
                 self._recordings.name_shapes({str(name): str(arkit) for name, arkit in names.items()})
             folder, forgotten = self._recordings.folder, float("-inf")
@@ -193,16 +193,17 @@ class LiveSession:
         """Has the solver forget the person."""
         self._forget, self._calibration = True, None
 
-    def record(self, on: bool, filmed: bool = False) -> str:
-        """Begins or ends a recording, with the camera's film if asked; says in words what happened."""
+    def record(self, on: bool, filmed: bool = False) -> None:
+        """Begins or ends a recording, with the camera's film if asked; notes in words what happens."""
         with self._lock:
             if on == self._recordings.running:
-                return "already recording" if on else "nothing is being recorded"
-            if on:
+                self._notes("already recording" if on else "nothing is being recorded")
+            elif on:
                 seen = filmed and not isinstance(self._source, ReceivedSource)  # which has no pictures
-                return f"recording into {self._recordings.start(filmed=seen)}"
-            self._recordings.stop(self._notes)
-            return "recorded; its files are being written"
+                self._notes(f"recording into {self._recordings.start(filmed=seen)}")
+            else:
+                self._notes("recorded; its files are being written")  # first: short takes are written at once
+                self._recordings.stop(self._notes)
 
     def run(self, seconds: float | None = None, progress: Progress | None = None) -> None:
         """Goes through the frames until they or the seconds end, or an interrupt comes.
@@ -229,11 +230,11 @@ class LiveSession:
                     self._watch.look(picture, solved, now)
                 progress("live", self.figures.frames)
                 if seconds is not None and self.figures.seconds >= seconds:
-                    self._notes(f"The {seconds:g} seconds are over")
+                    self.ended = f"The {seconds:g} seconds are over"
                     break
             else:
-                self._notes(f"{self._source.video.path.name} has ended after {self.figures.frames} frames")
-            self.ended = self._notes.kept()[-1]
+                self.ended = f"{self._source.video.path.name} has ended after {self.figures.frames} frames"
+            self._notes(self.ended)
         except KeyboardInterrupt:  # how people end what has no end of its own
             pass
 
