@@ -127,15 +127,11 @@ def test_a_slider_moves_the_mesh_that_the_browser_shows(chromium: Any, viewer: R
 def test_a_number_that_is_typed_beyond_the_slider_ends_at_its_end(chromium: Any, viewer: RigViewer) -> None:
     from selenium.webdriver.common.keys import Keys
 
-    seen: list[float] = []
-    handle = viewer.sliders["eyeBlinkLeft"].handle
-    handle.on_update(lambda event: seen.append(event.target.value))
     box = chromium.execute_script(_BOX, thumb(chromium, "Blink L"))
     box.send_keys(Keys.CONTROL + "a")
     box.send_keys("57", Keys.TAB)
     until(lambda: float(viewer.editor.pose[6]) == 1.0)
     until(lambda: box.get_attribute("value") == "1")
-    assert max(seen) <= 1.0
     viewer.editor.reset()
     viewer.show_frame(0)
 

@@ -138,7 +138,7 @@ def test_a_socket_of_another_origin_is_refused(viewer: RigViewer) -> None:
 def test_servers_of_others_are_left_alone() -> None:
     server = pytest.importorskip("websockets.asyncio.server", reason="the extra viewer is not installed")
     before = server.serve
-    with only_this_page("x", "token", lambda message: True):
+    with only_this_page("x", "token"):
         assert server.serve is not before
     assert server.serve is before
 

@@ -19,7 +19,6 @@ from torchface.files.extra_packages import import_extra
 from torchface.mesh import Mesh
 from torchface.number_checks import checked_count
 from torchface.viz.browser.origin_check import only_this_page
-from torchface.viz.browser.page_messages import MessageCheck
 
 if TYPE_CHECKING:
     import viser
@@ -48,11 +47,9 @@ def start_server(label: str, token: str, port: int = 8080) -> "viser.ViserServer
     """
     viser = import_viser()
     port = free_port(HOST, port)
-    messages = MessageCheck()
     title = f"{label} – torchface" if label != "torchface" else label
-    with _quiet(), only_this_page(title, token, messages.accepts):
+    with _quiet(), only_this_page(title, token):
         server = viser.ViserServer(host=HOST, port=port, label=label, verbose=False)
-    messages.watch(server)
     # Any page open in the browser could ask viser for a public tunnel to this one; there is none.
     setattr(server, "request_share_url", lambda verbose=True: None)  # noqa: B010
     server.scene.set_up_direction("+y")

@@ -3,7 +3,7 @@
 import importlib
 import secrets
 import threading
-from collections.abc import Awaitable, Callable, Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from html import escape
 from http import HTTPStatus
@@ -23,11 +23,9 @@ _HEADERS = {
 }
 _LARGEST_MESSAGE = 2**16
 """Bytes; what a page's inputs, clicks and camera have to say takes a hundredth of that."""
-_MAX_REFUSED = 100
 _starting = threading.Lock()
 
 Serve = Callable[["ServerConnection", "Request"], "Response | None"]
-Listen = Callable[["ServerConnection"], Awaitable[None]]
 
 
 def is_allowed(host: str | None, origin: str | None, port: int) -> bool:
@@ -62,7 +60,7 @@ def without_token(path: str, token: str) -> str | None:
 
 
 @contextmanager
-def only_this_page(title: str, token: str, accepts: Callable[[bytes | str], bool]) -> Iterator[None]:
+def only_this_page(title: str, token: str) -> Iterator[None]:
     """Servers that viser starts meanwhile answer their own page alone, under a path that begins with the token.
 
     The page is shown in no frame, and called by ``title``. viser hands its server's handshake to ``websockets`` and has
@@ -70,41 +68,20 @@ def only_this_page(title: str, token: str, accepts: Callable[[bytes | str], bool
 
     Args:
         token: that a request for the page, and for its socket, must name.
-        accepts: which messages of a browser get through; a browser that sends a hundred others is disconnected.
     """
     server: Any = importlib.import_module("websockets.asyncio.server")
     with _starting:
         before = server.serve
 
-        def serve(listen: Listen, *arguments: Any, process_request: Serve, **more: Any) -> Any:
+        def serve(*arguments: Any, process_request: Serve, **more: Any) -> Any:
             more["max_size"] = _LARGEST_MESSAGE
-            guarded = _guarded(process_request, title, token)
-            return before(_filtered(listen, accepts), *arguments, process_request=guarded, **more)
+            return before(*arguments, process_request=_guarded(process_request, title, token), **more)
 
         server.serve = serve
         try:
             yield
         finally:
             server.serve = before
-
-
-def _filtered(listen: Listen, accepts: Callable[[bytes | str], bool]) -> Listen:
-    async def listen_to_accepted(connection: "ServerConnection") -> None:
-        receive = connection.recv
-        refused = 0
-
-        async def next_accepted() -> bytes | str:
-            nonlocal refused
-            while not accepts(message := await receive()):
-                refused += 1
-                if refused > _MAX_REFUSED:
-                    await connection.close(1008, "This page takes no such messages.")
-            return message
-
-        setattr(connection, "recv", next_accepted)  # noqa: B010
-        await listen(connection)
-
-    return listen_to_accepted
 
 
 def _guarded(answer: Serve, title: str, token: str) -> Serve:

@@ -204,7 +204,8 @@ class RigViewer(BrowserPage):
         return sliders
 
     def _set(self, name: str, value: float) -> None:
-        self.set_weight(name, float(value))
+        row = self.rig.names.index(name)  # a number that is typed may lie beyond the slider's ends
+        self.set_weight(name, min(max(float(value), float(self.editor.low[row])), float(self.editor.high[row])))
 
     def _shared(self, handle: Any, act: Callable[[Any], Any]) -> SharedInput:
         return SharedInput(handle, self._lock, act)
