@@ -11,11 +11,12 @@ import torch
 
 from planted.characters import Planted, box_mesh, caricature, decimated, packed, unpacked, write_character
 from torchface.errors import AlignmentError, FileFormatError, ValueRangeError
-from torchface.geometry.similarity import Similarity
+from torchface.geometry.similarity import Similarity, similarity_transform
+from torchface.io import load_rig
 from torchface.io.gltf.character_scene import Character, read_character
 from torchface.io.gltf.gltf_document import read_document
 from torchface.io.vrm.vrm_expressions import vrm_expressions
-from torchface.landmarks.surfaces.face_on_surface import FaceOnSurface, FaceSearch
+from torchface.landmarks.surfaces.face_on_surface import FaceOnSurface, FaceSearch, NoFaceOnSurfaceError
 from torchface.mesh import Mesh
 from torchface.rig import BlendshapeRig
 from torchface.shape_names import ARKIT
@@ -104,6 +105,22 @@ def test_made_shapes_go_the_way_of_the_characters_own(rigged: Rigged) -> None:
     assert float(moved[len(rigged.own.vertices) :].max()) == 0  # the body
 
 
+@pytest.mark.bench
+def test_the_written_character_knows_its_landmarks(rigged: Rigged) -> None:
+    made, person = load_rig(rigged.after), rigged.own
+    notes = made.neutral.annotations
+    assert notes is not None
+    assert notes.landmarks is not None
+    eyes = made.vertices[notes.landmarks[[36, 45]]]
+    truth = person.vertices[person.neutral.landmarks[[36, 45]]]
+    assert float((eyes[0] - eyes[1]).norm()) == pytest.approx(100 * float((truth[0] - truth[1]).norm()), rel=0.01)
+    jaw = made.deltas[made.names.index("A25_Jaw_Open")].norm(dim=1)
+    own = person.deltas[person.names.index("jawOpen")].norm(dim=1)[person.neutral.landmarks]
+    # Millimetres: those of the upper lip move by at most 17, of the lower by 33 at least.
+    assert torch.allclose(jaw[notes.landmarks[48:]] / 100, own[48:], atol=4.0)
+    assert {"eyeball_left", "eyeball_right", "face", "Body", "Hair"} <= set(notes.regions)
+
+
 def test_a_chair_is_refused_with_a_picture_of_what_was_seen(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(character_face, "FaceSearch", partial(FaceSearch, rings=FEW))
     seat, faces = box_mesh(torch.zeros(3), torch.tensor([400.0, 60.0, 400.0]))
@@ -185,8 +202,11 @@ def test_files_that_are_no_characters_are_refused(tmp_path: Path) -> None:
         check_character(tmp_path / "hero.obj")
 
 
-def test_a_character_that_has_all_shapes_is_copied_at_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(character_rig, "find_character_face", lambda *_: pytest.fail("looks for a face"))
+def test_a_character_that_has_all_shapes_is_copied(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def unseen(*_: object) -> None:
+        raise NoFaceOnSurfaceError("found no face", ())
+
+    monkeypatch.setattr(character_rig, "find_character_face", unseen)
     head = Mesh(torch.eye(3), torch.tensor([[0, 1, 2]]))
     names = [name.replace("Left", "_L").replace("Right", "_R") for name in ARKIT]
     how = Planted(vrm="VRMC_vrm", expressions={"blinkLeft": names[0]})
@@ -202,6 +222,38 @@ def test_a_character_that_has_all_shapes_is_copied_at_once(tmp_path: Path, monke
     assert report.figure is None
     assert "already there: 52" in report.lines()[0]
     assert "nothing to make" in " ".join(report.lines())
+    assert "no landmarks were added, which track --rig needs: found no face" in " ".join(report.lines())
+
+
+def test_landmarks_are_added_to_a_character_that_has_all_shapes_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    person = performer(texture=False)
+    shapes = dict(zip(person.names, person.deltas, strict=True)) | {"tongueOut": person.deltas[0]}
+    write_character(tmp_path / "a.glb", person.neutral, shapes, Planted(turn=TURN, units=100.0))
+    placed(monkeypatch, read_character(read_document(tmp_path / "a.glb")).vertices[: len(person.vertices)], person)
+    report = rig_character(tmp_path / "a.glb", tmp_path / "b.glb")
+    assert any(line.startswith("landmarks and regions added") for line in report.lines())
+    given, made = load_rig(tmp_path / "a.glb"), load_rig(tmp_path / "b.glb")
+    assert given.neutral.annotations.landmarks is None
+    assert torch.equal(made.vertices, given.vertices)
+    assert torch.equal(made.deltas, given.deltas)
+    size = 100.0 * float(person.vertices[:, 0].max() - person.vertices[:, 0].min())
+    body = made.neutral.annotations.regions["Body"].nonzero()[:, 0][0]
+    truth = made.vertices[body + person.neutral.landmarks]
+    apart = (made.vertices[made.neutral.landmarks] - truth).norm(dim=1)[17:]
+    assert float(apart.max()) < 0.02 * size
+    monkeypatch.setattr(character_rig, "find_character_face", lambda *_: pytest.fail("looks for a face"))
+    rig_character(tmp_path / "b.glb", tmp_path / "c.glb")
+    assert torch.equal(load_rig(tmp_path / "c.glb").neutral.landmarks, made.neutral.landmarks)
+
+
+def placed(patch: pytest.MonkeyPatch, vertices: torch.Tensor, person: BlendshapeRig) -> None:
+    """Lets the face of the embedded performer be found on a character whose first vertices are his."""
+    _, search = character_face.character_search()
+    pose = similarity_transform(person.vertices.double()[None], vertices[None])
+    found = FaceOnSurface(pose.apply(search.reference.all)[0], pose, 1.0, 0.0, (), torch.zeros(0, 3))
+    patch.setattr(FaceSearch, "find", lambda *_: found)
 
 
 def test_few_triangles_and_shapes_that_move_far_are_warned_of(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -25,6 +25,7 @@ from torchface.io.gltf.primitive_reading import (
     read_triangles,
     read_uvs,
 )
+from torchface.io.gltf.rest_of_skin import blended, skin_matrices
 from torchface.io.gltf.scene import node_transforms
 from torchface.io.images.image_samples import decode_samples
 
@@ -183,7 +184,11 @@ class _Shelf:
         document.reserve(count * (BYTES_A_VERTEX + 16 * 8), f"{location}.POSITION")
         record = document.item("nodes", node, "nodes")
         if record.get("skin") is not None and "JOINTS_0" in attributes:
-            matrices, head = _skinned(document, record["skin"], attributes, location, count, transforms, under)
+            joints, moved = skin_matrices(document, record["skin"], transforms)
+            of_head = np.array([joint in under for joint in joints], np.float64)
+            matrices = blended(document, moved, attributes, location, count)
+            matrices[np.isnan(matrices).any((1, 2))] = np.eye(4)
+            head = np.nan_to_num(blended(document, of_head, attributes, location, count)).astype(np.float32)
         else:
             matrices, head = np.broadcast_to(transform, (count, 4, 4)), np.full(count, node in under, np.float32)
         with np.errstate(over="ignore", invalid="ignore"):
@@ -254,47 +259,6 @@ class _Shelf:
             else:
                 self._images[source] = paint if paint[0].numel() <= _MAX_TEXTURE else None
         return self._images[source]
-
-
-def _skinned(
-    document: Document,
-    index: object,
-    attributes: dict[str, Any],
-    location: str,
-    count: int,
-    transforms: dict[int, NDArray[np.float64]],
-    under: set[int],
-) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
-    """Each vertex's matrix (C,4,4) to the scene at rest, and its weight on the head's bones (C,)."""
-    skin, where = document.item("skins", index, "skin"), f"skins[{index}]"
-    joints = document.array(skin, "joints", where)
-    if not joints or any(not isinstance(joint, int) or joint not in transforms for joint in joints):
-        raise document.error(f"{where}.joints", "a joint outside of the scene", "nodes of the scene")
-    binds = np.broadcast_to(np.eye(4), (len(joints), 4, 4))
-    if skin.get("inverseBindMatrices") is not None:
-        rows = read_floats(document, skin["inverseBindMatrices"], where, ("MAT4",))
-        if len(rows) < len(joints):
-            raise document.error(f"{where}.inverseBindMatrices", len(rows), f"one for each of {len(joints)} joints")
-        binds = rows[: len(joints)].reshape(-1, 4, 4).transpose(0, 2, 1).astype(np.float64)
-    moved = np.stack([transforms[joint] for joint in joints]) @ binds
-    of_head = np.array([joint in under for joint in joints], np.float32)
-    matrices = np.zeros((count, 4, 4))
-    total, head = np.zeros(count), np.zeros(count, np.float32)
-    for number in range(4):  # sets of four joints a vertex
-        if f"JOINTS_{number}" not in attributes or f"WEIGHTS_{number}" not in attributes:
-            break
-        ids = read_floats(document, attributes[f"JOINTS_{number}"], f"{location}.JOINTS_{number}", ("VEC4",), count)
-        weights = read_floats(document, attributes[f"WEIGHTS_{number}"], f"{location}.WEIGHTS", ("VEC4",), count)
-        if count and not 0 <= ids.min() <= ids.max() < len(joints):
-            raise document.error(f"{location}.JOINTS_{number}", int(ids.max()), f"less than the {len(joints)} joints")
-        for column in range(4):
-            joint, weight = ids[:, column].astype(np.int64), weights[:, column]
-            matrices += weight[:, None, None] * moved[joint]
-            total += weight
-            head += weight * of_head[joint]
-    unbound = total < 1e-6
-    matrices[unbound], total[unbound] = np.eye(4), 1.0
-    return matrices / total[:, None, None], (head / total).astype(np.float32)
 
 
 def _head_bone(document: Document, transforms: dict[int, NDArray[np.float64]]) -> int | None:

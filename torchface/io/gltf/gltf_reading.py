@@ -15,14 +15,22 @@ from torchface.errors import FileFormatError, NoShapesError
 from torchface.geometry.meshes.uv_seams import merge_equal_rows
 from torchface.io.gltf.corrective_extras import rig_of_targets, scene_correctives
 from torchface.io.gltf.gltf_document import Document, read_document
-from torchface.io.gltf.mesh_extras import read_annotations, read_mesh_count, read_order, read_polygons
+from torchface.io.gltf.mesh_extras import (
+    is_own_mesh,
+    read_annotations,
+    read_mesh_count,
+    read_order,
+    read_polygons,
+    read_row_annotations,
+)
 from torchface.io.gltf.primitive_reading import BYTES_A_CORNER, BYTES_A_VERTEX, MaterialLook, Part, filled, read_part
+from torchface.io.gltf.rest_of_skin import at_rest
 from torchface.io.gltf.scene import Instance, instances
 from torchface.io.images.image_files import decode_image
 from torchface.io.images.texture_atlas import Look, with_used_looks
 from torchface.io.length_units import millimetres_per
 from torchface.io.scenes.scene_pieces import Piece, all_names, join_deltas, join_meshes, joined_size
-from torchface.mesh import Mesh
+from torchface.mesh import Annotations, Mesh
 from torchface.rig import BlendshapeRig
 
 _AT_ONCE = 2**20  # numbers
@@ -61,7 +69,7 @@ def _read(document: Document, scale: float) -> tuple[Mesh, Tensor, tuple[str, ..
         if part is not None and len(part.triangles):
             size = part.deltas.nbytes + BYTES_A_VERTEX * len(part.positions) + BYTES_A_CORNER * part.triangles.size
             document.reserve(size, f"nodes: {instance.name[:40]}")
-            instanced.append((instance, part))
+            instanced.append((instance, at_rest(document, instance, part)))
     if not instanced:
         raise FileFormatError(f"{document.path}: found no triangle in its scene, expected a mesh")
     whole = rejoined(document, instanced)
@@ -69,7 +77,7 @@ def _read(document: Document, scale: float) -> tuple[Mesh, Tensor, tuple[str, ..
     made = [_piece(document, instance, part, scale, kinds) for instance, part in ([whole] if whole else instanced)]
     pieces = [piece for piece, _ in made]
     look = torch.cat([one for _, one in made])
-    ours = any("torchface" in part.extras for _, part in instanced)
+    ours = any(is_own_mesh(part.extras.get("torchface")) for _, part in instanced)
     del parts, instanced, part, whole, made  # their shapes fit the memory once, not twice
     document.reserve(joined_size(pieces), "the scene's morph targets")
     mesh = join_meshes(pieces, None)
@@ -125,7 +133,7 @@ def _piece(
         uv_faces,
         None if part.colors is None else torch.from_numpy(part.colors[joined.row_of]),
         read_polygons(document, extras, location, faces),
-        read_annotations(document, extras, location, len(vertices)) if joined.authored else None,
+        _annotations(document, part.extras.get("torchface"), location, vertices / scale, joined),
         torch.from_numpy(deltas),
         part.names,
     )
@@ -208,6 +216,7 @@ def rejoined(document: Document, instanced: Sequence[tuple[Instance, Part]]) -> 
         np.concatenate([part.vertex_ids for part in parts if part.vertex_ids is not None]),
         tuple(one for part in parts for one in part.looks),
         first[1].extras,
+        (),
     )
     return replace(first[0], transform=np.eye(4)), whole
 
@@ -228,6 +237,19 @@ def weld(part: Part) -> Weld:
         if welded is not None:
             return welded
     return _by_position(part)
+
+
+def _annotations(
+    document: Document, extras: object, location: str, vertices: NDArray[np.float64], joined: Weld
+) -> Annotations | None:
+    """Those of the mesh as it was written; without landmarks there, those of a character's rows."""
+    own = read_annotations(document, extras, location, len(vertices)) if joined.authored else None
+    if own is not None and own.landmarks is not None:
+        return own
+    of_rows = read_row_annotations(document, extras, location, vertices, (joined.vertex_of, joined.row_of))
+    if own is None or of_rows is None:
+        return of_rows or own
+    return replace(own, landmarks=of_rows.landmarks, regions={**of_rows.regions, **own.regions})
 
 
 def _by_id(part: Part, ids: NDArray[np.int64]) -> Weld | None:

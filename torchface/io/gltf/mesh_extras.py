@@ -12,6 +12,8 @@ from torchface.io.meshes.polygons import corners_of_fans, corners_of_polygons, p
 from torchface.mesh import Annotations, Mesh
 
 _VERSION = 1
+_MOVED = 1e-3  # of a mesh's size: rows are others that lie further from where landmarks were written
+Split = tuple[NDArray[np.int64], NDArray[np.int64]]
 
 
 def write_extras(mesh: Mesh) -> dict[str, Any]:
@@ -27,6 +29,11 @@ def write_extras(mesh: Mesh) -> dict[str, Any]:
         extras.update({name: tensor.tolist() for name, tensor in lists.items() if tensor is not None})
         extras["regions"] = {name: _runs(mask.cpu().numpy()) for name, mask in annotations.regions.items()}
     return extras
+
+
+def is_own_mesh(extras: object) -> bool:
+    """Whether ``write_extras`` made a mesh's record: torchface wrote the mesh, not only annotations to another's."""
+    return isinstance(extras, dict) and "vertices" in extras
 
 
 def write_order(rows: Tensor, meshes: int) -> dict[str, Any]:
@@ -95,6 +102,61 @@ def read_annotations(document: Document, extras: object, location: str, count: i
     if not ids and not masks:
         return None
     return Annotations(regions=masks, **ids)
+
+
+def row_extras(extras: object, positions: NDArray[np.float64], notes: Annotations) -> dict[str, Any]:
+    """A mesh's extras with landmarks and regions of its C rows as the file has them, beside all that it has.
+
+    Args:
+        positions: in the scene, (C,3); with those of the landmarks the file says what they are of.
+        notes: landmarks (68,), -1 those of other meshes; regions (C,).
+    """
+    kept = dict(extras) if isinstance(extras, dict) else {}
+    ours = kept.get("torchface") if isinstance(kept.get("torchface"), dict) else {}
+    rows: dict[str, Any] = {"count": len(positions)}
+    if notes.landmarks is not None:
+        at = notes.landmarks.numpy()
+        rows |= {
+            "landmarks": at.tolist(),
+            "places": [[float(f"{x:.6g}") for x in row] for row in positions[at[at >= 0]]],
+        }
+    rows["regions"] = {name: _runs(mask.cpu().numpy()) for name, mask in notes.regions.items()}
+    return {**kept, "torchface": {**(ours or {}), "version": _VERSION, "rows": rows}}
+
+
+def read_row_annotations(
+    document: Document, extras: object, location: str, vertices: NDArray[np.float64], split: Split
+) -> Annotations | None:
+    """What ``row_extras`` wrote, at the mesh's vertices; none where other rows are in these places now.
+
+    Args:
+        vertices: in the scene, (V,3), the file's unit.
+        split: for each row its vertex (C,), and for each vertex its first row.
+    """
+    record = document.record(_record(document, extras, location).get("rows"), f"{location}.rows")
+    location, (vertex_of, row_of), count = f"{location}.rows", split, len(split[0])
+    if record.get("count") != count:
+        return None
+    landmarks = None
+    if "landmarks" in record:
+        at = _integers(document, record, "landmarks", location, ())
+        places = [
+            document.numbers({"place": row}, "place", location, 3) for row in document.array(record, "places", location)
+        ]
+        known = at[at >= 0]
+        if len(known) and int(known.max()) >= count:
+            raise document.error(f"{location}.landmarks", f"row {known.max()}", f"-1 to {count - 1}")
+        if len(places) != len(known):
+            raise document.error(
+                f"{location}.places", f"{len(places)} places", f"one for each of {len(known)} landmarks"
+            )
+        if len(known) and np.abs(vertices[vertex_of[known]] - places).max() > _MOVED * np.ptp(vertices, axis=0).max():
+            return None
+        landmarks = torch.from_numpy(np.where(at < 0, -1, vertex_of[at]))
+    regions = document.record(record.get("regions"), f"{location}.regions")
+    document.reserve(len(regions) * count, f"{location}.regions")
+    masks = {name: _mask(document, regions, name, f"{location}.regions", count)[row_of] for name in regions}
+    return Annotations(landmarks, masks)
 
 
 def _record(document: Document, extras: object, location: str) -> dict[str, Any]:

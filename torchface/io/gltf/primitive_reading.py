@@ -42,6 +42,7 @@ class Part:
     # The texture and colour of the triangles, and of how many, in their order.
     looks: tuple[tuple[MaterialLook, int], ...]
     extras: dict[str, Any]  # the mesh's extras
+    attributes: tuple[tuple[dict[str, Any], int], ...]  # accessors of vertices that share them, and how many these are
 
 
 def read_part(document: Document, index: int) -> Part | None:
@@ -81,6 +82,7 @@ def read_part(document: Document, index: int) -> Part | None:
         None if any(block.vertex_ids is None for block in rows) else np.concatenate([b.vertex_ids for b in rows]),
         tuple(looks),
         document.record(mesh.get("extras"), f"{location}.extras") if isinstance(mesh.get("extras"), dict) else {},
+        tuple((block.attributes, len(block.positions)) for block in rows),
     )
 
 
@@ -98,6 +100,7 @@ class _Block:
     uvs: NDArray[np.float32] | None
     colors: NDArray[np.float32] | None
     vertex_ids: NDArray[np.int64] | None
+    attributes: dict[str, Any]
 
 
 def read_positions(
@@ -144,7 +147,7 @@ def _read_block(document: Document, primitive: dict[str, Any], location: str, fi
         numbers = read_floats(document, attributes["_VERTEX_ID"], f"{location}._VERTEX_ID", ("SCALAR",), count)[:, 0]
         whole = numbers == np.floor(numbers)
         ids = numbers.astype(np.int64) if bool(np.all(whole & (numbers >= 0) & (numbers < _MAX_EXACT_ID))) else None
-    return _Block(first, positions, deltas, uvs, colors, ids)
+    return _Block(first, positions, deltas, uvs, colors, ids, attributes)
 
 
 def read_triangles(document: Document, primitive: dict[str, Any], location: str, count: int) -> NDArray[np.int64]:

@@ -20,13 +20,14 @@ class Instance:
 
     mesh: int  # its index among the document's meshes
     name: str  # the node's name, else the mesh's, else mesh_0 and so on
-    transform: NDArray[np.float64]  # from mesh to scene, (4,4)
+    transform: NDArray[np.float64]  # from mesh to scene, (4,4); of a skinned mesh none
+    skin: int | None = None
 
 
 def instances(document: Document) -> list[Instance]:
     """What the default scene shows; without a scene all root nodes, without nodes all meshes.
 
-    A skinned mesh stands where its skeleton's rest pose puts it, so its node does not move it.
+    A skinned mesh stands where its skeleton's rest pose puts it (``rest_of_skin``), so its node does not move it.
     """
     meshes = document.objects("meshes")
     nodes = document.objects("nodes")
@@ -38,8 +39,9 @@ def instances(document: Document) -> list[Instance]:
         if node.get("mesh") is None:
             continue
         mesh = document.item("meshes", node["mesh"], f"{location}.mesh")
-        skinned = node.get("skin") is not None
-        visible.append(Instance(node["mesh"], _name(node, mesh, node["mesh"]), np.eye(4) if skinned else transform))
+        skin = node.get("skin")
+        placed = transform if skin is None else np.eye(4)
+        visible.append(Instance(node["mesh"], _name(node, mesh, node["mesh"]), placed, skin))
         if len(visible) > _MAX_INSTANCES:
             raise document.error("nodes", f"more than {_MAX_INSTANCES} meshes in the scene", "a rig")
     return visible

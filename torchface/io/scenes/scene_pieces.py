@@ -1,7 +1,7 @@
 """The meshes of a scene put together as one rig."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import accumulate
 
 import torch
@@ -53,10 +53,10 @@ def join_deltas(pieces: Sequence[Piece]) -> Tensor:
 def join_meshes(pieces: Sequence[Piece], texture: Tensor | None) -> Mesh:
     """One mesh of all; of several, each piece becomes a region."""
     if len(pieces) == 1:
-        only = pieces[0]
-        return Mesh(
-            only.vertices, only.faces, only.uvs, only.uv_faces, only.colors, texture, only.polygons, only.annotations
-        )
+        only, notes = pieces[0], pieces[0].annotations
+        if notes is not None and notes.landmarks is not None and bool((notes.landmarks < 0).any()):
+            notes = replace(notes, landmarks=None)
+        return Mesh(only.vertices, only.faces, only.uvs, only.uv_faces, only.colors, texture, only.polygons, notes)
     counts = [len(piece.vertices) for piece in pieces]
     faces = torch.cat([piece.faces + first for piece, first in zip(pieces, _starts(counts), strict=True)])
     uvs = uv_faces = colors = None
@@ -70,10 +70,24 @@ def join_meshes(pieces: Sequence[Piece], texture: Tensor | None) -> Mesh:
     regions: dict[str, Tensor] = {}
     owner = torch.repeat_interleave(torch.arange(len(pieces)), torch.tensor(counts))
     for i, piece in enumerate(pieces):
-        regions[piece.name] = regions.get(piece.name, torch.zeros(len(owner), dtype=torch.bool)) | (owner == i)
+        own = {} if piece.annotations is None else piece.annotations.regions
+        for name, mask in {piece.name: torch.ones(counts[i], dtype=torch.bool), **own}.items():
+            regions.setdefault(name, torch.zeros(len(owner), dtype=torch.bool))[owner == i] |= mask
     vertices = torch.cat([piece.vertices for piece in pieces])
-    annotations = Annotations(regions=regions)
+    annotations = Annotations(_join_landmarks(pieces, counts), regions)
     return Mesh(vertices, faces, uvs, uv_faces, colors, texture, _join_polygons(pieces, counts), annotations)
+
+
+def _join_landmarks(pieces: Sequence[Piece], counts: list[int]) -> Tensor | None:
+    """Landmarks of which each piece knows its own, -1 those of others; none where some are of no piece."""
+    joined: Tensor | None = None
+    for piece, first in zip(pieces, _starts(counts), strict=True):
+        marks = None if piece.annotations is None else piece.annotations.landmarks
+        if marks is not None:
+            joined = torch.full_like(marks, -1) if joined is None else joined
+            if len(marks) == len(joined):
+                joined = torch.where((joined < 0) & (marks >= 0), marks + first, joined)
+    return None if joined is None or bool((joined < 0).any()) else joined
 
 
 def _join_polygons(pieces: Sequence[Piece], counts: list[int]) -> Tensor | None:

@@ -4,7 +4,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
-from scipy.spatial import cKDTree
 from torch import Tensor
 
 from torchface.errors import AlignmentError, FileFormatError, NoShapesError, ValueRangeError
@@ -15,11 +14,12 @@ from torchface.io.head_models.head_model_file import HeadModelFile
 from torchface.io.head_models.head_model_files import HEAD_MODEL_ENDINGS, is_head_model_file, load_head_model_file
 from torchface.io.mesh_files import MESH_ENDINGS
 from torchface.io.rig_files import SCENE_ENDINGS
-from torchface.mesh import Annotations, Mesh, submesh
+from torchface.mesh import Mesh, submesh
 from torchface.modeling import HeadModel
 from torchface.modeling.morphable.published_models import head_model_of
 from torchface.modeling.rigging.carried_shapes import CarriedShapes
 from torchface.modeling.rigging.eyelid_closure import BLINKS
+from torchface.modeling.rigging.head_annotations import annotations_on, on_face
 from torchface.modeling.rigging.mouth_parts import tongue_out
 from torchface.modeling.rigging.other_topology import shapes_on
 from torchface.progress import Progress, silent
@@ -35,7 +35,7 @@ TONGUE = "tongueOut"
 _HEAD, _BODY = 330.0, 600.0
 """Millimetres: of a mesh taller than the second the uppermost first are the head."""
 _MEDIAN_LIMIT, _STRETCH_LIMIT = 3.0, 1.0
-_BESIDE, _LEAST_TRIANGLES = 4.0, 50
+_LEAST_TRIANGLES = 50
 _EXTENTS, _SIZES = (0.3, 8.0), (0.5, 2.0)
 """A source's extent in the template's, and its head's size, in which its unit is not doubted."""
 _GIVE = "give the face's landmarks (--landmarks FILE, from torchface pick)"
@@ -130,7 +130,7 @@ def make_arkit(
         registration = _registered(source, given.neutral, head, progress)
         carried = shapes_on(given, head.whole, registration=registration, progress=progress)
         pose = head.back(registration.pose)
-        sized = annotated(head.whole, given.neutral, registration)
+        sized = replace(head.whole, annotations=annotations_on(carried.rig, carried.template, registration.pose))
         neutral = replace(source.neutral, annotations=sized.annotations)
         made = {name: carried.rig.deltas[row] for row, name in enumerate(carried.rig.names) if name in wanted}
         if TONGUE in wanted and TONGUE not in made:
@@ -143,7 +143,7 @@ def make_arkit(
                 f"left out: {', '.join(missing)}" + (": the head has no tongue of its own" if TONGUE in missing else "")
             )
     elif not is_annotated(neutral):
-        neutral, notes, pose = _only_annotated(source, template, landmarks, progress)
+        neutral, notes, pose = _only_annotated(source, shapes, template, landmarks, progress)
     order = [name for name in (*ARKIT, *others) if name in shapes]
     deltas = torch.stack([shapes[name].to(neutral.vertices) for name in order])
     rig = BlendshapeRig(neutral, deltas, order)
@@ -241,16 +241,17 @@ def is_annotated(mesh: Mesh) -> bool:
 
 
 def _only_annotated(
-    source: Source, path: Path | None, landmarks: Path | None, progress: Progress
+    source: Source, shapes: dict[str, Tensor], path: Path | None, landmarks: Path | None, progress: Progress
 ) -> tuple[Mesh, list[str], Similarity | None]:
     """A head that has all shapes with landmarks and regions; where none are found, as it is, and a note."""
-    template = _template(path).neutral
+    template = _template(path)
     try:
-        head = _sized(source, template, landmarks, progress)
-        registration = _registered(source, template, head, progress)
+        head = _sized(source, template.neutral, landmarks, progress)
+        registration = _registered(source, template.neutral, head, progress)
     except (AlignmentError, ValueRangeError) as error:
         return source.neutral, [f"note: the rig has no landmarks and regions, which `track --rig` needs: {error}"], None
-    notes = annotated(head.whole, template, registration).annotations
+    own = BlendshapeRig(head.whole, torch.stack(list(shapes.values())) / head.size, tuple(shapes))
+    notes = annotations_on(own, on_face(template, registration), registration.pose)
     lines = [
         f"landmarks and regions: registered by {registration.record.start}; {registration.record.figures()}",
         *head.notes(),
@@ -281,24 +282,6 @@ def _landmarks(source: Source, template: Mesh, path: Path | None) -> tuple[Tenso
     if notes is not None and notes.landmarks is not None and len(notes.landmarks) == 68:
         return ids, source.neutral.vertices[notes.landmarks].double()
     return None
-
-
-def annotated(head: Mesh, template: Mesh, registration: Registration) -> Mesh:
-    """A head with the template's landmarks and regions where it has none of its own, so that other commands know it."""
-    own, given = head.annotations or Annotations(), template.annotations
-    if given is None:
-        return head
-    on_head = registration.mesh.vertices.double()
-    landmarks, regions = own.landmarks, dict(own.regions)
-    vertices = head.vertices.double().cpu()
-    if (landmarks is None or len(landmarks) != 68) and given.landmarks is not None:
-        landmarks = torch.from_numpy(cKDTree(vertices).query(on_head[given.landmarks])[1])
-    distance, nearest = cKDTree(on_head).query(vertices)
-    near = torch.from_numpy(distance) < _BESIDE * float(registration.pose.scale[0])
-    for name, mask in given.regions.items():
-        if name not in regions:
-            regions[name] = mask.cpu()[torch.from_numpy(nearest)] & near
-    return replace(head, annotations=Annotations(landmarks, regions, own.mirror, own.contacts))
 
 
 def _tongue(neutral: Mesh, carried: CarriedShapes) -> dict[str, Tensor]:

@@ -6,6 +6,7 @@ import copy
 import time
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -16,8 +17,9 @@ from torchface.errors import AlignmentError, FileFormatError, ValueRangeError
 from torchface.files.job_lock import file_lock
 from torchface.files.whole_files import all_or_none, check_ending, check_there
 from torchface.geometry.meshes.operators import vertex_normals
+from torchface.io.gltf.character_annotations import annotate_character
 from torchface.io.gltf.character_scene import Block, Character, read_character
-from torchface.io.gltf.gltf_document import Document, read_document
+from torchface.io.gltf.gltf_document import read_document
 from torchface.io.gltf.morph_insertion import AddedTargets, document_with_targets, rename_targets, write_edited
 from torchface.io.gltf.part_insertion import document_with_parts
 from torchface.io.images.image_files import IMAGE_ENDINGS, encode_png
@@ -26,6 +28,7 @@ from torchface.io.vrm.vrm_expressions import VRM_ENDING, MorphBind, add_expressi
 from torchface.landmarks.surfaces.face_on_surface import NoFaceOnSurfaceError
 from torchface.modeling.rigging.carried_shapes import CarriedShapes
 from torchface.modeling.rigging.eyelid_closure import BLINKS
+from torchface.modeling.rigging.head_annotations import annotations_on, on_face
 from torchface.modeling.rigging.joined_vertices import joined_vertices
 from torchface.modeling.rigging.mouth_parts import tongue_out
 from torchface.modeling.rigging.other_topology import shapes_on
@@ -121,7 +124,7 @@ def rig_character(
         present, empty = _present(character)
         missing = [name for name in ARKIT if name not in present]
         if not (missing or inner_mouth or eyes):
-            return _copied(document, present, out, begin)
+            return _copied(character, present, out, begin, progress)
         surface = textured(character)
         figure = out.with_name(f"{out.stem}{PICTURE_ENDING}")
         try:
@@ -166,6 +169,7 @@ def rig_character(
         )
         rename_targets(root, _spelled(present))
         expressions = add_expressions(document, root, job.binds(present, added))
+        annotate_character(root, character, face.rows, annotations_on(rig, carried.template, carried.registration.pose))
         with all_or_none():
             write_edited(document, root, data, out)
             save_rendered_image(job.views(surface, present), figure)
@@ -247,18 +251,41 @@ def _spelled(present: dict[str, _Present]) -> dict[str, str]:
     return {own: name for own, name in single.items() if own != name and side_written_out(own) == name}
 
 
-def _copied(document: Document, present: dict[str, _Present], out: Path, begin: float) -> CharacterReport:
-    """Writes a character that has all of ARKit's shapes, with their names and a VRM's expressions alone changed."""
+def _copied(
+    character: Character, present: dict[str, _Present], out: Path, begin: float, progress: Progress
+) -> CharacterReport:
+    """Writes a character that has all of ARKit's shapes: names, a VRM's expressions and landmarks alone are new."""
+    document = character.document
     root = copy.deepcopy(document.root)
     rename_targets(root, _spelled(present))
     expressions = add_expressions(document, root, {name: shape.binds for name, shape in present.items()})
+    known = any(document.first_extras(key) is not None for key in ("landmarks", "rows"))
+    found = [] if known else [_landmarks_added(root, character, present, progress)]
     write_edited(document, root, b"", out)
-    notes = [*_present_lines(present), "nothing to make: the file was copied, and no face was looked for"]
+    notes = [*_present_lines(present), "nothing to make: the file was copied", *found]
     if expressions:
         notes.append(f"expressions added to the VRM: {len(expressions)}")
     names = {name: shape.names for name, shape in present.items()}
     seconds = time.perf_counter() - begin
     return CharacterReport((), names, expressions, 0.0, (0.0, seconds), None, tuple(notes))
+
+
+def _landmarks_added(
+    root: dict[str, Any], character: Character, present: dict[str, _Present], progress: Progress
+) -> str:
+    """Adds landmarks and regions to a character's file; a line for people to read."""
+    template = performer(texture=False)
+    try:
+        face = find_character_face(character, textured(character), progress)
+        registration = _registered(template, face, character.document.path, progress)
+    except AlignmentError as error:
+        return f"  note: no landmarks were added, which track --rig needs: {error}"
+    deltas = torch.stack([_present_motion(character, face, shape)[face.rows] for shape in present.values()])
+    own = BlendshapeRig(face.head, deltas.float(), tuple(present))
+    annotate_character(
+        root, character, face.rows, annotations_on(own, on_face(template, registration), registration.pose)
+    )
+    return f"landmarks and regions added; template: {registration.record.figures()}"
 
 
 def _present_lines(there: dict[str, _Present]) -> list[str]:
@@ -363,20 +390,11 @@ class _Job:
             if name in self.made:
                 moved[self.face.rows] = self.rig.select([name]).deltas[0].double()
             elif name in present:
-                moved = self._present_motion(present[name])
+                moved = _present_motion(self.character, self.face, present[name])
             shapes[name] = moved
         landmarks = self.face.found.pose.inverse().apply(self.face.found.points[17:68])[0]
         middle = landmarks[torch.isfinite(landmarks).all(-1)].mean(0)
         return character_sheet(upright, shapes, middle, FACE_SPAN)
-
-    def _present_motion(self, shape: _Present) -> Tensor:
-        moved = torch.zeros_like(self.character.vertices)
-        for bind in shape.binds:
-            for block in self.character.blocks:
-                if (block.node, block.mesh) == (bind.node, bind.mesh):
-                    own = self.character.targets(block)[bind.target].double() * bind.weight
-                    moved[block.rows] += torch.einsum("vij,vj->vi", self.character.linear[block.rows], own)
-        return self.face.found.pose.inverse().apply_vectors(moved[None])[0]
 
     def notes(
         self, there: dict[str, _Present], expressions: tuple[str, ...], seconds: tuple[float, float]
@@ -414,7 +432,7 @@ class _Job:
 
     def _doubts(self, there: dict[str, _Present]) -> list[str]:
         """Which of the character's own shapes move nothing, and whether its ``mouthClose`` opens the jaw itself."""
-        motion = {name: self._present_motion(shape) for name, shape in there.items()}
+        motion = {name: _present_motion(self.character, self.face, shape) for name, shape in there.items()}
         still = [name for name, moved in motion.items() if not bool((moved.norm(dim=-1) > _STILL_MM).any())]
         lines = [f"  note: {', '.join(still)}: there, but nothing moves by it"] if still else []
         far = {name: float(moved.norm(dim=-1).max()) for name, moved in motion.items()}
@@ -435,6 +453,17 @@ class _Job:
                     f"  note: its {_CLOSE} opens the jaw itself, as Audio2Face's does; ARKit's leaves that to {_JAW}"
                 )
         return lines
+
+
+def _present_motion(character: Character, face: CharacterFace, shape: _Present) -> Tensor:
+    """How a shape that a character has moves its vertices, (V,3) at a head's size."""
+    moved = torch.zeros_like(character.vertices)
+    for bind in shape.binds:
+        for block in character.blocks:
+            if (block.node, block.mesh) == (bind.node, bind.mesh):
+                own = character.targets(block)[bind.target].double() * bind.weight
+                moved[block.rows] += torch.einsum("vij,vj->vi", character.linear[block.rows], own)
+    return face.found.pose.inverse().apply_vectors(moved[None])[0]
 
 
 def _normal_changes(rest: Tensor, faces: Tensor, deltas: Tensor) -> Tensor:

@@ -22,6 +22,7 @@ from torchface.rig import BlendshapeRig
 from torchface.workflows.named_heads import NamedHeads, load_head_model, matching
 from torchface.workflows.named_priors import DEFAULT_PRIOR
 from torchface.workflows.track.track_models import DEFAULT_LANDMARKS, TrackModels, is_table, load_track_models
+from torchface.workflows.track.upright_rig import upright
 
 METHOD = "track/9"
 """Of the keys; another number where the same inputs, or pieces of another length, come to give other results."""
@@ -79,7 +80,7 @@ class TrackInputs:
     rate_varies: str = ""  # how, in words
     # of the rig's topology, from which the person's is solved; None where the rig is the person's
     heads: HeadModel | None = None
-    about: str = ""  # what there is to say of them
+    about: str = ""  # what there is to say of them, or of the rig
 
     @property
     def reading_key(self) -> str:
@@ -114,7 +115,8 @@ def load_inputs(video: Path | None, rig: Path | None, settings: TrackSettings) -
         heads, actor = matching(load_head_model(named.name), rig, settings.part)
         inputs = replace(inputs_of(clip, actor, settings), heads=heads, about=named.line)
     else:
-        inputs = inputs_of(clip, load_actor(rig, settings.part), settings)
+        actor, line = upright(load_actor(rig, settings.part))
+        inputs = replace(inputs_of(clip, actor, settings), about=line)
     inputs.check_length(clip.count)
     if settings.neutral_frame is not None and settings.offsets is not None:
         raise ValueRangeError("--neutral-frame: found --offsets beside it, expected one of the two")

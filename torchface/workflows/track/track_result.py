@@ -197,8 +197,8 @@ class Tracked:
             f"to frame; the solved face lies {float(errors.nanmedian()):.2f} px from them in the median frame, and "
             f"less than {float(errors.nanquantile(0.95)):.2f} px in 95 % of the frames",
         ]
-        if self.head is not None:
-            lines += [line for line in (self.inputs.about, *self.head.lines()) if line]
+        about = self.inputs.about
+        lines += [line for line in (about, *(() if self.head is None else self.head.lines())) if line]
         lines.extend((*self.reductions, *self.outlier_lines()))
         lines.extend(
             f"frames {span.first} to {span.last} show another face than the first frames (its look correlates by "

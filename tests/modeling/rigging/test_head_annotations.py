@@ -1,0 +1,41 @@
+"""A head takes landmarks and regions over from a template that lies on it."""
+
+import torch
+
+from planted.characters import other_topology
+from torchface.geometry.similarity import Similarity
+from torchface.mesh import Annotations, Mesh
+from torchface.modeling.rigging.head_annotations import annotations_on
+from torchface.rig import BlendshapeRig
+from torchface.synthetic import performer
+
+SAME = Similarity(torch.ones(1).double(), torch.eye(3).double()[None], torch.zeros(1, 3).double())
+
+
+def test_a_head_of_another_topology_gets_the_landmarks() -> None:
+    person = performer(texture=False)
+    notes = annotations_on(other_topology(person), person, SAME)
+    head, own = other_topology(person), person.neutral.annotations
+    assert torch.equal(head.vertices[notes.landmarks], person.vertices[own.landmarks])
+    place = torch.cdist(person.vertices, head.vertices).argmin(1)
+    assert notes.regions.keys() == own.regions.keys()
+    for name, mask in own.regions.items():
+        assert float((notes.regions[name][place] == mask).double().mean()) > 0.999
+
+
+def test_of_lips_that_touch_the_one_that_moves_alike_is_taken() -> None:
+    """Two strips in one place; the second goes down with the jaw. A tooth before them is another part."""
+    strip = torch.tensor(
+        [[0.0, 0, 0], [10, 0, 0], [0, 5, 0], [10, 5, 0], [0, 0, 0], [10, 0, 0], [0, -5, 0], [10, -5, 0]]
+    )
+    skin = torch.tensor([[0, 1, 2], [1, 3, 2], [4, 6, 5], [5, 6, 7], [2, 3, 8], [3, 9, 8], [6, 8, 7], [7, 8, 9]])
+    ends = torch.tensor([[-20.0, 0, 0], [30, 0, 0]])
+    tooth = torch.tensor([[5.0, 0, 0.1], [5, 1, 0.1], [6, 1, 0.1]])
+    jaw = torch.zeros(13, 3)
+    jaw[4:8, 1] = -30.0
+    points = torch.cat([strip, ends, tooth])
+    head = BlendshapeRig(Mesh(points, torch.cat([skin, torch.tensor([[10, 11, 12]])])), jaw[None], ("jawOpen",))
+    marks = torch.tensor([0, 4, 1, 5] * 17)
+    template = BlendshapeRig(Mesh(points[:10], skin, annotations=Annotations(marks)), jaw[None, :10], ("jawOpen",))
+    shifted = BlendshapeRig(template.neutral.with_vertices(points[:10] + 0.2), template.deltas, template.names)
+    assert torch.equal(annotations_on(head, shifted, SAME).landmarks, marks)

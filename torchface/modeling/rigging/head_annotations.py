@@ -1,0 +1,58 @@
+"""Landmarks and regions of a head, taken over from a template that lies on it."""
+
+import torch
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+from torchface.geometry.similarity import Similarity
+from torchface.mesh import Annotations
+from torchface.modeling.rigging.eyelid_closure import BLINKS
+from torchface.modeling.rigging.joined_vertices import joined_vertices
+from torchface.registration import Registration
+from torchface.rig import BlendshapeRig
+
+_BESIDE = 4.0  # millimetres at the template's size
+_TELLING = ("jawOpen", *BLINKS)  # which of lips and lids that touch a vertex is of, its motion says
+
+
+def annotations_on(head: BlendshapeRig, template: BlendshapeRig, pose: Similarity) -> Annotations:
+    """The head's annotations, with the template's landmarks and regions where it has none of its own.
+
+    Args:
+        head: in any place and size.
+        template: on the head's face, in its own place and size.
+        pose: takes the template to the head.
+    """
+    own, given = head.neutral.annotations or Annotations(), template.neutral.annotations or Annotations()
+    back = pose.inverse()
+    names = [name for name in _TELLING if name in head.names and name in template.names]
+    rest = back.apply(head.vertices.detach().cpu().double())[0]
+    ours = [rest, *back.apply_vectors(_deltas(head, names))]
+    known = template.vertices.detach().cpu().double()
+    landmarks, regions = own.landmarks, dict(own.regions)
+    if (landmarks is None or len(landmarks) != 68) and given.landmarks is not None:
+        ids = given.landmarks.cpu()
+        part = joined_vertices(rest, head.neutral.faces.cpu())
+        part_of = part.part[part.of]
+        near = torch.from_numpy(cKDTree(rest.numpy()).query(known[ids].numpy())[1])
+        skin = (part_of == part_of[near].bincount().argmax()).nonzero()[:, 0]
+        tree = cKDTree(torch.cat([one[skin] for one in ours], 1).numpy())
+        wanted = torch.cat([one[ids] for one in (known, *_deltas(template, names))], 1)
+        landmarks = skin[torch.from_numpy(tree.query(wanted.numpy())[1])]
+    distance, nearest = cKDTree(known.numpy()).query(rest.numpy())
+    close = torch.from_numpy(distance) < _BESIDE
+    for name, mask in given.regions.items():
+        if name not in regions:
+            regions[name] = mask.cpu()[torch.from_numpy(nearest)] & close
+    return Annotations(landmarks, regions, own.mirror, own.contacts)
+
+
+def on_face(template: BlendshapeRig, registration: Registration) -> BlendshapeRig:
+    """A registered template in its own place and size, with its own deltas."""
+    vertices = registration.pose.inverse().apply(registration.mesh.vertices.detach().cpu().double())[0]
+    fitted = template.neutral.with_vertices(vertices.to(template.vertices))
+    return BlendshapeRig(fitted, template.deltas, template.names)
+
+
+def _deltas(rig: BlendshapeRig, names: list[str]) -> Tensor:
+    return rig.deltas[[rig.names.index(name) for name in names]].detach().cpu().double()
