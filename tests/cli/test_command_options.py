@@ -174,6 +174,14 @@ def test_the_help_shows_one_value_where_an_option_is_given_again_for_each(
     assert option in " ".join(capsys.readouterr().out.split())
 
 
+def test_a_wrong_word_is_refused_with_the_right_ones_in_their_order(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        main(["attach", "--unit", "yard"])
+    printed = capsys.readouterr()
+    words = " ".join(word for word in (printed.out + printed.err).split() if word != "│")
+    assert "Expected one of ('um', 'mm', 'cm', 'm', 'in')." in words
+
+
 @pytest.mark.parametrize("kind", ["symbolic link", "hard link", "link to the folder", "way round"])
 def test_another_name_of_the_same_file_is_the_same(
     kind: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]

@@ -5,10 +5,12 @@ from pathlib import Path
 import pytest
 import torch
 
+from planted.characters import Planted, unpacked, write_character
 from torchface import BlendshapeRig, Take, Track, load_take, save_rig, save_take
 from torchface.cli import main
 from torchface.io import load_animation
 from torchface.io.images.image_files import load_image
+from torchface.io.weights.weight_csv import ROTATIONS
 from torchface.synthetic import performer
 from torchface.workflows.retarget_weights import retarget_weights
 from torchface.workflows.weight_files import WeightFiles
@@ -88,3 +90,36 @@ def test_uneven_times_go_with_the_weights(tmp_path: Path) -> None:
     for found in written:
         assert found is not None
         torch.testing.assert_close(found.times, seconds - seconds[0], atol=2e-5, rtol=0)
+
+
+def test_the_animated_character_keeps_all_that_it_has(tmp_path: Path) -> None:
+    """Nodes, skeleton, materials and its own animation; the head's bone turns as the take says."""
+    person = performer(texture=False).select(["jawOpen", "mouthPucker"])
+    shapes = dict(zip(person.names, person.deltas, strict=True))
+    write_character(tmp_path / "hero.vrm", person.neutral, shapes, Planted(vrm="VRMC_vrm"))
+    weights = torch.rand(20, 2, 1, generator=torch.Generator().manual_seed(1)).round(decimals=3)
+    still = torch.zeros(20, dtype=torch.float64)
+    columns = {name: torch.linspace(0, 0.4, 20).double() if name == "HeadYaw" else still for name in ROTATIONS}
+    save_take(Take(30.0, weights=Track(person.names, weights), extras={"columns": columns}), tmp_path / "take.csv")
+    words = ["retarget", tmp_path / "take.csv", "--to", tmp_path / "hero.vrm", "--out", tmp_path / "out.csv"]
+    main([str(word) for word in (*words, "--animation", tmp_path / "out.glb", "--quiet")])
+    (before, _), (after, _) = unpacked(tmp_path / "hero.vrm"), unpacked(tmp_path / "out.glb")
+    for key in ("nodes", "skins", "materials", "meshes", "extensions", "scenes"):
+        assert after[key] == before[key], key
+    assert [one["name"] for one in after["animations"]] == ["performance", "talk"]
+    turned = {channel["target"]["node"] for channel in after["animations"][0]["channels"]}
+    bones = before["extensions"]["VRMC_vrm"]["humanoid"]["humanBones"]
+    assert turned == {0, bones["head"]["node"], bones["neck"]["node"]}
+    with pytest.warns(UserWarning, match="left out: animations .* talk"):
+        played = load_animation(tmp_path / "out.glb")
+    torch.testing.assert_close(played.weights.values, weights, atol=1e-3, rtol=0)
+
+
+def test_weights_called_as_a_rig_are_refused_with_the_option_that_writes_one(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "take.csv").touch()
+    words = ["retarget", tmp_path / "take.csv", "--to", tmp_path, "--out", tmp_path / "hero_take.glb"]
+    with pytest.raises(SystemExit):
+        main([str(word) for word in words])
+    assert "the animated rig is written by --animation" in " ".join(capsys.readouterr().err.split())

@@ -11,6 +11,7 @@ from types import NoneType, UnionType
 from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
 from tyro.conf import FlagCreatePairsOff, Positional, UseAppendAction, arg
+from tyro.constructors import PrimitiveConstructorSpec
 
 from torchface.cli.terminal import console
 from torchface.errors import FileFormatError
@@ -123,10 +124,28 @@ def plain_options(command: Command) -> Command:
             notes += get_args(FlagCreatePairsOff[bool])[1:]  # no --no-quiet
         if name == "out" and Positional not in notes:
             changes["aliases"] = ["-o"]
-        if changes:
+        if choices := _choices(kind):
+            notes.append(choices)
+        if changes or choices:
             hints[name] = Annotated[(kind, *notes, arg(**changes))]  # type: ignore[misc]
     command.__annotations__ = hints
     return command
+
+
+def _choices(kind: Any) -> PrimitiveConstructorSpec[Any] | None:
+    """How an option that may be left out takes one of several words; tyro lists None among them, in any order."""
+    given = [option for option in get_args(kind) if option is not NoneType]
+    if get_origin(kind) not in (Union, UnionType) or len(given) != 1 or get_origin(given[0]) is not Literal:
+        return None
+    values = {str(value): value for value in get_args(given[0])}
+    return PrimitiveConstructorSpec(
+        nargs=1,
+        metavar="{" + ",".join(values) + "}",
+        instance_from_str=lambda words: values[words[0]],
+        is_instance=lambda value: value is None or value in values.values(),
+        str_from_instance=lambda value: [str(value)],
+        choices=tuple(values),
+    )
 
 
 def _many(kind: Any) -> bool:

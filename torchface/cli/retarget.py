@@ -44,15 +44,16 @@ def retarget(
             each of the target's shapes is one of ARKit's, otherwise frame,time,<shape>,... with the target's own names.
         live_link: Also write Live Link Face CSV whatever the target's names are: halves are merged, shapes that ARKit
             does not have are left out.
-        animation: Also write the target rig with this animation as .glb, USD or .ma (Maya).
+        animation: Also write the target rig with this animation as .glb, USD or .ma (Maya). From a .glb or .vrm to a
+            .glb all that the file has is kept, and the head and the eyes turn where WEIGHTS has their rotations.
         part: Keep this region of the target rig only, such as face.
     """
     from torchface.files.job_lock import file_lock
     from torchface.workflows.retarget_weights import retarget_weights
     from torchface.workflows.weight_files import WeightFiles
 
+    files = WeightFiles(out, animation, live_link, reduce)
     with file_lock(out, ".csv"), progress_bars(quiet) as progress:
-        files = WeightFiles(out, animation, live_link, reduce)
         done = retarget_weights(weights, to, files, from_, table, part, progress, poses)
     driven = len(done.shapes.to_names) - len(done.shapes.undriven)
     console.print(f"{len(done.take)} frames; {driven} of {len(done.shapes.to_names)} shapes driven")

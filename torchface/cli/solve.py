@@ -139,9 +139,10 @@ def solve(
         )
         work_on(job, MARKER_TAKES, take, out, (jobs, cluster, time_limit), _COLUMNS, "rmse_mm", quiet)
         return
+    outputs = TakeOutputs(out, animation, live_link, reduce, report, stream)
     with file_lock(out, ".csv"), progress_bars(quiet) as progress:
         inputs = TakeInputs(rig, take[0], attachment, part, camera, options)
-        done = solve_take(inputs, TakeOutputs(out, animation, live_link, reduce, report, stream), settings, progress)
+        done = solve_take(inputs, outputs, settings, progress)
     print_lines(done.lines())
     for path in (out, animation, live_link, None if report is None else report / "index.html"):
         if path is not None:

@@ -91,7 +91,7 @@ def retarget_weights(
         raise NameMismatchError(f"{table or poses or weights}: {error}") from error
     moved, notes = _mouth_closed(retarget_take(played, shapes), rig, target, rules)
     progress("writing")
-    left_out, written = write_weights(moved, files, target)
+    left_out, written = write_weights(moved, files, target, to if part is None else None)
     return Retargeted(moved, shapes, (*faults, *notes, *left_out), (*said, *written))
 
 

@@ -6,12 +6,15 @@ from pathlib import Path
 
 import torch
 
-from torchface.errors import NameMismatchError, ValueRangeError
-from torchface.files.whole_files import all_or_none, check_ending, check_writable, make_folder
+from torchface.errors import FileFormatError, NameMismatchError, ValueRangeError
+from torchface.files.whole_files import all_or_none, check_ending, check_writable, make_folder, write_file
+from torchface.io.gltf.gltf_document import read_document
+from torchface.io.gltf.performance_animation import Performance, performed_glb
 from torchface.io.rig_files import ANIMATION_ENDINGS, SCENE_ENDINGS, load_animation, save_animation
+from torchface.io.scenes.weight_keys import weight_keys, with_correctives
 from torchface.io.take_files import load_take
 from torchface.io.weights.live_link_csv import not_in_live_link, save_live_link
-from torchface.io.weights.weight_csv import save_weights_csv
+from torchface.io.weights.weight_csv import ROTATIONS, save_weights_csv
 from torchface.number_checks import checked_number
 from torchface.rig import BlendshapeRig
 from torchface.shape_names import ARKIT, mapping
@@ -19,6 +22,7 @@ from torchface.take import Take, Track
 from torchface.temporal.key_reduction import KeyReduction, kept_keys, reduction_error
 
 _SHOWN = 8
+_KEPT = (".glb", ".vrm")  # rigs' files that are written again with all that they have
 _ROUNDED = 1e-3  # what a file's rounding leaves beyond 0 or 1
 
 
@@ -31,6 +35,13 @@ class WeightFiles:
     live_link: Path | None = None  # Live Link Face's CSV whatever the names are, if wanted
     # Keep as few keys as stay within this of every frame's weights; a row and a key a frame if absent.
     reduce: float | None = None
+
+    def __post_init__(self) -> None:
+        if self.animation is None and self.out.suffix.lower() in ANIMATION_ENDINGS:
+            raise FileFormatError(
+                f"{self.out}: found the ending {self.out.suffix!r} for the weights, expected .csv; the animated rig is "
+                f"written by --animation {self.out}"
+            )
 
     def check(self, folder: Path | None = None) -> None:
         """Raises where one of them, or a folder beside, cannot be written to or has another ending than it may have."""
@@ -89,7 +100,9 @@ def check_live_link(names: Sequence[str], target: Path | str | None) -> None:
         )
 
 
-def write_weights(take: Take, files: WeightFiles, rig: BlendshapeRig) -> tuple[list[str], list[str]]:
+def write_weights(
+    take: Take, files: WeightFiles, rig: BlendshapeRig, source: Path | None = None
+) -> tuple[list[str], list[str]]:
     """Writes a take's weights, and says what a file leaves out and how many keys it has.
 
     ``files.out`` is Live Link Face's CSV where it gives every shape back, because all are ARKit's; else
@@ -98,6 +111,7 @@ def write_weights(take: Take, files: WeightFiles, rig: BlendshapeRig) -> tuple[l
     Args:
         take: weights by the rig's names.
         files: what is written; ``live_link`` has ARKit's names by :func:`torchface.shape_names.mapping`.
+        source: the rig's file, where the rig is all of it; see :func:`write_animation`.
 
     Returns:
         Warnings, and other lines for people to read.
@@ -121,9 +135,35 @@ def write_weights(take: Take, files: WeightFiles, rig: BlendshapeRig) -> tuple[l
         warnings.append(f"{files.live_link} does not give back (halves are merged, others left out): {listed}")
     if files.animation is not None:
         make_folder(files.animation.parent)
-        match = save_animation(rig, take, files.animation, reduce=files.reduce)
-        notes += [] if match.reduction is None else [f"{files.animation}: {match.reduction}"]
+        reduced = write_animation(rig, take, files.animation, files.reduce, source)
+        notes += [] if reduced is None else [f"{files.animation}: {reduced}"]
     return warnings, notes
+
+
+def write_animation(
+    rig: BlendshapeRig, take: Take, path: Path, reduce: float | None = None, source: Path | None = None
+) -> KeyReduction | None:
+    """Writes a rig with a take as its animation, and says how many keys that has where few were asked for.
+
+    A ``.glb`` of a rig from a ``.glb`` or ``.vrm`` is that file, with all that it has, and the take as its first
+    animation: weights, and the rotations of head and eyes that the take has.
+
+    Args:
+        source: the rig's file; its meshes alone are written where it is absent or of another kind.
+    """
+    if source is None or source.suffix.lower() not in _KEPT or path.suffix.lower() != ".glb":
+        return save_animation(rig, take, path, reduce=reduce).reduction
+    taken, reduction = (take, None) if reduce is None else reduced_take(take, reduce)
+    keys = with_correctives(rig, weight_keys(rig, taken)[0])
+    names = (*rig.names, *(() if rig.correctives is None else rig.correctives.names))
+    columns = taken.extras.get("columns", {})
+    turns = None
+    if all(name in columns for name in ROTATIONS):
+        angles = torch.stack([torch.as_tensor(columns[name]) for name in ROTATIONS], 1).double().nan_to_num(0.0)
+        turns = angles.numpy() if bool(angles.any()) else None
+    performance = Performance(keys.seconds.numpy(), names, keys.weights.numpy(), turns)
+    write_file(path, performed_glb(read_document(source), performance))
+    return reduction
 
 
 def reduced_take(take: Take, bound: float) -> tuple[Take, KeyReduction]:

@@ -133,7 +133,7 @@ def _piece(
         uv_faces,
         None if part.colors is None else torch.from_numpy(part.colors[joined.row_of]),
         read_polygons(document, extras, location, faces),
-        _annotations(document, part.extras.get("torchface"), location, vertices / scale, joined),
+        _annotations(document, part.extras.get("torchface"), location, vertices.astype(np.float64) / scale, joined),
         torch.from_numpy(deltas),
         part.names,
     )

@@ -140,9 +140,11 @@ def read_row_annotations(
     landmarks = None
     if "landmarks" in record:
         at = _integers(document, record, "landmarks", location, ())
-        places = [
-            document.numbers({"place": row}, "place", location, 3) for row in document.array(record, "places", location)
-        ]
+        rows = document.array(record, "places", location)
+        absent = (np.inf, np.inf, np.inf)
+        places = np.array(
+            [document.numbers({"place": row}, "place", location, 3) or absent for row in rows], np.float64
+        )
         known = at[at >= 0]
         if len(known) and int(known.max()) >= count:
             raise document.error(f"{location}.landmarks", f"row {known.max()}", f"-1 to {count - 1}")

@@ -27,7 +27,8 @@ class Performance:
     seconds: NDArray[np.float64]  # of each frame, (T,)
     names: Sequence[str]
     weights: NDArray[np.float32]  # (T,N)
-    rotations: NDArray[np.float64]  # Live Link Face's yaw, pitch and roll of head, left and right eye, (T,9) radians
+    # Live Link Face's yaw, pitch and roll of head, left and right eye, (T,9) radians; the head keeps its pose without
+    rotations: NDArray[np.float64] | None = None
 
 
 def performed_glb(document: Document, performance: Performance) -> bytes:
@@ -54,7 +55,8 @@ def performed_glb(document: Document, performance: Performance) -> bytes:
         if key not in written:
             written[key] = buffers.keys(_keys(names, rest, performance).reshape(-1, 1))
         drive(index, "weights", written[key])
-    for node_index, turned in _turned(document, root, performance):
+    turns = [] if performance.rotations is None else _turned(document, root, performance.rotations)
+    for node_index, turned in turns:
         quaternions = np.ascontiguousarray(turned.as_quat(), np.float32)
         drive(node_index, "rotation", buffers.keys(quaternions))
     animation = {"name": "performance", "samplers": samplers, "channels": channels}
@@ -80,9 +82,9 @@ def _keys(names: Sequence[str], rest: Sequence[float], performance: Performance)
     return keys
 
 
-def _turned(document: Document, root: dict[str, Any], performance: Performance) -> list[tuple[int, Rotation]]:
+def _turned(document: Document, root: dict[str, Any], rotations: NDArray[np.float64]) -> list[tuple[int, Rotation]]:
     """Nodes, and how each is rotated beside its parent in every frame, (T,)."""
-    head, left, right = (performance.rotations[:, 3 * i : 3 * i + 3] for i in range(3))
+    head, left, right = (rotations[:, 3 * i : 3 * i + 3] for i in range(3))
     whole = Rotation.from_euler("YXZ", head)
     parts, found = character_nodes(document), list[tuple[int, Rotation]]()
     transforms, nodes = node_transforms(document), document.objects("nodes")

@@ -17,6 +17,7 @@ from torchface.io.weights.weight_csv import ROTATIONS
 from torchface.rig import BlendshapeRig
 from torchface.workflows.track.head_rotations import head_rotations
 from torchface.workflows.track.track_files import ANIMATION, LANDMARKS, SUMMARY, SUMMARY_FORMAT
+from torchface.workflows.track.upright_rig import upright
 
 _GROWN = ("hair", "lash_hair", "brow_hair", "shirt")
 _POSE = (*(f"pose_T{axis}" for axis in "xyz"), *(f"pose_{name.removeprefix('Head').lower()}" for name in ROTATIONS[:3]))
@@ -80,7 +81,7 @@ def read_tracked_film(film: Path, track: Path) -> TrackedFilm:
     if not bool(seen.any()):
         raise ValueRangeError(f"{track}: found no frame with a face, expected some")
     pose = pose.nan_to_num(0.0)
-    rig = bare(load_rig(track / ANIMATION))
+    rig = bare(upright(load_rig(track / ANIMATION))[0])
     if not record["intrinsics"]:
         raise FileFormatError(f"{track / SUMMARY}: found no intrinsics, which older tracks lack; track the film again")
     lens = record["intrinsics"].tensor(3, 3), record["distortion"].tensor(5)

@@ -75,7 +75,7 @@ def solve_take(
     seconds = time.perf_counter() - started
 
     progress("writing")
-    left_out, written = write_weights(solution.take, outputs, rig)
+    left_out, written = write_weights(solution.take, outputs, rig, inputs.rig if inputs.part is None else None)
     samples = len(solution.take) * len(attachment.triangles)
     seen = float(torch.isfinite(solution.markers).all(-1).sum()) / samples
     warnings = (*notes, *solution.warnings, *left_out)

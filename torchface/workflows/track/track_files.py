@@ -3,7 +3,6 @@
 from pathlib import Path
 
 from torchface.files.whole_files import delete_file
-from torchface.io import save_animation
 from torchface.io.landmarks.openface_csv import save_landmarks_csv
 from torchface.io.weights.live_link_csv import save_live_link
 from torchface.io.weights.weight_csv import save_weights_csv
@@ -13,7 +12,7 @@ from torchface.take import Take, Track
 from torchface.workflows.track.head_rotations import rotation_columns
 from torchface.workflows.track.take_solution import OFFSETS
 from torchface.workflows.track.track_result import Tracked
-from torchface.workflows.weight_files import reduced_take
+from torchface.workflows.weight_files import reduced_take, write_animation
 
 WEIGHTS, CONFIDENCE, LIVE_LINK, LANDMARKS = "weights.csv", "confidence.csv", "live_link.csv", "landmarks.csv"
 ANIMATION, OVERLAY, SUMMARY = "animation.glb", "overlay.mp4", "summary.json"
@@ -69,9 +68,10 @@ def write_curves(tracked: Tracked, out: Path) -> dict[str, Path]:
     columns["presence"] = reading.presence
     track = Track(LANDMARK_NAMES, reading.landmarks, reading.confidence)
     save_landmarks_csv(Take(fps, landmarks=track, extras={"columns": columns}, seconds=when), products["landmarks"])
-    match = save_animation(tracked.shown, take, products["animation"], reduce=bound)
-    if match.reduction is not None:
-        tracked.reductions.append(f"{ANIMATION}: {match.reduction}")
+    own = tracked.inputs.rig if tracked.shown is tracked.rig else None
+    reduced = write_animation(tracked.shown, take, products["animation"], bound, own)
+    if reduced is not None:
+        tracked.reductions.append(f"{ANIMATION}: {reduced}")
     return products
 
 

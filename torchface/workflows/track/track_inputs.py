@@ -81,6 +81,7 @@ class TrackInputs:
     # of the rig's topology, from which the person's is solved; None where the rig is the person's
     heads: HeadModel | None = None
     about: str = ""  # what there is to say of them, or of the rig
+    rig: Path | None = None  # the actor's file, where the actor is all of it
 
     @property
     def reading_key(self) -> str:
@@ -116,7 +117,8 @@ def load_inputs(video: Path | None, rig: Path | None, settings: TrackSettings) -
         inputs = replace(inputs_of(clip, actor, settings), heads=heads, about=named.line)
     else:
         actor, line = upright(load_actor(rig, settings.part))
-        inputs = replace(inputs_of(clip, actor, settings), about=line)
+        whole = rig if settings.part is None else None
+        inputs = replace(inputs_of(clip, actor, settings), about=line, rig=whole)
     inputs.check_length(clip.count)
     if settings.neutral_frame is not None and settings.offsets is not None:
         raise ValueRangeError("--neutral-frame: found --offsets beside it, expected one of the two")
@@ -150,8 +152,9 @@ def load_actor(rig: Path, part: str | None) -> BlendshapeRig:
     if count != 68:
         what = "no landmark vertices" if count == 0 else f"{count} landmark vertices"
         raise ValueRangeError(
-            f"{rig}: found {what}, expected the 68 of iBUG: torchface pick annotates them on the rig; or track without "
-            f"--rig, and torchface retarget OUT/weights.csv --to {rig} --animation TAKE.glb carries the weights over"
+            f"{rig}: found {what}, expected the 68 of iBUG: torchface rig {rig} --out NEW.glb finds them on a "
+            f"character's face, torchface pick takes them by hand; or track without --rig, and torchface retarget "
+            f"OUT/weights.csv --to {rig} --animation TAKE.glb carries the weights over"
         )
     return actor
 
