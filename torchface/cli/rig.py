@@ -72,8 +72,9 @@ def rig(
     command goes on where it was.
 
     Args:
-        scan: The actor at rest: any topology and pose, with holes, hair and collar; or several actors' scans, or
-            folders of them. Without a template a character's file.
+        scan: The actor at rest: any topology and pose, with holes, hair and collar; one that has the template's
+            triangles is taken as it is. Or several actors' scans, or folders of them. Without a template a character's
+            file.
         out: The .glb or USD file to write, or a name without an ending for a folder of OBJ files in the template's
             vertex order.
         template: A .glb or USD file with shapes, a folder of OBJ files, or ICT-FaceKit's FaceXModel folder. With

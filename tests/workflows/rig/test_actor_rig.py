@@ -18,8 +18,8 @@ from torchface.geometry.similarity import similarity_transform
 from torchface.io import load_detail_maps, load_rig, save_mesh, save_rig
 from torchface.io.landmarks.picks import Correspondences, save_correspondences
 from torchface.mesh import Mesh
-from torchface.modeling import MorphableModel
-from torchface.registration import hidden_parts, with_template_skin
+from torchface.modeling import MorphableModel, transfer_deformation
+from torchface.registration import hidden_parts, in_place_of, with_template_skin
 from torchface.rig import BlendshapeRig
 from torchface.synthetic.head.neutral_head import neutral_head
 from torchface.workflows.rig.actor_rig import RigOptions, rig_actor
@@ -182,6 +182,16 @@ def test_a_neutral_scanned_in_a_pose_is_brought_back_to_rest(actor: Actor, tmp_p
     left = rig_actor(*files)
     at_rest, as_scanned = (inner_error(one.rig, actor.true)[0] for one in (posed, left))
     assert at_rest < 0.5 * as_scanned
+
+
+def test_a_head_with_the_templates_triangles_is_not_registered(actor: Actor, tmp_path: Path) -> None:
+    save_mesh(actor.true.neutral, tmp_path / "head.obj")
+    report = rig_actor(tmp_path / "head.obj", actor.folder / "template.glb", tmp_path / "head.glb")
+    assert "taken as it is" in report.lines()[0]
+    made = load_rig(tmp_path / "head.glb")
+    truth = transfer_deformation(load_rig(actor.folder / "template.glb"), in_place_of(actor.true.neutral, made.neutral))
+    torch.testing.assert_close(made.vertices, truth.vertices, atol=1e-3, rtol=0)
+    torch.testing.assert_close(made.deltas, truth.deltas, atol=1e-2, rtol=0)
 
 
 def test_bad_examples_are_skipped_and_none_that_serves_ends_it(actor: Actor, tmp_path: Path) -> None:

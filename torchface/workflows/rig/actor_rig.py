@@ -1,6 +1,6 @@
 """From raw scans of an actor and a template rig on disk to the actor's own rig on disk."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import torch
@@ -18,6 +18,7 @@ from torchface.errors import (
 from torchface.files.job_lock import file_lock
 from torchface.files.whole_files import all_or_none, check_writable, make_folder
 from torchface.geometry.meshes.normal_maps import DetailMaps
+from torchface.geometry.similarity import similarity_transform
 from torchface.io import load_mesh, load_rig, save_rig
 from torchface.io.maya.maya_writing import MAYA_ENDING
 from torchface.io.rig_files import check_rig_ending
@@ -46,6 +47,7 @@ from torchface.modeling.rigging.part_placement import with_mouth_behind_skin
 from torchface.progress import Progress, silent
 from torchface.registration import Registration, hidden_parts, in_place_of, register, with_template_skin
 from torchface.registration.landmark_files import landmark_file, load_scan_landmarks
+from torchface.registration.nonrigid.registration_record import RegistrationRecord
 from torchface.registration.scan_colors import without_colors
 from torchface.rendering.compositing import save_rendered_image
 from torchface.rig import BlendshapeRig
@@ -110,6 +112,8 @@ class ActorReport:
         """For people to read."""
         record = self.neutral.record
         lines = [f"neutral: aligned with the scan by {record.start}; {record.figures()}"]
+        if not record.stages:
+            lines = [f"neutral: {record.start}"]
         lines += [f"  note: {note}" for note in record.notes]
         lines.append(f"  figure: {self.figure}")
         lines.append(f"rig: {len(self.rig.vertices)} vertices, {len(self.rig.names)} shapes transferred")
@@ -196,18 +200,20 @@ def _rig_actor(
     if model is not None and bool(shown.any()):
         raise ValueRangeError("model: found a pose beside a model of heads at rest, expected one of the two")
     registration = job.registered(job.posed(rig, shown), scan, landmarks, options.texture_size, model)
-    progress("looking at the eyes")
-    registration = with_eye_note(
-        rig,
-        job.read(scan),
-        registration,
-        shown,
-        lambda weights: job.registered(job.posed(rig, weights), scan, landmarks, 0),
-    )
+    as_it_is, parts = not registration.record.stages, inner_parts(rig)
+    if not as_it_is:
+        progress("looking at the eyes")
+        registration = with_eye_note(
+            rig,
+            job.read(scan),
+            registration,
+            shown,
+            lambda weights: job.registered(job.posed(rig, weights), scan, landmarks, 0),
+        )
     neutral = _at_rest(rig, shown, _upright(registration, rig.neutral))
-    parts = inner_parts(rig)
-    neutral = with_mouth_behind_skin(place_parts(rig, neutral, parts))
-    neutral = with_template_skin(neutral, rig.neutral, hidden_parts(rig.neutral, registration.matched))
+    if not as_it_is:  # whose teeth and eyes are where they belong
+        neutral = with_mouth_behind_skin(place_parts(rig, neutral, parts))
+        neutral = with_template_skin(neutral, rig.neutral, hidden_parts(rig.neutral, registration.matched))
     transferred = transfer_with_report(rig, neutral, progress=progress)
     actor: BlendshapeRig = transferred.rig
     predicted = None if regression is None else neutral_rig(regression, rig, neutral)
@@ -286,6 +292,8 @@ class _Actor:
         model: MorphableModel | HeadModel | None = None,
     ) -> Registration:
         options, read = self.options, self.read(scan)
+        if read.fingerprint() == mesh.fingerprint():
+            return _as_it_is(mesh, read)
         marks = None if landmarks is None else load_scan_landmarks(landmarks, mesh, scan, options.unit)
         detector = None
         if marks is None and options.detector is not None:
@@ -335,6 +343,17 @@ class _Actor:
         if fine and not maps:
             raise AlignmentError(f"detail: none of {len(fine)} scans could be used; {self.skipped[-1]}")
         return maps
+
+
+def _as_it_is(template: Mesh, head: Mesh) -> Registration:
+    """A head that has the template's triangles, as its registration."""
+    known = torch.ones(len(head.vertices), dtype=torch.bool)
+    pose = similarity_transform(template.vertices.double()[None], head.vertices.double()[None])
+    painted = template if head.texture is None else head
+    mesh = replace(head, annotations=template.annotations, uvs=painted.uvs, uv_faces=painted.uv_faces)
+    start = "taken as it is, for its triangles are the template's (no scan to register)"
+    record = RegistrationRecord(start, 0.0, (), (), 0.0, 1.0, 0.0, 0.0, 1.0, slid=0.0)
+    return Registration(mesh, pose, torch.zeros(len(head.vertices)).double(), known, record)
 
 
 def _upright(registration: Registration, template: Mesh) -> Mesh:
