@@ -350,7 +350,8 @@ def _as_it_is(template: Mesh, head: Mesh) -> Registration:
     known = torch.ones(len(head.vertices), dtype=torch.bool)
     pose = similarity_transform(template.vertices.double()[None], head.vertices.double()[None])
     painted = template if head.texture is None else head
-    mesh = replace(head, annotations=template.annotations, uvs=painted.uvs, uv_faces=painted.uv_faces)
+    mesh = replace(template, vertices=head.vertices, colors=head.colors, texture=head.texture)
+    mesh = replace(mesh, uvs=painted.uvs, uv_faces=painted.uv_faces)
     start = "taken as it is, for its triangles are the template's (no scan to register)"
     record = RegistrationRecord(start, 0.0, (), (), 0.0, 1.0, 0.0, 0.0, 1.0, slid=0.0)
     return Registration(mesh, pose, torch.zeros(len(head.vertices)).double(), known, record)
