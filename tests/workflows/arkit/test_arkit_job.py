@@ -157,6 +157,29 @@ def test_meshes_of_a_rigs_topology_become_the_planted_weights(
     assert load_take(tmp_path / "w.csv").fps == pytest.approx(20.0 if kind in ("anchors", "cache") else 30.0, rel=1e-2)
 
 
+def test_meshes_in_left_handed_axes_are_turned_round_and_said(
+    folder: Path, rig: BlendshapeRig, weights: torch.Tensor, tmp_path: Path
+) -> None:
+    meshes = rig(weights[:1])[0] * torch.tensor([-0.1, 0.1, 0.1])  # one frame, centimetres
+    np.savez(tmp_path / "unity.npz", vertices=meshes.numpy())
+    lines = animation_to_weights(folder / "rig.glb", tmp_path / "unity.npz", tmp_path / "w.csv", ALONE, silent)
+    assert float((solved(tmp_path / "w.csv", rig) - weights[:1]).abs().mean()) < 0.01
+    assert lines[0].startswith("unity.npz: mirrored, as by left-handed axes")
+    assert "centimetres" in lines[1]
+
+
+def test_another_animation_is_refused_with_what_is_wrong(folder: Path, rig: BlendshapeRig, tmp_path: Path) -> None:
+    np.savez(tmp_path / "other.npz", blend=np.zeros((3, 5)))
+    with pytest.raises(FileFormatError, match=r"other\.npz: found no vertices \(but blend\), expected .* exp"):
+        animation_to_weights(folder / "rig.glb", tmp_path / "other.npz", tmp_path / "w.csv", ALONE, silent)
+    save_mesh(Mesh(rig.vertices, rig.neutral.faces.flip(0)), tmp_path / "frame.obj")
+    with pytest.raises(FileFormatError, match=r"triangle 0 of vertices .* another order"):
+        animation_to_weights(folder / "rig.glb", tmp_path / "frame.obj", tmp_path / "w.csv", ALONE, silent)
+    (tmp_path / "hero.fbx").touch()
+    with pytest.raises(FileFormatError, match=r"torchface convert .*hero\.fbx .*hero\.glb reads it with Blender"):
+        arkit_head(tmp_path / "hero.fbx", tmp_path / "a.glb", None, None, False, None, silent)
+
+
 def test_frames_that_are_no_faces_of_the_head_are_named(
     folder: Path, rig: BlendshapeRig, weights: torch.Tensor, tmp_path: Path
 ) -> None:

@@ -132,8 +132,19 @@ class MeshSolver:
         found: Similarity = similarity_transform(mesh[None].double(), self.rest[None], steady)
         return float(1 / found.scale[0])
 
+    def is_mirrored(self, mesh: Tensor) -> bool:
+        """Whether a mesh (V,3) is the rig's mirror image, as one in left-handed axes is."""
+        steady = self._share[:, None]
+        own, other = (one.double() - (steady * one.double()).sum(0) for one in (self.rest, mesh))
+        return float(torch.linalg.det((steady * own).T @ other)) < 0
+
     def check_unit(self, mesh: Tensor) -> None:
-        """Raises ``ValueRangeError`` where a mesh (V,3) has not the rig's size, as one in another unit has."""
+        """Raises ``ValueRangeError`` where a mesh (V,3) has not the rig's size, as one in another unit has, or is
+        mirrored."""
+        if self.is_mirrored(mesh):
+            raise ValueRangeError(
+                "meshes: found the rig's mirror image, expected right-handed axes: turn one coordinate's sign"
+            )
         scale = self.scale_of(mesh)
         if not MIN_HEAD_SCALE <= scale <= MAX_HEAD_SCALE:
             raise ValueRangeError(

@@ -128,7 +128,7 @@ def animation_to_weights(
         rig = BlendshapeRig(rig.neutral.with_vertices(moving.person), rig.deltas, rig.names)
     solver = MeshSolver(rig)
     scale, note = _unit_factor(solver, moving.read(0, 1)[0], animation)
-    read = (lambda begin, end: moving.read(begin, end) * scale) if scale != 1 else moving.read
+    read = (lambda begin, end: moving.read(begin, end) * scale) if note else moving.read
     fps = settings.fps or moving.fps or _FPS
     solution = solver.solve(read, moving.count, fps, settings.temporal, progress)
     broken = _broken_frames(solution, animation)
@@ -205,16 +205,25 @@ def load_moving_head(path: Path, head: Source) -> MovingHead:
         key = arrays.first(_VERTICES)
         if key is not None and "faces" not in arrays:
             return _of_array(arrays, key, len(head.neutral.vertices))
+        if path.suffix.lower() != ".safetensors":
+            raise arrays.error("vertices", "those of frames, or expression parameters such as exp")
     own = head.neutral
     if path.suffix.lower() in USD_ENDINGS and (cache := read_usd_points(path, len(own.vertices))) is not None:
         points, times = cache
         fps = (len(times) - 1) / float(times[-1] - times[0])
         return MovingHead(len(points), lambda begin, end: points[begin:end], fps)
     animated = load_animated(path)
-    if len(animated.neutral.vertices) != len(own.vertices) or not torch.equal(animated.neutral.faces, own.faces):
+    found, wanted = ((len(mesh.vertices), len(mesh.faces)) for mesh in (animated.neutral, own))
+    if found != wanted:
         raise FileFormatError(
-            f"{path}: found meshes of {len(animated.neutral.vertices)} vertices and {len(animated.neutral.faces)} "
-            f"triangles, expected those of {head.path}, {len(own.vertices)} and {len(own.faces)}"
+            f"{path}: found meshes of {found[0]} vertices and {found[1]} triangles, expected those of {head.path}, "
+            f"{wanted[0]} and {wanted[1]}"
+        )
+    if not torch.equal(animated.neutral.faces, own.faces):
+        row = int((animated.neutral.faces != own.faces).any(1).nonzero()[0])
+        raise FileFormatError(
+            f"{path}: found triangle {row} of vertices {animated.neutral.faces[row].tolist()}, expected "
+            f"{own.faces[row].tolist()}, as in {head.path}: its vertices have another order, or its triangles do"
         )
     notes = (f"warning: {path.name}: {animated.missing}",) if animated.missing else ()
     return MovingHead(animated.count, animated.read, animated.fps, notes=notes)
@@ -241,7 +250,7 @@ def _by_parameters(path: Path, arrays: ArrayFile, head: Source) -> MovingHead:
 
 def _of_array(arrays: ArrayFile, key: str, vertices: int) -> MovingHead:
     shape = arrays.shape(key)
-    flat = len(shape) == 2 and shape[1] == 3 * vertices
+    flat = shape == (vertices, 3) or (len(shape) == 2 and shape[1] == 3 * vertices)
     if (not flat and (len(shape) != 3 or shape[1:] != (vertices, 3))) or not shape[0]:
         raise arrays.error(key, f"(T,{vertices},3) vertices of the head")
     meshes = arrays.numbers(key, *shape).reshape(-1, vertices, 3)
@@ -322,15 +331,19 @@ def _all_of_arkit(take: Take) -> Take:
     return replace(take, weights=Track(ARKIT, (take.weights.values[..., 0] @ matrix.T)[..., None]))
 
 
-def _unit_factor(solver: MeshSolver, first: Tensor, path: Path) -> tuple[float, list[str]]:
-    """Millimetres per unit of the meshes, by their size beside the rig; a note where it is not 1."""
-    scale = solver.scale_of(first)
-    for factor in _UNITS:
-        if 0.7 <= scale * factor <= 1.4:
-            note = f"{path.name}: taken to be in {_UNIT_NAMES[factor]}, by the head's size"
-            return factor, [] if factor == 1 else [note]
-    solver.check_unit(first)
-    return 1.0, []
+def _unit_factor(solver: MeshSolver, first: Tensor, path: Path) -> tuple[Tensor, list[str]]:
+    """What the meshes' coordinates (3,) are multiplied by to be right-handed millimetres; notes where that is not 1."""
+    factor, notes = torch.ones(3), list[str]()
+    if solver.is_mirrored(first):
+        factor = torch.tensor([1.0, 1.0, -1.0])
+        notes.append(f"{path.name}: mirrored, as by left-handed axes (Unity, Unreal); taken with z the other way")
+    scale = solver.scale_of(first * factor)
+    for unit in _UNITS:
+        if 0.7 <= scale * unit <= 1.4:
+            note = f"{path.name}: taken to be in {_UNIT_NAMES[unit]}, by the head's size"
+            return unit * factor, [*notes, *([] if unit == 1 else [note])]
+    solver.check_unit(first * factor)
+    return factor, notes
 
 
 def _broken_frames(solution: MeshSolution, path: Path) -> list[str]:

@@ -10,6 +10,7 @@ from torchface.errors import AlignmentError, FileFormatError, NoShapesError, Val
 from torchface.geometry.meshes.unit_check import check_unit, extent
 from torchface.geometry.similarity import Similarity, similarity_transform
 from torchface.io import load_mesh, load_rig
+from torchface.io.blender.blender_files import BLENDER_ENDINGS
 from torchface.io.head_models.head_model_file import HeadModelFile
 from torchface.io.head_models.head_model_files import HEAD_MODEL_ENDINGS, is_head_model_file, load_head_model_file
 from torchface.io.mesh_files import MESH_ENDINGS
@@ -86,7 +87,9 @@ def load_source(path: Path, unit: str | None = None) -> Source:
         return Source(path, load_mesh(path, unit), unit=unit)
     if path.is_file() and path.suffix.lower() not in SCENE_ENDINGS:
         known = ", ".join((*SCENE_ENDINGS, *MESH_ENDINGS, *HEAD_MODEL_ENDINGS))
-        raise FileFormatError(f"{path}: found {path.suffix!r}, expected {known}, or a folder of OBJ files")
+        how = path.suffix.lower() in BLENDER_ENDINGS
+        convert = f" (torchface convert {path} {path.with_suffix('.glb')} reads it with Blender)" if how else ""
+        raise FileFormatError(f"{path}: found {path.suffix!r}{convert}, expected {known}, or a folder of OBJ files")
     try:
         rig = load_rig(path, unit)
     except NoShapesError:
