@@ -13,10 +13,9 @@ def export_zoo(out: Path, names: tuple[str, ...] = ()) -> None:
 
     Args:
         out: The folder to write into.
-        names: Of the models; all but detectors of landmarks on scans, which have no graph, if absent.
+        names: Of the models; all if absent.
     """
-    with_graph = [name for name in zoo.list_models() if zoo.describe(name).kind != "uv_landmarks"]
-    for name in names or with_graph:
+    for name in names or zoo.list_models():
         export_model(name, out / f"{name}.onnx")
 
 

@@ -17,6 +17,7 @@ from torchface.optim import BoxQP
 from torchface.rig import BlendshapeRig
 from torchface.synthetic import performer
 from torchface.synthetic.stages.marker_stage import place_markers
+from torchface.temporal.adaptive_kalman import LANDMARK_SETTINGS, AdaptiveFilter, adaptive_smoother
 
 pytestmark = pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU that torch sees")
 
@@ -104,7 +105,7 @@ def test_the_video_solver_with_priors(rig: BlendshapeRig) -> None:
     assert_same_on_both(solver, (landmarks,), 1e-3, solve_whole_take)
 
 
-def test_head_poses(rig: BlendshapeRig) -> None:
+def test_head_poses_and_filters(rig: BlendshapeRig) -> None:
     landmarks, intrinsics = portraits(rig)
     points = rig.vertices[rig.neutral.landmarks].double()
     here = tensors_of(measure_poses(points, landmarks, intrinsics))
@@ -115,6 +116,12 @@ def test_head_poses(rig: BlendshapeRig) -> None:
     wanted = tensors_of(robust_pnp(points[17:48], landmarks[:, 17:48], intrinsics))
     for a, b in zip(wanted, found, strict=True):
         torch.testing.assert_close(b.cpu().double(), a.double(), rtol=1e-4, atol=1e-4)
+    smooth = adaptive_smoother(landmarks.cuda())
+    torch.testing.assert_close(smooth.cpu(), adaptive_smoother(landmarks), rtol=1e-6, atol=1e-6)
+    calm, calmed = (AdaptiveFilter(68, 2, LANDMARK_SETTINGS) for _ in range(2))
+    for frame in landmarks:  # filters go frame by frame
+        a, b = calm.step(frame), calmed.step(frame.cuda())
+        torch.testing.assert_close(b.cpu(), a, rtol=1e-6, atol=1e-6)
 
 
 def test_models_lie_where_they_were_asked_for() -> None:

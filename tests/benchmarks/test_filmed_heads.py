@@ -18,7 +18,7 @@ from torchface.rig import BlendshapeRig
 from torchface.workflows.surface_sites import sites_on_rig
 from torchface.workflows.track.frame_readings import read_frames
 from torchface.workflows.track.person_head import person_head
-from torchface.workflows.track.take_solution import undistorted_landmarks
+from torchface.workflows.track.take_solution import smoothed_landmarks
 from torchface.workflows.track.track_inputs import TrackSettings, load_inputs
 from torchface.workflows.track.track_state import TrackState
 from train.expression_films import Settings, render
@@ -41,7 +41,7 @@ def test_heads_of_films(data: Path) -> None:
         assert inputs.heads is not None
         with TemporaryDirectory() as folder:
             reading, _ = read_frames(inputs, TrackState(Path(folder), inputs.reading_key), silent)
-        marks = undistorted_landmarks(inputs, reading)
+        marks = smoothed_landmarks(inputs, reading, None)
         bare = replace(inputs, models=replace(inputs.models, places=torch.zeros(0, 3)))
         unread = replace(reading, expression=torch.full_like(reading.expression, torch.nan))
         heads = [

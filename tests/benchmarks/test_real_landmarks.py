@@ -23,6 +23,7 @@ from torchface.io import load_rig
 from torchface.io.rigs.ict_facekit import load_identity_modes
 from torchface.modeling import FitSettings, HeadModel, MorphableModel, fit_images
 from torchface.rig import BlendshapeRig
+from torchface.temporal.adaptive_kalman import LANDMARK_SETTINGS, adaptive_filter
 from torchface.workflows.named_priors import load_priors
 
 pytestmark = [pytest.mark.real, pytest.mark.bench]
@@ -70,7 +71,7 @@ def projected(solver: VideoSolver, solution: VideoSolution) -> Tensor:
     return image[..., :2] / image[..., 2:]
 
 
-def measured(solver: VideoSolver, landmarks: Tensor) -> Row:
+def measured(solver: VideoSolver, landmarks: Tensor, raw: Tensor) -> Row:
     begun = time.process_time()
     with torch.no_grad():
         solution = solver(landmarks)
@@ -79,7 +80,7 @@ def measured(solver: VideoSolver, landmarks: Tensor) -> Row:
     apart = (landmarks[:, 36] - landmarks[:, 45]).norm(dim=1)[:, None, None]
     off = (seen - landmarks) / apart
     left = (off - off.mean(0)) * apart
-    reference, found = opening(landmarks), opening(seen)
+    reference, found = opening(raw), opening(seen)
     centred = reference - reference.mean()
     shut = reference < 0.5 * reference.median()
     blinks = [i for i, name in enumerate(solver.names) if name.startswith("eyeBlink")]
@@ -119,9 +120,10 @@ def test_real_landmarks(data: Path, ict_folder: Path) -> None:
     print(f"{'lids':>7s}{'blink':>7s}{'ms':>7s}")
     totals: dict[str, list[Row]] = {}
     for clip, (width, height, fps) in CLIPS.items():
-        landmarks = torch.from_numpy(references[clip]).double()
+        raw = torch.from_numpy(references[clip]).double()
+        landmarks = adaptive_filter(raw, LANDMARK_SETTINGS)
         calibration = assumed_calibration(width, height)
-        for head, actor in (("mean", rig), ("fitted", fitted(rig, modes, landmarks, (width, height)))):
+        for head, actor in (("mean", rig), ("fitted", fitted(rig, modes, raw, (width, height)))):
             apart = VideoSettings(pixel_noise=0.5, relative_noise=0.025, steps=5)
             walking = VideoSettings.of_found_landmarks(fps=fps)
             remembering = VideoSettings.of_found_landmarks(True, fps=fps)
@@ -138,7 +140,7 @@ def test_real_landmarks(data: Path, ict_folder: Path) -> None:
                 assert offsets.millimetres.shape == (LANDMARKS, 3)
                 ways["track" if way[0] == "t" else "track with dynamics"] = ways[way].shifted(offsets)
             for way, one in ways.items():
-                row = measured(one, landmarks)
+                row = measured(one, landmarks, raw)
                 totals.setdefault(way, []).append(row)
                 print(f"{clip:16s}{head:6s}{way:24s}{row.jumps:11d} of {row.frames:3d}{row.error:7.2f}", end="")
                 print(

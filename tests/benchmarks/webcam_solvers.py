@@ -32,6 +32,7 @@ from torchface.landmarks.images.face_reading import READ_FOR_SOLVER, FaceReading
 from torchface.landmarks.images.frame_reader.face_reader import STATE, FaceReader
 from torchface.shape_names import ARKIT, mapping
 from torchface.synthetic import performer
+from torchface.temporal.adaptive_kalman import LANDMARK_SETTINGS, AdaptiveFilter
 from torchface.workflows.track.track_inputs import solver_for
 from torchface.workflows.track.track_models import load_track_models
 from torchface.workflows.webcam.webcam_graph import default_webcam_solver, webcam_networks
@@ -80,12 +81,13 @@ def video_solver(readings: list[FaceReading], fps: float, size: tuple[int, int])
     """``VideoSolver`` on the embedded performer's mean head, frame by frame."""
     rig = performer(texture=False)
     solver = solver_for(rig, load_track_models(rig, fps=fps), assumed_calibration(*size))
+    smoother = AdaptiveFilter(68, 2, LANDMARK_SETTINGS)
     state: VideoState | None = None
 
     def step(reading: FaceReading) -> Tensor:
         nonlocal state
         sure = reading.trust.nan_to_num(0.0)
-        landmarks = reading.trusted_landmarks.float()
+        landmarks = smoother.step(reading.trusted_landmarks).float()
         if state is None and int((torch.isfinite(landmarks).all(1) & (sure > 0)).sum()) < _LEAST:
             return torch.zeros(len(rig.names))
         state = solver.step(state or solver.start(), landmarks, confidence=sure, interval=1 / fps)

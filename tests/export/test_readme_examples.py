@@ -17,7 +17,8 @@ from torchface.capture import MarkerSolver
 from torchface.capture.own_rig import VideoSolver
 from torchface.enhancement.wrinkle_maps.wrinkle_weights import RigWrinkles, WrinkleWeights
 from torchface.geometry.cameras.calibration import assumed_calibration
-from torchface.landmarks import LandmarkTrees, TreeSettings
+from torchface.landmarks import DetectorSettings, LandmarkTrees, TreeSettings, UVLandmarkDetector
+from torchface.landmarks.scans.hog import HogLayout
 from torchface.modeling import ExpressionRegression, HeadModel, MorphableModel
 from torchface.onnx import export_model, export_video_solver, export_wrinkle_weights
 from torchface.onnx.video_graph_export import synthetic_landmarks
@@ -27,6 +28,7 @@ from train.rendered_people.webcam_video import talking_subject
 
 EXPORT = Path(__file__).resolve().parents[2] / "export"
 WEB = EXPORT / "web"
+SIZE = 64
 
 
 def noise(*shape: int, seed: int = 0) -> Tensor:
@@ -53,6 +55,10 @@ def folder(dome_rig: BlendshapeRig, tmp_path_factory: pytest.TempPathFactory) ->
     offsets = dome_rig.deltas * (1 + 0.3 * noise(6, 4, 1, 1))
     regression = ExpressionRegression.fit(people, people[:, None] + offsets, names=dome_rig.names)
     solver = MarkerSolver(dome_rig, Attachment.from_vertices(dome_rig.neutral, range(0, 600, 9)))
+    images = torch.rand(3, 1, SIZE, SIZE, generator=torch.Generator().manual_seed(1))
+    places = torch.tensor([[20.0, 20.0], [40.0, 44.0]]) + noise(3, 2, 2)
+    settings = DetectorSettings(hog=HogLayout(stride=4), responses=50)
+    detector = UVLandmarkDetector.fit(images, places, ("left", "right"), "curvature", settings)
     coarse = torch.rand(1, 1, 12, 20)
     picture = (255 * torch.nn.functional.interpolate(coarse, (360, 640), mode="bilinear")[0, 0]).byte()
     box = torch.tensor([[220.0, 90, 180, 180]])
@@ -60,7 +66,7 @@ def folder(dome_rig: BlendshapeRig, tmp_path_factory: pytest.TempPathFactory) ->
     trees = LandmarkTrees.fit([picture], box, 220 + 100 * torch.rand(1, 68, 2), few)
     (path / "picture.gray").write_bytes(picture.numpy().tobytes())
     np.save(path / "picture.npy", picture.numpy())
-    models = {"head": head, "expressions": regression, "face_landmarks": trees}
+    models = {"head": head, "expressions": regression, "uv_landmarks": detector, "face_landmarks": trees}
     for name, model in {**models, "solver": solver}.items():
         export_model(model, path / f"{name}.onnx")
     markers = solver.rest + solver.basis[..., 0] * torch.linspace(0, 1, 5)[:, None, None]
@@ -75,7 +81,7 @@ def folder(dome_rig: BlendshapeRig, tmp_path_factory: pytest.TempPathFactory) ->
     export_wrinkle_weights(RigWrinkles(wrinkles, person), poses, path / "map_weights.onnx")
     film(path)
     marks = synthetic_landmarks(VideoSolver(person, None, camera.intrinsics), 5)[1]
-    inputs = {"neutral": people[0], "markers": markers, "landmarks": marks}
+    inputs = {"neutral": people[0], "image": images[0], "markers": markers, "landmarks": marks}
     for name, values in inputs.items():
         array = values.numpy().astype(np.float32)
         np.save(path / f"{name}.npy", array)
@@ -124,6 +130,7 @@ def node() -> str:
 RESULTS = {
     "A head from coefficients": "vertices",
     "A rig from a neutral face": "offsets",
+    "Landmarks of an unwrapped head": "pixels",
     "Landmarks of faces in a picture": "landmarks",
     "Weights from markers": "previous",
     "Weights from landmarks in a video": "weights",

@@ -287,9 +287,9 @@ def export_model(name: str, /, out: OutputPath, quiet: Quiet = False) -> None:
     """Write a model of the zoo, or of a folder, as an ONNX file, and check it against PyTorch.
 
     A head model gives the decoder (coefficients to vertices and colours), an expression regression the offsets of a
-    neutral face, face landmarks the trees (grey image and boxes to 68 points), face boxes the network (colour image to
-    boxes and roll angles), a marker solver the solve, a dynamics prior mean and deviation of the next frame's weights.
-    Names, units, licence, data and what was measured are in the file's metadata.
+    neutral face, UV landmarks the bank of filters, face landmarks the trees (grey image and boxes to 68 points),
+    face boxes the network (colour image to boxes and roll angles), a marker solver the solve, a dynamics prior mean and
+    deviation of the next frame's weights. Names, units, licence, data and what was measured are in the file's metadata.
 
     Args:
         name: Of the model, or its folder.

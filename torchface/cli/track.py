@@ -90,8 +90,7 @@ def track(
         anybody: The rig is not the actor's: a head is solved with its shapes, and the head model's topology.
         head_model: Which head model a head is solved with, by name or folder; if absent one of people in
             $TORCHFACE_HOME or the checkout, else `head`, of performers made by code.
-        whole_take: With --dynamics solve each frame from all frames, those after too; without, a frame without a face
-            comes from those beside it.
+        whole_take: Smooth landmarks over all frames, those after each too; with --dynamics the weights as well.
         overlay: overlay.mp4: the rig, in its texture or clay, beside the picture, parts of low confidence tinted; half
             through over it; or none.
         fps: Frames a second of a .csv of landmarks without VIDEO; by its times if absent.

@@ -9,7 +9,7 @@ from torchface.capture import ActionUnitClassifier, ExampleSolver, MarkerSolver
 from torchface.capture.own_rig import VideoSolver
 from torchface.capture.priors import DynamicsPrior, ShapePrior
 from torchface.errors import ValueRangeError
-from torchface.landmarks import BoxNetwork, LandmarkNetwork, LandmarkTrees
+from torchface.landmarks import BoxNetwork, LandmarkNetwork, LandmarkTrees, UVLandmarkDetector
 from torchface.landmarks.images.networks.eye_network import EyeNetwork
 from torchface.landmarks.images.networks.part_network import PartNetwork
 from torchface.modeling import ExpressionRegression, HeadModel
@@ -23,12 +23,14 @@ from torchface.onnx.landmark_trees_graph import export_landmark_trees
 from torchface.onnx.module_graph import export_module, export_shape_prior
 from torchface.onnx.network_graphs import export_network
 from torchface.onnx.solver_graph_export import SolverReport, export_marker_solver
+from torchface.onnx.uv_landmark_graph import export_landmark_bank
 from torchface.onnx.video_graph_export import VideoReport, write_video_solver
 
 _Report = ExportReport | SolverReport | VideoReport | ExampleReport | ActionUnitReport
 _EXPORTS: dict[type[nn.Module], Callable[..., _Report]] = {
     HeadModel: export_head_decoder,
     ExpressionRegression: export_expression_regression,
+    UVLandmarkDetector: export_landmark_bank,
     LandmarkNetwork: export_network,
     EyeNetwork: export_network,
     PartNetwork: export_network,

@@ -27,6 +27,7 @@ from torchface.onnx.unrolled_operators import TRANSLATIONS
 from torchface.onnx.video_graph import LANDMARKS, VideoGraph
 from torchface.rig import BlendshapeRig
 from torchface.take import Track
+from torchface.temporal.adaptive_kalman import LANDMARK_SETTINGS, adaptive_filter
 
 FRAMES = 100
 _MAX_FRAMES = 300  # of a video that it is checked with
@@ -140,7 +141,7 @@ def check_frames(video: Track, camera: CameraCalibration) -> CheckFrames:
     """The first frames of a video from where a face is seen, as ``torchface track`` solves them."""
     if video.values.shape[1:] != (LANDMARKS, 2):
         raise ShapeError(f"video: found landmarks {tuple(video.values.shape)}, expected (T,{LANDMARKS},2)")
-    landmarks = undistort(video.values.double(), camera).float()
+    landmarks = adaptive_filter(undistort(video.values.double(), camera), LANDMARK_SETTINGS).float()
     shown = (torch.isfinite(landmarks).all(2).sum(1) >= _MIN_LANDMARKS).nonzero()[:, 0]
     if not len(shown):
         raise ValueRangeError(f"video: found no face in {len(landmarks)} frames, expected one to check the graph with")

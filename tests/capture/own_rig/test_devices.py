@@ -23,6 +23,14 @@ from torchface.geometry.cameras.robust_pnp import robust_pnp
 from torchface.geometry.rotations import rotation_matrix
 from torchface.onnx.video_graph_export import synthetic_landmarks
 from torchface.synthetic import performer
+from torchface.temporal import (
+    AdaptiveFilter,
+    KalmanFilter,
+    KalmanSettings,
+    adaptive_filter,
+    adaptive_smoother,
+    kalman_smoother,
+)
 
 K = torch.tensor([[700.0, 0, 319.5], [0, 700.0, 239.5], [0, 0, 1]], dtype=torch.float64)
 
@@ -114,6 +122,26 @@ def test_robust_pnp(seen: tuple[Tensor, Tensor], device: str) -> None:
 
 def test_head_poses(seen: tuple[Tensor, Tensor], device: str) -> None:
     check(lambda *given: list(vars(measure_poses(*given)).values()), device, *seen, K)
+
+
+def test_filters_along_time(seen: tuple[Tensor, Tensor], device: str) -> None:
+    landmarks = seen[1][:, 25:33]
+    settings = KalmanSettings(0.5, 0.1)
+    for filtered in (adaptive_filter, adaptive_smoother):
+        check(filtered, device, landmarks)
+    check(lambda x: kalman_smoother(x, settings), device, landmarks)
+
+
+def test_running_filters_follow_what_they_are_given(seen: tuple[Tensor, Tensor], device: str) -> None:
+    """A filter that began on the CPU goes on elsewhere."""
+    frames = seen[1]
+    for make in (lambda: AdaptiveFilter(68, 2), lambda: KalmanFilter(68, KalmanSettings(0.5, 0.1))):
+        some = (lambda x: x) if isinstance(make(), AdaptiveFilter) else (lambda x: x[:, 0])
+        ours, other = make(), make()
+        for t, frame in enumerate(frames):
+            expected = ours.step(some(frame))
+            found = other.step(some(frame.to(device) if t > 1 else frame))
+            torch.testing.assert_close(found.cpu(), expected, equal_nan=True, rtol=1e-9, atol=1e-9)
 
 
 def test_landmarks_of_a_lens_that_bends(seen: tuple[Tensor, Tensor], device: str) -> None:

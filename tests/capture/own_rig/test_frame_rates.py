@@ -11,6 +11,7 @@ from torchface.errors import ValueRangeError
 from torchface.geometry.rotations import rotation_matrix
 from torchface.rig import BlendshapeRig
 from torchface.synthetic import performer
+from torchface.temporal.adaptive_kalman import LANDMARK_SETTINGS, adaptive_filter
 from torchface.temporal.interpolation import values_at
 
 K = torch.tensor([[700.0, 0, 319.5], [0, 700.0, 239.5], [0, 0, 1]], dtype=torch.float64)
@@ -39,10 +40,12 @@ def filmed(rig: BlendshapeRig, seconds: Tensor) -> Tensor:
 
 
 def solved(rig: BlendshapeRig, seconds: Tensor) -> Tensor:
-    """Weights as a video whose frames are shown then gives them."""
+    """Weights as a video whose frames are shown then gives them, filtered live."""
     fps = float((len(seconds) - 1) / seconds[-1])
+    intervals = [fps * step for step in frame_intervals(seconds, len(seconds), 1 / fps)]
+    landmarks = adaptive_filter(filmed(rig, seconds), LANDMARK_SETTINGS, intervals)
     solver = VideoSolver(rig, None, K, settings=VideoSettings.of_found_landmarks(fps=fps))
-    return solver(filmed(rig, seconds), seconds=seconds).weights.double()
+    return solver(landmarks, seconds=seconds).weights.double()
 
 
 @pytest.fixture(scope="module")

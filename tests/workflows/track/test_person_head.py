@@ -35,7 +35,7 @@ def actor() -> BlendshapeRig:
 
 @pytest.fixture(scope="module")
 def take(actor: BlendshapeRig, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Tensor]:
-    """A table of the actor's landmarks, with 0.1 pixels of noise, as head and face move, and the weights."""
+    """A table of the actor's landmarks as the head rotates and the face moves, and the weights."""
     phase = torch.linspace(0, 2 * torch.pi, COUNT)
     weights = torch.zeros(COUNT, len(actor.names))
     weights[:, actor.names.index("jawOpen")] = 0.3 - 0.3 * (2 * phase).cos()
@@ -49,9 +49,8 @@ def take(actor: BlendshapeRig, tmp_path_factory: pytest.TempPathFactory) -> tupl
         seen = points @ camera.rotation.T + camera.translation
         pixels.append(seen[:, :2] / seen[:, 2:] * intrinsics.diagonal()[:2] + intrinsics[:2, 2])
     folder = tmp_path_factory.mktemp("take")
-    names, found = tuple(str(i) for i in range(68)), torch.stack(pixels).float()
-    found += 0.1 * torch.randn(found.shape, generator=torch.Generator().manual_seed(0))
-    save_landmarks_csv(Take(25.0, landmarks=Track(names, found)), folder / "take.csv")
+    names = tuple(str(i) for i in range(68))
+    save_landmarks_csv(Take(25.0, landmarks=Track(names, torch.stack(pixels).float())), folder / "take.csv")
     return folder / "take.csv", weights
 
 

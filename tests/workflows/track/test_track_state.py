@@ -37,12 +37,13 @@ def test_what_is_up_to_date_is_kept(done: Done, filmed: Filmed, tmp_path: Path) 
     made = {path: path.stat().st_mtime_ns for path in (out / "overlay.mp4", out / FOLDER / "solution.safetensors")}
     again = track_video(filmed.video, filmed.rig, out, TrackSettings(camera=filmed.camera))
     assert {path: path.stat().st_mtime_ns for path in made} == made
-    assert set(again.seconds) == {"checks"}
+    assert set(again.seconds) == {"smoothing"}
     torch.testing.assert_close(again.solution.weights, done.tracked.solution.weights)
     smooth = track_video(
         filmed.video, filmed.rig, out, TrackSettings(camera=filmed.camera, overlay="none", whole_take=True)
     )
-    assert set(smooth.seconds) == {"checks", "weights"}  # landmarks stay
+    assert set(smooth.seconds) == {"smoothing", "weights"}  # landmarks stay
+    assert not torch.equal(smooth.solution.weights, again.solution.weights)
 
 
 def assert_same_file(path: Path, other: Path) -> None:
@@ -84,7 +85,7 @@ def test_damaged_files_are_told_and_made_anew(
     with pytest.warns(UserWarning, match="overlay.mp4: found other content than was written"):
         again = track_video(filmed.video, filmed.rig, out, settings)
     assert again.reused == FRAMES
-    assert set(again.seconds) == {"checks", "overlay"}
+    assert set(again.seconds) == {"smoothing", "overlay"}
     assert {path.relative_to(out) for path in out.rglob("*") if path.is_file()} == names
     for name in names - {Path("summary.json"), Path(FOLDER) / "track.json"}:  # these hold times and hashes of files
         if name.suffix == ".safetensors":  # whose header names things in any order

@@ -19,7 +19,7 @@ from torchface.progress import Progress
 from torchface.temporal.interpolation import values_at
 from torchface.workflows.track.frame_readings import read_frames
 from torchface.workflows.track.take_measurements import take_measurements
-from torchface.workflows.track.take_solution import frame_times, judged_reading, undistorted_landmarks
+from torchface.workflows.track.take_solution import frame_times, judged_reading, smoothed_landmarks
 from torchface.workflows.track.track_inputs import METHOD, TrackInputs, inputs_of, with_times
 from torchface.workflows.track.track_state import TrackState
 
@@ -52,7 +52,7 @@ class OtherCamera:
         reading, _ = read_frames(inputs, state, lambda what, *count: progress(f"{name}: {what}", *count))
         own = frame_times(inputs, len(reading.landmarks))
         reading = judged_reading(inputs, reading, state.looks() if inputs.models.finder is not None else None).reading
-        landmarks = undistorted_landmarks(inputs, reading).double()
+        landmarks = smoothed_landmarks(inputs, reading, own).double()
         shown = torch.arange(len(landmarks)) / inputs.clip.fps if own is None else own
         shown = shown.double() + self.begin
         near = (times >= shown[0] - 0.5 / inputs.clip.fps) & (times <= shown[-1] + 0.5 / inputs.clip.fps)

@@ -53,7 +53,7 @@ def person_head(
 
     Args:
         inputs: whose actor is the rig of the model's mean head.
-        landmarks: (T,68,2) pixels of a camera without distortion.
+        landmarks: smoothed, (T,68,2) pixels of a camera without distortion.
         reading: of the frames, (T,...): how far each landmark is trusted.
     """
     progress("solving the head")

@@ -1,4 +1,4 @@
-"""From readings of all frames to weights: landmarks, fixed offsets of the rig's landmarks, the solve."""
+"""From readings of all frames to weights: smoothed landmarks, fixed offsets of the rig's landmarks, the solve."""
 
 import warnings
 from collections.abc import Sequence
@@ -20,6 +20,7 @@ from torchface.capture.own_rig.outlier_landmarks import landmark_reach, landmark
 from torchface.capture.own_rig.resting_frames import activity_of_readings, resting_share
 from torchface.capture.own_rig.take_eyes import TakeEyes, take_eyes
 from torchface.capture.own_rig.take_solve import solve_take
+from torchface.capture.own_rig.weight_walk import frame_intervals
 from torchface.capture.weight_readings import WeightReadings
 from torchface.errors import AlignmentError, FileFormatError, ValueRangeError
 from torchface.files.checkpoints import read_checkpoint, write_checkpoint
@@ -32,6 +33,7 @@ from torchface.progress import Progress
 from torchface.rig import BlendshapeRig
 from torchface.shape_names import ARKIT
 from torchface.temporal import savitzky_golay
+from torchface.temporal.adaptive_kalman import LANDMARK_SETTINGS, adaptive_filter, adaptive_smoother
 from torchface.workflows.track.track_inputs import METHOD, TrackInputs
 from torchface.workflows.track.track_models import identity_modes
 from torchface.workflows.track.track_state import TrackState
@@ -79,9 +81,13 @@ def judged_reading(inputs: TrackInputs, reading: FaceReading, looks: Tensor | No
     return JudgedReading(reading, outliers, others)
 
 
-def undistorted_landmarks(inputs: TrackInputs, reading: FaceReading) -> Tensor:
-    """The landmarks (T,68,2) as a camera without distortion has them."""
-    return undistort(reading.trusted_landmarks.double(), inputs.calibration).float()
+def smoothed_landmarks(inputs: TrackInputs, reading: FaceReading, times: Tensor | None) -> Tensor:
+    """The landmarks (T,68,2) as a camera without distortion has them, filtered along time."""
+    fps, count = inputs.clip.fps, len(reading.landmarks)
+    intervals = None if times is None else [fps * step for step in frame_intervals(times, count, 1 / fps)]
+    smooth = adaptive_smoother if inputs.settings.whole_take else adaptive_filter
+    landmarks = undistort(reading.trusted_landmarks.double(), inputs.calibration)
+    return smooth(landmarks, LANDMARK_SETTINGS, intervals).float()
 
 
 def known_offsets(inputs: TrackInputs, out: Path) -> LandmarkOffsets | None:
@@ -107,7 +113,7 @@ def offsets_of(path: Path, inputs: TrackInputs) -> LandmarkOffsets:
 def new_offsets(
     inputs: TrackInputs, solver: VideoSolver, landmarks: Tensor, reading: FaceReading
 ) -> LandmarkOffsets | None:
-    """The offsets of a take's landmarks (T,68,2) and their reading (T,...); None where it is too short."""
+    """The offsets of a take's smoothed landmarks (T,68,2) and their reading (T,...); None where it is too short."""
     read = None
     if inputs.models.expects and bool(torch.isfinite(reading.expression_deviation).any()):
         read = WeightReadings.of_expression(reading.expression, reading.expression_deviation, solver.names)
@@ -132,7 +138,7 @@ def known_rest(reading: FaceReading) -> Tensor | None:
 
 
 def seen_eyes(inputs: TrackInputs, solver: VideoSolver, landmarks: Tensor, reading: FaceReading) -> TakeEyes | None:
-    """What a take shows of the eyes, with landmarks (T,68,2); None where nobody looked at them."""
+    """What a take shows of the eyes, with landmarks (T,68,2) smoothed; None where nobody looked at them."""
     if not bool(torch.isfinite(reading.openness).any()):
         return None
     K, rest = inputs.calibration.intrinsics.double(), solver.rest[:LANDMARKS].double()
@@ -229,7 +235,7 @@ def new_solution(
     progress: Progress,
     measured: FaceMeasurements | None = None,
 ) -> VideoSolution:
-    """Weights and poses of landmarks (T,68,2), trusted (T,68)."""
+    """Weights and poses of smoothed landmarks (T,68,2), trusted (T,68)."""
     try:
         solution = solve_take(solver, landmarks, trust, times, inputs.settings.whole_take, progress, measured)
     except ValueRangeError as error:

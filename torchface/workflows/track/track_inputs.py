@@ -24,7 +24,7 @@ from torchface.workflows.named_priors import DEFAULT_PRIOR
 from torchface.workflows.track.track_models import DEFAULT_LANDMARKS, TrackModels, is_table, load_track_models
 from torchface.workflows.track.upright_rig import upright
 
-METHOD = "track/10"
+METHOD = "track/9"
 """Of the keys; another number where the same inputs, or pieces of another length, come to give other results."""
 
 Overlay = Literal["side", "over", "none"]
@@ -46,8 +46,7 @@ class TrackSettings:
     dynamics: str | Path | None = None
     camera: Path | None = None  # a calibration; a focal length is assumed without
     face: int = 0  # which of several, from 0, the largest first
-    # each frame solved from all frames where there is a dynamics prior; without one, frames without a face come from
-    # those beside them
+    # landmarks smoothed by all frames, those after each too; weights as well where there is a dynamics prior
     whole_take: bool = False
     part: str | None = None  # keep this region of the rig only
     overlay: Overlay = "side"  # the rig in a video beside the picture, half through over it, or no video

@@ -43,8 +43,8 @@ from torchface.workflows.track.take_solution import (
     new_offsets,
     new_solution,
     seen_eyes,
+    smoothed_landmarks,
     solution_key,
-    undistorted_landmarks,
     warn_of_offsets,
     with_eyes,
 )
@@ -91,10 +91,10 @@ def _track(inputs: TrackInputs, others: list[OtherCamera], out: Path, filmed: bo
     if state.done == reused:
         seconds.clear()
     times = frame_times(inputs, len(reading.landmarks))
-    with _timed(seconds, "checks"):
+    with _timed(seconds, "smoothing"):
         judged = judged_reading(inputs, reading, None if inputs.models.finder is None else state.looks())
         reading = with_own_brows(judged.reading)
-        landmarks = undistorted_landmarks(inputs, reading)
+        landmarks = smoothed_landmarks(inputs, reading, times)
     head = None
     if inputs.heads is not None:
         with _timed(seconds, "head"):
