@@ -114,6 +114,7 @@ def rig(
 
     if template is None and neutral is None and scan:
         of_scans = {"--landmarks": landmarks, "--examples": examples, "--detail": detail, "--expressions": expressions}
+        of_scans |= {"--pose": pose or None, "--part": part, "--unit": unit, "--detector": detector, "--model": model}
         _rig_character(
             scan, out, (inner_mouth, eyes), [flag for flag, value in of_scans.items() if value is not None], quiet
         )

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from torchface.geometry.cameras.pinhole import Camera
-from torchface.geometry.meshes.operators import vertex_normals
+from torchface.geometry.meshes.operators import components, vertex_normals
 from torchface.geometry.meshes.rasterization import DrawnPixels, rasterise
 from torchface.mesh import Mesh
 from torchface.rendering.clay_shading import vertex_openness
@@ -42,9 +42,10 @@ class QuickClay:
     def of(mesh: Mesh, skin: bool = False) -> "QuickClay":
         """A mesh at rest, prepared, its eyes along z; with its texture in place of clay if asked for."""
         faces, drawn = mesh.faces.cpu(), ~clear_triangles(mesh)
-        colors = triangle_colors(mesh)
+        colors, paint = triangle_colors(mesh), _paint(mesh, drawn) if skin else None
+        painted = paint is not None
         for name, mask in ({} if mesh.annotations is None else mesh.annotations.regions).items():
-            if name in {"upper_lip", "lower_lip"}:
+            if name in {"upper_lip", "lower_lip"} and not painted:  # a texture shows them
                 colors[mask.cpu()[faces].all(1)] = torch.tensor(_LIPS)
         clay = torch.tensor([CLAY])
         part = (colors != clay).any(1).long()
@@ -52,11 +53,12 @@ class QuickClay:
         part[part > 0] += row
         palette = 255 * torch.cat([clay, others]).double().numpy()
         openness = vertex_openness(Mesh(mesh.vertices, mesh.faces[drawn.to(mesh.faces.device)]))
-        lit = faces[drawn & (part > 0)].unique()  # a closed mouth at rest would leave its teeth dark when it opens
+        # A closed mouth at rest would leave its teeth dark when it opens; some are parts without a name.
+        loose = components(faces, len(mesh.vertices))
+        inside = (part > 0) | (loose != loose[faces.flatten()].mode().values)[faces[:, 0]]
+        lit = faces[drawn & inside].unique()
         openness[lit] = openness[lit].clamp(min=_LEAST_OPEN)
-        return QuickClay(
-            faces[drawn], part[drawn], openness, _lit_colors(palette), _paint(mesh, drawn) if skin else None
-        )
+        return QuickClay(faces[drawn], part[drawn], openness, _lit_colors(palette), paint)
 
     def draw(self, vertices: Tensor, camera: Camera, tint: Tensor | None = None) -> np.ndarray:
         """The mesh before a dark ground, (H,W,3) uint8.

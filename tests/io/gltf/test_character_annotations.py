@@ -31,7 +31,7 @@ def annotated(tmp_path: Path) -> Path:
     eye = torch.zeros(len(rows), dtype=torch.bool)
     eye[: len(person.vertices)] = person.neutral.annotations.regions["eyeball_left"]
     root = read_document(tmp_path / "bare.glb").root
-    annotate_character(root, character, rows, Annotations(marks, {"eyeball_left": eye}))
+    annotate_character(root, character, rows, Annotations(marks, {"eyeball_left": eye, "mouth_interior": eye}))
     write_edited(character.document, root, b"", tmp_path / "a.glb")
     np.savez(tmp_path / "truth.npz", marks=character.vertices[marks], eye=character.vertices[eye])
     return tmp_path / "a.glb"
@@ -43,6 +43,7 @@ def test_landmarks_and_regions_come_back_from_all_meshes(annotated: Path) -> Non
     assert np.abs(at - truth["marks"]).max() < 1e-4
     eye = mesh.vertices[mesh.annotations.regions["eyeball_left"]].numpy() / 1000
     assert {tuple(row) for row in eye.round(2)} == {tuple(row) for row in truth["eye"].astype(np.float32).round(2)}
+    assert set(mesh.annotations.regions) == {"Body", "Hair", "eyeball_left"}
     assert "author" in unpacked(annotated)[0]["meshes"][0]["extras"]
 
 

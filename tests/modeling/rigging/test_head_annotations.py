@@ -3,6 +3,7 @@
 import torch
 
 from planted.characters import other_topology
+from torchface.geometry.meshes.operators import components
 from torchface.geometry.similarity import Similarity
 from torchface.mesh import Annotations, Mesh
 from torchface.modeling.rigging.head_annotations import annotations_on
@@ -39,3 +40,18 @@ def test_of_lips_that_touch_the_one_that_moves_alike_is_taken() -> None:
     template = BlendshapeRig(Mesh(points[:10], skin, annotations=Annotations(marks)), jaw[None, :10], ("jawOpen",))
     shifted = BlendshapeRig(template.neutral.with_vertices(points[:10] + 0.2), template.deltas, template.names)
     assert torch.equal(annotations_on(head, shifted, SAME).landmarks, marks)
+
+
+def test_an_eye_of_its_own_is_an_eyeball_from_front_to_back() -> None:
+    """Also where the template's has another size and place."""
+    person = performer(texture=False)
+    head, own = other_topology(person), person.neutral.annotations
+    ball = own.regions["eyeball_left"]
+    middle = person.vertices[ball].mean(0)
+    smaller = torch.where(ball[:, None], middle + 0.9 * (person.vertices - middle), person.vertices)
+    template = BlendshapeRig(person.neutral.with_vertices(smaller), person.deltas, person.names)
+    found = annotations_on(head, template, SAME).regions["eyeball_left"]
+    place = torch.cdist(person.vertices, head.vertices).argmin(1)
+    label = components(head.neutral.faces, len(head.vertices))
+    eye = label == label[place[ball]].mode().values
+    assert bool(found[eye].all())

@@ -10,6 +10,7 @@ import pytest
 import torch
 
 from planted.characters import Planted, box_mesh, caricature, decimated, packed, unpacked, write_character
+from torchface.cli import main
 from torchface.errors import AlignmentError, FileFormatError, ValueRangeError
 from torchface.geometry.similarity import Similarity, similarity_transform
 from torchface.io import load_rig
@@ -87,6 +88,7 @@ def test_only_missing_shapes_are_made_and_the_vrm_has_expressions_for_all(rigged
     assert expressions["eyeBlinkRight"][0].target == 3 + report.made.index("eyeBlinkRight")
     assert report.figure is not None
     assert report.figure.is_file()
+    assert any("a .glb's numbers are metres" in line for line in report.lines())
 
 
 @pytest.mark.bench
@@ -200,6 +202,16 @@ def test_files_that_are_no_characters_are_refused(tmp_path: Path) -> None:
         check_character(tmp_path)
     with pytest.raises(FileFormatError, match="no such file"):
         check_character(tmp_path / "hero.obj")
+    (tmp_path / "hero.obj").touch()
+    with pytest.raises(FileFormatError, match=r"torchface arkit .*hero\.obj --out .*hero\.glb"):
+        check_character(tmp_path / "hero.obj")
+
+
+def test_options_of_scans_are_refused_for_a_character(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "hero.glb").touch()
+    with pytest.raises(SystemExit):
+        main(["rig", str(tmp_path / "hero.glb"), "--unit", "cm", "--part", "face", "--out", str(tmp_path / "a.glb")])
+    assert "found --part and --unit without --template" in " ".join(capsys.readouterr().err.split())
 
 
 def test_a_character_that_has_all_shapes_is_copied(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -8,6 +8,7 @@ from torch import Tensor
 from torchface.io.gltf.character_scene import Character
 from torchface.io.gltf.mesh_extras import row_extras
 from torchface.mesh import Annotations
+from torchface.part_materials import EYEBALL, part_material
 
 
 def annotate_character(root: dict[str, Any], character: Character, rows: Tensor, notes: Annotations) -> None:
@@ -16,14 +17,17 @@ def annotate_character(root: dict[str, Any], character: Character, rows: Tensor,
     Args:
         root: the file's JSON, which is changed.
         rows: of the character's vertices, (K,).
-        notes: landmarks and regions of these K; a mesh that has none of them stays as it is.
+        notes: landmarks and regions of these K; a mesh that has none of them stays as it is. Regions of parts that are
+            drawn in colours of their own (mouth, sockets) are left out, for a character has its colours.
     """
     if notes.landmarks is None:
         return
     marks = rows[notes.landmarks]
-    regions = {name: torch.zeros(len(character.vertices), dtype=torch.bool) for name in notes.regions}
+    regions: dict[str, Tensor] = {}
     for name, mask in notes.regions.items():
-        regions[name][rows[mask]] = True
+        if part_material(name) in (None, EYEBALL):
+            regions[name] = torch.zeros(len(character.vertices), dtype=torch.bool)
+            regions[name][rows[mask]] = True
     blocks: dict[tuple[int, int], list[slice]] = {}
     for block in character.blocks:
         blocks.setdefault((block.mesh, block.node), []).append(block.rows)

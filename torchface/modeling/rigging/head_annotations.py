@@ -12,6 +12,7 @@ from torchface.registration import Registration
 from torchface.rig import BlendshapeRig
 
 _BESIDE = 4.0  # millimetres at the template's size
+_EYEBALL, _MOST = "eyeball", 0.4  # of a part's vertices
 _TELLING = ("jawOpen", *BLINKS)  # which of lips and lids that touch a vertex is of, its motion says
 
 
@@ -30,20 +31,25 @@ def annotations_on(head: BlendshapeRig, template: BlendshapeRig, pose: Similarit
     ours = [rest, *back.apply_vectors(_deltas(head, names))]
     known = template.vertices.detach().cpu().double()
     landmarks, regions = own.landmarks, dict(own.regions)
+    joined = joined_vertices(rest, head.neutral.faces.cpu())
+    part = joined.part[joined.of]
+    skin = int(part.mode().values)
     if (landmarks is None or len(landmarks) != 68) and given.landmarks is not None:
         ids = given.landmarks.cpu()
-        part = joined_vertices(rest, head.neutral.faces.cpu())
-        part_of = part.part[part.of]
-        near = torch.from_numpy(cKDTree(rest.numpy()).query(known[ids].numpy())[1])
-        skin = (part_of == part_of[near].bincount().argmax()).nonzero()[:, 0]
-        tree = cKDTree(torch.cat([one[skin] for one in ours], 1).numpy())
+        skin = int(part[torch.from_numpy(cKDTree(rest.numpy()).query(known[ids].numpy())[1])].mode().values)
+        rows = (part == skin).nonzero()[:, 0]
+        tree = cKDTree(torch.cat([one[rows] for one in ours], 1).numpy())
         wanted = torch.cat([one[ids] for one in (known, *_deltas(template, names))], 1)
-        landmarks = skin[torch.from_numpy(tree.query(wanted.numpy())[1])]
+        landmarks = rows[torch.from_numpy(tree.query(wanted.numpy())[1])]
     distance, nearest = cKDTree(known.numpy()).query(rest.numpy())
     close = torch.from_numpy(distance) < _BESIDE
     for name, mask in given.regions.items():
         if name not in regions:
-            regions[name] = mask.cpu()[torch.from_numpy(nearest)] & close
+            inside = mask.cpu()[torch.from_numpy(nearest)] & close
+            if name.startswith(_EYEBALL):  # an eye of its own is one from front to back
+                share = part.bincount(inside.double()) / part.bincount()
+                inside = torch.where(part == skin, inside, share[part] > _MOST)
+            regions[name] = inside
     return Annotations(landmarks, regions, own.mirror, own.contacts)
 
 

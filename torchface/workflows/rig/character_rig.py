@@ -59,6 +59,7 @@ _FAR, _LEAST_MET = 1.0, 0.6
 _OF_SCANS = ("the scan has neither", "the scan's triangles", "landmarks disagree")
 """Notes of a registration that say nothing of a character."""
 _COARSE, _WIDE = 1500, 500.0  # triangles of a skin, millimetres of a shape's motion: what is warned of
+_OTHER_UNIT = 3.0  # times a head's size
 _TONGUE, _JAW, _CLOSE = "tongueOut", "jawOpen", "mouthClose"
 _MOST_TRIANGLES = 500_000  # of a head: its shapes take some 6 GB
 _CONVERT = {
@@ -188,7 +189,8 @@ def check_character(path: Path) -> None:
     if ending not in CHARACTER_ENDINGS:
         if ending not in _CONVERT:
             check_there(path)
-        converted = f"torchface convert {path.name} {path.stem}.glb" if ending in MESH_ENDINGS else "export it as .glb"
+        bare = f"a mesh alone gets them by: torchface arkit {path} --out {path.with_suffix('.glb')}"
+        converted = bare if ending in MESH_ENDINGS else "export it as .glb"
         how = _CONVERT.get(ending, converted).format(path=path, stem=path.with_suffix(""))
         raise FileFormatError(
             f"{path}: found {ending!r}, expected a character's .glb, .vrm or USD ({how}), or --template for a scan"
@@ -411,6 +413,11 @@ class _Job:
                 f"  note: {1 + len(found.others)} faces were seen; the one at {_place(found.middle)} was taken"
             )
             lines.append(f"    the others are at {', '.join(map(_place, found.others))}, in the file's unit")
+        size = 1000 * float(found.pose.scale[0])
+        if not 1 / _OTHER_UNIT < size < _OTHER_UNIT:
+            lines.append(
+                f"  note: {size:.3g} times a head's size, as other programs take it: a .glb's numbers are metres"
+            )
         if (count := len(self.face.skin.faces)) < _COARSE:
             lines.append(f"  warning: its skin has {count:,} triangles, expected {_COARSE:,} for lids and lips to shut")
         lines.append(f"template: {record.figures()}")

@@ -1,0 +1,37 @@
+"""A rig drawn fast: its lips in its own texture, and teeth that a shut mouth hides in light."""
+
+from dataclasses import replace
+
+import torch
+
+from torchface.geometry.cameras.pinhole import Camera
+from torchface.mesh import Mesh
+from torchface.rendering.quick_clay import QuickClay
+from torchface.synthetic import performer
+
+BLUE = torch.tensor([0.1, 0.2, 0.8])
+
+
+def test_lips_are_drawn_in_the_texture() -> None:
+    head = performer(texture=False).neutral
+    painted = replace(head, texture=BLUE[:, None, None].expand(3, 8, 8).contiguous())
+    intrinsics = torch.tensor([[900.0, 0, 160], [0, 900, 160], [0, 0, 1]]).double()
+    flip = torch.diag(torch.tensor([1.0, -1.0, -1.0])).double()
+    lip = head.vertices[head.landmarks[57]].double()
+    camera = Camera(intrinsics, flip, torch.tensor([0.0, 0, 400]).double() - flip @ lip, 320, 320)
+    red, _, blue = QuickClay.of(painted, skin=True).draw(head.vertices, camera)[160, 160].tolist()
+    assert blue > 2 * red
+    red, _, blue = QuickClay.of(painted).draw(head.vertices, camera)[160, 160].tolist()  # clay
+    assert red > blue
+
+
+def test_what_lies_within_keeps_light_for_when_it_is_seen() -> None:
+    """A plate closely behind a larger one, as teeth behind lips, of no region."""
+    grid = torch.cartesian_prod(torch.linspace(-40, 40, 21), torch.linspace(-40, 40, 21))
+    rows = torch.arange(20 * 21).view(20, 21)[:, :20].flatten()
+    faces = torch.cat([torch.stack([rows, rows + 21, rows + 1], 1), torch.stack([rows + 1, rows + 21, rows + 22], 1)])
+    front = torch.cat([grid, torch.zeros(len(grid), 1)], 1)
+    teeth = torch.cat([grid[:105] * 0.5, torch.full((105, 1), -2.0)], 1)
+    both = Mesh(torch.cat([front, teeth]), torch.cat([faces, faces[(faces < 105).all(1)] + len(front)]))
+    clay = QuickClay.of(both)
+    assert float(clay.openness[len(front) :].min()) >= 0.6
