@@ -113,7 +113,12 @@ def rig(
     from torchface.workflows.rig_names import naming_lines
 
     if template is None and neutral is None and scan:
-        of_scans = {"--landmarks": landmarks, "--examples": examples, "--detail": detail, "--expressions": expressions}
+        of_scans: dict[str, object] = {
+            "--landmarks": landmarks,
+            "--examples": examples,
+            "--detail": detail,
+            "--expressions": expressions,
+        }
         of_scans |= {"--pose": pose or None, "--part": part, "--unit": unit, "--detector": detector, "--model": model}
         _rig_character(
             scan, out, (inner_mouth, eyes), [flag for flag, value in of_scans.items() if value is not None], quiet

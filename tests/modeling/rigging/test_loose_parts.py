@@ -2,6 +2,8 @@
 
 import torch
 
+from torchface.geometry.meshes.operators import components, vertex_normals
+from torchface.mesh import submesh
 from torchface.modeling.rigging.eyelid_closure import stands_before
 from torchface.modeling.rigging.loose_parts import moved_parts
 from torchface.rendering.raycast import RayCaster
@@ -27,3 +29,26 @@ def test_a_tear_film_stays_before_the_eye_in_shapes_of_the_lids() -> None:
     eye = RayCaster(vertices, faces[ball[faces].all(1)])
     for delta in moved:
         assert float(stands_before(eye, (all_vertices + delta)[used]).max()) < 0
+
+
+def test_a_beard_that_stands_off_the_skin_goes_with_the_jaw() -> None:
+    """A shell a centimetre before chin and cheeks, which the skin touches nowhere; its tip hangs from it."""
+    actor = performer(texture=False).select(["jawOpen"])
+    regions, vertices = actor.neutral.annotations.regions, actor.vertices.double()  # type: ignore[union-attr]
+    chin = (regions["chin"] | regions["jaw"]) & (vertices[:, 2] > 20)
+    piece = submesh(actor.neutral, chin)
+    off = vertices[chin] + 10 * vertex_normals(vertices, actor.neutral.faces)[chin]
+    low = off[:, 1] < off[:, 1].median()
+    off[low, 1] -= (off[:, 1].median() - off[low, 1]) * 2
+    count = len(vertices)
+    both, faces = torch.cat([vertices, off]), torch.cat([actor.neutral.faces, piece.mesh.faces + count])
+    loose = torch.arange(len(both)) >= count
+    deltas = torch.zeros(1, len(both), 3, dtype=torch.float64)
+    deltas[:, :count] = actor.deltas.double()
+    moved = moved_parts(actor, both, faces, components(faces, len(both)), loose, deltas).deltas[0]
+    under = moved[:count][chin]
+    front = (vertices[chin][:, 2] > 60) & ~low
+    assert float(under[front].norm(dim=1).mean()) > 25
+    assert torch.allclose(moved[count:][front], under[front], atol=6.0)  # millimetres
+    before_the_neck = low & (off[:, 2] > off[:, 2].quantile(0.9))
+    assert float(moved[count:][before_the_neck][:, 1].mean()) < -15

@@ -3,7 +3,7 @@
 import pytest
 
 from torchface.io.gltf.character_scene import Block
-from torchface.workflows.rig.character_face import _is_still
+from torchface.workflows.rig.character_face import _FACIAL, _STILL, _is_called
 
 
 @pytest.mark.parametrize(
@@ -20,4 +20,11 @@ from torchface.workflows.rig.character_face import _is_still
     ],
 )
 def test_hair_and_what_is_worn_stay_still(name: str, material: str, still: bool) -> None:
-    assert _is_still(Block(0, 0, (0,), name, (material,), slice(0, 1), (), ())) is still
+    assert _is_called(Block(0, 0, (0,), name, (material,), slice(0, 1), (), ()), _STILL) is still
+
+
+@pytest.mark.parametrize(
+    ("name", "facial"), [("avatarBeard", True), ("Moustache_01", True), ("Wolf3D_Hair", False), ("brown_coat", False)]
+)
+def test_beards_move_however_long_they_are(name: str, facial: bool) -> None:
+    assert _is_called(Block(0, 0, (0,), name, ("",), slice(0, 1), (), ()), _FACIAL) is facial

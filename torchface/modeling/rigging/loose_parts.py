@@ -21,6 +21,7 @@ from torchface.rendering.raycast import RayCaster
 from torchface.rig import BlendshapeRig
 
 _ROOT, _LYING, _STIFF = 0.3, 2.0, 0.01
+_WIDE, _OVER = 60.0, 15.0  # millimetres: parts that cover skin are so wide; and how far they stand off it
 _SHELL, _CLEAR = 6.0, 0.2  # millimetres before an eye: where shells lie at most, how near they come at least
 
 
@@ -89,7 +90,10 @@ def moved_parts(
 
 
 def _attached(head: JoinedHead, faces: Tensor, left: Tensor) -> None:
-    """Lets parts go with the skin where they touch it, and the rest of each with that: lashes stay straight."""
+    """Lets parts go with the skin where they touch it, and the rest of each with that: lashes stay straight.
+
+    Wide parts, such as beards, go with the skin under them, the less the further they stand off.
+    """
     ids = left.nonzero()[:, 0]
     row = torch.full((len(left),), -1)
     row[ids] = torch.arange(len(ids))
@@ -99,11 +103,13 @@ def _attached(head: JoinedHead, faces: Tensor, left: Tensor) -> None:
     corner, distance = faces[~head.loose[faces].any(1)][place.triangle], place.distance
     part = head.part[ids].unique(return_inverse=True)[1]
     near = torch.stack([_root_reach(distance[part == one]) for one in range(int(part.max()) + 1)])
-    root = distance <= near[part]
-    weight = torch.where(root, 1.0, 1e-9).numpy()
+    weight = torch.where(distance <= near[part], 1.0, 1e-9).double()
+    wide = torch.stack([(points[part == one].amax(0) - points[part == one].amin(0)).max() for one in range(len(near))])
+    wide = wide[part] > _WIDE
+    weight[wide] = torch.exp(-((distance[wide] / _OVER) ** 2)).clamp(min=1e-9)
     beside = torch.einsum("njkc,jk->njc", head.deltas[:, corner], place.barycentric)
-    guess = (beside * root[:, None]).permute(1, 0, 2).flatten(1)
-    matrix = sparse.diags_array(weight) + _STIFF * stretching_energy(points, own)
+    guess = (beside * weight[:, None]).permute(1, 0, 2).flatten(1)
+    matrix = sparse.diags_array(weight.numpy()) + _STIFF * stretching_energy(points, own)
     solved = SparseCholesky(matrix).solve(guess)
     head.deltas[:, ids] = solved.unflatten(1, (-1, 3)).permute(1, 0, 2)
 

@@ -42,6 +42,8 @@ _STILL = re.compile(
     re.IGNORECASE,
 )
 """Names of what does not move with a face, wherever it lies."""
+_FACIAL = re.compile(r"beard|mou?stache|goatee|whisker|stubble|sideburn|eyebrow|eyelash", re.IGNORECASE)
+"""Names of what moves with a face however far it reaches."""
 SKIN = (0.8, 0.65, 0.56, 1.0)
 _LEAST_ASTRAY, _ASTRAY = 15.0, 4.0  # millimetres, and times the median, that a point may lie from a head's
 _SHARES = torch.linspace(0.04, 0.96, 17, dtype=torch.float64)
@@ -139,12 +141,14 @@ def face_pieces(character: Character, found: FaceOnSurface, reference: Mesh, poi
             found.views,
         )
     skin_tree = cKDTree(vertices[skin_faces.unique()].numpy())
-    still = torch.tensor([_is_still(block) for block in character.blocks])
+    still = torch.tensor([_is_called(block, _STILL) for block in character.blocks])
+    facials = torch.tensor([_is_called(block, _FACIAL) for block in character.blocks]) & ~still
     for one in part[faces[:, 0]].unique().tolist():  # a head has tens of parts
         rows = (part == one).nonzero()[:, 0]
         own = vertices[rows]
         name_moves = not bool(still[character.block[rows[0]]])
-        allowed[one] = one == skin_part or (name_moves and _moves(own, placed, skin_tree))
+        facial = bool(facials[character.block[rows[0]]])
+        allowed[one] = one == skin_part or facial or (name_moves and _moves(own, placed, skin_tree))
     kept = faces[allowed[part[faces[:, 0]]]]
     rows, local = kept.unique(return_inverse=True)
     cut = torch.zeros(len(vertices), dtype=torch.bool)
@@ -166,10 +170,10 @@ def face_pieces(character: Character, found: FaceOnSurface, reference: Mesh, poi
     )
 
 
-def _is_still(block: Block) -> bool:
-    """Whether a block's name, or that of its one material, says that it does not move with a face."""
+def _is_called(block: Block, names: re.Pattern[str]) -> bool:
+    """Whether a block's name, or that of its one material, is one of these."""
     named = (block.name, *(block.materials if len(block.materials) == 1 else ()))
-    return any(_STILL.search(name) for name in named)
+    return any(names.search(name) for name in named)
 
 
 def find_skin(vertices: Tensor, faces: Tensor, part: Tensor, placed: Tensor) -> tuple[int, Tensor, float]:
