@@ -16,7 +16,13 @@ from torchface.landmarks.images.ibug_68 import as_annotated
 from torchface.modeling.morphable.head_model import HeadModel
 from torchface.modeling.photographs.fit_problem import Problem
 from torchface.modeling.photographs.fit_settings import FitSettings, SurfacePoints
-from torchface.modeling.photographs.image_fit import ImageFit, contour_curves, fit_images, smooth_differences
+from torchface.modeling.photographs.image_fit import (
+    ImageFit,
+    contour_curves,
+    fit_images,
+    smooth_differences,
+    with_whole_eyeballs,
+)
 from torchface.modeling.photographs.image_input import annotated_vertices
 from torchface.modeling.photographs.landmark_view import LandmarkSites, LinearPoints
 from torchface.modeling.rigging.deformation_transfer import transfer_deformation
@@ -325,3 +331,12 @@ def test_both_sides_move_alike() -> None:
 def test_none_are_expected() -> None:
     head = neutral_head(texture=False)
     assert smooth_differences(head.vertices, head.landmarks, 0.0).shape == (0, len(head.vertices), 3)
+
+
+def test_eyeballs_are_not_bent() -> None:
+    head = neutral_head()
+    modes = with_whole_eyeballs(smooth_differences(head.vertices, head.landmarks, 1.0), head)
+    ball = head.annotations.regions["eyeball_left"]
+    moved = modes[:, ball]
+    assert float(moved.norm(dim=-1).amax()) > 0.1
+    assert float((moved - moved[:, :1]).abs().max()) == 0

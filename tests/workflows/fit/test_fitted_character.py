@@ -1,5 +1,7 @@
 """Hair that hangs beside the neck is found in what photographs show, and what stands behind the head is none."""
 
+import math
+
 import pytest
 import torch
 from torch import Tensor
@@ -9,7 +11,9 @@ from torchface.landmarks.images.networks.part_finder import FaceParts
 from torchface.landmarks.images.networks.part_network import PARTS
 from torchface.modeling import ImageFit
 from torchface.synthetic import neutral_head, performer
-from torchface.workflows.fit.fitted_character import dressed_rig, hangs_down
+from torchface.synthetic.head.signed_distance import EYE_CENTRE
+from torchface.synthetic.head.skin_texture import eye_color
+from torchface.workflows.fit.fitted_character import dressed_rig, hangs_down, iris_size
 
 SIZE, HAIR, SKIN = 128, PARTS.index("hair"), PARTS.index("skin")
 
@@ -83,3 +87,16 @@ def test_teeth_are_as_bright_as_photographed_and_grey_in_black_and_white(colors:
     shown = made.texture[:, ((1 - at[:, 1]) * size).long(), (at[:, 0] * size).long()]
     assert abs(float(shown.mean()) - 0.5) < 0.06
     assert bool((made.texture == made.texture[:1]).all()) != colors
+
+
+@pytest.mark.parametrize("scale", [0.85, 1.0])
+def test_irises_are_as_wide_as_peoples_on_eyeballs_of_any_size(scale: float) -> None:
+    head = neutral_head()
+    smaller = head.with_vertices(scale * head.vertices)
+    ball = smaller.vertices[head.annotations.regions["eyeball_left"]]
+    radius = 0.5 * float(ball[:, 0].max() - ball[:, 0].min())
+    polar = torch.linspace(0, 0.8, 800)
+    across = torch.stack([polar.sin(), torch.zeros(800), polar.cos()], dim=1)
+    colors = eye_color(torch.tensor(EYE_CENTRE) + radius * across, size=iris_size(smaller))
+    edge = float(polar[(colors.mean(1) < 0.5).nonzero().amax()])
+    assert 2 * radius * math.sin(edge) == pytest.approx(11.7, abs=0.4)

@@ -28,6 +28,7 @@ from torchface.modeling.photographs.image_texture import photographed_skin
 from torchface.modeling.photographs.landmark_view import JAW, LANDMARKS, LandmarkSites, LinearPoints, Views
 from torchface.modeling.photographs.texture_fit import ColorFit
 from torchface.modeling.rigging.deformation_transfer import transfer_with_report
+from torchface.part_materials import EYEBALL, part_material
 from torchface.progress import Progress, silent
 from torchface.rig import BlendshapeRig
 from torchface.shape_names import mirror
@@ -142,7 +143,7 @@ def fit_images(
     pixels = landmarks.detach().cpu().double()
     mean = model.shape.mean.cpu()
     vertices = annotated_vertices(mean, vertices) if settings.annotated else vertices
-    unknown = smooth_differences(mean, vertices, settings.unknown_deviation)
+    unknown = with_whole_eyeballs(smooth_differences(mean, vertices, settings.unknown_deviation), rig.neutral)
     modes = torch.cat([model.shape.modes.cpu(), unknown])
     deltas = _in_place(rig, mean)
     faces, surface = model.faces.cpu(), settings.surface
@@ -346,6 +347,16 @@ def smooth_differences(vertices: Tensor, landmarks: Tensor, deviation: float) ->
         field[..., axis] = deviation * (_symmetric(x, at, mirrored, sign) @ vectors / values.sqrt()).T
         modes.append(field)
     return torch.cat(modes).float()
+
+
+def with_whole_eyeballs(fields: Tensor, mesh: Mesh) -> Tensor:
+    """Displacements (M,V,3) of a mesh that move each of its annotated eyeballs without bending it."""
+    regions = {} if mesh.annotations is None else mesh.annotations.regions
+    for name, mask in regions.items():
+        if part_material(name) is EYEBALL and bool(mask.any()):
+            ball = mask.to(fields.device)
+            fields[:, ball] = fields[:, ball].mean(1, keepdim=True)
+    return fields
 
 
 def _symmetric(x: Tensor, at: Tensor, mirrored: Tensor, sign: float) -> Tensor:

@@ -44,6 +44,7 @@ class Look:
         lips: how much redder than the skin the lips are, 1 as usual.
         freckles: how strong they are, 1 as usual.
         teeth, whites: how bright teeth and the whites of the eyes are, 1 as usual.
+        iris_size: how wide irises are on their eyeballs, 1 as usual.
         haircut: "short", "long" to the shoulders, or "tied" at the back; bald if absent.
 
     Example:
@@ -61,6 +62,7 @@ class Look:
     shirt: tuple[float, float, float] = (0.23, 0.28, 0.34)
     teeth: float = 1.0
     whites: float = 1.0
+    iris_size: float = 1.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,7 +127,7 @@ def _painted(look: Look, p: Tensor, marks: Tensor, bare: Tensor) -> tuple[Tensor
     shown = ramp(hair + 0.12 * strand * ramp(hair, 0.0, 0.15), 0.0, 0.30) * root
     color = color + (tone - color) * (0.94 * shown).clamp(0, 1)[:, None]
     color = inner_color(color, marks)
-    color[ball] = eye_color(p[ball], look.iris, look.whites)
+    color[ball] = eye_color(p[ball], look.iris, look.whites, look.iris_size)
     height = _height(p, lips, hair, strand, old) - 0.30 * creases - 0.9 * groove
     height = height + _neck(p) * (1 - ramp(hair, 0.0, 0.3))
     height = height * (1 - ramp(eyeball + socket + mouth + nostril, 0.1, 0.4))

@@ -161,8 +161,18 @@ def _cropped_hair(p: Tensor, fine: Tensor, pores: Tensor) -> Tensor:
     return 0.66 * ramp(y - edge + 5.0 * fine, -6.0, 11.0) * (0.86 + 0.3 * pores)
 
 
-def eye_color(p: Tensor, brown: tuple[float, float, float] = (0.33, 0.24, 0.14), whites: float = 1.0) -> Tensor:
-    """Colours (N,3) of points of an eyeball: sclera with veins, limbal ring, iris of a colour, pupil, highlight."""
+IRIS_EDGE = 0.45
+"""Half the angle that an iris takes up, seen from the eyeball's middle, radians."""
+
+
+def eye_color(
+    p: Tensor, brown: tuple[float, float, float] = (0.33, 0.24, 0.14), whites: float = 1.0, size: float = 1.0
+) -> Tensor:
+    """Colours (N,3) of points of an eyeball: sclera with veins, limbal ring, iris of a colour, pupil, highlight.
+
+    Args:
+        size: of the iris, 1 as usual.
+    """
     centre = torch.tensor(EYE_CENTRE)
     offset = torch.cat([p[:, :1].abs(), p[:, 1:]], dim=1) - centre
     way = torch.nn.functional.normalize(offset, dim=1)
@@ -173,6 +183,7 @@ def eye_color(p: Tensor, brown: tuple[float, float, float] = (0.33, 0.24, 0.14),
     color = mix(color, (0.78, 0.45, 0.42), 0.16 * veins * ramp(polar, 0.55, 0.9))
     color = mix(color, (0.78, 0.52, 0.48), 0.75 * ramp(polar, 0.75, 1.5))
     color = color * (1 - 0.30 * ramp(way[:, 1], 0.12, 0.42))[:, None]  # the upper lid's shade
+    polar = polar / size
     spokes = torch.stack([angle.cos() * 9, angle.sin() * 9, polar * 2.5], dim=1)
     iris = torch.tensor(brown) * (1 + 0.45 * noise(spokes, 1.0, 8))[:, None]
     light = torch.tensor(brown) * 1.35 + 0.05
@@ -180,7 +191,7 @@ def eye_color(p: Tensor, brown: tuple[float, float, float] = (0.33, 0.24, 0.14),
     caustic = ramp(-(way[:, 1] + 0.6 * way[:, 0]), -0.05, 0.35)  # light gathers opposite the highlight
     iris = iris * (0.8 + 0.75 * caustic)[:, None]
     iris = mix(iris, (0.07, 0.05, 0.045), 0.9 * ramp(polar, 0.36, 0.44))
-    color = color + (iris - color) * (1 - ramp(polar, 0.425, 0.475))[:, None]
+    color = color + (iris - color) * (1 - ramp(polar, IRIS_EDGE - 0.025, IRIS_EDGE + 0.025))[:, None]
     color = mix(color, (0.015, 0.012, 0.012), 1 - ramp(polar, 0.165, 0.195))
     for x, y, size, strength in ((-0.15, 0.20, 0.075, 0.95), (0.13, -0.17, 0.05, 0.25)):
         glint = way - torch.nn.functional.normalize(torch.tensor([x, y, 0.97]), dim=0)

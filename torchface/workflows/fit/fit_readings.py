@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from torchface.attachment import Attachment
 from torchface.capture.energy import Quadratic
 from torchface.capture.weight_readings import WeightReadings
 from torchface.landmarks import FaceReading
@@ -14,6 +15,9 @@ from torchface.rig import BlendshapeRig
 from torchface.workflows.surface_sites import sites_on_rig
 
 __all__ = ["with_readings"]
+
+_EYE_SEEN = 0.5  # how likely nothing hides an eye whose iris counts
+_EYES = (slice(36, 42), slice(42, 48))
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,7 +39,7 @@ class ReadExpressions:
 
 
 def with_readings(settings: FitSettings, readings: FaceReading, places: Tensor, rig: BlendshapeRig) -> FitSettings:
-    """Settings with each landmark's deviation, and the points of the surface and the expressions that were read.
+    """Settings with each landmark's deviation, points of the surface, irises, and the expressions that were read.
 
     Args:
         settings: with the prior on expressions.
@@ -53,10 +57,30 @@ def with_readings(settings: FitSettings, readings: FaceReading, places: Tensor, 
     settings = replace(settings, deviations=readings.deviation, irises=readings.iris)
     if len(places) and len(places) == readings.points.shape[1]:
         surface = SurfacePoints(readings.points, readings.point_deviation, sites_on_rig(rig, places))
-        settings = replace(settings, surface=surface)
+        settings = replace(settings, surface=_with_irises(surface, readings, rig))
     if bool(torch.isfinite(readings.expression).any()):
         read = WeightReadings.of_expression(
             readings.expression.double(), readings.expression_deviation.double(), rig.names
         )
         settings = replace(settings, expression_prior=ReadExpressions(settings.expression_prior, read))
     return settings
+
+
+def _with_irises(surface: SurfacePoints, readings: FaceReading, rig: BlendshapeRig) -> SurfacePoints:
+    """Points of a surface, then the middles of seen irises where the rig has eyeballs: they show the gaze."""
+    neutral = rig.neutral
+    regions = {} if neutral.annotations is None else neutral.annotations.regions
+    balls = [regions[name].cpu() for name in ("eyeball_right", "eyeball_left") if name in regions]
+    if len(balls) < 2 or not all(bool(ball.any()) for ball in balls):
+        return surface
+    front = neutral.vertices[:, 2].detach().cpu()
+    poles = torch.stack([front.masked_fill(~ball, -torch.inf).argmax() for ball in balls])
+    irises = torch.where(readings.eye_visibility[..., None] > _EYE_SEEN, readings.iris, torch.nan)
+    lids = torch.stack([readings.deviation[:, eye].median(1).values for eye in _EYES], dim=1)
+    own, more = surface.sites, Attachment.from_vertices(neutral, poles)
+    sites = Attachment(torch.cat([own.triangles, more.triangles]), torch.cat([own.barycentric, more.barycentric]))
+    return SurfacePoints(
+        torch.cat([surface.points, irises], dim=1),
+        torch.cat([surface.deviations, lids], dim=1),
+        sites.made_for(neutral),
+    )

@@ -1,5 +1,6 @@
 """A fitted head as a character: the template's teeth, tongue, lashes, hair and collar in its photographs' colours."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -11,14 +12,16 @@ from torch import Tensor
 from torchface.geometry.meshes.normal_maps import SurfaceMaps
 from torchface.landmarks.images.face_crop import cut_crop
 from torchface.landmarks.images.networks.part_finder import FaceParts
+from torchface.mesh import Mesh
 from torchface.modeling import ImageFit
-from torchface.modeling.photographs.eye_color import with_iris
+from torchface.modeling.photographs.eye_color import IRIS_WIDTH, with_iris
 from torchface.modeling.photographs.image_texture import without_colors
 from torchface.modeling.photographs.skin_light import exposed
 from torchface.registration import hidden_parts, with_template_skin
 from torchface.rig import BlendshapeRig
 from torchface.synthetic.head.embedded_character import character
 from torchface.synthetic.head.skin_maps import Look
+from torchface.synthetic.head.skin_texture import IRIS_EDGE
 
 # In distances between the eyes' outer corners: how far from the face's middle hair hangs beside the neck, and how far
 # below the mouth.
@@ -76,6 +79,7 @@ def dressed_rig(
         iris=usual.iris if fit.iris is None else _color(fit.iris),
         haircut=None if fit.hair is None else "long" if hangs_down(parts, marks) else "short",
         shirt=usual.shirt if shirt is None else _color(shirt),
+        iris_size=iris_size(neutral),
         **_brightness(images, parts),
     )
     skin = neutral.texture
@@ -83,6 +87,14 @@ def dressed_rig(
         BlendshapeRig(neutral, rig.deltas, rig.names), look, _SIZE if skin is None else skin.shape[-1], skin
     )
     return DressedRig(_grey(made.rig) if without_colors(images) else made.rig, made.surface)
+
+
+def iris_size(mesh: Mesh) -> float:
+    """How much wider than painted on the performer's eyeballs irises of people's width are on those of a head."""
+    assert mesh.annotations is not None
+    ball = mesh.vertices[mesh.annotations.regions["eyeball_left"]]
+    radius = 0.5 * float((ball.amax(0) - ball.amin(0)).mean())
+    return math.asin(min(1.0, 0.5 * IRIS_WIDTH / radius)) / IRIS_EDGE
 
 
 def _grey(rig: BlendshapeRig) -> BlendshapeRig:
