@@ -7,7 +7,10 @@ import torch
 from reading_here import same_process  # noqa: F401
 
 from planted.characters import box_mesh
+from torchface.io.gltf.character_annotations import annotate_character
+from torchface.io.gltf.character_scene import read_character
 from torchface.io.usd.usd_reading import read_usd_rig
+from torchface.mesh import Annotations
 from torchface.synthetic import performer
 from torchface.workflows.rig import usd_character
 from torchface.workflows.rig.character_rig import CharacterReport
@@ -67,6 +70,8 @@ def test_shapes_are_added_in_the_files_axes_and_the_rest_stays(
         document = read_document(bare)
         added = AddedTargets(0, (0,), (smile.deltas / 1000).numpy())
         root, data = document_with_targets(document, [added], smile.names)
+        marks = Annotations(smile.neutral.landmarks, {"lids": smile.neutral.annotations.regions["lids_left"]})
+        annotate_character(root, read_character(document), torch.arange(len(smile.vertices)), marks)
         write_edited(document, root, data, made)
         return CharacterReport(smile.names, {"jawOpen": ("jawOpen",)}, (), 0.0, (0.0, 0.0), None)
 
@@ -75,6 +80,8 @@ def test_shapes_are_added_in_the_files_axes_and_the_rest_stays(
     assert report.made == ("mouthSmileLeft",)
     rig = read_usd_rig(out)
     assert rig.names == ("jawOpen", "mouthSmileLeft")
+    assert torch.equal(rig.neutral.landmarks, smile.neutral.landmarks)
+    assert set(rig.neutral.annotations.regions) == {"Head", "Box", "lids"}
     count = len(smile.vertices)
     assert torch.allclose(rig.deltas[1, :count], smile.deltas[0], atol=1e-3)
     assert float(rig.deltas[1, count:].abs().max()) == 0

@@ -32,7 +32,7 @@ from torchface.escaped_text import visible
 from torchface.files.documents import parse_json
 from torchface.io.gltf.corrective_extras import read_correctives, rig_of_targets
 from torchface.io.gltf.gltf_document import Document
-from torchface.io.gltf.mesh_extras import read_annotations
+from torchface.io.gltf.mesh_extras import is_own_mesh, read_annotations, read_row_annotations
 from torchface.io.images.image_files import decode_image
 from torchface.io.images.texture_atlas import MAX_TEXELS, Look, with_used_looks
 from torchface.io.length_units import millimetres_per
@@ -126,7 +126,7 @@ def _mesh(scene: Scene, pieces: list[Piece]) -> Mesh:
     looks = [
         Look(None if name is None else images[name], to_srgb(torch.tensor(color).clamp(0, 1))) for name, color in kinds
     ]
-    ours = any(record["notes"] is not None for record in records)
+    ours = any(is_own_mesh(_notes(record)) for record in records)
     return with_used_looks(mesh, torch.cat(rows), looks, images_only=ours or mesh.colors is not None)
 
 
@@ -244,7 +244,7 @@ def _piece(scene: Scene, number: int, unit: str | None) -> Piece:
         light = _finite(arrays["colors"], f"{location}: colours").clip(0, 1)
         colors = to_srgb(torch.from_numpy(light))
     notes = _notes(record)
-    document = Document(scene.path, {})
+    document, every = Document(scene.path, {}), np.arange(len(points))
     return Piece(
         record["name"],
         torch.from_numpy(vertices),
@@ -253,7 +253,8 @@ def _piece(scene: Scene, number: int, unit: str | None) -> Piece:
         uv_faces,
         colors,
         polygons if polygons.shape[1] > 3 else None,
-        read_annotations(document, notes, record["place"], len(points)),
+        read_annotations(document, notes, record["place"], len(points))
+        or read_row_annotations(document, notes, record["place"], vertices / 1000, (every, every)),
         torch.from_numpy(deltas),
         tuple(names),
     )

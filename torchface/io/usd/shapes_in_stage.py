@@ -1,7 +1,8 @@
 """A process that adds blend shapes to meshes of a USD file and writes it; it stands alone, with OpenUSD beside it.
 
-``python shapes_in_stage.py IN FOLDER OUT``: the folder holds ``shapes.json``, a list of ``path`` and ``names`` of each
-mesh, and ``shapes.npz``, of mesh i and shape j ``i/j/rows`` and ``i/j/offsets``, in the mesh's own points.
+``python shapes_in_stage.py IN FOLDER OUT``: the folder holds ``shapes.json``, a list of ``path``, ``names`` and
+``notes`` (landmarks and regions as JSON, or none) of each mesh, and ``shapes.npz``, of mesh i and shape j
+``i/j/rows`` and ``i/j/offsets``, in the mesh's own points.
 """
 
 import json
@@ -24,6 +25,10 @@ def add_shapes(layer: Any, meshes: list[dict[str, Any]], arrays: Any) -> None:
         prim = stage.GetPrimAtPath(record["path"])
         if not prim or prim.IsInstanceProxy():
             raise SystemExit(f"{record['path']} is an instance, in which nothing can be written: make it editable")
+        if record["notes"] is not None and prim.GetCustomDataByKey("torchface") is None:
+            prim.SetCustomDataByKey("torchface", record["notes"])
+        if not record["names"]:
+            continue
         binding = UsdSkel.BindingAPI.Apply(prim)
         names = list(binding.GetBlendShapesAttr().Get() or [])
         targets = list(binding.GetBlendShapeTargetsRel().GetTargets())

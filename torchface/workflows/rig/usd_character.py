@@ -79,13 +79,14 @@ def _write_glb(scene: Scene, path: Path) -> None:
 
 
 def _write_shapes(scene: Scene, made: Path, names: tuple[str, ...], folder: Path) -> None:
-    """What the process takes: the new shapes of each mesh in its own axes and unit."""
+    """What the process takes: the new shapes of each mesh in its own axes and unit, and landmarks and regions."""
     character = read_character(read_document(made))
     meshes: list[dict[str, Any]] = []
     arrays: dict[str, Any] = {}
     for block in character.blocks:
         new = [name for name in block.names if name in names]
-        if not new:
+        notes = character.document.objects("meshes")[block.mesh].get("extras", {}).get("torchface")
+        if not new and notes is None:
             continue
         record = scene.record["meshes"][block.mesh]
         back = np.linalg.inv(mesh_transform(scene, record, None)[0])
@@ -93,6 +94,7 @@ def _write_shapes(scene: Scene, made: Path, names: tuple[str, ...], folder: Path
             delta = character.targets(block)[block.names.index(name)].double().numpy() * 1000 @ back
             moved = np.flatnonzero((delta != 0).any(1))
             arrays[f"{len(meshes)}/{row}/rows"], arrays[f"{len(meshes)}/{row}/offsets"] = moved, delta[moved]
-        meshes.append({"path": record["path"], "names": new})
+        noted = None if notes is None else json.dumps(notes, separators=(",", ":"))
+        meshes.append({"path": record["path"], "names": new, "notes": noted})
     write_file(folder / "shapes.json", json.dumps(meshes).encode())
     np.savez(folder / "shapes.npz", **arrays)

@@ -152,7 +152,7 @@ def load_actor(rig: Path, part: str | None) -> BlendshapeRig:
     if count != 68:
         what = "no landmark vertices" if count == 0 else f"{count} landmark vertices"
         raise ValueRangeError(
-            f"{rig}: found {what}, expected the 68 of iBUG: torchface rig {rig} --out NEW.glb finds them on a "
+            f"{rig}: found {what}, expected the 68 of iBUG: torchface rig {rig} --out NEW{rig.suffix} finds them on a "
             f"character's face, torchface pick takes them by hand; or track without --rig, and torchface retarget "
             f"OUT/weights.csv --to {rig} --animation TAKE.glb carries the weights over"
         )
