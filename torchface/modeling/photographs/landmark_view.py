@@ -16,6 +16,8 @@ JAW = 17
 """How many of the 68 landmarks trace the face's contour; they come first."""
 BROWS = slice(17, 27)
 """Which of them trace the brows."""
+LIPS = slice(48, 68)
+"""Which of them trace the lips."""
 
 
 @dataclass(frozen=True, eq=False)
