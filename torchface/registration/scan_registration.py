@@ -10,6 +10,7 @@ from torch import Tensor
 
 from torchface.errors import AlignmentError, ShapeError
 from torchface.geometry.meshes.operators import edges, vertex_normals
+from torchface.geometry.meshes.rigid_icp import Samples, ScanPoints, find_pose, fit_of, rigid_icp
 from torchface.geometry.meshes.surface_index import SurfaceIndex, SurfacePoints
 from torchface.geometry.similarity import MAX_HEAD_SCALE, MIN_HEAD_SCALE, Similarity
 from torchface.mesh import Mesh
@@ -24,7 +25,6 @@ from torchface.registration.nonrigid.lip_contact import contact_pull
 from torchface.registration.nonrigid.registration_record import RegistrationRecord
 from torchface.registration.nonrigid.schedule import DEFAULT_SCHEDULE, Schedule
 from torchface.registration.nonrigid.unfolding import grown
-from torchface.registration.rigid_icp import Samples, ScanPoints, find_pose, fit_of, rigid_icp
 from torchface.registration.scan_colors import (
     ScanColors,
     has_colors,
@@ -233,7 +233,7 @@ def _start(
     by, surface, notes = "landmarks", SurfaceIndex(prepared.vertices, prepared.faces), list[str]()
     if landmarks is None:
         by = "shape"
-        pose, notes = _pose_by_shape(template, samples, ScanPoints(prepared.vertices, prepared.faces), exposed)
+        pose, notes = _pose_by_shape(template, samples, ScanPoints.of(prepared.vertices, prepared.faces), exposed)
         if detector is not None:
             aligned = template.with_vertices(pose.apply(vertices)[0].to(template.vertices))
             landmarks = detector(aligned, scan, pose)
@@ -245,7 +245,7 @@ def _start(
     if _faces_away(samples, surface, pose):
         prepared = prepared.turned()
         surface = SurfaceIndex(prepared.vertices, prepared.faces)
-    targets = ScanPoints(prepared.vertices, prepared.faces)
+    targets = ScanPoints.of(prepared.vertices, prepared.faces)
     pose = rigid_icp(samples, targets, pose, _RIGID_REACHES, scale=True, landmarks=(vertices[ids], points)).pose
     return _Start(by, pose, LandmarkPull.of(ids, points, template), prepared, surface, (*prepared.notes, *notes))
 

@@ -8,8 +8,7 @@ from torch import Tensor
 from torchface.errors import ShapeError, ValueRangeError
 from torchface.geometry.similarity import Similarity
 from torchface.landmarks.scans.face_frame import FaceFrame
-from torchface.landmarks.scans.pose_search import nose_candidates
-from torchface.landmarks.scans.surface_sample import sample_surface
+from torchface.landmarks.scans.pose_search import nose_candidates, sample_surface
 from torchface.landmarks.scans.uv_landmark_names import MIRRORED, UV_LANDMARK_NAMES, uv_landmarks_from_ibug
 from torchface.mesh import Mesh
 from torchface.synthetic import draw_identities, neutral_head

@@ -7,10 +7,10 @@ import torch
 from torch import Tensor, nn
 
 from torchface.errors import ShapeError, ValueRangeError
+from torchface.geometry.meshes.rigid_icp import Samples, ScanPoints, rigid_icp
 from torchface.geometry.similarity import Similarity, similarity_transform
 from torchface.landmarks.scans.cylinder import CylinderLayout, unwrap
-from torchface.landmarks.scans.pose_search import find_pose, nose_candidates, protrusion, refine
-from torchface.landmarks.scans.surface_sample import sample_surface
+from torchface.landmarks.scans.pose_search import find_pose, nose_candidates, protrusion, sample_surface
 from torchface.landmarks.scans.uv_landmark_names import MIRRORED, UV_LANDMARK_NAMES
 from torchface.mesh import Mesh
 
@@ -18,7 +18,7 @@ _AXIS_BEHIND_EYES = 70.0
 _MAP = CylinderLayout(size=128, pitch=2.8)
 _ABOVE_EYES, _BELOW_MOUTH, _HALF_ANGLE = 32.0, 22.0, 1.15
 _ITERATIONS = 2
-_MAX_MISFIT = 3.5
+_LEAST_FIT = 0.5  # faces fit by 0.7 to 0.8 of 1, a ball of a head's size by 0.4
 _LAST_REACHES = (8.0, 6.0, 5.0, 5.0, 5.0, 5.0, 5.0, 5.0, 5.0, 5.0)
 
 
@@ -122,13 +122,13 @@ class FaceFrame(nn.Module):
         """
         sample = sample_surface(scan)
         nose, direction = self.nose
-        pose, rest = find_pose(self.surface, self.normals, nose, direction, sample, nose_candidates(sample))
-        if rest > _MAX_MISFIT:
+        found = find_pose(Samples(self.surface, self.normals), nose, direction, sample, nose_candidates(sample))
+        if float(found.fit[0]) < _LEAST_FIT:
             raise ValueRangeError(
-                f"scan: found no face; the likeliest place differs from the mean face by {rest:.1f} mm on average, "
-                f"expected at most {_MAX_MISFIT} (are the units millimetres?)"
+                f"scan: found no face; at the likeliest place the mean face fits {float(found.fit[0]):.2f} of 1, "
+                f"expected at least {_LEAST_FIT} (are the units millimetres?)"
             )
-        return self._refined(sample, pose.inverse())
+        return self._refined(sample, found.pose.inverse())
 
     def settle(self, scan: Mesh, pose: Similarity) -> Similarity:
         """A pose that is right to within some millimetres and degrees, made as good as :meth:`locate` makes it."""
@@ -138,8 +138,9 @@ class FaceFrame(nn.Module):
         """See :meth:`locate`."""
         return self.locate(scan)
 
-    def _refined(self, sample: Any, pose: Similarity) -> Similarity:
-        return refine(pose.inverse(), self.surface, self.normals, sample, _LAST_REACHES).inverse()
+    def _refined(self, sample: ScanPoints, pose: Similarity) -> Similarity:
+        face = Samples(self.surface, self.normals)
+        return rigid_icp(face, sample, pose.inverse(), _LAST_REACHES, scale=True).pose.inverse()
 
 
 def _mean_landmarks(landmarks: Tensor) -> Tensor:

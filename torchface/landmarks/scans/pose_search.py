@@ -1,4 +1,4 @@
-"""Rigid pose of a known surface in a scan of any pose: hypotheses from noses, judged and refined by nearest points."""
+"""Rigid pose of a face in a scan of any pose: hypotheses from noses, refined and judged by nearest points."""
 
 import math
 from dataclasses import dataclass
@@ -7,23 +7,56 @@ import torch
 from scipy.spatial import cKDTree
 from torch import Tensor
 
+from torchface.errors import ValueRangeError
+from torchface.geometry.meshes.operators import components, corners, triangle_areas, triangle_cross
+from torchface.geometry.meshes.rigid_icp import Fit, Samples, ScanPoints, fit_of, rigid_icp
 from torchface.geometry.rotations import rotation_matrix
 from torchface.geometry.similarity import Similarity
-from torchface.landmarks.scans.surface_sample import SurfaceSample
+from torchface.mesh import Mesh
 
+_POINTS = 20000
+_CRUMB = 0.05  # parts smaller than this share of the largest are left out
 _QUERIES = 3000
 _CANDIDATES = 40
-_REACH = 12.0  # millimetres; what is further away is as wrong as it gets
 _NEAR, _FAR = 9.0, 26.0  # millimetres round a point that may be a nose
 _APART = 9.0  # millimetres between two such points
-_FACING = 0.5  # cosine of the angle between normals beyond which points do not match
 _ROLLS = 24  # turns about the nose's direction that are tried
 _TILT = 18.0  # degrees that the nose's direction is tilted up, down, left and right, beside as it is
 _SURVIVORS = 700, 30  # hypotheses that go on after a first look, and after a first refinement
-# How far a point's match may lie in each round of the first refinement, and of the last one, millimetres.
+_FEW, _SOME = 60, 400  # of the face's points: in the first look and refinement, and in the last one
+_SLACK = 0.5  # of the first matches, see `rigid_icp`
+_REACH = 12.0  # millimetres, of the first look
 _FIRST_REACHES = (25.0, 22.0, 19.0, 16.0, 14.0, 12.0)
 _REACHES = (25.0, 20.0, 16.0, 12.0, 12.0, 9.0, 9.0, 7.0, 7.0, 6.0, 6.0, 5.0, 5.0, 5.0, 5.0)
-_LARGEST_SCALE = 1.2  # the head may be this many times larger or smaller than the mean
+
+
+def sample_surface(mesh: Mesh) -> ScanPoints:
+    """Area-weighted random points with normals on a scan's large connected parts, normals made to point outward.
+
+    Normals that point inward on the whole (a scan turned inside out) are flipped: those of a head point away from the
+    middle of its points more often than toward it.
+    """
+    vertices = mesh.vertices.detach().cpu().double()
+    faces = mesh.faces.cpu()
+    area = triangle_areas(vertices, faces)
+    if len(faces) == 0 or not float(area.sum()) > 0:
+        raise ValueRangeError(f"scan: found {len(faces)} triangles without area, expected a surface")
+    part = components(faces, len(vertices))[faces[:, 0]]
+    part_area = torch.zeros(int(part.max()) + 1, dtype=torch.float64).index_add_(0, part, area)
+    area = area * (part_area >= _CRUMB * part_area.max())[part]
+    generator = torch.Generator().manual_seed(0)
+    pick = torch.searchsorted(
+        area.cumsum(0), torch.rand(_POINTS, generator=generator, dtype=torch.float64) * area.sum()
+    )
+    pick = pick.clamp(max=len(faces) - 1)
+    first, second = torch.rand(2, _POINTS, 1, generator=generator, dtype=torch.float64)
+    root = first.sqrt()
+    a, b, c = corners(vertices, faces[pick])
+    points = (1 - root) * a + root * (1 - second) * b + root * second * c
+    normals = torch.nn.functional.normalize(triangle_cross(vertices, faces[pick]), dim=-1, eps=1e-20)
+    if float(((points - points.mean(0)) * normals).sum(-1).sign().sum()) < 0:
+        normals = -normals
+    return ScanPoints(points, normals, torch.zeros(_POINTS, dtype=torch.bool))
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,7 +94,7 @@ def protrusion(points: Tensor, normals: Tensor, queries: Tensor) -> tuple[Tensor
     return mean, direction
 
 
-def nose_candidates(surface: SurfaceSample) -> NoseCandidates:
+def nose_candidates(surface: ScanPoints) -> NoseCandidates:
     """The points of a scan that stand out most, no two close together; hair, ears and collars are among them."""
     thinned = slice(0, 4 * _QUERIES)
     looked = surface.points[:_QUERIES]
@@ -95,65 +128,19 @@ def hypotheses(nose: Tensor, direction: Tensor, found: NoseCandidates) -> Simila
     return Similarity(torch.ones(len(rotation), dtype=torch.float64), rotation, translation)
 
 
-def misfit(poses: Similarity, points: Tensor, normals: Tensor, surface: SurfaceSample) -> Tensor:
-    """Mean distance (B,) of moved points from a surface, millimetres; one that is far or faces away counts 12."""
-    moved, turned = poses.apply(points), normals @ poses.rotation.transpose(-1, -2)
-    distance, row = surface.nearest(moved, _REACH)
-    facing = (surface.normals[row] * turned).sum(-1) > _FACING
-    return torch.where(facing, distance.clamp(max=_REACH), _REACH).mean(-1)
-
-
-def refine(
-    poses: Similarity, points: Tensor, normals: Tensor, surface: SurfaceSample, reaches: tuple[float, ...]
-) -> Similarity:
-    r"""Similarity ICP, point to plane, for a batch of poses.
-
-    .. math:: \min_{\omega, t, \sigma} \sum_i \rho_i
-        \big(n_i \cdot ((1+\sigma) x_i + \omega \times x_i + t - y_i)\big)^2
-
-    with y the nearest surface points, n their normals, :math:`\rho` Tukey's weight within the round's reach and 0
-    where normals disagree.
-    """
-    eye = torch.eye(7, dtype=torch.float64)
-    for reach in reaches:  # each round starts where the last one ended
-        moved, turned = poses.apply(points), normals @ poses.rotation.transpose(-1, -2)
-        distance, row = surface.nearest(moved, reach)
-        n, y = surface.normals[row], surface.points[row]
-        centre = moved.mean(1, keepdim=True)
-        arm = moved - centre
-        weight = (1 - (distance / reach).clamp(max=1) ** 2) ** 2 * ((n * turned).sum(-1) > _FACING)
-        columns = torch.cat([torch.linalg.cross(arm, n), n, (arm * n).sum(-1, keepdim=True)], dim=-1)
-        residual = ((y - moved) * n).sum(-1)
-        weighted = columns * weight[..., None]
-        # A little ridge: a pose that no point supports stays where it is.
-        normal_matrix = weighted.transpose(-1, -2) @ columns + 1e-3 * eye
-        step = torch.linalg.solve(normal_matrix, (weighted * residual[..., None]).sum(1))
-        scale = (poses.scale * (1 + step[:, 6].clamp(-0.1, 0.1))).clamp(1 / _LARGEST_SCALE, _LARGEST_SCALE)
-        poses = poses.moved(step[:, :3].clamp(-0.3, 0.3), scale / poses.scale, step[:, 3:6], centre[:, 0])
-    return poses
-
-
-def find_pose(
-    points: Tensor, normals: Tensor, nose: Tensor, direction: Tensor, surface: SurfaceSample, found: NoseCandidates
-) -> tuple[Similarity, float]:
-    """The pose of points (N,3) with normals (N,3) in a scan, and its misfit in millimetres.
+def find_pose(face: Samples, nose: Tensor, direction: Tensor, surface: ScanPoints, found: NoseCandidates) -> Fit:
+    """The pose of a face in a scan, a batch of one, and how well it fits there.
 
     Args:
+        face: its points, in an order whose beginnings are spread over it.
         nose, direction: the face's nose and where it looks, each (3,).
-        found: where noses may be on it.
+        found: where noses may be on the scan.
     """
     tried = hypotheses(nose, direction, found)
-    few = slice(None, None, max(1, len(points) // 60))
-    some = slice(None, None, max(1, len(points) // 400))
-    rough = misfit(tried, points[few], normals[few], surface)
-    tried = tried[rough.argsort()[: _SURVIVORS[0]]]
-    tried = refine(tried, points[few], normals[few], surface, _FIRST_REACHES)
-    score = misfit(tried, points[few], normals[few], surface)
-    tried = tried[score.argsort()[: _SURVIVORS[1]]]
-    tried = refine(tried, points[some], normals[some], surface, _REACHES)
-    score = misfit(tried, points[some], normals[some], surface)
-    winner = score.argmin()[None]
-    return tried[winner], float(score[winner])
+    likely = fit_of(face.first(_FEW), surface, tried, _REACH, _SLACK).argsort(descending=True)
+    start = tried[likely[: _SURVIVORS[0]]]
+    rough = rigid_icp(face.first(_FEW), surface, start, _FIRST_REACHES, scale=True, slack=_SLACK).best(_SURVIVORS[1])
+    return rigid_icp(face.first(_SOME), surface, rough.pose, _REACHES, scale=True).best(1)
 
 
 def _frame(direction: Tensor) -> Tensor:

@@ -7,11 +7,11 @@ from torch import Tensor
 
 from torchface.errors import AlignmentError, ShapeError, ValueRangeError
 from torchface.geometry.meshes.operators import triangle_areas
+from torchface.geometry.meshes.rigid_icp import Samples, ScanPoints, even_rotations, falling_reaches, rigid_icp
 from torchface.geometry.meshes.unit_check import check_unit, extent
 from torchface.geometry.similarity import Similarity, similarity_transform
 from torchface.mesh import Mesh
 from torchface.number_checks import checked_type
-from torchface.registration.rigid_icp import Samples, ScanPoints, even_rotations, falling_reaches, rigid_icp
 from torchface.registration.scan_preparation import check_same_hand
 
 Correspondences = tuple[Tensor, Tensor]
@@ -82,7 +82,7 @@ def align_scan(
         _LEAST_EXTENT,
         _MOST_EXTENT,
     )
-    target = ScanPoints(scan.vertices, scan.faces, whole_border=True)
+    target = ScanPoints.of(scan.vertices, scan.faces, whole_border=True)
     samples = _samples(mesh)
     if correspondences is None:
         pose = _found_by_itself(samples, target)

@@ -8,9 +8,9 @@ from torchface.capture.markers.rest_pose import check_not_collinear
 from torchface.capture.markers.surface_motion import SurfaceMotion
 from torchface.errors import AlignmentError, ValueRangeError
 from torchface.geometry.meshes.operators import vertex_normals
+from torchface.geometry.meshes.rigid_icp import Samples, ScanPoints, find_pose
 from torchface.geometry.meshes.surface_index import SurfaceIndex
 from torchface.geometry.spheres import nearest_sphere
-from torchface.registration.rigid_icp import Samples, ScanPoints, find_pose
 from torchface.rig import BlendshapeRig
 from torchface.take import Take
 
@@ -67,7 +67,7 @@ def sites_by_shape(rig: BlendshapeRig, rom: Take) -> Attachment:
             "(torchface pick --mode markers)"
         )
     try:
-        pose = find_pose(Samples(points, _outward(points)), ScanPoints(vertices, faces)).pose
+        pose = find_pose(Samples(points, _outward(points)), ScanPoints.of(vertices, faces)).pose
     except AlignmentError as error:
         raise AlignmentError(
             f"markers: by their shape alone they lie nowhere on the face: {error}; "

@@ -1,4 +1,4 @@
-"""Pose of a template on a scan before it bends: by landmarks, or by its shape alone, in any pose."""
+"""Rigid pose of a known surface on a scan: by landmarks, or by its shape alone, in any pose."""
 
 import math
 from dataclasses import dataclass
@@ -53,13 +53,19 @@ class Samples:
 
 
 class ScanPoints:
-    """A scan's vertices with normals, to look up the nearest; at most 20,000 of them.
+    """Points (N,3) of a scan with unit normals (N,3), float64, to look up the nearest.
 
     Args:
-        whole_border: those of the border are among them, so that what lies beyond is recognised.
+        border: which of them lie on the scan's border, (N,) bool: what lies beyond has its nearest point there.
     """
 
-    def __init__(self, vertices: Tensor, faces: Tensor, whole_border: bool = False) -> None:
+    def __init__(self, points: Tensor, normals: Tensor, border: Tensor) -> None:
+        self.points, self.normals, self.border = points, normals, border
+        self._tree = cKDTree(points.numpy())
+
+    @staticmethod
+    def of(vertices: Tensor, faces: Tensor, whole_border: bool = False) -> "ScanPoints":
+        """Vertices of a scan, at most 20,000; with ``whole_border`` all of its border are among them."""
         points = vertices.double()
         normals = vertex_normals(points, faces)
         used = (normals.norm(dim=1) > 0.5).nonzero()[:, 0]
@@ -67,8 +73,7 @@ class ScanPoints:
         border = border_vertices(faces, len(points))
         if whole_border:
             keep = torch.cat([keep, used[border[used]]]).unique()
-        self.points, self.normals, self.border = points[keep], normals[keep], border[keep]
-        self._tree = cKDTree(self.points.numpy())
+        return ScanPoints(points[keep], normals[keep], border[keep])
 
     def nearest(self, queries: Tensor, slack: float = 0.0) -> tuple[Tensor, Tensor]:
         """Distance and row of a point at most ``1 + slack`` times as far as the nearest from each query (...,3)."""
