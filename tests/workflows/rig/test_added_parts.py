@@ -47,15 +47,19 @@ def rigged(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path, Charac
     folder = tmp_path_factory.mktemp("parts")
     head = in_one_piece(performer(texture=False))
     write_character(folder / "a.glb", head, how=Planted(body=False))
-    # Where the finder would find the face is known.
+    with pytest.MonkeyPatch.context() as patch:
+        known_face(patch)
+        report = rig_character(folder / "a.glb", folder / "b.glb", inner_mouth=True, eyes=True)
+    return folder / "a.glb", folder / "b.glb", report, head
+
+
+def known_face(patch: pytest.MonkeyPatch) -> None:
+    """Where the finder would find the face is known."""
     _, search = character_search()
     one = torch.ones(1, dtype=torch.float64)
     pose = Similarity(1e-3 * one, torch.eye(3, dtype=torch.float64)[None], torch.zeros(1, 3, dtype=torch.float64))
     found = FaceOnSurface(pose.apply(search.reference.all)[0], pose, 1.0, 0.0, (), torch.zeros(0, 3))
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(FaceSearch, "find", lambda *_: found)
-        report = rig_character(folder / "a.glb", folder / "b.glb", inner_mouth=True, eyes=True)
-    return folder / "a.glb", folder / "b.glb", report, head
+    patch.setattr(FaceSearch, "find", lambda *_: found)
 
 
 def motion(character: Character, name: str) -> torch.Tensor:
@@ -99,3 +103,22 @@ def test_the_mouth_opens_and_no_tooth_stands_before_a_lip(rigged: tuple[Path, Pa
     assert not bool(border_edges(skin).all(1).any())
     out = motion(character, "tongueOut")
     assert float(out[len(head.vertices) :, 2].max()) > 20.0  # millimetres, toward the viewer
+
+
+@pytest.mark.bench
+def test_added_teeth_go_with_the_jaw_that_a_character_has(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """By another program's name, and as far as its own chin goes: 0.6 of the template's."""
+    known_face(monkeypatch)
+    actor = performer(texture=False)
+    jaw = 0.6 * actor.deltas[actor.names.index("jawOpen")]
+    write_character(tmp_path / "a.glb", actor.neutral, {"A25_Jaw_Open": jaw}, Planted(body=False))
+    report = rig_character(tmp_path / "a.glb", tmp_path / "b.glb", inner_mouth=True)
+    assert "jawOpen" not in report.made
+    character = read_character(read_document(tmp_path / "b.glb"))
+    moved = motion(character, "A25_Jaw_Open")
+    count = len(actor.vertices)
+    torch.testing.assert_close(moved[:count].float(), jaw, atol=1e-3, rtol=0)
+    far = moved[count:].norm(dim=1)
+    chin = float(jaw[actor.neutral.landmarks[8]].norm())
+    assert 0.6 * chin < float(far.max()) < 1.1 * chin  # the lower teeth and the tongue
+    assert float((far < 0.5).double().mean()) > 0.3  # the upper ones

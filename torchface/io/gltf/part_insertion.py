@@ -2,7 +2,7 @@
 
 import copy
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -30,6 +30,9 @@ class ExtendedBlock:
     faces: Mapping[int, NDArray[np.int64]]  # all triangles of each of its primitives
     uvs: NDArray[np.float64]  # texture coordinates, origin at the lower left, (n,2); NaN where they are taken by share
     parts: NDArray[np.int64] | None  # triangles in the material of the parts, (P,3), or none
+    # How the new ones move in morph targets that the block has, by their rows, (n,3) in the array's axes; NaN and other
+    # targets by share.
+    moves: Mapping[int, NDArray[np.float64]] = field(default_factory=dict)
 
 
 def document_with_parts(character: Character, blocks: Sequence[ExtendedBlock], page: bytes) -> Document:
@@ -80,11 +83,19 @@ def _extend(
         both = np.concatenate([rows, new.astype(np.float32)])
         attributes[name] = writer.joints(both) if name.startswith("JOINTS") else writer.vertices(both)
     targets = []
-    for row in document.array(first, "targets", where):
+    for number, row in enumerate(document.array(first, "targets", where)):
+        read = {
+            name: read_floats(document, index, f"{where}.targets", _TYPES, count)
+            for name, index in document.record(row, where).items()
+        }
+        if number in one.moves:
+            read.setdefault("POSITION", np.zeros((count, 3), np.float32))
         target = {}
-        for name, index in document.record(row, where).items():
-            rows = read_floats(document, index, f"{where}.targets", _TYPES, count)
-            target[name] = writer.deltas(np.concatenate([rows, (one.shares @ rows).astype(np.float32)]))
+        for name, rows in read.items():
+            new = one.shares @ rows
+            if name == "POSITION" and number in one.moves:
+                new = np.where(np.isnan(one.moves[number]), new, one.moves[number])
+            target[name] = writer.deltas(np.concatenate([rows, new.astype(np.float32)]))
         targets.append(target)
     mirrored = np.linalg.det(character.linear[block.rows.start].numpy()) < 0
     for number in block.primitives:

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import copy
 import time
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +22,7 @@ from torchface.io.gltf.character_annotations import annotate_character
 from torchface.io.gltf.character_scene import Block, Character, read_character
 from torchface.io.gltf.gltf_document import read_document
 from torchface.io.gltf.morph_insertion import AddedTargets, document_with_targets, rename_targets, write_edited
-from torchface.io.gltf.part_insertion import document_with_parts
+from torchface.io.gltf.part_insertion import ExtendedBlock, document_with_parts
 from torchface.io.images.image_files import IMAGE_ENDINGS, encode_png
 from torchface.io.mesh_files import MESH_ENDINGS
 from torchface.io.vrm.vrm_expressions import VRM_ENDING, MorphBind, add_expressions, vrm_expressions
@@ -59,6 +60,7 @@ _FAR, _LEAST_MET = 1.0, 0.6
 _OF_SCANS = ("the scan has neither", "the scan's triangles", "landmarks disagree")
 """Notes of a registration that say nothing of a character."""
 _COARSE, _WIDE = 1500, 500.0  # triangles of a skin, millimetres of a shape's motion: what is warned of
+_LARGEST = 2.0  # times a shape as it was made, to which that of a part may be brought
 _OTHER_UNIT = 3.0  # times a head's size
 _TONGUE, _JAW, _CLOSE = "tongueOut", "jawOpen", "mouthClose"
 _MOST_TRIANGLES = 500_000  # of a head: its shapes take some 6 GB
@@ -143,7 +145,7 @@ def rig_character(
         shut = eyes_shut_at_rest(face, template.neutral)
         template = with_shut_eyes(template, shut) if any(shut) else template
         registration = _registered(template, face, path, progress)
-        given: AddedParts | None = None
+        given, bare = None, character
         if inner_mouth or eyes:
             progress("adding parts")
             given = added_parts(character, face, template, registration, (inner_mouth, eyes))
@@ -161,6 +163,10 @@ def rig_character(
             progress=progress,
         )
         rig = _with_tongue(carried)
+        if given is not None and given.blocks and present:
+            moving = _moving_parts(character, face, rig, present, given.blocks)
+            document = document_with_parts(bare, moving, encode_png(given.page))
+            character = read_character(document)
         made = tuple(name for name in missing if name in rig.names)
         job = _Job(character, face, carried, rig, made, given, empty, shut)
         progress("writing the character")
@@ -315,6 +321,41 @@ def _registered(template: BlendshapeRig, face: CharacterFace, path: Path, progre
             f"{_FAR:g}) and meets {met:.0%} of it (expected at least {_LEAST_MET:.0%}): is it a face?"
         )
     return registration
+
+
+def _moving_parts(
+    character: Character,
+    face: CharacterFace,
+    rig: BlendshapeRig,
+    present: dict[str, _Present],
+    blocks: Sequence[ExtendedBlock],
+) -> list[ExtendedBlock]:
+    """The added parts with their motion in the shapes that the character has: as made, and as far as its skin moves."""
+    own = {name: _present_motion(character, face, shape)[face.rows] for name, shape in present.items()}
+    skin = torch.isin(face.rows, face.skin_rows)
+    moving = []
+    for one in blocks:
+        block = character.blocks[one.block]
+        parts = torch.from_numpy(~np.isnan(one.uvs[:, 0])).nonzero()[:, 0]
+        rows = block.rows.stop - len(one.places) + parts
+        place = torch.full((len(character.vertices),), -1)
+        place[face.rows] = torch.arange(len(face.rows))
+        head = place[rows]
+        parts, rows, head = parts[head >= 0], rows[head >= 0], head[head >= 0]
+        moves: dict[int, np.ndarray] = {}
+        for name, shape in present.items():
+            binds = [bind for bind in shape.binds if (bind.node, bind.mesh) == (block.node, block.mesh)]
+            if name not in rig.names or not binds:
+                continue
+            made = rig.select([name]).deltas[0].double()
+            size = float((own[name][skin] * made[skin]).sum() / made[skin].square().sum().clamp(min=1e-9))
+            turned = face.found.pose.apply_vectors(made[head][None])[0] * min(max(size, 0.0), _LARGEST)
+            back = torch.einsum("vij,vj->vi", torch.linalg.inv(character.linear[rows]), turned)
+            for bind in binds:
+                moved = moves.setdefault(bind.target, np.full((len(one.places), 3), np.nan))
+                moved[parts] = (back / (len(binds) * (bind.weight or 1.0))).numpy()
+        moving.append(replace(one, moves=moves))
+    return moving
 
 
 def _with_tongue(carried: CarriedShapes) -> BlendshapeRig:
