@@ -24,6 +24,7 @@ from torchface.shape_names import ARKIT
 from torchface.synthetic import draw_identities, performer
 from torchface.workflows.rig import character_face, character_rig
 from torchface.workflows.rig.character_rig import CharacterReport, check_character, rig_character
+from torchface.workflows.rig.present_shapes import present_shapes
 
 FEW = ((0.0, 4),)
 TURN = torch.tensor([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]], dtype=torch.float64)  # lies on its back
@@ -280,7 +281,7 @@ def test_few_triangles_and_shapes_that_move_far_are_warned_of(tmp_path: Path, mo
     monkeypatch.setattr(FaceSearch, "find", lambda *_: found)
     character = read_character(read_document(tmp_path / "a.glb"))
     face = character_face.find_character_face(character, character_face.textured(character))
-    there, empty = character_rig._present(character)
+    there, empty = present_shapes(character)
     record = SimpleNamespace(figures=str, notes=())
     carried = SimpleNamespace(registration=SimpleNamespace(record=record))
     job = character_rig._Job(character, face, carried, coarse, (), None, empty, (False, False))  # type: ignore[arg-type]

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import copy
 import time
-from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -22,10 +21,10 @@ from torchface.io.gltf.character_annotations import annotate_character
 from torchface.io.gltf.character_scene import Block, Character, read_character
 from torchface.io.gltf.gltf_document import read_document
 from torchface.io.gltf.morph_insertion import AddedTargets, document_with_targets, rename_targets, write_edited
-from torchface.io.gltf.part_insertion import ExtendedBlock, document_with_parts
+from torchface.io.gltf.part_insertion import document_with_parts
 from torchface.io.images.image_files import IMAGE_ENDINGS, encode_png
 from torchface.io.mesh_files import MESH_ENDINGS
-from torchface.io.vrm.vrm_expressions import VRM_ENDING, MorphBind, add_expressions, vrm_expressions
+from torchface.io.vrm.vrm_expressions import VRM_ENDING, MorphBind, add_expressions
 from torchface.landmarks.surfaces.face_on_surface import NoFaceOnSurfaceError
 from torchface.modeling.rigging.carried_shapes import CarriedShapes
 from torchface.modeling.rigging.eyelid_closure import BLINKS
@@ -39,11 +38,18 @@ from torchface.rendering.compositing import save_rendered_image, sheet
 from torchface.rendering.textured_surface import TexturedSurface
 from torchface.rig import BlendshapeRig
 from torchface.shape_names import ARKIT
-from torchface.shape_names.recognised_names import arkit_name, recognised_shapes, side_written_out
 from torchface.synthetic import performer
 from torchface.viz.figures.character_views import SHOWN, character_sheet
 from torchface.workflows.rig.added_parts import AddedParts, added_parts
 from torchface.workflows.rig.character_face import CharacterFace, find_character_face, textured
+from torchface.workflows.rig.present_shapes import (
+    PresentShape,
+    moving_parts,
+    present_lines,
+    present_motion,
+    present_shapes,
+    spelled,
+)
 from torchface.workflows.rig.shut_eyes import eyes_shut_at_rest, with_shut_eyes
 
 CHARACTER_ENDINGS = (".glb", VRM_ENDING)
@@ -60,7 +66,6 @@ _FAR, _LEAST_MET = 1.0, 0.6
 _OF_SCANS = ("the scan has neither", "the scan's triangles", "landmarks disagree")
 """Notes of a registration that say nothing of a character."""
 _COARSE, _WIDE = 1500, 500.0  # triangles of a skin, millimetres of a shape's motion: what is warned of
-_LARGEST = 2.0  # times a shape as it was made, to which that of a part may be brought
 _OTHER_UNIT = 3.0  # times a head's size
 _TONGUE, _JAW, _CLOSE = "tongueOut", "jawOpen", "mouthClose"
 _MOST_TRIANGLES = 500_000  # of a head: its shapes take some 6 GB
@@ -124,7 +129,7 @@ def rig_character(
         progress("reading the character")
         document = read_document(path)
         character = read_character(document)
-        present, empty = _present(character)
+        present, empty = present_shapes(character)
         missing = [name for name in ARKIT if name not in present]
         if not (missing or inner_mouth or eyes):
             return _copied(character, present, out, begin, progress)
@@ -164,7 +169,7 @@ def rig_character(
         )
         rig = _with_tongue(carried)
         if given is not None and given.blocks and present:
-            moving = _moving_parts(character, face, rig, present, given.blocks)
+            moving = moving_parts(character, face, rig, present, given.blocks)
             document = document_with_parts(bare, moving, encode_png(given.page))
             character = read_character(document)
         made = tuple(name for name in missing if name in rig.names)
@@ -174,7 +179,7 @@ def rig_character(
         root, data = (
             document_with_targets(document, added, made, empty) if added else (copy.deepcopy(document.root), b"")
         )
-        rename_targets(root, _spelled(present))
+        rename_targets(root, spelled(present))
         expressions = add_expressions(document, root, job.binds(present, added))
         annotate_character(root, character, face.rows, annotations_on(rig, carried.template, carried.registration.pose))
         with all_or_none():
@@ -203,74 +208,18 @@ def check_character(path: Path) -> None:
         )
 
 
-@dataclass(frozen=True)
-class _Present:
-    """One of ARKit's shapes that a character has.
-
-    Args:
-        names: how it calls it.
-        binds: morph targets, and how much of each.
-    """
-
-    names: tuple[str, ...]
-    binds: tuple[MorphBind, ...]
-
-
-def _present(character: Character) -> tuple[dict[str, _Present], tuple[str, ...]]:
-    """The shapes that a character has, by ARKit's names: as morph targets, else as a VRM's expressions.
-
-    Behind them ARKit's names of targets by which nothing moves: they count as missing.
-    """
-    blocks: dict[tuple[int, int], Block] = {}
-    for block in character.blocks:
-        blocks.setdefault((block.node, block.mesh), block)
-    names = list(dict.fromkeys(name for block in blocks.values() for name in block.names))
-    found = {}
-    for arkit, shape in recognised_shapes(names).items():
-        binds = [
-            MorphBind(block.node, block.mesh, block.names.index(name))
-            for name in shape.names
-            for block in blocks.values()
-            if name in block.names
-        ]
-        found[arkit] = _Present(shape.names, tuple(binds))
-    empty = tuple(
-        name
-        for name, shape in found.items()
-        if shape.names == (name,)
-        and not any(
-            bool(character.targets(block)[bind.target].any())
-            for bind in shape.binds
-            for block in character.blocks
-            if (block.node, block.mesh) == (bind.node, bind.mesh)
-        )
-    )
-    found = {name: shape for name, shape in found.items() if name not in empty}
-    for expression, bound in vrm_expressions(character.document).items():
-        named = arkit_name(expression)
-        if named is not None and named in ARKIT and bound and named not in found:
-            found[named] = _Present((expression,), bound)
-    return {name: found[name] for name in ARKIT if name in found}, empty
-
-
-def _spelled(present: dict[str, _Present]) -> dict[str, str]:
-    """Names of the character's shapes that are ARKit's with a letter for the side, and ARKit's."""
-    single = {shape.names[0]: name for name, shape in present.items() if len(shape.names) == 1}
-    return {own: name for own, name in single.items() if own != name and side_written_out(own) == name}
-
-
 def _copied(
-    character: Character, present: dict[str, _Present], out: Path, begin: float, progress: Progress
+    character: Character, present: dict[str, PresentShape], out: Path, begin: float, progress: Progress
 ) -> CharacterReport:
     """Writes a character that has all of ARKit's shapes: names, a VRM's expressions and landmarks alone are new."""
     document = character.document
     root = copy.deepcopy(document.root)
-    rename_targets(root, _spelled(present))
+    rename_targets(root, spelled(present))
     expressions = add_expressions(document, root, {name: shape.binds for name, shape in present.items()})
     known = any(document.first_extras(key) is not None for key in ("landmarks", "rows"))
     found = [] if known else [_landmarks_added(root, character, present, progress)]
     write_edited(document, root, b"", out)
-    notes = [*_present_lines(present), "nothing to make: the file was copied", *found]
+    notes = [*present_lines(present), "nothing to make: the file was copied", *found]
     if expressions:
         notes.append(f"expressions added to the VRM: {len(expressions)}")
     names = {name: shape.names for name, shape in present.items()}
@@ -279,7 +228,7 @@ def _copied(
 
 
 def _landmarks_added(
-    root: dict[str, Any], character: Character, present: dict[str, _Present], progress: Progress
+    root: dict[str, Any], character: Character, present: dict[str, PresentShape], progress: Progress
 ) -> str:
     """Adds landmarks and regions to a character's file; a line for people to read."""
     template = performer(texture=False)
@@ -288,25 +237,12 @@ def _landmarks_added(
         registration = _registered(template, face, character.document.path, progress)
     except AlignmentError as error:
         return f"  note: no landmarks were added, which track --rig needs: {error}"
-    deltas = torch.stack([_present_motion(character, face, shape)[face.rows] for shape in present.values()])
+    deltas = torch.stack([present_motion(character, face, shape)[face.rows] for shape in present.values()])
     own = BlendshapeRig(face.head, deltas.float(), tuple(present))
     annotate_character(
         root, character, face.rows, annotations_on(own, on_face(template, registration), registration.pose)
     )
     return f"landmarks and regions added; template: {registration.record.figures()}"
-
-
-def _present_lines(there: dict[str, _Present]) -> list[str]:
-    """The shapes that a character has, for people to read."""
-    own = {name: shape.names for name, shape in there.items() if shape.names != (name,)}
-    lines = [f"already there: {len(there)} of ARKit's 52, kept as they are"] if there else []
-    if spelled := _spelled(there):
-        some = ", ".join(f"{old} -> {new}" for old, new in list(spelled.items())[:3])
-        lines.append(f"  written with ARKit's names: {len(spelled)} shapes, such as {some}")
-        own = {name: names for name, names in own.items() if names[0] not in spelled}
-    if own:
-        lines.append("  by other names: " + ", ".join(f"{k} ({' + '.join(v)})" for k, v in own.items()))
-    return lines
 
 
 def _registered(template: BlendshapeRig, face: CharacterFace, path: Path, progress: Progress) -> Registration:
@@ -321,41 +257,6 @@ def _registered(template: BlendshapeRig, face: CharacterFace, path: Path, progre
             f"{_FAR:g}) and meets {met:.0%} of it (expected at least {_LEAST_MET:.0%}): is it a face?"
         )
     return registration
-
-
-def _moving_parts(
-    character: Character,
-    face: CharacterFace,
-    rig: BlendshapeRig,
-    present: dict[str, _Present],
-    blocks: Sequence[ExtendedBlock],
-) -> list[ExtendedBlock]:
-    """The added parts with their motion in the shapes that the character has: as made, and as far as its skin moves."""
-    own = {name: _present_motion(character, face, shape)[face.rows] for name, shape in present.items()}
-    skin = torch.isin(face.rows, face.skin_rows)
-    moving = []
-    for one in blocks:
-        block = character.blocks[one.block]
-        parts = torch.from_numpy(~np.isnan(one.uvs[:, 0])).nonzero()[:, 0]
-        rows = block.rows.stop - len(one.places) + parts
-        place = torch.full((len(character.vertices),), -1)
-        place[face.rows] = torch.arange(len(face.rows))
-        head = place[rows]
-        parts, rows, head = parts[head >= 0], rows[head >= 0], head[head >= 0]
-        moves: dict[int, np.ndarray] = {}
-        for name, shape in present.items():
-            binds = [bind for bind in shape.binds if (bind.node, bind.mesh) == (block.node, block.mesh)]
-            if name not in rig.names or not binds:
-                continue
-            made = rig.select([name]).deltas[0].double()
-            size = float((own[name][skin] * made[skin]).sum() / made[skin].square().sum().clamp(min=1e-9))
-            turned = face.found.pose.apply_vectors(made[head][None])[0] * min(max(size, 0.0), _LARGEST)
-            back = torch.einsum("vij,vj->vi", torch.linalg.inv(character.linear[rows]), turned)
-            for bind in binds:
-                moved = moves.setdefault(bind.target, np.full((len(one.places), 3), np.nan))
-                moved[parts] = (back / (len(binds) * (bind.weight or 1.0))).numpy()
-        moving.append(replace(one, moves=moves))
-    return moving
 
 
 def _with_tongue(carried: CarriedShapes) -> BlendshapeRig:
@@ -409,7 +310,7 @@ class _Job:
             added.append(AddedTargets(block.mesh, block.primitives, positions, normal_rows))
         return added
 
-    def binds(self, present: dict[str, _Present], added: list[AddedTargets]) -> dict[str, tuple[MorphBind, ...]]:
+    def binds(self, present: dict[str, PresentShape], added: list[AddedTargets]) -> dict[str, tuple[MorphBind, ...]]:
         """What each of ARKit's expressions of a VRM drives: shapes that were there, and new ones."""
         bound = {name: shape.binds for name, shape in present.items()}
         meshes = {one.mesh for one in added}
@@ -424,7 +325,7 @@ class _Job:
         before = sum(one not in block.names for one in self.made[:row])
         return block.names.index(name) if name in block.names else len(block.names) + before
 
-    def views(self, surface: TexturedSurface, present: dict[str, _Present]) -> Tensor:
+    def views(self, surface: TexturedSurface, present: dict[str, PresentShape]) -> Tensor:
         """The face at rest and with shapes on, those that were there among them."""
         upright = surface.moved(self.face.found.pose.inverse())
         shapes = {}
@@ -433,14 +334,14 @@ class _Job:
             if name in self.made:
                 moved[self.face.rows] = self.rig.select([name]).deltas[0].double()
             elif name in present:
-                moved = _present_motion(self.character, self.face, present[name])
+                moved = present_motion(self.character, self.face, present[name])
             shapes[name] = moved
         landmarks = self.face.found.pose.inverse().apply(self.face.found.points[17:68])[0]
         middle = landmarks[torch.isfinite(landmarks).all(-1)].mean(0)
         return character_sheet(upright, shapes, middle, FACE_SPAN)
 
     def notes(
-        self, there: dict[str, _Present], expressions: tuple[str, ...], seconds: tuple[float, float]
+        self, there: dict[str, PresentShape], expressions: tuple[str, ...], seconds: tuple[float, float]
     ) -> list[str]:
         """For people to read."""
         found, record, character = self.face.found, self.carried.registration.record, self.character
@@ -467,7 +368,7 @@ class _Job:
         if any(name in self.made for name in (*BLINKS, _JAW)):
             cut = self.parts is not None and self.parts.lips_cut
             lines += [f"  {note}" for note in self.carried.notes(lips_cut=cut, shut=self.shut)]
-        lines += _present_lines(there)
+        lines += present_lines(there)
         lines += self._doubts(there)
         missing = [name for name in ARKIT if name not in self.made and name not in there]
         why = " (it has no tongue of its own; --inner-mouth gives it one)" if missing == [_TONGUE] else ""
@@ -478,9 +379,9 @@ class _Job:
             lines.append(f"expressions added to the VRM: {len(expressions)}")
         return [*lines, f"in all {seconds[1]:.1f} s"]
 
-    def _doubts(self, there: dict[str, _Present]) -> list[str]:
+    def _doubts(self, there: dict[str, PresentShape]) -> list[str]:
         """Which of the character's own shapes move nothing, and whether its ``mouthClose`` opens the jaw itself."""
-        motion = {name: _present_motion(self.character, self.face, shape) for name, shape in there.items()}
+        motion = {name: present_motion(self.character, self.face, shape) for name, shape in there.items()}
         still = [name for name, moved in motion.items() if not bool((moved.norm(dim=-1) > _STILL_MM).any())]
         lines = [f"  note: {', '.join(still)}: there, but nothing moves by it"] if still else []
         far = {name: float(moved.norm(dim=-1).max()) for name, moved in motion.items()}
@@ -501,17 +402,6 @@ class _Job:
                     f"  note: its {_CLOSE} opens the jaw itself, as Audio2Face's does; ARKit's leaves that to {_JAW}"
                 )
         return lines
-
-
-def _present_motion(character: Character, face: CharacterFace, shape: _Present) -> Tensor:
-    """How a shape that a character has moves its vertices, (V,3) at a head's size."""
-    moved = torch.zeros_like(character.vertices)
-    for bind in shape.binds:
-        for block in character.blocks:
-            if (block.node, block.mesh) == (bind.node, bind.mesh):
-                own = character.targets(block)[bind.target].double() * bind.weight
-                moved[block.rows] += torch.einsum("vij,vj->vi", character.linear[block.rows], own)
-    return face.found.pose.inverse().apply_vectors(moved[None])[0]
 
 
 def _normal_changes(rest: Tensor, faces: Tensor, deltas: Tensor) -> Tensor:
