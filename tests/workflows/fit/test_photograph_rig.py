@@ -1,6 +1,6 @@
 """A performer is photographed, and the command makes a rig of the pictures that looks as the performer does."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import pytest
@@ -325,6 +325,11 @@ def test_given_landmarks_that_do_not_fit_are_said(people: People, tmp_path: Path
     assert "takeo.ppm: the given landmarks do not fit well" in made.remarks[0]
     assert "those that landmark_network finds have" in made.remarks[0]
     assert made.remarks[0] in made.lines()
+    fits = replace(made, fit=replace(made.fit, residuals=torch.zeros_like(made.fit.residuals)), remarks=())
+    assert fits.verdict().startswith("result: good, eyes, nose and mouth lie 0.0%")
+    warned = replace(fits, remarks=("WARNING: takeo.ppm: the mouth hidden", "note: dark"))
+    assert warned.verdict().startswith("result: in part")
+    assert "; 1 warning below; " in warned.verdict()
 
 
 def test_exact_landmarks_of_one_head_are_of_one_person() -> None:

@@ -97,7 +97,10 @@ class FittedHead:
         off = float((residuals / eyes_distances(self.fit.landmarks)).max())
         fit = f"eyes, nose and mouth lie {off:.1%} of the eyes' distance from the landmarks"
         look = f"look at {self.overlays[0].name} first" if self.overlays else "look at the rig first"
-        return f"result: {'poor' if off > _POOR else 'good'}, {fit} (at most {_POOR:.0%} is usual); {look}"
+        warned = sum(line.startswith("WARNING") for line in self.remarks)
+        word = "poor" if off > _POOR else "in part" if warned else "good"
+        more = f"; {warned} {'warnings' if warned > 1 else 'warning'} below" if warned else ""
+        return f"result: {word}, {fit} (at most {_POOR:.0%} is usual){more}; {look}"
 
     def lines(self) -> list[str]:
         """For people to read."""
