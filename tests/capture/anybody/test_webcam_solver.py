@@ -234,6 +234,16 @@ def test_an_expression_that_is_read_decides_what_is_not_seen(solver: WebcamSolve
     assert float(solved(solver, replace(read, expression_deviation=unknown))[puff]) < 0.15
 
 
+def test_a_smile_that_is_read_and_never_ends_is_not_the_persons_face(solver: WebcamSolver, person: Tensor) -> None:
+    smile = weights_of(mouthSmileLeft=0.5, mouthSmileRight=0.5)
+    state, deviation = solver.start(), torch.full((52,), 0.2)
+    for turn in turns(66):
+        reading = seen(solver, person, smile, turn)
+        state = solver.step(state, replace(reading, expression=smile.float(), expression_deviation=deviation), 1 / FPS)
+    rows = [ARKIT.index(name) for name in ("mouthSmileLeft", "mouthSmileRight")]
+    assert float(state.weights[rows].min()) > 0.47
+
+
 def test_antagonists_are_never_on_together(solver: WebcamSolver, person: Tensor) -> None:
     state, pairs, nobody = solver.start(), solver.arkit_signed, torch.zeros_like(person)
     for frame in range(12):

@@ -10,6 +10,7 @@ from torch.nn.functional import pad
 from torchface.capture.own_rig.face_points import JAW, LANDMARKS, FacePoints, make_room_for_points
 from torchface.capture.own_rig.gauss_newton import HeadState, Linearised
 from torchface.capture.own_rig.landmark_offsets import lid_pairs
+from torchface.capture.energy import Quadratic
 from torchface.errors import ShapeError
 from torchface.optim.exported_operators import symmetric_inverse
 from torchface.rig import BlendshapeRig
@@ -24,6 +25,7 @@ _GRADE = 1e-3  # how much more the first coordinate varies than the last, so tha
 _LEFT_EYE = 42  # the first of its landmarks
 _POSE_INFORMATION = 1e-6
 _SOFTENING = 0.1
+_READINGS = 5.0  # how many readings of a frame what was read counts as, beside what a person looks like
 _RESTING = 100.0  # how much surer rest is of somebody who has been asked to rest
 
 
@@ -91,15 +93,16 @@ class PersonLandmarks(nn.Module):
         return FacePoints(self.rest + moved[self.owner], basis, self.rows, self.valid, self.side)
 
     def information(
-        self, at: Linearised, head: HeadState, person: Tensor, penalty: float, resting: Tensor
+        self, at: Linearised, head: HeadState, person: Tensor, penalty: float, resting: Tensor, read: Quadratic
     ) -> tuple[Tensor, Tensor]:
         r"""What a frame's residuals say of the person, expression and pose marginalised out.
 
         .. math:: A = J_z^\top J_z - J_z^\top J_x (J_x^\top J_x + \Lambda)^{-1} J_x^\top J_z, \quad
             g = J_z^\top r - J_z^\top J_x (J_x^\top J_x + \Lambda)^{-1} (J_x^\top r + \Lambda x)
 
-        with :math:`\Lambda` the quadratic that an L1 penalty on the weights touches: shapes at rest are likely to be,
-        what is active is left open.
+        with :math:`\Lambda` what readings of the weights say, and x beside what was read; of shapes that nothing reads,
+        the quadratic that an L1 penalty on the weights touches: shapes at rest are likely to be, what is active is
+        left open.
 
         Args:
             at: the frame's residuals, linearised at the state.
@@ -107,6 +110,7 @@ class PersonLandmarks(nn.Module):
             person: the coefficients there, (D,).
             penalty: for a weight of 1.
             resting: whether the person has been asked to rest, () bool.
+            read: energy of the weights (1,N) by what was read of them.
 
         Returns:
             A (D,D), and :math:`A z - g` (D,): the information vector of the coefficients.
@@ -118,11 +122,14 @@ class PersonLandmarks(nn.Module):
         basis = self.person_basis - (closed[:, None, None, None] * self.closing_basis).sum(0)
         by_person = (by_place @ head.rotation[0] @ basis).flatten(0, 1)
         by_head, residual = at.jacobian[0].flatten(0, 1), at.residual[0].flatten()
-        rest = torch.where(resting, _RESTING * penalty / _SOFTENING, penalty / (weights + _SOFTENING))
-        rest = pad(rest, (0, 6), value=_POSE_INFORMATION)
+        unread = read.H[0].diagonal() <= 0
+        rest = torch.where(resting, _RESTING * penalty / _SOFTENING, unread * penalty / (weights + _SOFTENING))
+        known = rest.diag() + _READINGS * read.H[0]
+        pull = rest * weights + _READINGS * (read.H[0] @ weights + read.f[0])
+        known = pad(known, (0, 6, 0, 6)) + pad(0 * weights, (0, 6), value=_POSE_INFORMATION).diag()
         coupling = by_head.T @ by_person
-        explained = symmetric_inverse(by_head.T @ by_head + rest.diag()) @ torch.cat(
-            [coupling, (residual @ by_head + rest * pad(weights, (0, 6)))[:, None]], dim=1
+        explained = symmetric_inverse(by_head.T @ by_head + known) @ torch.cat(
+            [coupling, (residual @ by_head + pad(pull, (0, 6)))[:, None]], dim=1
         )
         through, count = coupling.T @ explained, by_person.shape[1]
         information = by_person.T @ by_person - through[:, :count]

@@ -181,9 +181,8 @@ class WebcamSolver(WebcamSolverParts):
 
         evidence = relative_trust(torch.where(frame.trust > 0, frame.trust, 0.0)[None]) @ self.influence
         hidden = unseen_time(before.hidden[None], evidence, frame.interval)
-        known = self._known_energy(signals, before, evidence, hidden, frame.interval) + self._read_energy(
-            frame, evidence
-        )
+        read = self._read_energy(frame, evidence)
+        known = self._known_energy(signals, before, evidence, hidden, frame.interval) + read
         upper = highest_weights(gain_factors(before.gains, self.gain_shapes), self.gain_shapes, frame.pose)
         unit = eyes / (points.rest[EYE_CORNERS[0]] - points.rest[EYE_CORNERS[1]]).norm()
         variance = (self.settings.noise * eyes).square() + (0.5 * frame.spread).square()
@@ -207,7 +206,7 @@ class WebcamSolver(WebcamSolverParts):
         error = self._error(at, precision, eyes, frame.trust)
         learns = frame.learns * (before.learned < self.settings.learning)
         good = learns * (since_shown > _SETTLED) * (error < LOST_FIT)
-        person, information, evidence = self._learned_person(at, head, frame, before, good)
+        person, information, evidence = self._learned_person(at, head, read, frame, before, good)
         gains, gains_seen = learned_gains(weights, self.gain_shapes, before, frame.interval, frame.pose, frame.learns)
         learned = (before.learned + good * frame.interval).clamp(max=self.settings.learning)
         return replace(
@@ -290,10 +289,10 @@ class WebcamSolver(WebcamSolverParts):
         return ((inner * squared).sum() / inner.sum().clamp(min=1e-6)).sqrt() / eyes
 
     def _learned_person(
-        self, at: Linearised, head: HeadState, frame: _Frame, before: WebcamState, good: Tensor
+        self, at: Linearised, head: HeadState, read: Quadratic, frame: _Frame, before: WebcamState, good: Tensor
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Coefficients, information and evidence with a frame's, where it is ``good``."""
-        given = [at.residual, at.jacobian, head.weights, head.rotation, frame.interval, frame.pose]
+        given = [at.residual, at.jacobian, head.weights, head.rotation, read.H, read.f, frame.interval, frame.pose]
         given += [before.person, before.information, before.evidence, before.learned]
         learns = good > 0
         if torch.compiler.is_compiling():  # a graph has both ways; here a call that is not exported takes one
@@ -306,6 +305,8 @@ class WebcamSolver(WebcamSolverParts):
         jacobian: Tensor,
         weights: Tensor,
         rotation: Tensor,
+        read_curvature: Tensor,
+        read_gradient: Tensor,
         interval: Tensor,
         pose: Tensor,
         person: Tensor,
@@ -316,7 +317,7 @@ class WebcamSolver(WebcamSolverParts):
         head, at = HeadState(weights, rotation, rotation[:, 0]), Linearised(residual, jacobian)
         resting = (pose - 1).abs() < 0.5
         frame_information, frame_evidence = self.person.information(
-            at, head, person, self.settings.rest_penalty, resting
+            at, head, person, self.settings.rest_penalty, resting, Quadratic(read_curvature, read_gradient)
         )
         eager = 1 + _EAGER * torch.exp(-learned / _EAGER_FOR)
         share = (interval / self.settings.alike * eager).clamp(max=1.0)

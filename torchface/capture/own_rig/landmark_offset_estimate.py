@@ -17,6 +17,7 @@ from torchface.capture.own_rig.state_estimate import Expectation
 from torchface.capture.own_rig.video_solver import VideoSolver
 from torchface.capture.weight_readings import WeightReadings
 from torchface.errors import AlignmentError, ValueRangeError
+from torchface.geometry.similarity import similarity_transform
 from torchface.optim.box_qp import box_qp
 
 _SEARCHED, _FRAMES, _ROUNDS, _REWEIGHTINGS = 120, 40, 3, 3
@@ -32,6 +33,9 @@ _MODEL_ERROR = 0.5  # millimetres; what no constant expression and no offset exp
 _PENALTY, _SOFTENING = 6.0, 0.1
 _PRIOR = 0.3
 _LEAST_NOISE, _NOISE_FACTOR = 0.015, 2.0
+# What the mean of a take's readings counts beside one frame's: it errs less than they do, and smiles that last would else
+# become offsets. From 1 to 10 the error of smiles fell from 0.138 to 0.107 in rendered films.
+_READINGS = 10.0
 _FREE = 1e3
 
 
@@ -167,7 +171,19 @@ def _estimated(solver: VideoSolver, take: _Take, likely: Tensor | None, neutral:
         if begun == 0:
             scale = mean.scale
         offsets, expression = _split(mean, offsets, expression, scale**2 * likely, None if neutral else solver)
+        offsets = _without_pose(offsets, solver.points.rest[:LANDMARKS].double(), likely)
     return offsets.rounded()
+
+
+def _without_pose(offsets: LandmarkOffsets, rest: Tensor, likely: Tensor) -> LandmarkOffsets:
+    """The offsets without what moves, turns or grows all landmarks (68,3) alike: that is where the head is.
+
+    Frames cannot tell a smaller head from one that is further away, so the covariance of offsets alone would say; heads
+    with small eyes and mouths are small, and the rig was drawn by up to 8 % nearer, and larger, than the face.
+    """
+    weights = likely.diagonal().view(-1, 3).sum(1).reciprocal()
+    moved = similarity_transform(rest[None], (rest + offsets.millimetres)[None], weights[None])
+    return replace(offsets, millimetres=moved.inverse().apply(rest + offsets.millimetres)[0] - rest)
 
 
 def _split(
@@ -243,8 +259,8 @@ def _mean_problem(solver: VideoSolver, take: _Take, start: HeadState, likely: Te
     gradient = factor * torch.einsum("t,tij,ti->j", share, left, rest)
     read = None
     if terms.read is not None:
-        H_read = torch.einsum("t,tij->ij", share, terms.read.H)
-        read = Quadratic(H_read[None], (share @ terms.read.f)[None])
+        H_read = _READINGS * torch.einsum("t,tij->ij", share, terms.read.H)
+        read = Quadratic(H_read[None], _READINGS * (share @ terms.read.f)[None])
     mean = _Mean(
         read,
         0.5 * (H + H.T),
