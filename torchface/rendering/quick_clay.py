@@ -18,10 +18,12 @@ BACKGROUND = (38, 40, 44)
 _TINT = (236, 92, 40)
 _LIPS = (0.77, 0.52, 0.47)
 _LEVELS, _TINT_LEVELS = 256, 4
-_AMBIENT, _HIGHLIGHT = 0.30, 0.16
-_LIGHTS = (((-0.55, 0.60, 0.60), 0.66), ((0.80, 0.05, 0.45), 0.24))  # right, up, toward the viewer; strength
+_AMBIENT, _HIGHLIGHT = 0.38, 0.16
+# Right, up, toward the viewer; strength. Light from steeply above blackens the lids of eyes that lie deep.
+_LIGHTS = (((-0.45, 0.40, 0.80), 0.52), ((0.70, 0.05, 0.60), 0.24))
+_IN_CREASES = 0.6  # of the lights' strength, where nothing of the sky is seen
 _LEAST_OPEN = 0.6
-_EXPOSURE = 1.35  # of skin in these lights
+_EXPOSURE = 1.25  # of skin in these lights
 _SMALLEST = 1.0  # millimetres before the lens
 _JUMP = 0.012  # of the nearness; neighbours that differ by more are an edge
 
@@ -104,7 +106,9 @@ class QuickClay:
         for (x, y, z), strength in _LIGHTS:
             toward = torch.nn.functional.normalize(points.new_tensor([x, -y, -z]), dim=0)
             facing = normals @ toward
-            light = light + strength * ((facing + 0.15) / 1.15).clamp(min=0) * (0.4 + 0.6 * self.openness)
+            light = light + strength * ((facing + 0.15) / 1.15).clamp(min=0) * (
+                _IN_CREASES + (1 - _IN_CREASES) * self.openness
+            )
             half = torch.nn.functional.normalize(toward + points.new_tensor([0.0, 0.0, -1.0]), dim=0)
             light = light + _HIGHLIGHT * strength * (normals @ half).clamp(min=0) ** 24
         return light
