@@ -102,13 +102,11 @@ class QuickClay:
     def _light(self, points: Tensor) -> Tensor:
         """The light on vertices (V,3) in the camera's frame, (V,), 1 at most but in highlights."""
         normals = vertex_normals(points, self.faces)
-        light = _AMBIENT * self.openness
+        light, reached = _AMBIENT * self.openness, _IN_CREASES + (1 - _IN_CREASES) * self.openness
         for (x, y, z), strength in _LIGHTS:
             toward = torch.nn.functional.normalize(points.new_tensor([x, -y, -z]), dim=0)
             facing = normals @ toward
-            light = light + strength * ((facing + 0.15) / 1.15).clamp(min=0) * (
-                _IN_CREASES + (1 - _IN_CREASES) * self.openness
-            )
+            light = light + strength * ((facing + 0.15) / 1.15).clamp(min=0) * reached
             half = torch.nn.functional.normalize(toward + points.new_tensor([0.0, 0.0, -1.0]), dim=0)
             light = light + _HIGHLIGHT * strength * (normals @ half).clamp(min=0) ** 24
         return light

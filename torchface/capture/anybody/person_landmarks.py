@@ -7,10 +7,10 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import pad
 
+from torchface.capture.energy import Quadratic
 from torchface.capture.own_rig.face_points import JAW, LANDMARKS, FacePoints, make_room_for_points
 from torchface.capture.own_rig.gauss_newton import HeadState, Linearised
 from torchface.capture.own_rig.landmark_offsets import lid_pairs
-from torchface.capture.energy import Quadratic
 from torchface.errors import ShapeError
 from torchface.optim.exported_operators import symmetric_inverse
 from torchface.rig import BlendshapeRig
@@ -25,7 +25,7 @@ _GRADE = 1e-3  # how much more the first coordinate varies than the last, so tha
 _LEFT_EYE = 42  # the first of its landmarks
 _POSE_INFORMATION = 1e-6
 _SOFTENING = 0.1
-_READINGS = 5.0  # how many readings of a frame what was read counts as, beside what a person looks like
+_READINGS = 5.0  # how much what was read of a frame counts here, beside one of its readings: as in a take's offsets
 _RESTING = 100.0  # how much surer rest is of somebody who has been asked to rest
 
 

@@ -33,7 +33,7 @@ _MODEL_ERROR = 0.5  # millimetres; what no constant expression and no offset exp
 _PENALTY, _SOFTENING = 6.0, 0.1
 _PRIOR = 0.3
 _LEAST_NOISE, _NOISE_FACTOR = 0.015, 2.0
-# What the mean of a take's readings counts beside one frame's: it errs less than they do, and smiles that last would else
+# How much the mean of a take's readings counts beside one frame's reading: it errs less, and smiles that last would
 # become offsets. From 1 to 10 the error of smiles fell from 0.138 to 0.107 in rendered films.
 _READINGS = 10.0
 _FREE = 1e3
