@@ -11,6 +11,7 @@ from torch import Tensor, nn
 from torchface.correctives.activation import CorrectiveActivation
 from torchface.errors import ShapeError, ValueRangeError
 from torchface.geometry.cameras.sliding_contour import LevelCurves, level_curves, outermost
+from torchface.geometry.meshes.operators import components
 from torchface.rig import BlendshapeRig
 
 LANDMARKS = 68
@@ -63,7 +64,9 @@ class FacePoints:
         wing, top, bottom = float(x[marks[[31, 35]]].max()), float(y[marks[27]]), float(y[marks[33]])
         nose = (x < 1.2 * wing) & (y < top) & (y > bottom - 0.1 * (top - bottom))
         faces = rig.neutral.faces
-        curves = _thinned(level_curves(rig.vertices, faces[~nose[faces].any(1)], marks[:JAW]), rig.vertices)
+        part = components(faces, count)
+        skin = torch.isin(part, part[marks])[faces[:, 0]]  # no hair, clothes and other heads, which reach further out
+        curves = _thinned(level_curves(rig.vertices, faces[skin & ~nose[faces].any(1)], marks[:JAW]), rig.vertices)
         used, place = torch.cat([marks.cpu(), curves.vertices.flatten()]).unique(return_inverse=True)
         values = stacked[:, used.to(marks.device)].double().cpu().transpose(0, 1)
         local = replace(curves, vertices=place[LANDMARKS:].reshape(curves.vertices.shape))
