@@ -19,7 +19,7 @@ from .people_split import held_out_people
 from .take_store import StoredTake, TakesRead, TakeStore
 
 _METHOD = "takes of priors/2"
-_SUFFIXES = (".csv", ".c3d")
+_SUFFIXES = (".csv", ".c3d", ".trc")
 _SAME_RATE = 1e-3  # relative; 59.94 and 60 frames a second are not the same, rounding is
 
 
@@ -72,7 +72,7 @@ def read_takes(
     """All takes of a folder, by name; one is in memory at a time.
 
     Args:
-        folder: with .csv and .c3d files, or with a folder of such files for each person.
+        folder: with .csv, .c3d and .trc files, or with a folder of such files for each person.
         work: folder that keeps their weights, a file a take; those of an earlier run are taken up.
         fps: frame rate to bring all takes to; that of the first if absent.
         rig: of the performer of marker takes.

@@ -1,6 +1,6 @@
 """``torchface train priors --takes DIR --out models/NAME``: which weights faces have, and how they go on.
 
-From weight takes (Live Link Face, CSV), or from marker takes (C3D, CSV) with ``--rig`` and ``--attachment``: they
+From weight takes (Live Link Face, CSV), or from marker takes (C3D, TRC, CSV) with ``--rig`` and ``--attachment``: they
 are aligned with the rig and solved first. ``--performances 60`` learns from takes of so many people made by code
 instead, and needs no file. ``--names`` and ``--rig`` make a prior for a rig's own names out of takes with ARKit's.
 """

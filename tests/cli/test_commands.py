@@ -411,4 +411,4 @@ def test_weights_in_place_of_markers_are_told(tmp_path: Path, capsys: pytest.Cap
     with pytest.raises(SystemExit):
         main(["attach", str(tmp_path / "rig.glb"), str(tmp_path / "take.csv"), "--out", str(tmp_path / "sites.json")])
     told = " ".join(capsys.readouterr().err.split())
-    assert "found 52 weights, expected a marker take (.c3d, .csv); such weights go to another rig by" in told
+    assert "found 52 weights, expected a marker take (.c3d, .trc, .csv); such weights go to another rig by" in told

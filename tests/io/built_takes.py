@@ -57,6 +57,36 @@ def c3d_files(draw: st.DrawFn) -> Files:
 
 
 @st.composite
+def trc_files(draw: st.DrawFn) -> Files:
+    """The header's fields, labels and rows of numbers, with cells too many, too few, empty or odd."""
+    markers, frames = draw(st.integers(0, 3)), draw(st.integers(0, 4))
+    values = [
+        draw(numbers(1, 99)),
+        "60",
+        str(draw(counts(frames))),
+        str(draw(counts(markers))),
+        draw(st.sampled_from(["mm", "m", "?"])),
+    ]
+    label = st.sampled_from(["a", "b", "", "a_2", "unlabeled1"])
+    lines = [
+        "PathFileType\t4\t(X/Y/Z)\tcase.trc",
+        "DataRate\tCameraRate\tNumFrames\tNumMarkers\tUnits",
+        "\t".join(values),
+        "Frame#\tTime\t" + "\t\t\t".join(draw(label) for _ in range(markers)),
+        draw(st.sampled_from(["\t\tX1\tY1\tZ1", "", "\t"])),
+    ]
+    for row in range(frames):
+        width = draw(seldom(st.integers(0, 12), st.just(3 * markers), 20))
+        cells = [
+            draw(seldom(numbers(), st.just(str(row + 1)))),
+            str(row / 60),
+            *(draw(numbers()) for _ in range(width)),
+        ]
+        lines.append("\t".join(cells))
+    return {"case.trc": draw(st.sampled_from(LINE_ENDS)).join(map(str, draw(altered(lines, 1)))).encode()}
+
+
+@st.composite
 def csv_files(draw: st.DrawFn) -> Files:
     """Headers of every kind of table, with columns too many, missing or twice, and rows that may not fit them."""
     from torchface.shape_names import ARKIT

@@ -45,6 +45,7 @@ READERS: list[tuple[Callable[[Path], object], str, str]] = [
     (read_gltf_detail, "built_meshes", "gltf_files"),
     (load_rig, "built_meshes", "rig_folders"),
     (load_take, "built_takes", "c3d_files"),
+    (load_take, "built_takes", "trc_files"),
     (load_take, "built_takes", "csv_files"),
     (load_dlib_faces, "built_documents", "dlib_files"),
     (load_landmark_points, "built_documents", "pts_files"),

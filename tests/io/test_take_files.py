@@ -19,7 +19,7 @@ def _markers() -> Track:
     return Track(("nose", "chin"), torch.randn(4, 2, 3, generator=torch.Generator().manual_seed(0)))
 
 
-@pytest.mark.parametrize("suffix", [".c3d", ".C3D", ".csv"])
+@pytest.mark.parametrize("suffix", [".c3d", ".C3D", ".trc", ".csv"])
 def test_markers_go_to_the_format_of_the_suffix(suffix: str, tmp_path: Path) -> None:
     take = Take(100.0, markers=_markers())
     save_take(take, tmp_path / f"take{suffix}")
@@ -59,7 +59,7 @@ def test_a_csv_holds_the_weights_or_the_one_track_there_is(tmp_path: Path) -> No
 
 
 def test_what_no_reader_knows_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(FileFormatError, match=r"take\.fbx: found the ending '\.fbx', expected \.c3d, \.csv"):
+    with pytest.raises(FileFormatError, match=r"take\.fbx: found the ending '\.fbx', expected \.c3d, \.trc, \.csv"):
         load_take(tmp_path / "take.fbx")
     with pytest.raises(FileFormatError, match=r"take\.fbx: found the ending"):
         save_take(Take(60.0, markers=_markers()), tmp_path / "take.fbx")

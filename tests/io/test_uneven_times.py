@@ -32,13 +32,14 @@ def tracks(frames: int) -> dict[str, Track]:
     return {
         "weights.csv": Track(("one", "two"), torch.rand(frames, 2, 1, generator=generator)),
         "markers.csv": Track(("a", "b"), torch.rand(frames, 2, 3, generator=generator)),
+        "markers.trc": Track(("a", "b"), torch.rand(frames, 2, 3, generator=generator)),
         "landmarks.csv": Track(("0", "1"), torch.rand(frames, 2, 2, generator=generator)),
         "live_link.csv": Track(ARKIT, torch.rand(frames, 52, 1, generator=generator)),
     }
 
 
 def taken(name: str, seconds: torch.Tensor, fps: float = 30.0) -> Take:
-    kind = {"markers.csv": "markers", "landmarks.csv": "landmarks"}.get(name, "weights")
+    kind = {"markers.csv": "markers", "markers.trc": "markers", "landmarks.csv": "landmarks"}.get(name, "weights")
     return Take(fps, **{kind: tracks(len(seconds))[name]}, seconds=seconds)
 
 
@@ -53,8 +54,8 @@ def test_tables_give_the_times_back(name: str, kind: str, tmp_path: Path) -> Non
         torch.testing.assert_close(found.times, seconds - seconds[0], atol=slack, rtol=0)
         if kind != "variable rate":
             assert found.fps == 30
-        save_take(found, tmp_path / "again.csv")
-        again = load_take(tmp_path / "again.csv")
+        save_take(found, tmp_path / "again.csv" if name.endswith("csv") else tmp_path / "again.trc")
+        again = load_take(tmp_path / "again.csv" if name.endswith("csv") else tmp_path / "again.trc")
         torch.testing.assert_close(again.times, found.times, atol=1e-9, rtol=0)
 
 
@@ -72,14 +73,14 @@ def test_animations_give_the_times_back(name: str, kind: str, tmp_path: Path) ->
 
 def test_c3d_holds_dropped_frames_as_empty_ones_and_no_other_times(tmp_path: Path) -> None:
     seconds = planted_seconds("dropped frames", 2)
-    take = taken("markers.csv", seconds)
+    take = taken("markers.trc", seconds)
     save_take(take, tmp_path / "take.c3d")
     found = load_take(tmp_path / "take.c3d")
     seen = ~found.markers.values.isnan().any(-1).any(-1)
     torch.testing.assert_close(found.times[seen], seconds - seconds[0], atol=1e-9, rtol=0)
     assert found.markers.values[seen].equal(take.markers.values)
     with pytest.raises(ValueRangeError, match=r"uneven times.*expected an even rate for C3D"):
-        save_take(taken("markers.csv", planted_seconds("variable rate", 2)), tmp_path / "other.c3d")
+        save_take(taken("markers.trc", planted_seconds("variable rate", 2)), tmp_path / "other.c3d")
     assert not (tmp_path / "other.c3d").exists()
 
 
@@ -89,7 +90,7 @@ def test_broken_times_are_refused_or_repaired_and_said(change: str, name: str, t
     seconds = planted_seconds("variable rate", 1, 30)
     path = tmp_path / name
     save_take(taken(name, seconds), path)
-    blank = ","
+    blank = "\t" if name.endswith("trc") else ","
     lines = path.read_text().splitlines()
     first = len(lines) - 30
     rows = [line.split(blank) for line in lines[first:]]

@@ -48,7 +48,7 @@ def attach(
 
     Args:
         rig: The performer's rig: a .glb or USD file, a folder of OBJ files, or ICT-FaceKit's FaceXModel folder.
-        rom: Markers over a range of motion: .c3d or .csv. Every expression, strongly; no frame need be neutral.
+        rom: Markers over a range of motion: .c3d, .trc or .csv. Every expression, strongly; no frame need be neutral.
             Or several, or folders of them.
         out: The attachment to write.
         initial: Where the markers sit roughly: an attachment or landmarks as `torchface pick` writes them, labelled
@@ -61,7 +61,7 @@ def attach(
         frames: Use the frames A:B of the take only, from A up to, not including, B; counted from 0.
         unit: What the take's coordinates are in: um, mm, cm, m or in; else what the file says (CSV: millimetres).
         flip: Negate this axis of the take's coordinates: for takes exported in left-handed axes, which are mirrored.
-        scale: Of the take against the rig: held at 1, or free, to be estimated. Held where the unit is known (C3D,
+        scale: Of the take against the rig: held at 1, or free, to be estimated. Held where the unit is known (C3D, TRC,
             --unit), if absent.
         insist: Write the sites although the rig does not explain the markers, or the take leaves most of them
             uncertain.

@@ -46,7 +46,7 @@ def enhance(
 ) -> None:
     """Enhance a coarse animation with the wrinkles, creases and pores of a captured actor.
 
-    INPUT is markers (.c3d, .csv, with --attachment), weights (.csv, with --rig), an animated .glb, a mesh
+    INPUT is markers (.c3d, .trc, .csv, with --attachment), weights (.csv, with --rig), an animated .glb, a mesh
     sequence (.safetensors), a folder of meshes, a frame each, or the folder of `torchface track`. Meshes of the model's
     topology pass straight; others are registered to the model, or by --pairs.
 

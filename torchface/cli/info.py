@@ -14,7 +14,7 @@ def info(
     """Say what a file holds: a rig, mesh, take, attachment, solver, video or image.
 
     Args:
-        path: A .glb, USD, .obj, .ply, .stl, .off, .c3d, .csv, .txt (Face Cap, iFacialMocap), .json (attachment,
+        path: A .glb, USD, .obj, .ply, .stl, .off, .c3d, .trc, .csv, .txt (Face Cap, iFacialMocap), .json (attachment,
             Audio2Face, ARKit), .gesichter or .onnx file, arrays (.npz, .npy, .safetensors), what
             `fit` writes of a photograph (.pts, .toml), landmarks (.ljson, dlib's .xml), MediaPipe's .task, or a rig's
             folder.

@@ -64,7 +64,7 @@ def solve(
 
     Args:
         rig: A .glb or USD file, a folder of OBJ files, or ICT-FaceKit's FaceXModel folder.
-        take: Markers: .c3d or .csv; or several, or folders of them.
+        take: Markers: .c3d, .trc or .csv; or several, or folders of them.
         attachment: Where the markers sit on the rig, as JSON. Markers match by label; a subject's prefix (Actor:M001)
             and another case do not matter, labels that it does not know are left out.
         out: The weights to write: Live Link Face CSV if each of the rig's shapes is one of ARKit's, otherwise
@@ -98,7 +98,7 @@ def solve(
         frames: Solve the frames A:B of the take only, from A up to, not including, B; counted from 0.
         unit: What the take's coordinates are in: um, mm, cm, m or in; else what the file says (CSV: millimetres).
         flip: Negate this axis of the take's coordinates: for takes exported in left-handed axes, which are mirrored.
-        scale: Of the take against the rig: held at 1, or free, to be estimated. Held where the unit is known (C3D,
+        scale: Of the take against the rig: held at 1, or free, to be estimated. Held where the unit is known (C3D, TRC,
             --unit), if absent.
         insist: Write weights although the rig does not explain the markers.
     """

@@ -13,6 +13,7 @@ from torchface.files.whole_files import check_ending, read_file
 from torchface.io.landmarks.openface_csv import is_landmark_header, load_landmarks_csv, save_landmarks_csv
 from torchface.io.markers.c3d import load_c3d, save_c3d
 from torchface.io.markers.marker_csv import is_marker_header, load_markers_csv, save_markers_csv
+from torchface.io.markers.trc import load_trc, save_trc
 from torchface.io.protocols.live_link_recordings import load_live_link_packets
 from torchface.io.tables.csv_table import MAX_TABLE_BYTES, TableReader, quoted
 from torchface.io.tables.numbered_csv import is_numbered
@@ -24,7 +25,7 @@ from torchface.io.weights.weight_csv import ROTATIONS, load_weights_csv, save_we
 from torchface.number_checks import checked_path, checked_type
 from torchface.take import Take, Track
 
-MARKER_ENDINGS = (".c3d",)
+MARKER_ENDINGS = (".c3d", ".trc")
 TAKE_ENDINGS = (*MARKER_ENDINGS, ".csv")
 RECORDING_ENDINGS = (".txt", ".json", ".gesichter")
 """Of weights as phones and other programs record them, which are read alone."""
@@ -40,6 +41,7 @@ def load_take(path: str | Path, unit: str | None = None) -> Take:
 
     ==================================== =====================================================
     ``.c3d``                             markers, :func:`torchface.io.markers.c3d.load_c3d`
+    ``.trc``                             markers, :func:`torchface.io.markers.trc.load_trc`
     ``Timecode,BlendshapeCount,...``     weights, :func:`torchface.io.weights.live_link_csv.load_live_link`
     ``frame,time,<label>_x,...``         markers, :func:`torchface.io.markers.marker_csv.load_markers_csv`
     ``frame,time,<shape>,...``           weights, :func:`torchface.io.weights.weight_csv.load_weights_csv`
@@ -73,6 +75,8 @@ def load_take(path: str | Path, unit: str | None = None) -> Take:
     suffix = path.suffix.lower()
     if suffix == ".c3d":
         return load_c3d(path, unit)
+    if suffix == ".trc":
+        return load_trc(path, unit)
     if suffix == ".json":
         return in_usual_units(load_weight_json(path), path)
     if suffix == ".gesichter":
@@ -108,7 +112,7 @@ def _load_text(path: Path) -> Take:
 def save_take(take: Take, path: str | Path) -> None:
     """Writes a performance in the format that ``path`` ends in.
 
-    ``.c3d`` holds the markers, a ``.csv`` the weights of a take that has some, else its markers or its
+    ``.c3d`` and ``.trc`` hold the markers, a ``.csv`` the weights of a take that has some, else its markers or its
     landmarks; whatever else the take holds is left out. Weights whose names are ARKit's 52, in whatever order and case,
     become a Live Link Face file; others a plain table that keeps their names
     (:func:`torchface.io.weights.live_link_csv.save_live_link` maps them to ARKit's instead).
@@ -118,7 +122,7 @@ def save_take(take: Take, path: str | Path) -> None:
         path: the file; it appears only when it is complete.
 
     Raises:
-        FileFormatError: the ending is neither ``.c3d`` nor ``.csv``.
+        FileFormatError: the ending is none of ``.c3d``, ``.trc``, ``.csv``.
         ValueRangeError: the take holds nothing for this format, markers and landmarks for one ``.csv``, or infinite
             numbers.
         NameMismatchError: a name would not come back as it is.
@@ -126,8 +130,8 @@ def save_take(take: Take, path: str | Path) -> None:
     Example:
         >>> from torchface.take import Track
         >>> markers = Track(("chin", "nose"), torch.tensor([[[0.0, -60.0, 90.0], [0.0, 0.0, 110.0]]] * 2))
-        >>> save_take(Take(120.0, markers=markers), "take.c3d")
-        >>> load_take("take.c3d").markers.names
+        >>> save_take(Take(120.0, markers=markers), "take.trc")
+        >>> load_take("take.trc").markers.names
         ('chin', 'nose')
     """
     checked_type("take", take, Take)
@@ -137,6 +141,8 @@ def save_take(take: Take, path: str | Path) -> None:
     suffix = path.suffix.lower()
     if suffix == ".c3d":
         return save_c3d(take, path)
+    if suffix == ".trc":
+        return save_trc(take, path)
     if take.weights is not None:
         return save_live_link(take, path) if are_live_link_shapes(take.weights.names) else save_weights_csv(take, path)
     present = [name for name in ("markers", "landmarks") if getattr(take, name) is not None]

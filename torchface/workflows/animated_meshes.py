@@ -116,7 +116,7 @@ def _is_take(file: Path) -> bool:
     try:
         ending = file.suffix.lower()
         if ending != ".csv":
-            return ending in (".safetensors", ".c3d")
+            return ending in (".safetensors", ".c3d", ".trc")
         header = TableReader(file).header
         return is_numbered(header) or is_live_link(header)
     except FileFormatError:

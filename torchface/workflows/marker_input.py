@@ -45,7 +45,7 @@ class MarkerOptions:
     scale: Literal["held", "free"] | None = None
 
     def frees_scale(self, path: Path) -> bool:
-        """Whether an alignment estimates the scale of the markers in this file: C3D states its unit."""
+        """Whether an alignment estimates the scale of the markers in this file: C3D and TRC state their unit."""
         if self.scale is not None:
             return self.scale == "free"
         return self.unit is None and path.suffix.lower() not in MARKER_ENDINGS
@@ -68,7 +68,7 @@ def read_markers(path: Path, labels: Sequence[str] | None, options: MarkerOption
     """The take with the markers of an attachment alone, by its labels, all frames; and remarks for the user.
 
     Args:
-        path: ``.c3d`` or ``.csv``.
+        path: ``.c3d``, ``.trc`` or ``.csv``.
         labels: the attachment's; all labelled markers of the file where there is none.
         options: unit and label map.
     """
@@ -78,7 +78,7 @@ def read_markers(path: Path, labels: Sequence[str] | None, options: MarkerOption
         held = ", ".join(
             f"{len(track.names)} {kind}" for kind in ("weights", "landmarks") if (track := getattr(take, kind))
         )
-        raise ValueRangeError(f"{path}: found {held or 'no markers'}, expected a marker take (.c3d, .csv){other}")
+        raise ValueRangeError(f"{path}: found {held or 'no markers'}, expected a marker take (.c3d, .trc, .csv){other}")
     renamed = None if options.labels is None else load_label_map(options.labels)
     try:
         names = take.markers.names
@@ -126,7 +126,7 @@ def read_range_of_motion(
     """The frames of a range of motion with the markers that are seen in them, the sites of these, and remarks.
 
     Args:
-        path: ``.c3d`` or ``.csv``.
+        path: ``.c3d``, ``.trc`` or ``.csv``.
         initial: sites to begin with, if there are any.
         options: unit, label map, frames.
     """

@@ -12,6 +12,7 @@ from torchface import load_take
 from torchface.errors import FileFormatError
 from torchface.io.markers.c3d import load_c3d, save_c3d
 from torchface.io.markers.marker_csv import load_markers_csv, save_markers_csv
+from torchface.io.markers.trc import load_trc, save_trc
 from torchface.take import Take, Track
 
 _GOOD = """frame,time,nose_x,nose_y,nose_z,chin_x,chin_y,chin_z
@@ -131,12 +132,13 @@ def test_the_origin_stands_for_not_seen(tmp_path: Path) -> None:
     markers = load_markers_csv(table).markers
     assert markers is not None
     assert torch.isnan(markers.values).any(2).tolist() == [[True, False], [True, False], [False, False]]
-    # The other format ends in the same function.
-    values = torch.tensor([[[0.0, 0, 0], [0, 5, 0]], [[1, 0, 0], [0, 0, 0]]])
-    save_c3d(Take(60.0, markers=Track(("a", "b"), values)), tmp_path / "take.c3d")
-    found = load_c3d(tmp_path / "take.c3d").markers
-    assert found is not None
-    assert torch.isnan(found.values).any(2).tolist() == [[True, False], [False, True]]
-    save_c3d(Take(60.0, markers=Track(("a", "b"), torch.zeros(2, 2, 3))), tmp_path / "take.c3d")
-    with pytest.raises(FileFormatError, match=r"none of them seen .* other than \(0, 0, 0\)"):
-        load_c3d(tmp_path / "take.c3d")
+    # The other formats end in the same function.
+    for name, save, load in (("take.c3d", save_c3d, load_c3d), ("take.trc", save_trc, load_trc)):
+        values = torch.tensor([[[0.0, 0, 0], [0, 5, 0]], [[1, 0, 0], [0, 0, 0]]])
+        save(Take(60.0, markers=Track(("a", "b"), values)), tmp_path / name)
+        found = load(tmp_path / name).markers
+        assert found is not None
+        assert torch.isnan(found.values).any(2).tolist() == [[True, False], [False, True]]
+        save(Take(60.0, markers=Track(("a", "b"), torch.zeros(2, 2, 3))), tmp_path / name)
+        with pytest.raises(FileFormatError, match=r"none of them seen .* other than \(0, 0, 0\)"):
+            load(tmp_path / name)

@@ -417,7 +417,7 @@ def test_what_does_not_fit_the_model_is_named(actor: Actor, tmp_path: Path) -> N
 
 def test_markers_that_do_not_fit_are_named(actor: Actor, tmp_path: Path) -> None:
     points = actor.attachment.on(actor.mesh.faces, actor.frames)
-    take, sites = tmp_path / "take.c3d", actor.folder / "attachment.json"
+    take, sites = tmp_path / "take.trc", actor.folder / "attachment.json"
     labels = actor.attachment.labels or ()
     save_take(Take(FPS, markers=Track(labels, points)), take)
     with pytest.raises(NameMismatchError, match=r"\(--attachment\)"):
@@ -432,11 +432,11 @@ def test_markers_that_do_not_fit_are_named(actor: Actor, tmp_path: Path) -> None
     )
     with pytest.raises(TopologyError, match=r"expected the model's.*\(--rig\)"):
         coarse(actor, take, tmp_path, attachment=foreign)
-    large = tmp_path / "large.c3d"
+    large = tmp_path / "large.trc"
     save_take(Take(FPS, markers=Track(labels, 10 * points)), large)
     with pytest.raises(AlignmentError, match=r"10\.\d times too large.*--unit"):
         coarse(actor, large, tmp_path, attachment=sites)
-    mixed = tmp_path / "mixed.c3d"
+    mixed = tmp_path / "mixed.trc"
     save_take(Take(FPS, markers=Track(labels, points[:, torch.randperm(60)])), mixed)
     with pytest.raises(AlignmentError):
         coarse(actor, mixed, tmp_path, attachment=sites)

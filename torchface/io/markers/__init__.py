@@ -1,1 +1,1 @@
-"""Marker takes as files: C3D, CSV, and tables of labels."""
+"""Marker takes as files: C3D, TRC, CSV, and tables of labels."""

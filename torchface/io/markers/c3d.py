@@ -186,7 +186,8 @@ def save_c3d(take: Take, path: str | Path) -> None:
         take, _ = given.on_grid()
         if take.fps != given.fps:
             raise ValueRangeError(
-                f"{path}: found frames {given.rate}, expected an even rate for C3D: write .csv, or take.resampled()"
+                f"{path}: found frames {given.rate}, expected an even rate for C3D: write .csv or .trc, or "
+                "take.resampled()"
             )
         numbers = range(first, first + len(take))
     labels, positions = values_to_write(take.markers, "marker positions", 3, path)

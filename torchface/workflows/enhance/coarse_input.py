@@ -53,7 +53,7 @@ def read_coarse(path: Path, model: Mesh, settings: InputSettings, state: Path, p
     """An animation in the model's vertices, from markers, weights, an animated ``.glb``, meshes or a tracked video.
 
     Args:
-        path: ``.c3d``, ``.csv`` of markers or weights, ``.glb``, ``.safetensors``, a mesh, a folder of
+        path: ``.c3d``, ``.trc``, ``.csv`` of markers or weights, ``.glb``, ``.safetensors``, a mesh, a folder of
             meshes, or the folder of ``torchface track``.
         state: a folder for what a later run may take up.
     """
@@ -62,7 +62,7 @@ def read_coarse(path: Path, model: Mesh, settings: InputSettings, state: Path, p
         return _markers(path, model, settings, state, progress)
     for name, value in (("--attachment", settings.attachment), ("--neutral", settings.neutral)):
         if value is not None:
-            raise ValueRangeError(f"{path}: found {name} and no markers, expected a .c3d or .csv of markers")
+            raise ValueRangeError(f"{path}: found {name} and no markers, expected a .c3d, .trc or .csv of markers")
     animated, notes = _even(load_animated(tracked_animation(path), settings.rig, settings.part), settings.fps)
     if has_topology_of(animated.neutral, model):
         coarse = same_topology(animated, model, settings.fps)
@@ -88,7 +88,7 @@ def is_markers(path: Path) -> bool:
     if not path.exists():
         raise FileFormatError(f"{path}: found no such file or folder, expected an animation or markers")
     ending = path.suffix.lower()
-    return ending == ".c3d" or (ending == ".csv" and is_marker_header(TableReader(path).header))
+    return ending in (".c3d", ".trc") or (ending == ".csv" and is_marker_header(TableReader(path).header))
 
 
 def tracked_animation(path: Path) -> Path:
