@@ -18,9 +18,9 @@ from torchface.io.rig_files import SCENE_ENDINGS
 from torchface.mesh import Mesh, submesh
 from torchface.modeling import HeadModel
 from torchface.modeling.morphable.published_models import head_model_of
+from torchface.modeling.rigging.annotated_heads import annotations_on, on_face
 from torchface.modeling.rigging.carried_shapes import CarriedShapes
 from torchface.modeling.rigging.eyelid_closure import BLINKS
-from torchface.modeling.rigging.head_annotations import annotations_on, on_face
 from torchface.modeling.rigging.mouth_parts import tongue_out
 from torchface.modeling.rigging.other_topology import shapes_on
 from torchface.progress import Progress, silent

@@ -6,7 +6,7 @@ from planted.characters import other_topology
 from torchface.geometry.meshes.operators import components
 from torchface.geometry.similarity import Similarity
 from torchface.mesh import Annotations, Mesh
-from torchface.modeling.rigging.head_annotations import annotations_on
+from torchface.modeling.rigging.annotated_heads import annotations_on
 from torchface.rig import BlendshapeRig
 from torchface.synthetic import performer
 
