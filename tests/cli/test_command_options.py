@@ -174,6 +174,22 @@ def test_the_help_shows_one_value_where_an_option_is_given_again_for_each(
     assert option in " ".join(capsys.readouterr().out.split())
 
 
+@pytest.mark.parametrize(
+    ("words", "hint"),
+    [
+        ("live 0 --to osc://a:1 vmc://b:2", "again for each: --to osc://a:1 --to vmc://b:2"),
+        ("convert a.obj --out b.glb", "OUT has a place and no flag: torchface convert a.obj b.glb"),
+        ("convert a.obj -o b.glb", "OUT has a place and no flag: torchface convert a.obj b.glb"),
+    ],
+)
+def test_an_option_given_in_the_way_of_another_is_refused_with_the_right_way(
+    words: str, hint: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit, match="2"):
+        main(words.split())
+    assert hint in " ".join(capsys.readouterr().err.split())
+
+
 def test_a_wrong_word_is_refused_with_the_right_ones_in_their_order(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit):
         main(["attach", "--unit", "yard"])

@@ -14,7 +14,7 @@ from torchface.cli.annotate import annotate
 from torchface.cli.arkit import arkit
 from torchface.cli.attach import attach
 from torchface.cli.calibrate import calibrate
-from torchface.cli.command_options import checked
+from torchface.cli.command_options import checked, usage_hints
 from torchface.cli.convert import convert
 from torchface.cli.corrective import corrective
 from torchface.cli.demo import demo
@@ -33,7 +33,7 @@ from torchface.cli.retarget import retarget
 from torchface.cli.retime import retime
 from torchface.cli.rig import rig
 from torchface.cli.solve import solve
-from torchface.cli.terminal import PlainConsole, plain_errors
+from torchface.cli.terminal import PlainConsole, plain_errors, print_lines
 from torchface.cli.track import track
 from torchface.cli.train import train
 from torchface.cli.transfer import transfer
@@ -110,7 +110,12 @@ def main(arguments: Sequence[str] | None = None) -> None:
         elif words[0] == "train":
             train(words[1:])
         elif words[0] in COMMANDS:  # alone: what tyro says of a wrong value then names its help
-            tyro.cli(checked(COMMANDS[words[0]]), prog=f"torchface {words[0]}", args=words[1:])
+            try:
+                tyro.cli(checked(COMMANDS[words[0]]), prog=f"torchface {words[0]}", args=words[1:])
+            except SystemExit as end:
+                if end.code:
+                    print_lines(usage_hints(COMMANDS[words[0]], words[1:]))
+                raise
         elif words[0] in GROUPS:
             group = GROUPS[words[0]]
             tyro.extras.subcommand_cli_from_dict(

@@ -1,11 +1,12 @@
 """Options of commands: their help in plain words, without a default that is none, and texts that are read as values."""
 
 import re
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, is_dataclass
 from functools import wraps
 from inspect import signature
+from itertools import takewhile
 from pathlib import Path
 from types import NoneType, UnionType
 from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
@@ -130,6 +131,20 @@ def plain_options(command: Command) -> Command:
             hints[name] = Annotated[(kind, *notes, arg(**changes))]  # type: ignore[misc]
     command.__annotations__ = hints
     return command
+
+
+def usage_hints(command: Callable[..., Any], words: Sequence[str]) -> Iterator[str]:
+    """What tyro does not say of options that it refused: which are given again, and which have a place and no flag."""
+    for name, hint in get_type_hints(command, include_extras=True).items():
+        flag, notes = f"--{name.replace('_', '-')}", getattr(hint, "__metadata__", ())
+        flags = (flag, "-o") if name == "out" else (flag,)
+        if Positional in notes and any(word.split("=")[0] in flags for word in words):
+            given = [word for word in words if not word.startswith("-")]
+            yield f"{name.upper()} has a place and no flag: torchface {command.__name__} {' '.join(given)}"
+        for at, word in enumerate(words):
+            values = [*takewhile(lambda value: not value.startswith("-"), words[at + 1 :])]
+            if UseAppendAction in notes and word == flag and len(values) > 1:
+                yield f"{flag} takes one value and is given again for each: {' '.join(f'{flag} {v}' for v in values)}"
 
 
 def _choices(kind: Any) -> PrimitiveConstructorSpec[Any] | None:

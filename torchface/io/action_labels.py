@@ -1,7 +1,7 @@
 """Labels of a head-camera video as TOML: where to look, and which action units were performed when."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -73,6 +73,7 @@ class ActionLabels:
         regions: boxes (left, top, right, bottom) by name.
         performed: what was done when, in any order; empty for a video that is only to be classified.
         groups: which regions show which units, where these are others than the usual.
+        source: the file, for messages.
 
     Raises:
         ValueRangeError: a frame outside the video, an empty stretch or box, or a number that is not finite.
@@ -92,33 +93,37 @@ class ActionLabels:
     regions: dict[str, Box]
     performed: tuple[Performed, ...] = ()
     groups: tuple[RegionGroup, ...] = ()
+    source: str = field(default="labels", compare=False)
 
     def __post_init__(self) -> None:
         if not 1 <= self.frames <= _MAX_FRAMES:
-            raise ValueRangeError(f"labels: found {self.frames} frames, expected 1 to {_MAX_FRAMES}")
+            raise ValueRangeError(f"{self.source}: found {self.frames} frames, expected 1 to {_MAX_FRAMES}")
         if not 0 <= self.neutral < self.frames:
-            raise ValueRangeError(f"labels: found neutral frame {self.neutral}, expected 0 to {self.frames - 1}")
+            raise ValueRangeError(f"{self.source}: found neutral frame {self.neutral}, expected 0 to {self.frames - 1}")
         if not all(math.isfinite(v) for point in (self.helmet, *self.markers) for v in point):
-            raise ValueRangeError(f"labels: found helmet {self.helmet} and markers {self.markers}, expected pixels")
+            raise ValueRangeError(
+                f"{self.source}: found helmet {self.helmet} and markers {self.markers}, expected pixels"
+            )
         if not self.regions:
-            raise NameMismatchError("labels: found no region, expected at least one")
+            raise NameMismatchError(f"{self.source}: found no region, expected at least one")
         for name, (left, top, right, bottom) in self.regions.items():
             if not (math.isfinite(left + top + right + bottom) and left + 1 < right and top + 1 < bottom):
                 raise ValueRangeError(
-                    f"labels: region {name!r} is {(left, top, right, bottom)}, expected left < right, top < bottom"
+                    f"{self.source}: region {name!r} is {(left, top, right, bottom)}, expected left < right, "
+                    "top < bottom"
                 )
         for stretch in self.performed:
             if not 0 <= stretch.first < stretch.last <= self.frames:
                 raise ValueRangeError(
-                    f"labels: {' '.join(stretch.units)} is performed from frame {stretch.first} to before "
+                    f"{self.source}: {' '.join(stretch.units)} is performed from frame {stretch.first} to before "
                     f"{stretch.last}, expected a stretch within the video's {self.frames} frames"
                 )
             if not all(stretch.units) or not stretch.units or len(set(stretch.units)) < len(stretch.units):
-                raise NameMismatchError(f"labels: found the units {stretch.units!r}, expected distinct names")
+                raise NameMismatchError(f"{self.source}: found the units {stretch.units!r}, expected distinct names")
         for group in self.groups:
             if not group.regions or not group.units or not set(group.regions) <= set(self.regions):
                 raise NameMismatchError(
-                    f"labels: group {group.name!r:.60} has regions {', '.join(group.regions)} and units "
+                    f"{self.source}: group {group.name!r:.60} has regions {', '.join(group.regions)} and units "
                     f"{', '.join(group.units)}, expected some of {', '.join(self.regions)}, and a unit"
                 )
 
@@ -148,29 +153,27 @@ def load_action_labels(path: str | Path) -> ActionLabels:
         _pixels(point) for point in (document["helmet"], *document["markers"].rows(2, 2, "two markers"))
     )
     performed = document["performed"].rows() if document["performed"] else []
-    try:
-        return ActionLabels(
-            document["frames"].whole(),
-            document["neutral"].whole(),
-            helmet,
-            (left, right),
-            {name: _pixels(box, 4) for name, box in document["regions"].table().items()},
-            tuple(
-                Performed(stretch["units"].texts(), stretch["first"].whole(), stretch["last"].whole())
-                for stretch in performed
-            ),
-            tuple(
-                RegionGroup(
-                    group["name"].text(),
-                    group["regions"].texts(),
-                    group["units"].texts(),
-                    group["other_units"].texts() if group["other_units"] else (),
-                )
-                for group in (document["groups"].rows() if document["groups"] else [])
-            ),
-        )
-    except (ValueRangeError, NameMismatchError) as error:
-        raise type(error)(f"{path}: {error}") from error
+    return ActionLabels(
+        document["frames"].whole(),
+        document["neutral"].whole(),
+        helmet,
+        (left, right),
+        {name: _pixels(box, 4) for name, box in document["regions"].table().items()},
+        tuple(
+            Performed(stretch["units"].texts(), stretch["first"].whole(), stretch["last"].whole())
+            for stretch in performed
+        ),
+        tuple(
+            RegionGroup(
+                group["name"].text(),
+                group["regions"].texts(),
+                group["units"].texts(),
+                group["other_units"].texts() if group["other_units"] else (),
+            )
+            for group in (document["groups"].rows() if document["groups"] else [])
+        ),
+        str(path),
+    )
 
 
 def _pixels(value: Value, count: int = 2) -> Any:

@@ -7,7 +7,7 @@ import torch
 
 from torchface.capture.action_units import RegionVideo, read_regions
 from torchface.capture.action_units.painted_regions import region_grid, sample_regions
-from torchface.errors import FileFormatError, NameMismatchError, ShapeError, ValueRangeError
+from torchface.errors import AlignmentError, FileFormatError, NameMismatchError, ShapeError, ValueRangeError
 from torchface.io.video import write_video
 from train.filmed_performers.camera_stage import RecordedSession
 
@@ -34,6 +34,9 @@ def test_bad_input_is_named(session: RecordedSession, regions: RegionVideo, tmp_
         read_regions(video, cheek, ["cheek"])
     with pytest.raises(ShapeError, match=rf"found {labels.frames} frames, expected {labels.frames + 5} as its labels"):
         read_regions(video, replace(labels, frames=labels.frames + 5), ["mouth"])
+    astray = replace(labels, markers=(labels.markers[0], (500.0, 3.0)), source="take.toml")
+    with pytest.raises(AlignmentError, match=r"take.toml: the second of markers is at \(500.0, 3.0\)"):
+        read_regions(video, astray, ["mouth"])
     path = tmp_path / "broken.avi"
     path.write_bytes(video.path.read_bytes()[:200_000])
     with pytest.raises(FileFormatError, match="could be decoded"):

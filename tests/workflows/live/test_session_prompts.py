@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from torchface.workflows.live.live_figures import LiveFigures
+from torchface.workflows.live.live_figures import LiveFigures, LiveReport
 from torchface.workflows.live.live_frames import LiveFrame
 from torchface.workflows.live.session_prompts import GuidedCalibration, LightWatch
 
@@ -41,3 +41,12 @@ def test_latency_is_told_within_a_hundredth() -> None:
     assert figures.latency(0.5) == pytest.approx(500, rel=0.01)
     assert figures.latency(0.99) == pytest.approx(990, rel=0.01)
     assert (figures.frames, figures.found) == (1000, 500)
+    assert figures.fps == pytest.approx(30)
+
+
+def test_a_short_session_of_a_camera_has_the_cameras_rate() -> None:
+    """Not frames by seconds: of three frames there are two intervals, and the last one's solve is none."""
+    figures = LiveFigures()
+    for i in range(3):
+        figures.add(i / 30, i / 30 + 0.1, True)
+    assert LiveReport(figures, 0).lines()[0] == "3 frames solved in 0.2 s, a face in 3; they came at 30.0 a second"

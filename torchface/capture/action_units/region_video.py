@@ -11,7 +11,7 @@ from torch import Tensor
 from torchface.capture.action_units.painted_pattern import Method, aligned_grid, neutral_flow, pattern_levels
 from torchface.capture.action_units.painted_regions import region_grid, sample_regions
 from torchface.capture.action_units.stabilization import PointTracker, steady_transforms
-from torchface.errors import ShapeError
+from torchface.errors import AlignmentError, ShapeError
 from torchface.io.action_labels import ActionLabels
 from torchface.io.video import VideoFile, open_video
 from torchface.progress import Progress, silent
@@ -81,12 +81,15 @@ def read_regions(
     neutral = levels.pattern(sample_regions(still[None].float() / 255, grid, _identity())[0])
     if reference is not None:
         grid = aligned_grid(grid, neutral_flow(neutral, reference, method))
-    tracker = PointTracker(still, torch.tensor(labels.helmet), torch.tensor(labels.markers))
     tracked = []
-    for chunk in video.chunks(_CHUNK):  # once to follow the points, once to read: no whole video is in memory
-        tracked.append(tracker(chunk))
-    _check_length(video, labels, sum(len(chunk) for chunk in tracked))
-    transforms = steady_transforms(tracker.points, torch.cat(tracked))
+    try:
+        tracker = PointTracker(still, torch.tensor(labels.helmet), torch.tensor(labels.markers))
+        for chunk in video.chunks(_CHUNK):  # once to follow the points, once to read: no whole video is in memory
+            tracked.append(tracker(chunk))
+        _check_length(video, labels, sum(len(chunk) for chunk in tracked))
+        transforms = steady_transforms(tracker.points, torch.cat(tracked))
+    except AlignmentError as error:
+        raise AlignmentError(f"{labels.source}: {error} ({video.path.name})") from None
     patterns, done = [], 0
     for chunk in islice(video.chunks(_CHUNK), len(tracked)):
         regions = sample_regions(chunk.float() / 255, grid, transforms[done : done + len(chunk)])

@@ -11,6 +11,7 @@ _LEVELS = 3
 _REACH = 4  # pixels about a marker's expected place in which its centroid is taken
 _MAX_RESIDUAL = 0.2  # of a grey value of 1, mean over the window
 _MAX_STEP = 20.0  # pixels from one frame to the next
+_FIELDS = ("helmet", "the first of markers", "the second of markers")  # of the labels, in which the points stand
 
 
 class PointTracker:
@@ -31,14 +32,14 @@ class PointTracker:
         for i, (x, y) in enumerate(torch.cat([helmet[None], markers]).tolist()):
             if not (2 <= x < width - 2 and 2 <= y < height - 2):
                 raise AlignmentError(
-                    f"stabilisation: point {i} is at ({x:.1f}, {y:.1f}), expected it inside the image of "
-                    f"{width} x {height} pixels"
+                    f"{_FIELDS[i]} is at ({x:.1f}, {y:.1f}), expected inside the image of {width} x {height} pixels"
                 )
             top, left = max(int(y) - 5, 0), max(int(x) - 5, 0)
             around = reference[top : int(y) + 7, left : int(x) + 7].float()
             if float(around.max() - around.min()) < 20:
                 raise AlignmentError(
-                    f"stabilisation: nothing to track at point {i}, ({x:.1f}, {y:.1f}); expected a corner or a marker"
+                    f"{_FIELDS[i]}: found nothing to follow at ({x:.1f}, {y:.1f}) in the neutral frame, expected "
+                    + ("a bright marker" if i else "a corner or an edge of the helmet")
                 )
         self._reference = np.ascontiguousarray(reference.numpy())
         blobs, brightness = _blobs(reference, markers.float())
@@ -115,9 +116,7 @@ def steady_transforms(reference: Tensor, tracked: Tensor) -> Tensor:
     worst = int(lost.float().mean(0).argmax())
     share = float(lost[:, worst].float().mean())
     if share > 0.2:
-        raise AlignmentError(
-            f"stabilisation: point {worst} was lost in {share:.0%} of {len(tracked)} frames, expected it in view"
-        )
+        raise AlignmentError(f"{_FIELDS[worst]} was lost in {share:.0%} of {len(tracked)} frames, expected in view")
     z = torch.view_as_complex(reference.double().contiguous())
     moved = torch.view_as_complex(_filled(tracked.double()).contiguous())
     centred, target = z - z.mean(), moved - moved.mean(1, keepdim=True)

@@ -15,12 +15,12 @@ class LiveFigures:
     def __init__(self) -> None:
         self.frames = self.found = 0
         self._histogram = np.zeros(_BINS + 1, np.int64)
-        self._first = self._last = 0.0
+        self._first = self._last = self._came = 0.0
 
     def add(self, came: float, gone: float, seen: bool) -> None:
         """Counts a frame that came and was sent on at these times, in seconds."""
         self._first = self._first if self.frames else came
-        self._last = gone
+        self._last, self._came = gone, came
         self.frames += 1
         self.found += seen
         latency = 1000 * (gone - came)
@@ -41,8 +41,8 @@ class LiveFigures:
 
     @property
     def fps(self) -> float:
-        """Frames a second, over all."""
-        return self.frames / max(self.seconds, 1e-9) if self.frames else 0.0
+        """Frames a second, from the first one's arrival to the last one's; 0 before the second."""
+        return (self.frames - 1) / max(self._came - self._first, 1e-9) if self.frames > 1 else 0.0
 
 
 @dataclass(frozen=True)
@@ -57,7 +57,8 @@ class LiveReport:
         """For people to read."""
         figures = self.figures
         return [
-            f"{figures.frames} frames at {figures.fps:.1f} a second, a face in {figures.found}",
+            f"{figures.frames} frames solved in {figures.seconds:.1f} s, a face in {figures.found}; they came at "
+            f"{figures.fps:.1f} a second",
             f"{figures.latency(0.5):.1f} ms from frame to packet (99th percentile {figures.latency(0.99):.1f} ms), "
             f"{self.dropped} frames came while another was solved and were left out",
             *(f"warning: {note}" for note in self.notes),
