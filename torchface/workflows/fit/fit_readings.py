@@ -16,7 +16,7 @@ from torchface.workflows.surface_sites import sites_on_rig
 
 __all__ = ["with_readings"]
 
-_EYE_SEEN = 0.5  # how likely nothing hides an eye whose iris counts
+_EYE_SEEN, _EYE_SHUT = 0.5, 0.5  # how likely nothing hides an eye whose iris counts, and how likely its lids do
 _EYES = (slice(36, 42), slice(42, 48))
 
 
@@ -75,7 +75,8 @@ def _with_irises(surface: SurfacePoints, readings: FaceReading, rig: BlendshapeR
         return surface
     front = neutral.vertices[:, 2].detach().cpu()
     poles = torch.stack([front.masked_fill(~ball, -torch.inf).argmax() for ball in balls])
-    irises = torch.where(readings.eye_visibility[..., None] > _EYE_SEEN, readings.iris, torch.nan)
+    shown = (readings.eye_visibility > _EYE_SEEN) & ~(readings.closed > _EYE_SHUT)
+    irises = torch.where(shown[..., None], readings.iris, torch.nan)
     lids = torch.stack([readings.deviation[:, eye].median(1).values for eye in _EYES], dim=1)
     own, more = surface.sites, Attachment.from_vertices(neutral, poles)
     sites = Attachment(torch.cat([own.triangles, more.triangles]), torch.cat([own.barycentric, more.barycentric]))
