@@ -115,18 +115,20 @@ def video_solver(
     from torchface.capture.own_rig.landmark_offsets import LandmarkOffsets
     from torchface.errors import FileFormatError, ValueRangeError
     from torchface.files.job_lock import file_lock
-    from torchface.io import load_rig, load_take
+    from torchface.io import load_take
     from torchface.io.camera_files import load_calibration
     from torchface.number_checks import check_rate
     from torchface.onnx import export_video_solver
     from torchface.workflows.named_priors import load_priors
     from torchface.workflows.track.take_solution import rig_digest
+    from torchface.workflows.track.track_inputs import load_actor
+    from torchface.workflows.track.upright_rig import upright
 
     with file_lock(out, ".onnx"), progress_bars(quiet) as progress:
         if fps is not None:
             check_rate(fps, "--fps", ValueRangeError)
         progress("reading rig, camera and priors")
-        loaded, calibration = load_rig(rig, part=part), load_calibration(camera)
+        (loaded, about), calibration = upright(load_actor(rig, part)), load_calibration(camera)
         priors = load_priors(loaded, prior, dynamics, fps)
         video = None if landmarks is None else load_take(landmarks).landmarks
         if landmarks is not None and video is None:
@@ -139,6 +141,7 @@ def video_solver(
             loaded, calibration, out, priors.shapes, priors.dynamics, video=video, offsets=shift
         )
     print_table(report.rows())
+    print_lines([about] if about else [])
     if priors.unlearned:
         console.print(f"the priors say nothing of {', '.join(priors.unlearned)}", soft_wrap=True)
     print_path(out)

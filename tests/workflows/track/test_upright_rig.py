@@ -37,3 +37,5 @@ def test_a_head_at_its_place_stays_as_it_is() -> None:
     turn = torch.linalg.matrix_exp(torch.tensor([[0.0, 0, 0.3], [0, 0, 0], [-0.3, 0, 0]]))
     rig = moved(person, 1.2, turn, torch.tensor([0.0, 30.0, 0.0]))
     assert upright(rig) == (rig, "")
+    bare = BlendshapeRig.from_tensors(100 * rig.vertices, rig.neutral.faces, rig.deltas, rig.names)  # no landmarks
+    assert upright(bare) == (bare, "")

@@ -33,6 +33,7 @@ from torchface.take import Track
 from torchface.workflows.named_finders import part_finder
 from torchface.workflows.relight.tracked_film import TrackedFilm, bare, read_tracked_film
 from torchface.workflows.relight.wanted_light import WantedLight
+from torchface.workflows.track.upright_rig import upright
 
 FilmLight = Literal["once", "each"]
 Draw = Callable[[int, Tensor, PointLight | EnvironmentLight], Tensor]
@@ -191,7 +192,7 @@ def _painter(tracked: TrackedFilm, settings: RelightSettings) -> Draw | None:
 
 def _other_head(path: Path) -> BlendshapeRig:
     """A head for the actor's place, with teeth where the template has some; hair and clothes are the film's."""
-    other = load_rig(path)
+    other = upright(load_rig(path))[0]
     texture = other.neutral.texture
     if texture is None or other.neutral.uvs is None:
         raise ValueRangeError(

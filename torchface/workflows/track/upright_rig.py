@@ -2,6 +2,7 @@
 
 import torch
 
+from torchface.capture.own_rig.face_points import LANDMARKS
 from torchface.geometry.similarity import Similarity, similarity_transform
 from torchface.rig import BlendshapeRig
 from torchface.synthetic import neutral_head
@@ -16,8 +17,11 @@ def upright(rig: BlendshapeRig) -> tuple[BlendshapeRig, str]:
     A character in centimetres, on its back, or with its head 1.6 m above the ground is one; weights stay what they are.
 
     Args:
-        rig: with iBUG's 68.
+        rig: one without iBUG's 68 stays as it is.
     """
+    notes = rig.neutral.annotations
+    if notes is None or notes.landmarks is None or len(notes.landmarks) != LANDMARKS:
+        return rig, ""
     head = neutral_head(texture=False)
     usual, found = (mesh.vertices[mesh.landmarks][_INNER].detach().double() for mesh in (head, rig.neutral))
     pose = similarity_transform(usual[None], found[None])
