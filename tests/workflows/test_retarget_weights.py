@@ -1,5 +1,6 @@
 """``torchface retarget`` onto a rig whose mouthClose opens the jaw."""
 
+import json
 from pathlib import Path
 
 import pytest
@@ -113,6 +114,19 @@ def test_the_animated_character_keeps_all_that_it_has(tmp_path: Path) -> None:
     with pytest.warns(UserWarning, match="left out: animations .* talk"):
         played = load_animation(tmp_path / "out.glb")
     torch.testing.assert_close(played.weights.values, weights, atol=1e-3, rtol=0)
+
+
+def test_what_an_unpacked_character_loses_is_said(tmp_path: Path) -> None:
+    rig = performer(texture=False).select(["jawOpen", "mouthPucker"])
+    save_rig(rig, tmp_path / "hero.glb")
+    root, binary = unpacked(tmp_path / "hero.glb")
+    root["buffers"][0]["uri"] = "hero.bin"
+    (tmp_path / "hero.bin").write_bytes(binary)
+    (tmp_path / "hero.gltf").write_text(json.dumps(root))
+    save_take(Take(30.0, weights=Track(rig.names, torch.rand(3, 2, 1))), tmp_path / "take.csv")
+    files = WeightFiles(tmp_path / "out.csv", tmp_path / "out.glb")
+    done = retarget_weights(tmp_path / "take.csv", tmp_path / "hero.gltf", files)
+    assert any("gltf-transform/cli copy" in warning for warning in done.warnings)
 
 
 def test_weights_called_as_a_rig_are_refused_with_the_option_that_writes_one(

@@ -137,6 +137,11 @@ def write_weights(
         make_folder(files.animation.parent)
         reduced = write_animation(rig, take, files.animation, files.reduce, source)
         notes += [] if reduced is None else [f"{files.animation}: {reduced}"]
+        if source is not None and source.suffix.lower() == ".gltf":
+            warnings.append(
+                f"{files.animation} has the meshes of {source} alone; packed, it keeps nodes, skeleton and materials: "
+                f"npx @gltf-transform/cli copy {source} {source.with_suffix('.glb')}"
+            )
     return warnings, notes
 
 
