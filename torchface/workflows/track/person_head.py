@@ -1,5 +1,6 @@
 """The head of whoever a video shows: solved with a head model from frames of several angles and expressions."""
 
+import math
 from dataclasses import dataclass, replace
 
 import torch
@@ -20,6 +21,7 @@ from torchface.workflows.track.track_inputs import TrackInputs
 FRAMES = 10
 """How many frames the head is solved from at most."""
 
+_READINGS = 10.0  # how much what was read of a frame counts beside the head, as in a take's offsets
 _DOUBTED = 0.2  # trust below which a landmark does not count
 
 
@@ -72,6 +74,7 @@ def person_head(
             reading.of_frames(frames),
             iris=undistort(reading.iris[frames].double(), inputs.calibration),
             points=undistort(reading.points[frames].double(), inputs.calibration),
+            expression_deviation=reading.expression_deviation[frames] / math.sqrt(_READINGS),
         )
         settings = with_readings(settings, shown, inputs.models.places, rig)
     fit = fit_images(
