@@ -251,4 +251,4 @@ def test_the_command_writes_a_solver_of_rig_and_camera(
     main(["export", "video-solver", *given, "--quiet"])
     assert capsys.readouterr().out.splitlines()[-1] == f"{tmp_path}/out.onnx"
     session = onnxruntime.InferenceSession(tmp_path / "out.onnx", providers=["CPUExecutionProvider"])
-    assert [o.name for o in session.get_outputs()] == ["weights", "rotation", "translation"]
+    assert [o.name for o in session.get_outputs()] == ["weights", "rotation", "translation", "hidden"]
