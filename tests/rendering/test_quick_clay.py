@@ -35,3 +35,18 @@ def test_what_lies_within_keeps_light_for_when_it_is_seen() -> None:
     both = Mesh(torch.cat([front, teeth]), torch.cat([faces, faces[(faces < 105).all(1)] + len(front)]))
     clay = QuickClay.of(both)
     assert float(clay.openness[len(front) :].min()) >= 0.6
+
+
+def test_teeth_are_dark_behind_lips_that_are_hardly_apart() -> None:
+    rig = performer(texture=False)
+    head, clay = rig.neutral, QuickClay.of(rig.neutral)
+    intrinsics = torch.tensor([[3000.0, 0, 160], [0, 3000, 160], [0, 0, 1]]).double()
+    flip = torch.diag(torch.tensor([1.0, -1.0, -1.0])).double()
+    for jaw in (0.05, 0.4):
+        posed = rig(jaw * torch.eye(len(rig.names))[[rig.names.index("jawOpen")]])[0]
+        middle = posed[head.landmarks[[62, 66]]].mean(0).double()
+        camera = Camera(intrinsics, flip, torch.tensor([0.0, 0, 400]).double() - flip @ middle, 320, 320)
+        drawn, evenly = (one.draw(posed, camera).astype(float) for one in (clay, replace(clay, mouth=None)))
+        assert (drawn <= evenly).all()
+        changed = evenly.sum(2) - drawn.sum(2) > 60
+        assert changed.sum() > 200 if jaw < 0.1 else not changed.any()

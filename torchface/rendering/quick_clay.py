@@ -23,6 +23,10 @@ _AMBIENT, _HIGHLIGHT = 0.38, 0.16
 _LIGHTS = (((-0.45, 0.40, 0.80), 0.52), ((0.70, 0.05, 0.60), 0.24))
 _IN_CREASES = 0.6  # of the lights' strength, where nothing of the sky is seen
 _LEAST_OPEN = 0.6
+_IN_MOUTH = ("mouth_interior", "teeth", "gums", "tongue")
+_IBUG, _INNER_LIPS = 68, [62, 66]
+# Of teeth behind shut lips, which would flicker in the gap, and millimetres between lips that let all light in.
+_BEHIND_LIPS, _LIPS_APART = 0.1, 4.0
 _EXPOSURE = 1.25  # of skin in these lights
 _SMALLEST = 1.0  # millimetres before the lens
 _JUMP = 0.012  # of the nearness; neighbours that differ by more are an edge
@@ -39,6 +43,8 @@ class QuickClay:
     # The mesh's texture, (H,W,3) in [0,255], and where the triangles' corners lie in it, (F,3,2) pixels, for all but
     # the parts; clay if absent.
     paint: tuple[Tensor, Tensor] | None = None
+    # Which vertices lie in the mouth, (V,) bool, and the landmarks in the middle of the lips' inner edges, (2,)
+    mouth: tuple[Tensor, Tensor] | None = None
 
     @staticmethod
     def of(mesh: Mesh, skin: bool = False) -> "QuickClay":
@@ -60,7 +66,7 @@ class QuickClay:
         inside = (part > 0) | (loose != loose[faces.flatten()].mode().values)[faces[:, 0]]
         lit = faces[drawn & inside].unique()
         openness[lit] = openness[lit].clamp(min=_LEAST_OPEN)
-        return QuickClay(faces[drawn], part[drawn], openness, _lit_colors(palette), paint)
+        return QuickClay(faces[drawn], part[drawn], openness, _lit_colors(palette), paint, _mouth(mesh))
 
     def draw(self, vertices: Tensor, camera: Camera, tint: Tensor | None = None) -> np.ndarray:
         """The mesh before a dark ground, (H,W,3) uint8.
@@ -76,7 +82,12 @@ class QuickClay:
         nearness = 1 / points[:, 2]
         pixels = (points @ camera.intrinsics.double().T)[:, :2] * nearness[:, None]
         drawn = rasterise(pixels, nearness, self.faces, camera.height, camera.width)
-        light = drawn.of_vertices(self._light(points.float()), self.faces)
+        lit = self._light(points.float())
+        if self.mouth is not None:
+            inside, lips = self.mouth
+            apart = float((points[lips[0]] - points[lips[1]]).norm())
+            lit[inside] *= min(_BEHIND_LIPS + apart / _LIPS_APART, 1.0)
+        light = drawn.of_vertices(lit, self.faces)
         row = self.part[drawn.triangle] * _TINT_LEVELS
         if tint is not None:
             level = (tint[self.faces].mean(1) * (_TINT_LEVELS - 1)).round().clamp(0, _TINT_LEVELS - 1).long()
@@ -110,6 +121,15 @@ class QuickClay:
             half = torch.nn.functional.normalize(toward + points.new_tensor([0.0, 0.0, -1.0]), dim=0)
             light = light + _HIGHLIGHT * strength * (normals @ half).clamp(min=0) ** 24
         return light
+
+
+def _mouth(mesh: Mesh) -> tuple[Tensor, Tensor] | None:
+    """What lies in a mesh's mouth, and the lips' landmarks before it; see ``QuickClay``."""
+    notes = mesh.annotations
+    if notes is None or notes.landmarks is None or len(notes.landmarks) != _IBUG:
+        return None
+    inside = [mask.cpu() for name, mask in notes.regions.items() if name.startswith(_IN_MOUTH)]
+    return (torch.stack(inside).any(0), notes.landmarks.cpu()[_INNER_LIPS]) if inside else None
 
 
 def _paint(mesh: Mesh, drawn: Tensor) -> tuple[Tensor, Tensor] | None:
