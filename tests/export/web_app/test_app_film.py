@@ -67,8 +67,7 @@ def test_weights_are_pythons_the_character_is_drawn_and_the_rate_is_told(
         recorded = record(page, tmp_path, 40)
         assert_same_weights(webcam_graph(), recorded, TOLERANCE)
         assert np.array([one["weights"] for one in recorded.solved]).std(0).max() > 0.02
-        canvas = page.driver.find_element("id", "character").screenshot_as_png
-        assert np.asarray(Image.open(io.BytesIO(canvas)).convert("L"), float).std() > 15
+        until(lambda: drawn_contrast(page) > 15)  # a busy machine may draw later than it solves
     with opened(app, faces, tmp_path, isolated, streamed=True) as page:
         page.start()
         until(lambda: page.driver.execute_script("return watched.solved.length") >= 150)
@@ -78,6 +77,12 @@ def test_weights_are_pythons_the_character_is_drawn_and_the_rate_is_told(
             f"\n{'isolated' if isolated else 'one thread'}: {1 / times.mean():.0f} frames a second, "
             f"{np.median(solving):.0f} ms a frame in the worker, least {solving.min():.0f}"
         )
+
+
+def drawn_contrast(page: Page) -> float:
+    """The standard deviation of the grey levels where the character is drawn."""
+    picture = Image.open(io.BytesIO(page.driver.find_element("id", "character").screenshot_as_png))
+    return float(np.asarray(picture.convert("L"), float).std())
 
 
 def test_of_two_faces_one_is_followed(app: Path, faces: np.ndarray, tmp_path: Path) -> None:
@@ -97,7 +102,7 @@ def test_a_take_is_saved_as_film_and_as_usd_with_its_textures(app: Path, faces: 
 
     with opened(app, faces, tmp_path) as page:
         page.driver.execute_script("document.getElementById('keep-film').click()")
-        recorded = record(page, tmp_path, 5)
+        recorded = record(page, tmp_path, 20)
         for kind, name in ((".mp4", "take.mp4"), (".usdz", "take.usdz"), ("film", "camera.mp4")):
             (tmp_path / name).write_bytes(blob(page, kind))
     animated = read_gltf_weights(recorded.glb)

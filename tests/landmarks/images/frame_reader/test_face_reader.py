@@ -224,6 +224,18 @@ def test_what_was_refused_is_not_tried_again_and_again(
     assert any(webcam.step(frame).presence > 0.9 for _ in range(15))
 
 
+def test_a_face_is_kept_between_pictures_that_are_seconds_apart(
+    webcam: Webcam, portrait: tuple[Tensor, Tensor], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Where the box network does not see it, as with two frames a second it did not; lost where it is gone."""
+    assert column(webcam.step(scene(portrait[0], (60, 50)), 2.0)) < 190
+    assert column(webcam.step(scene(portrait[0], (230, 50)), 2.0)) > 190  # the box network finds it elsewhere
+    monkeypatch.setattr(webcam.reader, "search", lambda *given: torch.zeros(FOUND))
+    for left in (220, 230):
+        assert webcam.step(scene(portrait[0], (left, 50)), 2.0).presence > 0.9
+    assert webcam.step(scene(portrait[0], (20, 50)), 2.0).presence == 0
+
+
 def test_whatever_is_shown_is_read_safely(webcam: Webcam, portrait: tuple[Tensor, Tensor]) -> None:
     frame = scene(portrait[0], (60, 50))
     expected = webcam.step(frame).landmarks

@@ -44,7 +44,7 @@ STATE = _PLACED + IDENTITY
 """Numbers that a reader hands on."""
 
 _FAR, _LOOSE = 0.75, 0.25  # shared share of two places
-_LONGEST = 0.5  # seconds: after a longer break the face may be anywhere
+_LONGEST = 0.5  # seconds: after a longer break the face may be elsewhere
 _ANYWHERE = (32.0, 32.0, 64.0, 1.0, 0.0)  # a place, where there is none to look at
 _SHRUNK, _GROWN = 0.6, 1.6  # of a face from one picture to the next
 _LONG = 1e3  # seconds
@@ -111,7 +111,9 @@ class FaceReader(nn.Module):
         same = (size == state[14:_PLACED]).all()
         # Another picture size is another camera: its face may be anywhere.
         place, people = place * same, state[_PLACED:] * same
-        followed = (following > 0.5) & same & (interval <= _LONGEST)
+        known = (following > 0.5) & same
+        late = known & (interval > _LONGEST)
+        followed = known & ~late
         crowded = is_beside(people)
         hidden = crowded & is_awaited(people)
         waiting = hidden | (~crowded & (missing < _PATIENCE))
@@ -127,7 +129,9 @@ class FaceReader(nn.Module):
             lambda image, place, waiting, attempt, longest: torch.zeros(FOUND),
             (image, place, waiting, attempt, longest),
         )
-        there = found[5] > 0.5
+        there, confirmed = found[5] > 0.5, found[6] > 0.5
+        # After a long while too it is where it was, if it is seen there, or nowhere.
+        followed, asked = followed | (late & (confirmed | ~there)), asked | late
         people = after_boxes(people, found[7:].view(CANDIDATES, 4), searched, interval)
         begin = torch.where(followed, sought(place, anchor), found[:5])
         ready = plausible(begin, size, settings.smallest) & (followed | there)
@@ -160,13 +164,12 @@ class FaceReader(nn.Module):
         )
         stranger = is_other(people, own, appearance, interval)
         vague = confidence_of(deviation / own[2].clamp(min=1)).mean() < settings.vague
-        confirmed = found[6] > 0.5
         kept = ((presence >= settings.likely) & ~vague) | ~asked | confirmed
         kept = kept & (presence >= settings.least) & (growth > _SHRUNK) & (growth < _GROWN)
         good = (followed & kept) | (~followed & ~vague & (presence >= settings.new))
         good = good & ready & ~stranger & plausible(own, size, settings.smallest)
         clear = ((presence >= settings.sure) & ~vague) | confirmed
-        refused = lost_now & there & ~good
+        refused = lost_now & ~followed & there & ~good
         counts = [
             good.float(),
             torch.where(good, 0.0, (missing + interval).clamp(max=_LONG)),
