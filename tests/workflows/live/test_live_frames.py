@@ -23,7 +23,7 @@ from torchface.workflows.live.live_frames import PlayedVideo, SourceSettings, op
 
 
 class Planted:
-    """OpenCV's capture, playing what a test wrote down: sizes of pictures, None for a failure, seconds for a wait."""
+    """OpenCV's capture, playing what a test wrote: sizes of pictures, None for a failure, waits (seconds or events)."""
 
     def __init__(self, script: list[Any], opens: bool = True) -> None:
         self.script, self.opens = iter(script), opens
@@ -42,8 +42,8 @@ class Planted:
 
     def read(self) -> tuple[bool, np.ndarray | None]:
         what = next(self.script, None)
-        while isinstance(what, float):
-            time.sleep(what)
+        while isinstance(what, (float, threading.Event)):
+            time.sleep(what) if isinstance(what, float) else what.wait(20)
             what = next(self.script, None)
         if what is None:
             return False, None
@@ -59,8 +59,8 @@ class Planted:
 
 @pytest.fixture
 def quick(monkeypatch: pytest.MonkeyPatch) -> pytest.MonkeyPatch:
-    """Patience of a quarter of a second, and a rate measured over a tenth."""
-    times = {"_MAX_WAIT": 0.25, "_FIRST_WAIT": 0.25, "_RETRY": 0.01, "_TICK": 0.02, "_MEASURED": 0.1}
+    """Patience of a second, and a rate measured over a tenth."""
+    times = {"_MAX_WAIT": 1.0, "_FIRST_WAIT": 20.0, "_RETRY": 0.01, "_TICK": 0.02, "_MEASURED": 0.1}
     for name, value in times.items():
         monkeypatch.setattr(module, name, value)
     return monkeypatch
@@ -88,10 +88,13 @@ def test_a_camera_is_asked_for_little_delay_and_gives_red_first(quick: pytest.Mo
 
 
 def test_pictures_of_another_size_are_fitted_and_told(quick: pytest.MonkeyPatch) -> None:
-    plug_in(quick, Planted([(64, 48), (64, 48), 0.03, (128, 48), 0.03, (128, 48)]))
+    seen, frames = threading.Event(), []
+    plug_in(quick, Planted([(64, 48), (64, 48), seen, (128, 48), (128, 48)]))
     told: list[str] = []
     with closing(Camera(0, told.append)) as opened:
-        frames = [frame for _, frame in opened.frames()]
+        for _, frame in opened.frames():
+            frames.append(frame)
+            seen.set()
     assert {frame.shape for frame in frames} == {(48, 64, 3)}
     last = frames[-1]
     assert last[24, 32].tolist() == [200, 20, 10]
@@ -110,7 +113,7 @@ def test_one_that_is_pulled_out_ends_the_frames_and_is_told(quick: pytest.Monkey
         frames = list(opened.frames())
         assert time.perf_counter() - began < 3
     assert frames
-    assert told == ["camera 3 gave no frame for 0 seconds: is it still plugged in?"]
+    assert told == ["camera 3 gave no frame for 1 seconds: is it still plugged in?"]
 
 
 def test_a_rate_that_changes_is_told_once(quick: pytest.MonkeyPatch) -> None:
@@ -133,6 +136,7 @@ def test_no_camera_a_silent_one_and_what_to_do(quick: pytest.MonkeyPatch) -> Non
     with pytest.raises(FileFormatError, match=r"no other program holds, or another one's number: 2 \(Back\)"):
         open_source("0", print)
     plug_in(quick, Planted([]))
+    quick.setattr(module, "_FIRST_WAIT", 0.25)
     with pytest.raises(FileFormatError, match="camera 1: gives no frame within"):
         open_source("1", print)
     with pytest.raises(FileFormatError, match=r"film\.mp4: .*no such file"):

@@ -30,6 +30,7 @@ from torchface.workflows.browser_app.built_page import built_page
 from torchface.workflows.live import live_anybody
 from torchface.workflows.live.live_anybody import LiveSettings, go_live
 from torchface.workflows.live.live_frames import LiveFrame
+from torchface.workflows.live.live_session import LiveSession
 from torchface.workflows.live.live_view import FRAME, PICTURE, LiveView
 from torchface.workflows.live.page_server import PageServer, Preparing
 
@@ -219,6 +220,14 @@ class Opened:
         save_rig(rig, folder / "dome.glb")
         patch.setattr(live_anybody, "open_source", lambda *_: self.source)
         patch.setattr(live_anybody, "RECORDINGS", self.kept)
+        asked: list[Mapping[str, Any]] = []
+        self._asked, asking = asked, LiveSession.asked
+
+        def keeping(session: LiveSession, message: Mapping[str, Any]) -> None:
+            asking(session, message)
+            asked.append(message)
+
+        patch.setattr(LiveSession, "asked", keeping)
         self.urls: list[str] = []
         self.said: list[str] = []
         settings = LiveSettings("0", folder / "dome.glb", port=0)
@@ -228,6 +237,12 @@ class Opened:
         self.url: str = until(lambda: self.urls and self.urls[0])
         self.stream = until(lambda: [one.split()[-1] for one in self.said if "OBS" in one])[0]
         (folder / "dome.glb").unlink()  # a character that is deleted while it plays is shown and recorded all the same
+
+    @property
+    def frozen(self) -> bool:
+        """Whether the session does what the page asked for last: to stand still."""
+        controls = [message["controls"] for message in self._asked if "controls" in message]
+        return bool(controls) and controls[-1]["weights"]["frozen"] is True
 
     def close(self) -> None:
         self.source.open = False
@@ -281,9 +296,10 @@ def test_settings_reach_the_session_and_are_there_after_a_reload(page: Any, live
     page.execute_script(f"const e = {group}; e.value = 0; e.dispatchEvent(new Event('input'))")
     until(lambda: abs(sent_jaw(live) - 0.8) < 1e-2)
     page.find_element("id", "freeze").click()
-    time.sleep(0.3)
+    until(lambda: live.frozen)
     live.source.jaw = 0.0
-    time.sleep(0.5)
+    live.solver.controls.clear()
+    until(lambda: len(live.solver.controls) > 10)  # frames with the mouth shut
     assert abs(sent_jaw(live) - 0.8) < 1e-2
     page.find_element("tag name", "body").send_keys("f")
     until(lambda: sent_jaw(live) < 1e-2)
@@ -300,7 +316,7 @@ def sent_jaw(live: Opened) -> float:
 @pytest.mark.browser
 def test_takes_are_recorded_played_renamed_and_deleted(page: Any, live: Opened) -> None:
     page.find_element("id", "record").click()
-    time.sleep(2)
+    until(lambda: "frames" in text(page, "recorded") and int(text(page, "recorded").split()[2]) >= 50)
     page.find_element("id", "record").click()
     until((live.kept / "summary.json").exists)
     until(lambda: page.find_elements("css selector", "#takes li"))

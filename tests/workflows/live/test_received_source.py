@@ -1,5 +1,6 @@
 """A phone as the camera: its packets move a character, are recorded and sent on; what is lost is held, then relaxes."""
 
+import _thread
 import json
 import math
 import socket
@@ -15,6 +16,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
+from headless_chromium import until
 from osc_receiver import values_by_address
 from received_frames import decode_frame
 
@@ -26,10 +28,13 @@ from torchface.io.protocols.live_link_recordings import recorded_packets
 from torchface.io.protocols.osc_messages import osc_message
 from torchface.io.protocols.received_face import ReceivedFace
 from torchface.shape_names import ARKIT
+from torchface.workflows.live import live_session
 from torchface.workflows.live.live_anybody import LiveSettings, go_live
+from torchface.workflows.live.live_figures import LiveFigures
 from torchface.workflows.live.received_source import ReceivedSolver, ReceivedSource, ReceivedWatch
 from torchface.workflows.live.session_prompts import STEPS
 
+_LIMIT = 120.0  # seconds, of a session that the phone ends before
 JAW = ARKIT.index("jawOpen")
 PICTURE = np.zeros((4, 4, 3), np.uint8)
 
@@ -49,8 +54,11 @@ def free_port() -> int:
 
 
 @contextmanager
-def phone(packets: list[bytes], port: int, said: list[str], fps: float = 120.0) -> Iterator[None]:
-    """Sends packets at a rate, beside what goes on, once the session has said that it listens."""
+def phone(
+    monkeypatch: pytest.MonkeyPatch, packets: list[bytes], port: int, said: list[str], fps: float = 120.0
+) -> Iterator[None]:
+    """Sends packets at a rate, beside what goes on, once the session has said that it listens, and ends that when all
+    have been found."""
 
     def send() -> None:
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
@@ -59,7 +67,17 @@ def phone(packets: list[bytes], port: int, said: list[str], fps: float = 120.0) 
             for packet in packets:
                 sender.sendto(packet, ("127.0.0.1", port))
                 time.sleep(1 / fps)
+        until(lambda: figures[-1].found >= len(packets))  # of a busy machine that may be late
+        _thread.interrupt_main()
 
+    figures: list[LiveFigures] = []
+
+    class Kept(LiveFigures):
+        def __init__(self) -> None:
+            super().__init__()
+            figures.append(self)
+
+    monkeypatch.setattr(live_session, "LiveFigures", Kept)
     thread = threading.Thread(target=send)
     thread.start()
     yield
@@ -68,16 +86,16 @@ def phone(packets: list[bytes], port: int, said: list[str], fps: float = 120.0) 
 
 @pytest.mark.real
 def test_an_iphones_packets_move_a_character_and_are_recorded_and_sent_on(
-    dome: Path, tmp_path: Path, data: Path
+    dome: Path, tmp_path: Path, data: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     packets = list(recorded_packets(data / "protocols" / "live_link_debug-jawopen.gesichter"))
     port, said = free_port(), list[str]()
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as engine, phone(packets, port, said):
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as engine, phone(monkeypatch, packets, port, said):
         engine.bind(("127.0.0.1", 0))
         engine.settimeout(5)
         to = (f"livelink://127.0.0.1:{engine.getsockname()[1]}",)
         settings = LiveSettings(
-            f"livelink://127.0.0.1:{port}", dome, None, to, tmp_path / "out", page=False, seconds=2.5
+            f"livelink://127.0.0.1:{port}", dome, None, to, tmp_path / "out", page=False, seconds=_LIMIT
         )
         report, (saved,) = go_live(settings, said.append, print, lambda progress: pytest.fail("no solver is needed"))
         sent = torch.stack([decode_frame(engine.recv(2048)).weights for _ in range(report.figures.frames)])
@@ -119,16 +137,16 @@ def engine() -> Iterator[tuple[int, list[bytes]]]:
 
 @pytest.mark.real
 def test_a_performance_of_an_iphone_is_recorded_and_sent_by_two_protocols_at_once(
-    dome: Path, tmp_path: Path, data: Path
+    dome: Path, tmp_path: Path, data: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """In its own time; read by python-osc. Between two packets of the file seven are missing."""
     packets = list(recorded_packets(data / "protocols" / "live_link_dao.gesichter"))
     acted = torch.tensor([struct.unpack("!61f", packet[-244:]) for packet in packets])
     port, said = free_port(), list[str]()
-    with engine() as (vmc, vmc_packets), engine() as (osc, osc_packets), phone(packets, port, said, 60.0):
+    with engine() as (vmc, vmc_packets), engine() as (osc, osc_packets), phone(monkeypatch, packets, port, said, 60.0):
         to = (f"vmc://127.0.0.1:{vmc}", f"osc://127.0.0.1:{osc}/face")
         settings = LiveSettings(
-            f"livelink://127.0.0.1:{port}", dome, None, to, tmp_path / "out", page=False, seconds=4.5
+            f"livelink://127.0.0.1:{port}", dome, None, to, tmp_path / "out", page=False, seconds=_LIMIT
         )
         report, _ = go_live(settings, said.append, print, lambda progress: pytest.fail("no solver is needed"))
     assert report.figures.found >= len(packets)

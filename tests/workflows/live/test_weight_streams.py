@@ -3,6 +3,7 @@
 import socket
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -10,6 +11,7 @@ from osc_receiver import OscReceiver, values_by_address
 from received_frames import decode_frame
 
 from torchface.errors import NameMismatchError, ValueRangeError
+from torchface.io.protocols import weight_sender
 from torchface.shape_names import ARKIT
 from torchface.workflows.live import weight_streams
 from torchface.workflows.live.weight_streams import WeightStreams, mapped_sender
@@ -27,7 +29,9 @@ def drained(receiver: socket.socket) -> list[bytes]:
             return packets
 
 
-def test_each_receiver_has_a_rate_of_its_own_and_a_dead_one_slows_none() -> None:
+def test_each_receiver_has_a_rate_of_its_own_and_a_dead_one_slows_none(monkeypatch: pytest.MonkeyPatch) -> None:
+    clock = SimpleNamespace(now=0.0, monotonic=lambda: clock.now)
+    monkeypatch.setattr(weight_sender, "time", clock)
     with (
         socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as fast,
         socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as slow,
@@ -45,17 +49,19 @@ def test_each_receiver_has_a_rate_of_its_own_and_a_dead_one_slows_none() -> None
         )
         said: list[str] = []
         with WeightStreams(addresses, ARKIT, 60.0, said.append) as streams:
-            begun, longest = time.perf_counter(), 0.0
+            took = []
             for frame in range(60):
+                clock.now = frame / 60
                 before = time.perf_counter()
                 streams.send(torch.full((52,), frame / 64), torch.zeros(9))
-                longest = max(longest, time.perf_counter() - before)
-                time.sleep(max(0.0, begun + (frame + 1) / 60 - time.perf_counter()))
+                took.append(time.perf_counter() - before)
             notes = streams.notes()
         frames = [decode_frame(packet) for packet in drained(fast)]
         assert [frame.weights[JAW].item() for frame in frames] == [i / 64 for i in range(60)]
-        assert 17 <= len(drained(slow)) <= 22
-        assert longest < 0.25
+        sent = [round(64 * decode_frame(packet).weights[JAW].item()) for packet in drained(slow)]
+        assert sent == [0, 1, *range(3, 60, 3)]  # of 60 a second 20, and one that is early
+        # One may be long where the machine is busy with other things.
+        assert sorted(took)[-2] < 0.25
         assert any("nobody listens there yet" in words for words in said)
         assert any(note.startswith("vts://127.0.0.1:9: 60 of 60 frames") for note in notes)
 
