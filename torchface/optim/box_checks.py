@@ -8,6 +8,7 @@ from torch import Tensor
 
 from torchface.errors import ShapeError, ValueRangeError
 from torchface.number_checks import as_tensor, checked_number
+from torchface.optim.blas_threads import one_blas_thread
 from torchface.optim.box_problem import BoxProblem, check_box, metric
 
 _TOLERANCE = {torch.float32: 3e-6, torch.float64: 1e-11}
@@ -57,7 +58,8 @@ def _all_factor(H: Tensor, lift: Tensor) -> bool:
     if H.device.type != "cpu":
         return not bool((torch.linalg.cholesky_ex(lifted)[1] > 0).any())
     # One by one by LAPACK takes half of torch's time.
-    return not any(dpotrf(one.T, lower=1, clean=0, overwrite_a=1)[1] for one in lifted.numpy())
+    with one_blas_thread(H.shape[-1]):
+        return not any(dpotrf(one.T, lower=1, clean=0, overwrite_a=1)[1] for one in lifted.numpy())
 
 
 def checked_bounds(

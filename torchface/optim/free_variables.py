@@ -8,6 +8,8 @@ from scipy.linalg.lapack import dposv
 from torch import Tensor
 from torch.nn.functional import pad
 
+from torchface.optim.blas_threads import one_blas_thread
+
 Array: TypeAlias = "np.ndarray"
 
 # Numbers in the matrices that an accelerator factors at once.
@@ -41,10 +43,11 @@ def _solved_one_by_one(H: Tensor, diagonal: Tensor, free: Tensor, right: Tensor,
     every = H.numpy() if H.ndim == 3 else [H.numpy()] * len(right)
     lifts = diagonal.expand_as(right).numpy()
     rows = zip(every, lifts, free.numpy(), right.numpy(), found.numpy(), ridge.tolist(), strict=True)
-    for matrix, lift, taken, side, solution, share in rows:
-        ids = taken.nonzero()[0]
-        if len(ids):
-            solution[ids] = _solution(matrix, lift, ids, side, share)
+    with one_blas_thread(H.shape[-1]):
+        for matrix, lift, taken, side, solution, share in rows:
+            ids = taken.nonzero()[0]
+            if len(ids):
+                solution[ids] = _solution(matrix, lift, ids, side, share)
     return found
 
 

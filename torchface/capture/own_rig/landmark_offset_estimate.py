@@ -18,6 +18,7 @@ from torchface.capture.own_rig.video_solver import VideoSolver
 from torchface.capture.weight_readings import WeightReadings
 from torchface.errors import AlignmentError, ValueRangeError
 from torchface.geometry.similarity import similarity_transform
+from torchface.optim.blas_threads import one_blas_thread
 from torchface.optim.box_qp import box_qp
 
 _SEARCHED, _FRAMES, _ROUNDS, _REWEIGHTINGS = 120, 40, 3, 3
@@ -111,7 +112,7 @@ def estimate_offsets(
         return None
     chosen = shown[torch.linspace(0, len(shown) - 1, min(_SEARCHED, len(shown))).round().long()]
     likely = None if identity_modes is None else _likely_offsets(identity_modes.to(landmarks).double())
-    with torch.no_grad():
+    with torch.no_grad(), one_blas_thread():
         rest = None if resting is None else resting[chosen].double()
         take = _Take(landmarks[chosen].double(), trust[chosen], rest, None if read is None else read.of_frames(chosen))
         return _estimated(solver, take, likely, neutral is not None)

@@ -23,6 +23,7 @@ from torchface.capture.own_rig.weight_walk import (
 )
 from torchface.errors import ShapeError, ValueRangeError
 from torchface.geometry.cameras.pnp import solve_pnp
+from torchface.optim.blas_threads import one_blas_thread
 from torchface.optim.data_dependent import data_dependent
 from torchface.progress import Progress, silent
 
@@ -170,12 +171,13 @@ class VideoSolver(FrameSolver):
         first = int(enough.nonzero()[0, 0])
         intervals = frame_intervals(seconds, count, self.settings.interval)
         # A frame is solved from the one before.
-        for t in range(first, count):
-            turn, place, sure = (None if x is None else x[t] for x in (rotation, translation, confidence))
-            more = None if measured is None else measured.of_frames(torch.tensor([t], device=landmarks.device))
-            state = self.step(state, landmarks[t], turn, place, sure, intervals[t], more)
-            states.append(state)
-            progress("solving for weights", t + 1, count)
+        with one_blas_thread():
+            for t in range(first, count):
+                turn, place, sure = (None if x is None else x[t] for x in (rotation, translation, confidence))
+                more = None if measured is None else measured.of_frames(torch.tensor([t], device=landmarks.device))
+                state = self.step(state, landmarks[t], turn, place, sure, intervals[t], more)
+                states.append(state)
+                progress("solving for weights", t + 1, count)
         return [states[0]] * first + states, enough
 
     def start(self) -> VideoState:
