@@ -125,6 +125,40 @@ def test_a_second_sender_and_another_version_are_counted() -> None:
     assert "1 not understood (found version 7" in counts.words()
 
 
+def test_two_programs_of_one_name_at_one_address_are_not_mixed() -> None:
+    packets = [LiveLinkPackets(ARKIT, 60.0, "iPhone") for _ in range(2)]
+    with (
+        WeightReceiver("livelink://127.0.0.1:0") as receiver,
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as first,
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as second,
+    ):
+        for _ in range(20):
+            for sender, encode, value in ((first, packets[0], 0.25), (second, packets[1], 0.75)):
+                sender.sendto(encode(torch.full((52,), value), None)[0], ("127.0.0.1", receiver.port))
+        faces = [face for _, face in receiver.faces(1.0)]
+        counts = receiver.counts
+    assert {face.weights[0].item() for face in faces[3:]} == {0.25}
+    assert counts.others >= 18
+    assert "of another sender" in counts.words()
+
+
+def test_a_program_that_sends_each_frame_from_another_port_is_one_sender() -> None:
+    encode = LiveLinkPackets(ARKIT, 60.0, "script")
+    with WeightReceiver("livelink://127.0.0.1:0") as receiver:
+        faces = []
+        for i in range(12):
+            faces += played(receiver, encode(torch.full((52,), i / 16), None))
+    assert [face.weights[0].item() for face in faces] == [i / 16 for i in range(12)]
+    assert receiver.counts.others == 0
+
+
+def test_a_program_that_begins_anew_at_another_port_is_taken_after_a_while() -> None:
+    order = FrameOrder()
+    assert [order.takes("phone", i, i / 60, 5) for i in range(3)] == [True] * 3
+    assert not order.takes("phone", 3, 1.0, 6)
+    assert order.takes("phone", 3, 2.1, 6)
+
+
 def test_a_face_that_the_app_does_not_see_is_said() -> None:
     (packet,) = LiveLinkPackets(ARKIT, 60.0)(WEIGHTS, None)
     for cut in (packet[: -61 * 4 - 1], packet[: -61 * 4 - 1] + b"\0"):

@@ -22,6 +22,7 @@ _FAR = 300  # frames; a number so much further, or so much earlier, is a clock t
 _SET = 0.2  # seconds: no network holds frames back for longer; older numbers after that are a clock that was set
 _RECENT = 30
 _FREE = 2.0  # seconds after which another sender may take over
+_PORTS = 8  # of a sender that are remembered
 
 
 @dataclass
@@ -54,15 +55,26 @@ class FrameOrder:
         self._stands = False  # whether the sender's clock does not go on
         self._heard = self._taken = self._jumped = float("-inf")
         self._steps: deque[int] = deque(maxlen=_RECENT)
+        self._ports: deque[int] = deque(maxlen=_PORTS)
+        self._port: int | None = None  # of the sender, once it has sent twice from one
 
-    def takes(self, sender: str, number: int | None, now: float) -> bool:
-        """Whether a frame is taken, by the sender's number, if it counts, and the time in seconds; counts it."""
-        if sender != self.sender:
+    def takes(self, sender: str, number: int | None, now: float, port: int = 0) -> bool:
+        """Whether a frame is taken, by the sender's number, if it counts, and the time in seconds; counts it.
+
+        Two programs of one name and address are distinguished by their ports; one that sends each frame from another
+        port is one sender.
+        """
+        if sender != self.sender or (self._port is not None and port != self._port):
             if now - self._heard < _FREE:
                 self.counts.others += 1
                 return False
             self.sender, self._last, self._before = sender, None, None
             self._steps.clear()
+            self._ports.clear()
+            self._port = None
+        if self._port is None and port in self._ports:
+            self._port = port
+        self._ports.append(port)
         self._heard = now
         if number is not None and self._last is not None:
             step = number - self._last
@@ -149,16 +161,17 @@ class WeightReceiver:
         found = list[tuple[float, ReceivedFace]]()
         for _ in range(_MOST_AT_ONCE):
             try:
-                packet, (host, *_) = self._socket.recvfrom(_LARGEST_PACKET)
+                packet, (host, port, *_) = self._socket.recvfrom(_LARGEST_PACKET)
             except BlockingIOError:
                 break
             except ConnectionError:  # the phone does not listen yet: the system reports what was asked before
                 continue
             now, host = time.perf_counter(), host.removeprefix("::ffff:")  # what IPv6 makes of IPv4
-            found += [(now, face) for face in self._faces(packet, host, now)]
+            found += [(now, face) for face in self._faces(packet, (host, port), now)]
         return found
 
-    def _faces(self, packet: bytes, host: str, now: float) -> list[ReceivedFace]:
+    def _faces(self, packet: bytes, came: tuple[str, int], now: float) -> list[ReceivedFace]:
+        host, port = came
         if host not in self._read and len(self._read) >= _MOST_SENDERS:  # what each sends in parts is kept apart
             self._read.clear()
         read = self._read.setdefault(host, self._make())
@@ -168,7 +181,7 @@ class WeightReceiver:
             self.counts.malformed += 1
             self.counts.fault = str(error).removeprefix("packet: ")[:120]
             return []
-        taken = [face for face in faces if self._order.takes(f"{face.subject} {host}", face.number, now)]
+        taken = [face for face in faces if self._order.takes(f"{face.subject} {host}", face.number, now, port)]
         if taken:
             self._heard = now
         return taken
