@@ -51,7 +51,7 @@ def surface(kind: HeadKind, head: DrawnHead, posed: Tensor, looks: Looks, genera
     if looks.hairdo.curtain > 0:
         pieces.append(_piece(*curtain(rest, looks.hairdo, generator), CURTAIN))
     if not bool((kind.material == TEETH).any()):
-        pieces += [_piece(*row, TEETH) for row in teeth(rest, posed)]
+        pieces += [_piece(*row, TEETH) for row in teeth(rest, posed, kind.faces)]
     pieces.append(_piece(*shoulders(rest, kind.landmarks), CLOTHES))
     sizes = [len(vertices) for vertices, _, _ in pieces]
     first = [sum(sizes[:i]) for i in range(len(sizes))]

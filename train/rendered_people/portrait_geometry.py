@@ -9,10 +9,13 @@ import torch
 from torch import Tensor
 
 from torchface.geometry.meshes.operators import vertex_normals
+from torchface.rendering.raycast import RayCaster
 from torchface.synthetic.head.head_annotations import head_annotations
 from torchface.synthetic.head.identity import ramp, sculpted_vertices
 
 _TEETH_DEEP = 3.5  # behind the lips, millimetres
+# Millimetres: of teeth behind skin; of what one sees behind them through an open mouth; from where one looks.
+_BEHIND, _THROAT, _AHEAD = 2.0, 12.0, 100.0
 # The left brow's upper edge from its inner end: annotators mark it there, the head's own landmarks lie in its middle.
 _BROW_EDGE = ((11.0, 20.5, 92.0), (22.0, 24.0, 90.0), (34.0, 26.0, 85.0), (44.5, 24.0, 76.0), (54.0, 17.0, 62.0))
 
@@ -64,7 +67,7 @@ def portrait(rest: Tensor, moved: Tensor, faces: Tensor, hairdo: Hairdo, generat
     pieces = [(head, faces, 0)]
     if hairdo.curtain > 0:
         pieces.append((*curtain(rest, hairdo, generator), 1))
-    pieces += [(*row, 2) for row in teeth(rest, moved)]
+    pieces += [(*row, 2) for row in teeth(rest, moved, faces)]
     pieces.append((*shoulders(rest), 3))
     sizes = [len(piece[0]) for piece in pieces]
     first = [sum(sizes[:i]) for i in range(len(sizes))]
@@ -139,7 +142,7 @@ def curtain(rest: Tensor, hairdo: Hairdo, generator: torch.Generator) -> tuple[T
     return points, _grid_faces(rows, columns)
 
 
-def teeth(rest: Tensor, moved: Tensor) -> list[tuple[Tensor, Tensor]]:
+def teeth(rest: Tensor, moved: Tensor, faces: Tensor) -> list[tuple[Tensor, Tensor]]:
     """The upper row, which stays with the skull, and the lower, which goes with the chin."""
     marks = _marks()
     rest_points, moved_points = rest[marks], moved[marks]
@@ -152,8 +155,18 @@ def teeth(rest: Tensor, moved: Tensor) -> list[tuple[Tensor, Tensor]]:
         y = middle[1] + torch.linspace(top, bottom, 4).double()[:, None]
         set_back = 0.0 if top > 0 else -1.5
         points = torch.stack([x.expand(4, 17), y.expand(4, 17), (arch + set_back).expand(4, 17)], -1).view(-1, 3)
-        rows.append((points + shift, _grid_faces(4, 17)))
+        rows.append((_behind(points + shift, moved, faces), _grid_faces(4, 17)))
     return rows
+
+
+def _behind(points: Tensor, head: Tensor, faces: Tensor) -> Tensor:
+    """Points (P,3) no nearer than 2 mm behind the skin of a head (V,3) before them, whose chin may lie far back."""
+    ahead = torch.tensor([0.0, 0.0, _AHEAD], dtype=points.dtype)
+    way = points.new_tensor([0.0, 0.0, -1.0]).expand(len(points), 3)
+    skin = points[:, 2] + _AHEAD - RayCaster(head, faces).cast(points + ahead, way).distance
+    seen = skin < points[:, 2] - _THROAT  # through an open mouth
+    z = torch.where(seen, points[:, 2], torch.minimum(points[:, 2], skin - _BEHIND))
+    return torch.cat([points[:, :2], z[:, None]], dim=1)
 
 
 def shoulders(rest: Tensor, marks: Tensor | None = None) -> tuple[Tensor, Tensor]:
