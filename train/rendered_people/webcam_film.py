@@ -31,7 +31,7 @@ from .webcam_video import WebcamFrame, WebcamSettings, stacked, webcam_frames
 FPS = 30.0
 """Frames a second of every film."""
 
-_METHOD = "webcam films/3"
+_METHOD = "webcam films/4"
 _LOOKS = {
     "plain": {"glasses": None, "beard": 0.0, "moustache": 0.0, "stubble": 0.0},
     "glasses": {"glasses": (24.0, 17.0, 0.1, 2.0, 0.05), "beard": 0.0, "moustache": 0.0},
