@@ -60,8 +60,7 @@ def test_each_receiver_has_a_rate_of_its_own_and_a_dead_one_slows_none(monkeypat
         assert [frame.weights[JAW].item() for frame in frames] == [i / 64 for i in range(60)]
         sent = [round(64 * decode_frame(packet).weights[JAW].item()) for packet in drained(slow)]
         assert sent == [0, 1, *range(3, 60, 3)]  # of 60 a second 20, and one that is early
-        # One may be long where the machine is busy with other things.
-        assert sorted(took)[-2] < 0.25
+        assert max(took) < 0.25
         assert any("nobody listens there yet" in words for words in said)
         assert any(note.startswith("vts://127.0.0.1:9: 60 of 60 frames") for note in notes)
 
