@@ -25,7 +25,9 @@ ALL = {
     **{(name, second): command for name, group in GROUPS.items() for second, command in group.commands.items()},
     ("export",): export_model,
 }
-WRITES = re.compile(r"to write|[Aa]lso write|[Aa]lso draw|Folder for|folder (to|for)|into this folder")
+WRITES = re.compile(
+    r"to write|[Aa]lso write|[Aa]lso draw|Folder for|folder (to|for)|into this folder|Where Save writes"
+)
 
 
 @dataclass(frozen=True)
@@ -99,7 +101,7 @@ def words_for(words: tuple[str, ...], command: Any, values: dict[str, Path], fol
 
 def test_the_commands_are_looked_through() -> None:
     assert len(CASES) > 60
-    assert {words for words, *_ in CASES} >= {("solve",), ("retarget",), ("convert",), ("export", "solver")}
+    assert {words for words, *_ in CASES} >= {("solve",), ("retarget",), ("convert",), ("export", "solver"), ("view",)}
 
 
 @pytest.mark.parametrize("words", ALL)

@@ -4,7 +4,7 @@ from pathlib import Path
 
 from tyro.conf import Positional
 
-from torchface.cli.command_options import Part
+from torchface.cli.command_options import OptionalOutputPath, Part
 from torchface.cli.progress_bars import progress_bars
 from torchface.cli.terminal import Quiet, serve_page
 
@@ -12,20 +12,24 @@ from torchface.cli.terminal import Quiet, serve_page
 def view(
     rig: Positional[Path],
     weights: Positional[Path | None] = None,
+    out: OptionalOutputPath = None,
     part: Part = None,
     port: int = 8080,
     quiet: Quiet = False,
 ) -> None:
-    """Show a rig in the browser: a slider a shape, playback of a take, detail maps.
+    """Show a rig in the browser: a slider a shape, symmetric editing, playback of a take, detail maps,
+    saving edited weights.
 
     The page is at 127.0.0.1, no other machine can open it, and none but who knows the whole address that is printed.
     Needs viser (torchface's extra `viewer`).
 
     Args:
         rig: A .glb or USD file, a folder of OBJ files, or ICT-FaceKit's FaceXModel folder.
-        weights: A weight take to play, such as a Live Link Face CSV.
+        weights: A weight take to play and edit, such as a Live Link Face CSV.
+        out: Where Save writes the weights: a .csv; if absent edited_weights.csv here, or beside the take.
         port: The first port to try.
     """
+    from torchface.files.whole_files import check_ending, check_writable
     from torchface.io import load_detail_maps, load_rig, load_take
     from torchface.io.rig_files import SCENE_ENDINGS
     from torchface.viz.browser.browser_page import HOST, free_port, import_viser
@@ -33,6 +37,10 @@ def view(
 
     import_viser()  # what is missing should be said before a large rig is read
     free_port(HOST, port)
+    if out is None:
+        out = Path("edited_weights.csv") if weights is None else weights.with_name(f"{weights.stem}_edited.csv")
+    check_ending(out, ".csv")
+    check_writable(out)
     with progress_bars(quiet) as progress:
         progress("reading the rig")
         loaded = load_rig(rig, part=part)
@@ -42,5 +50,5 @@ def view(
             progress("reading the take")
             take = load_take(weights)
         progress("opening the page")
-        viewer = RigViewer(loaded, take, detail, rig.stem, port)
+        viewer = RigViewer(loaded, take, out, detail, rig.stem, port)
     serve_page(viewer)

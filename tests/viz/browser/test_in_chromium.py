@@ -83,10 +83,10 @@ _BOX = "return arguments[0].closest('[id]').parentElement.querySelector('input[i
 
 
 @pytest.fixture(scope="module")
-def viewer(chromium: Any, ball_rig: BlendshapeRig) -> Iterator[RigViewer]:
+def viewer(chromium: Any, ball_rig: BlendshapeRig, tmp_path_factory: pytest.TempPathFactory) -> Iterator[RigViewer]:
     ramp = torch.linspace(0, 1, 240)[:, None, None]
     take = Take(20.0, weights=Track(("jawOpen",), ramp))  # long: a slow machine looks seldom while it plays
-    opened = RigViewer(ball_rig, take, label="two balls", port=0)
+    opened = RigViewer(ball_rig, take, tmp_path_factory.mktemp("out") / "edited.csv", label="two balls", port=0)
     chromium.get(opened.url)
     shown(chromium, "/head/part0")
     yield opened
@@ -99,7 +99,7 @@ def test_the_page_loads_with_head_panel_and_a_slider_a_shape(chromium: Any, view
     _, vertices = shown(chromium, "/head/part0")
     torch.testing.assert_close(vertices, viewer.rig.vertices[:2562])
     words = until(lambda: t if "Jaw" in (t := chromium.find_element("tag name", "body").text) else "")
-    for word in ("Timeline", "Pose", "Active shapes", "Brows", "Eyes", "Jaw", "Mouth", "Cheeks", "Nose", "Other"):
+    for word in ("Timeline", "Editing", "Active shapes", "Brows", "Eyes", "Jaw", "Mouth", "Cheeks", "Nose", "Other"):
         assert word in words
     for name in ("InnerUp", "Blink L", "Open", "Smile L", "Smile R", "Sneer L", "Puff", "tongueOut"):
         thumb(chromium, name)
@@ -113,10 +113,11 @@ def test_a_slider_moves_the_mesh_that_the_browser_shows(chromium: Any, viewer: R
     before = picture(chromium)
     nose_version, nose = shown(chromium, "/head/part1")
     thumb(chromium, "Smile L").send_keys(Keys.ARROW_RIGHT * 40)
-    until(lambda: abs(float(viewer.pose[1]) - 0.40) < 1e-6)
-    expected = viewer.rig(torch.tensor([[0, 0.4, 0, 0, 0, 0, 0, 0]]))[0, :2562]
+    until(lambda: abs(float(viewer.editor.pose[1]) - 0.40) < 1e-6)
+    expected = viewer.rig(torch.tensor([[0, 0.4, 0.4, 0, 0, 0, 0, 0]]))[0, :2562]  # symmetric: the right one too
     until(lambda: (shown(chromium, "/head/part0")[1] - expected).abs().max() < 1e-4)
-    assert float(thumb(chromium, "Smile R").get_attribute("aria-valuenow")) == 0
+    twin = thumb(chromium, "Smile R")
+    until(lambda: float(twin.get_attribute("aria-valuenow")) == 0.4)
     assert shown(chromium, "/head/part1")[0] == nose_version  # what did not move was not sent
     assert torch.equal(shown(chromium, "/head/part1")[1], nose)
     until(lambda: np.abs(picture(chromium) - before).max() > 40)
@@ -129,20 +130,23 @@ def test_a_number_that_is_typed_beyond_the_slider_ends_at_its_end(chromium: Any,
     box = chromium.execute_script(_BOX, thumb(chromium, "Blink L"))
     box.send_keys(Keys.CONTROL + "a")
     box.send_keys("57", Keys.TAB)
-    until(lambda: float(viewer.pose[6]) == 1.0)
+    until(lambda: float(viewer.editor.pose[6]) == 1.0)
     until(lambda: box.get_attribute("value") == "1")
+    viewer.editor.reset()
     viewer.show_frame(0)
 
 
-def test_rest_and_the_takes_pose_are_buttons_of_the_page(chromium: Any, viewer: RigViewer) -> None:
-    viewer.show_frame(120)
-    for words, jaw in (("Neutral", 0.0), ("Pose of the take", 120 / 239)):
-        button = until(lambda words=words: chromium.find_elements("xpath", f"//button[contains(., '{words}')]"))[0]
-        chromium.execute_script("arguments[0].click()", button)
-        until(lambda jaw=jaw: abs(float(viewer.pose.sum()) - jaw) < 1e-6)
-        expected = viewer.rig(viewer.pose[None])[0, :2562]
-        until(lambda expected=expected: (shown(chromium, "/head/part0")[1] - expected).abs().max() < 1e-4)
-    viewer.show_frame(0)
+def test_reset_and_save_are_buttons_of_the_page(chromium: Any, viewer: RigViewer) -> None:
+    viewer.set_weight("jawOpen", 0.5)
+    assert viewer.editor.edited
+    button = until(lambda: chromium.find_elements("xpath", "//button[contains(., 'Save weights')]"))[0]
+    chromium.execute_script("arguments[0].click()", button)
+    until(viewer.out.exists)
+    until(lambda: viewer.out.name in chromium.find_element("tag name", "body").text)
+    reset = chromium.find_elements("xpath", "//button[contains(., 'Reset all')]")[0]
+    chromium.execute_script("arguments[0].click()", reset)
+    until(lambda: not viewer.editor.edited)
+    until(lambda: (shown(chromium, "/head/part0")[1] - viewer.rig.vertices[:2562]).abs().max() < 1e-4)
 
 
 @pytest.mark.bench
@@ -162,9 +166,9 @@ def test_play_moves_the_mesh_along_the_take(chromium: Any, viewer: RigViewer) ->
     pause = until(lambda: chromium.find_elements("xpath", "//button[contains(., 'Pause')]"))[0]
     chromium.execute_script("arguments[0].click()", pause)
     until(lambda: not viewer.playback.playing)
-    expected = viewer.rig(viewer.pose[None])[0, :2562]
+    expected = viewer.rig(viewer.editor.pose[None])[0, :2562]
     until(lambda: (shown(chromium, "/head/part0")[1] - expected).abs().max() < 1e-4)
-    until(lambda: thumb(chromium, "Frame").get_attribute("aria-valuenow") == str(viewer.frame))
+    until(lambda: thumb(chromium, "Frame").get_attribute("aria-valuenow") == str(viewer.editor.frame))
 
 
 @pytest.mark.bench
@@ -180,7 +184,7 @@ def test_the_texture_is_hidden_in_motion_and_shown_at_rest(chromium: Any, ball_r
 
         with dragged(opened):
             until(lambda: chromium.execute_script(visible) is False)
-        expected = opened.rig(opened.pose[None])[0]
+        expected = opened.rig(opened.editor.pose[None])[0]
         until(lambda: chromium.execute_script(visible) is True)
         over = OVER * vertex_normals(expected, opened.rig.neutral.faces)  # where pieces in motion do not show through
         until(lambda: (1000 * shown(chromium, "/head/textured")[1] - expected - over).abs().max() < 1e-3)

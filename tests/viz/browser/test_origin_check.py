@@ -62,9 +62,10 @@ def test_an_address_begins_with_the_token(path: str, expected: str | None) -> No
 
 
 @pytest.fixture(scope="module")
-def viewer(ball_rig: BlendshapeRig) -> Iterator[RigViewer]:
+def viewer(ball_rig: BlendshapeRig, tmp_path_factory: pytest.TempPathFactory) -> Iterator[RigViewer]:
     pytest.importorskip("viser", reason="the extra viewer is not installed")
-    opened = RigViewer(ball_rig, label="<two> balls", port=0)
+    out = tmp_path_factory.mktemp("out") / "edited.csv"
+    opened = RigViewer(ball_rig, out=out, label="<two> balls", port=0)
     yield opened
     opened.stop()
 

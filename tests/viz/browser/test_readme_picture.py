@@ -24,10 +24,10 @@ _CLOSE = "document.querySelectorAll('.mantine-Notification-closeButton').forEach
 def shoot(chromium: Any, rig: BlendshapeRig, path: Path) -> None:
     """The viewer with a take loaded and a surprised smile dialled in, as an image."""
     take = perform(600, torch.Generator().manual_seed(1))
-    viewer = RigViewer(rig, take, label="performer.glb", port=0)
+    viewer = RigViewer(rig, take, "performance_edited.csv", label="performer.glb", port=0)
     try:
         viewer.show_frame(240)
-        viewer.rest()
+        viewer.editor.rest()
         dialled = {
             **GESTURES["smile"],
             "browInnerUp": 0.4,

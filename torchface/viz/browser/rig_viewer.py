@@ -1,16 +1,18 @@
-"""The rig viewer: a slider a shape, playback of a take."""
+"""The rig viewer: a slider a shape, symmetric editing, playback of a take, saving what was edited."""
 
 import re
 import time
 from collections.abc import Callable, Sequence
 from functools import partial
+from pathlib import Path
 from typing import Any
 
-import torch
 from torch import Tensor
 
-from torchface.errors import NameMismatchError, ValueRangeError
+from torchface.errors import ValueRangeError
+from torchface.files.whole_files import make_folder
 from torchface.geometry.meshes.normal_maps import DetailMaps
+from torchface.io import save_take
 from torchface.mesh import Mesh
 from torchface.rig import BlendshapeRig
 from torchface.shape_names import mirror
@@ -19,6 +21,7 @@ from torchface.viz.browser.browser_page import BrowserPage, SharedInput, frame_c
 from torchface.viz.browser.head_mesh import HeadOnPage
 from torchface.viz.browser.html_lists import caption, shape_list
 from torchface.viz.browser.playback import Playback
+from torchface.viz.browser.weight_editor import WeightEditor
 
 _TICK = 1 / 120
 _REST = 0.25
@@ -29,14 +32,15 @@ _READING = 3
 _TEXTURE_INTERVAL, _ROUGH_SIDE = 0.2, 512  # seconds in which a page reads a head; texels of its wrinkles in motion
 _SPEEDS = ("0.1", "0.25", "0.5", "1", "2")
 _OPEN_GROUPS = ("brows", "eyes", "jaw", "mouth")
-_ACTIVE = 0.01  # weights that are listed
+_SPREAD = 6
 
 
 class RigViewer(BrowserPage):
     """A rig in the browser.
 
     Args:
-        take: weights to play, mapped to the rig's names; one neutral pose if absent.
+        take: weights to play and edit, mapped to the rig's names; one neutral pose if absent.
+        out: where *Save* writes; a path that the page shows and cannot change.
         detail: wrinkle maps of the rig's shapes, which follow the weights: in motion with few texels, at rest with all.
         port: the first to try, 0 for any.
     """
@@ -45,6 +49,7 @@ class RigViewer(BrowserPage):
         self,
         rig: BlendshapeRig,
         take: Take | None = None,
+        out: str | Path = "edited_weights.csv",
         detail: DetailMaps | None = None,
         label: str = "torchface",
         port: int = 8080,
@@ -52,15 +57,10 @@ class RigViewer(BrowserPage):
         if take is not None and take.weights is None:
             raise ValueRangeError("take: found no weights, expected a weight take such as Live Link Face's")
         weights = None if take is None or take.weights is None else rig.weights_from(take.weights)
-        self.rig, self.take = rig, take
-        self.weights = torch.zeros(1, len(rig.names)) if weights is None else weights.detach().cpu().float()
-        if not torch.isfinite(self.weights).all():
-            missing = int((~torch.isfinite(self.weights)).sum())
-            raise ValueRangeError(f"weights: {missing} are NaN or infinite; expected numbers to show")
-        self.low, self.high = self.weights.amin(0).clamp(max=0.0), self.weights.amax(0).clamp(min=1.0)
-        self.frame, self.pose = 0, self.weights[0].clone()
+        self.rig, self.take, self.out = rig, take, Path(out)
+        self.editor = WeightEditor(rig.names, weights, spread=0 if weights is None else _SPREAD, symmetric=True)
         times = None if take is None or take.seconds is None else tuple(take.times.tolist())
-        self.playback = Playback(len(self.weights), 60.0 if take is None else take.fps, times=times)
+        self.playback = Playback(len(self.editor), 60.0 if take is None else take.fps, times=times)
         self._moved_at = self._panel_at = float("-inf")
         self._panel_due = False
         super().__init__(label, port)
@@ -70,7 +70,7 @@ class RigViewer(BrowserPage):
         frame_camera(self.server, rig.neutral)
         if self.take is not None:
             self._add_timeline()
-        self._add_pose()
+        self._add_editing()
         with self.server.gui.add_folder("Active shapes"):
             self._active = self.server.gui.add_html("")
         self.sliders = self._add_sliders()
@@ -80,39 +80,33 @@ class RigViewer(BrowserPage):
     def show_frame(self, frame: int) -> int:
         """Brings a frame into view; returns how many pieces of the head were sent."""
         with self._lock:
-            self.frame = min(max(frame, 0), len(self.weights) - 1)
-            self.pose = self.weights[self.frame].clone()
+            self.editor.frame = frame
             return self._show()
 
     def set_weight(self, name: str, value: float) -> int:
-        """Moves a shape until another frame is shown; returns the pieces sent."""
-        if name not in self.rig.names:
-            raise NameMismatchError(f"weights: found {name!r}, expected a shape of the rig: {self.rig.names[0]}, ...")
-        if not abs(value) < float("inf"):
-            raise ValueRangeError(f"weights: found {value} for {name}, expected a number")
+        """Moves a shape in the frame in view, with symmetric editing its twin too; returns the pieces sent."""
         with self._lock:
             if self.playback.playing:
                 self._pause()
-            self.pose[self.rig.names.index(name)] = value
+            self.editor.set(name, value)
             return self._show()
 
-    def rest(self) -> None:
-        """Shows the head at rest until another frame is shown."""
+    def save(self) -> Path:
+        """Writes the weights as they stand now."""
         with self._lock:
-            if self.playback.playing:
-                self._pause()
-            self.pose = torch.zeros_like(self.pose)
-            self._show()
+            make_folder(self.out.parent)
+            save_take(self.editor.to_take(self.take), self.out)
+        return self.out
 
     def _posed(self) -> Mesh:
         return self.rig.neutral.with_vertices(self._vertices())
 
     def _vertices(self) -> Tensor:
-        return self.rig(self.pose[None].to(self.rig.deltas))[0].detach()
+        return self.rig(self.editor.pose[None].to(self.rig.deltas))[0].detach()
 
     def _normal_map(self) -> Tensor | None:
         detail = self._few_texels if self._rough else self._detail
-        return detail.blend(self.rig.names, self.pose) if detail is not None and self._wrinkled else None
+        return detail.blend(self.rig.names, self.editor.pose) if detail is not None and self._wrinkled else None
 
     def _show_wrinkles(self, enabled: bool) -> None:
         self._wrinkled = bool(enabled)
@@ -132,7 +126,7 @@ class RigViewer(BrowserPage):
                 now = time.monotonic()
                 if self.playback.playing:
                     due = self.playback.frame(now)
-                    if due != self.frame:
+                    if due != self.editor.frame:
                         self.show_frame(due)
                     if self.playback.ended(now):
                         self._pause()
@@ -151,20 +145,20 @@ class RigViewer(BrowserPage):
             self._settled_at = time.monotonic()
 
     def _refresh_panel(self) -> None:
-        pose = self.pose.tolist()
+        pose = self.editor.pose.tolist()
         with self.server.atomic():
-            self._active.content = shape_list(self._moved())
+            self._active.content = shape_list(self.editor.active())
             for name, value in zip(self.rig.names, pose, strict=True):
                 self.sliders[name].push(round(value, 3))
             if self.take is not None:
-                self._frame.push(self.frame)
-                self._time.content = _time_line(self.frame, len(self.weights), self.take)
+                self._frame.push(self.editor.frame)
+                self._time.content = _time_line(self.editor.frame, len(self.editor), self.take)
 
     def _add_timeline(self) -> None:
         gui = self.server.gui
         with gui.add_folder("Timeline"):
             self._play = gui.add_button("Play", icon=icon("PLAYER_PLAY"))
-            frame = gui.add_slider("Frame", 0, max(len(self.weights) - 1, 1), 1, 0)
+            frame = gui.add_slider("Frame", 0, max(len(self.editor) - 1, 1), 1, 0)
             self._time = gui.add_html("")
             speed = gui.add_dropdown("Speed", _SPEEDS, initial_value="1")
             loop = gui.add_checkbox("Loop", True)
@@ -173,14 +167,14 @@ class RigViewer(BrowserPage):
         self._shared(speed, lambda value: self._pace(speed=float(value)))
         self._shared(loop, lambda value: self._pace(loop=bool(value)))
 
-    def _moved(self) -> list[tuple[str, float]]:
-        """Shapes that are seen in the pose, the largest weight first."""
-        order = self.pose.abs().argsort(descending=True, stable=True).tolist()
-        return [(self.rig.names[i], float(self.pose[i])) for i in order if abs(float(self.pose[i])) >= _ACTIVE]
-
-    def _add_pose(self) -> None:
+    def _add_editing(self) -> None:
         gui = self.server.gui
-        with gui.add_folder("Pose"):
+        with gui.add_folder("Editing"):
+            symmetric = gui.add_checkbox("Symmetric", True, hint="A slider moves its mirror twin too")
+            self._shared(symmetric, lambda value: setattr(self.editor, "symmetric", bool(value)))
+            if self.take is not None:
+                spread = gui.add_slider("Spread", 0, 60, 1, _SPREAD, hint="Frames beside that an edit takes along")
+                self._shared(spread, lambda value: setattr(self.editor, "spread", int(value)))
             if self.head.has_texture:
                 texture = gui.add_checkbox(
                     "Texture", True, hint="In motion the head shows in plain colours, unless it has wrinkles"
@@ -188,13 +182,17 @@ class RigViewer(BrowserPage):
                 self._shared(texture, self.head.enable_texture)
             if self._detail is not None:
                 self._shared(gui.add_checkbox("Wrinkles", True), self._show_wrinkles)
-            gui.add_button("Neutral").on_click(lambda _: self.rest())
+            actions: dict[str, Callable[[], None]] = {"Reset": self.editor.reset}
             if self.take is not None:
-                gui.add_button("Pose of the take").on_click(lambda _: self._seek(self.frame))
+                actions = {"Neutral": self.editor.rest, "Reset frame": self.editor.reset_frame}
+                actions["Reset all"] = self.editor.reset
+            buttons: Any = gui.add_button_group("Pose", tuple(actions))
+            buttons.on_click(lambda event: self._edit(actions[event.target.value]))
+            self._add_save_button("Save weights", f"Writes {self.out}", lambda: str(self.save()))
 
     def _add_sliders(self) -> dict[str, SharedInput]:
-        gui = self.server.gui
-        low, high = self.low.tolist(), self.high.tolist()
+        gui, editor = self.server.gui, self.editor
+        low, high = editor.low.tolist(), editor.high.tolist()
         sliders: dict[str, SharedInput] = {}
         for group, rows in grouped(self.rig.names).items():
             with gui.add_folder(group.capitalize(), expand_by_default=group in _OPEN_GROUPS):
@@ -207,7 +205,7 @@ class RigViewer(BrowserPage):
 
     def _set(self, name: str, value: float) -> None:
         row = self.rig.names.index(name)  # a number that is typed may lie beyond the slider's ends
-        self.set_weight(name, min(max(float(value), float(self.low[row])), float(self.high[row])))
+        self.set_weight(name, min(max(float(value), float(self.editor.low[row])), float(self.editor.high[row])))
 
     def _shared(self, handle: Any, act: Callable[[Any], Any]) -> SharedInput:
         return SharedInput(handle, self._lock, act)
@@ -232,6 +230,13 @@ class RigViewer(BrowserPage):
             self._pause()
         self.playback = self.playback.seek(frame, time.monotonic())
         self.show_frame(self.playback.origin)
+
+    def _edit(self, action: Callable[[], None]) -> None:
+        with self._lock:
+            if self.playback.playing:
+                self._pause()
+            action()
+            self._show()
 
 
 def _time_line(frame: int, frames: int, take: Take) -> str:
