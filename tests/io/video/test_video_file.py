@@ -86,8 +86,8 @@ def test_a_broken_video_is_refused(frames: torch.Tensor, tmp_path: Path) -> None
     for name, start, message in (
         ("empty.avi", b"", "0 bytes"),
         ("header.avi", content[:64], "cannot be opened"),
-        ("text.avi", b"this is no video, whatever its name says", "at its start"),
-        ("playlist.avi", b"#EXTM3U\n#EXTINF:1,\nfile:///etc/passwd\n", "at its start"),
+        ("text.avi", b"this is no video, whatever its name says", "begins as no video does"),
+        ("playlist.avi", b"#EXTM3U\n#EXTINF:1,\nfile:///etc/passwd\n", "begins as no video does"),
     ):
         (tmp_path / name).write_bytes(start)
         with pytest.raises(FileFormatError, match=message):

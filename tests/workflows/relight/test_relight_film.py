@@ -159,6 +159,18 @@ def test_hair_and_clothes_of_a_head_of_track_are_left_out() -> None:
     assert torch.equal(left.deltas, rig.deltas[:, ~grown])
 
 
+def test_lashes_and_clear_shells_of_a_head_are_left_out() -> None:
+    """Drawn as opaque, ICT-FaceKit's would lie over the eyes."""
+    head = performer(texture=False)
+    assert head.neutral.annotations is not None
+    shells = torch.zeros(len(head.vertices), dtype=torch.bool)
+    shells[:90] = True
+    regions = {**head.neutral.annotations.regions, "eye_occlusion_left": shells, "eyelashes": shells.roll(90)}
+    annotated = replace(head.neutral, annotations=replace(head.neutral.annotations, regions=regions))
+    shown = bare(BlendshapeRig(annotated, head.deltas, head.names))
+    assert len(bare(head).vertices) - len(shown.vertices) == 180
+
+
 def test_a_light_from_behind_the_head_is_doubted() -> None:
     film = PointLight(torch.full((3,), 0.3), torch.full((3,), 0.6), torch.zeros(3))
     behind, front = (WantedLight(azimuth=azimuth, ambient=0.25).beside(film) for azimuth in (-167.0, 60.0))

@@ -188,4 +188,7 @@ def _demuxer(path: Path) -> str:
         return "mov"
     if head[:6] in (b"GIF87a", b"GIF89a"):
         return "gif"
-    raise FileFormatError(f"{path}: found {head[:8]!r} at its start, expected an AVI, Matroska, MP4, MOV or GIF video")
+    found = f"a {path.suffix} file" if path.suffix else "a file without an ending"
+    raise FileFormatError(
+        f"{path}: found {found} that begins as no video does, expected AVI, Matroska, MP4, MOV or GIF"
+    )

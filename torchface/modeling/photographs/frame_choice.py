@@ -49,7 +49,9 @@ def choose_frames(
     quality = trust[:, JAW:].double().mean(1)
     usable = features.isfinite().all(1) & ((trust[:, JAW:] > 0).sum(1) >= _MIN_LANDMARKS)
     if not bool(usable.any()):
-        raise ValueRangeError("choose_frames: found no frame that shows a face, expected one")
+        raise ValueRangeError(
+            "found no frame that shows a face, expected one in which it is seen from within 60 degrees of the front"
+        )
     near = usable & (angle < _MOST_ANGLE)
     usable = near if bool(near.any()) else usable
     usable &= quality >= _SEEN * quality[usable].quantile(0.9)

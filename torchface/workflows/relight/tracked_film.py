@@ -14,6 +14,7 @@ from torchface.io import load_animation, load_rig
 from torchface.io.landmarks.openface_csv import load_landmarks_csv
 from torchface.io.video import VideoFile, open_video
 from torchface.io.weights.weight_csv import ROTATIONS
+from torchface.part_materials import part_material
 from torchface.rig import BlendshapeRig
 from torchface.workflows.track.head_rotations import head_rotations
 from torchface.workflows.track.track_files import ANIMATION, LANDMARKS, SUMMARY, SUMMARY_FORMAT
@@ -92,7 +93,13 @@ def read_tracked_film(film: Path, track: Path) -> TrackedFilm:
 
 
 def bare(rig: BlendshapeRig) -> BlendshapeRig:
-    """A rig without hair and clothes, which the film has its own of."""
+    """A rig without hair and clothes, which the film has its own of, and without lashes and shells that are clear,
+    which would be painted over the eyes."""
     regions = {} if rig.neutral.annotations is None else rig.neutral.annotations.regions
-    grown = [mask for name, mask in regions.items() if name.startswith(_GROWN)]
-    return rig.part(~torch.stack(grown).any(0)) if grown else rig
+    left_out = [mask for name, mask in regions.items() if name.startswith(_GROWN) or _is_clear(name)]
+    return rig.part(~torch.stack(left_out).any(0)) if left_out else rig
+
+
+def _is_clear(region: str) -> bool:
+    material = part_material(region)
+    return material is not None and material.alpha == "BLEND"
