@@ -11,6 +11,10 @@ from torchface.errors import ShapeError
 from torchface.shape_names import ARKIT, mapping
 
 _BLINK_DEVIATION = 0.2
+LASTING = 10.0
+"""How much what was read of weights counts, beside one reading of it, where a take's fixed offsets or the person's head
+could explain a lasting expression instead. From 1 to 10 the error of smiles fell from 0.138 to 0.107 in rendered films.
+"""
 _BLINKS = [name.startswith("eyeBlink") for name in ARKIT]
 
 

@@ -166,12 +166,12 @@ IRIS_EDGE = 0.45
 
 
 def eye_color(
-    p: Tensor, brown: tuple[float, float, float] = (0.33, 0.24, 0.14), whites: float = 1.0, size: float = 1.0
+    p: Tensor, brown: tuple[float, float, float] = (0.33, 0.24, 0.14), whites: float = 1.0, iris_size: float = 1.0
 ) -> Tensor:
     """Colours (N,3) of points of an eyeball: sclera with veins, limbal ring, iris of a colour, pupil, highlight.
 
     Args:
-        size: of the iris, 1 as usual.
+        iris_size: 1 as usual.
     """
     centre = torch.tensor(EYE_CENTRE)
     offset = torch.cat([p[:, :1].abs(), p[:, 1:]], dim=1) - centre
@@ -183,7 +183,7 @@ def eye_color(
     color = mix(color, (0.78, 0.45, 0.42), 0.16 * veins * ramp(polar, 0.55, 0.9))
     color = mix(color, (0.78, 0.52, 0.48), 0.75 * ramp(polar, 0.75, 1.5))
     color = color * (1 - 0.30 * ramp(way[:, 1], 0.12, 0.42))[:, None]  # the upper lid's shade
-    polar = polar / size
+    polar = polar / iris_size
     spokes = torch.stack([angle.cos() * 9, angle.sin() * 9, polar * 2.5], dim=1)
     iris = torch.tensor(brown) * (1 + 0.45 * noise(spokes, 1.0, 8))[:, None]
     light = torch.tensor(brown) * 1.35 + 0.05

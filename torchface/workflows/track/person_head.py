@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from torchface.capture.weight_readings import LASTING
 from torchface.errors import ValueRangeError
 from torchface.geometry.cameras.distortion import undistort
 from torchface.geometry.meshes.normal_maps import SurfaceMaps
@@ -21,7 +22,6 @@ from torchface.workflows.track.track_inputs import TrackInputs
 FRAMES = 10
 """How many frames the head is solved from at most."""
 
-_READINGS = 10.0  # how much what was read of a frame counts beside the head, as in a take's offsets
 _DOUBTED = 0.2  # trust below which a landmark does not count
 
 
@@ -74,7 +74,7 @@ def person_head(
             reading.of_frames(frames),
             iris=undistort(reading.iris[frames].double(), inputs.calibration),
             points=undistort(reading.points[frames].double(), inputs.calibration),
-            expression_deviation=reading.expression_deviation[frames] / math.sqrt(_READINGS),
+            expression_deviation=reading.expression_deviation[frames] / math.sqrt(LASTING),
         )
         settings = with_readings(settings, shown, inputs.models.places, rig)
     fit = fit_images(
