@@ -97,6 +97,6 @@ def test_irises_are_as_wide_as_peoples_on_eyeballs_of_any_size(scale: float) -> 
     radius = 0.5 * float(ball[:, 0].max() - ball[:, 0].min())
     polar = torch.linspace(0, 0.8, 800)
     across = torch.stack([polar.sin(), torch.zeros(800), polar.cos()], dim=1)
-    colors = eye_color(torch.tensor(EYE_CENTRE) + radius * across, size=iris_size(smaller))
+    colors = eye_color(torch.tensor(EYE_CENTRE) + radius * across, iris_size=iris_size(smaller))
     edge = float(polar[(colors.mean(1) < 0.5).nonzero().amax()])
     assert 2 * radius * math.sin(edge) == pytest.approx(11.7, abs=0.4)
