@@ -82,7 +82,7 @@ class Endless:
 
     def __init__(self, count: int, fps: float = 30.0, interrupt: bool = False) -> None:
         self.video = VideoFile(Path("planted"), fps, 64, 48, count)
-        self.dropped, self.interrupt = 0, interrupt
+        self.dropped, self.late, self.interrupt = 0, 0.0, interrupt
 
     def frames(self) -> Iterator[tuple[float, np.ndarray]]:
         began = time.perf_counter()

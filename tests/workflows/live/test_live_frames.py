@@ -211,12 +211,15 @@ def test_a_video_that_is_decoded_slower_than_it_plays_is_shown_all_the_same(
 def test_a_video_that_is_recorded_loses_no_frame(tmp_path: Path, clock: Clock) -> None:
     write_video([torch.zeros(10, 3, 32, 48, dtype=torch.uint8)], tmp_path / "film.avi", 50.0)
     played = open_source(str(tmp_path / "film.avi"), print, SourceSettings(every=True))
-    times = []
+    times, waited = [], []
     for came, _ in played.frames():
         times.append(came)
+        waited.append(clock.now - came - played.late)
         clock.sleep(0.07)
     assert played.dropped == 0
     assert times == pytest.approx([100 + number / 50 for number in range(10)])  # the film's own
+    assert max(waited) <= 0.02 + 1e-6  # no frame waits for all that were late before it
+    assert played.late == pytest.approx(9 * 0.05)
 
 
 def test_a_video_that_loops_begins_anew_without_a_pause(tmp_path: Path, clock: Clock) -> None:

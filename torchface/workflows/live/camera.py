@@ -54,7 +54,7 @@ class Camera:
             (cv2.CAP_PROP_BUFFERSIZE, 1),
         ):
             self._capture.set(setting, value)
-        self.dropped, self._begun = 0, False
+        self.dropped, self.late, self._begun = 0, 0.0, False
         self._newest: tuple[float, np.ndarray] | None = None
         self._change = threading.Condition()
         self._open = True

@@ -25,7 +25,8 @@ Say = Callable[[str], None]
 class FrameSource(Protocol):
     """Where frames come from.
 
-    ``video`` holds rate and size, ``dropped`` how many frames came while another was worked on.
+    ``video`` holds rate and size, ``dropped`` how many frames came while another was worked on, ``late`` by how many
+    seconds a film that loses no frame has fallen behind its own time.
     """
 
     @property
@@ -33,6 +34,9 @@ class FrameSource(Protocol):
 
     @property
     def dropped(self) -> int: ...
+
+    @property
+    def late(self) -> float: ...
 
     def frames(self) -> Iterator[tuple[float, np.ndarray]]:
         """When each frame came, seconds, and the frame, uint8 (H,W,3), red first."""
@@ -66,12 +70,12 @@ class PlayedVideo:
 
     def __init__(self, path: Path, settings: SourceSettings = _DEFAULT) -> None:
         self.video = replace(open_video(path), even=False)
-        self.dropped = 0
+        self.dropped, self.late = 0, 0.0
         self._settings = settings
         self._times, _ = self.video.uneven_seconds()
 
     def frames(self) -> Iterator[tuple[float, np.ndarray]]:
-        """When each frame was due, and the frame, uint8 (H,W,3), red first."""
+        """When each frame was due in the film's own time, and the frame, uint8 (H,W,3), red first."""
         again = True
         while again:
             again = False
@@ -83,14 +87,15 @@ class PlayedVideo:
         started: float | None = None
         skipped, before = 0, 0.0
         for number, frame in enumerate(self.video.color_frames()):
-            started = time.perf_counter() if started is None else started  # with the first frame: opening takes a while
+            if started is None:
+                started = time.perf_counter() - self.late  # with the first frame: opening takes a while
             due = started + self._time(number)
-            early = due - time.perf_counter()
+            early = due + self.late - time.perf_counter()
             if early > 0:
                 time.sleep(early)
-            elif (
-                -early > 1 / self.video.fps and not self._settings.every
-            ):  # a camera would have shown the next one by now
+            elif (over := -early > 1 / self.video.fps) and self._settings.every:
+                self.late -= early
+            elif over:  # a camera would have shown the next one by now
                 gained = (before + early) * self.video.fps if skipped else 1.0  # frames, by the one before
                 if skipped < _LONGEST_GAP * self.video.fps and gained > _WORTH:
                     self.dropped, skipped, before = self.dropped + 1, skipped + 1, -early

@@ -217,11 +217,12 @@ class LiveSession:
                 wanted = self._weights.apply(solved, None if before is None else came - before)
                 self._streams.send(wanted.weights, wanted.rotations)
                 now = time.perf_counter()
-                self.figures.add(came, now, solved.seen)
+                given = came + self._source.late
+                self.figures.add(given, now, solved.seen)
                 interval = 0.0 if before is None else came - before
                 with self._changed:
                     shown = picture if solved.drawn is None else solved.drawn
-                    self._view = LiveView(came, interval, 1000 * (now - came), shown, wanted)
+                    self._view = LiveView(given, interval, 1000 * (now - given), shown, wanted)
                     self._changed.notify_all()
                 self._keep(came, wanted, picture)
                 self._advance(interval, solved)

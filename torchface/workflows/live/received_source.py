@@ -40,7 +40,7 @@ class ReceivedSource:
     def __init__(self, address: str, every: bool = False) -> None:
         self.receiver = WeightReceiver(address)
         self.video = VideoFile(Path(f"{self.receiver.scheme} {self.receiver.port}"), _FPS, *_SIZE, 1)
-        self.dropped, self._every = 0, every
+        self.dropped, self.late, self._every = 0, 0.0, every
         self._in_parts = self.receiver.scheme == "osc"  # where each weight may come in a packet of its own
         self.face: ReceivedFace | None = None
         self.fresh, self.heard = False, float("-inf")
