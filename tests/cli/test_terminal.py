@@ -149,16 +149,23 @@ def test_a_warning_is_one_line_without_the_sources_path() -> None:
 
 def test_ctrl_c_ends_a_command_without_a_traceback() -> None:
     program = (
-        "import os, signal, torchface.cli as cli\n"
+        "import atexit, os, signal, sys, torchface.cli as cli\n"
         "signal.signal(signal.SIGINT, signal.default_int_handler)\n"  # a shell's background job ignores it
         "def info(path: str) -> None:\n"
         "    'Stops itself.'\n"
-        "    os.kill(os.getpid(), signal.SIGINT)\n"
+        "    try:\n"
+        "        os.kill(os.getpid(), signal.SIGINT)\n"
+        "    finally:\n"
+        "        os.kill(os.getpid(), signal.SIGINT)\n"  # by whom the first did not seem to help
+        "        print('all is written')\n"
         "cli.COMMANDS['info'] = info\n"
-        "cli.main(['info', '--path', 'x'])\n"
+        "sys.argv[1:] = ['info', '--path', 'x']\n"
+        "atexit.register(os.kill, os.getpid(), signal.SIGINT)\n"
+        "cli.main()\n"
     )
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=120, check=False)
     assert done.returncode == 130
+    assert "all is written" in done.stdout
     assert "stopped" in done.stderr
     assert "Traceback" not in done.stderr
 

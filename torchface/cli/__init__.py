@@ -33,7 +33,7 @@ from torchface.cli.retarget import retarget
 from torchface.cli.retime import retime
 from torchface.cli.rig import rig
 from torchface.cli.solve import solve
-from torchface.cli.terminal import PlainConsole, plain_errors, print_lines
+from torchface.cli.terminal import PlainConsole, count_interrupts_once, plain_errors, print_lines
 from torchface.cli.track import track
 from torchface.cli.train import train
 from torchface.cli.transfer import transfer
@@ -97,6 +97,8 @@ DESCRIPTION = "Learn face rigs from scans, solve performances with them, ship th
 def main(arguments: Sequence[str] | None = None) -> None:
     """Runs one command; an error that the user can mend ends with its message and exit status 2."""
     words = list(sys.argv[1:] if arguments is None else arguments)
+    if arguments is None:
+        count_interrupts_once()
     with plain_errors():
         if words in (["--version"], ["-V"]):
             print(f"torchface {__version__}")

@@ -1,7 +1,9 @@
 """Output of commands on a terminal: results, addresses of pages, errors."""
 
 import os
+import signal
 import sys
+import time
 import warnings
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
@@ -67,6 +69,7 @@ def print_lines(lines: Iterable[str]) -> None:
 
 
 _MISTAKE, _STOPPED, _NOBODY_READS = 2, 130, 141  # the last is the status of SIGPIPE in shells
+_ONCE = 2.0  # seconds
 
 
 def serve_page(page: "BrowserPage", line: str = "") -> None:
@@ -77,6 +80,20 @@ def serve_page(page: "BrowserPage", line: str = "") -> None:
         page.wait()
     except KeyboardInterrupt:
         page.stop()
+
+
+def count_interrupts_once() -> None:
+    """Has a Ctrl-C soon after another do nothing: it would break off what ends the program after the first."""
+    before = float("-inf")
+
+    def interrupt(*_: object) -> None:
+        nonlocal before
+        before, since = time.monotonic(), time.monotonic() - before
+        if since > _ONCE:
+            raise KeyboardInterrupt
+
+    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:  # a shell's background job ignores it
+        signal.signal(signal.SIGINT, interrupt)
 
 
 @contextmanager
