@@ -1,12 +1,13 @@
 // Which character: the one that came with the page, one that is chosen, or one that is dropped on it.
 
+import { ARKIT } from "./arkit_names.js";
 import { readCharacter } from "./character.js";
 import { checkSize, listed } from "./character_check.js";
 import { forgetFile, keepFile, keptFile } from "./kept_files.js";
 import { changedNames } from "./shape_name_table.js";
 import { hideProblem, showCharacterLine, showProblem } from "./words.js";
 
-const KEY = "character";
+const KEY = "character", TONGUE = ARKIT.indexOf("tongueOut");
 const element = (id) => document.getElementById(id);
 
 /**
@@ -68,9 +69,10 @@ async function taken(file, use, sources, keep) {
   }
 }
 
-/** Says which of a character's shapes the face moves. */
-export function tellCharacter({ name, check: { driven, unknown } }) {
-  const others = unknown.length > 0 ? `; these stay still: ${listed(unknown)}` : "";
+/** Says which of a character's shapes the face moves; no camera sees the tongue, and phones send it. */
+export function tellCharacter({ name, check: { driven, unknown, meshes } }) {
+  const tongues = new Set([...meshes.values()].flat().filter(({ sources }) => sources.length > 0 && sources.every(([row]) => row === TONGUE)).map((one) => one.name));
+  const others = (tongues.size > 0 ? `, ${[...tongues].join(", ")} by a phone alone` : "") + (unknown.length > 0 ? `; these stay still: ${listed(unknown)}` : "");
   const hint = driven.length === 0 ? ". Say below, at Names of shapes, which of ARKit's each of them means" : "";
-  showCharacterLine(`${name}: your face moves ${driven.length} of its ${driven.length + unknown.length} shapes${others}${hint}`);
+  showCharacterLine(`${name}: your face moves ${driven.length - tongues.size} of its ${driven.length + unknown.length} shapes${others}${hint}`);
 }
