@@ -1,5 +1,6 @@
 // The engine behind a socket: `torchface live` solves, sends on and records; this page shows and says what is wanted.
 
+import { isStream } from "./stream_view.js";
 import { Take } from "./take.js";
 
 const FRAME = 1, PICTURE = 2; // first number of a message
@@ -15,6 +16,7 @@ export class ServerEngine {
   #picture;
   #socket = null;
   #ended = false;
+  #lost = false;
   #sent = "";
   #names = {};
   running = false;
@@ -35,6 +37,7 @@ export class ServerEngine {
     this.#socket = new WebSocket(address);
     this.#socket.binaryType = "arraybuffer";
     this.#socket.onopen = () => {
+      if (this.#lost && isStream()) return location.reload(); // torchface was started again, with what may be another character
       this.#sent = "";
       this.sendControls();
       this.nameShapes(this.#names);
@@ -42,7 +45,8 @@ export class ServerEngine {
     this.#socket.onmessage = ({ data }) => (typeof data === "string" ? this.#take(JSON.parse(data)) : this.#show(data));
     this.#socket.onclose = () => {
       this.#set(false);
-      if (this.#ended) return;
+      this.#lost = true;
+      if (this.#ended && !isStream()) return; // the page's address goes with the program, that of the stream view stays
       this.#page.status("torchface does not answer: it has ended, or is busy.");
       setTimeout(() => this.start(), AGAIN);
     };

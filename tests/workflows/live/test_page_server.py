@@ -387,6 +387,27 @@ def test_the_stream_view_shows_the_character_alone_on_its_colour(chromium: Any, 
 
 
 @pytest.mark.browser
+@pytest.mark.usefixtures("live")  # which builds the page
+def test_the_stream_view_goes_on_when_torchface_is_started_again(
+    chromium: Any, dome_rig: BlendshapeRig, tmp_path: Path
+) -> None:
+    save_rig(dome_rig, tmp_path / "dome.glb")
+    files = {"character.glb": (tmp_path / "dome.glb").read_bytes()}
+
+    def shows() -> bool:
+        return bool(chromium.execute_script("return document.documentElement.dataset.running") == "on")
+
+    first = PageServer(built_page(silent), files, lambda name: b"", Desk(), 0)
+    chromium.get(first.stream_url)
+    until(shows)
+    first.stop()
+    until(lambda: not shows())
+    second = PageServer(built_page(silent), files, lambda name: b"", Desk(), first.port)
+    until(shows)
+    second.stop()
+
+
+@pytest.mark.browser
 def test_the_end_is_said(page: Any, live: Opened) -> None:
     live.source.open = False
     until(lambda: text(page, "status").startswith("planted has ended after"), 60)
