@@ -10,7 +10,7 @@ import { FrameRate } from "./frame_rate.js";
 import { offerGroups } from "./group_settings.js";
 import { ServerEngine } from "./server_engine.js";
 import { changedNames, giveNames, offerNames } from "./shape_name_table.js";
-import { choosePerson, keepSettings, settings } from "./settings.js";
+import { choosePerson, keepSettings, onSettings, settings } from "./settings.js";
 import { Stage } from "./stage.js";
 import { StateWords, isSeen } from "./state_words.js";
 import { isStream, layOutStream } from "./stream_view.js";
@@ -25,7 +25,7 @@ const INVITATION = server ? "" : "Start the camera to begin.";
 const rate = new FrameRate(), words = new StateWords();
 let character = null, stage = null, calibration = null;
 let newest = null; // as it was solved, before what the user set
-let frozen = false, said = "";
+let frozen = false, said = "", noted = "";
 let weights = null; // what the user set of weights
 
 const mirrored = (stream ? layOutStream() : null) ?? settings.mirror;
@@ -71,7 +71,8 @@ const page = {
   state({ words: told = "", notes = [], ended = "", calibrate = false }) {
     said = ended || told;
     if (ended || !engine.running) showStatus(said || INVITATION);
-    showNotes(notes);
+    if (notes.join("\n") !== noted) showNotes(notes); // else what this page has noted since would go
+    noted = notes.join("\n");
     if (calibrate && calibration === null && !stream) startCalibration();
   },
 };
@@ -159,31 +160,37 @@ element("reset").addEventListener("click", () => {
   collect();
   speak("Begun anew");
 });
-function showPeople() {
+function showSettings() {
   element("person").value = settings.person;
   element("people").replaceChildren(...Object.keys(settings.people).map((name) => Object.assign(document.createElement("option"), { value: name })));
   offerGroups(element("groups"), collect);
+  element("mirror").checked = settings.mirror;
+  for (const id of ["gain", "smoothing"]) {
+    element(id).value = settings[id];
+    element(`${id}-value`).value = settings[id].toFixed(1);
+  }
 }
+onSettings(() => {
+  if (stream) return;
+  collect();
+  setMirror(settings.mirror);
+  showSettings();
+});
 element("person").addEventListener("change", ({ target }) => {
   choosePerson(target.value.trim());
   if (engine.running) engine.reset();
   collect();
-  showPeople();
+  showSettings();
 });
-element("mirror").checked = settings.mirror;
 element("mirror").addEventListener("change", ({ target }) => {
   keepSettings({ mirror: target.checked });
   setMirror(target.checked);
 });
-for (const id of ["gain", "smoothing"]) {
-  const tell = () => (element(`${id}-value`).value = settings[id].toFixed(1));
-  element(id).value = settings[id];
-  tell();
+for (const id of ["gain", "smoothing"])
   element(id).addEventListener("input", ({ target }) => {
     keepSettings({ [id]: Number(target.value) });
-    tell();
+    element(`${id}-value`).value = settings[id].toFixed(1);
   });
-}
 document.addEventListener("keydown", ({ key, target, ctrlKey, metaKey, altKey }) => {
   if (key === "Escape") return endCalibration();
   if (ctrlKey || metaKey || altKey || target.matches?.("input:not([type=range], [type=checkbox])")) return;
@@ -198,7 +205,7 @@ setInterval(showRate, 500);
 
 collect();
 setMirror(mirrored);
-showPeople();
+showSettings();
 try {
   stage = new Stage(element("character"));
 } catch {

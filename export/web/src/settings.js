@@ -18,6 +18,15 @@ export function keepSettings(changed) {
   }
 }
 
+/** Calls when another page of the same address has changed them: each would else write over what the other one set. */
+export function onSettings(call) {
+  window.addEventListener("storage", ({ key }) => {
+    if (key !== KEY) return;
+    Object.assign(settings, START, remembered());
+    call();
+  });
+}
+
 /** Takes what was kept of a person; a new one begins with what is usual. */
 export function choosePerson(name) {
   const kept = Object.hasOwn(settings.people, name) ? settings.people[name] : {};
