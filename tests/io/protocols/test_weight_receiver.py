@@ -16,6 +16,7 @@ from torchface.errors import ValueRangeError
 from torchface.io.protocols.ifacialmocap_packets import START, IFacialMocapPackets
 from torchface.io.protocols.live_link_packets import LiveLinkPackets
 from torchface.io.protocols.live_link_recordings import recorded_packets
+from torchface.io.protocols.osc_messages import osc_message
 from torchface.io.protocols.osc_packets import OscPackets
 from torchface.io.protocols.received_face import ReceivedFace
 from torchface.io.protocols.vmc_packets import VmcPackets
@@ -140,6 +141,37 @@ def test_two_programs_of_one_name_at_one_address_are_not_mixed() -> None:
     assert {face.weights[0].item() for face in faces[3:]} == {0.25}
     assert counts.others >= 18
     assert "of another sender" in counts.words()
+
+
+@pytest.mark.parametrize("scheme", ["osc", "vmc"])
+def test_parts_of_faces_of_two_programs_at_one_address_are_not_mixed(scheme: str) -> None:
+    """Each sends a shape of its own by many packets, which come by turns."""
+
+    def parts(name: str, value: float) -> list[bytes]:
+        if scheme == "osc":
+            return [osc_message(f"/face/{name}", value)]
+        return [osc_message("/VMC/Ext/Blend/Val", name, value), osc_message("/VMC/Ext/Blend/Apply")]
+
+    with (
+        WeightReceiver(f"{scheme}://127.0.0.1:0") as receiver,
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as first,
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as second,
+    ):
+        for _ in range(20):
+            for pair in zip(parts("jawOpen", 0.5), parts("cheekPuff", 0.75), strict=True):
+                for sender, packet in zip((first, second), pair, strict=True):
+                    sender.sendto(packet, ("127.0.0.1", receiver.port))
+        faces = [face for _, face in receiver.faces(1.0)][3:]
+    assert len(faces) >= 16
+    assert {float(face.weights[ARKIT.index("jawOpen")]) for face in faces} == {0.5}
+    assert {float(face.weights[ARKIT.index("cheekPuff")]) for face in faces} == {0.0}
+
+
+def test_parts_of_a_face_from_a_new_port_each_are_one_face() -> None:
+    with WeightReceiver("osc://127.0.0.1:0") as receiver:
+        for name in ARKIT[:40]:
+            (face,) = played(receiver, [osc_message(f"/face/{name}", 0.5)])
+    assert face.weights.count_nonzero() == 40
 
 
 def test_a_program_that_sends_each_frame_from_another_port_is_one_sender() -> None:

@@ -310,6 +310,32 @@ def test_controls_reach_the_solver_and_reset_does_once(dome: Path, tmp_path: Pat
     assert view.solved.seen
 
 
+@pytest.mark.parametrize("number", [float("nan"), float("inf"), 1e308, None, "1"])
+def test_numbers_of_a_page_that_are_none_change_nothing(dome: Path, tmp_path: Path, number: object) -> None:
+    session, recordings = a_session(Endless(3), tmp_path, dome, [])
+    plain = [0.5] * 52
+    for solver, weights in (
+        ({"gain": number}, {}),
+        ({"smoothing": number}, {}),
+        ({"pose": number}, {}),
+        ({}, {"gain": [*plain[1:], number]}),
+        ({}, {"dead": [*plain[1:], number]}),
+        ({}, {"smoothing": [*plain[1:], number]}),
+        ({}, {"centre": {"rotation": [number] * 9, "gaze": [0.0] * 4}}),
+        ({}, {"centre": {"rotation": [0.0] * 9, "gaze": [number] * 4}}),
+    ):
+        asked = {
+            "solver": {"pose": 0, "gain": 2.0, "smoothing": 0.5, **solver},
+            "weights": {"gain": plain, "dead": plain, "smoothing": plain, **weights},
+        }
+        with pytest.raises(ValueRangeError, match="found"):
+            session.asked(json.loads(json.dumps({"controls": asked})))
+    session.record(True)
+    session.run()
+    assert recordings.finish()[0].error == ""
+    assert bool(load_take(tmp_path / "live_link.csv").weights.values.isfinite().all())  # type: ignore[union-attr]
+
+
 def test_a_guided_calibration_asks_for_five_faces_in_ten_seconds(dome: Path, tmp_path: Path) -> None:
     told: list[str] = []
     session, _ = a_session(Endless(320), tmp_path, dome, told)

@@ -58,6 +58,11 @@ class FrameOrder:
         self._ports: deque[int] = deque(maxlen=_PORTS)
         self._port: int | None = None  # of the sender, once it has sent twice from one
 
+    @property
+    def knows_port(self) -> bool:
+        """Whether the sender sends from one port."""
+        return self._port is not None
+
     def takes(self, sender: str, number: int | None, now: float, port: int = 0) -> bool:
         """Whether a frame is taken, by the sender's number, if it counts, and the time in seconds; counts it.
 
@@ -118,7 +123,7 @@ class WeightReceiver:
         self.address = address
         parts = parse_source(address)
         self.scheme = parts.scheme
-        self._read: dict[str, Read] = {}
+        self._read: dict[tuple[str, int], Read] = {}
         self._make = _readers(parts)
         self._order = FrameOrder()
         self.counts = self._order.counts
@@ -172,11 +177,10 @@ class WeightReceiver:
 
     def _faces(self, packet: bytes, came: tuple[str, int], now: float) -> list[ReceivedFace]:
         host, port = came
-        if host not in self._read and len(self._read) >= _MOST_SENDERS:  # what each sends in parts is kept apart
-            self._read.clear()
-        read = self._read.setdefault(host, self._make())
         try:
-            faces = read(packet)
+            faces = self._reader(host, port)(packet)
+            if not self._order.knows_port:  # else one program may send each part of a face from another port
+                faces = self._reader(host, 0)(packet)
         except TorchfaceError as error:
             self.counts.malformed += 1
             self.counts.fault = str(error).removeprefix("packet: ")[:120]
@@ -185,6 +189,13 @@ class WeightReceiver:
         if taken:
             self._heard = now
         return taken
+
+    def _reader(self, host: str, port: int) -> Read:
+        """The reader of a sender, as what each sends in parts is kept apart."""
+        read = self._read[host, port] = self._read.pop((host, port), None) or self._make()
+        if len(self._read) > _MOST_SENDERS:  # of which one may send from a new port each time
+            del self._read[next(iter(self._read))]
+        return read
 
     @property
     def asks(self) -> bool:
