@@ -287,5 +287,11 @@ def test_a_character_of_meshopt_and_ktx2_is_taken(opened: Open, data: Path) -> N
     """Face Cap's head as three.js ships it, by the decoders that the page brings."""
     page = opened.page
     page.driver.find_element("id", "file").send_keys(str(data / "characters" / "facecap.glb"))
-    until(lambda: page.text("character-line") == "facecap.glb: your face moves 51 of its 52 shapes, tongueOut by a phone alone" or page.problem)
+    until(
+        lambda: (
+            page.text("character-line")
+            == "facecap.glb: your face moves 51 of its 52 shapes, tongueOut by a phone alone"
+            or page.problem
+        )
+    )
     assert page.problem == ""

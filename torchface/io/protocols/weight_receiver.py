@@ -192,7 +192,8 @@ class WeightReceiver:
 
     def _reader(self, host: str, port: int) -> Read:
         """The reader of a sender, as what each sends in parts is kept apart."""
-        read = self._read[host, port] = self._read.pop((host, port), None) or self._make()
+        came = host, port
+        read = self._read[came] = self._read.pop(came) if came in self._read else self._make()
         if len(self._read) > _MOST_SENDERS:  # of which one may send from a new port each time
             del self._read[next(iter(self._read))]
         return read
