@@ -1,6 +1,7 @@
 """Joint Gauss-Newton over identity, expression, poses and focal length, each step a quadratic program in a box."""
 
 from dataclasses import dataclass, replace
+from math import log
 
 import torch
 from torch import Tensor
@@ -19,7 +20,8 @@ from torchface.modeling.photographs.landmark_view import (
 from torchface.optim import box_qp
 
 _DONE, _HALVINGS = 1e-5, 6
-_MAX_CONTOUR_ERROR, _SETTLED, _TRIAL_ITERATIONS = 1.5, 0.02, 3
+_SETTLED = 0.02
+_LEAST_GAIN = 5.0  # of a log posterior: views from the front alone cannot tell sliding landmarks from fixed ones
 _EXPECTED, _LEAST_UNKNOWN = 2.0, 1e-2  # of unknown differences: how many are expected to be as large as expected
 # Errors of a network's points along heads' forms, beside those that their spread about one head shows: a person's are
 # alike in all pictures (0.88), for networks draw points toward the mean head. Checked by test_likeness.
@@ -108,30 +110,22 @@ def energy(
 
 
 def solve_either(problem: Problem, initial: State) -> tuple[Problem, State]:
-    """``solve``, with sliding contour landmarks and where they fit ill without, whichever leaves less."""
+    """``solve``, with sliding contour landmarks or with fixed ones: what makes the landmarks more probable."""
     if problem.settings.sliding is not None:
         return problem, solve(problem, initial)
-    sliding = replace(problem, settings=replace(problem.settings, sliding=True))
-    state = solve(replace(sliding, settings=replace(sliding.settings, max_iterations=_TRIAL_ITERATIONS)), initial)
-    if _contour_error(sliding, state) >= _MAX_CONTOUR_ERROR:
-        fixed = replace(problem, settings=replace(problem.settings, sliding=False))
-        other = solve(fixed, initial)
-        if _contour_error(fixed, other) < _contour_error(sliding, state):
-            return fixed, other
-    return sliding, solve(sliding, state)
+    sliding, fixed = (replace(problem, settings=replace(problem.settings, sliding=slide)) for slide in (True, False))
+    state, other = solve(sliding, initial), solve(fixed, initial)
+    if _improbability(fixed, other) < _improbability(sliding, state) - _LEAST_GAIN:
+        return fixed, other
+    return sliding, state
 
 
-def _contour_error(problem: Problem, state: State) -> float:
-    """Root mean square of contour landmarks in what is expected of them beside the inner ones: 1 if all is well."""
+def _improbability(problem: Problem, state: State) -> float:
+    """Minus the log posterior up to a constant, with the noise that was estimated."""
     picked = problem.points.picked(state.rows)
-    factors = replace(whitening(problem, state, picked), mixing=None)
-    r = residuals(picked, state.coefficients[problem.rows], state.views, problem.targets, factors).square().sum(-1)
-    contour, inner = problem.seen.clone(), problem.seen.clone()
-    contour[:, JAW:], inner[:, :JAW] = False, False
-    if not contour.any():
-        return 0.0
-    each = r[contour].mean() / (0.5 * (1 + problem.settings.contour_slide**2))
-    return float((each / r[inner].mean().clamp(min=1e-12)).sqrt())
+    factors = whitening(problem, state, picked)
+    measured = 2 * int(problem.seen.sum())
+    return energy(problem, state, picked, factors, problem.prior(state)) + measured * log(state.noise)
 
 
 def solve(problem: Problem, state: State, free: Tensor | None = None) -> State:
