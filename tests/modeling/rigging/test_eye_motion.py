@@ -4,7 +4,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from torchface.landmarks.surfaces.eye_openings import EyeOpening
+from torchface.landmarks.surfaces.eye_openings import Opening
 from torchface.modeling.rigging.eye_motion import eyeballs, slid
 from torchface.modeling.rigging.joined_vertices import JoinedHead
 from torchface.rig import BlendshapeRig
@@ -36,7 +36,7 @@ def moved(rig: BlendshapeRig, width: float, *plates: tuple[float, float, int]) -
     part = torch.arange(len(pieces)).repeat_interleave(torch.tensor([len(one) for one in pieces]))
     everything = torch.ones(len(points), dtype=torch.bool)
     head = JoinedHead(points, part, everything, torch.ones(len(SHAPES), len(points), 3).double())
-    own = slid(head, rig, eyeball, EyeOpening(upper, lower, share), everything)
+    own = slid(head, rig, eyeball, Opening(upper, lower, share), everything)
     pole = rig.deltas.double()[:, eyeball.nonzero()[:, 0][ball[:, 2].argmax()]]
     return own, [head.deltas[:, part == one] for one in range(len(pieces))], pole
 

@@ -18,13 +18,23 @@ _SMOOTH = 5  # columns
 
 
 @dataclass(frozen=True, eq=False)
-class EyeOpening:
-    """The edges of an eye's lids, from the viewer's left to the right."""
+class Opening:
+    """The edges of lids or lips, from the viewer's left to the right."""
 
     # upper, lower: (n,3), each column of pixels one point
     upper: Tensor
     lower: Tensor
     share: Tensor  # how far each lies along the line between the corners, (n,) in [0,1]
+
+    @staticmethod
+    def smoothed(upper: Tensor, lower: Tensor, share: Tensor) -> "Opening":
+        """Each edge the median over neighbouring columns, which spikes of lashes do not shift."""
+        padded = [
+            torch.cat([edge[:1].expand(_SMOOTH // 2, 3), edge, edge[-1:].expand(_SMOOTH // 2, 3)])
+            for edge in (upper, lower)
+        ]
+        first, second = (edge.unfold(0, _SMOOTH, 1).median(-1).values for edge in padded)
+        return Opening(first, second, share)
 
     def at(self, shares: Tensor) -> tuple[Tensor, Tensor]:
         """Points of the upper and lower edge (k,3) at shares (k,) of the way between the corners."""
@@ -35,7 +45,7 @@ class EyeOpening:
         return edges[0], edges[1]
 
 
-def eye_opening(vertices: Tensor, skin: Tensor, middle: Tensor, span: float) -> EyeOpening | None:
+def eye_opening(vertices: Tensor, skin: Tensor, middle: Tensor, span: float) -> Opening | None:
     """The opening of an eye, seen from the front; none where the skin is whole there, as of closed or painted eyes.
 
     Args:
@@ -73,10 +83,4 @@ def eye_opening(vertices: Tensor, skin: Tensor, middle: Tensor, span: float) -> 
     if int(usable.sum()) < _LEAST_WIDTH * _SIDE / 2:
         return None
     share = ((x - x[0]).double() / float(x[-1] - x[0]))[usable]
-    return EyeOpening(_smoothed(upper[usable]), _smoothed(lower[usable]), share)
-
-
-def _smoothed(points: Tensor) -> Tensor:
-    """The median over neighbouring columns, which spikes of lashes do not shift."""
-    padded = torch.cat([points[:1].expand(_SMOOTH // 2, 3), points, points[-1:].expand(_SMOOTH // 2, 3)])
-    return padded.unfold(0, _SMOOTH, 1).median(-1).values
+    return Opening.smoothed(upper[usable], lower[usable], share)

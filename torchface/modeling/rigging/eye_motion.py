@@ -7,7 +7,7 @@ from torch import Tensor
 
 from torchface.geometry.similarity import similarity_transform
 from torchface.geometry.spheres import nearest_sphere
-from torchface.landmarks.surfaces.eye_openings import EyeOpening
+from torchface.landmarks.surfaces.eye_openings import Opening
 from torchface.modeling.rigging.joined_vertices import JoinedHead
 from torchface.rig import BlendshapeRig
 
@@ -51,9 +51,7 @@ def turned(head: JoinedHead, template: BlendshapeRig, eyeball: Tensor, left: Ten
     return own
 
 
-def slid(
-    head: JoinedHead, template: BlendshapeRig, eyeball: Tensor, opening: EyeOpening | None, left: Tensor
-) -> Tensor:
+def slid(head: JoinedHead, template: BlendshapeRig, eyeball: Tensor, opening: Opening | None, left: Tensor) -> Tensor:
     """Slides plates on which an eye is drawn as far as an eyeball's pole goes; which vertices those are, (J,).
 
     Of several the hindmost stays, as the white, and those before it go; where these are highlights alone, its middle

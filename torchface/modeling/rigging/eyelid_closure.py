@@ -10,7 +10,7 @@ from torch import Tensor
 from torchface.geometry.meshes.operators import vertex_areas
 from torchface.geometry.meshes.shell_energies import bending_energy, stretching_energy
 from torchface.geometry.meshes.surface_index import SurfaceIndex, SurfacePoints
-from torchface.landmarks.surfaces.eye_openings import EyeOpening, eye_opening
+from torchface.landmarks.surfaces.eye_openings import Opening, eye_opening
 from torchface.optim.sparse import SparseCholesky
 from torchface.rendering.raycast import RayCaster
 from torchface.rig import BlendshapeRig
@@ -59,7 +59,7 @@ class SkinOfHead:
         return self.faces[~self.loose[self.faces].any(1)]
 
 
-def eyes_seen(head: SkinOfHead, marks: Tensor) -> list[EyeOpening | None]:
+def eyes_seen(head: SkinOfHead, marks: Tensor) -> list[Opening | None]:
     """The openings of the right and left eye, by iBUG's 68 marks (68,3) of the head; NaN where one is not known."""
     found = []
     for eye in EYES:
@@ -74,7 +74,7 @@ def shut_blinks(
     head: SkinOfHead,
     deltas: Tensor,
     names: Sequence[str],
-    openings: Sequence[EyeOpening | None],
+    openings: Sequence[Opening | None],
     apart: Tensor | None = None,
     looking_down: Sequence[float | None] = (None, None),
 ) -> tuple[Tensor, tuple[float | None, ...]]:
@@ -164,7 +164,7 @@ class _Lids:
     eye: Tensor  # the triangles of what lies in it
 
     @staticmethod
-    def of(head: SkinOfHead, opening: EyeOpening, index: SurfaceIndex) -> "_Lids":
+    def of(head: SkinOfHead, opening: Opening, index: SurfaceIndex) -> "_Lids":
         above, below = opening.at(_SHARES)
         edge, skin = torch.cat([above, below]), head.skin
         middle, height = edge.mean(0), float((above - below)[:, 1].max())

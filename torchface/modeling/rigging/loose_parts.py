@@ -11,7 +11,7 @@ from torch import Tensor
 
 from torchface.geometry.meshes.shell_energies import stretching_energy
 from torchface.geometry.meshes.surface_index import SurfaceIndex
-from torchface.landmarks.surfaces.eye_openings import EyeOpening
+from torchface.landmarks.surfaces.eye_openings import Opening
 from torchface.modeling.rigging.eye_motion import eyeballs, slid, turned
 from torchface.modeling.rigging.eyelid_closure import stands_before
 from torchface.modeling.rigging.joined_vertices import JoinedHead
@@ -47,7 +47,7 @@ def moved_parts(
     part: Tensor,
     loose: Tensor,
     deltas: Tensor,
-    openings: Sequence[EyeOpening | None] = (None, None),
+    openings: Sequence[Opening | None] = (None, None),
 ) -> LooseParts:
     """Deltas of a head's loose parts beside those of its skin.
 

@@ -10,7 +10,7 @@ from torchface.modeling.rigging.eyelid_closure import SkinOfHead
 from torchface.modeling.rigging.joined_vertices import joined_vertices
 from torchface.progress import Progress
 from torchface.registration.scan_preparation import Landmarks
-from torchface.workflows.rig.character_face import character_search, find_skin, mesh_surface, with_lids
+from torchface.workflows.rig.character_face import character_search, find_skin, mesh_surface, with_edges
 
 _ASTRAY, _LEAST_ASTRAY, _LEAST = 4.0, 15.0, 12
 _FLAT, _TOP = 0.4, 0.18  # of its height: how deep a body is at most, and how much of it the head is
@@ -49,7 +49,7 @@ def seen_landmarks(head: Mesh, template: Mesh, progress: Progress) -> Landmarks 
     if int(usable.sum()) < _LEAST:
         return None
     own = SkinOfHead(upright.vertices, upright.faces, part != skin, part)
-    ids, places = with_lids((ids[usable], placed[usable]), reference, own, placed)
+    ids, places = with_edges((ids[usable], placed[usable]), reference, own, placed)
     return ids, found.pose.apply(places)[0]
 
 

@@ -15,12 +15,14 @@ from torchface.geometry.meshes.uv_seams import split_at_seams
 from torchface.io.gltf.character_scene import Block, Character
 from torchface.landmarks.images.checked_detector import shipped_detector
 from torchface.landmarks.images.ibug_68 import COUNT
+from torchface.landmarks.surfaces.eye_openings import Opening
 from torchface.landmarks.surfaces.face_on_surface import (
     FaceOnSurface,
     FaceSearch,
     NoFaceOnSurfaceError,
     ReferencePoints,
 )
+from torchface.landmarks.surfaces.lip_line import lip_line
 from torchface.mesh import Mesh
 from torchface.modeling.rigging.eyelid_closure import EYES, SkinOfHead, eyes_seen
 from torchface.modeling.rigging.joined_vertices import joined_vertices
@@ -157,7 +159,7 @@ def face_pieces(character: Character, found: FaceOnSurface, reference: Mesh, poi
     cut_joined[joined.of[cut]] = True
     skin_rows, skin_local = skin_faces.unique(return_inverse=True)
     upright = SkinOfHead(vertices, faces, part != skin_part, part)
-    landmarks = with_lids(_landmarks(reference, points, placed, on_skin), reference, upright, placed)
+    landmarks = with_edges(_landmarks(reference, points, placed, on_skin), reference, upright, placed)
     return CharacterFace(
         found,
         vertices,
@@ -219,28 +221,40 @@ def _landmarks(reference: Mesh, points: ReferencePoints, placed: Tensor, on_skin
     return ids[usable], placed[usable]
 
 
-def with_lids(landmarks: Landmarks, reference: Mesh, head: SkinOfHead, placed: Tensor) -> Landmarks:
-    """The pairs with the lids' edges in place of the finder's points there, of each eye whose edges can be seen."""
+def with_edges(landmarks: Landmarks, reference: Mesh, head: SkinOfHead, placed: Tensor) -> Landmarks:
+    """The pairs with the edges of lids and lips in place of the finder's points there, where these can be seen."""
     assert reference.annotations is not None
     regions = reference.annotations.regions
     eyeballs = regions["eyeball_left"] | regions["eyeball_right"]
     rest = reference.vertices.double()
     template = SkinOfHead(rest, reference.faces, eyeballs, eyeballs.long())
+    marks = rest[reference.landmarks]
+    seen = [*eyes_seen(head, placed), _lips_seen(head, placed)]
+    known = [*eyes_seen(template, marks), _lips_seen(template, marks)]
+    rims = [(regions[lids] & ~eyeballs,) * 2 for lids in ("lids_right", "lids_left")]
+    rims.append((regions["upper_lip"], regions["lower_lip"]))
     ids, targets = landmarks
-    seen, known = eyes_seen(head, placed), eyes_seen(template, rest[reference.landmarks])
-    for own, there, lids in zip(seen, known, ("lids_right", "lids_left"), strict=True):
+    for own, there, around in zip(seen, known, rims, strict=True):
         if own is None or there is None:
             continue
+        shares = _SHARES[(own.share.min() <= _SHARES) & (own.share.max() >= _SHARES)]
         pairs, points = [], []
-        rim = (regions[lids] & ~eyeballs).nonzero()[:, 0]
-        for edge, place in zip(there.at(_SHARES), own.at(_SHARES), strict=True):
+        for edge, place, region in zip(there.at(shares), own.at(shares), around, strict=True):
+            rim = region.nonzero()[:, 0]
             nearest = torch.cdist(edge, rest[rim]).argmin(1)
             pairs.append(rim[nearest])
             points.append(place + (rest[rim[nearest]] - edge))
-        outside = ~regions[lids][ids]
+        outside = ~(around[0] | around[1])[ids]
         ids = torch.cat([ids[outside], *pairs])
         targets = torch.cat([targets[outside], *points])
     return ids, targets
+
+
+def _lips_seen(head: SkinOfHead, marks: Tensor) -> Opening | None:
+    """The edges of the lips, by iBUG's 68 marks (68,3) of the head; NaN where one is not known."""
+    joined, lips = joined_vertices(head.vertices, head.skin), marks[_LIPS]
+    lips = lips[torch.isfinite(lips).all(-1)]
+    return lip_line(joined.vertices, joined.faces, lips) if len(lips) else None
 
 
 def plain_surface(vertices: Tensor, faces: Tensor, color: Sequence[float] = (1.0, 1.0, 1.0, 1.0)) -> TexturedSurface:
