@@ -271,6 +271,31 @@ def test_a_disk_that_fills_keeps_what_was_recorded(dome: Path, tmp_path: Path, m
     assert sum(path.stat().st_size for path in (tmp_path / "out").iterdir()) < held_free
 
 
+def test_an_animation_that_finds_no_room_leaves_the_take(
+    dome: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write = recordings_module.write_file
+
+    def full(path: Path, data: bytes) -> None:
+        if path.suffix == ".glb":
+            raise FileFormatError(f"{path}: the disk is full")
+        write(path, data)
+
+    monkeypatch.setattr(recordings_module, "write_file", full)
+    told: list[str] = []
+    session, recordings = a_session(Endless(9), tmp_path / "out", dome, told)
+    session.record(True)
+    session.run()
+    session.record(False)
+    (saved,) = recordings.finish()
+    missing = f"without animation.glb: {tmp_path / 'out' / 'animation.glb'}: the disk is full"
+    assert (saved.frames, saved.error, saved.note) == (9, "", missing)
+    assert told[-1] == f"recorded into {tmp_path / 'out'}: 9 frames; {missing}"
+    assert [take.frames for take in kept_takes(tmp_path / "out")] == [9]
+    assert json.loads((tmp_path / "out" / "summary.json").read_text())["files"] == ["weights.csv", "live_link.csv"]
+    assert len(take_file(tmp_path / "out", "first")) == 9 * 66 * 4
+
+
 def test_memory_does_not_grow_with_the_frames(dome: Path, tmp_path: Path) -> None:
     sizes: list[int] = []
 

@@ -249,8 +249,8 @@ class LiveSession:
             try:
                 self._recordings.add(came, solved, picture)
             except FileFormatError as error:  # a full disk ends the recording and not the session
-                self._recordings.stop()
                 self._notes(f"the recording ended: {error}")
+                self._recordings.stop(self._notes)
 
     def _advance(self, interval: float, solved: LiveFrame) -> None:
         calibration = self._calibration

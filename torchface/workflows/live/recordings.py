@@ -256,15 +256,17 @@ class Recordings:
             try:
                 if film is not None:  # before the summary, by which a take is listed
                     film.close()
-                if log.count:
-                    self._write(log, folder, found)
-                self.saved.append(SavedTake(folder, log.count, note=film.problem if film is not None else ""))
+                missing = self._write(log, folder, found) if log.count else ""
+                problems = [one for one in (missing, film.problem if film is not None else "") if one]
+                self.saved.append(SavedTake(folder, log.count, note="; ".join(problems)))
             except (TorchfaceError, OSError) as error:
                 self.saved.append(SavedTake(folder, log.count, str(error)))
         if say is not None:
-            say(self.saved[-1].error or f"recorded into {folder}: {log.count} frames")
+            done = self.saved[-1]
+            say(done.error or f"recorded into {folder}: {log.count} frames" + (f"; {done.note}" if done.note else ""))
 
-    def _write(self, log: FrameLog, folder: Path, found: int, more: Mapping[str, str] = MappingProxyType({})) -> None:
+    def _write(self, log: FrameLog, folder: Path, found: int, more: Mapping[str, str] = MappingProxyType({})) -> str:
+        """Makes a take's files; why its animation is missing, where the others alone could be written."""
         take = log.take(self._fps)
         assert take.weights is not None
         driven = self._character.weights(take.weights.values[..., 0])
@@ -284,11 +286,21 @@ class Recordings:
         names, targets = self._character.targets(driven)
         turns = np.stack([take.extras["columns"][name].numpy() for name in ROTATIONS], 1)
         performance = Performance(take.times.numpy(), names, targets.numpy(), turns)
-        with all_or_none():
-            save_weights_csv(moved, folder / WEIGHTS)
-            save_live_link(take, folder / LIVE_LINK)
-            write_file(folder / ANIMATION, performed_glb(self._character.document, performance))
-            write_file(folder / SUMMARY, json.dumps(summary, indent=1).encode())
+        animation, missing = performed_glb(self._character.document, performance), ""
+        for files in (summary["files"], [WEIGHTS, LIVE_LINK]):
+            try:
+                with all_or_none():
+                    save_weights_csv(moved, folder / WEIGHTS)
+                    save_live_link(take, folder / LIVE_LINK)
+                    if ANIMATION in files:
+                        write_file(folder / ANIMATION, animation)
+                    write_file(folder / SUMMARY, json.dumps({**summary, "files": files}, indent=1).encode())
+                break
+            except FileFormatError as error:  # on a full disk the performance may go without its largest file
+                if ANIMATION not in files:
+                    raise
+                missing = f"without {ANIMATION}: {error}"
+        return missing
 
 
 @contextmanager
