@@ -33,6 +33,7 @@ from torchface.workflows.live.camera import DEFAULT_SIZE
 from torchface.workflows.live.kept_takes import (
     ANIMATION,
     LIVE_LINK,
+    SUMMARY,
     WEIGHTS,
     kept_takes,
     printable,
@@ -261,8 +262,7 @@ def import_recordings(folder: Path, recordings: Recordings, say: Say) -> None:
     known = {take.name for take in kept_takes(folder)}
     for path in sorted(folder.glob("*")):
         if path.suffix.lower() in (".csv", *RECORDING_ENDINGS) and printable(path.name) not in (
-            WEIGHTS,
-            LIVE_LINK,
+            *(WEIGHTS, LIVE_LINK, SUMMARY),
             *known,
         ):
             try:
