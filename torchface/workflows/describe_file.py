@@ -244,8 +244,7 @@ def _with_texture_rows(path: Path, rows: Rows) -> Rows:
     if not unread:
         return rows
     rows = [("texture", "cannot be read") if row == ("texture", "none") else row for row in rows]
-    more = f"{len(unread)} of its textures cannot be read ({unread[0]}): export it with PNG or JPEG"
-    return [*rows, ("warning", more)]
+    return [*rows, ("warning", f"{len(unread)} of its textures cannot be read: {unread[0]}")]
 
 
 def _extent(points: Tensor) -> str:

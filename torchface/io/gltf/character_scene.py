@@ -246,7 +246,7 @@ class _Shelf:
         return self._rows[key], texcoord
 
     def _image(self, index: object) -> Tensor | None:
-        """The image of a texture; none where it is of a kind that is not read, such as KTX2."""
+        """The image of a texture; none where it is of a kind that is not read."""
         found = image_bytes(self.document, index)
         if found is None:
             return None

@@ -1,5 +1,6 @@
 """A glTF scene as one rig: all its meshes put together, shapes of the same name joined."""
 
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import accumulate
@@ -11,7 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchface.color_space import to_srgb
-from torchface.errors import FileFormatError, NoShapesError
+from torchface.errors import FileFormatError, MissingExtraError, NoShapesError
 from torchface.geometry.meshes.uv_seams import merge_equal_rows
 from torchface.io.gltf.corrective_extras import rig_of_targets, scene_correctives
 from torchface.io.gltf.gltf_document import Document, read_document
@@ -27,6 +28,7 @@ from torchface.io.gltf.primitive_reading import BYTES_A_CORNER, BYTES_A_VERTEX, 
 from torchface.io.gltf.rest_of_skin import at_rest
 from torchface.io.gltf.scene import Instance, instances
 from torchface.io.images.image_files import decode_image
+from torchface.io.images.ktx2_images import is_ktx2, ktx2_reader
 from torchface.io.images.texture_atlas import Look, with_used_looks
 from torchface.io.length_units import millimetres_per
 from torchface.io.scenes.scene_pieces import Piece, all_names, join_deltas, join_meshes, joined_size
@@ -158,12 +160,16 @@ def _moved(
         return (points @ linear.T + translation).astype(np.float32)
 
 
+_IMAGE_EXTENSIONS = "EXT_texture_webp", "KHR_texture_basisu"
+
+
 def image_bytes(document: Document, index: object) -> tuple[memoryview, int] | None:
-    """The encoded image of a texture, a WebP of an extension too, and its number; None where another one has it."""
+    """The encoded image of a texture, a WebP or KTX2 of an extension too, and its number; None where it has none."""
     location = f"textures[{index}]"
     texture = document.item("textures", index, location)
-    webp = document.record(texture.get("extensions"), location).get("EXT_texture_webp")
-    source = texture.get("source", document.record(webp, location).get("source"))
+    extensions = document.record(texture.get("extensions"), location)
+    named = [document.record(extensions.get(name), location).get("source") for name in _IMAGE_EXTENSIONS]
+    source = texture.get("source", next((one for one in named if one is not None), None))
     if source is None:
         return None
     image, location = document.item("images", source, f"{location}.source"), f"images[{source}]"
@@ -173,19 +179,28 @@ def image_bytes(document: Document, index: object) -> tuple[memoryview, int] | N
 
 
 def unread_textures(path: str | Path) -> list[str]:
-    """The kinds of the textures of a file that cannot be read, such as ``KHR_texture_basisu`` (KTX2)."""
-    document = read_document(path)
-    return [
-        ", ".join(document.record(texture.get("extensions"), f"textures[{row}]")) or "no image"
-        for row, texture in enumerate(document.objects("textures"))
-        if image_bytes(document, row) is None
-    ]
+    """Why textures of a file cannot be read, a sentence for each of them."""
+    document, found = read_document(path), list[str]()
+    for row in range(len(document.objects("textures"))):
+        image = image_bytes(document, row)
+        if image is None:
+            found.append("found none of a kind that is known, expected PNG, JPEG, WebP or KTX2")
+        elif is_ktx2(image[0]):
+            try:
+                ktx2_reader(f"textures[{row}]")
+            except MissingExtraError as error:
+                found.append(str(error))
+    return found
 
 
 def read_texture(document: Document, index: int) -> Tensor | None:
-    """The image of a texture; none where only an extension has it."""
+    """The image of a texture; none, with a warning, where it is of a kind that is not read here."""
     found = image_bytes(document, index)
-    return None if found is None else decode_image(bytes(found[0]), f"{document.path}: images[{found[1]}]")
+    try:
+        return None if found is None else decode_image(bytes(found[0]), f"{document.path}: images[{found[1]}]")
+    except MissingExtraError as error:
+        warnings.warn(f"{error}; the surface goes without it", stacklevel=2)
+        return None
 
 
 def rejoined(document: Document, instanced: Sequence[tuple[Instance, Part]]) -> tuple[Instance, Part] | None:

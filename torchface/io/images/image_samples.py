@@ -11,6 +11,7 @@ from torch import Tensor
 
 from torchface.errors import FileFormatError
 from torchface.io.images.image_headers import ImageHeader, read_header
+from torchface.io.images.ktx2_images import is_ktx2, ktx2_header, ktx2_samples
 
 _PIXELS_ALWAYS, _PIXELS_PER_BYTE = 4096 * 4096, 100
 _BYTES_ALWAYS, _BYTES_PER_BYTE = 480 * 2**20, 18
@@ -60,6 +61,9 @@ def decode_samples(data: bytes, source: str, planes: int = 3) -> Samples:
     Args:
         planes: that the caller makes of it.
     """
+    if is_ktx2(data):
+        _check_memory(ktx2_header(data, source), planes, len(data), source)
+        return Samples(ktx2_samples(data, source))
     header = read_header(data, source)
     if header is None:
         return Samples(_decoded(header, data, source, planes))
