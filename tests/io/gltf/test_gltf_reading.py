@@ -139,6 +139,26 @@ def test_interleaved_and_normalised_attributes(tmp_path: Path) -> None:
     assert close(corners, [[[0, 1], [1, 1], [1, 0]], [[0, 1], [1, 0], [0, 0.8]]], 1e-6)
 
 
+def test_texture_coordinates_are_shifted_turned_and_scaled_as_the_material_says(tmp_path: Path) -> None:
+    """Whole numbers of gltfpack, brought into the picture by ``KHR_texture_transform``."""
+    build = square(["a", "b"])
+    primitive = build.root["meshes"][0]["primitives"][0]
+    whole = np.array([[0, 0], [4095, 0], [4095, 2047], [0, 2047]], np.uint16)
+    primitive["attributes"]["TEXCOORD_1"] = build.accessor(whole)
+    change = {"texCoord": 1, "offset": [0.25, 0.5], "scale": [0.5 / 4095, 0.25 / 2047]}
+    texture = {"index": 0, "extensions": {"KHR_texture_transform": change}}
+    build.root["materials"] = [{"pbrMetallicRoughness": {"baseColorTexture": texture}}]
+    build.root["textures"] = [{}]
+    primitive["material"] = 0
+    mesh = load_mesh(build.save(tmp_path / "face.gltf", extensionsRequired=["KHR_texture_transform"]))
+    corners = mesh.uvs[mesh.uv_faces]
+    assert close(corners[0], [[0.25, 0.5], [0.75, 0.5], [0.75, 0.25]], 1e-6)  # from the lower left
+    change["rotation"] = np.pi / 2  # counter-clockwise, as the picture is seen
+    mesh = load_mesh(build.save(tmp_path / "face.gltf"))
+    corners = mesh.uvs[mesh.uv_faces]
+    assert close(corners[0], [[0.25, 0.5], [0.25, 1.0], [0.5, 1.0]], 1e-6)
+
+
 @pytest.mark.parametrize(("mode", "order"), [(5, [0, 1, 3, 2]), (6, [0, 1, 2, 3])])
 def test_strips_and_fans_face_the_way_triangles_do(mode: int, order: list[int], tmp_path: Path) -> None:
     build = square(["a", "b"])

@@ -199,8 +199,8 @@ class _Shelf:
         for number, primitive in group:
             faces = read_triangles(document, primitive, f"meshes[{mesh}].primitives[{number}]", count)
             document.reserve(faces.size * BYTES_A_CORNER, location)
-            material, texcoord = self._material(primitive, f"meshes[{mesh}].primitives[{number}].material")
-            if (found := read_uvs(document, attributes, texcoord, location, count)) is not None:
+            material, texture = self._material(primitive, f"meshes[{mesh}].primitives[{number}].material")
+            if (found := read_uvs(document, attributes, texture, location, count)) is not None:
                 uvs = found
             mirrored = np.linalg.det(matrices[faces[:, 0], :3, :3]) < 0
             self.faces.append(np.where(mirrored[:, None], faces[:, ::-1], faces) + self._count)
@@ -225,13 +225,12 @@ class _Shelf:
         self.head.append(head)
         self._count += count
 
-    def _material(self, primitive: dict[str, Any], where: str) -> tuple[int, int]:
-        """The row of a primitive's colour and texture, and which set of coordinates it takes."""
+    def _material(self, primitive: dict[str, Any], where: str) -> tuple[int, dict[str, Any]]:
+        """The row of a primitive's colour and texture, and what the material says of the texture."""
         document, key = self.document, primitive.get("material")
         material = {} if key is None else document.item("materials", key, where)
         surface = document.record(material.get("pbrMetallicRoughness"), where)
         texture = document.record(surface.get("baseColorTexture"), where)
-        texcoord = document.integer(texture, "texCoord", where, 0)
         if key not in self._rows:
             factor = document.numbers(surface, "baseColorFactor", where, 4) or [1.0, 1.0, 1.0, 1.0]
             color = torch.tensor(factor).clamp(0, 1)
@@ -243,7 +242,7 @@ class _Shelf:
             self._rows[key] = len(self.colors)
             self.colors.append(color)
             self.textures.append(image)
-        return self._rows[key], texcoord
+        return self._rows[key], texture
 
     def _image(self, index: object) -> Tensor | None:
         """The image of a texture; none where it is of a kind that is not read."""

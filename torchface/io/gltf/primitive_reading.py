@@ -1,6 +1,7 @@
 """A glTF mesh as one part of a rig: its primitives' vertices, triangles and morph targets put together."""
 
 import json
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -56,16 +57,16 @@ def read_part(document: Document, index: int) -> Part | None:
         if primitive.get("mode", _TRIANGLES) not in (_TRIANGLES, _STRIP, _FAN):
             continue
         # Exporters that split by material let all primitives share one set of vertices.
-        key = json.dumps([primitive.get("attributes"), primitive.get("targets")], sort_keys=True)
+        look, texture = _look(document, primitive, f"{location}.primitives[{i}]")
+        shared = [primitive.get("attributes"), primitive.get("targets"), texture.get("extensions")]
+        key = json.dumps(shared, sort_keys=True)
         if key not in blocks:
-            blocks[key] = _read_block(document, primitive, f"{location}.primitives[{i}]", first)
+            blocks[key] = _read_block(document, primitive, texture, f"{location}.primitives[{i}]", first)
             first += len(blocks[key].positions)
         corners = read_triangles(document, primitive, f"{location}.primitives[{i}]", len(blocks[key].positions))
         triangles.append(corners + blocks[key].first)
         painted = _painted(primitive)  # that texture is not of the mesh
-        looks.append(
-            (MaterialLook() if painted else _look(document, primitive, f"{location}.primitives[{i}]")[0], len(corners))
-        )
+        looks.append((MaterialLook() if painted else look, len(corners)))
     if not blocks:
         return None
     rows = list(blocks.values())
@@ -116,17 +117,32 @@ def read_positions(
 
 
 def read_uvs(
-    document: Document, attributes: dict[str, Any], number: int, location: str, count: int
+    document: Document, attributes: dict[str, Any], texture: dict[str, Any], location: str, count: int
 ) -> NDArray[np.float32] | None:
-    """A set of texture coordinates (C,2), origin at the lower left; none where it is absent."""
-    name = f"TEXCOORD_{number}"
+    """The coordinates (C,2) in a texture, by what a material says of it, origin at the lower left; none without them.
+
+    ``KHR_texture_transform`` shifts, turns and scales them, as files with quantised coordinates need.
+    """
+    where = f"{location}.material.baseColorTexture"
+    change = document.record(document.record(texture.get("extensions"), where).get("KHR_texture_transform"), where)
+    name = f"TEXCOORD_{document.integer(change if 'texCoord' in change else texture, 'texCoord', where, 0)}"
     if name not in attributes:
         return None
     uvs = read_floats(document, attributes[name], f"{location}.{name}", ("VEC2",), count)
-    return np.stack([uvs[:, 0], 1 - uvs[:, 1]], axis=1)
+    across, down = (uvs * (document.numbers(change, "scale", where, 2) or (1.0, 1.0))).T
+    if "rotation" in change:
+        (turn,) = document.numbers({"rotation": [change["rotation"]]}, "rotation", where, 1) or (0.0,)
+        across, down = (
+            math.cos(turn) * across + math.sin(turn) * down,
+            math.cos(turn) * down - math.sin(turn) * across,
+        )
+    right, below = document.numbers(change, "offset", where, 2) or (0.0, 0.0)
+    return np.stack([across + right, 1 - (down + below)], axis=1).astype(np.float32)
 
 
-def _read_block(document: Document, primitive: dict[str, Any], location: str, first: int) -> _Block:
+def _read_block(
+    document: Document, primitive: dict[str, Any], texture: dict[str, Any], location: str, first: int
+) -> _Block:
     attributes, positions = read_positions(document, primitive, location)
     count = len(positions)
     document.reserve(count * BYTES_A_VERTEX, f"{location}.POSITION")
@@ -137,7 +153,7 @@ def _read_block(document: Document, primitive: dict[str, Any], location: str, fi
         target = document.record(row, f"{location}.targets[{i}]")
         if "POSITION" in target:
             deltas[i] = read_floats(document, target["POSITION"], f"{location}.targets[{i}].POSITION", ("VEC3",), count)
-    uvs = read_uvs(document, attributes, _look(document, primitive, location)[1], location, count)
+    uvs = read_uvs(document, attributes, texture, location, count)
     colors = ids = None
     color_name = "_COLOR" if "_COLOR" in attributes or _painted(primitive) else "COLOR_0"
     if color_name in attributes:
@@ -173,19 +189,18 @@ def read_triangles(document: Document, primitive: dict[str, Any], location: str,
     return np.stack([corners[steps], corners[steps + 1 + odd], corners[steps + 2 - odd]], axis=1)
 
 
-def _look(document: Document, primitive: dict[str, Any], location: str) -> tuple[MaterialLook, int]:
-    """The base colour, and which set of texture coordinates its texture takes."""
+def _look(document: Document, primitive: dict[str, Any], location: str) -> tuple[MaterialLook, dict[str, Any]]:
+    """The base colour, and what the material says of its texture."""
     if primitive.get("material") is None:
-        return MaterialLook(), 0
+        return MaterialLook(), {}
     material = document.item("materials", primitive["material"], f"{location}.material")
     surface = document.record(material.get("pbrMetallicRoughness"), f"{location}.material")
     red, green, blue, _ = document.numbers(surface, "baseColorFactor", f"{location}.material", 4) or (1.0,) * 4
     texture = document.record(surface.get("baseColorTexture"), f"{location}.material.baseColorTexture")
     if "index" not in texture:
-        return MaterialLook(None, (red, green, blue)), 0
+        return MaterialLook(None, (red, green, blue)), {}
     index = document.integer(texture, "index", f"{location}.material.baseColorTexture")
-    coordinates = document.integer(texture, "texCoord", f"{location}.material.baseColorTexture", 0)
-    return MaterialLook(index, (red, green, blue)), coordinates
+    return MaterialLook(index, (red, green, blue)), texture
 
 
 def _painted(primitive: dict[str, Any]) -> bool:
