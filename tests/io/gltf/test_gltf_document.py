@@ -134,7 +134,7 @@ DAMAGES: dict[str, tuple[Damage, str]] = {
         lambda b: b.root["meshes"][0]["primitives"][0].update(attributes={}),
         "attributes: found no POSITION",
     ),
-    "Draco": (lambda b: b.root.update(extensionsRequired=["KHR_draco_mesh_compression"]), "'KHR_draco_mesh_compress"),
+    "a compression": (lambda b: b.root.update(extensionsRequired=["XYZ_mesh_compression"]), "'XYZ_mesh_compression'"),
     "another version": (lambda b: b.root.update(asset={"version": "1.0"}), "asset.version: found '1.0'"),
     "an array that is none": (lambda b: b.root.update(meshes={"a": 1}), "found {'a': 1}, expected an array"),
     "polygons of gigabytes": (

@@ -17,7 +17,7 @@ def read_indices(document: Document, index: object, where: str) -> NDArray[np.in
     accessor = document.item("accessors", index, where)
     if accessor.get("componentType") not in _INDEX_COMPONENTS:
         raise document.error(where, shown(accessor.get("componentType")), "unsigned integers (5121, 5123 or 5125)")
-    return _read(document, accessor, f"accessors[{index}]", ("SCALAR",), None)[:, 0].astype(np.int64)
+    return _read(document, accessor, index, ("SCALAR",), None)[:, 0].astype(np.int64)
 
 
 def read_floats(
@@ -29,7 +29,7 @@ def read_floats(
         types: what D may be, such as ``("VEC3",)``.
     """
     accessor = document.item("accessors", index, where)
-    rows = _read(document, accessor, f"accessors[{index}]", types, count)
+    rows = _read(document, accessor, index, types, count)
     kind, result = rows.dtype, rows.astype(np.float32)
     if accessor.get("normalized") is True and kind.kind in "iu":
         result = np.maximum(result / np.float32(np.iinfo(kind).max), np.float32(-1))
@@ -40,8 +40,9 @@ def read_floats(
 
 
 def _read(
-    document: Document, accessor: dict[str, Any], location: str, types: tuple[str, ...], expected: int | None
+    document: Document, accessor: dict[str, Any], index: object, types: tuple[str, ...], expected: int | None
 ) -> NDArray[Any]:
+    location = f"accessors[{index}]"
     component, kind = accessor.get("componentType"), accessor.get("type")
     if not isinstance(component, int) or component not in _COMPONENTS:
         raise document.error(
@@ -54,7 +55,11 @@ def _read(
         raise document.error(f"{location}.count", count, f"{expected}, as the primitive's other attributes")
     dtype, width = np.dtype(_COMPONENTS[component]), _WIDTHS[kind]
     document.reserve(count * width * 4, f"{location}.count")
-    if accessor.get("bufferView") is None:
+    if isinstance(index, int) and index in document.unpacked_accessors:
+        rows = document.unpacked_accessors[index]
+        if rows.shape != (count, width):
+            raise document.error(location, f"{rows.shape} numbers that Draco unpacks", f"{(count, width)}")
+    elif accessor.get("bufferView") is None:
         rows = np.zeros((count, width), dtype)
     else:
         view, stride = document.view(accessor["bufferView"], f"{location}.bufferView")

@@ -15,7 +15,7 @@ from torchface.color_space import to_srgb
 from torchface.errors import FileFormatError, TorchfaceError
 from torchface.io.gltf.accessors import read_floats
 from torchface.io.gltf.character_nodes import vrm_bones
-from torchface.io.gltf.gltf_document import Document
+from torchface.io.gltf.gltf_document import DRACO, Document
 from torchface.io.gltf.gltf_reading import image_bytes
 from torchface.io.gltf.primitive_reading import (
     BYTES_A_CORNER,
@@ -179,6 +179,11 @@ class _Shelf:
         under: set[int],
     ) -> None:
         document, location = self.document, f"meshes[{mesh}].primitives[{group[0][0]}]"
+        if DRACO in document.record(group[0][1].get("extensions"), f"{location}.extensions"):
+            plain = (
+                "plain data, to which shapes can be added; decompress it: npx @gltf-transform/cli copy IN.glb OUT.glb"
+            )
+            raise document.error(location, "Draco compression", plain)
         attributes, positions = read_positions(document, group[0][1], location)
         count = len(positions)
         document.reserve(count * (BYTES_A_VERTEX + 16 * 8), f"{location}.POSITION")

@@ -11,6 +11,8 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import unquote
 
+from numpy.typing import NDArray
+
 from torchface.errors import FileFormatError
 from torchface.files.documents import parse_json
 from torchface.files.extra_packages import import_extra
@@ -25,8 +27,9 @@ _UNPACKED_PER_BYTE = 32
 _SHORT = reprlib.Repr()
 _SHORT.maxstring = 60
 _MESHOPT = ("EXT_meshopt_compression", "KHR_meshopt_compression")
+DRACO = "KHR_draco_mesh_compression"
 _EXTENSIONS = (
-    *("KHR_mesh_quantization", *_MESHOPT, "KHR_texture_transform", "KHR_texture_basisu", "EXT_texture_webp"),
+    *("KHR_mesh_quantization", *_MESHOPT, DRACO, "KHR_texture_transform", "KHR_texture_basisu", "EXT_texture_webp"),
     *("KHR_materials_", "KHR_lights_punctual"),
 )
 """Extensions a file may require: the first three are read, the others change no vertex."""
@@ -44,6 +47,8 @@ class Document:
     path: Path
     root: dict[str, Any]
     binary: memoryview | None = None  # the binary chunk of a .glb
+    # rows of accessors that Draco has packed, by their number
+    unpacked_accessors: dict[int, NDArray[Any]] = field(default_factory=dict)
     _sources: dict[str, memoryview] = field(default_factory=dict)
     _unpacked_views: dict[str, memoryview] = field(default_factory=dict)
     _unpacked: int = 0

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from torchface.color_space import to_srgb
 from torchface.io.gltf.accessors import read_floats, read_indices
+from torchface.io.gltf.draco_primitives import unpack_draco
 from torchface.io.gltf.gltf_document import Document, shown
 
 _TRIANGLES, _STRIP, _FAN = 4, 5, 6
@@ -60,6 +61,7 @@ def read_part(document: Document, index: int) -> Part | None:
         look, texture = _look(document, primitive, f"{location}.primitives[{i}]")
         shared = [primitive.get("attributes"), primitive.get("targets"), texture.get("extensions")]
         key = json.dumps(shared, sort_keys=True)
+        unpack_draco(document, primitive, f"{location}.primitives[{i}]")
         if key not in blocks:
             blocks[key] = _read_block(document, primitive, texture, f"{location}.primitives[{i}]", first)
             first += len(blocks[key].positions)
@@ -87,10 +89,6 @@ def read_part(document: Document, index: int) -> Part | None:
     )
 
 
-DECOMPRESSED = "plain data; decompress it: npx @gltf-transform/cli copy IN.glb OUT.glb"
-"""What is expected in place of Draco's compression, which the page reads and torchface does not."""
-
-
 @dataclass(frozen=True)
 class _Block:
     """The vertices of one set of accessors; ``first`` is where they begin in the part."""
@@ -108,8 +106,6 @@ def read_positions(
     document: Document, primitive: dict[str, Any], location: str
 ) -> tuple[dict[str, Any], NDArray[np.float32]]:
     """The attributes of a primitive, and its positions (C,3)."""
-    if "KHR_draco_mesh_compression" in document.record(primitive.get("extensions"), f"{location}.extensions"):
-        raise document.error(location, "Draco compression", DECOMPRESSED)
     attributes = document.record(primitive.get("attributes"), f"{location}.attributes")
     if "POSITION" not in attributes:
         raise document.error(f"{location}.attributes", "no POSITION", "one")
