@@ -164,6 +164,17 @@ def test_several_recordings_lie_beside_each_other(dome: Path, tmp_path: Path) ->
     assert len(load_take(tmp_path / "out" / "take_3" / "weights.csv")) == 5
 
 
+def test_two_sessions_of_one_folder_record_into_folders_of_their_own(dome: Path, tmp_path: Path) -> None:
+    (first, one), (second, two) = (a_session(Endless(n), tmp_path / "out", dome, []) for n in (5, 7))
+    first.record(True)
+    second.record(True)
+    first.run()
+    second.run()
+    saved = one.finish() + two.finish()
+    assert [(take.folder.name, take.frames) for take in saved] == [("out", 5), ("take_2", 7)]
+    assert sorted(take.frames for take in kept_takes(tmp_path / "out")) == [5, 7]
+
+
 def test_a_take_is_kept_from_rows_read_again_and_imported_from_files(dome: Path, tmp_path: Path) -> None:
     told: list[str] = []
     session, recordings = a_session(Endless(1), tmp_path / "takes", dome, told)

@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from torchface.errors import FileFormatError, TorchfaceError, ValueRangeError
-from torchface.files.temporary_files import new_temporary
+from torchface.files.temporary_files import new_temporary, remove_left_over
 from torchface.files.whole_files import all_or_none, make_folder, write_file
 from torchface.files.write_errors import unwritten
 from torchface.io.gltf.performance_animation import Performance, performed_glb
@@ -29,6 +29,7 @@ from torchface.workflows.live.kept_takes import ANIMATION, LIVE_LINK, SUMMARY, W
 from torchface.workflows.live.live_frames import LiveFrame, Say
 from torchface.workflows.live.take_film import FILM, TakeFilm
 
+_LOG = "frames"
 _EVEN = 1e-6  # seconds by which times that are even may be off
 _LOOK = 128  # frames between looks at how full the disk is
 _RESERVE, _NUMBER_BYTES = (
@@ -57,7 +58,7 @@ class FrameLog:
         self._row = np.dtype([("weights", "<f4", *numbers[:1]), ("rotations", "<f4", *numbers[1:]), ("time", "<f8")])
         self._first = 0.0
         try:
-            handle, self._path = new_temporary(folder / "frames")
+            handle, self._path = new_temporary(folder / _LOG)
         except OSError as error:
             raise unwritten(folder, error) from error
         self._file = os.fdopen(handle, "r+b", buffering=2**18)
@@ -246,7 +247,9 @@ class Recordings:
         return self.saved
 
     def _next(self) -> Path:
-        if self._folder not in self._begun and not (self._folder / SUMMARY).exists():
+        remove_left_over(self._folder, _LOG)  # of sessions that were killed
+        written = (self._folder / SUMMARY).exists() or any(self._folder.glob(f".{_LOG}.*"))  # by another session
+        if self._folder not in self._begun and not written:
             return self._folder
         numbered = (self._folder / f"take_{number}" for number in range(2, _MAX_TAKES))
         return next(folder for folder in numbered if folder not in self._begun and not folder.exists())
