@@ -283,21 +283,19 @@ class Recordings:
             "even": take.seconds is None,
             "seconds": round(float(take.times[-1]), 3),
             "found": found,
-            "files": [WEIGHTS, LIVE_LINK, ANIMATION],
-            **more,
         }
         names, targets = self._character.targets(driven)
         turns = np.stack([take.extras["columns"][name].numpy() for name in ROTATIONS], 1)
         performance = Performance(take.times.numpy(), names, targets.numpy(), turns)
         animation, missing = performed_glb(self._character.document, performance), ""
-        for files in (summary["files"], [WEIGHTS, LIVE_LINK]):
+        for files in ([WEIGHTS, LIVE_LINK, ANIMATION], [WEIGHTS, LIVE_LINK]):
             try:
                 with all_or_none():
                     save_weights_csv(moved, folder / WEIGHTS)
                     save_live_link(take, folder / LIVE_LINK)
                     if ANIMATION in files:
                         write_file(folder / ANIMATION, animation)
-                    write_file(folder / SUMMARY, json.dumps({**summary, "files": files}, indent=1).encode())
+                    write_file(folder / SUMMARY, json.dumps({**summary, "files": files, **more}, indent=1).encode())
                 break
             except FileFormatError as error:  # on a full disk the performance may go without its largest file
                 if ANIMATION not in files:
