@@ -13,6 +13,7 @@ from torchface.mesh import Annotations, Mesh
 from torchface.modeling.rigging.deformation_transfer import transfer_with_report
 from torchface.modeling.rigging.lid_and_lip_closing import find_seams
 from torchface.rig import BlendshapeRig
+from torchface.synthetic import performer
 
 COLUMNS = 31
 SKIN = torch.linspace(24, 0, 13, dtype=torch.float64)
@@ -156,6 +157,20 @@ def test_lips_of_another_mouth_open_and_close_by_as_much() -> None:
         change = rim_gap(target.vertices + moved) - rim_gap(target.vertices)
         expected = scale * (rim_gap(rig.vertices + source) - rim_gap(rig.vertices))
         assert float((change - expected)[2:-2].max()) < 0.05
+
+
+def test_lips_that_are_apart_at_rest_stay_apart() -> None:
+    actor = performer(texture=False).select(["mouthFrownLeft", "mouthPucker", "jawOpen"])
+    apart = actor.neutral.with_vertices(actor.vertices + 0.2 * actor.deltas[2])
+    moved = transfer_with_report(actor, apart).rig
+    upper, lower = actor.neutral.landmarks[[62, 66]]
+
+    def gap(vertices: Tensor) -> float:
+        return float(vertices[upper, 1] - vertices[lower, 1])
+
+    assert gap(apart.vertices) > 4
+    for shape in moved.deltas[:2]:
+        assert gap(apart.vertices + shape) > 0.8 * gap(apart.vertices)
 
 
 @pytest.mark.real

@@ -33,6 +33,7 @@ STILL = 0.01
 _LINK_WEIGHT = 100.0
 _LINK_TOLERANCE = 0.02
 _CONTACT_DECAY = 4.0
+_TOUCHING = 0.3  # millimetres between lips that touch at rest
 _NEAREST = 16  # vertices
 
 
@@ -243,8 +244,12 @@ class _ClosedGaps:
     target_across: Tensor
 
     def extra(self, rows: Tensor, change: Tensor) -> Tensor:
-        """How much more the target has to close, (K,3), by the share of the source's gap that a change closes."""
-        closed = ((change * self.source_across[rows]).sum(-1) / self.gap[rows].clamp(min=0.1)).clamp(0, 1)
+        """How much more the target has to close, (K,3), by the share of the source's gap that a change closes.
+
+        Lips that touch at rest close nothing, however they press: the target's stay as far apart as they are at rest.
+        """
+        closed = ((change * self.source_across[rows]).sum(-1) / self.gap[rows].clamp(min=_TOUCHING)).clamp(0, 1)
+        closed[self.gap[rows] < _TOUCHING] = 0.0
         return self.target_across[rows] * (closed * self.wider[rows])[:, None]
 
 
