@@ -57,6 +57,20 @@ def test_half_a_blink_is_made_whole(actor: BlendshapeRig, eyes: bool) -> None:
     assert not bool(moved[head.loose].any())
 
 
+def test_upper_lid_goes_along_with_its_edge(actor: BlendshapeRig) -> None:
+    head, marks = head_of(actor)
+    upper = eyes_seen(head, marks)[0].upper
+    away, nearest = torch.cdist(head.vertices, upper).min(1)
+    edge_alone = actor.deltas.double() * torch.exp(-((away / 0.8) ** 2))[:, None]
+    shut = shut_blinks(head, edge_alone, actor.names, eyes_seen(head, marks))[0][0]
+    beside = head.vertices - upper[nearest]
+    middle = (beside[:, 0].abs() < 1) & ((upper[nearest, 0] - upper[:, 0].mean()).abs() < 6)
+    lid = middle & (beside[:, 1] > 0.5) & (away < 2.2) & (beside[:, 2] > 0)
+    assert int(lid.sum()) > 2
+    assert float(shut[lid, 1].max()) < 0.7 * float(shut[:, 1].min())
+    assert float(edge_alone[0, lid, 1].max()) > 0.2 * float(actor.deltas[0, :, 1].min())
+
+
 def test_lids_of_other_shapes_follow_as_far_as_the_template_s() -> None:
     names = ["eyeLookDownLeft", "eyeLookUpLeft", "eyeWideLeft"]
     actor = performer(texture=False).select([*BLINKS, *names])

@@ -39,6 +39,8 @@ _PLACES = (
     )
     / 4
 )  # of a triangle beside its corners: one of a coarse head stands through a round eye
+# Of its edge's way: how high an upper lid goes half as far. Millimetres: below and behind the edge, and of lag.
+_GOES_ALONG, _BESIDE, _LAG = 0.42, 1.5, 0.5
 _LID = 0.8  # of the opening's height, from the upper lid's edge up: what unfolds
 _OTHER = 0.4, 0.6  # millimetres of a lid from the template's, mean: where it begins to unfold, and does wholly
 _FINEST, _HELD = 1.3, 0.005  # millimetres: narrower folds go; how much each place of the lid keeps to where it is
@@ -87,7 +89,7 @@ def shut_blinks(
 
     nine tenths of it by the upper lid. An upper lid that is not of the form from which the blink came unfolds: narrow
     folds that it keeps from rest are smoothed by least bending. Then the lids go before what lies in the eye, be it a
-    ball or a plate.
+    ball or a plate. Of an upper lid that is thicker or higher than the template's more goes along than its edge.
 
     Blinks are fitted to openings, an eye's other shapes are not: where lids that look down go a smaller share of a
     blink's way than the template's, lids of all these shapes move as many times as far as that takes.
@@ -207,9 +209,21 @@ class _Lids:
             gap * (gap[:, 1:2] < _TOUCH) * torch.tensor([0.0, 1.0, 1.0])
         )  # lids that overlap have shut; they may slide
         moved = delta.index_add(0, self.rows, self._change([_UPPER * gap, (_UPPER - 1) * gap]))
+        moved[self.rows] = self._with_its_edge(moved)
         if apart is not None:
             moved[self.rows] += self._unfolding(moved[self.rows], apart[self.rows])
         return _before_the_eye(self.head, self.eye, moved, self.rows)
+
+    def _with_its_edge(self, delta: Tensor) -> Tensor:
+        """A pose of the vertices around, (n,3), in which the upper lid goes down with its edge, the less the higher."""
+        rest, edge = self.head.vertices[self.rows], self._at(self.head.vertices, self.edges[0])
+        distance, nearest = torch.cdist(rest, edge).min(1)
+        way, own = self._at(delta, self.edges[0])[nearest], delta[self.rows]
+        far = distance / (_GOES_ALONG * way.norm(dim=-1).clamp(min=1e-6))
+        least = way / (1 + far**5)[:, None]
+        lags = (own[:, 1] - least[:, 1]).clamp(min=0)
+        front = ((rest - edge[nearest])[:, 1:] / _BESIDE + 1).clamp(0, 1).prod(1)
+        return own + (front * lags / (lags + _LAG))[:, None] * (least - own)
 
     def _change(self, edges: Sequence[Tensor]) -> Tensor:
         """The change (n,3) of the vertices around that moves the edges' points, (k,3) each."""
