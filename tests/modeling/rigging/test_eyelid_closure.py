@@ -68,7 +68,7 @@ def test_upper_lid_goes_along_with_its_edge(actor: BlendshapeRig) -> None:
     lid = middle & (beside[:, 1] > 0.5) & (away < 2.2) & (beside[:, 2] > 0)
     assert int(lid.sum()) > 2
     assert float(shut[lid, 1].max()) < 0.7 * float(shut[:, 1].min())
-    assert float(edge_alone[0, lid, 1].max()) > 0.2 * float(actor.deltas[0, :, 1].min())
+    assert float(edge_alone[0, lid, 1].min()) > 0.4 * float(actor.deltas[0, :, 1].min())
 
 
 def test_lids_of_other_shapes_follow_as_far_as_the_template_s() -> None:
