@@ -43,6 +43,7 @@ class RegistrationRecord:
     # How far the landmarks inside the face end from their vertices, median, millimetres; NaN without any. What slides
     # along the surface is as near to it as what does not: no distance to the scan shows this.
     slid: float = math.nan
+    bent: bool = True  # False of a head that has the template's triangles and was taken as it is
 
     def figures(self) -> str:
         """How near it has come, how much of it the scan shows, and how far it has slid, in one line."""

@@ -15,7 +15,8 @@ from torchface.workflows.batch.batch_items import SCAN_ENDINGS, BatchItem, ItemK
 from torchface.workflows.batch.batch_job import model_content
 from torchface.workflows.batch.contact_sheet import face_picture
 from torchface.workflows.batch.outcomes import Made
-from torchface.workflows.rig.actor_rig import ActorReport, RigOptions, rig_actor
+from torchface.workflows.rig.actor_report import ActorReport
+from torchface.workflows.rig.actor_rig import RigOptions, rig_actor
 
 ACTORS = ItemKind("scan", "rigged", SCAN_ENDINGS)
 _METHOD = "rig batch/3"

@@ -42,7 +42,7 @@ from torchface.modeling import (
     transfer_with_report,
 )
 from torchface.modeling.rigging.example_rigging import RiggingSchedule
-from torchface.modeling.rigging.part_clearance import Penetration, penetration
+from torchface.modeling.rigging.part_clearance import penetration
 from torchface.modeling.rigging.part_placement import with_mouth_behind_skin
 from torchface.progress import Progress, silent
 from torchface.registration import Registration, hidden_parts, in_place_of, register, with_template_skin
@@ -54,6 +54,7 @@ from torchface.rig import BlendshapeRig
 from torchface.shape_names import mapping
 from torchface.viz.figures.registration_views import registration_sheet
 from torchface.workflows.register.register_scans import load_shape_model
+from torchface.workflows.rig.actor_report import ActorReport
 from torchface.workflows.rig.expression_scans import (
     LAYOUT,
     Expression,
@@ -91,55 +92,6 @@ class RigOptions:
     colors: bool = True  # whether the scans' colours are used, to find hair and as the actor's
     # a regression of expressions, by name or folder, which predicts those of the shapes that it knows
     expressions: str | Path | None = None
-
-
-@dataclass(frozen=True, eq=False)
-class ActorReport:
-    """What was made, and how near it comes to the scans."""
-
-    rig: BlendshapeRig  # the actor's, in the template's place
-    neutral: Registration  # the neutral scan's registration
-    transfer_summary: str  # on triangles without area; empty where there are none
-    examples: ExampleRig | None  # what the examples taught; None without any
-    example_names: tuple[str, ...]  # the examples used, in the order of `examples.errors`
-    maps: dict[str, NormalMap]  # the baked normal maps by name, the neutral's first
-    skipped: tuple[str, ...]  # lines on scans that could not be used
-    figure: Path  # of the registration: scan, face, distances and lines
-    penetration: Penetration | None = None  # how far teeth, gums and eyes stand out of the skin
-    predicted: int = 0  # how many of the shapes a model of expressions has predicted
-
-    def lines(self) -> list[str]:
-        """For people to read."""
-        record = self.neutral.record
-        lines = [f"neutral: aligned with the scan by {record.start}; {record.figures()}"]
-        if not record.stages:
-            lines = [f"neutral: {record.start}"]
-        lines += [f"  note: {note}" for note in record.notes]
-        lines.append(f"  figure: {self.figure}")
-        lines.append(f"rig: {len(self.rig.vertices)} vertices, {len(self.rig.names)} shapes transferred")
-        if self.predicted:
-            lines[-1] += f", {self.predicted} of them predicted by the model of expressions"
-        lines += [f"  note: {self.transfer_summary}"] if self.transfer_summary else []
-        lines += [] if self.penetration is None else [self.penetration.line()]
-        if self.examples is not None:
-            errors = self.examples.errors
-            lines.append(
-                f"examples: {len(self.example_names)}, from {float(errors[0].mean()):.2f} mm (transferred shapes) to "
-                f"{float(errors[-1].mean()):.2f} mm root mean square; the shapes rotated by up to "
-                f"{float(self.examples.angles.max()):.0f}°"
-            )
-            lines += [
-                f"  {name}: {float(before):.2f} to {float(after):.2f} mm"
-                for name, before, after in zip(self.example_names, errors[0], errors[-1], strict=True)
-            ]
-        if self.maps:
-            lines.append(f"normal maps: {len(self.maps)}")
-            lines += [
-                f"  {name}: {baked.statistics.hit_share:.0%} of the texels found the scan, median "
-                f"{baked.statistics.median_distance:.2f} mm apart"
-                for name, baked in self.maps.items()
-            ]
-        return lines + [f"skipped: {line}" for line in self.skipped]
 
 
 def rig_actor(
@@ -200,7 +152,7 @@ def _rig_actor(
     if model is not None and bool(shown.any()):
         raise ValueRangeError("model: found a pose beside a model of heads at rest, expected one of the two")
     registration = job.registered(job.posed(rig, shown), scan, landmarks, options.texture_size, model)
-    as_it_is, parts = not registration.record.stages, inner_parts(rig)
+    as_it_is, parts = not registration.record.bent, inner_parts(rig)
     if not as_it_is:
         progress("looking at the eyes")
         registration = with_eye_note(
@@ -353,7 +305,7 @@ def _as_it_is(template: Mesh, head: Mesh) -> Registration:
     mesh = replace(template, vertices=head.vertices, colors=head.colors, texture=head.texture)
     mesh = replace(mesh, uvs=painted.uvs, uv_faces=painted.uv_faces)
     start = "taken as it is, for its triangles are the template's (no scan to register)"
-    record = RegistrationRecord(start, 0.0, (), (), 0.0, 1.0, 0.0, 0.0, 1.0, slid=0.0)
+    record = RegistrationRecord(start, 0.0, (), (), 0.0, 1.0, 0.0, 0.0, 1.0, slid=0.0, bent=False)
     return Registration(mesh, pose, torch.zeros(len(head.vertices)).double(), known, record)
 
 
