@@ -12,15 +12,14 @@ const LINES = [
  * @param {object | null} solved what the graph says of the picture.
  */
 export function drawFace(canvas, solved) {
-  const context = canvas.getContext("2d"), { width, height } = solved ?? {}, { style } = canvas.parentElement;
-  if (solved && style.aspectRatio !== `${width} / ${height}`) style.aspectRatio = `${width} / ${height}`; // no bands beside the picture
-  // As many pixels as are seen: without a graphics card the browser scales the others down with each picture.
-  const [across, down] = [canvas.clientWidth, canvas.clientHeight].map((size) => Math.round(size * window.devicePixelRatio));
-  if (canvas.width !== across || canvas.height !== down) [canvas.width, canvas.height] = [across, down];
-  context.setTransform(1, 0, 0, 1, 0, 0);
-  context.clearRect(0, 0, across, down);
+  const context = canvas.getContext("2d");
+  const [width, height] = solved ? [solved.width, solved.height] : [canvas.width, canvas.height];
+  if (canvas.width !== width || canvas.height !== height) {
+    [canvas.width, canvas.height] = [width, height];
+    canvas.parentElement.style.aspectRatio = `${width} / ${height}`; // no bands beside the picture
+  }
+  context.clearRect(0, 0, width, height);
   if (!solved || !Number.isFinite(solved.landmarks[0])) return;
-  context.setTransform(across / width, 0, 0, down / height, 0, 0);
   const at = (i) => [solved.landmarks[2 * i] + 0.5, solved.landmarks[2 * i + 1] + 0.5]; // pixels' centres are at integers
   context.globalAlpha = Math.max(0.25, Math.min(1, solved.presence));
   for (const [color, thickness] of [["rgb(0 0 0 / 55%)", 3], ["rgb(120 230 255)", 1.25]]) {
