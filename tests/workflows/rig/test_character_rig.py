@@ -23,6 +23,7 @@ from torchface.rig import BlendshapeRig
 from torchface.shape_names import ARKIT
 from torchface.synthetic import draw_identities, performer
 from torchface.workflows.rig import character_face, character_rig
+from torchface.workflows.rig.character_job import CharacterJob
 from torchface.workflows.rig.character_rig import CharacterReport, check_character, rig_character
 from torchface.workflows.rig.present_shapes import present_shapes
 
@@ -284,7 +285,7 @@ def test_few_triangles_and_shapes_that_move_far_are_warned_of(tmp_path: Path, mo
     there, empty = present_shapes(character)
     record = SimpleNamespace(figures=str, notes=())
     carried = SimpleNamespace(registration=SimpleNamespace(record=record))
-    job = character_rig._Job(character, face, carried, coarse, (), None, empty, (False, False))  # type: ignore[arg-type]
+    job = CharacterJob(character, face, carried, coarse, (), None, empty, (False, False))  # type: ignore[arg-type]
     lines = job.notes(there, (), (0.0, 0.0))
     warnings = [line for line in lines if "warning" in line]
     assert len(warnings) == 2

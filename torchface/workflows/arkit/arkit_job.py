@@ -36,7 +36,8 @@ from torchface.workflows.arkit.head_parameters import (
 )
 from torchface.workflows.rig.actor_rig import check_out
 from torchface.workflows.rig.character_face import plain_surface
-from torchface.workflows.rig.character_rig import FACE_SPAN, PICTURE_ENDING
+from torchface.workflows.rig.character_job import FACE_SPAN
+from torchface.workflows.rig.character_rig import PICTURE_ENDING
 from torchface.workflows.weight_files import WeightFiles, write_weights
 
 _ENOUGH = 45  # of ARKit's shapes: such a rig is taken as it is

@@ -8,40 +8,33 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
-from torch import Tensor
 
-from torchface.capture.mouth_close_conventions import mouth_close_of
 from torchface.errors import AlignmentError, FileFormatError, ValueRangeError
 from torchface.files.job_lock import file_lock
 from torchface.files.whole_files import all_or_none, check_ending, check_there
-from torchface.geometry.meshes.operators import vertex_normals
 from torchface.io.gltf.character_annotations import annotate_character
-from torchface.io.gltf.character_scene import Block, Character, read_character
+from torchface.io.gltf.character_scene import Character, read_character
 from torchface.io.gltf.gltf_document import read_document
-from torchface.io.gltf.morph_insertion import AddedTargets, document_with_targets, rename_targets, write_edited
+from torchface.io.gltf.morph_insertion import document_with_targets, rename_targets, write_edited
 from torchface.io.gltf.part_insertion import document_with_parts
 from torchface.io.images.image_files import IMAGE_ENDINGS, encode_png
 from torchface.io.mesh_files import MESH_ENDINGS
-from torchface.io.vrm.vrm_expressions import VRM_ENDING, MorphBind, add_expressions
+from torchface.io.vrm.vrm_expressions import VRM_ENDING, add_expressions
 from torchface.landmarks.surfaces.face_on_surface import NoFaceOnSurfaceError
 from torchface.modeling.rigging.annotated_heads import annotations_on, on_face
 from torchface.modeling.rigging.carried_shapes import CarriedShapes
-from torchface.modeling.rigging.eyelid_closure import BLINKS
-from torchface.modeling.rigging.joined_vertices import joined_vertices
 from torchface.modeling.rigging.mouth_parts import tongue_out
 from torchface.modeling.rigging.other_topology import shapes_on
 from torchface.progress import Progress, silent
 from torchface.registration import Registration, register
 from torchface.rendering.compositing import save_rendered_image, sheet
-from torchface.rendering.textured_surface import TexturedSurface
 from torchface.rig import BlendshapeRig
 from torchface.shape_names import ARKIT
 from torchface.synthetic import performer
-from torchface.viz.figures.character_views import SHOWN, character_sheet
-from torchface.workflows.rig.added_parts import AddedParts, added_parts
+from torchface.workflows.rig.added_parts import added_parts
 from torchface.workflows.rig.character_face import CharacterFace, find_character_face, textured
+from torchface.workflows.rig.character_job import CharacterJob
 from torchface.workflows.rig.present_shapes import (
     PresentShape,
     moving_parts,
@@ -56,18 +49,10 @@ CHARACTER_ENDINGS = (".glb", VRM_ENDING)
 """Files of characters that are read and written."""
 PICTURE_ENDING = "_face.png"
 """Ends the name of the picture that lies beside a character's rig."""
-FACE_SPAN = 260.0
-"""Of each picture of the face, millimetres at a head's size."""
-
-_STILL_MM = 2e-3  # at a head's size; what moves less does not move
 # Millimetres of a head's size between face and template, and the share of the face that is met: 0.1 at most and 0.84 at
 # least on 13 characters, 2.1 and 0.42 on a box under a ball.
 _FAR, _LEAST_MET = 1.0, 0.6
-_OF_SCANS = ("the scan has neither", "the scan's triangles", "landmarks disagree")
-"""Notes of a registration that say nothing of a character."""
-_COARSE, _WIDE = 1500, 500.0  # triangles of a skin, millimetres of a shape's motion: what is warned of
-_OTHER_UNIT = 3.0  # times a head's size
-_TONGUE, _JAW, _CLOSE = "tongueOut", "jawOpen", "mouthClose"
+_TONGUE, _JAW = "tongueOut", "jawOpen"
 _MOST_TRIANGLES = 500_000  # of a head: its shapes take some 6 GB
 _CONVERT = {
     ".fbx": "install Blender, blender.org, and let it write one with skeleton and shape keys: "
@@ -173,7 +158,7 @@ def rig_character(
             document = document_with_parts(bare, moving, encode_png(given.page))
             character = read_character(document)
         made = tuple(name for name in missing if name in rig.names)
-        job = _Job(character, face, carried, rig, made, given, empty, shut)
+        job = CharacterJob(character, face, carried, rig, made, given, empty, shut)
         progress("writing the character")
         added = job.targets()
         root, data = (
@@ -268,151 +253,3 @@ def _with_tongue(carried: CarriedShapes) -> BlendshapeRig:
     jaw = rig.deltas[rig.names.index(_JAW)] if _JAW in rig.names else None
     out = tongue_out(rig.vertices, carried.tongue, lips, jaw)
     return BlendshapeRig(rig.neutral, torch.cat([rig.deltas, out[None].to(rig.deltas)]), (*rig.names, _TONGUE))
-
-
-@dataclass(frozen=True, eq=False)
-class _Job:
-    """A character, its face, and the shapes that were made for it."""
-
-    character: Character
-    face: CharacterFace
-    carried: CarriedShapes
-    rig: BlendshapeRig
-    made: tuple[str, ...]
-    parts: AddedParts | None
-    empty: tuple[str, ...]
-    shut: tuple[bool, bool]
-
-    def targets(self) -> list[AddedTargets]:
-        """The new morph targets of the meshes that move, in their own axes and unit."""
-        if not self.made:
-            return []
-        deltas = self.rig.select(self.made).deltas.double()
-        rest = self.face.head.vertices.double()
-        turned = _normal_changes(rest, self.face.head.faces, deltas)
-        added = []
-        for number, block in enumerate(self.character.blocks):
-            here = (self.character.block[self.face.rows] == number).nonzero()[:, 0]
-            if not len(here) or not bool((deltas[:, here].norm(dim=-1) > _STILL_MM).any()):
-                continue
-            rows = self.face.rows[here]
-            back = torch.linalg.inv(self.character.linear[rows])
-            moved = self.face.found.pose.apply_vectors(deltas[:, here])
-            own = torch.einsum("vij,nvj->nvi", back, moved)
-            own[deltas[:, here].norm(dim=-1) <= _STILL_MM] = 0.0
-            rotated = turned[:, here] @ self.face.found.pose.rotation[0].T.double()
-            scale = torch.linalg.det(self.character.linear[rows]).abs().clamp(min=1e-30).pow(1 / 3)
-            normals = torch.einsum("vji,nvj->nvi", self.character.linear[rows] / scale[:, None, None], rotated)
-            shape = (len(self.made), block.rows.stop - block.rows.start, 3)
-            positions, normal_rows = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
-            at = (rows - block.rows.start).numpy()
-            positions[:, at], normal_rows[:, at] = own.numpy(), normals.numpy()
-            added.append(AddedTargets(block.mesh, block.primitives, positions, normal_rows))
-        return added
-
-    def binds(self, present: dict[str, PresentShape], added: list[AddedTargets]) -> dict[str, tuple[MorphBind, ...]]:
-        """What each of ARKit's expressions of a VRM drives: shapes that were there, and new ones."""
-        bound = {name: shape.binds for name, shape in present.items()}
-        meshes = {one.mesh for one in added}
-        blocks = {(block.node, block.mesh): block for block in self.character.blocks if block.mesh in meshes}
-        for row, name in enumerate(self.made):
-            bound[name] = tuple(MorphBind(node, mesh, self._row(block, row)) for (node, mesh), block in blocks.items())
-        return {name: bound[name] for name in ARKIT if name in bound}
-
-    def _row(self, block: Block, row: int) -> int:
-        """The number that a made shape has among a block's targets: that of its name, else behind those there were."""
-        name = self.made[row]
-        before = sum(one not in block.names for one in self.made[:row])
-        return block.names.index(name) if name in block.names else len(block.names) + before
-
-    def views(self, surface: TexturedSurface, present: dict[str, PresentShape]) -> Tensor:
-        """The face at rest and with shapes on, those that were there among them."""
-        upright = surface.moved(self.face.found.pose.inverse())
-        shapes = {}
-        for name in {name for names in SHOWN.values() for name in names}:
-            moved = torch.zeros_like(upright.vertices)
-            if name in self.made:
-                moved[self.face.rows] = self.rig.select([name]).deltas[0].double()
-            elif name in present:
-                moved = present_motion(self.character, self.face, present[name])
-            shapes[name] = moved
-        landmarks = self.face.found.pose.inverse().apply(self.face.found.points[17:68])[0]
-        middle = landmarks[torch.isfinite(landmarks).all(-1)].mean(0)
-        return character_sheet(upright, shapes, middle, FACE_SPAN)
-
-    def notes(
-        self, there: dict[str, PresentShape], expressions: tuple[str, ...], seconds: tuple[float, float]
-    ) -> list[str]:
-        """For people to read."""
-        found, record, character = self.face.found, self.carried.registration.record, self.character
-        where = f"bone {character.head_bone!r} and " if character.head is not None else ""
-        lines = [
-            f"face: found by {where}{len(found.views)} views in {seconds[0]:.1f} s; presence {found.presence:.2f}, "
-            f"its points {found.misfit:.2f} distances of the eyes from a head's"
-        ]
-        if len(found.others):
-            lines.append(
-                f"  note: {1 + len(found.others)} faces were seen; the one at {_place(found.middle)} was taken"
-            )
-            lines.append(f"    the others are at {', '.join(map(_place, found.others))}, in the file's unit")
-        size = 1000 * float(found.pose.scale[0])
-        if not 1 / _OTHER_UNIT < size < _OTHER_UNIT:
-            lines.append(
-                f"  note: {size:.3g} times a head's size, as other programs take it: a .glb's numbers are metres"
-            )
-        if (count := len(self.face.skin.faces)) < _COARSE:
-            lines.append(f"  warning: its skin has {count:,} triangles, expected {_COARSE:,} for lids and lips to shut")
-        lines.append(f"template: {record.figures()}")
-        lines += [f"  note: {note}" for note in record.notes if not note.startswith(_OF_SCANS)]
-        lines += [f"parts: {note}" for note in (() if self.parts is None else self.parts.notes)]
-        if any(name in self.made for name in (*BLINKS, _JAW)):
-            cut = self.parts is not None and self.parts.lips_cut
-            lines += [f"  {note}" for note in self.carried.notes(lips_cut=cut, shut=self.shut)]
-        lines += present_lines(there)
-        lines += self._doubts(there)
-        missing = [name for name in ARKIT if name not in self.made and name not in there]
-        why = " (it has no tongue of its own; --inner-mouth gives it one)" if missing == [_TONGUE] else ""
-        lines.append(f"made: {len(self.made)} shapes" + (f"; not made: {', '.join(missing)}{why}" if missing else ""))
-        if self.empty:
-            lines.append(f"  note: {', '.join(self.empty)}: the file's own moves nothing and counts as missing")
-        if expressions:
-            lines.append(f"expressions added to the VRM: {len(expressions)}")
-        return [*lines, f"in all {seconds[1]:.1f} s"]
-
-    def _doubts(self, there: dict[str, PresentShape]) -> list[str]:
-        """Which of the character's own shapes move nothing, and whether its ``mouthClose`` opens the jaw itself."""
-        motion = {name: present_motion(self.character, self.face, shape) for name, shape in there.items()}
-        still = [name for name, moved in motion.items() if not bool((moved.norm(dim=-1) > _STILL_MM).any())]
-        lines = [f"  note: {', '.join(still)}: there, but nothing moves by it"] if still else []
-        far = {name: float(moved.norm(dim=-1).max()) for name, moved in motion.items()}
-        lines += [
-            f"  warning: its {name} moves by {size:.3g} mm at a head's size"
-            for name, size in far.items()
-            if size > _WIDE
-        ]
-        if _JAW in motion and _CLOSE in motion and not {_JAW, _CLOSE} & set(still):
-            deltas = torch.stack([motion[_JAW], motion[_CLOSE]]).float()
-            own = BlendshapeRig.from_tensors(self.face.vertices.float(), self.character.faces, deltas, (_JAW, _CLOSE))
-            try:
-                convention = mouth_close_of(own)
-            except ValueRangeError as error:
-                return [*lines, f"  note: {error}"]
-            if convention is not None and convention.opens_jaw:
-                lines.append(
-                    f"  note: its {_CLOSE} opens the jaw itself, as Audio2Face's does; ARKit's leaves that to {_JAW}"
-                )
-        return lines
-
-
-def _normal_changes(rest: Tensor, faces: Tensor, deltas: Tensor) -> Tensor:
-    """How each vertex's normal changes in shapes (N,V,3), those in one place as one."""
-    joined = joined_vertices(rest, faces)
-    before = vertex_normals(joined.vertices, joined.faces)
-    kept = torch.zeros(len(joined.vertices), dtype=torch.int64)
-    kept[joined.of] = torch.arange(len(joined.of))
-    changes = torch.stack([vertex_normals(joined.vertices + one[kept], joined.faces) - before for one in deltas])
-    return changes[:, joined.of]
-
-
-def _place(point: Tensor) -> str:
-    return "(" + ", ".join(f"{value:.4g}" for value in point.tolist()) + ")"
