@@ -29,7 +29,7 @@ EYES = (slice(36, 42), slice(42, 48))
 _SHARES = torch.linspace(0.0, 1.0, 41, dtype=torch.float64)
 _UPPER = 0.9  # of what is left of the opening: what the upper lid closes
 _REACH, _LEAST_REACH = 0.5, 3.0  # of the opening's height, millimetres: how far the lids around go along
-_FIRM, _TOUCH = 100.0, 0.3
+_FIRM, _TOUCH, _OVERLAP = 100.0, 0.3, 0.5
 _SPAN, _ASIDE = 76.0, 1.6
 _AROUND = 1.5  # of the opening's half width, round its middle: the lids
 _BEHIND, _BEFORE, _LIFT, _MOST, _HIDDEN = 1.5, 0.5, 0.25, 12.0, 0.2
@@ -205,9 +205,9 @@ class _Lids:
     def shut(self, delta: Tensor, apart: Tensor | None) -> Tensor:
         """The blink (J,3), shut and unfolded."""
         gap = self.gap(delta)
-        gap = (
-            gap * (gap[:, 1:2] < _TOUCH) * torch.tensor([0.0, 1.0, 1.0])
-        )  # lids that overlap have shut; they may slide
+        # Lids that overlap a little have shut; they may slide.
+        wrong = torch.where(gap[:, 1:2] < _TOUCH, 1.0, 1 - _OVERLAP / gap[:, 1:2].clamp(min=_OVERLAP))
+        gap = gap * wrong * torch.tensor([0.0, 1.0, 1.0])
         moved = delta.index_add(0, self.rows, self._change([_UPPER * gap, (_UPPER - 1) * gap]))
         moved[self.rows] = self._with_its_edge(moved)
         if apart is not None:
