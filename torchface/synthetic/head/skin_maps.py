@@ -24,7 +24,7 @@ from torchface.synthetic.head.skin_texture import (
     texel_values,
     vertex_marks,
 )
-from torchface.synthetic.head.teeth_and_tongue import PAGE
+from torchface.synthetic.head.teeth_and_tongue import PAGE, TEETH
 
 _MELANIN = (1.9, 2.2, 2.4)
 _MARGIN = 6  # texels round a part's rectangle
@@ -275,6 +275,10 @@ def _paint_parts(color: Tensor, rough: Tensor, normals: Tensor, look: Look) -> N
         }[name]
 
 
+# Cheeks keep the light from teeth far back; from the middle incisor to the second molar.
+_LIGHT_ON_TEETH = (1.0, 0.99, 0.95, 0.82, 0.62, 0.42, 0.3)
+
+
 def _teeth(at: Tensor, look: Look) -> Tensor:
     v = at[:, 1]
     yellow = min(1.0, max(0.0, (look.age - 25) / 60))
@@ -284,6 +288,8 @@ def _teeth(at: Tensor, look: Look) -> Tensor:
         (0.35 + 0.5 * yellow) * (1 - ramp(v, 0.1, 0.7)),
     )
     color = mix(color, (0.84, 0.85, 0.86), 0.5 * ramp(v, 0.85, 1.0))
+    number = (at[:, 0] * TEETH).long().clamp(max=TEETH - 1)
+    color = color * torch.tensor(_LIGHT_ON_TEETH)[number][:, None]
     return look.teeth * mix(color, (0.80, 0.72, 0.58), 0.15 * yellow * torch.ones(len(at)))
 
 

@@ -30,7 +30,10 @@ _ROUND, _GUM_STEPS = 10, 4
 _LEVELS = np.array([-0.3, 0.02, 0.35, 0.7, 0.92, 1.0])
 _WIDTHS = np.array([0.70, 0.78, 0.93, 1.0, 0.97, 0.86])
 PAGE = {"teeth": (0.252, 0.80, 0.312, 0.93), "gums": (0.325, 0.80, 0.385, 0.93), "tongue": (0.62, 0.80, 0.74, 0.93)}
-"""Left, lower, right and upper border of each part on the page, among the islands above the skin."""
+"""Left, lower, right and upper border of each part on the page, among the islands above the skin; teeth stand side by
+side in theirs, the incisors left."""
+
+TEETH = len(_UPPER)
 
 _RISE, _SPREAD = 9.5e-4, 3.2  # of the dental arch: how far it falls back at a distance from the midline
 
@@ -106,15 +109,19 @@ def _jaw(jaw: str, crowns: np.ndarray) -> tuple[HeadPart, HeadPart]:
     edge, front, way = _EDGES[jaw]
     borders = np.concatenate([[0], np.cumsum(crowns[:, 0])])
     teeth = []
-    for crown, start in zip(crowns, borders, strict=False):  # fourteen of a jaw, each of its own form
-        tooth = _tooth(crown, start + crown[0] / 2, front, edge, way)
+    left, low, right, high = PAGE["teeth"]
+    for number, (crown, start) in enumerate(zip(crowns, borders, strict=False)):  # fourteen, each of its own form
+        strip = (left + number / TEETH * (right - left), low, left + (number + 1) / TEETH * (right - left), high)
+        tooth = _tooth(crown, start + crown[0] / 2, front, edge, way, strip)
         tooth = tooth.turned() if way > 0 else tooth
         teeth += [tooth, tooth.mirrored()]
     return HeadPart.joined(teeth), _gums(crowns, borders, front, edge, way)
 
 
-def _tooth(crown: np.ndarray, arc: float, front: float, edge: float, way: float) -> HeadPart:
-    """Loops round a crown from under the gum to its edge, and a lid of quads."""
+def _tooth(
+    crown: np.ndarray, arc: float, front: float, edge: float, way: float, page: tuple[float, float, float, float]
+) -> HeadPart:
+    """Loops round a crown from under the gum to its edge, and a lid of quads, on a rectangle of the page."""
     width, height, depth, thin, short, cusp = crown
     angle = (np.arange(_ROUND) + 0.5) * 2 * np.pi / _ROUND
     round_off = lambda t: np.sign(t) * np.abs(t) ** 0.72  # noqa: E731
@@ -130,10 +137,10 @@ def _tooth(crown: np.ndarray, arc: float, front: float, edge: float, way: float)
     level = np.repeat(_LEVELS[:, None] * height, _ROUND, 1)
     level[-2:] -= np.array([[0.5], [1.0]]) * cusp * np.abs(across)
     y = edge - way * (height + short) + way * level
-    tube = HeadPart.grid(torch.from_numpy(np.stack([flat[..., 0], y, flat[..., 1]], -1)), PAGE["teeth"], closed=True)
+    tube = HeadPart.grid(torch.from_numpy(np.stack([flat[..., 0], y, flat[..., 1]], -1)), page, closed=True)
     last, i = (len(_LEVELS) - 1) * _ROUND, torch.arange(_ROUND // 2 - 1)
     lid = torch.stack([last + i, last + i + 1, last + _ROUND - 2 - i, last + _ROUND - 1 - i], 1)
-    left, _, right, top = PAGE["teeth"]
+    left, _, right, top = page
     spots = torch.tensor([[left, top - 0.01], [right, top - 0.01], [right, top], [left, top]])
     return HeadPart(tube.vertices, torch.cat([tube.quads, lid]), torch.cat([tube.uvs, spots.expand(len(lid), 4, 2)]))
 
