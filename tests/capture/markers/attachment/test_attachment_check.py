@@ -93,9 +93,9 @@ def on_a_helmet(take: Take, rows: list[int]) -> Take:
     return replace(take, markers=Track(take.markers.names, values))
 
 
-def test_markers_on_the_helmet_are_named_and_disturb_no_other(performance: Performance) -> None:
+@pytest.mark.parametrize("rows", [[4, 30, 55, 80], [1, 2, 3, 4]])
+def test_markers_on_the_helmet_are_named_and_disturb_no_other(performance: Performance, rows: list[int]) -> None:
     rig, attachment, _ = performance
-    rows = [4, 30, 55, 80]
     take = on_a_helmet(filmed(performance), rows)
     labels = attachment.labels or ()
     with pytest.raises(AlignmentError, match="sit on the helmet") as refusal:

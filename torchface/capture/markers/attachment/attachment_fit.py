@@ -26,6 +26,7 @@ from torchface.take import Take
 _LAST_ITERATIONS, _TOLERANCE = 6, 1e-3
 _COARSE_FRAMES, _CAREFUL_FRAMES, _JOINT_FRAMES = 240, 60, 120
 _MIN_MOTION = 0.3
+_UNKNOWN_ERROR = 1.0  # millimetres, of a marker before any iteration
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,12 +120,15 @@ def fit_attachment(
     solver = SiteSolver(motion, SiteSearch(motion, initial), initial_points, standoff, scale)
     if not insist:
         check_not_mirrored(paths, initial_points, str(rom.extras.get("source", "take")))
-    pose = pose_of_points(paths.nanmedian(0).values, initial_points, scale)
+    middle = paths.nanmedian(0).values
+    pose = pose_of_points(middle, initial_points, scale)
     _check_motion(pose.apply(paths))
+    off = (pose.apply(middle[None])[0] - initial_points).norm(dim=1)
     shown = paths[~torch.isnan(paths).any(-1).all(1)]
     few = _spread(shown, _COARSE_FRAMES)
     errors: list[Tensor] = []
-    first = FitState(replace(initial, residual=None), pose, 0.0, None)
+    # Markers on the helmet would bend the first weights, and with them the sites of the others, for good.
+    first = FitState(replace(initial, residual=None), pose, 0.0, None, off.where(~inlier_markers(off), _UNKNOWN_ERROR))
     state = solver.alternate(few, first, errors, progress)
     if solver.helmet_slips(few, state):
         shown = shown[(~torch.isnan(shown).any(-1)).sum(1) >= MIN_MARKERS]
