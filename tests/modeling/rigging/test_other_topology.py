@@ -111,10 +111,11 @@ def test_what_may_not_move_does_not(
         shapes_on(template, mesh, registration=carried.registration, movable=movable[:5])
 
 
-def test_vertices_split_at_a_seam_are_one_and_lips_that_touch_are_two() -> None:
-    """Two squares share an edge that is split; a third lies on one of them, facing the other way."""
+@pytest.mark.parametrize("gap", [0.0, 0.03])
+def test_vertices_split_at_a_seam_are_one_and_lips_that_touch_are_two(gap: float) -> None:
+    """Two squares share an edge that is split, its halves apart or not; a third lies on one, facing the other way."""
     square = torch.tensor([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], dtype=torch.float64)
-    vertices = torch.cat([square, square + torch.tensor([1.0, 0, 0]), square])
+    vertices = torch.cat([square, square + torch.tensor([1.0 + gap, 0, 0]), square])
     faces = torch.tensor([[0, 1, 2], [0, 2, 3], [4, 5, 6], [4, 6, 7], [8, 10, 9], [8, 11, 10]])
     joined = joined_vertices(vertices, faces)
     assert len(joined.vertices) == 10
