@@ -40,7 +40,7 @@ class Settings(RecipeSettings):
             neutral.* in the folder if absent.
         performer: Learn from the embedded performer with so many vertices instead.
         fps: Of the frames.
-        held_out: How many sequences, the last, are kept for the test; two, or one of two, none of one if not said.
+        held_out: How many sequences, the last, are kept for the test; if not said two, but at most half.
         wavelength: Of what counts as fine, millimetres: half of a wave of this length is detail.
         patch: Vertices a patch, in the mean of which frames are compared.
         regions: How many regions are looked for.
@@ -70,7 +70,7 @@ def train(settings: Settings, run: Run) -> EnhancementModel:
     progress = run.progress
     capture = _capture(settings)
     count = len(capture.sequences)
-    held_out = min(2, count - 1) if settings.held_out is None else settings.held_out
+    held_out = min(2, count // 2) if settings.held_out is None else settings.held_out
     learned = count - held_out
     if held_out < 0 or learned < 1:
         raise ValueRangeError(f"--held-out: found {held_out} of {count} sequences, expected at least one to learn from")
@@ -86,7 +86,8 @@ def train(settings: Settings, run: Run) -> EnhancementModel:
     colors = gather(part, work / "learned_colors.safetensors", progress, colors=True)[0] if part.colored else None
     known, numbers = gathered("learned", 0, learned)
     test = gathered("tested", learned, count)[0] if held_out else None
-    progress(f"{len(known)} frames of {learned} sequences to learn from, {0 if test is None else len(test)} to test on")
+    tested = 0 if test is None else len(test)
+    progress(f"{len(known)} frames of {learned} of {count} sequences to learn from, {tested} to test on")
     mesh = capture.neutral
     model = EnhancementModel.fit(
         CapturedPerformance(
@@ -138,7 +139,7 @@ def save(model: EnhancementModel, settings: Settings, metrics: dict[str, float],
     if settings.frames is None:
         data = f"{frames} frames of {sequences} expressions of the embedded performer with planted wrinkles; no person."
     else:
-        data = f"{frames} captured frames of {sequences} sequences."
+        data = f"{frames} captured frames; sequences: {sequences}."
     named = ", ".join(model.region_names)
     card = model_card(
         settings,

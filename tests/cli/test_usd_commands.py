@@ -39,7 +39,9 @@ def test_info_tells_shapes_and_animation(
     assert all(name in told for name in dome_rig.names)
 
 
-def test_transfer_and_retarget_go_from_usd_to_usd(shot: Path, dome_rig: BlendshapeRig, tmp_path: Path) -> None:
+def test_transfer_and_retarget_go_from_usd_to_usd(
+    shot: Path, dome_rig: BlendshapeRig, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     save_mesh(dome_rig.neutral.with_vertices(dome_rig.vertices * 1.1), tmp_path / "neutral.usda")
     main(["transfer", str(shot), str(tmp_path / "neutral.usda"), "--out", str(tmp_path / "actor.usdz")])
     actor = load_rig(tmp_path / "actor.usdz")
@@ -49,6 +51,7 @@ def test_transfer_and_retarget_go_from_usd_to_usd(shot: Path, dome_rig: Blendsha
     words = ["--to", str(tmp_path / "actor.usdz"), "--out", str(tmp_path / "o.csv")]
     main(["retarget", str(tmp_path / "w.csv"), *words, "--animation", str(tmp_path / "moved.usda")])
     assert load_animation(tmp_path / "moved.usda").weights.values[:, 0, 0].tolist() == [0.5, 1]
+    assert capsys.readouterr().out.split()[-2:] == [str(tmp_path / "o.csv"), str(tmp_path / "moved.usda")]
 
 
 def test_an_ending_without_animation_is_refused_before_any_work(

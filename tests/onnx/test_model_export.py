@@ -139,7 +139,7 @@ def test_the_command_exports_models_of_a_folder(
 
 
 def test_what_has_no_graph_is_named(regression: ExpressionRegression, dome_rig: BlendshapeRig, tmp_path: Path) -> None:
-    with pytest.raises(ValueRangeError, match="found a Linear"):
+    with pytest.raises(ValueRangeError, match=r"found no graph for Linear.*export enhancement"):
         export_model(nn.Linear(2, 2), tmp_path / "x.onnx")
     neutrals = dome_rig.vertices + noise(4, *dome_rig.vertices.shape)
     whole = ExpressionRegression.fit(

@@ -63,4 +63,6 @@ def retarget(
             console.print(f"{what} {', '.join(names[:_MAX_NAMES])}{more}", highlight=False)
     print_lines(done.notes)
     print_lines(f"warning: {warning}" for warning in done.warnings)
-    print_path(out)
+    for path in (out, animation, live_link):
+        if path is not None:
+            print_path(path)

@@ -70,6 +70,8 @@ def export_model(
             return export(model, path, facts=facts)
     if example := getattr(model, "example_inputs", None):
         return export_module(model, example(), path, facts)
+    elsewhere = "; `torchface export enhancement --model NAME --rig RIG --out DIR` writes graphs of an EnhancementModel"
     raise ValueRangeError(
-        f"{path}: found a {type(model).__name__}, expected one of {', '.join(kind.__name__ for kind in _EXPORTS)}"
+        f"{path}: found no graph for {type(model).__name__}, expected one of "
+        f"{', '.join(kind.__name__ for kind in _EXPORTS)}{elsewhere}"
     )

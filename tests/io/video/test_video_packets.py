@@ -201,3 +201,12 @@ def test_an_ffmpeg_without_x264_writes_mpeg4(tmp_path: Path, monkeypatch: pytest
     assert (video.width, video.height, video.count) == (161, 121, 8)
     assert video.fps == pytest.approx(120000 / 1001, rel=1e-5)
     assert (torch.cat(list(video.color_chunks())).float() - frames.float()).abs().mean() < 5
+
+
+def test_an_empty_video_and_a_folder_are_named(tmp_path: Path) -> None:
+    empty, folder = tmp_path / "a.mp4", tmp_path / "b.mp4"
+    empty.touch()
+    folder.mkdir()
+    for path, words in ((empty, "found an empty file, expected content"), (folder, "found a folder")):
+        with pytest.raises(FileFormatError, match=f"{path.name}: {words}"):
+            open_video(path)

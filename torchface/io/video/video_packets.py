@@ -14,6 +14,7 @@ import numpy as np
 
 from torchface.errors import FileFormatError
 from torchface.files.extra_packages import import_extra
+from torchface.files.whole_files import checked_size
 
 if TYPE_CHECKING:
     from av.container import InputContainer
@@ -171,11 +172,7 @@ def reason(error: Exception) -> str:
 def _demuxer(path: Path) -> str:
     """FFmpeg's name of the container that the file's first bytes are of."""
     try:
-        if not path.is_file():
-            raise FileFormatError(f"{path}: found no such file, expected a video")
-        size = path.stat().st_size
-        if not 0 < size <= _MAX_BYTES:
-            raise FileFormatError(f"{path}: found {size} bytes, expected 1 to {_MAX_BYTES}")
+        checked_size(path, _MAX_BYTES)
         with path.open("rb") as file:
             head = file.read(16)
     except (OSError, ValueError) as error:  # ValueError: a NUL in the name

@@ -168,7 +168,7 @@ def fit_photographs(
     named = NamedHeads.of(model)
     heads, rig = matching(load_head_model(named.name), settings.template, settings.part)
     prior = load_priors(rig, settings.prior, None).shapes
-    progress(f"reading {len(photographs)} photographs")
+    progress("reading the photographs")
     found, one_film = list[PhotographLandmarks](), False
     if landmarks or not photographs:
         images = [load_image(path) for path in photographs]
@@ -233,7 +233,7 @@ def _pictures(
 ) -> tuple[list[Path], list[Tensor], list[PhotographLandmarks]]:
     """Photographs and frames of videos, by name, with their landmarks found."""
     names, images, found = list[Path](), list[Tensor](), list[PhotographLandmarks]()
-    progress(f"finding the landmarks of {len(paths)} photographs")
+    progress("finding landmarks in the photographs")
     for path in paths:
         if path.suffix.lower() in VIDEO_ENDINGS:
             rest = rig.vertices[rig.neutral.landmarks].detach()
