@@ -1,11 +1,11 @@
 """The pictures that lie beside an enhancement model: its regions, the detail it keeps, what compression loses."""
 
-import textwrap
 from dataclasses import replace
 from pathlib import Path
 
 import torch
 from matplotlib import colormaps
+from matplotlib.patches import Patch
 from torch import Tensor
 
 from torchface import Mesh
@@ -13,7 +13,7 @@ from torchface.enhancement import EnhancementModel
 from torchface.files.whole_files import make_folder
 from torchface.geometry.meshes.operators import vertex_normals
 from torchface.progress import Progress
-from torchface.rendering.compositing import caption, headed, save_rendered_image, sheet
+from torchface.rendering.compositing import caption, from_figure, new_figure, save_rendered_image, sheet
 from torchface.viz.figures.error_maps import error_views, round_maximum
 from torchface.viz.figures.face_views import face_views
 
@@ -21,7 +21,7 @@ from .restored_frames import Restored, Shown, restored
 
 _TRIED = 24  # frames among which the most detailed one is looked for
 _HEIGHT = 420
-_LINE = 110  # characters of a heading
+_NAMES_A_LINE = 6
 
 
 def draw(
@@ -42,10 +42,11 @@ def _regions(model: EnhancementModel, neutral: Mesh) -> Tensor:
     """The region that counts most at each vertex, in a colour of its own."""
     hues = torch.tensor(colormaps["tab20"](range(len(model.region_names))))[:, :3].to(neutral.vertices)
     row = face_views(neutral, colors=hues[model.vertex_weights.argmax(0)], width=_HEIGHT * 4 // 5, height=_HEIGHT)
-    names = textwrap.wrap(", ".join(model.region_names), _LINE)
-    for line in reversed(names):
-        row = headed(row, line)
-    return row
+    lines = -(-len(model.region_names) // _NAMES_A_LINE)
+    figure = new_figure(row.shape[2] / 100, 0.1 + 0.25 * lines)
+    keys = [Patch(color=hue, label=name) for hue, name in zip(hues.tolist(), model.region_names, strict=True)]
+    figure.legend(handles=keys, loc="center", ncol=_NAMES_A_LINE, frameon=False)
+    return sheet([from_figure(figure), row], 1)
 
 
 def _most_detailed(model: EnhancementModel, frames: Shown) -> Restored:

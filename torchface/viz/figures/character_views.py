@@ -11,6 +11,8 @@ from torchface.rendering.compositing import headed, sheet
 from torchface.rendering.textured_surface import TexturedSurface
 from torchface.viz.figures.face_views import FRONT, THREE_QUARTER
 
+_INTO_THE_HEAD, _NEARER = 0.25, 1.12  # of the span; how much larger the face is for it
+
 SHOWN = {
     "neutral": (),
     "blink": ("eyeBlinkLeft", "eyeBlinkRight"),
@@ -29,12 +31,15 @@ def character_sheet(
     Args:
         shapes: by ARKit's names how far each vertex goes, (V,3) of the surface's unit; one that is absent is left out.
     """
+    # Turned about a point of the face alone, the back of the head leaves the picture.
+    inside = middle - torch.tensor([0.0, 0.0, _INTO_THE_HEAD * span]).to(middle)
     columns = []
     for pose, names in SHOWN.items():
         moved = surface.vertices + sum((shapes[name] for name in names if name in shapes), torch.zeros(1, 3))
         posed = replace(surface, vertices=moved)
         views = [
-            posed.draw(look_at(middle, yaw, 0.0, span, 2 * side, 2 * side)).picture for yaw in (FRONT, THREE_QUARTER)
+            posed.draw(look_at(place, yaw, 0.0, high, 2 * side, 2 * side)).picture
+            for yaw, place, high in ((FRONT, middle, span), (THREE_QUARTER, inside, _NEARER * span))
         ]
         small = [torch.nn.functional.avg_pool2d(view[None], 2)[0] for view in views]
         columns.append(headed(sheet(small, 1), pose))
