@@ -6,6 +6,7 @@ too. ``--performer 20000`` learns from the embedded performer with so many verti
 file. Killed and started again, a run goes on where it was.
 """
 
+import warnings
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -109,9 +110,21 @@ def train(settings: Settings, run: Run) -> EnhancementModel:
         progress=progress,
     )
     metrics = measured(model, known, test, progress)
+    _warn_if_worse(metrics)
     save(model, settings, metrics, len(known), learned)
     draw(model, mesh, known, test, settings.out / "pictures", progress)
     return model
+
+
+def _warn_if_worse(metrics: dict[str, float]) -> None:
+    for name, share in metrics.items():
+        if name.startswith("held out: missing detail, of ") and share >= 1:
+            shown = name.removeprefix("held out: missing detail, of ").removesuffix("'s").removesuffix("'")
+            warnings.warn(
+                f"sequences held out: found errors {share:.2f} times those of {shown}, expected less than 1: the model "
+                "makes animations worse that are unlike what it has learned; it needs sequences of more expressions",
+                stacklevel=3,
+            )
 
 
 def _capture(settings: Settings) -> Capture:

@@ -87,6 +87,13 @@ def test_a_model_is_learned_measured_saved_and_drawn(folder, monkeypatch):
     assert not list(folder.parent.glob(".*.training"))
 
 
+def test_a_model_that_makes_other_sequences_worse_is_warned_of(folder, monkeypatch):
+    monkeypatch.setattr(recipe, "draw", lambda *a: None)
+    monkeypatch.setattr(recipe, "measured", lambda *a: {"held out: missing detail, of the coarse frames'": 1.1})
+    with pytest.warns(UserWarning, match=r"found errors 1.10 times those of the coarse frames, expected less than 1"):
+        train(settings(folder))
+
+
 def test_a_run_that_is_killed_goes_on(folder, monkeypatch):
     monkeypatch.setattr(recipe, "draw", lambda *a: None)
     whole = train(settings(folder))
