@@ -84,7 +84,7 @@ def test_a_broken_video_is_refused(frames: torch.Tensor, tmp_path: Path) -> None
     with pytest.raises(FileFormatError, match=r"frames could be decoded, expected 20"):
         list(open_video(cut).chunks())
     for name, start, message in (
-        ("empty.avi", b"", "0 bytes"),
+        ("empty.avi", b"", "an empty file, expected content"),
         ("header.avi", content[:64], "cannot be opened"),
         ("text.avi", b"this is no video, whatever its name says", "begins as no video does"),
         ("playlist.avi", b"#EXTM3U\n#EXTINF:1,\nfile:///etc/passwd\n", "begins as no video does"),
