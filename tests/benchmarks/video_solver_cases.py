@@ -9,11 +9,11 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+from planted.gaussian_density import gaussian
 from torchface.capture.own_rig import VideoSettings, VideoSolver, solve_whole_take
 from torchface.capture.own_rig.face_points import FacePoints
 from torchface.capture.priors import (
     DynamicsPrior,
-    GaussianMixture,
     ReciprocalPrior,
     ShapePrior,
 )
@@ -189,9 +189,9 @@ def whole(prior: ShapePrior, dynamics: DynamicsPrior, **settings: float) -> Solv
     )
 
 
-def gaussian(takes: list[Tensor], names: tuple[str, ...]) -> ShapePrior:
+def one_gaussian(takes: list[Tensor], names: tuple[str, ...]) -> ShapePrior:
     """One Gaussian with full covariance, its floor as small as helps."""
-    return ShapePrior(names, [range(len(names))], [GaussianMixture.fit(torch.cat(takes), 1, floor=1e-5)])
+    return ShapePrior(names, [range(len(names))], [gaussian(torch.cat(takes), floor=1e-5)])
 
 
 def parzen(takes: list[Tensor], names: tuple[str, ...]) -> ShapePrior:
@@ -201,7 +201,7 @@ def parzen(takes: list[Tensor], names: tuple[str, ...]) -> ShapePrior:
 
 FITS: dict[str, tuple[Callable[..., ShapePrior], float]] = {
     "the paper's Parzen window, λ/P": (parzen, 0.0),
-    "one Gaussian": (gaussian, 0.0),
+    "one Gaussian": (one_gaussian, 0.0),
     "default": (ShapePrior.fit, 1.0),
 }
 

@@ -18,7 +18,6 @@ from torchface.capture.action_units.classifier import ActionUnitClassifier, Grou
 from torchface.capture.priors import (
     DynamicsPrior,
     DynamicsSettings,
-    GaussianMixture,
     ParzenDensity,
     ReciprocalPrior,
     ShapePrior,
@@ -75,15 +74,13 @@ def noise(*shape: int, seed: int = 0) -> Tensor:
 
 def shape_prior() -> ShapePrior:
     samples = 0.3 * noise(60, 3).abs()
-    return ShapePrior(
-        NAMES, ((0, 1), (2,)), [GaussianMixture.fit(samples[:, :2], 2), StudentDensity.fit(samples[:, 2:])]
-    )
+    return ShapePrior(NAMES, ((0, 1), (2,)), [StudentDensity.fit(samples[:, :2]), StudentDensity.fit(samples[:, 2:])])
 
 
 def reciprocal_prior() -> ReciprocalPrior:
     samples = 0.3 * noise(60, 3).abs()
     return ReciprocalPrior(
-        NAMES, ((0, 1), (2,)), [GaussianMixture.fit(samples[:, :2], 2), ParzenDensity.fit(samples[:, 2:])]
+        NAMES, ((0, 1), (2,)), [StudentDensity.fit(samples[:, :2]), ParzenDensity.fit(samples[:, 2:])]
     )
 
 

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 
 from torchface import __version__
 from torchface.capture.own_rig import VideoSettings, VideoSolver
-from torchface.capture.priors import DynamicsPrior, DynamicsSettings, GaussianMixture, ShapePrior
+from torchface.capture.priors import DynamicsPrior, DynamicsSettings, ParzenDensity, ShapePrior
 from torchface.cli import main
 from torchface.correctives import Corrective, Correctives
 from torchface.errors import ShapeError, ValueRangeError
@@ -226,7 +226,7 @@ def test_a_graph_that_differs_is_not_written(
 
 
 def test_what_has_no_graph_is_refused(rig: BlendshapeRig) -> None:
-    bells = ShapePrior(SEEN, [range(len(SEEN))], [GaussianMixture.fit(torch.rand(30, len(SEEN)), 1)])
+    bells = ShapePrior(SEEN, [range(len(SEEN))], [ParzenDensity.fit(torch.rand(30, len(SEEN)))])
     with pytest.raises(ValueRangeError, match="expected one of Student's distributions"):
         VideoGraph(VideoSolver(rig, None, K, bells))
     with pytest.raises(ValueRangeError, match="pose_trust"):

@@ -25,19 +25,15 @@ _FILES = ("regions.csv", "frames.csv", "shapes.csv", "methods.csv")
 
 def evaluate(
     result: Annotated[Positional[Path], arg(metavar="RESULT")],
-    truth: Annotated[Positional[tuple[Path, ...]], arg(metavar="TRUTH...")],
+    truth: Annotated[Positional[Path], arg(metavar="TRUTH")],
     out: Annotated[Path, Output(_FILES)] = Path("out/evaluation"),
     rig: Path | None = None,
     truth_rig: Path | None = None,
     part: str | None = None,
     frames: tuple[int, ...] | None = None,
     by_number: bool = False,
-    scans: bool = False,
     benchmark: bool = False,
-    landmarks: Path | None = None,
-    unit: str | None = None,
     align: bool = False,
-    as_is: bool = False,
     scale: float | None = None,
     height: int = 290,
     jobs: Jobs = 1,
@@ -48,8 +44,8 @@ def evaluate(
     """Compare a result with the truth: error of every vertex, by region, by shape, over time, as heat maps.
 
     RESULT and TRUTH are each weights (.csv, with the rig that they move), an animated .glb, a mesh sequence
-    (.safetensors), a mesh, or a folder of meshes, a frame each; both of one topology. Or the truth is raw scans
-    (--scans), which are registered first; killed and started again, what is registered is kept.
+    (.safetensors), a mesh, or a folder of meshes, a frame each; both of one topology. Raw scans are registered first
+    (`torchface register`).
 
     With --benchmark TRUTH is a folder of films with true weights, NAME.csv, as `python -m train.expression_films`
     renders them, and RESULT a folder of what was found in them, NAME.csv or NAME/live_link.csv, or a folder of such
@@ -66,23 +62,18 @@ def evaluate(
 
     Args:
         result: What came back.
-        truth: What was; several files only with --scans.
+        truth: What was.
         out: Folder of the report.
         rig: The rig that the result's weights move, or whose topology its meshes have.
         truth_rig: The rig that the truth's weights move; --rig if absent.
         part: Keep this region only, such as face.
         frames: Which of the result's frames, from 0, the truth's are, in order; all if absent.
         by_number: Compare the first frame with the first, and so on, whatever their times say.
-        scans: TRUTH is raw scans, in files or folders.
         benchmark: RESULT and TRUTH are folders of films' weights.
-        landmarks: A folder of landmark files named as the scans; see `torchface register`.
-        unit: Unit of the scans (mm, cm, m) where it is not the format's own.
-        align: Turn and move each frame of the result to where it is nearest to the truth; scans are always so.
-        as_is: Leave the result where it is, with scans too.
+        align: Turn and move each frame of the result to where it is nearest to the truth.
         scale: Where the heat maps' red begins, millimetres; at a rounded 95th percentile if absent.
         height: Of each view of a face in the report, pixels.
     """
-    from torchface.errors import ValueRangeError
     from torchface.files.job_lock import job_lock
     from torchface.number_checks import checked_count
     from torchface.viz.figures.face_views import PICTURE_HEIGHTS
@@ -95,15 +86,10 @@ def evaluate(
     if benchmark:
         _benchmark(result, truth, out, quiet)
         return
-    if align and as_is:
-        raise ValueRangeError("evaluate: found --align and --as-is, expected one of the two")
     checked_count("--height", height, *PICTURE_HEIGHTS)
-    choice = True if align else False if as_is else None
-    settings = EvaluationSettings(rig, truth_rig, part, frames, scans, landmarks, unit, choice, scale, by_number)
+    settings = EvaluationSettings(rig, truth_rig, part, frames, align, scale, by_number)
     if cluster is not None or is_batch([result], RESULTS):
-        if len(truth) != 1:
-            raise ValueRangeError(f"truth: found {len(truth)} places for many results, expected one")
-        job = ResultJob(truth[0], settings, height)
+        job = ResultJob(truth, settings, height)
         work_on(job, RESULTS, [result], out, (jobs, cluster, time_limit), _COLUMNS, "mean_mm", quiet)
         return
     with job_lock(out), progress_bars(quiet) as progress:
@@ -125,16 +111,16 @@ def evaluate(
     print_path(page)
 
 
-def _benchmark(result: Path, truth: tuple[Path, ...], out: Path, quiet: bool) -> None:
+def _benchmark(result: Path, truth: Path, out: Path, quiet: bool) -> None:
     """Compares films' weights, and prints a row a method."""
     from torchface.errors import ValueRangeError
     from torchface.files.job_lock import job_lock
     from torchface.workflows.evaluate.expression_benchmark import expression_benchmark
 
-    if len(truth) != 1 or not (result.is_dir() and truth[0].is_dir()):
+    if not (result.is_dir() and truth.is_dir()):
         raise ValueRangeError("evaluate --benchmark: expected a folder of results and one folder of films with truth")
     with job_lock(out), progress_bars(quiet) as progress:
-        found = expression_benchmark(result, truth[0], out, progress)
+        found = expression_benchmark(result, truth, out, progress)
     rows = found.table()
     table = Table(title=f"{len(found.films)} films, {found.frames} frames")
     for number, head in enumerate(rows.heading):

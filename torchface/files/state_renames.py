@@ -3,7 +3,7 @@
 from collections.abc import Collection, Mapping
 from typing import Any
 
-_SHAPE_PRIOR = {"log_shares": "log_mixing_weights", "freedom": "degrees_of_freedom"}
+_SHAPE_PRIOR = {"freedom": "degrees_of_freedom"}
 _DYNAMICS_PRIOR = {
     "trust": "gain",
     "processes.spread": "processes.covariance_root",

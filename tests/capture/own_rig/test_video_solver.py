@@ -8,9 +8,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
+from planted.gaussian_density import gaussian
 from torchface.capture.own_rig import VideoSettings, VideoSolver, solve_whole_take
 from torchface.capture.own_rig.face_points import FacePoints
-from torchface.capture.priors import DynamicsPrior, GaussianMixture, ShapePrior
+from torchface.capture.priors import DynamicsPrior, ShapePrior
 from torchface.correctives import Corrective, Correctives
 from torchface.errors import NameMismatchError, ShapeError, ValueRangeError
 from torchface.geometry.rotations import rotation_matrix
@@ -280,7 +281,7 @@ def test_a_strong_prior_has_its_way(small: BlendshapeRig) -> None:
     """The more a prior counts, the closer to its peak; where it counts for nothing, it changes nothing."""
     samples = 0.3 + 0.02 * torch.randn(200, len(SEEN), generator=torch.Generator().manual_seed(0))
     found = film(small, acted(1), *poses(1), noise=1.0)
-    density = GaussianMixture.fit(samples, 1)
+    density = gaussian(samples)
     weak, strong = (ShapePrior(SEEN, [range(len(SEEN))], [density], strength) for strength in (0.0, 1e7))
     peak = VideoSolver(small, None, K, strong)(found).weights
     torch.testing.assert_close(peak[0], samples.mean(0).double(), atol=2e-3, rtol=0)

@@ -2,17 +2,15 @@
 
 import pytest
 import torch
-from scipy.stats import multivariate_normal, multivariate_t
+from scipy.stats import multivariate_t
 
 from torchface.capture import DynamicsPrior, DynamicsSettings, ShapePrior
 from torchface.capture.priors import (
     AdaptedDynamicsPrior,
-    GaussianMixture,
     ParzenDensity,
     ReciprocalPrior,
     StudentDensity,
     adapt_dynamics,
-    face_halves,
     unlearned,
     windows_of,
 )
@@ -54,28 +52,6 @@ def test_a_student_density_in_other_names_is_scipys() -> None:
     torch.testing.assert_close(renamed.log_density(points), torch.from_numpy(wanted), rtol=1e-4, atol=1e-3)
     assert prior.renamed(NAMES) is prior
     assert renamed.config["strength"] == prior.strength
-
-
-def test_a_mixture_in_other_names_is_scipys_group_by_group() -> None:
-    learned = torch.cat([samples(), samples(seed=1)])
-    halves = face_halves(NAMES)
-    prior = ShapePrior(NAMES, halves, [GaussianMixture.fit(learned[:, list(half)], 2) for half in halves])
-    renamed = prior.renamed(SPLIT)
-    assert renamed.groups == ((1, 2, 3), (0, 4))
-    points = samples(5, seed=3) @ mapping(NAMES, SPLIT).double().T
-    total = torch.zeros(5, dtype=torch.float64)
-    for group, half, density in zip(renamed.groups, prior.groups, prior.densities, strict=True):
-        assert isinstance(density, GaussianMixture)
-        back = mapping([NAMES[i] for i in half], [SPLIT[i] for i in group]).double()
-        parts = []
-        for mean, factor, share in zip(density.means, density.factors, density.log_mixing_weights, strict=True):
-            covariance = back @ torch.linalg.inv(factor.double() @ factor.double().T) @ back.T
-            split = torch.tensor([SPLIT[i].startswith("browInnerUp") for i in group]).double()
-            covariance = covariance + PARTING_VARIANCE * torch.diag(split)
-            gaussian = multivariate_normal((back @ mean.double()).numpy(), covariance.numpy())
-            parts.append(share + torch.from_numpy(gaussian.logpdf(points[:, list(group)].numpy())))
-        total += torch.stack(parts).logsumexp(0)
-    torch.testing.assert_close(renamed.log_density(points), total, rtol=1e-4, atol=1e-3)
 
 
 def test_a_parzen_window_keeps_its_distances_in_other_names() -> None:

@@ -5,13 +5,11 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 import torch
-from scipy.stats import multivariate_normal, multivariate_t
+from scipy.stats import multivariate_t
 from sklearn.cluster import estimate_bandwidth
-from sklearn.mixture import GaussianMixture as TheirMixture
 from torch import Tensor
 
 from torchface.capture.priors import (
-    GaussianMixture,
     ParzenDensity,
     ReciprocalPrior,
     ShapePrior,
@@ -32,22 +30,6 @@ def clusters(frames: int = 600, seed: int = 0) -> Tensor:
     member = torch.randint(3, (frames,), generator=generator)
     noise = torch.randn(frames, 5, generator=generator, dtype=torch.float64)
     return centers[member] + torch.einsum("tde,te->td", spread[member], noise)
-
-
-def test_a_single_gaussian_is_scipys() -> None:
-    x = clusters()
-    mixture = GaussianMixture.fit(x, 1, floor=1e-6).double()
-    covariance = np.cov(x.numpy().T, bias=True) + 1e-6 * np.eye(5)
-    theirs = multivariate_normal(x.mean(0).numpy(), covariance).logpdf(x.numpy())
-    np.testing.assert_allclose(mixture.log_density(x).numpy(), theirs, atol=1e-3)
-
-
-def test_a_mixture_is_as_likely_as_scikit_learns() -> None:
-    x, held_out = clusters(), clusters(seed=1)
-    mixture = GaussianMixture.fit(x, 3, floor=1e-6)
-    theirs = TheirMixture(3, n_init=5, random_state=0).fit(x.numpy())
-    ours = float(mixture.log_density(held_out.float()).mean())
-    assert ours == pytest.approx(theirs.score(held_out.numpy()), abs=0.02)
 
 
 def test_the_bandwidth_is_scikit_learns() -> None:
@@ -71,15 +53,13 @@ def test_heavy_tails_are_scipys() -> None:
     assert pulls[1] < 0.7 * pulls[0]  # a Gaussian's would double
 
 
-@pytest.fixture(params=["parzen", "mixture", "student"])
-def density(request: pytest.FixtureRequest) -> ParzenDensity | GaussianMixture | StudentDensity:
+@pytest.fixture(params=["parzen", "student"])
+def density(request: pytest.FixtureRequest) -> ParzenDensity | StudentDensity:
     x = clusters()
-    if request.param == "student":
-        return StudentDensity.fit(x, degrees_of_freedom=4.0)
-    return ParzenDensity.fit(x) if request.param == "parzen" else GaussianMixture.fit(x, 3)
+    return ParzenDensity.fit(x) if request.param == "parzen" else StudentDensity.fit(x, degrees_of_freedom=4.0)
 
 
-def test_bounds_touch_and_lie_above(density: ParzenDensity | GaussianMixture | StudentDensity) -> None:
+def test_bounds_touch_and_lie_above(density: ParzenDensity | StudentDensity) -> None:
     density = density.double()
     at = clusters(5, seed=3).requires_grad_()
     (slope,) = torch.autograd.grad(-density.log_density(at).sum(), at)
@@ -106,11 +86,8 @@ def test_halves_are_independent() -> None:
     assert not energy.H[:, :2, 2:].any()
 
 
-@pytest.mark.parametrize("kind", [StudentDensity, GaussianMixture])
-def test_a_solve_with_the_prior_never_gets_worse(kind: type[StudentDensity] | type[GaussianMixture]) -> None:
-    parts = [clusters(120)[:, list(half)] for half in face_halves(NAMES)]
-    densities = [kind.fit(part) if kind is StudentDensity else GaussianMixture.fit(part, 4) for part in parts]
-    prior = ShapePrior(NAMES, face_halves(NAMES), densities).double()
+def test_a_solve_with_the_prior_never_gets_worse() -> None:
+    prior = ShapePrior.fit([clusters(120)], NAMES, face_halves(NAMES)).double()
     w = torch.rand(20, 5, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     before = prior.log_density(w)
     for _ in range(10):
@@ -150,10 +127,10 @@ def test_bad_input() -> None:
         ShapePrior.fit([torch.full((5, 5), torch.nan)], NAMES)
     with pytest.raises(ValueRangeError, match="all samples the same"):
         ParzenDensity.fit(torch.ones(9, 2))
-    with pytest.raises(FileFormatError, match="expected one of parzen, mixture, student"):
+    with pytest.raises(FileFormatError, match="expected one of parzen, student"):
         ShapePrior.from_config({"names": ["a"], "groups": [[0]], "densities": [{"kind": "os.system"}], "strength": 1.0})
     with pytest.raises(FileFormatError, match="at most"):
-        GaussianMixture.from_config({"components": 10**6, "dimensions": 10**5})
+        StudentDensity.from_config({"dimensions": 10**5})
     prior = ShapePrior.fit([clusters(100)], NAMES)
     with pytest.raises(NameMismatchError, match="learned for other shapes"):
         prior.require(["jawOpen"])

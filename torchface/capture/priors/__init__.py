@@ -2,7 +2,6 @@
 
 from torchface.capture.priors.adapted_dynamics import AdaptedDynamicsPrior, adapt_dynamics
 from torchface.capture.priors.dynamics_prior import DynamicsPrior, DynamicsSettings
-from torchface.capture.priors.gaussian_mixture import GaussianMixture
 from torchface.capture.priors.motion_features import face_regions, windows_of
 from torchface.capture.priors.name_translation import unlearned
 from torchface.capture.priors.parzen_window import ParzenDensity, automatic_bandwidth
@@ -13,7 +12,6 @@ __all__ = [
     "AdaptedDynamicsPrior",
     "DynamicsPrior",
     "DynamicsSettings",
-    "GaussianMixture",
     "ParzenDensity",
     "ReciprocalPrior",
     "ShapePrior",

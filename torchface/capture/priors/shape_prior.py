@@ -11,7 +11,6 @@ import torch
 from torch import Tensor, nn
 
 from torchface.capture.energy import Quadratic
-from torchface.capture.priors.gaussian_mixture import GaussianMixture
 from torchface.capture.priors.name_translation import name_matrices, require_same_names
 from torchface.capture.priors.parzen_window import ParzenDensity
 from torchface.capture.priors.student_t import PARTING_VARIANCE, StudentDensity, StudentGroups
@@ -20,17 +19,16 @@ from torchface.errors import FileFormatError, ShapeError, ValueRangeError
 from torchface.number_checks import LARGEST_WEIGHT, as_real, checked_number, checked_type
 
 _UPPER = re.compile(r"(eye|brow|pupil)", re.IGNORECASE)
-LearnedDensity = ParzenDensity | GaussianMixture | StudentDensity
-_KINDS: dict[str, type[ParzenDensity] | type[GaussianMixture] | type[StudentDensity]] = {
+LearnedDensity = ParzenDensity | StudentDensity
+_KINDS: dict[str, type[ParzenDensity] | type[StudentDensity]] = {
     "parzen": ParzenDensity,
-    "mixture": GaussianMixture,
     "student": StudentDensity,
 }
 STRENGTH = 0.15  # of a fitted prior: chosen by the error of solves of real takes that were left out of the learning
 
 
 class Density(Protocol):
-    """A density as a prior uses it; see ``StudentDensity``, ``GaussianMixture``, ``ParzenDensity``."""
+    """A density as a prior uses it; see ``StudentDensity`` and ``ParzenDensity``."""
 
     def log_density(self, samples: Tensor) -> Tensor:
         """(B,D) to (B,)."""

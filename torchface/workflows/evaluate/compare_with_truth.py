@@ -1,6 +1,5 @@
 """From a result and the truth on disk to how far they are apart: figures, tables, heat maps."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -10,7 +9,6 @@ from torch import Tensor
 from torchface.errors import ShapeError, ValueRangeError
 from torchface.evaluation import (
     ShapeErrors,
-    error_figures,
     region_figures,
     rigidly_aligned,
     shape_errors,
@@ -24,7 +22,6 @@ from torchface.shape_names import mapping
 from torchface.viz.figures.error_maps import round_maximum
 from torchface.workflows.animated_meshes import AnimatedMesh, load_animated
 from torchface.workflows.evaluate.evaluation_record import ALL, Compared, Evaluation, write_tables
-from torchface.workflows.evaluate.scan_truth import ScanTruth, scan_truth
 
 _CHUNK = 32
 _MAX_DISTANCES = 2**29
@@ -39,24 +36,18 @@ _GROUP_OF_LANDMARK = (*[0] * 17, *[1] * 10, *[2] * 9, *[3] * 12, *[4] * 20)
 class EvaluationSettings:
     """What is compared how."""
 
-    # Moves the result's weights, is the template of scans, and annotates meshes of its topology.
-    rig: Path | None = None
+    rig: Path | None = None  # moves the result's weights, and annotates meshes of its topology
     truth_rig: Path | None = None  # moves the truth's weights; rig if absent
     part: str | None = None  # keep this annotated region only
     frames: tuple[int, ...] | None = None  # frames of the result that the truth's are, in order, from 0; all if absent
-    scans: bool = False  # the truth is raw scans, which are registered first
-    landmarks: Path | None = None  # a folder of the scans' landmark files
-    unit: str | None = None  # of the scans' files; each format's own if absent
-    # Align each frame of the result rigidly with the truth; if absent, with scans only, which have a space of their
-    # own.
-    align: bool | None = None
+    align: bool = False  # each frame of the result rigidly with the truth
     maximum: float | None = None  # of the heat maps' scale, millimetres; the 95th percentile, rounded up, if absent
     by_number: bool = False  # the first frame is compared with the first, and so on, whatever their times
 
 
 def evaluate(
     result: Path,
-    truth: Sequence[Path],
+    truth: Path,
     out: Path,
     settings: EvaluationSettings = EvaluationSettings(),
     progress: Progress | None = None,
@@ -64,48 +55,35 @@ def evaluate(
     """Reads, compares and writes tables and a summary; see ``torchface evaluate --help`` for the arguments.
 
     Writes ``regions.csv``, ``frames.csv``, ``shapes.csv`` where both have weights, and ``summary.json``;
-    :func:`torchface.workflows.evaluate.evaluate_page.write_evaluation_page` makes the report. Scans are registered into
-    ``out/registered``, and those that are there from an earlier run are taken as they are.
+    :func:`torchface.workflows.evaluate.evaluate_page.write_evaluation_page` makes the report.
     """
     with within_job(out):
         return _evaluate(result, truth, out, settings, progress or silent)
 
 
-def _evaluate(
-    result: Path, truth: Sequence[Path], out: Path, settings: EvaluationSettings, progress: Progress
-) -> Evaluation:
+def _evaluate(result: Path, truth: Path, out: Path, settings: EvaluationSettings, progress: Progress) -> Evaluation:
     progress("reading result and truth")
     animated = load_animated(result, settings.rig, settings.part)
-    scans: ScanTruth | None = None
-    if settings.scans:
-        scans = scan_truth(animated, truth, out / "registered", settings.landmarks, settings.unit, progress)
-        true = scans.animated
-    else:
-        if len(truth) != 1:
-            raise ValueRangeError(f"truth: found {len(truth)} files, expected one, or a folder; or scans (--scans)")
-        true = load_animated(truth[0], settings.truth_rig or settings.rig, settings.part)
-        true.require_topology_of(animated, "; raw scans need --scans, other rigs --truth-rig")
+    true = load_animated(truth, settings.truth_rig or settings.rig, settings.part)
+    true.require_topology_of(animated, "; other rigs need --truth-rig, raw scans torchface register first")
     progress("comparing")
-    evaluation = compare(animated, true, settings, scans)
+    evaluation = compare(animated, true, settings)
     progress("writing")
     with all_or_none():
         write_tables(evaluation, out)
     return evaluation
 
 
-def compare(
-    found: AnimatedMesh, true: AnimatedMesh, settings: EvaluationSettings, scans: ScanTruth | None = None
-) -> Evaluation:
+def compare(found: AnimatedMesh, true: AnimatedMesh, settings: EvaluationSettings) -> Evaluation:
     """Compares frame by frame."""
-    frames, true_rows, paired = _pairs(found, true, settings)
-    aligned = scans is not None if settings.align is None else settings.align
-    notes = [*([] if scans is None else scans.notes), *paired]
+    frames, true_rows, notes = _pairs(found, true, settings)
+    aligned = settings.align
     if len(frames) * len(found.neutral.vertices) > _MAX_DISTANCES:
         raise ValueRangeError(
             f"{found.path}: found {len(frames)} frames of {len(found.neutral.vertices)} vertices, more than "
             f"{_MAX_DISTANCES} distances; expected fewer (--part face, or --frames)"
         )
-    errors, rotation, translation, surface = [], [], [], []
+    errors, rotation, translation = [], [], []
     for begin in range(0, len(frames), _CHUNK):  # some frames at a time: all of a take's vertices fill the memory
         rows = frames[begin : begin + _CHUNK]
         a, b, motion = _pair(found, true, rows, true_rows[begin : begin + _CHUNK], aligned)
@@ -113,8 +91,6 @@ def compare(
         if motion is not None:
             rotation.append(motion[0])
             translation.append(motion[1])
-        if scans is not None:
-            surface.append(scans.surface_errors(begin, scans.settled(begin, a) if aligned else a))
     distances = torch.cat(errors)
     empty = ~torch.isfinite(distances).any(1)
     if empty.all():
@@ -144,7 +120,6 @@ def compare(
         tuple(_shown(found, true, (frames, true_rows), distances, aligned)),
         round_maximum(figures[ALL].percentile_95) if maximum is None else maximum,
         tuple(notes),
-        error_figures(torch.cat(surface)) if surface else None,
     )
 
 

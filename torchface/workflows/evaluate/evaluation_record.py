@@ -47,8 +47,6 @@ class Evaluation:
     shown: tuple[Compared, ...]  # frames for figures: the one of median error and the worst
     maximum: float  # of the heat maps' scale, millimetres
     notes: tuple[str, ...]  # what was found and done, for people to read
-    # Where the truth was scans, how far the result is from their surface, aligned with it again where it was aligned.
-    surface: ErrorFigures | None = None
 
     @property
     def frame_mean(self) -> Tensor:
@@ -71,8 +69,6 @@ class Evaluation:
                     f"{name}: mean {errors.mean:.3f} mm, median {errors.median:.3f}, 95th percentile "
                     f"{errors.percentile_95:.3f}, largest {errors.largest:.3f}; total {errors.total:.4e} mm a frame"
                 )
-        if self.surface is not None:
-            lines.append(f"to the scans' surface: mean {self.surface.mean:.3f} mm, median {self.surface.median:.3f}")
         if self.shapes is not None:
             error = self.shapes.error
             lines.append(
@@ -125,7 +121,6 @@ def summary(evaluation: Evaluation) -> dict[str, object]:
         "alignment": "rigid, a frame" if evaluation.aligned else "none",
         "unit": "millimetres",
         "regions": {name: asdict(figures) for name, figures in evaluation.regions.items()},
-        "surface": None if evaluation.surface is None else asdict(evaluation.surface),
         "weights": None
         if shapes is None
         else {

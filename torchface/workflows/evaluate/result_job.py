@@ -40,7 +40,7 @@ class ResultJob:
     def run(self, item: BatchItem, out: Path) -> Made:
         """Compares a result with its truth and writes the folder ``NAME``."""
         folder = out / item.name
-        evaluation = evaluate(item.path, [self._truth(item)], folder, item.settings_of(self.settings))
+        evaluation = evaluate(item.path, self._truth(item), folder, item.settings_of(self.settings))
         page = write_evaluation_page(evaluation, folder, self.height)
         whole = evaluation.regions[ALL]
         return Made(
@@ -60,7 +60,7 @@ class ResultJob:
 
     def _truth(self, item: BatchItem) -> Path:
         truth = item.path_of(self.truth)
-        if not truth.is_dir() or is_animation(truth) or self.settings.scans:
+        if not truth.is_dir() or is_animation(truth):
             return truth
         named = sorted(path for path in truth.iterdir() if path.stem == item.path.stem and is_animation(path))
         if len(named) != 1:
