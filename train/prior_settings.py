@@ -67,6 +67,17 @@ class PriorSettings(RecipeSettings):
     iterations: int = 50
     pictures: Path | None = None
 
+    @property
+    def kinds(self) -> tuple[Kind, ...]:
+        """Of the priors that the run makes."""
+        return ("shape", "dynamics") if self.kind == "both" else (self.kind,)
+
+    @property
+    def folders(self) -> tuple[Path, ...]:
+        if self.kind != "both":
+            return (self.out,)
+        return tuple(self.out.with_name(f"{self.out.name}_{kind}") for kind in self.kinds)
+
 
 @dataclass(frozen=True, eq=False)
 class Material:

@@ -17,7 +17,7 @@ from torchface.synthetic import performer
 from .dynamics_priors import learned_dynamics
 from .model_cards import model_card
 from .prior_figures import save_figure
-from .prior_settings import Kind, LearnedPrior, Material, PriorSettings
+from .prior_settings import LearnedPrior, Material, PriorSettings
 from .prior_takes import read_takes, renamed, split, synthetic_takes
 from .runner import Recipe, Run, metric_lines, recipe
 from .shape_priors import learned_shape
@@ -36,10 +36,8 @@ def train(settings: Settings, run: Run) -> dict[str, dict[str, float]]:
     """
     _check_one_source(settings)
     material = _material(settings, run.work, run.progress)
-    kinds: tuple[Kind, ...] = ("shape", "dynamics") if settings.kind == "both" else (settings.kind,)
     measured = {}
-    for kind in kinds:
-        out = settings.out if len(kinds) == 1 else settings.out.with_name(f"{settings.out.name}_{kind}")
+    for kind, out in zip(settings.kinds, settings.folders, strict=True):
         own = replace(settings, kind=kind, out=out)
         learned = learned_dynamics if kind == "dynamics" else learned_shape
         prior = learned(own, material, run.progress)

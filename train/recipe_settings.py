@@ -49,6 +49,11 @@ class RecipeSettings:
         """Folder of what is not finished, beside ``out``; it goes when the run has come to its end."""
         return self.out.parent / f".{self.out.name}.training"
 
+    @property
+    def folders(self) -> tuple[Path, ...]:
+        """Folders of the models that the run makes."""
+        return (self.out,)
+
     def forget(self) -> None:
         """Deletes what a run that was killed has left."""
         shutil.rmtree(self.work, ignore_errors=True)

@@ -14,7 +14,7 @@ import tyro
 from torchface import zoo
 from torchface.cli.command_options import inputs_kept, plain_options
 from torchface.cli.progress_bars import progress_bars
-from torchface.cli.terminal import plain_errors
+from torchface.cli.terminal import plain_errors, print_lines
 from torchface.errors import TorchfaceError, ValueRangeError
 from torchface.files.job_lock import job_lock
 from torchface.files.whole_files import made_folder, make_folder
@@ -83,9 +83,13 @@ def _running(settings: RecipeSettings, progress: Progress) -> Iterator[Run]:
         settings.forget()
     log = RunLog(settings.out, goes_on=settings.work.is_dir())
     with made_folder(settings.work) as work:
-        if not (begun := work / "settings.toml").is_file():  # a run that is refused leaves the killed one's
+        if fresh := not (begun := work / "settings.toml").is_file():  # a run that is refused leaves the killed one's
             write_settings(begun, settings)
-        yield Run(progress, log, work, device)
+        try:
+            yield Run(progress, log, work, device)
+        finally:
+            if fresh and list(work.iterdir()) == [begun]:  # nothing that a run could go on from
+                begun.unlink()
     if (settings.out / "model.toml").is_file():
         step = log.rows[-1].step if log.rows else 0
         for name, value in zoo.describe(settings.out.resolve()).metrics.items():
@@ -127,6 +131,11 @@ class Recipe(Generic[Settings, Trained]):
             with kept, job_lock(chosen.out), progress_bars(chosen.quiet) as progress:
                 try:
                     trained = self.train(chosen, progress)
+                except KeyboardInterrupt:
+                    if chosen.work.is_dir():
+                        line = f"{chosen.work} keeps what was done: the same command goes on from there"
+                        print_lines([f"{line}, with --no-resume it starts anew"])
+                    raise
                 except TorchfaceError as error:
                     name, _, rest = str(error).partition(": ")
                     if name not in vars(chosen) or is_dataclass(vars(chosen)[name]):
@@ -134,7 +143,7 @@ class Recipe(Generic[Settings, Trained]):
                     raise type(error)(f"--{name.replace('_', '-')}: {rest}") from error  # what the library calls it
             for line in self.lines(chosen, trained):
                 print(line)
-            print(f"written to {chosen.out}")
+            print(f"written to {' and '.join(map(str, chosen.folders))}")
 
     def chosen(self, words: Sequence[str]) -> Settings:
         """The settings of flags and, behind ``--config``, of a file; flags win."""

@@ -50,7 +50,7 @@ def test_both_priors_of_weight_takes(folder: Path, tmp_path: Path) -> None:
         trial_frames=4,
     )
     measured = train(settings, lambda step, *_: lines.append(step))
-    assert set(measured) == {"own_shape", "own_dynamics"}
+    assert set(measured) == {"own_shape", "own_dynamics"} == {folder.name for folder in settings.folders}
     shape, dynamics = (zoo.get_model(tmp_path / name) for name in measured)
     assert isinstance(shape, ShapePrior)
     assert isinstance(dynamics, DynamicsPrior)

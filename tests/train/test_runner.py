@@ -250,6 +250,22 @@ def test_a_run_may_start_anew(tmp_path: Path) -> None:
     assert [row.step for row in read_log(tmp_path / "line" / "log.csv")] == [50, 50, 60, 60]
 
 
+@pytest.mark.parametrize("kept", [True, False])
+def test_a_stopped_run_says_how_to_go_on_and_leaves_nothing_else(
+    kept: bool, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def stopped(_: Settings, run: Run) -> None:
+        if kept:
+            run.checkpoint.write_bytes(b"what was done")
+        raise KeyboardInterrupt
+
+    with pytest.raises(SystemExit):
+        Recipe(Settings, recipe(stopped), None).main(["--data", "here", "--out", str(tmp_path / "line"), "-q"])
+    said = " ".join(capsys.readouterr().err.split())
+    assert (".line.training keeps what was done: the same command goes on from there" in said) is kept
+    assert [path.name for path in tmp_path.glob(".line.training")] == [".line.training"] * kept
+
+
 def test_a_checkpoint_holds_no_pickle(tmp_path: Path) -> None:
     settings = Settings(data=tmp_path, out=tmp_path / "line")
     with pytest.raises(KeyboardInterrupt):

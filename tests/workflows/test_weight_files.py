@@ -165,19 +165,36 @@ def test_missing_weights_are_told_by_every_command(
     assert main(["info", str(file)]) in (0, None)
     told = "1 weights are missing, of tongueOut; the first is tongueOut in frame 3"
     assert told in said()
-    words = ["retarget", str(file), "--to", str(stage / "arkit.glb"), "--out", str(tmp_path / "out.csv"), "-q"]
-    assert main(words) in (0, None)
-    shown = said()
-    assert told in shown
+    rig = str(stage / "arkit.glb")
+    for command in (
+        ["retarget", str(file), "--to", rig],
+        ["evaluate", str(file), str(file), "--rig", rig],
+        ["render", rig, "--take", str(file)],
+        ["demo", "--take", str(file)],
+    ):
+        with pytest.raises(SystemExit):
+            main([*command, "--out", str(tmp_path / "out.png" if "render" in command else tmp_path / "out.csv"), "-q"])
+        assert told in said()
+        assert {path.name for path in tmp_path.iterdir()} == {"gaps.csv"}
+
+
+def test_a_frame_without_a_face_stays_one(stage: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    values = torch.zeros(5, 2, 1)
+    values[3], values[1, 0] = torch.nan, 1.5
+    save_weights_csv(Take(30.0, weights=Track(("jawOpen", "browInnerUp"), values)), tmp_path / "gaps.csv")
+    words = ["retarget", str(tmp_path / "gaps.csv"), "--to", str(stage / "own.glb"), "--out", str(tmp_path / "out.csv")]
+    (tmp_path / "table.toml").write_text("[ctrl_a]\nsum = { jawOpen = 1.0 }\n")
+    assert main([*words, "--table", str(tmp_path / "table.toml"), "-q"]) in (0, None)
+    shown = " ".join(capsys.readouterr().err.split())
+    assert "2 weights are missing, of jawOpen, browInnerUp" in shown
     assert "1 weights are below 0 or above 1, of jawOpen" in shown
-    (tmp_path / "out.csv").unlink()
+    moved = load_take(tmp_path / "out.csv").weights
+    assert moved is not None
+    assert moved.values.isnan().all(1)[:, 0].tolist() == [False, False, False, True, False]
+    assert torch.isfinite(moved.values[[0, 1, 2, 4]]).all()
     with pytest.raises(SystemExit):
-        main([*words, "--animation", str(tmp_path / "a.glb")])
-    assert told in said()
-    assert not (tmp_path / "out.csv").exists()
-    with pytest.raises(SystemExit):
-        main(["demo", "--take", str(file), "--out", str(tmp_path / "demo")])
-    assert told in said()
+        main([*words, "--table", str(tmp_path / "table.toml"), "-q", "--animation", str(tmp_path / "a.glb")])
+    assert "expected numbers for an animation" in " ".join(capsys.readouterr().err.split())
 
 
 def test_weights_go_to_a_csv_only(stage: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -26,6 +26,7 @@ from torchface.io.weights.live_link_csv import is_live_link
 from torchface.mesh import Mesh, submesh
 from torchface.rig import BlendshapeRig
 from torchface.take import Take, Track
+from torchface.workflows.weight_files import check_whole_frames
 
 _FORMS = "weights as .csv, an animated .glb or .usdc, a mesh sequence as .safetensors, a mesh, or a folder of meshes"
 
@@ -137,6 +138,7 @@ def _of_weights(path: Path, rig: BlendshapeRig | None) -> AnimatedMesh:
     take = load_take(path)
     if take.weights is None:
         raise ValueRangeError(f"{path}: found no weights, expected a take of them")
+    check_whole_frames(path, take.weights)
     numbered = path.suffix.lower() == ".csv" and is_numbered(TableReader(path).header)
     return replace(moved_mesh(path, rig, take), numbered=numbered)
 

@@ -62,6 +62,7 @@ def retarget_weights(
     played = load_weight_take(weights)
     assert played.weights is not None
     faults = [f"{weights}: {fault}" for fault in weight_faults(played.weights)]
+    faceless = ~torch.isfinite(played.weights.values).flatten(1).any(1)
     if files.animation is not None and not bool(torch.isfinite(played.weights.values).all()):
         raise ValueRangeError(
             f"{faults[0]}; expected numbers for an animation (leave out --animation, or fill them in)"
@@ -90,6 +91,8 @@ def retarget_weights(
     except NameMismatchError as error:
         raise NameMismatchError(f"{table or poses or weights}: {error}") from error
     moved, notes = _mouth_closed(retarget_take(played, shapes), rig, target, rules)
+    assert moved.weights is not None
+    moved.weights.values[faceless] = torch.nan  # of shapes that nothing drives as well
     progress("writing")
     left_out, written = write_weights(moved, files, target, to if part is None else None)
     return Retargeted(moved, shapes, (*faults, *notes, *left_out), (*said, *written))

@@ -61,7 +61,18 @@ def load_weight_take(path: Path) -> Take:
         raise ValueRangeError(
             f"{path}: found no weights, expected a weight take such as Live Link Face's, or an animated rig"
         )
+    check_whole_frames(path, take.weights)
     return take
+
+
+def check_whole_frames(path: Path, weights: Track) -> None:
+    """Raises ``ValueRangeError`` where a frame of weights (T,N,1) lacks some of them; one without a face lacks all."""
+    missing = ~torch.isfinite(weights.values[..., 0])
+    if (missing.any(1) & ~missing.all(1)).any():
+        raise ValueRangeError(
+            f"{path}: found that {weight_faults(weights)[0]}; expected a number in each cell, or a row without any "
+            "where no face was seen (leave out a shape that was not recorded)"
+        )
 
 
 def checked_reduction(bound: float | None) -> float | None:
