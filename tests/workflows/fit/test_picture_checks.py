@@ -19,13 +19,26 @@ from torchface.modeling import ImageFit
 from torchface.synthetic import neutral_head
 from torchface.workflows.fit.fit_checks import strange_lines
 from torchface.workflows.fit.fit_landmarks import PhotographLandmarks, find_in_photographs
-from torchface.workflows.fit.picture_checks import cover_lines, light_lines, picture_lines, profile_lines
+from torchface.workflows.fit.picture_checks import (
+    color_lines,
+    cover_lines,
+    light_lines,
+    picture_lines,
+    profile_lines,
+)
+from torchface.workflows.named_finders import part_finder
 
 
 def skin() -> Tensor:
-    """A picture of skin with grain, 200 x 200."""
-    grain = 0.03 * torch.randn(1, 200, 200, generator=torch.Generator().manual_seed(0))
+    """A picture of skin with grain, in brightness and in hue, 200 x 200."""
+    grain = torch.randn(4, 200, 200, generator=torch.Generator().manual_seed(0))
+    grain = 0.03 * grain[:1] + 0.015 * grain[1:]
     return (torch.tensor([0.78, 0.58, 0.48])[:, None, None] + grain).clamp(0, 1)
+
+
+def painted(image: Tensor) -> Tensor:
+    """Brushstrokes of one colour each, ten pixels wide."""
+    return image[:, ::10, ::10].repeat_interleave(10, 1).repeat_interleave(10, 2)
 
 
 def reading(eyes: float = 90.0) -> FaceReading:
@@ -41,57 +54,68 @@ def found(face: FaceReading) -> PhotographLandmarks:
     return PhotographLandmarks(Path("a.png"), "network", face, 0, face.box[None], (200, 200))
 
 
+def bare() -> FaceParts:
+    """Skin all over."""
+    shares = torch.zeros(len(PARTS), 200, 200)
+    shares[PARTS.index("skin")] = 1.0
+    return FaceParts(shares, torch.eye(2, 3, dtype=torch.float64))
+
+
+def colored(image: Tensor) -> list[str]:
+    return color_lines(Path("a.png"), image, bare(), reading().landmarks)
+
+
 def test_a_face_that_is_shown_well_is_not_remarked_on() -> None:
-    assert picture_lines(found(reading()), skin()) == []
+    assert picture_lines(found(reading())) == colored(skin()) == []
 
 
 @pytest.mark.parametrize(
     ("change", "line"),
     [
         (lambda image: image.mean(0).expand(3, -1, -1), "no colours"),
-        (lambda image: (image * 4).round() / 4, "without grain"),
-        (lambda image: image.flip(0), "colours that skin has not (red 0.83"),
+        (lambda image: (image * 4).round() / 4, "even patches with edges between them"),
+        (lambda image: painted(image), "even patches with edges between them"),
+        (lambda image: image.flip(0), "colours that skin has not in white light (red 0.83"),
+        (lambda image: image * torch.tensor([0.82, 1.0, 1.2])[:, None, None], "blue 0.99 of green): a filter"),
         (lambda image: torch.full_like(image, 0.7), "a drawing, a statue"),
-        (
-            lambda image: image[:1] * torch.tensor([1.0, 0.8, 0.7])[:, None, None],
-            "one hue all over (red over green differs",
-        ),
+        (lambda image: image[:1] * torch.tensor([1.0, 0.8, 0.7])[:, None, None], "skin of one hue (it varies by 0.2%"),
+        (lambda image: image.mean(0) + 0.3 * (image - image.mean(0)), "skin of one hue (it varies by 0.8%"),
     ],
 )
 def test_pictures_that_are_not_plain_photographs(change: Callable[[Tensor], Tensor], line: str) -> None:
-    lines = picture_lines(found(reading()), change(skin()))
+    lines = colored(change(skin()))
     assert any(line in one and one.startswith("WARNING: a.png: ") for one in lines), lines
 
 
 def test_hidden_and_small_faces() -> None:
     face = reading()
     behind = replace(face, eye_visibility=torch.tensor([0.1, 0.05]))
-    assert "the eyes hidden (visible to 8%" in picture_lines(found(behind), skin())[0]
+    assert "the eyes hidden (visible to 8%" in picture_lines(found(behind))[0]
     masked = replace(face, visibility=torch.where(torch.arange(68) < 48, 1.0, 0.02))
-    assert "the mouth hidden (visible to 2%" in picture_lines(found(masked), skin())[0]
+    assert "the mouth hidden (visible to 2%" in picture_lines(found(masked))[0]
     both = replace(behind, visibility=masked.visibility)
     with pytest.raises(NoFaceError, match=r"a\.png: found eyes and mouth hidden .* --insist"):
-        picture_lines(found(both), skin())
-    assert "eyes and mouth hidden" in picture_lines(found(both), skin(), insist=True)[0]
-    assert "20 pixels between the eyes' outer corners" in picture_lines(found(reading(20.0)), skin())[0]
+        picture_lines(found(both))
+    assert "eyes and mouth hidden" in picture_lines(found(both), insist=True)[0]
+    assert "20 pixels between the eyes' outer corners" in picture_lines(found(reading(20.0)))[0]
     with pytest.raises(NoFaceError, match="found 8 pixels between the outer corners of the eyes, expected at least 10"):
-        picture_lines(found(reading(8.0)), skin())
+        picture_lines(found(reading(8.0)))
     with pytest.raises(NoFaceError, match=r"hardly a face \(likelihood 0\.20\)"):
-        picture_lines(found(replace(face, presence=torch.tensor(0.2))), skin())
+        picture_lines(found(replace(face, presence=torch.tensor(0.2))))
 
 
 def test_two_faces_of_one_size() -> None:
     face = reading()
     pair = replace(found(face), boxes=torch.stack([face.box, face.box]))
-    assert "the largest of 2 faces is taken, 1 more nearly as large (--face 1)" in picture_lines(pair, skin())[0]
-    assert picture_lines(replace(pair, asked=True), skin()) == []
+    assert "the largest of 2 faces is taken, 1 more nearly as large (--face 1)" in picture_lines(pair)[0]
+    assert picture_lines(replace(pair, asked=True)) == []
     few = found(reading(25.0))
     crowd = replace(few, boxes=few.boxes.expand(7, 4))
     with pytest.raises(
         NoFaceError, match=r"found 7 faces, 7 of them of similar size, the largest 33 pixels .* --face .*6 at \("
     ):
-        picture_lines(crowd, skin())
-    assert "25 pixels between" in picture_lines(replace(crowd, asked=True), skin())[0]
+        picture_lines(crowd)
+    assert "25 pixels between" in picture_lines(replace(crowd, asked=True))[0]
 
 
 @pytest.mark.parametrize(
@@ -153,7 +177,8 @@ def test_a_photograph_that_is_spoilt(data: Path) -> None:
     def seen(image: Image.Image) -> tuple[PhotographLandmarks, list[str]]:
         pixels = torch.from_numpy(np.asarray(image.convert("RGB")).copy()).permute(2, 0, 1).float() / 255
         one = find_in_photographs([Path("a.png")], [pixels])[0]
-        return one, picture_lines(one, pixels)
+        parts = part_finder()((255 * pixels).byte(), one.confident)
+        return one, picture_lines(one) + color_lines(Path("a.png"), pixels, parts, one.confident)
 
     whole, lines = seen(plain)
     assert lines == []

@@ -39,7 +39,7 @@ from torchface.workflows.fit.fit_landmarks import (
 )
 from torchface.workflows.fit.fit_readings import with_readings
 from torchface.workflows.fit.fitted_character import dressed_rig
-from torchface.workflows.fit.picture_checks import cover_lines, light_lines, picture_lines, profile_lines
+from torchface.workflows.fit.picture_checks import color_lines, cover_lines, light_lines, picture_lines, profile_lines
 from torchface.workflows.fit.video_pictures import video_pictures
 from torchface.workflows.named_finders import part_finder
 from torchface.workflows.named_heads import NamedHeads, load_head_model, matching
@@ -198,8 +198,9 @@ def fit_photographs(
     if found:
         readings = FaceReading.stacked([one.face for one in found])
         fitting = with_readings(fitting, readings, found[0].places, rig)
-    remarks = [line for one, image in zip(found, images, strict=False) for line in picture_lines(one, image, insist)]
+    remarks = [line for one in found for line in picture_lines(one, insist)]
     for photograph, image, shown, points in zip(photographs, images, parts, marks, strict=True):
+        remarks += color_lines(photograph, image, shown, points)
         remarks += cover_lines(photograph, shown, points)
         remarks += [] if settings.everything else light_lines(photograph, image, shown, points)
     # The tracker has followed one face through a film.

@@ -1,14 +1,18 @@
 """Checks of what photographs show: a face that is large, uncovered, alone, in colour, not drawn and not filtered."""
 
 import math
+from collections.abc import Sequence
 from pathlib import Path
 
 import cv2
+import numpy as np
 import torch
 from torch import Tensor
+from torch.nn.functional import avg_pool2d
 
 from torchface.color_space import to_linear
 from torchface.landmarks import NoFaceError
+from torchface.landmarks.images.face_crop import cut_crop
 from torchface.landmarks.images.networks.part_finder import FaceParts
 from torchface.modeling import ImageFit
 from torchface.modeling.photographs.image_texture import GREY
@@ -20,12 +24,19 @@ _LEAST_EYES, _FEW_EYES = 10.0, 30.0
 _PRESENT = 0.5
 _HIDDEN, _EYE_HIDDEN = 0.4, 0.3  # visibilities; those of 9 faces that nothing hides were above 0.87 and 0.91
 _RIVAL = 0.5  # of the chosen face's area: another that large may be the one that is meant
-_RED, _BLUE = (
-    (0.03, 1.0),
-    (-1.1, 0.1),
-)  # logarithms of red and blue over green of skin; 8 faces 0.20 to 0.51, -0.53 to -0.08
-_ONE_HUE = 0.02  # of red over green, its logarithm's middle 80 %; 19 photographs 0.11 to 0.76, clay 0.008
-_FLAT, _FLAT_GREY = 0.65, 0.18  # share of pixels like their neighbours; 9 photographs at most 0.12
+# Logarithms of skin's colour, medians: the mean of red and blue over green, and blue over red. 32 faces in 13 pictures
+# 0.00 to 0.16 and -0.80 to -0.23; on a toned poster -0.25 and -1.8.
+_GREEN_CAST, _RED_CAST = (-0.12, 0.20), (-1.2, -0.18)
+# Standard deviation of skin's hue where it varies least: those faces at least 0.017 (also small, blurred, compressed),
+# 13 of 17 rendered ones at most 0.0125.
+_ONE_HUE, _BLOTCHES = 0.0135, 0.017
+# Median step from pixel to pixel on a face beside its strongest twentieth: of photographs at least 0.16, compressed
+# 0.146; painted by five filters at most 0.14, by a sixth (edge-preserving) 0.18.
+_PAINTED, _LEAST_STEP = 0.14, 4 / 255
+_SURE = 0.9  # share of a part
+_FEWEST = 100  # pixels
+_FINEST = 300.0  # pixels across a face: of larger ones pixels are averaged
+_FLAT_GREY = 0.18  # share of pixels like their neighbours; 9 photographs at most 0.12
 _CHEEK = 0.14  # of the distance of the eyes' outer corners
 _ONE_SIDE, _TWO_HUES = 2.5, 1.6  # factors; of 5 photographs 1.0 to 1.15 and 1.0 to 1.25, of a patchy one 1.5 and 2.1
 _DEVELOPED = 1.4  # a factor of light
@@ -37,11 +48,10 @@ _COVERS = {
 _PARTS = {"nose": slice(27, 36), "mouth": slice(48, 68)}
 
 
-def picture_lines(found: PhotographLandmarks, image: Tensor, insist: bool = False) -> list[str]:
+def picture_lines(found: PhotographLandmarks, insist: bool = False) -> list[str]:
     """What speaks against a photograph, for people to read; nothing where it shows one face well.
 
     Args:
-        image: the photograph, (3,H,W) in [0,1].
         insist: report also what is refused otherwise.
     """
     face, name = found.face, found.photograph.name
@@ -75,7 +85,7 @@ def picture_lines(found: PhotographLandmarks, image: Tensor, insist: bool = Fals
     if rivals and eyes >= _FEW_EYES:
         numbers = f"--face 1 to {rivals}" if rivals > 1 else "--face 1"
         lines.append(f"the largest of {len(found.boxes)} faces is taken, {rivals} more nearly as large ({numbers})")
-    return [f"WARNING: {name}: {line}" for line in [*lines, *_color_lines(image, face.box)]]
+    return [f"WARNING: {name}: {line}" for line in lines]
 
 
 def _rivals(found: PhotographLandmarks) -> int:
@@ -102,17 +112,10 @@ def cover_lines(photograph: Path, parts: FaceParts, landmarks: Tensor) -> list[s
         parts: what it shows.
         landmarks: of the face, (68,2) pixels; NaN for missing.
     """
-    known = landmarks[landmarks.isfinite().all(-1)]
-    outline = torch.from_numpy(cv2.convexHull(known.float().numpy())[:, 0]).double()
-    low, high = outline.amin(0), outline.amax(0)
-    steps = torch.linspace(0, 1, _GRID, dtype=torch.float64)
-    grid = torch.cartesian_prod(*(low[k] + (high[k] - low[k]) * steps for k in (0, 1)))
-    edge = torch.roll(outline, -1, 0) - outline
-    aside = edge[:, 0] * (grid[:, None, 1] - outline[:, 1]) - edge[:, 1] * (grid[:, None, 0] - outline[:, 0])
-    inside = grid[(aside >= 0).all(1) | (aside <= 0).all(1)]
+    face = _inside(parts, landmarks)
     lines = []
     for name, (least, words) in _COVERS.items():
-        share = float(parts.at(inside, name).nanmean())
+        share = float(parts.of(name)[face].mean())
         if share > least:
             lines.append(f"WARNING: {photograph.name}: {words} {share:.0%} of the face; its skin there is completed")
     return lines
@@ -174,38 +177,96 @@ def _hidden_parts(found: PhotographLandmarks) -> dict[str, float]:
     return ({"eyes": eyes} if eyes < _EYE_HIDDEN else {}) | hidden
 
 
-def _color_lines(image: Tensor, box: Tensor) -> list[str]:
-    """What colours and grain of the face's middle say against a photograph of skin."""
-    middle = _middle(image, box)
-    if min(middle.shape[1:]) < 4:
+def color_lines(photograph: Path, image: Tensor, parts: FaceParts, landmarks: Tensor) -> list[str]:
+    """What colours and grain of the skin say against a photograph of a person, for people to read.
+
+    Args:
+        image: the photograph, (3,H,W) in [0,1].
+        parts: what it shows.
+        landmarks: of the face, (68,2) pixels; NaN for missing.
+    """
+    marks = landmarks.double()
+    face = _inside(parts, marks)
+    crop = cut_crop((255 * image[:3].clamp(0, 1)).byte(), parts.transform, len(face)).double() / 255
+    skin = crop[:, face & (parts.of("skin") > _SURE)]
+    if skin.shape[1] < _FEWEST:
         return []
-    grey = float((middle.amax(0) - middle.amin(0)).mean()) < GREY
-    light = middle.mean(0)
-    alike = [(light.diff(dim=axis).abs() < 1 / 255) for axis in (0, 1)]
-    flat = float((alike[0][:, 1:] & alike[1][1:]).float().mean())
+    if float((skin.amax(0) - skin.amin(0)).mean()) < GREY:
+        lines = ["no colours: the skin is grey, and what it hides of the eyes' colour too"]
+        flat = _flat_share(image, marks)
+        if flat > _FLAT_GREY:
+            lines.insert(0, f"{flat:.0%} of the face without grain, which photographs have: a drawing, a statue?")
+    else:
+        lines = _hue_lines(skin)
+    steps = _steps(image, marks)
+    if len(steps) >= _FEWEST:
+        usual, strong = steps.quantile(steps.new_tensor([0.5, 0.95])).tolist()
+        if strong > _LEAST_STEP and usual < _PAINTED * strong:
+            lines.append(
+                f"a face of even patches with edges between them (from pixel to pixel it mostly differs by "
+                f"{usual / strong:.1%} of its edges, photographs by 15% at least): a painting, a drawing, "
+                f"a strong filter or denoising?"
+            )
+    return [f"WARNING: {photograph.name}: {line}" for line in lines]
+
+
+def _hue_lines(skin: Tensor) -> list[str]:
+    """What colours (3,P) of skin say against a photograph of a person in white light."""
+    red, green, blue = skin.clamp(min=0.02).log()
+    hue, light = torch.stack([red - green, blue - green], dim=1), (red + green + blue) / 3
     lines = []
-    if flat > (_FLAT_GREY if grey else _FLAT):
-        what = "a drawing, a statue" if grey else "a drawing, a strong filter"
-        lines.append(f"{flat:.0%} of the face without grain, which photographs have: {what}? It may be nobody's head")
-    if grey:
-        return [*lines, "no colours: the skin is grey, and what it hides of the eyes' colour too"]
-    ratio = (middle[0].clamp(min=0.02) / middle[1].clamp(min=0.02)).log().flatten()
-    low, high = ratio.quantile(ratio.new_tensor([0.1, 0.9])).tolist()
-    if high - low < _ONE_HUE:
+    powers = torch.stack([torch.ones_like(light), light, light.square()], dim=1)
+    apart = hue - powers @ torch.linalg.lstsq(powers, hue).solution  # what brightness does not explain
+    least = float(torch.linalg.eigvalsh(apart.T.cov())[0].clamp(min=0).sqrt())
+    if least < _ONE_HUE:
         lines.append(
-            f"one hue all over (red over green differs by {high - low:.1%}): a toned picture, a statue, a mask?"
+            f"skin of one hue (it varies by {least:.1%}, that of people by {_BLOTCHES:.1%} at least): a rendered head, "
+            f"a statue, a mask, a toned or smoothed picture?"
         )
-    red, green, blue = middle.flatten(1).median(dim=1).values.clamp(min=0.02).log().tolist()
-    if not (_RED[0] < red - green < _RED[1] and _BLUE[0] < blue - green < _BLUE[1]):
+    cast = hue.median(0).values
+    green_cast, red_cast = float(cast.mean()), float(cast[1] - cast[0])
+    if not (_GREEN_CAST[0] < green_cast < _GREEN_CAST[1] and _RED_CAST[0] < red_cast < _RED_CAST[1]):
+        red_share, blue_share = cast.exp().tolist()
         lines.append(
-            f"colours that skin has not (red {math.exp(red - green):.2f} and blue {math.exp(blue - green):.2f} of "
-            f"green): a filter, coloured light, paint?"
+            f"colours that skin has not in white light (red {red_share:.2f} and blue {blue_share:.2f} of green): "
+            f"a filter, coloured light, paint?"
         )
     return lines
 
 
-def _middle(image: Tensor, box: Tensor) -> Tensor:
-    """The middle quarter of a face's box (4,) in an image (3,H,W)."""
-    x, y, width, height = box.tolist()
-    low = (max(int(y + height / 4), 0), max(int(x + width / 4), 0))
-    return image[:3, low[0] : int(y + 3 * height / 4), low[1] : int(x + 3 * width / 4)]
+def _steps(image: Tensor, marks: Tensor) -> Tensor:
+    """By how much a face with landmarks (68,2) differs from pixel to pixel, to the right or downward, (P,)."""
+    known = marks[marks.isfinite().all(-1)]
+    low, high = known.amin(0).floor().long().clamp(min=0), known.amax(0).ceil().long().clamp(min=0)
+    scale = max(1, round(float((high - low).max()) / _FINEST))
+    piece = image[:3, low[1] : high[1], low[0] : high[0]].mean(0, keepdim=True)
+    if min(piece.shape[1:]) < 2 * scale:
+        return piece.new_zeros(0)
+    light = avg_pool2d(piece[None], scale)[0, 0]
+    face = _outlined((known - low) / scale - 0.5 + 0.5 / scale, light.shape)
+    right, down = light.diff(dim=1)[:-1].abs(), light.diff(dim=0)[:, :-1].abs()
+    return torch.maximum(right, down)[face[:-1, :-1] & face[1:, :-1] & face[:-1, 1:]]
+
+
+def _flat_share(image: Tensor, marks: Tensor) -> float:
+    """The share of pixels like their neighbours in the middle of a face with landmarks (68,2)."""
+    known = marks[marks.isfinite().all(-1)]
+    low, high = known.amin(0), known.amax(0)
+    (left, top), (right, bottom) = ((low + share * (high - low)).long().clamp(min=0).tolist() for share in (0.25, 0.75))
+    light = image[:3, top:bottom, left:right].mean(0)
+    if min(light.shape) < 4:
+        return 0.0
+    alike = [(light.diff(dim=axis).abs() < 1 / 255) for axis in (0, 1)]
+    return float((alike[0][:, 1:] & alike[1][1:]).float().mean())
+
+
+def _inside(parts: FaceParts, landmarks: Tensor) -> Tensor:
+    """The pixels of the parts' crop within a face with landmarks (68,2), NaN for missing; (S,S) bool."""
+    known = landmarks[landmarks.isfinite().all(-1)].double()
+    return _outlined(known @ parts.transform[:, :2].T + parts.transform[:, 2], parts.shares.shape[1:])
+
+
+def _outlined(points: Tensor, shape: Sequence[int]) -> Tensor:
+    """The pixels (H,W) bool within the hull of points (P,2)."""
+    outline = cv2.convexHull(points.round().int().numpy())
+    return torch.from_numpy(cv2.fillConvexPoly(np.zeros(tuple(shape), np.uint8), outline, 1)).bool()
