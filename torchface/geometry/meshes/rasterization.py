@@ -134,14 +134,15 @@ class DrawnPixels:
 
     pixel: Tensor  # row-major index in the image, each once, (S,) int64
     triangle: Tensor  # in front there, (S,) int64
-    barycentric: tuple[Tensor, Tensor, Tensor]  # of the pixel's centre in the image, three times (S,) float32
     nearness: Tensor  # as the corners', interpolated, (S,) float32
+    planes: "_Planes"
+    at: tuple[np.ndarray, np.ndarray, np.ndarray]  # row and column of each pixel, and which of the planes it is of
 
-    def of_vertices(self, values: Tensor, faces: Tensor) -> Tensor:
-        """Values (V,) of vertices at the pixels, (S,), linear in the image."""
-        corners = faces[self.triangle].unbind(1)
-        first, second, third = (values[corner] * share for corner, share in zip(corners, self.barycentric, strict=True))
-        return first + second + third
+    def interpolated(self, values: Tensor) -> Tensor:
+        """Values (F,3) of triangles' corners at the pixels, (S,) float32, linear in the image."""
+        row, column, plane = self.at
+        across, down, rest = self.planes.linear(values.numpy()[self.planes.triangle].T)
+        return torch.from_numpy(across[plane] * column + down[plane] * row + rest[plane])
 
 
 def rasterise(points: Tensor, nearness: Tensor, faces: Tensor, height: int, width: int) -> DrawnPixels:
@@ -163,22 +164,15 @@ def rasterise(points: Tensor, nearness: Tensor, faces: Tensor, height: int, widt
     triangles = faces.cpu().numpy()
     # Rows count downward: what is counter-clockwise on the mesh is clockwise here.
     planes = _Planes.of(xy, triangles, height, width, _SLACK, _LEAST_AREA, facing=True)
-    across, down, rest = (near[triangles[planes.triangle].T][:, None] * planes.edges).sum(0)
+    across, down, rest = planes.linear(near[triangles[planes.triangle].T])
     row, column, plane = next(planes.samples(width, _SLACK, None))
     value = (across[plane] * column + (down[plane] * row + rest[plane])).astype(np.float32)
     pixel = row * width + column
     kept = _nearest(pixel, value, height * width)
-    row, column, plane = row[kept], column[kept], plane[kept]
-    first, second = (
-        (a[plane] * column + (b[plane] * row + c[plane])).clip(0, 1).astype(np.float32) for a, b, c in planes.edges[:2]
-    )
-    third = np.maximum(1 - first - second, 0)
-    return DrawnPixels(
-        torch.from_numpy(pixel[kept]),
-        torch.from_numpy(planes.triangle[plane]),
-        (torch.from_numpy(first), torch.from_numpy(second), torch.from_numpy(third)),
-        torch.from_numpy(value[kept]),
-    )
+    at = row[kept], column[kept], plane[kept]
+    parts = (pixel[kept], planes.triangle[at[2]], value[kept])
+    covered, triangle, closeness = (torch.from_numpy(part) for part in parts)
+    return DrawnPixels(covered, triangle, closeness, planes, at)
 
 
 def _nearest(pixel: np.ndarray, nearness: np.ndarray, count: int) -> np.ndarray:
@@ -233,6 +227,10 @@ class _Planes:
         first = np.ceil(low - slack).clip(0, height).astype(np.int64)
         last = np.floor(high + slack).clip(-1, height - 1).astype(np.int64)
         return cls(triangle, edges, first, (last - first + 1).clip(0))
+
+    def linear(self, corners: np.ndarray) -> np.ndarray:
+        """Values at each triangle's corners, (3,P), as linear functions a, b and c of the pixel, (3,P)."""
+        return (corners[:, None] * self.edges).sum(0)
 
     def samples(
         self, width: int, slack: float, batch: int | None = _BATCH

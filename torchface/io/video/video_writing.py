@@ -123,7 +123,7 @@ def _add_stream(container: "OutputContainer", first: Tensor, fps: float) -> "Vid
     lossless = container.format.name != "mp4"
     codec = "ffv1" if lossless else "libx264" if "libx264" in pyav().codecs_available else "mpeg4"
     # With macroblock trees x264 does not always code the same frames into the same bytes.
-    options = {"preset": "veryfast", "crf": "16", "x264-params": "mbtree=0"} if codec == "libx264" else {}
+    options = {"preset": "superfast", "crf": "16", "x264-params": "mbtree=0"} if codec == "libx264" else {}
     stream = cast("VideoStream", container.add_stream(codec, rate=_rate(fps, codec), options=options))
     stream.width, stream.height = width, height
     if lossless:
