@@ -22,10 +22,8 @@ from torchface.files.content_keys import content_key
 from torchface.io import MeshSequence, MeshSequenceWriter
 from torchface.io.mesh_files import MESH_ENDINGS
 from torchface.progress import Progress
-from torchface.rig import BlendshapeRig
 from torchface.synthetic.stages.weight_curves import GESTURES
 from torchface.synthetic.stages.wrinkles import WrinkledPerformer
-from torchface.take import Track
 from torchface.workflows.animated_meshes import load_animated, meshes_over_time
 
 _METHOD = "captured sequences/1"
@@ -52,7 +50,6 @@ class CapturedSequence:
         name: of the file or folder.
         read: vertices (t,V,3) of the frames from one number up to another, without it, millimetres.
         faces: (F,3) int64, of its own file.
-        moved: what moves it where that is a rig: the rig and its weights.
         colors: of the vertices, (t,V,3) in [0,1], read as ``read`` does, where there are some.
     """
 
@@ -60,7 +57,6 @@ class CapturedSequence:
     count: int
     read: Callable[[int, int], Tensor]
     faces: Tensor
-    moved: tuple[BlendshapeRig, Track] | None = None
     colors: Callable[[int, int], Tensor] | None = None
 
 
@@ -88,17 +84,6 @@ class Capture:
     def colored(self) -> bool:
         """Whether all sequences have vertex colours."""
         return all(sequence.colors is not None for sequence in self.sequences)
-
-    @property
-    def weights(self) -> Track | None:
-        """Of the one rig that moves all sequences, if one does."""
-        moved = [sequence.moved for sequence in self.sequences if sequence.moved is not None]
-        if len(moved) < len(self.sequences):
-            return None
-        rig, first = moved[0]
-        if not all(one.names == rig.names and torch.equal(one.deltas, rig.deltas) for one, _ in moved):
-            return None
-        return Track(first.names, torch.cat([track.select(first.names).values for _, track in moved]))
 
 
 def read_capture(folder: Path, neutral: Path | None) -> Capture:
@@ -236,9 +221,7 @@ def _animated(path: Path) -> CapturedSequence:
         vertices, faces = _npz(path)
         return CapturedSequence(path.name, len(vertices), lambda begin, end: vertices[begin:end], faces)
     animated = load_animated(path)
-    known = animated.rig is not None and animated.weights is not None
-    moved = (animated.rig, animated.weights) if known else None
-    return CapturedSequence(path.name, animated.count, animated.read, animated.neutral.faces, moved, animated.colors)  # type: ignore[arg-type]
+    return CapturedSequence(path.name, animated.count, animated.read, animated.neutral.faces, animated.colors)
 
 
 def _of_meshes(name: str, files: list[Path]) -> CapturedSequence:

@@ -99,7 +99,6 @@ def train(settings: Settings, run: Run) -> EnhancementModel:
             coarse=known.coarse,
             colors=colors,
             landmarks=None if mesh.annotations is None else mesh.annotations.landmarks,
-            weights=None if pairs is None else pairs.part(0, learned).weights,
         ),
         EnhancementSettings(settings.fps, settings.wavelength, settings.detail, settings.matching),
         patch_size=settings.patch,

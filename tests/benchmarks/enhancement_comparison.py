@@ -24,7 +24,6 @@ from torch import Tensor
 from torchface.enhancement import CapturedPerformance, EnhancementModel, EnhancementSettings
 from torchface.enhancement.enhancement_settings import Matching
 from torchface.geometry.meshes.operators import triangle_areas
-from torchface.take import Track
 
 VERTICES, FRAMES = 20_000, 200
 LEAST_RELIEF = 2.0  # micrometres that the smooth input must lack in a region
@@ -87,7 +86,7 @@ def bench_of(kind: str, data: Path) -> Bench:
     return Bench(scene, model, paired, database, ruler, methods, regions)
 
 
-def fitted(scene: Scene, coarse: Tensor | None, weights: bool = False) -> EnhancementModel:
+def fitted(scene: Scene, coarse: Tensor | None) -> EnhancementModel:
     return EnhancementModel.fit(
         CapturedPerformance(
             scene.frames,
@@ -96,7 +95,6 @@ def fitted(scene: Scene, coarse: Tensor | None, weights: bool = False) -> Enhanc
             scene.neutral,
             coarse=coarse,
             landmarks=scene.performer.neutral.landmarks,
-            weights=Track(scene.performer.names, scene.weights[..., None]) if weights else None,
         ),
         EnhancementSettings(fps=FPS),
     )

@@ -26,10 +26,8 @@ from enhancement_comparison import (
     Bench,
     Measured,
     bench_of,
-    fitted,
     measure,
     shares,
-    total,
 )
 from enhancement_pictures import compared
 from enhancement_scenes import FPS
@@ -122,42 +120,6 @@ def test_bars(bench: Bench, measured: Measured) -> None:
         assert own.fine < min(shares(bench, measured, name + kind).fine for name in (NEAREST, HOLISTIC, FOUR))
         assert own.flicker <= 1.2
         assert own.fine <= 0.15
-
-
-WEIGHTS = {
-    "performer": {"": (0.139, 0.129, 0.152), PAIRS: (0.137, 0.111, 0.150)},
-    "ict": {"": (0.083, 0.085, 0.104), PAIRS: (0.061, 0.053, 0.100)},
-}
-"""Fine part without the rig's weights, with them, and by ridge regression on them alone: docs/benchmarks.md."""
-
-
-def test_weights_of_the_rig(bench: Bench) -> None:
-    """Weights that move the input find more of the detail than its shape, and than a regression on them alone."""
-    scene = bench.scene
-    known = [bench.ruler.known(true) for true in scene.truth]
-    pairs = list(zip(scene.coarse, scene.test_weights, known, strict=True))
-    smooth = total([bench.ruler.errors(bench.smooth(coarse), true) for coarse, _, true in pairs])
-    flicker = torch.stack([true.flicker for true in known]).sum(0)
-    for kind, rigged in (("", None), (PAIRS, scene.rigged)):
-        model = fitted(scene, rigged, weights=True)
-        rows = [scene.weights, torch.cat(scene.test_weights)]
-        centre = rows[0].mean(0)
-        learned, asked = ((row - centre).double() for row in rows)
-        details = scene.frames - (model.low(scene.frames) if rigged is None else rigged)
-        gram = learned.T @ learned
-        ways = gram + 1e-4 * gram.diagonal().mean() * torch.eye(len(gram))
-        middle = details.mean(0)
-        added = asked @ torch.linalg.solve(ways, learned.T @ (details - middle).flatten(1).double())
-        regressed = (middle + added.view(-1, *middle.shape).float()).split([len(row) for row in scene.test_weights])
-        found = {"without": [], "with": [], "ridge": []}
-        for (coarse, weights, true), detail in zip(pairs, regressed, strict=True):
-            found["without"].append(bench.ruler.errors(model(coarse), true))
-            found["with"].append(bench.ruler.errors(model.enhance(coarse, rig_weights=weights).vertices, true))
-            base = model.low(coarse) if rigged is None else coarse
-            found["ridge"].append(bench.ruler.errors(base + detail, true))
-        fine = {name: bench.ruler.shares(total(parts), smooth, flicker).fine for name, parts in found.items()}
-        print(f"{scene.name}{kind}: " + ", ".join(f"{name} {value:.3f}" for name, value in fine.items()))
-        assert list(fine.values()) == pytest.approx(WEIGHTS[scene.name][kind], abs=0.01)
 
 
 def test_pictures(bench: Bench) -> None:

@@ -78,8 +78,8 @@ def test_an_expression_that_the_database_never_shows_is_told(model, database):
 
 def test_a_model_of_an_earlier_version_is_refused(model):
     lacking = {name: value for name, value in model.config.items() if name != "scale"}
-    for config in (lacking, {**model.config, "limits": [0.5] * len(model.region_names)}):
-        with pytest.raises(ValueRangeError, match="earlier version, which had no limits in its state: learn it again"):
+    for config in (lacking, {**model.config, "limits": [0.5]}, {**model.config, "weight_names": ["jawOpen"]}):
+        with pytest.raises(ValueRangeError, match="earlier version, whose state was another: learn it again"):
             EnhancementModel.from_config(config)
 
 

@@ -12,9 +12,7 @@ import torch
 from torchface import Mesh, save_mesh, zoo
 from torchface.enhancement import EnhancementModel
 from torchface.errors import FileFormatError, TopologyError, TorchfaceError, ValueRangeError
-from torchface.io import MeshSequenceWriter, save_animation
-from torchface.rig import BlendshapeRig
-from torchface.take import Take, Track
+from torchface.io import MeshSequenceWriter
 from torchface.viz.figures import face_views
 from train import captured_sequences
 from train import enhancement as recipe
@@ -132,27 +130,6 @@ def test_what_a_coarse_animation_lacks_of_the_same_frames_is_learned(folder, mon
     assert zoo.describe(folder.parent / "model").metrics["learned: missing detail, of the coarse frames'"] < 0.1
     left = (model(shown[1]) - frames(1)).square().mean().sqrt()
     assert float(left) < 0.1 * float((shown[1] - frames(1)).square().mean().sqrt())
-
-
-def test_weights_of_one_rig_are_learned_with_its_animations(folder, monkeypatch):
-    monkeypatch.setattr(recipe, "draw", lambda *a: None)
-    coarse, mesh = folder.parent / "coarse", sheet()
-    coarse.mkdir()
-    bumps = torch.stack([(frames(kind)[4] - mesh.vertices) / 1.3 for kind in range(3)])
-    rig = BlendshapeRig(mesh, bumps, ("one", "two", "three"))
-    course = torch.linspace(0, torch.pi, 9).sin().clamp(min=0)[:, None]
-    rows = {"a": [1.0, 0, 0], "b": [0, 1.0, 0], "c": [0, 0, 1.0], "d": [0.6, 0, 0.4]}
-    for name, row in rows.items():
-        weights = Track(rig.names, (course * torch.tensor(row))[..., None])
-        save_animation(rig, Take(30.0, weights=weights), coarse / f"{name}.glb")
-    model = train(settings(folder, coarse=coarse))
-    assert model.weight_names == rig.names
-    assert torch.allclose(model.database_weights[:9], course * torch.tensor(rows["a"]), atol=1e-5)
-    assert zoo.get_model(folder.parent / "model").weight_names == rig.names
-    save_animation(rig.select(["two", "one"]), Take(30.0, weights=weights), coarse / "c.glb")
-    assert train(settings(folder, coarse=coarse)).weight_names == rig.names  # c is held out
-    save_animation(BlendshapeRig(mesh, 2 * bumps, rig.names), Take(30.0, weights=weights), coarse / "a.glb")
-    assert train(settings(folder, coarse=coarse)).weight_names == ()  # not all of one rig
 
 
 @pytest.mark.parametrize(("kept", "learned"), [("ab", [1, 1]), ("abc", [2, 1]), ("abcd", [2, 2]), ("a", [1])])

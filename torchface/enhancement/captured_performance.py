@@ -9,7 +9,6 @@ from torch import Tensor
 from torchface.errors import ShapeError, TopologyError, ValueRangeError
 from torchface.io.meshes.mesh_sequence import MeshSequence
 from torchface.number_checks import as_tensor
-from torchface.take import Track
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,14 +25,12 @@ class CapturedPerformance:
             animation lacks, and what it has itself beyond the smooth part stays. Absent, the smooth part's detail
             takes the place of the input's own.
         colors: of the frames' vertices, in [0,1], (K,V,3); or on disk.
-        weights: of the actor's rig in the same frames, (K,N,1), where they are known: a model then uses those of its
-            input, see :meth:`EnhancementModel.enhance`.
         landmarks: vertex ids of the 68 iBUG landmarks, which name the regions and set the eyes apart.
 
     Raises:
         TopologyError: frames are of another mesh.
-        ShapeError: not one coarse frame or row of weights a frame, or not one colour a vertex.
-        ValueRangeError: fewer than two frames, a neutral or weights that are not finite, or sequences in pieces.
+        ShapeError: not one coarse frame a frame, or not one colour a vertex.
+        ValueRangeError: fewer than two frames, a neutral that is not finite, or sequences in pieces.
 
     Example:
         >>> from torchface.synthetic import performer
@@ -51,7 +48,6 @@ class CapturedPerformance:
     coarse: Tensor | MeshSequence | None = None
     colors: Tensor | MeshSequence | None = None
     landmarks: Tensor | None = None
-    weights: Track | None = None
 
     def __post_init__(self) -> None:
         for name, expected in (("faces", "(F,3)"), ("neutral", "(V,3)"), ("sequences", "(K,)")):
@@ -67,15 +63,6 @@ class CapturedPerformance:
         _check_sequences(self.sequences, count)
         if self.colors is not None and tuple(self.colors.shape) != (count, len(self.neutral), 3):
             raise ShapeError(f"colors: found {tuple(self.colors.shape)}, expected {(count, len(self.neutral), 3)}")
-        if self.weights is not None:
-            _check_weights(self.weights, count)
-
-
-def _check_weights(weights: Track, count: int) -> None:
-    if len(weights) != count or weights.values.shape[2] != 1 or not weights.names:
-        raise ShapeError(f"weights: found {tuple(weights.values.shape)}, expected ({count},N,1), a row a frame")
-    if not bool(torch.isfinite(weights.values).all()):
-        raise ValueRangeError("weights: found NaN or infinite ones, expected none; leave such frames out")
 
 
 def _check_sequences(sequences: Tensor, count: int) -> None:

@@ -16,7 +16,7 @@ from torchface.enhancement.detail.low_pass import vertex_areas
 from torchface.enhancement.enhancement_settings import DEFAULT_SETTINGS, EnhancementSettings, EnhancementSizes
 from torchface.enhancement.matching.face_regions import Regions
 from torchface.enhancement.prepared_database import PreparedDatabase
-from torchface.errors import ShapeError, TopologyError, ValueRangeError
+from torchface.errors import TopologyError, ValueRangeError
 from torchface.geometry.similarity import Similarity, similarity_transform
 from torchface.number_checks import MAX_FPS, MIN_FPS, checked_count, checked_number
 from torchface.optim.data_dependent import data_dependent
@@ -72,7 +72,6 @@ class EnhancementModel(nn.Module):
         lost_share: of the details' energy, by their compression.
         keeps_input: whether detail goes onto the coarse frames themselves and not onto their smooth part.
         scale: how much of what is added to the coarse frames, see :meth:`on_actor`.
-        weight_names: of the N shapes of the actor's rig whose weights it knows in its frames; none in most models.
 
     Source: Facial Performance Enhancement Using Dynamic Shape Space Analysis, sections 4 and 5. Changed: the filter
     works on displacements, alignment and averages by patches; detail is of low rank.
@@ -105,8 +104,6 @@ class EnhancementModel(nn.Module):
     color_coefficients: Tensor
     limits: Tensor
     map_shares: Tensor
-    database_weights: Tensor | None
-    weight_terms: Tensor | None
 
     def __init__(
         self,
@@ -117,7 +114,6 @@ class EnhancementModel(nn.Module):
         lost_share: float = 0.0,
         keeps_input: bool = False,
         scale: float = 1.0,
-        weight_names: Sequence[str] = (),
     ) -> None:
         super().__init__()
         self.sizes, self.settings = sizes, settings
@@ -126,7 +122,6 @@ class EnhancementModel(nn.Module):
         self.lost_share = checked_number("lost_share", lost_share, 0.0, 1.0)
         self.keeps_input = bool(keeps_input)
         self.scale = checked_number("scale", scale, most=_MOST_SCALE)
-        self.weight_names = tuple(weight_names)
         vertices, triangles, frames = sizes.vertices, sizes.triangles, sizes.frames
         regions = len(self.region_names)
         self.register_buffer("neutral", torch.zeros(vertices, 3))
@@ -146,9 +141,6 @@ class EnhancementModel(nn.Module):
         self.register_buffer("mean_color", torch.zeros(colored, 3))
         self.register_buffer("color_components", torch.zeros(color_rank, 3 * colored, dtype=torch.float16))
         self.register_buffer("color_coefficients", torch.zeros(frames if color_rank else 0, color_rank))
-        known = len(self.weight_names)  # states of models without weights have none of both
-        self.register_buffer("database_weights", torch.zeros(frames, known) if known else None)
-        self.register_buffer("weight_terms", torch.ones(regions, 3, dtype=torch.float64) if known else None)
         self._prepared: Prepared[PreparedDatabase] = Prepared()
 
     @classmethod
@@ -200,7 +192,6 @@ class EnhancementModel(nn.Module):
             "lost_share": self.lost_share,
             "keeps_input": self.keeps_input,
             "scale": self.scale,
-            **({"weight_names": list(self.weight_names)} if self.weight_names else {}),
         }
 
     @classmethod
@@ -210,19 +201,14 @@ class EnhancementModel(nn.Module):
         Raises:
             ValueRangeError: the config is of an earlier version.
         """
-        if "scale" not in config or "limits" in config:
-            raise ValueRangeError(
-                "found a model of an earlier version, which had no limits in its state: learn it again"
-            )
+        if "scale" not in config or "limits" in config or "weight_names" in config:
+            raise ValueRangeError("found a model of an earlier version, whose state was another: learn it again")
         given = dict(config)
         words, choices = list(given["region_names"]), [*given["voluntary"], given["keeps_input"]]
         if not all(isinstance(word, str) and _REGION.fullmatch(word) for word in words):  # they name files
             raise ValueRangeError("region_names: found other than letters, digits, - and _, expected these alone")
         if not all(isinstance(choice, bool) for choice in choices):
             raise ValueRangeError("voluntary or keeps_input: found neither true nor false, expected one")
-        shapes = given.get("weight_names", [])
-        if not isinstance(shapes, list) or not all(isinstance(shape, str) for shape in shapes):
-            raise ValueRangeError("weight_names: found other than texts, expected names of shapes")
         sizes = EnhancementSizes(**{size.name: given.pop(size.name) for size in fields(EnhancementSizes)})
         settings = EnhancementSettings(
             **{setting.name: given.pop(setting.name) for setting in fields(EnhancementSettings)}
@@ -239,28 +225,22 @@ class EnhancementModel(nn.Module):
         return self.enhance(coarse).vertices
 
     @data_dependent("WrinkleWeights, which `torchface export enhancement` writes")
-    def enhance(self, coarse: Tensor, previous: Tensor | None = None, rig_weights: Tensor | None = None) -> Enhancement:
+    def enhance(self, coarse: Tensor, previous: Tensor | None = None) -> Enhancement:
         """Enhanced frames, with what they were made of.
 
         Args:
             coarse: (T,V,3), millimetres, in this mesh and any rigid place.
             previous: weights of the frame before, (R,K), towards which those of the first are damped.
-            rig_weights: of the actor's rig that moves the coarse frames, (T,N), in the order of ``weight_names``, where
-                they are known and the model has learned with some; they find the detail better than shape alone.
 
         Raises:
             TopologyError: another number of vertices, or another order.
             AlignmentError: another unit.
-            ShapeError: not a row of weights a frame, or the model knows none.
             ValueRangeError: NaN or infinity.
         """
         self._check_frames(coarse)
-        if rig_weights is not None:
-            self._check_weights(rig_weights, len(coarse))
         pieces, size = [], max(1, _NUMBERS // len(self.neutral))
         for begin in range(0, len(coarse), size):
-            some = slice(begin, begin + size)
-            pieces.append(self._enhanced(coarse[some], previous, None if rig_weights is None else rig_weights[some]))
+            pieces.append(self._enhanced(coarse[begin : begin + size], previous))
             previous = pieces[-1].weights[-1].detach()
         if not pieces:
             regions, frames = len(self.region_names), len(self.sequences)
@@ -373,8 +353,6 @@ class EnhancementModel(nn.Module):
             self.coefficients,
             self.regions,
             self.settings,
-            self.database_weights,
-            self.weight_terms,
         )
         return self._prepared.get(database.inputs, lambda: database)
 
@@ -393,8 +371,6 @@ class EnhancementModel(nn.Module):
             raise ValueRangeError(f"limits: found {self.limits.tolist()}, expected positive ones")
         if not bool(((self.map_shares >= 0) & (self.map_shares <= 1)).all()):
             raise ValueRangeError(f"map_shares: found {self.map_shares.tolist()}, expected some of 0 to 1")
-        if self.weight_terms is not None and not bool((self.weight_terms > 0).all()):
-            raise ValueRangeError("weight_terms: found some that are not positive, expected none")
         weights = self.region_weights
         if not bool(((weights >= 0) & (weights <= 1)).all()) or not bool((weights > 0).any(1).all()):
             raise ValueRangeError("region_weights: found some beyond 0 to 1, or a region without any, expected neither")
@@ -402,7 +378,7 @@ class EnhancementModel(nn.Module):
             if values.is_floating_point() and values.numel() and not float(values.abs().max()) <= _LARGEST:
                 raise ValueRangeError(f"{name}: found numbers beyond {_LARGEST:g}, expected none")
 
-    def _enhanced(self, coarse: Tensor, previous: Tensor | None, rig_weights: Tensor | None) -> Enhancement:
+    def _enhanced(self, coarse: Tensor, previous: Tensor | None) -> Enhancement:
         smooth, displacements, pose = self._smooth(coarse)
         prepared = self.prepared
         encoder = prepared.encoder
@@ -413,8 +389,6 @@ class EnhancementModel(nn.Module):
         if self.settings.matching == "learned":
             shares = self.map_shares.to(features)
             coefficients = coefficients + prepared.learned_map.corrections(features, matched, self.map_reach, shares)
-        if rig_weights is not None:
-            coefficients = prepared.weight_map.blended(features, rig_weights.to(features), matched, coefficients)
         weights = encoder.detail.site_weights(prepared.vertex_weights)
         details = blended(self.components, coefficients, weights)
         low, own = (self.neutral.to(smooth) + moved for moved in (smooth, displacements))
@@ -435,15 +409,6 @@ class EnhancementModel(nn.Module):
         encoder = self.prepared.encoder
         displacements, pose = encoder.alignment.aligned(coarse, "coarse")
         return encoder.low_pass(displacements), displacements, pose
-
-    def _check_weights(self, rig_weights: Tensor, count: int) -> None:
-        if not self.weight_names or rig_weights.shape != (count, len(self.weight_names)):
-            raise ShapeError(
-                f"rig_weights: found {tuple(rig_weights.shape)}, expected ({count},{len(self.weight_names)}), a row a "
-                "frame; a model fitted without weights knows none"
-            )
-        if not bool(torch.isfinite(rig_weights.detach()).all()):
-            raise ValueRangeError("rig_weights: found NaN or infinite ones, expected none")
 
     def _check_frames(self, coarse: Tensor) -> None:
         if coarse.ndim != 3 or coarse.shape[1:] != self.neutral.shape:

@@ -17,7 +17,6 @@ from torchface.enhancement.enhancement_settings import EnhancementSettings, Enha
 from torchface.enhancement.matching.face_regions import regions_of_motion
 from torchface.enhancement.matching.learned_map import map_shares
 from torchface.enhancement.matching.patches import grow_patches
-from torchface.enhancement.matching.weight_map import weight_terms
 from torchface.errors import ValueRangeError
 from torchface.files.checkpoints import read_checkpoint, write_checkpoint
 from torchface.files.content_keys import content_key
@@ -67,7 +66,6 @@ def fit_enhancement(
         0 if performance.colors is None else min(_COLOR_RANK, frames),
     )
     keeps_input = performance.coarse is not None
-    names = () if performance.weights is None else performance.weights.names
     model = EnhancementModel(
         sizes,
         regions.names,
@@ -75,7 +73,6 @@ def fit_enhancement(
         settings,
         learned.basis.lost_share,
         keeps_input,
-        weight_names=names,
     )
     model.neutral, model.faces, model.patches = neutral.clone(), faces.clone(), patches
     model.region_weights, model.sequences = regions.weights.float(), sequences.clone()
@@ -88,11 +85,6 @@ def fit_enhancement(
         products = region_products(model.components, encoder.detail.site_weights(prepared.vertex_weights))
         shares = map_shares(prepared.projection, model.coefficients, model.map_reach, products, sequences)
         model.map_shares = shares.to(model.map_shares)
-    if performance.weights is not None:
-        progress("learning from the weights")
-        rows = performance.weights.values[..., 0]
-        found = weight_terms(prepared.projection, rows, model.coefficients, sequences)
-        model.database_weights, model.weight_terms = rows.to(model.coefficients), found
     if performance.colors is not None:
         _learn_colors(model, performance.colors)
     return model.eval()

@@ -13,7 +13,6 @@ from torchface.enhancement.enhancement_settings import EnhancementSettings
 from torchface.enhancement.matching.face_regions import Regions, surface_distances
 from torchface.enhancement.matching.learned_map import LearnedMap
 from torchface.enhancement.matching.region_projection import RegionProjection
-from torchface.enhancement.matching.weight_map import WeightMap
 from torchface.enhancement.timing.actor_timing import ActorTiming
 from torchface.geometry.meshes.operators import triangle_areas
 
@@ -97,15 +96,12 @@ class PreparedDatabase:
     coefficients: Tensor  # of the frames' details, (K,r)
     regions: Regions
     settings: EnhancementSettings  # how frames are split and detail is found
-    weights: Tensor | None = None  # of the actor's rig in the frames, (K,N), where they are known
-    weight_terms: Tensor | None = None  # of the map from them, (R,3), see WeightMap
 
     @property
     def inputs(self) -> tuple[Tensor | float, ...]:
         """All that the parts depend on and that may change."""
         tensors = self.neutral, self.faces, self.patches, self.sequences, self.features, self.coefficients
-        known = () if self.weights is None or self.weight_terms is None else (self.weights, self.weight_terms)
-        return *tensors, *known, self.regions.weights, self.settings.wavelength, self.settings.temporal
+        return *tensors, self.regions.weights, self.settings.wavelength, self.settings.temporal
 
     @cached_property
     @torch.no_grad()
@@ -136,14 +132,6 @@ class PreparedDatabase:
     def learned_map(self) -> LearnedMap:
         """What is added to the blend where frames lie beyond the database."""
         return LearnedMap(self.projection, self.coefficients)
-
-    @cached_property
-    @torch.no_grad()
-    def weight_map(self) -> WeightMap:
-        """What finds detail by the rig's weights."""
-        assert self.weights is not None
-        assert self.weight_terms is not None
-        return WeightMap(self.projection, self.weights, self.coefficients, self.weight_terms)
 
     @cached_property
     @torch.no_grad()

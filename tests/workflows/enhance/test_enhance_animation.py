@@ -202,57 +202,6 @@ def test_registration_is_asked_once(actor: Actor, tmp_path: Path, monkeypatch: p
     assert asked == [len(order)]
 
 
-@pytest.fixture(scope="module")
-def knowing(actor: Actor) -> Path:
-    """A model of the actor that has learned with its rig's weights."""
-    learned = torch.linspace(0, 1, 8).repeat(2)[:, None] * actor.weights[-1]
-    frames = actor.rig(learned)
-    model = EnhancementModel.fit(
-        CapturedPerformance(
-            folded(frames, actor.mesh.vertices),
-            actor.mesh.faces,
-            torch.arange(2).repeat_interleave(8),
-            actor.mesh.vertices,
-            coarse=frames,
-            weights=Track(actor.rig.names, learned[..., None]),
-        ),
-        rank=8,
-    )
-    zoo.save_model(model, actor.folder / "knowing", zoo.ModelCard("MIT", "made", {}, "here"))
-    return actor.folder / "knowing"
-
-
-@pytest.mark.parametrize("kind", ["weights.csv", "animation.glb"])
-def test_weights_of_the_actors_own_rig_are_used(actor: Actor, knowing: Path, tmp_path: Path, kind: str) -> None:
-    path, rig = actor.folder / kind, actor.folder / "rig.glb" if kind == "weights.csv" else None
-    if kind == "animation.glb":
-        path = tmp_path / kind
-        save_animation(actor.rig, load_take(actor.folder / "weights.csv"), path)
-    done = enhance_animation(path, str(knowing), tmp_path / "out", replace(PLAIN, given=InputSettings(rig=rig)))
-    model = zoo.get_model(knowing)
-    with torch.no_grad():
-        expected = model.enhance(actor.frames, rig_weights=actor.weights).vertices
-        without = model.enhance(actor.frames).vertices
-    found = done.frames.sequence.read(0, FRAMES)
-    torch.testing.assert_close(found, expected, atol=2e-3, rtol=0)
-    assert float((without - expected).abs().max()) > 0.01
-    assert f"the weights of the rig's {len(actor.rig.names)} shapes" in " ".join(done.notes)
-
-
-def test_weights_of_another_rig_or_timing_are_not_used(actor: Actor, knowing: Path, tmp_path: Path) -> None:
-    names = zoo.get_model(knowing).weight_names
-    found = coarse(actor, actor.folder / "weights.csv", tmp_path, rig=actor.folder / "rig.glb")
-    assert torch.allclose(found.rig_weights(names), actor.weights, atol=1e-5)
-    assert found.rig_weights((*names, "another")) is None
-    assert found.rig_weights(()) is None
-    assert enhanced_frames.retimed_animation(found, zoo.get_model(knowing), silent).rig_weights(names) is None
-    other = BlendshapeRig(
-        actor.mesh.with_vertices(actor.mesh.vertices * torch.tensor([1.2, 1.0, 0.9])), actor.rig.deltas, names
-    )
-    save_rig(other, tmp_path / "other.glb")
-    assert coarse(actor, actor.folder / "weights.csv", tmp_path, rig=tmp_path / "other.glb").weights is None
-
-
 @pytest.fixture
 def killed(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     """Has the third piece of four frames end the run; gives the frames that went through the model."""

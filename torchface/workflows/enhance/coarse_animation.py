@@ -1,6 +1,6 @@
 """Coarse animation to be enhanced, in the vertices of the model's dense mesh, whatever it came from."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -10,7 +10,7 @@ from torch import Tensor
 from torchface.errors import AlignmentError, ValueRangeError
 from torchface.geometry.similarity import MAX_HEAD_SCALE, MIN_HEAD_SCALE, similarity_transform
 from torchface.mesh import Mesh
-from torchface.take import Take, Track
+from torchface.take import Take
 from torchface.workflows.animated_meshes import AnimatedMesh
 
 DEFAULT_FPS = 30.0
@@ -37,14 +37,7 @@ class CoarseAnimation:
     residual: float | None = None
     notes: tuple[str, ...] = ()  # lines for people to read; warnings begin with warning:
     head: Tensor | None = None  # its own head at rest in the model's vertices, (V,3), where that is another person's
-    weights: Track | None = None  # of the rig that moves it, where that is of the model's mesh and actor
     moments: Tensor | None = None  # which of its frames each region shows in each frame, (R,T), where it was retimed
-
-    def rig_weights(self, names: Sequence[str]) -> Tensor | None:
-        """The weights of these shapes, (T,N); None where one is missing, or none are asked for."""
-        if self.weights is None or not names or not set(names) <= set(self.weights.names):
-            return None
-        return self.weights.select(names).values[..., 0]
 
 
 def same_topology(animated: AnimatedMesh, model: Mesh, fps: float | None) -> CoarseAnimation:
@@ -77,7 +70,6 @@ def same_topology(animated: AnimatedMesh, model: Mesh, fps: float | None) -> Coa
         residual,
         (*rate_notes(animated, fps), *notes),
         animated.neutral.vertices.float() if another else None,
-        None if another else animated.weights,
     )
 
 

@@ -212,8 +212,6 @@ def _enhance(
     frames = enhance_frames(animation, model, out, state, key, progress)
     mesh = framed_model(model)
     products, notes = {"meshes, every frame": out / SEQUENCE}, list(animation.notes)
-    if animation.rig_weights(model.weight_names) is not None:
-        notes.append(f"the weights of the rig's {len(model.weight_names)} shapes helped to find the detail")
     if frames.colors is not None:
         products["vertex colours, every frame"] = frames.colors.path
     share = float(frames.outside.any(1).float().mean())

@@ -70,7 +70,6 @@ def enhance_frames(
     colored = has_colors(model)
     distances, outside, previous = [], [], None
     step, seconds, fresh = piece_size(vertices), 0.0, 0
-    rig_weights = animation.rig_weights(model.weight_names)
     with (
         _Output(out / SEQUENCE, count, model, key) as meshes,
         _Output(out / COLORS if colored else None, count, model, key) as colors,
@@ -83,8 +82,7 @@ def enhance_frames(
             if kept is None or min(meshes.done, colors.done) < end:
                 started = time.perf_counter()
                 with torch.no_grad():
-                    some = None if rig_weights is None else rig_weights[begin:end]
-                    enhanced = model.enhance(animation.read(begin, end), previous, some)
+                    enhanced = model.enhance(animation.read(begin, end), previous)
                     shades = model.colors(enhanced.weights) if colored else None
                 kept = {"distances": enhanced.distances, "outside": enhanced.outside, "previous": enhanced.weights[-1]}
                 write_checkpoint(_piece(state, begin), kept, key)
@@ -168,7 +166,7 @@ def retimed_animation(animation: CoarseAnimation, model: EnhancementModel, progr
         return at_moments(animation.read(first, last), asked - first, shares)
 
     note = shift_note((moments - torch.arange(animation.count)).abs() / animation.fps, model.region_names)
-    return replace(animation, read=read, notes=(*animation.notes, note), weights=None, moments=moments)
+    return replace(animation, read=read, notes=(*animation.notes, note), moments=moments)
 
 
 def shift_note(shifts: Tensor, names: Sequence[str]) -> str:
