@@ -158,16 +158,18 @@ const jobs = {
     return { expected, found, left: meshes.some((mesh) => "position" in mesh.geometry.morphAttributes) };
   },
 
-  /** Materials of a skin, of one whose wrinkles come and go, of an eye, and of a skin that counts as metal, made lighter: type, and whether normals are drawn. */
+  /** Materials of a skin, of one whose wrinkles come and go, of an eye, and of a skin that counts as metal, made lighter: type, whether normals are drawn, and how the picture's colours are read. The eye's picture glows too. */
   async lighter() {
     const { lighten, withoutMetal } = await load("lighter_drawing");
     const THREE = await import("three");
     const still = new THREE.Texture(), mixed = new THREE.WebGLRenderTarget(2, 2).texture, root = new THREE.Group();
-    for (const [normalMap, roughness, metalness] of [[still, 1, 0], [mixed, 1, 0], [still, 0.25, 0], [still, 1, 1]])
-      root.add(new THREE.Mesh(new THREE.BufferGeometry(), new THREE.MeshStandardMaterial({ normalMap, roughness, metalness })));
+    for (const [normalMap, roughness, metalness] of [[still, 1, 0], [mixed, 1, 0], [still, 0.25, 0], [still, 1, 1]]) {
+      const map = Object.assign(new THREE.Texture(), { colorSpace: THREE.SRGBColorSpace }), emissiveMap = roughness < 1 ? map : null;
+      root.add(new THREE.Mesh(new THREE.BufferGeometry(), new THREE.MeshStandardMaterial({ normalMap, roughness, metalness, map, emissiveMap })));
+    }
     withoutMetal(root);
     lighten(root);
-    return root.children.map(({ material }) => [material.type, material.normalMap !== null]);
+    return root.children.map(({ material }) => [material.type, material.normalMap !== null, material.map.colorSpace]);
   },
 
   /** Drawings of [milliseconds, and those for each pixel drawn for one of the page's], from two on: their time, rest and ratio. */

@@ -67,7 +67,7 @@ def test_morph_targets_summed_for_software_drawing_are_those_of_three(run: Run, 
 
 def test_matte_surfaces_are_drawn_without_fine_normals_but_with_wrinkles_in_software(run: Run) -> None:
     matte, shiny = "MeshLambertMaterial", "MeshStandardMaterial"
-    assert run("lighter", None) == [[matte, False], [matte, True], [shiny, True], [matte, False]]
+    assert run("lighter", None) == [[matte, False, ""], [matte, True, ""], [shiny, True, "srgb"], [matte, False, ""]]
 
 
 def saved(run: Run, job: dict[str, Any], kind: str) -> bytes:
