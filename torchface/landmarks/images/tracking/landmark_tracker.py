@@ -88,8 +88,7 @@ class LandmarkTracker:
         self._followed = FollowedFace()
         self._faces: FaceBoxes | None = None  # of the frame, if it was searched
         self._nearby = torch.zeros(CANDIDATES, 4)  # faces in a small copy of it; see _about
-        self._moved = torch.zeros(0), torch.zeros(0)
-        """Landmarks of the latest frame's face, and its place."""
+        self._placed = torch.zeros(0), torch.zeros(0)  # the latest landmarks, and their place
 
     @property
     def memory(self) -> Tensor:
@@ -141,13 +140,17 @@ class LandmarkTracker:
             return FaceReading.lost()
         followed.missed = 0
         refined = refined_face(face, frame, self.appearance)
-        known = refined.landmarks is self._moved[0]
-        place = followed.place = self._moved[1] if known else face_place(refined.landmarks)
+        place = followed.place = self._place(refined.landmarks)
         if face is not before:
             followed.set_anchor(face.search_box)
         followed.covered = bool(face.visibility.amin() < _HIDDEN)
         followed.latest_look = look_at(frame, place)
         return refined
+
+    def _place(self, landmarks: Tensor) -> Tensor:
+        if landmarks is not self._placed[0]:
+            self._placed = landmarks, face_place(landmarks)
+        return self._placed[1]
 
     def _found(self, frame: Tensor) -> FaceBoxes:
         """The frame's faces, which are looked for once."""
@@ -171,7 +174,7 @@ class LandmarkTracker:
     def _is_person(self, frame: Tensor, face: FaceReading) -> bool:
         """Whether a face is the followed person's, and not somebody's who passes before them; notes whose it is."""
         people, around = self._followed.people, place_around(face.landmarks)
-        look = look_at(frame, face_place(face.landmarks), LOOK_SIZE)
+        look = look_at(frame, self._place(face.landmarks), LOOK_SIZE)
         other = is_other(people, around, look, _INTERVAL)
         self._followed.people = after_face(people, around, look, (~other, other), _INTERVAL)
         return not bool(other)
@@ -191,8 +194,8 @@ class LandmarkTracker:
         if not self._plausible(box, frame):
             return None
         face = find_in_box(self.finder, frame, box, float(tilt))
-        place = face_place(face.landmarks)
-        moved, self._moved = place[:4], (face.landmarks, place)
+        place = self._place(face.landmarks)
+        moved = place[:4]
         if not self._plausible(moved, frame) or not 0.6 < float(moved[2] / before[2]) < 1.6:
             return None
         if float(overlaps(before[None], moved[None])) < _UNMOVED:  # it moved far: once more from where it is now
