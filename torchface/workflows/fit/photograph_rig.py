@@ -20,6 +20,7 @@ from torchface.io.video.video_file import VIDEO_ENDINGS
 from torchface.landmarks.images.face_crop import cut_crop
 from torchface.landmarks.images.face_reading import FaceReading
 from torchface.modeling import FitSettings, ImageFit, fit_images, transfer_with_report
+from torchface.modeling.photographs.image_texture import without_colors
 from torchface.modeling.photographs.landmark_view import JAW
 from torchface.number_checks import checked_count
 from torchface.progress import Progress, silent
@@ -90,6 +91,7 @@ class FittedHead:
     remarks: tuple[str, ...] = ()
     heads: str = ""  # what there is to say of the head model
     shown: tuple[Path, ...] = ()  # the photographs, and the frames of videos, by their names
+    grey: bool = False  # whether all of them are black and white
 
     def verdict(self) -> str:
         """Whether the head is to be used, in a line; no landmark says whether skin and likeness are right."""
@@ -128,11 +130,12 @@ class FittedHead:
                 f"show by {off / 3**0.5:.0%} of full brightness"
             )
         regions = {} if self.rig.neutral.annotations is None else self.rig.neutral.annotations.regions
+        seen = "brightness in the photographs, which show no colours" if self.grey else "colour in the photographs"
         if fit.hair is not None:
             what = "the template's haircut, not the person's" if "hair" in regions else "painted on the head as a cap"
-            lines.append(f"hair: {_code(fit.hair)}, its colour in the photographs; {what}")
+            lines.append(f"hair: {_code(fit.hair)}, its {seen}; {what}")
         if fit.iris is not None:
-            lines.append(f"irises: {_code(fit.iris)}, their colour in the photographs")
+            lines.append(f"irises: {_code(fit.iris)}, their {seen}")
         elif fit.mesh.texture is not None:
             lines.append("irises: the template's; the photographs show too little of them, or eyes too small")
         lines.append(f"rig: {len(self.rig.vertices)} vertices, {len(self.rig.names)} shapes transferred")
@@ -200,7 +203,7 @@ def fit_photographs(
         fitting = with_readings(fitting, readings, found[0].places, rig)
     remarks = [line for one in found for line in picture_lines(one, insist)]
     for photograph, image, shown, points in zip(photographs, images, parts, marks, strict=True):
-        remarks += color_lines(photograph, image, shown, points)
+        remarks += color_lines(photograph, image, shown, points) if found else []
         remarks += cover_lines(photograph, shown, points)
         remarks += [] if settings.everything else light_lines(photograph, image, shown, points)
     # The tracker has followed one face through a film.
@@ -226,7 +229,17 @@ def fit_photographs(
         for path, one in zip(overlays, found, strict=False):  # to be corrected and given as --landmarks
             save_pts(one.face.landmarks, path.with_suffix(".pts"))
     summary = transferred.report.summary()
-    return FittedHead(made, fit, overlays, summary, tuple(found), tuple(remarks), named.line, tuple(photographs))
+    return FittedHead(
+        made,
+        fit,
+        overlays,
+        summary,
+        tuple(found),
+        tuple(remarks),
+        named.line,
+        tuple(photographs),
+        without_colors(images),
+    )
 
 
 def _pictures(
