@@ -81,3 +81,16 @@ def test_painted_irises_take_a_colour_and_nothing_else_does() -> None:
     colors = mesh.texture[:, changed]
     assert float((colors.median(1).values / colors.median(1).values.norm() - blue / blue.norm()).abs().max()) < 0.03
     assert float(texture[:, changed].mean(0).max()) < 0.72  # the whites stay
+
+
+def test_teeth_are_darker_the_further_back_they_lie() -> None:
+    head = performer(texture=False).neutral
+    assert head.annotations is not None
+    teeth = torch.arange(len(head.vertices)) % 3 == 0
+    head = replace(head, annotations=replace(head.annotations, regions={"teeth_upper": teeth}))
+    colored = with_part_colors(replace(head, colors=torch.ones(len(head.vertices), 3)), None)
+    assert colored.colors is not None
+    depth, light = head.vertices[teeth, 2], colored.colors[teeth].mean(1)
+    order = depth.argsort(descending=True)
+    assert bool((light[order].diff() < 1e-6).all())
+    assert float(light[order[-1]]) < 0.5 * float(light[order[0]]) < 0.45

@@ -13,24 +13,26 @@ from torchface.color_space import to_linear, to_srgb
 from torchface.errors import FileFormatError, ValueRangeError
 from torchface.files.documents import write_json
 from torchface.geometry.cameras.pinhole import Camera
+from torchface.geometry.meshes.rasterization import rasterise_uvs
 from torchface.io import save_animation, save_image, save_rig
 from torchface.io.landmarks.openface_csv import save_landmarks_csv
 from torchface.io.video import open_video, write_video
 from torchface.landmarks.images.networks.part_finder import FaceParts
 from torchface.landmarks.images.networks.part_network import PARTS
+from torchface.modeling.photographs.skin_mask import FacePlaces
 from torchface.rendering.pixel_coverage import footprint
 from torchface.rendering.point_light import PointLight
 from torchface.rendering.texture_overlay import relight, skin_faces
 from torchface.rig import BlendshapeRig
-from torchface.synthetic import performer
+from torchface.synthetic import neutral_head, performer
 from torchface.take import Take, Track
+from torchface.workflows.relight.other_head import other_head, without_painted_hair
 from torchface.workflows.relight.relight_film import (
     RelightSettings,
     _angles,
     _doubts,
     _light,
     _near_face,
-    _other_head,
     _reaching,
     _shown,
     relight_film,
@@ -141,10 +143,28 @@ def test_a_film_in_its_own_light_is_the_film_and_others_are_as_bright(filmed: Fi
 
 def test_a_bare_performer_in_the_actors_place_has_teeth_and_no_hair(tmp_path: Path) -> None:
     save_rig(performer().select(["jawOpen"]), tmp_path / "bare.glb")
-    notes = _other_head(tmp_path / "bare.glb").neutral.annotations
+    notes = other_head(tmp_path / "bare.glb").neutral.annotations
     assert notes is not None
     assert bool(notes.regions["teeth_upper"].any())
     assert not any(name.startswith(("hair", "shirt")) and bool(mask.any()) for name, mask in notes.regions.items())
+
+
+def test_hair_painted_on_a_head_is_left_out_and_its_face_is_not() -> None:
+    """A fit paints hair as a cap, which would lie on the film's forehead."""
+    head = neutral_head()
+    assert head.uvs is not None
+    assert head.uv_faces is not None
+    high = FacePlaces.of(head).place[:, 1]
+    texels = rasterise_uvs(head.uvs, head.uv_faces, 256, 256)
+    at = texels.interpolate(high[:, None], head.faces)[:, 0]
+    plain = torch.tensor([0.78, 0.58, 0.48]).expand(len(at), 3)
+    capped = torch.where(at[:, None] > 0.6, torch.tensor([0.1, 0.07, 0.05]), plain)
+    lips = torch.where(at[:, None] < -0.9, torch.tensor([0.5, 0.2, 0.2]), capped)
+    bare_head = without_painted_hair(replace(head, colors=None, texture=texels.image(lips)))
+    assert bare_head.texture is not None
+    shown = bare_head.texture.flatten(1)[:, texels.texels].T
+    assert float((shown - plain)[at > 0].abs().max()) < 0.02
+    torch.testing.assert_close(shown[at < 0.2], lips[at < 0.2])
 
 
 def test_hair_and_clothes_of_a_head_of_track_are_left_out() -> None:

@@ -44,6 +44,8 @@ _TONE = 40  # rounds over the mesh: the skin around
 _EVEN = 0.04, 0.10  # of a skin's brightness: what is added to it against shadows in even light at most, in shadows
 _DARK = 0.02  # of full white
 _BROW_ENDS = 0.6, 0.95  # shares of skin between which hair of brows and beards ends
+# Lips and cheeks keep light from teeth: shares at the front and far back, and millimetres behind the foremost.
+_TEETH_LIGHT, _TEETH_BACK = (0.85, 0.3), (4.0, 28.0)
 _IRIS_COSINE = 0.9  # of the angle between the eye's axis and the border of an iris 11 mm wide
 
 
@@ -317,6 +319,11 @@ def with_part_colors(mesh: Mesh, iris: Tensor | None) -> Mesh:
         if material is None or not bool(mask.any()):
             continue
         colors[mask] = colors.new_tensor(material.color)
+        if material.name == "teeth":
+            behind = mesh.vertices[mask, 2].max() - mesh.vertices[mask, 2]
+            share = ((behind - _TEETH_BACK[0]) / (_TEETH_BACK[1] - _TEETH_BACK[0])).clamp(0, 1)
+            light = _TEETH_LIGHT[0] + (_TEETH_LIGHT[1] - _TEETH_LIGHT[0]) * share
+            colors[mask] *= light[:, None].to(colors)
         if material is EYEBALL and iris is not None:
             ball = mesh.vertices[mask]
             ahead = torch.nn.functional.normalize(ball - (ball.amin(0) + ball.amax(0)) / 2, dim=1)[:, 2]

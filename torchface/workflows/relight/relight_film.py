@@ -14,8 +14,6 @@ from torch import Tensor
 from torchface.capture.own_rig.lighting import estimate_light
 from torchface.errors import AlignmentError, ValueRangeError
 from torchface.files.whole_files import check_ending, check_writable
-from torchface.geometry.similarity import similarity_transform
-from torchface.io import load_rig
 from torchface.io.images.image_files import load_paint
 from torchface.io.images.radiance_hdr import load_panorama
 from torchface.io.video import open_video, write_video
@@ -26,14 +24,10 @@ from torchface.progress import Progress, silent
 from torchface.rendering.environment_light import EnvironmentLight
 from torchface.rendering.point_light import PointLight, vertex_albedo
 from torchface.rendering.texture_overlay import FacePaint, overlay, relight, skin_faces
-from torchface.rig import BlendshapeRig
-from torchface.synthetic import Look, character
-from torchface.synthetic.head.embedded_character import is_performers
-from torchface.take import Track
 from torchface.workflows.named_finders import part_finder
-from torchface.workflows.relight.tracked_film import TrackedFilm, bare, read_tracked_film
+from torchface.workflows.relight.other_head import as_paint, other_head, placed
+from torchface.workflows.relight.tracked_film import TrackedFilm, read_tracked_film
 from torchface.workflows.relight.wanted_light import WantedLight
-from torchface.workflows.track.upright_rig import upright
 
 FilmLight = Literal["once", "each"]
 Draw = Callable[[int, Tensor, PointLight | EnvironmentLight], Tensor]
@@ -172,8 +166,8 @@ def _painter(tracked: TrackedFilm, settings: RelightSettings) -> Draw | None:
     if settings.texture is not None:
         paint = FacePaint.of(tracked.rig.neutral, load_paint(settings.texture))
     elif settings.rig is not None:
-        other = _other_head(settings.rig)
-        paint, moved = _head(other.neutral), _placed(other, tracked, settings.rig)
+        other = other_head(settings.rig)
+        paint, moved = as_paint(other.neutral), placed(other, tracked, settings.rig)
         height = other.vertices[:, 1] - other.vertices[other.neutral.landmarks[_CHIN], 1]
         share = ((height + _NECK[1]) / (_NECK[1] - _NECK[0])).clamp(0, 1)
         # The film's own hair, or scalp, is kept.
@@ -188,44 +182,6 @@ def _painter(tracked: TrackedFilm, settings: RelightSettings) -> Draw | None:
         return overlay(image, moved(frame), paint, light, tracked.camera(frame), tracked.calibration, share)
 
     return draw
-
-
-def _other_head(path: Path) -> BlendshapeRig:
-    """A head for the actor's place, with teeth where the template has some; hair and clothes are the film's."""
-    other = upright(load_rig(path))[0]
-    texture = other.neutral.texture
-    if texture is None or other.neutral.uvs is None:
-        raise ValueRangeError(
-            f"{path}: found a rig without a texture that can be read, expected one as PNG or JPEG, which the film is "
-            "to show"
-        )
-    if is_performers(other):
-        other = character(other, Look(haircut=None), texture.shape[-1], texture.float()).rig
-    return bare(other)
-
-
-def _head(mesh: Mesh) -> FacePaint:
-    """All of another head as paint, eyes and teeth too."""
-    assert mesh.texture is not None
-    texture = torch.cat([mesh.texture.float(), torch.ones_like(mesh.texture[:1]).float()])
-    paint = FacePaint.of(mesh, texture)
-    return replace(paint, skin=torch.ones_like(paint.skin))
-
-
-def _placed(other: BlendshapeRig, tracked: TrackedFilm, path: Path) -> Callable[[int], Tensor]:
-    """Another head that stands where the actor's does, by their landmarks, and moves as it."""
-    marks = other.neutral.landmarks, tracked.rig.neutral.landmarks
-    if len(marks[0]) != len(marks[1]):
-        raise ValueRangeError(f"{path}: found {len(marks[0])} landmarks, expected the actor's {len(marks[1])}")
-    target = tracked.rig.vertices[marks[1]].double()[None]
-    pose = similarity_transform(other.vertices[marks[0]].double()[None], target)
-    weights = other.weights_from(Track(tracked.rig.names, tracked.weights[..., None]))
-
-    def vertices(frame: int) -> Tensor:
-        posed = other(weights[frame : frame + 1].to(other.deltas))
-        return pose.apply(posed.double())[0]
-
-    return vertices
 
 
 def _shown(frame: Tensor, parts: FaceParts, before: Sequence[str], marks: Tensor) -> Tensor:
