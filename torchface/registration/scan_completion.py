@@ -3,6 +3,7 @@
 import numpy as np
 import torch
 from scipy import sparse
+from scipy.spatial import cKDTree
 from torch import Tensor
 
 from torchface.geometry.meshes.operators import edges, triangle_areas
@@ -11,6 +12,10 @@ from torchface.optim.sparse import SparseCholesky
 
 _LINK = 0.577  # cotangent of 60°: the weight of an edge between equilateral triangles
 _FORM_FADES, _COLORS_FADE = 80.0, 40.0
+# Beside what is unseen lie vertices that hair or a scan's border moved: of those so near, millimetres, the form goes on
+# from what a plate of this reach makes of those less than about so far off it, and what is off fades within 5 mm.
+_BESIDE, _ALIKE, _EDGE_FADES = 20.0, 0.5, 5.0
+_FIRST_REACH, _REACH, _ROUNDS = 20.0, 5.0, 6
 _LEAST_AREA = 1e-3
 _MIN_COUNT = 4
 
@@ -22,6 +27,10 @@ def completed_form(rest: Tensor, current: Tensor, faces: Tensor, unseen: Tensor,
     goes on over the unseen ones as a thin plate does, and fades with the distance, :math:`\ell` = 80 mm:
 
     .. math:: \min_y \int \lVert \Delta y \rVert^2 + \ell^{-4} \lVert y \rVert^2
+        + s^{-4} w \lVert y - d \rVert^2
+
+    Shown vertices within 20 mm of unseen ones pull the plate to their offset d by a robust weight w (Cauchy's squared,
+    0.5 mm; s = 5 mm), as hair moves some of them; those further away hold it.
 
     Args:
         unseen: whose positions the scan does not show, (V,) bool; the rest of the mesh stays.
@@ -34,7 +43,17 @@ def completed_form(rest: Tensor, current: Tensor, faces: Tensor, unseen: Tensor,
     aligned = similarity_transform(rest[shown][None], current[shown][None]).apply(rest)[0]
     stiffness, area = _membrane(aligned, faces)
     plate = stiffness @ sparse.diags_array(1 / area) @ stiffness + sparse.diags_array(area / _FORM_FADES**4)
-    return aligned + _spread(plate, current - aligned, unseen)
+    offset = current - aligned
+    gap, _ = cKDTree(aligned[unseen].numpy()).query(aligned.numpy())
+    beside = shown & (torch.from_numpy(gap) < _BESIDE)
+    weights, reach = beside.double(), _FIRST_REACH
+    for _ in range(_ROUNDS):
+        pull = weights.numpy() * area / reach**4
+        form = _spread(plate, offset, unseen | beside, pull)
+        weights = beside / (1 + (offset - form).square().sum(1) / _ALIKE**2).square()
+        reach = _REACH
+    edge = _spread(stiffness + sparse.diags_array(area / _EDGE_FADES**2), offset - form, unseen)
+    return torch.where(unseen[:, None], aligned + form + edge, current)
 
 
 def completed_colors(colors: Tensor, base: Tensor, vertices: Tensor, faces: Tensor, unseen: Tensor) -> Tensor:
@@ -63,11 +82,18 @@ def _membrane(vertices: Tensor, faces: Tensor) -> tuple[sparse.csr_array, np.nda
     return (sparse.diags_array(links.sum(1)) - links).tocsr(), area.clamp(min=_LEAST_AREA).numpy()
 
 
-def _spread(system: sparse.csr_array, values: Tensor, unknown: Tensor) -> Tensor:
-    """Values (V,K) with the unknown rows at the least of the quadratic form, the others held."""
+def _spread(system: sparse.csr_array, values: Tensor, unknown: Tensor, pull: np.ndarray | None = None) -> Tensor:
+    """Values (V,K) with the unknown rows at the least of the quadratic form, the others held.
+
+    Args:
+        pull: how much each row (V,) is drawn to its value.
+    """
     held = values.masked_fill(unknown[:, None], 0.0).numpy()
     rows = unknown.nonzero()[:, 0].numpy()
-    pull = system[rows] @ held
+    right = -(system[rows] @ held)
+    if pull is not None:
+        system = (system + sparse.diags_array(pull)).tocsr()
+        right += (pull[:, None] * values.numpy())[rows]
     filled = values.clone()
-    filled[unknown] = torch.from_numpy(SparseCholesky(system[rows][:, rows]).solve(-pull))
+    filled[unknown] = torch.from_numpy(SparseCholesky(system[rows][:, rows]).solve(right))
     return filled

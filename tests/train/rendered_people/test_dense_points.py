@@ -54,7 +54,9 @@ def test_pictures_have_the_weights_that_they_show(performers: HeadKind) -> None:
         assert float(picture.weights.min()) >= 0
         assert float(picture.weights.max()) <= 1
         spots = picture.points[picture.point_visible].round().long()
-        assert float((picture.rgba[3, spots[:, 1], spots[:, 0]] == 255).float().mean()) > 0.95
+        shown = (picture.rgba[3] == 255).float()
+        near = torch.nn.functional.max_pool2d(shown[None], 3, 1, 1)[0]  # points on an outline round to beside it
+        assert bool(near[spots[:, 1], spots[:, 0]].all())
 
 
 @pytest.mark.bench

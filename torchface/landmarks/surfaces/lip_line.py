@@ -14,7 +14,7 @@ _DEEP, _OPEN = 4.0, 24.0  # millimetres: a step in depth that is no line between
 _REACH, _ASTRAY = 16.0, 0.3  # millimetres from the found lips at most, and what a column costs there; off a line, 1
 _LEAN = 0.1  # what a step of the line up or down costs
 _GAP, _LEAST = 8.0, 0.7  # millimetres without a line at most; of the found lips' width at least
-_SHARP = 0.8  # how much more upward the skin looks below a crease than above it, of its normal
+_SHARP = 0.9  # how much more upward the skin looks below a crease than above it, of its normal
 
 
 def lip_line(vertices: Tensor, skin: Tensor, lips: Tensor) -> Opening | None:

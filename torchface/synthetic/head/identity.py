@@ -194,11 +194,16 @@ _FIELDS: tuple[tuple[str, str, float, float, Field], ...] = (
 
 # What heads have that the sculpture has not, which keeps the place of every point that networks learned: millimetres
 # along an axis (0 to the side) about a point of the left side, and how far that reaches. The profile becomes as convex
-# as people's (Legan and Burstone 1980: 12 degrees; the sculpture's 4).
+# as people's (Legan and Burstone 1980: 12 degrees; the sculpture's 4); upper lip and lower lip stand before the base of
+# the nose and the fold below them and the chin behind it as far as people's (Arnett et al. 1999: 3.5, 1.5, -6 and -3).
 _PROPORTIONS: tuple[tuple[int, float, tuple[float, float, float], tuple[float, float, float]], ...] = (
-    (2, -5.6, (0, -104, 86), (22, 11, 40)),  # the chin stands behind the lips
+    (2, -4.8, (0, -104, 86), (22, 11, 40)),  # the chin stands behind the lips
     (1, 1.6, (0, -111, 74), (24, 12, 30)),
     (2, 1.8, (0, -54.5, 92), (20, 7, 25)),  # the skin between nose and lip before the bones
+    (2, 2.8, (0, -50.5, 90), (13, 4.4, 25)),
+    (2, 0.8, (0, -34, 113), (15, 13, 10)),  # the tip of the nose
+    (2, -1.5, (0, -69, 95), (15, 5, 25)),  # the lower lip behind the upper one
+    (2, 1.2, (0, -83, 86), (18, 5, 30)),
     (0, 2.4, (60, -14, 24), (22, 24, 16)),  # the face before the ears
     (0, 1.4, (50, -45, 20), (12, 18, 22)),
     (0, -1.6, (47, -60, 34), (12, 14, 16)),  # the cheek beside the mouth

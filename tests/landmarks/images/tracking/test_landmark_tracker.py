@@ -95,7 +95,7 @@ def test_the_past_alone_counts(trees: LandmarkTrees, film: tuple[Tensor, Tensor]
 
 def test_many_starts_are_steadier_than_two(trees: LandmarkTrees, film: tuple[Tensor, Tensor]) -> None:
     frames, _ = film
-    noisy = frames[:1].repeat(10, 1, 1, 1).float()  # a still face: what moves is noise
+    noisy = frames[:1].repeat(30, 1, 1, 1).float()  # a still face: what moves is noise
     noisy += 5 * torch.randn(noisy.shape, generator=torch.Generator().manual_seed(0))
     noisy = noisy.clamp(0, 255).to(torch.uint8)
     finders = [TreeFinder(trees, ConsensusSettings(starts=count)) for count in (2, 16)]
