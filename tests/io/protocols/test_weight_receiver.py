@@ -244,6 +244,14 @@ def test_a_clock_that_jumps_goes_on_from_there() -> None:
     assert (order.counts.jumps, order.counts.lost, order.counts.late) == (2, 0, 0)
 
 
+def test_an_app_that_sends_nothing_for_ten_seconds_has_not_set_its_clock() -> None:
+    order = FrameOrder()
+    assert [order.takes("phone", number, number / 60) for number in (60, 61, 661)] == [True] * 3
+    assert order.counts.words() == ""
+    order.takes("phone", 100_000, 661 / 60 + 0.1)
+    assert order.counts.words() == "1 jump of its clock"
+
+
 def test_a_clock_that_is_set_back_a_little_stops_nothing_for_longer_than_a_network_does() -> None:
     order = FrameOrder()
     assert all(order.takes("phone", number, number / 60) for number in range(120, 300))

@@ -124,7 +124,6 @@ def test_the_pages_socket_gives_frames_pictures_and_state_and_takes_wishes(serve
         server.stop()
         assert not [one for one in threading.enumerate() if one.name == "torchface-sender"]  # all is said by now
         words = [json.loads(message) for message in socket if isinstance(message, str)]
-    until(lambda: desk.closed, 10)
     assert desk.messages == [{"record": True}, {"reset": True}]  # whose refusal ends nothing
     assert json.loads(messages["state"]) == {"words": "here"}
     assert words[-1]["ended"] == "torchface has ended."
@@ -185,6 +184,24 @@ def test_the_page_hands_takes_over(server: PageServer, desk: Desk) -> None:
         until(lambda: desk.kept, 10)
     assert [name for name, _ in desk.kept] == ["Prüfung"]
     np.testing.assert_array_equal(desk.kept[0][1], rows)
+
+
+def test_a_pose_ends_with_the_page_that_has_asked_for_it_and_with_no_other(server: PageServer, desk: Desk) -> None:
+    first, other, last = ({"controls": {"solver": {"pose": pose}}} for pose in (2, 0, 3))
+    address = server.url.replace("http", "ws") + "socket"
+    with connect(address) as posing:
+        posing.send(json.dumps(first))
+        until(lambda: desk.messages, 10)
+        with connect(address) as page:
+            page.send(json.dumps(other))
+            page.send(json.dumps({"reset": True}))
+            until(lambda: len(desk.messages) == 2, 10)
+        until(lambda: len([one for one in threading.enumerate() if one.name == "torchface-sender"]) == 1, 10)
+        posing.send(json.dumps(last))
+        until(lambda: len(desk.messages) == 3, 10)
+        assert not desk.closed
+    until(lambda: desk.closed, 10)
+    assert desk.messages == [first, {"reset": True}, last]
 
 
 def test_the_streams_socket_gives_frames_alone_and_takes_nothing(server: PageServer, desk: Desk) -> None:

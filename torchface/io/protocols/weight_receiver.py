@@ -20,6 +20,7 @@ from torchface.io.protocols.vmc_packets import VmcReader
 
 _FAR = 300  # frames; a number so much further, or so much earlier, is a clock that was set
 _SET = 0.2  # seconds: no network holds frames back for longer; older numbers after that are a clock that was set
+_QUICKEST = 240  # frames a second that a clock counts on while its app sends nothing
 _RECENT = 30
 _FREE = 2.0  # seconds after which another sender may take over
 _PORTS = 8  # of a sender that are remembered
@@ -39,7 +40,8 @@ class PacketCounts:
 
     def words(self) -> str:
         """What went wrong, for people; empty if nothing did."""
-        names = {"lost": "lost", "late": "late", "others": "of another sender", "jumps": "jumps of its clock"}
+        names = {"lost": "lost", "late": "late", "others": "of another sender"}
+        names["jumps"] = "jump of its clock" if self.jumps == 1 else "jumps of its clock"
         found = [f"{getattr(self, name)} {words}" for name, words in names.items() if getattr(self, name)]
         return ", ".join([*found, *([f"{self.malformed} not understood ({self.fault})"] if self.malformed else [])])
 
@@ -89,11 +91,12 @@ class FrameOrder:
                 self.counts.late += 1
                 return False
             self._stands = step == 0
-            if step < 0 or step >= _FAR:
+            paused = 0 < step <= _QUICKEST * (now - self._taken)
+            if step < 0 or (step >= _FAR and not paused):
                 self.counts.jumps += 1
                 self._before, self._jumped = self._last, now
                 self._steps.clear()
-            elif step > 0:
+            elif 0 < step < _FAR:
                 self._steps.append(step)
                 # A phone at half its clock's rate counts every other one.
                 usual = sorted(self._steps)[len(self._steps) // 4]

@@ -173,7 +173,7 @@ class LiveSession:
         self._solving.start()
 
     def left(self) -> None:
-        """A page was closed, which may have asked for a pose."""
+        """The page was closed that has asked for a pose."""
         self._pose = 0
 
     def _set(self, controls: object) -> None:

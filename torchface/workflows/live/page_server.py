@@ -61,7 +61,7 @@ class LiveDesk(Protocol):
         """Keeps a take that a page has made or was given, rows (T,66) as of :func:`kept_takes.take_rows`."""
 
     def left(self) -> None:
-        """A page was closed, which may have asked for a pose."""
+        """The page was closed that has asked for a pose."""
 
 
 class Preparing:
@@ -129,6 +129,7 @@ class PageServer:
         self._keeping = threading.Lock()  # no take comes to a desk that has just been left
         self._stopped = threading.Event()
         self._senders = set[threading.Thread]()
+        self._posing: ServerConnection | None = None
         logger = logging.getLogger(__name__)
         logger.setLevel(logging.CRITICAL + 1)  # browsers that hang up are no news
         self._server = serve(
@@ -212,16 +213,17 @@ class PageServer:
         try:
             for message in connection:
                 if private:
-                    upload = self._take(message, upload)
+                    upload = self._take(message, upload, connection)
         except ConnectionClosed:
             pass
-        if private:
+        if self._posing is connection:
+            self._posing = None
             self._desk.left()
         sender.join(2 * _WAIT)
         self._senders.discard(sender)
 
-    def _take(self, message: str | bytes, upload: TakeUpload | None) -> TakeUpload | None:
-        """Does what a message asks for; the take that a page is still handing over."""
+    def _take(self, message: str | bytes, upload: TakeUpload | None, page: ServerConnection) -> TakeUpload | None:
+        """Does what a message of a page asks for; the take that it is still handing over."""
         try:
             if isinstance(message, bytes):
                 if upload is not None and upload.is_whole_with(message):
@@ -232,11 +234,20 @@ class PageServer:
             asked = json.loads(message)
             if isinstance(asked, dict) and "keep" in asked:
                 return TakeUpload(str(asked["keep"]), asked.get("bytes"))
-            if isinstance(asked, dict):
+            if isinstance(asked, dict) and self._counts(asked, page):
                 self._desk.asked(asked)
         except (TorchfaceError, ValueError, OSError, RecursionError):
             pass  # a message that is none; what went wrong with one that is stands in the notes
         return None
+
+    def _counts(self, asked: dict[str, Any], page: ServerConnection) -> bool:
+        """Whether what a page asks for counts: not its controls while another page has the person hold a pose."""
+        controls = asked.get("controls")
+        if isinstance(controls, dict) and isinstance(solver := controls.get("solver"), dict):
+            if self._posing not in (None, page):
+                return False
+            self._posing = page if solver.get("pose") else None
+        return True
 
     def _send(self, connection: ServerConnection, private: bool) -> None:
         shown: LiveView | None = None
