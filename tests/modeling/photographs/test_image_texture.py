@@ -1,6 +1,9 @@
 """Irises planted on a head come back from its picture, and a written eyeball wears them."""
 
+import math
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import cast
 
 import pytest
 import torch
@@ -10,7 +13,9 @@ from torchface.geometry.cameras.pinhole import look_at
 from torchface.io.gltf.part_textures.iris_texture import painted_eye
 from torchface.mesh import Mesh
 from torchface.modeling.photographs.eye_color import iris_color, with_iris
-from torchface.modeling.photographs.image_texture import part_vertices, with_part_colors
+from torchface.modeling.photographs.image_texture import _spectacles, _View, part_vertices, with_part_colors
+from torchface.modeling.photographs.skin_light import like_skin_around
+from torchface.modeling.photographs.skin_mask import FacePlaces
 from torchface.rendering.clay_shading import Lighting, render
 from torchface.synthetic import neutral_head, performer
 
@@ -94,3 +99,24 @@ def test_teeth_are_darker_the_further_back_they_lie() -> None:
     order = depth.argsort(descending=True)
     assert bool((light[order].diff() < 1e-6).all())
     assert float(light[order[-1]]) < 0.5 * float(light[order[0]]) < 0.45
+
+
+def test_frames_count_where_a_photograph_shows_enough_of_glasses() -> None:
+    places = FacePlaces.of(neutral_head())
+    view = cast(_View, SimpleNamespace(places=places, shown=SimpleNamespace(cosine=torch.ones(len(places.frames)))))
+    between = (places.place[:, 0].abs() < 0.03) & (places.frames > 0.5)
+    assert bool(between.any())  # the bridge
+    shown = (torch.arange(len(places.frames)) % 20 == 0).double()
+    assert torch.equal(_spectacles([view], [shown]), places.frames)
+    assert not _spectacles([view], [shown * 0.2]).any()
+    assert not _spectacles([view], [shown * (torch.arange(len(shown)) % 60 == 0)]).any()
+
+
+def test_strands_and_red_folds_are_nearer_to_the_skin_around_and_moles_stay() -> None:
+    tone = torch.tensor([[0.78, 0.58, 0.48]]).double()
+    strand, fold = torch.tensor([[0.12, 0.09, 0.07]]).double(), torch.tensor([[0.6, 0.15, 0.12]]).double()
+    mole = tone * 0.8
+    left = [(like_skin_around(one, tone, 0.8, 0.12) / tone).log()[0] for one in (strand, fold, mole)]
+    assert float(left[0].mean()) > -0.8
+    assert float(left[1].max() - left[1].min()) < 0.25
+    assert float(left[2].mean()) == pytest.approx(math.log(0.8), abs=0.02)

@@ -211,7 +211,7 @@ def test_an_upper_lid_that_paint_darkens_in_spots_is_skin_when_it_shuts(head: Me
 def test_a_place_of_skin_keeps_its_pores_and_loses_what_is_of_another_hue() -> None:
     tone = torch.tensor([[0.7, 0.5, 0.4]], dtype=torch.float64)
     pore, edge = 0.93 * tone, tone * torch.tensor([0.9, 0.6, 0.1])
-    assert torch.allclose(like_skin_around(pore, tone), pore, rtol=0.01)
-    left = (like_skin_around(edge, tone) / tone).log()
+    assert torch.allclose(like_skin_around(pore, tone, 0.2, 0.06), pore, rtol=0.01)
+    left = (like_skin_around(edge, tone, 0.2, 0.06) / tone).log()
     assert float(left.mean()) > -0.21
     assert float(left.amax() - left.amin()) < 0.125  # 2.2 at the edge

@@ -43,6 +43,10 @@ _LID_SHADOW = 0.5  # of the eye's opening
 _TONE = 40  # rounds over the mesh: the skin around
 _EVEN = 0.04, 0.10  # of a skin's brightness: what is added to it against shadows in even light at most, in shadows
 _DARK = 0.02  # of full white
+# Logarithms by which a place of skin differs from the skin around it, in brightness and hue: strands of hair, and folds
+# in shadow differ more.
+_FOLDS, _PORES, _FRAMED_SKIN = (0.8, 0.12), (0.2, 0.06), (0.06, 0.04)
+_GLASS, _GLASSES, _FRAMED = 0.3, 0.03, 0.5  # shares: of a place, of the places where frames lie, of those that count
 _BROW_ENDS = 0.6, 0.95  # shares of skin between which hair of brows and beards ends
 # Lips and cheeks keep light from teeth: shares at the front and far back, and millimetres behind the foremost.
 _TEETH_LIGHT, _TEETH_BACK = (0.85, 0.3), (4.0, 28.0)
@@ -136,7 +140,8 @@ def photographed_skin(
         confidence = torch.where(others, 0.0, torch.ones(count, len(others)) if confidence is None else confidence)
     texture = photo_texture(posed, images, cameras, size, base, confidence, lights, patches)
     if parts is not None and patches is not None:
-        texture = _without_sharp_shadows(texture, views, mesh, graph, others)
+        glasses = [one.at(at, "glasses") for one, at in zip(parts, pixels, strict=True)]
+        texture = _without_sharp_shadows(texture, views, mesh, graph, others, _spectacles(views, glasses))
     if cap is not None and paint_hair:
         texture = _capped(texture, cap, mesh, others)
     colors = texture.colors
@@ -198,15 +203,32 @@ def _without_patches(
     return replace(view, image=image, shown=shown, patch=patch_offset(shown.colors, skin, base, graph, mirror))
 
 
-def _without_sharp_shadows(
-    texture: PhotoTexture, views: Sequence[_View], mesh: Mesh, graph: VertexGraph, others: Tensor
-) -> PhotoTexture:
-    """A texture whose skin is like the skin around it where much was to be done against shadows, and on upper lids.
+def _spectacles(views: Sequence[_View], glasses: Sequence[Tensor]) -> Tensor:
+    """How far each vertex lies where spectacles have frames, whose thin parts look like skin to the network, (V,).
 
-    In even light it stays as it is, with its moles.
+    Args:
+        glasses: how surely a photograph shows glasses at each, (V,) each; 0 everywhere where none shows enough of them.
+    """
+    frames = [view.places.frames for view in views]
+    seen = [
+        share[(frame > _FRAMED) & (view.shown.cosine > 0)]
+        for view, share, frame in zip(views, glasses, frames, strict=True)
+    ]
+    worn = any(float((share.nan_to_num(0.0) > _GLASS).float().mean()) > _GLASSES for share in seen if len(share))
+    return frames[0] * worn
+
+
+def _without_sharp_shadows(
+    texture: PhotoTexture, views: Sequence[_View], mesh: Mesh, graph: VertexGraph, others: Tensor, frames: Tensor
+) -> PhotoTexture:
+    """A texture whose skin is like the skin around it where much was to be done against shadows, on upper lids and
+    where spectacles have frames.
+
+    In even light it stays as it is, with its moles, but for what is far darker or redder than the skin around it.
 
     Args:
         others: parts that are no skin, (V,) bool.
+        frames: see ``_spectacles``.
     """
     places, faces = views[0].places, mesh.faces.cpu()
     bare = torch.stack([view.parts.bare * (view.shown.cosine > 0) for view in views]).amax(0)
@@ -216,12 +238,16 @@ def _without_sharp_shadows(
     tone = graph.smoothed(colors, bare * ~places.features, _TONE)
     added = torch.stack([view.patch for view in views]).abs().mean(-1).amax(0) / tone.mean(1).clamp(min=_DARK)
     shaded = ((graph.smoothed(added[:, None], bare, _TONE)[:, 0] - _EVEN[0]) / (_EVEN[1] - _EVEN[0])).clamp(0, 1)
-    weight = torch.maximum(bare * places.rim * shaded, places.lids * ~others)
-    at = texture.texels.interpolate(torch.cat([tone, weight.double()[:, None]], dim=1), faces)
     image = texture.image.flatten(1)[:, texture.texels.texels].T.double()
-    evened = torch.lerp(image, like_skin_around(image, at[:, :3]), at[:, 3:])
-    colors = torch.lerp(colors, like_skin_around(colors, tone), weight.double()[:, None])
-    return replace(texture, image=texture.texels.image(evened.clamp(0, 1)), colors=colors.float())
+    for weight, most in (
+        (bare * places.rim, _FOLDS),
+        (torch.maximum(bare * places.rim * shaded, places.lids * ~others), _PORES),
+        (frames * ~others, _FRAMED_SKIN),
+    ):
+        at = texture.texels.interpolate(torch.cat([tone, weight.double()[:, None]], dim=1), faces)
+        image = torch.lerp(image, like_skin_around(image, at[:, :3], *most), at[:, 3:])
+        colors = torch.lerp(colors, like_skin_around(colors, tone, *most), weight.double()[:, None])
+    return replace(texture, image=texture.texels.image(image.clamp(0, 1)), colors=colors.float())
 
 
 def _without_brows(colors: Tensor, places: FacePlaces, graph: VertexGraph) -> Tensor:

@@ -27,7 +27,6 @@ _BOTH = 0.2  # share of skin from which both sides are compared
 _PEOPLE_HUE = (0.15, 0.06, 0.15)  # of the channels, by which skins of people differ from the colour model
 _AROUND = 40  # rounds
 _SURE, _DARKEST = 0.5, 0.02
-_TEXEL_TONE, _TEXEL_HUE = 0.2, 0.06  # logarithms by which a place of skin differs from the skin around it
 
 
 # In linear light: what is brightest in a picture that is well exposed, fair skin, and the white of an eye in the lids'
@@ -167,15 +166,16 @@ def patch_offset(
     return torch.lerp(graph.smoothed(offset, seen[:, 0], _AROUND), offset, seen)
 
 
-def like_skin_around(colors: Tensor, tone: Tensor) -> Tensor:
+def like_skin_around(colors: Tensor, tone: Tensor, most: float, hue: float) -> Tensor:
     """Colours (P,3) of skin, as near to those of the skin around, (P,3), as pores and wrinkles are.
+
+    Logarithms of their brightness differ by ``most``, those of their channels beside it by ``hue``.
 
     What ``patch_offset`` leaves at the sharp edges of shadows differs far more, and in hue.
     """
     apart = _log(colors) - _log(tone)
     level = apart.mean(1, keepdim=True)
-    hue = (apart - level).clamp(-_TEXEL_HUE, _TEXEL_HUE)
-    return (_log(tone) + _TEXEL_TONE * (level / _TEXEL_TONE).tanh() + hue).exp()
+    return (_log(tone) + most * (level / most).tanh() + (apart - level).clamp(-hue, hue)).exp()
 
 
 def _limited(apart: Tensor, tone: float, hue: float) -> Tensor:

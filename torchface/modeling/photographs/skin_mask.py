@@ -19,6 +19,7 @@ _FOREHEAD = 0.15
 _BROW, _FRINGE = 0.13, (0.16, 0.30)
 """In distances between the eyes' outer corners, but for the second row: shares of the way to the face's outline."""
 
+_FRAMES = (0.05, 0.08, 0.36, 0.44)  # from the eyes' landmarks
 _LID, _LID_BROW, _RIM = (0.01, 0.03, 0.10, 0.15), (0.06, 0.10), (0.02, 0.05)
 """In the same distances: from the upper lid's edge, from a brow, and from what is no skin beside it."""
 _SHADOW = 5  # pixels of the network's crop across which hair darkens skin
@@ -37,6 +38,7 @@ class FacePlaces:
     chin: Tensor  # the chin's place, (3,)
     brow: Tensor  # near a brow's landmarks, (V,) bool
     lids: Tensor  # how much each is of an upper lid, which open eyes fold away, (V,) in [0,1]
+    frames: Tensor  # how much each lies where spectacles have frames, and not on eyes or brows, (V,) in [0,1]
     rim: Tensor  # how far each is off eyes, nostrils and lips, (V,) in [0,1]
     brows: float  # how high the brows are
     ears: float  # how far forward the ears' landmarks lie
@@ -67,10 +69,12 @@ class FacePlaces:
         features = torch.cdist(place, torch.cat([at[JAW:27], at[31:LANDMARKS]])).amin(1) < _NEAR_FEATURES
         from_brow = torch.cdist(place, at[JAW:27]).amin(1)
         ears, brows = float(at[[0, 16], 2].mean()), float(at[17:27, 1].mean())
+        from_eyes = torch.cdist(place, at[36:48]).amin(1)
+        frames = _ramp(from_eyes, *_FRAMES[:2]) * (1 - _ramp(from_eyes, *_FRAMES[2:])) * _ramp(from_brow, *_LID_BROW)
         beside = torch.cdist(place, at[[31, 32, 33, 34, 35, *range(36, LANDMARKS)]]).amin(1)
         return FacePlaces(
             length / reach, length - reach, place, features, ears - place[:, 2], at[8], from_brow < _BROW,
-            _upper_lids(place, at) * _ramp(from_brow, *_LID_BROW), _ramp(beside, *_RIM), brows, ears,
+            _upper_lids(place, at) * _ramp(from_brow, *_LID_BROW), frames, _ramp(beside, *_RIM), brows, ears,
         )  # fmt: skip
 
 
