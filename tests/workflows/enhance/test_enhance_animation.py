@@ -349,8 +349,18 @@ def test_what_does_not_fit_the_model_is_named(actor: Actor, tmp_path: Path) -> N
     with pytest.raises(AlignmentError, match="stand in another order"):
         coarse(actor, written(tmp_path / "order.safetensors", actor.frames[:, order], faces), tmp_path)
     wider = actor.frames * torch.tensor([1.15, 1.0, 0.9])
-    notes = coarse(actor, written(tmp_path / "wider.safetensors", wider, faces), tmp_path).notes
+    other = written(tmp_path / "wider.safetensors", wider, faces)
+    notes = coarse(actor, other, tmp_path).notes
     assert any(line.startswith("warning: ") and "another person" in line for line in notes)
+    with pytest.raises(AlignmentError, match=r"another person, whose head would become dents; .*\(--rig\)"):
+        enhance_animation(other, actor.model, tmp_path / "other", PLAIN)
+    assert not (tmp_path / "other").exists()
+    stretch = torch.tensor([1.15, 1.0, 0.9])
+    own = BlendshapeRig(actor.mesh.with_vertices(actor.mesh.vertices * stretch), actor.rig.deltas, actor.rig.names)
+    save_rig(own, tmp_path / "own.glb")
+    given = replace(PLAIN, given=InputSettings(rig=tmp_path / "own.glb"))
+    done = enhance_animation(other, actor.model, tmp_path / "other", given)
+    assert float((done.frames.sequence.read(0, FRAMES) - wider).norm(dim=-1).mean()) < 0.5
     with pytest.raises(NameMismatchError, match=r"\(--rig\)"):
         coarse(actor, actor.folder / "weights.csv", tmp_path)
     with pytest.raises(ValueRangeError, match="found --attachment and no markers"):

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from torchface import zoo
 from torchface.enhancement import EnhancementModel
-from torchface.errors import NameMismatchError, TopologyError, ValueRangeError
+from torchface.errors import AlignmentError, NameMismatchError, TopologyError, ValueRangeError
 from torchface.files.content_keys import content_key
 from torchface.files.documents import write_json
 from torchface.files.job_lock import within_job
@@ -23,7 +23,7 @@ from torchface.optim.eigenpairs import largest_eigenpairs
 from torchface.progress import Progress, silent
 from torchface.rig import BlendshapeRig
 from torchface.take import Take, Track
-from torchface.workflows.enhance.coarse_animation import CoarseAnimation
+from torchface.workflows.enhance.coarse_animation import OWN_HEAD_MM, SAME_TOPOLOGY, CoarseAnimation
 from torchface.workflows.enhance.coarse_input import InputSettings, read_coarse
 from torchface.workflows.enhance.enhance_views import drawn_frames, framed_model
 from torchface.workflows.enhance.enhanced_frames import (
@@ -115,6 +115,7 @@ _METHOD = "enhance/2"
 _FORMAT = "torchface.enhance-summary/1"
 _MANY_OUTSIDE = 0.25
 _BADLY_SHOWN_MM = 0.1
+_ANOTHER, _ASKED = 0.75, 4  # of the regions of so many frames outside
 
 
 @dataclass(frozen=True)
@@ -202,6 +203,7 @@ def _enhance(
     neutral = Mesh(model.neutral, model.faces)
     painted = None if settings.textures is None else _texels(settings.textures, model, model_name, settings)
     animation = read_coarse(path, neutral, settings.given, state, progress)
+    _check_actor(animation, model)
     if animation.head is not None or settings.detail != 1:
         model = model.on_actor(model.neutral if animation.head is None else animation.head, settings.detail)
     given = settings.given
@@ -235,6 +237,24 @@ def _enhance(
     with all_or_none():
         _write_tables(done, out)
     return done
+
+
+def _check_actor(animation: CoarseAnimation, model: EnhancementModel) -> None:
+    """Raises ``AlignmentError`` where frames without a face at rest are another head: its shape would become dents."""
+    residual = animation.residual
+    if animation.kind != SAME_TOPOLOGY or animation.head is not None or residual is None or residual <= OWN_HEAD_MM:
+        return
+    rows = torch.linspace(0, animation.count - 1, min(_ASKED, animation.count)).long().unique().tolist()
+    with torch.no_grad():
+        outside = torch.cat([model.enhance(animation.read(row, row + 1)).outside for row in rows])
+    share = float(outside.float().mean())
+    if share > _ANOTHER:
+        raise AlignmentError(
+            f"{animation.path}: found {share:.0%} of the regions of {len(rows)} frames unlike any that the model has "
+            f"seen, and the frame nearest to its neutral {residual:.1f} mm from it (root mean square): it seems to be "
+            f"another person, whose head would become dents; expected the model's actor, at most {_ANOTHER:.0%}, or "
+            "the person's own rig beside (--rig)"
+        )
 
 
 def _texels(path: Path, model: EnhancementModel, name: str, settings: EnhanceSettings) -> TexelMap:
