@@ -39,6 +39,7 @@ _UNREADABLE = (
 )
 _NUMBER = re.compile(r"[ _.-]*\d+$")
 _RISE, _HOLD, _FALL = (0.2, 0.5), (0.1, 0.4), (0.3, 0.7)  # seconds of a performer's expressions
+_SAME_RATE = 2e-3  # relative
 _TWO_SIDED = 3  # takes of each gesture: both sides, left more, right more
 
 
@@ -51,6 +52,7 @@ class CapturedSequence:
         read: vertices (t,V,3) of the frames from one number up to another, without it, millimetres.
         faces: (F,3) int64, of its own file.
         colors: of the vertices, (t,V,3) in [0,1], read as ``read`` does, where there are some.
+        fps: frames a second, where its file says.
     """
 
     name: str
@@ -58,6 +60,7 @@ class CapturedSequence:
     read: Callable[[int, int], Tensor]
     faces: Tensor
     colors: Callable[[int, int], Tensor] | None = None
+    fps: float | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,6 +82,22 @@ class Capture:
     def part(self, begin: int, end: int) -> "Capture":
         """Some of the sequences."""
         return Capture(self.sequences[begin:end], self.neutral, self.neutral_file, f"{self.key} {begin} {end}")
+
+    @property
+    def fps(self) -> float | None:
+        """Frames a second, where a file says."""
+        return next((sequence.fps for sequence in self.sequences if sequence.fps is not None), None)
+
+    def check_rate(self, fps: float | None) -> None:
+        """Raises where a file says another rate than the expected one, or than the first that says one."""
+        expected = self.fps if fps is None else fps
+        for sequence in self.sequences:
+            if sequence.fps is not None and expected is not None and abs(sequence.fps / expected - 1) > _SAME_RATE:
+                whose = "of the other sequences" if fps is None else "of the frames (--fps)"
+                raise ValueRangeError(
+                    f"{sequence.name}: found {sequence.fps:g} frames a second, expected the {expected:g} {whose}: "
+                    "timing is learned of one rate"
+                )
 
     @property
     def colored(self) -> bool:
@@ -220,8 +239,8 @@ def _animated(path: Path) -> CapturedSequence:
     if path.suffix.lower() == ".npz":
         vertices, faces = _npz(path)
         return CapturedSequence(path.name, len(vertices), lambda begin, end: vertices[begin:end], faces)
-    animated = load_animated(path)
-    return CapturedSequence(path.name, animated.count, animated.read, animated.neutral.faces, animated.colors)
+    found = load_animated(path)
+    return CapturedSequence(path.name, found.count, found.read, found.neutral.faces, found.colors, found.fps)
 
 
 def _of_meshes(name: str, files: list[Path]) -> CapturedSequence:

@@ -17,6 +17,7 @@ from torchface import TorchfaceError, zoo
 from torchface.enhancement import CapturedPerformance, EnhancementModel, EnhancementSettings
 from torchface.enhancement.detail.low_pass import WAVELENGTH
 from torchface.errors import ValueRangeError
+from torchface.workflows.enhance.coarse_animation import DEFAULT_FPS
 
 from .captured_sequences import Capture, gather, performed, read_capture, read_pairs
 from .enhancement_figures import draw
@@ -36,11 +37,10 @@ class Settings(RecipeSettings):
         coarse: Folder of what a coarse animation shows of the same frames, in the model's topology and the same places:
             sequences of the same names and lengths (`torchface enhance ... --detail 0` writes such meshes). Then what
             that kind of input lacks or gets wrong is learned, for such inputs; the more it errs the more that gains.
-            If all are .glb animations of one rig, its weights are learned from too, and used where an input has them.
         neutral: The neutral as a mesh; with landmarks (see `torchface annotate`) regions are named and eyes set apart.
             neutral.* in the folder if absent.
         performer: Learn from the embedded performer with so many vertices instead.
-        fps: Of the frames.
+        fps: Of the frames; as their files say if absent, 30 where none does.
         held_out: How many sequences, the last, are kept for the test; if not said two, but at most half.
         wavelength: Of what counts as fine, millimetres: half of a wave of this length is detail.
         patch: Vertices a patch, in the mean of which frames are compared.
@@ -55,7 +55,7 @@ class Settings(RecipeSettings):
     neutral: Path | None = None
     performer: int = 0
     out: Path = Path("models/enhancement")
-    fps: float = 30.0
+    fps: float | None = None
     held_out: int | None = None
     wavelength: float = WAVELENGTH
     patch: int = 100
@@ -70,6 +70,7 @@ def train(settings: Settings, run: Run) -> EnhancementModel:
     """Gathers, learns, tests, saves and draws."""
     progress = run.progress
     capture = _capture(settings)
+    fps = settings.fps or capture.fps or DEFAULT_FPS
     count = len(capture.sequences)
     held_out = min(2, count // 2) if settings.held_out is None else settings.held_out
     learned = count - held_out
@@ -100,7 +101,7 @@ def train(settings: Settings, run: Run) -> EnhancementModel:
             colors=colors,
             landmarks=None if mesh.annotations is None else mesh.annotations.landmarks,
         ),
-        EnhancementSettings(settings.fps, settings.wavelength, settings.detail, settings.matching),
+        EnhancementSettings(fps, settings.wavelength, settings.detail, settings.matching),
         patch_size=settings.patch,
         region_count=settings.regions,
         rank=settings.rank,
@@ -131,10 +132,12 @@ def _capture(settings: Settings) -> Capture:
         raise TorchfaceError("found neither frames nor a performer, or both; expected one: --frames or --performer")
     if settings.frames is None:
         try:
-            return performed(settings.performer, settings.seed, settings.fps)
+            return performed(settings.performer, settings.seed, settings.fps or DEFAULT_FPS)
         except ValueRangeError as error:
             raise ValueRangeError(f"--performer: {error}") from None
-    return read_capture(settings.frames, settings.neutral)
+    capture = read_capture(settings.frames, settings.neutral)
+    capture.check_rate(settings.fps)
+    return capture
 
 
 def _pairs(settings: Settings, capture: Capture) -> Capture | None:
@@ -143,7 +146,9 @@ def _pairs(settings: Settings, capture: Capture) -> Capture | None:
         return None
     if settings.frames is None:
         raise TorchfaceError("found --coarse with --performer, expected it beside --frames, of the same sequences")
-    return read_pairs(settings.coarse, capture)
+    pairs = read_pairs(settings.coarse, capture)
+    pairs.check_rate(settings.fps or capture.fps)
+    return pairs
 
 
 def save(model: EnhancementModel, settings: Settings, metrics: dict[str, float], frames: int, sequences: int) -> None:

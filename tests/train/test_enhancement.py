@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from torchface import Mesh, save_mesh, zoo
+from torchface import BlendshapeRig, Mesh, Take, Track, save_animation, save_mesh, zoo
 from torchface.enhancement import EnhancementModel
 from torchface.errors import FileFormatError, TopologyError, TorchfaceError, ValueRangeError
 from torchface.io import MeshSequenceWriter
@@ -130,6 +130,22 @@ def test_what_a_coarse_animation_lacks_of_the_same_frames_is_learned(folder, mon
     assert zoo.describe(folder.parent / "model").metrics["learned: missing detail, of the coarse frames'"] < 0.1
     left = (model(shown[1]) - frames(1)).square().mean().sqrt()
     assert float(left) < 0.1 * float((shown[1] - frames(1)).square().mean().sqrt())
+
+
+def test_the_rate_is_that_of_the_files_and_of_all_of_them(folder, monkeypatch):
+    monkeypatch.setattr(recipe, "draw", lambda *a: None)
+    coarse, mesh = folder.parent / "coarse", sheet()
+    coarse.mkdir()
+    bump = BlendshapeRig(mesh, (frames(0)[4:5] - mesh.vertices), ("one",))
+    weights = Track(bump.names, torch.linspace(0, torch.pi, 9).sin().clamp(min=0)[:, None, None])
+    for name in "abcd":
+        save_animation(bump, Take(25.0, weights=weights), coarse / f"{name}.glb")
+    assert train(settings(coarse, neutral=folder / "neutral.obj")).fps == 25
+    with pytest.raises(ValueRangeError, match=r"a.glb: found 25 frames a second, expected the 30 of .*\(--fps"):
+        train(settings(folder, coarse=coarse, fps=30.0))
+    save_animation(bump, Take(60.0, weights=weights), coarse / "c.glb")
+    with pytest.raises(ValueRangeError, match=r"c.glb: found 60 frames .* the 25 of the other sequences"):
+        train(settings(folder, coarse=coarse))
 
 
 @pytest.mark.parametrize(("kept", "learned"), [("ab", [1, 1]), ("abc", [2, 1]), ("abcd", [2, 2]), ("a", [1])])

@@ -20,6 +20,7 @@ OWN_HEAD_MM = 1.0
 """From how far on an input's face at rest is its own head: without it, at 1.3 mm, the model added 0.22 mm to another
 person's smooth frames (root mean square), with it 0.13 as to the actor's."""
 _SAMPLED = 24
+_SAME_RATE = 2e-3  # relative; 29.97 and 30 are the same
 _UNITS = ((1000.0, "metres"), (10.0, "centimetres"), (25.4, "inches"), (0.001, "micrometres"))
 
 
@@ -97,7 +98,9 @@ def known_rate(animated: AnimatedMesh, fps: float | None) -> float:
 
 
 def rate_notes(animated: AnimatedMesh, fps: float | None) -> list[str]:
-    """Says where a rate was assumed."""
+    """Says where a rate was assumed, or is another than the file's."""
+    if fps is not None and animated.fps is not None and abs(fps / animated.fps - 1) > _SAME_RATE:
+        return [f"warning: {animated.path.name} has {animated.fps:g} frames a second; {fps:g} are taken (--fps)"]
     if fps is not None or animated.fps is not None:
         return []
     return [f"{animated.path.name} has no frame rate; {DEFAULT_FPS:g} a second are assumed (--fps)"]

@@ -155,7 +155,8 @@ class Enhanced:
         count, vertices = self.animation.count, len(self.model.neutral)
         lines = [
             f"{count} frames of {self.animation.kind} on {vertices} vertices, {self.animation.fps:g} a second; model "
-            f"{self.model_name}, {len(self.model.sequences)} frames, {len(self.model.regions.names)} regions",
+            f"{self.model_name}, {len(self.model.sequences)} frames, {self.model.fps:g} a second, "
+            f"{len(self.model.regions.names)} regions",
             f"{self.outside_share:.0%} of the frames are outside of what the model has seen in some region"
             + (" (there detail is a guess, and far away but the nearest)" if self.outside_share else ""),
         ]
