@@ -48,6 +48,8 @@ def test_what_is_not_one_with_the_hair_on_the_head_is_none() -> None:
     cap = (y < -1.6) & (x.abs() < 1.2)
     beside = (x > 0.5) & (x < 1.2) & (y > -0.8)  # someone's dark coat
     assert not hangs_down([_parts(cap | beside)], marks[None])
+    curtain = (x > 0.7) & (x < 1.4)  # as high as the picture
+    assert not hangs_down([_parts((cap & (x < 0.6)) | curtain)], marks[None])
 
 
 @pytest.mark.parametrize("yaw", [-50.0, 50.0])

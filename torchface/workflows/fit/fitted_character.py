@@ -157,12 +157,17 @@ def hangs_down(parts: Sequence[FaceParts], marks: Tensor) -> bool:
 
 
 def _grown(shown: FaceParts, points: Tensor) -> Tensor:
-    """Which pixels (S,S) of a crop belong to hair that is one with hair over the brows, landmarks (68,2)."""
+    """Which pixels (S,S) of a crop belong to hair that is one with hair over the brows' middle, landmarks (68,2).
+
+    What reaches over them beside the head alone is a curtain or a wall.
+    """
     hair = cv2.erode((shown.of("hair") > _HAIR).numpy().astype(np.uint8), np.ones((3, 3), np.uint8))
     _, label = cv2.connectedComponents(hair, connectivity=4)
     brows = points[17:27] @ shown.transform[:, :2].T + shown.transform[:, 2]
     high = int(brows[:, 1].nan_to_num(0.0).amin().clamp(0, len(label)))
-    names, counts = np.unique(label[:high], return_counts=True)
+    left, right = brows[:, 0].nan_to_num(0.0).aminmax()
+    over = label[:high, max(0, int(left)) : max(1, int(right))]
+    names, counts = np.unique(over, return_counts=True)
     on_head = [name for name, count in zip(names, counts, strict=True) if name and count > _TUFT]
     return torch.from_numpy(cv2.dilate(np.isin(label, on_head).astype(np.uint8), np.ones((3, 3), np.uint8)))
 
