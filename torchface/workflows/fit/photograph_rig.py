@@ -134,6 +134,8 @@ class FittedHead:
         if fit.hair is not None:
             what = "the template's haircut, not the person's" if "hair" in regions else "painted on the head as a cap"
             lines.append(f"hair: {_code(fit.hair)}, its {seen}; {what}")
+        elif fit.mesh.texture is not None:
+            lines.append("hair: none seen over the brows; the network that looks for it misses grey hair at times")
         if fit.iris is not None:
             lines.append(f"irises: {_code(fit.iris)}, their {seen}")
         elif fit.mesh.texture is not None:
