@@ -12,6 +12,7 @@ from torch import Tensor
 
 from torchface.capture.priors import DynamicsPrior, windows_of
 from torchface.files.whole_files import make_folder, write_file
+from torchface.viz.figures.curves import plain_log_ticks
 
 from .prior_trials import OneStep
 
@@ -78,6 +79,7 @@ def choice_picture(tables: Mapping[str, Mapping[str, Sequence[tuple[float, float
             axes.plot([x for x, _ in points], [y for _, y in points], "o-", label=label)
         if min(x for points in curves.values() for x, _ in points) > 0 and "window" not in xlabel:
             axes.set_xscale("log")
+            plain_log_ticks(axes.xaxis)
         axes.set(xlabel=xlabel, ylabel=ylabel)
         axes.grid(alpha=0.3)
         axes.legend()

@@ -1,6 +1,7 @@
 """Curves over a take: marker error, sums of weights, single weights (the thesis's figures 58 and 60), and bars."""
 
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -11,6 +12,22 @@ __all__ = ["error_curve", "named_bars", "weight_curves"]
 
 SOLVED, TRUE, SINGLE = "#1f5fa8", "#d9822b", "#8e9aa8"
 _APART, _ROW = 1.15, 1.08  # from one curve of weights to the next, and hundreds of pixels of that
+
+
+def _legend_above(figure: Any, axes: Any) -> None:
+    """A key of what axes show, once each, above all of a figure: within, it lies on curves."""
+    handles, names = axes.get_legend_handles_labels()
+    shown = dict(zip(names, handles, strict=True))
+    figure.legend(shown.values(), shown, loc="outside upper right", frameon=False, ncols=3, fontsize=9)
+
+
+def plain_log_ticks(axis: Any) -> None:
+    """Numbers as people write them on a logarithmic axis: 0.5, 1, 2 and not 5 x 10^-1."""
+    from matplotlib.ticker import LogLocator
+
+    axis.set_minor_locator(LogLocator(subs=(2.0, 5.0)))
+    axis.set_major_formatter("{x:g}")
+    axis.set_minor_formatter("{x:g}")
 
 
 def error_curve(error: Tensor, fps: float, label: str = "marker RMSE (mm)") -> Tensor:
@@ -27,7 +44,7 @@ def error_curve(error: Tensor, fps: float, label: str = "marker RMSE (mm)") -> T
     axes.axhline(median, color="grey", linewidth=0.8, linestyle="--", label=f"median {median:.3f}")
     axes.plot(seconds, error.detach().cpu(), color=SOLVED, linewidth=0.9)
     axes.set(xlabel="seconds", ylabel=label, xlim=(0.0, float(seconds[-1]) or 1.0), ylim=(0.0, 1.05 * most))
-    axes.legend(loc="lower right", frameon=False, fontsize=9)
+    _legend_above(figure, axes)
     return from_figure(figure)
 
 
@@ -75,9 +92,7 @@ def weight_curves(solved: Tensor, true: Tensor | None, names: Sequence[str], fps
         ticks.append((base + 0.5, f"{label}\n0 to {most:.3g}"))
     axes.set_yticks(*zip(*ticks, strict=True), fontsize=9)
     axes.set(xlabel="seconds", xlim=(0.0, float(seconds[-1]) or 1.0), ylim=(0.95 - _APART * len(curves), 1.1))
-    handles, names_shown = axes.get_legend_handles_labels()
-    shown = dict(zip(names_shown, handles, strict=True))
-    axes.legend(shown.values(), shown, loc="upper right", frameon=False, ncols=2, fontsize=9)
+    _legend_above(figure, axes)
     return from_figure(figure)
 
 
@@ -106,7 +121,7 @@ def compared_curves(
         axes.axis("off")
     for axes in grid[-2:]:
         axes.set_xlabel("seconds")
-    figure.legend(*grid[0].get_legend_handles_labels(), loc="outside upper right", frameon=False, ncols=3, fontsize=9)
+    _legend_above(figure, grid[0])
     return from_figure(figure)
 
 
@@ -145,5 +160,5 @@ def motion_curves(
             axes.set(ylabel=f"{unit} {name}", xlim=(0.0, float(seconds[-1]) or 1.0), ylim=(-reach, reach))
         grid[2, column].set_xlabel("seconds")
     if true is not None:
-        grid[0, 0].legend(loc="upper right", frameon=False, ncols=2, fontsize=9)
+        _legend_above(figure, grid[0, 0])
     return from_figure(figure)

@@ -15,7 +15,7 @@ from torchface.rendering.clay_shading import DEFAULT_LIGHTING, render
 from torchface.rendering.compositing import from_figure, heat_colors, new_figure, sheet
 from torchface.rendering.part_colors import clear_triangles
 from torchface.rendering.raycast import RayCaster
-from torchface.viz.figures.curves import SOLVED, TRUE
+from torchface.viz.figures.curves import SOLVED, TRUE, plain_log_ticks
 from torchface.viz.figures.face_views import FRONT, THREE_QUARTER, clay_colors, color_bar, frame_face
 from torchface.viz.figures.region_colors import as_seen
 
@@ -27,6 +27,8 @@ SIDE = 55.0
 _WIDTH, _HEIGHT = 520, 650
 _NOT_KNOWN = (0.55, 0.55, 0.55)
 _LIFT = 0.5
+_LETTER, _DOT = (6.5, 13.0), 4.0  # pixels: a letter of a label; a marker's half
+_REACHES, _TURNS = (6.0, 14.0, 26.0, 40.0), 12  # pixels from a marker at which its label is tried
 
 
 def marker_map(mesh: Mesh, points: Tensor, errors: Tensor, maximum: float, labels: Sequence[str]) -> Tensor:
@@ -85,21 +87,41 @@ def _view(mesh: Mesh, points: Tensor, colors: np.ndarray, labels: Sequence[str],
     at = camera.project(points.double())
     x, y = at[front].T
     axes.scatter(x, y, s=34, c=colors[front.numpy()], edgecolors="black", linewidths=0.6)
+    taken = [at[front].float()]
     for i in front.nonzero()[:, 0].tolist():
         if labels[i]:
-            left = float(at[i, 0]) < _WIDTH / 2
+            place, covered = _free_place(at[i].float(), labels[i], torch.cat(taken))
+            taken.append(covered)
             axes.annotate(
                 labels[i],
-                (float(at[i, 0]), float(at[i, 1])),
-                xytext=(-6 if left else 6, 6),
-                textcoords="offset points",
-                ha="right" if left else "left",
+                at[i].tolist(),
+                xytext=place.tolist(),
+                ha="center",
+                va="center",
                 fontsize=7.5,
                 bbox={"boxstyle": "round,pad=0.15", "fc": "white", "ec": "none", "alpha": 0.75},
+                arrowprops={"arrowstyle": "-", "color": "black", "linewidth": 0.5},
             )
     axes.set(xlim=(0, _WIDTH), ylim=(_HEIGHT, 0))
     axes.axis("off")
     return from_figure(figure)
+
+
+def _free_place(at: Tensor, label: str, taken: Tensor) -> tuple[Tensor, Tensor]:
+    """Where round a point (2,) a label's middle covers the fewest of other points (P,2), and what it then covers."""
+    half = torch.tensor([0.5 * _LETTER[0] * len(label), 0.5 * _LETTER[1]])
+    best: tuple[int, Tensor] | None = None
+    for reach in _REACHES:
+        for turn in range(_TURNS):
+            angle = 2 * math.pi * turn / _TURNS
+            place = at + torch.tensor([math.cos(angle), math.sin(angle)]) * (half + reach)
+            place = place.clamp(min=half, max=torch.tensor([_WIDTH, _HEIGHT]) - half)
+            count = int(((taken - place).abs() < half + _DOT).all(1).sum())
+            if best is None or count < best[0]:
+                best = count, place
+    assert best is not None
+    across = torch.linspace(-1, 1, max(2, len(label) // 2))[:, None] * torch.tensor([1.0, 0.0])
+    return best[1], best[1] + across * half
 
 
 def marker_views(markers: Tensor, on_mesh: Tensor, title: str = "") -> Tensor:
@@ -168,5 +190,7 @@ def errors_by_iteration(errors: Tensor) -> Tensor:
     axes.plot(iterations, errors.amax(1), color=TRUE, linewidth=1.2, label=f"worst, {float(errors[-1].max()):.2f} mm")
     axes.plot(iterations, errors.mean(1), color=SOLVED, linewidth=1.6, label=f"mean, {float(errors[-1].mean()):.2f} mm")
     axes.set(xlabel="iteration", ylabel="marker error (mm)", yscale="log", xlim=(1, len(errors)))
-    axes.legend(loc="upper right", frameon=False)
+    axes.xaxis.get_major_locator().set_params(integer=True)
+    plain_log_ticks(axes.yaxis)
+    figure.legend(loc="outside upper right", frameon=False, ncols=2, fontsize=9)
     return from_figure(figure)
