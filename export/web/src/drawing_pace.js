@@ -2,7 +2,7 @@
 // processor that solves.
 
 const QUICK = 12; // milliseconds; a graphics card draws in less
-const SHARE = 0.3; // of the time that slower drawing may take
+const SHARE = 0.5; // of the time that slower drawing may take
 const LONGEST_REST = 400; // milliseconds; the first drawing takes seconds
 const SLOW_ONES = 5; // drawings in a row until they are made coarser
 const COARSER = 0.7; // about half the pixels

@@ -211,14 +211,14 @@ def test_times_rise_and_the_rate_is_their_mean(run: Run) -> None:
     assert told["rate"] == pytest.approx(29.7, rel=1e-5)
 
 
-def test_slow_drawing_takes_a_third_of_the_time_at_most_and_becomes_coarser_where_that_helps(run: Run) -> None:
+def test_slow_drawing_takes_half_of_the_time_at_most_and_becomes_coarser_where_that_helps(run: Run) -> None:
     quick = [(3.0, 0.0)] * 50
     took, rests, ratios = np.array(run("pace", [*quick, (5000.0, 0.0), *quick, *[(5.0, 20.0)] * 40])).T
     assert not rests[took < 4].any()
     assert rests[50] < 1000  # the first drawing takes seconds, and the character is awaited
     assert (ratios[:101] == 2).all()  # one slow drawing is none
     slow = took[101:] > 12
-    assert (took[101:] / (took + rests)[101:])[slow].max() < 1 / 3
+    assert (took[101:] / (took + rests)[101:])[slow].max() < 0.51
     assert 0.5 <= ratios[-1] < 0.7
     assert not slow[-1]
     of_corners = np.array(run("pace", [(60.0, 1.0)] * 40))
