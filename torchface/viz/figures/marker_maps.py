@@ -94,8 +94,8 @@ def _view(mesh: Mesh, points: Tensor, colors: np.ndarray, labels: Sequence[str],
             taken.append(covered)
             axes.annotate(
                 labels[i],
-                at[i].tolist(),
-                xytext=place.tolist(),
+                tuple(at[i].tolist()),
+                xytext=tuple(place.tolist()),
                 ha="center",
                 va="center",
                 fontsize=7.5,
@@ -190,7 +190,7 @@ def errors_by_iteration(errors: Tensor) -> Tensor:
     axes.plot(iterations, errors.amax(1), color=TRUE, linewidth=1.2, label=f"worst, {float(errors[-1].max()):.2f} mm")
     axes.plot(iterations, errors.mean(1), color=SOLVED, linewidth=1.6, label=f"mean, {float(errors[-1].mean()):.2f} mm")
     axes.set(xlabel="iteration", ylabel="marker error (mm)", yscale="log", xlim=(1, len(errors)))
-    axes.xaxis.get_major_locator().set_params(integer=True)
+    axes.locator_params("x", integer=True)
     plain_log_ticks(axes.yaxis)
     figure.legend(loc="outside upper right", frameon=False, ncols=2, fontsize=9)
     return from_figure(figure)
