@@ -2,7 +2,6 @@
 
 import time
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import torch
 from torch import Tensor
@@ -10,7 +9,7 @@ from torch import Tensor
 from torchface.geometry.cameras.pnp import Pose, solve_pnp
 from torchface.geometry.rotations import rotation_matrix
 from torchface.geometry.similarity import similarity_transform
-from torchface.modeling import FitSettings, HeadModel, ImageFit, MorphableModel, fit_images, transfer_deformation
+from torchface.modeling import FitSettings, HeadModel, ImageFit, MorphableModel, fit_images
 from torchface.modeling.photographs.fit_problem import Problem, State, whitening
 from torchface.modeling.photographs.image_fit import contour_curves
 from torchface.modeling.photographs.landmark_view import (
@@ -35,9 +34,6 @@ HEADS = range(50)
 
 
 PORTRAITS = (-40.0, 0.0, 40.0)
-
-
-PICTURES = Path("out/image_fit")
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,14 +93,11 @@ def alternate(problem: Problem, state: State, iterations: int = 40) -> State:
     return state
 
 
-def planted(
-    faces: Faces, seed: int, slides: bool, yaws: tuple[float, ...] = PORTRAITS, own: bool = False, jitter: float = 0.0
-) -> Planted:
+def planted(faces: Faces, seed: int, slides: bool, yaws: tuple[float, ...] = PORTRAITS, jitter: float = 0.0) -> Planted:
     """A random head with a random expression.
 
     Args:
         slides: contour landmarks lie where the silhouette is seen; else they are vertices, hidden or not.
-        own: the expression is of the person's own shapes, transferred to the head.
         jitter: of contour landmarks along the contour, pixels.
     """
     generator = torch.Generator().manual_seed(seed)
@@ -112,7 +105,7 @@ def planted(
     rest = rig.vertices + torch.tensordot(torch.randn(20, generator=generator), faces.modes, dims=1)
     take = faces.takes[seed % len(faces.takes)]
     weights = take[int(torch.randint(len(take), (1,), generator=generator))]
-    deltas = transfer_deformation(rig, rig.neutral.with_vertices(rest)).deltas if own else rig.deltas
+    deltas = rig.deltas
     face = rest + torch.tensordot(weights, deltas, dims=1)
     focal = FOCAL * (0.8 + 0.4 * float(torch.rand(1, generator=generator)))
     centre = face[rig.neutral.landmarks].mean(0).double()

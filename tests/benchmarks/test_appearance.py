@@ -15,7 +15,7 @@ finds in the others.
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -213,30 +213,3 @@ def test_fifteen_frames_of_a_real_clip(data: Path, one_thread: None) -> None:
     )
     assert after.mean() < 0.0045
     assert after.max() < 0.015
-
-
-def test_what_each_choice_is_worth(scenes: list[Scene]) -> None:
-    """Features, parts of the texture, freedom of the shape; under noise of 0.04 and light from one side."""
-    generator = torch.Generator().manual_seed(0)
-    lit = []
-    for scene in scenes:
-        frames, shape = scene.frames.float() / 255, (len(scene.frames), 1, 1)
-        across, down = (torch.linspace(-1, 1, count) for count in (frames.shape[2], frames.shape[1]))
-        ramp = 0.35 * (2 * torch.rand(2, *shape, generator=generator) - 1)
-        light = 1 + ramp[0] * across + ramp[1] * down[:, None]
-        noisy = frames * light + 0.03 * torch.randn(frames.shape, generator=generator)
-        noisy[:LEARNED] = frames[:LEARNED]
-        lit.append(replace(scene, frames=(255 * noisy.clamp(0, 1)).round().to(torch.uint8)))
-    default = AppearanceSettings()
-    choices = {
-        "as it comes": default,
-        "grey values": replace(default, features="grey"),
-        "gradient directions": replace(default, features="gradient_direction"),
-        "one texture, not two": replace(default, parts=False),
-        "shapes as they were seen only": replace(default, reach=1e6, flexibility=0.0),
-        "mirror images learned too": replace(default, mirror=True),
-        "one resolution": replace(default, resolutions=(32.0,)),
-    }
-    means = table(lit, {name: lambda scene, chosen=chosen: fitted(scene, chosen) for name, chosen in choices.items()})
-    assert means["as it comes"] <= BOUND * means["landmark trees"]
-    assert means["as it comes"] <= min(means["grey values"], means["gradient directions"])

@@ -157,28 +157,3 @@ def test_photographs(data: Path) -> None:
         print(f"  {picture}, learned from the others: {100 * errors[-1].mean():.1f} %")
     print(f"learned from photographs: mean difference {100 * torch.cat(errors).mean():.1f} %")
     assert torch.cat(errors).mean() < 0.1
-
-
-def test_time_of_a_full_model(tmp_path: Path) -> None:
-    """What the leaves say does not change how long they take: random ones will do."""
-    generator = torch.Generator().manual_seed(0)
-    for components in (40, 136):
-        model = LandmarkTrees(components=components)
-        model.mean.copy_(0.2 + 0.6 * torch.rand(68, 2, generator=generator))
-        model.anchors.random_(0, 68, generator=generator)
-        model.first.random_(0, 400, generator=generator)
-        model.second.random_(0, 400, generator=generator)
-        model.thresholds.normal_(0, 0.5, generator=generator)
-        model.leaves.random_(-127, 128, generator=generator)
-        model.scales.fill_(1e-5)
-        model.bases.normal_(0, 0.3, generator=generator)
-        report = export_model(model, tmp_path / f"{components}.onnx")
-        options = onnxruntime.SessionOptions()
-        options.intra_op_num_threads = options.inter_op_num_threads = 1
-        session = onnxruntime.InferenceSession(report.path, options)
-        image = torch.randint(256, (480, 640), dtype=torch.uint8, generator=generator).numpy()
-        inputs = {"image": image, "boxes": np.array([[200, 120, 180, 180]], np.float32)}
-        spent = cpu_milliseconds(lambda _, session=session, inputs=inputs: session.run(None, inputs), 500)
-        print(f"\n10 cascades of 500 trees, depth 5, leaves on {components} components: {spent:.2f} ms a face "
-              f"(median), {report.size / 1e6:.1f} MB")  # fmt: skip
-        assert spent <= 1.5

@@ -11,17 +11,14 @@ from pathlib import Path
 
 import pytest
 import torch
-from torch import Tensor
 from video_solver_cases import (
     FITS,
     FRAMES,
     HEADS,
-    PICTURES,
     TEST,
     Faces,
     K,
     RandomWalk,
-    Shot,
     Solve,
     by,
     chosen,
@@ -34,29 +31,20 @@ from video_solver_cases import (
     with_correctives,
 )
 
-from torchface.capture.own_rig import VideoSettings, VideoSolver
+from torchface.capture.own_rig import VideoSolver
 from torchface.capture.own_rig.state_estimate import Expectation, StateEstimate
 from torchface.capture.priors import (
     DynamicsPrior,
     DynamicsSettings,
     ShapePrior,
 )
-from torchface.capture.retargeting import retarget_take, shape_map
-from torchface.geometry.cameras.pinhole import look_at
-from torchface.geometry.cameras.pnp import solve_pnp
 from torchface.io import load_take
 from torchface.io.rigs.ict_facekit import load_ict_facekit, load_identity_modes
 from torchface.modeling import transfer_deformation
 from torchface.optim.prepared_program import PreparedProgram
-from torchface.rendering.clay_shading import render
-from torchface.rendering.compositing import caption, heat_colors, save_rendered_image, sheet
 from torchface.shape_names import mapping
-from torchface.synthetic import performer
-from torchface.take import Take, Track
 
 pytestmark = pytest.mark.real
-
-STABLE = [0, 1, 2, 14, 15, 16, 27, 28, 29, 30, 31, 33, 35, 36, 39, 42, 45]
 
 
 @pytest.fixture(scope="module")
@@ -154,26 +142,6 @@ def test_heads_outside_the_model(faces: Faces, learned: Learned) -> None:
     assert rows["default + dynamics"].vertices < rows["one Gaussian"].vertices
 
 
-def test_pose_from_stable_landmarks(faces: Faces, learned: Learned) -> None:
-    """What it costs to believe a pose that stable landmarks alone give."""
-    filmed = shots(faces, TEST, 2, 60, first=40)
-    print("\npose by PnP of stable landmarks, κ times as sure as the frame's landmarks; the default prior, no dynamics")
-    errors = {}
-    for trust in (0.0, 0.1, 1.0, 10.0):
-
-        def solve(shot: Shot, trust: float = trust) -> Tensor:
-            settings = VideoSettings(pose_trust=trust)
-            solver = VideoSolver(shot.rig, None, K, learned.priors["default"], settings=settings)
-            points = shot.rig.vertices[shot.rig.neutral.landmarks][STABLE].double()
-            pose = solve_pnp(points, shot.landmarks[:, STABLE], K)
-            return solver(shot.landmarks, pose.rotation, pose.translation).weights
-
-        row = measured(filmed, solve)
-        errors[trust] = row.vertices
-        print(row.line(f"κ = {trust}"))
-    assert errors[0.0] < errors[1.0]
-
-
 def test_speed(faces: Faces, monkeypatch: pytest.MonkeyPatch) -> None:
     """What each part of a frame costs, frame by frame, one thread, float64, both priors: 200 frames a second."""
     (shot,) = shots(faces, TEST, 1, 240, first=60)
@@ -234,47 +202,3 @@ def test_speed(faces: Faces, monkeypatch: pytest.MonkeyPatch) -> None:
         share = seconds / len(shot.landmarks)
         print(f"  {part:34s}{1e3 * share:8.2f} ms{share / clocked:7.0%}")
     assert plain < 1 / 200
-
-
-def test_pictures(faces: Faces, learned: Learned) -> None:
-    """Figures 81 to 94: heat maps and side views of strong expressions, and one result on several rigs."""
-    (shot,) = shots(faces, TEST, 1, 240, first=80)
-    ways = {name: learned.ways()[name] for name in ("no prior", "one Gaussian", "default + dynamics")}
-    found = {name: solve(shot) for name, solve in ways.items()}
-    moved = shot.weights @ shot.rig.deltas.double().norm(dim=-1).mean(1)
-    moments: list[int] = []
-    for t in moved.argsort(descending=True).tolist():
-        if t > 20 and all(abs(t - other) > 25 for other in moments):
-            moments.append(t)
-    centre = shot.rig.vertices[shot.rig.neutral.landmarks].mean(0)
-    cells = []
-    for t in moments[:3]:
-        truth = shot.true(shot.weights[t : t + 1].float())[0]
-        for name, w in found.items():
-            posed = shot.rig(w[t : t + 1].float())[0]
-            off = (posed - truth).norm(dim=-1)
-            mesh = shot.rig.neutral.with_vertices(posed)
-            camera = look_at(centre, 90, span=230.0, width=260, height=320)
-            front = look_at(centre, 0, span=230.0, width=260, height=320)
-            heat = render(mesh, front, heat_colors(off, 3.0, "RdYlGn_r"), samples=2)
-            cells.append(caption(heat, f"{name}: {float(off.mean()):.2f} mm", 13))
-            cells.append(caption(render(mesh, camera, samples=2), "side", 13))
-        mesh = shot.rig.neutral.with_vertices(truth)
-        cells.append(caption(render(mesh, front, samples=2), "truth", 13))
-        cells.append(caption(render(mesh, camera, samples=2), "side", 13))
-    save_rendered_image(sheet(cells, 8), PICTURES / "heat.png")
-    take = Take(60.0, weights=Track(shot.rig.names, found["default + dynamics"][:, :, None].float()))
-    others = [head(faces, 90), head(faces, 91), performer()]
-    cells = []
-    for t in moments[:3]:
-        row = [shot.true.neutral.with_vertices(shot.true(shot.weights[t : t + 1].float())[0])]
-        for rig in others:
-            track = retarget_take(take, shape_map(shot.rig.names, rig.names)).weights
-            assert track is not None
-            row.append(rig.neutral.with_vertices(rig(track.values[t : t + 1, :, 0])[0]))
-        for name, mesh in zip(("truth", "head A", "head B", "performer"), row, strict=True):
-            middle = mesh.vertices[mesh.landmarks].mean(0)
-            for yaw in (0, 60):
-                view = look_at(middle, yaw, span=240.0, width=240, height=300)
-                cells.append(caption(render(mesh, view, samples=2), name, 13))
-    save_rendered_image(sheet(cells, 8), PICTURES / "retargeted.png")

@@ -4,7 +4,6 @@ import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
 
 import torch
 from torch import Tensor
@@ -33,9 +32,6 @@ TEST = (4, 5)
 
 
 STRENGTHS = (0.05, 0.1, 0.15, 0.3, 1.0)
-
-
-PICTURES = Path("out/video_solver")
 
 
 @dataclass(frozen=True, eq=False)
