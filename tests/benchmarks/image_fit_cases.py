@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from torchface import Attachment
 from torchface.geometry.cameras.pnp import Pose, solve_pnp
 from torchface.geometry.rotations import rotation_matrix
 from torchface.geometry.similarity import similarity_transform
@@ -34,6 +35,9 @@ HEADS = range(50)
 
 
 PORTRAITS = (-40.0, 0.0, 40.0)
+
+
+Capture = tuple[BlendshapeRig, Attachment, list[Tensor]]
 
 
 @dataclass(frozen=True, eq=False)

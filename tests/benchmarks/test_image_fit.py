@@ -19,6 +19,7 @@ from image_fit_cases import (
     HEADS,
     SIZE,
     SPREAD,
+    Capture,
     Faces,
     Row,
     alternate,
@@ -29,12 +30,12 @@ from image_fit_cases import (
 )
 from torch import Tensor
 
-from torchface import load_take, zoo
+from torchface import zoo
 from torchface.geometry.cameras.pnp import solve_pnp
 from torchface.io.images.image_files import load_image
 from torchface.io.landmarks.dlib_xml import load_dlib_faces
 from torchface.io.landmarks.landmark_points import load_landmark_points
-from torchface.io.rigs.ict_facekit import load_ict_facekit, load_identity_modes
+from torchface.io.rigs.ict_facekit import load_identity_modes
 from torchface.modeling import FitSettings, HeadModel, fit_images
 from torchface.modeling.photographs.fit_problem import Problem, State
 from torchface.modeling.photographs.image_fit import contour_curves
@@ -46,7 +47,6 @@ from torchface.modeling.photographs.landmark_view import (
     Views,
 )
 from torchface.rig import BlendshapeRig
-from torchface.shape_names import mapping
 from torchface.synthetic import performer
 from torchface.workflows.named_priors import DEFAULT_PRIOR, load_priors
 
@@ -54,13 +54,8 @@ pytestmark = pytest.mark.real
 
 
 @pytest.fixture(scope="module")
-def faces(ict_folder: Path, performances: list[Path]) -> Faces:
-    rig = load_ict_facekit(ict_folder, part="face")
-    takes = []
-    for path in performances:
-        track = load_take(path).weights
-        assert track is not None
-        takes.append((track.values[..., 0] @ mapping(track.names, rig.names).T).clamp(0, 1))
+def faces(ict_folder: Path, real_capture: Capture) -> Faces:
+    rig, _, takes = real_capture
     return Faces(rig, load_identity_modes(ict_folder, part="face").deltas, takes)
 
 

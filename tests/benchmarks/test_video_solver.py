@@ -11,12 +11,12 @@ from pathlib import Path
 
 import pytest
 import torch
+from image_fit_cases import Capture, Faces
 from video_solver_cases import (
     FITS,
     FRAMES,
     HEADS,
     TEST,
-    Faces,
     K,
     RandomWalk,
     Solve,
@@ -38,24 +38,17 @@ from torchface.capture.priors import (
     DynamicsSettings,
     ShapePrior,
 )
-from torchface.io import load_take
-from torchface.io.rigs.ict_facekit import load_ict_facekit, load_identity_modes
+from torchface.io.rigs.ict_facekit import load_identity_modes
 from torchface.modeling import transfer_deformation
 from torchface.optim.prepared_program import PreparedProgram
-from torchface.shape_names import mapping
 
 pytestmark = pytest.mark.real
 
 
 @pytest.fixture(scope="module")
-def faces(ict_folder: Path, performances: list[Path]) -> Faces:
+def faces(ict_folder: Path, real_capture: Capture) -> Faces:
     torch.set_num_threads(1)
-    rig = load_ict_facekit(ict_folder, part="face")
-    takes = []
-    for path in performances:
-        track = load_take(path).weights
-        assert track is not None
-        takes.append((track.values[..., 0] @ mapping(track.names, rig.names).T).clamp(0, 1))
+    rig, _, takes = real_capture
     return Faces(rig, load_identity_modes(ict_folder, part="face").deltas, takes)
 
 

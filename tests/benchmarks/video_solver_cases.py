@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
+from image_fit_cases import Faces
 from torch import Tensor
 
 from planted.gaussian_density import gaussian
@@ -32,13 +33,6 @@ TEST = (4, 5)
 
 
 STRENGTHS = (0.05, 0.1, 0.15, 0.3, 1.0)
-
-
-@dataclass(frozen=True, eq=False)
-class Faces:
-    rig: BlendshapeRig
-    modes: Tensor
-    takes: list[Tensor]
 
 
 @dataclass(frozen=True, eq=False)

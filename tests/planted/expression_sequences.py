@@ -42,25 +42,6 @@ def expression_sequences(weights: Tensor, names: Sequence[str], fps: float) -> t
     return tuple(slice(a, b) for a, b in pairwise(valleys) if b - a >= _SHORTEST * fps)
 
 
-def from_neutral_to_neutral(weights: Tensor, names: Sequence[str], fps: float) -> Tensor:
-    """A piece of a take whose first and last frames are exactly neutral, (T,N), and whose timing is the take's own.
-
-    Every frame is scaled by one number, so that its activity (the sum of the weights without gaze and blinks) counts
-    from the line between both ends; where it is largest the frame stays as it was.
-
-    Args:
-        weights: (T,N), at least three frames, such as one of ``expression_sequences``.
-        names: of the shapes.
-        fps: frames a second.
-    """
-    activity = _activity(weights, names, fps)
-    above = (activity - np.linspace(activity[0], activity[-1], len(activity))).clip(min=0)
-    share = above / activity.clip(min=_STILL)
-    share[[0, -1]] = 0
-    scale = torch.from_numpy(share / share[above.argmax()]).clamp(max=1)
-    return weights * scale.to(weights)[:, None]
-
-
 def _activity(weights: Tensor, names: Sequence[str], fps: float) -> NDArray[np.float64]:
     """The sum of the weights of each frame without gaze and blinks, (T,), smoothed by a tenth of a second."""
     counted = torch.tensor([not name.lower().startswith(_NOT_EXPRESSIONS) for name in names])

@@ -1,4 +1,4 @@
-"""Pieces of takes from rest to rest: found where they were planted, made neutral at both ends."""
+"""Pieces of takes from rest to rest: found where they were planted."""
 
 import itertools
 from pathlib import Path
@@ -7,7 +7,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from planted.expression_sequences import expression_sequences, from_neutral_to_neutral
+from planted.expression_sequences import expression_sequences
 from torchface.io import load_take
 
 FPS = 60.0
@@ -35,15 +35,6 @@ def test_what_is_still_holds_no_expression() -> None:
     assert expression_sequences(torch.full((300, 3), 0.2), NAMES, FPS) == ()
 
 
-def test_a_piece_made_neutral_keeps_its_peak_and_its_timing() -> None:
-    weights = planted((150, 0.6), length=300)
-    made = from_neutral_to_neutral(weights, NAMES, FPS)
-    assert made[[0, -1]].abs().max() == 0
-    assert (made[150] - weights[150]).abs().max() < 1e-3
-    rising, before = made[:140, 0].diff(), weights[:140, 0].diff()
-    assert torch.corrcoef(torch.stack([rising, before]))[0, 1] > 0.98
-
-
 @pytest.mark.real
 def test_real_takes_hold_pieces_that_do_not_overlap(performances: list[Path]) -> None:
     for path in performances:
@@ -52,7 +43,3 @@ def test_real_takes_hold_pieces_that_do_not_overlap(performances: list[Path]) ->
         pieces = expression_sequences(track.values[..., 0], track.names, FPS)
         assert len(pieces) >= 2
         assert all(a.stop <= b.start for a, b in itertools.pairwise(pieces))
-        for piece in pieces:
-            made = from_neutral_to_neutral(track.values[piece, :, 0], track.names, FPS)
-            assert made[[0, -1]].abs().max() == 0
-            assert (made <= track.values[piece, :, 0] + 1e-6).all()
