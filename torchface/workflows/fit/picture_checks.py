@@ -205,7 +205,7 @@ def color_lines(photograph: Path, image: Tensor, parts: FaceParts, landmarks: Te
             lines.append(
                 f"a face of even patches with edges between them (from pixel to pixel it mostly differs by "
                 f"{usual / strong:.1%} of its edges, photographs by 15% at least): a painting, a drawing, "
-                f"a strong filter or denoising?"
+                f"a rendered head, a strong filter or denoising?"
             )
     return [f"WARNING: {photograph.name}: {line}" for line in lines]
 
