@@ -7,8 +7,10 @@ import torch
 from torch import Tensor
 
 from torchface.errors import ShapeError, ValueRangeError
+from torchface.geometry.cameras.pinhole import look_at
 from torchface.landmarks.images.networks.part_finder import FaceParts, PartFinder
 from torchface.landmarks.images.networks.part_network import PART_SIZE, PARTS, PartNetwork
+from torchface.synthetic import neutral_head
 
 
 def red_is_skin(crops: Tensor) -> Tensor:
@@ -55,6 +57,26 @@ def test_leaves_behind_a_head_are_no_hair() -> None:
     places = torch.tensor([[30.0, 50.0], [70.0, 50.0]])
     torch.testing.assert_close(found.at(places, "hair"), torch.tensor([0.0, 1.0]))
     torch.testing.assert_close(found.at(places, "background"), torch.tensor([1.0, 0.0]))
+
+
+def test_cloth_without_a_hue_over_the_nose_is_grey_hair() -> None:
+    """The network takes grey hair for cloth."""
+    head = neutral_head(texture=False)
+    camera = look_at(head.vertices[head.landmarks].mean(0), 0.0, span=400.0, width=100, height=100)
+    landmarks = camera.project(head.vertices[head.landmarks].double()).float()
+
+    def all_cloth(crops: Tensor) -> Tensor:
+        shares = torch.zeros(len(crops), len(PARTS), *crops.shape[2:])
+        shares[:, PARTS.index("cloth")] = 1.0
+        return shares
+
+    image = torch.full((3, 100, 100), 120, dtype=torch.uint8)
+    image[:, :, 50:] = torch.tensor([140, 60, 60], dtype=torch.uint8)[:, None, None]  # a red cap
+    found = PartFinder(all_cloth)(image, landmarks)
+    nose = float(landmarks[30, 1])
+    places = torch.tensor([[35.0, nose - 15], [65.0, nose - 15], [35.0, nose + 15]])
+    torch.testing.assert_close(found.at(places, "hair"), torch.tensor([1.0, 0.0, 0.0]))
+    torch.testing.assert_close(found.at(places, "cloth"), torch.tensor([0.0, 1.0, 1.0]))
 
 
 def test_shares_of_a_crop_sum_to_one_at_its_own_size() -> None:

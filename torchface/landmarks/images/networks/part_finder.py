@@ -12,6 +12,7 @@ from torchface.landmarks.images.graph_session import graph_session
 from torchface.landmarks.images.ibug_68 import turned_box
 from torchface.landmarks.images.networks.part_network import PART_MARGIN, PART_SIZE, PARTS
 
+_GREY_HAIR = 0.25  # of its brightness, by which the channels of grey hair differ at most
 _GREEN = 0.008  # of full white, by which leaves are greener than red or blue
 _ROW = {name: number for number, name in enumerate(PARTS)}
 
@@ -62,7 +63,9 @@ class PartFinder:
         transform = crop_transform(box, float(tilt), PART_SIZE, PART_MARGIN)
         crop = cut_crop(image, transform, PART_SIZE).float() / 255
         both = self.network(torch.stack([crop, crop.flip(-1)]))
-        return FaceParts(_without_leaves((both[0] + both[1].flip(-1)) / 2, crop), transform)
+        shares = _without_leaves((both[0] + both[1].flip(-1)) / 2, crop)
+        nose = known[30].double() @ transform[:, :2].T + transform[:, 2]
+        return FaceParts(_with_grey_hair(shares, crop, float(nose[1])), transform)
 
 
 def _without_leaves(shares: Tensor, crop: Tensor) -> Tensor:
@@ -72,6 +75,20 @@ def _without_leaves(shares: Tensor, crop: Tensor) -> Tensor:
     shares = shares.clone()
     shares[background] += torch.where(green, shares[hair], 0.0)
     shares[hair] *= ~green
+    return shares
+
+
+def _with_grey_hair(shares: Tensor, crop: Tensor, nose: float) -> Tensor:
+    """Shares (10,S,S) of a crop (3,S,S) in which what is cloth without a hue over the nose's tip is hair.
+
+    The network takes grey hair for cloth; a grey hat is hair then, of its colour.
+    """
+    grey = crop.amax(0) - crop.amin(0) < _GREY_HAIR * crop.mean(0)
+    over = torch.arange(crop.shape[1])[:, None] < nose
+    moved = shares[_ROW["cloth"]] * (grey & over)
+    shares = shares.clone()
+    shares[_ROW["hair"]] += moved
+    shares[_ROW["cloth"]] -= moved
     return shares
 
 
