@@ -16,6 +16,9 @@ def gaussian(samples: Tensor, floor: float = 1e-4) -> Any:
 class GaussianDensity(nn.Module):
     """As ``StudentDensity``, of a mean (D) and a precision (D,D)."""
 
+    mean: Tensor
+    precision: Tensor
+
     def __init__(self, mean: Tensor, precision: Tensor) -> None:
         super().__init__()
         self.register_buffer("mean", mean)
