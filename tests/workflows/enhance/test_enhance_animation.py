@@ -360,6 +360,7 @@ def test_what_does_not_fit_the_model_is_named(actor: Actor, tmp_path: Path) -> N
     save_rig(own, tmp_path / "own.glb")
     given = replace(PLAIN, given=InputSettings(rig=tmp_path / "own.glb"))
     done = enhance_animation(other, actor.model, tmp_path / "other", given)
+    assert any("keeps the input's own head" in line for line in done.notes)
     assert float((done.frames.sequence.read(0, FRAMES) - wider).norm(dim=-1).mean()) < 0.5
     with pytest.raises(NameMismatchError, match=r"\(--rig\)"):
         coarse(actor, actor.folder / "weights.csv", tmp_path)

@@ -65,6 +65,8 @@ def same_topology(animated: AnimatedMesh, model: Mesh, fps: float | None) -> Coa
         return vertices
 
     another = animated.rig is not None and residual > OWN_HEAD_MM
+    if another:
+        notes = [*notes, f"the result keeps the input's own head, which is {residual:.1f} mm from the model's at rest"]
     return CoarseAnimation(
         animated.path,
         SAME_TOPOLOGY,
