@@ -5,12 +5,14 @@ import socket
 import time
 import tracemalloc
 from collections.abc import Iterator
+from multiprocessing import active_children
 from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
+from headless_chromium import until
 from planted_faces import FRONTAL, JAW, SMILE, Endless, ShadeSolver, film
 from received_frames import decode_frame
 
@@ -24,7 +26,7 @@ from torchface.io.video.video_packets import pyav
 from torchface.progress import silent
 from torchface.shape_names import ARKIT
 from torchface.workflows.browser_app.character import load_character
-from torchface.workflows.live import live_anybody
+from torchface.workflows.live import live_anybody, live_session
 from torchface.workflows.live import recordings as recordings_module
 from torchface.workflows.live.kept_takes import film_of, kept_takes, remove_take, take_file
 from torchface.workflows.live.live_anybody import LiveSettings, go_live, import_recordings
@@ -494,3 +496,20 @@ def test_a_take_that_was_dropped_outlives_a_solver_that_cannot_be_made(
     (kept,) = kept_takes(tmp_path / "out")
     assert (kept.name, kept.frames) == ("mine", 3)
     assert said[-1] == f"what was dropped on the page is kept in {tmp_path / 'out'}"
+
+
+def test_a_film_that_is_being_solved_does_not_hold_up_the_end(
+    dome: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The process that solves it ends too, and the user is told."""
+    told = list[str]()
+    session, _ = a_session(Endless(3), tmp_path / "take", dome, told)
+    monkeypatch.setattr(live_session, "film_of", lambda folder, place: 300)
+    monkeypatch.setattr(live_session, "solved_again", time.sleep)
+    session.asked({"solve": "first"})
+    until(active_children)
+    began = time.monotonic()
+    session.close()
+    assert time.monotonic() - began < 60
+    assert not active_children()
+    assert told[-1] == "first: not solved again: torchface ended before; its film stays with it"

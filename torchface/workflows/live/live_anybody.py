@@ -238,6 +238,7 @@ def go_live(
                 stack.callback(server.stop)  # before the streams end
             session.run(settings.seconds, progress)
         finally:
+            session.close()
             if recordings.running:
                 progress("writing the recording")
             saved = recordings.finish()

@@ -6,7 +6,7 @@ from collections import deque
 from collections.abc import Mapping
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
-from multiprocessing import get_context
+from multiprocessing import active_children, get_context
 from pathlib import Path
 from typing import Any
 
@@ -87,6 +87,7 @@ class LiveSession:
         self._takes: tuple[float, list[dict[str, Any]]] = (float("-inf"), [])
         self._lock = threading.RLock()
         self._solving: threading.Thread | None = None
+        self._closing = False
 
     def next_view(self, before: LiveView | None, seconds: float) -> LiveView | None:
         """The newest moment once there is another than ``before``; None where none came in time."""
@@ -167,10 +168,19 @@ class LiveSession:
                 self.keep(f"{name}, solved again", take_rows(rows).float().numpy())
                 self._notes(f"{name}: solved again")
             except (TorchfaceError, OSError, BrokenProcessPool) as error:
-                self._notes(f"{name}: not solved again: {error}")
+                why = "torchface ended before; its film stays with it" if self._closing else error
+                self._notes(f"{name}: not solved again: {why}")
 
         self._solving = threading.Thread(target=solve, name="torchface-solve-again", daemon=True)
         self._solving.start()
+
+    def close(self) -> None:
+        """Breaks off the solve of a film, which may have minutes to go."""
+        self._closing = True
+        if self._solving is not None and self._solving.is_alive():
+            for process in active_children():
+                process.kill()
+            self._solving.join()
 
     def left(self) -> None:
         """The page was closed that has asked for a pose."""
