@@ -13,14 +13,17 @@ from torchface.optim.sparse import SparseCholesky
 _LINK = 0.577  # cotangent of 60°: the weight of an edge between equilateral triangles
 _FORM_FADES, _COLORS_FADE = 80.0, 40.0
 # Beside what is unseen lie vertices that hair or a scan's border moved: of those so near, millimetres, the form goes on
-# from what a plate of this reach makes of those less than about so far off it, and what is off fades within 5 mm.
-_BESIDE, _ALIKE, _EDGE_FADES = 20.0, 0.5, 5.0
+# from what a plate of this reach makes of those less than about so far off it. Those further off are no skin; what the
+# rest is off fades within 15 mm.
+_BESIDE, _ALIKE, _NO_SKIN, _EDGE_FADES = 20.0, 0.5, 3.0, 15.0
 _FIRST_REACH, _REACH, _ROUNDS = 20.0, 5.0, 6
 _LEAST_AREA = 1e-3
 _MIN_COUNT = 4
 
 
-def completed_form(rest: Tensor, current: Tensor, faces: Tensor, unseen: Tensor, shown: Tensor) -> Tensor:
+def completed_form(
+    rest: Tensor, current: Tensor, faces: Tensor, unseen: Tensor, shown: Tensor
+) -> tuple[Tensor, Tensor]:
     r"""Vertices (V,3), the unseen ones where the template has them, bent to go on smoothly from those around.
 
     A similarity aligns the template with what the scan shows. The offset y from there to the registered vertices
@@ -30,16 +33,20 @@ def completed_form(rest: Tensor, current: Tensor, faces: Tensor, unseen: Tensor,
         + s^{-4} w \lVert y - d \rVert^2
 
     Shown vertices within 20 mm of unseen ones pull the plate to their offset d by a robust weight w (Cauchy's squared,
-    0.5 mm; s = 5 mm), as hair moves some of them; those further away hold it.
+    0.5 mm; s = 5 mm), as hair moves some of them; those further away hold it. Of those within 20 mm what lies more
+    than 3 mm off the plate is unseen too.
 
     Args:
         unseen: whose positions the scan does not show, (V,) bool; the rest of the mesh stays.
         shown: whose positions it shows, (V,) bool: they align the template.
 
+    Returns:
+        The vertices, and which were unseen, (V,) bool.
+
     Source: Botsch and Sorkine 2008 (thin plates over a mesh).
     """
     if not unseen.any() or int(shown.sum()) < _MIN_COUNT:
-        return current
+        return current, unseen
     aligned = similarity_transform(rest[shown][None], current[shown][None]).apply(rest)[0]
     stiffness, area = _membrane(aligned, faces)
     plate = stiffness @ sparse.diags_array(1 / area) @ stiffness + sparse.diags_array(area / _FORM_FADES**4)
@@ -50,10 +57,11 @@ def completed_form(rest: Tensor, current: Tensor, faces: Tensor, unseen: Tensor,
     for _ in range(_ROUNDS):
         pull = weights.numpy() * area / reach**4
         form = _spread(plate, offset, unseen | beside, pull)
-        weights = beside / (1 + (offset - form).square().sum(1) / _ALIKE**2).square()
-        reach = _REACH
+        off = (offset - form).norm(dim=1)
+        weights, reach = beside / (1 + (off / _ALIKE).square()).square(), _REACH
+    unseen = unseen | (beside & (off > _NO_SKIN))
     edge = _spread(stiffness + sparse.diags_array(area / _EDGE_FADES**2), offset - form, unseen)
-    return torch.where(unseen[:, None], aligned + form + edge, current)
+    return torch.where(unseen[:, None], aligned + form + edge, current), unseen
 
 
 def completed_colors(colors: Tensor, base: Tensor, vertices: Tensor, faces: Tensor, unseen: Tensor) -> Tensor:

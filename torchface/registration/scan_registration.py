@@ -362,7 +362,8 @@ def _completed(
     before, rest, faces = deformer.current, template.vertices.detach().cpu().double(), deformer.faces
     for _ in range(_MAX_COMPLETIONS):
         shown = deformer.outward & ~unseen
-        deformer.lay(completed_form(rest, before, faces, unseen, shown))
+        laid, unseen = completed_form(rest, before, faces, unseen, shown)
+        deformer.lay(laid)
         folded = faces[deformer.folded_triangles()].flatten()
         around = torch.zeros_like(unseen)
         around[folded[~cover.features[folded]]] = True
