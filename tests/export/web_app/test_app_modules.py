@@ -78,9 +78,9 @@ def test_several_people_are_said_and_which_one_is_followed(run: Run) -> None:
         "words",
         [
             [frame(0, 0, 0.5), True],
-            [frame(0.4, 0), True],
-            [frame(0.6, 0), False],
-            [frame(0.6, 0, 0.5), True],  # in a mirror
+            [frame(0.61, 0), True],
+            [frame(0.7, 0), False],
+            [frame(0.7, 0, 0.5), True],  # in a mirror
             [frame(1, 0.9), False],
             [frame(0, 3), False],
         ],
