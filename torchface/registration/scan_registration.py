@@ -1,26 +1,22 @@
 """A template bent onto a raw scan: the scan's face in the template's topology."""
 
 import time
-from collections.abc import Callable
 from dataclasses import dataclass, replace
-from itertools import product
 
 import torch
 from torch import Tensor
 
 from torchface.errors import AlignmentError, ShapeError
 from torchface.geometry.meshes.operators import edges, vertex_normals
-from torchface.geometry.meshes.rigid_icp import Samples, ScanPoints, find_pose, fit_of, rigid_icp
 from torchface.geometry.meshes.surface_index import SurfaceIndex, SurfacePoints
-from torchface.geometry.similarity import MAX_HEAD_SCALE, MIN_HEAD_SCALE, Similarity
+from torchface.geometry.similarity import Similarity
 from torchface.mesh import Mesh
 from torchface.number_checks import checked_type
 from torchface.progress import Progress, silent
 from torchface.registration.hair_and_cloth import Cover
 from torchface.registration.model_fit import HasShape, ModelFit, ShapeModel, fit_to_scan, shape_model
-from torchface.registration.nonrigid.correspondence import evenly_spread, exposed_vertices
+from torchface.registration.nonrigid.correspondence import exposed_vertices
 from torchface.registration.nonrigid.deformer import Deformer
-from torchface.registration.nonrigid.landmark_pull import LandmarkPull
 from torchface.registration.nonrigid.lip_contact import contact_pull
 from torchface.registration.nonrigid.registration_record import RegistrationRecord
 from torchface.registration.nonrigid.schedule import DEFAULT_SCHEDULE, Schedule
@@ -38,23 +34,16 @@ from torchface.registration.scan_completion import completed_colors, completed_f
 from torchface.registration.scan_preparation import (
     Landmarks,
     PreparedScan,
-    check_landmarks,
     check_template,
     prepare_scan,
 )
+from torchface.registration.scan_start import Detector, StartOnScan, scale_notes, start_on_scan
 
-_RIGID_SAMPLES = 1500
-_RIGID_REACHES = (20.0, 17.0, 14.0, 12.0, 10.0, 8.0)
-_SIZES, _SURE_FIT = (1.0, 0.85, 1.15), 0.6  # of a template that looks for its place by shape; of its face there
 _NEAR = 3.0
 _FAR = 10.0
 _SETTLED = 12.0  # reach of a stage, millimetres: from there on the template lies close to the scan
 _MAX_COMPLETIONS = 6
 _MIN_MET = 0.1  # share of what faces outward; scans of faces alone under templates of whole heads give a quarter
-
-Detector = Callable[[Mesh, Mesh, Similarity], Landmarks | None]
-"""Finds landmarks by itself: given the template aligned with the scan, the scan, and the similarity from the one's own
-space to the other's; gives template vertex ids and scan points, or nothing."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -146,7 +135,7 @@ def register(
     prepared = prepare_scan(scan, template)
     progress("laying the template on the scan")
     schedule = schedule or DEFAULT_SCHEDULE
-    start = _start(template, scan, prepared, landmarks, detector, schedule)
+    start = start_on_scan(template, scan, prepared, landmarks, detector, schedule)
     aligned = start.pose.apply(template.vertices.detach().cpu().double())[0]
     contacts = contact_pull(aligned, template)
     fit, stages_left = None, schedule.stages
@@ -178,7 +167,7 @@ def register(
         nearest, unseen = _completed(deformer, template, start.surface, nearest, unseen, cover)
         matched &= ~unseen
     mesh = replace(template, vertices=deformer.current.to(template.vertices), colors=None, texture=None)
-    notes = [*start.notes, *_scale_notes(start.pose), *start.pull.disagreement(deformer.current), *_model_notes(fit)]
+    notes = [*start.notes, *scale_notes(start.pose), *start.pull.disagreement(deformer.current), *_model_notes(fit)]
     notes += _final_notes(template, scan, deformer, texture_size)
     if cover.false_colors:
         notes.append(
@@ -208,96 +197,11 @@ def register(
     return Registration(mesh, start.pose, nearest.distance.to(device), matched.to(device), record, coefficients)
 
 
-@dataclass(frozen=True, eq=False)
-class _Start:
-    by: str
-    pose: Similarity
-    pull: LandmarkPull
-    prepared: PreparedScan
-    surface: SurfaceIndex
-    notes: tuple[str, ...]
-
-
-def _start(
-    template: Mesh,
-    scan: Mesh,
-    prepared: PreparedScan,
-    landmarks: Landmarks | None,
-    detector: Detector | None,
-    schedule: Schedule,
-) -> _Start:
-    """The pose, by landmarks or shape, and the scan with its outside out."""
-    vertices, faces = template.vertices.detach().cpu().double(), template.faces.cpu()
-    exposed = exposed_vertices(vertices, faces, schedule.opening).nonzero()[:, 0]
-    samples = Samples.of(vertices, faces, evenly_spread(vertices, exposed, _RIGID_SAMPLES))
-    by, surface, notes = "landmarks", SurfaceIndex(prepared.vertices, prepared.faces), list[str]()
-    if landmarks is None:
-        by = "shape"
-        pose, notes = _pose_by_shape(template, samples, ScanPoints.of(prepared.vertices, prepared.faces), exposed)
-        if detector is not None:
-            aligned = template.with_vertices(pose.apply(vertices)[0].to(template.vertices))
-            landmarks = detector(aligned, scan, pose)
-            by = "detected landmarks" if landmarks is not None else by
-    if landmarks is None:
-        return _Start(by, pose, LandmarkPull.none(), prepared, surface, (*prepared.notes, *notes))
-    (ids, points), pose, note = check_landmarks(landmarks, template, surface)
-    notes = [note] if note else []
-    if _faces_away(samples, surface, pose):
-        prepared = prepared.turned()
-        surface = SurfaceIndex(prepared.vertices, prepared.faces)
-    targets = ScanPoints.of(prepared.vertices, prepared.faces)
-    pose = rigid_icp(samples, targets, pose, _RIGID_REACHES, scale=True, landmarks=(vertices[ids], points)).pose
-    return _Start(by, pose, LandmarkPull.of(ids, points, template), prepared, surface, (*prepared.notes, *notes))
-
-
-def _pose_by_shape(template: Mesh, samples: Samples, scan: ScanPoints, exposed: Tensor) -> tuple[Similarity, list[str]]:
-    """The pose in which the face fits best, and a note where that is not well.
-
-    By the whole template, or by its face alone where the rest (shoulders, another hairdo) is not on the scan; larger
-    and smaller where it fits in neither way.
-    """
-    notes, face = template.annotations, samples
-    if notes is not None and "face" in notes.regions and int(notes.regions["face"].cpu()[exposed].sum()) >= 3:
-        ids = exposed[notes.regions["face"].cpu()[exposed]]
-        vertices = template.vertices.detach().cpu().double()
-        face = Samples.of(vertices, template.faces.cpu(), evenly_spread(vertices, ids, _RIGID_SAMPLES))
-    best, pose, refused = -1.0, None, AlignmentError("")
-    for size, some in product(_SIZES, (samples,) if face is samples else (samples, face)):
-        try:
-            found = find_pose(some, scan, size).pose
-        except AlignmentError as error:
-            refused = error
-            continue
-        fit = float(fit_of(face, scan, found, float(found.scale) * _RIGID_REACHES[-1])[0])
-        if fit > best:
-            best, pose = fit, found
-        if best >= _SURE_FIT:
-            return found, []
-    if pose is None:
-        raise AlignmentError(
-            f"register: the template lies nowhere on the scan by its shape alone: {refused}; give landmarks"
-        )
-    return pose, [
-        f"the face was found by its shape alone and fits {best:.2f} of 1 there, where heads fit {_SURE_FIT} and more: "
-        "look at the report's pictures, and give landmarks if it lies elsewhere"
-    ]
-
-
-def _model_fit(model: ShapeModel, template: Mesh, aligned: Tensor, start: _Start, schedule: Schedule) -> ModelFit:
+def _model_fit(model: ShapeModel, template: Mesh, aligned: Tensor, start: StartOnScan, schedule: Schedule) -> ModelFit:
     faces = template.faces.cpu()
     exposed = exposed_vertices(aligned, faces, schedule.opening).nonzero()[:, 0]
     landmarks = (start.pull.vertices, start.pull.points)
     return fit_to_scan(model, faces, aligned, exposed, start.surface, landmarks, schedule.largest_angle)
-
-
-def _scale_notes(pose: Similarity) -> list[str]:
-    scale = float(pose.scale[0])
-    if MIN_HEAD_SCALE <= scale <= MAX_HEAD_SCALE:
-        return []
-    return [
-        f"the template was aligned with the scan at {scale:.3g} times its size, heads differ by {MIN_HEAD_SCALE} to "
-        f"{MAX_HEAD_SCALE} times: are both in millimetres, and the landmarks this scan's?"
-    ]
 
 
 def _model_notes(fit: ModelFit | None) -> list[str]:
@@ -305,14 +209,6 @@ def _model_notes(fit: ModelFit | None) -> list[str]:
         return []
     far = float(fit.coefficients.abs().max())
     return [f"the model comes to {fit.noise:.2f} mm (robust deviation) of the scan, {far:.1f} standard deviations off"]
-
-
-def _faces_away(samples: Samples, surface: SurfaceIndex, pose: Similarity) -> bool:
-    """Whether most normals of the scan oppose the template's where both are near each other."""
-    nearest = surface.among_nearest_samples(pose.apply(samples.points)[0])
-    agree = (surface.normals_at(nearest) * (samples.normals @ pose.rotation[0].double().T)).sum(-1)
-    near = nearest.distance <= nearest.distance.median()
-    return float(agree[near].mean()) < 0
 
 
 def _nearest(surface: SurfaceIndex, points: Tensor) -> SurfacePoints:

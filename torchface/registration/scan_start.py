@@ -1,0 +1,121 @@
+"""Where a template starts on a scan: the similarity by landmarks or by its shape, and which side of the scan is out."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from itertools import product
+
+from torch import Tensor
+
+from torchface.errors import AlignmentError
+from torchface.geometry.meshes.rigid_icp import Samples, ScanPoints, find_pose, fit_of, rigid_icp
+from torchface.geometry.meshes.surface_index import SurfaceIndex
+from torchface.geometry.similarity import MAX_HEAD_SCALE, MIN_HEAD_SCALE, Similarity
+from torchface.mesh import Mesh
+from torchface.registration.nonrigid.correspondence import evenly_spread, exposed_vertices
+from torchface.registration.nonrigid.landmark_pull import LandmarkPull
+from torchface.registration.nonrigid.schedule import Schedule
+from torchface.registration.scan_preparation import Landmarks, PreparedScan, check_landmarks
+
+_RIGID_SAMPLES = 1500
+_RIGID_REACHES = (20.0, 17.0, 14.0, 12.0, 10.0, 8.0)
+_SIZES, _SURE_FIT = (1.0, 0.85, 1.15), 0.6  # of a template that looks for its place by shape; of its face there
+
+Detector = Callable[[Mesh, Mesh, Similarity], Landmarks | None]
+"""Finds landmarks by itself: given the template aligned with the scan, the scan, and the similarity from the one's own
+space to the other's; gives template vertex ids and scan points, or nothing."""
+
+
+@dataclass(frozen=True, eq=False)
+class StartOnScan:
+    """Where a template starts, and the scan it starts on."""
+
+    by: str  # landmarks, detected landmarks or shape
+    pose: Similarity
+    pull: LandmarkPull
+    prepared: PreparedScan
+    surface: SurfaceIndex
+    notes: tuple[str, ...]
+
+
+def start_on_scan(
+    template: Mesh,
+    scan: Mesh,
+    prepared: PreparedScan,
+    landmarks: Landmarks | None,
+    detector: Detector | None,
+    schedule: Schedule,
+) -> StartOnScan:
+    """The pose, by landmarks or shape, and the scan with its outside out."""
+    vertices, faces = template.vertices.detach().cpu().double(), template.faces.cpu()
+    exposed = exposed_vertices(vertices, faces, schedule.opening).nonzero()[:, 0]
+    samples = Samples.of(vertices, faces, evenly_spread(vertices, exposed, _RIGID_SAMPLES))
+    by, surface, notes = "landmarks", SurfaceIndex(prepared.vertices, prepared.faces), list[str]()
+    if landmarks is None:
+        by = "shape"
+        pose, notes = _pose_by_shape(template, samples, ScanPoints.of(prepared.vertices, prepared.faces), exposed)
+        if detector is not None:
+            aligned = template.with_vertices(pose.apply(vertices)[0].to(template.vertices))
+            landmarks = detector(aligned, scan, pose)
+            by = "detected landmarks" if landmarks is not None else by
+    if landmarks is None:
+        return StartOnScan(by, pose, LandmarkPull.none(), prepared, surface, (*prepared.notes, *notes))
+    (ids, points), pose, note = check_landmarks(landmarks, template, surface)
+    notes = [note] if note else []
+    if _faces_away(samples, surface, pose):
+        prepared = prepared.turned()
+        surface = SurfaceIndex(prepared.vertices, prepared.faces)
+    targets = ScanPoints.of(prepared.vertices, prepared.faces)
+    pose = rigid_icp(samples, targets, pose, _RIGID_REACHES, scale=True, landmarks=(vertices[ids], points)).pose
+    return StartOnScan(by, pose, LandmarkPull.of(ids, points, template), prepared, surface, (*prepared.notes, *notes))
+
+
+def _pose_by_shape(template: Mesh, samples: Samples, scan: ScanPoints, exposed: Tensor) -> tuple[Similarity, list[str]]:
+    """The pose in which the face fits best, and a note where that is not well.
+
+    By the whole template, or by its face alone where the rest (shoulders, another hairdo) is not on the scan; larger
+    and smaller where it fits in neither way.
+    """
+    notes, face = template.annotations, samples
+    if notes is not None and "face" in notes.regions and int(notes.regions["face"].cpu()[exposed].sum()) >= 3:
+        ids = exposed[notes.regions["face"].cpu()[exposed]]
+        vertices = template.vertices.detach().cpu().double()
+        face = Samples.of(vertices, template.faces.cpu(), evenly_spread(vertices, ids, _RIGID_SAMPLES))
+    best, pose, refused = -1.0, None, AlignmentError("")
+    for size, some in product(_SIZES, (samples,) if face is samples else (samples, face)):
+        try:
+            found = find_pose(some, scan, size).pose
+        except AlignmentError as error:
+            refused = error
+            continue
+        fit = float(fit_of(face, scan, found, float(found.scale) * _RIGID_REACHES[-1])[0])
+        if fit > best:
+            best, pose = fit, found
+        if best >= _SURE_FIT:
+            return found, []
+    if pose is None:
+        raise AlignmentError(
+            f"register: the template lies nowhere on the scan by its shape alone: {refused}; give landmarks"
+        )
+    return pose, [
+        f"the face was found by its shape alone and fits {best:.2f} of 1 there, where heads fit {_SURE_FIT} and more: "
+        "look at the report's pictures, and give landmarks if it lies elsewhere"
+    ]
+
+
+def scale_notes(pose: Similarity) -> list[str]:
+    """What to say of a pose that gives a template a size that no head has."""
+    scale = float(pose.scale[0])
+    if MIN_HEAD_SCALE <= scale <= MAX_HEAD_SCALE:
+        return []
+    return [
+        f"the template was aligned with the scan at {scale:.3g} times its size, heads differ by {MIN_HEAD_SCALE} to "
+        f"{MAX_HEAD_SCALE} times: are both in millimetres, and the landmarks this scan's?"
+    ]
+
+
+def _faces_away(samples: Samples, surface: SurfaceIndex, pose: Similarity) -> bool:
+    """Whether most normals of the scan oppose the template's where both are near each other."""
+    nearest = surface.among_nearest_samples(pose.apply(samples.points)[0])
+    agree = (surface.normals_at(nearest) * (samples.normals @ pose.rotation[0].double().T)).sum(-1)
+    near = nearest.distance <= nearest.distance.median()
+    return float(agree[near].mean()) < 0
