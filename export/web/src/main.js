@@ -108,7 +108,8 @@ function startCalibration() {
   element("prompt").hidden = false;
   element("prompt-progress").value = 0;
   showPrompt();
-  element("prompt-stop").focus();
+  element("prompt-stop").focus({ preventScroll: true });
+  element("stage").scrollIntoView({ block: "nearest" }); // on a phone it may be above, and its words are longer than the button
 }
 
 function endCalibration() {

@@ -39,7 +39,10 @@ def test_calibration_is_spoken_and_left_with_escape(opened: Open, recorded: Reco
     page.start()
     count = driver.execute_script("return watched.sent.length")
     with page.held_pictures():  # so the first step lasts while it is looked at
+        driver.execute_script("document.getElementById('controls').scrollIntoView()")  # as on a phone
         page.click("calibrate")
+        words = "return document.getElementById('prompt-words').getBoundingClientRect().top"
+        assert 0 <= driver.execute_script(words) < driver.execute_script("return innerHeight")
         assert page.text("prompt-words") == "1 of 6: Look into the camera with a resting face."
         assert page.text("spoken") == "Look into the camera with a resting face."
         assert driver.switch_to.active_element.get_attribute("id") == "prompt-stop"
