@@ -109,7 +109,7 @@ function startCalibration() {
   element("prompt-progress").value = 0;
   showPrompt();
   element("prompt-stop").focus({ preventScroll: true });
-  element("stage").scrollIntoView({ block: "nearest" }); // on a phone it may be above, and its words are longer than the button
+  element("prompt").scrollIntoView({ block: "nearest" }); // on a phone it may be above, with its words above the button
 }
 
 function endCalibration() {
