@@ -123,7 +123,7 @@ def test_form_goes_on_as_the_template_does(mask: Mesh) -> None:
     truth = pose.apply(rest)[0]
     unseen = rest[:, 1] > 40
     torn = torch.where(unseen[:, None], truth + 30.0, truth)
-    found, hidden = completed_form(rest, torn, mask.faces, unseen, ~unseen)
+    found, hidden = completed_form(rest, torn, mask.faces, unseen, ~unseen, ~unseen)
     assert torch.equal(hidden, unseen)
     assert float((found - truth).abs().max()) < 1e-4
     assert torch.equal(found[~unseen], truth[~unseen])
@@ -133,7 +133,7 @@ def test_form_bends_on_without_an_edge(mask: Mesh) -> None:
     rest = mask.vertices
     bent = rest + torch.stack([0 * rest[:, 0], 0 * rest[:, 1], 0.0008 * (rest[:, 1] + 110).square()], dim=-1)
     unseen = rest[:, 1] > 60
-    found, _ = completed_form(rest, torch.where(unseen[:, None], rest, bent), mask.faces, unseen, ~unseen)
+    found, _ = completed_form(rest, torch.where(unseen[:, None], rest, bent), mask.faces, unseen, ~unseen, ~unseen)
     normals, smooth = vertex_normals(found, mask.faces), vertex_normals(bent, mask.faces)
     near = (rest[:, 1] - 60).abs() < 12
     angle = torch.rad2deg((normals * smooth).sum(-1).clamp(-1, 1).acos())
@@ -144,9 +144,12 @@ def test_form_ignores_vertices_that_hair_moved(mask: Mesh) -> None:
     rest, unseen = mask.vertices, mask.vertices[:, 1] > 60
     hair = ~unseen & (rest[:, 1] > 52) & (rest[:, 0] > 0)
     lifted = rest + 7.0 * hair[:, None] * torch.tensor([0.0, 0.0, 1.0], dtype=rest.dtype)
-    found, hidden = completed_form(rest, lifted, mask.faces, unseen, ~unseen)
+    found, hidden = completed_form(rest, lifted, mask.faces, unseen, ~unseen, ~unseen)
     assert torch.equal(hidden, unseen | hair)
     assert float((found - rest).norm(dim=1).max()) < 0.5  # a similarity of the few lifted ones
+    found, hidden = completed_form(rest, lifted, mask.faces, unseen, ~unseen, torch.zeros_like(unseen))
+    assert torch.equal(hidden, unseen)  # without hair it is the person's
+    assert torch.equal(found[~unseen], lifted[~unseen])
 
 
 def test_colors_go_over_into_the_base(mask: Mesh) -> None:

@@ -16,7 +16,7 @@ from torchface.rendering.raycast import RayCaster
 
 _AT_THE_EARS = (0, 1, 2, 14, 15, 16)
 _FEATURE = 0.17
-_GROWN = 0.06
+_GROWN, _BESIDE = 0.06, 0.13
 _DARKEST, _BLACK = 1.5, 1e-4
 _BRIGHTEST, _OTHER_HUE = 2.0, 0.6
 # Of a face's hue, logarithms of red and blue over green: the largest robust deviation, and the least and largest
@@ -122,12 +122,16 @@ class Cover:
     def _graph(self) -> VertexGraph:
         return VertexGraph(self._faces, len(self._none))
 
-    def _grown(self, mask: Tensor) -> Tensor:
-        """With what lies within some 9 mm, where hair lifts the surface."""
+    def beside(self, hidden: Tensor) -> Tensor:
+        """What lies within some 20 mm of hidden vertices (V,) and may be hair or cloth too, (V,) bool."""
+        return self._grown(hidden, _BESIDE)
+
+    def _grown(self, mask: Tensor, reach: float = _GROWN) -> Tensor:
+        """With what lies within some 9 mm, or another reach, where hair lifts the surface."""
         if not mask.any():
             return mask
         gap, _ = cKDTree(self._rest[mask].numpy()).query(self._rest.numpy())
-        return (torch.from_numpy(gap) < _GROWN * self._width) & ~self.features
+        return (torch.from_numpy(gap) < reach * self._width) & ~self.features
 
     def _broken_ears(self, current: Tensor, found: SurfacePoints, hidden: Tensor) -> Tensor:
         """Ears of which the scan shows too little: whole, or they come out as flakes."""

@@ -13,8 +13,8 @@ from torchface.optim.sparse import SparseCholesky
 _LINK = 0.577  # cotangent of 60°: the weight of an edge between equilateral triangles
 _FORM_FADES, _COLORS_FADE = 80.0, 40.0
 # Beside what is unseen lie vertices that hair or a scan's border moved: of those so near, millimetres, the form goes on
-# from what a plate of this reach makes of those less than about so far off it. Those further off are no skin; what the
-# rest is off fades within 15 mm.
+# from what a plate of this reach makes of those less than about so far off it. Beside hair those further off are no
+# skin; what the rest is off fades within 15 mm.
 _BESIDE, _ALIKE, _NO_SKIN, _EDGE_FADES = 20.0, 0.5, 3.0, 15.0
 _FIRST_REACH, _REACH, _ROUNDS = 20.0, 5.0, 6
 _LEAST_AREA = 1e-3
@@ -22,7 +22,7 @@ _MIN_COUNT = 4
 
 
 def completed_form(
-    rest: Tensor, current: Tensor, faces: Tensor, unseen: Tensor, shown: Tensor
+    rest: Tensor, current: Tensor, faces: Tensor, unseen: Tensor, shown: Tensor, doubtful: Tensor
 ) -> tuple[Tensor, Tensor]:
     r"""Vertices (V,3), the unseen ones where the template has them, bent to go on smoothly from those around.
 
@@ -33,12 +33,13 @@ def completed_form(
         + s^{-4} w \lVert y - d \rVert^2
 
     Shown vertices within 20 mm of unseen ones pull the plate to their offset d by a robust weight w (Cauchy's squared,
-    0.5 mm; s = 5 mm), as hair moves some of them; those further away hold it. Of those within 20 mm what lies more
-    than 3 mm off the plate is unseen too.
+    0.5 mm; s = 5 mm), as hair moves some of them; those further away hold it. Of those within 20 mm doubtful ones
+    that lie more than 3 mm off the plate are unseen too.
 
     Args:
         unseen: whose positions the scan does not show, (V,) bool; the rest of the mesh stays.
         shown: whose positions it shows, (V,) bool: they align the template.
+        doubtful: which may be hair or cloth, (V,) bool: where a scan ends, all that it shows is the person's.
 
     Returns:
         The vertices, and which were unseen, (V,) bool.
@@ -59,7 +60,7 @@ def completed_form(
         form = _spread(plate, offset, unseen | beside, pull)
         off = (offset - form).norm(dim=1)
         weights, reach = beside / (1 + (off / _ALIKE).square()).square(), _REACH
-    unseen = unseen | (beside & (off > _NO_SKIN))
+    unseen = unseen | (beside & doubtful & (off > _NO_SKIN))
     edge = _spread(stiffness + sparse.diags_array(area / _EDGE_FADES**2), offset - form, unseen)
     return torch.where(unseen[:, None], aligned + form + edge, current), unseen
 

@@ -256,9 +256,10 @@ def _completed(
     of an ear all.
     """
     before, rest, faces = deformer.current, template.vertices.detach().cpu().double(), deformer.faces
+    doubtful = cover.beside(deformer.hidden)
     for _ in range(_MAX_COMPLETIONS):
         shown = deformer.outward & ~unseen
-        laid, unseen = completed_form(rest, before, faces, unseen, shown)
+        laid, unseen = completed_form(rest, before, faces, unseen, shown, doubtful)
         deformer.lay(laid)
         folded = faces[deformer.folded_triangles()].flatten()
         around = torch.zeros_like(unseen)
