@@ -176,6 +176,11 @@ def test_missing_weights_are_told_by_every_command(
             main([*command, "--out", str(tmp_path / "out.png" if "render" in command else tmp_path / "out.csv"), "-q"])
         assert told in said()
         assert {path.name for path in tmp_path.iterdir()} == {"gaps.csv"}
+    values[0] = torch.nan  # no face, which is no fault
+    save_weights_csv(Take(30.0, weights=Track(("jawOpen", "tongueOut"), values)), file)
+    with pytest.raises(SystemExit):
+        main(["retarget", str(file), "--to", rig, "--out", str(tmp_path / "out.csv"), "-q"])
+    assert told in said()
 
 
 def test_a_frame_without_a_face_stays_one(stage: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

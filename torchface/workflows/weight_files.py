@@ -67,10 +67,12 @@ def load_weight_take(path: Path) -> Take:
 
 def check_whole_frames(path: Path, weights: Track) -> None:
     """Raises ``ValueRangeError`` where a frame of weights (T,N,1) lacks some of them; one without a face lacks all."""
-    missing = ~torch.isfinite(weights.values[..., 0])
-    if (missing.any(1) & ~missing.all(1)).any():
+    missing = ~torch.isfinite(weights.values)
+    faceless = missing.all(1, keepdim=True)
+    if (missing & ~faceless).any():
+        partial = Track(weights.names, weights.values.masked_fill(faceless, 0.0))
         raise ValueRangeError(
-            f"{path}: found that {weight_faults(weights)[0]}; expected a number in each cell, or a row without any "
+            f"{path}: found that {weight_faults(partial)[0]}; expected a number in each cell, or a row without any "
             "where no face was seen (leave out a shape that was not recorded)"
         )
 

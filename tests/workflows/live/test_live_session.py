@@ -498,8 +498,9 @@ def test_a_take_that_was_dropped_outlives_a_solver_that_cannot_be_made(
     assert said[-1] == f"what was dropped on the page is kept in {tmp_path / 'out'}"
 
 
+@pytest.mark.parametrize("begun", [True, False])
 def test_a_film_that_is_being_solved_does_not_hold_up_the_end(
-    dome: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    dome: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, begun: bool
 ) -> None:
     """The process that solves it ends too, and the user is told."""
     told = list[str]()
@@ -507,9 +508,12 @@ def test_a_film_that_is_being_solved_does_not_hold_up_the_end(
     monkeypatch.setattr(live_session, "film_of", lambda folder, place: 300)
     monkeypatch.setattr(live_session, "solved_again", time.sleep)
     session.asked({"solve": "first"})
-    until(active_children)
+    if begun:
+        until(active_children)
     began = time.monotonic()
     session.close()
     assert time.monotonic() - began < 60
     assert not active_children()
     assert told[-1] == "first: not solved again: torchface ended before; its film stays with it"
+    with pytest.raises(ValueRangeError, match="found a session that is ending"):
+        session.asked({"solve": "first"})

@@ -156,6 +156,8 @@ class LiveSession:
 
     def _solve(self, film: Path, place: str) -> None:
         """Solves a film in a process of its own, beside what goes on."""
+        if self._closing:
+            raise ValueRangeError("solve again: found a session that is ending, expected one that goes on")
         if self._solving is not None and self._solving.is_alive():
             raise ValueRangeError("solve again: found a film that is being solved, expected one at a time")
         name = next((take.name for take in kept_takes(self._recordings.folder) if take.place == place), place)
@@ -177,10 +179,10 @@ class LiveSession:
     def close(self) -> None:
         """Breaks off the solve of a film, which may have minutes to go."""
         self._closing = True
-        if self._solving is not None and self._solving.is_alive():
+        while self._solving is not None and self._solving.is_alive():  # it may not have begun its process yet
             for process in active_children():
                 process.kill()
-            self._solving.join()
+            self._solving.join(0.1)
 
     def left(self) -> None:
         """The page was closed that has asked for a pose."""
