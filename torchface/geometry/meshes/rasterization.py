@@ -139,7 +139,7 @@ class DrawnPixels:
     at: tuple[np.ndarray, np.ndarray, np.ndarray]  # row and column of each pixel, and which of the planes it is of
 
     def interpolated(self, values: Tensor) -> Tensor:
-        """Values (F,3) of triangles' corners at the pixels, (S,) float32, linear in the image."""
+        """Values (F,3) of triangles' corners at the pixels, (S,) float64, linear in the image."""
         row, column, plane = self.at
         across, down, rest = self.planes.linear(values.numpy()[self.planes.triangle].T)
         return torch.from_numpy(across[plane] * column + down[plane] * row + rest[plane])

@@ -21,7 +21,7 @@ ONE_PERSON, OTHERS = 0.95, 0.25
 
 Of 39 pairs of photographs of one person each all were above 0.97 (68 landmarks, the modes of ICT-FaceKit). Of 9 pairs
 with found landmarks all were above 0.96 with those modes, but three of turned heads 0.38 to 0.45 with the zoo's
-``head``; of 244 pairs of two people 38 and 34 % are below 0.25, 57 and 54 % below 0.95: the rest nothing tells apart.
+``head``; of 244 pairs of two people 38 and 34 % are below 0.25, 57 and 54 % below 0.95: nothing distinguishes the rest.
 """
 
 ALONE = FitSettings(transfers=0, unknown_deviation=0.0, least_noise=0.004)

@@ -50,9 +50,10 @@ _SHRUNK, _GROWN = 0.6, 1.6  # of a face from one picture to the next
 _LONG = 1e3  # seconds
 _DOUBT = 0.25  # seconds of presence below ``sure`` and the like after which the box network is asked, again and again
 _PATIENCE = 0.3  # seconds for which a lost face is waited for at its place before another of several is taken
-# Seconds after which the box network is asked who else is about: usually, where a landmark is less visible than the
-# fourth, and where somebody is near; and pixels of the followed face's side in the copy of the picture for that.
-_COUNTED, _COVERED, _CROWDED, _HIDDEN, _ENOUGH = 0.25, 0.06, 0.02, 0.3, 48.0
+# Seconds after which the box network is asked who else is about: usually, and where a landmark is less visible than the
+# third. Where somebody is near it is asked in every picture: else the other is taken for the followed one at times. And
+# pixels of the followed face's side in the copy of the picture for that.
+_COUNTED, _COVERED, _HIDDEN, _ENOUGH = 0.25, 0.06, 0.3, 48.0
 _EAGER, _PAUSE = 0.5, 0.1  # seconds after a face was lost in which every frame is searched; between searches afterwards
 
 
@@ -119,8 +120,8 @@ class FaceReader(nn.Module):
         waiting = hidden | (~crowded & (missing < _PATIENCE))
         asked = followed & (doubt >= _DOUBT) & ((since >= _DOUBT) | crowded)
         lost_now = ~followed & ((missing <= _EAGER) | (since >= _PAUSE) | hidden)
-        pause = torch.where(crowded, _CROWDED, torch.where(covered > 0.5, _COVERED, _COUNTED))
-        searched = asked | lost_now | (followed & (since >= pause))
+        pause = torch.where(covered > 0.5, _COVERED, _COUNTED)
+        searched = asked | lost_now | (followed & (crowded | (since >= pause)))
         # Who is about as large as the face that is followed is seen in a small copy too.
         enough = (size.amax(0) * _ENOUGH / place[2].clamp(min=1)).clamp(max=INPUT_SIZE)
         longest = torch.where(followed, enough, float(INPUT_SIZE))
