@@ -56,4 +56,5 @@ def find_in_box(finder: LandmarkFinder, image: Tensor, box: Tensor, tilt: float 
                 f"{name}: found {part} from {float(values.min()):g} to {float(values.max()):g}, expected "
                 + ("0 to 1" if most == 1 else "0 pixels or more")
             )
-    return replace(reading, search_box=box)
+    # The next call may overwrite what it gave.
+    return replace(reading, landmarks=reading.landmarks.clone(), search_box=box)

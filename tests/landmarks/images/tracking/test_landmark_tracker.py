@@ -1,6 +1,7 @@
 """A filmed performer's landmarks are followed, lost and found again; what trembles in one start is steady in many."""
 
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -23,6 +24,7 @@ from torchface.landmarks import (
     landmark_jitter,
     track_landmarks,
 )
+from torchface.landmarks.images.face_reading import FaceReading
 from torchface.landmarks.images.ibug_68 import MIRROR_68, box_around, turned_box
 from torchface.landmarks.images.trees.landmark_consensus import ConsensusSettings, consensus
 from torchface.landmarks.images.trees.tree_finder import TreeFinder
@@ -91,6 +93,20 @@ def test_the_past_alone_counts(trees: LandmarkTrees, film: tuple[Tensor, Tensor]
     assert torch.equal(torch.cat([first.values, second.values]), whole.values)
     grey = (frames.float() * torch.tensor([0.299, 0.587, 0.114])[:, None, None]).sum(1).round().to(torch.uint8)
     assert (track_landmarks(grey, LandmarkTracker(trees)).values - whole.values).abs().mean() < 0.3
+
+
+def test_a_finder_may_write_over_the_landmarks_that_it_gave(trees: LandmarkTrees, film: tuple[Tensor, Tensor]) -> None:
+    frames, _ = film
+    finder, landmarks = TreeFinder(trees), torch.zeros(68, 2)
+
+    def overwriting(image: Tensor, box: Tensor, tilt: float = 0.0) -> FaceReading:
+        reading = finder(image, box, tilt)
+        landmarks.copy_(reading.landmarks)
+        return replace(reading, landmarks=landmarks)
+
+    trackers = LandmarkTracker(finder), LandmarkTracker(overwriting)
+    first, second = (track_landmarks(frames[:8], tracker).values for tracker in trackers)
+    assert torch.equal(first, second)
 
 
 def test_many_starts_are_steadier_than_two(trees: LandmarkTrees, film: tuple[Tensor, Tensor]) -> None:
