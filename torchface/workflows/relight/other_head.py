@@ -55,7 +55,10 @@ def without_painted_hair(mesh: Mesh) -> Mesh:
     places, colors, faces = FacePlaces.of(mesh), vertex_albedo(mesh).double().clamp(min=_DARK), mesh.faces.cpu()
     parts = part_vertices(mesh)
     forehead = (places.place[:, 1] > places.brows + _ABOVE_BROWS) & ~parts
-    skin = colors[places.cheeks & ~parts].median(0).values
+    cheeks = places.cheeks & ~parts
+    if not cheeks.any():
+        return mesh  # nothing says what skin looks like
+    skin = colors[cheeks].median(0).values
     unlike = (colors.log() - skin.log()).norm(dim=1) > _UNLIKE_SKIN
     graph = VertexGraph(faces, len(colors))
     hair = (forehead & unlike).double()
