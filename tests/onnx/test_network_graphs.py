@@ -8,6 +8,7 @@ import onnxruntime
 import pytest
 import torch
 
+from torchface import zoo
 from torchface.landmarks import BoxNetwork
 from torchface.landmarks.images.boxes import box_network
 from torchface.landmarks.images.networks.eye_network import EyeNetwork
@@ -47,6 +48,13 @@ def test_other_sizes_than_it_was_exported_with(
     assert facts["task"] == "face_boxes"
     assert facts["values"] == str(list(FACE_VALUES)).replace("'", '"')
     assert facts["licence"] == "MIT"
+
+
+def test_the_landmark_network_of_the_zoo(tmp_path: Path) -> None:
+    """Its graph is within a tenth of a pixel and a fiftieth of a deviation, in half precision."""
+    report = export_model(zoo.get_model("landmark_network"), tmp_path / "landmarks.onnx")
+    assert report.parity["landmarks"] < 0.1
+    assert report.parity["point_deviation"] < 0.02
 
 
 def test_eyes_in_a_small_file(tmp_path: Path) -> None:

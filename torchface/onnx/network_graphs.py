@@ -85,6 +85,9 @@ def export_network(network: ImageNetwork, path: str | Path, facts: Mapping[str, 
         named = {next(iter(form.parity)): found} if isinstance(found, Tensor) else found._asdict()
         cases.append(({form.images: images}, named))
     units = {name: "pixels" if name in _PIXELS else "of 1" for name in form.parity}
+    units |= {
+        name: "pixels (above 1 a share)" for name in form.parity if name.endswith("deviation") and name in _PIXELS
+    }
     return write_checked(network_model(network, facts), path, cases, form.parity, units)
 
 
