@@ -15,6 +15,7 @@ from torchface.files.checkpoints import read_checkpoint, write_checkpoint
 from torchface.files.content_keys import content_key
 from torchface.geometry.meshes.operators import vertex_normals
 from torchface.geometry.meshes.surface_index import SurfaceIndex
+from torchface.geometry.meshes.unit_check import extent
 from torchface.geometry.similarity import Similarity, similarity_transform
 from torchface.io.landmarks.picks import load_correspondences
 from torchface.io.tables.csv_table import TableReader
@@ -25,6 +26,7 @@ from torchface.workflows.enhance.coarse_animation import check_scale, residual_n
 
 _METHOD = "enhance: correspondence/1"
 _NEAR, _NEAR_BY_PAIRS = 2.0, 6.0
+_SMALLEST, _LARGEST = 0.12, 5.8  # of the model's extent: a whole person beside a face, or a face beside a whole person
 _MOST_POINTS = 5000
 _ALIKE = 0.5  # cosine between two surfaces that are to be one
 _COLUMNS = ("input", "model")
@@ -112,6 +114,12 @@ def find_correspondence(
     )
     parts = read_checkpoint(state, key)
     if parts is None:
+        size, expected = extent(head.vertices), extent(model.vertices)
+        if not _SMALLEST < size / max(expected, 1e-9) < _LARGEST:
+            raise ValueRangeError(
+                f"{path}: its head measures {size:.0f} mm from corner to corner, the model's {expected:.0f} mm; scale "
+                "it to the size of a head, in Blender for example"
+            )
         bent, pose, known = _by_registration(head, model, progress) if given is None else _by_pairs(head, model, *given)
         parts = {"laid": bent.float(), "known": known, **{name: part.double() for name, part in vars(pose).items()}}
         write_checkpoint(state, parts, key)
