@@ -60,27 +60,30 @@ def strange_lines(photographs: Sequence[Path], fit: ImageFit) -> list[str]:
     ]
 
 
-def one_person_lines(photographs: Sequence[Path], marks: Tensor, bare: BareFit, insist: bool = False) -> list[str]:
+def one_person_lines(
+    photographs: Sequence[Path], marks: Tensor, bare: BareFit, insist: bool = False, expected: float = ONE_PERSON
+) -> list[str]:
     """Whether photographs that were fitted together show one person, for people to read; nothing if they do.
 
     Args:
         photographs: the files, I of them.
         marks: their landmarks, (I,68,2).
         insist: report it only.
+        expected: the probability from which on nothing is said.
     """
     if len(photographs) < 2:
         return []
     alone = [bare(marks[i : i + 1], [i]) for i in range(len(marks))]
     sure = same_person(alone).sigmoid()
     worst = int(sure.argmin())
-    if float(sure[worst]) >= ONE_PERSON:
+    if float(sure[worst]) >= expected:
         return []
     joint = float(misfits(bare(marks, list(range(len(marks))))).square().mean().sqrt())
     each = float(torch.stack([misfits(fit)[0] for fit in alone]).square().mean().sqrt())
     listed = ", ".join(f"{path.name} {share:.0%}" for path, share in zip(photographs, sure.tolist(), strict=True))
     figures = (
         f"probability that each shows the person of the others, by the form of the heads alone: {listed}, expected "
-        f"above {ONE_PERSON:.0%}; landmarks lie {joint:.1%} of the eyes' distance from one head "
+        f"above {expected:.0%}; landmarks lie {joint:.1%} of the eyes' distance from one head "
         f"for all, {each:.1%} from a head for each"
     )
     if float(sure[worst]) < OTHERS and not insist:

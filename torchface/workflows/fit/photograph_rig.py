@@ -29,7 +29,15 @@ from torchface.rendering.compositing import save_rendered_image
 from torchface.rig import BlendshapeRig
 from torchface.synthetic.head.embedded_character import is_performers
 from torchface.viz.figures.landmark_dots import with_dots
-from torchface.workflows.fit.fit_checks import ALONE, eyes_distances, landmark_lines, one_person_lines, strange_lines
+from torchface.workflows.fit.fit_checks import (
+    ALONE,
+    ONE_PERSON,
+    OTHERS,
+    eyes_distances,
+    landmark_lines,
+    one_person_lines,
+    strange_lines,
+)
 from torchface.workflows.fit.fit_landmarks import (
     DEFAULT_LANDMARKS,
     PhotographLandmarks,
@@ -209,7 +217,7 @@ def fit_photographs(
         remarks += cover_lines(photograph, shown, points)
         remarks += [] if settings.everything else light_lines(photograph, image, shown, points)
     # The tracker has followed one face through a film.
-    remarks += one_person_lines(photographs, marks, bare, insist or one_film)
+    remarks += one_person_lines(photographs, marks, bare, insist or one_film, OTHERS if one_film else ONE_PERSON)
     fit = fit_images(heads, rig, marks, sizes, images, settings.focal, fitting, progress)
     remarks += profile_lines(fit)
     if found:
