@@ -331,8 +331,20 @@ def test_given_landmarks_that_do_not_fit_are_said(people: People, tmp_path: Path
     assert "irises: #404040, their brightness in the photographs, which show no colours" in eyes.lines()
     assert "irises: #404040, their colour in the photographs" in replace(eyes, grey=False).lines()
     warned = replace(fits, remarks=("WARNING: takeo.ppm: the mouth hidden", "note: dark"))
-    assert warned.verdict().startswith("result: in part")
+    assert warned.verdict().startswith("result: partly usable")
     assert "; 1 warning below; " in warned.verdict()
+
+
+@pytest.mark.real
+def test_landmarks_of_another_photograph_make_a_poor_result(data: Path, tmp_path: Path) -> None:
+    folder, settings = data / "images" / "people", PhotographSettings(fit=FitSettings(texture_size=0))
+    made = fit_photographs([folder / "lfpw_1.png"], [folder / "lfpw_2.pts"], None, tmp_path / "rig.glb", settings)
+    assert made.verdict().startswith("result: poor, the given landmarks do not fit and are not on a face"), (
+        made.verdict()
+    )
+    (line,) = made.remarks
+    assert line.startswith("WARNING: lfpw_1.png: the given landmarks do not fit well")
+    assert "expected less than 4.5%; landmark_network finds no face where they lie" in line
 
 
 def test_exact_landmarks_of_one_head_are_of_one_person() -> None:

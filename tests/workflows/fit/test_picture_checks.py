@@ -1,5 +1,6 @@
 """What makes a photograph unfit for a likeness is said with its figure; what is hardly a face is refused."""
 
+import re
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -100,6 +101,11 @@ def test_hidden_and_small_faces() -> None:
     assert "20 pixels between the eyes' outer corners" in picture_lines(found(reading(20.0)))[0]
     with pytest.raises(NoFaceError, match="found 8 pixels between the outer corners of the eyes, expected at least 10"):
         picture_lines(found(reading(8.0)))
+    turned = replace(face, landmarks=200 - face.landmarks, deviation=torch.full((68,), 90.0))
+    turned.landmarks[36:42] += torch.tensor([20.0, 0.0])
+    with pytest.raises(NoFaceError, match=r"a face upside down \(roll angle 180°\).*expected an upright face \(0°\)"):
+        picture_lines(found(turned))
+    assert picture_lines(found(replace(turned, deviation=face.deviation))) == []
     with pytest.raises(NoFaceError, match=r"hardly a face \(likelihood 0\.20\)"):
         picture_lines(found(replace(face, presence=torch.tensor(0.2))))
 
@@ -229,3 +235,6 @@ def test_light_from_one_side_is_remarked_on(right: tuple[float, ...], words: str
     assert [words in line for line in lines] == [True] if words else lines == []
     dim = light_lines(Path("a.png"), to_srgb(0.3 * picture), parts, points)
     assert next(line for line in dim if "under-exposed" in line).startswith("note: a.png")
+    dark = light_lines(Path("a.png"), to_srgb(0.05 * picture), parts, points)
+    assert re.match(r"WARNING: a\.png: too dark: it shows 1/\d+ of the light .* expected at least 1/5; ", dark[0]), dark
+    assert not any("too fair" in line for line in dark)

@@ -173,14 +173,14 @@ def test_a_spike_in_a_take_that_is_not_cleaned_is_no_good_result(
     take = changed(stage, "spiked.c3d", spiked)
     solve(stage, take)
     printed = " ".join(capsys.readouterr().err.split())
-    assert "result: in part, single frames are wrong" in printed
+    assert "result: partly usable, single frames are wrong" in printed
     assert "20" in printed.split("mm from the solved face, at worst")[0]
     assert "add --clean" in printed
     solve(stage, take, "--clean")
     assert "warning" not in capsys.readouterr().err
 
 
-@pytest.mark.parametrize(("noise", "verdict"), [(0.7, "in part"), (2.0, "poor")])
+@pytest.mark.parametrize(("noise", "verdict"), [(0.7, "partly usable"), (2.0, "poor")])
 def test_markers_that_lie_beside_the_solved_face_are_no_good_result(
     stage: Path, noise: float, verdict: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -204,7 +204,7 @@ def test_coverage_is_of_the_attachment(
     printed = " ".join(capsys.readouterr().err.split())
     assert "warning: the take shows 12 of the attachment's 30 markers" in printed
     share = float(torch.isfinite(take.markers.values[:, :12, 0]).double().mean()) * 12 / 30
-    assert printed.startswith(f"result: in part, {100 * share:.1f} % of the markers' samples were seen")
+    assert printed.startswith(f"result: partly usable, {100 * share:.1f} % of the markers' samples were seen")
     with pytest.raises(SystemExit):
         solve(stage, stage / "one.c3d")
     assert not (stage / "weights.csv").exists()

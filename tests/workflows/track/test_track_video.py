@@ -172,7 +172,7 @@ def test_the_verdict_comes_first(done: Done) -> None:
     marks = tracked.reading.landmarks.clone()
     marks[: FRAMES // 2] = torch.nan
     half = replace(tracked, reading=replace(tracked.reading, landmarks=marks))
-    assert half.verdict().startswith(f"result: in part, the face was found in {FRAMES - FRAMES // 2} of {FRAMES}")
+    assert half.verdict().startswith(f"result: partly usable, the face was found in {FRAMES - FRAMES // 2} of {FRAMES}")
 
 
 def test_offsets_of_another_person_are_said(done: Done, filmed: Filmed, tmp_path: Path) -> None:

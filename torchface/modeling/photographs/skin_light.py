@@ -40,12 +40,20 @@ _EYE_PIXELS = 10  # of the crop
 def exposure_gain(image: Tensor, parts: FaceParts) -> float:
     """What a photograph's light is multiplied by to be well exposed; what is too dark shows nobody's complexion.
 
-    By what is brightest in the whole picture and about the face; but not so far that its skin is more than fair, or the
-    whites of the eyes brighter than in good light: beside a dark complexion they are bright in a dim picture too.
+    As :func:`needed_gain`, but at most 2.5.
 
     Args:
         image: sRGB, (3,H,W).
         parts: what it shows.
+    """
+    return min(needed_gain(image, parts), _BRIGHTER)
+
+
+def needed_gain(image: Tensor, parts: FaceParts) -> float:
+    """What would make a photograph well exposed, however dark it is; see :func:`exposure_gain`.
+
+    By what is brightest in the whole picture and about the face; but not so far that its skin is more than fair, or the
+    whites of the eyes brighter than in good light: beside a dark complexion they are bright in a dim picture too.
     """
     image = image[:3]
     crop = to_linear(cut_crop((255 * image.clamp(0, 1)).byte(), parts.transform, parts.shares.shape[-1]) / 255).double()
@@ -55,7 +63,7 @@ def exposure_gain(image: Tensor, parts: FaceParts) -> float:
     gain = math.prod(max(1.0, _WHITE / max(one, 0.01)) for one in brightest) ** 0.5
     limits = [_FAIR / max(float(skin.median()), 1e-3)] if len(skin) else []
     limits += [_EYE_WHITE / max(float(eyes.quantile(_EYE)), 1e-3)] if len(eyes) >= _EYE_PIXELS else []
-    return max(1.0, min(gain, _BRIGHTER, *limits))
+    return max(1.0, min([gain, *limits]))
 
 
 def exposed(image: Tensor, parts: FaceParts) -> Tensor:

@@ -16,6 +16,9 @@ MISFIT = 0.045
 """Of the eyes' distance: landmarks that lie further from the fit are remarked on; those found in three photographs
 of people at most 2.4 % without the contour."""
 
+NO_FACE_THERE = "finds no face where they lie"
+"""In the line on given landmarks that do not fit and are not on a face: such a fit is poor, however near it comes."""
+
 ONE_PERSON, OTHERS = 0.95, 0.25
 """Probabilities: photographs above the first show one person, those below the second are refused.
 
@@ -115,11 +118,15 @@ def landmark_lines(
         said = f"{name}: the given landmarks do not fit well, residual {misfit:.1%} of the eyes' distance"
         reading = _found_there(photographs[i], images[i], marks[i], finder)
         if reading is None:
-            lines.append(f"{said}; {finder} finds no face there to compare with; look at them in the image of the fit")
+            lines.append(
+                f"WARNING: {said}, expected less than {MISFIT:.1%}; {finder} {NO_FACE_THERE}: are they of another "
+                f"photograph? Look at them in the image of the fit, or leave out --landmarks"
+            )
             continue
         other = float(misfits(bare(reading.confident[None], [i]))[0])
         lines.append(
-            f"{said}; those that {finder} finds have {other:.1%}; look at both in the images of the fit"
+            ("WARNING: " if other < misfit else "")
+            + f"{said}; those that {finder} finds have {other:.1%}; look at both in the images of the fit"
             + (", and leave out --landmarks to take the found ones" if other < misfit else "")
         )
     return lines

@@ -31,6 +31,7 @@ from torchface.synthetic.head.embedded_character import is_performers
 from torchface.viz.figures.landmark_dots import with_dots
 from torchface.workflows.fit.fit_checks import (
     ALONE,
+    NO_FACE_THERE,
     ONE_PERSON,
     OTHERS,
     eyes_distances,
@@ -108,7 +109,9 @@ class FittedHead:
         fit = f"eyes, nose and mouth lie {off:.1%} of the eyes' distance from the landmarks"
         look = f"look at {self.overlays[0].name} first" if self.overlays else "look at the rig first"
         warned = sum(line.startswith("WARNING") for line in self.remarks)
-        word = "poor" if off > _POOR else "in part" if warned else "good"
+        stray = any(NO_FACE_THERE in line for line in self.remarks)
+        word = "poor" if off > _POOR or stray else "partly usable" if warned else "good"
+        word += ", the given landmarks do not fit and are not on a face that is found" if stray else ""
         more = f"; {warned} {'warnings' if warned > 1 else 'warning'} below" if warned else ""
         return f"result: {word}, {fit} (at most {_POOR:.0%} is usual){more}; {look}"
 

@@ -16,12 +16,15 @@ from torchface.landmarks.images.face_crop import cut_crop
 from torchface.landmarks.images.networks.part_finder import FaceParts
 from torchface.modeling import ImageFit
 from torchface.modeling.photographs.image_texture import GREY
-from torchface.modeling.photographs.skin_light import exposure_gain
+from torchface.modeling.photographs.skin_light import exposure_gain, needed_gain
 from torchface.workflows.fit.fit_landmarks import PhotographLandmarks
 
 # Pixels between the outer corners of the eyes: a face 40 pixels wide has 20.
 _LEAST_EYES, _FEW_EYES = 10.0, 30.0
 _PRESENT = 0.5
+# Degrees, and mean confidence: of 7 upright faces with the mouth covered that were found upside down at most 0.42, of
+# 18 faces in photographs that were turned upside down at least 0.63.
+_TILTED, _SURE_TILTED = 90.0, 0.5
 _HIDDEN, _EYE_HIDDEN = 0.4, 0.3  # visibilities; those of 9 faces that nothing hides were above 0.87 and 0.91
 _RIVAL = 0.5  # of the chosen face's area: another that large may be the one that is meant
 # Logarithms of skin's colour, medians: the mean of red and blue over green, and blue over red. 32 faces in 13 pictures
@@ -39,7 +42,7 @@ _FINEST = 300.0  # pixels across a face: of larger ones pixels are averaged
 _FLAT_GREY = 0.18  # share of pixels like their neighbours; 9 photographs at most 0.12
 _CHEEK = 0.14  # of the distance of the eyes' outer corners
 _ONE_SIDE, _TWO_HUES = 2.5, 1.6  # factors; of 5 photographs 1.0 to 1.15 and 1.0 to 1.25, of a patchy one 1.5 and 2.1
-_DEVELOPED = 1.4  # a factor of light
+_DEVELOPED, _TOO_DARK = 1.4, 5.0  # factors of light
 _PROFILE = 50.0  # degrees
 _GRID = 40
 _COVERS = {
@@ -62,6 +65,13 @@ def picture_lines(found: PhotographLandmarks, insist: bool = False) -> list[str]
         refusals.append(f"{eyes:.0f} pixels between the outer corners of the eyes, expected at least {_LEAST_EYES:.0f}")
     if float(face.presence) < _PRESENT:
         refusals.append(f"hardly a face (likelihood {float(face.presence):.2f}), expected one of a person")
+    across = face.landmarks[42:48].mean(0) - face.landmarks[36:42].mean(0)
+    roll, confidence = math.degrees(math.atan2(across[1], across[0])), float(face.confidence.mean())
+    if abs(roll) > _TILTED and confidence < _SURE_TILTED:
+        refusals.append(
+            f"a face upside down (roll angle {roll:.0f}°) with landmarks that are unsure (confidence "
+            f"{confidence:.2f}), expected an upright face (0°), or a confidence of {_SURE_TILTED} at least"
+        )
     if {"eyes", "mouth"} <= set(hidden):
         refusals.append(f"eyes and mouth hidden (visible to {hidden['eyes']:.0%} and {hidden['mouth']:.0%})")
     rivals = _rivals(found)
@@ -129,8 +139,14 @@ def light_lines(photograph: Path, image: Tensor, parts: FaceParts, landmarks: Te
         parts: what it shows.
         landmarks: of the face, (68,2) pixels; NaN for missing.
     """
-    lines, gain = list[str](), exposure_gain(image, parts)
-    if gain > _DEVELOPED:
+    lines, gain, needed = list[str](), exposure_gain(image, parts), needed_gain(image, parts)
+    if needed > _TOO_DARK:
+        lines.append(
+            f"WARNING: {photograph.name}: too dark: it shows 1/{needed:.0f} of the light of a well exposed photograph, "
+            f"expected at least 1/{_TOO_DARK:.0f}; its light is multiplied by {gain:.1f} only, so the painted skin is "
+            f"too dark; give a photograph in good light"
+        )
+    elif gain > _DEVELOPED:
         lines.append(
             f"note: {photograph.name}: taken for under-exposed, its light multiplied by {gain:.1f}, for what "
             f"should be white in it is grey; if the skin is too fair now, give a photograph in good light"

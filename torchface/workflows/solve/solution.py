@@ -144,11 +144,11 @@ class SolveReport:
             return f"result: poor, {lie}; are rig and sites this person's own, and the labels right?); {seen}"
         if fit.noisy:
             why = "more noise than a stage's, another head's rig, or a take that needs --clean or --slip?"
-            return f"result: in part, {lie}; {why}); {seen}"
+            return f"result: partly usable, {lie}; {why}); {seen}"
         if self.solution.stray_warnings:
-            return f"result: in part, single frames are wrong, see the warning; {lie}); {seen}"
+            return f"result: partly usable, single frames are wrong, see the warning; {lie}); {seen}"
         if self.seen < _MOST:
-            return f"result: in part, {seen}, and where they are missing weights are guessed; {lie})"
+            return f"result: partly usable, {seen}, and where they are missing weights are guessed; {lie})"
         return f"result: good, {lie}); {seen}"
 
     def lines(self) -> list[str]:

@@ -184,7 +184,7 @@ class Tracked:
             )
             return f"result: poor, {fit} (at most {100 * _POOR:.3g} % is usual; {whose}?); {found}"
         if seen < _MOST * count:
-            return f"result: in part, {found}; there {fit} (at most {100 * _POOR:.3g} % is usual)"
+            return f"result: partly usable, {found}; there {fit} (at most {100 * _POOR:.3g} % is usual)"
         return f"result: good, {found}, and {fit} (at most {100 * _POOR:.3g} % is usual)"
 
     def lines(self) -> list[str]:
