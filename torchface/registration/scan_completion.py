@@ -14,8 +14,8 @@ _LINK = 0.577  # cotangent of 60°: the weight of an edge between equilateral tr
 _FORM_FADES, _COLORS_FADE = 80.0, 40.0
 # Beside what is unseen lie vertices that hair or a scan's border moved: of those so near, millimetres, the form goes on
 # from what a plate of this reach makes of those less than about so far off it. Beside hair those further off are no
-# skin; what the rest is off fades within 15 mm.
-_BESIDE, _ALIKE, _NO_SKIN, _EDGE_FADES = 20.0, 0.5, 3.0, 15.0
+# skin; what the rest is off goes on as a plate of its own, that fades within 20 mm, so that no edge shows.
+_BESIDE, _ALIKE, _NO_SKIN, _EDGE_FADES = 20.0, 0.5, 3.0, 20.0
 _FIRST_REACH, _REACH, _ROUNDS = 20.0, 5.0, 6
 _LEAST_AREA = 1e-3
 _MIN_COUNT = 4
@@ -50,7 +50,8 @@ def completed_form(
         return current, unseen
     aligned = similarity_transform(rest[shown][None], current[shown][None]).apply(rest)[0]
     stiffness, area = _membrane(aligned, faces)
-    plate = stiffness @ sparse.diags_array(1 / area) @ stiffness + sparse.diags_array(area / _FORM_FADES**4)
+    bending = stiffness @ sparse.diags_array(1 / area) @ stiffness
+    plate = bending + sparse.diags_array(area / _FORM_FADES**4)
     offset = current - aligned
     gap, _ = cKDTree(aligned[unseen].numpy()).query(aligned.numpy())
     beside = shown & (torch.from_numpy(gap) < _BESIDE)
@@ -61,7 +62,7 @@ def completed_form(
         off = (offset - form).norm(dim=1)
         weights, reach = beside / (1 + (off / _ALIKE).square()).square(), _REACH
     unseen = unseen | (beside & doubtful & (off > _NO_SKIN))
-    edge = _spread(stiffness + sparse.diags_array(area / _EDGE_FADES**2), offset - form, unseen)
+    edge = _spread(bending + sparse.diags_array(area / _EDGE_FADES**4), offset - form, unseen)
     return torch.where(unseen[:, None], aligned + form + edge, current), unseen
 
 
