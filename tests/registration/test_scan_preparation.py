@@ -1,5 +1,6 @@
 """Scans, templates and landmarks that cannot be right, and what is said of them."""
 
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -7,12 +8,13 @@ import pytest
 import torch
 
 from torchface.errors import AlignmentError, ShapeError, TopologyError, ValueRangeError
+from torchface.geometry.meshes.surface_index import SurfaceIndex
 from torchface.geometry.mirrored_points import check_mirrored
 from torchface.io.landmarks.landmark_points import load_landmark_points
 from torchface.mesh import Mesh
 from torchface.registration import register
 from torchface.registration.nonrigid.schedule import DEFAULT_SCHEDULE, Level, Schedule, Stage
-from torchface.registration.scan_preparation import check_same_hand, prepare_scan
+from torchface.registration.scan_preparation import check_landmarks, check_same_hand, prepare_scan
 from torchface.synthetic import performer
 
 
@@ -73,6 +75,28 @@ def test_fewer_than_three_landmarks_are_refused(mask: Mesh) -> None:
     lost[4:7] += 500.0
     with pytest.raises(ShapeError, match=r"found 2 that can be used of 8 \(3 are NaN, 3 lie more than 15 mm off"):
         register(mask, mask, (mask.landmarks, lost))
+
+
+@pytest.mark.parametrize(
+    ("factor", "unit", "cure"), [(1e-3, "metres", "1000"), (0.1, "centimetres", "10"), (1e3, "millimetres", "0.001")]
+)
+def test_landmarks_in_another_unit_than_the_scan_are_refused(mask: Mesh, factor: float, unit: str, cure: str) -> None:
+    points = mask.vertices[mask.landmarks] * factor
+    words = rf"mm across, where the template's are \S+ mm across, as points in {unit} beside a scan in .*: multiply them by {cure}$"
+    with pytest.raises(ValueRangeError, match=words):
+        register(mask, mask, (mask.landmarks, points))
+
+
+def test_a_scan_of_one_side_of_the_face_is_said() -> None:
+    head = performer(texture=False).neutral
+    ids = head.landmarks.cpu()
+    points = head.vertices.double()
+    least = points[ids[30], 0] - 5
+    kept = head.faces[(points[head.faces, 0] > least).all(1)]
+    note = check_landmarks((ids, points[ids]), head, SurfaceIndex(points, kept))[2]
+    words = r"WARNING: the scan shows one side .*: (\d+) of \1 landmarks at the person's right lie off it, 0 of "
+    assert re.search(words, note), note
+    assert check_landmarks((ids, points[ids]), head, SurfaceIndex(points, head.faces))[2] == ""
 
 
 def test_landmarks_on_a_line_are_refused(mask: Mesh, make_mask) -> None:

@@ -1,6 +1,8 @@
 """Faults of a scan and its landmarks: repaired where that is safe, reported where it is not."""
 
+import math
 from dataclasses import dataclass
+from itertools import permutations
 
 import torch
 from torch import Tensor
@@ -18,6 +20,15 @@ _CRUMB = 0.02
 _OFF_SURFACE = 15.0
 _WORST_LANDMARK_FIT = 0.1
 _LINE = 0.02
+_UNITS = {  # by the power of ten that points are too small by
+    3: "metres beside a scan in millimetres",
+    2: "metres beside a scan in centimetres",
+    1: "centimetres beside a scan in millimetres",
+    -1: "millimetres beside a scan in centimetres",
+    -3: "millimetres beside a scan in metres",
+}
+# Millimetres from the face's middle, beyond what a scan that ends 5 mm beyond it can show; share of a side's landmarks.
+_BESIDE, _ONE_SIDE = 20.0, 0.8
 _LEAST_EXTENT, _MOST_EXTENT = 0.17, 9.0  # of a template's: a scan may show less than the face or the whole person
 
 Landmarks = tuple[Tensor, Tensor]
@@ -118,7 +129,9 @@ def check_landmarks(landmarks: Landmarks, template: Mesh, scan: SurfaceIndex) ->
             f"landmarks: found template vertices {int(ids.min())} to {int(ids.max())}, "
             f"expected 0 to {len(template.vertices) - 1}"
         )
+    own = template.vertices.detach().cpu().double()[ids]
     present = torch.isfinite(points).all(-1)
+    _check_size(own[present], points[present])
     off = torch.zeros_like(present)
     off[present] = scan.nearest(points[present]).distance > _OFF_SURFACE
     keep = present & ~off
@@ -127,8 +140,8 @@ def check_landmarks(landmarks: Landmarks, template: Mesh, scan: SurfaceIndex) ->
     if int(keep.sum()) < 3:
         why = f" ({', '.join(reasons)})" if reasons else ""
         raise ShapeError(f"landmarks: found {int(keep.sum())} that can be used of {len(ids)}{why}, expected at least 3")
-    ids, points = ids[keep], points[keep]
-    own = template.vertices.detach().cpu().double()[ids]
+    sides = _one_side(own[present], off[present])
+    ids, points, own = ids[keep], points[keep], own[keep]
     for name, cloud in (("template", own), ("scan", points)):
         singular_values = torch.linalg.svdvals(cloud - cloud.mean(0))
         if float(singular_values[1]) <= _LINE * float(singular_values[0]):
@@ -142,5 +155,36 @@ def check_landmarks(landmarks: Landmarks, template: Mesh, scan: SurfaceIndex) ->
             f"landmarks: the best similarity leaves {error:.1f} mm (root mean square) between the template's and the "
             f"scan's, which are {size:.0f} mm across; expected both in the same order"
         )
-    note = f"of {len(keep)} landmarks {' and '.join(reasons)}; they were left out" if reasons else ""
+    note = f"of {len(keep)} landmarks {' and '.join(reasons)}; they were left out{sides}" if reasons else ""
     return (ids, points), pose, note
+
+
+def _check_size(own: Tensor, points: Tensor) -> None:
+    """Refuses points on a scan (L,3) in another unit than a template's own (L,3); the farthest half may be wrong."""
+    if len(points) < 3:
+        return
+    order = (points - points.median(0).values).norm(dim=1).argsort()[: max(3, len(points) // 2 + 1)]
+    size, beside = extent(points[order]), extent(own[order])
+    if not 0 < size < _LEAST_EXTENT * beside and not size > _MOST_EXTENT * beside:
+        return
+    power = round(math.log10(max(beside, 1e-30) / size))
+    seem = f", as points in {_UNITS[power]} are" if power in _UNITS else ""
+    raise ValueRangeError(
+        f"landmarks: found {size:.3g} mm across, where the template's are {beside:.3g} mm across{seem}; "
+        f"expected the scan's unit: multiply them by {10.0**power:g}"
+    )
+
+
+def _one_side(own: Tensor, off: Tensor) -> str:
+    """What to say where a template's landmarks (L,3) are off the scan, (L,) bool, on one side of the face only."""
+    middle = 0.5 * (own[:, 0].amin() + own[:, 0].amax())
+    left, right = own[:, 0] - middle > _BESIDE, middle - own[:, 0] > _BESIDE
+    for (name, away), (other, near) in permutations((("left", left), ("right", right))):
+        lost, kept = int((off & away).sum()), int((~off & near).sum())
+        if lost > _ONE_SIDE * int(away.sum()) and kept > _ONE_SIDE * int(near.sum()):
+            return (
+                f". WARNING: the scan shows one side of the face only: {lost} of {int(away.sum())} landmarks at the "
+                f"person's {name} lie off it, {int(near.sum()) - kept} of {int(near.sum())} at their {other}; the "
+                f"{name} side is a guess"
+            )
+    return ""

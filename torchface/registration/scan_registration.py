@@ -45,6 +45,12 @@ _SETTLED = 12.0  # reach of a stage, millimetres: from there on the template lie
 _MAX_COMPLETIONS = 6
 _MIN_MET = 0.1  # share of what faces outward; scans of faces alone under templates of whole heads give a quarter
 
+NO_COLORS = (
+    "the scan has neither a texture with coordinates nor vertex colours (is the image that its material names beside "
+    "it?); the result has no colours"
+)
+"""A note, untrue of a scan whose colours the user leaves out."""
+
 
 @dataclass(frozen=True, eq=False)
 class Registration:
@@ -238,10 +244,11 @@ def _final_notes(template: Mesh, scan: Mesh, deformer: Deformer, texture_size: i
             "there, or smooth them in a mesh editor"
         )
     if not has_colors(scan):
-        notes.append(
-            "the scan has neither a texture with coordinates nor vertex colours (is the image that its material "
-            "names beside it?); the result has no colours"
-        )
+        notes += [
+            NO_COLORS,
+            "without colours hair cannot be distinguished from skin: where the scan has hair, the skull may have the "
+            "hair's shape",
+        ]
     elif template.uvs is None and texture_size:
         notes.append("the template has no texture coordinates; the scan's colours are on the vertices only")
     return notes

@@ -98,7 +98,8 @@ def _pose_by_shape(template: Mesh, samples: Samples, scan: ScanPoints, exposed: 
         )
     return pose, [
         f"the face was found by its shape alone and fits {best:.2f} of 1 there, where heads fit {_SURE_FIT} and more: "
-        "look at the report's pictures, and give landmarks if it lies elsewhere"
+        "look at the registered mesh (torchface register writes NAME.glb and contact_sheet.png), and give landmarks if "
+        "it lies elsewhere"
     ]
 
 

@@ -105,6 +105,10 @@ def test_a_loose_part_that_the_scan_does_not_show_keeps_the_templates_colours(
     assert found.colors is not None
     torch.testing.assert_close(found.colors[count:], colors[count:], atol=0.01, rtol=0)
     assert float((found.colors[:count] - 0.5).abs().median()) < 0.02
+    left_out = replace(settings, colors=False)
+    notes = " ".join(register_scans(whole, [tmp_path / "grey.ply"], tmp_path / "clay", left_out).done[0].notes)
+    assert "without colours hair cannot be distinguished from skin" in notes
+    assert "the scan has neither a texture" not in notes
 
 
 def test_bad_scans_are_told_and_skipped(scans: Path, done: BatchReport) -> None:

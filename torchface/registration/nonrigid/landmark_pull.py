@@ -89,6 +89,7 @@ class LandmarkPull:
         let_go = "; those along the jaw were let go" if (self.contour & (off > _DISAGREES)).any() else ""
         return [
             f"landmarks disagree with the surface, on which the registered mesh lies beside them: "
-            f"{' and '.join(remarks)}{let_go}. They are likely picked or found at wrong places: look at them in the "
-            "report's pictures, correct them in their file or leave those out"
+            f"{' and '.join(remarks)}{let_go}. They are likely picked or found at wrong places: look at them beside "
+            "the registered mesh (torchface register writes NAME.glb and contact_sheet.png), "
+            "correct them in their file or leave those out"
         ]

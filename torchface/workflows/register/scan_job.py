@@ -21,8 +21,8 @@ from torchface.registration.landmark_files import landmark_file, load_scan_landm
 from torchface.registration.model_fit import LinearShape
 from torchface.registration.nonrigid.schedule import Schedule
 from torchface.registration.registered_mesh import hidden_parts, in_place_of, with_template_skin
-from torchface.registration.scan_colors import without_colors
-from torchface.registration.scan_registration import Registration, register
+from torchface.registration.scan_colors import has_colors, without_colors
+from torchface.registration.scan_registration import NO_COLORS, Registration, register
 from torchface.rendering.clay_shading import render
 from torchface.rendering.compositing import sheet
 from torchface.viz.figures.error_maps import error_colors
@@ -97,7 +97,8 @@ class ScanJob:
     def _registered(self, scan: Path, points: Path | None) -> tuple[Registration, int]:
         """The registration, and how many landmarks were given."""
         mesh, landmarks = load_mesh(scan, self.unit), None
-        mesh = mesh if self.colors else without_colors(mesh)
+        left_out = not self.colors and has_colors(mesh)
+        mesh = without_colors(mesh) if left_out else mesh
         if points is not None:
             landmarks = load_scan_landmarks(points, self.template, scan, self.unit)
         registration = register(
@@ -109,6 +110,9 @@ class ScanJob:
             schedule=self.schedule,
             texture_size=self.texture_size,
         )
+        if left_out:
+            notes = tuple(note for note in registration.record.notes if note != NO_COLORS)
+            registration = replace(registration, record=replace(registration.record, notes=notes))
         found = with_placed_parts(self.template, registration)
         hidden = hidden_parts(self.template, found.matched)
         found = replace(found, mesh=with_template_skin(found.mesh, self.template, hidden))
