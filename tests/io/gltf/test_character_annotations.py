@@ -62,6 +62,21 @@ def test_landmarks_of_rows_that_were_put_in_another_order_are_not_taken(annotate
     assert load_mesh(annotated).annotations.landmarks is None
 
 
+def test_landmarks_are_of_rows_that_two_materials_share(annotated: Path) -> None:
+    """Of which one places its texture otherwise, as beside whole numbers of gltfpack."""
+    before = load_mesh(annotated)
+    root, binary = unpacked(annotated)
+    change = {"KHR_texture_transform": {"scale": [0.5, 0.5]}}
+    root["materials"].append({"pbrMetallicRoughness": {"baseColorTexture": {"index": 0, "extensions": change}}})
+    primitives = root["meshes"][0]["primitives"]
+    primitives.append({**primitives[0], "material": len(root["materials"]) - 1})
+    annotated.write_bytes(packed(root, binary))
+    after = load_mesh(annotated)
+    assert torch.equal(after.vertices[after.landmarks], before.vertices[before.landmarks])
+    for name, mask in before.annotations.regions.items():
+        assert torch.equal(after.vertices[after.annotations.regions[name]], before.vertices[mask])
+
+
 @pytest.mark.parametrize(
     ("field", "value"),
     [

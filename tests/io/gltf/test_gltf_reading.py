@@ -7,6 +7,8 @@ import torch
 from gltf_samples import LIFT, SQUARE, SQUARE_TRIANGLES, Builder, square
 
 from torchface.io import load_mesh, load_rig
+from torchface.io.gltf.character_scene import read_character
+from torchface.io.gltf.gltf_document import read_document
 
 
 def close(found: torch.Tensor, expected: object, within: float = 1e-3) -> bool:
@@ -157,6 +159,22 @@ def test_texture_coordinates_are_shifted_turned_and_scaled_as_the_material_says(
     mesh = load_mesh(build.save(tmp_path / "face.gltf"))
     corners = mesh.uvs[mesh.uv_faces]
     assert close(corners[0], [[0.25, 0.5], [0.25, 1.0], [0.5, 1.0]], 1e-6)
+
+
+def test_materials_of_a_character_place_their_textures_on_rows_that_they_share(tmp_path: Path) -> None:
+    build = square()
+    (first,) = build.root["meshes"][0]["primitives"]
+    first["attributes"]["TEXCOORD_0"] = build.accessor(np.array([[0, 0], [100, 0], [1, 1], [0, 1]], np.float32))
+    change = {"KHR_texture_transform": {"scale": [0.01, 0.01]}}
+    textures = [{"index": 0, "extensions": change}, {"index": 0}]
+    build.root["materials"] = [{"pbrMetallicRoughness": {"baseColorTexture": texture}} for texture in textures]
+    build.root["textures"] = [{}]
+    build.root["meshes"][0]["primitives"] = [
+        {**first, "material": row, "indices": build.accessor(SQUARE_TRIANGLES.reshape(2, 3)[row].ravel())}
+        for row in range(2)
+    ]
+    character = read_character(read_document(build.save(tmp_path / "face.gltf")))
+    assert close(character.uvs[[1, 3]], [[1, 1], [0, 0]], 1e-6)  # each of one of them alone; from the lower left
 
 
 @pytest.mark.parametrize(("mode", "order"), [(5, [0, 1, 3, 2]), (6, [0, 1, 2, 3])])

@@ -18,6 +18,7 @@ from torchface.rig import BlendshapeRig
 from torchface.synthetic import performer
 from torchface.workflows.rig.character_face import character_search
 from torchface.workflows.rig.character_rig import CharacterReport, rig_character
+from torchface.workflows.rig.face_openings import Loop
 
 AXIS, STEP = -15.0, 2.5  # millimetres: the axis round which the head is sampled, and how densely
 
@@ -65,6 +66,17 @@ def known_face(patch: pytest.MonkeyPatch) -> None:
 def motion(character: Character, name: str) -> torch.Tensor:
     (block,) = character.blocks
     return 1000 * character.targets(block)[block.names.index(name)].double()
+
+
+def test_the_upper_edge_of_lips_that_have_crossed_is_that_of_its_vertex() -> None:
+    angle = torch.arange(12, dtype=torch.float64) * np.pi / 6
+    places = torch.stack([angle.cos(), -0.01 * angle.sin(), 0 * angle], 1)  # the upper edge, 1 to 5, lies lower
+    loop = Loop.of(torch.arange(12), places, top=3)
+    assert loop.vertices.tolist() == list(range(12))
+    assert loop.share[[0, 3, 6, 9]].tolist() == pytest.approx([0.0, 0.25, 0.5, 0.75])
+    turned = Loop.of(torch.arange(12).flip(0), places, top=3)
+    assert turned.vertices.tolist() == list(range(12))
+    assert Loop.of(torch.arange(12), places).vertices.tolist() == [0, *range(11, 0, -1)]
 
 
 @pytest.mark.bench

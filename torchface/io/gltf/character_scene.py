@@ -206,7 +206,8 @@ class _Shelf:
             document.reserve(faces.size * BYTES_A_CORNER, location)
             material, texture = self._material(primitive, f"meshes[{mesh}].primitives[{number}].material")
             if (found := read_uvs(document, attributes, texture, location, count)) is not None:
-                uvs = found
+                own = np.unique(faces)  # other materials may place their textures otherwise
+                uvs[own] = found[own]
             mirrored = np.linalg.det(matrices[faces[:, 0], :3, :3]) < 0
             self.faces.append(np.where(mirrored[:, None], faces[:, ::-1], faces) + self._count)
             self.material.append(np.full(len(faces), material))

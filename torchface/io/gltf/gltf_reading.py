@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import accumulate
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -135,7 +136,7 @@ def _piece(
         uv_faces,
         None if part.colors is None else torch.from_numpy(part.colors[joined.row_of]),
         read_polygons(document, extras, location, faces),
-        _annotations(document, part.extras.get("torchface"), location, vertices.astype(np.float64) / scale, joined),
+        _annotations(document, part, location, vertices.astype(np.float64) / scale, joined),
         torch.from_numpy(deltas),
         part.names,
     )
@@ -255,16 +256,28 @@ def weld(part: Part) -> Weld:
 
 
 def _annotations(
-    document: Document, extras: object, location: str, vertices: NDArray[np.float64], joined: Weld
+    document: Document, part: Part, location: str, vertices: NDArray[np.float64], joined: Weld
 ) -> Annotations | None:
     """Those of the mesh as it was written; without landmarks there, those of a character's rows."""
+    extras = part.extras.get("torchface")
     own = read_annotations(document, extras, location, len(vertices)) if joined.authored else None
     if own is not None and own.landmarks is not None:
         return own
-    of_rows = read_row_annotations(document, extras, location, vertices, (joined.vertex_of, joined.row_of))
+    once = _read_once(part)
+    row_of = np.cumsum(once)[joined.row_of] - 1
+    of_rows = read_row_annotations(document, extras, location, vertices, (joined.vertex_of[once], row_of))
     if own is None or of_rows is None:
         return of_rows or own
     return replace(own, landmarks=of_rows.landmarks, regions={**of_rows.regions, **own.regions})
+
+
+def _read_once(part: Part) -> NDArray[np.bool_]:
+    """The rows (C,) without those that were read a second time, for a material that places its texture otherwise."""
+    seen, once = list[dict[str, Any]](), list[NDArray[np.bool_]]()
+    for attributes, count in part.attributes:
+        once.append(np.full(count, attributes not in seen))
+        seen.append(attributes)
+    return np.concatenate(once) if once else np.ones(len(part.positions), bool)
 
 
 def _by_id(part: Part, ids: NDArray[np.int64]) -> Weld | None:

@@ -111,7 +111,7 @@ class _Fitting:
             self._lips_cut = hole is None
             loop = self._opened.cut_lips(edge) if hole is None else hole
             self._weld(loop, "mouth", MOUTH_CONTACT + 1, True)
-            ring = Loop.of(_ring("mouth", MOUTH_CONTACT, True), self._template)
+            ring = self._loop("mouth", MOUTH_CONTACT, True)
             self._followed.append(TemplatePlaces(loop.vertices, *ring.between(loop.share)))
             self._notes.append("added: the mouth's bag" + ", behind lips that were cut apart" * self._lips_cut)
         if self._has_loose(edge.mean(0), 26.0):
@@ -146,13 +146,18 @@ class _Fitting:
         near = (loose[:, :2].norm(dim=-1) < reach) & (loose[:, 2] < -2.0) & (loose[:, 2] > -2 * INSIDE)
         return int(near.sum()) >= _LOOSE
 
+    def _loop(self, name: str, number: int, left: bool) -> Loop:
+        """A ring of the template as it lies on the face, where the edges of touching lips may have crossed."""
+        ring = _ring(name, number, left)
+        return Loop.of(ring, self._template, int(ring[0]) if name == "mouth" else None)
+
     def _weld(self, loop: Loop, name: str, number: int, left: bool) -> None:
         """Joins the template's inside, from a ring on, to an opening's edge by a strip in the skin's colours."""
         places, rings = self._opened.places(), len(topology().rings[name]) - 1
         deep = float(places[loop.vertices, 2].mean()) - 0.5
         while number < rings and float(self._template[_ring(name, number, left), 2].mean()) > deep:
             number += 1
-        inner = Loop.of(_ring(name, number, left), self._template)
+        inner = self._loop(name, number, left)
         host = torch.stack([loop.vertices[(loop.share - one).abs().argmin()] for one in inner.share])
         rows = self._append(self._template[inner.vertices], None, host)
         if name == "mouth":

@@ -137,7 +137,8 @@ class CharacterJob:
         lines += present_lines(there)
         lines += self._doubts(there)
         missing = [name for name in ARKIT if name not in self.made and name not in there]
-        why = " (it has no tongue of its own; --inner-mouth gives it one)" if missing == [_TONGUE] else ""
+        tongue = " (it has no tongue of its own; --inner-mouth gives one to a mouth without teeth)"
+        why = tongue if missing == [_TONGUE] else ""
         lines.append(f"made: {len(self.made)} shapes" + (f"; not made: {', '.join(missing)}{why}" if missing else ""))
         if self.empty:
             lines.append(f"  note: {', '.join(self.empty)}: the file's own moves nothing and counts as missing")

@@ -30,13 +30,18 @@ class Loop:
     share: Tensor
 
     @staticmethod
-    def of(vertices: Tensor, places: Tensor) -> "Loop":
-        """Of vertices in order, whichever way round they run; a half of the way lies above."""
+    def of(vertices: Tensor, places: Tensor, top: int | None = None) -> "Loop":
+        """Of vertices in order, whichever way round they run; a half of the way lies above.
+
+        Args:
+            top: a vertex that is of the upper edge; if absent, the edge that lies higher is the upper one.
+        """
         x = places[vertices, 0]
         ordered = vertices.roll(-int(x.argmax()))
         right = int(places[ordered, 0].argmin())
         upper, lower = ordered[: right + 1], torch.cat([ordered[:1], ordered[right:].flip(0)])
-        if float(places[upper, 1].mean()) < float(places[lower, 1].mean()):
+        higher = float(places[upper, 1].mean()) >= float(places[lower, 1].mean())
+        if not (higher if top is None else bool((upper == top).any())):
             upper, lower = lower, upper
         halves = []
         for chain in (upper, lower):
