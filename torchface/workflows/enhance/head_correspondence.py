@@ -31,7 +31,7 @@ _MOST_POINTS = 5000
 _ALIKE = 0.5  # cosine between two surfaces that are to be one
 _COLUMNS = ("input", "model")
 
-PLACE = "the result stands where the model stands, not where the input does"
+PLACE = "the result has the place, direction and size of the model's head, not those of the input's"
 """What users read whose input has a space of its own."""
 
 

@@ -241,7 +241,7 @@ class LiveSession:
                 before = came
                 if self._watch is not None:
                     self._watch.look(picture, solved, now)
-                progress("live", self.figures.frames)
+                progress("frames solved live", self.figures.frames)
                 if seconds is not None and self.figures.seconds >= seconds:
                     self.ended = f"The {seconds:g} seconds are over"
                     break
