@@ -339,12 +339,13 @@ def test_given_landmarks_that_do_not_fit_are_said(people: People, tmp_path: Path
 def test_landmarks_of_another_photograph_make_a_poor_result(data: Path, tmp_path: Path) -> None:
     folder, settings = data / "images" / "people", PhotographSettings(fit=FitSettings(texture_size=0))
     made = fit_photographs([folder / "lfpw_1.png"], [folder / "lfpw_2.pts"], None, tmp_path / "rig.glb", settings)
-    assert made.verdict().startswith("result: poor, the given landmarks do not fit and are not on a face"), (
-        made.verdict()
-    )
+    assert made.verdict().startswith("result: poor, the given landmarks are not on a face"), made.verdict()
     (line,) = made.remarks
     assert line.startswith("WARNING: lfpw_1.png: the given landmarks do not fit well")
-    assert "expected less than 4.5%; landmark_network finds no face where they lie" in line
+    assert "expected less than 4.5%; landmark_network finds no face where the given landmarks lie" in line
+    made = fit_photographs([folder / "lfpw_2.png"], [folder / "lfpw_1.pts"], None, tmp_path / "rig.glb", settings)
+    assert made.verdict().startswith("result: poor, the given landmarks are not on a face")
+    assert "no face where the given landmarks lie, but 1 elsewhere" in " ".join(made.remarks)
 
 
 def test_exact_landmarks_of_one_head_are_of_one_person() -> None:

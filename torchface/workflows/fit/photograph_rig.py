@@ -111,7 +111,7 @@ class FittedHead:
         warned = sum(line.startswith("WARNING") for line in self.remarks)
         stray = any(NO_FACE_THERE in line for line in self.remarks)
         word = "poor" if off > _POOR or stray else "partly usable" if warned else "good"
-        word += ", the given landmarks do not fit and are not on a face that is found" if stray else ""
+        word += ", the given landmarks are not on a face that is found" if stray else ""
         more = f"; {warned} {'warnings' if warned > 1 else 'warning'} below" if warned else ""
         return f"result: {word}, {fit} (at most {_POOR:.0%} is usual){more}; {look}"
 
