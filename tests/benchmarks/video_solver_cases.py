@@ -181,7 +181,7 @@ def whole(prior: ShapePrior, dynamics: DynamicsPrior, **settings: float) -> Solv
 
 def one_gaussian(takes: list[Tensor], names: tuple[str, ...]) -> ShapePrior:
     """One Gaussian with full covariance, its floor as small as helps."""
-    return ShapePrior(names, [range(len(names))], [gaussian(torch.cat(takes), floor=1e-5)])
+    return ShapePrior(names, [range(len(names))], [gaussian(torch.cat(takes), variance=1e-5)])
 
 
 def parzen(takes: list[Tensor], names: tuple[str, ...]) -> ShapePrior:

@@ -6,11 +6,11 @@ import torch
 from torch import Tensor, nn
 
 
-def gaussian(samples: Tensor, floor: float = 1e-4) -> Any:
-    """The Gaussian of weights (T,D), the floor added to each variance."""
+def gaussian(samples: Tensor, variance: float = 1e-4) -> Any:
+    """The Gaussian of weights (T,D), with a variance added to each."""
     x = samples.detach().double()
     covariance = torch.cov(x.T, correction=0).reshape(x.shape[1], x.shape[1])
-    return GaussianDensity(x.mean(0), torch.linalg.inv(covariance + floor * torch.eye(x.shape[1]).double()))
+    return GaussianDensity(x.mean(0), torch.linalg.inv(covariance + variance * torch.eye(x.shape[1]).double()))
 
 
 class GaussianDensity(nn.Module):

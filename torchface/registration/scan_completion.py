@@ -34,7 +34,8 @@ def completed_form(
 
     Shown vertices within 20 mm of unseen ones pull the plate to their offset d by a robust weight w (Cauchy's squared,
     0.5 mm; s = 5 mm), as hair moves some of them; those further away hold it. Of those within 20 mm doubtful ones
-    that lie more than 3 mm off the plate are unseen too.
+    that lie more than 3 mm off the plate are unseen too. What the others are off goes on over the unseen ones as
+    a plate of its own, which fades within 20 mm, so that no edge shows.
 
     Args:
         unseen: whose positions the scan does not show, (V,) bool; the rest of the mesh stays.
