@@ -11,13 +11,21 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
+import torch
 from torch import Tensor
 
 from torchface import TorchfaceError, zoo
 from torchface.enhancement import CapturedPerformance, EnhancementModel, EnhancementSettings
 from torchface.enhancement.detail.low_pass import WAVELENGTH
 from torchface.errors import ValueRangeError
-from torchface.workflows.enhance.coarse_animation import DEFAULT_FPS
+from torchface.io import MeshSequence
+from torchface.workflows.enhance.coarse_animation import (
+    DEFAULT_FPS,
+    OWN_HEAD_MM,
+    SAMPLED,
+    distance_at_rest,
+    residual_notes,
+)
 
 from .captured_sequences import Capture, gather, performed, read_capture, read_pairs
 from .enhancement_figures import draw
@@ -88,6 +96,12 @@ def train(settings: Settings, run: Run) -> EnhancementModel:
     colors = gather(part, work / "learned_colors.safetensors", progress, colors=True)[0] if part.colored else None
     known, numbers = gathered("learned", 0, learned)
     test = gathered("tested", learned, count)[0] if held_out else None
+    if settings.frames is not None:
+        shown = [known] if test is None else [known, test]
+        _warn_of_another_person(capture, [part.truth for part in shown], settings.frames)
+        if pairs is not None and settings.coarse is not None:
+            coarse = [part.coarse for part in shown if part.coarse is not None]
+            _warn_of_another_person(pairs, coarse, settings.coarse)
     tested = 0 if test is None else len(test)
     progress(f"{len(known)} frames of {learned} of {count} sequences to learn from, {tested} to test on")
     mesh = capture.neutral
@@ -114,6 +128,27 @@ def train(settings: Settings, run: Run) -> EnhancementModel:
     save(model, settings, metrics, len(known), learned)
     draw(model, mesh, known, test, settings.out / "pictures", progress)
     return model
+
+
+def _warn_of_another_person(capture: Capture, gathered: list[MeshSequence], folder: Path) -> None:
+    """Looks for a face at rest in each sequence, as ``torchface enhance`` does in its input."""
+    frames = [(part, number) for part in gathered for number in range(len(part))]
+    begin, far = 0, list[str]()
+    for sequence in capture.sequences:
+        some = frames[begin : begin + sequence.count : max(1, sequence.count // SAMPLED)]
+        at_rest = torch.cat([part.read(number, number + 1) for part, number in some])
+        distance = distance_at_rest(at_rest, capture.neutral.vertices, folder / sequence.name)
+        residual_notes(distance, folder / sequence.name)
+        if distance > OWN_HEAD_MM:
+            far.append(f"{sequence.name} {distance:.1f} mm")
+        begin += sequence.count
+    if far:
+        warnings.warn(
+            f"{folder}: {len(far)} of {len(capture.sequences)} sequences come no nearer to the neutral than "
+            f"{', '.join(far[:5])} (root mean square), expected at most {OWN_HEAD_MM:g} mm: they show another "
+            "person, whose head would be learned as an expression, or no face at rest",
+            stacklevel=3,
+        )
 
 
 def _warn_if_worse(metrics: dict[str, float]) -> None:

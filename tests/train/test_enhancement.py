@@ -11,7 +11,7 @@ import torch
 
 from torchface import BlendshapeRig, Mesh, Take, Track, save_animation, save_mesh, zoo
 from torchface.enhancement import EnhancementModel
-from torchface.errors import FileFormatError, TopologyError, TorchfaceError, ValueRangeError
+from torchface.errors import AlignmentError, FileFormatError, TopologyError, TorchfaceError, ValueRangeError
 from torchface.io import MeshSequenceWriter
 from torchface.viz.figures import face_views
 from train import captured_sequences
@@ -89,6 +89,24 @@ def test_a_model_that_makes_other_sequences_worse_is_warned_of(folder, monkeypat
     monkeypatch.setattr(recipe, "draw", lambda *a: None)
     monkeypatch.setattr(recipe, "measured", lambda *a: {"held out: missing detail, of the coarse frames'": 1.1})
     with pytest.warns(UserWarning, match=r"found errors 1.10 times those of the coarse frames, expected less than 1"):
+        train(settings(folder))
+
+
+def test_another_persons_sequences_are_warned_of(folder, monkeypatch):
+    """Another head in the same vertices, one learned from and one held out; the head in metres is refused by name."""
+    monkeypatch.setattr(recipe, "draw", lambda *a: None)
+    mesh, wider = sheet(), sheet().vertices[:, 0].square() / 200
+
+    def another(name: str, scale: float) -> None:
+        moved = frames(1)
+        moved[..., 2] += wider
+        np.savez_compressed(folder / name, vertices=scale * moved.numpy(), faces=mesh.faces.numpy())
+
+    another("b.npz", 1.0)
+    with pytest.warns(UserWarning, match=r"1 of 4 sequences come .* b\.npz [2-9]\.\d mm .*another person"):
+        train(settings(folder))
+    another("z.npz", 0.001)
+    with pytest.raises(AlignmentError, match=r"z\.npz: found a head .* it seems to be in metres"):
         train(settings(folder))
 
 

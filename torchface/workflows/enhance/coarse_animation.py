@@ -19,7 +19,7 @@ OTHER_ACTOR_MM, NO_HEAD_MM = 4.0, 20.0
 OWN_HEAD_MM = 1.0
 """From how far on an input's face at rest is its own head: without it, at 1.3 mm, the model added 0.22 mm to another
 person's smooth frames (root mean square), with it 0.13 as to the actor's."""
-_SAMPLED = 24
+SAMPLED = 24  # frames of an animation, in which one at rest is looked for
 _SAME_RATE = 2e-3  # relative; 29.97 and 30 are the same
 _UNITS = ((1000.0, "metres"), (10.0, "centimetres"), (25.4, "inches"), (0.001, "micrometres"))
 
@@ -48,15 +48,11 @@ class CoarseAnimation:
 
 def same_topology(animated: AnimatedMesh, model: Mesh, fps: float | None) -> CoarseAnimation:
     """An animation that has the model's vertices and triangles already."""
-    step = max(1, animated.count // _SAMPLED)
+    step = max(1, animated.count // SAMPLED)
     some = torch.cat([animated.read(t, t + 1) for t in range(0, animated.count, step)])
     check_finite(some, animated.path, step)
     at_rest = animated.neutral.vertices[None] if animated.rig is not None else some
-    target = model.vertices.expand_as(at_rest)
-    check_scale(float((_size(target) / _size(at_rest).clamp(min=1e-9)).median()), animated.path)
-    pose = similarity_transform(at_rest, target)
-    left = (pose.apply(at_rest) - target).square().sum(-1).mean(-1).sqrt()
-    residual = float(left.min())  # without a rest pose, of the frame that comes nearest to one
+    residual = distance_at_rest(at_rest, model.vertices, animated.path)
     notes = residual_notes(residual, animated.path)
 
     def read(begin: int, end: int) -> Tensor:
@@ -79,6 +75,14 @@ def same_topology(animated: AnimatedMesh, model: Mesh, fps: float | None) -> Coa
         (*rate_notes(animated, fps), *notes),
         animated.neutral.vertices.float() if another else None,
     )
+
+
+def distance_at_rest(frames: Tensor, rest: Tensor, path: Path) -> float:
+    """Root mean square distance from a face at rest (V,3) of the frame (t,V,3) nearest to it, all aligned with it."""
+    target = rest.expand_as(frames)
+    check_scale(float((_size(target) / _size(frames).clamp(min=1e-9)).median()), path)
+    aligned = similarity_transform(frames, target).apply(frames)
+    return float((aligned - target).square().sum(-1).mean(-1).sqrt().min())
 
 
 def _size(vertices: Tensor) -> Tensor:
