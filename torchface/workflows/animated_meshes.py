@@ -172,7 +172,7 @@ def _of_sequence(path: Path, rig: BlendshapeRig | None) -> AnimatedMesh:
         raise FileFormatError(f"{path}: found {sequence.shape[2]} numbers a vertex, expected 3, positions")
     first = sequence.read(0, 1)[0].nan_to_num(0.0)
     neutral = _at_rest(path, Mesh(first, sequence.faces), rig)
-    return AnimatedMesh(path, neutral, len(sequence), sequence.read, rig=rig)
+    return AnimatedMesh(path, neutral, len(sequence), sequence.read, sequence.fps, rig=rig)
 
 
 def _of_folder(folder: Path, rig: BlendshapeRig | None) -> AnimatedMesh:

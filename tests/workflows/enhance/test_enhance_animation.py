@@ -42,6 +42,7 @@ from torchface.registration import Registration
 from torchface.rendering.clay_shading import sample_texture
 from torchface.rig import BlendshapeRig
 from torchface.take import Take, Track
+from torchface.workflows.animated_meshes import load_animated
 from torchface.workflows.enhance import enhance_views, enhanced_frames, head_correspondence
 from torchface.workflows.enhance.coarse_input import InputSettings, read_coarse
 from torchface.workflows.enhance.enhance_animation import EnhanceSettings, animation_targets, enhance_animation
@@ -115,6 +116,17 @@ def test_all_files_of_one_animation_give_the_same(actor: Actor, tmp_path: Path) 
         torch.testing.assert_close(found.read(3, 7), frames[3:7], atol=2e-3, rtol=0)
         assert found.fps == FPS
     assert "30 a second are assumed" in " ".join(coarse(actor, sequence, tmp_path).notes)
+    for path in (tmp_path / "animation.glb", tmp_path / "tracked"):
+        note = coarse(actor, path, tmp_path, rig=actor.folder / "rig.glb").notes[0]
+        assert note == f"warning: --rig {actor.folder / 'rig.glb'} is not used: animation.glb has its own rig"
+
+
+def test_a_result_has_the_rate_of_its_input(actor: Actor, tmp_path: Path) -> None:
+    take = load_take(actor.folder / "weights.csv")
+    save_take(replace(take, fps=2 * FPS), tmp_path / "weights.csv")
+    settings = replace(PLAIN, given=InputSettings(rig=actor.folder / "rig.glb"))
+    enhance_animation(tmp_path / "weights.csv", actor.model, tmp_path, settings)
+    assert load_animated(tmp_path / "enhanced.safetensors").fps == 2 * FPS
 
 
 def test_uneven_times_are_brought_to_an_even_rate_and_said(actor: Actor, tmp_path: Path) -> None:

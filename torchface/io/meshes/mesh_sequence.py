@@ -18,6 +18,7 @@ from torchface.files.documents import read_json, write_json
 from torchface.files.temporary_files import open_plain
 from torchface.files.whole_files import sync_folder
 from torchface.files.write_errors import unwritten
+from torchface.number_checks import check_rate
 
 FORMAT = "torchface.mesh-sequence/1"
 _MAX_COUNT = 2**31
@@ -27,7 +28,7 @@ _UNKNOWN = "0" * 64  # in place of the numbers' hash, until all are written
 
 
 class MeshSequence:
-    """Vertices (M,V,C) float32 on disk, mapped into memory as they are read; ``faces`` and the writer's ``key``.
+    """Vertices (M,V,C) float32 on disk, mapped into memory as they are read; ``faces``, the writer's ``key``, ``fps``.
 
     Args:
         path: what a :class:`MeshSequenceWriter` wrote; any safetensors file with ``vertices`` and ``faces`` will do.
@@ -53,6 +54,8 @@ class MeshSequence:
                 metadata = file.metadata() or {}
                 self.key: str = metadata.get("key", "")
                 self._content: str | None = metadata.get("content")
+                rate = metadata.get("fps")
+                self.fps = None if rate is None else check_rate(float(rate), str(self.path))
                 if not {"vertices", "faces"} <= names:
                     raise FileFormatError(f"{self.path}: found {sorted(names)[:5]}, expected vertices and faces")
                 vertices, faces = file.get_slice("vertices"), file.get_slice("faces")
@@ -120,6 +123,7 @@ class MeshSequenceWriter:
         faces: triangles (F,3) int64 that all share.
         channels: numbers a vertex.
         key: says what the meshes are made of; another key begins anew.
+        fps: frames a second, where the meshes are an animation.
 
     Raises:
         FileFormatError: the file cannot be written.
@@ -132,7 +136,14 @@ class MeshSequenceWriter:
     """
 
     def __init__(
-        self, path: str | Path, count: int, vertices: int, faces: Tensor, channels: int = 3, key: str = ""
+        self,
+        path: str | Path,
+        count: int,
+        vertices: int,
+        faces: Tensor,
+        channels: int = 3,
+        key: str = "",
+        fps: float | None = None,
     ) -> None:
         if not (0 < count < _MAX_COUNT and vertices > 0 and channels > 0):
             raise ShapeError(f"mesh sequence: found {count} meshes of ({vertices},{channels}), expected at least one")
@@ -141,9 +152,10 @@ class MeshSequenceWriter:
         self._note = self.path.with_name(f"{self.path.name}.part.json")
         numbers = faces.detach().cpu().contiguous().numpy().astype("<i8").tobytes()
         size = 4 * count * vertices * channels
+        rate = {} if fps is None else {"fps": repr(float(fps))}
         header = json.dumps(
             {
-                "__metadata__": {"format": FORMAT, "key": key, "content": _UNKNOWN},
+                "__metadata__": {"format": FORMAT, "key": key, **rate, "content": _UNKNOWN},
                 "faces": {"dtype": "I64", "shape": list(faces.shape), "data_offsets": [0, len(numbers)]},
                 "vertices": {
                     "dtype": "F32",

@@ -6,9 +6,10 @@ from pathlib import Path
 from torch import Tensor
 
 from torchface.attachment import Attachment
-from torchface.errors import FileFormatError, NameMismatchError, ValueRangeError
+from torchface.errors import FileFormatError, NameMismatchError, TopologyError, ValueRangeError
 from torchface.io import load_rig
 from torchface.io.markers.marker_csv import is_marker_header
+from torchface.io.rig_files import SCENE_ENDINGS
 from torchface.io.tables.csv_table import TableReader
 from torchface.mesh import Mesh
 from torchface.progress import Progress
@@ -60,10 +61,15 @@ def read_coarse(path: Path, model: Mesh, settings: InputSettings, state: Path, p
     progress("reading the input")
     if is_markers(path):
         return _markers(path, model, settings, state, progress)
-    for name, value in (("--attachment", settings.attachment), ("--neutral", settings.neutral)):
+    options = settings.markers
+    of_markers = {"--attachment": settings.attachment, "--neutral": settings.neutral, "--labels": options.labels}
+    for name, value in {**of_markers, "--unit": options.unit, "--flip": options.flip}.items():
         if value is not None:
             raise ValueRangeError(f"{path}: found {name} and no markers, expected a .c3d, .trc or .csv of markers")
-    animated, notes = _even(load_animated(tracked_animation(path), settings.rig, settings.part), settings.fps)
+    source = tracked_animation(path)
+    animated, notes = _even(load_animated(source, settings.rig, settings.part), settings.fps)
+    if settings.rig is not None and animated.take is not None and source.suffix.lower() in SCENE_ENDINGS:
+        notes = [*notes, f"warning: --rig {settings.rig} is not used: {source.name} has its own rig"]
     if has_topology_of(animated.neutral, model):
         coarse = same_topology(animated, model, settings.fps)
         return replace(coarse, notes=(*notes, *coarse.notes))
@@ -129,6 +135,11 @@ def _markers(path: Path, model: Mesh, settings: InputSettings, state: Path, prog
     attachment = Attachment.load(settings.attachment)
     rig = None if settings.rig is None else load_rig(settings.rig, part=settings.part)
     if check_attachment(attachment, settings.attachment, rig, model):
+        if rig is not None and not has_topology_of(rig.neutral, model):
+            raise TopologyError(
+                f"{settings.attachment}: found marker sites on the model's own mesh beside --rig {settings.rig}, "
+                f"expected sites on that rig, or no --rig"
+            )
         sites, notes = MarkerSites(attachment), list[str]()
     else:
         assert rig is not None

@@ -71,8 +71,8 @@ def enhance_frames(
     distances, outside, previous = [], [], None
     step, seconds, fresh = piece_size(vertices), 0.0, 0
     with (
-        _Output(out / SEQUENCE, count, model, key) as meshes,
-        _Output(out / COLORS if colored else None, count, model, key) as colors,
+        _Output(out / SEQUENCE, animation, model, key) as meshes,
+        _Output(out / COLORS if colored else None, animation, model, key) as colors,
     ):
         if meshes.done == 0:
             check_space(out, count, vertices, colored)
@@ -112,12 +112,12 @@ def has_colors(model: EnhancementModel) -> bool:
 class _Output:
     """A mesh sequence that is written, or that an earlier run has finished; or none."""
 
-    def __init__(self, path: Path | None, count: int, model: EnhancementModel, key: str) -> None:
+    def __init__(self, path: Path | None, animation: CoarseAnimation, model: EnhancementModel, key: str) -> None:
         self._writer: MeshSequenceWriter | None = None
-        self.done = count
+        count = self.done = animation.count
         if path is None or _is_finished(path, count, key):
             return
-        self._writer = MeshSequenceWriter(path, count, len(model.neutral), model.faces, key=key)
+        self._writer = MeshSequenceWriter(path, count, len(model.neutral), model.faces, key=key, fps=animation.fps)
         self.done = self._writer.done
 
     def append(self, begin: int, vertices: Tensor) -> None:

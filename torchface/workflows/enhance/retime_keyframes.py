@@ -146,7 +146,8 @@ def retime_keyframes(
     progress("writing the motion")
     with job_lock(out):
         key = content_key("retime/1", frames=moved)
-        with MeshSequenceWriter(out / SEQUENCE, frames, len(model.neutral), model.faces, key=key) as writer:
+        size = len(model.neutral)
+        with MeshSequenceWriter(out / SEQUENCE, frames, size, model.faces, key=key, fps=rate) as writer:
             writer.append(moved)
         with all_or_none():  # not around the sequence, which notes at once how far it is
             # Regions' shares in a vertex add up to 1: a target a region gives every frame.
