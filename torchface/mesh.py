@@ -248,11 +248,8 @@ class Submesh:
 
 
 def submesh(mesh: Mesh, keep: Tensor) -> Submesh:
-    """The part of a mesh whose vertices are kept; a face stays when all its corners do.
-
-    Args:
-        keep: a boolean mask (V,) or vertex ids (K,) int64; order of the whole is kept.
-    """
+    """The part of a mesh whose vertices, (V,) bool or (K,) int64, are kept in its order; so are faces of kept
+    corners."""
     count, device = len(mesh.vertices), mesh.vertices.device
     if keep.dtype == torch.bool:
         _check_shape("keep", keep, (count,))

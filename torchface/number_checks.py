@@ -45,10 +45,7 @@ def checked_number(
 def checked_count(
     name: str, value: object, least: int = 0, most: int = 2**31 - 1, *, error: type[TorchfaceError] = ValueRangeError
 ) -> int:
-    """The whole number itself, where it is in its range.
-
-    Args, Raises: as :func:`checked_number`; 3.0 is no whole number.
-    """
+    """The whole number itself, where it is in its range; as :func:`checked_number`, but 3.0 is no whole number."""
     fraction = isinstance(value, float) or (isinstance(value, torch.Tensor) and value.is_floating_point())
     if fraction or not least <= _real(value) <= most:
         raise error(f"{name}: found {_shown(value)}, expected {_range_text('a whole number', least, most)}")

@@ -22,10 +22,6 @@ def weaker_sides(weights: Tensor, signed: Tensor) -> Tensor:
 
     A solver holds these at 0 in its next step. Once the larger one has come to 0 both are free, and either may grow: so
     the steps of a solve follow the sign without a choice being made beforehand.
-
-    Args:
-        weights: (B,N).
-        signed: as of :func:`signed_quantities`, (K,N).
     """
     signed = signed.to(weights)
     difference = weights @ signed.T

@@ -61,13 +61,8 @@ class CurveCalibration:
         return tuple(pose for pose in HELD if self._samples.get(pose) and not bool((self._held(pose) > 0).any()))
 
     def add(self, weights: Tensor, pose: int, interval: float) -> None:
-        """Learns from a frame.
-
-        Args:
-            weights: by ARKit's names, (52,), as they come.
-            pose: that the person has been asked to hold now, 1 to 5; 0 for none.
-            interval: seconds since the frame before.
-        """
+        """Learns from a frame's weights (52,) and the pose asked for, 1 to 5 or 0 for none, ``interval`` seconds
+        after the last."""
         if weights.shape != (len(ARKIT),):
             raise ShapeError(f"weights: found {tuple(weights.shape)}, expected ({len(ARKIT)},)")
         self.seconds += interval

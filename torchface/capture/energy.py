@@ -102,30 +102,15 @@ def marker_term(basis: Tensor, rest: Tensor, targets: Tensor) -> Quadratic:
 
 
 def sparsity_term(shapes: int, weight: float | Tensor, like: Tensor) -> Quadratic:
-    r"""The L1 penalty on every active shape, :math:`E(w) = \beta \sum_i w_i = \beta \lVert w \rVert_1` for w ≥ 0.
-
-    Args:
-        shapes: N.
-        weight: :math:`\beta`, mm² a marker for a weight of 1.
-        like: a tensor whose dtype and device the term takes.
-
-    Source: thesis 4.1.4, equation 33.
-    """
+    r"""The L1 penalty on every active shape, :math:`E(w) = \beta \sum_i w_i = \beta \lVert w \rVert_1` for w ≥ 0;
+    :math:`\beta` is mm² a marker. Source: thesis 4.1.4, equation 33."""
     check_weight("sparsity", weight)
     return Quadratic(like.new_zeros(shapes, shapes), weight * like.new_ones(1, shapes))
 
 
 def ridge_term(shapes: int, weight: float | Tensor, like: Tensor, center: Tensor | None = None) -> Quadratic:
-    r"""Tikhonov's term, :math:`E(w) = \varepsilon \lVert w - \bar w \rVert^2`: one minimum, whatever the markers see.
-
-    Args:
-        shapes: N.
-        weight: :math:`\varepsilon`, mm² a marker for a squared weight of 1.
-        like: a tensor whose dtype and device the term takes.
-        center: :math:`\bar w`, (B,N); zero if absent.
-
-    Source: thesis 4.1.4, equation 33.
-    """
+    r"""Tikhonov's term, :math:`E(w) = \varepsilon \lVert w - \bar w \rVert^2`, about 0 or (B,N): one minimum,
+    whatever the markers see; :math:`\varepsilon` is mm² a marker. Source: thesis 4.1.4, equation 33."""
     check_weight("ridge", weight)
     H = 2 * weight * torch.eye(shapes, dtype=like.dtype, device=like.device)
     if center is None:
@@ -134,28 +119,14 @@ def ridge_term(shapes: int, weight: float | Tensor, like: Tensor, center: Tensor
 
 
 def pull_term(targets: Tensor, strength: Tensor) -> Quadratic:
-    r"""A pull of each weight toward a value of its own, :math:`E(w) = \sum_i \gamma_i (w_i - \tilde w_i)^2`.
-
-    Args:
-        targets: :math:`\tilde w`, (B,N).
-        strength: :math:`\gamma`, (B,N), mm² a marker for a squared weight of 1, not negative.
-
-    Source: thesis 4.1.8, equation 38.
-    """
+    r"""A pull (B,N), mm² a marker, of each weight toward its own value (B,N), :math:`\sum_i \gamma_i (w_i - \tilde
+    w_i)^2`. Source: thesis 4.1.8, equation 38."""
     return Quadratic(torch.diag_embed(2 * strength), -2 * strength * targets, (strength * targets.square()).sum(-1))
 
 
 def gaussian_term(mean: Tensor, variance: Tensor) -> Quadratic:
-    r"""How unlikely weights are under a Gaussian of each, :math:`E(w) = \tfrac12 \sum_i (w_i - m_i)^2 / V_i`.
-
-    Which is :math:`-\log p` without its constant.
-
-    Args:
-        mean: :math:`m`, (B,N).
-        variance: :math:`V`, (B,N), positive.
-
-    Source: thesis 4.2.10, equation 65 with its weight 1/V for each shape.
-    """
+    r"""How unlikely weights are under a Gaussian of each, (B,N), but for a constant: :math:`E(w) = \tfrac12 \sum_i
+    (w_i - m_i)^2 / V_i`. Source: thesis 4.2.10, equation 65 with its weight 1/V for each shape."""
     return Quadratic(torch.diag_embed(1 / variance), -mean / variance, 0.5 * (mean.square() / variance).sum(1))
 
 

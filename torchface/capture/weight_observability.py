@@ -99,8 +99,6 @@ def weight_observability(
         basis: B, (M,C,N).
         names: of the N shapes.
         noise: a direction whose unit change moves the points less is not seen.
-        points: what they are called.
-        unit: of ``basis`` and ``noise``.
 
     Source: thesis 4.1.4: the rank of B should be at least N.
     """

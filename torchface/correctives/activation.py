@@ -97,11 +97,8 @@ class CorrectiveActivation(nn.Module):
         return padded.scatter_add(2, self.drivers.expand_as(derivative), derivative)[..., : self.shapes]
 
     def pulled_back(self, derivative: Tensor, matrix: Tensor) -> Tensor:
-        r"""The product :math:`(\partial a / \partial w)^\top Z` (B,N,K), by its few numbers that are not zero.
-
-        Args:
-            matrix: :math:`Z`, (C,K) for all frames or (B,C,K).
-        """
+        r"""The product :math:`(\partial a / \partial w)^\top Z` (B,N,K), by its few numbers that are not zero; Z is
+        (C,K) or (B,C,K)."""
         if torch.compiler.is_compiling():  # how many are not zero is for a call to find
             return self._dense(derivative).mT @ matrix
         count, pairs = len(derivative), len(self.pairs)

@@ -32,12 +32,7 @@ def retimed_moments(model: EnhancementModel, features: Tensor, fps: float) -> Te
 
 
 def at_moments(frames: Tensor, moments: Tensor, vertex_weights: Tensor) -> Tensor:
-    """An animation (T,V,3) whose regions stand at moments of their own.
-
-    Args:
-        moments: in frames from the first of ``frames`` on, (R,T).
-        vertex_weights: the share of each region in each vertex, (R,V), of sum 1.
-    """
+    """An animation (T,V,3) whose regions stand at moments (R,T), frames, of their own; their shares (R,V) sum to 1."""
     # From the first region's on, so that where all agree no rounding of the shares' sum moves the moment.
     base = moments[0]
     spread = (moments - base).T @ vertex_weights.to(moments)

@@ -119,12 +119,8 @@ class LearnedFrames:
 def learn_frames(
     performance: CapturedPerformance, encoder: Encoder, rank: int, key: str, folder: Path | None, progress: Progress
 ) -> LearnedFrames:
-    """Goes through a database once.
-
-    Args:
-        performance: frames in any rigid pose each; their coarse frames, where there are any, in the same poses.
-        key: of the settings; with the frames' own content it says whether a checkpoint is of this run.
-    """
+    """Goes through a database of frames in any rigid pose once; ``key`` of the settings and the content name a
+    checkpoint."""
     frames, coarse = performance.frames, performance.coarse
     count, size = len(frames), encoder.detail.size
     path = None if folder is None else folder / CHECKPOINT

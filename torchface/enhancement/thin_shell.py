@@ -103,14 +103,10 @@ class ThinShell:
             self._factor(self.used)
 
     def spread(self, displacements: Tensor) -> Tensor:
-        """Displacements of every vertex from those of the points.
+        """Displacements (T,V,3) of every vertex from those of the points, (T,M,3), whose rigid motion is taken out, see
+        :meth:`follow`.
 
-        Args:
-            displacements: of the points, (T,M,3), millimetres; a NaN row is a point that was not seen, whose place then
-                is where the shell has it. Rigid motion of the whole is to be taken out before, see :meth:`follow`.
-
-        Returns:
-            (T,V,3), millimetres; NaN in frames where fewer than 12 points were seen.
+        A NaN row was not seen; frames with fewer than 12 points are NaN.
         """
         seen = torch.isfinite(displacements).all(-1)
         self._check(displacements, seen)

@@ -86,11 +86,9 @@ class ExpressionScore:
 
 
 def expression_score(found: Tensor, found_names: Sequence[str], true: Tensor, fps: float) -> ExpressionScore:
-    """Compares a film's weights with the true ones.
+    """Compares a film's weights (T,N) with the true ones; in a lost face's frame of NaN the frame before stands.
 
-    Args:
-        found: (T,N); a column of NaN is a shape that the method does not support, NaN elsewhere a lost face, for
-            which the frame before stands.
+    A column of NaN is a shape that the method does not support.
     """
     if found.ndim != 2 or true.shape != (len(found), len(ARKIT)) or len(found) < 3:
         raise ShapeError(

@@ -11,9 +11,6 @@ def cache_folder(kind: str) -> Path:
     """The folder for cached files of one kind, made if it is missing; deleting it costs time alone.
 
     It lies in ``$TORCHFACE_CACHE`` if that is set, else where the system has a user's caches.
-
-    Args:
-        kind: a plain name, such as ``app``.
     """
     return make_folder(_root() / kind)
 

@@ -16,12 +16,8 @@ _FORMAT = "torchface.checkpoint/1"
 
 
 def write_checkpoint(path: Path, tensors: Mapping[str, Tensor], key: str) -> None:
-    """Writes tensors, what they were made of, and a hash of their numbers; the file appears only when it is complete.
-
-    Args:
-        path: of the file; its folder must be there.
-        key: of what the tensors were made of, see :func:`~torchface.files.content_keys.content_key`.
-    """
+    """Writes tensors, the content key of what they were made of, and a hash of their numbers; the file appears only
+    when it is complete, in a folder that is there."""
     packed = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
     write_file(path, save(packed, {"format": _FORMAT, "key": key, "content": _content(packed)}))
 

@@ -10,14 +10,8 @@ from torchface.errors import MissingExtraError
 
 
 def import_extra(module: str, package: str, extra: str, job: str) -> Any:
-    """A module of a package that torchface installs only with an extra.
-
-    Args:
-        module: what to import, such as ``sklearn.svm``.
-        package: what users know it as, such as ``scikit-learn``.
-        extra: of torchface, that installs it.
-        job: what needs it, for the message.
-    """
+    """A ``module`` of a ``package`` that torchface installs only with an extra; ``job`` is what needs it, for the
+    message."""
     try:
         return importlib.import_module(module)
     except ImportError as error:

@@ -39,11 +39,7 @@ def check_beside(path: Path, other: Path, data: bytes | None = None) -> None:
 
 
 def free_stem(path: Path, stem: str, parts: Mapping[str, bytes]) -> str:
-    """What names of parts begin with where the user's files stay: ``stem``, or ``stem_2`` and so on, with a warning.
-
-    Args:
-        parts: by names that begin with ``stem``.
-    """
+    """What names of parts begin with where the user's files stay: ``stem``, or ``stem_2`` and so on, with a warning."""
     for candidate in itertools.chain([stem], (f"{stem}_{number}" for number in itertools.count(2))):
         places = {candidate + name.removeprefix(stem): data for name, data in parts.items()}
         if all(_gives_way(path, path.with_name(name), data) for name, data in places.items()):

@@ -41,11 +41,7 @@ def job_lock(folder: str | Path) -> Iterator[Path]:
 
 @contextmanager
 def file_lock(file: str | Path, *endings: str) -> Iterator[Path]:
-    """Holds one file of results, and what is written beside it, for one run; see :func:`job_lock`.
-
-    Args:
-        endings: those that the file may have; any if absent.
-    """
+    """Holds one file of results, of some endings, and what is written beside it, for one run; see :func:`job_lock`."""
     file = Path(file)
     if endings:
         check_ending(file, *endings)

@@ -11,13 +11,8 @@ _PIECE = 2**20  # bytes
 def line_pieces(
     path: Path, data: bytes, start: int = 0, end: int | None = None, unread: tuple[bytes, ...] = ()
 ) -> Iterator[bytes]:
-    """The text between two places, in pieces that end where a line does.
-
-    Args:
-        start: where to begin.
-        end: where to stop; the end of the text if absent.
-        unread: beginnings of lines that nobody reads: those of any length are left out.
-    """
+    """The text between two places in pieces that end where a line does, without lines of any length that begin
+    ``unread``."""
     end = len(data) if end is None else end
     while start < end:
         cut = end

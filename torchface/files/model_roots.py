@@ -12,12 +12,7 @@ MODEL_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,63}")
 
 
 def model_roots(package: Path, home: str | None) -> list[Path]:
-    """Folders of models that are there, each once: the checkout's, the installed package's, the user's own.
-
-    Args:
-        package: the folder that torchface is imported from.
-        home: the user's own folder of models, if any.
-    """
+    """Folders of models that are there, each once: the checkout's, the installed package's, the user's own ``home``."""
     checkout = package.parent
     wanted = [checkout / "models"] if is_checkout(checkout, package.name) else []
     wanted += [package / "_models", *([Path(home)] if home else [])]

@@ -45,8 +45,6 @@ def write_model(
     """Writes a model into a folder; its files take their places together, ``model.toml`` last.
 
     Args:
-        model: a module with ``config`` and ``from_config``.
-        folder: made where it is missing.
         record: kind, licence, data, metrics, recipe; size, hash and config are filled in.
         card: Markdown for ``CARD.md``: what the model is good for, measured how, its limits.
         half: names in the state that are stored in half precision.
@@ -205,12 +203,8 @@ _FAMILIES = {
 
 
 def pack_state(state: Mapping[str, Tensor], half: Collection[str] = ()) -> bytes:
-    """The bytes of a state; integers take as few of them as their values allow.
-
-    Args:
-        state: finite tensors by name.
-        half: names of float tensors that are stored in half precision.
-    """
+    """The bytes of a state of finite tensors, floats of ``half`` in half precision; integers take as few as they
+    can."""
     unknown = sorted(set(half) - set(state))
     if unknown:
         raise ValueRangeError(f"half: found {', '.join(unknown)}, expected names among {', '.join(state)}")
@@ -231,13 +225,8 @@ def pack_state(state: Mapping[str, Tensor], half: Collection[str] = ()) -> bytes
 def read_state(
     path: Path, expected: Mapping[str, Tensor], size: int, kind: str = ""
 ) -> tuple[dict[str, Tensor], bytes]:
-    """A state in the shapes and types of ``expected``, and the bytes it came from.
-
-    Args:
-        expected: the module's own state; tensors on the meta device will do.
-        size: how many bytes the file should have.
-        kind: of the model, for keys that were renamed; see ``state_renames``.
-    """
+    """A state in the shapes and types of ``expected``, maybe on the meta device, and the bytes, ``size``, it came
+    from."""
     try:
         check_size(path, size)
         with path.open("rb") as file:

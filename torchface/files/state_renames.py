@@ -32,10 +32,6 @@ def current_state_keys(kind: str, stored: Collection[str], expected: Collection[
     A key is renamed only where the module lacks it, has the new one, and the state does not hold that one besides;
     what is left over is for the reader to refuse.
 
-    Args:
-        kind: of the model, a key of :data:`STATE_RENAMES`.
-        expected: keys of the module's own state.
-
     Returns:
         A name for each of ``stored``, all different.
     """

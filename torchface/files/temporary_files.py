@@ -30,14 +30,7 @@ def temporary_name(path: Path) -> Path:
 
 
 def new_temporary(path: Path, mode: int = 0o666) -> tuple[int, Path]:
-    """A new file under a temporary name beside ``path``, open for reading and writing.
-
-    Args:
-        mode: permissions, of which the process's umask takes its part.
-
-    Returns:
-        The descriptor and the temporary path.
-    """
+    """A new file under a temporary name beside ``path``, open for reading and writing: its descriptor and path."""
     while True:
         temporary = temporary_name(path)
         with suppress(FileExistsError):  # drawn before by a process of the same number that died
@@ -50,12 +43,8 @@ def open_plain(path: Path, flags: int, mode: int = 0o666) -> int:
 
 
 def remove_left_over(folder: Path, name: str | None = None) -> None:
-    """Deletes temporary files whose process is dead; those of another machine after a day.
-
-    Args:
-        folder: of the files they should have become.
-        name: of the one file; of all if absent.
-    """
+    """Deletes a folder's temporary files, of one ``name`` or all, whose process is dead; another machine's after a
+    day."""
     begin = "." if name is None else f".{shortened(name)}."
     with suppress(OSError), os.scandir(folder) as entries:
         for entry in entries:

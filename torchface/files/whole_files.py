@@ -154,9 +154,6 @@ def make_folder(folder: str | Path) -> Path:
 def check_ending(path: str | Path, *endings: str) -> None:
     """Refuses a file whose name does not end as what is written into it.
 
-    Args:
-        endings: those that it may have, with their dots, lower case; upper case will do, too.
-
     Example:
         >>> check_ending("weights.CSV", ".csv")
         >>> check_ending("weights.xlsx", ".csv")

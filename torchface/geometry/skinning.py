@@ -9,12 +9,8 @@ from torchface.geometry.rotations import rotation_matrix
 
 
 def joint_transforms(positions: Tensor, parents: Sequence[int], rotations: Tensor) -> tuple[Tensor, Tensor]:
-    r"""Where joints take the space around them: :math:`x \mapsto A_j x + t_j`, (B,J,3,3) and (B,J,3).
-
-    Args:
-        parents: of each joint, -1 for a root; before its children.
-        rotations: of each joint beside its parent, axis times angle, (B,J,3).
-    """
+    r"""Where joints, turned beside their parents by vectors (B,J,3), take the space: :math:`x \mapsto A_j x + t_j`,
+    (B,J,3,3) and (B,J,3). A root's parent is -1; parents come before children."""
     own = rotation_matrix(rotations.reshape(-1, 3)).reshape(*rotations.shape, 3)
     turns: list[Tensor] = []
     shifts: list[Tensor] = []

@@ -62,11 +62,7 @@ def export_checked(
     metadata: Mapping[str, object],
     sizes: Mapping[str, Sequence[str | None]] | None = None,
 ) -> ExportReport:
-    """Exports a module of batches, the last case of two rows or more, and writes it as :func:`write_checked` does.
-
-    Args:
-        sizes: as of ``exported_model``; the first axis of each input is the batch if absent.
-    """
+    """Exports a module of batches, the last case of two rows or more, and writes it as :func:`write_checked` does."""
     example = cases[-1][0]
     model = exported_model(module, example, list(allowed), metadata, sizes or dict.fromkeys(example, ("batch",)))
     return write_checked(model, path, cases, allowed, units)
@@ -75,11 +71,10 @@ def export_checked(
 def write_checked(
     model: onnx.ModelProto, path: str | Path, cases: Cases, allowed: Mapping[str, float], units: Mapping[str, str]
 ) -> ExportReport:
-    """Runs a graph on cases of different batch sizes and writes it if it agrees.
+    """Runs a graph on cases of different batch sizes and writes it, complete, if they differ by no more than
+    ``allowed``.
 
-    Args:
-        path: the file to write; it appears only when it is complete and checked.
-        allowed: by output, how far apart the two may be; of deviations above 1, in shares of them.
+    Of deviations above 1 the difference counts in shares of them.
     """
     content = model.SerializeToString()
     session = graph_session(content)

@@ -43,12 +43,8 @@ PART: Mapping[Callable[..., object], Callable[..., object]] = {graph_part._opove
 
 
 def with_parts(model: onnx.ModelProto, parts: Mapping[str, onnx.ModelProto], kept: str) -> onnx.ModelProto:
-    """A graph with parts in the place of their nodes.
-
-    Args:
-        parts: of one output each, by the names of their nodes.
-        kept: what names of weights begin with that stay as they are.
-    """
+    """A graph with parts of one output each in the place of the nodes of their names; weights of ``kept`` keep
+    theirs."""
     whole = onnx.ModelProto()
     whole.CopyFrom(model)
     names = dict[str, dict[str, str]]()

@@ -172,11 +172,8 @@ def export_marker_solver(
     hybrid: bool = False,
     progress: Progress | None = None,
 ) -> SolverReport:
-    """Writes a solver as ONNX, and checks it; see :func:`export_solver`.
-
-    Args:
-        hybrid: with the inputs of the hybrid solve.
-    """
+    """Writes a solver as ONNX, with the inputs of the ``hybrid`` solve if asked, and checks it; see
+    :func:`export_solver`."""
     progress = progress or silent
     solver = copy.deepcopy(solver).cpu().float()
     frames = _frames(solver, markers)

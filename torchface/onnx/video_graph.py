@@ -263,15 +263,10 @@ class GaussNewtonStep(nn.Module):
         rows: Tensor,
         *given: Tensor,
     ) -> tuple[Tensor, ...]:
-        """The next values of the first seven arguments.
+        """The next values of the first seven arguments: () twice, (1,N), (1,3,3), (1,3), the program's dual (N+6,), the
+        points (1,68).
 
-        Args:
-            iteration: from 0, ().
-            settled: whether the last step moved no weight further than the tolerance, () bool.
-            weights, rotation, translation: (1,N), (1,3,3), (1,3).
-            dual: of the last program, (N+6,).
-            rows: which point each landmark is, (1,68).
-            given: tensors of :func:`frame_terms`.
+        ``given`` are tensors of :func:`frame_terms`; ``settled`` says that no weight has moved beyond the tolerance.
         """
         head = HeadState(weights, rotation, translation)
         rows = torch.where((iteration > 0) & (iteration < SLIDING_STEPS), self.solver.chosen(head), rows)
@@ -285,11 +280,9 @@ class GaussNewtonStep(nn.Module):
 
 
 def frame_terms(landmarks: Tensor, precision: Tensor, *expected: Tensor) -> FrameTerms:
-    """The terms of one frame's energy; poses are not tracked.
+    """The terms of one frame's energy, of landmarks (1,68,2) and their precision; poses are not tracked.
 
-    Args:
-        landmarks, precision: as of ``FrameTerms``, (1,68,2) and (1,68).
-        expected: mean weights, rotation and translation, (1,N), (1,3,3), (1,3), and the information, (1,N+6,N+6).
+    ``expected`` are mean weights (1,N), rotation (1,3,3), translation (1,3), and information (1,N+6,N+6).
     """
     mean = HeadState(*expected[:3])
     return FrameTerms(landmarks, precision, mean.rotation, mean.translation, Expectation(mean, expected[3]))

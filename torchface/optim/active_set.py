@@ -28,12 +28,8 @@ _DAMPING = 1e-5
 
 
 def primal_dual_active_set(problem: BoxProblem, start: Tensor, iterations: int = 10) -> tuple[Tensor, Tensor]:
-    """The minimisers (B,N) of the problems whose active set settles, ``start`` of the others, and the gradient there.
-
-    Args:
-        start: in the box, (B,N); its variables at a bound are the first active set.
-        iterations: at most so many factorisations.
-    """
+    """The minimisers (B,N) of the problems whose active set, first that of ``start``, settles, else ``start``; and
+    the gradient there."""
     checked_count("primal_dual_active_set: iterations", iterations)
     found, slope = start.clone(), problem.gradient(start)
     gradient = slope.clone()

@@ -35,11 +35,8 @@ _CAREFUL_ROUNDS = ((60, 8), (400, 8), (800, 8), (1600, 8), (0, 100))
 def solve_batch(
     problem: BoxProblem, factors: SplittingFactors | None, start: Tensor | None, tolerance: float
 ) -> Tensor:
-    """The minimisers (B,N), or where steps do not reach them the last of these.
-
-    Args:
-        factors: of one H of all of them; those of an H each are made here, as far as needed.
-    """
+    """The minimisers (B,N), or the last steps that do not reach them; factors of several H are made here, as far as
+    needed."""
     left = _Unsolved(problem, factors, start, tolerance)
     if start is not None and left.without(left.state.z):
         return left.x

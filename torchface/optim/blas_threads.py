@@ -18,10 +18,6 @@ def one_blas_thread(variables: int | None = None) -> AbstractContextManager[obje
 
     OpenBLAS gives the product of a frame's Jacobian with itself to as many threads as the machine has cores, which in
     a loop over frames wait for each other: a take's solve took 2.5 times the processor time on two cores.
-
-    Args:
-        variables: of the systems that are factored within, for which nothing is done where they are few; anything else
-            is computed if absent.
     """
     if variables is not None and variables <= _ALONE:
         return nullcontext()

@@ -20,9 +20,6 @@ def data_dependent(instead: str) -> Callable[[Callable[Given, Result]], Callable
     method are dozens of pieces, for minutes. What follows one path only is refused at once: ``torch.jit.trace``,
     ``torch.export`` and the transforms of ``torch.func``. Tensors of integers become floats.
 
-    Args:
-        instead: what may be exported, for the error.
-
     Example:
         >>> @data_dependent("a series")
         ... def halved(x):

@@ -37,15 +37,9 @@ def _(matrix: Tensor, rho: float) -> Tensor:
 def box_splitting(
     constant: Tensor, step: Tensor, double_step: Tensor, lower: Tensor, upper: Tensor, dual: Tensor, steps: int
 ) -> tuple[Tensor, Tensor]:
-    """Steps of ``torchface.optim.operator_splitting`` from zero: the last v and the clipped z, (1,N).
+    """Steps of ``torchface.optim.operator_splitting`` from a dual (1,N): the last v and the clipped z, (1,N).
 
-    Args:
-        constant: c, (1,N).
-        step: G, (N,N).
-        double_step: 2G + (2 - α) I, (N,N).
-        lower, upper: the box, (N,).
-        dual: the scaled dual to start from, (1,N).
-        steps: how many.
+    ``constant`` is c (1,N), ``step`` G (N,N), ``double_step`` 2G + (2 - α) I; the box is (N,).
     """
     v, z = dual, torch.zeros_like(dual)
     for _ in range(steps):  # each needs the one before
@@ -62,11 +56,8 @@ def _(constant: Tensor, *_: Any) -> tuple[Tensor, Tensor]:
 def split_box_program(
     H: Tensor, gradient: Tensor, lower: Tensor, upper: Tensor, dual: Tensor, identity: Tensor, rho: float, steps: int
 ) -> tuple[Tensor, Tensor]:
-    r"""The least of :math:`\tfrac12 x^\top H x + g^\top x` in a box, (1,D), and the scaled dual (D,) there.
-
-    Args:
-        rho: of the metric, a share of H's diagonal.
-    """
+    r"""The least of :math:`\tfrac12 x^\top H x + g^\top x` in a box, (1,D), and the dual (D,), with a metric of
+    ``rho`` of H's diagonal."""
     diagonal = (H * identity).sum(0)
     inverse = symmetric_inverse(H + rho * diagonal * identity)
     return _split(_prepared(inverse, H, gradient, identity, rho), (lower, upper), dual, steps, H.dtype)

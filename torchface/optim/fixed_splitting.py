@@ -125,11 +125,8 @@ class FixedSplitting(nn.Module):
 
 
 def newton_inverse(matrix: Tensor, rho: float, doublings: int) -> Tensor:
-    r"""The inverses (B,N,N) of :math:`M + \rho I` for matrices M (B,N,N) with a unit diagonal, by products alone.
-
-    Args:
-        doublings: of the digits, for N = 1.
-    """
+    r"""The inverses (B,N,N) of :math:`M + \rho I` for matrices of a unit diagonal, by products, so many doublings of
+    digits."""
     size = matrix.shape[-1]
     identity = torch.eye(size, dtype=matrix.dtype, device=matrix.device)
     A = matrix + rho * identity

@@ -20,12 +20,8 @@ _RIDGE_TRIES = 5
 
 
 def solve_free(H: Tensor, diagonal: Tensor, free: Tensor, right: Tensor, damping: Tensor | None = None) -> Tensor:
-    r"""Solves :math:`(H_{FF} + \delta D) x_F = b_F` with :math:`x = 0` elsewhere.
-
-    Args:
-        diagonal: the metric in which it is scaled, (N,) or (B,N).
-        free: which variables take part, (B,N) bool.
-    """
+    r"""Solves :math:`(H_{FF} + \delta D) x_F = b_F` for ``free`` (B,N), :math:`x = 0` elsewhere, in a metric (N,) or
+    (B,N)."""
     ridge = right.new_full((len(right),), RIDGE) if damping is None else damping.clamp(min=RIDGE)
     if right.device.type == "cpu":
         return _solved_one_by_one(H, diagonal, free, right, ridge)

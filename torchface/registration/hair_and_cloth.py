@@ -40,9 +40,6 @@ class Cover:
     Skin is what has the colour of brows, nose, mouth and cheeks together, lit more or less. Only what lies away from
     the features of the face (further than some 25 mm from their landmarks) can be covered: beards, brows and lips
     have other colours too. All of it asks for the 68 landmarks on the template; nothing is covered without.
-
-    Args:
-        colors: of the scan; without them only ears are judged.
     """
 
     def __init__(self, template: Mesh, exposed: Tensor, surface: SurfaceIndex, colors: ScanColors | None) -> None:
@@ -70,11 +67,8 @@ class Cover:
         self.features &= ~torch.stack([*self.ears, self._none]).any(0)
 
     def hidden(self, current: Tensor, settled: bool) -> Tensor:
-        """The covered vertices, (V,) bool, with the template's vertices (V,3) about where they belong.
-
-        Args:
-            settled: whether they lie near enough to the scan that an ear can be judged.
-        """
+        """The covered vertices, (V,) bool, of (V,3) about where they belong; ears are judged once these have
+        ``settled``."""
         if not self.known or (self._colors is None and not (settled and self.ears)):
             return self._none
         nearest = self._surface.among_nearest_samples(current[self._exposed])

@@ -99,9 +99,6 @@ def fit_to_scan(
     life as the surfaces meet; what lies off by several times as much, such as hair, counts little. What a model cannot
     explain it misses by patches, not by vertices: however many there are, a square of :math:`\ell` = 20 mm counts once.
 
-    Args:
-        landmarks: template vertices (L,) and where they belong (L,3) float64; none of them is needed.
-
     Source: Amberg, Knothe, Vetter 2008 (a statistical model in non-rigid ICP); thesis 3.2.3 and 3.2.4.
     """
     mean, modes = model.mean.detach().cpu().double(), model.modes.detach().cpu().double()

@@ -102,12 +102,8 @@ def shown_share(vertices: Tensor, unseen: Tensor) -> Tensor:
 
 
 def with_edge_of_hair(unseen: Tensor, shown: Tensor, matched: Tensor, faces: Tensor) -> Tensor:
-    """Unseen vertices (V,) and those beside them that hair covers or darkens: what is dark up to the first skin.
-
-    Args:
-        shown: colours of the scan nearest to each vertex, (V,3).
-        matched: which vertices lie on the scan's skin, (V,) bool.
-    """
+    """Unseen vertices (V,) and those beside them that hair covers or darkens: what is dark up to the first
+    ``matched`` skin."""
     if not matched.any() or not unseen.any():
         return unseen
     light = to_linear(shown.double()).mean(1)
@@ -132,10 +128,6 @@ def resampled_texture(mesh: Mesh, colors: Tensor, shown: Tensor, source: ScanCol
     5 mm whose surface faces the same way gives the colour. Where there is none, the vertex colours do, and they take
     over where the scan does not show the skin. Charts are widened by four texels, so that no background shows at
     their seams.
-
-    Args:
-        colors: of its vertices, (V,3).
-        shown: how much of the colour is the scan's, (V,) in [0,1].
     """
     if mesh.uvs is None or mesh.uv_faces is None:
         raise TopologyError("mesh: found no texture coordinates, expected some to lay a texture out in")

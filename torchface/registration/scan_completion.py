@@ -68,11 +68,8 @@ def completed_form(
 
 
 def completed_colors(colors: Tensor, base: Tensor, vertices: Tensor, faces: Tensor, unseen: Tensor) -> Tensor:
-    """Colours (V,3), the unseen ones going over from those around to a base within some 40 mm, as a membrane does.
-
-    Args:
-        base: what the skin looks like far from anything seen, (V,3).
-    """
+    """Colours (V,3), the unseen ones going over from those around to ``base`` (V,3) within some 40 mm, as a membrane
+    does."""
     if not unseen.any():
         return colors
     stiffness, area = _membrane(vertices, faces)
@@ -94,11 +91,7 @@ def _membrane(vertices: Tensor, faces: Tensor) -> tuple[sparse.csr_array, np.nda
 
 
 def _spread(system: sparse.csr_array, values: Tensor, unknown: Tensor, pull: np.ndarray | None = None) -> Tensor:
-    """Values (V,K) with the unknown rows at the least of the quadratic form, the others held.
-
-    Args:
-        pull: how much each row (V,) is drawn to its value.
-    """
+    """Values (V,K) with the unknown rows, or those pulled (V,), at the least of the quadratic form, the others held."""
     held = values.masked_fill(unknown[:, None], 0.0).numpy()
     rows = unknown.nonzero()[:, 0].numpy()
     right = -(system[rows] @ held)

@@ -6,11 +6,7 @@ from torch import Tensor
 
 
 def gaussian_blur(images: Tensor, sigma: float, truncate: float = 3.0) -> Tensor:
-    """Images (B,C,H,W) blurred with a standard deviation in pixels; the border is repeated outward.
-
-    Args:
-        truncate: standard deviations at which the kernel ends.
-    """
+    """Images (B,C,H,W) blurred with a standard deviation in pixels; the border is repeated outward."""
     # Loaded here: kornia takes half a second, and most of what imports this module never blurs.
     from kornia.filters import gaussian_blur2d
 

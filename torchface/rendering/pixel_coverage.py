@@ -50,11 +50,8 @@ class Footprint:
         )
 
     def softened(self, values: Tensor, weights: Tensor | None = None, sigma: float = 1.0) -> Tensor:
-        """Values (S,C) of the samples, blurred over the image by ``sigma`` pixels.
-
-        Args:
-            weights: what each counts beside its share of a pixel, (S,).
-        """
+        """Values (S,C) of the samples, blurred by ``sigma`` pixels; each counts by weights (S,) beside its share of
+        a pixel."""
         weight = (self.share if weights is None else self.share * weights).float()[:, None]
         rows, columns = self.pixel // self.width, self.pixel % self.width
         (top, left), (bottom, right) = (int(rows.min()), int(columns.min())), (int(rows.max()), int(columns.max()))
@@ -77,12 +74,9 @@ class Footprint:
 def footprint(
     vertices: Tensor, faces: Tensor, shows: Tensor, camera: Camera, calibration: CameraCalibration | None = None
 ) -> Footprint:
-    """The samples of those triangles that show: what the mesh itself hides, or is seen from behind, is missing.
+    """The samples of those triangles that show, (F,) bool: what the mesh hides, or is seen from behind, is missing.
 
-    Args:
-        faces: (F,3) int64; all of them hide what is behind them.
-        shows: the triangles wanted, (F,) bool.
-        calibration: of a lens that bends the image; rays are bent with it, so that nothing has to be warped.
+    Rays are bent as by the calibration's lens, so that nothing has to be warped.
     """
     points = in_camera_frame(camera, vertices)
     caster = RayCaster(points, faces)

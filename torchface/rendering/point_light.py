@@ -94,7 +94,6 @@ def irradiance(points: Tensor, normals: Tensor, light: PointLight, lit: Tensor |
     Args:
         points: in the camera's frame, (...,3), millimetres.
         normals: unit, (...,3).
-        light: see :class:`PointLight`.
         lit: the share of the source that each point sees, (...,); all if absent.
 
     Returns:
@@ -109,12 +108,8 @@ def irradiance(points: Tensor, normals: Tensor, light: PointLight, lit: Tensor |
 
 
 def lit_by(position: Tensor, caster: RayCaster, points: Tensor, normals: Tensor) -> Tensor:
-    """Whether each point (Q,3) faces a source at ``position`` (3,) with nothing of the mesh between, (Q,) bool.
-
-    Args:
-        position: in the frame of the points, millimetres; or one for each point, (Q,3).
-        normals: unit.
-    """
+    """Whether each point (Q,3) faces a source at ``position``, (3,) or (Q,3), with nothing of the mesh between, (Q,)
+    bool."""
     toward = torch.nn.functional.normalize(position.double() - points.double(), dim=-1)
     facing = (toward * normals).sum(-1) > 0
     asked = facing.nonzero()[:, 0]

@@ -69,11 +69,7 @@ class QuickClay:
         return QuickClay(faces[drawn], part[drawn], openness, _lit_colors(palette), paint, _mouth(mesh))
 
     def draw(self, vertices: Tensor, camera: Camera, tint: Tensor | None = None) -> np.ndarray:
-        """The mesh before a dark ground, (H,W,3) uint8.
-
-        Args:
-            tint: how far each vertex is marked, (V,) in [0,1]; none if absent.
-        """
+        """The mesh before a dark ground, (H,W,3) uint8, its vertices marked by a tint (V,) in [0,1]."""
         image = np.full(camera.height * camera.width, _words(np.array(BACKGROUND, np.uint8)))
         size = (camera.height, camera.width, 4)
         points = vertices.double() @ camera.rotation.double().T + camera.translation.double()

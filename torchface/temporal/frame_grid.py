@@ -17,10 +17,6 @@ def frame_grid(seconds: Tensor, fps: float) -> tuple[float, Tensor]:
 
     Frames that were dropped leave places free at the take's own rate; frames at any times need a finer grid.
 
-    Args:
-        seconds: (T,), rising.
-        fps: the usual number of frames a second.
-
     Returns:
         Places a second, a multiple of ``fps``, and the place of each frame, (T,) int64, rising from 0.
     """

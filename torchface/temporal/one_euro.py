@@ -106,9 +106,7 @@ def one_euro_step(
 ) -> tuple[Tensor, Tensor]:
     """The next filtered values (...) and their speeds (...), a second; see :class:`OneEuroFilter`.
 
-    Args:
-        unit: what counts as much as a value of 1, of each channel.
-        opening: factor of the cutoff of the values.
+    A channel's ``unit`` counts as much as a value of 1; ``opening`` is a factor of the cutoff.
     """
     step = values - before
     speed = speed + (step / interval - speed) * _share_taken(settings.speed_cutoff, interval)

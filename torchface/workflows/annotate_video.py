@@ -39,12 +39,6 @@ def prepare_annotation(video: Path, folder: Path, track: Tracker, count: int = 1
 
     Proposals are kept in the folder's ``proposals.json``; with the same video, count and key nothing is tracked anew.
     More frames asked for later hold the earlier ones.
-
-    Args:
-        folder: made if missing.
-        track: finds the landmarks; called only where it must be.
-        count: how many frames.
-        key: of what the tracker's landmarks depend on beside the video.
     """
     if not 1 <= count <= _MAX_FRAMES:
         raise ValueRangeError(f"count: found {count}, expected 1 to {_MAX_FRAMES}")
@@ -72,11 +66,8 @@ def prepare_annotation(video: Path, folder: Path, track: Tracker, count: int = 1
 
 
 def write_proposals(annotation: Annotation) -> list[Path]:
-    """Writes every frame with its proposed landmarks, to be edited elsewhere; the user's own are kept.
-
-    Returns:
-        The files with landmarks, new and old.
-    """
+    """Writes every frame with its proposed landmarks, to be edited elsewhere, but for the user's own; all these
+    files."""
     paths = []
     for frame in annotation.frames:
         path = annotation.folder / f"{frame.name}.pts"

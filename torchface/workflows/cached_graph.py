@@ -25,13 +25,9 @@ def cached_graph(kind: str, make: "Callable[[], onnx.ModelProto]", code: Sequenc
 
 
 def cached_file(kind: str, ending: str, make: Callable[[], bytes], code: Sequence[str], **models: object) -> bytes:
-    """A file's content: from the cache where it is there and whole, else made; kept if the cache can be written to.
+    """What ``make`` makes of models: from the cache where it is there and whole; kept if the cache can be written to.
 
-    Args:
-        kind: of the file, a plain name.
-        make: makes it, in seconds to a minute.
-        code: folders of this package whose code says what becomes of the models.
-        models: what the file is made of, as :func:`~torchface.files.content_keys.content_key` takes it.
+    ``code`` are folders of this package that say what becomes of the models, ``models`` as of ``content_key``.
     """
     name = _name(kind, ending, code, models)
     content = _kept(kind, name)

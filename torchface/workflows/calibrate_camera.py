@@ -94,11 +94,9 @@ class CalibrationReport:
 
 
 def calibrate(paths: Sequence[Path], board: Board, out: Path, progress: Progress | None = None) -> CalibrationReport:
-    """Calibrates a camera from images, or a video, of a checkerboard held at various angles, and writes it.
+    """Calibrates a camera from images of one size, or a video, of a checkerboard held at various angles, and writes it.
 
-    Args:
-        paths: image files of one size, or one video.
-        out: the ``.toml`` to write; beside it an image of the corners found, and of views without distortion.
+    Beside ``out`` goes an image of the corners found, and of views without distortion.
 
     Source: Zhang 2000; thesis 4.2.4.
     """
@@ -124,11 +122,6 @@ def calibrate_beside(
     films: Sequence[Path], board: Board, out: Path, progress: Progress | None = None
 ) -> tuple[list[CalibrationReport], list[PlacedCamera], list[str]]:
     """Calibrates cameras that are fixed to each other, from their films of one checkerboard, and writes them.
-
-    Args:
-        films: of each camera, taken at once; those without timecodes began together.
-        board: the checkerboard, seen by the first camera and each other one at once.
-        out: the ``.toml`` to write; see :func:`~torchface.io.camera_files.save_cameras`.
 
     Returns:
         A report of each camera, the cameras, and lines about how they lie.
@@ -181,12 +174,8 @@ def calibrate_beside(
 def find_boards(
     images: Iterator[tuple[str, Tensor]], board: Board, progress: Progress
 ) -> tuple[list[View], list[tuple[str, str]]]:
-    """The views with the whole board, and the names of the other images with the reason why not.
-
-    Args:
-        images: names and images, uint8 (H,W), of one size.
-        progress: called with the number of images done.
-    """
+    """The views with the whole board, and of other images, uint8 (H,W) of one size, the names and the reasons why
+    not."""
     views: list[View] = []
     left_out: list[tuple[str, str]] = []
     first: tuple[str, torch.Size] | None = None
@@ -235,10 +224,6 @@ def calibrate_views(views: Sequence[View], board: Board, left_out: Sequence[tupl
 
     Views whose residuals are far larger than those of the others are left out; k3 is estimated only where it differs
     significantly from 0.
-
-    Args:
-        views: with the board, of one size.
-        left_out: images without it, and why; those left out here are added.
     """
     left = list(left_out)
     _check_count(views, left)

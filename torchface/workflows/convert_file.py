@@ -56,13 +56,10 @@ def convert_file(
     """Reads whatever holds a rig or a mesh and writes it as ``out``'s ending says.
 
     Args:
-        source: a rig or mesh, ``.fbx`` or ``.blend``.
         out: ``.glb``, USD, ``.ma``, ``.fbx``, ``.blend``, or a name without an ending for a folder of OBJ files; for
             what has no shapes any mesh's ending.
         unit: of the source's numbers, where it is not the format's own.
-        part: keep this annotated region only.
         names: how shapes are called in ``out``; see ``rig_names``.
-        pose: weights by name, to write the mesh in that pose instead of the rig.
         reduce: keep as few keys as stay within this of every frame's weights; all if absent.
     """
     progress = progress or silent

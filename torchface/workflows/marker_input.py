@@ -65,13 +65,8 @@ MARKER_TAKES = ItemKind("take", "solved", (*MARKER_ENDINGS, ".csv"), is_marker_t
 
 
 def read_markers(path: Path, labels: Sequence[str] | None, options: MarkerOptions) -> tuple[Take, list[str]]:
-    """The take with the markers of an attachment alone, by its labels, all frames; and remarks for the user.
-
-    Args:
-        path: ``.c3d``, ``.trc`` or ``.csv``.
-        labels: the attachment's; all labelled markers of the file where there is none.
-        options: unit and label map.
-    """
+    """The take with the markers of an attachment alone, or all labelled ones of the file, all frames; and remarks
+    for the user."""
     take = load_take(path, options.unit)
     if take.markers is None:
         other = "; such weights go to another rig by torchface retarget" if take.weights is not None else ""
@@ -98,12 +93,8 @@ def _flipped(values: Tensor, axis: str) -> Tensor:
 
 
 def scale_warnings(scale: float, held: bool, read_as: str | None = None) -> list[str]:
-    """Warnings where the scale that fits a take to its performer's rig best is not 1.
-
-    Args:
-        held: the take was aligned at scale 1 all the same.
-        read_as: the unit that its markers were read in, where it is known.
-    """
+    """Warnings where the scale that fits a take to its performer's rig best is not 1, though it was maybe held
+    there."""
     if abs(scale - 1) <= MAX_SCALE_DIFFERENCE:
         return []
     unit = unit_of_scale(scale, read_as) if not MIN_HEAD_SCALE <= scale <= MAX_HEAD_SCALE else ""
@@ -123,13 +114,7 @@ def scale_warnings(scale: float, held: bool, read_as: str | None = None) -> list
 def read_range_of_motion(
     path: Path, initial: Attachment | None, options: MarkerOptions
 ) -> tuple[Take, Attachment | None, list[str]]:
-    """The frames of a range of motion with the markers that are seen in them, the sites of these, and remarks.
-
-    Args:
-        path: ``.c3d``, ``.trc`` or ``.csv``.
-        initial: sites to begin with, if there are any.
-        options: unit, label map, frames.
-    """
+    """The frames of a range of motion with the markers that are seen in them, the sites of these, and remarks."""
     take, notes = read_markers(path, None if initial is None else initial.labels, options)
     take = take.frames(frame_span(options.frames, len(take)))
     assert take.markers is not None

@@ -97,12 +97,8 @@ def load_finder(
 
 
 def network_finder(network: LandmarkNetwork, name: str, photographs: bool = False) -> EyedFinder:
-    """A finder that runs a landmark network, and on the eyes that it finds the zoo's eye network, in ONNX Runtime: in a
-    third of PyTorch's time for single crops.
-
-    Args:
-        photographs: show it each crop's mirror image too.
-    """
+    """A finder that runs a landmark network, and on the eyes that it finds the zoo's eye network, in ONNX Runtime:
+    in a third of PyTorch's time for single crops. For ``photographs`` it is shown each crop's mirror image too."""
     finder = graph_finder(_graph(network), Path(name))
     if photographs:
         finder = replace(finder, network=BothSides(finder.network, network.mirror))

@@ -64,12 +64,8 @@ def load_head_model(name_or_path: str | Path) -> HeadModel:
 def matching(
     model: HeadModel, template: Path | None = None, part: str | None = None
 ) -> tuple[HeadModel, BlendshapeRig]:
-    """A model, and the rig whose shapes its heads are to have, of one topology.
-
-    Args:
-        template: a rig; the one that travels with the model if absent, else the embedded performer.
-        part: an annotated region, such as ``"face"``, that both are cut to; a model of that part alone stays as it is.
-    """
+    """A model, and a rig, the template, else the model's, else the embedded performer, of one topology; cut to a
+    part."""
     source, rig = "the model's own rig", model.rig
     if template is not None:
         source, rig = str(template), load_rig(template)
@@ -123,10 +119,7 @@ def in_one_tile(uvs: Tensor, uv_faces: Tensor, kind: Tensor) -> tuple[Tensor, Te
     """Charts that all lie in [0,1] without covering each other; the same where none lies in a further tile.
 
     The tile of the most triangles keeps a large square of the image; all others, and what lies over it but is of
-    another kind, as eyeballs over a face, have small ones along two edges.
-
-    Args:
-        kind: of each triangle, (F,) int64: those of different kinds have tiles of their own.
+    another ``kind`` (F,), as eyeballs over a face, have small ones along two edges.
     """
     tiles = uvs[uv_faces].mean(1).floor().long()
     if not bool(tiles.any()):

@@ -45,14 +45,8 @@ def pose_weights(words: Sequence[str], option: str = "--weights") -> dict[str, f
 def load_posed(
     path: Path, weights: dict[str, float], take: Path | None = None, frame: int = 0, part: str | None = None
 ) -> Posed:
-    """Reads a mesh or a rig and poses it.
-
-    Args:
-        path: a mesh file, a rig file or a rig's folder.
-        weights: the pose, by shape name in any of the spellings that ``torchface.shape_names`` reads.
-        take: the pose from a frame of a weight take, or of an animated rig's file, instead.
-        part: keep this annotated region only.
-    """
+    """Reads a mesh or a rig, or a part of it, and poses it by weights or by a frame of a take or of an animated
+    rig's file."""
     if weights or take is not None:
         if path.suffix.lower() in MESH_ENDINGS:
             raise NameMismatchError(f"{path}: found a mesh without shapes; a pose needs a rig (.glb or a folder)")
@@ -89,13 +83,7 @@ def posed_mesh(rig: BlendshapeRig, weights: Mapping[str, float], option: str = "
 
 
 def load_neutral(path: Path, unit: str | None = None, part: str | None = None) -> tuple[Mesh, BlendshapeRig | None]:
-    """The mesh at rest of whatever holds a rig or a mesh, and the rig where there are shapes.
-
-    Args:
-        path: a mesh file, a rig file or a rig's folder.
-        unit: of its numbers, where it is not the format's own.
-        part: keep this annotated region only.
-    """
+    """The mesh at rest of whatever holds a rig or a mesh, or a part of it, and the rig where there are shapes."""
     if path.suffix.lower() not in MESH_ENDINGS:
         try:
             rig = load_rig(path, unit, part)

@@ -124,13 +124,8 @@ def _learned(
 def _mouth_closed(
     take: Take, source: BlendshapeRig | None, target: BlendshapeRig, ruled: Collection[str]
 ) -> tuple[Take, list[str]]:
-    """The take in the convention of the target's ``mouthClose``, and notes for the user.
-
-    Args:
-        take: weights by the target's names.
-        source: that the weights are of; ARKit's if absent.
-        ruled: shapes that a table drives: what it says of either is left alone.
-    """
+    """The take in the convention of the target's ``mouthClose``, and notes for the user; a table's shapes,
+    ``ruled``, stay."""
     assert take.weights is not None
     try:
         wanted, found = mouth_close_of(target), None if source is None else mouth_close_of(source)

@@ -38,11 +38,6 @@ def sculpt_corrective(
 ) -> tuple[SculptedCorrective, list[str]]:
     """Reads a rig, its animation and its detail maps, adds a corrective, writes all of it.
 
-    Args:
-        at: the pose, NAME=WEIGHT in words, or several in one.
-        sculpt: the rig in that pose, as an artist changed it, in its topology.
-        out: the rig's new file; see ``torchface convert``.
-
     Returns:
         What was made, and lines for people to read.
     """

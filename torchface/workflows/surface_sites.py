@@ -30,10 +30,6 @@ def sites_on_rig(rig: BlendshapeRig, places: Tensor) -> Attachment:
     The rig's head is bent onto the performer's by their landmarks, and each point goes to the vertex of the skin that
     lies nearest and moves alike with the jaw and the lids: so networks were taught where their points are on other
     heads. On a rig of the performer's own topology the points are known.
-
-    Args:
-        rig: with the 68 landmarks annotated.
-        places: of the points on the sculpture, (P,3), millimetres; see ``LandmarkNetwork.places``.
     """
     actor = performer(texture=False)
     template = actor.neutral.with_vertices(sculpted_vertices().float())
@@ -97,11 +93,8 @@ def alike_vertices(
 
 
 def jaw_and_lids(rig: BlendshapeRig, landmarks: Tensor) -> tuple[Tensor, Tensor] | None:
-    """How far the jaw and the lids move each vertex down, (V,), of the chin's and the lids' motion; None without them.
-
-    Args:
-        landmarks: vertices of iBUG's 68.
-    """
+    """How far the jaw and the lids move each vertex down, (V,), of the chin's and the lids' motion; None without
+    them."""
     shapes = mapping(ARKIT, rig.names)
     rows = [shapes[:, ARKIT.index(name)] for name in ("jawOpen", "eyeBlinkLeft", "eyeBlinkRight")]
     if any(float(row.amax()) <= 0 for row in rows):

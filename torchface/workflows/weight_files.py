@@ -121,11 +121,6 @@ def write_weights(
     ``files.out`` is Live Link Face's CSV where it gives every shape back, because all are ARKit's; else
     ``frame,time,<shape>,...`` with every shape by its own name.
 
-    Args:
-        take: weights by the rig's names.
-        files: what is written; ``live_link`` has ARKit's names by :func:`torchface.shape_names.mapping`.
-        source: the rig's file, where the rig is all of it; see :func:`write_animation`.
-
     Returns:
         Warnings, and other lines for people to read.
     """
@@ -163,11 +158,8 @@ def write_animation(
 ) -> KeyReduction | None:
     """Writes a rig with a take as its animation, and says how many keys that has where few were asked for.
 
-    A ``.glb`` of a rig from a ``.glb`` or ``.vrm`` is that file, with all that it has, and the take as its first
-    animation: weights, and the rotations of head and eyes that the take has.
-
-    Args:
-        source: the rig's file; its meshes alone are written where it is absent or of another kind.
+    A ``.glb`` of a rig from a ``.glb`` or ``.vrm``, ``source``, is that file, with all that it has, and the take as its
+    first animation: weights, and the rotations of head and eyes that the take has.
     """
     if source is None or source.suffix.lower() not in _KEPT or path.suffix.lower() != ".glb":
         return save_animation(rig, take, path, reduce=reduce).reduction

@@ -74,13 +74,8 @@ def _fetch_card(reference: HubReference) -> None:
 
 
 def _fetched(reference: HubReference, file: str, size: int, exactly: bool = False) -> Path:
-    """A file of a model as a plain file on this machine, fetched where it is not there yet and its size is allowed.
-
-    Args:
-        file: its name in the model's folder.
-        size: the most bytes that it may have.
-        exactly: it must have as many.
-    """
+    """A file of a model as a plain file on this machine, fetched where it is not there and has ``size`` bytes at
+    most or exactly."""
     owner, _, name = reference.repository.partition("/")
     # The package's own cache holds links, which a model's folder may not have.
     folder = cache_folder("hub") / owner / name / reference.revision

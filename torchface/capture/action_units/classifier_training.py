@@ -79,13 +79,11 @@ def merged_videos(videos: Sequence[RegionVideo], names: Sequence[str]) -> tuple[
 def label_group(
     patterns: Tensor, labels: Sequence[ActionLabels], group: RegionGroup, settings: TrainingSettings
 ) -> GroupClasses:
-    """The class of every frame: the set of the group's units and their intensity; 0 for rest.
+    """The class of every frame: the set of the group's units and their intensity; 0 for rest; of regions (T,G,h,w) of
+    all videos.
 
-    Intensities are clustered for each performer and each set of units by itself, so that a performer's strongest
-    frames are the highest level.
-
-    Args:
-        patterns: the group's regions over all videos, one after the other, (T,G,h,w).
+    Intensities are clustered for each performer and set of units, so a performer's strongest frames are the highest
+    level.
     """
     classes = torch.zeros(len(patterns), dtype=torch.int64)
     rows: list[tuple[float, ...]] = [(0.0,) * len(group.units)]

@@ -45,11 +45,7 @@ def performed_groups(labels: Sequence[ActionLabels]) -> tuple[RegionGroup, ...]:
 
 
 def region_grid(boxes: Mapping[str, Box], names: Sequence[str], size: int, width: int, height: int) -> Tensor:
-    """The pixels of a neutral image at which regions of ``size`` x ``size`` are read, (R,size,size,2).
-
-    Args:
-        boxes: (left, top, right, bottom) by name.
-    """
+    """The pixels of a neutral image at which regions, boxes of left, top, right, bottom, are read, (R,size,size,2)."""
     lacking = [name for name in names if name not in boxes]
     if lacking:
         raise NameMismatchError(f"regions: found no {', '.join(lacking)}, expected {', '.join(names)}")
@@ -68,12 +64,8 @@ def region_grid(boxes: Mapping[str, Box], names: Sequence[str], size: int, width
 
 
 def sample_regions(frames: Tensor, grid: Tensor, transforms: Tensor) -> Tensor:
-    """Regions (t,R,h,w) of frames (t,H,W), each read in one interpolation.
-
-    Args:
-        grid: pixels of the neutral image, (R,h,w,2).
-        transforms: neutral image to frame, (t,2,3).
-    """
+    """Regions (t,R,h,w) of frames (t,H,W) at pixels (R,h,w,2) of the neutral image, which (t,2,3) transform to the
+    frames."""
     regions, height, width = grid.shape[:3]
     pixels = torch.einsum("nc,tdc->tnd", grid.reshape(-1, 2), transforms[..., :2]) + transforms[:, None, :, 2]
     size = torch.tensor([frames.shape[2], frames.shape[1]], dtype=torch.float32)

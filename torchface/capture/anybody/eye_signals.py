@@ -64,10 +64,6 @@ def eye_signals(
         gaze: where the eyes seem to look, (2,2), NaN where nobody said.
         usual: openness of eyes at rest, (2,).
         looking: what looking up or down adds to the rig's openness at weights (8,) of ``LOOKS``, (2,8).
-        before: the state of the frame before, or its signals.
-        interval: seconds since then, ().
-        pose: what the person has been asked to hold, () of ``POSES``.
-        learns: 0 where nothing is to be learned, ().
     """
     openness, closed, visibility = read.openness, read.closed, read.visibility
     known = ~torch.isnan(openness)

@@ -34,16 +34,7 @@ def highest_weights(factors: Tensor, groups: Tensor, pose: Tensor) -> Tensor:
 def learned_gains(
     weights: Tensor, groups: Tensor, before: WebcamState, interval: Tensor, pose: Tensor, learns: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Logarithms of gains, and for how long each has been asked for, (G,).
-
-    Args:
-        weights: before gains, (N,).
-        groups: see :func:`gain_groups`.
-        before: the state of the frame before.
-        interval: seconds since then, ().
-        pose: what the person has been asked to hold, () of ``POSES``.
-        learns: 0 where nothing is to be learned, ().
-    """
+    """Logarithms of gains, and for how long each has been asked for, (G,)."""
     reached = (groups @ weights) / groups.sum(1)
     asked = learns * _asked(pose)
     seen = before.gains_seen + asked * interval

@@ -108,11 +108,8 @@ class MeshSolver:
         return (meshes - middle[:, None]) @ rotation.transpose(1, 2) + self._at_rest
 
     def _poses(self, coordinates: Tensor) -> tuple[Tensor, Tensor]:
-        """Rotations (t,3,3) onto the rig at rest, and the middles (t,3) of the steady vertices, that go to its own.
-
-        Args:
-            coordinates: of the meshes, (t,3,V).
-        """
+        """Rotations (t,3,3) of meshes (t,3,V) onto the rig at rest, and the steady vertices' middles (t,3) that go
+        to its own."""
         middle = (coordinates @ self._share.to(coordinates)).double()
         covariance = (coordinates @ self._arms.to(coordinates)).transpose(1, 2).double()
         if not bool(torch.isfinite(covariance).all()):

@@ -29,20 +29,11 @@ _OUTLIER_RATIO, _OUTLIER_DISTANCE, _POINT_ITERATIONS = 3.0, 4.0, 8
 def solve_weights(
     affine: Tensor, moved: Tensor, ridge: float, initial: Tensor | None = None, unbounded: int = 0
 ) -> Tensor:
-    r"""Weights for markers whose sites follow affine maps, as a step of an alternation.
+    r"""Weights (T,N) for markers (T,M,3), NaN for not seen, whose sites follow affine maps (M,3,N+1), a step of an
+    alternation.
 
     A marker that is not seen is filled in by the previous weights, which keeps one H for all frames; the weights
-    converge over the steps of the alternation.
-
-    Args:
-        affine: of the sites, (M,3,N+1), millimetres of rig space.
-        moved: markers in rig space, (T,M,3), NaN for not seen.
-        ridge: mm² a marker for a squared weight of 1.
-        initial: weights of the step before, (T,N).
-        unbounded: how many of the last columns are unbounded, with hardly a ridge.
-
-    Returns:
-        Weights in [0,1], (T,N), float64; the last ``unbounded`` unbounded.
+    converge over the steps of the alternation. The last ``unbounded`` ones have no bounds.
     """
     basis, rest = affine[..., 1:], affine[..., 0]
     gaps = torch.isnan(moved)
@@ -118,10 +109,6 @@ def pose_of_take(affine: Tensor, paths: Tensor, scale: bool = True) -> Similarit
     Args:
         affine: of the sites, (M,3,N+1), millimetres of rig space.
         paths: markers (T,M,3), millimetres of any space, NaN for not seen; every frame shows some.
-        scale: estimate the scale; otherwise it is 1.
-
-    Returns:
-        Marker space to rig space.
     """
     rest = affine[..., 0]
     pose = pose_of_points(paths.nanmedian(0).values, rest, scale)

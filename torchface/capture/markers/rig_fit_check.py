@@ -174,15 +174,9 @@ def _is_elsewhere(pose: Similarity, markers: Tensor, radius: float) -> bool:
 
 
 def unit_of_scale(scale: float, read_as: str | None = None) -> str:
-    """The unit in which coordinates are that must grow by this factor to be millimetres.
-
-    Args:
-        read_as: the unit that they were read in; of unknown ones those too small were read as millimetres, and those
-            too large are.
-
-    Returns:
-        ``m``, ``cm``, ``in``, ``mm`` or ``um``; empty where it is no unit's, or the one they were read in.
-    """
+    """The unit, ``m``, ``cm``, ``in``, ``mm`` or ``um``, in which coordinates are that must grow by this factor to
+    be millimetres; empty where it is none's, or the one they were read in. Of unknown ones those too small were read
+    as millimetres, and those too large are."""
     if read_as is None:
         read_as = "mm" if scale > 1 else next((name for name in _UNITS if _near(scale * _UNITS[name], 1.0)), "mm")
     size = scale * _UNITS[read_as]

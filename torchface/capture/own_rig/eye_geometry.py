@@ -105,12 +105,8 @@ def openness_of(landmarks: Tensor) -> Tensor:
 
 
 def openness_rows(rest: Tensor, basis: Tensor, names: Sequence[str]) -> tuple[Tensor, Tensor]:
-    """What a unit of each shape adds to each eye's openness, 0 shut and 1 at rest, (2,N); and the rig's at rest, (2,).
-
-    Args:
-        rest, basis: of the 68 landmarks, (68,3) and (68,3,N).
-        names: of the shapes, by ARKit.
-    """
+    """What a unit of each shape adds to each eye's openness, 0 shut and 1 at rest, (2,N); and the rig's at rest,
+    (2,)."""
     at_rest = openness_of(rest[None])[0]
     moved = openness_of((rest[..., None] + basis).permute(2, 0, 1)).T - at_rest[:, None]
     blinks = [names.index(f"eyeBlink{side}") if f"eyeBlink{side}" in names else -1 for side in ("Right", "Left")]
@@ -129,7 +125,6 @@ def seen_gaze(rays: Tensor, iris: Tensor, rotation: Tensor, depth: Tensor, eyes:
         iris: of the irises, (...,2,2).
         rotation: head to camera, (...,3,3).
         depth: of the eyes, (...,2), millimetres.
-        eyes: where eyeballs lie; as people have them if absent.
     """
     eyes = eyes or Eyeballs.usual()
     radius = eyes.radius.to(rays)[:, None]

@@ -38,13 +38,8 @@ class FacePoints:
 
     @staticmethod
     def of(rig: BlendshapeRig, landmark_vertices: Tensor, slides: bool = True) -> "FacePoints":
-        """Those of a rig whose landmarks are the vertices (68,), float64.
-
-        Args:
-            rig: N shapes.
-            landmark_vertices: vertex ids in iBUG's order, (68,).
-            slides: contour landmarks slide; otherwise they stay at their vertices, visible or not.
-        """
+        """Those of a rig whose landmarks are the vertices (68,), float64; those of the contour slide or stay,
+        visible or not."""
         count = len(rig.vertices)
         marks = landmark_vertices.detach().long().to(rig.vertices.device)
         if marks.shape != (LANDMARKS,):
@@ -103,12 +98,7 @@ class FacePoints:
         return self.rest + moved.unflatten(1, self.rest.shape)
 
     def linearised(self, weights: Tensor, rows: Tensor) -> tuple[Tensor, Tensor]:
-        """Some points at weights (B,N), (B,L,3), and what a unit more of each weight adds there, (B,L,3,N).
-
-        Args:
-            weights: (B,N).
-            rows: which points, (B,L).
-        """
+        """Some points (B,L) at weights (B,N), (B,L,3), and what a unit more of each weight adds there, (B,L,3,N)."""
         basis = self.basis[rows]
         placed = self.rest[rows] + (basis.flatten(1, 2) @ weights[..., None]).view(*rows.shape, 3)
         if self.activation is None or self.corrective_basis is None:
@@ -122,11 +112,6 @@ class FacePoints:
 
         A contour landmark is the point of its curve that is seen furthest out, away from the face's own vertical; on
         the near side of a turned face that is the landmark's own vertex.
-
-        Args:
-            weights: (B,N).
-            rotation, translation: rig to camera, (B,3,3) and (B,3).
-            intrinsics: (3,3).
         """
         rows = torch.arange(LANDMARKS, device=weights.device).expand(len(weights), -1)
         if self.rows.shape[1] == 1:
@@ -141,12 +126,8 @@ class FacePoints:
         return torch.cat([torch.where(best > 0, slid, rows[:, :JAW]), rows[:, JAW:]], dim=1)
 
     def eyes_distance(self, rotation: Tensor, translation: Tensor, intrinsics: Tensor) -> Tensor:
-        """How far apart a camera straight ahead of them would see the eyes' outer corners, (B,), pixels.
-
-        Args:
-            rotation, translation: rig to camera, (B,3,3) and (B,3).
-            intrinsics: (3,3).
-        """
+        """How far apart a camera straight ahead would see the eyes' outer corners, (B,), pixels, from (B,3,3) and
+        (B,3)."""
         right, left = (self.rest[i] for i in EYE_CORNERS)
         apart = (right - left).norm()
         depth = rotation[:, 2] @ (0.5 * (right + left)) + translation[:, 2]
@@ -160,11 +141,6 @@ def make_room_for_points(
     """Gives a solver's buffers of points the sizes that a state has them in, where these fit one another.
 
     Another rig's contour may have more or fewer points. What does not fit is left to ``load_state_dict`` to refuse.
-
-    Args:
-        solver: with the buffers ``rest``, ``basis``, ``rows`` and ``valid`` of :class:`FacePoints`.
-        state: to be loaded, by names that begin with ``prefix``.
-        more: other buffers with a row a point.
     """
     by_point, by_curve = ("rest", "basis", *more), ("rows", "valid")
     tensors = {name: state.get(prefix + name) for name in (*by_point, *by_curve)}

@@ -45,12 +45,8 @@ class FrameSolver(VideoSolverParts):
         return (self.settings.relative_noise * apart).clamp(min=self.settings.pixel_noise)
 
     def precision(self, seen: Tensor, confidence: Tensor | None, noise: Tensor) -> Tensor:
-        """One over the standard deviation of each landmark, (B,68), 0 where not seen.
-
-        Args:
-            seen, confidence: of landmarks, (B,68).
-            noise: standard deviations of landmarks that count 1, (B,68) or (B,1), pixels.
-        """
+        """One over each landmark's standard deviation, (B,68), pixels, 0 where not seen; ``noise`` is that of one
+        that counts 1."""
         weights = self.landmark_weights.double() * seen
         if confidence is not None:
             weights = weights * confidence

@@ -103,9 +103,7 @@ def linearise(
     .. math:: r_l = W_l \big( \pi(K (R (b_l + B_l w) + t)) - q_l \big)
 
     Args:
-        head: the state where to linearise.
         rows: which point each landmark is, (B,68); see ``FacePoints.chosen``.
-        intrinsics: K, (3,3).
         landmarks: q, (B,68,2), pixels, finite.
         precision: one over the standard deviation of each landmark, (B,68), 0 for those not seen.
         along: how much an error along the contour counts beside one across it, 0 to 1.
@@ -127,13 +125,8 @@ def linearise(
 
 
 def sliding(lines: Tensor, pixels: Tensor, along: float) -> Tensor:
-    """Offsets of landmarks, or their derivatives, in which those of the contour count less along it than across it.
-
-    Args:
-        lines: (B,68,2,K), along x and y.
-        pixels: where a rig's landmarks are seen, (B,68,2).
-        along: how much an offset along the contour counts beside one across it, 0 to 1.
-    """
+    """Offsets of landmarks (B,68,2,K), or their derivatives, in which those of the contour count ``along`` of it
+    less than across."""
     if along >= 1:
         return lines
     contour, jaw = lines[:, :JAW], pixels[:, :JAW]
@@ -152,14 +145,9 @@ def energy_of_step(energy: Quadratic, weights: Tensor) -> Quadratic:
 def box_step(
     energy: Quadratic, head: HeadState, lower: Tensor, upper: Tensor, exactness: float, rest: Tensor
 ) -> HeadState:
-    """The least of an energy of a step in a box of weights, exactly: B programs, warm-started.
+    """The least of an energy (B,N+6) of a step in a box of weights and motion, exactly: B programs, warm-started.
 
-    Args:
-        energy: of a step from the state, (B,N+6,N+6) and (B,N+6), float64.
-        head: the state, its weights in the box.
-        lower, upper: bounds of weights and motion, (N+6,), infinite for the motion.
-        exactness: residual of a program at which it counts as solved.
-        rest: which weights are held at 0, (B,N) bool.
+    ``exactness`` is the residual at which a program counts as solved; shapes that ``rest``, (B,N), are held at 0.
     """
     begin = pad(head.weights, (0, 6))
     H, f = energy.H, energy.f - (energy.H @ begin[..., None])[..., 0]
@@ -177,10 +165,8 @@ def split_step(
 
     Args:
         energy: of a step from the state, (1,N+6,N+6) and (1,N+6), float64.
-        head: the state of one frame.
         upper: bounds of the weights, (N,); the lower ones are 0.
         dual: the splitting's scaled dual to start from, (N+6,); zeros at a frame's first step.
-        steps: of operator splitting.
         quick: in single precision, with an inverse of as many digits.
 
     Returns:

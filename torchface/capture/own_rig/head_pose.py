@@ -40,8 +40,6 @@ def measure_poses(points: Tensor, landmarks: Tensor, intrinsics: Tensor, confide
     Args:
         points: the 68 landmarks on the rig at rest, (68,3), millimetres.
         landmarks: (T,68,2), pixels, NaN for not seen; undistorted.
-        intrinsics: K, (3,3).
-        confidence: from 0, (T,68); equal if absent.
 
     Returns:
         ``HeadPoses``. Frames with fewer than six stable landmarks that agree are not found.

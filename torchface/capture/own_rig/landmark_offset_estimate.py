@@ -187,12 +187,8 @@ def _without_pose(offsets: LandmarkOffsets, rest: Tensor, likely: Tensor) -> Lan
 def _split(
     mean: _Mean, before: LandmarkOffsets, expression: Tensor | None, likely: Tensor, solver: VideoSolver | None
 ) -> tuple[LandmarkOffsets, Tensor]:
-    """The mean residual as offsets and a constant expression, (N,), which is none where no solver is given.
-
-    Args:
-        likely: covariance of the offsets, (204,204).
-        solver: with the prior of the expression.
-    """
+    """The mean residual as offsets and a constant expression, (N,), none without a solver; their covariance is
+    (204,204)."""
     count = len(mean.weights)
     here = torch.cat([mean.weights, before.millimetres.flatten()])
     f = mean.gradient - mean.H @ here

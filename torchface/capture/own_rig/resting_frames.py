@@ -15,11 +15,8 @@ _SEEN = 0.3  # deviation of a reading beyond which it says nothing
 
 
 def resting_share(activity: Tensor) -> Tensor:
-    """How far a face rests in frames of some activity (T,), in [0,1]: about 1 in a twelfth of them at least.
-
-    Args:
-        activity: sums of weights; NaN for unknown, which counts as no rest.
-    """
+    """How far a face rests in frames (T,) of some sum of weights, in [0,1]: about 1 in a twelfth of them; NaN is no
+    rest."""
     known = torch.isfinite(activity)
     if not bool(known.any()):
         return torch.zeros_like(activity)

@@ -82,9 +82,7 @@ def seen_skin(
         frames: (T,3,H,W) sRGB in [0,1].
         vertices: in each frame, (T,V,3), millimetres.
         albedo: (V,3) sRGB.
-        cameras: one a frame.
         weights: of the vertices, (V,); 0 leaves one out.
-        calibration: of a lens that bends the image.
     """
     parts, casters = [], []
     for t, camera in enumerate(cameras):  # a frame at a time: each has a mesh of its own

@@ -21,13 +21,8 @@ class StateEstimate:
     covariance: Tensor  # of weights, rotation and translation in the camera's frame, (B,N+6,N+6)
 
     def predicted(self, steps: Tensor, variance: Tensor, motion_variance: Tensor) -> "StateEstimate":
-        """One frame on.
-
-        Args:
-            steps: by which the weights are expected to change, (B,N).
-            variance: of that, (B,N).
-            motion_variance: of the head's motion between frames, (6,).
-        """
+        """One frame on, by steps (B,N) of the weights of a variance (B,N) and a motion of the head of a variance
+        (6,)."""
         noise = torch.cat([variance, motion_variance.expand(len(variance), 6)], dim=1)
         mean = HeadState(self.mean.weights + steps, self.mean.rotation, self.mean.translation)
         return StateEstimate(mean, self.covariance + torch.diag_embed(noise))
@@ -50,13 +45,8 @@ class Expectation:
         return Quadratic(self.information, (self.information @ off[..., None])[..., 0])
 
     def updated(self, head: HeadState, seen: Quadratic) -> StateEstimate:
-        """After a frame whose landmarks were linearised at a state.
-
-        Args:
-            seen: the landmarks' energy, of a step from there.
-
-        Source: Kalman 1960, in its information form.
-        """
+        """After a frame whose landmarks' energy, of a step from a state, was linearised there. Source: Kalman 1960,
+        in its information form."""
         both = seen + self.energy(head)
         covariance = torch.cholesky_inverse(torch.linalg.cholesky(both.H))
         return StateEstimate(head.stepped(-(covariance @ both.f[..., None])[..., 0]), covariance)

@@ -66,12 +66,7 @@ class TakeEyes:
     straight: Tensor | None = None
 
     def readings(self, rest: Tensor, basis: Tensor, names: Sequence[str], eyeballs: Eyeballs) -> WeightReadings:
-        """As readings of the weights of a rig.
-
-        Args:
-            rest, basis: of the 68 landmarks, (68,3) and (68,3,N).
-            names: of the rig's N shapes.
-        """
+        """As readings of the weights of a rig whose landmarks have ``rest`` (68,3) and ``basis`` (68,3,N)."""
         called = arkit_names(names)
         opened, _ = openness_rows(rest.double(), basis.double(), called)
         one = torch.eye(len(called)).double()
@@ -120,13 +115,11 @@ def take_eyes(
     """What a take shows of the eyes beside the person's own open and shut eyes, and beside looking straight ahead.
 
     Args:
-        reading: of T frames.
         rays: of the 68 landmarks at depth 1, (T,68,2); NaN where none was found.
         iris: of the irises at depth 1, (T,2,2).
         rotation: head to camera, (T,3,3); NaN for lost.
         depth: of the eyes, (T,2), millimetres.
         resting: how far the face rests in each frame, (T,) in [0,1].
-        eyeballs: of the rig; as people have them if absent.
         looking: what looking up or down adds to openness at weights (8,) of ``LOOKS``, (2,8); nothing if absent.
     """
     closed, seen = reading.closed.double(), reading.eye_visibility.double().clamp(0, 1)
@@ -206,12 +199,6 @@ def _straight(raw: Tensor, trust: Tensor, lens: Tensor, reading: FaceReading, ey
 
     with :math:`\bar r` what was read in the mean; m, known to :math:`s_m`, is from what the landmark network expects of
     the looks, whose errors are alike in all frames, and of the lens, where eyes turn against the head to stay on it.
-
-    Args:
-        raw, trust: gaze (T,2,2) and how much it counts, (T,2).
-        lens: where it is, (T,2).
-        reading: of the frames.
-        eyeballs: of the rig.
     """
     turns = (eyeballs or Eyeballs.usual()).turns.to(raw)
     rows = [ARKIT.index(name) for name in LOOKS]

@@ -36,14 +36,11 @@ def solve_take(
     mean rate and what was solved is read off at their own times.
 
     Args:
-        solver: of the rig and the camera.
         landmarks: (T,68,2), pixels; NaN for not seen.
         confidence: how far each landmark is trusted, (T,68) in [0,1].
         seconds: when each frame is shown, (T,), rising; even if absent.
         whole_take: each frame is solved from all frames, with a dynamics prior; without one, frames that show no face
             lie between those before and after.
-        progress: called with how many frames are solved.
-        measured: what else is known of the frames.
     """
     if seconds is not None and solver.dynamics is not None:
         frame_intervals(seconds, len(landmarks), solver.settings.interval)  # checks them

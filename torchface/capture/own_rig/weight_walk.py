@@ -40,13 +40,8 @@ def read_evidence(read: Quadratic, weights: Tensor) -> Tensor:
 
 
 def unseen_time(before: Tensor | None, evidence: Tensor, interval: float | Tensor) -> Tensor:
-    """For how long shapes have been hidden, (B,N), seconds.
-
-    Args:
-        before: the same after the frame before, (B,N); None before the first.
-        evidence: share of each shape's evidence that is seen, (B,N) in [0,1].
-        interval: seconds since the frame before.
-    """
+    """For how long shapes have been hidden, (B,N), seconds, by that ``before`` and the share of their evidence that
+    is seen."""
     since = torch.zeros_like(evidence) if before is None else before
     return torch.where(evidence < HIDDEN, since + interval, 0.0)
 
@@ -67,16 +62,8 @@ def twins_of(names: Sequence[str]) -> Tensor:
 def expected_weights(
     weights: Tensor, evidence: Tensor, hidden: Tensor, interval: float | Tensor, twins: Tensor
 ) -> Tensor:
-    """The weights (B,N) that the frame before leads to: seen ones stay; hidden ones come to those of the face's other
-    side while that is seen, and else go to rest after ``HOLD`` seconds.
-
-    Args:
-        weights: of the frame before, (B,N).
-        evidence: share of each shape's evidence that is seen, (B,N) in [0,1].
-        hidden: for how long shapes have been hidden, (B,N), seconds; see ``unseen_time``.
-        interval: seconds since the frame before.
-        twins: of :func:`twins_of`, (N,).
-    """
+    """The weights (B,N) that the frame before leads to: seen ones stay; hidden ones come to those of the face's
+    other side while that is seen, and else go to rest after ``HOLD`` seconds."""
     rested = weights * (-(hidden - HOLD).clamp(min=0).clamp(max=interval) / RELAXATION).exp()
     own = torch.arange(len(twins), device=twins.device)
     followed = (hidden > 0) & (evidence[:, twins] >= HIDDEN) & (twins != own)
@@ -91,13 +78,8 @@ def counted_share(evidence: Tensor) -> Tensor:
 
 
 def walk_information(variance: Tensor, evidence: Tensor, interval: float | Tensor) -> Tensor:
-    """How certain the last frame's weights make this one's, one over a variance, (B,N).
-
-    Args:
-        variance: of the random walk after a second, (N,).
-        evidence: share of each shape's evidence that is seen, (B,N) in [0,1].
-        interval: seconds since the frame before.
-    """
+    """How certain the last frame's weights make this one's, one over a variance, (B,N), of a walk of ``variance`` a
+    second."""
     return 1 / (variance * interval * counted_share(evidence))
 
 

@@ -35,9 +35,6 @@ def fitted_kernel(inputs: Tensor, targets: Tensor, inducing: Tensor, active: Ten
     One length for places, one for slopes, one for curvatures; by Adam on what gpytorch makes of them so that they stay
     positive.
 
-    Args:
-        active: 1 for inputs that the kernel uses, else 0, (O,N).
-
     Source: Titsias 2009.
     """
     import gpytorch  # takes seconds, and only training needs it
@@ -80,9 +77,6 @@ class LeftOutProcess:
 
     In the first pass ``learn`` takes each part, then ``settle`` solves; in the second ``predict`` gives what the other
     folds make of a part, and ``compare`` how well. Memory is two matrices a fold.
-
-    Args:
-        folds: K; what is left out together has one number below it.
     """
 
     posterior: Posterior

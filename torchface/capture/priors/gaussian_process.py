@@ -150,11 +150,8 @@ def whitening_of(kernel: Kernel, inducing: Tensor) -> Tensor:
 def posterior(
     kernel: Kernel, inducing: Tensor, whitening: Tensor, statistics: Statistics, redundancy: float
 ) -> Posterior:
-    """The posterior of a process given the statistics of its frames.
-
-    Args:
-        redundancy: number of correlated frames that count as one independent frame.
-    """
+    """The posterior of a process given its frames' statistics; so many correlated frames as ``redundancy`` count as
+    one."""
     noise = kernel.noise * redundancy
     eye = torch.eye(len(inducing), dtype=inducing.dtype)
     factor = torch.linalg.cholesky(statistics.square / noise + eye)

@@ -30,12 +30,10 @@ def face_regions(names: Sequence[str]) -> tuple[tuple[int, ...], ...]:
 
 
 def motion_basis(window: int) -> Tensor:
-    """Discrete orthonormal polynomials over a window's frames: place, slope and curvature, (J,O), float64.
+    """Discrete orthonormal polynomials over a window's J frames: place, slope and curvature, (J,O), float64, O at most
+    3.
 
     White noise of the frames is white, and of the same size, in all of them.
-
-    Args:
-        window: J; O is the smaller of J and 3.
     """
     # On the CPU also where a model is being rebuilt without memory: it is computed, not loaded.
     steps = torch.linspace(-1, 1, window, dtype=torch.float64, device="cpu")
@@ -45,13 +43,9 @@ def motion_basis(window: int) -> Tensor:
 
 
 def moving_parts(windows: Tensor, motion: Tensor) -> Tensor:
-    """The motion in windows (B,J,N): slope, curvature, and the last step by itself, which has no lag; (B,K,N).
-
-    K is 3, 2 for a window of two frames, 0 for a window of one.
-
-    Args:
-        motion: the same along the columns of :func:`motion_basis`, (B,O,N).
-    """
+    """The motion in windows (B,J,N), or ``motion`` along the columns of :func:`motion_basis`, (B,O,N): slope,
+    curvature, and the last step by itself, which has no lag; (B,K,N). K is 3, 2 for a window of two frames, 0 for a
+    window of one."""
     if windows.shape[1] < 2:
         return motion[:, 1:]
     return torch.cat([motion[:, 1:], windows[:, -1:] - windows[:, -2:-1]], dim=1)

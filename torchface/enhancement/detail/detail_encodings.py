@@ -40,11 +40,7 @@ class DisplacementDetail:
         return 3 * len(self._neutral)
 
     def encode(self, low: Tensor, frames: Tensor, turned: TurnedFrames | None = None) -> Tensor:
-        """The detail (B,3V), millimetres, of frames (B,V,3) beyond their smooth parts.
-
-        Args:
-            turned: how the smooth parts' surface is turned, where that is known.
-        """
+        """The detail (B,3V), millimetres, of frames (B,V,3) beyond their smooth parts, whose surface is ``turned``."""
         turned = self._frames.turned(low - self._neutral.to(low)) if turned is None else turned
         return turned.to_local(frames - low).reshape(len(low), -1)
 
@@ -131,11 +127,8 @@ class SurfaceReconstruction:
         self._factor = SparseCholesky(system + anchor * sparse.eye_array(len(rest)))
 
     def __call__(self, low: Tensor, changes: Tensor) -> Tensor:
-        """The surface (B,V,3) near a smooth one.
-
-        Args:
-            changes: of the triangles' gradients from the smooth surface's, (B,F,3,3); differentiable, as ``low`` is.
-        """
+        """The surface (B,V,3) near a smooth one, by its triangles' changes (B,F,3,3) of gradient; differentiable in
+        both."""
         count, triangles = changes.shape[:2]
         columns = changes.permute(1, 3, 0, 2).reshape(3 * triangles, 3 * count)
         step = solved(self._factor, self._divergence(columns))

@@ -167,11 +167,7 @@ def _pieces(links: Tensor, count: int) -> Tensor:
 
 
 def surface_distances(vertices: Tensor, faces: Tensor, sources: Tensor, limit: float = float("inf")) -> Tensor:
-    """The shortest way along edges from the nearest of the sources (S,) to each vertex, (V,), millimetres.
-
-    Args:
-        limit: what is further away gets infinity.
-    """
+    """The shortest way along edges from the nearest source (S,) to each vertex, (V,), mm; infinite beyond ``limit``."""
     pairs = edges(faces)
     lengths = (vertices[pairs[:, 0]] - vertices[pairs[:, 1]]).norm(dim=1).double().clamp(min=1e-9)
     ways = coo_array((lengths.cpu().numpy(), pairs.T.cpu().numpy()), shape=(len(vertices),) * 2).tocsr()
@@ -227,8 +223,6 @@ def named_regions(
 
     Args:
         labels: the region of each triangle, (F,) int64.
-        count: of regions, R.
-        neutral: (V,3), millimetres.
         landmarks: vertex ids of the 68 iBUG landmarks; without them all are numbered, and none is voluntary.
     """
     numbered = [f"region_{number:02d}" for number in range(count - len(eyes))]

@@ -36,12 +36,8 @@ class LearnedMap:
         self._maps = [_ridge_regression(known[:, :components], coefficients, ridge) for known in projection.known]
 
     def corrections(self, features: Tensor, matched: Matched, reach: Tensor, shares: Tensor) -> Tensor:
-        r"""What to add to the blend's coefficients, (T,R,r).
-
-        Args:
-            reach: :math:`\delta` of each region, (R,), in units of the database's spread.
-            shares: :math:`\beta` of each region, (R,).
-        """
+        r"""What to add to the blend's coefficients, (T,R,r), by each region's :math:`\delta` (R,) and :math:`\beta`
+        (R,)."""
         beyond = self._projection.residuals(features, matched.weights)
         share = shares.to(features) * _faded(reach.to(features), matched.distances.to(features))
         pairs = zip(beyond, self._maps, strict=True)
@@ -59,7 +55,6 @@ def map_shares(
     animation lacks much motion that goes on linearly it is near 1; of wrinkles alone, which saturate, it is less.
 
     Args:
-        reach: see :class:`LearnedMap`, (R,).
         products: of the details' components with each other over each region, (R,r,r).
         sequences: the number of each frame's sequence, (K,) int64.
     """

@@ -88,12 +88,8 @@ class RegionProjection:
         self._held = SimplexQP(H + self._pull[..., None] * identity) if self.temporal > 0 else None
 
     def project(self, features: Tensor, previous: Tensor | None = None) -> Matched:
-        """The combinations of the database that look most like frames.
-
-        Args:
-            features: of the frames, (T,P,9); differentiable.
-            previous: weights of the frame before the first, (R,K).
-        """
+        """The combinations of the database that look most like frames (T,P,9), after the weights (R,K) of the one
+        before."""
         if features.ndim != 3 or features.shape[1:] != (self.patch_count, len(_UNITS)):
             raise ShapeError(f"features: found {tuple(features.shape)}, expected (T,{self.patch_count},9)")
         centred = [space.centred(features) for space in self._spaces]
@@ -110,9 +106,6 @@ class RegionProjection:
 
         Twice the distance within which 95 % of the database's frames lie from all its sequences but their own, between
         0.1 and 0.75: sequences that show an expression each say little of one another.
-
-        Args:
-            sequences: the number of each frame's sequence, (K,) int64.
         """
         if len(sequences.unique()) < 2:
             return torch.full((len(self._spaces),), _MOST_LIMIT, dtype=torch.float64)

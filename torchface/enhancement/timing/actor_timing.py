@@ -35,12 +35,8 @@ _FEWER_INPUTS = 1e-3  # how much the descent prefers inputs that count for nothi
 class ActorTiming:
     """How the captured actor moves between two poses.
 
-    A region of enough captured motions has a regression of its own, see
-    :class:`LearnedTiming`; any other takes the mean of its nearest motions, see
-    :func:`~torchface.enhancement.timing.nearest_timing.nearest_timing`; one at rest follows the whole face.
-
-    Args:
-        sequences: the number of each captured frame's sequence, (K,).
+    A region of enough captured motions has a regression of its own, :class:`LearnedTiming`; any other takes the mean of
+    its nearest motions, ``nearest_timing``; one at rest follows the whole face.
     """
 
     def __init__(self, database: Tensor, sequences: Tensor, weights: Tensor, fps: float) -> None:
@@ -52,10 +48,8 @@ class ActorTiming:
     def times(self, keyframes: Tensor, frames: int, length: float, extend: bool = True) -> Tensor:
         """How far the motion between two keyframes has come in each frame, (R,frames), 0 first, 1 last, never falling.
 
-        Args:
-            length: of the motion, in frames of the database.
-            extend: to the whole motion of which the keyframes meet a part; regressions know whole motions alone, so
-                the nearest motions are taken otherwise.
+        ``length`` is in frames of the database. With ``extend`` to the whole motion of which the keyframes meet a part:
+        regressions know whole motions alone, so the nearest motions are taken otherwise.
         """
         checked_count("frames", frames, 2)
         checked_number("length", length, above=True)
@@ -98,10 +92,6 @@ class LearnedTiming:
         """Learns from captured sequences, cut into motions where they turn; None from few motions.
 
         The inverse length scales and the ridge have the least leave-one-out error, which has a closed form.
-
-        Args:
-            sequences: the number of each frame's sequence, (K,).
-            region: share of each patch in the region, (P,).
         """
         scale = region.detach().double().clamp(min=0).sqrt()[:, None].clone()
         frames = (database.detach().double() * scale).flatten(1)
@@ -125,11 +115,8 @@ class LearnedTiming:
         return cls(scale, centre, directions, mean, deviation, inputs, inverse_lengths, mean_profile, dual)
 
     def times(self, keyframes: Tensor, frames: int, length: float) -> Tensor:
-        """How far the motion between two keyframes, features (2,P,C), has come, (frames,), from 0 to 1, never falling.
-
-        Args:
-            length: of the motion, in frames of the database.
-        """
+        """How far the motion of ``length`` frames between keyframes (2,P,C) has come, (frames,), from 0 to 1, never
+        falling."""
         checked_count("frames", frames, 2)
         checked_number("length", length, above=True)
         pair = (keyframes.detach().double() * self.scale).flatten(1)

@@ -37,9 +37,7 @@ def nearest_timing(
 
     Args:
         captured: features of each captured sequence, (n,P,C) each, see :func:`captured_sequences`.
-        length: of the motion, in frames of the database.
         nearest: how many captured motions are averaged; the paper takes one.
-        extend: to the whole motion of which the keyframes meet a part.
 
     Returns:
         (frames,), 0 first and 1 last, never falling.

@@ -64,9 +64,6 @@ def learn_wrinkle_basis(
     frame) and maps (least squares a vertex) are found in turns, as in semi-non-negative matrix factorisation, here
     with the regions' soft borders in both.
 
-    Args:
-        details: of an actor's frames, displacements (K,3V) as components and coefficients.
-
     Source: Ding, Li, Jordan 2010, Convex and semi-nonnegative matrix factorizations.
     """
     checked_count("maps", count, 1)

@@ -39,16 +39,9 @@ def captured_poses(model: EnhancementModel, shapes: Tensor) -> Tensor:
 
 
 def teaching_poses(captured: Tensor, areas_moved: Tensor, count: int) -> Tensor:
-    """Poses that weights are learned from: the actor's own, and mixtures of two of them, region by region.
-
-    Args:
-        captured: the actor's poses, (K,N).
-        areas_moved: how much each shape moves each region, (R,N).
-        count: of poses, at least one a shape and some of the actor's.
-
-    Returns:
-        (count,N): each shape alone; then the actor's poses, evenly picked; half of the rest are mixtures.
-    """
+    """Poses that weights are learned from, at least one a shape and some of the actor's (K,N), (count,N): each shape
+    alone; the actor's, evenly picked; half of the rest are mixtures of two, region by region, by how much each shape
+    moves each (R,N)."""
     generator = torch.Generator().manual_seed(0)
     shapes = captured.shape[1]
     left = max(0, count - shapes)
@@ -66,13 +59,10 @@ def teaching_poses(captured: Tensor, areas_moved: Tensor, count: int) -> Tensor:
 def taught_details(
     model: EnhancementModel, read: Callable[[int, int], Tensor], count: int, progress: Progress | None = None
 ) -> LearnedBasis:
-    """What the model adds to frames of a rig on its mesh, in the axes of the rig's own skin.
+    """What the model adds to a rig's frames on its mesh, along two tangents and the normal of the rig's skin,
+    (count,3V).
 
-    Args:
-        read: frames (t,V,3) from one number up to another, without it, on the model's mesh, millimetres.
-
-    Returns:
-        Displacements (count,3V) along two tangents and the normal, as components and coefficients.
+    ``read`` gives the frames (t,V,3) from one number up to another, without it.
     """
     progress = silent if progress is None else progress
     detail = DisplacementDetail(model.neutral, model.faces)

@@ -96,13 +96,8 @@ class WrinkleWeights(nn.Module):
         sites: Tensor | None = None,
         components: int = _COMPONENTS,
     ) -> "WrinkleWeights":
-        """Learns from poses whose weights are known.
-
-        Args:
-            poses: the rig's vertices, (K,V,3), millimetres, each in any rigid place.
-            weights: of the maps at these poses, (K,R,M), in [0,1].
-            sites: vertices to look at, (S,); some 2,000, evenly picked, if absent.
-        """
+        """Learns from poses (K,V,3) whose weights (K,R,M) are known, each in any rigid place, by some 2,000
+        vertices."""
         regions, vertices = region_weights.shape
         shapes = poses.shape[1:] == neutral.shape == (vertices, 3) and weights.shape[:2] == (len(poses), regions)
         if not shapes or weights.ndim != 3 or len(region_names) != regions:

@@ -7,14 +7,8 @@ from torchface.optim.exported_operators import symmetric_inverse
 
 
 def affine_pose(points: Tensor, rays: Tensor, trust: Tensor) -> tuple[Tensor, Tensor]:
-    """The pose, (3,3) and (3,) millimetres, in which an affine camera sees points (L,3), not in a plane.
-
-    Args:
-        rays: where they are seen, (L,2), at depth 1.
-        trust: how much each counts, (L,), not all zero.
-
-    Source: DeMenthon and Davis 1995, the first iteration of POSIT.
-    """
+    """The pose, (3,3) and (3,) mm, in which an affine camera sees points (L,3), not in a plane, along rays (L,2).
+    Source: DeMenthon and Davis 1995, the first iteration of POSIT."""
     proportion = (trust / trust.sum())[:, None]
     centre, middle = (proportion * points).sum(0), (proportion * rays).sum(0)
     x, q = (points - centre) * proportion, rays - middle

@@ -164,15 +164,8 @@ def _better(one: Pose, other: Pose) -> Pose:
 
 
 def refined_poses(x: Tensor, q: Tensor, K: Tensor, w: Tensor, rotation: Tensor, translation: Tensor) -> Pose:
-    """Poses after Levenberg's method from initial ones, for arguments that are checked already, all float64.
-
-    Args:
-        x: points, (B,N,3), millimetres.
-        q: pixels, (B,N,2).
-
-    Returns:
-        ``Pose``; errors are infinite where points stay behind the camera.
-    """
+    """Poses after Levenberg's method from initial ones, of points (B,N,3) and pixels (B,N,2), checked, float64;
+    errors are infinite where points stay behind the camera."""
     min_depth = _MIN_DEPTH * (x - x.mean(1, keepdim=True)).norm(dim=-1).amax(1)
     damping = torch.full_like(translation[:, 0], 1e-4)
     error = _error(x, q, K, w, rotation, translation, min_depth)

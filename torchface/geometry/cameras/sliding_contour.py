@@ -30,14 +30,8 @@ class LevelCurves:
 
 
 def level_curves(vertices: Tensor, faces: Tensor, starts: Tensor) -> LevelCurves:
-    """Curves from points at the side of an upright face to its midline, each at the height of its start.
-
-    Args:
-        starts: vertex ids (J,).
-
-    Returns:
-        For each start the crossings of its height with the mesh's edges on its side of the face, not behind it.
-    """
+    """From vertices (J,) at the side of an upright face to its midline, not behind it, each at the height of its
+    start."""
     if vertices.ndim != 2 or vertices.shape[1] != 3 or faces.ndim != 2 or faces.shape[1] != 3 or starts.ndim != 1:
         raise ShapeError(
             f"level_curves: found vertices {tuple(vertices.shape)}, faces {tuple(faces.shape)}, starts "
@@ -77,11 +71,10 @@ def _edges_once(faces: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def outermost(pixels: Tensor, valid: Tensor, outward: Tensor) -> Tensor:
-    """The point of each curve that is seen furthest out: the rows (B,J) of pixels (B,J,C,2).
+    """The point of each curve that is seen furthest out along (B,J,2): the rows (B,J) of those of (B,J,C,2) that are
+    valid.
 
-    Args:
-        valid: which of them are points, (J,C) bool.
-        outward: directions in the image, (B,J,2); zero for curves whose start is meant.
+    A direction of zero means the curve's start.
     """
     reach = (pixels * outward[:, :, None]).sum(-1).masked_fill(~valid, -torch.inf)
     furthest = reach.argmax(-1)

@@ -48,7 +48,6 @@ class ContactFinder:
         """The pairs in contact in a pose.
 
         Args:
-            vertices: (V,3), millimetres.
             reach: how far apart vertices in contact may be, millimetres.
             moving: mask (V,); pairs of which neither end moves are left out.
             rings: 1 or 2; vertices that a path of 2 or 4 edges joins do not meet.

@@ -123,12 +123,8 @@ class PreparedReconstruction:
         self.vertex_count = stiffness.shape[1]
 
     def solve(self, gradients: Tensor, positions: Tensor, values: Sequence[Tensor]) -> Tensor:
-        """Vertices (N,V,3), float64, for N sets of gradients.
-
-        Args:
-            positions: where pinned vertices are held, and where the others are drawn by next to nothing, (N,V,3).
-            values: of each constraint, (N,K,3) or (K,3), millimetres.
-        """
+        """Vertices (N,V,3), float64, for N sets of gradients, constraints' values (N,K,3) or (K,3), and where pinned
+        vertices are held and the others drawn by next to nothing."""
         result = positions.detach().double().cpu().numpy().copy()
         if len(self._free) == 0:
             return torch.from_numpy(result)

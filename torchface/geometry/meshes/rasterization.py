@@ -42,12 +42,8 @@ class TexelMap:
         return mask.view(self.height, self.width)
 
     def image(self, values: Tensor, margin: int = _MARGIN, background: Tensor | None = None) -> Tensor:
-        """A texture (C,H,W) float32 of values (M,C) at the texels, with a margin so that no background shows at seams.
-
-        Args:
-            margin: around the charts, of the nearest texel's value, texels wide.
-            background: beyond that, (C,); the mean of all if absent.
-        """
+        """A texture (C,H,W) float32 of values (M,C) at the texels, a margin of the nearest, then a background or the
+        mean."""
         import cv2  # loads in 0.1 s
 
         values = values.detach().float()
@@ -235,12 +231,8 @@ class _Planes:
     def samples(
         self, width: int, slack: float, batch: int | None = _BATCH
     ) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-        """Row and column of every pixel that a triangle covers, and which of the P it is; each (S,) int64, by triangle.
-
-        Args:
-            slack: that triangles are wider by, pixels.
-            batch: about how many pixels are given at once, the last triangles' first; all if absent.
-        """
+        """Row and column of every pixel that a triangle covers, and which of the P it is; each (S,) int64, by
+        triangle, in batches of about so many pixels. Triangles are wider by ``slack`` pixels."""
         plane, row = _expanded(self.rows, self.first)
         left, right = np.full(len(plane), -np.inf), np.full(len(plane), np.inf)
         for a, b, c in self.edges:  # the three borders of every row

@@ -53,11 +53,8 @@ class Samples:
 
 
 class ScanPoints:
-    """Points (N,3) of a scan with unit normals (N,3), float64, to look up the nearest.
-
-    Args:
-        border: which of them lie on the scan's border, (N,) bool: what lies beyond has its nearest point there.
-    """
+    """Points (N,3) of a scan with unit normals (N,3), float64, to look up the nearest; beyond ``border`` the scan
+    ends."""
 
     def __init__(self, points: Tensor, normals: Tensor, border: Tensor) -> None:
         self.points, self.normals, self.border = points, normals, border

@@ -24,13 +24,7 @@ def extent(points: Tensor) -> float:
 
 
 def check_unit(name: str, points: Tensor, beside: float, what: str, least: float, most: float) -> None:
-    """Refuses points whose extent shows another unit than millimetres.
-
-    Args:
-        beside: the extent to be expected, millimetres; see :func:`extent`.
-        what: has that extent, such as ``"a template"``.
-        least, most: the ratios of the extents that are taken.
-    """
+    """Refuses points whose extent is not ``least`` to ``most`` times that of ``what``, ``beside``, millimetres."""
     size = extent(points)
     ratio = size / max(beside, 1e-30)
     if least <= ratio <= most:

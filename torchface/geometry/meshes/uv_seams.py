@@ -24,11 +24,8 @@ def split_at_seams(
     uv_faces: NDArray[np.int64] | None,
     mirrored: NDArray[np.bool_] | None = None,
 ) -> Split:
-    """Vertices with one texture coordinate each.
-
-    Args:
-        mirrored: at which corners (F,3) the texture is; a pair that is on both sides gets two rows.
-    """
+    """Vertices with one texture coordinate each, and one orientation of the texture where corners (F,3) say it is
+    mirrored."""
     if uv_faces is None:
         return Split(np.arange(vertex_count), None, faces)
     keys = uv_faces * vertex_count + faces
@@ -41,11 +38,8 @@ def split_at_seams(
 
 
 def merge_equal_rows(rows: NDArray[Any]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Rows (C,K) that are equal as one, numbered by first appearance; -0 equals 0.
-
-    Returns:
-        For each row the number of its value, (C,), and for each value its first row, (V,).
-    """
+    """Rows (C,K) that are equal as one; -0 equals 0: the number of each value (C,), by first appearance, and its row
+    (V,)."""
     rows = np.ascontiguousarray(rows + rows.dtype.type(0))  # so that -0 equals 0 bit by bit
     bits: NDArray[Any] = rows.view(np.int32).reshape(len(rows), -1)
     if bits.shape[1] > _MAX_SORTED_COLUMNS:

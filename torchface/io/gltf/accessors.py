@@ -23,11 +23,7 @@ def read_indices(document: Document, index: object, where: str) -> NDArray[np.in
 def read_floats(
     document: Document, index: object, where: str, types: tuple[str, ...], count: int | None = None
 ) -> NDArray[np.float32]:
-    """Rows (C,D) of an attribute; integers are normalised where the accessor says so.
-
-    Args:
-        types: what D may be, such as ``("VEC3",)``.
-    """
+    """Rows (C,D) of an attribute of one of these ``types``; integers are normalised where the accessor says so."""
     accessor = document.item("accessors", index, where)
     rows = _read(document, accessor, index, types, count)
     kind, result = rows.dtype, rows.astype(np.float32)

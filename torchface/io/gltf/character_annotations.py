@@ -12,13 +12,9 @@ from torchface.part_materials import EYEBALL, part_material
 
 
 def annotate_character(root: dict[str, Any], character: Character, rows: Tensor, notes: Annotations) -> None:
-    """Adds annotations to the JSON of a character's file.
+    """Adds to the JSON ``root`` landmarks and regions of a character's vertices (K,), on meshes that have some of them.
 
-    Args:
-        root: the file's JSON, which is changed.
-        rows: of the character's vertices, (K,).
-        notes: landmarks and regions of these K; a mesh that has none of them stays as it is. Regions of parts that are
-            drawn in colours of their own (mouth, sockets) are left out, for a character has its colours.
+    Regions of parts that are drawn in colours of their own (mouth, sockets) are left out: a character has its colours.
     """
     if notes.landmarks is None:
         return

@@ -105,12 +105,8 @@ def read_annotations(document: Document, extras: object, location: str, count: i
 
 
 def row_extras(extras: object, positions: NDArray[np.float64], notes: Annotations) -> dict[str, Any]:
-    """A mesh's extras with landmarks and regions of its C rows as the file has them, beside all that it has.
-
-    Args:
-        positions: in the scene, (C,3); with those of the landmarks the file says what they are of.
-        notes: landmarks (68,), -1 those of other meshes; regions (C,).
-    """
+    """A mesh's extras with landmarks (68,), -1 those of other meshes, and regions (C,) of its rows at positions
+    (C,3)."""
     kept = dict(extras) if isinstance(extras, dict) else {}
     ours = kept.get("torchface") if isinstance(kept.get("torchface"), dict) else {}
     rows: dict[str, Any] = {"count": len(positions)}
@@ -127,12 +123,7 @@ def row_extras(extras: object, positions: NDArray[np.float64], notes: Annotation
 def read_row_annotations(
     document: Document, extras: object, location: str, vertices: NDArray[np.float64], split: Split
 ) -> Annotations | None:
-    """What ``row_extras`` wrote, at the mesh's vertices; none where other rows are in these places now.
-
-    Args:
-        vertices: in the scene, (V,3), the file's unit.
-        split: for each row its vertex (C,), and for each vertex its first row.
-    """
+    """What ``row_extras`` wrote, at the mesh's vertices (V,3); none where other rows are in these places now."""
     record = document.record(_record(document, extras, location).get("rows"), f"{location}.rows")
     location, (vertex_of, row_of), count = f"{location}.rows", split, len(split[0])
     if record.get("count") != count:

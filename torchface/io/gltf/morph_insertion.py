@@ -41,8 +41,6 @@ def document_with_targets(
     without data. Weights of meshes, nodes and animations get zeros for them.
 
     Args:
-        document: a ``.glb`` whose first buffer is its binary chunk.
-        added: at least one.
         names: of the new morph targets; a mesh has none of them but those ``filled``.
         filled: of them those that take the place of the target of that name in a mesh that has one.
     """

@@ -23,11 +23,8 @@ _MAX_EXACT_ID = 2**24
 
 
 class PrimitiveWriter:
-    """Writes the primitives of one mesh into a buffer.
-
-    Args:
-        tangents: glTF's, at each triangle's corners, (F,3,4), for the first primitive; its material has a normal map.
-    """
+    """Writes the primitives of one mesh into a buffer; the first has glTF's tangents (F,3,4) where it has a normal
+    map."""
 
     def __init__(
         self, mesh: Mesh, split: Split, buffers: BufferWriter, tangents: NDArray[np.float32] | None = None
@@ -118,11 +115,8 @@ def shown_motion(mesh: Mesh, normals: Tensor, delta: Tensor) -> tuple[NDArray[np
 
 
 class MaterialWriter:
-    """Collects the materials of one mesh; ``fields`` is what the document gets of them.
-
-    Args:
-        jpeg: whether images of three channels are JPEG, which is smaller; else all are PNG.
-    """
+    """Collects the ``fields`` of one mesh's materials; images of three channels are JPEG, which is smaller, or all
+    PNG."""
 
     def __init__(self, mesh: Mesh, buffers: BufferWriter, jpeg: bool = False) -> None:
         self.mesh, self.buffers, self._jpeg = mesh, buffers, jpeg

@@ -40,11 +40,7 @@ class StoredArray:
 
 
 class ArrayFile:
-    """The arrays of a file by name, read one by one.
-
-    Args:
-        largest: bytes that all arrays that are read may take.
-    """
+    """The arrays of a file by name, read one by one, of at most ``largest`` bytes together."""
 
     def __init__(self, path: str | Path, largest: int = LARGEST_ARRAYS) -> None:
         self.path = Path(path)

@@ -57,9 +57,6 @@ def decode_samples(data: bytes, source: str, planes: int = 3) -> Samples:
     for a byte of the file, and below 1.5 GiB where each eight pixels have a byte, as photographs and textures of 30 to
     80 megapixels do; and an image of more than 4096 x 4096 pixels needs a byte for every hundred of them. So no file
     of some kilobytes unpacks to gigabytes.
-
-    Args:
-        planes: that the caller makes of it.
     """
     if is_ktx2(data):
         _check_memory(ktx2_header(data, source), planes, len(data), source)

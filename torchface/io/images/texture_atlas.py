@@ -37,12 +37,8 @@ MAX_TEXELS = 2**27  # of all images of a scene
 
 
 def with_used_looks(mesh: Mesh, look: Tensor, looks: Sequence[Look], images_only: bool) -> Mesh:
-    """:func:`with_looks` of those that occur.
-
-    Args:
-        images_only: triangles of plain colours get no place of their own, and nothing changes where no look has an
-            image.
-    """
+    """:func:`with_looks` of those that occur; with ``images_only`` plain colours get no place, and without images
+    nothing changes."""
     painted = torch.tensor([one.image is not None for one in looks])
     if images_only and not bool(painted.all()):
         if not bool(painted.any()):

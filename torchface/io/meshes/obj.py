@@ -40,11 +40,8 @@ def read_obj(path: str | Path, unit: str = "mm") -> Mesh:
 
 
 def read_obj_vertices(path: str | Path, neutral: Mesh, topology: bytes | None, unit: str = "mm") -> Tensor:
-    """The vertices (V,3) of a shape whose faces are those of the mesh at rest; fast for many files.
-
-    Args:
-        topology: ``face_bytes`` of the neutral's file; a shape with the same bytes there is not parsed further.
-    """
+    """The vertices (V,3) of a shape whose faces are those of the mesh at rest; the same face bytes are not parsed
+    further."""
     path, data = Path(path), read_file(path)
     table = read_vertices(path, data)
     if len(table) != len(neutral.vertices):

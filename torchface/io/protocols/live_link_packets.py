@@ -45,11 +45,8 @@ def rotations_sent(rotations: Tensor | None) -> Tensor:
 
 
 class LiveLinkPackets:
-    """Packets of frames, as the app would send them: ARKit's 52 weights and nine rotations each.
-
-    Args:
-        subject: the name under which the receiver lists the face.
-    """
+    """Packets of frames, as the app would send them, under a subject's name: ARKit's 52 weights and nine rotations
+    each."""
 
     def __init__(self, names: Sequence[str], fps: float, subject: str = "torchface") -> None:
         check_rate(fps, "stream", ValueRangeError)

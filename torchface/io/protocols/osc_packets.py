@@ -56,9 +56,6 @@ class OscReader:
     Known are ARKit's names (``/torchface/weights/jawOpen``), Unified Expressions (``/avatar/parameters/v2/JawOpen``),
     rotations by Live Link Face's names in radians, and what the app Face Cap sends (``/W``, ``/HR``, ``/ELR``,
     ``/ERR``). Other addresses are passed over.
-
-    Args:
-        prefix: addresses with another one are passed over; any if empty.
     """
 
     def __init__(self, prefix: str = "") -> None:

@@ -33,7 +33,6 @@ class VmcPackets:
     Args:
         names: of the weights that come, (N,); any rig's names that ARKit's can be had from.
         namings: of ``NAMINGS``; an avatar leaves out the clips that it lacks.
-        clock: what time it is, seconds.
 
     Source: Virtual Motion Capture Protocol, marionette specification, protocol.vmc.info.
     """

@@ -75,9 +75,6 @@ def save_obj_folder(rig: BlendshapeRig, folder: str | Path, detail: DetailMaps |
     Landmarks, regions, the mirror map, the order of the shapes and when correctives act are in ``rig.json``; a
     corrective's OBJ is the neutral with its delta alone. The texture lies beside the
     neutral, detail maps are called ``<shape>_normals.png``. ``load_obj_folder`` gives the same rig.
-
-    Args:
-        folder: made where it is missing; what it holds of the same rig is replaced when all is written.
     """
     folder = Path(folder)
     _check_names(rig, folder)

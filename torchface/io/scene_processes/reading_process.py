@@ -16,11 +16,8 @@ _FOREIGN = ("PXR_PLUGINPATH_NAME", "PXR_AR_DEFAULT_SEARCH_PATH", "PYTHONSTARTUP"
 
 
 def read_scene(command: Sequence[str], path: Path, reader: str, seconds: float) -> Scene:
-    """What ``command PATH FOLDER`` finds in a file; what it left out is reported as ``UserWarning``.
-
-    Args:
-        command: leaves a scene in the folder; see ``torchface.io.scene_processes.scene_arrays``.
-    """
+    """The scene (``scene_arrays``) that ``command PATH FOLDER`` leaves of a file; it reports what it left out as
+    ``UserWarning``."""
     with tempfile.TemporaryDirectory(prefix="torchface-scene-") as folder:
         said = run_process([*command, str(path.absolute()), folder], f"{path}", reader, seconds)
         if not any(Path(folder, name).exists() for name in ("scene.json", "refused.json")):

@@ -76,11 +76,8 @@ def load_scene(path: Path, folder: Path) -> Scene:
 
 
 def scene_rig(scene: Scene, unit: str | None = None) -> BlendshapeRig | None:
-    """All meshes together as a rig, in millimetres, y up; none where nothing has a shape.
-
-    Args:
-        unit: of the file's numbers; what the file says if absent.
-    """
+    """All meshes together as a rig, in millimetres by ``unit`` or the file's own, y up; none where nothing has a
+    shape."""
     pieces = pieces_of(scene, unit)
     names = all_names(pieces)
     if not names:

@@ -82,12 +82,8 @@ def with_correctives(rig: BlendshapeRig, keys: WeightKeys) -> WeightKeys:
 
 
 def common_keys(rig: BlendshapeRig, keys: WeightKeys, bound: float) -> tuple[WeightKeys, KeyReduction]:
-    """Few keys that all shapes share, for files that have one time for all; correctives, which such files hold as
-    weights, stay within the bound too.
-
-    Args:
-        bound: of the distance between a frame's weights and the lines between keys.
-    """
+    """Few keys that all shapes share, for files that have one time for all; frames' weights stay within ``bound`` of
+    the lines between them, and those of correctives, which such files hold as weights, too."""
     values = with_correctives(rig, keys).weights
     kept = kept_keys(keys.seconds, values, bound)
     reduction = KeyReduction(len(kept), int(kept.sum()), reduction_error(keys.seconds, values, kept))

@@ -84,12 +84,9 @@ class TableReader:
         is_blank: Callable[[list[str]], bool] = lambda cells: False,
         only: Iterable[str] | None = None,
     ) -> Table:
-        """All rows.
+        """All rows; the columns ``texts`` are kept as they stand, and of numbers those ``only``, or all, are read.
 
-        Args:
-            texts: columns that are kept as they stand; every other holds numbers.
-            is_blank: whether a row may be short of cells; the missing ones count as empty.
-            only: columns of numbers that are read, where others may hold anything; all if absent.
+        A row that ``is_blank`` may be short of cells; the missing ones count as empty.
         """
         width = len(self.header)
         text_cells: dict[str, list[str]] = {name: [] for name in texts}

@@ -13,11 +13,7 @@ _BREAKS = frozenset("\0\t\n\r")
 
 
 def values_to_write(track: Track | None, what: str, width: int, path: Path) -> tuple[tuple[str, ...], np.ndarray]:
-    """Names and values (T,C,D) float32 of a take's track, if it has one; a channel with a NaN is NaN in all.
-
-    Args:
-        what: what it holds, for messages, such as ``"marker positions"``.
-    """
+    """Names and values (T,C,D) float32 of a take's track, if it has one; a channel with a NaN is NaN in all."""
     if track is None or track.values.shape[:2].numel() == 0:
         raise ValueRangeError(f"{path}: found a take without {what}, expected some to write")
     if track.values.shape[2] != width:

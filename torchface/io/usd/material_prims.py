@@ -33,11 +33,8 @@ class _Look:
 def write_materials(usd: Any, stage: Any, prim: Any, mesh: Mesh, root: str, stem: str) -> tuple[dict[str, bytes], str]:
     """Binds materials to a mesh prim; parts that regions name are ``GeomSubset``s of its polygons.
 
-    Args:
-        stem: what names of image files begin with.
-
-    Returns:
-        PNG files by name, which belong beside the layer, and the path of the first material, the face's.
+    Returns PNG files by names that begin with ``stem``, which belong beside the layer, and the path of the face's
+    material.
     """
     scope = usd.UsdGeom.Scope.Define(stage, f"{root}/materials").GetPath()
     looks = _polygons_by_look(mesh, stem)
@@ -151,9 +148,6 @@ def write_wrinkles(
     The neutral's is the material's normal. Those of shapes are connected to nothing, as ``UsdPreviewSurface`` has no
     place for them; the mesh's ``customData`` names them: ``"wrinkleMaps": [{"shape": ..., "texture": name of the
     prim}]`` in the JSON under ``torchface``.
-
-    Args:
-        stem: what names of image files begin with.
     """
     images: dict[str, bytes] = {}
 

@@ -13,11 +13,8 @@ _PR_SET_PDEATHSIG = 1  # of Linux
 
 
 def limit_growth(start: int, size: int) -> None:
-    """Ends this process's growth at so much memory, time and output as files of ``size`` bytes may take.
-
-    Args:
-        start: bytes of addresses before the first was opened.
-    """
+    """Ends this process's growth from ``start`` bytes of addresses at what files of ``size`` bytes may take of
+    everything."""
     if sys.platform == "win32":  # no such limits there
         return
     import resource

@@ -34,8 +34,7 @@ _MAX_MESHES = 4096
 def extract(path: Path, limit: Callable[[int], None]) -> tuple[dict[str, Any], dict[str, Any]]:
     """A USD scene as what JSON can hold, and arrays by name; see ``torchface.io.scene_processes.scene_arrays``.
 
-    Args:
-        limit: called with the bytes of all files so far, before the next is opened.
+    ``limit`` is called with the bytes of all files so far, before the next is opened.
     """
     with _refusals():
         layers, stage = _opened(path, limit)

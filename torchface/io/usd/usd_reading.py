@@ -51,14 +51,8 @@ def read_usd_weights(path: str | Path) -> Take | None:
 
 
 def read_usd_points(path: str | Path, count: int) -> tuple[Tensor, Tensor] | None:
-    """The frames of a point cache, as Audio2Face and other programs write it: points (T,V,3), millimetres, y up.
-
-    Args:
-        count: V, by which the prim is known.
-
-    Returns:
-        The points, and the times (T,), seconds; none where no points move.
-    """
+    """The frames of a point cache of V points, as Audio2Face and other programs write it: (T,V,3), millimetres, y
+    up; and the times (T,), seconds. None where no points move."""
     scene = read_stage(path, "--points", str(count))
     if not scene.record["meshes"]:
         return None

@@ -267,9 +267,6 @@ def rate_changes(seconds: np.ndarray, fps: float) -> str:
     Phone cameras jitter by some milliseconds and lose a frame now and then: that passes. What does not: a rate that
     changes by more than a tenth, averaged over fifteen frames, durations that deviate by more than a quarter (root mean
     square), and holes in which more than one frame in a hundred is missing.
-
-    Args:
-        seconds: when each frame is shown, (P,), in any order; a repeated time counts once.
     """
     durations = np.diff(np.unique(seconds[np.isfinite(seconds)]))
     if len(durations) < 3:

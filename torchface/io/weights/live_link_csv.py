@@ -50,9 +50,6 @@ def load_live_link(path: str | Path) -> Take:
 
     Frames that were dropped are not filled: the others keep their times.
 
-    Args:
-        path: the CSV file that the app wrote.
-
     Returns:
         weights (T,52,1), float32, which holds the app's ten decimals without loss; ``timecode``; ``extras``.
 

@@ -22,7 +22,6 @@ def crop_transform(box: Tensor, tilt: float, size: int, margin: float = CROP_MAR
         box: x, y, width, height of the face, (4,) pixels; one that is no square counts as the square of the same middle
             and area.
         tilt: :math:`\theta`, radians, clockwise as the image is seen; the crop shows the face upright.
-        size: n, pixels a side of the crop.
         margin: m, the crop's side in sides of the box.
 
     Returns:

@@ -47,11 +47,8 @@ def as_annotated(landmarks: Tensor) -> Tensor:
 
 
 def tilt_around(landmarks: Tensor) -> Tensor:
-    """How far a face is turned in the image plane: from where eyes and mouth lie to each other.
-
-    Returns:
-        (...,) radians, clockwise as the image is seen, 0 for an upright face; NaN where landmarks are missing.
-    """
+    """How far a face is turned in the image plane, (...,) radians, clockwise as seen, by where eyes and mouth lie to
+    each other; NaN where landmarks are missing."""
     if landmarks.shape[-2:] != (68, 2):
         raise ShapeError(f"landmarks: found {tuple(landmarks.shape)}, expected (...,68,2)")
     right, left, mouth = (landmarks[..., rows, :].mean(-2) for rows in (_RIGHT_EYE, _LEFT_EYE, _MOUTH))
@@ -65,9 +62,6 @@ def box_around(landmarks: Tensor) -> Tensor:
 
     A square of :math:`1.6\sqrt{(w^2 + h^2)/2}`, w and h the extent of brows, nose, eyes and mouth; their mean lies in
     its middle, a little below. The two factors are medians of the boxes of OpenCV's Haar cascade over frontal faces.
-
-    Args:
-        landmarks: iBUG's 68, (...,68,2), pixels; NaN rows are left out.
 
     Returns:
         x, y, width, height, (...,4) pixels; NaN where brows, nose, eyes and mouth are all missing.

@@ -63,12 +63,10 @@ def is_awaited(identity: Tensor) -> Tensor:
 
 
 def after_boxes(identity: Tensor, faces: Tensor, searched: Tensor, interval: Tensor) -> Tensor:
-    """What is known after the box network has looked at the next picture, before a face is read there.
+    """What is known after the box network, where it has ``searched``, has looked at the next picture, before a face is
+    read.
 
-    Args:
-        faces: x and y of the middle, side, pixels, and score of the likeliest, (CANDIDATES,4).
-        searched: whether it has looked at all, () bool.
-        interval: seconds since the picture before, ().
+    ``faces`` have x and y of the middle, side, pixels, and score, the likeliest first, (CANDIDATES,4).
     """
     own, other = _motions(identity)
     hidden = _is_known(identity) & (_apart(own, _expected(other, 1)) < _BEFORE) & (own[5] >= _SOON)
@@ -108,11 +106,8 @@ def is_other(identity: Tensor, place: Tensor, look: Tensor, interval: Tensor) ->
 
 
 def after_face(identity: Tensor, place: Tensor, look: Tensor, whose: tuple[Tensor, Tensor], interval: Tensor) -> Tensor:
-    """What is known after a face has been seen at a place, where it looks so (192,).
-
-    Args:
-        whose: whether it is the followed one's, and whether it is the other's; () bool each.
-    """
+    """What is known after a face that looks so (192,) was seen; ``whose``, () bool: the followed one's, or the
+    other's."""
     seen, stranger = whose
     own, other = _motions(identity)
     fresh = (own[2] <= 0) | (own[5] >= _FORGOTTEN)

@@ -62,10 +62,6 @@ def template_features(template: Mesh, detector: UVLandmarkDetector | None = None
     lids and lips close (both vertices of a pair lie on the line that a scan with closed eyes shows), where annotated.
     What is not annotated is detected as on a scan; a template without colours, on which a detector that needs them
     sees nothing, has its twelve landmarks from the 68 and no lines.
-
-    Args:
-        template: a face, millimetres.
-        detector: asked where annotations are missing.
     """
     notes = template.annotations
     ibug = None if notes is None or notes.landmarks is None or len(notes.landmarks) != 68 else notes.landmarks

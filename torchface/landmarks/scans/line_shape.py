@@ -38,11 +38,8 @@ class LineShape:
     def fit(
         lines: Sequence[Tensor], images: Sequence[Tensor] | None = None, corner_deviation: float = 0.0
     ) -> "LineShape":
-        """The mean course of pixel lines, each (N,2) from its left to its right corner; two lines at least.
-
-        Args:
-            images: what each line runs through, (C,S,S); without them the profile is not learned.
-        """
+        """The mean course of pixel lines, two at least, each (N,2) from its left to its right corner; the profile of
+        images (C,S,S)."""
         rows = torch.stack([_offsets(line.double()) for line in lines])
         shape = LineShape(rows.mean(0), rows.std(0).clamp(min=_MIN_DEVIATION), corner_deviation)
         if images is None:

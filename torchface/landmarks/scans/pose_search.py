@@ -129,12 +129,9 @@ def hypotheses(nose: Tensor, direction: Tensor, found: NoseCandidates) -> Simila
 
 
 def find_pose(face: Samples, nose: Tensor, direction: Tensor, surface: ScanPoints, found: NoseCandidates) -> Fit:
-    """The pose of a face in a scan, a batch of one, and how well it fits there.
+    """The pose of a face in a scan, a batch of one, and how well it fits there; ``found`` is where noses may be.
 
-    Args:
-        face: its points, in an order whose beginnings are spread over it.
-        nose, direction: the face's nose and where it looks, each (3,).
-        found: where noses may be on the scan.
+    The first of the face's points are spread over it; its nose and where it looks are (3,).
     """
     tried = hypotheses(nose, direction, found)
     likely = fit_of(face.first(_FEW), surface, tried, _REACH, _SLACK).argsort(descending=True)

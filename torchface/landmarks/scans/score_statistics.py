@@ -37,14 +37,8 @@ def score_statistics(
     settings: DetectorSettings,
     progress: Progress | None = None,
 ) -> ScoreStatistics:
-    """Scores every filter in all images but its own.
-
-    Args:
-        filters: (L,M,bins,side,side).
-        landmarks: pixels, (M,L,2); NaN where one is not known.
-
-    Source: thesis 3.2.2.
-    """
+    """Scores every filter (L,M,bins,side,side) in all images but its own; landmarks (M,L,2) are pixels, NaN if
+    unknown. Source: thesis 3.2.2."""
     progress = progress or silent
     count, names = landmarks.shape[:2]
     sums = torch.zeros(2, names, count, 3, dtype=torch.float64)

@@ -48,11 +48,7 @@ class Opening:
 def eye_opening(vertices: Tensor, skin: Tensor, middle: Tensor, span: float) -> Opening | None:
     """The opening of an eye, seen from the front; none where the skin is whole there, as of closed or painted eyes.
 
-    Args:
-        vertices: of a head, (V,3), upright, looking along z.
-        skin: its triangles without those of eyeballs and lashes, (F,3).
-        middle: of the eye, (3,).
-        span: of the picture, in the vertices' unit: about twice an eye's width.
+    Vertices (V,3) of an upright head look along z; skin (F,3) has no eyeballs and lashes; the picture spans two eyes.
     """
     camera = look_at(middle, 0.0, 0.0, span, _SIDE, _SIDE)
     origins, directions = (rays.reshape(-1, 3) for rays in camera.rays())

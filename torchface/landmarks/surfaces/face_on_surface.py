@@ -76,12 +76,7 @@ class FaceOnSurface:
 
 
 class NoFaceOnSurfaceError(AlignmentError):
-    """A surface shows no face.
-
-    Args:
-        views: pictures of what was seen.
-        likeness: of a face that pictures show though its form is none, the score from afar; else 0.
-    """
+    """A surface shows no face; ``likeness`` is that of one in pictures whose form is none, the score from afar."""
 
     def __init__(self, message: str, views: Sequence[Tensor], likeness: float = 0.0) -> None:
         super().__init__(message)
@@ -101,12 +96,8 @@ class FaceSearch:
     def find(
         self, surface: TexturedSurface, framed: Tensor | None = None, progress: Progress | None = None
     ) -> FaceOnSurface:
-        """The face on a surface: the one that most pictures show, of several.
-
-        Args:
-            surface: any unit, turned by any angle.
-            framed: vertices (V,) bool that the pictures from around frame, such as those of a head's bone.
-        """
+        """The face on a surface, of any unit and turn: the one that most pictures, round vertices ``framed`` (V,),
+        show."""
         progress = progress or silent
         pictures: list[Tensor] = []
         refused: NoFaceOnSurfaceError | None = None
@@ -354,13 +345,7 @@ def _together(points: Sequence[Tensor], weights: Sequence[Tensor], astray: float
 
 
 def _through_holes(reference: Tensor, points: Tensor, landmarks: Tensor) -> Tensor:
-    """Which points (N,) of eyes and mouth lie so far behind a face that they are seen through holes there.
-
-    Args:
-        reference: where a head has them, (N,3).
-        points: in its place, (N,3) with NaN.
-        landmarks: iBUG's 68 of the head, (68,3).
-    """
+    """Which points (N,), in place of ``reference`` (N,3), lie so far behind a face that they are seen through holes."""
     eyes = (landmarks[_EYES[0]] - landmarks[_EYES[1]]).norm()
     openings = torch.stack([landmarks[one].double().mean(0) for one in _OPENINGS])
     near = torch.cdist(reference, openings).amin(1) < _AROUND_OPENING * eyes

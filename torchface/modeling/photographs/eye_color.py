@@ -39,8 +39,6 @@ def iris_color(
 
     Args:
         posed: the head as the photographs show it, or as each of them does, its eyeballs annotated.
-        images: photographs, (3,H,W) each.
-        cameras: one each.
         irises: centres in each photograph, (I,2,2) pixels.
     """
     ringed = None if irises is None else _ring_color(irises, images, cameras, posed)

@@ -26,13 +26,8 @@ class Displacement:
 
     @staticmethod
     def of(places: Tensor, steps: Tensor, unit: float) -> "Displacement":
-        """Follows steps (L,2) of places (L,2), NaN for missing, as far as they agree.
-
-        Args:
-            unit: the distance of the eyes' outer corners, pixels.
-
-        Source: the mean of a Gaussian process; Rasmussen and Williams 2006, equation 2.25.
-        """
+        """Follows steps (L,2) of places (L,2), NaN for missing, as far as they agree; ``unit`` is the eyes'
+        distance, pixels. Source: the mean of a Gaussian process; Rasmussen and Williams 2006, equation 2.25."""
         known = torch.isfinite(steps).all(-1) & torch.isfinite(places).all(-1)
         places, reach = places[known].double(), _REACH * unit
         alike = _bumps(places, places, reach) + _DOUBT * torch.eye(len(places), dtype=torch.float64)

@@ -65,10 +65,6 @@ def hair_cap(shown: Sequence[Shown], places: Sequence[FacePlaces], hair: Tensor)
 
     Where it begins is, in each column of the forehead, the height that best parts skin below from hair above, so that a
     fringe is hair and no second pair of brows.
-
-    Args:
-        places: where the vertices lie beside the landmarks in each.
-        hair: how far each shows hair, (I,V); see ``ShownParts``.
     """
     at, found, colors = list[Tensor](), list[Tensor](), list[Tensor]()
     for one, where, share in zip(shown, places, hair, strict=True):
@@ -93,14 +89,7 @@ def hair_cap(shown: Sequence[Shown], places: Sequence[FacePlaces], hair: Tensor)
 def hair_beyond(
     images: Sequence[Tensor], parts: Sequence[FaceParts], marks: Sequence[Tensor], places: FacePlaces
 ) -> HairCap | None:
-    """Hair that photographs show above the brows and off the head that was found, such as a shock of it; None without.
-
-    Args:
-        images: photographs, (3,H,W) each.
-        parts: what each shows.
-        marks: the landmarks in each, (68,2) pixels.
-        places: of the vertices.
-    """
+    """Hair that photographs (3,H,W) with landmarks (68,2) show above the brows and off the head found; None without."""
     colors = []
     for image, shown, points in zip(images, parts, marks, strict=True):
         size, transform = shown.shares.shape[-1], shown.transform
@@ -117,12 +106,8 @@ def hair_beyond(
 
 
 def without_veil(color: Tensor, skin: Tensor, images: Sequence[Tensor], heads: Sequence[Tensor]) -> Tensor:
-    """Hair's colour (3,), as dark beside skin's (3,) as in pictures that have black; films of webcams are washed out.
-
-    Args:
-        images: photographs, (3,H,W) each.
-        heads: vertices of the head in each, (V,2) pixels.
-    """
+    """Hair's colour (3,), as dark beside skin's (3,) as in pictures that have black; films of webcams are washed
+    out."""
     darkest = []
     for image, head in zip(images, heads, strict=True):
         size = torch.tensor(image.shape[:0:-1], dtype=head.dtype)

@@ -178,14 +178,7 @@ def fit_images(
 
 
 def with_skin(fit: ImageFit, model: HeadModel, images: Sequence[Tensor], settings: FitSettings) -> ImageFit:
-    """A fit with the skin that its photographs show.
-
-    Args:
-        fit: of I photographs.
-        model: whose colours skin is completed with, where it has some.
-        images: the photographs, (3,H,W) each.
-        settings: the texture's size, parts and irises of the photographs.
-    """
+    """A fit with the skin that its photographs (3,H,W) show, completed with the model's colours where it has some."""
     bent = [FeatureAlignment.of(*one) for one in zip(fit.landmarks, fit.residuals, strict=True)]
     images = [way.image(image[:3].cpu()) for way, image in zip(bent, images, strict=True)]
     if settings.parts is not None:

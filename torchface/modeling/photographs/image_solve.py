@@ -129,11 +129,7 @@ def _improbability(problem: Problem, state: State) -> float:
 
 
 def solve(problem: Problem, state: State, free: Tensor | None = None) -> State:
-    """Gauss-Newton until nothing changes.
-
-    Args:
-        free: which coefficients may change, (D,) bool; all if absent.
-    """
+    """Gauss-Newton until nothing changes, of all coefficients or the ``free`` ones, (D,) bool."""
     lower, upper = problem.bounds()
     for _ in range(problem.settings.max_iterations):
         x = state.coefficients

@@ -204,11 +204,8 @@ def _without_patches(
 
 
 def _spectacles(views: Sequence[_View], glasses: Sequence[Tensor]) -> Tensor:
-    """How far each vertex lies where spectacles have frames, whose thin parts look like skin to the network, (V,).
-
-    Args:
-        glasses: how surely a photograph shows glasses at each, (V,) each; 0 everywhere where none shows enough of them.
-    """
+    """How far each vertex lies where spectacles have frames, whose thin parts look like skin to the network, (V,),
+    by how surely each photograph shows glasses there, (V,)."""
     frames = [view.places.frames for view in views]
     seen = [
         share[(frame > _FRAMED) & (view.shown.cosine > 0)]
@@ -281,12 +278,8 @@ def _capped(texture: PhotoTexture, cap: HairCap, mesh: Mesh, parts: Tensor) -> P
 
 
 def _with_parts(texture: PhotoTexture, colors: Tensor, mesh: Mesh, parts: Tensor, iris: Tensor) -> PhotoTexture:
-    """A texture that shows parts (V,) that are no skin in their colours (V,3), and eyeballs with an iris and a pupil.
-
-    Args:
-        mesh: at rest.
-        iris: its colour, sRGB (3,).
-    """
+    """A texture that shows parts (V,) that are no skin in their colours (V,3), and eyeballs with an iris (3,) and a
+    pupil."""
     texels, faces = texture.texels, mesh.faces.cpu()
     corners = faces[texels.triangles]
     painted = texels.interpolate(colors.double(), faces)
@@ -331,12 +324,8 @@ def part_vertices(mesh: Mesh) -> Tensor:
 
 
 def with_part_colors(mesh: Mesh, iris: Tensor | None) -> Mesh:
-    """A mesh with vertex colours whose parts have those of their materials, and whose eyeballs have the iris in front.
-
-    Args:
-        mesh: a head with colours.
-        iris: sRGB (3,); the eyeballs' own if absent.
-    """
+    """A head with colours whose parts have those of their materials, and whose eyeballs an iris, sRGB (3,), in
+    front."""
     if mesh.colors is None or mesh.annotations is None:
         return mesh
     colors = mesh.colors.clone()

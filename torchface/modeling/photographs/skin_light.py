@@ -38,14 +38,8 @@ _EYE_PIXELS = 10  # of the crop
 
 
 def exposure_gain(image: Tensor, parts: FaceParts) -> float:
-    """What a photograph's light is multiplied by to be well exposed; what is too dark shows nobody's complexion.
-
-    As :func:`needed_gain`, but at most 2.5.
-
-    Args:
-        image: sRGB, (3,H,W).
-        parts: what it shows.
-    """
+    """What a photograph's light is multiplied by, at most 2.5, to be well exposed; what is too dark shows nobody's
+    complexion."""
     return min(needed_gain(image, parts), _BRIGHTER)
 
 
@@ -124,12 +118,10 @@ def unlit(colors: Tensor, normals: Tensor, camera: Camera, light: EnvironmentLig
 
 
 def light_hue(colors: Tensor, skin: Tensor, tone: Tensor | None) -> Tensor:
-    """The hue of a coloured light, (3,) of mean 1 in sRGB: how far skin's hue lies beyond where people's skin lies.
+    """The hue of a coloured light, (3,) of mean 1 in sRGB: how far skin's hue lies beyond that of people's.
 
-    Args:
-        colors: in even light, sRGB (V,3).
-        skin: how surely each vertex is seen to be skin, (V,) in [0,1].
-        tone: of a skin like it, (V,3); the light is white if absent.
+    Of colours (V,3) in even light and how surely they are skin (V,); the light is white without a tone (V,3) of a skin
+    like it.
     """
     sure = skin > _SURE
     if tone is None or int(sure.sum()) < _LEAST:

@@ -17,13 +17,7 @@ _TELLING = ("jawOpen", *BLINKS)  # which of lips and lids that touch a vertex is
 
 
 def annotations_on(head: BlendshapeRig, template: BlendshapeRig, pose: Similarity) -> Annotations:
-    """The head's annotations, with the template's landmarks and regions where it has none of its own.
-
-    Args:
-        head: in any place and size.
-        template: on the head's face, in its own place and size.
-        pose: takes the template to the head.
-    """
+    """The head's annotations, with those that it lacks of the template, which ``pose`` takes onto its face."""
     own, given = head.neutral.annotations or Annotations(), template.neutral.annotations or Annotations()
     back = pose.inverse()
     names = [name for name in _TELLING if name in head.names and name in template.names]

@@ -392,12 +392,8 @@ def _expected_errors(regression: ExpressionRegression, parts: Tensor, distance: 
 
 
 def _shares_of_the_whole(transferred: Tensor, split: Tensor) -> Tensor:
-    """What part of a predicted whole each shape moves at each vertex, (N,V,1): as the transferred halves divide it.
-
-    Args:
-        transferred: (N,V,3), millimetres.
-        split: where a shape is a half of a predicted one, (N,M) bool.
-    """
+    """What part of a predicted whole each shape moves at each vertex, (N,V,1): as the transferred halves (N,V,3)
+    divide it."""
     size = transferred.norm(dim=-1)
     shares = torch.ones_like(size)
     for column in split.any(0).nonzero()[:, 0]:  # one or two shapes of a rig are split

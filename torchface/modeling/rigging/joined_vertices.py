@@ -43,11 +43,7 @@ class JoinedHead:
 
 
 def joined_vertices(vertices: Tensor, faces: Tensor) -> JoinedMesh:
-    """Joins the vertices that a file has split at seams; lips that touch, and lashes on a lid, stay apart.
-
-    Args:
-        vertices: (V,3), millimetres.
-    """
+    """Joins the vertices (V,3) that a file has split at seams; lips that touch, and lashes on a lid, stay apart."""
     normals, seam = vertex_normals(vertices, faces), border_vertices(faces, len(vertices)).nonzero()[:, 0]
     near = cKDTree(vertices[seam].numpy()).query_pairs(_SAME_PLACE, output_type="ndarray")
     first, second = seam[torch.from_numpy(near)].T

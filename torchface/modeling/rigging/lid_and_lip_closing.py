@@ -41,12 +41,7 @@ class Seams:
 
 
 def find_seams(rig: BlendshapeRig, moving: Tensor) -> Seams:
-    """The seams of a rig.
-
-    Args:
-        rig: N shapes, V vertices.
-        moving: which vertices each shape moves, (N,V) bool.
-    """
+    """The seams of a rig whose shapes move vertices (N,V) bool."""
     neutral = rig.neutral
     vertices, deltas = neutral.vertices.detach().double().cpu(), rig.deltas.detach().double().cpu()
     named = None if neutral.annotations is None else neutral.annotations.contacts

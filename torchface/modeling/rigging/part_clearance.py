@@ -73,8 +73,7 @@ def _closing_over_jaw(rig: BlendshapeRig) -> dict[int, int]:
 def _cleared(deltas: Tensor, moving: Tensor, poses: Tensor, clearance: "Clearance", under: Mapping[int, int]) -> Tensor:
     """Changes deltas (N,V,3) in place until each pose (K,N) in turn is clear; which shapes were changed, (N,) bool.
 
-    Args:
-        under: rows of shapes that stand on another's pose, and that other's.
+    ``under`` are the rows of shapes that stand on another's pose, and that other's.
     """
     changed = torch.zeros(len(deltas), dtype=torch.bool)
     for weights in poses:  # each pose builds on the changes of the one before

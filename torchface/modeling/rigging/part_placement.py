@@ -106,11 +106,8 @@ def with_placed_parts(template: Mesh, registration: Registration) -> Registratio
 
 
 def with_mouth_behind_skin(head: Mesh) -> Mesh:
-    """A head whose mouth, where it has come through lip or chin, lies behind the skin again; its rim stays.
-
-    Args:
-        head: with the region ``mouth_interior``, upright: z points forward.
-    """
+    """An upright head whose ``mouth_interior``, where it has come through lip or chin, lies behind the skin again;
+    its rim stays."""
     regions = {} if head.annotations is None else head.annotations.regions
     if "mouth_interior" not in regions:
         return head

@@ -41,7 +41,6 @@ class ShapeTransfer:
     """One source and one target, the latter brought to the source's place and size.
 
     Args:
-        source: the template: N shapes, V vertices, millimetres.
         target: the new neutral, of the same topology.
         contact_weight: how firmly lids and lips keep their gap; 0 leaves that out.
     """
@@ -223,13 +222,8 @@ class Follower:
     system: PreparedReconstruction  # factored once, for the iterations to come
 
     def follow(self, gradients: Tensor, values: Sequence[Tensor]) -> Tensor:
-        """Displacements (G,V,3) in the source's frame.
-
-        Args:
-            gradients: what is added to the target's gradients in G shapes of one group, (G,F,3,3), in the source's
-                frame.
-            values: how much each of the ``matrices`` measures more, (G,K,3), millimetres.
-        """
+        """Displacements (G,V,3), by what is added to the gradients (G,F,3,3) and what the matrices measure more
+        (G,K,3), mm."""
         none = torch.zeros(len(gradients), self.system.vertex_count, 3, dtype=torch.float64)
         return self.system.solve(gradients, none, values)
 

@@ -180,11 +180,8 @@ def reading_parts(reader: FaceReader) -> dict[str, Callable[[], onnx.ModelProto]
 def reading_model(
     reader: FaceReader, state_size: int, parts: Mapping[str, onnx.ModelProto] | None = None
 ) -> onnx.ModelProto:
-    """The model of :class:`WebcamReading`, with networks stored as halves, for a solver of so many state numbers.
-
-    Args:
-        parts: what ``reading_parts`` makes; made if absent, and none of a reader of another kind.
-    """
+    """The model of :class:`WebcamReading`, with networks stored as halves; ``reading_parts`` makes its parts where
+    absent."""
     examples = {
         "image": _PICTURE,
         "interval": torch.tensor(_USUAL),

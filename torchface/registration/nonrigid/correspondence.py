@@ -43,9 +43,6 @@ def correspondences(
     than ``largest_angle``. The rest weighs :math:`(1 + d^2/c^2)^{-2}` (Geman and McClure) with c half the reach, so
     that hair a few centimetres off pulls little.
 
-    Args:
-        vertices: ids of those that look for one, (n,).
-
     Source: Amberg, Romdhani, Vetter 2007, section 4; thesis 3.2.3, figure 15.
     """
     nearest = scan.among_nearest_samples(current[vertices])

@@ -36,11 +36,7 @@ _SLIVER = 0.1
 
 
 class Deformer:
-    """A template on its way to a scan; vertices in ``hidden`` (V,) have no place there, and follow the others.
-
-    Args:
-        schedule: of its constants; the stages are given one by one to ``run``.
-    """
+    """A template on its way to a scan; vertices in ``hidden`` (V,) have no place there, and follow the others."""
 
     def __init__(
         self,
@@ -232,9 +228,6 @@ def stiffness_rows(vertices: Tensor, faces: Tensor, gradient_length: float) -> s
     :math:`X_i = (A_i^\top, p_i)`, so that ``D X`` is simply the positions :math:`p`. The translation part of a
     difference is where the two maps send the middle :math:`m_{ij}` of the edge, which makes the energy the same
     wherever the origin lies, and zero for every affine motion of the whole.
-
-    Args:
-        gradient_length: :math:`g`, millimetres.
 
     Source: Amberg, Romdhani, Vetter 2007, equations 3 and 10; thesis 3.2.3, equation 5.
     """

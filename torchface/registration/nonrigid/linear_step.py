@@ -110,12 +110,7 @@ class LinearStep:
         return place[contacts.pairs[:, 1]] - place[contacts.pairs[:, 0]] - contacts.offsets
 
     def minimise(self, maps: Array, data: Data, tolerance: float = _TOLERANCE) -> Array:
-        """The best maps (4V,3) among those that differ from ``maps`` by what the subspace spans.
-
-        Args:
-            maps: X so far, (4V,3).
-            tolerance: at which residual, as a share of the first, the iteration ends.
-        """
+        """The best maps (4V,3) among those that differ from ``maps`` by what the subspace spans."""
         weights, normals = data.weights[:, None], data.normals
         if self._solver is None:
             mean = sparse.diags_array((1 + 2 * self._rho) / 3 * data.weights)

@@ -211,12 +211,9 @@ def _hump(spots: Tensor, forward: float, up: float, wide: float, tall: float) ->
 
 
 def _ear_relief(spots: Tensor, inside: Tensor, rolled: Tensor) -> Tensor:
-    """How far the ear's front stands out of the head's side: rim, furrow, inner ridge, bowl, the flaps round it.
+    """How far the ear's front stands out of the head's side, at spots (K,L,2): rim, furrow, inner ridge, bowl, flaps.
 
-    Args:
-        inside: how far within the outline, (K,L), mm.
-        rolled: how strong the rim is, (L,).
-        spots: forward and up from the middle, (K,L,2), mm.
+    ``inside`` (K,L) is how far within the outline, mm; ``rolled`` (L,) how strong the rim is.
     """
     plane = 8.0 - 0.42 * spots[..., 0] - 0.22 * (-14 - spots[..., 1]).clamp(min=0)
     rim = rolled * (2.6 * torch.exp(-(((inside - 2.2) / 1.7) ** 2)) - 2.6 * torch.exp(-(((inside - 6.3) / 2.0) ** 2)))

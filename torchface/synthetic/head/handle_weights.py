@@ -89,12 +89,8 @@ def _unmoved_parts() -> Tensor:
 
 
 def _interpolated(values: Tensor, fixed: Tensor, reach: float | None = None) -> Tensor:
-    """Values given where fixed, (V,C), elsewhere interpolated as a thin plate: the squared Laplacian is zero there.
-
-    Args:
-        reach: under tension, so that the plate does not swing out farther than about so many millimetres; without if
-            absent.
-    """
+    """Values (V,C) where fixed (V,), elsewhere interpolated as a thin plate, whose squared Laplacian is zero, under
+    tension with a reach so that it swings out no farther."""
     t = topology()
     p = sculpted_vertices().numpy()
     quads = t.quads.numpy()

@@ -74,12 +74,7 @@ class SkinMaps:
 
 
 def skin_maps(look: Look, size: int = 2048, skin: Tensor | None = None) -> SkinMaps:
-    """The images of a person.
-
-    Args:
-        skin: colours of skin, lips and brows in the head's layout in place of the look's, (3,size,size), such as a fit
-            to photographs gives.
-    """
+    """The images of a person, with skin (3,size,size), such as of a fit to photographs, in place of the look's."""
     return _look_maps(look, size) if skin is None else _maps(look, size, skin)
 
 
@@ -102,11 +97,7 @@ def _maps(look: Look, size: int, skin: Tensor | None) -> SkinMaps:
 
 
 def _painted(look: Look, p: Tensor, marks: Tensor, bare: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Colour (N,3), roughness (N,) and relief (N,) at points (N,3) with marks (N,8).
-
-    Args:
-        bare: the skin's colours (N,3), or (N,0) for the look's own.
-    """
+    """Colour (N,3), the skin's own or the look's, roughness (N,) and relief (N,) at points (N,3) with marks (N,8)."""
     lips, mouth, _, socket, lash, eyeball, nostril, ear = marks.unbind(1)
     hair = hair_share(p) * (1 - ear) * (1 - ramp(eyeball + socket + mouth, 0.2, 0.5))
     hair = hair if look.haircut else torch.zeros_like(hair)

@@ -168,11 +168,8 @@ IRIS_EDGE = 0.45
 def eye_color(
     p: Tensor, brown: tuple[float, float, float] = (0.33, 0.24, 0.14), whites: float = 1.0, iris_size: float = 1.0
 ) -> Tensor:
-    """Colours (N,3) of points of an eyeball: sclera with veins, limbal ring, iris of a colour, pupil, highlight.
-
-    Args:
-        iris_size: 1 as usual.
-    """
+    """Colours (N,3) of points of an eyeball: sclera with veins, limbal ring, iris of a colour and size, pupil,
+    highlight."""
     centre = torch.tensor(EYE_CENTRE)
     offset = torch.cat([p[:, :1].abs(), p[:, 1:]], dim=1) - centre
     way = torch.nn.functional.normalize(offset, dim=1)

@@ -36,9 +36,6 @@ def fuse(
     The truncated signed distance along each viewing ray is averaged over the views in the voxels round the surface;
     its zero becomes triangles by surface nets.
 
-    Args:
-        voxel: millimetres a side.
-
     Source: Curless and Levoy 1996; Gibson 1998 (surface nets).
     """
     caster = RayCaster(mesh.vertices, mesh.faces)
@@ -65,16 +62,9 @@ def fuse(
 
 
 def surface_net(cells: Tensor, values: Tensor, shape: Tensor, origin: Tensor, voxel: float) -> tuple[Tensor, Tensor]:
-    """The zero of values known at some points of a grid, as triangles facing the positive side.
+    """The zero of values at a grid's cells, row-major, ascending, (N,) both, as triangles facing the positive side.
 
-    Args:
-        cells: row-major indices of the known points, ascending, (N,).
-        values: (N,).
-        shape: of the grid, (3,).
-        origin: of its first point, (3,).
-
-    Returns:
-        Vertices (V,3) and faces (F,3): a vertex in each cube with both signs, a quad (two triangles) round each edge.
+    Vertices (V,3) and faces (F,3): a vertex in each cube with both signs, a quad (two triangles) round each edge.
     """
     strides = torch.tensor([int(shape[1] * shape[2]), int(shape[2]), 1])
     offsets = torch.tensor([[i, j, k] for i in (0, 1) for j in (0, 1) for k in (0, 1)])

@@ -174,9 +174,6 @@ def landmarks_by_shape(rig: BlendshapeRig) -> Tensor:
 
     It takes the place at which each of ARKit's shapes moves the performer to that at which it moves the rig. Within
     2 mm on other performers; on another family of heads within 6 mm inside the face, more along the jaw.
-
-    Args:
-        rig: with shapes whose names mean ARKit's; see ``torchface.shape_names.mapping``.
     """
     known = performer(texture=False)
     ours, here = _centres(known), _centres(rig)

@@ -64,11 +64,8 @@ def catmull_clark(
 
 
 def divided_corner_values(polygons: Tensor, corner_values: Tensor) -> Tensor:
-    """Values (Q,4,E) at the corners of the quads that a round makes of each polygon, divided linearly.
-
-    Args:
-        polygons: (P,K) int64, padded with -1.
-    """
+    """Values (Q,4,E) at the corners of the quads that a round makes of polygons (P,K), padded with -1, divided
+    linearly."""
     after, before, sides, valid = _neighbouring_slots(polygons)
     corner = corner_values.masked_fill(~valid[..., None], 0.0)
     centre = (corner.sum(1) / sides[:, None])[:, None].expand_as(corner)
@@ -83,9 +80,6 @@ def subdivision_operator(polygons: Tensor, count: int) -> tuple[sparse.csr_array
 
     Rows are the old vertices, then a point an edge, then a point a polygon; a quad holds an old vertex, the point of
     the edge after it, the polygon's, that of the edge before it.
-
-    Args:
-        polygons: (P,K) int64, padded with -1.
     """
     after, before, _, valid = _neighbouring_slots(polygons)
     width = polygons.shape[1]

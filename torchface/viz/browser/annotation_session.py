@@ -11,13 +11,8 @@ from torchface.landmarks.images.appearance.annotated_frames import AnnotatedFram
 
 
 class AnnotationSession:
-    """Frames whose landmarks a user corrects one after another.
-
-    Args:
-        frames: images with the landmarks to start from.
-        folder: where :meth:`save` writes to.
-        saved: names of frames whose landmarks are the user's own already.
-    """
+    """Frames whose landmarks a user corrects one after another, and saves in a folder; those ``saved`` are the
+    user's own."""
 
     def __init__(self, frames: Sequence[AnnotatedFrame], folder: str | Path, saved: Sequence[str] = ()) -> None:
         if not frames:

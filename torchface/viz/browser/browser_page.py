@@ -38,12 +38,9 @@ def import_viser() -> Any:
 
 
 def start_server(label: str, token: str, port: int = 8080) -> "viser.ViserServer":
-    """A page on ``http://127.0.0.1:PORT/TOKEN/``, or on the next port that is free.
+    """A page on ``http://127.0.0.1:PORT/TOKEN/``, or on the next port that is free; 0 is any.
 
-    Args:
-        label: heads the panel, and names the browser's tab.
-        token: what the page's address must name: other users of this machine do not know it.
-        port: the first to try; 0 takes any that is free.
+    Other users of this machine do not know the token.
     """
     viser = import_viser()
     port = free_port(HOST, port)
@@ -62,11 +59,7 @@ def start_server(label: str, token: str, port: int = 8080) -> "viser.ViserServer
 
 
 class BrowserPage:
-    """A page and its server, until it is closed.
-
-    Args:
-        port: the first to try, 0 for any.
-    """
+    """A page and its server, on the first free port from ``port``, until it is closed."""
 
     def __init__(self, label: str, port: int) -> None:
         self._lock = threading.RLock()
@@ -116,12 +109,8 @@ def icon(name: str) -> Any:
 
 
 def frame_camera(server: "viser.ViserServer", mesh: Mesh, width: float = 1.0) -> None:
-    """Sets the camera before a mesh, looking along -z: round its landmarks where annotated, else the whole of it.
-
-    Args:
-        mesh: at rest, millimetres.
-        width: how many times the mesh's own width must fit in, to its right.
-    """
+    """Sets the camera before a mesh, looking along -z: round its landmarks where annotated, else the whole,
+    ``width`` times as wide."""
     points, room = mesh.vertices.double(), 1.12
     if mesh.annotations is not None and mesh.annotations.landmarks is not None and width == 1.0:
         points, room = points[mesh.annotations.landmarks], 2.1
@@ -177,12 +166,8 @@ _SAME = 5e-4
 
 
 class SharedInput:
-    """A slider, dropdown or checkbox of the page, which distinguishes changes by the user from those by the program.
-
-    Args:
-        lock: held while ``act`` runs.
-        act: called with the newest value after the user changed it.
-    """
+    """A slider, dropdown or checkbox of the page, which distinguishes changes by the user, on which it acts, from
+    the program's."""
 
     def __init__(self, handle: Any, lock: AbstractContextManager, act: Callable[[Any], Any]) -> None:
         self.handle = handle
@@ -217,10 +202,6 @@ def free_port(host: str, first: int) -> int:
     """The first port from ``first`` that can be listened on; 0 stays, for any.
 
     A server that looks for one by itself waits for ever where it runs out of them.
-
-    Args:
-        host: the address to listen on.
-        first: 0 to 65535.
     """
     checked_count("port", first, 0, LAST_PORT)
     if first == 0:

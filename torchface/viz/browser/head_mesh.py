@@ -43,8 +43,6 @@ class HeadOnPage:
     files can be made: pieces move with them then, and the page reads the next file hidden beside the one in view.
 
     Args:
-        mesh: what to show, millimetres.
-        offset: where to, millimetres.
         normal_map: gives the normal map (3,H,W) of the pose, or nothing; called at each :meth:`settle`.
     """
 
@@ -141,11 +139,8 @@ class HeadOnPage:
         return sent
 
     def settle(self, calls: int = 1) -> None:
-        """Shows the texture, where the head has one that is not shown.
-
-        Args:
-            calls: after how many more calls one with wrinkles is shown, 1 to 3; until then the page has to read it.
-        """
+        """Shows the texture, where the head has one that is not shown; one with wrinkles, which the page reads
+        first, ``calls`` later."""
         if self.settled:
             return
         with self._server.atomic():
@@ -199,11 +194,8 @@ _ROUGHNESS = 0.72
 
 
 class TexturedHead:
-    """A mesh's material, prepared once; positions, and a normal map where there is one, go in each time.
-
-    Args:
-        mesh: its texture is used where it has one, else its vertex colours, else clay.
-    """
+    """A mesh's material, prepared once, of its texture, vertex colours or clay; positions and normal map go in each
+    time."""
 
     def __init__(self, mesh: Mesh) -> None:
         self._mesh = mesh = mesh.to("cpu")
@@ -216,12 +208,7 @@ class TexturedHead:
         self._color = [*to_linear(torch.tensor(CLAY)).tolist(), 1.0] if source == "material" else None
 
     def glb(self, vertices: Tensor, normal_map: Tensor | None = None) -> bytes:
-        """A ``.glb`` of the mesh, in metres.
-
-        Args:
-            vertices: (V,3), millimetres.
-            normal_map: unit vectors in tangent space, (3,H,W); left out where the mesh has no UVs.
-        """
+        """A ``.glb`` of vertices (V,3), in metres, with a normal map (3,H,W) where the mesh has UVs."""
         buffers = BufferWriter()
         mesh = self._mesh.with_vertices(vertices.detach().cpu().float())
         primitive = PrimitiveWriter(mesh, self._split, buffers).add(self._surface, 0, torch.zeros(3))

@@ -50,9 +50,6 @@ class LandmarkEditor(BrowserPage):
 
     A dot is dragged, or chosen by a click; a click on the image brings the chosen one there. *Save* writes the
     frame's files and switches to the next.
-
-    Args:
-        port: the first to try, 0 for any.
     """
 
     def __init__(self, session: AnnotationSession, label: str = "torchface annotate", port: int = 8080) -> None:

@@ -34,10 +34,6 @@ def is_allowed(host: str | None, origin: str | None, port: int) -> bool:
     A browser sends in ``Origin`` which page opens a connection, and in ``Host`` by which name it found this machine: a
     foreign page has another origin, and one whose name was made to point at 127.0.0.1 has another host. Programs that
     are no browsers send no origin; they could do as they like anyway.
-
-    Args:
-        host: the request's ``Host``.
-        origin: its ``Origin``; None where it has none.
     """
     places = {f"{name}:{port}" for name in _HOSTS} | (set(_HOSTS) if port == 80 else set())
     return host in places and (origin is None or origin in {f"http://{name}" for name in places})
@@ -45,9 +41,6 @@ def is_allowed(host: str | None, origin: str | None, port: int) -> bool:
 
 def without_token(path: str, token: str) -> str | None:
     """A request's path without the token that it must begin with; None where it does not.
-
-    Args:
-        path: of the request, such as ``/TOKEN/index.html``.
 
     Example:
         >>> without_token("/secret/index.html?a=1", "secret"), without_token("/index.html", "secret")
@@ -65,9 +58,6 @@ def only_this_page(title: str, token: str) -> Iterator[None]:
 
     The page is shown in no frame, and called by ``title``. viser hands its server's handshake to ``websockets`` and has
     no setting for any of these.
-
-    Args:
-        token: that a request for the page, and for its socket, must name.
     """
     server: Any = importlib.import_module("websockets.asyncio.server")
     with _starting:

@@ -41,11 +41,7 @@ class Picks:
 
 
 class PickSession:
-    """Picks in the making.
-
-    Args:
-        mesh: what landmarks and markers go on; the template of the pairs.
-        landmark_set: names and order; landmarks that the mesh brings, if as many, are picked already.
+    """Picks in the making; landmarks that the mesh brings, as many as the set has, are picked already.
 
     Every change can be undone, one step a click.
     """

@@ -35,12 +35,9 @@ class Picker(BrowserPage):
     """Landmark vertices, marker sites and scan correspondences by clicking.
 
     Args:
-        mesh: what is picked on; a rig is picked on at rest and keeps its shapes when saved.
         scan: shown to the right of it, for pairs.
-        out: the folder that *Save* writes to; the page shows it and cannot change it.
         landmark_set: names and order of the landmarks.
         mode: what the first click picks: one of ``MODES``.
-        port: the first to try, 0 for any.
     """
 
     def __init__(
@@ -214,10 +211,6 @@ def save_picks(session: PickSession, folder: str | Path, rig: BlendshapeRig | No
     attachment.json      marker sites, ``Attachment.load``
     correspondences.json pairs of template and scan, :func:`torchface.io.landmarks.picks.load_correspondences`
     ==================== =======================================================================================
-
-    Args:
-        folder: where to; made if missing.
-        rig: the rig whose neutral the session's mesh is, so that its shapes are kept.
 
     Returns:
         The files written.

@@ -36,14 +36,8 @@ _SPREAD = 6
 
 
 class RigViewer(BrowserPage):
-    """A rig in the browser.
-
-    Args:
-        take: weights to play and edit, mapped to the rig's names; one neutral pose if absent.
-        out: where *Save* writes; a path that the page shows and cannot change.
-        detail: wrinkle maps of the rig's shapes, which follow the weights: in motion with few texels, at rest with all.
-        port: the first to try, 0 for any.
-    """
+    """A rig in the browser, neutral or with a take mapped to its names, and wrinkle maps of its shapes, which follow
+    the weights: in motion with few texels, at rest with all."""
 
     def __init__(
         self,

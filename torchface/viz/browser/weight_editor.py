@@ -23,8 +23,6 @@ class WeightEditor:
     .. math:: \Delta_k = \tfrac12 \left(1 + \cos \tfrac{\pi k}{s+1}\right) \Delta_0, \quad |k| \le s
 
     Args:
-        names: the rig's shapes, N.
-        weights: (T,N), finite; one frame of zeros if absent.
         spread: frames on each side that an edit takes along.
         symmetric: an edit of a left shape sets its right twin to the same value, and the other way round.
     """

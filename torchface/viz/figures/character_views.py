@@ -26,11 +26,8 @@ SHOWN = {
 def character_sheet(
     surface: TexturedSurface, shapes: Mapping[str, Tensor], middle: Tensor, span: float, side: int = 300
 ) -> Tensor:
-    """A column a pose of :data:`SHOWN`, a row a view; (3,H,W).
-
-    Args:
-        shapes: by ARKit's names how far each vertex goes, (V,3) of the surface's unit; one that is absent is left out.
-    """
+    """A column a pose of :data:`SHOWN`, a row a view; (3,H,W). By ARKit's names ``shapes`` say how far vertices go,
+    (V,3)."""
     # Turned about a point of the face alone, the back of the head leaves the picture.
     inside = middle - torch.tensor([0.0, 0.0, _INTO_THE_HEAD * span]).to(middle)
     columns = []

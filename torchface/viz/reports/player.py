@@ -77,12 +77,10 @@ class Player:
 
 
 def write_player(player: Player, folder: Path, name: str = "performance") -> str:
-    """Writes ``player.js`` and the data as ``NAME.js`` into a folder.
+    """Writes ``player.js`` and the data as ``NAME.js`` into a folder; gives the HTML that plays it, for
+    ``Section.markup``.
 
     Long takes and high frame rates are thinned to 60 frames a second and 6,000 frames.
-
-    Returns:
-        HTML that plays it in a page of this folder, for ``Section.markup``.
     """
     first = player.takes[0]
     for take in player.takes:

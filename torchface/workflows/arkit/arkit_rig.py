@@ -104,13 +104,10 @@ def make_arkit(
     everything: bool = False,
     progress: Progress | None = None,
 ) -> ArkitRig:
-    """Gives a source those of ARKit's 52 shapes that it lacks, on its own vertices.
+    """Gives a source those of ARKit's 52 shapes that it lacks, or all, on its own vertices.
 
-    Args:
-        source: see :func:`load_source`.
-        template: a rig with ARKit's shapes; the embedded performer if absent.
-        landmarks: of the source, see ``load_scan_landmarks``; its own if absent, else found by its shape.
-        everything: make all of them, also those that it has.
+    They are those of a template, else the embedded performer. Landmarks are given, else the source's own, else found by
+    its shape.
     """
     progress = progress or silent
     rig = None if source.rig is None else source.rig.linear("torchface arkit")
@@ -303,12 +300,7 @@ def _tongue(neutral: Mesh, carried: CarriedShapes) -> dict[str, Tensor]:
 
 
 def published_head(path: Path, components: int | None = None, progress: Progress | None = None) -> HeadModel:
-    """A head model of others with ARKit's shapes as its rig, ready for `fit`, `track`, `register` and `rig`.
-
-    Args:
-        path: see ``load_head_model_file``.
-        components: of its shape, of the largest deviations; all if absent.
-    """
+    """A head model of others with ARKit's shapes as its rig and some or all components of its shape, ready for use."""
     model = load_head_model_file(path)
     made = make_arkit(Source(path, model.neutral, None, model), progress=progress)
     return head_model_of(model, made.rig, components)

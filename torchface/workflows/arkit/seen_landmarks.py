@@ -19,10 +19,7 @@ _FLAT, _TOP = 0.4, 0.18  # of its height: how deep a body is at most, and how mu
 def seen_landmarks(head: Mesh, template: Mesh, progress: Progress) -> Landmarks | None:
     """Vertices of a template and where they lie on a head in any pose and unit; None where no face is seen.
 
-    Args:
-        head: at rest.
-        template: with 68 landmarks; of the embedded performer's topology the finder's other points count, of others the
-            68 without their contour.
+    On the embedded performer's topology the finder's other points count, on others the 68 without their contour.
     """
     reference, search = character_search()
     points = search.reference

@@ -86,9 +86,6 @@ def on_cluster(
     Each item takes one CPU, and as many are under way as the cluster has, so that millions do not fill its memory.
     Where a process or a machine is lost its items are given to others, four attempts in all. At the time limit the
     item's process ends.
-
-    Args:
-        job: what is done with each; travels once to each machine.
     """
     ray = _import_ray()
     started_here = not ray.is_initialized()

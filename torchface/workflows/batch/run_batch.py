@@ -90,11 +90,7 @@ def run_batch(
     died, the time limit) is tried again.
 
     Args:
-        job: what is done with each.
         out: the folder of results, made where it is missing; not one that holds items.
-        options: where the items are worked on.
-        progress: called with how many items are done, and of how many; those of an earlier run count at once.
-        finished: called with each item's outcome, those of an earlier run first.
     """
     options.check()
     folder, progress = Path(out).resolve(), progress or silent

@@ -121,12 +121,9 @@ class Character:
 
 
 def load_character(path: str | Path | None = None, table: Path | None = None, progress: Progress = silent) -> Character:
-    """Reads a character.
+    """Reads a ``.glb`` or ``.vrm`` as it is, or what else holds a rig, or the embedded performer.
 
-    Args:
-        path: a ``.glb`` or ``.vrm``, which is taken as it is, or what else holds a rig; the embedded performer if
-            absent.
-        table: for shapes of other names than ARKit's; see :func:`torchface.capture.retargeting.load_shape_rules`.
+    A table (``load_shape_rules``) is for shapes of other names than ARKit's.
     """
     whole = path is not None and Path(path).suffix.lower() in _GLB
     name = "the embedded performer" if path is None else Path(path).name if whole else f"{Path(path).stem}.glb"

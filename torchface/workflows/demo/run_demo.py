@@ -123,11 +123,8 @@ def scene_from(
 ) -> Scene:
     """A scene of the user's own parts; what is not given, the embedded performer gives.
 
-    Args:
-        template: a rig. ICT-FaceKit's folder brings identity modes, and the head is drawn from them.
-        take: a weight take, such as a Live Link Face CSV.
-        target: a neutral of the template's topology; its true rig is then the template's deltas on it.
-        seed: decides the head and whatever else is drawn.
+    A template of ICT-FaceKit brings identity modes, from which the head is drawn by the seed. A target is a neutral of
+    the template's topology; its true rig is then the template's deltas on it.
     """
     played = None if take is None else _weight_take(take)
     generator = torch.Generator().manual_seed(seed)

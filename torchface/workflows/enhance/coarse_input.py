@@ -51,12 +51,10 @@ class InputSettings:
 
 
 def read_coarse(path: Path, model: Mesh, settings: InputSettings, state: Path, progress: Progress) -> CoarseAnimation:
-    """An animation in the model's vertices, from markers, weights, an animated ``.glb``, meshes or a tracked video.
+    """An animation in the model's vertices, from markers, weights, an animated ``.glb``, meshes or a tracked video's
+    folder.
 
-    Args:
-        path: ``.c3d``, ``.trc``, ``.csv`` of markers or weights, ``.glb``, ``.safetensors``, a mesh, a folder of
-            meshes, or the folder of ``torchface track``.
-        state: a folder for what a later run may take up.
+    The folder ``state`` is for what a later run may take up.
     """
     progress("reading the input")
     if is_markers(path):

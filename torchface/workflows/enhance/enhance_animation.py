@@ -58,13 +58,10 @@ class AnimationTargets:
 def animation_targets(
     sequence: MeshSequence, neutral: Tensor, megabytes: float, progress: Progress
 ) -> AnimationTargets:
-    r"""Every frame (T,V,3) as a target where these are small enough, else as few principal components as show it.
+    r"""Every frame (T,V,3) as a target where these take no more megabytes, else as few principal components as show it.
 
     Components are those of frames spread over the animation, as many as leave 0.005 mm, root mean square, or as fit.
     Their weights in all frames are projections: no frame is left out.
-
-    Args:
-        megabytes: that the targets may take, not counting what glTF leaves out of them because it is still.
     """
     frames, vertices = sequence.shape[:2]
     most = int(megabytes * 1e6 // (_BYTES_A_VERTEX * vertices))

@@ -58,12 +58,8 @@ def check_space(out: Path, frames: int, vertices: int, colors: bool) -> None:
 def enhance_frames(
     animation: CoarseAnimation, model: EnhancementModel, out: Path, state: Path, key: str, progress: Progress
 ) -> EnhancedFrames:
-    """Enhances an animation into files of a folder.
-
-    Args:
-        state: a folder for what a killed run leaves to the next.
-        key: of everything that the frames come from; what another key left is made anew.
-    """
+    """Enhances an animation into files of a folder; the folder ``state`` keeps what a killed run leaves to the next
+    of one key."""
     make_folder(out)
     make_folder(state)
     count, vertices = animation.count, len(model.neutral)

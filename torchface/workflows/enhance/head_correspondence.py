@@ -96,12 +96,8 @@ class HeadCorrespondence:
 def find_correspondence(
     head: Mesh, model: Mesh, pairs: Path | None, path: Path, state: Path, progress: Progress
 ) -> HeadCorrespondence:
-    """Aligns a head at rest with the model's and bends it onto its surface.
-
-    Args:
-        pairs: places known by the user, for a head of another topology; by registration if absent.
-        state: a file that keeps the correspondence for a later run of the same.
-    """
+    """Aligns a head at rest with the model's and bends it onto its surface, by pairs for one of another topology,
+    else by registration; the file ``state`` keeps the correspondence for a later run."""
     if has_topology_of(head, model):
         vertices, target = head.vertices.double(), model.vertices.double()
         pose = similarity_transform(vertices[None], target[None])

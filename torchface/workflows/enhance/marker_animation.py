@@ -76,13 +76,11 @@ def check_attachment(attachment: Attachment, path: Path, rig: BlendshapeRig | No
 def marker_animation(
     path: Path, sites: MarkerSites, model: Mesh, neutral: int | None, options: MarkerOptions
 ) -> CoarseAnimation:
-    """A take of markers, spread over the model by the thin shell.
+    """A take of markers, spread over the model by the thin shell; motion counts from the frame ``neutral``, else from
+    the sites.
 
-    A marker that is not seen in a frame holds nothing there. Frames that show fewer than 12 are interpolated
-    from those before and after.
-
-    Args:
-        neutral: a frame with the face at rest, from which motion counts; else from the sites.
+    A marker that is not seen in a frame holds nothing there. Frames that show fewer than 12 are interpolated from those
+    before and after.
     """
     take, notes = read_markers(path, sites.attachment.labels, options)
     if take.seconds is not None:

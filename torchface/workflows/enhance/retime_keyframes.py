@@ -104,11 +104,8 @@ def retime_keyframes(
 
     Args:
         first, last: the motion's ends, in the model's topology.
-        frames: how many it lasts, both counted.
-        model_name: the actor's model, by name or folder.
         out: folder for ``retimed.safetensors``, which ``torchface enhance`` takes, ``retimed.glb`` (a morph target a
             region, exact), ``timing.csv`` and the page.
-        fps: frames a second; the model's if absent.
         extend: time it as the whole captured motion of which the keyframes meet a part.
 
     Source: Facial Performance Enhancement Using Dynamic Shape Space Analysis, section 6.2.

@@ -56,12 +56,8 @@ class RigOnModel:
 def rig_on_model(
     rig: BlendshapeRig, path: Path, model: Mesh, pairs: Path | None, state: Path, progress: Progress
 ) -> RigOnModel:
-    """Finds how a rig lies on a model's mesh: by its vertices if they are the model's, else by registration or pairs.
-
-    Args:
-        pairs: vertices of the rig and where they lie on the model; found by registration if absent.
-        state: a file that keeps the correspondence for a later run of the same.
-    """
+    """Finds how a rig lies on a model's mesh: by its vertices if they are the model's, else by pairs or
+    registration, which the file ``state`` keeps for a later run."""
     correspondence = find_correspondence(rig.neutral, model, pairs, path, state, progress)
     progress("setting up the thin shell")
     dense = correspondence.carrier(rig.neutral, model, path)

@@ -280,12 +280,10 @@ def bake_region_maps(
     size: int,
     progress: Progress,
 ) -> RegionMaps:
-    """Bakes the actor's face at rest, and with each map of displacements everywhere at 1.
+    """Bakes the actor's face at rest, and with each map of displacements (M,3,V), along the neutral's tangents and
+    normal, at 1.
 
-    Args:
-        displacements: of the maps, (M,3,V), millimetres along two tangents and the normal of the model's neutral.
-        shares: of the regions in the rig's vertices, (R,N).
-        scale: from the rig's millimetres to the model's.
+    ``shares`` (R,N) are of the regions in the rig's vertices, ``scale`` is from the rig's millimetres to the model's.
     """
     still = Similarity(
         torch.ones(1, dtype=torch.float64),

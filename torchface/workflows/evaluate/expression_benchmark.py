@@ -83,14 +83,10 @@ class ExpressionBenchmark:
 def expression_benchmark(
     results: Path, films: Path, out: Path, progress: Progress | None = None
 ) -> ExpressionBenchmark:
-    """Compares weights of films with the truth, and writes figures and a report.
+    """Compares weights of films with the truth, ``FILM.csv`` in a folder, and writes figures and a report.
 
-    Args:
-        results: a folder with ``FILM.csv`` or ``FILM/live_link.csv`` of each film, as any program writes Live Link's
-            curves or ``torchface`` its weights; or a folder of such folders, one a method. An empty column says that
-            the method does not give the shape.
-        films: a folder with the true weights of each film, ``FILM.csv``.
-        out: folder for ``methods.csv``, ``shapes.csv`` and the report ``index.html``.
+    Results are a folder with ``FILM.csv`` or ``FILM/live_link.csv`` of each film, or a folder of such folders, one a
+    method. An empty column says that the method does not give the shape.
     """
     progress = progress or silent
     with within_job(out):

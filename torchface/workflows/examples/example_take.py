@@ -111,15 +111,7 @@ def track_by_examples(
     face: int = 0,
     progress: Progress | None = None,
 ) -> ExampleTake:
-    """Tracks a face and solves it by examples; all three methods are measured on it.
-
-    Args:
-        video: a file; may be left out where ``landmarks`` is a table of them.
-        examples: what ``torchface examples`` wrote, of one person or several.
-        out: the folder for ``weights.csv``, ``landmarks.csv``, ``methods.csv`` and ``overlay.mp4``.
-        method: whose weights are written and drawn.
-        landmarks: what finds them, or a ``.csv`` that holds them.
-    """
+    """Tracks a face and solves it by examples; all three methods are measured on it."""
     progress = progress or silent
     if not examples:
         raise ValueRangeError("track: found no examples, expected what `torchface examples` wrote (--examples)")

@@ -27,12 +27,10 @@ Say = Callable[[str], None]  # takes a sentence for the person
 def guided_examples(
     camera: str, say: Say, seconds: float = SECONDS, landmarks: str = DEFAULT_LANDMARKS
 ) -> ExampleShapes:
-    """The paper's 16 expressions of the person before a camera; of each the frame in which they are calmest.
+    """The paper's 16 expressions of the person before a camera, or in a film of one; of each the frame in which they
+    are calmest.
 
-    Args:
-        camera: a camera's number, or a video file that was recorded to the same clock, read at once.
-        say: called with what the person should do, and the count-down.
-        seconds: for each expression.
+    ``say`` is called with what the person should do, for so many seconds each, and the count-down.
     """
     checked_number("--seconds", seconds, 0.1, 60.0)
     tracker = LandmarkTracker(load_finder(landmarks).finder)

@@ -19,12 +19,8 @@ from torchface.workflows.track.head_rotations import head_rotations
 
 
 class ExamplesSolver:
-    """Solves frames by example expressions, as the dissertation's program does, for ARKit's weights and a turned head.
-
-    Args:
-        examples: what ``torchface examples`` wrote; of several people the mean is taken.
-        method: all shapes at once, the head first and then regions, or by a linear model of landmarks.
-    """
+    """Solves frames by examples, of several people by their mean, as the dissertation's program, for ARKit's weights
+    and a turned head."""
 
     names = ARKIT
 

@@ -22,12 +22,10 @@ _MOST = 256
 def picture_examples(
     pictures: Sequence[Path], landmarks: str = DEFAULT_LANDMARKS, progress: Progress = silent
 ) -> ExampleShapes:
-    """Examples of the person in pictures.
+    """Examples of the person in pictures: files, or one folder of them.
 
-    Args:
-        pictures: files, or one folder of them. Where names say what they show (``neutral.png``, ``pucker.jpg``, ARKit's
-            ``jawOpen.png``, digits before a name left out), any order and choice that has a neutral; otherwise the
-            paper's 16 in its order.
+    Where names say what they show (``neutral.png``, ``pucker.jpg``, ARKit's ``jawOpen.png``, digits before a name left
+    out), any order and choice that has a neutral; otherwise the paper's 16 in its order.
     """
     files = _files(pictures)
     names = _names(files)

@@ -50,11 +50,7 @@ def misfits(fit: ImageFit) -> Tensor:
 
 
 def strange_lines(photographs: Sequence[Path], fit: ImageFit) -> list[str]:
-    """Which found landmarks no head of the model explains, for people to read.
-
-    Args:
-        photographs: the files, I of them.
-    """
+    """Which found landmarks of the photographs' no head of the model explains, for people to read."""
     # A contour that a model cannot follow is the model's fault.
     inner = fit.residuals[:, JAW:].square().sum(-1).nanmean(1).sqrt() / eyes_distances(fit.landmarks)
     return [
@@ -68,14 +64,8 @@ def strange_lines(photographs: Sequence[Path], fit: ImageFit) -> list[str]:
 def one_person_lines(
     photographs: Sequence[Path], marks: Tensor, bare: BareFit, insist: bool = False, expected: float = ONE_PERSON
 ) -> list[str]:
-    """Whether photographs that were fitted together show one person, for people to read; nothing if they do.
-
-    Args:
-        photographs: the files, I of them.
-        marks: their landmarks, (I,68,2).
-        insist: report it only.
-        expected: the probability from which on nothing is said.
-    """
+    """Whether photographs that were fitted together show one person, for people to read; nothing if that is as
+    likely as expected."""
     if len(photographs) < 2:
         return []
     alone = [bare(marks[i : i + 1], [i]) for i in range(len(marks))]
@@ -102,14 +92,8 @@ def one_person_lines(
 def landmark_lines(
     photographs: Sequence[Path], images: Sequence[Tensor], marks: Tensor, finder: str | Path, bare: BareFit
 ) -> list[str]:
-    """Which given landmarks do not fit, and how those that are found do, for people to read.
-
-    Args:
-        photographs: the files, I of them.
-        images: they, (3,H,W).
-        marks: the landmarks given, (I,68,2).
-        finder: finds landmarks; by name or folder.
-    """
+    """Which given landmarks (I,68,2) of photographs (3,H,W) do not fit, and how those that are found do, for people
+    to read."""
     lines = []
     for i, misfit in enumerate(
         misfits(bare(marks, list(range(len(marks))))).tolist()

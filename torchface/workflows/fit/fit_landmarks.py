@@ -23,12 +23,10 @@ from torchface.workflows.named_finders import DEFAULT_LANDMARKS, load_finder
 
 
 def landmarks_of(photographs: Sequence[Path], files: Sequence[Path], face: int | None = None) -> list[Tensor]:
-    """The landmarks (68,2) of each photograph: a file each, or one of dlib's XML that names them, or a table.
+    """The landmarks (68,2) of each photograph: a file each, or one of dlib's XML that names them, or a table, a row
+    each.
 
-    Args:
-        files: of landmarks; a table has a row a photograph.
-        face: which of several in an XML, from 0, numbered as where no file is given: as they are detected, the largest
-            first; after them those that are not detected.
+    ``face`` is which of several in an XML, as they are detected, the largest first, then those that are not.
     """
     if not photographs:
         raise NameMismatchError("fit: found no photograph, expected one at least")
@@ -67,13 +65,8 @@ def _rows_of(table: Path, photographs: Sequence[Path]) -> list[Tensor]:
 
 
 def check_inside(photographs: Sequence[Path], landmarks: Tensor, sizes: Sequence[tuple[int, int]]) -> None:
-    """Refuses landmarks of which most lie outside their photograph, as those counted before it was turned upright may.
-
-    Args:
-        photographs: image files, P.
-        landmarks: (P,L,2) pixels; NaN where there is none.
-        sizes: width and height of each photograph, upright.
-    """
+    """Refuses landmarks (P,68,2) of which most lie outside their photograph, as those counted before it was turned
+    upright."""
     for photograph, points, (width, height) in zip(photographs, landmarks, sizes, strict=True):  # sizes differ
         points = points[points.isfinite().all(-1)]
         inside = (points >= -0.5).all(-1) & (points < points.new_tensor([width, height]) - 0.5).all(-1)
@@ -196,14 +189,7 @@ def find_in_photographs(
     model: str | Path = DEFAULT_LANDMARKS,
     face: int | None = None,
 ) -> list[PhotographLandmarks]:
-    """Finds one face in each photograph.
-
-    Args:
-        photographs: the files, for what is said.
-        images: they, (3,H,W) in [0,1].
-        model: of landmarks, by name or folder.
-        face: which one of each, from 0, the largest first; the largest if absent.
-    """
+    """Finds one face in each photograph (3,H,W), the largest, or which of them by number, the largest first."""
     named = load_finder(model, photographs=True, option="landmark model")
     finder = named.finder
     readings = []

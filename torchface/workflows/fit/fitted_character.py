@@ -55,17 +55,10 @@ def dressed_rig(
     marks: Tensor,
     whole: bool,
 ) -> DressedRig:
-    """A fitted rig with the skin of its photographs.
+    """A fitted rig with the skin of its photographs; ``template`` has the parts that nobody sees in them.
 
-    Args:
-        rig: with the fit's head and shapes.
-        template: whose parts nobody sees in photographs.
-        fit: with its skin.
-        images: the photographs, (3,H,W) each.
-        parts: what each shows.
-        marks: the landmarks in each, (I,68,2) pixels.
-        whole: as a character with teeth, tongue, lashes, hair and collar, for rigs of the performer's topology; the
-            photographs' brows are its only ones.
+    A ``whole`` one is a character with teeth, tongue, lashes, hair and collar, for rigs of the performer's topology;
+    the photographs' brows are its only ones.
     """
     # Photographs show little of eyeballs and teeth: parts of their own keep the template's skin.
     unseen = hidden_parts(template.neutral, torch.zeros(len(template.vertices), dtype=torch.bool))
@@ -128,13 +121,9 @@ def _pixels(images: Sequence[Tensor], parts: Sequence[FaceParts], name: str, sha
 
 
 def hangs_down(parts: Sequence[FaceParts], marks: Tensor) -> bool:
-    """Whether photographs show hair beside the neck that grows on the head.
+    """Whether photographs, with landmarks (I,68,2), show hair beside the neck that grows on the head.
 
     Of a face that is turned the near side counts: beside the other lies what stands behind the head.
-
-    Args:
-        parts: what each shows.
-        marks: the landmarks in each, (I,68,2) pixels; NaN for missing.
     """
     found = []
     for shown, points in zip(parts, marks.double(), strict=True):

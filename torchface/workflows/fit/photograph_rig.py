@@ -273,14 +273,8 @@ def _pictures(
 
 
 def overlay(fit: ImageFit, view: int, image: Tensor, marks: Tensor, rig: BlendshapeRig | None = None) -> Tensor:
-    """A photograph, the head before it with its skin, and the landmarks: found green, fitted red; (3,H,W), cut to it.
-
-    Args:
-        fit: of I photographs.
-        image: it, (3,H,W).
-        marks: its landmarks, (68,2).
-        rig: the person's, with the fit's shapes first; the fit's head if absent.
-    """
+    """A photograph, the head before it with its skin, and landmarks (68,2): found green, fitted red; (3,H,W), cut to
+    it."""
     camera, corner = _cut(fit.cameras[view], marks)
     posed = fit.posed[view]
     if rig is not None:

@@ -52,11 +52,8 @@ _PARTS = {"nose": slice(27, 36), "mouth": slice(48, 68)}
 
 
 def picture_lines(found: PhotographLandmarks, insist: bool = False) -> list[str]:
-    """What speaks against a photograph, for people to read; nothing where it shows one face well.
-
-    Args:
-        insist: report also what is refused otherwise.
-    """
+    """What speaks against a photograph, for people to read, refused or, insisted on, not; nothing where it shows one
+    face well."""
     face, name = found.face, found.photograph.name
     eyes = float((face.landmarks[36] - face.landmarks[45]).norm())
     hidden = _hidden_parts(found)
@@ -116,12 +113,7 @@ def profile_lines(fit: ImageFit) -> list[str]:
 
 
 def cover_lines(photograph: Path, parts: FaceParts, landmarks: Tensor) -> list[str]:
-    """What stands before a face, for people to read; nothing where nothing does.
-
-    Args:
-        parts: what it shows.
-        landmarks: of the face, (68,2) pixels; NaN for missing.
-    """
+    """What stands before a face with landmarks (68,2), for people to read; nothing where nothing does."""
     face = _inside(parts, landmarks)
     lines = []
     for name, (least, words) in _COVERS.items():
@@ -132,13 +124,7 @@ def cover_lines(photograph: Path, parts: FaceParts, landmarks: Tensor) -> list[s
 
 
 def light_lines(photograph: Path, image: Tensor, parts: FaceParts, landmarks: Tensor) -> list[str]:
-    """What a photograph's light keeps from the skin's own colour, for people to read; nothing in good light.
-
-    Args:
-        image: the photograph, (3,H,W) in [0,1].
-        parts: what it shows.
-        landmarks: of the face, (68,2) pixels; NaN for missing.
-    """
+    """What a photograph's light keeps from the skin's own colour, for people to read; nothing in good light."""
     lines, gain, needed = list[str](), exposure_gain(image, parts), needed_gain(image, parts)
     if needed > _TOO_DARK:
         lines.append(
@@ -194,13 +180,7 @@ def _hidden_parts(found: PhotographLandmarks) -> dict[str, float]:
 
 
 def color_lines(photograph: Path, image: Tensor, parts: FaceParts, landmarks: Tensor) -> list[str]:
-    """What colours and grain of the skin say against a photograph of a person, for people to read.
-
-    Args:
-        image: the photograph, (3,H,W) in [0,1].
-        parts: what it shows.
-        landmarks: of the face, (68,2) pixels; NaN for missing.
-    """
+    """What colours and grain of the skin say against a photograph of a person, for people to read."""
     marks = landmarks.double()
     face = _inside(parts, marks)
     crop = cut_crop((255 * image[:3].clamp(0, 1)).byte(), parts.transform, len(face)).double() / 255

@@ -34,14 +34,8 @@ class VideoPictures:
 def video_pictures(
     video: Path, rest: Tensor, progress: Progress, model: str | Path = DEFAULT_LANDMARKS, face: int = 0
 ) -> VideoPictures:
-    """Chooses frames of a video to fit a head to.
-
-    Args:
-        rest: landmarks of a head at rest, (68,3) millimetres.
-        progress: called with how many frames are read.
-        model: finds landmarks; by name or folder.
-        face: which of several, from 0, the largest first.
-    """
+    """Chooses frames of a video to fit a head, of landmarks (68,3) at rest, to; ``face`` is which of several, the
+    largest first."""
     clip = open_video(video)
     clip.check()
     named = load_finder(model, option="landmark model")

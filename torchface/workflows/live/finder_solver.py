@@ -15,11 +15,8 @@ _USUAL = 1 / 30  # seconds
 
 
 class FinderSolver:
-    """Solves frames for ARKit's weights, as ``WebcamSolver`` does, from what a tracker reads.
-
-    Args:
-        landmarks: what finds landmarks; see :func:`~torchface.workflows.named_finders.load_finder`.
-    """
+    """Solves frames for ARKit's weights, as ``WebcamSolver`` does, from what a tracker reads by a finder
+    (``load_finder``)."""
 
     names = ARKIT
 

@@ -62,11 +62,7 @@ prepared_webcam_graph()
 
 
 class PersonSolver:
-    """Solves frames for ARKit's weights.
-
-    Args:
-        better: gives once a session to go on with, else None.
-    """
+    """Solves frames for ARKit's weights; ``better`` gives once a session to go on with, else None."""
 
     def __init__(self, session: WebcamSession, better: Callable[[], WebcamSession | None] = lambda: None) -> None:
         self._session, self._better = session, better
@@ -164,15 +160,10 @@ def go_live(
     make_solver: Callable[[Progress], FaceSolver],
     progress: Progress | None = None,
 ) -> tuple[LiveReport, list[SavedTake]]:
-    """Solves, sends, records and shows what a camera sees, until it ends or is interrupted.
+    """Solves, sends, records and shows what a camera sees, until it ends or is interrupted: the figures, and what was
+    recorded.
 
-    Args:
-        say: called with what the user should know while it runs, and without a page what a calibration asks for.
-        opened: called with the page's address.
-        make_solver: gives what solves the frames, by ARKit's names; called with the progress of its steps.
-
-    Returns:
-        The figures, and what was recorded.
+    ``say`` is called with what the user should know, ``opened`` with the page's address.
     """
     progress = progress or silent
     for address in settings.addresses:

@@ -61,12 +61,7 @@ _WORTH = 0.25  # frames that leaving one out has to gain
 
 
 class PlayedVideo:
-    """A video file whose frames come at its own rate, as a camera's would.
-
-    Args:
-        path: of the file; its frame rate may vary.
-        settings: whether each frame is given, and whether it begins anew at its end.
-    """
+    """A video file whose frames, at any times, come at its own rate, as a camera's would."""
 
     def __init__(self, path: Path, settings: SourceSettings = _DEFAULT) -> None:
         self.video = replace(open_video(path), even=False)
@@ -115,12 +110,8 @@ class PlayedVideo:
 
 
 def open_source(camera: str, say: Say, settings: SourceSettings = _DEFAULT) -> FrameSource:
-    """A camera by its number, or a video file by its path.
-
-    Args:
-        camera: ``"0"``, ``"1"``, ... or a path.
-        say: called with what happens to the camera on the way.
-    """
+    """A camera by its number, or a video file by its path; ``say`` is called with what happens to the camera on the
+    way."""
     if re.fullmatch("[0-9]{1,3}", camera):
         return Camera(int(camera), say, settings.size)
     return PlayedVideo(Path(camera), settings)
@@ -174,12 +165,8 @@ class FaceSolver(Protocol):
     def names(self) -> tuple[str, ...]: ...
 
     def step(self, picture: np.ndarray, interval: float | None, controls: WebcamControls) -> LiveFrame:
-        """Solves the next frame.
-
-        Args:
-            picture: uint8 (H,W,3), red first.
-            interval: seconds since the frame before; absent for the first.
-        """
+        """Solves the next frame, uint8 (H,W,3), red first, ``interval`` seconds after the last; absent for the
+        first."""
 
 
 def solved_frames(

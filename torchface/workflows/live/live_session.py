@@ -53,9 +53,6 @@ class LiveSession:
     """The loop over frames, and what a page may ask of it meanwhile.
 
     Args:
-        solver: by ARKit's names.
-        streams: where weights are sent to.
-        recordings: what keeps them when asked to.
         notes: called with what the user should know.
         prompt: called with what a guided calibration asks for, each time that changes.
         watch: says what the user should know of the source.
@@ -218,11 +215,7 @@ class LiveSession:
                 self._recordings.stop(self._notes)
 
     def run(self, seconds: float | None = None, progress: Progress | None = None) -> None:
-        """Goes through the frames until they or the seconds end, or an interrupt comes.
-
-        Args:
-            seconds: after which it ends.
-        """
+        """Goes through the frames until they or the seconds end, or an interrupt comes."""
         progress, before = progress or silent, None
         try:
             for came, picture, solved in solved_frames(self._source, self._solver, self._controls):

@@ -49,12 +49,7 @@ class LiveView:
 
 
 class TakeUpload:
-    """A take that a page hands over in parts.
-
-    Args:
-        name: for people.
-        size: bytes of all parts.
-    """
+    """A take of ``size`` bytes that a page hands over in parts; its name is for people."""
 
     def __init__(self, name: str, size: object) -> None:
         if not isinstance(size, int) or not 0 < size <= _LARGEST_TAKE or size % (4 * ROW):

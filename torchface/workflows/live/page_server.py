@@ -65,11 +65,8 @@ class LiveDesk(Protocol):
 
 
 class Preparing:
-    """A session's desk before there is a session: the page says what is being made.
-
-    Args:
-        progress: of the program; it gets the same steps.
-    """
+    """A session's desk before there is a session: the page says what is being made, with the steps of the program's
+    progress."""
 
     def __init__(self, progress: Progress) -> None:
         self.wishes: dict[str, Any] = {}
@@ -114,13 +111,7 @@ class Preparing:
 
 
 class PageServer:
-    """Serves the page until it is stopped.
-
-    Args:
-        character: ``character.glb`` and ``character.json``, by name.
-        takes: gives the rows of a take by its name.
-        port: the first to try, 0 for any.
-    """
+    """Serves the page until it is stopped; ``takes`` gives the rows of a take by its name."""
 
     def __init__(self, folder: Path, character: Mapping[str, bytes], takes: Reply, desk: LiveDesk, port: int) -> None:
         self._folder, self._character, self._takes, self._desk = folder, character, takes, desk

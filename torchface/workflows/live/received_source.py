@@ -30,12 +30,8 @@ _CUTOFF, _SPREAD, _SPEED = 9.0, 9.0, 10.0  # Hz without smoothing, by how much l
 
 
 class ReceivedSource:
-    """Faces as a source of frames; while none come, ticks go on so that the last one can relax.
-
-    Args:
-        address: see :class:`torchface.io.protocols.weight_receiver.WeightReceiver`.
-        every: give each face, as for a recording; else of those that wait the newest.
-    """
+    """Faces (``WeightReceiver``) as a source of frames, each or the newest of those that wait; while none come,
+    ticks go on so that the last one can relax."""
 
     def __init__(self, address: str, every: bool = False) -> None:
         self.receiver = WeightReceiver(address)
@@ -70,11 +66,8 @@ class ReceivedSource:
 
 
 class ReceivedSolver:
-    """What a received face is for the session: corrected for the person, smoothed, held and relaxed while it is lost.
-
-    Args:
-        say: called with guided poses that were not held.
-    """
+    """What a received face is for the session: corrected for the person, smoothed, held and relaxed while it is
+    lost."""
 
     names = ARKIT
 
@@ -128,11 +121,7 @@ class ReceivedSolver:
 
 
 class ReceivedWatch:
-    """Words about the sender, for the status line; each change is said.
-
-    Args:
-        say: called with a change.
-    """
+    """Words about the sender, for the status line; each change is said."""
 
     def __init__(self, source: ReceivedSource, say: Say) -> None:
         self._source, self._say = source, say

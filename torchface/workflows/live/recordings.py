@@ -43,13 +43,7 @@ def _columns(names: Sequence[str]) -> int:
 
 
 class FrameLog:
-    """A temporary file in a folder, a row of numbers a frame; it goes when the log is closed.
-
-    Args:
-        folder: where there is space; it must exist.
-        names: of the weights, (N,).
-        columns: numbers a frame in the files that are made of it; those of one table if absent.
-    """
+    """A temporary file in a folder that exists, a row of numbers a frame; it goes when the log is closed."""
 
     def __init__(self, folder: Path, names: tuple[str, ...], columns: int | None = None) -> None:
         self.names, self.count = names, 0
@@ -88,11 +82,7 @@ class FrameLog:
                 )
 
     def take(self, fps: float) -> Take:
-        """The frames, as they lie on the disk: valid until the log is closed.
-
-        Args:
-            fps: where times do not say: of a single frame.
-        """
+        """The frames, as they lie on the disk: valid until the log is closed; ``fps`` is a single frame's."""
         if self.count == 0:
             raise ValueRangeError("recording: found no frame, expected at least one")
         try:
@@ -140,13 +130,8 @@ class SavedTake:
 
 
 class Recordings:
-    """The takes of one session; frames go to the disk as they come, files are made when a take ends.
-
-    Args:
-        folder: of the first take; later ones lie in it as ``take_2`` and so on.
-        source: names the camera or video in the summary.
-        fps: frames a second, where the frames do not say.
-    """
+    """The takes of one session, in ``folder``, later ones in ``take_2`` of it; frames go to the disk as they come,
+    files are made when a take ends."""
 
     def __init__(self, folder: Path, character: Character, source: str, fps: float) -> None:
         self._folder, self._given, self._source, self._fps = folder, character, source, fps
@@ -183,12 +168,7 @@ class Recordings:
         self._character = self._given.renamed(meanings)
 
     def start(self, place: Path | None = None, filmed: bool = False) -> Path:
-        """Begins a take and returns its folder.
-
-        Args:
-            place: whose files it replaces; a new one if absent.
-            filmed: keep the camera's film too.
-        """
+        """Begins a take, maybe with the camera's film, and returns its folder; it replaces the files of ``place``."""
         self._place = place or self._next()
         self._begun.add(self._place)
         self._log, self._found = self._new_log(self._place), 0
@@ -224,11 +204,8 @@ class Recordings:
             self._film.add(came, picture)
 
     def stop(self, say: Say | None = None) -> None:
-        """Ends the take that runs; its files are made beside what goes on, see :meth:`finish`.
-
-        Args:
-            say: called, in another thread, with how that ended.
-        """
+        """Ends the take that runs; its files are made beside what goes on, and how that ends is said in another
+        thread."""
         log, self._log = self._log, None
         film, self._film = self._film, None
         if log is None:

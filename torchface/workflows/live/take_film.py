@@ -23,11 +23,7 @@ _OPTIONS = {"preset": "ultrafast", "crf": "18"}
 
 
 class TakeFilm:
-    """A film that is written in a thread of its own, each picture at its time; nothing of it can end the session.
-
-    Args:
-        path: where it lies once it is complete.
-    """
+    """A film that is written in a thread of its own, each picture at its time; nothing of it can end the session."""
 
     def __init__(self, path: Path) -> None:
         self.problem = ""

@@ -45,10 +45,6 @@ class WeightControls:
         .. math:: w' = \mathrm{clip}\big(g \max(0, w - d) / (1 - d), 0, 1\big)
 
         .. math:: R' = R \, R_0^T \, \mathrm{diag}(1, -1, -1)
-
-        Args:
-            solved: weights by ARKit's names.
-            interval: seconds since the frame before.
         """
         settings, before = self.settings, self._before
         if settings.frozen and before is not None:

@@ -17,11 +17,7 @@ _MAP = re.compile(r"(?<=[?&])map=[^&]*&?")
 
 
 class MappedSender:
-    """A sender that gets weights by other names, after a mapping table.
-
-    Args:
-        sender: of the weights by the table's names.
-    """
+    """A sender that gets weights by other names, after a mapping table."""
 
     def __init__(self, sender: FrameSender, shapes: ShapeMap) -> None:
         self._sender, self._shapes, self.address = sender, shapes, sender.address
@@ -45,10 +41,6 @@ def mapped_sender(address: str, names: Sequence[str], fps: float) -> FrameSender
 
     The table's names are what VMC, VRChat and plain OSC then send; the other protocols have names of their own, which
     must be among them.
-
-    Args:
-        address: see :func:`torchface.io.open_sender`.
-        names: of the weights that come, (N,).
     """
     parts = parse_address(address)
     if "map" not in parts.options:
@@ -66,13 +58,7 @@ def mapped_sender(address: str, names: Sequence[str], fps: float) -> FrameSender
 
 
 class WeightStreams:
-    """Senders to several addresses.
-
-    Args:
-        addresses: see :func:`torchface.io.open_sender`.
-        names: of the weights, (N,).
-        say: called once with a receiver that refuses packets, or that the network no longer reaches.
-    """
+    """Senders to several addresses; says once which receiver refuses packets, or is not reached any more."""
 
     def __init__(self, addresses: Sequence[str], names: Sequence[str], fps: float, say: Callable[[str], None]) -> None:
         self._say, self._sent = say, 0

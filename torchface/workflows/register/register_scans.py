@@ -72,13 +72,9 @@ def register_scans(
     """Registers scans one by one into a folder: ``NAME.glb`` and ``records/NAME.json`` of each, a table and a sheet.
 
     Args:
-        template: a face, millimetres.
         scans: files and folders; a folder stands for the scans in it, sorted by name.
         out: the folder to write into, made where it is missing; not one that holds scans or landmarks.
-        settings: where the scans' landmarks are, and how each is registered.
-        options: how many processes, or which cluster, and how long each scan may take.
         progress: called with how many scans are done, and of how many; those of an earlier run count at once.
-        finished: called with each scan's outcome, those of an earlier run first.
     """
     landmarks, detector, model = settings.landmarks, settings.detector, settings.model
     check_template(template)

@@ -68,14 +68,8 @@ class RelightSettings:
 def relight_film(
     film: Path, track: Path, out: Path, settings: RelightSettings, progress: Progress | None = None
 ) -> list[str]:
-    """Reads a film and its track, and writes the film anew.
-
-    Args:
-        track: the folder that ``torchface track`` wrote of it.
-        settings: what it is to show.
-
-    Returns:
-        Lines for people to read.
+    """Reads a film and the folder that ``torchface track`` wrote of it, and writes the film anew; gives lines for
+    people.
 
     Source: thesis 4.2.11 and figure 80.
     """

@@ -110,14 +110,11 @@ def rig_actor(
     the scan, its mesh.
 
     Args:
-        scan: the actor at rest, any topology and pose.
-        out: the file or folder to write; see ``save_rig``.
         landmarks: of the scan; see ``load_scan_landmarks``. Found by shape alone if absent.
         examples: a folder of scans of expressions; see ``expressions_in``. Landmark files named as the scans may lie
             beside them.
         detail: a folder of high-resolution scans, named for the one shape that each shows at full strength, and
             ``neutral``.
-        options: how the files are read and what is made of them.
     """
     check_out(out)
     if detail is not None and out.suffix.lower() == MAYA_ENDING:
@@ -200,12 +197,7 @@ def _rig_actor(
 
 
 def load_expressions(name_or_path: str | Path, template: BlendshapeRig, path: Path | None) -> ExpressionRegression:
-    """A regression of expressions for the template's topology.
-
-    Args:
-        name_or_path: see ``zoo.get_model``.
-        path: where the rig was read; None for the embedded performer.
-    """
+    """A regression of expressions for the template's topology; ``path`` is None for the embedded performer."""
     model = zoo.get_model(name_or_path, ExpressionRegression)
     wanted, named = template.neutral.fingerprint(), "the embedded performer" if path is None else str(path)
     if (model.topology or wanted) != wanted or len(model.neutral_mean) != len(template.vertices):

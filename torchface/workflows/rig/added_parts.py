@@ -53,13 +53,8 @@ def added_parts(
     registration: Registration,
     wanted: tuple[bool, bool],
 ) -> AddedParts:
-    """The parts that a character lacks.
-
-    Args:
-        face: where it is.
-        registration: of the template with ``face.skin``.
-        wanted: the inside of the mouth, and eyes.
-    """
+    """The ``wanted`` parts, the inside of the mouth and eyes, that a character lacks, by the template registered to
+    its skin."""
     fitting = _Fitting(character, face, template, registration)
     if wanted[0]:
         fitting.add_mouth()

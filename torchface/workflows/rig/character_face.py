@@ -82,12 +82,7 @@ def textured(character: Character) -> TexturedSurface:
 def find_character_face(
     character: Character, surface: TexturedSurface, progress: Progress | None = None
 ) -> CharacterFace:
-    """The face of a character.
-
-    Args:
-        character: in any unit and pose.
-        surface: the same, to be looked at.
-    """
+    """The face of a character, in any unit and pose, which the surface shows."""
     reference, search = character_search()
     framed = None if character.head is None else character.head > _HEAD_SHARE
     found = search.find(surface, framed, progress)

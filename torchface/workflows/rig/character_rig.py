@@ -65,16 +65,8 @@ _CONVERT = {
 
 @dataclass(frozen=True, eq=False)
 class CharacterReport:
-    """What was found on a character and made for it.
-
-    Args:
-        made: names of the shapes that were made.
-        present: of ARKit's names those that the character has, and how it calls them.
-        expressions: of a VRM, those that were added.
-        median_mm: between face and template, at a head's size.
-        seconds: that finding the face took, and all.
-        figure: pictures of the face before and after; None where there was nothing to make.
-    """
+    """What was found on a character and made for it; ``made`` and ``present`` by ARKit's names, ``expressions`` a
+    VRM's."""
 
     made: tuple[str, ...]
     present: dict[str, tuple[str, ...]]
@@ -102,8 +94,6 @@ def rig_character(
     seen.
 
     Args:
-        path: a ``.glb`` or ``.vrm``.
-        out: the file to write, of the same ending.
         inner_mouth: give it a bag, teeth, gums and a tongue where it has none; lips in one piece are cut apart.
         eyes: give it eyeballs where it has none; eyes in one piece with the skin are cut out.
     """

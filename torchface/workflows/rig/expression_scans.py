@@ -69,9 +69,6 @@ def expressions_in(folder: Path, names: Sequence[str]) -> list[Expression]:
 
     Without ``weights.csv`` each file's name gives what it shows: shapes joined by ``+``, each with ``=WEIGHT`` where
     that is not 1. A file named ``neutral`` is left out.
-
-    Args:
-        folder: scans, and ``weights.csv`` where the names do not give it.
     """
     if not folder.is_dir():
         raise FileFormatError(f"{folder}: found no such folder, expected one with scans: {LAYOUT}")
@@ -143,11 +140,6 @@ def check_side(actor: BlendshapeRig, weights: Tensor, found: Tensor, seen: Tenso
     count, nor does what slides along the skin, which no registration sees.
 
     A head alone looks like another head when it is mirrored; an expression of one side does not.
-
-    Args:
-        weights: of the expression, (N,).
-        found: the registered vertices, aligned with the rig, (V,3).
-        seen: vertices that the scan shows, (V,) bool.
     """
     weights = weights.to(actor.deltas)
     swapped = weights[mirror(actor.names).to(weights.device)]

@@ -31,11 +31,8 @@ class Loop:
 
     @staticmethod
     def of(vertices: Tensor, places: Tensor, top: int | None = None) -> "Loop":
-        """Of vertices in order, whichever way round they run; a half of the way lies above.
-
-        Args:
-            top: a vertex that is of the upper edge; if absent, the edge that lies higher is the upper one.
-        """
+        """Of vertices in order, either way round; a half of the way lies above: that with the vertex ``top``, else
+        the higher."""
         x = places[vertices, 0]
         ordered = vertices.roll(-int(x.argmax()))
         right = int(places[ordered, 0].argmin())
@@ -60,12 +57,7 @@ class Loop:
 
 
 class OpenedFace:
-    """A face's mesh, opened where that is asked for; places are in the template's space.
-
-    Args:
-        rest: vertices, (V,3) float64.
-        skin: which vertices are of the skin, (V,) bool.
-    """
+    """A face's mesh, its vertices (V,3) float64, opened where that is asked for; places are in the template's space."""
 
     def __init__(self, rest: Tensor, faces: Tensor, skin: Tensor) -> None:
         self._rest, self._skin = rest, skin

@@ -62,14 +62,8 @@ def predict_rig(
     options: RigOptions | None = None,
     progress: Progress | None = None,
 ) -> PredictedRig:
-    """Makes a rig of a head in the template's topology and writes it, with a report ``NAME_shapes/index.html``.
-
-    Args:
-        out: the file or folder to write; see ``save_rig``.
-        expressions: the regression, by name or folder.
-        template: a rig; the embedded performer if absent.
-        options: ``part``, ``unit`` and ``names`` are used.
-    """
+    """Makes a rig of a head in the topology of a template or the embedded performer, by a regression, and writes it,
+    with a report ``NAME_shapes/index.html``."""
     options, progress = options or RigOptions(), progress or silent
     check_out(out)
     with file_lock(out):

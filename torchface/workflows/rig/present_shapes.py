@@ -22,12 +22,7 @@ _LARGEST = 2.0  # times a shape as it was made, to which that of a part may be b
 
 @dataclass(frozen=True)
 class PresentShape:
-    """One of ARKit's shapes that a character has.
-
-    Args:
-        names: how it calls it.
-        binds: morph targets, and how much of each.
-    """
+    """One of ARKit's shapes that a character has: how it calls it, and how much of which morph targets it is."""
 
     names: tuple[str, ...]
     binds: tuple[MorphBind, ...]

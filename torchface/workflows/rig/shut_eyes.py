@@ -47,12 +47,6 @@ def with_eye_note(
 
     The scan's face is drawn from the front and the eye network looks at it; where the scan has no colours, or they do
     not show a face, the template is registered once more with its lids the other way.
-
-    Args:
-        rig: the template; one without shapes that shut both eyes is not judged.
-        registration: of the template in the pose ``shown``.
-        shown: the template's weights that the scan is taken to show, (N,).
-        other_fit: registers the template at weights (N,) to the scan.
     """
     rows = mapping(rig.names, _BLINKS) > 0.5
     if not bool(rows.any(1).all()):

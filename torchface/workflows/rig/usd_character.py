@@ -26,11 +26,7 @@ _SECONDS = 600.0
 
 
 def rig_usd_character(path: Path, out: Path, progress: Progress | None = None) -> CharacterReport:
-    """Adds ARKit's shapes as blend shapes to the meshes of a USD character's face; all else of its layer stays.
-
-    Args:
-        path: ``.usd``, ``.usda``, ``.usdc`` or ``.usdz``.
-    """
+    """Adds ARKit's shapes as blend shapes to the meshes of a USD character's face; all else of its layer stays."""
     check_ending(out, path.suffix.lower())
     scene = read_stage(path)
     with tempfile.TemporaryDirectory(prefix="torchface-usd-") as folder:

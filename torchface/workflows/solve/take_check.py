@@ -87,12 +87,8 @@ def check_coverage(attachment: Attachment, take: Take, shapes: int, insist: bool
 
 
 def check_explained(solver: MarkerSolver, take: Take, aligned: bool, slip: bool, insist: bool = False) -> FitCheck:
-    """How well a rig explains a take's markers.
-
-    Args:
-        take: markers in rig space, all known to the solver.
-        insist: refuse nothing.
-    """
+    """How well a rig explains a take's markers, in rig space and known to the solver; insisted on, nothing is
+    refused."""
     assert take.markers is not None
     markers = solver.arrange(take.markers).double()
     fit = check_fit(torch.cat([solver.rest[..., None], solver.every_basis], dim=2), markers, slip)
@@ -119,12 +115,6 @@ def check_head(
     rig: BlendshapeRig, attachment: Attachment, take: Take, insist: bool = False, cause: str = ""
 ) -> list[str]:
     """Whether rig, attachment and take belong to one head.
-
-    Args:
-        rig: whose mesh has the attachment's triangles.
-        take: markers in rig space, without the helmet's motion.
-        insist: warn in place of the error.
-        cause: what :func:`check_explained` has found, which leaves a smooth residual too.
 
     Returns:
         Warnings where the residual of the take is that of another head.

@@ -37,12 +37,7 @@ def stream_weights(
     wait: Callable[[float], None] = time.sleep,
     times: Sequence[float] | None = None,
 ) -> StreamReport:
-    """Sends frames of weights, each at its time.
-
-    Args:
-        frames: (N,) each; each is taken when it is due.
-        times: when each frame is due, seconds after the first; ``fps`` a second if absent.
-    """
+    """Sends frames of weights (N,), taken when they are due, at ``fps`` or at times in seconds after the first."""
     sent: list[Tensor] = []
     latency: list[float] = []
     coming = iter(frames)

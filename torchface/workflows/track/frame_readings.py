@@ -93,12 +93,7 @@ def _track(
 
 
 def given_reading(path: Path, clip: VideoFile) -> FaceReading:
-    """A table's landmarks as a tracker of the video would have read them, (T,...).
-
-    Args:
-        path: the table; see :func:`~torchface.io.landmarks.landmark_tables.load_landmark_table`.
-        clip: the video that they are of.
-    """
+    """A table's landmarks as a tracker of the video would have read them, (T,...)."""
     table = load_landmark_table(path)
     if len(table.points) != clip.count:
         raise ValueRangeError(

@@ -51,12 +51,10 @@ class PersonHead:
 def person_head(
     inputs: TrackInputs, heads: HeadModel, landmarks: Tensor, reading: FaceReading, progress: Progress
 ) -> PersonHead:
-    """Solves the head of a take, its expressions and poses together; see ``fit_images``.
+    """Solves the head of a take, its expressions and poses together, from smoothed landmarks (T,68,2); see
+    ``fit_images``.
 
-    Args:
-        inputs: whose actor is the rig of the model's mean head.
-        landmarks: smoothed, (T,68,2) pixels of a camera without distortion.
-        reading: of the frames, (T,...): how far each landmark is trusted.
+    The inputs' actor is the rig of the model's mean head; the reading says how far each landmark is trusted.
     """
     progress("solving the head")
     rig, clip, trust = inputs.actor, inputs.clip, reading.trust

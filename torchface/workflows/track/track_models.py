@@ -55,11 +55,8 @@ def load_track_models(
 ) -> TrackModels:
     """Reads models by name or folder, see :func:`torchface.zoo.get_model`, and makes priors fit the rig and the video.
 
-    Args:
-        rig: whose shapes' names the priors are brought to.
-        landmarks, appearance, prior, dynamics: the models; for landmarks also a table of them; ``prior`` may be "none".
-            The prior by default is left out where it has learned less than half of the rig's shapes.
-        fps: frames a second of the video, to which the dynamics prior is brought; its own if absent.
+    Landmarks may also be a table, ``prior`` "none"; the one by default is left out where it has learned less than half
+    of the rig's shapes.
     """
     named = None if is_table(landmarks) else load_finder(landmarks)
     priors = load_priors(rig, prior, dynamics, fps)

@@ -29,10 +29,6 @@ class TrackState:
     Readings are kept in pieces, each a complete file with the hash of its content; pieces of other videos, models or
     settings, damaged ones and those behind them are deleted, damaged ones with a warning; so is what a killed run left
     under a temporary name. The folder of results must be held for this run.
-
-    Args:
-        out: the folder of results; it is made with the first piece.
-        key: says what the landmarks come from, see :func:`~torchface.files.content_keys.content_key`.
     """
 
     def __init__(self, out: str | Path, key: str) -> None:

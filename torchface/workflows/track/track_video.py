@@ -182,14 +182,7 @@ _SHARP = 0.6  # of the sharpest frame
 def with_filmed_skin(
     head: PersonHead, inputs: TrackInputs, model: HeadModel, reading: FaceReading, progress: Progress
 ) -> PersonHead:
-    """A head as it is shown: with skin of sharp frames from the front and from each side, and what belongs to it.
-
-    Args:
-        head: solved from frames of the take.
-        inputs: with the video.
-        model: that the head is of.
-        reading: of the frames, (T,...).
-    """
+    """A head as it is shown: with skin of sharp frames from the front and from each side, and what belongs to it."""
     progress("finding the head's skin")
     wanted = dict.fromkeys(head.frames.tolist())
     for number, frame in enumerate(inputs.clip.color_frames()):

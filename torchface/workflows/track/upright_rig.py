@@ -12,12 +12,10 @@ _INNER = slice(17, 68)
 
 
 def upright(rig: BlendshapeRig) -> tuple[BlendshapeRig, str]:
-    """The rig brought to a head's place, and a line for people about its size and turn, empty where both are usual.
+    """The rig, if it has iBUG's 68, brought to a head's place, and a line for people about its size and turn, empty
+    where both are usual.
 
     A character in centimetres, on its back, or with its head 1.6 m above the ground is one; weights stay what they are.
-
-    Args:
-        rig: one without iBUG's 68 stays as it is.
     """
     notes = rig.neutral.annotations
     if notes is None or notes.landmarks is None or len(notes.landmarks) != LANDMARKS:

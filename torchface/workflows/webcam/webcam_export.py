@@ -56,11 +56,7 @@ class WebcamReport:
 
 
 def export_webcam(out: str | Path, progress: Progress | None = None) -> WebcamReport:
-    """Writes the graph from a webcam's picture to weights, and checks it.
-
-    Args:
-        out: the file to write; it appears only when it is complete and checked.
-    """
+    """Writes the graph from a webcam's picture to weights; the file appears only when it is complete and checked."""
     out, progress = Path(out), progress or silent
     check_writable(out)
     content = webcam_graph(progress)

@@ -23,12 +23,8 @@ _HEAD_NAME = re.compile(r"(head|rotat|tilt)", re.IGNORECASE)
 
 
 def shape_regions(names: Sequence[str], basis: Tensor) -> tuple[str, ...]:
-    """The region of each shape: the head by its name, the others by where landmarks move most.
-
-    Args:
-        names: of N shapes; one of the head holds ``rotate``, ``tilt`` or ``head``.
-        basis: what each adds to landmarks, (68,2,N).
-    """
+    """The region of each of N shapes: the head by its name, the others by where ``basis`` (68,2,N) moves landmarks
+    most."""
     squared = basis.detach().square().sum(1)
     moves = torch.stack([squared[list(rows)].sum(0) for rows in REGION_LANDMARKS.values()])
     regions = tuple(REGION_LANDMARKS)

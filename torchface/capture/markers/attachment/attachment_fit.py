@@ -267,7 +267,6 @@ def check_sites(
     and unit, pose and slip are solved for, so what is left has other causes and smaller limits.
 
     Args:
-        labels: of the M markers.
         error: root mean square distance of each marker to its site, (M,), millimetres.
         off_skin: distance of each marker from its site that lasts over the take, (M,), millimetres.
         radius: of the sites at rest, mean distance from their centre, millimetres.

@@ -73,13 +73,8 @@ class Sites:
 
 
 def best_sites(points: Tensor, faces: Tensor, candidates: Tensor, moments: PathMoments) -> Sites:
-    """The best site of each marker among the points of its candidate triangles, rows (M,Q) of ``faces``, exact.
-
-    Args:
-        points: affine maps of the vertices, (V,3,N+1), float64.
-
-    Source: thesis 4.1.2, algorithm 4, steps 4 and 5.
-    """
+    """The best site of each marker among the points of its candidate triangles, rows (M,Q) of ``faces``, exact, by
+    the affine maps (V,3,N+1) of the vertices. Source: thesis 4.1.2, algorithm 4, steps 4 and 5."""
     used, local = faces[candidates].unique(return_inverse=True)
     corner = (points[used] @ moments.factor).flatten(1)[local]
     a = corner[:, :, 0]

@@ -20,12 +20,8 @@ def frame_poses(paths: Tensor, target: Tensor, scale: Tensor) -> Similarity:
 def solve_frames(
     affine: Tensor, paths: Tensor, pose: Similarity, ridge: float, initial: Tensor | None
 ) -> tuple[Tensor, Similarity]:
-    """Weights (T,N) of all frames; where every frame has a pose of its own, its motion together with them.
-
-    Args:
-        affine: of the sites, (M,3,N+1), millimetres.
-        paths: markers (T,M,3), NaN for not seen.
-    """
+    """Weights (T,N) by sites' affine maps (M,3,N+1) and markers (T,M,3); where every frame has a pose of its own,
+    that too."""
     moved = pose.apply(paths)
     if len(pose.scale) == 1:
         return solve_weights(affine, moved, ridge, initial), pose

@@ -49,12 +49,7 @@ class TakeCurvature:
 
     @staticmethod
     def of(fit: SitesOnTake, ridge: float, bounded: bool = True) -> "TakeCurvature":
-        """At sites, pose and weights.
-
-        Args:
-            ridge: mm² a marker for a squared weight of 1.
-            bounded: weights at 0 or 1 are in the active set.
-        """
+        """At sites, pose and weights; those at 0 or 1 are in the active set if ``bounded``."""
         affine, moved, weights, slips = fit.affine, fit.moved, fit.weights, fit.slips
         markers, frames = len(affine), len(moved)
         rest, basis = affine[..., 0], affine[..., 1:]
@@ -105,11 +100,8 @@ class TakeCurvature:
         )
 
     def step(self, precision: Tensor, gradient: Tensor) -> tuple[Tensor, Tensor]:
-        """A Newton step of sites and pose (2M+G,), with a quadratic prior on them, and the change of the weights (T,N).
-
-        Args:
-            precision: of the prior, (2M+G,), mm² a squared unit.
-        """
+        """A Newton step of sites and pose (2M+G,), with a prior's ``precision`` (2M+G,), and the change of the
+        weights (T,N)."""
         step = torch.linalg.solve(self.information + torch.diag(precision), self.gradient + gradient)
         return step, torch.cholesky_solve((self.weight_gradient - self.cross @ step)[..., None], self.factor)[..., 0]
 

@@ -241,11 +241,8 @@ class SiteSearch:
         return self.rows[found.reshape(len(points), count)]
 
     def similar_motion(self, lifted: Tensor, points: Tensor, moments: PathMoments) -> Tensor:
-        """Of the faces round sites at rest (M,3) those, (M,Q), whose middle moves most like the marker.
-
-        Args:
-            lifted: affine maps of the vertices, (V,3,N+1).
-        """
+        """Of the faces round sites (M,3) those, (M,Q), whose middle moves most like the marker, by the maps
+        (V,3,N+1)."""
         around = self.near(points, _NEIGHBOURHOOD)
         used, row = around.unique(return_inverse=True)
         middle = (lifted[self._faces[used]].mean(1) @ moments.factor).flatten(1)

@@ -168,11 +168,7 @@ class Paint:
 
 
 def painted(mesh: Mesh, rows: Tensor, values: Tensor, color: Callable[[Tensor], Tensor], side: int = _SIDE) -> Paint:
-    """Colours by values (V,C) at the vertices of triangles (K,), as an image where one tile holds their layout.
-
-    Args:
-        color: sRGB and opacity (N,4) of values (N,C).
-    """
+    """Colours, sRGB and opacity, by values (V,C) at triangles (K,), as an image where one tile holds their layout."""
     if mesh.uvs is None or mesh.uv_faces is None:
         return Paint(None, color(values).float())
     corners = mesh.uvs[mesh.uv_faces[rows]].double()

@@ -17,12 +17,10 @@ _LIDS = (((37,), (41,)), ((38,), (40,)), ((43,), (47,)), ((44,), (46,)))
 
 
 def with_forehead(landmarks: Tensor, jaw_margin: float = 0.0) -> Tensor:
-    """The 68 and ten points over the brows that follow them: (B,68,2) to (B,78,2), linear.
+    """The 68 and ten points over the brows that follow them: (B,68,2) to (B,78,2), linear; the jaw line is moved
+    outward.
 
     Brows lie on the border of the 68; without skin above them their upper edge cannot be found.
-
-    Args:
-        jaw_margin: by how much of its distance from the nose the jaw line is moved outward.
     """
     eyes = torch.stack([landmarks[:, 36:42].mean(1), landmarks[:, 42:48].mean(1)], dim=1)
     brows = landmarks[:, _BROWS].unflatten(1, (2, 5))

@@ -201,11 +201,7 @@ def _said_faces(maps: FaceMaps) -> Tensor:
 
 
 def face_geometry(faces: Tensor, cells: Tensor) -> Tensor:
-    """What maps say of faces (...,4) in cells, column and row (...,2): the geometry (...,5) of :class:`FaceMaps`.
-
-    Args:
-        faces: x and y of the centre, side, pixels, and roll angle, radians, (...,4).
-    """
+    """What maps say of faces (...,4), x and y, side, roll angle, in cells (...,2): the (...,5) of :class:`FaceMaps`."""
     middle = (faces[..., :2] + 0.5) / STRIDE - 0.5 - cells
     side = (faces[..., 2:3] / TYPICAL_SIDE).log()
     return torch.cat([middle, side, faces[..., 3:].cos(), faces[..., 3:].sin()], -1)

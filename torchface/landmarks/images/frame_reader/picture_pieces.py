@@ -16,13 +16,10 @@ def picture_size(image: Tensor) -> Tensor:
 
 
 def sampled(image: Tensor, points: Tensor, spacing: Tensor, beyond: Tensor) -> Tensor:
-    """A picture's colours (3,P) in [0,1] at points between its pixels; beyond the border the border's pixels go on.
+    """A picture's colours (3,P) in [0,1] at points, ``spacing`` apart, between its pixels; the border's go on beyond
+    it.
 
-    Where the points are further apart than pixels, whole pixels are averaged first, so that none are skipped.
-
-    Args:
-        spacing: from one point to the next, () pixels.
-        beyond: how far what is averaged goes on beyond the points, () pixels.
+    Where the points are further apart than pixels, whole pixels are averaged first, and ``beyond`` the points.
     """
     last = picture_size(image) - 1
     low = (points.amin(0) - beyond).clamp(min=0).minimum(last).floor()
@@ -52,13 +49,8 @@ def whole_numbers(values: Tensor) -> list[int]:
 
 
 def cut_square(image: Tensor, place: Tensor, size: int, margin: float) -> Tensor:
-    """The square (1,3,S,S) in [0,1] of a picture uint8 (H,W,C) round a face (5,), upright, as a network takes it.
-
-    It shows what :func:`~torchface.landmarks.images.face_crop.cut_crop` does.
-
-    Args:
-        margin: side of the square, of the place's.
-    """
+    """As :func:`~torchface.landmarks.images.face_crop.cut_crop`: the square (1,3,S,S) in [0,1] of a picture uint8
+    (H,W,C) round a face (5,), upright, ``margin`` times the place's side, as a network takes it."""
     spacing = place[2] * (margin / size)
     points = torch.addmm(place[:2], crop_grid(size, size), spacing * axes(place))
     beyond = spacing * place[3:].abs().sum() / 2 + AROUND
@@ -77,12 +69,10 @@ def from_square(points: Tensor, place: Tensor, size: int, margin: float) -> Tens
 
 
 def whole_picture(image: Tensor, longest: int | Tensor) -> tuple[Tensor, Tensor]:
-    """A picture made smaller until its longer side has so many pixels, its sides multiples of 32.
+    """A picture (1,3,h,w) in [0,1] made smaller until its longer side has so many pixels, multiples of 32, the last
+    rows and columns repeated; and what to multiply its pixels by, (2,).
 
     Halved before by interpolation where it is more than twice as large, so that few pixels are skipped.
-
-    Returns:
-        (1,3,h,w) in [0,1], the last rows and columns repeated; and what to multiply its pixels by, (2,), x and y.
     """
     size = picture_size(image)
     target = (size * (longest / size.amax(0)).clamp(max=1)).round().clamp(min=1)

@@ -61,11 +61,8 @@ def deviation_loss(distance: Tensor, deviation: Tensor, weight: Tensor) -> Tenso
 
 
 def gap_loss(points: Tensor, truth: Tensor, weight: Tensor, pairs: Tensor, steepness: float) -> Tensor:
-    """The loss of the vectors between pairs (P,2) of points (B,L,2), such as between upper and lower lid.
-
-    Args:
-        steepness: how much steeper it is near the truth than far away.
-    """
+    """The loss of the vectors between pairs (P,2) of points (B,L,2), such as lids, steeper near the truth than far
+    away."""
     first, second = pairs.to(points.device).unbind(1)
     apart = (points[:, first] - points[:, second]) - (truth[:, first] - truth[:, second])
     size = (apart.square().sum(-1) + 1e-6).sqrt()
@@ -74,12 +71,8 @@ def gap_loss(points: Tensor, truth: Tensor, weight: Tensor, pairs: Tensor, steep
 
 
 def heat_loss(heat: Tensor, truth: Tensor, weight: Tensor, stride: int, spread: float) -> Tensor:
-    """The weighted mean cross entropy of heat maps (B,L,h,w) with a Gaussian about the truth (B,L,2), crop's pixels.
-
-    Args:
-        stride: pixels of the crop a side of a cell.
-        spread: the Gaussian's standard deviation, cells.
-    """
+    """The weighted mean cross entropy of heat maps (B,L,h,w) with a Gaussian of ``spread`` cells about the truth
+    (B,L,2)."""
     squared = (cell_places(heat, stride) - truth[:, :, None]).square().sum(-1) / stride**2
     wanted = torch.softmax(-squared / (2 * spread**2), dim=-1)
     form = -(wanted * heat.flatten(2).log_softmax(-1)).sum(-1)

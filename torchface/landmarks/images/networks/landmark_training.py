@@ -198,11 +198,7 @@ def _loss(
 
 
 def openings(points: Tensor, face: Tensor) -> Tensor:
-    """How far a face is open, (B,7) of its size: right and left lids, lips inside and outside, mouth's width, brows.
-
-    Args:
-        face: the landmarks whose size counts, (B,68,2).
-    """
+    """How far a ``face`` (B,68,2) is open, (B,7) of its size: lids, lips inside and outside, mouth's width, brows."""
     size = (face - face.mean(1, keepdim=True)).square().sum(-1).mean(1).clamp(min=1e-4).sqrt()
     first, second = _PAIRS.to(points.device).unbind(1)
     lengths = ((points[:, first] - points[:, second]).square().sum(-1) + 1e-6).sqrt() / size[:, None]

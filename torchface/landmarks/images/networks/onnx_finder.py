@@ -62,10 +62,6 @@ def onnx_finder(path: str | Path, limits: GraphLimits | None = None) -> CropFind
     graph's metadata hold as ``crop`` (1.25 if none) and turned upright. It gives ``landmarks`` (B,68,2), their standard
     ``deviation`` (B,68), both in the crop's pixels, ``visibility`` (B,68) and ``presence`` (B,) in [0,1].
 
-    Args:
-        path: the file; weights lie in it.
-        limits: of time and memory.
-
     Raises:
         FileFormatError: it is no ONNX graph, or one of other inputs and outputs, which the message names; or it takes
             more time or memory than the limits.
@@ -195,11 +191,8 @@ _TO_END = 2.0  # seconds that a process has to end once nothing more comes in
 
 
 class AnsweringProcess:
-    """A process whose requests go in at its standard input and whose answers come out at its standard output.
-
-    Args:
-        error: what is raised where it fails.
-    """
+    """A process whose requests go in at its standard input and whose answers come out at its output; or else
+    ``error``."""
 
     def __init__(
         self,

@@ -56,9 +56,7 @@ def augmented(
         rgba: cut-out faces, uint8 (B,4,H,W).
         landmarks: iBUG's 68 and P other points, (B,68+P,2) pixels.
         visible: which of them nothing hides, (B,68+P) bool.
-        size: of a crop, pixels a side.
         margin: a crop's side, of the side of the face's box.
-        settings: how widely.
         mirror: which of the other points each becomes in a mirror, (P,) int64; without any if absent.
     """
     settings = settings or AugmentationSettings()
@@ -248,11 +246,8 @@ def with_light(images: Tensor, generator: torch.Generator, grey_share: float = 0
 
 
 def with_blur(images: Tensor, generator: torch.Generator, share: float, widest: float) -> Tensor:
-    """Images (B,3,H,W), changed in place, of which a share is out of focus, and an eighth moves.
-
-    Args:
-        widest: standard deviation of their blur beyond 0.3, pixels, at most.
-    """
+    """Images (B,3,H,W), changed in place, of which a share is out of focus by 0.3 to ``widest`` more, and an eighth
+    moves."""
     from kornia.filters import gaussian_blur2d, motion_blur
 
     count = len(images)

@@ -31,11 +31,8 @@ class PictureNetwork(nn.Module):
         Args:
             pictures: indexed by numbers (B,), such as a ``TensorDataset``; each batch is asked for by a
                 ``DataLoader``'s workers. What they give, the class says.
-            network: goes on from its weights; a new one if absent.
-            settings: how; those of the class by default.
             checkpoint: a file that is kept while it runs, and taken up by the next run with the same settings; more
                 pictures may have come by then.
-            device: where the network computes.
             log: called with what was measured, every fifty steps.
 
         Returns:

@@ -314,10 +314,6 @@ def best_test(right: Tensor, wanted: Tensor) -> Tensor:
 
     It is the one with the largest :math:`\lVert s_l \rVert^2 / n_l + \lVert s_r \rVert^2 / n_r`, s the sums of what is
     wanted on its two sides.
-
-    Args:
-        right: whether a test sends a sample right, 0 or 1, (tests,n).
-        wanted: (n,K).
     """
     sums, number = right @ wanted, right.sum(1)
     other, rest = wanted.sum(0) - sums, right.shape[1] - number

@@ -73,14 +73,8 @@ def _importance(places: Tensor, quads: Tensor, coarse: Mesh) -> Tensor:
 def _partly_divided(
     polygons: Tensor, children: Tensor, uvs: Tensor | None, divided: Tensor
 ) -> tuple[Tensor, Tensor | None]:
-    """Polygons (P,8), padded with -1, of which some are divided, and their corners' texture coordinates (P,8,2).
-
-    Args:
-        polygons: before the last round, (Q,K).
-        children: the quads that it makes of each, (Q,K,4), in the vertices after it.
-        uvs: at the corners before it, (Q,K,2).
-        divided: which polygons are, (Q,).
-    """
+    """Polygons (P,8), padded with -1, of which some (Q,) are divided into quads (Q,K,4), and their corners' texture
+    coordinates (P,8,2)."""
     middles = children[..., 1]
     has_middle = torch.zeros(int(children.max()) + 1, dtype=torch.bool)
     has_middle[middles[divided]] = True

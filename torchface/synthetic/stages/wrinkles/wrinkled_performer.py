@@ -24,12 +24,10 @@ _LEAST_COMPRESSION = 0.04  # below it a rig's largest compression is taken to be
 
 
 def steady_folding(compression: Tensor, scale: Tensor, trace: Tensor) -> Tensor:
-    """How far skin folds that is held compressed, in [0,1], (T,G).
+    """How far skin folds that is held compressed, 1 minus the stretch, in [0,1], (T,G); stretching takes the trace
+    away.
 
-    Args:
-        compression: across each line, 1 minus the stretch, (T,G); negative where skin is stretched.
-        scale: the compression at which 1 - 1/e of the way is done, (G,).
-        trace: folding at rest, (G,); stretching takes it away.
+    ``scale`` (G,) is the compression at which 1 - 1/e of the way is done.
     """
     folded = 1 - (-compression.clamp(min=0) / scale).exp()
     flattened = (compression.clamp(max=0) / scale).exp()
@@ -37,13 +35,8 @@ def steady_folding(compression: Tensor, scale: Tensor, trace: Tensor) -> Tensor:
 
 
 def with_lag(folding: Tensor, fps: float, fold_time: float, unfold_time: float) -> Tensor:
-    """Folding (T,G) as skin shows it: a first-order low-pass, fast as it folds and slow as it unfolds.
-
-    Args:
-        folding: what it would be held still; the first frame is taken to have been held.
-        fold_time: time constant of folding, seconds.
-        unfold_time: time constant of unfolding, seconds.
-    """
+    """Folding (T,G) as skin shows it: a first-order low-pass, fast as it folds and slow as it unfolds, of times in
+    seconds."""
     fold, unfold = (1 - math.exp(-1 / (fps * time)) for time in (fold_time, unfold_time))
     shown = torch.empty_like(folding)
     shown[:1] = folding[:1]
@@ -61,14 +54,9 @@ def extreme_weights(names: Sequence[str]) -> Tensor:
 
 
 def compression_scale(extremes: Tensor, line: Tensor, places: Sequence[str]) -> Tensor:
-    """The compression that folds each line's skin by 1 - 1/e: half of what the rig's own extremes reach, (G,).
+    """The compression that folds each line's skin by 1 - 1/e: half of what the rig's extremes (E,G) reach, (G,).
 
-    So a rig that compresses skin less than skin does still wrinkles.
-
-    Args:
-        extremes: compression at every gauge in the rig's extremes, (E,G).
-        line: which line each gauge belongs to, (G,) int64.
-        places: name of each line's place; lines of one name share a scale.
+    So a rig that compresses skin less than skin does still wrinkles. Lines of one name share a scale.
     """
     most = extremes.amax(0)
     scale = torch.empty_like(most)
