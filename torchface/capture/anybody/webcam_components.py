@@ -62,7 +62,7 @@ class WebcamSettings:
     memory: float = 20.0
     rest_penalty: float = 6.0
     openness_noise: float = 0.1
-    gaze_noise: float = 0.05
+    gaze_noise: float = 0.1
 
     def __post_init__(self) -> None:
         for name in ("prior_strength", "sparsity", "ridge", "rest_penalty"):
@@ -75,8 +75,9 @@ class WebcamSettings:
 
 
 _UPRIGHT = (1 / 600, -1 / 600)  # of a face some way off; the camera's y goes down
-_BLINK_UNIT = 0.25  # what counts as a weight of 1 in the filter: of blinks, which it must not smooth away,
-_MOTION_UNITS = [0.5] * 3 + [100.0] * 3  # and of the head's motion, radians and millimetres
+# What counts as a weight of 1 in the filter, of what it must not smooth away, and of the head's motion.
+_FILTER_UNITS = {"eyeBlink": 0.25, "eyeLook": 0.5}
+_MOTION_UNITS = [0.5] * 3 + [100.0] * 3  # radians and millimetres
 _LOOK_EYES = (0, 0, 1, 1, 0, 0, 1, 1)  # whose each of ``LOOKS`` is
 _DAMPING_ROTATION, _DAMPING_TRANSLATION = 0.5, 500.0  # radians and millimetres that a step of a pose may well be
 _CONTOUR_TRUST = 0.5  # how much a landmark of the contour counts beside an inner one
@@ -159,7 +160,8 @@ class WebcamSolverParts(nn.Module):
             "upright": torch.tensor(_UPRIGHT),
             "damping": torch.tensor([_DAMPING_ROTATION] * 3 + [_DAMPING_TRANSLATION] * 3).double() ** -2,
             "filter_units": torch.tensor(
-                [_BLINK_UNIT if n.startswith("eyeBlink") else 1.0 for n in ARKIT] + _MOTION_UNITS
+                [min([u for k, u in _FILTER_UNITS.items() if n.startswith(k)], default=1.0) for n in ARKIT]
+                + _MOTION_UNITS
             ),
         }.items():
             # What no rig, person or prior brings is in no state.

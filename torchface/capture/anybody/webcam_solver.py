@@ -14,7 +14,7 @@ from torchface.capture.anybody.webcam_components import WebcamSolverParts
 from torchface.capture.anybody.webcam_outputs import LOST_FIT, OutputTables, calmed_state, lost_state
 from torchface.capture.anybody.webcam_state import WebcamControls, WebcamState
 from torchface.capture.energy import Quadratic
-from torchface.capture.own_rig.eye_geometry import CORNERS, look_weights, seen_gaze
+from torchface.capture.own_rig.eye_geometry import CORNERS, look_weights, seen_gaze, undrifted
 from torchface.capture.own_rig.face_points import EYE_CORNERS, JAW, LANDMARKS, FacePoints
 from torchface.capture.own_rig.gauss_newton import HeadState, Linearised, energy_of_step, linearise, split_step
 from torchface.capture.own_rig.weight_walk import (
@@ -248,7 +248,9 @@ class WebcamSolver(WebcamSolverParts):
         self, points: FacePoints, frame: _Frame, before: WebcamState, rotation: Tensor, translation: Tensor
     ) -> EyeSignals:
         middles = torch.stack([0.5 * (points.rest[a] + points.rest[b]) for a, b in CORNERS])
-        gaze = seen_gaze(frame.rays, frame.iris, rotation, middles @ rotation[2] + translation[2])
+        gaze = seen_gaze(
+            frame.rays, undrifted(frame.rays, frame.iris), rotation, middles @ rotation[2] + translation[2]
+        )
         looking = self.open_rows @ self.look_shapes
         return eye_signals(
             frame.eyes, gaze, self.usual_openness, looking, before, frame.interval, frame.pose, frame.learns
