@@ -18,6 +18,10 @@ __all__ = ["with_readings"]
 
 _EYE_SEEN, _EYE_SHUT = 0.5, 0.5  # how likely nothing hides an eye whose iris counts, and how likely its lids do
 _EYES = (slice(36, 42), slice(42, 48))
+_READ_COUNTS = 3.0
+"""How much what was read of weights counts beside one reading of it: a head that is not the person's errs alike in many
+landmarks. From 1 to 3 the error of smiles fell from 0.075 to 0.058 in pictures of 14 rendered people (zoo's head).
+"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,7 +33,8 @@ class ReadExpressions:
 
     def energy(self, weights: Tensor) -> WeightQuadratic:
         """Of weights (I,N), or (1,N) that all photographs show."""
-        read = self.readings.energy()
+        once = self.readings.energy()
+        read = Quadratic(_READ_COUNTS * once.H, _READ_COUNTS * once.f)
         if len(weights) != len(read.f):
             read = Quadratic(read.H.sum(0), read.f.sum(0, keepdim=True))
         if self.prior is None:
