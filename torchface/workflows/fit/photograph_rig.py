@@ -7,6 +7,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+from torchface.color_space import to_linear, to_srgb
 from torchface.errors import FileFormatError
 from torchface.files.whole_files import all_or_none
 from torchface.geometry.cameras.calibration import CameraCalibration
@@ -58,6 +59,7 @@ from torchface.workflows.rig.actor_rig import check_out
 from torchface.workflows.rig_names import Naming, renamed
 
 _OVER, _MARGIN = 480, 0.45
+_DIMMEST, _BRIGHTEST = 0.25, 2.5  # of what a drawing's light is multiplied by
 _LIGHT = Lighting(occlusion_rays=0)
 _WHITE, _BLACK = (1.0, 1.0, 1.0), (0.0, 0.0, 0.0)
 
@@ -285,8 +287,21 @@ def overlay(fit: ImageFit, view: int, image: Tensor, marks: Tensor, rig: Blendsh
     piece = cut_crop((255 * image[:3].clamp(0, 1)).round().byte(), corner[2] * shift, _OVER)
     drawn, behind = (render(posed, camera, lighting=_LIGHT, background=color, samples=1) for color in (_WHITE, _BLACK))
     dotted = with_dots(piece, *((points - corner[:2]) * corner[2] for points in (marks, fit.landmarks[view])))
-    over = torch.where((drawn - behind).mean(0) < 0.5, drawn, piece / 255)
+    shown = (drawn - behind).mean(0) < 0.5
+    inner = (fit.landmarks[view, JAW:] - corner[:2]) * corner[2]
+    low, high = inner.amin(0), inner.amax(0)
+    over = torch.where(shown, _as_bright(drawn, piece / 255, shown, low, high), piece / 255)
     return torch.cat([piece / 255, over, dotted / 255], dim=2)
+
+
+def _as_bright(drawn: Tensor, photograph: Tensor, shown: Tensor, low: Tensor, high: Tensor) -> Tensor:
+    """A drawing (3,H,W) as bright as the photograph is over the face, which it shows between two pixels (2,)."""
+    rows, columns = (torch.arange(size, dtype=low.dtype) for size in shown.shape)
+    face = shown & ((rows > low[1]) & (rows < high[1]))[:, None] & ((columns > low[0]) & (columns < high[0]))
+    if not bool(face.any()):
+        return drawn
+    seen, made = (float(to_linear(one).mean(0)[face].median()) for one in (photograph, drawn))
+    return to_srgb((to_linear(drawn) * max(_DIMMEST, min(seen / max(made, 1e-3), _BRIGHTEST))).clamp(0, 1))
 
 
 def _code(color: Tensor) -> str:
