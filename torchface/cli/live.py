@@ -125,6 +125,6 @@ def live(
     print_lines(report.lines())
     for take in saved:
         if take.error:
-            raise FileFormatError(f"the recording of {take.frames} frames is lost: {take.error}")
+            raise FileFormatError(f"{take.folder}: the recording of {take.frames} frames is not kept: {take.error}")
         if take.frames:
             print_path(take.folder)

@@ -30,6 +30,7 @@ from torchface.workflows.live import live_anybody, live_session
 from torchface.workflows.live import recordings as recordings_module
 from torchface.workflows.live.kept_takes import film_of, kept_takes, remove_take, take_file
 from torchface.workflows.live.live_anybody import LiveSettings, go_live, import_recordings
+from torchface.workflows.live.live_frames import LiveFrame
 from torchface.workflows.live.live_session import LiveSession, Notes
 from torchface.workflows.live.page_server import Preparing
 from torchface.workflows.live.recordings import FrameLog, Recordings
@@ -115,6 +116,17 @@ def test_uneven_frames_keep_their_times(dome: Path, tmp_path: Path) -> None:
     assert keys is not None
     np.testing.assert_allclose(keys, times - 1000, atol=1e-6)
     assert json.loads((tmp_path / "out" / "summary.json").read_text())["even"] is False
+
+
+def test_a_take_without_a_face_is_not_kept(dome: Path, tmp_path: Path) -> None:
+    """Its weights were zeros, which look like a face at rest."""
+    recordings = Recordings(tmp_path / "out", load_character(dome), "planted", 30.0)
+    recordings.start()
+    for i in range(3):
+        recordings.add(i / 30, LiveFrame(torch.zeros(len(ARKIT)), torch.eye(3), torch.full((68, 2), torch.nan)))
+    [take] = recordings.finish()
+    assert take.error == "found a face in none of its 3 frames, expected one"
+    assert not list((tmp_path / "out").iterdir())
 
 
 def test_even_frames_make_an_even_take(tmp_path: Path) -> None:

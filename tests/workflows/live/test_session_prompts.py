@@ -50,3 +50,10 @@ def test_a_short_session_of_a_camera_has_the_cameras_rate() -> None:
     for i in range(3):
         figures.add(i / 30, i / 30 + 0.1, True)
     assert LiveReport(figures, 0).lines()[0] == "3 frames solved in 0.2 s, a face in 3; they came at 30.0 a second"
+
+
+def test_a_session_without_a_face_is_warned_of() -> None:
+    figures = LiveFigures()
+    assert "warning" not in "".join(LiveReport(figures, 0).lines())
+    figures.add(0.0, 0.1, False)
+    assert LiveReport(figures, 0).lines()[-1].startswith("warning: no face was found")

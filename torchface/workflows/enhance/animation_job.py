@@ -15,7 +15,7 @@ from torchface.workflows.enhance.enhance_animation import EnhanceSettings, enhan
 from torchface.workflows.enhance.enhance_page import write_enhance_page
 from torchface.workflows.enhance.enhance_views import shown_frame, small_views
 
-_METHOD = "enhance batch/2"
+_METHOD = "enhance batch/3"
 
 
 def is_coarse(path: Path) -> bool:

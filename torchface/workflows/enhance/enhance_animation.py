@@ -108,7 +108,7 @@ def write_targets(targets: AnimationTargets, neutral: Mesh, fps: float, path: Pa
 STATE = "state"
 GLB, VIDEO, FRAMES, SUMMARY = "enhanced.glb", "comparison.mp4", "frames.csv", "summary.json"
 MESHES, TEXTURES = "meshes", "textures"
-_METHOD = "enhance/3"
+_METHOD = "enhance/4"
 _FORMAT = "torchface.enhance-summary/1"
 _MANY_OUTSIDE = 0.25
 _BADLY_SHOWN_MM = 0.1

@@ -19,12 +19,12 @@ from torchface.geometry.meshes.unit_check import extent
 from torchface.geometry.similarity import Similarity, similarity_transform
 from torchface.io.landmarks.picks import load_correspondences
 from torchface.io.tables.csv_table import TableReader
-from torchface.mesh import Mesh
+from torchface.mesh import Mesh, submesh
 from torchface.progress import Progress
 from torchface.registration import register
 from torchface.workflows.enhance.coarse_animation import check_scale, residual_notes
 
-_METHOD = "enhance: correspondence/1"
+_METHOD = "enhance: correspondence/2"
 _NEAR, _NEAR_BY_PAIRS = 2.0, 6.0
 _SMALLEST, _LARGEST = 0.12, 5.8  # of the model's extent: a whole person beside a face, or a face beside a whole person
 _MOST_POINTS = 5000
@@ -44,16 +44,17 @@ class HeadCorrespondence:
     known: Tensor  # which of them lie on that surface, (N,) bool
     residual: float  # root mean square distance between bent and what the pose alone gives, of the known, millimetres
     how: str = ""  # its vertices were found to lie there, in words; empty where they are the model's own
+    asked: int = 0  # how many of them were looked for
 
     def notes(self, path: Path) -> list[str]:
         """Lines for people to read on the head of a file."""
         notes = residual_notes(self.residual, path)
         if not self.how:
             return notes
-        share = float(self.known.float().mean())
+        found = int(self.known.sum())
         return [
-            f"{path.name}: {int(self.known.sum())} of {len(self.known)} vertices ({share:.0%}) have a place on the "
-            f"model by {self.how}; scaled by {float(self.pose.scale[0]):.3f}, bent by {self.residual:.2f} mm (root "
+            f"{path.name}: {found} of {self.asked} vertices ({found / self.asked:.0%}) have a place on the model by "
+            f"{self.how}; scaled by {float(self.pose.scale[0]):.3f}, bent by {self.residual:.2f} mm (root "
             "mean square)",
             *notes,
         ]
@@ -108,7 +109,7 @@ def find_correspondence(
     key = content_key(
         _METHOD, head=head.vertices, faces=head.faces, model=model.vertices, triangles=model.faces, given=given
     )
-    parts = read_checkpoint(state, key)
+    parts, face = read_checkpoint(state, key), _face(head)
     if parts is None:
         size, expected = extent(head.vertices), extent(model.vertices)
         if not _SMALLEST < size / max(expected, 1e-9) < _LARGEST:
@@ -116,7 +117,9 @@ def find_correspondence(
                 f"{path}: its head measures {size:.0f} mm from corner to corner, the model's {expected:.0f} mm; scale "
                 "it to the size of a head, in Blender for example"
             )
-        bent, pose, known = _by_registration(head, model, progress) if given is None else _by_pairs(head, model, *given)
+        bent, pose, known = (
+            _by_registration(head, face, model, progress) if given is None else _by_pairs(head, model, *given)
+        )
         parts = {"laid": bent.float(), "known": known, **{name: part.double() for name, part in vars(pose).items()}}
         write_checkpoint(state, parts, key)
     pose, bent, known = (
@@ -127,8 +130,10 @@ def find_correspondence(
     check_scale(float(pose.scale[0]), path)
     rigid = pose.apply(head.vertices.double())[0]
     residual = float((bent.double() - rigid)[known].square().sum(-1).mean().sqrt())
-    how = "registration" if pairs is None else f"{len(given[0]) if given else 0} pairs of {pairs.name}"
-    return HeadCorrespondence(pose, bent, known, residual, how)
+    if pairs is not None and given is not None:
+        return HeadCorrespondence(pose, bent, known, residual, f"{len(given[0])} pairs of {pairs.name}", len(known))
+    how = "registration" if bool(face.all()) else "registration of the region face"
+    return HeadCorrespondence(pose, bent, known, residual, how, int(face.sum()))
 
 
 def has_topology_of(mesh: Mesh, model: Mesh) -> bool:
@@ -176,18 +181,27 @@ def load_pairs(path: Path, head: Mesh, model: Mesh) -> tuple[Tensor, Tensor]:
     return ids, points.float()
 
 
-def _by_registration(head: Mesh, model: Mesh, progress: Progress) -> tuple[Tensor, Similarity, Tensor]:
-    """The sparse head is bent onto the dense one: that takes seconds, the other way round minutes."""
-    landmarks = None
-    marks = [None if mesh.annotations is None else mesh.annotations.landmarks for mesh in (head, model)]
+def _face(head: Mesh) -> Tensor:
+    """The head's annotated face, (V,) bool, or all of it: hair and teeth would be bent onto the model's skin."""
+    regions = {} if head.annotations is None else head.annotations.regions
+    return regions.get("face", torch.ones(len(head.vertices), dtype=torch.bool))
+
+
+def _by_registration(head: Mesh, face: Tensor, model: Mesh, progress: Progress) -> tuple[Tensor, Similarity, Tensor]:
+    """The sparse head's face is bent onto the dense one: that takes seconds, the other way round minutes."""
+    part, landmarks = submesh(head, face), None
+    marks = [None if mesh.annotations is None else mesh.annotations.landmarks for mesh in (part.mesh, model)]
     if marks[0] is not None and marks[1] is not None and len(marks[0]) == len(marks[1]):
         landmarks = marks[0], model.vertices[marks[1]].double()
 
     def report(step: str, done: int = 0, total: int = 0) -> None:
         progress("aligning the input with the model", done, total)
 
-    result = register(head, model, landmarks, texture_size=0, progress=report)
-    return result.mesh.vertices, result.pose, result.matched & (result.distance < _NEAR)
+    result = register(part.mesh, model, landmarks, texture_size=0, progress=report)
+    bent, known = result.pose.apply(head.vertices.double())[0].float(), torch.zeros_like(face)
+    bent[part.vertex_ids] = result.mesh.vertices
+    known[part.vertex_ids] = result.matched & (result.distance < _NEAR)
+    return bent, result.pose, known
 
 
 def _by_pairs(head: Mesh, model: Mesh, ids: Tensor, points: Tensor) -> tuple[Tensor, Similarity, Tensor]:

@@ -56,10 +56,12 @@ class LiveReport:
     def lines(self) -> list[str]:
         """For people to read."""
         figures = self.figures
+        none = figures.frames > 0 and figures.found == 0
         return [
             f"{figures.frames} frames solved in {figures.seconds:.1f} s, a face in {figures.found}; they came at "
             f"{figures.fps:.1f} a second",
             f"{figures.latency(0.5):.1f} ms from frame to packet (99th percentile {figures.latency(0.99):.1f} ms), "
             f"{self.dropped} frames came while another was solved and were left out",
+            *(["warning: no face was found, so nothing has moved: weights and head stayed at rest"] if none else []),
             *(f"warning: {note}" for note in self.notes),
         ]

@@ -236,6 +236,8 @@ class Recordings:
             try:
                 if film is not None:  # before the summary, by which a take is listed
                     film.close()
+                if log.count and found == 0:
+                    raise ValueRangeError(f"found a face in none of its {log.count} frames, expected one")
                 missing = self._write(log, folder, found) if log.count else ""
                 problems = [one for one in (missing, film.problem if film is not None else "") if one]
                 self.saved.append(SavedTake(folder, log.count, note="; ".join(problems)))
