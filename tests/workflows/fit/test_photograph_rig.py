@@ -10,6 +10,7 @@ from torch import Tensor
 
 from torchface import load_rig, save_rig, zoo
 from torchface.cli import main
+from torchface.color_space import to_linear
 from torchface.errors import (
     AlignmentError,
     FileFormatError,
@@ -104,7 +105,10 @@ def test_the_command_makes_the_actors_rig(
     blue = made.neutral.texture[2] > made.neutral.texture[0] + 0.15
     assert float(blue.float().mean()) < 0.01  # none of the background
     for i in range(3):
-        assert load_image(tmp_path / f"rig_{i + 1}_p{i}.png").shape == (3, 480, 1440)
+        sheet = load_image(tmp_path / f"rig_{i + 1}_p{i}.png")
+        assert sheet.shape == (3, 480, 1440)
+        seen, drawn = (to_linear(one)[:, 200:280, 200:280].mean(0).median() for one in (sheet, sheet[..., 480:960]))
+        assert float(drawn / seen) == pytest.approx(1, abs=0.15)
         camera = load_calibration(tmp_path / f"rig_{i + 1}_p{i}.toml")
         assert (camera.width, camera.height) == load_image(studio / f"p{i}.png").shape[:0:-1]
         assert not camera.assumed
