@@ -44,16 +44,16 @@ class HeadCorrespondence:
     known: Tensor  # which of them lie on that surface, (N,) bool
     residual: float  # root mean square distance between bent and what the pose alone gives, of the known, millimetres
     how: str = ""  # its vertices were found to lie there, in words; empty where they are the model's own
-    asked: int = 0  # how many of them were looked for
+    asked: int = 0  # how many of them were looked for; 0 if all
 
     def notes(self, path: Path) -> list[str]:
         """Lines for people to read on the head of a file."""
         notes = residual_notes(self.residual, path)
         if not self.how:
             return notes
-        found = int(self.known.sum())
+        found, asked = int(self.known.sum()), self.asked or len(self.known)
         return [
-            f"{path.name}: {found} of {self.asked} vertices ({found / self.asked:.0%}) have a place on the model by "
+            f"{path.name}: {found} of {asked} vertices ({found / asked:.0%}) have a place on the model by "
             f"{self.how}; scaled by {float(self.pose.scale[0]):.3f}, bent by {self.residual:.2f} mm (root "
             "mean square)",
             *notes,
@@ -131,7 +131,7 @@ def find_correspondence(
     rigid = pose.apply(head.vertices.double())[0]
     residual = float((bent.double() - rigid)[known].square().sum(-1).mean().sqrt())
     if pairs is not None and given is not None:
-        return HeadCorrespondence(pose, bent, known, residual, f"{len(given[0])} pairs of {pairs.name}", len(known))
+        return HeadCorrespondence(pose, bent, known, residual, f"{len(given[0])} pairs of {pairs.name}")
     how = "registration" if bool(face.all()) else "registration of the region face"
     return HeadCorrespondence(pose, bent, known, residual, how, int(face.sum()))
 
