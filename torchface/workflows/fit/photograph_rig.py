@@ -285,12 +285,11 @@ def overlay(fit: ImageFit, view: int, image: Tensor, marks: Tensor, rig: Blendsh
         posed = rig.neutral.with_vertices(rig(weights)[0].detach())
     shift = torch.cat([torch.eye(2, dtype=torch.float64), -corner[:2, None]], dim=1)
     piece = cut_crop((255 * image[:3].clamp(0, 1)).round().byte(), corner[2] * shift, _OVER)
-    drawn, behind = (render(posed, camera, lighting=_LIGHT, background=color, samples=1) for color in (_WHITE, _BLACK))
+    before, drawn = (render(posed, camera, lighting=_LIGHT, background=color) for color in (_WHITE, _BLACK))
     dotted = with_dots(piece, *((points - corner[:2]) * corner[2] for points in (marks, fit.landmarks[view])))
-    shown = (drawn - behind).mean(0) < 0.5
+    through = (before - drawn).mean(0)  # the share of what lies behind
     inner = (fit.landmarks[view, JAW:] - corner[:2]) * corner[2]
-    low, high = inner.amin(0), inner.amax(0)
-    over = torch.where(shown, _as_bright(drawn, piece / 255, shown, low, high), piece / 255)
+    over = _as_bright(drawn, piece / 255, through < 0.5, inner.amin(0), inner.amax(0)) + through * piece / 255
     return torch.cat([piece / 255, over, dotted / 255], dim=2)
 
 
