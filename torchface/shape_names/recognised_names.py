@@ -1,7 +1,7 @@
 """ARKit's shapes under the names that other programs give them: one table of aliases, and a reading by words."""
 
 import re
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from functools import cache
 
@@ -135,6 +135,11 @@ def recognised_shapes(names: Sequence[str]) -> dict[str, RecognisedShape]:
         if rows:
             found[arkit] = RecognisedShape(rows, tuple(names[i] for i in rows), arkit in row)
     return found
+
+
+def arkit_count(found: Collection[str], still: Sequence[str]) -> str:
+    """How many of ARKit's 52 shapes a rig has, for people to read; those that move nothing do not count."""
+    return f"{len(found)} of ARKit's 52" + (f" (its {', '.join(still)} moves nothing)" if still else "")
 
 
 def vowel_sources(name: str) -> dict[str, float]:

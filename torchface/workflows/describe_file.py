@@ -37,6 +37,7 @@ from torchface.io.video.video_file import VIDEO_ENDINGS
 from torchface.io.weights.json_recordings import is_weight_json
 from torchface.mesh import Mesh
 from torchface.rig import BlendshapeRig
+from torchface.shape_names.recognised_names import arkit_count, recognised_shapes
 from torchface.take import Take
 from torchface.workflows.named_finders import BUNDLE
 from torchface.workflows.posed_mesh import load_neutral, size_faults
@@ -232,7 +233,7 @@ def _mesh_rows(mesh: Mesh) -> Rows:
         notes = mesh.annotations
         rows += [
             ("landmarks", "none" if notes.landmarks is None else str(len(notes.landmarks))),
-            ("regions", ", ".join(notes.regions) or "none"),
+            ("regions", _named(tuple(notes.regions)) if notes.regions else "none"),
             ("mirror map", "no" if notes.mirror is None else "yes"),
             ("contact pairs", "none" if notes.contacts is None else str(len(notes.contacts))),
         ]
@@ -254,8 +255,13 @@ def _extent(points: Tensor) -> str:
 
 def _rig_rows(rig: BlendshapeRig) -> Rows:
     reach = rig.deltas.norm(dim=-1).amax(1)
-    shapes = ", ".join(f"{name} {float(r):.1f}" for name, r in zip(rig.names, reach, strict=True))
-    rows = [*_mesh_rows(rig.neutral), ("shapes", str(len(rig.names))), ("largest motion, mm", shapes)]
+    order = reach.argsort(descending=True)[:_MAX_NAMED].tolist()
+    largest = ", ".join(f"{rig.names[row]} {float(reach[row]):.1f}" for row in order)
+    rows = [*_mesh_rows(rig.neutral), ("shapes", _named(rig.names)), ("largest motions, mm", largest)]
+    moving = {name: bool((reach[list(shape.rows)] > 0).any()) for name, shape in recognised_shapes(rig.names).items()}
+    if moving:
+        still = [name for name, moves in moving.items() if not moves]
+        rows.append(("ARKit's shapes", arkit_count([name for name in moving if moving[name]], still)))
     if rig.correctives is not None:
         between = sum(definition.is_in_between for definition in rig.correctives.definitions)
         rows.append(("correctives", f"{len(rig.correctives.names)}, {between} of them in-betweens"))

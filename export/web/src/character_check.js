@@ -23,8 +23,9 @@ export function checkSize(size) {
  * @param {ArrayBuffer} bytes the whole file.
  * @param {Record<string, [number, number][] | object> | null} sources or rules of shapes by name; by ARKit's names if absent.
  * @param {Record<string, string>} changed ARKit's name, or none, of shapes whose own names say something else.
- * @returns {{document: object, binary: Uint8Array, meshes: Map<number, Shape[]>, driven: string[], unknown: string[]}}
- *   of each mesh its shapes in the file's order, each `{name, sources, rule}`; names each once.
+ * @returns {{document: object, binary: Uint8Array, meshes: Map<number, Shape[]>, driven: string[], unknown: string[],
+ *   still: string[]}} of each mesh its shapes in the file's order, each `{name, sources, rule}`; names each once, those
+ *   that would be driven but move nothing under `still`.
  */
 export function checkCharacter(bytes, sources = null, changed = {}) {
   checkSize(bytes.byteLength);
@@ -42,13 +43,19 @@ export function checkCharacter(bytes, sources = null, changed = {}) {
   const outside = (document.images ?? []).some(({ uri }) => uri !== undefined && !uri.startsWith("data:"));
   if (outside || (document.buffers ?? []).some(({ uri }) => uri !== undefined && !uri.startsWith("data:")))
     throw new CharacterError("The character's data lie in other files. Export it as one .glb with everything inside.");
-  const meshes = new Map();
+  const moves = ({ POSITION }) => {
+    const { min = [1], max = [1] } = document.accessors?.[POSITION] ?? { min: [0], max: [0] };
+    return [...min, ...max].some((value) => value !== 0);
+  };
+  const meshes = new Map(), moving = new Set();
   let numbers = 0;
   for (const [index, mesh] of (document.meshes ?? []).entries()) {
     const counts = (mesh.primitives ?? []).map((one) => one.targets?.length ?? 0);
     if (!counts[0]) continue;
     const names = namesOf(mesh);
     meshes.set(index, Array.from({ length: counts[0] }, (_, i) => shape(String(names[i] ?? `target_${i}`))));
+    for (const [i, { name }] of meshes.get(index).entries())
+      if (mesh.primitives.some(({ targets }) => moves(targets?.[i] ?? {}))) moving.add(name);
     for (const primitive of mesh.primitives)
       for (const target of primitive.targets ?? [])
         for (const accessor of Object.values(target)) numbers += 3 * (document.accessors?.[accessor]?.count ?? 0);
@@ -60,9 +67,10 @@ export function checkCharacter(bytes, sources = null, changed = {}) {
   if (!(numbers <= MOST_NUMBERS))
     throw new CharacterError("The character's shapes are too large for this page. Export it with fewer vertices.");
   const all = [...new Map([...meshes.values()].flat().map((one) => [one.name, one])).values()];
-  const driven = all.filter((one) => one.sources.length > 0).map((one) => one.name);
+  const driven = all.filter((one) => one.sources.length > 0 && moving.has(one.name)).map((one) => one.name);
+  const still = all.filter((one) => one.sources.length > 0 && !moving.has(one.name)).map((one) => one.name);
   const unknown = all.filter((one) => one.sources.length === 0).map((one) => one.name);
-  return { document, binary, meshes, driven, unknown };
+  return { document, binary, meshes, driven, unknown, still };
 }
 
 /** The first few names, and how many more there are. */

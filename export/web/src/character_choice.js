@@ -70,9 +70,13 @@ async function taken(file, use, sources, keep) {
 }
 
 /** Says which of a character's shapes the face moves; no camera sees the tongue, and phones send it. */
-export function tellCharacter({ name, check: { driven, unknown, meshes } }) {
-  const tongues = new Set([...meshes.values()].flat().filter(({ sources }) => sources.length > 0 && sources.every(([row]) => row === TONGUE)).map((one) => one.name));
-  const others = (tongues.size > 0 ? `, ${[...tongues].join(", ")} by a phone alone` : "") + (unknown.length > 0 ? `; these stay still: ${listed(unknown)}` : "");
+export function tellCharacter({ name, check: { driven, unknown, still, meshes } }) {
+  const shapes = new Map([...meshes.values()].flat().map((one) => [one.name, one]));
+  const tongues = driven.filter((one) => shapes.get(one).sources.every(([row]) => row === TONGUE));
+  const words = [`your face moves ${driven.length - tongues.length} of its ${driven.length + unknown.length + still.length} shapes`];
+  if (tongues.length > 0) words.push(`${tongues.join(", ")} moves only when a phone sends the face: a camera does not see the tongue`);
+  if (still.length > 0) words.push(`its ${still.join(", ")} moves nothing`);
+  if (unknown.length > 0) words.push(`these stay still: ${listed(unknown)}`);
   const hint = driven.length === 0 ? ". Say below, at Names of shapes, which of ARKit's each of them means" : "";
-  showCharacterLine(`${name}: your face moves ${driven.length - tongues.size} of its ${driven.length + unknown.length} shapes${others}${hint}`);
+  showCharacterLine(`${name}: ${words.join("; ")}${hint}`);
 }

@@ -134,14 +134,12 @@ class CharacterJob:
         if any(name in self.made for name in (*BLINKS, _JAW)):
             cut = self.parts is not None and self.parts.lips_cut
             lines += [f"  {note}" for note in self.carried.notes(lips_cut=cut, shut=self.shut)]
-        lines += present_lines(there)
+        lines += present_lines(there, self.empty)
         lines += self._doubts(there)
         missing = [name for name in ARKIT if name not in self.made and name not in there]
         tongue = " (it has no tongue of its own; --inner-mouth gives one to a mouth without teeth)"
         why = tongue if missing == [_TONGUE] else ""
         lines.append(f"made: {len(self.made)} shapes" + (f"; not made: {', '.join(missing)}{why}" if missing else ""))
-        if self.empty:
-            lines.append(f"  note: {', '.join(self.empty)}: the file's own moves nothing and counts as missing")
         if expressions:
             lines.append(f"expressions added to the VRM: {len(expressions)}")
         return [*lines, f"in all {seconds[1]:.1f} s"]

@@ -175,9 +175,11 @@ def check_character(path: Path) -> None:
     if ending not in CHARACTER_ENDINGS:
         if ending not in _CONVERT:
             check_there(path)
-        bare = f"a mesh alone gets them by: torchface arkit {path} --out {path.with_suffix('.glb')}"
+        bare = f"a mesh alone gets them by: torchface arkit {path} --out {path.stem}.glb"
         converted = bare if ending in MESH_ENDINGS else "export it as .glb"
-        how = _CONVERT.get(ending, converted).format(path=path, stem=path.with_suffix(""))
+        how = _CONVERT.get(ending, converted).format(
+            path=path, stem=path.stem
+        )  # here: the input's folder may be closed
         raise FileFormatError(
             f"{path}: found {ending!r}, expected a character's .glb, .vrm or USD ({how}), or --template for a scan"
         )
@@ -194,7 +196,7 @@ def _copied(
     known = any(document.first_extras(key) is not None for key in ("landmarks", "rows"))
     found = [] if known else [_landmarks_added(root, character, present, progress)]
     write_edited(document, root, b"", out)
-    notes = [*present_lines(present), "nothing to make: the file was copied", *found]
+    notes = [*present_lines(present, ()), "nothing to make: the file was copied", *found]
     if expressions:
         notes.append(f"expressions added to the VRM: {len(expressions)}")
     names = {name: shape.names for name, shape in present.items()}

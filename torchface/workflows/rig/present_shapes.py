@@ -14,7 +14,12 @@ from torchface.io.gltf.part_insertion import ExtendedBlock
 from torchface.io.vrm.vrm_expressions import MorphBind, vrm_expressions
 from torchface.rig import BlendshapeRig
 from torchface.shape_names import ARKIT
-from torchface.shape_names.recognised_names import arkit_name, recognised_shapes, side_written_out
+from torchface.shape_names.recognised_names import (
+    arkit_count,
+    arkit_name,
+    recognised_shapes,
+    side_written_out,
+)
 from torchface.workflows.rig.character_face import CharacterFace
 
 _LARGEST = 2.0  # times a shape as it was made, to which that of a part may be brought
@@ -71,10 +76,10 @@ def spelled(present: dict[str, PresentShape]) -> dict[str, str]:
     return {own: name for own, name in single.items() if own != name and side_written_out(own) == name}
 
 
-def present_lines(there: dict[str, PresentShape]) -> list[str]:
+def present_lines(there: dict[str, PresentShape], empty: Sequence[str]) -> list[str]:
     """The shapes that a character has, for people to read."""
     own = {name: shape.names for name, shape in there.items() if shape.names != (name,)}
-    lines = [f"already there: {len(there)} of ARKit's 52, kept as they are"] if there else []
+    lines = [f"already there: {arkit_count(there, empty)}, kept as they are"] if there else []
     if renamed := spelled(there):
         some = ", ".join(f"{old} -> {new}" for old, new in list(renamed.items())[:3])
         lines.append(f"  written with ARKit's names: {len(renamed)} shapes, such as {some}")
