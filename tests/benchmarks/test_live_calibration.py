@@ -57,6 +57,6 @@ def test_poses_are_seen_and_a_narrow_smile_counts_as_a_whole_one(tmp_path: Path,
     asked = [words for words in said if " of 5: " in words]
     assert asked == [f"{number + 1} of 5: {words}" for number, words in enumerate(STEPS)]
     assert said[-1 if said[-1].startswith("Calibrated") else -2] == (
-        "Calibrated" if left_out is None else f"Calibrated; not seen: {STEPS[left_out]}"
+        "Calibrated" if left_out is None else f"Calibrated, but these poses were not seen: {STEPS[left_out]}"
     )
     assert smiles[True] > smiles[False] + 0.05

@@ -81,11 +81,11 @@ def register(
             Column("median", "median_mm", "{:.3f} mm"),
             Column("95 %", "p95_mm", "{:.2f} mm"),
             Column("on the scan", "shown", "{:.0%}"),
-            Column("slid", "slid_mm", "{:.1f} mm"),
+            Column("landmarks", "slid_mm", "{:.1f} mm"),
             Column("start by", "start", "{}"),
         ),
         "median_mm",
-        "95 %: distance of the 95th percentile; on the scan: of what faces outward, the rest is the template's; slid: "
-        "how far landmarks inside the face end from their vertices, unknown without: what slides along the skin "
-        "is as near to it as what does not",
+        "95 %: distance of the 95th percentile; on the scan: of what faces outward, the rest is the template's; "
+        "landmarks: how far the scan's lie from the mesh's own, inside the face (?: the scan has none). Without them "
+        "no figure says whether the mesh lies too far to a side on the skin",
     )

@@ -63,6 +63,7 @@ class Registration:
         matched: which vertices' positions the scan shows, (V,) bool; the others follow their neighbours.
         record: what was done.
         coefficients: of the model that the registration started from, (K,), where one was given.
+        landmarks: the scan's points, given or found, that held it, (L,3) float64, in the scan's place.
     """
 
     mesh: Mesh
@@ -71,6 +72,7 @@ class Registration:
     matched: Tensor
     record: RegistrationRecord
     coefficients: Tensor | None = None
+    landmarks: Tensor | None = None
 
 
 def register(
@@ -200,7 +202,8 @@ def register(
     )
     device = template.vertices.device
     coefficients = None if fit is None else fit.coefficients.to(template.vertices)
-    return Registration(mesh, start.pose, nearest.distance.to(device), matched.to(device), record, coefficients)
+    distance, points = nearest.distance.to(device), start.pull.points
+    return Registration(mesh, start.pose, distance, matched.to(device), record, coefficients, points)
 
 
 def _model_fit(model: ShapeModel, template: Mesh, aligned: Tensor, start: StartOnScan, schedule: Schedule) -> ModelFit:

@@ -78,7 +78,7 @@ export class Calibration {
   get result() {
     const missed = this.#missed.join(", ");
     if (POSES.every(({ short }) => this.#missed.includes(short))) return `Not calibrated: no pose was seen (${missed}). Calibrate again, and hold each pose until the tone.`;
-    return missed ? `Calibrated in part; not seen: ${missed}.` : "Calibrated.";
+    return missed ? `Calibrated, but these poses were not seen: ${missed}.` : "Calibrated.";
   }
 
   /** Factors by which shapes of this person are raised, by name. */

@@ -160,7 +160,7 @@ def test_a_face_that_never_rests_is_asked_to_and_nothing_is_learned_from_it(run:
     begun = next(i for i, one in enumerate(told["told"]) if one["step"] == "next")
     assert begun == pytest.approx(30 * 20, abs=5)
     assert not any(one["pose"] for one in told["told"][10 : begun + 1])
-    assert told["result"] == "Calibrated in part; not seen: resting face."
+    assert told["result"] == "Calibrated, but these poses were not seen: resting face."
 
 
 def test_settings_of_a_face_are_kept_by_the_persons_name(run: Run) -> None:

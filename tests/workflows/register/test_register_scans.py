@@ -17,13 +17,14 @@ import torch
 
 from torchface.errors import FileFormatError, MissingExtraError, ShapeError, TopologyError, ValueRangeError
 from torchface.files import content_keys
-from torchface.io import load_mesh, save_mesh
+from torchface.io import load_image, load_mesh, save_mesh
 from torchface.io.landmarks.picks import Correspondences, save_correspondences
 from torchface.mesh import Annotations, Mesh
 from torchface.registration import Level, Schedule, Stage, register
 from torchface.registration.landmark_files import load_scan_landmarks
 from torchface.registration.model_fit import LinearShape
 from torchface.workflows.batch.batch_items import BatchItem, find_items
+from torchface.workflows.batch.batch_job import picture_path
 from torchface.workflows.batch.outcomes import Outcome
 from torchface.workflows.batch.run_batch import BatchOptions, BatchReport
 from torchface.workflows.register.register_scans import SCANS, ScanSettings, register_scans
@@ -77,6 +78,10 @@ def test_each_result_is_what_register_gives_for_that_scan(template: Mesh, scans:
         assert torch.equal(found.faces, template.faces)
         assert found.annotations is not None
         assert torch.equal(found.landmarks, template.landmarks)
+        picture = load_image(picture_path(done.out, entry.item))
+        assert picture.shape[1:] == (3 * 400 + 2 * 4, 320)
+        red = (picture[0] > 0.9) & (picture[1:] < 0.1).all(0)
+        assert int(red[:400].sum()) > 5 * len(template.landmarks)
         assert entry.figures["median_mm"] == pytest.approx(alone.record.median_distance, rel=1e-6)
 
 

@@ -48,9 +48,9 @@ class RegistrationRecord:
     def figures(self) -> str:
         """How near it has come, how much of it the scan shows, and how far it has slid, in one line."""
         covered = f", {self.covered:.0%} lies under hair, cloth or a broken ear" if self.covered >= 0.005 else ""
-        slid = f"landmarks inside the face end {self.slid:.1f} mm from their vertices"
+        slid = f"the scan's landmarks inside the face lie {self.slid:.1f} mm from the mesh's own (median)"
         if math.isnan(self.slid):
-            slid = "sliding along the skin does not show in these figures without landmarks (a model holds it)"
+            slid = "without landmarks no figure says whether the mesh lies too far to a side on the skin"
         return (
             f"median {self.median_distance:.3f} mm, 95th percentile {self.far_distance:.3f} mm from the scan, which "
             f"shows {self.shown:.0%} of what faces outward{covered}; edges stretched by up to {self.stretch:.0%}; "

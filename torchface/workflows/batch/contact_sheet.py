@@ -18,16 +18,18 @@ from torchface.workflows.batch.outcomes import Outcome
 
 CONTACT_SHEET = "contact_sheet.png"
 MOST_PICTURES = 400  # on one sheet: more is not looked at, and a picture of 60 megapixels opens slowly
-_TEXT = 11
-_LETTER = 7  # pixels a letter takes at most in a text of that size, on average
+_LARGE = 100  # pictures that are shown in full size; more of them become smaller
+_TEXT = 14
+_LETTER = 9  # pixels a letter takes at most in a text of that size, on average
 _SKIPPED = 217  # the grey of what has no picture, of 255
-WIDTH, HEIGHT = 144, 180  # of one view of a face, pixels
+WIDTH, HEIGHT = 320, 400  # of one view of a face, pixels
 
 
 def contact_sheet(outcomes: Sequence[Outcome], out: Path) -> Tensor:
     """The pictures of the first :data:`MOST_PICTURES` outcomes, with names, and headlines or errors; (3,H,W)."""
     pictured = outcomes[:MOST_PICTURES]
-    pictures = [_picture(outcome, out) for outcome in pictured]
+    share = min(1.0, (_LARGE / max(1, len(pictured))) ** 0.5)
+    pictures = [_picture(outcome, out, share) for outcome in pictured]
     size = next((picture.shape[1:] for picture in pictures if picture is not None), torch.Size((HEIGHT, WIDTH)))
     cells = []
     for outcome, picture in zip(pictured, pictures, strict=True):
@@ -59,12 +61,14 @@ def _blank(outcome: Outcome, height: int, width: int) -> Tensor:
     return from_pillow(view)
 
 
-def _picture(outcome: Outcome, out: Path) -> Tensor | None:
+def _picture(outcome: Outcome, out: Path, share: float) -> Tensor | None:
+    """An outcome's picture, (3,H,W), at a share of its size."""
     path = picture_path(out, outcome.item)
     if not outcome.done or not path.is_file():
         return None
     try:
         with Image.open(path) as image:
+            image.thumbnail((round(share * image.width), round(share * image.height)))
             return from_pillow(image)
     except OSError:  # somebody has written something else there meanwhile
         return None

@@ -52,7 +52,7 @@ class GuidedCalibration:
         missed = [STEPS[i] for i in asked if self.most[i] - self.rest[i] < _LEAST]
         if missed and len(missed) == len(asked):
             return f"Not calibrated: no pose was seen ({'; '.join(missed)})"
-        return f"Calibrated in part; not seen: {'; '.join(missed)}" if missed else "Calibrated"
+        return f"Calibrated, but these poses were not seen: {'; '.join(missed)}" if missed else "Calibrated"
 
     @property
     def step(self) -> int:

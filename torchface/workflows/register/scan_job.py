@@ -11,6 +11,7 @@ from torch import Tensor
 
 from torchface import zoo
 from torchface.files.content_keys import content_key
+from torchface.geometry.similarity import similarity_transform
 from torchface.io import load_mesh, save_mesh
 from torchface.io.meshes.named_files import named_files
 from torchface.landmarks import UVLandmarkDetector
@@ -24,7 +25,7 @@ from torchface.registration.registered_mesh import hidden_parts, in_place_of, wi
 from torchface.registration.scan_colors import has_colors, without_colors
 from torchface.registration.scan_registration import NO_COLORS, Registration, register
 from torchface.rendering.clay_shading import render
-from torchface.rendering.compositing import sheet
+from torchface.rendering.compositing import sheet, with_dots
 from torchface.viz.figures.error_maps import error_colors
 from torchface.viz.figures.face_views import frame_face
 from torchface.viz.figures.registration_views import lines_on_clay
@@ -119,13 +120,17 @@ class ScanJob:
         return found, 0 if landmarks is None else len(landmarks[0])
 
     def _picture(self, registration: Registration) -> Tensor:
-        """The face from the template's front, its lines, and its distances to the scan, (3,H,W)."""
+        """The face from its front with the scan's landmarks, its lines, its distances to the scan; (3,H,W)."""
         upright = in_place_of(registration.mesh, self.template)  # a scan may have any orientation
         camera = frame_face(upright, width=WIDTH, height=HEIGHT)
         seen = registration.distance.masked_fill(~registration.matched, torch.nan)
         distances = error_colors(seen.to(upright.vertices), _MAX_DISTANCE, "turbo")
-        views = [render(upright, camera, samples=1), lines_on_clay(upright, camera)]
-        return sheet([*views, render(upright, camera, distances, samples=1)], 1)
+        face = render(upright, camera, samples=1)
+        if registration.landmarks is not None and len(registration.landmarks):
+            own, turned = (mesh.vertices.double()[None] for mesh in (registration.mesh, upright))
+            pose = similarity_transform(own, turned, scale=False)
+            face = with_dots(face, camera.project(pose.apply(registration.landmarks[None].to(own))[0]))
+        return sheet([face, lines_on_clay(upright, camera), render(upright, camera, distances, samples=1)], 1)
 
     @cached_property
     def _shared_key(self) -> str:
