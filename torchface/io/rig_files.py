@@ -186,15 +186,15 @@ def load_animation(path: str | Path) -> Take | None:
     """The weights that a file's animation gives its shapes, one frame a key; none where nothing moves shapes.
 
     Args:
-        path: a ``.glb``, ``.gltf`` or USD file whose keys are a film's frames, as :func:`save_animation` writes them.
+        path: a ``.glb``, ``.gltf`` or USD file, as :func:`save_animation` or another program writes it.
 
     Returns:
         weights (T,N,1), by the names of the shapes; correctives follow them and are left out. Keys that come unevenly
-        keep their times.
+        keep their times; steps and cubic splines between keys further apart than a film's are sampled, at 30 frames a
+        second where the keys lie on such frames.
 
     Raises:
-        FileFormatError: another kind of file, broken, or keys out of order, or with gaps of ten frames where they are
-            not joined by straight lines.
+        FileFormatError: another kind of file, broken, or keys out of order.
         MissingExtraError: USD, and usd-core is not installed.
 
     Example:
