@@ -63,7 +63,7 @@ class Registration:
         matched: which vertices' positions the scan shows, (V,) bool; the others follow their neighbours.
         record: what was done.
         coefficients: of the model that the registration started from, (K,), where one was given.
-        landmarks: the scan's points, given or found, that held it, (L,3) float64, in the scan's place.
+        landmarks: those that held it, given or found: vertices (L,) and the scan's points (L,3) float64.
     """
 
     mesh: Mesh
@@ -72,7 +72,7 @@ class Registration:
     matched: Tensor
     record: RegistrationRecord
     coefficients: Tensor | None = None
-    landmarks: Tensor | None = None
+    landmarks: Landmarks | None = None
 
 
 def register(
@@ -202,8 +202,8 @@ def register(
     )
     device = template.vertices.device
     coefficients = None if fit is None else fit.coefficients.to(template.vertices)
-    distance, points = nearest.distance.to(device), start.pull.points
-    return Registration(mesh, start.pose, distance, matched.to(device), record, coefficients, points)
+    distance, held = nearest.distance.to(device), (start.pull.vertices, start.pull.points)
+    return Registration(mesh, start.pose, distance, matched.to(device), record, coefficients, held)
 
 
 def _model_fit(model: ShapeModel, template: Mesh, aligned: Tensor, start: StartOnScan, schedule: Schedule) -> ModelFit:

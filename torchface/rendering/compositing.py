@@ -83,20 +83,6 @@ def sheet(images: Sequence[Tensor], columns: int, gap: int = 4) -> Tensor:
     return page
 
 
-def with_dots(image: Tensor, pixels: Tensor, radius: float = 2.5) -> Tensor:
-    """The image (3,H,W) with a red dot, edged in white, at each of some places (L,2), pixels.
-
-    Example:
-        >>> with_dots(torch.zeros(3, 9, 9), torch.tensor([[4.0, 4.0]]))[:, 4, 4].tolist()
-        [1.0, 0.0, 0.0]
-    """
-    drawn = to_pillow(image)
-    draw = ImageDraw.Draw(drawn)
-    for x, y in pixels[pixels.isfinite().all(-1)].tolist():
-        draw.ellipse((x - radius, y - radius, x + radius, y + radius), "red", "white")
-    return from_pillow(drawn)
-
-
 def to_pillow(image: Tensor) -> Image.Image:
     """An 8-bit Pillow image of (3,H,W) in [0,1], which a notebook shows.
 

@@ -25,9 +25,10 @@ from torchface.registration.registered_mesh import hidden_parts, in_place_of, wi
 from torchface.registration.scan_colors import has_colors, without_colors
 from torchface.registration.scan_registration import NO_COLORS, Registration, register
 from torchface.rendering.clay_shading import render
-from torchface.rendering.compositing import sheet, with_dots
+from torchface.rendering.compositing import sheet
 from torchface.viz.figures.error_maps import error_colors
 from torchface.viz.figures.face_views import frame_face
+from torchface.viz.figures.landmark_dots import with_dots
 from torchface.viz.figures.registration_views import lines_on_clay
 from torchface.workflows.batch.batch_items import BatchItem
 from torchface.workflows.batch.contact_sheet import HEIGHT, WIDTH
@@ -120,16 +121,18 @@ class ScanJob:
         return found, 0 if landmarks is None else len(landmarks[0])
 
     def _picture(self, registration: Registration) -> Tensor:
-        """The face from its front with the scan's landmarks, its lines, its distances to the scan; (3,H,W)."""
+        """The face with landmarks (the scan's green, its own red), its lines, its distances to the scan; (3,H,W)."""
         upright = in_place_of(registration.mesh, self.template)  # a scan may have any orientation
         camera = frame_face(upright, width=WIDTH, height=HEIGHT)
         seen = registration.distance.masked_fill(~registration.matched, torch.nan)
         distances = error_colors(seen.to(upright.vertices), _MAX_DISTANCE, "turbo")
         face = render(upright, camera, samples=1)
-        if registration.landmarks is not None and len(registration.landmarks):
+        if registration.landmarks is not None:
+            ids, points = registration.landmarks
             own, turned = (mesh.vertices.double()[None] for mesh in (registration.mesh, upright))
-            pose = similarity_transform(own, turned, scale=False)
-            face = with_dots(face, camera.project(pose.apply(registration.landmarks[None].to(own))[0]))
+            points = similarity_transform(own, turned, scale=False).apply(points[None].to(own))
+            pixels = (camera.project(one) for one in (points[0], turned[0, ids]))
+            face = with_dots((255 * face.clamp(0, 1)).byte(), *pixels).float() / 255
         return sheet([face, lines_on_clay(upright, camera), render(upright, camera, distances, samples=1)], 1)
 
     @cached_property
