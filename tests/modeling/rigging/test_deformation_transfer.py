@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from torchface.correctives import Corrective, Correctives
-from torchface.errors import TopologyError, ValueRangeError
+from torchface.errors import AlignmentError, TopologyError, ValueRangeError
 from torchface.geometry.meshes.operators import components
 from torchface.io.rigs.ict_facekit import load_ict_facekit, load_identity_modes
 from torchface.mesh import Mesh
@@ -87,6 +87,24 @@ def test_what_is_still_in_the_source_is_still_in_the_result() -> None:
     still = rig.deltas.norm(dim=-1) < 0.01
     assert still.any(1).all()
     assert float(result.deltas.norm(dim=-1)[still].max()) < 0.02
+
+
+def test_a_face_that_is_not_the_neutral_is_refused_and_a_caricature_is_not() -> None:
+    actor = performer(texture=False).select(["jawOpen"])
+    rest = actor.vertices
+    shuffled = rest.clone()
+    some = torch.randperm(len(rest), generator=torch.Generator().manual_seed(0))[: len(rest) // 4]
+    shuffled[some] = rest[some.roll(1)]
+    for found, error, told in (
+        (0.1 * rest, ValueRangeError, "in centimetres .*--unit cm"),
+        (rest * torch.tensor([-1.0, 1.0, 1.0]), AlignmentError, "mirror image of the template.*right-handed"),
+        (shuffled, AlignmentError, r"edges of [\d.]+ mm where the template's have .* another order"),
+    ):
+        with pytest.raises(error, match=told):
+            transfer_deformation(actor, actor.neutral.with_vertices(found))
+    far = torch.where(rest[:, 2:] > rest[:, 2].median(), 2.0, 1.0)  # the nose, the lips and the brow twice as far out
+    caricature = rest * torch.tensor([3.0, 1.5, 1.0]) * far
+    assert transfer_deformation(actor, actor.neutral.with_vertices(caricature)).deltas.isfinite().all()
 
 
 def test_a_longer_jaw_swings_further() -> None:
